@@ -238,12 +238,12 @@ RIGHT = Setup(frozenset())
 SPOILT = {
     "reference unlocked": Setup(frozenset({"clock_unlocked"}), cabled(received=replace(RECEIVED, clock=_clock(2.0)))),
     "clock drifts": Setup(frozenset({"clock_drifts"}), spoil=_both(_moving_clock)),
-    "radar contact loose": Setup(frozenset({"contact_loose"}), spoil=channel(RECEIVER, 0, _bad_contact)),
+    "radar contact loose": Setup(frozenset({"contact_intermittent"}), spoil=channel(RECEIVER, 0, _bad_contact)),
     "sidelink contact loose": Setup(
-        frozenset({"contact_loose", "sidelink_lost"}), spoil=channel(RECEIVER, 1, _bad_contact)
+        frozenset({"contact_intermittent", "sidelink_lost"}), spoil=channel(RECEIVER, 1, _bad_contact)
     ),
     "own contact scatters": Setup(
-        frozenset({"contact_loose"}),
+        frozenset({"contact_intermittent"}),
         spoil=channel(TRANSMITTER, 0, lambda x: x * np.random.default_rng(3).normal(1, 0.12, len(x))[:, None]),
     ),
     "channels swapped": Setup(frozenset({"channels_swapped"}), spoil=_swapped),
@@ -255,7 +255,7 @@ SPOILT = {
         frozenset({"saturated_sidelink"}),
         spoil=channel(RECEIVER, 1, lambda x: (4 * x.real).clip(-8191, 8191) + 1j * (4 * x.imag).clip(-8191, 8191)),
     ),
-    "sidelink leaks": Setup(frozenset({"channel_leaks"}), spoil=_leaks),
+    "sidelink leaks": Setup(frozenset({"channel_crosstalk"}), spoil=_leaks),
     "code of another radar": Setup(frozenset({"wrong_code", "code_unconfirmed"}), spoil=_other_code),
     "triggers missed": Setup(frozenset({"triggers_missed"}), spoil=_captures(RECEIVER, _lost)),
     "triggers false": Setup(frozenset({"triggers_false"}), spoil=_captures(TRANSMITTER, _false)),
@@ -273,7 +273,7 @@ SPOILT = {
         frozenset({"link_weak", "channel_weak"}), cabled(received=replace(RECEIVED, radar_snr_db=-22.0))
     ),
     "converter without gain": Setup(frozenset({"channel_weak"}), spoil=channel(RECEIVER, 0, lambda x: 1e-3 * x)),
-    "path of the config wrong": Setup(frozenset({"path_disagrees"}), spoil=_stated(radar=-0.911)),
+    "path of the config wrong": Setup(frozenset({"path_offset_disagrees"}), spoil=_stated(radar=-0.911)),
     "clocks of the two channels apart": Setup(
         frozenset({"link_incoherent"}),
         spoil=channel(RECEIVER, 0, _turning(lambda x: 0.3 * np.random.default_rng(4).normal(size=(len(x), 1)))),
@@ -292,10 +292,11 @@ SPOILT = {
         spoil=channel(TRANSMITTER, 0, lambda x: np.where(_along(x) > 0.6, np.roll(x, -20, axis=1), x)),
     ),
     "amplifier steps by 1 dB": Setup(
-        frozenset({"contact_loose"}), spoil=channel(RECEIVER, 0, lambda x: np.where(_along(x) > 0.5, 0.89, 1.0) * x)
+        frozenset({"contact_intermittent"}),
+        spoil=channel(RECEIVER, 0, lambda x: np.where(_along(x) > 0.5, 0.89, 1.0) * x),
     ),
     "receiver stops early": Setup(frozenset({"triggers_missed"}), spoil=_captures(RECEIVER, _stopped)),
     "another transmitter": Setup(frozenset({"interference"}), spoil=channel(RECEIVER, 0, _tone)),
-    "split unequal": Setup(frozenset({"split_disagrees"}), spoil=_split),
+    "split unequal": Setup(frozenset({"splitter_channels_differ"}), spoil=_split),
 }
 """What is wrong → a set-up with it, and which flags name it."""

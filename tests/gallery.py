@@ -38,6 +38,7 @@ WIDTHS, COLOURS = (660, 600, 560), (256, 64, 32, 20)
 """Dots of a picture, and its colours where all of them would exceed the limit: the first that keep to the aim."""
 
 WITHOUT = {
+    "antenna_coupling": "the example of the UAV flight shows it",
     "raw_imu": "its recipe runs a library that apertura does not install, and ends in a log",
     "sizing": "its tables of estimates are all it has",
 }
@@ -264,9 +265,9 @@ def gis(_: Path) -> Made:
 
 def formed(engine: str) -> None:
     """Write an image of the posts of the first page by an engine, in a process that numba may simulate a device in."""
-    from website.picture import seen
+    from website.picture import example_history
 
-    np.save(f"{engine}.npy", ap.backproject(seen()[::5], GRID_OF_POSTS, engine=engine).values)
+    np.save(f"{engine}.npy", ap.backproject(example_history()[::5], GRID_OF_POSTS, engine=engine).values)
 
 
 GRID_OF_POSTS = ap.SceneGrid("local", -5.0, 8.0, 0.1, (64, 96))
@@ -350,9 +351,9 @@ def map_(folder: Path) -> Made | None:
 
 
 def me_or_the_radar(_: Path) -> Made:
-    from website.picture import seen
+    from website.picture import example_history
 
-    grid, right = ap.SceneGrid("local", -14.0, 10.0, 0.1, (200, 280)), seen()
+    grid, right = ap.SceneGrid("local", -14.0, 10.0, 0.1, (200, 280)), example_history()
     wave_m = 0.04 * np.sin(np.arange(len(right)) / 40)[:, None] * [0, 1, 1]
     moved = ap.Aperture(right.aperture.tx_m + wave_m, right.aperture.rx_m + wave_m)
     cases = {
@@ -503,6 +504,14 @@ def rail_pass(folder: Path) -> Made:
     return imaged(folder, "passA/radar-radar")
 
 
+def uav_flight(folder: Path) -> Made:
+    root = Path(shutil.copytree(ROOT / "examples/uav_flight", folder / "campaign"))
+    (root / "raw/f01").mkdir(parents=True)
+    for name in ("radar.out", "radar.track.csv"):
+        shutil.copyfile(SHARED / "bwsi_uav_flight" / name, root / "raw/f01" / name)
+    return imaged(folder, "f01/radar-radar")
+
+
 def gotcha(folder: Path) -> Made:
     root = Path(shutil.copytree(ROOT / "examples/gotcha", folder / "campaign"))
     (root / "raw/pass1").mkdir(parents=True)
@@ -524,7 +533,7 @@ MAKERS: dict[str, Callable[[Path], Made | None]] = {
     for made in (
         bench, calibrate_radiometry, calibration_flight, catalog, cluster, dem, design, fmcw, gis, gpu, inspect,
         interferometry, long_flights, map_, me_or_the_radar, notebook, refine_tracks, report, run, samples, verify,
-        xarray, your_own_recording, ci, sample, rail_pass, gotcha, px4_flight,
+        xarray, your_own_recording, ci, sample, rail_pass, uav_flight, gotcha, px4_flight,
     )
 }  # fmt: skip
 """Picture → what makes it, in a folder of its own that it begins in."""

@@ -155,10 +155,10 @@ def test_removing_a_link_keeps_what_it_points_to(tmp_path):
 @pytest.mark.parametrize(
     ("number", "remedy"),
     [
-        (errno.ENOSPC, "MB free there. Make room there"),
+        (errno.ENOSPC, "MB free there. Free disk space there"),
         (errno.EDQUOT, "a larger quota"),
         (errno.EFBIG, "ulimit -f"),
-        (errno.EROFS, "to where it may be written"),
+        (errno.EROFS, "to a writable file system"),
         (errno.EACCES, "its folder writable"),
         (errno.EIO, "Check the disk"),
         (errno.EMFILE, "ulimit -n"),
@@ -168,7 +168,7 @@ def test_an_error_of_the_machine_says_what_it_was_where_and_what_to_do(tmp_path,
     message = explained(OSError(number, os.strerror(number), str(tmp_path / "absent" / "x.tif")))
     assert message.startswith(f"{tmp_path}/absent/x.tif: {os.strerror(number)} ({errno.errorcode[number]})")
     assert remedy in message
-    assert message.endswith("run again: it goes on where it was.")
+    assert message.endswith("run again: the run resumes.")
 
 
 def test_memory_that_is_gone_and_a_reader_that_is_gone_are_no_defects():

@@ -188,4 +188,4 @@ def test_bounds_that_are_no_multiple_of_the_spacing_name_the_nearest_and_no_keys
     assert "10.1, 10.0] is 40.4 × 40 pixels of 0.25 m; the nearest whole grid is [0.0, 0.0, 10.0, 10.0]" in str(
         refused.value
     )
-    assert refused.value.expected == "values that go together"
+    assert refused.value.expected == "consistent values"

@@ -165,7 +165,7 @@ def test_a_hard_link_to_a_file_outside_is_read_but_not_written(root, outside):
     path = Path(root) / "results" / ".run.lock"
     path.hardlink_to(outside / "a.json")
     assert (root / "results" / ".run.lock").read_text() == "kept"
-    with pytest.raises(CampaignError, match=r"2 names \(hard links\)"):
+    with pytest.raises(CampaignError, match=r"a file with 2 hard links"):
         hold(root)
     assert (outside / "a.json").read_text() == "kept"
 
@@ -289,7 +289,7 @@ finally:
         ("step", "image", "f01", "uav1-uav2", "--campaign"),
         ("step", "export", "f01", "uav1-uav2", "--campaign"),
         ("step", "stac", "--campaign"),
-        ("look",),
+        ("preview",),
         ("clean", "--yes"),
     ],
     ids=lambda words: " ".join(words[:2]),

@@ -54,10 +54,10 @@ def test_a_byte_order_mark_and_the_line_ends_of_windows_change_nothing(tmp_path)
         (BOMB, "line 6, column 30: more than 100000 values"),
         ("[" * 200_000, f"line 1, column {DEEPEST + 1}: nested more than {DEEPEST} levels deep"),
         ("- " * 200_000, "nested more than"),
-        ("a: &a [*a]", "for itself"),
+        ("a: &a [*a]", "no complete node before it"),
         ("a: *b", "alias 'b'"),
-        ("x: " + "9" * 5000, "a number of 5000 digits"),
-        ("a: !!python/object/apply:os.system [touch x]", "where a plain value belongs"),
+        ("x: " + "9" * 5000, "an integer of 5000 digits"),
+        ("a: !!python/object/apply:os.system [touch x]", "instead of a plain value"),
         ("a: !!timestamp never", "not readable as YAML"),
         ("a: 2025-02-30", "not readable as YAML"),
         ("a: [1\nb: 2", "line 2, column 2"),
@@ -85,9 +85,9 @@ def test_a_bomb_of_aliases_is_refused_in_milliseconds(tmp_path):
 
 
 def test_a_key_that_stands_twice_is_named_with_its_line(tmp_path):
-    assert "line 3, column 3: key 'a' a second time" in refused(tmp_path, "x:\n  a: 1\n  a: 2\n")
+    assert "line 3, column 3: repeated key 'a'" in refused(tmp_path, "x:\n  a: 1\n  a: 2\n")
     message = refused(tmp_path, config_template() + "campaign: again\n")
-    assert "key 'campaign' a second time" in message
+    assert "repeated key 'campaign'" in message
 
 
 def test_numbers_that_are_each_allowed_and_overflow_together_are_one_message(tmp_path):
@@ -96,7 +96,7 @@ def test_numbers_that_are_each_allowed_and_overflow_together_are_one_message(tmp
         .replace("bounds_m: auto", "bounds_m: [-1.0e+308, -1.0e+308, 1.0e+308, 1.0e+308]")
         .replace("spacing_m: auto", "spacing_m: 1.0e-300")
     )
-    assert "too large or small" in complaint(lambda: read_settings(tmp_path / "config.yaml"))
+    assert "overflow or underflow" in complaint(lambda: read_settings(tmp_path / "config.yaml"))
 
 
 @pytest.mark.parametrize("number", ["1.0e+16", "-1e300", "9" * 20])
@@ -104,7 +104,7 @@ def test_a_number_that_nothing_of_ours_reaches_is_named_by_its_key(tmp_path, num
     (tmp_path / "config.yaml").write_text(config_template().replace("radar: 0.0", f"radar: {number}", 1))
     message = complaint(lambda: read_settings(tmp_path / "config.yaml"))
     assert "nodes.uav1.path_offset_m.radar is " in message
-    assert "no number beyond ±1e+15" in message
+    assert "numbers within ±1e+15" in message
 
 
 def test_a_wrong_value_is_quoted_no_longer_than_a_line(tmp_path):

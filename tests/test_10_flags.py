@@ -27,9 +27,9 @@ def test_a_flag_that_is_no_row_of_the_table_cannot_be_raised():
     assert flags == dict.fromkeys(FLAGS, "measured")
 
 
-def test_every_flag_says_what_was_measured_what_it_means_and_what_to_do():
+def test_every_flag_has_measured_quantity_meaning_and_advice():
     for flag in FLAGS.values():
-        for text in (flag.measured, flag.means, flag.look, flag.raised):
+        for text in (flag.measured, flag.meaning, flag.advice, flag.raised):
             assert text.strip()
             assert not set(text) & set("|`\n")
 
@@ -52,7 +52,7 @@ def test_the_page_from_symptom_to_remedy_names_flags_that_exist_and_those_that_s
     assert named <= set(FLAGS)
     from apertura.stages.assess import _LOOKS_WRONG
 
-    assert {*_LOOKS_WRONG, "attitude_suspect", "outside_swath", "accuracy_missed", "wrong_code"} <= named
+    assert {*_LOOKS_WRONG, "attitude_suspect", "outside_swath", "accuracy_not_met", "wrong_code"} <= named
 
 
 def test_pages_that_come_from_the_code_are_as_they_would_be_written_now():
@@ -62,8 +62,10 @@ def test_pages_that_come_from_the_code_are_as_they_would_be_written_now():
 
 def test_two_parts_that_raise_one_flag_both_have_their_say():
     """The union of dicts keeps the last line and loses the other without a word."""
-    merged = Flags.merged({"saturated_radar": "tx: 3 %"}, {"fix_poor": "9 pulses"}, {"saturated_radar": "rx: 40 %"})
-    assert merged == {"saturated_radar": "tx: 3 %; rx: 40 %", "fix_poor": "9 pulses"}
+    merged = Flags.merged(
+        {"saturated_radar": "tx: 3 %"}, {"fix_quality_low": "9 pulses"}, {"saturated_radar": "rx: 40 %"}
+    )
+    assert merged == {"saturated_radar": "tx: 3 %; rx: 40 %", "fix_quality_low": "9 pulses"}
     assert Flags.merged(merged, {"saturated_radar": "rx: 40 %"}) == merged
     assert Flags.merged({"defocused": "2 dB"}, {"defocused": "2 dB; most likely time tags"}) == {
         "defocused": "2 dB; most likely time tags"
@@ -71,13 +73,13 @@ def test_two_parts_that_raise_one_flag_both_have_their_say():
 
 
 def test_lines_that_begin_alike_are_both_kept_and_a_line_of_two_clauses_is_kept_once():
-    one, ten = {"fix_poor": "3 of 90 pulses of uav1"}, {"fix_poor": "3 of 90 pulses of uav10"}
-    assert Flags.merged(one, ten)["fix_poor"] == "3 of 90 pulses of uav1; 3 of 90 pulses of uav10"
-    assert Flags.merged(ten, one)["fix_poor"] == "3 of 90 pulses of uav10; 3 of 90 pulses of uav1"
-    shared = {"fix_poor": "3 of 90 pulses; a float solution"}
+    one, ten = {"fix_quality_low": "3 of 90 pulses of uav1"}, {"fix_quality_low": "3 of 90 pulses of uav10"}
+    assert Flags.merged(one, ten)["fix_quality_low"] == "3 of 90 pulses of uav1; 3 of 90 pulses of uav10"
+    assert Flags.merged(ten, one)["fix_quality_low"] == "3 of 90 pulses of uav10; 3 of 90 pulses of uav1"
+    shared = {"fix_quality_low": "3 of 90 pulses; a float solution"}
     assert Flags.merged(shared, shared, shared) == shared
-    longer = {"fix_poor": "3 of 90 pulses of uav10; at the end"}
-    assert Flags.merged(Flags.merged(one, ten), longer)["fix_poor"] == (
+    longer = {"fix_quality_low": "3 of 90 pulses of uav10; at the end"}
+    assert Flags.merged(Flags.merged(one, ten), longer)["fix_quality_low"] == (
         "3 of 90 pulses of uav1; 3 of 90 pulses of uav10; at the end"
     )
     assert pickle.loads(pickle.dumps(Flags.merged(one, ten))) == Flags.merged(one, ten)

@@ -137,7 +137,7 @@ def test_a_truncated_dem_is_one_message(tmp_path, share):
 @pytest.mark.parametrize(
     ("place", "expected"),
     [
-        ((500000, 5400100, 0, 2), "no CRS on Earth"),  # which is how GDAL reads it
+        ((500000, 5400100, 0, 2), "no geodetic CRS"),  # which is how GDAL reads it
         ((500000, 5400100, 1e-300, 1e-300), "a degenerate transform [1e-300, "),
         ((500000, 5400100, float("nan"), 2), "a degenerate transform [nan, "),
     ],
@@ -191,7 +191,7 @@ def test_a_grid_is_as_large_as_its_header_says(tmp_path):
     for rows in (8, 10, -9, 0, 2**31 - 1):
         assert "bytes for" in complaint(lambda rows=rows: lifted(gtx(path, rows=rows)))
     for header in ((np.nan, 7, 0.5, 0.5), (47, 7, 0, 0.5), (47, 7, 0.5, -1), (47, 1e300, 0.5, 0.5)):
-        assert "a grid that begins" in complaint(lambda header=header: lifted(gtx(path, header=header)))
+        assert "a grid that starts" in complaint(lambda header=header: lifted(gtx(path, header=header)))
     path.write_bytes(b"short")
     assert "5 bytes" in complaint(lambda: lifted(path))
 
@@ -199,7 +199,7 @@ def test_a_grid_is_as_large_as_its_header_says(tmp_path):
 def test_an_undulation_that_no_geoid_has_is_refused(tmp_path):
     for value in (1e30, -2000.0, np.nan):
         path = gtx(tmp_path / "egm96.gtx", values=np.full(81, value))
-        assert "no undulation of the Earth" in complaint(lambda path=path: lifted(path))
+        assert "no valid undulation at longitude" in complaint(lambda path=path: lifted(path))
 
 
 @pytest.mark.parametrize(
@@ -219,7 +219,7 @@ def test_a_tif_grid_says_what_proj_makes_of_it(tmp_path, place, shape):
     np.testing.assert_allclose(undulation(path, longitude, latitude), expected, atol=1e-6)
     values[:] = -999
     write_dem(path, values, place, "EPSG:4326", nodata=-999)
-    assert "no undulation of the Earth" in complaint(lambda: undulation(path, longitude, latitude))
+    assert "no valid undulation at longitude" in complaint(lambda: undulation(path, longitude, latitude))
 
 
 def test_a_tif_of_which_proj_divides_by_zero_is_read_or_refused(tmp_path):
@@ -231,6 +231,6 @@ def test_a_tif_of_which_proj_divides_by_zero_is_read_or_refused(tmp_path):
 
 
 def test_a_grid_of_another_suffix_or_format_is_refused(tmp_path):
-    assert "a file of kind '.gsb'" in complaint(lambda: lifted(gtx(tmp_path / "egm96.gsb")))
+    assert "a file of type '.gsb'" in complaint(lambda: lifted(gtx(tmp_path / "egm96.gsb")))
     (tmp_path / "egm96.tif").write_text(VRT.format("/etc/passwd"))
     assert "not readable as GeoTIFF" in complaint(lambda: lifted(tmp_path / "egm96.tif"))

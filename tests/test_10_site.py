@@ -71,8 +71,8 @@ def write(site, body, css=""):
 def test_dead_links_and_whatever_is_loaded_from_elsewhere_are_told(tmp_path):
     site = tmp_path / "site"
     assert write(site, '<a href="#here">a</a><a href="https://a.example/">b</a><link href="site.css">') == []
-    assert write(site, '<a href="gone.html">a</a>') == ["gone.html leads nowhere"]
-    assert write(site, '<a href="index.html#there">a</a>') == ["index.html#there: no such heading"]
+    assert write(site, '<a href="gone.html">a</a>') == ["gone.html: target does not exist"]
+    assert write(site, '<a href="index.html#there">a</a>') == ["index.html#there: heading does not exist"]
     for loaded in ('<script src="https://a.example/x.js">', '<img src="//a.example/x.png">'):
         assert len(write(site, loaded)) == 1
     assert len(write(site, "", css='@import url("https://a.example/font.css")')) == 1

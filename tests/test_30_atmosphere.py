@@ -69,7 +69,7 @@ def test_a_flight_has_one_refractivity_weighed_by_its_legs():
     assert flown.left_m == pytest.approx(0, abs=1e-12)
     climbing = air.over(np.linspace(900, 1200, 5), np.linspace(900, 1200, 5), (np.full(5, 1500.0),) * 2)
     assert 3e-3 < climbing.left_m < 1.5e-2  # of a path of 3 km
-    assert flown.report["vacuum_would_move_m"] == pytest.approx(flown.refractivity_n * 1e-6 * 5100 / 2, rel=1e-3)
+    assert flown.report["vacuum_shift_m"] == pytest.approx(flown.refractivity_n * 1e-6 * 5100 / 2, rel=1e-3)
 
 
 def test_what_the_weather_may_be_covers_ten_kelvin_twenty_hectopascals_and_any_humidity():
@@ -142,7 +142,9 @@ def test_the_air_of_a_scene_is_a_keyword_from_python_for_transfer_functions_and_
         image = ap.backproject(recorded, GRID, atmosphere=stated, **quick)
         assert np.abs(image.values - by_speed.values).max() < 2e-3 * np.abs(by_speed.values).max()
     assert np.abs(ap.backproject(given, GRID, **quick).values - by_speed.values).max() > 0.1
-    with pytest.raises(CampaignError, match="expected auto, vacuum, an Atmosphere, or N units"):
+    with pytest.raises(
+        CampaignError, match="expected auto, vacuum, an Atmosphere, or the refractivity at the terrain in N units"
+    ):
         ap.backproject(given, GRID, atmosphere="dry")
 
 
@@ -275,6 +277,6 @@ def test_who_takes_the_speed_of_light_in_vacuum_is_listed_with_the_reason():
         for path in source.rglob("*.py")
         if "SPEED_OF_LIGHT_M_S" in path.read_text(encoding="utf-8")
     }
-    assert users == set(VACUUM), "read docs/theory/atmosphere.md, One place"
+    assert users == set(VACUUM), "read docs/theory/atmosphere.md, Wave speed of a pair"
     for path in (source / "core/backprojection/engines").rglob("*.py"):
         assert "SPEED_OF_LIGHT_M_S" not in path.read_text(encoding="utf-8"), path

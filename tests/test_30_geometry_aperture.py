@@ -81,7 +81,7 @@ def test_phase_centres_of_different_shapes_are_refused():
         (np.zeros((4, 2)), np.zeros((4, 2))),
         (np.zeros(3), np.zeros(3)),
     ):
-        with pytest.raises(ValueError, match=r"expected phase centres of as many pulses, \(pulse, 3\) each"):
+        with pytest.raises(ValueError, match=r"expected phase centres of the same number of pulses, \(pulse, 3\) each"):
             Aperture(tx, rx)
 
 

@@ -143,10 +143,10 @@ def test_pulses_of_a_poor_fix_are_barred_however_short_it_is():
     poor = np.zeros(400, bool)
     poor[[0, 1, 100, 399]] = True
     holes = checked(time_s, place, poor=poor).holes
-    assert {hole.cause for hole in holes} == {"fix_poor"}
+    assert {hole.cause for hole in holes} == {"fix_quality_low"}
     edges = np.array(sorted(hole[:2] for hole in holes))
     np.testing.assert_allclose(edges, [(-np.inf, 0.2), (9.9, 10.1), (39.8, np.inf)])
-    assert checked(time_s, place, poor=np.ones(400, bool)).excluded(time_s)["fix_poor"].all()
+    assert checked(time_s, place, poor=np.ones(400, bool)).excluded(time_s)["fix_quality_low"].all()
 
 
 def test_a_log_that_freezes_and_jumps_is_not_splined_through_the_frozen_epochs():

@@ -17,13 +17,13 @@ from apertura.core.geometry.track_checks import check_track
 from apertura.formats.reading import read_track
 from apertura.formats.tracks.ardupilot import track_of
 from apertura.formats.tracks.dataflash_fields import read_fields
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 
 SECOND = np.timedelta64(1, "s")
 KINDS = {".bin": dataflash, ".log": dataflash_text}
 
 
-def read(tmp_path, rows, *, suffix=".bin", options=AS_IT_SAYS, forms=None):
+def read(tmp_path, rows, *, suffix=".bin", options=DEFAULT_OPTIONS, forms=None):
     path = tmp_path / f"a.track{suffix}"
     path.write_bytes(KINDS[suffix](rows, forms))
     return check(read_track(path, node="a", options=options), "track")
@@ -120,7 +120,7 @@ def test_several_receivers_are_listed_with_their_solutions(tmp_path, suffix):
         for name, row in dataflash_rows(receivers=(0, 1))
     ]
     track = read(tmp_path, rows, suffix=suffix)
-    found = "the log holds 0 (single 60) and 1 (fix 60); 0 is read: set nodes.a.log.body to choose"
+    found = "the log contains receivers 0 (single 60) and 1 (fix 60); 0 is used: select with nodes.a.log.body"
     assert track.attrs["remarks"] == [found]
     assert "remarks" not in read(tmp_path, rows, suffix=suffix, options=LogOptions(body="1")).attrs
 
@@ -176,7 +176,7 @@ def test_lines_of_a_text_log_that_are_no_messages_are_counted(tmp_path):
     path.write_bytes(b"\n".join([*lines[:100], b"@@@@@,,", *lines[100:]]))
     track = read_track(path, node="a")
     assert track.attrs["damage"].startswith("2 of ")
-    assert "lines are no messages, in 2 places, from line 101 on" in track.attrs["damage"]
+    assert "lines are not valid messages, in 2 blocks, from line 101 on" in track.attrs["damage"]
     assert track.sizes["epoch"] == 59
 
 
@@ -204,7 +204,7 @@ def test_kinds_of_solution_are_kept_and_epochs_without_any_are_counted(tmp_path)
 @pytest.mark.usefixtures("reader")
 def test_epochs_before_the_receiver_knew_the_week_are_counted(tmp_path):
     weeks = np.where(np.arange(60) < 9, 0, 2366)
-    assert read(tmp_path, dataflash_rows(GWk=weeks)).attrs["dropped"] == {"no time of the receiver": 9}
+    assert read(tmp_path, dataflash_rows(GWk=weeks)).attrs["dropped"] == {"no UTC from the receiver": 9}
     message = complaint(lambda: read(tmp_path, dataflash_rows(GWk=np.zeros(60, int))))
     assert "no epoch has a time in UTC" in message
     assert "nodes.a.log.start_utc" in message
@@ -224,7 +224,7 @@ def test_an_epoch_that_is_not_where_the_velocities_lead_is_left_out(tmp_path):
         for n, (name, v) in numbered(dataflash_rows())
     ]
     track = read(tmp_path, moved)
-    assert track.attrs["dropped"] == {"not where the receiver's velocity leads": 1}
+    assert track.attrs["dropped"] == {"position contradicts the receiver's velocity": 1}
     assert apart_m(track).max() < 0.02
 
 
@@ -240,9 +240,9 @@ def numbered(rows):
 @pytest.mark.parametrize(
     ("suffix", "data", "found"),
     [
-        (".bin", b"", "a flight log of kind '.bin'"),
-        (".log", b"GPS, 1, 2\n" * 50, "a flight log of kind '.log'"),
-        (".log", b"FMT\n" * 50, "no FMT message at its beginning"),
+        (".bin", b"", "a flight log with suffix '.bin'"),
+        (".log", b"GPS, 1, 2\n" * 50, "a flight log with suffix '.log'"),
+        (".log", b"FMT\n" * 50, "no FMT message at the start of the file"),
         (".log", b"FMT, 1\n" * 50, "no GPS message"),
         (".bin", dataflash([]), "no GPS message"),
         (".log", dataflash_text([]), "no GPS message"),
@@ -277,7 +277,7 @@ def read_damaged(path, data):
     except Exception:
         return None
     try:
-        return check(track_of(fields, node="a", options=AS_IT_SAYS, where=path), "track")
+        return check(track_of(fields, node="a", options=DEFAULT_OPTIONS, where=path), "track")
     except CampaignError:
         return None
 

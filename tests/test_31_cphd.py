@@ -139,7 +139,11 @@ def test_pulses_without_a_normal_signal_are_left_out_and_counted(tmp_path):
     pvp["TxPos"][3] = np.nan  # noise was recorded, nothing was sent
     signal[5] = 0
     echo = read(write(tmp_path / "rx.cphd", pvp, signal))
-    assert echo.attrs["pulses"] == {"used": 9, "dropped": 3, "reasons": {"not of SIGNAL 1": 2, "silent": 1}}
+    assert echo.attrs["pulses"] == {
+        "used": 9,
+        "dropped": 3,
+        "reasons": {"SIGNAL other than 1": 2, "all samples zero": 1},
+    }
     np.testing.assert_allclose(echo.transfer.values, expected_transfer(echo), atol=1e-5)
 
 
@@ -156,8 +160,8 @@ def test_samples_beyond_the_band_of_a_pulse_are_no_echo(tmp_path):
 def test_of_several_channels_the_one_named_is_read(tmp_path):
     pvp, signal = collected()
     path = write(tmp_path / "rx.cphd", pvp, np.stack([signal, 2 * signal]), channels=("HH", "VV"))
-    assert "2 channels, 'HH', 'VV'; expected the one that waveform.channel names" in complaint(lambda: read(path))
-    assert "expected one called 'HV'" in complaint(lambda: read(path, channel="HV"))
+    assert "2 channels, 'HH', 'VV'; expected a channel selected by waveform.channel" in complaint(lambda: read(path))
+    assert "expected channel 'HV'" in complaint(lambda: read(path, channel="HV"))
     np.testing.assert_allclose(read(path, channel="VV").transfer.values, 2 * signal, atol=1e-5)
 
 
@@ -168,7 +172,7 @@ def test_files_follow_each_other_in_the_order_of_their_names(tmp_path):
     np.testing.assert_allclose(read(second, first).transfer.values, np.concatenate([signal, 2 * signal]), atol=1e-5)
     write(first, {**pvp, "TxTime": pvp["TxTime"] + 2}, signal)
     assert complaint(lambda: read(first, second)).startswith(
-        f"{second}: pulses that are not later than those of the file"
+        f"{second}: pulses that are not later than those of the previous file"
     )
 
 
@@ -188,13 +192,13 @@ def changed(**changes):
     ("changes", "expected"),
     [
         ({"TxPos": (4, np.nan)}, "TxPos is not a number at index [4, 0]"),
-        ({"RcvPos": (4, 10.0)}, "rx_position of pulse 4 is 17 m from the Earth's centre (1 in all)"),
-        ({"TxTime": (4, 0.0)}, "pulse 4 is not later than the one before it"),
-        ({"SCSS": (6, 1.0001e6)}, "frequencies (SC0, SCSS) of pulse 6 are 3900 Hz from those of the first"),
-        ({"SC0": (6, 9.001e9)}, "frequencies (SC0, SCSS) of pulse 6 are 1e+06 Hz from those of the first"),
-        ({"SCSS": -1e6}, "no two samples between FX1 and FX2"),
-        ({"FX1": 1e10, "FX2": 1.1e10}, "no two samples between FX1 and FX2"),
-        ({"SIGNAL": np.zeros(PULSES)}, "no pulse of SIGNAL 1"),
+        ({"RcvPos": (4, 10.0)}, "rx_position of pulse 4 is 17 m from the Earth's centre (1 such pulses)"),
+        ({"TxTime": (4, 0.0)}, "pulse 4 is not later than the previous pulse"),
+        ({"SCSS": (6, 1.0001e6)}, "frequencies (SC0, SCSS) of pulse 6 differ by 3900 Hz from those of the first"),
+        ({"SC0": (6, 9.001e9)}, "frequencies (SC0, SCSS) of pulse 6 differ by 1e+06 Hz from those of the first"),
+        ({"SCSS": -1e6}, "fewer than two samples between FX1 and FX2"),
+        ({"FX1": 1e10, "FX2": 1.1e10}, "fewer than two samples between FX1 and FX2"),
+        ({"SIGNAL": np.zeros(PULSES)}, "no pulse with SIGNAL 1"),
         ({"SRPPos": (0, 1e300)}, "SRPPos reaches 1e+300"),
         ({"AmpSF": np.full(PULSES, np.inf)}, "AmpSF is not a number"),
     ],
@@ -210,7 +214,8 @@ def test_times_that_contradict_the_positions_are_flagged(tmp_path):
     pvp, _ = changed(RcvPos=(4, SRP + away * (1 + 50.0 / np.linalg.norm(away))))
     flag = read(write(tmp_path / "rx.cphd", pvp, signal)).attrs["flags"]["reference_point"]
     assert flag == (
-        "RcvTime - TxTime of pulse 4 is 1.67e-07 s from the delay of its reference point, 50 m of path (1 of 12 pulses)"
+        "RcvTime - TxTime of pulse 4 differs by 1.67e-07 s from the delay of its reference point, 50 m of path "
+        "(1 of 12 pulses)"
     )
     tropo = {"RcvTime": pvp["RcvTime"] + 8e-8}  # 24 m: a path through the whole atmosphere
     assert read(write(tmp_path / "b.cphd", {**right, **tropo}, signal)).attrs["flags"] == {}
@@ -227,7 +232,7 @@ def test_a_sample_that_is_not_a_number_is_named(tmp_path):
 @pytest.mark.parametrize(
     ("how", "pair", "expected"),
     [
-        ({"domain": "TOA"}, "tx-rx", "samples over TOA, and not over frequency"),
+        ({"domain": "TOA"}, "tx-rx", "samples in domain TOA, not in the frequency domain"),
         ({"collect": "MONOSTATIC"}, "tx-rx", "CollectType MONOSTATIC for pair tx-rx"),
         ({}, "rx-rx", "CollectType BISTATIC for pair rx-rx"),
     ],

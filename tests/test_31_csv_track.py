@@ -67,7 +67,7 @@ def test_seconds_count_from_where_the_config_says(tmp_path, start, options):
 
 def test_seconds_since_nobody_knows_when_are_refused(tmp_path):
     message = complaint(lambda: read(tmp_path, f"time_s,{GEODETIC}", range(40), *PLACES.T))
-    assert "nobody says since when" in message
+    assert "without a time zero" in message
     assert "nodes.a.log.start_utc" in message
     assert "a time of nan s" in complaint(
         lambda: read(tmp_path, f"time_s,{GEODETIC}", ["", *range(39)], *PLACES.T, start_utc="2025-05-14")
@@ -77,7 +77,7 @@ def test_seconds_since_nobody_knows_when_are_refused(tmp_path):
 def test_times_without_a_zone_ask_for_their_system(tmp_path):
     heading = f"time,{GEODETIC}"
     message = complaint(lambda: read(tmp_path, heading, TIMES, *PLACES.T))
-    assert "do not say whether they are UTC or GPST; expected key nodes.a.log.time_system" in message
+    assert "without a time system (UTC or GPST); expected key nodes.a.log.time_system" in message
     utc, gpst = (read(tmp_path, heading, TIMES, *PLACES.T, time_system=system) for system in ("utc", "gpst"))
     np.testing.assert_array_equal(utc.time.values, TIMES)
     np.testing.assert_array_equal(TIMES - gpst.time.values, np.timedelta64(18, "s"))
@@ -89,7 +89,7 @@ def test_times_without_a_zone_ask_for_their_system(tmp_path):
 def test_times_that_say_utc_are_not_gps_time(tmp_path, name):
     columns = [f"{time}Z" for time in TIMES], *PLACES.T
     message = complaint(lambda: read(tmp_path, f"{name},{GEODETIC}", *columns, time_system="gpst"))
-    assert f"times in column {name} are UTC; expected what config.yaml says, nodes.a.log.time_system" in message
+    assert f"times in column {name} are UTC; expected nodes.a.log.time_system of config.yaml" in message
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_a_map_that_does_not_fit_the_log_is_one_message(tmp_path, heading, optio
 def test_a_name_of_ours_that_is_also_mapped_is_not_guessed(tmp_path):
     heading = f"time_utc,{GEODETIC},alt"
     message = complaint(lambda: read(tmp_path, heading, TIMES, *PLACES.T, PLACES[:, 2], columns={"height_m": "alt"}))
-    assert "column height_m, besides 'alt' that config.yaml maps to it" in message
+    assert "column height_m in addition to 'alt', which config.yaml maps to height_m" in message
     assert "columns time and time_s" in complaint(
         lambda: read(tmp_path, f"time,time_s,{GEODETIC}", TIMES, range(40), *PLACES.T)
     )
@@ -118,7 +118,7 @@ def test_a_name_of_ours_that_is_also_mapped_is_not_guessed(tmp_path):
 def test_a_log_of_other_names_shows_them_and_how_they_are_mapped(tmp_path):
     message = complaint(lambda: read(tmp_path, "when,lat,lon,alt", TIMES, *PLACES.T))
     assert "no column latitude_deg among ['when', 'lat', 'lon', 'alt']" in message
-    assert "nodes.a.log.columns: {latitude_deg: NAME}, or to try it --set columns.latitude_deg=NAME" in message
+    assert "nodes.a.log.columns: {latitude_deg: NAME}; to try a name, use --set columns.latitude_deg=NAME" in message
     message = complaint(lambda: read(tmp_path, f"when,{GEODETIC}", TIMES, *PLACES.T))
     assert "no column time_utc among ['when', 'latitude_deg', 'longitude_deg', 'height_m']" in message
     wide = ",".join(f"column{number}" for number in range(900))
@@ -131,7 +131,7 @@ def test_cells_between_semicolons_are_named_with_their_line(tmp_path, comma):
         f"{time};{north};{east};{up}".replace(".", comma) for time, (north, east, up) in zip(TIMES, PLACES, strict=True)
     ]
     message = complaint(lambda: read(tmp_path, "time_utc;latitude_deg;longitude_deg;height_m", rows))
-    assert "line 1 has its cells between semicolons, not commas" in message
+    assert "cells of line 1 are separated by semicolons, not commas" in message
 
 
 def test_a_line_with_more_cells_than_the_heading_is_named(tmp_path):
@@ -165,7 +165,7 @@ def test_numbers_of_kinds_of_solution_ask_for_their_numbering(tmp_path, numbers)
     """4 is a fixed solution in GGA and DGPS in RTKLIB; 1 is a single one in GGA and fixed in RTKLIB."""
     columns = TIMES, *PLACES.T, np.resize(numbers, 40)
     message = complaint(lambda: read(tmp_path, f"time_utc,{GEODETIC},quality", *columns))
-    assert f"kinds of solution {', '.join(map(str, numbers))} in column 'quality'" in message
+    assert f"solution types {', '.join(map(str, numbers))} in column 'quality'" in message
     assert "nodes.a.log.quality in config.yaml. Add it: rtklib (1 fix, 2 float, 5 single) or gga (4 fix" in message
 
 
@@ -185,7 +185,7 @@ def test_epochs_that_gga_calls_not_measured_are_left_out(tmp_path):
     assert track.dropped == {
         "no fix (quality 0)": 1,
         "dead reckoning (quality 6)": 1,
-        "typed in (quality 7)": 1,
+        "manual input (quality 7)": 1,
         "simulated (quality 8)": 1,
     }
     assert set(track.fix.values) == {1}
@@ -214,13 +214,13 @@ def test_headings_and_comments_as_programs_write_them(tmp_path, lines):
 def test_a_second_heading_of_other_columns_is_refused(tmp_path):
     lines = [*rows_of()[:20], "longitude_deg,latitude_deg,time_utc,height_m", *rows_of()[20:]]
     message = complaint(lambda: read(tmp_path, f"time_utc,{GEODETIC}", lines))
-    assert "line 22 is another heading than the first: files were joined" in message
+    assert "line 22 is a second, different heading: concatenated files" in message
 
 
 @pytest.mark.parametrize(
     ("encoding", "name", "expected"),
     [
-        ("utf-16", "höhe", 'text in UTF-16, as "Unicode text" of Excel; save the file as UTF-8'),
+        ("utf-16", "höhe", 'text in UTF-16, such as "Unicode text" of Excel; save the file as UTF-8'),
         ("latin-1", "höhe", "byte 0xf6 in line 1 is not UTF-8; save the file as UTF-8"),
         ("cp1252", "µ", "byte 0xb5 in line 1 is not UTF-8; save the file as UTF-8"),
     ],
@@ -240,7 +240,7 @@ def test_text_that_is_not_utf_8_is_refused_with_what_to_do(tmp_path, encoding, n
 def test_a_time_that_is_not_in_iso_8601_is_named_with_its_column(tmp_path, name, text):
     columns = [*TIMES[:20], text, *TIMES[21:]], *PLACES.T
     message = complaint(lambda: read(tmp_path, f"{name},{GEODETIC}", *columns, time_system="utc"))
-    assert f"column {name}: '{text}' is no time in ISO 8601 such as 2025-05-14T09:30:00.5Z" in message
+    assert f"column {name}: '{text}' is not an ISO 8601 time such as 2025-05-14T09:30:00.5Z" in message
 
 
 def test_a_decimal_comma_of_seconds_is_one_of_iso_8601(tmp_path):

@@ -118,4 +118,4 @@ def test_a_line_that_the_file_ends_in_is_counted_as_no_epoch(tmp_path, kind):
     text = LOGS[kind][1].rstrip("\r\n")
     track, whole = (read(tmp_path, kind, data.encode()) for data in (text, LOGS[kind][1]))
     assert track.sizes["epoch"] == whole.sizes["epoch"] - 1
-    assert track.dropped == {**whole.dropped, "line cut off": 1}
+    assert track.dropped == {**whole.dropped, "truncated line": 1}

@@ -189,18 +189,21 @@ def test_a_click_beside_the_pulses_is_no_trigger():
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"beat": np.ones((8, 700))}, r"float64 of shape \(8, 700\): a sweep has 882 samples"),
-        ({"beat": np.ones((8, 882), "c8")}, "complex64 samples where waveform.iq is real"),
-        ({"beat": np.where(np.arange(8)[:, None] == 3, np.nan, np.ones((8, 882)))}, "sweep 3 holds what is no number"),
-        ({"beat": np.zeros((8, 882))}, "no sweep with a signal"),
+        ({"beat": np.ones((8, 700))}, r"float64 of shape \(8, 700\); a sweep has 882 samples"),
+        ({"beat": np.ones((8, 882), "c8")}, "complex64 samples, but waveform.iq is real"),
+        (
+            {"beat": np.where(np.arange(8)[:, None] == 3, np.nan, np.ones((8, 882)))},
+            "sweep 3 contains a sample that is not a number",
+        ),
+        ({"beat": np.zeros((8, 882))}, "no sweep with a non-zero sample"),
         ({"time": np.arange(7.0)}, "7 times for 8 sweeps"),
-        ({"time": np.r_[0.0, 2, 1, 3:8]}, "sweep 2 begins -1 s after another that lasts 0.02 s"),
-        ({"time": 1.7e9 + np.arange(8) / 128}, "sweep 1 begins 0.0078125 s after"),
-        ({"time": np.r_[0.0:7, np.nan]}, "time 7 is none between 1970 and 2199"),
-        ({"time": np.arange(8) * 10**18}, "time 1 is none between"),
-        ({"time": np.arange(8.0) * 1j}, "times as complex128"),
-        ({"time": None}, "no times of sweeps"),
-        ({"beat": None}, "no variable called beat"),
+        ({"time": np.r_[0.0, 2, 1, 3:8]}, "sweep 2 starts -1 s after the previous sweep, whose duration is 0.02 s"),
+        ({"time": 1.7e9 + np.arange(8) / 128}, "sweep 1 starts 0.0078125 s after"),
+        ({"time": np.r_[0.0:7, np.nan]}, "time 7 is not between 1970 and 2199"),
+        ({"time": np.arange(8) * 10**18}, "time 1 is not between"),
+        ({"time": np.arange(8.0) * 1j}, "array of times is complex128"),
+        ({"time": None}, "no sweep times"),
+        ({"beat": None}, "no variable beat"),
     ],
 )
 def test_what_no_sweeps_can_be_is_refused(tmp_path, change, told):
@@ -221,7 +224,7 @@ def test_times_alone_are_refused(tmp_path):
     [
         ({"sample_rate_hz": 48_000.0}, "44100 samples/s"),
         ({"trigger": TRIGGER | {"beat_channel": 3}}, "2 channels"),
-        ({"sweep_s": 0.1}, "8 triggers, none with a whole sweep"),
+        ({"sweep_s": 0.1}, "8 triggers, none followed by a complete sweep"),
         ({"start_utc": "soon"}, "waveform.start_utc"),
     ],
 )

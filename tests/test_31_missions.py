@@ -68,17 +68,17 @@ WRONG = {
     "a.plan": ("{}", "no key 'mission'"),
     "b.plan": (
         plan(item(16, 48.4, 9.9, 50), item(16, 48.5, 9.9, 50, frame=0)),
-        "from home up to waypoint 1, from sea at waypoint 2; give all waypoints one altitude frame",
+        "height reference home up to waypoint 1, sea at waypoint 2; use the same altitude frame for all waypoints",
     ),
     "c.plan": (plan(item(16, 48.4, 9.9, 50)), "1 waypoints"),
-    "d.plan": (plan(item(16, 148.4, 9.9, 50), item(16, 48.4, 9.9, 50)), "1 of them nowhere"),
+    "d.plan": (plan(item(16, 148.4, 9.9, 50), item(16, 48.4, 9.9, 50)), "1 of them with invalid coordinates"),
     "e.waypoints": ("hello\n", "not QGC WPL 110"),
     "f.kml": ("<kml><LineString><coordinates>9,48,1 9,49,1</coordinates></LineString></kml>", "clampToGround"),
     "g.csv": ("latitude_deg\n48\n", "no column longitude_deg"),
     "h.gpx": ("", "suffix '.gpx'"),
     "i.plan": (plan(item(16, 10**400, 9.9, 50), item(16, 48.4, 9.9, 50)), "unreadable mission"),
     "j.plan": (plan(item(16, 48.4, 9.9, 50)).replace('"command": 16', '"command": 1e400'), "unreadable mission"),
-    "k.kml": ("<LineString>" * 80_000, "no LineString that is closed"),
+    "k.kml": ("<LineString>" * 80_000, "no complete element LineString"),
 }
 
 

@@ -58,7 +58,7 @@ def test_a_date_that_is_late_after_midnight_is_that_of_the_next_day(tmp_path, wr
             late += 1
     track = read(tmp_path, "\n".join(lines) + "\n")
     np.testing.assert_array_equal(track.time.values, TIMES)
-    assert track.remarks[0].startswith(f"{wrong} dates after midnight are those of the day before")
+    assert track.remarks[0].startswith(f"{wrong} dates after midnight are those of the previous day")
 
 
 def test_a_receiver_that_is_not_sure_has_no_date(tmp_path):
@@ -79,7 +79,7 @@ def test_altitudes_without_geoid_separation_ask_for_an_offset(tmp_path, separati
     heights = geodetic_from_ecef(read(tmp_path, text, height_offset_m=48.0).position.values)[:, 2]
     np.testing.assert_allclose(heights, PLACES[:, 2] + 48, atol=1e-6)
     stated = logs.nmea(TIMES, PLACES)
-    assert "GGA states the geoid separation" in complaint(lambda: read(tmp_path, stated, height_offset_m=48.0))
+    assert "GGA contains the geoid separation" in complaint(lambda: read(tmp_path, stated, height_offset_m=48.0))
 
 
 def test_epochs_without_separation_among_others_are_left_out(tmp_path):
@@ -98,7 +98,7 @@ def test_what_kind_a_position_is_and_which_is_none(tmp_path):
     lines.append(logs.sealed("GNGGA,,,,,,0,00,99.99,,,,,,"))
     track = read(tmp_path, "\n".join(lines) + "\n")
     assert track.fix.values.tolist() == [5, 4, 5, 1, 2, 3]
-    assert track.dropped == {"no fix": 3, "dead reckoning": 1, "typed in": 1, "simulated": 1}
+    assert track.dropped == {"no fix": 3, "dead reckoning": 1, "manual input": 1, "simulated": 1}
 
 
 def test_of_two_talkers_the_one_of_all_systems_is_taken_and_what_is_said_twice_counts_once(tmp_path):
@@ -107,7 +107,7 @@ def test_of_two_talkers_the_one_of_all_systems_is_taken_and_what_is_said_twice_c
         lines += [logs.gga(time, place + [1e-4, 0, 0], talker="GP"), logs.gga(time, place)]
     track = read(tmp_path, "\n".join([*lines, lines[-1]]) + "\n")
     np.testing.assert_allclose(track.position.values, ecef_from_geodetic(*PLACES.T), atol=2e-5, rtol=0)
-    assert track.dropped == {"of another talker": 40, "said twice": 1}
+    assert track.dropped == {"from another talker": 40, "duplicate": 1}
     other = logs.gga(TIMES[0], PLACES[0] + [1e-3, 0, 0])
     assert "two positions of talker GN" in complaint(lambda: read(tmp_path, "\n".join([*lines, other]) + "\n"))
 
@@ -116,7 +116,7 @@ def test_of_two_talkers_the_one_of_all_systems_is_taken_and_what_is_said_twice_c
 def test_stamps_of_a_host_are_cut_off_and_told(tmp_path, caplog, prefix):
     track = read(tmp_path, logs.nmea(TIMES, PLACES, prefix=prefix), name="a.track.txt")
     np.testing.assert_array_equal(track.time.values, TIMES)
-    assert "88 lines begin with a host's stamp" in track.remarks[0]
+    assert "88 lines start with a time stamp of the host" in track.remarks[0]
     assert track.remarks[0] in caplog.text
     assert "remarks" not in read(tmp_path, logs.nmea(TIMES, PLACES)).attrs
 
@@ -138,8 +138,8 @@ def test_a_sentence_whose_checksum_is_wrong_or_missing_is_no_epoch(tmp_path):
     track = read(tmp_path, "\n".join(lines) + "\n")
     assert track.dropped == {
         "sentences with a wrong checksum": 1,
-        "sentences without a checksum, which others have": 1,
-        "sentences broken off": 2,
+        "sentences without a checksum in a log with checksums": 1,
+        "truncated sentences": 2,
     }
     np.testing.assert_array_equal(track.time.values, np.delete(TIMES, [3, 5, 7, 8]))
 
@@ -151,13 +151,13 @@ def test_a_log_without_any_checksum_is_read_with_a_remark(tmp_path, end):
     at = next(place for place, line in enumerate(lines) if "GGA,235957.30" in line)
     lines[at] = lines[at][:40]
     track = read(tmp_path, end.join(lines) + end)
-    assert track.dropped == {"sentences broken off": 1}
+    assert track.dropped == {"truncated sentences": 1}
     np.testing.assert_array_equal(track.time.values, np.delete(TIMES, 3))
     np.testing.assert_allclose(track.position.values, ecef_from_geodetic(*np.delete(PLACES, 3, 0).T), atol=2e-5, rtol=0)
     np.testing.assert_array_equal(track.position_std.values, np.tile([0.01, 0.02, 0.03], (39, 1)))
     assert "none of 87 sentences has a checksum" in track.remarks[0]
     cut = read(tmp_path, end.join(lines[:-1])[:-1])
-    assert cut.dropped == {"sentences broken off": 2}
+    assert cut.dropped == {"truncated sentences": 2}
     np.testing.assert_array_equal(cut.time.values, np.delete(TIMES, [3, 39]))
 
 
@@ -184,7 +184,7 @@ def test_a_sentence_that_no_receiver_sends_is_one_message(tmp_path, old, new):
     assert old in bodies[at]
     bodies[at] = bodies[at].replace(old, new, 1)
     message = complaint(lambda: read(tmp_path, "\n".join(map(logs.sealed, bodies)) + "\n"))
-    assert re.search(r"a\.track\.nmea: sentence '.*GGA", message)
+    assert re.search(r"a\.track\.nmea: invalid sentence '.*GGA", message)
     assert message.isprintable()
 
 
@@ -210,7 +210,7 @@ def test_a_day_of_the_config_that_is_not_the_logs_is_refused(tmp_path):
     for day in ("2025-05-13", "2025-05-15", "1970-01-01"):
         message = complaint(lambda day=day: read(tmp_path, text, start_utc=day))
         assert (
-            "RMC or ZDA date its first epoch 2025-05-14; expected what config.yaml says, nodes.a.log.start_utc"
+            "the date of the first epoch by RMC or ZDA is 2025-05-14; expected nodes.a.log.start_utc of config.yaml"
             in message
         )
     np.testing.assert_array_equal(read(tmp_path, text, start_utc="2025-05-14T09:00").time.values, TIMES)

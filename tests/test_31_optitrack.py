@@ -61,7 +61,7 @@ def test_millimetres_are_millimetres(tmp_path):
 def test_frames_that_do_not_show_the_body_are_counted(tmp_path):
     track = read(take(tmp_path, lost=[3, 4]))
     assert track.sizes["epoch"] == 10
-    assert track.dropped == {"body not seen": 2}
+    assert track.dropped == {"body not tracked": 2}
 
 
 def test_a_body_must_be_chosen_where_there_are_several(tmp_path):
@@ -75,7 +75,7 @@ def test_a_body_must_be_chosen_where_there_are_several(tmp_path):
 
 def test_a_wall_clock_without_zone_is_no_time(tmp_path):
     message = complaint(lambda: read(take(tmp_path), start_utc=None))
-    assert "a wall clock without zone; expected key nodes.a.log.start_utc" in message
+    assert "local time without a zone; expected key nodes.a.log.start_utc" in message
 
 
 def test_a_body_that_stands_still_has_one_position(tmp_path):
@@ -89,11 +89,11 @@ def test_a_body_that_stands_still_has_one_position(tmp_path):
         ("Quaternion", "XYZ", "Rotation Type 'XYZ', not quaternion"),
         ("Global", "Local", "Coordinate Space 'Local', not global"),
         ("Meters", "Inches", "Length Units 'Inches'"),
-        ("Frame,Time", "Fram,Time", "no line that begins with Frame"),
-        (",Name,Radar", ",Name,Radaa", "missing or doubled"),
-        ("X,Y,Z,W", "Y,Y,Z,W", "missing or doubled"),
-        ("Radar,Corner Reflector", "Radar,Radar", "missing or doubled"),
-        (",Type,Rigid", ",Typ,Rigid", "no lines Type"),
+        ("Frame,Time", "Fram,Time", "no line that starts with Frame"),
+        (",Name,Radar", ",Name,Radaa", "missing or repeated"),
+        ("X,Y,Z,W", "Y,Y,Z,W", "missing or repeated"),
+        ("Radar,Corner Reflector", "Radar,Radar", "missing or repeated"),
+        (",Type,Rigid", ",Typ,Rigid", "heading lines Type"),
         ("\r\n5,", "\r\n5,,", "line 13 has"),
         ("\r\n5,0.0", "\r\n5,x", "line 13: 'x"),
         ("\r\n5,0.0", "\r\n5,inf", "line 13: 'inf"),
@@ -110,7 +110,7 @@ def test_a_take_that_does_not_say_what_it_holds_is_one_message(tmp_path, old, ne
 
 
 def test_half_a_pose_and_a_long_quaternion_are_refused(tmp_path):
-    for column, value, expected in ((6, np.nan, "half a pose"), (3, 0.5, "no quaternion of length 1")):
+    for column, value, expected in ((6, np.nan, "incomplete pose"), (3, 0.5, "not a unit quaternion")):
         bodies = logs.poses()
         bodies["Radar"][4, column] = value
         path = take(tmp_path, bodies=bodies)
@@ -122,7 +122,7 @@ def test_a_real_pass_on_a_rail_comes_back_as_it_was_captured(shared):
     """10928 frames at 360 Hz in its heading, five without the radar; the rail is 3.42 m long, straight and level."""
     path = shared / "bwsi_rail_passA" / "Rail SAR 2.csv"
     track = read(path)
-    assert track.sizes["epoch"] + track.dropped["body not seen"] == 10928
+    assert track.sizes["epoch"] + track.dropped["body not tracked"] == 10928
     assert np.median(np.diff(track.time.values)) / np.timedelta64(1, "s") == pytest.approx(1 / 360, abs=1e-6)
     assert (track.time.values[-1] - track.time.values[0]) / np.timedelta64(1, "s") == pytest.approx(30.35, abs=0.01)
     low, high = track.position.values.min(axis=0), track.position.values.max(axis=0)

@@ -113,7 +113,7 @@ def test_standard_deviations_stand_under_their_names_in_any_order(tmp_path):
 def test_a_baseline_begins_where_header_or_config_say(tmp_path):
     text = written("enu")
     bare = "\n".join(line for line in text.splitlines() if "ref pos" not in line) + "\n"
-    assert "without the point that they begin at (ref pos); expected key nodes.a.log.base" in complaint(
+    assert "without the position of their base (ref pos); expected key nodes.a.log.base" in complaint(
         lambda: read(tmp_path, bare)
     )
     expected = read(tmp_path, text).position.values
@@ -133,7 +133,7 @@ def test_heights_above_a_geoid_take_an_offset_and_ellipsoidal_ones_none(tmp_path
     track = read(tmp_path, text, height_offset_m=48.0)
     np.testing.assert_allclose(track.position.values, ecef_from_geodetic(*(PLACES + [0, 0, 48]).T), atol=1e-5)
     message = complaint(lambda: read(tmp_path, written("llh"), height_offset_m=48.0))
-    assert "heights are ellipsoidal; expected what config.yaml says, nodes.a.log.height_offset_m" in message
+    assert "heights are ellipsoidal; expected nodes.a.log.height_offset_m of config.yaml" in message
 
 
 def restarted(first, second, **written):
@@ -199,7 +199,7 @@ def test_a_datum_other_than_wgs_84_is_refused(tmp_path, datum, kind):
 
 def test_a_header_that_states_two_time_systems_is_refused(tmp_path):
     text = logs.solution(TIMES, PLACES, LLH, system="GPST", head=["% obs start : 2025/05/14 23:59:57.0 UTC (week2366)"])
-    assert "times are GPST by the heading of the columns and UTC by line 2, '% obs start" in complaint(
+    assert "times are GPST according to the column heading and UTC according to line 2, '% obs start" in complaint(
         lambda: read(tmp_path, text)
     )
     assert read(tmp_path, text.replace(".0 UTC", ".0 GPST")).sizes["epoch"] == 40
@@ -236,9 +236,9 @@ def test_a_solution_that_was_filtered_backward_is_turned_round(tmp_path, caplog)
     track = read(tmp_path, "\n".join([*heading, *lines[: len(heading) - 1 : -1]]) + "\n")
     np.testing.assert_array_equal(track.time.values, TIMES)
     np.testing.assert_allclose(track.position.values, ECEF, atol=1e-5, rtol=0)
-    assert "times descend" in track.remarks[0]
+    assert "times decrease" in track.remarks[0]
     read_track(tmp_path / "a.track.pos", node="a")
-    assert caplog.text.count("times descend") == 1  # a command may read it for each of its checks
+    assert caplog.text.count("times decrease") == 1  # a command may read it for each of its checks
 
 
 @pytest.mark.parametrize(("weeks", "later"), [(1024, 1024), (2048, 2048), (0, 0)])
@@ -250,7 +250,7 @@ def test_dates_of_a_week_number_that_rolled_over_are_remarked(tmp_path, weeks, l
 
 def test_a_header_and_a_config_that_disagree_on_time_are_refused(tmp_path):
     text = logs.solution(TIMES, PLACES, LLH, system="GPST")
-    assert "times are GPST; expected what config.yaml says" in complaint(
+    assert "times are GPST; expected nodes.a.log.time_system of config.yaml" in complaint(
         lambda: read(tmp_path, text, time_system="utc")
     )
     assert read(tmp_path, text, time_system="gpst").sizes["epoch"] == 40
@@ -259,11 +259,11 @@ def test_a_header_and_a_config_that_disagree_on_time_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        (" 600.100000000 1", " 600.100000000", "line 4 has 5 columns, the header names 6"),
-        (" 600.100000000 1", " 600.100000000 1 7", "line 4 has 7 columns, the header names 6"),
-        ("height(m) Q", "height(m) height(m) Q", "'height(m)' a second time"),
+        (" 600.100000000 1", " 600.100000000", "line 4 has 5 columns, the header 6"),
+        (" 600.100000000 1", " 600.100000000 1 7", "line 4 has 7 columns, the header 6"),
+        ("height(m) Q", "height(m) height(m) Q", "repeated column 'height(m)'"),
         ("height(m)", "heigth(m)", "no header line"),
-        (" 600.100000000 1", " nan 1", "without a position"),
+        (" 600.100000000 1", " nan 1", "without a valid position"),
     ],
 )
 def test_a_table_that_does_not_fit_its_header_is_one_message(tmp_path, old, new, expected):

@@ -165,7 +165,7 @@ def test_the_wrong_sign_of_the_intermediate_frequency_is_another_echo(campaign, 
 @pytest.mark.parametrize(
     ("datatype", "if_hz", "expected"),
     [
-        ("rf32_le", 20e6, r"the band lies at 20 to 35\.75 MHz in samples at 64 MHz, within 1\.6 MHz of an end"),
+        ("rf32_le", 20e6, r"the band of 20 to 35\.75 MHz, sampled at 64 MHz, is within 1\.6 MHz of the edge"),
         ("rf32_le", None, "core:datatype rf32_le without apertura:if_hz; .*Add apertura:if_hz"),
         ("cf32_le", 8e6, "core:datatype cf32_le with apertura:if_hz"),
         ("cf24_le", None, "core:datatype 'cf24_le'; expected ci16_le: c or r"),
@@ -218,7 +218,7 @@ def test_floats_that_are_taken_for_counts_are_refused(campaign, taken_for, kind,
     rewrite(campaign, "a", numbers, f"c{taken_for}")
     edit_meta(campaign, "a", count)
     message = complaint(lambda: open_recording(recording_files(campaign / "raw/f01", "a")))
-    found = f"core:datatype c{taken_for}, and a.sigmf-data holds finite floating-point numbers; expected c{right}"
+    found = f"core:datatype c{taken_for}, but a.sigmf-data contains floating-point numbers; expected c{right}"
     assert found in message
     assert f"Set core:datatype to c{right}" in message
 
@@ -247,7 +247,7 @@ def test_a_float_that_is_no_sample_is_named(campaign, wrong):
     numbers[3, 5, 0, 1] = wrong
     rewrite(campaign, "a", numbers, "cf32_le")
     at = 3 * numbers.shape[1] + 5
-    with pytest.raises(CampaignError, match=rf"a.sigmf-data: sample {at} is not finite or beyond 1e15"):
+    with pytest.raises(CampaignError, match=rf"a.sigmf-data: sample {at} is not finite or exceeds 1e15"):
         transfers(campaign)
 
 
@@ -352,7 +352,10 @@ def test_metadata_that_a_collection_hashed_otherwise_are_refused(campaign):
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        ({"apertura:nodes": {"a": "rx_7"}}, "apertura:nodes gives 'a' the stream 'rx_7'; expected one of core:streams"),
+        (
+            {"apertura:nodes": {"a": "rx_7"}},
+            "apertura:nodes assigns stream 'rx_7' to 'a'; expected one of core:streams",
+        ),
         ({"core:streams": [{"name": "rx_0", "hash": "12"}]}, "collection.core:streams.0.hash"),
         ({"core:streams": [{"name": "../rx_0", "hash": "0" * 128}]}, "collection.core:streams.0.name"),
     ],

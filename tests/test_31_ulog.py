@@ -28,7 +28,7 @@ from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from apertura.core.geometry.track_checks import check_track
 from apertura.formats.reading import read_track
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 from apertura.formats.tracks.px4_ulog import track_of
 from apertura.formats.tracks.ulog_fields import read_fields
 
@@ -38,7 +38,7 @@ SECOND = np.timedelta64(1, "s")
 WIDE = {"time_utc_usec": "<Q", "fix_type": "<B"}
 
 
-def read(tmp_path, *topics, options=AS_IT_SAYS, **more):
+def read(tmp_path, *topics, options=DEFAULT_OPTIONS, **more):
     path = tmp_path / "a.track.ulg"
     path.write_bytes(ulog(*topics, **more))
     return check(read_track(path, node="a", options=options), "track")
@@ -130,8 +130,8 @@ def test_several_receivers_are_listed_with_their_solutions(tmp_path):
     topics = (SENSOR, 0, single), (SENSOR, 1, fixed)
     track = read(tmp_path, *topics)
     assert track.attrs["remarks"] == [
-        "the log holds sensor_gps:0 (single 60) and sensor_gps:1 (fix 59, no fix 1); sensor_gps:0 is read: set "
-        "nodes.a.log.body to choose"
+        "the log contains receivers sensor_gps:0 (single 60) and sensor_gps:1 (fix 59, no fix 1); sensor_gps:0 is "
+        "used: select with nodes.a.log.body"
     ]
     chosen = read(tmp_path, *topics, options=LogOptions(body="sensor_gps:1"))
     assert "remarks" not in chosen.attrs
@@ -169,7 +169,7 @@ def test_epochs_behind_foreign_bytes_are_read_and_the_bytes_are_counted(tmp_path
     assert apart_m(track).max() < 0.02
     stated = len(foreign) + lost * size - len(SYNC) * foreign.endswith(SYNC)
     assert track.attrs["damage"] == track.attrs["remarks"][0]
-    assert track.attrs["damage"].startswith(f"{stated} of {len(data) + len(foreign)} bytes are no messages")
+    assert track.attrs["damage"].startswith(f"{stated} of {len(data) + len(foreign)} bytes are not valid messages")
 
 
 def _last_message(data):
@@ -199,7 +199,7 @@ def test_dropouts_of_the_logger_are_reported(tmp_path):
     at = len(data) - 10 * len(_last_message(data))
     path.write_bytes(data[:at] + struct.pack("<HBH", 2, ord("O"), 1500) + data[at:])
     track = read_track(path, node="a")
-    assert track.attrs["remarks"] == ["1 dropouts of the logger, 1.5 s in all: messages are lost there"]
+    assert track.attrs["remarks"] == ["1 dropouts of the logger, total 1.5 s: their messages are lost"]
     assert track.sizes["epoch"] == 60
 
 
@@ -241,10 +241,10 @@ def test_accuracies_that_no_receiver_states_are_not_kept(tmp_path):
 @pytest.mark.usefixtures("reader")
 def test_epochs_without_utc_and_those_logged_twice_are_counted(tmp_path):
     receiver = ulog_receiver(time_utc_usec=np.where(np.arange(60) < 7, 0, ulog_receiver()["time_utc_usec"][1]))
-    assert read(tmp_path, (GPS, 0, receiver)).attrs["dropped"] == {"no time of the receiver": 7}
+    assert read(tmp_path, (GPS, 0, receiver)).attrs["dropped"] == {"no UTC from the receiver": 7}
     twice = {name: (kind, np.repeat(values, 2)) for name, (kind, values) in ulog_receiver().items()}
     track = read(tmp_path, (GPS, 0, twice))
-    assert track.attrs["dropped"] == {"held twice": 60}
+    assert track.attrs["dropped"] == {"duplicate": 60}
     assert track.sizes["epoch"] == 60
 
 
@@ -278,11 +278,11 @@ def test_a_receiver_that_learns_of_a_leap_second_on_the_way_is_refused(tmp_path)
     """It told 2 s too little at first; which half is right, the log alone does not say."""
     told = ulog_receiver()["time_utc_usec"][1] - np.where(np.arange(60) < 25, 2_000_000, 0)
     message = complaint(lambda: read(tmp_path, (GPS, 0, ulog_receiver(time_utc_usec=told))))
-    assert "25 of 60 times of the receiver do not fit the autopilot's clock" in message
-    assert "2.00 s off" in message
+    assert "25 of 60 times of the receiver disagree with the autopilot's clock" in message
+    assert "differs by 2.00 s" in message
     few = ulog_receiver()["time_utc_usec"][1] - np.where(np.arange(60) < 3, 2_000_000, 0)
     track = read(tmp_path, (GPS, 0, ulog_receiver(time_utc_usec=few)))
-    assert track.attrs["dropped"] == {"a time that is not the autopilot's": 3}
+    assert track.attrs["dropped"] == {"time contradicts the autopilot's clock": 3}
     assert apart_m(track).max() < 0.02
 
 
@@ -293,7 +293,7 @@ def test_an_epoch_that_is_not_where_the_velocities_lead_is_left_out(tmp_path, ep
     """A metre off, as by a flipped bit. At a log's ends nothing else tells; the last falls with its neighbour."""
     moved = ulog_receiver()[field][1] + step * (np.arange(60) == epoch)
     track = read(tmp_path, (GPS, 0, ulog_receiver(**{field: moved})))
-    assert track.attrs["dropped"] == {"not where the receiver's velocity leads": 1 + (epoch == 58)}
+    assert track.attrs["dropped"] == {"position contradicts the receiver's velocity": 1 + (epoch == 58)}
     assert apart_m(track).max() < 0.02
 
 
@@ -317,7 +317,7 @@ def test_a_step_between_solutions_is_no_epoch_out_of_place(tmp_path):
     [
         (b"", "Header too short"),
         (b"x" * 500, "Failed to parse header"),
-        (ulog((ATTITUDE, 0, ulog_attitude())), "no message of any of them"),
+        (ulog((ATTITUDE, 0, ulog_attitude())), "no position messages"),
         (ulog((GPS, 0, ulog_receiver(lat=None))), "no latitude and longitude"),
         (ulog((GPS, 0, ulog_receiver(fix_type=None))), "no fix_type"),
         (ulog((GPS, 0, ulog_receiver(vel_d_m_s=None))), "no vel_d_m_s"),
@@ -355,7 +355,7 @@ def read_damaged(path, data):
     except Exception:
         return None
     try:
-        return check(track_of(fields, node="a", options=AS_IT_SAYS, where=path), "track")
+        return check(track_of(fields, node="a", options=DEFAULT_OPTIONS, where=path), "track")
     except CampaignError:
         return None
 

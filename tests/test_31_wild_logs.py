@@ -19,8 +19,8 @@ GOOD = "2025-05-14T09:30:00Z,48,9,600,1"
     ("line", "expected"),
     [
         ("2025-05-14T09:30:01Z,48,9,1e308,1", "the height between -1000 and 100000 m"),
-        ("2025-05-14T09:30:01Z,48,9,inf,1", "1 epoch without a position"),
-        ("2025-05-14T09:30:01Z,48,1e9,600,1", "1 epoch without a position"),
+        ("2025-05-14T09:30:01Z,48,9,inf,1", "1 epoch without a valid position"),
+        ("2025-05-14T09:30:01Z,48,1e9,600,1", "1 epoch without a valid position"),
         ("99999-05-14T09:30:01Z,48,9,600,1", "a.track.csv: "),
         ("2500-05-14T09:30:01Z,48,9,600,1", "a.track.csv: "),
         ("0001-05-14T09:30:01Z,48,9,600,1", "a.track.csv: "),
@@ -41,7 +41,7 @@ def test_a_line_that_no_flight_logs_is_one_message(tmp_path, line, expected):
 
 def test_a_column_that_stands_twice_is_named(tmp_path):
     heading = "time_utc,latitude_deg,longitude_deg,height_m,height_m"
-    assert "column height_m a second time" in complaint(csv_log(tmp_path, GOOD, GOOD, heading=heading))
+    assert "repeated column height_m" in complaint(csv_log(tmp_path, GOOD, GOOD, heading=heading))
 
 
 def test_a_standard_deviation_below_zero_is_refused(tmp_path):

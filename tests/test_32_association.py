@@ -100,7 +100,7 @@ def test_recordings_with_little_in_common_are_flagged(common, flagged):
 
 def test_recordings_of_different_flights_are_refused_with_how_far_apart_they_are():
     (tx, rx), _ = fly(np.random.default_rng(8), 100)
-    with pytest.raises(CampaignError, match=r"begins \+18\.000 s.*half a repetition interval \(0\.025 s\)"):
+    with pytest.raises(CampaignError, match=r"starts \+18\.000 s.*half a repetition interval \(0\.025 s\)"):
         associate(tx, rx + 18 * NS, repetition_interval_s=0.05)
 
 
@@ -114,8 +114,8 @@ def test_a_tag_that_steps_back_is_named():
 def test_tags_further_apart_than_good_ones_are_flagged_with_what_was_flown_meanwhile(offset_s, flagged):
     (tx, rx), _ = fly(np.random.default_rng(5), interval_s=0.1, offset_s=offset_s)
     flags = associate(tx, rx, repetition_interval_s=0.1, speed_m_s=12.0).flags
-    assert ("time_tags_apart" in flags) == flagged
-    assert not flagged or flags["time_tags_apart"].endswith("moved 0.25 m meanwhile")
+    assert ("time_tag_offset" in flags) == flagged
+    assert not flagged or flags["time_tag_offset"].endswith("moved 0.25 m in that time")
 
 
 @pytest.mark.parametrize(("late_s", "left_out"), [(0.004, False), (0.006, True)])
@@ -142,8 +142,8 @@ def test_pulses_before_and_after_the_other_recording_are_remarked_from_five_perc
 def test_tags_late_by_whole_intervals_show_as_equal_recordings_that_begin_apart():
     (tx, rx), _ = fly(np.random.default_rng(5), pulses=130, jitter_s=0.001)
     shifted = associate(tx, rx + NS // 2, repetition_interval_s=0.05).flags["pulses_unpaired"]
-    assert shifted.startswith("10 pulses before and 0 after the other recording, of 130: both recordings are equally")
-    assert "+0.499 s apart" in shifted
+    assert shifted.startswith("of 130 transmitted pulses, 10 are before and 0 after the receiver's recording: ")
+    assert "equally long and start +0.499 s from each other" in shifted
     assert "equally" not in associate(tx, rx[10:], repetition_interval_s=0.05).flags["pulses_unpaired"]
 
 
@@ -155,7 +155,7 @@ def test_frame_counters_that_wrap_decide_against_any_tag_offset_below_half_a_tur
     assert pairs.method == "frame counter"
     assert share_right(pairs, numbers) == 1.0
     assert pairs.tx_index.size == rx.size
-    assert ("time_tags_apart" in pairs.flags) == (offset_s > 0.025)
+    assert ("time_tag_offset" in pairs.flags) == (offset_s > 0.025)
 
 
 def test_a_gap_of_several_turns_of_the_counter_is_bridged():
@@ -185,7 +185,7 @@ def test_a_misread_number_is_dropped_and_flagged():
     frame[42] = -1
     pairs = associate(tx, rx, repetition_interval_s=0.05, tx_frame=numbers[0], rx_frame=frame, frame_modulus=1024)
     assert share_right(pairs, numbers) == 1.0
-    assert pairs.flags["frame_counter_conflict"].startswith("1 pulse dropped")
+    assert pairs.flags["frame_counter_conflict"].startswith("1 pulse excluded")
 
 
 def test_without_any_read_number_the_tags_decide():

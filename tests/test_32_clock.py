@@ -122,15 +122,15 @@ def decision(ppm, *, std_hz=1.0, accuracy_db=-60.0, cfo_hz=None):
 def test_a_clock_is_corrected_only_when_the_asked_accuracy_needs_it(ppm, accuracy_db, correct):
     decided = decision(ppm, accuracy_db=accuracy_db)
     assert decided.correct == correct
-    assert decided.reason.endswith("corrected" if correct else "alone")
+    assert decided.reason.endswith(": samples corrected" if correct else ": not corrected")
     assert (decided.floor_db > accuracy_db) == correct
 
 
 def test_a_clock_that_noise_only_suggests_is_left_alone():
     """2400 Hz: left alone below three standard deviations, and both are stated."""
     assert not decision(2.0, std_hz=820.0).correct
-    assert decision(2.0, std_hz=820.0).reason.startswith("clock 2.00 ± 0.68 ppm fast")
-    assert decision(2.0, std_hz=820.0).reason.endswith("left alone: below 3 σ")
+    assert decision(2.0, std_hz=820.0).reason.startswith("clock +2.00 ± 0.68 ppm (CFO")
+    assert decision(2.0, std_hz=820.0).reason.endswith("not corrected: below 3 σ")
     assert decision(2.0, std_hz=780.0).correct
     assert ClockOffset(2400.0, 0.0, 2.0, 820.0, 0.1, one_clock=True).ppm(NUMEROLOGY) == pytest.approx(
         (2.0, 0.6833), abs=1e-3

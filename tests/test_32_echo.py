@@ -52,7 +52,7 @@ def test_an_echo_beyond_the_prefix_is_no_longer_a_pure_delay():
 
 
 def test_the_dft_needs_prefix_and_one_period():
-    with pytest.raises(ValueError, match="needs 80"):
+    with pytest.raises(ValueError, match="must have at least 80"):
         demodulate(np.ones((1, 79), np.complex64), Numerology(1e9, RATE, np.arange(4), 16, 64))
 
 

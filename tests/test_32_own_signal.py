@@ -68,7 +68,7 @@ def test_noise_neither_confirms_a_code_nor_denies_it():
 def test_a_prefix_as_long_as_the_period_leaves_nothing_to_compare_with():
     found = own_code(echoes(np.random.default_rng(1)), prefix_cells=CELLS - 30)
     assert found.carried is None
-    assert "nothing to compare with" in found.evidence
+    assert "too few others to measure the floor" in found.evidence
 
 
 def stability(transfer, time_s=None):

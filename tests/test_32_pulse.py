@@ -149,7 +149,7 @@ def test_auto_takes_matched_for_a_flat_spectrum_inverse_for_an_uneven_one_and_ma
     weak = flat * np.where(np.arange(500) % 2, 1.0, 0.14)
     assert pulse_filter(weak, requested="auto").report["filter"] == "matched"
     line = pulse_filter(weak, requested="inverse").flags["waveform_noise"]
-    assert line == "inverse loses 11.2 dB of the signal to noise ratio: 50% of the band lies 10 dB below its mean"
+    assert line == "SNR loss of the inverse filter 11.2 dB: 50% of the band is 10 dB below its mean"
     with pytest.raises(ValueError, match="no energy"):
         pulse_filter(np.zeros(8), requested="auto")
 
@@ -184,13 +184,13 @@ def test_division_needs_no_clock_where_the_pulse_is_sent_once(cfo_hz):
     assert coherent > 0.998
     assert abs(np.angle(np.vdot(expected, formed))) < 0.005
     assert "clock_unmeasured" not in measured.flags
-    assert measured.report["clock"]["reason"].startswith("a pulse that is sent once repeats nothing")
+    assert measured.report["clock"]["reason"].startswith("not measurable: a pulse that is sent once has no repetition")
 
 
 def test_captures_that_begin_in_the_direct_pulse_or_end_in_it_are_counted():
     held = {"lead_s": 0.2e-6, "pulse_s": 1e-6, "listen_s": 0.5e-6, "cell_s": 2.5e-9}
     assert truncation_flags(np.array([0.0, -0.2e-6, 0.5e-6, np.nan]), **held) == {}
-    assert "2 of 3 pulses" in truncation_flags(np.array([0.0, -0.25e-6, 0.75e-6]), **held)["pulse_cut"]
+    assert "2 of 3 pulses" in truncation_flags(np.array([0.0, -0.25e-6, 0.75e-6]), **held)["pulse_truncated"]
 
 
 PULSE = {

@@ -125,7 +125,7 @@ def test_a_geoid_grid_in_the_working_folder_opens_by_its_bare_name(shared, monke
 
 
 def test_the_grid_of_another_geoid_is_refused(shared):
-    with pytest.raises(CampaignError, match="another geoid than egm2008"):
+    with pytest.raises(CampaignError, match="a geoid other than egm2008"):
         geoid.geoid_file("egm2008", shared / "dem_isce3" / "egm96_15.gtx")
 
 
@@ -138,7 +138,7 @@ def test_what_the_dem_carries_is_taken_or_must_agree(shared, tmp_path, monkeypat
     stated = open_dem(silent, UTM_GRID.crs, datum="egm96", geoid=gtx).heights(UTM_GRID)
     np.testing.assert_allclose(carried, stated, atol=1e-6)
     assert 45 < (carried - 600).mean() < 50
-    with pytest.raises(CampaignError, match="heights of egm96 by its own CRS"):
+    with pytest.raises(CampaignError, match="heights of egm96 declared by its own CRS"):
         open_dem(carrying, UTM_GRID.crs, datum="ellipsoid")
     with pytest.raises(CampaignError, match="a CRS without heights"):
         open_dem(silent, UTM_GRID.crs, datum="carried")
@@ -184,7 +184,7 @@ def test_a_height_that_no_land_has_is_counted_where_it_counts(tmp_path, wild):
     terrain = open_dem(write_dem(path, heights, corner), UTM_GRID.crs, datum="ellipsoid")
     with pytest.raises(CampaignError, match=r"dem\.tif: 2 of the \d+ posts in rows ") as caught:
         terrain.heights(UTM_GRID)
-    assert f"most often {wild:g} m" in str(caught.value)
+    assert f"most frequently {wild:g} m" in str(caught.value)
     local = open_dem(write_dem(path, heights, corner, crs=None), "local", datum="carried")
     assert np.isfinite(local.heights(SceneGrid("local", 500020.0, 5400060.0, 0.5, (70, 90)))).all()
 
@@ -220,8 +220,9 @@ def test_a_void_filled_with_a_constant_is_refused_where_it_counts(tmp_path, fill
     terrain = open_dem(write_dem(path, heights, corner), UTM_GRID.crs, datum="ellipsoid")
     message = complaint(lambda: terrain.heights(UTM_GRID))
     count = "1 post" if side == 1 else f"{side**2} posts"
-    assert f"{count} from row 30, column 20 on are exactly {fill}, and all posts beside at least" in message
-    assert f"Declare {fill} as nodata of those posts and fill them with a GIS" in message
+    void = f"a void filled with {fill}: {count} of this value from row 30, column 20, surrounded by posts that differ"
+    assert void in message
+    assert f"Declare {fill} as nodata for these posts, and fill them with a GIS" in message
 
 
 @pytest.mark.parametrize("kind", ["sea cliff", "coast", "lake", "declared"])
@@ -260,11 +261,11 @@ def test_a_file_that_is_no_dem_is_refused(tmp_path):
     for path, expected in (
         (tmp_path / "dem.tif", "not readable"),
         (tmp_path / "none.tif", "no such file"),
-        (write_dem(tmp_path / "bare.tif", np.zeros((4, 4)), from_origin(0, 4, 1, 1), crs=None), "no CRS on Earth"),
+        (write_dem(tmp_path / "bare.tif", np.zeros((4, 4)), from_origin(0, 4, 1, 1), crs=None), "no geodetic CRS"),
     ):
         with pytest.raises(CampaignError, match=expected):
             open_dem(path, UTM_GRID.crs, datum="ellipsoid")
-    with pytest.raises(CampaignError, match="under a scene in the local frame"):
+    with pytest.raises(CampaignError, match="for a scene in the local frame"):
         open_dem(plane_dem(tmp_path / "utm.tif"), "local", datum="carried")
 
 

@@ -121,14 +121,14 @@ def test_an_antenna_below_flat_ground_is_refused_and_below_a_dem_beside_it_is_fl
     track = UTM_GRID.positions_at(np.arange(5.0), -40.0, np.array([660.0, 651.0, 649.5, 655.0, 660.0]))
     high = UTM_GRID.positions_at(np.arange(5.0), 10.0, 700.0)
     with pytest.raises(
-        CampaignError, match=r"f01: at 1 pulse the receiver is in or below .* worst at pulse 2: -0.50 m"
+        CampaignError, match=r"f01: at 1 pulse the receiver is at or below .* worst at pulse 2: clearance -0.50 m"
     ):
         check_antennas(UTM_GRID, FlatGround(650.0), Aperture(high, track), where="f01")
     low = UTM_GRID.positions_at(np.arange(5.0), 10.0, 649.0)
-    with pytest.raises(CampaignError, match=r"scene\.dem: .*transmitter.*where the DEM has 650.00 m"):
+    with pytest.raises(CampaignError, match=r"scene\.dem: .*transmitter.*, DEM height 650.00 m"):
         check_antennas(UTM_GRID, hill, Aperture(low, track), where="f01")
     flags = check_antennas(UTM_GRID, hill, Aperture(high, track), where="f01")
-    assert flags["platform_below_scene"].startswith("the receiver is 0.5 m below the lowest ground of the scene")
+    assert flags["platform_below_scene"].startswith("the receiver is 0.5 m below the lowest terrain of the scene")
     assert check_antennas(UTM_GRID, hill, Aperture(high, high), where="f01") == {}
 
 

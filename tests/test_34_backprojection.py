@@ -1,4 +1,4 @@
-"""The grid, the engines, tiles and what is measured in an image."""
+"""Backprojection engines, tiles and grid spacing, compared with the double sum over pulses and subcarriers."""
 
 import numpy as np
 import pytest
@@ -58,7 +58,7 @@ def test_every_engine_agrees_with_the_double_sum(name, window, bistatic):
 
 
 @pytest.mark.parametrize("name", TABLE_ENGINES)
-def test_a_target_peaks_where_it_is_with_the_amplitude_of_its_echo(name):
+def test_target_peaks_at_its_position_with_the_amplitude_of_its_echo(name):
     _, profiles = history((0.33, 10.07, 0.0))
     image = formed(name, profiles) / 64
     peak = find_peak(image, *np.unravel_index(np.abs(image).argmax(), image.shape))
@@ -68,24 +68,24 @@ def test_a_target_peaks_where_it_is_with_the_amplitude_of_its_echo(name):
 
 
 @pytest.mark.parametrize("name", TABLE_ENGINES)
-def test_swapping_transmitter_and_receiver_changes_nothing(name):
+def test_swapping_transmitter_and_receiver_leaves_the_image_unchanged(name):
     tx = np.stack([np.linspace(-4, 4, 64), np.zeros(64), np.full(64, 5.0)], -1)
-    one, two = (
+    image, swapped = (
         formed(name, history((0, 10.0, 0), tx=a, rx=b)[1]) for a, b in ((tx, tx + [2.0, 1, 1]), (tx + [2.0, 1, 1], tx))
     )
-    assert numerical_error_db(one.ravel(), two.ravel().astype(complex)) < -90
+    assert numerical_error_db(image.ravel(), swapped.ravel().astype(complex)) < -90
 
 
 @pytest.mark.parametrize("name", TABLE_ENGINES)
-def test_a_pair_of_coincident_platforms_is_monostatic(name):
+def test_coincident_platforms_give_the_monostatic_image(name):
     tx = np.stack([np.linspace(-4, 4, 64), np.zeros(64), np.full(64, 5.0)], -1)
     np.testing.assert_array_equal(
         formed(name, history((0, 10.0, 0), tx=tx, rx=tx.copy())[1]), formed(name, history((0, 10.0, 0), tx=tx)[1])
     )
 
 
-def test_a_raised_target_focuses_where_geometry_predicts():
-    """Layover: at height z it appears where the flat ground has the same path at the middle of the aperture."""
+def test_raised_target_is_laid_over_as_geometry_predicts():
+    """Layover: the target appears where flat terrain has the same path length at the middle of the aperture."""
     _, profiles = history((0.0, 10.0, 0.5))
     image = formed("numba", profiles)
     peak = find_peak(image, *np.unravel_index(np.abs(image).argmax(), image.shape))
@@ -93,7 +93,7 @@ def test_a_raised_target_focuses_where_geometry_predicts():
     assert 14.0 - (peak.row + 0.5) * 0.1 == pytest.approx(predicted, abs=0.03)
 
 
-def test_automatic_spacing_resolves_the_finest_cell():
+def test_automatic_spacing_samples_the_finest_resolution_cell():
     along = np.linspace(-4, 4, 64)
     tx = np.stack([along, 0 * along, 5 + 0 * along], -1)
     spacing = auto_spacing(Aperture(tx, tx), FREQUENCY, crs="local", bounds_m=(-4, 6, 4, 14), height_m=0.0)
@@ -105,8 +105,8 @@ def test_automatic_spacing_resolves_the_finest_cell():
 
 
 @pytest.mark.parametrize("name", TABLE_ENGINES)
-def test_tiles_change_nothing_to_the_bit(name):
-    grid = GRID[:64, :64]  # pieces of a tree share a block of pixels evenly
+def test_tiled_image_is_bit_identical(name):
+    grid = GRID[:64, :64]  # the tree divides a block of pixels into pieces of equal size
     _, profiles = history((0.33, 10.07, 0.0))
     tiled, options = np.zeros(grid.shape, np.complex64), {"side_px": 32} if name == "tree" else {}
     image = image_array(profiles, Setting(name, {}, options, -60.0, 1.0), grid, FlatGround(0.0), side_px=32)

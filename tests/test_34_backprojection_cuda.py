@@ -1,4 +1,4 @@
-"""The GPU engine: its prediction, its tests in numba's simulator, and what becomes of it where there is no device."""
+"""GPU engine: predictions, tests in the simulator of numba, and behaviour without a device."""
 
 import os
 import re
@@ -40,7 +40,7 @@ def plain():
 
 
 @pytest.mark.slow
-def test_the_simulated_device_passes_its_tests():
+def test_simulated_device_passes_its_tests():
     tests = Path(__file__).with_name("simulated_device.py")
     command = [sys.executable, "-m", "pytest", "-q", "-n0", "-p", "no:cacheprovider", str(tests)]
     environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -49,8 +49,8 @@ def test_the_simulated_device_passes_its_tests():
     assert int(re.search(r"(\d+) passed", run.stdout)[1]) >= 38
 
 
-def test_the_series_errs_by_no_more_than_is_reckoned_with():
-    """(8) in float32 as the kernel has it, random pixels about patches near and far: rounding, and orders left out."""
+def test_series_error_stays_below_its_bound():
+    """Eq. 8 in float32 as in the kernel, random pixels of near and far patches: rounding and truncated orders."""
     draw = np.random.default_rng(0)
     for reach, distance in ((0.5, 2.3), (0.5, 4.0), (0.5, 20.0), (5.0, 500.0), (0.5, 1e4)):
         w, d = draw.standard_normal((2, 20000, 3))
@@ -64,15 +64,15 @@ def test_the_series_errs_by_no_more_than_is_reckoned_with():
         for term in (-5 / 64, 1 / 8, -1 / 4, 1):
             root = np.float32(term) + s * root
         error = np.abs(np.float32(distance / 2) * s * root - exact)
-        most = reach * (2 * distance + reach) / distance**2
-        bound = LAST_TERM * distance * most**LAST_ORDER / (1 - most) + FLOAT32_ERROR * reach
-        assert most < FARTHEST
+        largest = reach * (2 * distance + reach) / distance**2
+        bound = LAST_TERM * distance * largest**LAST_ORDER / (1 - largest) + FLOAT32_ERROR * reach
+        assert largest < FARTHEST
         assert error.max() <= bound
-        assert error.max() > bound / 20  # and not by far less
+        assert error.max() > bound / 20  # the bound is not too loose
 
 
-def test_weights_err_by_no_more_than_is_reckoned_with():
-    """(8a), and angles along axes, in float32 as the kernel has them."""
+def test_weight_error_stays_below_its_bound():
+    """Eq. 8a and the angles about the beam axes, in float32 as in the kernel."""
     draw = np.random.default_rng(0)
     for reach, distance in ((0.5, 20.0), (5.0, 500.0), (0.5, 1e4)):
         w, d = draw.standard_normal((2, 20000, 3))
@@ -91,21 +91,21 @@ def test_weights_err_by_no_more_than_is_reckoned_with():
         error = np.abs(((axis * near).sum(1) - at_origin * longer) / (np.float32(1) + longer) - exact)
         assert PLACE_ERROR / 3 < error.max() / (reach / distance) <= PLACE_ERROR
         assert np.sqrt((error**2).mean()) / (reach / distance) == pytest.approx(PLACE_RMS, rel=0.1)
-        # The angle above a plane, and its place in a cut of 4097 samples over half a turn.
+        # Elevation angle, and its index in a cut of 4097 samples over 180°.
         along = np.einsum("nij,nj->ni", axes, w).astype(np.float32) + np.einsum("nij,nj->ni", turned, near)
         truth = np.einsum("nij,nj->ni", axes, w + d)
         angle = np.arctan2(along[:, 2], np.sqrt(along[:, 0] ** 2 + along[:, 1] ** 2))
-        place = (angle + np.float32(np.pi / 2)) * np.float32(4096 / np.pi)
+        index = (angle + np.float32(np.pi / 2)) * np.float32(4096 / np.pi)
         exact = (np.arctan2(truth[:, 2], np.hypot(truth[:, 0], truth[:, 1])) + np.pi / 2) * 4096 / np.pi
-        error = np.abs(place - exact) * np.pi / 4096
+        error = np.abs(index - exact) * np.pi / 4096
         assert ANGLE_ERROR / 5 < error.max() <= ANGLE_ERROR
         assert ANGLE_RMS / 5 < np.sqrt((error**2).mean()) <= ANGLE_RMS
 
 
-def test_bad_input_is_refused(plain):
+def test_invalid_input_is_refused(plain):
     _, profiles = plain
     tables = cuda.prepare(profiles)
-    with pytest.raises(ValueError, match="holds no pulse"):
+    with pytest.raises(ValueError, match="contains no pulse"):
         cuda.prepare(profiles[slice(0, 0)])
     with pytest.raises(ValueError, match="must be finite"):
         cuda.prepare(replace(profiles, start_m=profiles.start_m * np.nan))
@@ -120,52 +120,56 @@ def test_bad_input_is_refused(plain):
     assert cuda.form(tables, np.zeros((0, 4, 3))).shape == (0, 4)
 
 
-def test_weights_are_priced_and_their_error_is_in_the_prediction():
-    """An estimate, like all seconds of the engine: more for each beam; of a sector, for the pulses it takes."""
+def test_weights_add_to_predicted_time_and_error():
+    """Estimated time: longer with each beam, and proportional to the number of pulses in a sector."""
     sector = Sector.of(planning_job().aperture, chord_m=1.0, centre=0.0, half=0.05)
     asked = {"pulses": 300, "requested": {"oversampling": 16, "tolerance_rad": 1.5e-5}}
 
-    def priced(**changes):
+    def predicted(**changes):
         (setting,) = candidates(planning_job(**changes), **asked)
         return setting
 
-    plain, one, both = priced(), priced(beams=Beams(beam_of())), priced(beams=Beams(beam_of(), beam_of()))
-    assert plain.form_seconds < one.form_seconds < both.form_seconds < 10 * plain.form_seconds
-    taken = Integration(sector, 30, "0.05", "asked for", share=0.1)
-    assert priced(beams=Beams(sector=sector), integration=taken).form_seconds < plain.form_seconds / 3
-    steep = beam_of((0.5, 60.0))  # half a degree
-    errors = [setting.error_db for setting in (plain, both, priced(beams=Beams(steep)))]
+    plain, one_beam, two_beams = (
+        predicted(),
+        predicted(beams=Beams(beam_of())),
+        predicted(beams=Beams(beam_of(), beam_of())),
+    )
+    assert plain.form_seconds < one_beam.form_seconds < two_beams.form_seconds < 10 * plain.form_seconds
+    sector_only = Integration(sector, 30, "0.05", "asked for", share=0.1)
+    assert predicted(beams=Beams(sector=sector), integration=sector_only).form_seconds < plain.form_seconds / 3
+    steep = beam_of((0.5, 60.0))  # pattern falls within half a degree
+    errors = [setting.error_db for setting in (plain, two_beams, predicted(beams=Beams(steep)))]
     assert errors[0] < errors[1] < errors[2] - 1
-    assert "weights by" in priced(beams=Beams(steep)).reasons["oversampling"]
+    assert "weights by" in predicted(beams=Beams(steep)).reasons["oversampling"]
     assert "weights" not in plain.reasons["oversampling"]
 
 
 @pytest.mark.slow
-def test_a_weighed_image_is_formed_by_name_and_never_by_auto(monkeypatch):
+def test_weighted_image_uses_cuda_only_if_requested(monkeypatch):
     monkeypatch.setattr(cuda, "available", lambda: True)
-    seen = {"beams": Beams(beam_of(), beam_of())}
-    assert plan(**seen).engine != "cuda"
+    job = {"beams": Beams(beam_of(), beam_of())}
+    assert plan(**job).engine != "cuda"
     for requested in ({"engine": "cuda"}, {"engine_options": {"cuda": {"oversampling": 8}}}):
-        assert plan(overrides=requested, **seen).engine == "cuda"
+        assert plan(overrides=requested, **job).engine == "cuda"
 
 
 @pytest.mark.slow
-def test_an_engine_that_nobody_has_timed_is_taken_by_name_alone(monkeypatch):
-    """However large the image and however few the seconds predicted; not as a fallback either."""
+def test_engine_without_measured_cost_is_used_only_if_requested(monkeypatch):
+    """Independent of image size and predicted time; the engine is no fallback either."""
     monkeypatch.setattr(cuda, "available", lambda: True)
     large = plan(shape=(20000, 20000))
     assert "cuda" not in {large.engine, *(setting.engine for setting in large.fallbacks)}
     for requested in ({"engine": "cuda"}, {"engine_options": {"cuda": {"oversampling": 8}}}):
-        named = plan(shape=(20000, 20000), overrides=requested)
-        assert named.engine == "cuda"
-        assert any("seconds are not measured" in decision.reason for decision in named.decisions)
+        planned = plan(shape=(20000, 20000), overrides=requested)
+        assert planned.engine == "cuda"
+        assert any("seconds are not measured" in decision.reason for decision in planned.decisions)
     monkeypatch.setattr(cuda, "TIMED", True)
     assert plan(shape=(20000, 20000)).engine == "cuda"
-    assert plan().engine != "cuda"  # its first kernel takes longer to start than a small image on a processor
+    assert plan().engine != "cuda"  # the first kernel takes longer to start than a small image takes on the CPU
 
 
-def test_the_simulator_is_said_to_be_slower_than_the_double_sum_and_is_no_fallback(monkeypatch):
-    """Nor where it alone would come near an accuracy: what costs more than the double sum is worth nothing."""
+def test_simulator_is_predicted_slower_than_the_double_sum_and_is_no_fallback(monkeypatch):
+    """Even if no other engine meets the accuracy: an engine that costs more than the double sum is useless."""
     monkeypatch.setenv("NUMBA_ENABLE_CUDASIM", "1")
     without_library(monkeypatch)
     monkeypatch.setattr(cuda, "available", lambda: True)
@@ -174,14 +178,14 @@ def test_the_simulator_is_said_to_be_slower_than_the_double_sum_and_is_no_fallba
     settings = list(candidates(job, pulses=300, requested={}))
     assert min(setting.seconds for setting in settings) > 10 * double_sum.seconds
     assert min(setting.error_db for setting in settings) < -100
-    last = SettingSearch(job).fallbacks(Setting("numba", {}, {}, -94.0, 1.0))
-    assert [setting.engine for setting in last] == ["reference"]
+    fallbacks = SettingSearch(job).fallbacks(Setting("numba", {}, {}, -94.0, 1.0))
+    assert [setting.engine for setting in fallbacks] == ["reference"]
 
 
 @pytest.mark.skipif(cuda.available(), reason="there is a device")
-def test_without_a_device_the_engine_is_refused_with_one_message(plain):
+def test_engine_is_refused_without_a_device(plain):
     pixels, profiles = plain
-    with pytest.raises(CampaignError, match="engine cuda cannot run here") as told:
+    with pytest.raises(CampaignError, match="engine cuda is not available on this machine") as told:
         plan(overrides={"engine": "cuda"})
     assert "NVIDIA" in told.value.remedy
     assert "cuda" not in told.value.expected
@@ -192,7 +196,7 @@ def test_without_a_device_the_engine_is_refused_with_one_message(plain):
 
 
 @pytest.mark.slow
-def test_looking_for_a_device_imports_nothing_where_there_is_no_driver():
+def test_device_query_without_a_driver_does_not_import_numba():
     program = (
         "import sys; from apertura.core.backprojection.engines import load_engine\nload_engine('cuda').available()"
     )

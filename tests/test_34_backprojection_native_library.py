@@ -1,4 +1,4 @@
-"""The compiled library itself: instruction sets, layout of what is handed over, sanitizers."""
+"""Compiled library: instruction sets, memory layout of the arguments, sanitizers."""
 
 import os
 import shutil
@@ -23,14 +23,14 @@ def test_an_unknown_instruction_set_is_refused(monkeypatch):
         native.instruction_set()
 
 
-def test_without_the_compiled_library_the_engine_says_so(monkeypatch):
+def test_missing_library_is_reported_with_a_remedy(monkeypatch):
     without_library(monkeypatch)
     assert not native.available()
     with pytest.raises(RuntimeError, match="install a C\\+\\+ compiler"):
         native.instruction_set()
 
 
-def test_python_predicts_with_the_constants_of_the_kernel():
+def test_python_uses_the_constants_of_the_kernel():
     assert native_binding.kernel_constants() == pytest.approx(
         asdict(KERNEL) | {f"tree_{name}": value for name, value in asdict(TREE).items()}, rel=1e-6
     )
@@ -38,32 +38,32 @@ def test_python_predicts_with_the_constants_of_the_kernel():
 
 @pytest.mark.quick("int32_t*")
 @pytest.mark.parametrize(
-    ("was", "becomes", "named"),
+    ("declaration", "changed", "field"),
     [
         ("pulses, padded, width, rows", "pulses, padded, rows, width", "ApertureJob.width"),
         ("int32_t wide_sum; ", "int64_t wide_sum; ", "ApertureJob.wide_sum"),
         ("double peak; ", "double peak, sum; ", "BeamJob"),
     ],
 )
-def test_a_library_of_another_layout_is_refused_by_the_name_of_the_field(was, becomes, named, tmp_path, monkeypatch):
+def test_library_of_another_layout_is_refused_with_the_field_name(declaration, changed, field, tmp_path, monkeypatch):
     compiler = shutil.which("g++")
     if not compiler:
         pytest.skip("g++ is needed")
     shutil.copytree(Path(__file__).parents[1] / "native", tmp_path, dirs_exist_ok=True)
     job, contract = tmp_path / "job.hpp", tmp_path / "contract.cpp"
-    assert was in job.read_text()
-    job.write_text(job.read_text().replace(was, becomes))
-    library = tmp_path / f"{named}.so"
+    assert declaration in job.read_text()
+    job.write_text(job.read_text().replace(declaration, changed))
+    library = tmp_path / f"{field}.so"
     exports = 'extern "C" __attribute__((visibility("default"))) const char* apertura_isa(const char*) { return 0; }\n'
     contract.write_text(contract.read_text() + exports)
     subprocess.run([compiler, "-std=c++17", "-shared", "-fPIC", contract, "-o", library], check=True)
     monkeypatch.setenv("APERTURA_KERNEL", str(library))
-    with pytest.raises(CampaignError, match=rf"{named} at .*; expected {named} at byte \d+, \d+ bytes") as refused:
+    with pytest.raises(CampaignError, match=rf"{field} at .*; expected {field} at byte \d+, \d+ bytes") as refused:
         native.instruction_set()
     assert str(library) in str(refused.value)
 
 
-def test_a_library_that_tells_no_layout_is_refused(tmp_path, monkeypatch):
+def test_library_without_layout_table_is_refused(tmp_path, monkeypatch):
     compiler = shutil.which("g++")
     if not compiler:
         pytest.skip("g++ is needed")
@@ -71,25 +71,25 @@ def test_a_library_that_tells_no_layout_is_refused(tmp_path, monkeypatch):
     source.write_text('extern "C" const char* apertura_form(const char* name) { return name; }\n')
     subprocess.run([compiler, "-shared", "-fPIC", source, "-o", library], check=True)
     monkeypatch.setenv("APERTURA_KERNEL", str(library))
-    with pytest.raises(CampaignError, match=r"BeamJob\.axes at no place; expected .* byte 0, 8 bytes"):
+    with pytest.raises(CampaignError, match=r"BeamJob\.axes: no such field; expected .* byte 0, 8 bytes"):
         native.instruction_set()
 
 
-def test_no_environment_variable_means_the_best(monkeypatch):
+def test_default_is_the_best_instruction_set(monkeypatch):
     monkeypatch.delenv("APERTURA_ISA", raising=False)
     assert native.instruction_set() == next(filter(native_binding.supports, native.INSTRUCTION_SETS))
     assert "APERTURA_ISA" not in os.environ
 
 
 @pytest.mark.slow
-def test_the_kernel_is_clean_under_sanitizers(tmp_path):
+def test_kernel_passes_under_sanitizers(tmp_path):
     cmake, compiler = shutil.which("cmake"), shutil.which("g++")
     if not (cmake and compiler):
         pytest.skip("cmake and g++ are needed")
     root = Path(__file__).parents[1]
     subprocess.run([cmake, "-S", root, "-B", tmp_path, "-DAPERTURA_SANITIZE=ON"], check=True, capture_output=True)
     subprocess.run([cmake, "--build", tmp_path, "--parallel", "2"], check=True, capture_output=True)
-    runtimes = [  # with the C++ one, or the sanitizer knows no throw of the libraries that Python loads later
+    runtimes = [  # libstdc++ too: the sanitizer otherwise misses exceptions of libraries that Python loads later
         subprocess.run(
             [compiler, f"-print-file-name={name}"], check=True, capture_output=True, text=True
         ).stdout.strip()
@@ -99,7 +99,7 @@ def test_the_kernel_is_clean_under_sanitizers(tmp_path):
         **os.environ,
         "APERTURA_KERNEL": str(tmp_path / "_backprojection.so"),
         "LD_PRELOAD": " ".join(runtimes),
-        "ASAN_OPTIONS": "detect_leaks=0",  # Python's own
+        "ASAN_OPTIONS": "detect_leaks=0",  # leaks of Python itself
     }
     command = [
         sys.executable,
@@ -115,5 +115,5 @@ def test_the_kernel_is_clean_under_sanitizers(tmp_path):
             for name in ("native", "beams", "sector", "envelope", "contributions", "gradient", "tree")
         ),
     ]
-    done = subprocess.run(command, env=environment, cwd=root, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    run = subprocess.run(command, env=environment, cwd=root, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stdout[-3000:] + run.stderr[-3000:]

@@ -1,4 +1,4 @@
-"""Presummed pulses: only where the aperture is oversampled, and with the error that was predicted."""
+"""Presumming: used only for an oversampled aperture, with the predicted error."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from apertura.core.quality.measures import numerical_error_db
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("step_m", "summed"), [(0.002, True), (0.1, False)])
-def test_pulses_are_summed_only_where_the_aperture_is_oversampled(step_m, summed):
+def test_pulses_are_presummed_only_if_the_aperture_is_oversampled(step_m, summed):
     tx = straight_track(2000, length_m=2000 * step_m)
     job = {"aperture": monostatic(tx), "shape": (2000, 2000), "spacing_m": 0.005}
     planned = plan(overrides={"engine": "native"}, **job)
@@ -22,19 +22,19 @@ def test_pulses_are_summed_only_where_the_aperture_is_oversampled(step_m, summed
     if summed:
         assert planned.presum.factor >= 4
         assert plan(overrides={"engine": "native", "presum": 1}, **job).presum is None
-        # the tree makes pulses fewer tile by tile: it stands against the direct kernel with a sum of pulses
-        asked = ({"engine": "native"}, {"engine": "tree", "presum": 1})
-        either = [plan(overrides=overrides, **job).predicted_seconds for overrides in asked]
-        assert plan(**job).predicted_seconds <= min(either) / 0.9
+        # the tree reduces pulses tile by tile: it competes with the direct kernel on presummed pulses
+        alternatives = ({"engine": "native"}, {"engine": "tree", "presum": 1})
+        seconds = [plan(overrides=overrides, **job).predicted_seconds for overrides in alternatives]
+        assert plan(**job).predicted_seconds <= min(seconds) / 0.9
 
 
 def test_a_presum_beyond_the_doppler_band_of_a_wide_scene_is_refused():
-    with pytest.raises(CampaignError, match="presum is 32"):
+    with pytest.raises(CampaignError, match="presum factor 32"):
         plan(overrides={"presum": 32}, aperture=monostatic(straight_track(length_m=30)))
 
 
 def oversampled(noise: float = 1.0):
-    """Noise everywhere, a few targets, an aperture sampled ten times too finely."""
+    """Draw a campaign with noise, a few targets and an aperture oversampled about ten times."""
     for seed in range(100):
         drawn = draw(np.random.default_rng(seed), pixels=40, pulses=400)
         _, widest = drawn.job.aperture.phase_rates(drawn.job.points_m, wavelength_m=C / drawn.job.band_hz[1])
@@ -45,7 +45,7 @@ def oversampled(noise: float = 1.0):
 
 @pytest.mark.slow
 @compiled
-def test_a_presummed_image_equals_that_of_all_pulses_where_leaving_pulses_out_does_not():
+def test_presummed_image_equals_that_of_all_pulses_but_a_decimated_one_does_not():
     drawn, widest = oversampled()
     presum = design(400, 4, widest_cycles=widest)
     points = drawn.job.points_m
@@ -56,6 +56,6 @@ def test_a_presummed_image_equals_that_of_all_pulses_where_leaving_pulses_out_do
         native.form(native.prepare(profiles, oversampling=16), drawn.grid.positions(0.0), tolerance_rad=1e-5)
         for profiles in (drawn.profiles, fewer, drawn.profiles[::4])
     ]
-    error, left_out = (numerical_error_db(image.ravel(), images[0].ravel()) for image in images[1:])
+    error, decimation_error = (numerical_error_db(image.ravel(), images[0].ravel()) for image in images[1:])
     assert error <= predicted + 3 <= -65
-    assert left_out > -45
+    assert decimation_error > -45

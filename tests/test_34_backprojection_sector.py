@@ -1,4 +1,4 @@
-"""The sector integrated: the same weights in every engine, smooth over the scene, and what is outside costs nothing."""
+"""Integrated sector: equal weights in every engine, smooth over the scene, no cost for pulses outside."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -48,20 +48,20 @@ def sector_of(aperture: Aperture, half: float, centre: float = 0.02) -> Sector:
 
 
 def strip(pulses: int = 3000, length_m: float = 150.0) -> tuple[Aperture, SceneGrid]:
-    """A straight flight eastward, and a strip north of it."""
+    """Return a straight eastward flight and the grid of a strip north of it."""
     along = np.linspace(-length_m / 2, length_m / 2, pulses)
     track = np.stack([along, 0 * along, np.full(pulses, 20.0)], -1)
     return monostatic(track), SceneGrid("local", -length_m / 2, 46.0, 0.5, (32, int(2 * length_m)))
 
 
-def test_a_pulse_counts_where_the_total_path_is_shortest():
-    """For two antennas of other speeds the weight is largest at the pulse with the least total path."""
+def test_weight_is_largest_at_the_shortest_total_path():
+    """Also for antennas of different speeds."""
     along = np.linspace(-40, 40, 801)[:, None] * [1.0, 0.0, 0.0]
     aperture = Aperture(along + [0, 0, 10.0], 0.4 * along + [-6.0, -3.0, 12.0])
-    places = np.array([[-5.0, 30.0, 0.0], [0.0, 20.0, 0.0], [9.0, 40.0, 2.0]])
+    points = np.array([[-5.0, 30.0, 0.0], [0.0, 20.0, 0.0], [9.0, 40.0, 2.0]])
     sector = Sector.of(aperture, chord_m=1.0, centre=0.0, half=0.05)
-    shortest = aperture.path(places).argmin(axis=0)
-    weight = sector.weight(aperture, places)
+    shortest = aperture.path(points).argmin(axis=0)
+    weight = sector.weight(aperture, points)
     middles = (weight * np.arange(801)[:, None]).sum(axis=0) / weight.sum(axis=0)
     np.testing.assert_allclose(middles, shortest, atol=3)
     tx, rx = flight_axes(aperture, chord_m=1.0)
@@ -73,17 +73,17 @@ def test_a_pulse_counts_where_the_total_path_is_shortest():
 @pytest.mark.parametrize("half", [0.04, 0.1, 0.25])
 @pytest.mark.parametrize("antenna", [False, True])
 def test_engines_agree_on_both_sides_of_the_edge(isa, flown, half, antenna):
-    """Pulses wholly inside, at the edge, wholly outside; the last ones fill no batch, the sector ends within them."""
+    """Pulses inside, at the edge and outside; the sector ends within the last, incomplete batch."""
     beam = swaying_beam(flown.scene.tx, (12, 0, 0)) if antenna else None
-    beams, places = Beams(beam, None, sector_of(flown.aperture, half)), ecef(flown.pixels)
-    weight = beams.sector.weight(flown.aperture, places.reshape(-1, 3))
+    beams, points = Beams(beam, None, sector_of(flown.aperture, half)), ecef(flown.pixels)
+    weight = beams.sector.weight(flown.aperture, points.reshape(-1, 3))
     assert {0.0, 1.0} <= set(weight[:, 0]) or half == 0.25
-    truth, counts = reference.form(flown.scene.history(), places, beams=beams), np.zeros(4, np.int64)
-    image = native.form(native.prepare(flown.profiles), places, beams=beams, counts=counts)
-    other = numba.form(numba.prepare(flown.profiles), places, beams=beams)
+    truth, counts = reference.form(flown.scene.history(), points, beams=beams), np.zeros(4, np.int64)
+    image = native.form(native.prepare(flown.profiles), points, beams=beams, counts=counts)
+    other = numba.form(numba.prepare(flown.profiles), points, beams=beams)
     assert decibels(image - truth, truth) <= -70
     assert decibels(other - truth, truth) <= -70
-    whole = reference.form(flown.scene.history(), places, beams=beams.antennas)
+    whole = reference.form(flown.scene.history(), points, beams=beams.antennas)
     assert decibels(whole - truth, truth) > -25  # the sector matters
     assert counts[3] > 0 or half == 0.25
 
@@ -92,70 +92,70 @@ def test_engines_agree_on_both_sides_of_the_edge(isa, flown, half, antenna):
 @compiled
 @pytest.mark.parametrize("half", [0.04, 0.1, 0.25])
 @pytest.mark.parametrize("rough", [False, True])
-def test_engines_agree_where_the_centre_follows_what_was_flown(isa, flown, half, rough):
-    """A sector far ahead of the flight: the centre of each pixel is its own, and changes within patches and blocks."""
+def test_engines_agree_if_the_sector_centre_follows_the_flight(isa, flown, half, rough):
+    """Sector far ahead of the flight: each pixel has its own centre, which varies within patches and blocks."""
     pixels = flown.pixels.copy()
     if rough:
         pixels[..., 2] = 0.05 * np.sin(2 * pixels[..., 0])
-    places = ecef(pixels)
-    ahead = sector_of(flown.aperture, half, centre=0.6).following(flown.aperture, places[::8, ::8].reshape(-1, 3))
-    centres, beams = ahead.centre_at(places), Beams(sector=ahead)
+    points = ecef(pixels)
+    ahead = sector_of(flown.aperture, half, centre=0.6).following(flown.aperture, points[::8, ::8].reshape(-1, 3))
+    centres, beams = ahead.centre_at(points), Beams(sector=ahead)
     assert np.ptp(centres) > 0.05
     assert centres.max() < 0.6
-    truth, counts = reference.form(flown.scene.history(), places, beams=beams), np.zeros(4, np.int64)
-    tables = native.prepare(flown.scene.profiles(places))
-    image = native.form(tables, places, beams=beams, counts=counts)
+    truth, counts = reference.form(flown.scene.history(), points, beams=beams), np.zeros(4, np.int64)
+    tables = native.prepare(flown.scene.profiles(points))
+    image = native.form(tables, points, beams=beams, counts=counts)
     assert decibels(image - truth, truth) <= -70
-    assert counts[1] > 0 or rough  # weighed block by block, not only pixel by pixel
-    part = native.form(tables, places[16:, 32:], beams=beams)
+    assert counts[1] > 0 or rough  # weighted block by block, not only pixel by pixel
+    part = native.form(tables, points[16:, 32:], beams=beams)
     np.testing.assert_array_equal(part.view(np.uint32), image[16:, 32:].view(np.uint32))
 
 
 @compiled
-def test_a_rough_surface_is_weighed_at_its_height_at_the_edge(isa, flown):
+def test_rough_surface_is_weighted_at_its_height_at_the_edge(isa, flown):
     rough = flown.pixels.copy()
     rough[..., 2] = 0.3 * np.sin(2 * rough[..., 0]) + 0.04 * np.random.default_rng(6).standard_normal(rough.shape[:2])
-    places, beams = ecef(rough), Beams(sector=sector_of(flown.aperture, 0.15))
-    image = native.form(native.prepare(flown.scene.profiles(places)), places, beams=beams)
-    truth = reference.form(flown.scene.history(), places, beams=beams)
+    points, beams = ecef(rough), Beams(sector=sector_of(flown.aperture, 0.15))
+    image = native.form(native.prepare(flown.scene.profiles(points)), points, beams=beams)
+    truth = reference.form(flown.scene.history(), points, beams=beams)
     assert decibels(image - truth, truth) <= -65
 
 
 @compiled
-def test_inside_a_sector_pulses_go_as_fast_as_without(isa, flown):
-    """All of the scene inside: the same variants, and the same bits."""
-    tables, places = native.prepare(flown.profiles), ecef(flown.pixels)
+def test_pulses_inside_a_sector_use_the_unweighted_path(isa, flown):
+    """The whole scene is inside: same path variants, bit-identical images."""
+    tables, points = native.prepare(flown.profiles), ecef(flown.pixels)
     counts = np.zeros((2, 4), np.int64)
-    plain = native.form(tables, places, counts=counts[0])
-    within = native.form(tables, places, beams=Beams(sector=sector_of(flown.aperture, 2.0)), counts=counts[1])
+    plain = native.form(tables, points, counts=counts[0])
+    within = native.form(tables, points, beams=Beams(sector=sector_of(flown.aperture, 2.0)), counts=counts[1])
     np.testing.assert_array_equal(plain.view(np.uint32), within.view(np.uint32))
     np.testing.assert_array_equal(*counts)
 
 
 @compiled
-def test_images_by_parts_of_the_scene_have_no_seams(isa, flown):
-    """A tile has the bits of the whole, and a weight changes between neighbours as little across tiles as inside."""
-    beams, places = Beams(sector=sector_of(flown.aperture, 0.1)), ecef(flown.pixels)
+def test_tiled_images_have_no_seams(isa, flown):
+    """Tiles are bit-identical to the whole; weights vary across tile borders as little as inside tiles."""
+    beams, points = Beams(sector=sector_of(flown.aperture, 0.1)), ecef(flown.pixels)
     tables = native.prepare(flown.profiles)
-    whole, part = (native.form(tables, pixels, beams=beams) for pixels in (places, places[16:, 32:]))
+    whole, part = (native.form(tables, pixels, beams=beams) for pixels in (points, points[16:, 32:]))
     np.testing.assert_array_equal(part.view(np.uint32), whole[16:, 32:].view(np.uint32))
-    weight = beams.sector.weight(flown.aperture, places.reshape(-1, 3)).reshape(131, *places.shape[:2])
+    weight = beams.sector.weight(flown.aperture, points.reshape(-1, 3)).reshape(131, *points.shape[:2])
     steps = np.abs(np.diff(weight, axis=2)).max(axis=(0, 1))
     assert steps[31] <= 1.5 * np.median(steps)
 
 
-def test_a_place_is_what_the_definition_says_in_any_frame_and_beside_one_that_is_none():
+def test_sector_coordinate_follows_its_definition_next_to_undefined_points():
     track = straight_track(9) + [4.1e6, 0.9e6, 4.8e6]
     aperture, points = monostatic(track), track[4] + np.array([[0.3, 17.0, -9.0], [np.nan] * 3, [-4.0, 30.0, -10.0]])
     sector = Sector.of(aperture, chord_m=2.0, centre=0.1, half=0.25)
-    away = points[None] - track[:, None]
-    toward = 2 * away / np.linalg.norm(away, axis=-1, keepdims=True)
+    lines_of_sight = points[None] - track[:, None]
+    toward = 2 * lines_of_sight / np.linalg.norm(lines_of_sight, axis=-1, keepdims=True)
     expected = np.einsum("pnx,px->pn", toward, sector.tx_axis) - 0.1
     np.testing.assert_allclose(sector.place(aperture, points), expected, atol=1e-9)
     assert sector[:0].place(aperture[:0], points).shape == (0, 3)
 
 
-def test_the_edge_is_level_at_both_ends():
+def test_edge_weight_has_zero_slope_at_both_ends():
     depth = np.linspace(-0.5, 1.5, 2001)
     slope = np.gradient(edge(depth), depth)
     assert np.abs(np.diff(slope)).max() < 0.01
@@ -164,8 +164,8 @@ def test_the_edge_is_level_at_both_ends():
 @pytest.mark.quick("False-0.05")
 @pytest.mark.parametrize("centre", [0.05, 0.9])
 @pytest.mark.parametrize("antenna", [False, True])
-def test_pulses_that_are_left_out_add_nothing_at_all(antenna, centre):
-    """Whatever piece of the scene: each pulse with a weight anywhere in it is in a block that reaches it."""
+def test_excluded_pulses_have_zero_weight(antenna, centre):
+    """Each pulse with a non-zero weight in a region belongs to a block that is selected for it."""
     generator = np.random.default_rng(3)
     along = np.linspace(-60, 60, 1000)
     sway = np.stack([along, 2 * np.sin(along / 9), 20 + np.cos(along / 5)], -1)
@@ -180,12 +180,12 @@ def test_pulses_that_are_left_out_add_nothing_at_all(antenna, centre):
     weight = beams.weight(aperture, inside.reshape(-1, 3)).reshape(1000, 60, 40) != 0
     needed = np.add.reduceat(weight.any(axis=1), np.arange(0, 1000, PULSES), axis=0) > 0
     assert not (needed & ~lit).any()
-    assert lit.mean() < 0.7  # and most of the others are left out
+    assert lit.mean() < 0.7  # a large share of the blocks is excluded
 
 
 @compiled
 def test_tiles_beyond_the_swath_are_not_formed():
-    """By blocks of pulses and not, a lazily read flight gives the image of the whole, from the rows it needs alone."""
+    """A lazily read flight, with and without pulse blocks, gives the same image from only the rows it needs."""
     aperture, grid = strip()
     history = strip_history(aperture, np.array([[x, 36.0, 0.0] for x in (-60.0, -20.0, 0.0, 40.0)]))
     beams = Beams(sector=Sector.of(aperture, chord_m=4.0, centre=0.0, half=0.1))
@@ -194,7 +194,7 @@ def test_tiles_beyond_the_swath_are_not_formed():
     )
     profiles, read = range_compress(history, grid, FLAT, window=window), []
 
-    class Read:
+    class RecordingSamples:
         shape, ndim, dtype = profiles.samples.shape, 2, profiles.samples.dtype
 
         def __len__(self):
@@ -207,12 +207,14 @@ def test_tiles_beyond_the_swath_are_not_formed():
     weighing = Weighing(beams, None, 500)
     settings = [Setting("native", {"oversampling": 8}, {}, -60.0, 1.0, pulse_blocks=blocks) for blocks in (1, 7)]
     whole = image_array(profiles, settings[0], grid, FLAT, side_px=32, weighing=weighing).compute(scheduler="threads")
-    lazy = image_array(replace(profiles, samples=Read()), settings[1], grid, FLAT, side_px=32, weighing=weighing)
+    lazy = image_array(
+        replace(profiles, samples=RecordingSamples()), settings[1], grid, FLAT, side_px=32, weighing=weighing
+    )
     assert decibels(lazy.compute(scheduler="threads") - whole, whole) < -120
     read.clear()
     tile = lazy[:, :32].compute(scheduler="threads")
     assert decibels(tile - whole[:, :32], whole) < -120
-    assert 0 < max(pulses.stop for pulses in read) < 1000  # the first of eleven tiles needs no more of the flight
+    assert 0 < max(pulses.stop for pulses in read) < 1000  # the first tile needs only this part of the flight
     beyond = grid[:, 64:96]
     away = replace(beyond, north_m=beyond.north_m + 400)
     narrow = Beams(sector=Sector.of(aperture[:640], chord_m=4.0, centre=0.0, half=0.1))
@@ -223,18 +225,18 @@ def test_tiles_beyond_the_swath_are_not_formed():
 
 
 @pytest.mark.slow
-def test_the_range_window_of_a_long_flight_is_that_of_its_sector():
-    """It holds what the pulse may add to, at any length of the flight, and nothing for pulses that add to nothing."""
+def test_range_window_is_limited_by_the_sector():
+    """It covers all weighted pixels at any flight length, and is empty for pulses without weight in the scene."""
     spans = []
     for length in (150.0, 600.0):
         aperture, grid = strip(int(20 * length), length)
         beams = Beams(sector=Sector.of(aperture, chord_m=4.0, centre=0.0, half=0.1))
         near, far = swath(grid, FLAT, aperture, beams=beams)
         spans.append((far - near).max())
-        places = FLAT.positions(grid)[::4, ::5].reshape(-1, 3)
-        some = slice(0, None, 97)
-        path, weight = aperture[some].path(places), beams[some].weight(aperture[some], places)
-        assert ((path >= near[some, None]) & (path <= far[some, None]))[weight > 0].all()
+        points = FLAT.positions(grid)[::4, ::5].reshape(-1, 3)
+        sampled = slice(0, None, 97)
+        path, weight = aperture[sampled].path(points), beams[sampled].weight(aperture[sampled], points)
+        assert ((path >= near[sampled, None]) & (path <= far[sampled, None]))[weight > 0].all()
     assert spans[1] == pytest.approx(spans[0], rel=0.15)
     aperture, _ = strip(3000, 150.0)
     beams = Beams(sector=Sector.of(aperture, chord_m=4.0, centre=0.0, half=0.1))
@@ -244,11 +246,11 @@ def test_the_range_window_of_a_long_flight_is_that_of_its_sector():
     assert np.abs(aperture.tx_m[~idle, 0]).max() < 15
 
 
-def test_a_long_flight_is_bounded_by_pulses_that_stand_for_others():
-    """Of 40 000 pulses every third is looked at; no path of any pulse is left out."""
+def test_range_window_from_sampled_pulses_covers_all_pulses():
+    """Of 40 000 pulses every third is evaluated; the window still covers the paths of all pulses."""
     aperture, grid = strip(40_000, 150.0)
     near, far = swath(grid, FLAT, aperture)
-    some, places = slice(5, None, 1999), FLAT.positions(grid)[::8, ::10].reshape(-1, 3)
-    path = aperture[some].path(places)
-    assert (path >= near[some, None]).all()
-    assert (path <= far[some, None]).all()
+    sampled, points = slice(5, None, 1999), FLAT.positions(grid)[::8, ::10].reshape(-1, 3)
+    path = aperture[sampled].path(points)
+    assert (path >= near[sampled, None]).all()
+    assert (path <= far[sampled, None]).all()

@@ -1,4 +1,4 @@
-"""Tiles and blocks of pulses: the same image, however it is cut, and one block's tables at a time."""
+"""Tiles and pulse blocks: same image for any division, tables of one block in memory at a time."""
 
 import os
 import signal
@@ -20,8 +20,8 @@ from apertura.core.scene.terrain import FlatGround
 @pytest.mark.parametrize(
     ("engine", "form_options"), [("native", {"accumulate": "complex128", "tolerance_rad": 1e-5}), ("numba", {})]
 )
-def test_an_image_from_blocks_of_pulses_is_that_of_all_pulses(engine, form_options):
-    """Blocks are added in complex64: below -130 dB, far below what any table errs by."""
+def test_image_from_pulse_blocks_equals_that_of_all_pulses(engine, form_options):
+    """Blocks are added in complex64: below -130 dB, far below the error of any table."""
     if not load_engine(engine).available():
         pytest.skip("apertura was installed without a compiler")
     drawn = draw(np.random.default_rng(2), pixels=48, pulses=90)
@@ -34,9 +34,9 @@ def test_an_image_from_blocks_of_pulses_is_that_of_all_pulses(engine, form_optio
     assert numerical_error_db(images[1].ravel(), images[0].ravel().astype(np.complex128)) < -130
 
 
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # of fork in a process with threads
-def test_a_child_that_is_forked_after_an_image_forms_it_too(toy):
-    """Dask's threads do not live on in a child, which would wait for them for ever: here for ten seconds."""
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # raised by fork in a process with threads
+def test_child_forked_after_image_formation_forms_the_image(toy):
+    """Threads of Dask do not exist in a forked child, which would wait for them; the alarm ends it after 10 s."""
     drawn = draw(np.random.default_rng(2), pixels=40, pulses=64)
     setting = Setting("toy", {"refine": 1}, {}, -20.0, 1.0)
     image = image_array(drawn.profiles, setting, drawn.grid, FlatGround(0.0), side_px=16)
@@ -48,8 +48,8 @@ def test_a_child_that_is_forked_after_an_image_forms_it_too(toy):
     assert os.waitpid(child, 0)[1] == 0
 
 
-def test_blocks_of_pulses_are_prepared_one_after_the_other(toy):
-    """The next block's tables wait for every tile of the block before: one block's tables are held at a time."""
+def test_pulse_blocks_are_prepared_one_after_the_other(toy):
+    """Tables of the next block wait for every tile of the previous one: memory holds tables of one block."""
     drawn = draw(np.random.default_rng(2), pixels=40, pulses=64)
     setting = Setting("toy", {"refine": 1}, {}, -20.0, 1.0, pulse_blocks=3)
     toy_engine.CALLS.clear()
@@ -59,8 +59,8 @@ def test_blocks_of_pulses_are_prepared_one_after_the_other(toy):
     assert (["prepare"] + ["form"] * tiles) * 3 == toy_engine.CALLS
 
 
-@pytest.mark.parametrize("way", ["lazy", "stored"])
-def test_a_tile_alone_prepares_every_block_and_forms_no_other_tile(toy, way):
+@pytest.mark.parametrize("mode", ["lazy", "stored"])
+def test_single_tile_prepares_every_block_and_forms_no_other_tile(toy, mode):
     drawn = draw(np.random.default_rng(2), pixels=40, pulses=64)
     setting = Setting("toy", {"refine": 1}, {}, -20.0, 1.0, pulse_blocks=3)
     image = image_array(drawn.profiles, setting, drawn.grid, FlatGround(0.0), side_px=32)
@@ -68,7 +68,7 @@ def test_a_tile_alone_prepares_every_block_and_forms_no_other_tile(toy, way):
     toy_engine.CALLS.clear()
     window = (slice(0, 32), slice(32, 40))
     tile = np.zeros(drawn.grid.shape, np.complex64)
-    if way == "lazy":
+    if mode == "lazy":
         tile[window] = image[window].compute(scheduler="threads")
     else:
         compute_tiles(image, [window], tile, threads=2)
@@ -76,15 +76,15 @@ def test_a_tile_alone_prepares_every_block_and_forms_no_other_tile(toy, way):
     np.testing.assert_array_equal(tile[window], whole[window])
 
 
-def test_tiles_begin_at_patches_of_the_kernel():
+def test_tiles_start_at_kernel_patches():
     assert PATCH_PX % KERNEL.patch_side == 0
 
 
 @pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
-def test_an_image_of_several_regions_is_that_of_its_parts_to_the_bit(isa):
-    pixels = pixel_grid(280, 263, spacing_m=0.02)  # the kernel finishes 256 x 256 pixels before it goes on
-    tables, places = native.prepare(fly(scatter(pixels), pulses=13).profiles(ecef(pixels))), ecef(pixels)
-    whole = native.form(tables, places)
-    parts = [[native.form(tables, places[y : y + 80, x : x + 144]) for x in (0, 144)] for y in range(0, 280, 80)]
+def test_image_of_several_regions_is_bit_identical_to_its_parts(isa):
+    pixels = pixel_grid(280, 263, spacing_m=0.02)  # the kernel completes regions of 256 x 256 pixels in turn
+    tables, points = native.prepare(fly(scatter(pixels), pulses=13).profiles(ecef(pixels))), ecef(pixels)
+    whole = native.form(tables, points)
+    parts = [[native.form(tables, points[y : y + 80, x : x + 144]) for x in (0, 144)] for y in range(0, 280, 80)]
     assert whole.all()
     np.testing.assert_array_equal(np.block(parts).view(np.uint32), whole.view(np.uint32))

@@ -1,4 +1,4 @@
-"""The tree against the double sum: what goes by it, what goes directly, and the same bits however a block is cut."""
+"""Tree engine compared with the double sum: use of tree or direct kernel, bit-identical results for any division."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -33,41 +33,42 @@ def plain():
 
 @pytest.mark.quick("monostatic-*--74")
 @pytest.mark.parametrize("nodes_db", [-50, -74, -98])
-def test_every_instruction_set_errs_as_predicted(isa, flights, nodes_db):
+def test_every_instruction_set_meets_the_predicted_error(isa, flights, nodes_db):
     image, share = formed(flights, nodes_db=nodes_db)
     assert tree.instruction_set() == isa
     assert share.tolist() == [1, 0, 0]
     predicted_db = setting(flights, nodes_db=nodes_db).error_db
     assert error_db(flights.scene, flights.pixels, image) <= predicted_db + 3
-    assert nodes_db + 3 < predicted_db < max(nodes_db + 13, -83)  # cells and float32 err by that
+    assert nodes_db + 3 < predicted_db < max(nodes_db + 13, -83)  # limit of range cells and float32
 
 
-def test_tiles_change_nothing_to_the_bit(isa, plain):
-    chosen, places = setting(plain, nodes_db=-74), ecef(plain.pixels)
+def test_tiles_are_bit_identical_to_the_whole_image(isa, plain):
+    chosen, points = setting(plain, nodes_db=-74), ecef(plain.pixels)
     trees = tree.prepare(plain.profiles, **chosen.options)
-    whole = tree.form(trees, places, **chosen.form_options)
+    whole = tree.form(trees, points, **chosen.form_options)
     windows = pieces("tree", whole.shape, chosen.form_options)
     assert len(windows) == 4
     for window in windows:
-        alone = tree.form(trees, places[window], **chosen.form_options)
+        alone = tree.form(trees, points[window], **chosen.form_options)
         np.testing.assert_array_equal(alone.view(np.uint32), whole[window].view(np.uint32))
 
 
-def test_threads_give_the_same_bits(plain):
-    chosen, places = setting(plain, nodes_db=-74), ecef(plain.pixels)
+def test_threads_give_bit_identical_images(plain):
+    chosen, points = setting(plain, nodes_db=-74), ecef(plain.pixels)
     trees = tree.prepare(plain.profiles, **chosen.options)
     with ThreadPoolExecutor(2) as pool:
-        images = list(pool.map(lambda _: tree.form(trees, places, **chosen.form_options), range(4)))
+        images = list(pool.map(lambda _: tree.form(trees, points, **chosen.form_options), range(4)))
     assert all(np.array_equal(image, images[0]) for image in images)
 
 
-def test_pixels_without_a_place_are_nan_and_their_neighbours_unharmed(plain):
+def test_pixels_without_position_are_nan_and_others_unchanged(plain):
     pixels, (whole, _) = plain.pixels.copy(), formed(plain)
     pixels[3, 5] = np.nan
     image, share = formed(plain, pixels)
     assert np.argwhere(np.isnan(image)).tolist() == [[3, 5]]
     tile = pieces("tree", image.shape, {"side_px": 64})[0]
-    assert share[1] == pytest.approx(image[tile].size / image.size)  # its tile goes directly, all others by tree
+    # Only the tile of the undefined pixel uses the direct kernel.
+    assert share[1] == pytest.approx(image[tile].size / image.size)
     elsewhere = np.ones(image.shape, bool)
     elsewhere[tile] = False
     assert np.array_equal(image[elsewhere], whole[elsewhere])
@@ -75,8 +76,8 @@ def test_pixels_without_a_place_are_nan_and_their_neighbours_unharmed(plain):
     assert decibels(image - whole, whole) <= -65
 
 
-def test_tiles_at_the_end_of_profiles_go_directly():
-    """Profiles end in the middle of the scene: their edge has no band, and is the direct kernel's."""
+def test_tiles_at_the_end_of_profiles_use_the_direct_kernel():
+    """Profiles end in the middle of the scene: the step there is not band-limited and needs the direct kernel."""
     flight = flown(pixel_grid(130, 200, spacing_m=0.15), pulses=128)
     whole, _ = formed(flight)
     flight.profiles = replace(flight.profiles, samples=flight.profiles.samples[:, :100])
@@ -86,10 +87,10 @@ def test_tiles_at_the_end_of_profiles_go_directly():
     assert 0.2 < share[0] < 0.8
     assert share[1] > 0.2
     assert decibels(image - direct, direct) <= -62
-    assert decibels(whole - direct, direct) > -20  # the end matters
+    assert decibels(whole - direct, direct) > -20  # the truncation has an effect
 
 
-def test_tiles_beyond_all_profiles_cost_nothing(plain):
+def test_tiles_beyond_all_profiles_are_skipped(plain):
     far = pixel_grid(40, 40, range_m=60.0)
     image, share = formed(plain, far)
     assert share.tolist() == [0, 0, 1]
@@ -98,8 +99,8 @@ def test_tiles_beyond_all_profiles_cost_nothing(plain):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("jitter_m", [0.0, 1e-3, 1e-2])
-def test_pulses_off_a_smooth_track_are_taken_each_for_itself(plain, jitter_m):
-    """A smooth track's 64 pulses become few; white noise of a millimetre on it is not smooth at 12 m, and is kept."""
+def test_pulses_off_a_smooth_track_are_not_presummed(plain, jitter_m):
+    """64 pulses of a smooth track are presummed; with white noise of 1 mm at 12 m range they are not."""
     white = jitter_m * np.random.default_rng(8).standard_normal((2, 300, 3))
     true = plain.scene
     scene = observed(scatter(plain.pixels), true.tx + white[0], true.rx + white[1], true.carrier_hz)
@@ -114,22 +115,22 @@ def test_pulses_off_a_smooth_track_are_taken_each_for_itself(plain, jitter_m):
 @pytest.mark.quick("0.003-True", "0.0003-False")
 @pytest.mark.parametrize("together", [True, False])
 @pytest.mark.parametrize("jitter_m", [3e-4, 3e-3])
-def test_fewer_pulses_than_follow_a_track_err_as_predicted(plain, jitter_m, together):
-    """Of noise, the hardest of contents: nothing in it is the same from pulse to pulse."""
+def test_presumming_on_a_rough_track_has_the_predicted_error(plain, jitter_m, together):
+    """Profiles of noise are the worst case: no correlation between pulses."""
     flight = heard(shaken(plain, jitter_m, together=together))
     images = [formed(flight, nodes_db=-86, presum_db=presum_db)[0] for presum_db in (-100, -40)]
-    seen = [
+    predictions = [
         counted(flight.aperture[:256], ecef(plain.pixels[window]), presum_db=-40)
         for window in pieces("tree", images[0].shape, {"side_px": 64})
     ]
-    predicted_db = 10 * np.log10(np.mean([tile.presum_rad**2 for tile in seen]))
+    predicted_db = 10 * np.log10(np.mean([tile.presum_rad**2 for tile in predictions]))
     assert predicted_db - 7 <= decibels(images[1] - images[0], images[0]) <= predicted_db
 
 
 @pytest.mark.quick("0.05--74-4")
 @pytest.mark.parametrize(("height_m", "nodes_db", "layers"), [(0.02, -50, 3), (0.05, -74, 4), (0.3, -62, 7)])
-def test_rough_ground_is_interpolated_between_height_layers(height_m, nodes_db, layers):
-    """Eq. 11: relief from pixel to pixel is summed by trees on height layers, with one layer less directly."""
+def test_rough_terrain_is_interpolated_between_height_layers(height_m, nodes_db, layers):
+    """Eq. 11: relief between pixels is summed by trees on height layers; with one layer less by the direct kernel."""
     rough = pixel_grid(70, 90)
     rough[..., 2] += height_m * np.random.default_rng(6).uniform(-1, 1, rough.shape[:2])
     flight = flown(rough, pulses=300)
@@ -143,7 +144,7 @@ def test_rough_ground_is_interpolated_between_height_layers(height_m, nodes_db, 
 
 
 @pytest.mark.slow
-def test_rough_ground_goes_directly():
+def test_rough_terrain_uses_the_direct_kernel():
     rough = pixel_grid(70, 90)
     rough[..., 2] += 0.02 * np.random.default_rng(6).standard_normal(rough.shape[:2])
     flight = flown(rough, pulses=300)
@@ -152,7 +153,7 @@ def test_rough_ground_goes_directly():
     assert error_db(flight.scene, rough, image) <= -70
 
 
-def test_rolling_ground_goes_by_tree():
+def test_rolling_terrain_uses_the_tree():
     rolling = pixel_grid(70, 90)
     rolling[..., 2] = 0.15 * np.sin(rolling[..., 0]) * np.cos(1.3 * rolling[..., 1])
     flight = flown(rolling, pulses=300)
@@ -163,17 +164,17 @@ def test_rolling_ground_goes_by_tree():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("carrier_hz", "spacing_m", "rough_m"), [(1.2e9, 0.05, 6e-4), (10e9, 0.01, 5e-4)])
-def test_pixels_off_their_surface_err_as_predicted(carrier_hz, spacing_m, rough_m):
-    """Eq. 9: noise on the ground that the tree takes at -50 dB; what it adds is delay at 1 GHz, phase at 10 GHz."""
+def test_pixels_off_their_surface_have_the_predicted_error(carrier_hz, spacing_m, rough_m):
+    """Eq. 9: height noise that the tree accepts at -50 dB adds delay error at 1 GHz and phase error at 10 GHz."""
     pixels = pixel_grid(60, 60, spacing_m=spacing_m)
     rough, flight = pixels.copy(), flown(pixels, pulses=128, carrier_hz=carrier_hz)
     rough[..., 2] += rough_m * np.random.default_rng(6).standard_normal((60, 60))
     (surface,) = surfaces_of(ecef(rough), [(slice(0, 60), slice(0, 60))])
     powers = []
-    for places in (rough, pixels):
-        image, share = formed(flight, places, nodes_db=-50)
+    for positions in (rough, pixels):
+        image, share = formed(flight, positions, nodes_db=-50)
         assert share[0] == 1
-        powers.append(10 ** (error_db(flight.scene, places, image, 600) / 10))
+        powers.append(10 ** (error_db(flight.scene, positions, image, 600) / 10))
     wave = WAVENUMBERS | {"wavenumber_rad_m": 2 * np.pi * carrier_hz / C}
     predicted_db = 10 * np.log10(roughness(flight.aperture, surface, **wave))
     assert 10 * np.log10(powers[0] - powers[1]) == pytest.approx(predicted_db, abs=1)
@@ -181,8 +182,8 @@ def test_pixels_off_their_surface_err_as_predicted(carrier_hz, spacing_m, rough_
 
 @pytest.mark.quick("3.0-0.15-0")
 @pytest.mark.parametrize(("range_m", "spacing_m", "levels"), [(12.0, 0.05, 2), (5.0, 0.08, 1), (3.0, 0.15, 0)])
-def test_a_near_tile_takes_smaller_subapertures_or_goes_directly(range_m, spacing_m, levels):
-    """The nearer a tile, the more nodes a subaperture takes: beyond 128 of them there are fewer levels, or no tree."""
+def test_near_tile_uses_smaller_subapertures_or_the_direct_kernel(range_m, spacing_m, levels):
+    """Near tiles need more nodes per subaperture: above 128 nodes the tree has fewer levels, or is not used."""
     pixels = pixel_grid(100, 100, spacing_m=spacing_m, range_m=range_m)
     flight = flown(pixels, pulses=256, carrier_hz=4e9, range_m=range_m)
     image, share = formed(flight, side_px=128)
@@ -191,24 +192,24 @@ def test_a_near_tile_takes_smaller_subapertures_or_goes_directly(range_m, spacin
     assert error_db(flight.scene, pixels, image) <= -62
 
 
-def weighed_error_db(flight, image, beams):
-    pick = np.random.default_rng(3).integers(0, image.size, 100)
-    truth = reference.form(flight.scene.history(), ecef(flight.pixels).reshape(-1, 3)[pick][None], beams=beams)[0]
-    return decibels(image.ravel()[pick] - truth, truth)
+def weighted_error_db(flight, image, beams):
+    sampled = np.random.default_rng(3).integers(0, image.size, 100)
+    truth = reference.form(flight.scene.history(), ecef(flight.pixels).reshape(-1, 3)[sampled][None], beams=beams)[0]
+    return decibels(image.ravel()[sampled] - truth, truth)
 
 
 @pytest.mark.parametrize("sway_deg", [0.0, 3.0])
 def test_smooth_weights_are_applied_at_the_leaves(isa, plain, sway_deg):
-    """Also where they jump from pulse to pulse: those go each for itself."""
+    """Also if they jump between pulses, which are then not presummed."""
     beams = Beams(swaying_beam(plain.scene.tx, (12, 1, 0), 30, sway_deg=sway_deg))
     image, share = formed(plain, beams=beams)
     assert share.tolist() == [1, 0, 0]
-    assert weighed_error_db(plain, image, beams) <= -64
+    assert weighted_error_db(plain, image, beams) <= -64
     assert decibels(image - formed(plain)[0], image) > -30  # the weight matters
 
 
 def sector_of(flight, half, centre=0.02):
-    """The sector of a flight; one far ahead of it is centred, place by place, on where the flight came nearest."""
+    """Return beams of a sector; one far ahead of the flight is centred on the nearest pulse of each point."""
     sector = Sector.of(flight.aperture, chord_m=1.2, centre=centre, half=half)
     if centre < 0.3:
         return Beams(None, None, sector)
@@ -218,128 +219,130 @@ def sector_of(flight, half, centre=0.02):
 @pytest.mark.quick("*-0.02-0.1--74", "*-0.7-0.2--74")
 @pytest.mark.parametrize("nodes_db", [-50, -74])
 @pytest.mark.parametrize(("centre", "half"), [(0.02, 0.25), (0.02, 0.1), (0.7, 0.2), (0.7, 0.05)])
-def test_the_edges_of_a_sector_go_by_tree(isa, plain, centre, half, nodes_db):
-    """Also where the centre of each place is its own; what lies beyond the edges is left out, and costs nothing."""
+def test_sector_edges_use_the_tree(isa, plain, centre, half, nodes_db):
+    """Also with a separate centre for each point; pulses beyond the edges are skipped."""
     beams = sector_of(plain, half, centre)
     assert (beams.sector.ends is None) == (centre < 0.3)
     image, share = formed(plain, beams=beams, nodes_db=nodes_db)
     assert share[1] == 0
     assert share[0] > 0.2
     assert share[2] > 0.2 or half >= 0.2
-    assert weighed_error_db(plain, image, beams) <= setting(plain, nodes_db=nodes_db).error_db
+    assert weighted_error_db(plain, image, beams) <= setting(plain, nodes_db=nodes_db).error_db
     assert decibels(image - formed(plain, nodes_db=nodes_db)[0], image) > -25  # the sector matters
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("relief_m", [0.0, 0.4])
 @pytest.mark.parametrize("antenna", [False, True])
-def test_what_counts_as_a_whole_or_not_at_all_does_so_at_every_pixel(antenna, relief_m):
-    """Eq. 12, over random tiles of a flight that sways: inside a sector weights are one, silent pulses have none."""
+def test_weights_of_a_whole_tile_hold_at_every_pixel(antenna, relief_m):
+    """Eq. 12, random tiles of a swaying flight: weight 1 inside a sector, weight 0 of silent pulses."""
     generator, along = np.random.default_rng(3), np.linspace(-60, 60, 3200)
     sway = np.stack([along, 2 * np.sin(along / 9), 20 + np.cos(along / 5)], -1)
     aperture = Aperture(sway, sway + [3.0, 0.5, 1.0])
     beam = swaying_beam(sway, (20, 0, 0), 60, sway_deg=0.0) if antenna else None
-    plainly = Sector.of(aperture, chord_m=3.0, centre=0.05, half=0.3)
-    found = np.zeros(3, int)
-    for place in generator.uniform([-70, 15, -2], [70, 60, 4], (8, 3)):
-        pixels = place + generator.uniform(1, 3) * pixel_grid(12, 12, spacing_m=0.27, turned_deg=20.0, range_m=0.0)
+    abeam = Sector.of(aperture, chord_m=3.0, centre=0.05, half=0.3)
+    counts = np.zeros(3, int)
+    for centre in generator.uniform([-70, 15, -2], [70, 60, 4], (8, 3)):
+        pixels = centre + generator.uniform(1, 3) * pixel_grid(12, 12, spacing_m=0.27, turned_deg=20.0, range_m=0.0)
         pixels[..., 2] += relief_m * np.sin(pixels[..., 0]) * np.cos(1.3 * pixels[..., 1])
         (surface,) = surfaces_of(pixels, [(slice(0, 12), slice(0, 12))])
-        ahead = replace(plainly, centre=0.9).following(aperture, pixels[::11, ::11].reshape(-1, 3))
-        for sector in (plainly, ahead):
-            seen = weighed(Beams(beam, None, sector), aperture, surface, -74)
-            whole = Beams(beam, None, sector).weight(aperture, pixels.reshape(-1, 3)).reshape(len(seen.variant), 64, -1)
-            inside = sector.weight(aperture, pixels.reshape(-1, 3)).reshape(whole.shape)
-            silent = seen.variant == 2
-            assert not whole[silent].any()
-            assert (inside[~silent & ~seen.edge] == 1).all()
-            assert seen.edge[((inside > 0) & (inside < 1)).any(axis=(1, 2)) & ~silent].all()
-            found += [silent.sum(), (~silent & ~seen.edge).sum(), seen.edge.sum()]
-    assert (found > 20).all()
+        ahead = replace(abeam, centre=0.9).following(aperture, pixels[::11, ::11].reshape(-1, 3))
+        for sector in (abeam, ahead):
+            tile = weighed(Beams(beam, None, sector), aperture, surface, -74)
+            weight = (
+                Beams(beam, None, sector).weight(aperture, pixels.reshape(-1, 3)).reshape(len(tile.variant), 64, -1)
+            )
+            sector_weight = sector.weight(aperture, pixels.reshape(-1, 3)).reshape(weight.shape)
+            silent = tile.variant == 2
+            assert not weight[silent].any()
+            assert (sector_weight[~silent & ~tile.edge] == 1).all()
+            assert tile.edge[((sector_weight > 0) & (sector_weight < 1)).any(axis=(1, 2)) & ~silent].all()
+            counts += [silent.sum(), (~silent & ~tile.edge).sum(), tile.edge.sum()]
+    assert (counts > 20).all()
 
 
 @pytest.mark.parametrize(("half", "nodes_db"), [(0.04, -74), (0.01, -50)])
-def test_edges_too_steep_for_nodes_go_directly(plain, half, nodes_db):
-    """Eq. 13: they would take more than 128 nodes along a tile; what lies beyond them is left out still."""
+def test_edges_too_steep_for_the_nodes_use_the_direct_kernel(plain, half, nodes_db):
+    """Eq. 13: they need more than 128 nodes along a tile; pulses beyond the edges are still skipped."""
     beams = sector_of(plain, half)
     image, share = formed(plain, beams=beams, nodes_db=nodes_db)
     assert share[0] == 0
     assert (share[1:] > 0.3).all()
-    assert weighed_error_db(plain, image, beams) <= setting(plain, nodes_db=nodes_db).error_db
+    assert weighted_error_db(plain, image, beams) <= setting(plain, nodes_db=nodes_db).error_db
 
 
-def test_where_the_centre_changes_what_it_follows_an_edge_goes_directly(plain):
-    """From where the flight covered a whole sector to where it did not: a kink that no nodes hold."""
+def test_edges_with_a_kinked_sector_centre_use_the_direct_kernel(plain):
+    """The centre has a kink, not representable by nodes, where the flight starts to cover the whole sector."""
     beams = sector_of(plain, 0.25, 0.6)
     image, share = formed(plain, beams=beams)
     assert (share[:2] > 0.2).all()
-    assert weighed_error_db(plain, image, beams) <= -64
+    assert weighted_error_db(plain, image, beams) <= -64
 
 
 @pytest.mark.parametrize("nodes_db", [-50, -74, -98])
 @pytest.mark.parametrize("slope", [0.3, 0.8])
-def test_the_edge_of_a_sector_widens_a_band_as_predicted(slope, nodes_db):
-    """Eq. 13: the second derivative of the edge jumps; nodes of the band widened err by what they are made for."""
+def test_sector_edge_widens_the_band_as_predicted(slope, nodes_db):
+    """Eq. 13: the second derivative of the edge jumps; nodes of the widened band meet their design error."""
     at, generator, band_rad = np.linspace(-1, 1, 1001), np.random.default_rng(5), 15.0
     waves, kinks, tops = (generator.uniform(low, high, 150) for low, high in ((-15.0, 15.0), (-1, 1), (0, 1)))
 
-    def left_db(band):
+    def interpolation_error_db(band):
         count = int(nodes_for(np.array([band]), nodes_db)[0])
-        some = nodes(count, nodes_db)
-        to_all = weights(count, at, nodes_db, float(supports(nodes_db)[count]))
+        node_points = nodes(count, nodes_db)
+        interpolation = weights(count, at, nodes_db, float(supports(nodes_db)[count]))
 
         def content(x):
             x = x[:, None]
             return edge((x - kinks) * slope + np.round(tops)) * np.exp(1j * waves * x)
 
-        return float(10 * np.log10(np.mean(np.abs(to_all @ content(some) - content(at)) ** 2)))
+        return float(10 * np.log10(np.mean(np.abs(interpolation @ content(node_points) - content(at)) ** 2)))
 
     wider_rad = float(widened_rad(slope, np.array([band_rad]), nodes_db)[0])
-    assert nodes_db - 8 < left_db(band_rad + wider_rad) <= nodes_db + 1
-    assert left_db(band_rad) > nodes_db + 4 or wider_rad < 4
+    assert nodes_db - 8 < interpolation_error_db(band_rad + wider_rad) <= nodes_db + 1
+    assert interpolation_error_db(band_rad) > nodes_db + 4 or wider_rad < 4
 
 
-def test_what_a_tile_cannot_take_goes_to_its_quarters(monkeypatch):
-    """The edge of a sector is twice as steep over a large tile as over each of its quarters."""
+def test_pulses_unsuited_to_a_tile_are_passed_to_its_quarters(monkeypatch):
+    """A sector edge is twice as steep over a large tile as over each of its quarters."""
     flight = flown(pixel_grid(140, 150), pulses=300)
     beams = sector_of(flight, 0.1)
     image, share = formed(flight, beams=beams, side_px=256)
     monkeypatch.setattr(tree, "LEAST_QUARTER_PX", 256)
-    whole, less = formed(flight, beams=beams, side_px=256)
+    whole, whole_share = formed(flight, beams=beams, side_px=256)
     assert share[1] == 0
-    assert less[1] == 1
-    assert max(weighed_error_db(flight, one, beams) for one in (image, whole)) <= -64
+    assert whole_share[1] == 1
+    assert max(weighted_error_db(flight, formed_image, beams) for formed_image in (image, whole)) <= -64
 
 
-def test_weighed_tiles_and_threads_give_the_same_bits(isa, plain):
-    """Antennas and a sector together: a tile alone has the bits of the whole, by whatever thread."""
+def test_weighted_tiles_and_threads_give_bit_identical_images(isa, plain):
+    """Antenna pattern and sector together: tiles are bit-identical to the whole in any thread."""
     sector = Sector.of(plain.aperture, chord_m=1.2, centre=0.02, half=0.15)
     beams = Beams(swaying_beam(plain.scene.tx, (12, 1, 0), 30, sway_deg=0.0), None, sector)
-    chosen, places = setting(plain, nodes_db=-74), ecef(plain.pixels)
+    chosen, points = setting(plain, nodes_db=-74), ecef(plain.pixels)
     trees = tree.prepare(plain.profiles, **chosen.options)
-    whole = tree.form(trees, places, beams=beams, **chosen.form_options)
-    assert weighed_error_db(plain, whole, beams) <= -64
+    whole = tree.form(trees, points, beams=beams, **chosen.form_options)
+    assert weighted_error_db(plain, whole, beams) <= -64
     windows = pieces("tree", whole.shape, chosen.form_options)
     with ThreadPoolExecutor(2) as pool:
-        alone = pool.map(lambda part: tree.form(trees, places[part], beams=beams, **chosen.form_options), windows)
+        alone = pool.map(lambda part: tree.form(trees, points[part], beams=beams, **chosen.form_options), windows)
         for window, image in zip(windows, alone, strict=True):
             np.testing.assert_array_equal(image.view(np.uint32), whole[window].view(np.uint32))
 
 
 @pytest.mark.parametrize("pulses", [65, 68, 129, 130, 193])
-def test_the_last_pulses_of_a_flight_are_weighed_as_all_others(plain, pulses):
-    """Also where they are fewer than those between two that are looked at: the beam ends among the last four."""
-    few, turn = flown(pixel_grid(70, 90), pulses=pulses), np.radians(30)
-    axes = swaying_beam(few.scene.tx, (12, 0, 0), sway_deg=0).axes
-    axes[-4:] = [[np.cos(turn), np.sin(turn), 0], [-np.sin(turn), np.cos(turn), 0], [0, 0, 1]] @ axes[-4:]
+def test_last_pulses_of_a_flight_are_weighted_like_all_others(plain, pulses):
+    """Also if fewer pulses remain than the interval between sampled pulses: the beam ends among the last four."""
+    flight, tilt = flown(pixel_grid(70, 90), pulses=pulses), np.radians(30)
+    axes = swaying_beam(flight.scene.tx, (12, 0, 0), sway_deg=0).axes
+    axes[-4:] = [[np.cos(tilt), np.sin(tilt), 0], [-np.sin(tilt), np.cos(tilt), 0], [0, 0, 1]] @ axes[-4:]
     angle = np.radians([-32.0, 0, 32.0])
     beams = Beams(Beam(axes, angle, np.ones(3), angle, np.ones(3)))
-    image, _ = formed(few, beams=beams)
-    assert weighed_error_db(few, image, beams) <= -60
+    image, _ = formed(flight, beams=beams)
+    assert weighted_error_db(flight, image, beams) <= -60
 
 
 @pytest.mark.parametrize("first", [1, 17, 65])
-def test_a_profile_that_begins_elsewhere_is_seen_wherever_it_comes(first):
+def test_profile_with_a_different_start_is_detected_at_any_pulse(first):
     flight = flown(pixel_grid(70, 90), pulses=128)
     start_m, samples = flight.profiles.start_m.copy(), flight.profiles.samples.copy()
     start_m[first] += 35 * flight.profiles.step_m  # in the middle of the scene
@@ -352,11 +355,11 @@ def test_a_profile_that_begins_elsewhere_is_seen_wherever_it_comes(first):
 
 
 @pytest.mark.parametrize(
-    "asked", [{"side_px": 300}, {"side_px": 0}, {"chunk": 100}, {"nodes_db": -44}, {"height_layers": 99}]
+    "options", [{"side_px": 300}, {"side_px": 0}, {"chunk": 100}, {"nodes_db": -44}, {"height_layers": 99}]
 )
-def test_what_the_library_cannot_hold_is_refused(plain, asked):
-    with pytest.raises(ValueError, match=next(iter(asked))):
-        tree.form(tree.prepare(plain.profiles), ecef(plain.pixels), **asked)
+def test_options_beyond_the_limits_of_the_library_are_refused(plain, options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        tree.form(tree.prepare(plain.profiles), ecef(plain.pixels), **options)
 
 
 @pytest.mark.parametrize("pulses", [slice(10, 300), slice(32, 64), slice(None, None, 2)])
@@ -365,28 +368,28 @@ def test_pulses_from_the_middle_of_a_leaf_are_refused(plain, pulses):
         tree.prepare(plain.profiles)[pulses]
 
 
-def test_the_edge_of_a_beam_goes_directly(plain):
+def test_beam_edges_use_the_direct_kernel(plain):
     soft, angle = swaying_beam(plain.scene.tx, (12, 0, 0), sway_deg=1), np.radians([-5.0, 0, 5.0])
     beams = Beams(Beam(soft.axes, angle, np.ones(3), angle, np.ones(3)))
     image, share = formed(plain, beams=beams)
     assert share.tolist() == [0, 1, 0]
-    assert weighed_error_db(plain, image, beams) <= -62
+    assert weighted_error_db(plain, image, beams) <= -62
 
 
 @pytest.mark.parametrize("edges", [(0, 64, 192, 300), (0, 256, 300)])
-def test_prepared_pulses_add_up(plain, edges):
-    chosen, places = setting(plain, nodes_db=-74), ecef(plain.pixels)
+def test_images_of_prepared_pulses_sum_to_the_whole(plain, edges):
+    chosen, points = setting(plain, nodes_db=-74), ecef(plain.pixels)
     trees = tree.prepare(plain.profiles, **chosen.options)
     parts = [trees[first:last] for first, last in pairwise(edges)]
     assert [len(part) for part in parts] == np.diff(edges).tolist()
-    total = sum(tree.form(part, places, **chosen.form_options) for part in parts)
-    whole = tree.form(trees, places, **chosen.form_options)
+    total = sum(tree.form(part, points, **chosen.form_options) for part in parts)
+    whole = tree.form(trees, points, **chosen.form_options)
     assert decibels(total - whole, whole) <= -65
 
 
 @pytest.mark.parametrize(("count", "nodes_db"), [(8, -50), (20, -74), (40, -98)])
-def test_the_table_of_supports_is_the_widest_band_that_nodes_support(count, nodes_db):
-    """tree_supports.csv: for each number of nodes the band over which (6) errs by `nodes_db`, by bisection."""
+def test_table_of_supports_lists_the_widest_band_of_the_nodes(count, nodes_db):
+    """tree_supports.csv: for each number of nodes the band at which eq. 6 has the error `nodes_db`, by bisection."""
     gauss, share = np.polynomial.legendre.leggauss(160)
     at = nodes(count, nodes_db)
 
@@ -404,24 +407,24 @@ def test_the_table_of_supports_is_the_widest_band_that_nodes_support(count, node
     assert supports(nodes_db)[count] == pytest.approx(low, abs=0.02)
 
 
-def test_a_slope_that_peaks_in_a_tile_takes_the_nodes_of_its_airy_tail():
-    """Eq. 4b: the highest slope of the phase is no end of its spectrum where the slope is highest inside the tile."""
+def test_phase_slope_peaking_in_a_tile_needs_nodes_for_its_airy_tail():
+    """Eq. 4b: if the phase slope peaks inside the tile, the spectrum extends beyond that slope."""
     at, error_db = np.linspace(-1, 1, 4001), -74
     highest_rad, bend_rad = 60.0, 40.0
 
-    def left_db(band_rad):
+    def interpolation_error_db(band_rad):
         count = int(nodes_for(np.array([band_rad]), error_db)[0])
         wave = np.exp(1j * (highest_rad * at - bend_rad * at**3 / 6))
-        here = np.exp(1j * (highest_rad * nodes(count, error_db) - bend_rad * nodes(count, error_db) ** 3 / 6))
-        found = weights(count, at, error_db, float(supports(error_db)[count])) @ here
-        return decibels(found - wave, wave)
+        wave_at_nodes = np.exp(1j * (highest_rad * nodes(count, error_db) - bend_rad * nodes(count, error_db) ** 3 / 6))
+        interpolated = weights(count, at, error_db, float(supports(error_db)[count])) @ wave_at_nodes
+        return decibels(interpolated - wave, wave)
 
-    assert left_db(highest_rad + 3 * np.cbrt(bend_rad / 2)) < -70
-    assert left_db(highest_rad) > -30
+    assert interpolation_error_db(highest_rad + 3 * np.cbrt(bend_rad / 2)) < -70
+    assert interpolation_error_db(highest_rad) > -30
 
 
-def test_the_band_of_a_tile_is_the_largest_slope_of_its_phase_and_the_airy_tail_of_a_peak():
-    """Eq. 4 and 4b of a tile below the track, whose slopes along it peak inside: against differences of paths."""
+def test_tile_band_is_the_largest_phase_slope_plus_an_airy_tail():
+    """Eq. 4 and 4b for a tile below the track, with a slope peak inside, against finite differences of paths."""
     along = np.linspace(-2, 2, 128)
     track = np.stack([along, np.full(128, -1.0), np.full(128, 3.0)], -1)
     pixels = pixel_grid(64, 64, spacing_m=0.08, range_m=0.0)
@@ -461,19 +464,19 @@ def test_the_band_of_a_tile_is_the_largest_slope_of_its_phase_and_the_airy_tail_
                 "start_m": np.zeros(0),
                 "aperture": Aperture(*np.zeros((2, 0, 3))),
             },
-            "holds no pulse",
+            "contains no pulse",
         ),
         ({"start_m": np.full(300, np.nan)}, "must be finite"),
     ],
 )
-def test_profiles_that_no_tree_can_take_are_refused(plain, changes, message):
+def test_invalid_profiles_are_refused(plain, changes, message):
     with pytest.raises(ValueError, match=message):
         tree.prepare(replace(plain.profiles, **changes))
 
 
-def test_pixels_and_beams_of_other_shapes_are_refused(plain):
+def test_pixels_and_beams_of_wrong_shape_are_refused(plain):
     trees = tree.prepare(plain.profiles)
     with pytest.raises(ValueError, match=r"must be \(y, x, 3\)"):
         tree.form(trees, np.zeros((4, 3)))
-    with pytest.raises(ValueError, match="beams must be of 300 pulses"):
+    with pytest.raises(ValueError, match="beams must have 300 pulses"):
         tree.form(trees, ecef(plain.pixels), beams=Beams(swaying_beam(plain.scene.tx[:9], (12, 0, 0))))

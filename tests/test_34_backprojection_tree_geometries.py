@@ -1,4 +1,4 @@
-"""The tree in random geometries of the envelope; benchmarks/geometries.csv has 60 of them."""
+"""Tree engine in random geometries of its envelope; benchmarks/geometries.csv lists 60 of them."""
 
 import pytest
 from drawn import draw
@@ -10,15 +10,15 @@ pytestmark = compiled
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [5, 9, 50, 58])
-def test_a_random_geometry_is_certified_as_asked(seed):
-    """Among them tiles inside a circle, tiles as large as the range (9), a track that wobbles within a leaf (58)."""
-    found = measure(draw(seed), nodes_db=-74)
-    assert not found.failure, found
-    assert found.by_tree == 1
+def test_random_geometry_meets_the_requested_error(seed):
+    """With tiles inside a circular flight, tiles as large as the range (9), a track that bends within a leaf (58)."""
+    outcome = measure(draw(seed), nodes_db=-74)
+    assert not outcome.failure, outcome
+    assert outcome.by_tree == 1
 
 
 @pytest.mark.slow
-def test_every_random_geometry_is_certified_as_asked():
+def test_all_random_geometries_meet_the_requested_error():
     outcomes = [measure(draw(seed), nodes_db=-74) for seed in range(30)]
-    assert [found for found in outcomes if found.failure] == []
-    assert sum(found.by_tree > 0.99 for found in outcomes) >= 25
+    assert [outcome for outcome in outcomes if outcome.failure] == []
+    assert sum(outcome.by_tree > 0.99 for outcome in outcomes) >= 25

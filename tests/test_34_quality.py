@@ -1,4 +1,4 @@
-"""What is measured in an image, and how exactly it was computed."""
+"""Image measurements, and estimation of the numerical error of an image."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from apertura.core.scene.grid import SceneGrid
 
 
 def image_with_errors(generator, kind):
-    """(image, exact), 96 x 96: speckle, or targets 40 dB above it; errors as much everywhere, or by brightness."""
+    """Return (image, exact), 96 x 96: speckle or targets 40 dB above it; errors uniform or relative to brightness."""
     noise = generator.standard_normal((4, 96, 96))
     exact = noise[0] + 1j * noise[1]
     if kind != "speckle":
@@ -20,46 +20,46 @@ def image_with_errors(generator, kind):
 
 
 def certify(image, exact, seed, *, random=160, bright=112):
-    """The certificate of an image, and its true error (dB)."""
+    """Return the certified error of an image and its true error in dB."""
     windows = list(SceneGrid("local", 0, 0, 1, image.shape).tiles(32))
     generator = np.random.default_rng(seed)
     pixels = random_pixels(windows, random, generator)
     brightness = Brightness.of(image, windows)
-    picked = brightness.draw(image, windows, bright, generator)
+    bright_pixels = brightness.draw(image, windows, bright, generator)
     certificate = Certificate(windows, pixels, exact[tuple(pixels.T)])
-    found = certificate.error(image, brightness, picked, exact[tuple(picked.T)])
-    return found, numerical_error_db(image.ravel(), exact.ravel())
+    error = certificate.error(image, brightness, bright_pixels, exact[tuple(bright_pixels.T)])
+    return error, numerical_error_db(image.ravel(), exact.ravel())
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["speckle", "targets", "errors of bright targets"])
-def test_the_bound_holds_over_all_pixels_in_95_of_100_images_and_lies_close(kind):
-    generator, above = np.random.default_rng(4), []
+def test_error_bound_holds_with_95_percent_confidence_and_is_tight(kind):
+    generator, margins_db = np.random.default_rng(4), []
     for seed in range(200):
-        found, true_db = certify(*image_with_errors(generator, kind), seed)
-        above.append(found.bound_db - true_db)
-        assert found.estimate_db == pytest.approx(true_db, abs=2.5)
-    assert np.mean(np.array(above) >= 0) >= 0.95
-    assert 0.2 < np.median(above) < 3
+        error, true_db = certify(*image_with_errors(generator, kind), seed)
+        margins_db.append(error.bound_db - true_db)
+        assert error.estimate_db == pytest.approx(true_db, abs=2.5)
+    assert np.mean(np.array(margins_db) >= 0) >= 0.95
+    assert 0.2 < np.median(margins_db) < 3
 
 
-def test_bright_pixels_that_err_are_found_whatever_few_they_are():
-    """One target holds the power and all of the error: random pixels alone would certify what lies around it."""
+def test_errors_of_few_bright_pixels_are_detected():
+    """One target contains almost all power and error: random pixels alone would certify its surroundings."""
     generator = np.random.default_rng(5)
     exact = generator.standard_normal((96, 96)) + 0j
     exact[40, 50] = 1e4
     image = exact.astype(np.complex64)
     image[40:42, 50] += [0, 30]
     image[41, 50] *= 40
-    found, true_db = certify(image, exact, 0)
+    error, true_db = certify(image, exact, 0)
     assert true_db > -30
-    assert found.bound_db > true_db
+    assert error.bound_db > true_db
     assert certify(image, exact, 0, random=272, bright=0)[0].bound_db < true_db - 20
 
 
-def test_an_error_from_drawn_pixels_alone_counts_no_power_that_it_did_not_meet():
-    """Uniform draws, nothing known of the rest: the bound holds, and is wider where few targets hold the power."""
-    generator, above = np.random.default_rng(6), {}
+def test_bound_from_uniform_draws_uses_only_their_power():
+    """Uniform draws without the total power: the bound holds, and is wider if few targets contain the power."""
+    generator, margins_db = np.random.default_rng(6), {}
     for kind in ("speckle", "targets"):
         images = [image_with_errors(generator, kind) for _ in range(200)]
         draws = [generator.integers(0, image.size, 64) for image, _ in images]
@@ -67,12 +67,12 @@ def test_an_error_from_drawn_pixels_alone_counts_no_power_that_it_did_not_meet()
             error_bound(i.flat[d], e.flat[d], np.ones(64), power=np.abs(i.flat[d]) ** 2).bound_db
             for (i, e), d in zip(images, draws, strict=True)
         ]
-        above[kind] = np.array(bounds) - [numerical_error_db(i.ravel(), e.ravel()) for i, e in images]
-        assert np.mean(above[kind] >= 0) >= 0.95
-    assert np.median(above["speckle"]) < 3 < np.median(above["targets"])
+        margins_db[kind] = np.array(bounds) - [numerical_error_db(i.ravel(), e.ravel()) for i, e in images]
+        assert np.mean(margins_db[kind] >= 0) >= 0.95
+    assert np.median(margins_db["speckle"]) < 3 < np.median(margins_db["targets"])
 
 
-def test_an_image_without_error_and_one_that_is_all_error_are_certified_as_such():
+def test_exact_image_and_all_error_image_are_certified_correctly():
     exact = np.full(64, 2 + 1j)
     assert error_bound(exact, exact, np.ones(64), power=320.0).bound_db < -300
     assert error_bound(0 * exact, exact, np.ones(64), power=0.0).bound_db == 0
@@ -80,7 +80,7 @@ def test_an_image_without_error_and_one_that_is_all_error_are_certified_as_such(
     assert error_bound(signs * exact, exact, np.ones(64), power=320.0).bound_db == pytest.approx(0, abs=0.01)
 
 
-def test_the_patch_is_exact_between_pixels_although_the_carrier_folds():
+def test_patch_interpolation_is_exact_for_an_aliased_carrier():
     y, x = np.mgrid[:64, :64].astype(float)
 
     def scene(y, x):
@@ -92,7 +92,7 @@ def test_the_patch_is_exact_between_pixels_although_the_carrier_folds():
 
 
 def test_pslr_and_islr_of_an_unweighted_aperture():
-    """Of a sinc: PSLR −13.26 dB, −3 dB width 0.886 cells, ISLR about −9.7 dB within ten cells."""
+    """Sinc response: PSLR −13.26 dB, −3 dB width 0.886 cells, ISLR about −9.7 dB within ten cells."""
     x = np.arange(128) - 64.0
     image = np.outer(np.ones(128), np.sinc(x / 4)).astype(np.complex64)
     cut = cut_through(image, find_peak(image, 64, 64), direction=(1, 0), spacing_m=1.0, reach_m=31.0)
@@ -101,14 +101,14 @@ def test_pslr_and_islr_of_an_unweighted_aperture():
     assert cut.islr_db == pytest.approx(-9.9, abs=0.5)
 
 
-def test_coherence_is_one_in_phase_and_one_over_m_at_random():
+def test_coherence_factor_is_1_in_phase_and_1_over_m_at_random():
     generator = np.random.default_rng(2)
     draws = [coherence_factor(np.exp(2j * np.pi * generator.random(200))) for _ in range(400)]
     assert np.mean(draws) == pytest.approx(1 / 200, rel=0.15)
     assert coherence_factor(np.full(200, 3 - 2j)) == 1.0
 
 
-def test_a_survey_by_windows_is_the_survey_of_the_whole():
+def test_statistics_by_windows_equal_those_of_the_whole_image():
     generator = np.random.default_rng(5)
     image = (generator.standard_normal((60, 50)) + 1j * generator.standard_normal((60, 50))).astype(np.complex64)
     image[7, 8] = np.nan
@@ -122,7 +122,7 @@ def test_a_survey_by_windows_is_the_survey_of_the_whole():
     assert whole.entropy == pytest.approx(-(share * np.log(share)).sum(), abs=1e-6)
 
 
-def test_only_the_tile_that_misses_the_accuracy_is_named():
+def test_only_tiles_that_miss_the_accuracy_are_listed():
     generator = np.random.default_rng(6)
     image = (generator.standard_normal((64, 64)) + 1j * generator.standard_normal((64, 64))).astype(np.complex64)
     grid = SceneGrid("local", 0, 0, 1, (64, 64))
@@ -136,8 +136,8 @@ def test_only_the_tile_that_misses_the_accuracy_is_named():
     assert certificate.failing(worse, -30, power=2.0) == ([], [])
 
 
-def test_a_tile_whose_only_pixel_is_bright_is_judged_by_what_is_there():
-    """In a dark image, 36 dB above its mean: an error of -50 dB is no more there than -50 dB; one of -30 dB is."""
+def test_tile_with_a_single_bright_pixel_is_judged_relative_to_that_pixel():
+    """Pixel 36 dB above the mean of a dark image: its error counts relative to its own power, not to the mean."""
     image = np.full((64, 64), 1e-3, np.complex64)
     image[5, 5] = 1.0
     windows, pixels = list(SceneGrid("local", 0, 0, 1, (64, 64)).tiles(32)), np.array([[5, 5], [40, 40]])
@@ -147,39 +147,39 @@ def test_a_tile_whose_only_pixel_is_bright_is_judged_by_what_is_there():
         assert Certificate(windows, pixels, exact).failing(image, -40, power=power)[1] == failing
 
 
-@pytest.mark.parametrize(("count", "seen"), [(9, 9), (40, 9), (4, 4)])
-def test_every_tile_gets_a_pixel_as_long_as_there_are_as_many(count, seen):
+@pytest.mark.parametrize(("count", "covered_tiles"), [(9, 9), (40, 9), (4, 4)])
+def test_random_pixels_cover_every_tile_if_there_are_enough(count, covered_tiles):
     windows = list(SceneGrid("local", 0, 0, 1, (70, 90)).tiles(32))
     pixels = random_pixels(windows, count, np.random.default_rng(1))
     assert len(pixels) == count
-    assert len(np.unique(pixels // 32, axis=0)) == seen
+    assert len(np.unique(pixels // 32, axis=0)) == covered_tiles
 
 
 @pytest.mark.slow
-def test_draws_follow_brightness_and_their_density_is_what_was_drawn():
-    """Half by power, half by magnitude, random ones besides: over many draws each pixel is taken as often as said."""
+def test_draws_have_the_stated_density():
+    """Half by power, half by magnitude, plus random pixels: the frequency of each pixel equals the stated density."""
     generator = np.random.default_rng(8)
     image = (generator.standard_normal((6, 7)) + 1j * generator.standard_normal((6, 7))).astype(np.complex64)
     image[2, 3] *= 8
     windows = list(SceneGrid("local", 0, 0, 1, image.shape).tiles(4))
-    brightness, taken = Brightness.of(image, windows), np.zeros(image.shape)
+    brightness, frequency = Brightness.of(image, windows), np.zeros(image.shape)
     for _ in range(4000):
         drawn = np.concatenate([random_pixels(windows, 6, generator), brightness.draw(image, windows, 5, generator)])
-        np.add.at(taken, tuple(drawn.T), 1 / 4000)
-    every = np.argwhere(np.ones(image.shape, bool))
-    for pixel in every:
-        eleven = np.repeat(pixel[None], 11, 0)
-        density = brightness.density(eleven, image[tuple(eleven.T)], windows, random=6)[0]
-        assert taken[tuple(pixel)] == pytest.approx(density, abs=0.05)
+        np.add.at(frequency, tuple(drawn.T), 1 / 4000)
+    pixels = np.argwhere(np.ones(image.shape, bool))
+    for pixel in pixels:
+        copies = np.repeat(pixel[None], 11, 0)
+        density = brightness.density(copies, image[tuple(copies.T)], windows, random=6)[0]
+        assert frequency[tuple(pixel)] == pytest.approx(density, abs=0.05)
 
 
-def test_a_dark_image_has_no_bright_pixels_to_draw():
+def test_zero_image_has_no_bright_pixels_to_draw():
     dark, windows = np.zeros((8, 8), np.complex64), [(slice(0, 8), slice(0, 8))]
     assert Brightness.of(dark, windows).draw(dark, windows, 5, np.random.default_rng(0)).shape == (0, 2)
 
 
-class Counted:
-    """A raster that counts how often each of its pixels is read."""
+class CountingRaster:
+    """Raster that counts the reads of each pixel."""
 
     def __init__(self, shape):
         self.shape, self.read = shape, np.zeros(shape, np.int16)
@@ -189,9 +189,9 @@ class Counted:
         return np.ones(self.shape, np.complex64)[block]
 
 
-def test_a_small_raster_is_read_once_and_one_too_large_for_memory_block_by_block():
-    small = Counted((30, 40))
+def test_small_raster_is_read_once_and_a_large_one_is_not_loaded():
+    small = CountingRaster((30, 40))
     np.testing.assert_array_equal(held(small), np.ones((30, 40)))
     assert (small.read[1:, 1:] == 1).all()
-    large = Counted((4096, 4097))
+    large = CountingRaster((4096, 4097))
     assert held(large) is large

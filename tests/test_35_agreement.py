@@ -1,4 +1,4 @@
-"""What two pairs of one transmitter see alike of ground without points, and what that tells of the tracks."""
+"""Track refinement by the speckle coherence of two pairs with a common transmitter."""
 
 from dataclasses import replace
 from functools import cache
@@ -28,55 +28,55 @@ ERRORS = TrackErrors((0.01, 0.01, 0.01))
 PRIOR = Prior({node: NodePrior.of(ERRORS, KNOTS_S, np.eye(3)) for node in ("a", "b")})
 
 
-def flown(ahead_m):
+def track(ahead_m):
     return np.stack([TIME_S - 15 + ahead_m, 0 * TIME_S, np.full(600, 10.0)], -1)
 
 
 def speckle(generator):
-    """A scatterer to a resolution cell, beyond the grid on all sides."""
-    places = np.concatenate([generator.uniform((-14, 2), (14, 32), (30_000, 2)), np.zeros((30_000, 1))], axis=1)
+    """Draw about one scatterer per resolution cell, on an area larger than the grid."""
+    points = np.concatenate([generator.uniform((-14, 2), (14, 32), (30_000, 2)), np.zeros((30_000, 1))], axis=1)
     amplitude = generator.standard_normal((2, 30_000)).T @ [1, 1j]
-    return Scatterers(places, amplitude)
+    return Scatterers(points, amplitude)
 
 
 @cache
-def seen(seed, ahead_m=4.7):
-    """Pairs a-a and a-b over speckle, 1 cm wrong in each axis, and the unknowns of the truth."""
-    of_tracks, of_scene = np.random.default_rng(seed).spawn(2)
-    unknowns = of_tracks.standard_normal(PRIOR.size)
-    truth, ground = TrackCorrection(KNOTS_S, PRIOR.tracks(unknowns)), speckle(of_scene)
+def records_of(seed, ahead_m=4.7):
+    """Return records of pairs a-a and a-b over speckle with track errors of 1 cm per axis, and the true unknowns."""
+    track_generator, scene_generator = np.random.default_rng(seed).spawn(2)
+    unknowns = track_generator.standard_normal(PRIOR.size)
+    truth, scene = TrackCorrection(KNOTS_S, PRIOR.tracks(unknowns)), speckle(scene_generator)
     records = []
     for pair in ("a-a", "a-b"):
-        logged = Aperture(flown(0.0), flown(ahead_m if pair == "a-b" else 0.0))
+        logged = Aperture(track(0.0), track(ahead_m if pair == "a-b" else 0.0))
         between_m = logged.tx_m - logged.rx_m if pair == "a-b" else None
         longer_m = -truth.longer_m(pair, TIME_S, between_m)
-        echo = transfer(ground, truth.aperture(logged, pair, TIME_S), FREQUENCY_HZ, longer_m=longer_m, gridded=True)
+        echo = transfer(scene, truth.aperture(logged, pair, TIME_S), FREQUENCY_HZ, longer_m=longer_m, gridded=True)
         history = PhaseHistory(echo, FREQUENCY_HZ, window_weights("hann", 128), np.zeros(600), logged)
         records.append(PairRecord(pair, range_compress(history, GRID, GROUND), TIME_S, between_m))
     return records, unknowns
 
 
-def ground_of(records):
+def speckle_tiles(records):
     return SpeckleTiles.of(
-        [Blocks.of(one, KNOTS_S) for one in records], tiles(records, GRID, GROUND, correlation_s=1.0)
+        [Blocks.of(record, KNOTS_S) for record in records], tiles(records, GRID, GROUND, correlation_s=1.0)
     )
 
 
 @pytest.mark.slow
-def test_tiles_share_out_the_scene():
-    records, _ = seen(1)
-    found = tiles(records, GRID, GROUND, correlation_s=1.0)
-    area = sum(np.linalg.norm(np.cross(*tile.sides_m)) for tile in found)
+def test_tiles_partition_the_scene():
+    records, _ = records_of(1)
+    scene_tiles = tiles(records, GRID, GROUND, correlation_s=1.0)
+    area = sum(np.linalg.norm(np.cross(*tile.sides_m)) for tile in scene_tiles)
     assert area == pytest.approx(360.0)
-    pixels = np.concatenate([tile.patch.pixels_m for tile in found])
+    pixels = np.concatenate([tile.patch.pixels_m for tile in scene_tiles])
     assert (np.abs(pixels[:, :2] - (0, 15)) < (9, 10)).all()
     assert len(np.unique(pixels.round(6), axis=0)) == len(pixels)
 
 
 @pytest.mark.slow
-def test_speckle_of_two_pairs_agrees_from_the_true_tracks_only():
-    records, unknowns = seen(1)
-    ground = ground_of(records)
+def test_speckle_of_two_pairs_agrees_only_on_the_true_tracks():
+    records, unknowns = records_of(1)
+    ground = speckle_tiles(records)
     coherence = [
         np.abs(ground.agreements(tracks)[0].coherence(tracks)).mean()
         for tracks in (PRIOR.tracks(0 * unknowns), PRIOR.tracks(unknowns))
@@ -86,59 +86,59 @@ def test_speckle_of_two_pairs_agrees_from_the_true_tracks_only():
 
 
 @pytest.mark.slow
-def test_the_gradient_is_that_of_the_value():
-    records, unknowns = seen(1)
+def test_gradient_equals_the_finite_difference_of_the_value():
+    records, unknowns = records_of(1)
     tracks = PRIOR.tracks(0.3 * unknowns)
-    [agreement] = ground_of(records).agreements(PRIOR.tracks(0 * unknowns))
+    [agreement] = speckle_tiles(records).agreements(PRIOR.tracks(0 * unknowns))
     _, gradient = agreement(tracks)
     generator = np.random.default_rng(3)
-    for way in (PRIOR.tracks(unknowns), PRIOR.tracks(generator.standard_normal(PRIOR.size))):
-        values = [agreement({n: tracks[n] + step * way[n] for n in way})[0] for step in (-0.01, 0.01)]
-        slope = sum(float((gradient[node] * way[node]).sum()) for node in way)
+    for direction in (PRIOR.tracks(unknowns), PRIOR.tracks(generator.standard_normal(PRIOR.size))):
+        values = [agreement({n: tracks[n] + step * direction[n] for n in direction})[0] for step in (-0.01, 0.01)]
+        slope = sum(float((gradient[node] * direction[node]).sum()) for node in direction)
         assert (values[1] - values[0]) / 0.02 == pytest.approx(slope, rel=3e-3)
 
 
 @pytest.mark.slow
-def test_agreement_mends_what_blurs_speckle():
-    """Path errors of the pair that sends and receives, less what only moves the image, fall as eq. 23 says."""
-    left = []
+def test_agreement_reduces_the_path_error_that_blurs_speckle():
+    """Path errors of the monostatic pair, without the part that only displaces the image, fall by eq. 23."""
+    residual_ratios = []
     for seed in (1, 2):
-        records, unknowns = seen(seed)
-        ground, found = ground_of(records), np.zeros(PRIOR.size)
+        records, unknowns = records_of(seed)
+        ground, estimate = speckle_tiles(records), np.zeros(PRIOR.size)
         for _ in range(2):
-            [agreement] = ground.agreements(PRIOR.tracks(found))
-            found = minimise(agreement, PRIOR, Gauge.none(PRIOR.size), found, iterations=15)
-        left.append(blur_m(PRIOR.tracks(found - unknowns)["a"]) / blur_m(PRIOR.tracks(unknowns)["a"]))
-    assert max(left) < 0.75, left
+            [agreement] = ground.agreements(PRIOR.tracks(estimate))
+            estimate = minimise(agreement, PRIOR, Gauge.none(PRIOR.size), estimate, iterations=15)
+        residual_ratios.append(blur_m(PRIOR.tracks(estimate - unknowns)["a"]) / blur_m(PRIOR.tracks(unknowns)["a"]))
+    assert max(residual_ratios) < 0.75, residual_ratios
 
 
-def blur_m(moved_m):
-    """RMS of the path error at the middle of the scene that is no shift of it."""
-    place = np.array([0.0, 15, 0])
-    along = np.stack([np.interp(KNOTS_S, TIME_S, axis) for axis in flown(0.0).T], -1) - place
+def blur_m(error_m):
+    """Return the RMS path error at the scene centre that does not merely displace the image."""
+    centre = np.array([0.0, 15, 0])
+    along = np.stack([np.interp(KNOTS_S, TIME_S, axis) for axis in track(0.0).T], -1) - centre
     unit = along / np.linalg.norm(along, axis=1, keepdims=True)
-    path = 2 * np.einsum("ki,ki->k", unit, moved_m)
+    path = 2 * np.einsum("ki,ki->k", unit, error_m)
     shift = np.concatenate([np.ones((len(unit), 1)), unit[:, :2]], axis=1)
     return float(np.std(path - shift @ np.linalg.lstsq(shift, path)[0]))
 
 
 @pytest.mark.slow
-def test_one_pair_has_nothing_to_agree_with():
-    records, unknowns = seen(1)
-    ground = ground_of(records[:1])
+def test_single_pair_has_no_agreement():
+    records, unknowns = records_of(1)
+    ground = speckle_tiles(records[:1])
     assert ground.agreements(PRIOR.tracks(unknowns)) == []
-    found = refined_by_speckle(ground, PRIOR, KNOTS_S)
-    assert not found.accepted
-    assert "one pair" in found.flags["refinement_no_bright_place"]
+    refined = refined_by_speckle(ground, PRIOR, KNOTS_S)
+    assert not refined.accepted
+    assert "one pair" in refined.flags["refinement_no_bright_point"]
 
 
 @pytest.mark.slow
-def test_speckle_is_believed_by_the_coherence_of_tiles_that_were_not_fitted():
-    records, _ = seen(1)
-    found = refined_by_speckle(ground_of(records), PRIOR, KNOTS_S)
-    assert found.accepted, found.why
-    unlike = [records[0], replace(records[1], profiles=seen(2)[0][1].profiles)]
-    rejected = refined_by_speckle(ground_of(unlike), PRIOR, KNOTS_S)
+def test_speckle_refinement_is_accepted_by_coherence_of_tiles_not_fitted():
+    records, _ = records_of(1)
+    refined = refined_by_speckle(speckle_tiles(records), PRIOR, KNOTS_S)
+    assert refined.accepted, refined.reason
+    unrelated = [records[0], replace(records[1], profiles=records_of(2)[0][1].profiles)]
+    rejected = refined_by_speckle(speckle_tiles(unrelated), PRIOR, KNOTS_S)
     assert not rejected.accepted
     assert not np.any(rejected.correction.moved_m["a"])
     assert "not fitted" in rejected.flags["refinement_rejected"]

@@ -1,4 +1,4 @@
-"""One wrong constant of the config, found by what points gain: times of logs, lever arms, height of the ground."""
+"""Identification of one wrong constant by the peaks of points: log time offset, lever arm, terrain height."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from apertura.methods.causes import late_logs, other_height
 GROUND = FlatGround(0.0)
 
 
-def test_the_adjoint_of_a_cause_is_its_transpose():
+def test_adjoint_of_a_cause_is_its_transpose():
     generator, knots_s = np.random.default_rng(4), np.arange(0, 5, 0.1)
     flight = Prior({node: NodePrior.of(TrackErrors((0.01,) * 3), knots_s, np.eye(3)) for node in "ab"})
     flown = {node: (np.arange(0, 5, 0.01), generator.standard_normal((500, 3))) for node in "ab"}
@@ -26,53 +26,53 @@ def test_the_adjoint_of_a_cause_is_its_transpose():
         assert prior.adjoint(gradient) @ unknowns == pytest.approx(forward, rel=1e-12)
 
 
-def test_ground_that_lies_higher_is_as_if_all_flew_lower():
-    """A target on it is focused by the paths that it has."""
+def test_higher_terrain_is_equivalent_to_lower_tracks():
+    """A target on the higher terrain is focused with its true path length."""
     up, height_m = np.array([0.0, 0.0, 1.0]), 0.7
     flight = Prior({"a": NodePrior.of(TrackErrors((0.01,) * 3), np.arange(10.0), np.eye(3))})
     cause = other_height(["a"], np.arange(10.0), up)
-    moved = CausePrior.of(cause, flight, np.arange(10.0)).tracks(np.array([height_m]) / cause.std)["a"]
-    flown, target = np.array([3.0, -20.0, 30.0]), np.array([1.0, 5.0, height_m])
-    true_m = np.linalg.norm(flown - target)
-    assert np.linalg.norm(flown + moved[0] - target * [1, 1, 0]) == pytest.approx(true_m)
+    displacement_m = CausePrior.of(cause, flight, np.arange(10.0)).tracks(np.array([height_m]) / cause.std)["a"]
+    antenna, target = np.array([3.0, -20.0, 30.0]), np.array([1.0, 5.0, height_m])
+    true_m = np.linalg.norm(antenna - target)
+    assert np.linalg.norm(antenna + displacement_m[0] - target * [1, 1, 0]) == pytest.approx(true_m)
 
 
 @pytest.mark.slow
-def test_the_arm_that_is_wrong_is_found_to_centimetres():
-    """Beside errors of the logs of 3 mm, on a pass of 7.5 s."""
-    made, causes, (node, arm_m) = wrong_case("lever arm", "points-5", "short", 0.003, 2)
-    search = TrackSearch.begin(made.records, GRID, GROUND, made.errors)
-    found = explained(search.problem, causes, search.axes, np.random.default_rng(0))
-    assert found is not None
-    assert found.cause.quantity.kind == "lever arm"
-    assert list(found.cause.moved_m) == [node]
-    assert found.values == pytest.approx(arm_m, abs=0.03)
+def test_wrong_lever_arm_is_found_within_3_cm():
+    """In addition to track errors of 3 mm, on a pass of 7.5 s."""
+    case, causes, (node, arm_m) = wrong_case("lever arm", "points-5", "short", 0.003, 2)
+    search = TrackSearch.begin(case.records, GRID, GROUND, case.errors)
+    fit = explained(search.problem, causes, search.axes, np.random.default_rng(0))
+    assert fit is not None
+    assert fit.cause.quantity.kind == "lever arm"
+    assert list(fit.cause.moved_m) == [node]
+    assert fit.values == pytest.approx(arm_m, abs=0.03)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "seeds", "within"), [("time", (5,), 0.005), ("lever arm", (6,), 0.03), ("height", (0, 6), 0.1)]
+    ("kind", "seeds", "tolerance"), [("time", (5,), 0.005), ("lever arm", (6,), 0.03), ("height", (0, 6), 0.1)]
 )
-def test_one_wrong_constant_is_named_and_taken_back(kind, seeds, within):
-    """Within 5 ms, 3 cm, 10 cm: what is left of a height of 40 cm costs 0.2 dB."""
+def test_single_wrong_constant_is_identified_and_corrected(kind, seeds, tolerance):
+    """Within 5 ms, 3 cm, 10 cm: the residual of a height error of 40 cm costs 0.2 dB."""
     for seed in seeds:
-        made, causes, (node, values) = wrong_case(kind, "points-5", "wobble", 0.003, seed)
-        found = refine(made.records, GRID, GROUND, made.errors, causes=causes)
-        before, after = judge(made), judge(made, found.correction)
-        assert before.probe_loss_db < -1, seed  # there is something to explain
-        assert list(found.flags) == ["cause_found"], seed
-        assert found.report["cause"]["kind"] == kind
-        assert node == "all" or f" {node} " in found.report["cause"]["what"]
-        assert found.report["cause"]["values"] == pytest.approx(values, abs=within)
+        case, causes, (node, values) = wrong_case(kind, "points-5", "wobble", 0.003, seed)
+        refined = refine(case.records, GRID, GROUND, case.errors, causes=causes)
+        before, after = judge(case), judge(case, refined.correction)
+        assert before.probe_loss_db < -1, seed  # the error is significant
+        assert list(refined.flags) == ["cause_corrected"], seed
+        assert refined.report["cause"]["kind"] == kind
+        assert node == "all" or f" {node} " in refined.report["cause"]["what"]
+        assert refined.report["cause"]["values"] == pytest.approx(values, abs=tolerance)
         assert after.probe_loss_db > -0.3
         assert after.probe_shift_cm < 6
 
 
 @pytest.mark.slow
-def test_errors_of_the_logs_are_no_cause():
-    """4 cm over 7.5 s; by what points gain alone, a lever arm explains these well."""
+def test_random_track_errors_are_not_attributed_to_a_constant():
+    """Track errors of 4 cm over 7.5 s, which a lever arm would explain well by peak gain alone."""
     for seed in (0, 1, 3):
-        made, causes, _ = wrong_case("nothing", "points-6", "short", 0.04, seed)
-        found = refine(made.records, GRID, GROUND, made.errors, causes=causes)
-        assert found.accepted, seed
-        assert "cause" not in found.report, seed
+        case, causes, _ = wrong_case("nothing", "points-6", "short", 0.04, seed)
+        refined = refine(case.records, GRID, GROUND, case.errors, causes=causes)
+        assert refined.accepted, seed
+        assert "cause" not in refined.report, seed

@@ -1,4 +1,4 @@
-"""A recorder's clock and path from its echoes: found where a node changed its speed, refused or flagged where not."""
+"""Clock offset and path offset of a recorder from its echoes: estimated if the speed changes, else flagged."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ POINTS = np.array([[0.3, 4.0, 0.0], [-0.9, 4.6, 0.0], [1.1, 3.5, 0.0]])
 
 
 def start_and_stop(time_s):
-    """Stand for 3 s, go 3 m in 8 s with a swing, stand."""
+    """Return the positions along a track: stationary until 5 s, 3 m in 8 s with varying speed, stationary."""
     along = np.clip((time_s - 5.0) / 8.0, 0.0, 1.0)
     return 3.0 * (along + 0.04 * np.sin(4 * np.pi * along)) - 1.5
 
@@ -26,14 +26,14 @@ def steadily(time_s):
     return 0.3 * (time_s - 9.0)
 
 
-def flown(along):
+def track(along):
     return np.stack([along, 0 * along, np.full_like(along, 1.0)], -1)
 
 
-def given(move, *, amplitudes=(1.0, 0.4, 0.5), seed=3):
-    """Pulses from 1 to 15 s, by a clock that reads `BEHIND_S` less; constant coupling and noise added."""
+def echo_and_log(motion, *, amplitudes=(1.0, 0.4, 0.5), seed=3):
+    """Simulate pulses from 1 to 15 s with a clock late by `BEHIND_S`, constant coupling and noise; and a log."""
     pulse_s = np.arange(1.0, 15.0, 0.04)
-    antenna = flown(move(pulse_s))
+    antenna = track(motion(pulse_s))
     rng = np.random.default_rng(seed)
     paths = [2 * np.linalg.norm(antenna - point, axis=1) + PATH_M for point in POINTS]
     transfer = sum(
@@ -45,89 +45,93 @@ def given(move, *, amplitudes=(1.0, 0.4, 0.5), seed=3):
     echo = Recorded(
         transfer.astype(np.complex64), FREQUENCY, np.zeros(len(pulse_s)), pulse_s - BEHIND_S, SPEED_OF_LIGHT_M_S
     )
-    log = Logged(lambda at_s: Aperture(flown(move(at_s)), flown(move(at_s))), 0.0, 18.0)
+    log = Logged(lambda at_s: Aperture(track(motion(at_s)), track(motion(at_s))), 0.0, 18.0)
     return echo, log
 
 
-def test_a_start_and_a_stop_leave_a_fraction_of_a_second():
-    low, high = plausible_offsets(*given(start_and_stop), (-10.0, 15.0))
+def test_start_and_stop_limit_the_offset_to_two_seconds():
+    low, high = plausible_offsets(*echo_and_log(start_and_stop), (-10.0, 15.0))
     assert low < BEHIND_S < high
     assert high - low < 2.0
 
 
-def test_constant_velocity_rules_no_offset_out():
-    low, high = plausible_offsets(*given(steadily), (1.0, 6.0))
+def test_constant_velocity_excludes_no_offset():
+    low, high = plausible_offsets(*echo_and_log(steadily), (1.0, 6.0))
     assert (low, high) == pytest.approx((1.0, 6.0), abs=0.1)
 
 
-def test_offset_and_path_are_found_on_a_known_point():
-    found = align_on_point(*given(start_and_stop), POINTS[0], within_s=(-10.0, 15.0), search_m=5.0)
-    assert found.offset_s == pytest.approx(BEHIND_S, abs=0.003)
-    assert found.path_m == pytest.approx(PATH_M, abs=0.005)
-    assert found.contrast_db > 15
-    assert not found.flags
-    assert 0.01 < found.offset_width_s < 0.2
+def test_offset_and_path_are_estimated_from_a_known_point():
+    alignment = align_on_point(*echo_and_log(start_and_stop), POINTS[0], within_s=(-10.0, 15.0), search_m=5.0)
+    assert alignment.offset_s == pytest.approx(BEHIND_S, abs=0.003)
+    assert alignment.path_m == pytest.approx(PATH_M, abs=0.005)
+    assert alignment.contrast_db > 15
+    assert not alignment.flags
+    assert 0.01 < alignment.offset_width_s < 0.2
 
 
-def test_a_path_that_is_known_is_kept():
-    echo, log = given(start_and_stop)
+def test_known_path_offset_is_kept():
+    echo, log = echo_and_log(start_and_stop)
     known = Recorded(
         echo.transfer, FREQUENCY, echo.reference_delay_s - PATH_M / SPEED_OF_LIGHT_M_S, echo.time_s, SPEED_OF_LIGHT_M_S
     )
-    found = align_on_point(known, log, POINTS[0], within_s=(-10.0, 15.0), search_m=0.0)
-    assert found.path_m == 0.0
-    assert found.offset_s == pytest.approx(BEHIND_S, abs=0.003)
+    alignment = align_on_point(known, log, POINTS[0], within_s=(-10.0, 15.0), search_m=0.0)
+    assert alignment.path_m == 0.0
+    assert alignment.offset_s == pytest.approx(BEHIND_S, abs=0.003)
 
 
-def test_a_clock_that_runs_slow_is_told_on_a_long_recording():
-    """Ten minutes to and fro; 40 ppm are 24 ms, and 4 cm of path: over half a wave."""
+def test_clock_drift_is_estimated_on_a_long_recording():
+    """Oscillation over ten minutes: 40 ppm are 24 ms and 4 cm of path, more than half a wavelength."""
 
     def to_and_fro(time_s):
         return 2.0 * np.sin(0.6 * time_s + 0.4 * np.sin(0.05 * time_s))
 
     slow_ppm, pulse_s = 40.0, np.arange(1.0, 600.0, 0.2)
-    path = 2 * np.linalg.norm(flown(to_and_fro(pulse_s)) - POINTS[0], axis=1) + PATH_M
+    path = 2 * np.linalg.norm(track(to_and_fro(pulse_s)) - POINTS[0], axis=1) + PATH_M
     transfer = np.exp(-2j * np.pi * FREQUENCY * path[:, None] / SPEED_OF_LIGHT_M_S).astype(np.complex64)
     clock_s = (pulse_s - pulse_s[0]) / (1 + slow_ppm * 1e-6) + pulse_s[0] - BEHIND_S
     echo = Recorded(transfer, FREQUENCY, np.zeros(len(pulse_s)), clock_s, SPEED_OF_LIGHT_M_S)
-    log = Logged(lambda at_s: Aperture(flown(to_and_fro(at_s)), flown(to_and_fro(at_s))), 0.0, 610.0)
-    without = align_on_point(echo, log, POINTS[0], within_s=(2.9, 3.5), search_m=2.0)
-    found = estimate_drift(without, echo, log, POINTS[0])
-    assert found.drift_ppm == pytest.approx(slow_ppm, abs=0.5)
-    assert found.offset_s == pytest.approx(BEHIND_S, abs=1e-3)
-    assert abs(without.offset_s - BEHIND_S) > 5e-3
+    log = Logged(lambda at_s: Aperture(track(to_and_fro(at_s)), track(to_and_fro(at_s))), 0.0, 610.0)
+    without_drift = align_on_point(echo, log, POINTS[0], within_s=(2.9, 3.5), search_m=2.0)
+    with_drift = estimate_drift(without_drift, echo, log, POINTS[0])
+    assert with_drift.drift_ppm == pytest.approx(slow_ppm, abs=0.5)
+    assert with_drift.offset_s == pytest.approx(BEHIND_S, abs=1e-3)
+    assert abs(without_drift.offset_s - BEHIND_S) > 5e-3
 
 
-def test_on_a_short_recording_no_drift_is_told():
-    echo, log = given(start_and_stop)
-    found = align_on_point(echo, log, POINTS[0], within_s=(-10.0, 15.0), search_m=5.0)
-    kept = estimate_drift(found, echo, log, POINTS[0])
-    assert kept.drift_ppm == 0.0
-    assert "not observable" in kept.report["drift"]
+def test_clock_drift_is_not_observable_on_a_short_recording():
+    echo, log = echo_and_log(start_and_stop)
+    alignment = align_on_point(echo, log, POINTS[0], within_s=(-10.0, 15.0), search_m=5.0)
+    with_drift = estimate_drift(alignment, echo, log, POINTS[0])
+    assert with_drift.drift_ppm == 0.0
+    assert "not observable" in with_drift.report["drift"]
 
 
-def test_a_point_that_is_not_there_is_told_of():
-    found = align_on_point(*given(start_and_stop), np.array([-1.4, 9.0, 0.0]), within_s=(-10.0, 15.0), search_m=0.2)
-    assert {"alignment_uncertain", "alignment_ambiguous"} & found.flags.keys()
-
-
-@pytest.mark.slow
-def test_sharpness_alone_finds_both_where_the_speed_changes():
-    grid = SceneGrid.from_bounds("local", (-2.0, 2.5, 2.0, 5.5), spacing_m=0.05)
-    found = align_on_scene(*given(start_and_stop), grid, FlatGround(0.0), within_s=(-10.0, 15.0), search_m=1.6)
-    assert found.offset_s == pytest.approx(BEHIND_S, abs=0.1)
-    assert found.path_m == pytest.approx(PATH_M, abs=0.1)
-    assert np.linalg.norm(np.array(found.report["brightest_m"]) - POINTS[0]) < 0.06
+def test_absent_reference_point_is_flagged():
+    alignment = align_on_point(
+        *echo_and_log(start_and_stop), np.array([-1.4, 9.0, 0.0]), within_s=(-10.0, 15.0), search_m=0.2
+    )
+    assert {"alignment_uncertain", "alignment_ambiguous"} & alignment.flags.keys()
 
 
 @pytest.mark.slow
-def test_at_constant_velocity_sharpness_tells_nothing():
+def test_sharpness_determines_offset_and_path_if_the_speed_changes():
     grid = SceneGrid.from_bounds("local", (-2.0, 2.5, 2.0, 5.5), spacing_m=0.05)
-    found = align_on_scene(*given(steadily), grid, FlatGround(0.0), within_s=(2.5, 4.0), search_m=0.0)
-    assert "alignment_ambiguous" in found.flags
+    alignment = align_on_scene(
+        *echo_and_log(start_and_stop), grid, FlatGround(0.0), within_s=(-10.0, 15.0), search_m=1.6
+    )
+    assert alignment.offset_s == pytest.approx(BEHIND_S, abs=0.1)
+    assert alignment.path_m == pytest.approx(PATH_M, abs=0.1)
+    assert np.linalg.norm(np.array(alignment.report["brightest_m"]) - POINTS[0]) < 0.06
 
 
-def test_a_log_of_another_day_is_refused():
-    echo, log = given(start_and_stop)
+@pytest.mark.slow
+def test_sharpness_is_ambiguous_at_constant_velocity():
+    grid = SceneGrid.from_bounds("local", (-2.0, 2.5, 2.0, 5.5), spacing_m=0.05)
+    alignment = align_on_scene(*echo_and_log(steadily), grid, FlatGround(0.0), within_s=(2.5, 4.0), search_m=0.0)
+    assert "alignment_ambiguous" in alignment.flags
+
+
+def test_log_without_overlap_is_refused():
+    echo, log = echo_and_log(start_and_stop)
     with pytest.raises(ValueError, match="no offset puts half of the pulses inside the log"):
         plausible_offsets(echo, log, (100.0, 120.0))

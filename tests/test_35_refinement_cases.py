@@ -1,4 +1,4 @@
-"""Cases by which a refinement of tracks is judged: what they hold is what was asked."""
+"""Simulated cases for the evaluation of track refinement have the requested properties."""
 
 import numpy as np
 import pytest
@@ -19,24 +19,24 @@ FREQUENCY_HZ = 1.2e9 + 3.2e6 * np.arange(128)
     ("gridded", "spreading", "error"),
     [(True, True, 3e-6), (True, False, 3e-6), (False, True, 1e-7), (False, False, 1e-7)],
 )
-def test_echoes_are_those_of_the_plain_sum(gridded, spreading, error):
+def test_echoes_equal_the_direct_sum(gridded, spreading, error):
     generator = np.random.default_rng(1)
-    places = generator.uniform((-9, 5, 0), (9, 25, 1), (30, 3))
+    points = generator.uniform((-9, 5, 0), (9, 25, 1), (30, 3))
     amplitude = generator.standard_normal(30) + 1j * generator.standard_normal(30)
-    flown = Aperture(*(generator.uniform((-15, -1, 9), (15, 1, 11), (2, 40, 3))))
-    further = generator.uniform(-5, 5, 40)
+    aperture = Aperture(*(generator.uniform((-15, -1, 9), (15, 1, 11), (2, 40, 3))))
+    extra_path_m = generator.uniform(-5, 5, 40)
     exact = np.zeros((40, 128), complex)
-    for place, one in zip(places, amplitude, strict=True):
-        there, back = (np.linalg.norm(place - leg, axis=1) for leg in flown.legs)
-        path = (there + back + further)[:, None]
-        level = one / (there * back) if spreading else one * np.ones(40)
+    for point, value in zip(points, amplitude, strict=True):
+        transmit_m, receive_m = (np.linalg.norm(point - leg, axis=1) for leg in aperture.legs)
+        path = (transmit_m + receive_m + extra_path_m)[:, None]
+        level = value / (transmit_m * receive_m) if spreading else value * np.ones(40)
         exact += level[:, None] * np.exp(-2j * np.pi * FREQUENCY_HZ * path / SPEED_OF_LIGHT_M_S)
-    points = Scatterers(places, amplitude)
-    echo = transfer(points, flown, FREQUENCY_HZ, longer_m=further, spreading=spreading, gridded=gridded)
+    scatterers = Scatterers(points, amplitude)
+    echo = transfer(scatterers, aperture, FREQUENCY_HZ, longer_m=extra_path_m, spreading=spreading, gridded=gridded)
     assert np.linalg.norm(echo - exact) < error * np.linalg.norm(exact)
 
 
-def test_errors_have_the_deviation_and_the_correlation_of_the_prior():
+def test_drawn_errors_have_the_deviation_and_correlation_of_the_prior():
     time_s, generator = np.arange(3000) / 100, np.random.default_rng(2)
     errors = TrackErrors((0.01, 0.02, 0.03), correlation_s=1.0)
     drawn = np.stack([drawn_errors(time_s, errors, generator) for _ in range(200)])
@@ -48,19 +48,19 @@ def test_errors_have_the_deviation_and_the_correlation_of_the_prior():
 @pytest.mark.slow
 @compiled
 @pytest.mark.parametrize("pairs", ["mono", "bi"])
-def test_the_true_tracks_lose_nothing_and_the_logs_what_the_theory_says(pairs):
-    one = case("five", "straight", pairs, 0.01, None, 3)
-    assert judge(one, one.truth).probe_loss_db == 0
-    found = peaks(one.probes, one.truth, PROBES_M, one.reach_m)
-    assert np.abs(found.place_m - PROBES_M).max() < 0.02
+def test_true_tracks_have_no_loss_and_logged_tracks_the_predicted_one(pairs):
+    simulated = case("five", "straight", pairs, 0.01, None, 3)
+    assert judge(simulated, simulated.truth).probe_loss_db == 0
+    measured = peaks(simulated.probes, simulated.truth, PROBES_M, simulated.reach_m)
+    assert np.abs(measured.place_m - PROBES_M).max() < 0.02
     losses = [judge(case("five", "straight", pairs, 0.01, None, seed)).probe_loss_db for seed in range(3, 6)]
-    # 1 cm in each axis turns the echo by k·|g|·σ, |g| about 2: exp(-(2kσ)²), of which a search for the peak saves some
+    # 1 cm per axis gives an rms phase of k·|g|·σ, |g| about 2: loss exp(-(2kσ)²), slightly less at the best peak
     assert -2.2 < np.mean(losses) < -0.8
 
 
 @pytest.mark.slow
 @compiled
-def test_a_seed_keeps_its_tracks_and_noise_when_pairs_or_scene_change():
+def test_seed_gives_same_tracks_and_noise_for_other_pairs_or_scenes():
     joint, mono = (case("five", "straight", pairs, 0.01, 10, 1) for pairs in ("joint", "mono"))
     other = case("forty", "straight", "mono", 0.02, 10, 1)
     assert np.array_equal(joint.records[0].profiles.samples, mono.records[0].profiles.samples)

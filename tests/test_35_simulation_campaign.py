@@ -1,4 +1,4 @@
-"""Simulated folders against the input contract, the sample campaign and packages that know nothing of this one."""
+"""Simulated folders, checked against the input contract, the sample campaign and independent packages."""
 
 import csv
 import json
@@ -47,27 +47,27 @@ def leaves(tree, prefix=""):
     return set().union(*(leaves(value, f"{prefix}.{key}") for key, value in tree.items()), {prefix})
 
 
-def test_the_folder_has_the_files_and_keys_of_the_real_sample(demo):
+def test_folder_has_the_files_and_keys_of_the_real_sample(demo):
     sample = SHARED / "campaign-sample"
     if not sample.exists():
         pytest.skip("campaign-sample is not here")
     assert set(contents(demo)) == set(contents(sample))
-    mine, theirs = (yaml.safe_load((root / "config/config.yaml").read_text()) for root in (demo, sample))
-    assert leaves(mine) == leaves(theirs)
+    simulated, real = (yaml.safe_load((root / "config/config.yaml").read_text()) for root in (demo, sample))
+    assert leaves(simulated) == leaves(real)
     for name in ("uav1", "uav2"):
-        mine, theirs = (json.loads((root / f"raw/f01/{name}.sigmf-meta").read_text()) for root in (demo, sample))
-        assert set(mine["global"]) == set(theirs["global"])
-        assert set(mine["captures"][0]) == set(theirs["captures"][0])
+        simulated, real = (json.loads((root / f"raw/f01/{name}.sigmf-meta").read_text()) for root in (demo, sample))
+        assert set(simulated["global"]) == set(real["global"])
+        assert set(simulated["captures"][0]) == set(real["captures"][0])
     for name in ("uav1.track.csv", "uav2.track.pos"):
-        mine, theirs = ((root / "raw/f01" / name).read_text().splitlines() for root in (demo, sample))
-        assert [line for line in mine if line[0] in "t%"] == [line for line in theirs if line[0] in "t%"]
+        simulated, real = ((root / "raw/f01" / name).read_text().splitlines() for root in (demo, sample))
+        assert [line for line in simulated if line[0] in "t%"] == [line for line in real if line[0] in "t%"]
 
 
 @pytest.mark.parametrize("name", ["uav1", "uav2"])
-def test_recordings_are_valid_to_the_sigmf_package_and_hold_what_truth_says(demo, name):
+def test_recordings_are_valid_sigmf_and_contain_the_pulses_of_truth_json(demo, name):
     recording = sigmf.fromfile(str(demo / f"raw/f01/{name}.sigmf-meta"))
     recording.validate()  # schema
-    recording.calculate_hash()  # raises where the data are not those hashed
+    recording.calculate_hash()  # raises an error if the data do not match the hash
     node = json.loads((demo / "truth.json").read_text())["flights"]["f01"]["nodes"][name]
     kept = node["kept"] or list(range(24))
     starts = [capture["core:sample_start"] for capture in recording.get_captures()]
@@ -75,7 +75,7 @@ def test_recordings_are_valid_to_the_sigmf_package_and_hold_what_truth_says(demo
     assert recording.sample_count == 4000 * len(kept)
 
 
-def test_time_tags_are_late_by_the_error_drawn(demo):
+def test_time_tags_are_late_by_the_drawn_error(demo):
     truth = json.loads((demo / "truth.json").read_text())["flights"]["f01"]["nodes"]["uav2"]
     meta = json.loads((demo / "raw/f01/uav2.sigmf-meta").read_text())
     tags = np.array([capture["core:datetime"][:-1] for capture in meta["captures"]], "datetime64[ns]")
@@ -85,7 +85,7 @@ def test_time_tags_are_late_by_the_error_drawn(demo):
     assert late_s.mean() == pytest.approx(3.7e-3, abs=3e-4)
 
 
-def test_the_same_generator_state_writes_identical_bytes(tmp_path):
+def test_same_seed_writes_identical_bytes(tmp_path):
     first, again, other = (
         contents(simulate(tmp_path / name, small_simulation(), seed=seed))
         for name, seed in (("first", 1), ("again", 1), ("other", 2))
@@ -100,22 +100,22 @@ def test_the_same_generator_state_writes_identical_bytes(tmp_path):
     assert first["raw/f01/b.sigmf-data"] != other["raw/f01/b.sigmf-data"]
 
 
-def test_a_folder_that_holds_something_is_left_alone(tmp_path):
+def test_non_empty_folder_is_left_unchanged(tmp_path):
     (tmp_path / "there").mkdir()
     (tmp_path / "there" / "mine.txt").write_text("mine")
-    with pytest.raises(CampaignError, match="something is there already"):
+    with pytest.raises(CampaignError, match="already exists and is not an empty folder"):
         simulate(tmp_path / "there", small_simulation(), seed=0)
     assert contents(tmp_path) == {"there/mine.txt": b"mine"}
 
 
 @pytest.mark.parametrize(("atmosphere", "index"), [("vacuum", 1.0), (320.0, 1.00032)])
-def test_recorded_samples_have_the_phase_of_the_geometry_in_the_logs(tmp_path, atmosphere, index):
-    """From bytes alone: DFT, code, CSV log, truth's target; 1e-3 rad. Air lengthens what is flown, not the cable."""
+def test_recorded_samples_have_the_phase_of_the_logged_geometry(tmp_path, atmosphere, index):
+    """Computed from the files: DFT, code, CSV log, true target; 1e-3 rad. The refractive index applies to air only."""
     simulation = small_simulation()
-    one = replace(simulation, targets=(PointTarget((0.5, 1.0, 0.3)),), atmosphere=atmosphere)
+    single = replace(simulation, targets=(PointTarget((0.5, 1.0, 0.3)),), atmosphere=atmosphere)
     offset = {"radar": 1.374}
-    fixed = replace(one, nodes=dict.fromkeys(one.nodes, SimulatedNode(path_offset_m=offset)))
-    root = simulate(tmp_path / "c", fixed, seed=0)
+    with_offset = replace(single, nodes=dict.fromkeys(single.nodes, SimulatedNode(path_offset_m=offset)))
+    root = simulate(tmp_path / "c", with_offset, seed=0)
     counts = np.fromfile(root / "raw/f01/a.sigmf-data", "<i2").reshape(6, 224, 2).astype(float)
     captured = (counts[..., 0] + 1j * counts[..., 1])[:, 64:192]
     transfer = np.fft.fft(captured, axis=1)[:, :64] / np.load(root / "raw/codes.npy")
@@ -127,15 +127,15 @@ def test_recorded_samples_have_the_phase_of_the_geometry_in_the_logs(tmp_path, a
     times = times / np.timedelta64(1, "s")
     antenna = np.column_stack([np.interp(np.arange(6) / 500, times, axis) for axis in epochs.T])
     target = json.loads((root / "truth.json").read_text())["targets"][0]
-    place = ecef_from_projected("EPSG:32632", *(np.array(target[key]) for key in ("x", "y", "height_m")))
-    path_m = index * 2 * np.linalg.norm(antenna - place, axis=1) + 1.374
+    position = ecef_from_projected("EPSG:32632", *(np.array(target[key]) for key in ("x", "y", "height_m")))
+    path_m = index * 2 * np.linalg.norm(antenna - position, axis=1) + 1.374
     frequency = 1.2e9 + 4567e3 + 250e3 * np.arange(64)
     residual = np.angle(transfer * np.exp(2j * np.pi * frequency * path_m[:, None] / C))
     assert abs(residual.mean(axis=1)).max() < 1e-3
     assert abs(residual).max() < 5e-3  # 14 bits
 
 
-def test_gps_time_is_eighteen_seconds_ahead_of_the_csv_log(tmp_path):
+def test_gps_time_is_18_s_ahead_of_utc(tmp_path):
     simulation = small_simulation()
     first = {}
     for name, form in (("gpst", "pos"), ("utc", "pos_utc")):
@@ -149,7 +149,7 @@ def test_gps_time_is_eighteen_seconds_ahead_of_the_csv_log(tmp_path):
     assert first["gpst"][2:] == first["utc"][2:]
 
 
-def test_a_calibration_flight_has_its_own_reflector_and_the_config_its_stated_offsets(tmp_path):
+def test_calibration_flight_has_its_own_reflector_and_stated_offsets(tmp_path):
     simulation = small_simulation()
     flight = simulation.flights[0]
     calibration = replace(flight, name="cal", kind="calibration", targets=(PointTarget((0.0, 3.0, 1.0), 5.0),))
@@ -165,60 +165,60 @@ def test_a_calibration_flight_has_its_own_reflector_and_the_config_its_stated_of
     assert config["nodes"]["b"]["path_offset_m"] == {"radar": 0.0}
 
 
-def test_the_log_is_off_by_the_localization_error():
-    wrong = Impairments(localization=Localization(0.05))
-    simulation = small_simulation(secondary=wrong)
+def test_log_contains_the_localization_error():
+    impairments = Impairments(localization=Localization(0.05))
+    simulation = small_simulation(secondary=impairments)
     flight = simulation.flights[0]
-    seen, _ = recordings_of(simulation)
+    recordings, _ = recordings_of(simulation)
     logged = phase_centre(ORIGIN, flight.tracks["b"], np.arange(6) / 500)
-    assert abs(seen["b"].draw.position_error_m).max() > 0.01
-    for place in (seen["b"].truth.radar_rx, seen["b"].truth.sidelink_rx):
-        assert_allclose(logged - place, seen["b"].draw.position_error_m, atol=1e-8)
-    assert_allclose(seen["b"].truth.radar_tx, phase_centre(ORIGIN, flight.tracks["a"], np.arange(6) / 500))
+    assert abs(recordings["b"].draw.position_error_m).max() > 0.01
+    for true_centre in (recordings["b"].truth.radar_rx, recordings["b"].truth.sidelink_rx):
+        assert_allclose(logged - true_centre, recordings["b"].draw.position_error_m, atol=1e-8)
+    assert_allclose(recordings["b"].truth.radar_tx, phase_centre(ORIGIN, flight.tracks["a"], np.arange(6) / 500))
 
 
-def test_lever_arms_turn_with_the_node():
-    east = Straight((0.0, 0.0, 5.0), (1.0, 0.0, 0.0))  # nose east: forward is east, right is south
+def test_lever_arms_rotate_with_the_node():
+    east = Straight((0.0, 0.0, 5.0), (1.0, 0.0, 0.0))  # heading east: forward is east, right is south
     arm = ORIGIN.enu(phase_centre(ORIGIN, east, np.zeros(1), (1.0, 2.0, 0.5)))[0]
-    assert_allclose(arm, [1.0, -2.0, 4.5], atol=1e-5)  # the ellipsoid's normal turns by 1e-6 rad
+    assert_allclose(arm, [1.0, -2.0, 4.5], atol=1e-5)  # the ellipsoid normal rotates by 1e-6 rad
 
 
-def test_an_echo_is_as_strong_as_both_antennas_see_its_target():
-    """Level antennas that look left of a flight eastward: bearings and depressions are those of a map."""
-    plain = small_simulation()
+def test_echo_amplitude_includes_both_antenna_patterns():
+    """Level antennas that look left of an eastward flight, so that bearing and elevation follow from the map."""
+    omnidirectional = small_simulation()
     beams = {
         "a": {"radar_tx": GaussianBeam((-90.0, 0.0), (30.0, 40.0))},
         "b": {"radar_rx": GaussianBeam((270.0, 0.0), (50.0, 90.0))},
     }
-    nodes = {name: replace(node, antennas=beams[name]) for name, node in plain.nodes.items()}
-    standing = scatterers(ORIGIN, plain.targets, np.random.default_rng(0))
+    nodes = {name: replace(node, antennas=beams[name]) for name, node in omnidirectional.nodes.items()}
+    targets = scatterers(ORIGIN, omnidirectional.targets, np.random.default_rng(0))
     amplitude = {
         name: recordings_of(simulation)[0]["b"].channels["radar"].paths.amplitude
-        for name, simulation in (("plain", plain), ("looking", replace(plain, nodes=nodes)))
+        for name, simulation in (("plain", omnidirectional), ("looking", replace(omnidirectional, nodes=nodes)))
     }
     gain = 1.0
     for name, widths in (("a", (30, 40)), ("b", (50, 90))):
-        path = plain.flights[0].tracks[name].position(np.arange(6) / 500.0)
-        east, north, up = np.moveaxis(ORIGIN.enu(standing.position_m)[None] - path[:, None], -1, 0)
-        bearing, above = np.degrees(np.arctan2(east, north)), np.degrees(np.arctan2(up, np.hypot(east, north)))
-        db = -12.0412 * ((bearing / widths[0]) ** 2 + (above / widths[1]) ** 2)
+        path = omnidirectional.flights[0].tracks[name].position(np.arange(6) / 500.0)
+        east, north, up = np.moveaxis(ORIGIN.enu(targets.position_m)[None] - path[:, None], -1, 0)
+        bearing, elevation = np.degrees(np.arctan2(east, north)), np.degrees(np.arctan2(up, np.hypot(east, north)))
+        db = -12.0412 * ((bearing / widths[0]) ** 2 + (elevation / widths[1]) ** 2)
         gain = gain * 10 ** (db / 20)
     assert gain.max() / gain.min() > 1.2
     assert_allclose(amplitude["looking"] / amplitude["plain"], gain, rtol=1e-3)
 
 
-def test_a_wobbling_flight_has_the_spread_asked_for_and_its_log_resolves_it():
+def test_wobble_has_the_requested_deviation_and_is_resolved_by_the_log():
     straight = Straight((0.0, 0.0, 5.0), (1.0, 0.0, 0.0))
-    shaken = Wobble(sigma_m=(0.02, 0.03, 0.04)).around(straight, 600.0, np.random.default_rng(0))
+    wobbling = Wobble(sigma_m=(0.02, 0.03, 0.04)).around(straight, 600.0, np.random.default_rng(0))
     fine = np.arange(0, 600, 0.025)
-    away = shaken.position(fine) - straight.position(fine)
-    assert away.std(axis=0) == pytest.approx([0.02, 0.03, 0.04], rel=0.15)
+    deviation = wobbling.position(fine) - straight.position(fine)
+    assert deviation.std(axis=0) == pytest.approx([0.02, 0.03, 0.04], rel=0.15)
     coarse = np.arange(0, 600.1, 0.1)
-    linear = np.interp(fine, coarse, shaken.position(coarse)[:, 2])
-    assert abs(linear - shaken.position(fine)[:, 2]).max() < 1e-3
+    linear = np.interp(fine, coarse, wobbling.position(coarse)[:, 2])
+    assert abs(linear - wobbling.position(fine)[:, 2]).max() < 1e-3
 
 
-def test_a_real_flight_log_is_flown_point_by_point():
+def test_waypoints_of_a_real_log_are_reproduced():
     log = SHARED / "dji_rtk_ansfl" / "GTExtended.csv"
     if not log.exists():
         pytest.skip("dji_rtk_ansfl is not here")
@@ -233,7 +233,7 @@ def test_a_real_flight_log_is_flown_point_by_point():
     assert path.attitude(np.zeros(1))[0] == pytest.approx([0.0, 0.0, course])
 
 
-def test_extended_targets_and_clutter_scatter_as_much_as_they_say():
+def test_extended_targets_and_clutter_have_the_stated_amplitude():
     rng = np.random.default_rng(0)
     line = Line((0, 0, 0), (4, 0, 0), 9, amplitude=2.0).points(rng)
     plate = Plate((0, 0, 0), (1, 0, 0), (0, 1, 1), (3, 4), amplitude=1j).points(rng)

@@ -1,4 +1,4 @@
-"""Simulated recordings that run through: frames where truth says, noise between them."""
+"""Simulated continuous recordings: frames at the true samples, noise between them."""
 
 import json
 from dataclasses import replace
@@ -17,7 +17,7 @@ from apertura.simulation.synthesis import full_scale, samples
 
 
 def stream_of(simulation, name, **settings):
-    """A node's continuous recording as complex samples per channel, and its channels."""
+    """Return the continuous recording of a node, complex per channel, with channels, pulse times and blocks."""
     flight = simulation.flights[0]
     channels = recordings_of(simulation)[0][name].channels
     time_s = np.arange(flight.pulses) / simulation.waveform.prf_hz
@@ -30,23 +30,23 @@ def stream_of(simulation, name, **settings):
 FRAMING = Framing(register_bits=7, chip_samples=4, counter_bits=3, bit_chips=5, guard_samples=16)
 
 
-def test_a_continuous_recording_cut_at_its_pulses_is_the_triggered_recording():
+def test_continuous_recording_cut_at_its_pulses_equals_the_triggered_one():
     simulation = small_simulation(framing=FRAMING, continuous=True)
     stream, channels, time_s, _ = stream_of(simulation, "a")
     triggered = samples(channels["radar"], None)
     starts = pulse_samples(channels["radar"], time_s)
-    assert_allclose(starts, np.rint(starts), atol=1e-6)  # the transmitter's own pulses fall on its samples
+    assert_allclose(starts, np.rint(starts), atol=1e-6)  # pulses of the transmitter coincide with its samples
     cut = np.stack([stream[start : start + 224, 0] for start in np.rint(starts).astype(int)])
     gain = (cut * triggered.conj()).sum() / (abs(triggered) ** 2).sum()
     assert abs(np.angle(gain)) < 1e-4
     assert_allclose(cut / gain, triggered, atol=1e-3 * abs(triggered).max())
 
 
-def test_the_preamble_lies_where_truth_says_and_the_payload_counts_and_wraps():
-    late = Impairments(
+def test_preamble_starts_at_the_true_sample_and_payload_counts_frames():
+    impairments = Impairments(
         clock=Clock.of_ppm(1.0, carrier_hz=1.2e9 + 4567e3, sample_rate_hz=32e6), timing=Timing(offset_s=7e-6)
     )
-    simulation = small_simulation(framing=FRAMING, continuous=True, secondary=late, first_frame=5)
+    simulation = small_simulation(framing=FRAMING, continuous=True, secondary=impairments, first_frame=5)
     stream, channels, time_s, _ = stream_of(simulation, "b")
     chips = np.repeat(FRAMING.preamble().astype(float), 4)
     mixed = stream[:, 1] * np.exp(-2j * np.pi * 32 * 250e3 / 32e6 * np.arange(len(stream)))
@@ -64,49 +64,51 @@ def test_the_preamble_lies_where_truth_says_and_the_payload_counts_and_wraps():
         assert int("".join(map(str, bits[:3])), 2) == (5 + pulse) % 8
 
 
-def test_a_continuous_recording_is_the_definition_on_the_nodes_own_clock():
-    """One oscillator and one sampling clock run through; frames arrive where they arrive."""
-    late = Impairments(clock=Clock(cfo_hz=1234.0, sfo_hz=345.0), timing=Timing(offset_s=7.3e-6))
-    simulation = small_simulation(framing=FRAMING, continuous=True, secondary=late, first_frame=5)
+def test_continuous_recording_equals_the_definition_on_the_node_clock():
+    """One continuous oscillator and sampling clock; frames arrive at arbitrary sample phases."""
+    impairments = Impairments(clock=Clock(cfo_hz=1234.0, sfo_hz=345.0), timing=Timing(offset_s=7.3e-6))
+    simulation = small_simulation(framing=FRAMING, continuous=True, secondary=impairments, first_frame=5)
     stream, channels, time_s, _ = stream_of(simulation, "b")
     waveform, paths = channels["radar"].waveform, channels["radar"].paths
     rate = 32e6 + 345.0
     index = np.arange(len(stream))
-    begun_s = -1e-3 + 7.3e-6
+    start_s = -1e-3 + 7.3e-6
     for pulse in (0, 5):
-        middle = round((time_s[pulse] - begun_s) * rate)
-        near = index[middle - 1800 : middle + 260]
-        since = begun_s + near / rate - time_s[pulse]
-        expected = np.zeros(len(near), complex)
+        middle = round((time_s[pulse] - start_s) * rate)
+        indices = index[middle - 1800 : middle + 260]
+        since_pulse_s = start_s + indices / rate - time_s[pulse]
+        expected = np.zeros(len(indices), complex)
         for delay, amplitude in zip(paths.delay_s[pulse], paths.amplitude[pulse], strict=True):
-            here = since - delay
-            turns = np.outer(here - 2e-6, waveform.baseband_hz)
-            symbol = ((here >= 0) & (here < 7e-6)) * (np.exp(2j * np.pi * turns) @ waveform.codes)
-            sent = symbol + FRAMING.signal(waveform, 5 + pulse, here)
-            expected += amplitude * np.exp(-2j * np.pi * waveform.carrier_hz * delay) * sent
-        expected *= np.exp(-2j * np.pi * 1234.0 * near / rate)
+            since_arrival_s = since_pulse_s - delay
+            cycles = np.outer(since_arrival_s - 2e-6, waveform.baseband_hz)
+            symbol = ((since_arrival_s >= 0) & (since_arrival_s < 7e-6)) * (
+                np.exp(2j * np.pi * cycles) @ waveform.codes
+            )
+            frame = symbol + FRAMING.signal(waveform, 5 + pulse, since_arrival_s)
+            expected += amplitude * np.exp(-2j * np.pi * waveform.carrier_hz * delay) * frame
+        expected *= np.exp(-2j * np.pi * 1234.0 * indices / rate)
         scale = full_scale(channels["radar"], Adc(16, 20.0)) / 2**15
-        assert_allclose(stream[near, 0] * scale, expected, atol=1e-3 * abs(expected).max())
+        assert_allclose(stream[indices, 0] * scale, expected, atol=1e-3 * abs(expected).max())
 
 
-def test_a_smaller_block_changes_nothing_but_the_memory():
+def test_block_size_does_not_change_the_samples():
     noisy = Impairments(radar_snr_db=20.0, sidelink_snr_db=20.0)
     simulation = small_simulation(framing=FRAMING, continuous=True, secondary=noisy)
     whole, _, _, blocks = stream_of(simulation, "b")
-    pieces, _, _, small = stream_of(simulation, "b", block_samples=3000)
-    assert (pieces == whole).all()
-    assert max(map(len, small)) <= 3000 < max(map(len, blocks))
+    blockwise, _, _, small_blocks = stream_of(simulation, "b", block_samples=3000)
+    assert (blockwise == whole).all()
+    assert max(map(len, small_blocks)) <= 3000 < max(map(len, blocks))
 
 
-def test_nothing_is_missed_by_a_recorder_that_runs_through():
-    careless = Impairments(missed_fraction=0.5)
+def test_continuous_recorder_misses_no_pulse():
+    lossy = Impairments(missed_fraction=0.5)
     for continuous in (False, True):
-        simulation = small_simulation(continuous=continuous, secondary=careless, pulses=50)
+        simulation = small_simulation(continuous=continuous, secondary=lossy, pulses=50)
         kept = recordings_of(simulation)[0]["b"].draw.kept
         assert kept.all() == continuous
 
 
-def test_between_frames_there_is_noise_alone():
+def test_samples_between_frames_are_noise():
     noisy = Impairments(radar_snr_db=20.0, sidelink_snr_db=20.0)
     simulation = small_simulation(framing=FRAMING, continuous=True, secondary=noisy)
     stream, channels, _, _ = stream_of(simulation, "b")
@@ -118,17 +120,17 @@ def test_between_frames_there_is_noise_alone():
     assert len(stream) == 6 * 64000
 
 
-def test_a_continuous_folder_is_one_segment_that_describes_its_frames(tmp_path):
+def test_continuous_recording_is_one_segment_with_framing_metadata(tmp_path):
     simulation = small_simulation(framing=FRAMING, continuous=True, secondary=Impairments(time_tag=TimeTag(2e-3)))
     root = simulate(tmp_path / "c", simulation, seed=0)
     recording = sigmf.fromfile(str(root / "raw/f01/b.sigmf-meta"))
     recording.validate()
     (segment,) = recording.get_captures()
     assert segment["core:datetime"] == "2025-05-14T09:30:00.001000Z"  # 1 ms before the first pulse, 2 ms late
-    described = recording.get_global_field("apertura:framing")
-    chips = np.load(root / described["preamble"])
+    framing = recording.get_global_field("apertura:framing")
+    chips = np.load(root / framing["preamble"])
     assert set(chips.tolist()) == {-1, 1}
-    assert described["chip_samples"] == 4
+    assert framing["chip_samples"] == 4
     truth = json.loads((root / "truth.json").read_text())["flights"]["f01"]["nodes"]["b"]
     assert len(truth["pulse_start_sample"]) == 6
 

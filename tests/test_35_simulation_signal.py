@@ -1,4 +1,4 @@
-"""Samples of the simulator against physics written down another way."""
+"""Simulated samples, compared with independent formulations of the signal model."""
 
 from dataclasses import replace
 
@@ -45,7 +45,7 @@ def small_waveform(carrier_is="band_start", subcarriers=200):
 
 
 def two_uavs(pulses=6):
-    """A transmitter and, 4.7 m ahead of it, a receiver; two targets; metres in a local frame."""
+    """Return two targets and the geometry of a transmitter and a receiver 4.7 m ahead of it, metres, local frame."""
     along = np.linspace(-1.0, 1.0, pulses)
     sender = np.column_stack([along, np.zeros(pulses), np.full(pulses, 5.0)])
     receiver = sender + np.array([4.7, 0.3, 0.1])
@@ -54,15 +54,15 @@ def two_uavs(pulses=6):
 
 
 def recovered(waveform, captures):
-    """Transfer functions by nothing but a DFT and the code."""
+    """Return the transfer functions of captures from a DFT and the code."""
     window = captures[:, waveform.prefix_samples : waveform.prefix_samples + waveform.dft_samples]
     spectrum = np.fft.fft(window, axis=1) / waveform.dft_samples
-    numbers = np.rint(waveform.baseband_hz / waveform.subcarrier_spacing_hz).astype(int)
-    return spectrum[:, numbers] / waveform.codes
+    bins = np.rint(waveform.baseband_hz / waveform.subcarrier_spacing_hz).astype(int)
+    return spectrum[:, bins] / waveform.codes
 
 
 def by_definition(channel, pulse, count):
-    """Eq. of the transmitted symbol, delayed, seen by a receiver with its own clock; one path at a time."""
+    """Return samples of the delayed symbol on the clock of the receiver, summed path by path."""
     waveform = channel.waveform
     rate = waveform.sample_rate_hz + channel.sfo_hz
     index = np.arange(count)
@@ -72,11 +72,11 @@ def by_definition(channel, pulse, count):
     for delay, amplitude, drift in zip(
         paths.delay_s[pulse], paths.amplitude[pulse], paths.delay_rate[pulse], strict=True
     ):
-        late = delay + drift * since_start
+        path_delay = delay + drift * since_start
         symbol_time = since_start - waveform.cyclic_prefix_s
-        turns = np.outer(symbol_time, waveform.baseband_hz) - np.outer(late, waveform.frequency_hz)
-        there = (since_start >= delay - 1e-14) & (since_start < delay + waveform.duration_s - 1e-14)
-        total += amplitude * there * (np.exp(2j * np.pi * turns) @ (waveform.codes * channel.response))
+        cycles = np.outer(symbol_time, waveform.baseband_hz) - np.outer(path_delay, waveform.frequency_hz)
+        is_received = (since_start >= delay - 1e-14) & (since_start < delay + waveform.duration_s - 1e-14)
+        total += amplitude * is_received * (np.exp(2j * np.pi * cycles) @ (waveform.codes * channel.response))
     oscillator = waveform.carrier_hz * channel.start_s[pulse] - channel.cfo_hz * index / rate
     return total * np.exp(1j * (2 * np.pi * oscillator + channel.phase_rad[pulse]))
 
@@ -107,34 +107,36 @@ def test_samples_equal_the_definition_summed_path_by_path(carrier_is, sfo_hz, cf
 def test_recovered_phase_is_that_of_the_path_length():
     waveform = small_waveform()
     scatterers, geometry = two_uavs()
-    one = Scatterers(scatterers.position_m[:1], scatterers.amplitude[:1])
-    seen = observe(waveform, one, geometry, np.random.default_rng(0), receiver=Impairments())
-    transfer = recovered(waveform, samples(seen.channels["radar"], None))
-    path_m = np.linalg.norm(geometry.radar_tx - one.position_m, axis=1)
-    path_m += np.linalg.norm(geometry.radar_rx - one.position_m, axis=1)
+    target = Scatterers(scatterers.position_m[:1], scatterers.amplitude[:1])
+    observation = observe(waveform, target, geometry, np.random.default_rng(0), receiver=Impairments())
+    transfer = recovered(waveform, samples(observation.channels["radar"], None))
+    path_m = np.linalg.norm(geometry.radar_tx - target.position_m, axis=1)
+    path_m += np.linalg.norm(geometry.radar_rx - target.position_m, axis=1)
     expected = np.exp(-2j * np.pi * waveform.frequency_hz * path_m[:, None] / C)
     assert abs(np.angle(transfer / expected)).max() < 1e-6
 
 
 def test_fast_transfer_functions_equal_the_dft_of_samples():
     waveform = small_waveform("band_centre")
-    wrong = Impairments(carrier_phase=UniformPhase(), timing=Timing(half_width_s=20e-9), radar_ripple=Ripple(1.0, 3e-8))
-    seen = observe(waveform, *two_uavs(), np.random.default_rng(0), receiver=wrong)
-    assert seen.channels.keys() == {"radar", "sidelink"}
-    for channel in seen.channels.values():
+    impairments = Impairments(
+        carrier_phase=UniformPhase(), timing=Timing(half_width_s=20e-9), radar_ripple=Ripple(1.0, 3e-8)
+    )
+    observation = observe(waveform, *two_uavs(), np.random.default_rng(0), receiver=impairments)
+    assert observation.channels.keys() == {"radar", "sidelink"}
+    for channel in observation.channels.values():
         fast = transfer_functions(channel, None)
         assert_allclose(recovered(waveform, samples(channel, None)), fast, atol=1e-11 * abs(fast).max())
 
 
 @pytest.mark.parametrize("carrier_is", ["band_start", "band_centre"])
-def test_periodic_samples_are_the_exact_ones_wherever_all_echoes_are_there(carrier_is):
-    """From the last arrival to the first end; an echo that the window would not hold whole is left out."""
+def test_periodic_samples_are_exact_where_all_echoes_overlap(carrier_is):
+    """From the last arrival to the first end; an echo not entirely inside the window is omitted."""
     waveform = small_waveform(carrier_is)
-    wrong = Impairments(
+    impairments = Impairments(
         carrier_phase=UniformPhase(), timing=Timing(half_width_s=20e-9), clock=Clock(cfo_hz=3e4), doppler=False
     )
-    seen = observe(waveform, *two_uavs(), np.random.default_rng(0), receiver=wrong)
-    for channel in seen.channels.values():
+    observation = observe(waveform, *two_uavs(), np.random.default_rng(0), receiver=impairments)
+    for channel in observation.channels.values():
         arrival = (channel.paths.delay_s - channel.start_s[:, None]) * waveform.sample_rate_hz
         first, last = int(arrival.max()) + 1, int(arrival.min() + waveform.duration_s * waveform.sample_rate_hz) - 1
         exact, fast = samples(channel, None), periodic_samples(channel, None, np.arange(6))
@@ -145,40 +147,47 @@ def test_periodic_samples_are_the_exact_ones_wherever_all_echoes_are_there(carri
         assert_allclose(periodic_samples(late, None, np.arange(6)), fast)
 
 
-def test_periodic_synthesis_is_refused_where_the_symbol_is_not_periodic():
+def test_periodic_synthesis_is_refused_for_a_non_periodic_symbol():
     paths = Paths(np.full((2, 1), 1e-7), np.ones((2, 1), complex), np.zeros((2, 1)))
     channel = Channel(small_waveform(), paths, np.ones(200, complex), np.zeros(2), np.zeros(2))
-    for wrong in (replace(channel, sfo_hz=10.0), replace(channel, paths=replace(paths, delay_rate=paths.delay_s))):
+    for non_periodic in (
+        replace(channel, sfo_hz=10.0),
+        replace(channel, paths=replace(paths, delay_rate=paths.delay_s)),
+    ):
         with pytest.raises(ValueError, match="needs exact synthesis"):
-            periodic_samples(wrong, None, np.arange(2))
+            periodic_samples(non_periodic, None, np.arange(2))
 
 
-def test_noise_of_periodic_samples_is_as_strong_as_asked():
+def test_noise_of_periodic_samples_has_the_requested_variance():
     paths = Paths(np.full((40, 1), 1e-7), np.zeros((40, 1), complex), np.zeros((40, 1)))
     channel = Channel(small_waveform(), paths, np.ones(200), np.zeros(40), np.zeros(40), noise_variance=9.0)
-    found = periodic_samples(channel, np.random.default_rng(1), np.arange(40))
-    assert np.mean(np.abs(found) ** 2) == pytest.approx(9.0, rel=0.03)
+    noise = periodic_samples(channel, np.random.default_rng(1), np.arange(40))
+    assert np.mean(np.abs(noise) ** 2) == pytest.approx(9.0, rel=0.03)
 
 
 def test_sidelink_division_removes_phase_start_and_transmit_ripple_exactly():
     waveform = small_waveform()
-    wrong = Impairments(carrier_phase=UniformPhase(), timing=Timing(offset_s=30e-9, half_width_s=20e-9))
-    sender = Impairments(transmit_ripple=Ripple(2.0, 3e-8))
+    receiver_errors = Impairments(carrier_phase=UniformPhase(), timing=Timing(offset_s=30e-9, half_width_s=20e-9))
+    transmitter_errors = Impairments(transmit_ripple=Ripple(2.0, 3e-8))
 
     def ratio(receiver, transmitter):
-        seen = observe(waveform, *two_uavs(), np.random.default_rng(0), receiver=receiver, transmitter=transmitter)
-        radar, sidelink = (recovered(waveform, samples(seen.channels[name], None)) for name in ("radar", "sidelink"))
+        observation = observe(
+            waveform, *two_uavs(), np.random.default_rng(0), receiver=receiver, transmitter=transmitter
+        )
+        radar, sidelink = (
+            recovered(waveform, samples(observation.channels[name], None)) for name in ("radar", "sidelink")
+        )
         return radar, radar / sidelink
 
     clean, clean_ratio = ratio(Impairments(), Impairments())
-    dirty, dirty_ratio = ratio(wrong, sender)
-    assert abs(dirty / clean - 1).max() > 1
-    assert_allclose(dirty_ratio, clean_ratio, rtol=1e-9)
-    _, rippled = ratio(replace(wrong, radar_ripple=Ripple(2.0, 3e-8)), sender)
+    impaired, impaired_ratio = ratio(receiver_errors, transmitter_errors)
+    assert abs(impaired / clean - 1).max() > 1
+    assert_allclose(impaired_ratio, clean_ratio, rtol=1e-9)
+    _, rippled = ratio(replace(receiver_errors, radar_ripple=Ripple(2.0, 3e-8)), transmitter_errors)
     assert abs(rippled / clean_ratio - 1).max() > 0.1
 
 
-def test_nothing_is_there_before_the_first_echo_or_after_the_last():
+def test_samples_before_the_first_and_after_the_last_echo_are_zero():
     waveform = small_waveform()
     paths = Paths(np.array([[100e-9, 300e-9]]), np.ones((1, 2), complex), np.zeros((1, 2)))
     channel = Channel(waveform, paths, np.ones(200), np.zeros(1), np.zeros(1))
@@ -188,14 +197,14 @@ def test_nothing_is_there_before_the_first_echo_or_after_the_last():
     assert captured[first] > 0 < captured[end - 1]
 
 
-def test_cfo_of_a_tenth_of_the_spacing_costs_what_the_sinc_says():
+def test_cfo_loss_follows_the_sinc():
     waveform = small_waveform()
     _, geometry = two_uavs()
     point = Scatterers(np.array([[0.0, 11.0, 0.0]]), np.ones(1, complex))
 
     def matched(clock):
-        seen = observe(waveform, point, geometry, np.random.default_rng(0), receiver=Impairments(clock=clock))
-        channel = seen.channels["radar"]
+        observation = observe(waveform, point, geometry, np.random.default_rng(0), receiver=Impairments(clock=clock))
+        channel = observation.channels["radar"]
         ideal = transfer_functions(channel, None)
         return abs((recovered(waveform, samples(channel, None)) * ideal.conj()).mean() / (abs(ideal) ** 2).mean())
 
@@ -204,9 +213,9 @@ def test_cfo_of_a_tenth_of_the_spacing_costs_what_the_sinc_says():
         assert loss == pytest.approx(20 * np.log10(np.sinc(share)), abs=0.1)
 
 
-def test_a_fast_sampling_clock_moves_the_symbol_by_its_share_of_the_elapsed_time():
+def test_sampling_clock_offset_delays_the_symbol_in_proportion_to_time():
     waveform = small_waveform()
-    one = Channel(
+    channel = Channel(
         waveform,
         Paths(np.array([[50e-9]]), np.ones((1, 1), complex), np.zeros((1, 1))),
         np.ones(200),
@@ -214,33 +223,33 @@ def test_a_fast_sampling_clock_moves_the_symbol_by_its_share_of_the_elapsed_time
         np.zeros(1),
         sfo_hz=256e6 * 20e-6,
     )
-    transfer = recovered(waveform, samples(one, None))[0]
-    ideal = transfer_functions(one, None)[0]
+    transfer = recovered(waveform, samples(channel, None))[0]
+    ideal = transfer_functions(channel, None)[0]
     slope = np.polyfit(waveform.baseband_hz, np.unwrap(np.angle(transfer / ideal)), 1)[0]
     middle_s = waveform.cyclic_prefix_s + 0.5e-6
     assert slope == pytest.approx(-2 * np.pi * 20e-6 * middle_s, rel=0.02)
 
 
 @pytest.mark.parametrize("name", ["radar", "sidelink"])
-def test_noise_in_a_subcarrier_is_what_the_snr_says(name):
+def test_subcarrier_noise_matches_the_snr(name):
     waveform = small_waveform()
     noisy = Impairments(radar_snr_db=10.0, sidelink_snr_db=10.0, sidelink_gain_db=0.0)
-    seen = observe(waveform, *two_uavs(200), np.random.default_rng(0), receiver=noisy)
-    channel = seen.channels[name]
+    observation = observe(waveform, *two_uavs(200), np.random.default_rng(0), receiver=noisy)
+    channel = observation.channels[name]
     clean = recovered(waveform, samples(channel, None))
-    error = recovered(waveform, samples(channel, seen.noise[name])) - clean
+    error = recovered(waveform, samples(channel, observation.noise[name])) - clean
     snr_db = 10 * np.log10((abs(clean) ** 2).mean() / (abs(error) ** 2).mean())
     assert snr_db == pytest.approx(10.0, abs=0.1)
 
 
 def test_quantisation_noise_falls_by_6_02_db_per_bit():
     waveform = small_waveform()
-    seen = observe(waveform, *two_uavs(20), np.random.default_rng(0), receiver=Impairments())
-    clean = samples(seen.channels["radar"], None)[:, 30:]
+    observation = observe(waveform, *two_uavs(20), np.random.default_rng(0), receiver=Impairments())
+    clean = samples(observation.channels["radar"], None)[:, 30:]
     levels_db = []
     for bits in (8, 10, 12):
         adc = Adc(bits, backoff_db=14.0)
-        scale = full_scale(seen.channels["radar"], adc)
+        scale = full_scale(observation.channels["radar"], adc)
         counts = digitize(clean, adc, scale).astype(float)
         error = (counts[..., 0] + 1j * counts[..., 1]) * scale / 2 ** (bits - 1) - clean
         levels_db.append(10 * np.log10((abs(error) ** 2).mean() / scale**2))
@@ -251,23 +260,23 @@ def test_quantisation_noise_falls_by_6_02_db_per_bit():
 
 def test_too_little_backoff_clips_at_full_scale():
     waveform = small_waveform()
-    seen = observe(waveform, *two_uavs(20), np.random.default_rng(0), receiver=Impairments())
-    clean = samples(seen.channels["radar"], None)
+    observation = observe(waveform, *two_uavs(20), np.random.default_rng(0), receiver=Impairments())
+    clean = samples(observation.channels["radar"], None)
     for backoff_db, clips in ((14.0, False), (3.0, True)):
         adc = Adc(14, backoff_db)
-        counts = digitize(clean, adc, full_scale(seen.channels["radar"], adc))
+        counts = digitize(clean, adc, full_scale(observation.channels["radar"], adc))
         assert ((counts == 8191) | (counts == -8192)).any() == clips
         assert counts.max() <= 8191
         assert counts.min() >= -8192
 
 
-def test_the_rms_lies_the_backoff_under_full_scale():
+def test_rms_is_below_full_scale_by_the_backoff():
     waveform = small_waveform()
     noisy = Impairments(radar_snr_db=3.0, leakage=Leakage(10.0))
-    seen = observe(waveform, *two_uavs(50), np.random.default_rng(0), receiver=noisy)
+    observation = observe(waveform, *two_uavs(50), np.random.default_rng(0), receiver=noisy)
     adc = Adc(14, 14.0)
-    clean = samples(seen.channels["radar"], seen.noise["radar"])[:, 64:320]
-    counts = digitize(clean, adc, full_scale(seen.channels["radar"], adc)).astype(float)
+    clean = samples(observation.channels["radar"], observation.noise["radar"])[:, 64:320]
+    counts = digitize(clean, adc, full_scale(observation.channels["radar"], adc)).astype(float)
     assert 20 * np.log10(counts.std() / 8192) == pytest.approx(-14.0, abs=0.1)
 
 
@@ -276,28 +285,28 @@ def profile_db(transfer):
     return 10 * np.log10(power / power.max())
 
 
-def test_sidelink_reflection_and_leakage_stand_where_and_as_high_as_set():
+def test_sidelink_reflection_and_leakage_have_the_set_path_and_level():
     waveform = small_waveform()
-    wrong = Impairments(sidelink_multipath=(Reflection(12.0, 0.1),), leakage=Leakage(20.0, 9.0))
-    seen = observe(waveform, *two_uavs(1), np.random.default_rng(0), receiver=wrong)
+    impairments = Impairments(sidelink_multipath=(Reflection(12.0, 0.1),), leakage=Leakage(20.0, 9.0))
+    observation = observe(waveform, *two_uavs(1), np.random.default_rng(0), receiver=impairments)
     cell_m = C / 1e6 / 4096
-    sidelink = profile_db(transfer_functions(seen.channels["sidelink"], None))
+    sidelink = profile_db(transfer_functions(observation.channels["sidelink"], None))
     assert sidelink[int(np.argmax(sidelink)) + round(12.0 / cell_m)] == pytest.approx(-20.0, abs=1.0)
-    radar = profile_db(transfer_functions(seen.channels["radar"], None))
+    radar = profile_db(transfer_functions(observation.channels["radar"], None))
     leak_m = np.linalg.norm([4.7, 0.3, 0.1]) + 9.0
     assert np.argmax(radar) * cell_m == pytest.approx(leak_m, abs=0.3)
 
 
-def test_drawn_impairments_have_the_statistics_asked_for():
+def test_drawn_impairments_have_the_requested_statistics():
     time_s = np.arange(20000) / 100
-    wrong = Impairments(
+    impairments = Impairments(
         carrier_phase=PhaseWalk(0.5),
         timing=Timing(1e-9, 3e-9, 2.0),
         missed_fraction=0.1,
         sidelink_blockage=Blockage(0.2, mean_pulses=8.0),
         localization=Localization(0.02, window_s=1.0),
     )
-    drawn = draw_impairments(wrong, time_s, 1e9, np.random.default_rng(0))
+    drawn = draw_impairments(impairments, time_s, 1e9, np.random.default_rng(0))
     assert 1 - drawn.kept.mean() == pytest.approx(0.1, abs=0.01)
     assert np.diff(drawn.phase_rad).std() == pytest.approx(0.5 / np.sqrt(100), rel=0.03)
     assert drawn.start_s.mean() == pytest.approx(1e-9, abs=0.1e-9)
@@ -307,52 +316,56 @@ def test_drawn_impairments_have_the_statistics_asked_for():
     assert drawn.blocked.sum() / bursts == pytest.approx(8.0, rel=0.15)
     assert drawn.position_error_m.std(axis=0) == pytest.approx(np.full(3, 0.02), rel=0.1)
     neighbours = np.corrcoef(drawn.position_error_m[:-50, 0], drawn.position_error_m[50:, 0])[0, 1]
-    assert neighbours == pytest.approx(0.5, abs=0.1)  # half the window shared
+    assert neighbours == pytest.approx(0.5, abs=0.1)  # half of the averaging window is shared
 
 
-def test_switching_one_impairment_on_leaves_the_others_as_drawn():
+def test_enabling_one_impairment_leaves_the_others_unchanged():
     time_s = np.arange(100) / 10
     few = Impairments(missed_fraction=0.3, timing=Timing(half_width_s=1e-9))
     more = replace(few, carrier_phase=UniformPhase(), localization=Localization(0.1), sidelink_blockage=Blockage(0.3))
-    first, second = (draw_impairments(wrong, time_s, 1e9, np.random.default_rng(3)) for wrong in (few, more))
+    first, second = (
+        draw_impairments(impairments, time_s, 1e9, np.random.default_rng(3)) for impairments in (few, more)
+    )
     assert (first.kept == second.kept).all()
     assert (first.start_s == second.start_s).all()
     assert second.phase_rad.std() > 1
 
 
-def test_localization_error_moves_only_the_antennas_named():
-    wrong = Impairments(localization=Localization(0.05, points=("radar_rx",)))
+def test_localization_error_displaces_only_the_listed_antennas():
+    impairments = Impairments(localization=Localization(0.05, points=("radar_rx",)))
     scatterers, logged = two_uavs()
-    seen = observe(
-        small_waveform(), scatterers, logged, np.random.default_rng(0), receiver=wrong, transmitter=Impairments()
+    observation = observe(
+        small_waveform(), scatterers, logged, np.random.default_rng(0), receiver=impairments, transmitter=Impairments()
     )
-    assert_allclose(logged.radar_rx - seen.truth.radar_rx, seen.draw.position_error_m, atol=1e-12)
-    assert (seen.truth.sidelink_rx == logged.sidelink_rx).all()
-    assert (seen.truth.radar_tx == logged.radar_tx).all()
+    assert_allclose(logged.radar_rx - observation.truth.radar_rx, observation.draw.position_error_m, atol=1e-12)
+    assert (observation.truth.sidelink_rx == logged.sidelink_rx).all()
+    assert (observation.truth.radar_tx == logged.radar_tx).all()
 
 
-def test_doppler_turns_the_echo_within_the_pulse():
+def test_doppler_rotates_the_phase_within_the_pulse():
     waveform = small_waveform()
     scatterers, geometry = two_uavs()
-    one = Scatterers(scatterers.position_m[:1], scatterers.amplitude[:1])
+    target = Scatterers(scatterers.position_m[:1], scatterers.amplitude[:1])
     fast = replace(geometry, tx_velocity=np.tile([0, 200.0, 0], (6, 1)), rx_velocity=np.tile([0, 200.0, 0], (6, 1)))
     still, moving = (
         samples(
-            observe(waveform, one, fast, np.random.default_rng(0), receiver=Impairments(doppler=on)).channels["radar"],
+            observe(waveform, target, fast, np.random.default_rng(0), receiver=Impairments(doppler=on)).channels[
+                "radar"
+            ],
             None,
         )[0, 60:380]
         for on in (False, True)
     )
-    turn = np.unwrap(np.angle(moving / still))
-    rate_rad_s = np.polyfit(np.arange(320) / 256e6, turn, 1, w=abs(still))[0]
-    sight = [(geometry.radar_tx - one.position_m)[0], (geometry.radar_rx - one.position_m)[0]]
+    phase = np.unwrap(np.angle(moving / still))
+    rate_rad_s = np.polyfit(np.arange(320) / 256e6, phase, 1, w=abs(still))[0]
+    sight = [(geometry.radar_tx - target.position_m)[0], (geometry.radar_rx - target.position_m)[0]]
     closing = sum(200.0 * line[1] / np.linalg.norm(line) for line in sight)
     middle_hz = 1.2e9 + 100e6
     assert rate_rad_s == pytest.approx(-2 * np.pi * middle_hz * closing / C, rel=0.02)
 
 
 @pytest.mark.parametrize(
-    ("wrong", "loss_db"),
+    ("impairments", "loss_db"),
     [
         (Impairments(carrier_phase=UniformPhase(np.pi / 4)), -0.92),
         (Impairments(carrier_phase=UniformPhase(np.pi / 2)), -3.96),
@@ -360,25 +373,25 @@ def test_doppler_turns_the_echo_within_the_pulse():
         (Impairments(timing=Timing(half_width_s=0.2e-9)), -5.2),
     ],
 )
-def test_uncorrected_loss_is_that_of_the_independent_model(wrong, loss_db):
+def test_uncorrected_loss_equals_that_of_an_independent_model(impairments, loss_db):
     scatterers, geometry = paper_scene(pulses=600)
     waveform = replace(
         paper_waveform(), codes=paper_waveform().codes[::64], subcarrier_spacing_hz=6.4e6, sample_rate_hz=1.024e9
     )
-    clean, dirty = (
+    clean, impaired = (
         transfer_functions(
             observe(
                 waveform, scatterers, geometry, np.random.default_rng(2), receiver=receiver, sidelink=False
             ).channels["radar"],
             None,
         )
-        for receiver in (Impairments(), wrong)
+        for receiver in (Impairments(), impairments)
     )
     losses = []
     for point in scatterers.position_m:
         path_m = 2 * np.linalg.norm(geometry.radar_tx - point, axis=1)
         steering = np.exp(2j * np.pi * waveform.frequency_hz * path_m[:, None] / C)
-        losses.append(20 * np.log10(abs((dirty * steering).sum()) / abs((clean * steering).sum())))
+        losses.append(20 * np.log10(abs((impaired * steering).sum()) / abs((clean * steering).sum())))
     assert np.mean(losses) == pytest.approx(loss_db, abs=0.5)
 
 
@@ -390,7 +403,7 @@ def test_frame_counter_wraps_and_its_complement_follows():
     assert (second == -first).all()
 
 
-def test_the_preamble_correlates_with_itself_alone():
+def test_preamble_autocorrelation_has_one_peak():
     chips = Framing(register_bits=7).preamble().astype(float)
     circular = np.fft.ifft(abs(np.fft.fft(chips)) ** 2).real
     assert circular[0] == pytest.approx(127)

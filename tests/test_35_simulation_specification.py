@@ -1,4 +1,4 @@
-"""What a simulation is told: in YAML, in Python, by a preset, and what is wrong with it."""
+"""Specifications of simulations: YAML, Python, presets and their errors."""
 
 import json
 
@@ -27,8 +27,8 @@ from apertura.simulation.waveform import WaveformSpecification
 
 @pytest.mark.quick("demo", "paper", "swarm", "continuous", "flight", "paper-lab")
 @pytest.mark.parametrize("name", list(PRESETS))
-def test_a_preset_keeps_its_echoes_inside_the_prefix_and_its_targets_on_the_grid(name):
-    """In a triggered recording; one that runs through is cut where the pulses are."""
+def test_preset_has_echoes_inside_the_prefix_and_targets_on_the_grid(name):
+    """Triggered recordings; a continuous recording is cut at its pulses."""
     specification = preset(name, pulses=30)
     recordings, campaign = recordings_of(specification)
     waveform = campaign.waveform
@@ -51,14 +51,14 @@ def test_a_preset_keeps_its_echoes_inside_the_prefix_and_its_targets_on_the_grid
     width = widths.get(name, 6.0)
     assert (xmax - xmin, ymax - ymin) == pytest.approx(width if isinstance(width, tuple) else (width, width))
     targets = tuple(target for target in specification.targets if not isinstance(target, Clutter))
-    standing = scatterers(specification.origin, targets, np.random.default_rng(0))
-    x, y, _ = projected_from_ecef(specification.scene.crs, standing.position_m).T
+    points = scatterers(specification.origin, targets, np.random.default_rng(0))
+    x, y, _ = projected_from_ecef(specification.scene.crs, points.position_m).T
     assert ((xmin < x) & (x < xmax) & (ymin < y) & (y < ymax)).all()
 
 
 @pytest.mark.quick("demo", "swarm", "continuous", "flight")
 @pytest.mark.parametrize("name", list(PRESETS))
-def test_a_preset_makes_a_campaign_that_loads_and_whose_files_pass_the_check(tmp_path, name):
+def test_preset_gives_a_campaign_that_loads_and_has_all_files(tmp_path, name):
     root = simulate(tmp_path / "campaign", preset(name, pulses=3))
     campaign = Campaign.load(root)
     require_files(campaign)
@@ -71,7 +71,7 @@ def test_a_preset_makes_a_campaign_that_loads_and_whose_files_pass_the_check(tmp
 
 
 @pytest.mark.parametrize("name", list(PRESETS))
-def test_a_preset_printed_as_yaml_reads_back_as_itself(tmp_path, name):
+def test_preset_printed_as_yaml_reads_back_unchanged(tmp_path, name):
     (tmp_path / "spec.yaml").write_text(specification_text(preset(name)))
     assert read_specification(tmp_path / "spec.yaml") == preset(name)
 
@@ -102,32 +102,32 @@ scene: {crs: "EPSG:32632", half_width_m: 3, spacing_m: 0.1}
 """
 
 
-def test_a_specification_in_yaml_gives_the_bytes_of_the_same_values_in_python(tmp_path):
+def test_yaml_and_python_specifications_give_identical_bytes(tmp_path):
     (tmp_path / "spec.yaml").write_text(SPEC)
-    late = Impairments(carrier_phase=UniformPhase(), radar_snr_db=20, time_tag=TimeTag(1e-3))
+    impairments = Impairments(carrier_phase=UniformPhase(), radar_snr_db=20, time_tag=TimeTag(1e-3))
     tracks = {
         "a": Straight((-2, -11, 5), (5, 0, 0), Wobble()),
         "b": Waypoints((-5, 0, 5), ((-20, -11, 5), (3, -11, 5), (25, -11, 5))),
     }
-    same = CampaignSpecification(
+    specification = CampaignSpecification(
         "by_hand",
         Origin(48.0, 9.0, 500.0),
         WaveformSpecification(64, 1.2e9, 250e3, 5e-6, 2e-6, 32e6, 500),
         (PointTarget((0, 1, 0), 0.5 + 0.5j), Clutter((-1, -1, 1, 1), 0.1)),
-        {"a": SimulatedNode(), "b": SimulatedNode(attitude="none", log_format="pos", impairments=late)},
+        {"a": SimulatedNode(), "b": SimulatedNode(attitude="none", log_format="pos", impairments=impairments)},
         (SimulatedFlight("f01", "a", tracks, 4, start_utc="2025-05-14T10:00:00"),),
         ImageGrid("EPSG:32632", half_width_m=3, spacing_m=0.1),
     )
-    by_hand, in_python = (
-        contents(simulate(tmp_path / name, chosen, seed=3))
-        for name, chosen in (("yaml", tmp_path / "spec.yaml"), ("python", same))
+    from_yaml, from_python = (
+        contents(simulate(tmp_path / name, source, seed=3))
+        for name, source in (("yaml", tmp_path / "spec.yaml"), ("python", specification))
     )
-    assert by_hand == in_python
-    assert b"2025-05-14T10:00:00.00" in by_hand["raw/f01/a.sigmf-meta"]
+    assert from_yaml == from_python
+    assert b"2025-05-14T10:00:00.00" in from_yaml["raw/f01/a.sigmf-meta"]
 
 
 @pytest.mark.parametrize(
-    ("right", "wrong", "complaints"),
+    ("valid", "invalid", "complaints"),
     [
         ("radar_snr_db", "radar_snr", ("nodes.b.impairments.radar_snr: unknown key", "'radar_snr_db'")),
         ("half_width_m", "halfwidth_m", ("scene.halfwidth_m: unknown key", "'half_width_m'")),
@@ -142,18 +142,16 @@ def test_a_specification_in_yaml_gives_the_bytes_of_the_same_values_in_python(tm
         ("symbol_s: 5e-6, ", "", ("waveform.symbol_s: missing",)),
     ],
 )
-def test_what_is_wrong_in_a_specification_is_named_with_file_key_and_the_nearest_valid_one(
-    tmp_path, right, wrong, complaints
-):
-    assert right in SPEC
-    (tmp_path / "spec.yaml").write_text(SPEC.replace(right, wrong))
+def test_specification_errors_name_file_key_and_nearest_valid_key(tmp_path, valid, invalid, complaints):
+    assert valid in SPEC
+    (tmp_path / "spec.yaml").write_text(SPEC.replace(valid, invalid))
     with pytest.raises(CampaignError, match=r"spec\.yaml") as error:
         simulate(tmp_path / "campaign", tmp_path / "spec.yaml")
     assert all(complaint in str(error.value) for complaint in complaints), str(error.value)
     assert not (tmp_path / "campaign").exists()
 
 
-def test_parts_given_in_python_replace_those_of_the_specification(tmp_path):
+def test_python_arguments_replace_parts_of_the_specification(tmp_path):
     root = simulate(
         tmp_path / "campaign",
         small_simulation(),
@@ -168,11 +166,11 @@ def test_parts_given_in_python_replace_those_of_the_specification(tmp_path):
     settings = Campaign.load(root).settings
     assert set(settings.nodes) == {"a", "c"}
     assert (settings.waveform.subcarriers, settings.waveform.prf_hz) == (32, 400.0)
-    with pytest.raises(CampaignError, match="nodes are a, b, z, but tracks are of a, b"):
+    with pytest.raises(CampaignError, match="nodes are a, b, z, but the nodes with a track are a, b"):
         simulate(tmp_path / "other", small_simulation(), impairments={"z": Impairments()})
 
 
-def test_the_command_line_takes_a_specification_or_a_preset_and_a_seed(tmp_path):
+def test_command_line_accepts_a_specification_or_a_preset_and_a_seed(tmp_path):
     def run(*arguments):
         return CliRunner().invoke(app, ["simulate", *map(str, arguments)])
 

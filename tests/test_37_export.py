@@ -1,4 +1,4 @@
-"""Rasters and quicklooks: exact places, complete files, and overviews that tell the truth."""
+"""Rasters and quicklooks: georeference, complete files and correct overviews."""
 
 import hashlib
 import os
@@ -57,7 +57,7 @@ def overviews(path: Path) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("name", RASTERS)
-def test_a_raster_lies_where_the_grid_says_and_carries_its_origin(tmp_path, name):
+def test_raster_has_the_grid_georeference_and_its_provenance_tags(tmp_path, name):
     RASTERS[name](tmp_path / name, speckle(30, 50), **UTM, tags=TAGS, title="f01 · uav1–uav2")
     with rasterio.open(tmp_path / name) as raster:
         assert np.allclose(raster.bounds, (691523.4, 5332997.1, 691528.4, 5333000.1), rtol=0, atol=1e-6)
@@ -70,7 +70,7 @@ def test_a_raster_lies_where_the_grid_says_and_carries_its_origin(tmp_path, name
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
-def test_pixels_are_the_image_its_power_and_its_decibels(tmp_path):
+def test_rasters_contain_the_image_its_power_and_its_decibels(tmp_path):
     image = speckle(600, 40)
     rasters = {}
     for name, write in RASTERS.items():
@@ -83,7 +83,7 @@ def test_pixels_are_the_image_its_power_and_its_decibels(tmp_path):
     assert np.allclose(rasters["db.tif"], 20 * np.log10(np.abs(image.astype(complex))), rtol=0, atol=1e-5)
 
 
-def test_local_axes_survive_the_file(tmp_path):
+def test_local_crs_reads_back_unchanged(tmp_path):
     crs = local_crs("gotcha pass 1")
     write_slc(tmp_path / "slc.tif", speckle(5, 5), crs=crs, transform=Affine(0.2, 0, -50, 0, -0.2, 50), tags={})
     with rasterio.open(tmp_path / "slc.tif") as raster:
@@ -96,7 +96,7 @@ def test_local_axes_survive_the_file(tmp_path):
 @pytest.mark.quick("slc.tif-*", "power.tif-shape0", "db.tif-shape1")
 @pytest.mark.parametrize("shape", [(3, 5), (512, 512), (513, 40), (700, 1300)])
 @pytest.mark.parametrize("name", RASTERS)
-def test_every_raster_is_a_cog_in_the_strict_sense(tmp_path, name, shape):
+def test_every_raster_is_a_strictly_valid_cog(tmp_path, name, shape):
     cogeo = pytest.importorskip("rio_cogeo.cogeo", reason="rio-cogeo is a tool of the developers")
     RASTERS[name](tmp_path / name, speckle(*shape), **UTM, tags=TAGS)
     valid, errors, warnings = cogeo.cog_validate(tmp_path / name, strict=True)
@@ -108,16 +108,16 @@ def test_every_raster_is_a_cog_in_the_strict_sense(tmp_path, name, shape):
 
 @pytest.mark.quick("MODE-255")
 @pytest.mark.parametrize("band", [POWER, SLC, MASK, LOOKS, PHASE], ids=lambda band: f"{band.overviews}-{band.nodata}")
-def test_overviews_are_those_that_gdal_builds(tmp_path, band):
-    """Beyond the blocks that pass through memory, too, and beside places that hold nothing."""
+def test_overviews_equal_those_of_gdal(tmp_path, band):
+    """Also across the blocks read at once, and next to undefined pixels."""
     rng, shape = np.random.default_rng(5), (READ + 256, 1040)
     image = {"complex64": speckle(*shape), "uint8": rng.integers(0, 4, shape, np.uint8)}.get(band.dtype)
     image = np.abs(speckle(*shape)) if image is None else image
     image[rng.random(shape) < 0.4] = band.nodata
     image[:70, 30:200] = band.nodata
     write_cog(tmp_path / "own.tif", image, band, **UTM, tags={})
-    plain = {"driver": "GTiff", "count": 1, "dtype": band.dtype, "nodata": band.nodata, "tiled": True}
-    with rasterio.open(tmp_path / "plain.tif", "w", height=shape[0], width=shape[1], **UTM, **plain) as raster:
+    profile = {"driver": "GTiff", "count": 1, "dtype": band.dtype, "nodata": band.nodata, "tiled": True}
+    with rasterio.open(tmp_path / "plain.tif", "w", height=shape[0], width=shape[1], **UTM, **profile) as raster:
         raster.write(image, 1)
     as_cog = {"driver": "COG", "blocksize": 512, "overview_resampling": band.overviews}
     rasterio.shutil.copy(tmp_path / "plain.tif", tmp_path / "gdal.tif", **as_cog)
@@ -125,15 +125,19 @@ def test_overviews_are_those_that_gdal_builds(tmp_path, band):
         assert np.array_equal(raster.read(1), image, equal_nan=band.dtype != "uint8")
     own, gdal = overviews(tmp_path / "own.tif"), overviews(tmp_path / "gdal.tif")
     assert [level.shape for level in own] == [level.shape for level in gdal] == [(1152, 520), (576, 260), (288, 130)]
-    for mine, theirs in zip(own, gdal, strict=True):
-        told = ~np.isnan(theirs) if band is SLC else np.ones(theirs.shape, bool)  # GDAL lets a complex NaN spread
-        assert told.mean() > 0.1 or theirs.shape != own[0].shape
-        apart = 1e-3 if band is SLC else 1e-6  # what cancels has few digits of its phase left
-        assert np.allclose(np.abs(mine[told]), np.abs(theirs[told]), rtol=1e-6, equal_nan=band.dtype != "uint8")
-        assert np.allclose(mine[told], theirs[told], rtol=0, atol=apart, equal_nan=band.dtype != "uint8")
+    for own_level, gdal_level in zip(own, gdal, strict=True):
+        defined = ~np.isnan(gdal_level) if band is SLC else np.ones(gdal_level.shape, bool)  # GDAL spreads NaN
+        assert defined.mean() > 0.1 or gdal_level.shape != own[0].shape
+        tolerance = 1e-3 if band is SLC else 1e-6  # cancelling samples leave few digits of the phase
+        assert np.allclose(
+            np.abs(own_level[defined]), np.abs(gdal_level[defined]), rtol=1e-6, equal_nan=band.dtype != "uint8"
+        )
+        assert np.allclose(
+            own_level[defined], gdal_level[defined], rtol=0, atol=tolerance, equal_nan=band.dtype != "uint8"
+        )
 
 
-def test_an_odd_edge_counts_the_pixels_that_are_there(tmp_path):
+def test_overview_of_an_odd_edge_averages_existing_pixels(tmp_path):
     image = np.full((601, 1027), 3, np.float32)
     image[:, -1] = 7
     write_cog(tmp_path / "x.tif", image, MAGNITUDE, **UTM, tags={})
@@ -144,19 +148,19 @@ def test_an_odd_edge_counts_the_pixels_that_are_there(tmp_path):
     assert (quarter[:, -1] == 5).all()
 
 
-def test_slc_overviews_keep_a_target_that_a_plain_average_loses(tmp_path):
+def test_slc_overviews_keep_a_target_that_plain_averaging_cancels(tmp_path):
     y, x = np.mgrid[:700, :1300]
     magnitude = np.exp(-((x - 640.5) ** 2 + (y - 300.5) ** 2) / (2 * 3.0**2))
     image = (magnitude * np.exp(1j * np.radians(141) * x)).astype(np.complex64)
     write_slc(tmp_path / "slc.tif", image, **UTM, tags={})
     half = overviews(tmp_path / "slc.tif")[0]
-    plain = np.abs(image.reshape(350, 2, 650, 2).mean(axis=(1, 3))).max()
-    assert plain < 0.35 * magnitude.max()
+    averaged_peak = np.abs(image.reshape(350, 2, 650, 2).mean(axis=(1, 3))).max()
+    assert averaged_peak < 0.35 * magnitude.max()
     assert np.abs(half).max() > 0.95 * magnitude.max()
     assert np.unravel_index(np.argmax(np.abs(half)), half.shape) == (150, 320)
 
 
-def test_db_overviews_hold_the_mean_power_of_speckle(tmp_path):
+def test_db_overviews_contain_the_mean_power_of_speckle(tmp_path):
     image = speckle(700, 1300)
     write_db(tmp_path / "db.tif", image, **UTM, tags={})
     coarsest = overviews(tmp_path / "db.tif")[-1]
@@ -168,7 +172,7 @@ def test_db_overviews_hold_the_mean_power_of_speckle(tmp_path):
     assert bias == pytest.approx(-10 * np.euler_gamma / np.log(10), abs=0.05)
 
 
-def test_a_pixel_without_power_is_nodata_in_db_but_counts_in_the_mean(tmp_path):
+def test_zero_pixels_are_nodata_in_db_but_count_in_the_mean(tmp_path):
     image = np.zeros((600, 600), np.complex64)
     image[::2, ::2] = 2
     image[:100] = np.nan
@@ -181,7 +185,7 @@ def test_a_pixel_without_power_is_nodata_in_db_but_counts_in_the_mean(tmp_path):
     assert np.allclose(half[50:], 0.0, atol=1e-6)
 
 
-BY_ANOTHER_PROCESS = """
+EXPORT_SCRIPT = """
 import sys
 from pathlib import Path
 import numpy as np
@@ -197,25 +201,25 @@ for export in exports_in("pair"):
 
 
 @pytest.mark.slow
-def test_the_same_image_gives_the_same_bytes_in_any_process_and_from_any_store(tmp_path):
+def test_same_image_gives_same_bytes_in_any_process_and_from_any_array(tmp_path):
     image = speckle(600, 520)
     np.save(tmp_path / "image.npy", image)
     tiled = zarr.create_array(tmp_path / "image.zarr", shape=image.shape, chunks=(128, 200), dtype=image.dtype)
     tiled[:] = image
-    (tmp_path / "there").mkdir()
+    (tmp_path / "other").mkdir()
     subprocess.run(
-        [sys.executable, "-c", BY_ANOTHER_PROCESS, tmp_path / "there", tmp_path / "image.npy"],
+        [sys.executable, "-c", EXPORT_SCRIPT, tmp_path / "other", tmp_path / "image.npy"],
         check=True,
         env=os.environ | {"TZ": "Asia/Tokyo", "GDAL_NUM_THREADS": "2"},
     )
     for name, write in IMAGES.items():
         write(tmp_path / name, tiled, **UTM, tags={"A": "1", "B": "2"})
-        here, there = (hashlib.sha256((folder / name).read_bytes()) for folder in (tmp_path, tmp_path / "there"))
-        assert here.hexdigest() == there.hexdigest(), name
+        own, other = (hashlib.sha256((folder / name).read_bytes()) for folder in (tmp_path, tmp_path / "other"))
+        assert own.hexdigest() == other.hexdigest(), name
 
 
-class Blocks:
-    """An image that exists only block by block."""
+class BlockwiseImage:
+    """Image computed on access, which records the largest block read."""
 
     dtype = np.dtype(np.complex64)
 
@@ -231,14 +235,14 @@ class Blocks:
 
 @pytest.mark.quick("power.tif")
 @pytest.mark.parametrize("name", IMAGES)
-def test_an_image_is_never_held_whole(tmp_path, name):
-    image = Blocks(READ + 300, READ + 500)
+def test_image_is_read_in_blocks(tmp_path, name):
+    image = BlockwiseImage(READ + 300, READ + 500)
     IMAGES[name](tmp_path / name, image, **UTM, tags={})
     assert 0 < image.largest <= READ**2
     if name == "slc.tif":
         with rasterio.open(tmp_path / name) as raster:
             row, column = raster.height - 1, raster.width - 1
-            corners = [raster.read(1)[place] for place in ((0, 0), (0, column), (row, 0), (row, column))]
+            corners = [raster.read(1)[pixel] for pixel in ((0, 0), (0, column), (row, 0), (row, column))]
         assert corners == [1, column + 1, 1 + row * 1j, column + 1 + row * 1j]
 
 
@@ -248,7 +252,7 @@ from pathlib import Path
 import numpy as np
 from rasterio import Affine
 from apertura.formats.export import exports_in
-class Deadly:
+class KillingImage:
     shape, reads = (2100, 2100), 0
     def __getitem__(self, key):
         self.reads += 1
@@ -257,37 +261,37 @@ class Deadly:
         return np.ones((2100, 2100), np.complex64)[key]
 path = Path(sys.argv[1])
 export = next(export for export in exports_in("pair") if export.file == path.name)
-export.write(path, Deadly(), transform=Affine(1, 0, 0, 0, -1, 0), crs="EPSG:32632", tags={})
+export.write(path, KillingImage(), transform=Affine(1, 0, 0, 0, -1, 0), crs="EPSG:32632", tags={})
 """
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["slc.tif", "db.tif"])
-def test_a_killed_writer_leaves_no_half_file_and_the_next_one_clears_its_work(tmp_path, name):
+def test_killed_writer_leaves_no_partial_file_and_the_next_one_cleans_up(tmp_path, name):
     path = tmp_path / name
-    path.write_bytes(b"of the last run")
+    path.write_bytes(b"previous run")
     killed = subprocess.run([sys.executable, "-c", KILLED, path], check=False)
     assert killed.returncode == -signal.SIGKILL
-    assert path.read_bytes() == b"of the last run"
+    assert path.read_bytes() == b"previous run"
     assert (tmp_path / f".{name}.wip").is_dir()
     IMAGES[name](path, speckle(8, 8), **UTM, tags={})
-    assert [left.name for left in tmp_path.iterdir()] == [name]
+    assert [entry.name for entry in tmp_path.iterdir()] == [name]
 
 
 @pytest.mark.slow
-def test_a_full_disk_ends_in_an_error_and_leaves_nothing(tmp_path):
+def test_full_disk_raises_an_error_and_leaves_no_file(tmp_path):
     limited = """
 import resource, signal
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (2**20, 2**20))
 """
     np.save(tmp_path / "image.npy", speckle(600, 600))
-    arguments = [sys.executable, "-c", limited + BY_ANOTHER_PROCESS, tmp_path, tmp_path / "image.npy"]
+    arguments = [sys.executable, "-c", limited + EXPORT_SCRIPT, tmp_path, tmp_path / "image.npy"]
     assert subprocess.run(arguments, check=False, capture_output=True).returncode != 0
-    assert [left.name for left in tmp_path.iterdir()] == ["image.npy"]
+    assert [entry.name for entry in tmp_path.iterdir()] == ["image.npy"]
 
 
-def test_what_is_no_image_on_a_north_up_grid_is_refused_before_anything_is_written(tmp_path):
+def test_invalid_image_or_grid_is_refused_before_writing(tmp_path):
     path = tmp_path / "slc.tif"
     image, south_up = speckle(4, 4), Affine(1, 0, 0, 0, 1, 0)
     with pytest.raises(ContractError, match="not complex64"):
@@ -301,7 +305,7 @@ def test_what_is_no_image_on_a_north_up_grid_is_refused_before_anything_is_writt
     assert not any(tmp_path.iterdir())
 
 
-def test_layers_keep_angles_bits_and_the_unknown(tmp_path):
+def test_layers_keep_angles_bits_and_nodata(tmp_path):
     angle = np.full((600, 600), 30, np.float32)
     angle[:10] = np.nan
     bits = np.full((600, 600), SHADOW, np.uint8)
@@ -316,7 +320,7 @@ def test_layers_keep_angles_bits_and_the_unknown(tmp_path):
         assert np.array_equal(overviews(tmp_path / name)[0], layer[::2, ::2], equal_nan=name != "mask.tif")
 
 
-def test_shadow_and_layover_never_mix_in_an_overview(tmp_path):
+def test_overviews_do_not_mix_shadow_and_layover(tmp_path):
     bits = np.full((600, 600), SHADOW, np.uint8)
     bits[301:] = SHADOW | LAYOVER
     write_mask(tmp_path / "mask.tif", bits, **UTM, tags={})
@@ -325,18 +329,18 @@ def test_shadow_and_layover_never_mix_in_an_overview(tmp_path):
         write_mask(tmp_path / "mask.tif", bits.astype(float), **UTM, tags={})
 
 
-@pytest.mark.parametrize("at", [(0, 0), (1, 2), (1999, 1499), (1024, 700)])
-def test_shrinking_loses_no_pixel(at):
+@pytest.mark.parametrize("pixel", [(0, 0), (1, 2), (1999, 1499), (1024, 700)])
+def test_shrinking_includes_every_pixel(pixel):
     image = np.zeros((2000, 1500), np.complex64)
-    image[at] = 3j
+    image[pixel] = 3j
     mean, factor = shrink(image, 960)
     assert factor == 3
     assert np.count_nonzero(mean) == 1
-    pixels_in_group = (2 if at[0] >= 1998 else 3) * 3
-    assert mean[at[0] // 3, at[1] // 3] == pytest.approx(9 / pixels_in_group)
+    pixels_in_group = (2 if pixel[0] >= 1998 else 3) * 3
+    assert mean[pixel[0] // 3, pixel[1] // 3] == pytest.approx(9 / pixels_in_group)
 
 
-def test_a_glitch_does_not_blacken_the_quicklook():
+def test_single_outlier_does_not_darken_the_quicklook():
     y, x = np.mgrid[:100, :100]
     target = np.sinc((x - 30) / 2.0) ** 2 * np.sinc((y - 40) / 2.0) ** 2
     assert below_peak(target)[1] == 0
@@ -346,8 +350,8 @@ def test_a_glitch_does_not_blacken_the_quicklook():
     assert decibel.max() == 0
 
 
-def picture_of(path: Path, shape: tuple[int, int]) -> np.ndarray:
-    """Return brightness of the dots inside the frame, which is `LEFT` and `TOP` inches from the upper left."""
+def framed_dots(path: Path, shape: tuple[int, int]) -> np.ndarray:
+    """Return brightness of the dots inside the frame, `LEFT` and `TOP` inches from the upper left corner."""
     with rasterio.open(path) as png:
         dots = png.read([1, 2, 3]).sum(axis=0)
     scale = 6.4 * DPI / max(shape)
@@ -356,12 +360,12 @@ def picture_of(path: Path, shape: tuple[int, int]) -> np.ndarray:
 
 
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-def test_the_quicklook_has_north_up_and_east_right_and_leaves_the_unknown_white(tmp_path):
+def test_quicklook_is_north_up_with_undefined_pixels_white(tmp_path):
     image = np.full((120, 160), 1e-4, np.complex64)
     image[20:24, 120:124] = 1
     image[80:, :40] = np.nan
     write_quicklook(tmp_path / "q.png", image, **UTM, tags=TAGS, title="f01", subtitle="uav1–uav2")
-    dots = picture_of(tmp_path / "q.png", image.shape)
+    dots = framed_dots(tmp_path / "q.png", image.shape)
     rows, columns = (np.add(np.indices(dots.shape), 0.5) * 160 / dots.shape[1]).astype(int)
     inside = (rows > 0) & (rows < 119) & (columns > 0) & (columns < 159)
     bright = (rows >= 21) & (rows < 23) & (columns >= 121) & (columns < 123)
@@ -373,15 +377,15 @@ def test_the_quicklook_has_north_up_and_east_right_and_leaves_the_unknown_white(
 
 
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-def test_an_image_without_power_still_gets_a_picture_that_says_so(tmp_path):
+def test_quicklook_of_an_image_without_power_contains_a_note(tmp_path):
     for image in (np.zeros((30, 40), np.complex64), np.full((30, 40), np.nan, np.complex64)):
         write_quicklook(tmp_path / "q.png", image, **UTM, tags={})
-        words = picture_of(tmp_path / "q.png", image.shape)[5:-5, 5:-5]
-        assert 0 < np.count_nonzero(words < 300) < 0.02 * words.size
+        dots = framed_dots(tmp_path / "q.png", image.shape)[5:-5, 5:-5]
+        assert 0 < np.count_nonzero(dots < 300) < 0.02 * dots.size
 
 
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-def test_the_quicklook_carries_its_origin_in_the_file(tmp_path):
+def test_quicklook_contains_its_provenance_tags(tmp_path):
     write_quicklook(
         tmp_path / "q.png", speckle(30, 40), **UTM, tags=TAGS, title="f01", markers=[(691525, 5332999, "T")]
     )
@@ -389,18 +393,18 @@ def test_the_quicklook_carries_its_origin_in_the_file(tmp_path):
         assert TAGS.items() <= png.tags().items()
 
 
-def written_on(layout: MapLayout) -> list[str]:
-    """Return the words on a layout; every one must lie inside the figure and on no other."""
+def texts_of(layout: MapLayout) -> list[str]:
+    """Return the texts of a layout after checking that they lie inside the figure without overlap."""
     layout.figure.canvas.draw()
     boxes = [text.get_window_extent() for text in layout.figure.texts]
     assert all(box.x0 >= 0 and box.x1 <= layout.figure.bbox.x1 for box in boxes)
-    assert not any(one.overlaps(other) for number, one in enumerate(boxes) for other in boxes[:number])
+    assert not any(box.overlaps(previous) for number, box in enumerate(boxes) for previous in boxes[:number])
     return [text.get_text() for text in layout.figure.texts]
 
 
 @pytest.mark.parametrize("size_m", [(40, 400), (400, 40)])
 @pytest.mark.parametrize("count", [0, 1, 4, 9, 29])
-def test_flags_are_counted_and_named_as_far_as_there_is_room(size_m, count):
+def test_flags_are_counted_and_listed_as_space_permits(size_m, count):
     flags = list(FLAGS)[:count]
     assert len(flags) == count
     layout = MapLayout.for_bounds((0, 0, *size_m))
@@ -408,31 +412,31 @@ def test_flags_are_counted_and_named_as_far_as_there_is_room(size_m, count):
     layout.draw_scale_and_north()
     layout.write_words("f01", "uav1-uav2", "apertura 0.1.0 · numerical error −61.2 dB · code aaaaaaaaaaaa")
     layout.write_flags(flags)
-    words = " ".join(written_on(layout)).replace("and ", "")
-    assert ("no flags" if not count else f"{count} flag") in words
-    left = int(re.search(r"(\d+) more in image\.json", words)[1]) if "more in" in words else 0
-    assert sum(f"{flag}," in f"{words}," for flag in flags) == count - left
-    assert left == 0 or count > 4
+    text = " ".join(texts_of(layout)).replace("and ", "")
+    assert ("no flags" if not count else f"{count} flag") in text
+    unlisted = int(re.search(r"(\d+) more in image\.json", text)[1]) if "more in" in text else 0
+    assert sum(f"{flag}," in f"{text}," for flag in flags) == count - unlisted
+    assert unlisted == 0 or count > 4
 
 
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-def test_the_quicklook_names_the_flags_of_its_image(tmp_path, monkeypatch):
+def test_quicklook_lists_the_flags_of_its_image(tmp_path, monkeypatch):
     written = []
     monkeypatch.setattr(MapLayout, "write_flags", lambda _, flags: written.append(flags))
-    for flags in ("{}", '{"sidelink_noisy":"SNR 3 dB","beam_misses":"12 %"}'):
+    for flags in ("{}", '{"sidelink_noisy":"SNR 3 dB","outside_beam":"12 %"}'):
         write_quicklook(tmp_path / "q.png", speckle(30, 40), **UTM, tags=TAGS | {"APERTURA_FLAGS": flags})
-    write_quicklook(tmp_path / "q.png", speckle(30, 40), **UTM, tags=TAGS)  # not an image of a campaign
-    assert written == [[], ["sidelink_noisy", "beam_misses"]]
+    write_quicklook(tmp_path / "q.png", speckle(30, 40), **UTM, tags=TAGS)  # an image without campaign
+    assert written == [[], ["sidelink_noisy", "outside_beam"]]
 
 
-def test_a_long_footer_ends_inside_the_picture():
+def test_long_footer_ends_inside_the_figure():
     footer = (
-        "apertura 0.1.0 · focus: focused (0.0 dB lost) · geolocation uncertainty 1.5 m"
+        "apertura 0.1.0 · focus: focused (peak loss 0.0 dB) · geolocation uncertainty 1.5 m"
         " · numerical error below −77.31 dB · looks left, assumed · code 833b8269428b"
     )
     for bounds in ((0.0, 0.0, 7.0, 7.0), (0.0, 0.0, 2.0, 7.0)):
         layout = MapLayout.for_bounds(bounds)
         layout.write_words("flight", "", footer)
         layout.figure.canvas.draw()
-        (shown,) = (text for text in layout.figure.texts if text.get_text() == footer)
-        assert shown.get_window_extent().x1 <= layout.figure.bbox.x1
+        (drawn_footer,) = (text for text in layout.figure.texts if text.get_text() == footer)
+        assert drawn_footer.get_window_extent().x1 <= layout.figure.bbox.x1

@@ -1,4 +1,4 @@
-"""A pair's echo as CPHD: what the standard's own checker says of it, and the image that it gives when it comes back."""
+"""Echo of a pair as CPHD: consistency check of the standard, and the image after reading it back."""
 
 import shutil
 from pathlib import Path
@@ -26,18 +26,18 @@ AT = np.array([48.0, 11.0, 600.0])
 
 
 def failures(path):
-    """What the checker finds wrong, errors and warnings."""
+    """Return errors and warnings of the consistency check by name."""
     with path.open("rb") as stream:
         checker = sarkit.verification.CphdConsistency.from_file(stream, thorough=True)
         checker.check()
     return {
-        name: [part["details"] for part in one["details"] if not part["passed"]]
-        for name, one in checker.failures().items()
+        name: [part["details"] for part in failure["details"] if not part["passed"]]
+        for name, failure in checker.failures().items()
     }
 
 
 def reimported(campaign, flight, pair, target):
-    """A campaign that begins with the CPHD file of another's pair and images the same pixels, up to its image."""
+    """Process a new campaign whose input is the CPHD file of a pair, on the same grid, up to the image."""
     tx, rx = pair.split("-")
     file, scene = cphd.cphd(campaign, flight, pair), yaml.safe_load((campaign.root / "config/config.yaml").read_text())
     (target / "config").mkdir(parents=True)
@@ -63,13 +63,13 @@ def image_of(campaign, flight, pair):
     return open_stage(campaign.stage("image", flight, pair), "image").image.values
 
 
-def difference_db(one, other):
-    return 20 * np.log10(np.abs(one - other).max() / np.abs(one).max())
+def difference_db(first, second):
+    return 20 * np.log10(np.abs(first - second).max() / np.abs(first).max())
 
 
 @pytest.fixture(scope="module")
 def gotcha(shared, tmp_path_factory):
-    """Two degrees of Gotcha, imaged as finely as it is compared."""
+    """Process two degrees of Gotcha at the accuracy of the comparison."""
     root = tmp_path_factory.mktemp("gotcha") / "campaign"
     (root / "config").mkdir(parents=True)
     (root / "raw/pass1").mkdir(parents=True)
@@ -89,9 +89,9 @@ def gotcha(shared, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_positions_that_travel_with_the_samples_are_written_as_tracks_pulse_by_pulse(gotcha):
+def test_positions_of_phase_history_are_written_as_tracks_per_pulse(gotcha):
     written = {path.name for path in tracks.tracks(gotcha, "pass1")}
-    assert written == {"radar.csv", "tracks.png"}  # a local frame has no .pos
+    assert written == {"radar.csv", "tracks.png"}  # no .pos file for a local frame
     with gotcha.result("pass1", "tracks", "radar.csv").open("rb") as file:
         read = pd.read_csv(file)
     echo = open_stage(gotcha.stage("echo", "pass1", "radar-radar"), "echo")
@@ -99,22 +99,22 @@ def test_positions_that_travel_with_the_samples_are_written_as_tracks_pulse_by_p
 
 
 @pytest.mark.slow
-def test_gotcha_through_cphd_gives_the_same_image_to_80_db(gotcha, tmp_path):
+def test_gotcha_image_through_cphd_differs_by_less_than_minus_80_db(gotcha, tmp_path):
     again = reimported(gotcha, "pass1", "radar-radar", tmp_path / "again")
     assert failures(Path(gotcha.result("pass1", "radar-radar", "phase_history.cphd"))) == {}
-    one, other = (image_of(each, "pass1", "radar-radar") for each in (gotcha, again))
-    assert difference_db(one, other) < -80
-    echoes = [PairEcho.opened(each, "pass1", "radar-radar").stage for each in (gotcha, again)]
+    original, reread = (image_of(campaign, "pass1", "radar-radar") for campaign in (gotcha, again))
+    assert difference_db(original, reread) < -80
+    echoes = [PairEcho.opened(campaign, "pass1", "radar-radar").stage for campaign in (gotcha, again)]
     assert echoes[1].attrs["frame"] == "local"
     np.testing.assert_allclose(echoes[1].tx_position.values, echoes[0].tx_position.values, atol=2e-9)
     np.testing.assert_array_equal(echoes[1].time.values, echoes[0].time.values)
-    # referred to the middle of the scene, and no more to its origin: the samples themselves differ
-    assert np.abs(np.diff([each.reference_delay.values for each in echoes], axis=0)).min() > 1e-8
+    # Samples are referred to the scene centre instead of the origin, so they differ.
+    assert np.abs(np.diff([stage.reference_delay.values for stage in echoes], axis=0)).min() > 1e-8
 
 
 @pytest.fixture(scope="module")
 def fine_tiny(_tiny, tmp_path_factory):
-    """The tiny campaign's pairs, imaged as finely as they are compared."""
+    """Process the pairs of the tiny campaign at the accuracy of the comparison."""
     from folders import copy_writable, ingest_all
 
     root = copy_writable(_tiny, tmp_path_factory.mktemp("tiny") / "campaign")
@@ -130,27 +130,32 @@ def fine_tiny(_tiny, tmp_path_factory):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
-def test_a_simulated_pair_through_cphd_gives_the_same_image_to_80_db(fine_tiny, tmp_path, pair):
+def test_simulated_image_through_cphd_differs_by_less_than_minus_80_db(fine_tiny, tmp_path, pair):
     again = reimported(fine_tiny, "f01", pair, tmp_path / "again")
     assert failures(Path(fine_tiny.result("f01", pair, "phase_history.cphd"))) == {}
     assert difference_db(image_of(fine_tiny, "f01", pair), image_of(again, "f01", pair)) < -80
-    one, other = (PairEcho.opened(each, "f01", pair).stage for each in (fine_tiny, again))
+    original, reread = (PairEcho.opened(campaign, "f01", pair).stage for campaign in (fine_tiny, again))
     for name in ("time", "tx_position", "rx_position", "path_limit"):
-        np.testing.assert_array_equal(one[name].values, other[name].values, err_msg=name)
+        np.testing.assert_array_equal(original[name].values, reread[name].values, err_msg=name)
 
 
 def collection(pulses=6, **changes):
-    """A small monostatic flight about a place on Earth."""
-    place = ecef_from_geodetic(*AT)
-    north, east, down = ned_axes(place).T
-    track = place - 300.0 * down + 200.0 * east + 2.0 * np.arange(pulses)[:, None] * north
+    """Return the CPHD collection of a small monostatic flight at a position on Earth."""
+    origin = ecef_from_geodetic(*AT)
+    north, east, down = ned_axes(origin).T
+    track = origin - 300.0 * down + 200.0 * east + 2.0 * np.arange(pulses)[:, None] * north
     limit_m = np.full(pulses, 5000.0)
     time = np.datetime64("2025-05-14T09:30:00.123456789", "ns") + np.arange(pulses) * np.timedelta64(10_000_001, "ns")
     frequency = 1.2e9 + 1e5 * np.arange(64)
     parts = {"time": time, "tx_m": track, "rx_m": track, "frequency_hz": frequency, "path_limit_m": limit_m}
-    ground = {"point_m": place, "origin_m": place, "axes": np.stack([east, north, -down])}
-    rest = {"area_m": (-5.0, -5.0, 5.0, 5.0), "spacing_m": 0.5, "parameters": {}, "wave_speed_m_s": SPEED_OF_LIGHT_M_S}
-    return CphdCollection("c f01 a-a", "a-a", **(parts | ground | rest | changes))
+    ground = {"point_m": origin, "origin_m": origin, "axes": np.stack([east, north, -down])}
+    other_fields = {
+        "area_m": (-5.0, -5.0, 5.0, 5.0),
+        "spacing_m": 0.5,
+        "parameters": {},
+        "wave_speed_m_s": SPEED_OF_LIGHT_M_S,
+    }
+    return CphdCollection("c f01 a-a", "a-a", **(parts | ground | other_fields | changes))
 
 
 def noise(count):
@@ -158,48 +163,48 @@ def noise(count):
     return (rng.standard_normal((count, 64)) + 1j * rng.standard_normal((count, 64))).astype(np.complex64)
 
 
-def test_what_is_written_in_blocks_comes_back_to_the_bit(tmp_path):
-    flown, samples = collection(), noise(6)
-    write_cphd(tmp_path / "a.cphd", flown, (samples[part] for part in (slice(0, 1), slice(1, 5), slice(5, 6))))
+def test_cphd_written_in_blocks_reads_back_bit_identical(tmp_path):
+    written, samples = collection(), noise(6)
+    write_cphd(tmp_path / "a.cphd", written, (samples[part] for part in (slice(0, 1), slice(1, 5), slice(5, 6))))
     assert failures(tmp_path / "a.cphd") == {}
     echo = read_phase_history("cphd", [tmp_path / "a.cphd"], pair="a-a")
     np.testing.assert_array_equal(echo.transfer.values, samples)
-    np.testing.assert_array_equal(echo.time.values, flown.time)
-    np.testing.assert_array_equal(echo.tx_position.values, flown.tx_m)
-    np.testing.assert_array_equal(echo.path_limit.values, flown.path_limit_m)
-    np.testing.assert_allclose(echo.reference_delay.values, flown.reference_delay_s, rtol=1e-15)
+    np.testing.assert_array_equal(echo.time.values, written.time)
+    np.testing.assert_array_equal(echo.tx_position.values, written.tx_m)
+    np.testing.assert_array_equal(echo.path_limit.values, written.path_limit_m)
+    np.testing.assert_allclose(echo.reference_delay.values, written.reference_delay_s, rtol=1e-15)
 
 
-def test_blocks_of_too_few_pulses_leave_no_file(tmp_path):
+def test_missing_pulses_are_refused_and_leave_no_file(tmp_path):
     with pytest.raises(ValueError, match="5 pulses: must be 6"):
         write_cphd(tmp_path / "a.cphd", collection(), [noise(5)])
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_swath_ends_where_echoes_leave_the_prefix(tmp_path):
-    """Without a prefix it is what the frequencies resolve at 1.25 times the sampling that it needs."""
+def test_swath_ends_where_echoes_exceed_the_prefix(tmp_path):
+    """Without a prefix, the swath is the unambiguous range of the frequency step divided by 1.25."""
     first, last = collection(path_limit_m=np.full(6, np.inf)).swath_s
     assert last == -first == pytest.approx(0.5 / 1.25 / 1e5)
-    flown = collection(path_limit_m=np.full(6, 900.0))
-    assert flown.swath_s == pytest.approx((first, (900.0 / SPEED_OF_LIGHT_M_S - flown.reference_delay_s).min()))
-    write_cphd(tmp_path / "a.cphd", flown, [noise(6)])
+    limited = collection(path_limit_m=np.full(6, 900.0))
+    assert limited.swath_s == pytest.approx((first, (900.0 / SPEED_OF_LIGHT_M_S - limited.reference_delay_s).min()))
+    write_cphd(tmp_path / "a.cphd", limited, [noise(6)])
     assert failures(tmp_path / "a.cphd") == {}
 
 
 @pytest.mark.slow
-def test_cphd_is_made_when_it_is_asked_for_and_goes_stale_with_its_echo(fine_tiny):
-    made = [result for name, result in results_of(fine_tiny) if name == "cphd"]
-    assert [on_demand(fine_tiny, result.manifest) for result in made] == [True, True]
+def test_cphd_is_produced_on_request_and_becomes_out_of_date(fine_tiny):
+    cphd_results = [result for name, result in results_of(fine_tiny) if name == "cphd"]
+    assert [on_demand(fine_tiny, result.manifest) for result in cphd_results] == [True, True]
     cphd.cphd(fine_tiny, "f01", "uav1-uav1")
     stage = PairEcho.opened(fine_tiny, "f01", "uav1-uav1").stage
     assert stage.sizes["pulse"] == 40
     assert stale_results(fine_tiny) == {}
     path = fine_tiny.result("f01", "uav1-uav1", "phase_history.cphd")
     path.write_bytes(path.read_bytes()[:-1])
-    assert stale_results(fine_tiny) == {made[0].manifest: "phase_history.cphd has changed since it was written"}
+    assert stale_results(fine_tiny) == {cphd_results[0].manifest: "phase_history.cphd is not as it was written"}
 
 
-def test_a_scene_in_another_frame_than_the_file_is_refused_by_the_check(tmp_path):
+def test_scene_in_another_frame_than_the_cphd_file_is_refused(tmp_path):
     (tmp_path / "config").mkdir()
     (tmp_path / "raw/f01").mkdir(parents=True)
     write_cphd(tmp_path / "raw/f01/a.cphd", collection(), [noise(6)])
@@ -207,6 +212,6 @@ def test_a_scene_in_another_frame_than_the_file_is_refused_by_the_check(tmp_path
     scene = "scene: {crs: local, bounds_m: [-5, -5, 5, 5], spacing_m: 0.5}\n"
     (tmp_path / "config/config.yaml").write_text(config + scene)
     (tmp_path / "config/flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\nf01\timage\ta\ta\n")
-    told = [str(problem) for problem in problems(tmp_path, without=["memory"])]
-    assert len(told) == 1
-    assert "local for a phase history with positions in ECEF; expected an EPSG code, or auto" in told[0]
+    messages = [str(problem) for problem in problems(tmp_path, without=["memory"])]
+    assert len(messages) == 1
+    assert "local for phase history with positions on Earth; expected an EPSG code, or auto" in messages[0]

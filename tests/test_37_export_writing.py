@@ -1,4 +1,4 @@
-"""What GDAL writes is what it was given, or an error says so: in memory, and on the disk."""
+"""Verification of files written by GDAL, in memory and on disk."""
 
 import errno
 
@@ -21,13 +21,13 @@ def image():
 
 @pytest.fixture
 def on_disk(monkeypatch):
-    """Nothing is small enough for memory."""
+    """Write every file on disk, none in memory."""
     for module in (cog, writing):
         monkeypatch.setattr(module, "IN_MEMORY_BYTES", 0)
 
 
 @pytest.mark.parametrize("write", [write_slc, write_power, write_db])
-def test_a_large_image_and_a_small_one_are_written_to_the_same_bytes(tmp_path, request, write):
+def test_writing_through_memory_and_disk_gives_the_same_bytes(tmp_path, request, write):
     write(tmp_path / "x.tif", image(), **UTM)
     in_memory = (tmp_path / "x.tif").read_bytes()
     request.getfixturevalue("on_disk")
@@ -38,7 +38,7 @@ def test_a_large_image_and_a_small_one_are_written_to_the_same_bytes(tmp_path, r
 
 @pytest.mark.quick("write_power")
 @pytest.mark.parametrize("write", [write_slc, write_power, write_db])
-def test_threads_of_gdal_change_no_byte(tmp_path, write):
+def test_gdal_threads_do_not_change_the_file(tmp_path, write):
     several = np.tile(image(), (3, 3))
     for threads in (1, 3):
         with rasterio.Env(GDAL_NUM_THREADS=threads):
@@ -52,20 +52,20 @@ def written(tmp_path):
     return tmp_path / "x.tif"
 
 
-def test_a_raster_that_reads_back_passes_and_one_that_lacks_pixels_or_tags_does_not(written):
+def test_read_back_check_detects_missing_pixels_and_tags(written):
     checksum = added(0, power(image()))
     check_written(written, checksum, UTM["tags"])
-    with pytest.raises(OSError, match="does not read back"):
+    with pytest.raises(OSError, match="differs from the data written"):
         check_written(written, checksum + 1, UTM["tags"])
-    with pytest.raises(OSError, match="does not read back"):
+    with pytest.raises(OSError, match="differs from the data written"):
         check_written(written, checksum, {"APERTURA_FLAGS": "{}"})
 
 
-def test_what_gdal_cannot_write_is_an_error_of_the_machine_that_names_the_file(tmp_path, monkeypatch, on_disk):
-    def breaks(*_):
+def test_gdal_write_failure_is_an_os_error_with_the_file_name(tmp_path, monkeypatch, on_disk):
+    def fail(*_):
         raise rasterio.errors.RasterioIOError("Write failed. See previous exception for details.")
 
-    monkeypatch.setattr(cog, "check_written", breaks)
+    monkeypatch.setattr(cog, "check_written", fail)
     with pytest.raises(OSError, match="Write failed") as caught:
         write_slc(tmp_path / "x.tif", image(), **UTM)
     assert (caught.value.errno, caught.value.filename) == (errno.EIO, str(tmp_path / "x.tif"))

@@ -1,4 +1,4 @@
-"""Pictures and words of the report say what was measured, whatever the names, and the same to the byte."""
+"""Plots and text of the report: content, escaping of untrusted text, and reproducibility."""
 
 import io
 from pathlib import Path
@@ -58,8 +58,8 @@ def pulses(path):
 
 
 def phase(path):
-    turns = np.random.default_rng(1).normal(size=200)
-    phasors = {"before": np.exp(9j * turns), "after": np.exp(0.1j * turns), "refined": np.ones(200, complex)}
+    noise = np.random.default_rng(1).normal(size=200)
+    phasors = {"before": np.exp(9j * noise), "after": np.exp(0.1j * noise), "refined": np.ones(200, complex)}
     draw_phase(path, TIME_S, phasors, **SHARED)
 
 
@@ -70,9 +70,9 @@ def cuts(path):
 
 
 def waterfall(path):
-    falling = Waterfall(np.linspace(100, 120, 200), 0.4, 60)
-    falling.add(0, np.ones((200, 60), np.complex64))
-    draw_waterfall(path, falling, TIME_S, np.linspace(110, 130, 200), **SHARED)
+    profiles = Waterfall(np.linspace(100, 120, 200), 0.4, 60)
+    profiles.add(0, np.ones((200, 60), np.complex64))
+    draw_waterfall(path, profiles, TIME_S, np.linspace(110, 130, 200), **SHARED)
 
 
 def panels(path):
@@ -91,7 +91,7 @@ def budget(path):
         {"cause": "positions", "stated": "1 cm", "loss_db": -0.2, "shift_m": 0.01, "phase_rad": 0.1},
         {
             "cause": "between epochs",
-            "stated": "not stated; 1 m would do this",
+            "stated": "not stated; effect computed for 1 m",
             "loss_db": -3.0,
             "shift_m": 5.0,
             "phase_rad": None,
@@ -106,31 +106,31 @@ DRAWN = (geometry, pulses, phase, cuts, waterfall, panels, budget)
 
 @pytest.mark.quick("cuts")
 @pytest.mark.parametrize("draw", DRAWN, ids=lambda draw: draw.__name__)
-def test_a_picture_is_as_wide_as_a_page_clips_nothing_and_is_the_same_every_time(draw, tmp_path):
-    draw(tmp_path / "one.png")
-    draw(tmp_path / "two.png")
-    data = (tmp_path / "one.png").read_bytes()
-    assert data == (tmp_path / "two.png").read_bytes()
+def test_plot_has_page_width_clips_nothing_and_is_reproducible(draw, tmp_path):
+    draw(tmp_path / "first.png")
+    draw(tmp_path / "second.png")
+    data = (tmp_path / "first.png").read_bytes()
+    assert data == (tmp_path / "second.png").read_bytes()
     drawn = imread(io.BytesIO(data), format="png")[..., :3]
     assert drawn.shape[1] / 220 == pytest.approx(6.7, abs=0.01)  # inches between the margins of A4
     edge = np.concatenate([drawn[0], drawn[-1], drawn[:, 0], drawn[:, -1]])
-    assert (edge == 1).all()  # what leaves the sheet would colour its edge
+    assert (edge == 1).all()  # clipped content would colour the edge
     assert (drawn < 0.5).any()
 
 
 def figure_of(draw, path, monkeypatch):
-    """The figure that is drawn, before it becomes a file."""
+    """Return the figure drawn, without writing a file."""
     figures = []
     monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: figures.append(self) or Path(path).write_bytes(b""))
     draw(path)
     return figures[0]
 
 
-def test_the_legend_of_a_budget_shows_what_a_bar_of_each_kind_looks_like(monkeypatch, tmp_path):
-    """Also of a kind that no line of the image is, as in the first of its three drawings."""
+def test_budget_legend_shows_each_kind_of_bar(monkeypatch, tmp_path):
+    """Also a kind that no line of the image has, as in the first of the three panels."""
     stated = [{"cause": "positions", "stated": "1 cm", "loss_db": -0.2, "shift_m": 0.01, "phase_rad": 0.1}]
     (legend,) = figure_of(
-        lambda path: draw_budget(path, stated, Measured(), **SHARED), tmp_path / "one.png", monkeypatch
+        lambda path: draw_budget(path, stated, Measured(), **SHARED), tmp_path / "first.png", monkeypatch
     ).legends
     counted, left_out = legend.legend_handles
     assert (counted.get_hatch(), left_out.get_hatch()) == (None, "/////")
@@ -140,19 +140,19 @@ def test_the_legend_of_a_budget_shows_what_a_bar_of_each_kind_looks_like(monkeyp
 @pytest.mark.parametrize(
     ("counted", "labels"),
     [
-        (True, ["of 2 pulses", "pulses from the first pulse sent; no times"]),
+        (True, ["pulses per 2 transmitted", "pulses from the first pulse sent (no times recorded)"]),
         (False, ["pulses in 2 s", "time from the first pulse sent, s"]),
     ],
 )
-def test_pulses_that_came_without_times_are_counted_and_not_drawn_over_seconds(counted, labels, monkeypatch, tmp_path):
-    at = np.arange(100.0)
-    record = PulseRecord(at, at != 5, {"unpaired": 1}, at[at != 5], counted=counted)
-    axes = figure_of(lambda path: draw_pulses(path, record, **SHARED), tmp_path / "one.png", monkeypatch).axes[0]
+def test_pulses_without_times_are_counted_instead_of_drawn_over_time(counted, labels, monkeypatch, tmp_path):
+    index = np.arange(100.0)
+    record = PulseRecord(index, index != 5, {"unpaired": 1}, index[index != 5], counted=counted)
+    axes = figure_of(lambda path: draw_pulses(path, record, **SHARED), tmp_path / "first.png", monkeypatch).axes[0]
     assert axes.get_ylabel() == labels[0]
     assert axes.get_xlabel().startswith(labels[1])
 
 
-def test_panels_of_a_local_frame_have_x_and_y_and_no_north(monkeypatch, tmp_path):
+def test_panels_of_a_local_frame_have_x_and_y_and_no_north_arrow(monkeypatch, tmp_path):
     power = {"a-a": np.eye(60)}
 
     def texts(local):
@@ -161,47 +161,47 @@ def test_panels_of_a_local_frame_have_x_and_y_and_no_north(monkeypatch, tmp_path
         axes = figure.axes[0]
         return [axes.get_xlabel(), axes.get_ylabel(), *(text.get_text() for text in axes.texts)]
 
-    assert texts(True) == ["x of the corner, m", "y of the corner, m", "2 m"]
-    assert texts(False) == ["east of the corner, m", "north of the corner, m", "2 m", "", "N"]
+    assert texts(True) == ["x from the lower left corner, m", "y from the lower left corner, m", "2 m"]
+    assert texts(False) == ["east from the lower left corner, m", "north from the lower left corner, m", "2 m", "", "N"]
 
 
-def test_the_sidelink_takes_out_what_clocks_and_triggers_put_in():
+def test_sidelink_correction_removes_clock_and_trigger_phase():
     generator, wavenumber = np.random.default_rng(3), 2 * np.pi * 1.3e9 / SPEED_OF_LIGHT_M_S
-    turned, length_m = generator.uniform(-np.pi, np.pi, 500), 8 + generator.normal(size=500)
-    sidelink = np.angle(np.exp(1j * (turned - wavenumber * length_m)))
+    phase_error, length_m = generator.uniform(-np.pi, np.pi, 500), 8 + generator.normal(size=500)
+    sidelink = np.angle(np.exp(1j * (phase_error - wavenumber * length_m)))
     corrected = np.full(500, 2 - 1j)
     error = sidelink_error_rad(sidelink, length_m, wavenumber_rad_m=wavenumber)
     before = corrected * np.exp(1j * error)
-    np.testing.assert_allclose(before, corrected * np.exp(1j * turned), atol=1e-9)
+    np.testing.assert_allclose(before, corrected * np.exp(1j * phase_error), atol=1e-9)
     assert steadiness(corrected) == pytest.approx((0.0, 1.0), abs=1e-6)
     assert steadiness(before)[0] > 1.5
     assert steadiness(before)[1] < 0.15
 
 
-def test_a_waterfall_shows_a_path_where_it_is_however_profiles_begin():
+def test_waterfall_shows_a_path_at_its_length_for_any_profile_start():
     start = np.random.default_rng(5).uniform(50, 58, 90)
-    falling = Waterfall(start, 0.5, 100)
-    at = (start[:, None] + 0.5 * np.arange(100) - 80.0) / 0.5  # samples from a path of 80 m
+    profile_map = Waterfall(start, 0.5, 100)
+    samples = (start[:, None] + 0.5 * np.arange(100) - 80.0) / 0.5  # samples from a path of 80 m
     for first in range(0, 90, 32):
-        falling.add(first, np.sinc(at[first : first + 32] / 2).astype(np.complex64))
-    low, high = falling.span_m
-    rows, columns = falling.mean.shape
+        profile_map.add(first, np.sinc(samples[first : first + 32] / 2).astype(np.complex64))
+    low, high = profile_map.span_m
+    rows, columns = profile_map.mean.shape
     centres = low + (np.arange(rows) + 0.5) * (high - low) / rows
-    brightest = centres[np.nanargmax(falling.mean, axis=0)]
+    brightest = centres[np.nanargmax(profile_map.mean, axis=0)]
     assert columns == 90
     assert np.abs(brightest - 80.0).max() < 0.8
 
 
-def test_a_long_flight_becomes_a_small_waterfall_of_the_same_mean_power():
+def test_waterfall_of_a_long_flight_is_reduced_with_the_same_mean_power():
     start = np.full(3000, 10.0)
-    falling = Waterfall(start, 0.1, 2000)
+    profile_map = Waterfall(start, 0.1, 2000)
     for first in range(0, 3000, 500):
-        falling.add(first, np.full((500, 2000), 3.0, np.complex64))
-    assert falling.mean.shape == (667, 500)
-    np.testing.assert_allclose(falling.mean[:-1], 9.0)
+        profile_map.add(first, np.full((500, 2000), 3.0, np.complex64))
+    assert profile_map.mean.shape == (667, 500)
+    np.testing.assert_allclose(profile_map.mean[:-1], 9.0)
 
 
-def test_text_of_strangers_stays_text_on_the_page():
+def test_untrusted_text_is_escaped_on_the_page():
     blocks = [Heading(1, HOSTILE), Paragraph(HOSTILE), Table(HOSTILE, [HOSTILE], [[HOSTILE]]), Picture(b"png", HOSTILE)]
     html = page(HOSTILE, blocks)
     assert html.count("<script") == html.count("onerror=alert(1)>") == 0
@@ -211,7 +211,7 @@ def test_text_of_strangers_stays_text_on_the_page():
     assert "&amp;amp; it&#39;s" in html
 
 
-def test_text_of_strangers_stays_text_on_the_landing_page():
+def test_untrusted_text_is_escaped_on_the_landing_page():
     text = f"{rst_text(HOSTILE)}\n\n{rst_table([HOSTILE], [[HOSTILE], ['']])}"
     body = publish_parts(text, writer="html")["body"]
     assert "<script" not in body

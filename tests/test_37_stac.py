@@ -1,4 +1,4 @@
-"""Images as STAC items: valid by the shipped schemas, and refused by each where it is broken."""
+"""Images as STAC items: validation against the shipped schemas."""
 
 import json
 from datetime import UTC, datetime, timedelta
@@ -26,9 +26,9 @@ from apertura.formats.catalog.validation import document_problem, stac_problems
 from apertura.formats.export.cog import write_slc
 
 START = datetime(2025, 5, 14, 9, 30, tzinfo=UTC)
-FLOWN = AcquisitionTime(START, START + timedelta(seconds=15), 1.4e9, 4e8)
+ACQUISITION = AcquisitionTime(START, START + timedelta(seconds=15), 1.4e9, 4e8)
 SQUARE = {"type": "Polygon", "coordinates": [[[9, 48], [9.1, 48], [9.1, 48.1], [9, 48.1], [9, 48]]]}
-PLACE = Affine(0.5, 0, 500000, 0, -0.5, 100)
+TRANSFORM = Affine(0.5, 0, 500000, 0, -0.5, 100)
 WKT = CRS("EPSG:32632").to_wkt()
 DIGEST = "ab" * 32
 HOSTILE = '<script>alert("x")</script> ../../etc \u202e\n"}'
@@ -36,7 +36,7 @@ HOSTILE = '<script>alert("x")</script> ../../etc \u202e\n"}'
 
 def facts():
     return {
-        **projection(WKT, (4, 6), PLACE[:6]),
+        **projection(WKT, (4, 6), TRANSFORM[:6]),
         "sar:instrument_mode": "bistatic",
         "product:type": "SLC",
         "view:incidence_angle": 45.0,
@@ -50,7 +50,7 @@ def facts():
 def slc(tmp_path_factory):
     path = tmp_path_factory.mktemp("slc") / "slc.tif"
     tags = {"APERTURA_INPUTS": json.dumps({"raw/codes.npy": DIGEST})}
-    write_slc(path, np.ones((4, 6), "c8"), transform=PLACE, crs=WKT, tags=tags, title="a")
+    write_slc(path, np.ones((4, 6), "c8"), transform=TRANSFORM, crs=WKT, tags=tags, title="a")
     return path
 
 
@@ -58,7 +58,7 @@ def image(slc, name="a-b", **changes):
     asset = asset_of(slc, f"../../../f01/{name}/slc.tif", sha256=DIGEST, facts=read_facts(slc))
     inputs = {"raw/codes.npy": DIGEST}
     return Image(**{
-        "flight": "f01", "name": name, "title": "a scene", "geometry": SQUARE, "acquisition": FLOWN,
+        "flight": "f01", "name": name, "title": "a scene", "geometry": SQUARE, "acquisition": ACQUISITION,
         "properties": facts(), "assets": {"slc": asset}, "inputs": inputs, **changes,
     })  # fmt: skip
 
@@ -67,9 +67,9 @@ def item(slc, **changes):
     return item_of(image(slc, **changes), "../../../..").to_dict()
 
 
-def test_a_raster_says_its_bands_and_inputs(slc):
-    found = read_facts(slc)
-    assert found.bands == [
+def test_bands_and_inputs_are_read_from_a_raster(slc):
+    raster_facts = read_facts(slc)
+    assert raster_facts.bands == [
         {
             "data_type": "cfloat32",
             "raster:sampling": "area",
@@ -78,55 +78,57 @@ def test_a_raster_says_its_bands_and_inputs(slc):
             "unit": "1",
         }
     ]
-    assert found.inputs == {"raw/codes.npy": DIGEST}
+    assert raster_facts.inputs == {"raw/codes.npy": DIGEST}
 
 
-def test_a_file_that_is_no_geotiff_is_one_message(tmp_path):
+def test_file_that_is_no_geotiff_is_refused(tmp_path):
     path = tmp_path / "db.tif"
     path.write_text("no raster")
     with pytest.raises(CampaignError, match=r"db\.tif: cannot be read as GeoTIFF; expected a GeoTIFF of the workflow"):
         read_facts(path)
 
 
-def test_an_item_declares_and_keeps_every_extension(slc):
+def test_item_declares_and_conforms_to_every_extension(slc):
     document = item(slc)
     assert sorted(document["stac_extensions"]) == sorted(EXTENSIONS.values())
     assert document_problem(document) is None
 
 
-BROKEN = {
-    "sar: band of no letter": lambda found: found["properties"].update({"sar:frequency_band": "Q"}),
-    "sar: no mode": lambda found: found["properties"].pop("sar:instrument_mode"),
-    "sar: side of no name": lambda found: found["properties"].update({"sar:observation_direction": "front"}),
-    "sar: deprecated product type": lambda found: found["properties"].update({"sar:product_type": "SLC"}),
-    "product: no type": lambda found: found["properties"].pop("product:type"),
-    "view: angle below ground": lambda found: found["properties"].update({"view:incidence_angle": 91.0}),
-    "projection: half a shape": lambda found: found["properties"].update({"proj:shape": [4]}),
-    "projection: no transform": lambda found: found["properties"].pop("proj:transform"),
-    "processing: no lineage": lambda found: found["properties"].pop("processing:lineage"),
-    "processing: unnamed GDAL": lambda found: found["properties"]["processing:software"].pop("gdal"),
-    "file: sha256 of 31 bytes": lambda found: found["assets"]["slc"].update({"file:checksum": "1220" + "ab" * 31}),
-    "file: no size": lambda found: found["assets"]["slc"].pop("file:size"),
-    "file: input by md5": lambda found: found["links"][0].update({"file:checksum": "d50110" + "ab" * 16}),
-    "raster: no bands": lambda found: found["assets"]["slc"].pop("bands"),
-    "raster: type of no name": lambda found: found["assets"]["slc"]["bands"][0].update({"data_type": "complex"}),
-    "core: no geometry": lambda found: found.pop("geometry"),
-    "core: place without footprint": lambda found: found.update({"geometry": None}),
-    "core: no time": lambda found: found["properties"].update({"datetime": "yesterday"}),
+DEFECTS = {
+    "sar: unknown band letter": lambda item: item["properties"].update({"sar:frequency_band": "Q"}),
+    "sar: no mode": lambda item: item["properties"].pop("sar:instrument_mode"),
+    "sar: unknown observation direction": lambda item: item["properties"].update(
+        {"sar:observation_direction": "front"}
+    ),
+    "sar: deprecated product type": lambda item: item["properties"].update({"sar:product_type": "SLC"}),
+    "product: no type": lambda item: item["properties"].pop("product:type"),
+    "view: angle below ground": lambda item: item["properties"].update({"view:incidence_angle": 91.0}),
+    "projection: half a shape": lambda item: item["properties"].update({"proj:shape": [4]}),
+    "projection: no transform": lambda item: item["properties"].pop("proj:transform"),
+    "processing: no lineage": lambda item: item["properties"].pop("processing:lineage"),
+    "processing: unnamed GDAL": lambda item: item["properties"]["processing:software"].pop("gdal"),
+    "file: sha256 of 31 bytes": lambda item: item["assets"]["slc"].update({"file:checksum": "1220" + "ab" * 31}),
+    "file: no size": lambda item: item["assets"]["slc"].pop("file:size"),
+    "file: input by md5": lambda item: item["links"][0].update({"file:checksum": "d50110" + "ab" * 16}),
+    "raster: no bands": lambda item: item["assets"]["slc"].pop("bands"),
+    "raster: unknown data type": lambda item: item["assets"]["slc"]["bands"][0].update({"data_type": "complex"}),
+    "core: no geometry": lambda item: item.pop("geometry"),
+    "core: code without footprint": lambda item: item.update({"geometry": None}),
+    "core: no time": lambda item: item["properties"].update({"datetime": "yesterday"}),
 }
 
 
-@pytest.mark.parametrize("name", BROKEN)
-def test_a_broken_item_is_refused(slc, name):
+@pytest.mark.parametrize("name", DEFECTS)
+def test_invalid_item_is_refused(slc, name):
     document = item(slc)
-    BROKEN[name](document)
+    DEFECTS[name](document)
     assert document_problem(document)
 
 
-def test_an_extension_without_a_schema_here_is_not_believed(slc):
+def test_extension_without_a_shipped_schema_is_refused(slc):
     document = item(slc)
     document["stac_extensions"].append("https://example.com/schema.json")
-    assert document_problem(document) == "no schema of https://example.com/schema.json here"
+    assert document_problem(document) == "the schema of https://example.com/schema.json is not available"
 
 
 def written(folder, images, campaign="tandem"):
@@ -137,12 +139,12 @@ def written(folder, images, campaign="tandem"):
     return folder
 
 
-def test_pystac_finds_every_item_and_file_from_the_catalog_down(slc, tmp_path):
-    sums = image(slc, "coherent", made_from=["a-b"])
-    folder = written(tmp_path / "results" / "stac", [sums, image(slc)])
+def test_pystac_finds_every_item_and_file_of_the_catalog(slc, tmp_path):
+    fused = image(slc, "coherent", made_from=["a-b"])
+    folder = written(tmp_path / "results" / "stac", [fused, image(slc)])
     assert stac_problems(folder) == []
     catalog = pystac.Catalog.from_file(folder / CATALOG)
-    items = {one.id: one for one in catalog.get_items(recursive=True)}
+    items = {entry.id: entry for entry in catalog.get_items(recursive=True)}
     assert sorted(items) == ["f01-a-b", "f01-coherent"]
     assert items["f01-a-b"].assets["slc"].get_absolute_href() == str(tmp_path / "results/f01/a-b/slc.tif")
     links = [link for link in items["f01-coherent"].links if link.rel == "derived_from"]
@@ -151,14 +153,14 @@ def test_pystac_finds_every_item_and_file_from_the_catalog_down(slc, tmp_path):
     assert links[1].get_absolute_href() == items["f01-a-b"].self_href
 
 
-def test_links_are_relative_and_no_file_names_itself(slc, tmp_path):
+def test_links_are_relative_and_no_file_links_to_itself(slc, tmp_path):
     files = catalog_files("tandem", [image(slc)])
     hrefs = [link["href"] for document in files.values() for link in document["links"]]
     assert all(href.startswith(".") for href in hrefs)
     assert not [link for document in files.values() for link in document["links"] if link["rel"] == "self"]
 
 
-def test_a_catalog_of_which_an_item_is_gone_or_edited_is_wrong(slc, tmp_path):
+def test_missing_or_edited_items_of_a_catalog_are_reported(slc, tmp_path):
     folder = written(tmp_path, [image(slc), image(slc, "coherent")])
     (folder / "images/f01/a-b.json").unlink()
     path = folder / "images/f01/coherent.json"
@@ -168,7 +170,7 @@ def test_a_catalog_of_which_an_item_is_gone_or_edited_is_wrong(slc, tmp_path):
     assert problems[1].startswith("images/f01/coherent.json: properties/sar:frequency_band: 'l' is not one of")
 
 
-def test_a_link_out_of_the_catalog_is_not_followed(slc, tmp_path):
+def test_link_out_of_the_catalog_is_not_followed(slc, tmp_path):
     folder = written(tmp_path / "stac", [image(slc)])
     path = folder / "collection.json"
     document = json.loads(path.read_text())
@@ -177,24 +179,24 @@ def test_a_link_out_of_the_catalog_is_not_followed(slc, tmp_path):
     assert stac_problems(folder) == ["../../secret.json: path '../../secret.json' leads out of the campaign folder"]
 
 
-def test_a_campaign_without_a_place_has_items_without_geometry_and_no_collection(slc, tmp_path):
+def test_local_campaign_has_items_without_geometry_and_no_collection(slc, tmp_path):
     local = CRS.from_wkt('LOCAL_CS["yard",UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]').to_wkt()
-    properties = {**facts(), **projection(local, (4, 6), PLACE[:6])}
+    properties = {**facts(), **projection(local, (4, 6), TRANSFORM[:6])}
     folder = written(tmp_path, [image(slc, geometry=None, properties=properties)])
     assert stac_problems(folder) == []
-    (found,) = pystac.Catalog.from_file(folder / CATALOG).get_items(recursive=True)
-    assert found.geometry is None
-    assert found.bbox is None
-    assert found.properties["proj:code"] is None
-    assert found.collection_id is None
+    (entry,) = pystac.Catalog.from_file(folder / CATALOG).get_items(recursive=True)
+    assert entry.geometry is None
+    assert entry.bbox is None
+    assert entry.properties["proj:code"] is None
+    assert entry.collection_id is None
     assert not (folder / "collection.json").exists()
 
 
 @pytest.mark.parametrize(
     ("ghz", "band"), [(0.15, None), (0.25, "P"), (0.7, "P"), (1.0, "L"), (39.9, "Ka"), (77.0, None)]
 )
-def test_every_frequency_has_the_extension_and_its_letter_where_there_is_one(slc, ghz, band):
-    """The table of bands of the extension: P from 0.25 to 1 GHz; no letter is required."""
+def test_frequency_band_letter_follows_the_table_of_the_extension(slc, ghz, band):
+    """Bands of the extension: P from 0.25 to 1 GHz; the letter is optional."""
     document = item(slc, acquisition=AcquisitionTime(START, START, 1e9 * ghz, 1e8))
     assert document["properties"]["sar:center_frequency"] == ghz
     assert document["properties"].get("sar:frequency_band") == band
@@ -202,7 +204,7 @@ def test_every_frequency_has_the_extension_and_its_letter_where_there_is_one(slc
     assert document_problem(document) is None
 
 
-def test_author_licence_and_doi_are_those_of_the_collection(slc):
+def test_author_licence_and_doi_are_written_to_the_collection(slc):
     files = catalog_files("tandem", [image(slc)], licence="CC-BY-4.0", author="A. Nother", doi="10.5281/zenodo.1")
     collection = files["collection.json"]
     assert document_problem(collection) is None
@@ -214,22 +216,22 @@ def test_author_licence_and_doi_are_those_of_the_collection(slc):
     assert catalog_files("tandem", [image(slc)])["collection.json"]["license"] == "other"
 
 
-def test_times_of_a_recording_without_a_clock_say_so(slc):
+def test_recording_without_a_clock_is_marked(slc):
     counted = AcquisitionTime(instant(0), instant(10**9), 9.6e9, 6e8)
     assert item(slc, acquisition=counted)["properties"]["apertura:clock"].startswith("none:")
     assert "apertura:clock" not in item(slc)["properties"]
 
 
-def test_hostile_names_stay_text_and_addresses_are_encoded(slc, tmp_path):
+def test_untrusted_names_are_escaped_and_links_encoded(slc, tmp_path):
     inputs = {'raw/a b#?"<x>.npy': DIGEST}
     folder = written(tmp_path, [image(slc, title=HOSTILE, inputs=inputs)], campaign=HOSTILE)
     assert stac_problems(folder) == []
-    found = json.loads((folder / "images/f01/a-b.json").read_text())
-    assert found["properties"]["title"] == HOSTILE
-    assert found["links"][0]["href"] == "../../../../raw/a%20b%23%3F%22%3Cx%3E.npy"
+    document = json.loads((folder / "images/f01/a-b.json").read_text())
+    assert document["properties"]["title"] == HOSTILE
+    assert document["links"][0]["href"] == "../../../../raw/a%20b%23%3F%22%3Cx%3E.npy"
     assert sorted(path.name for path in tmp_path.rglob("*.json")) == ["a-b.json", CATALOG, "collection.json"]
 
 
-def test_the_same_images_in_any_order_give_the_same_catalog(slc):
+def test_catalog_does_not_depend_on_the_order_of_images(slc):
     images = [image(slc), image(slc, "coherent", made_from=["a-b"])]
     assert json.dumps(catalog_files("tandem", images)) == json.dumps(catalog_files("tandem", images[::-1]))

@@ -1,4 +1,4 @@
-"""What QGIS shows without being asked: decibels from noise floor to peak, classes by their names."""
+"""Default QGIS styles: decibels from noise floor to peak, classes with their names."""
 
 from xml.etree import ElementTree as ET
 
@@ -31,7 +31,7 @@ def test_decibels_are_black_at_the_noise_floor_and_white_at_the_peak(tmp_path, f
     assert ends_of(tmp_path / "db.qml") == [black, 32.0]
 
 
-def test_a_style_is_refused_where_nobody_measured_the_image(tmp_path):
+def test_style_of_an_image_without_levels_is_refused(tmp_path):
     write_db(tmp_path / "db.tif", IMAGE, **GRID, tags={})
     with pytest.raises(ContractError, match="no peak and noise floor"):
         write_db_style(tmp_path / "db.qml")
@@ -41,27 +41,27 @@ def test_a_style_is_refused_where_nobody_measured_the_image(tmp_path):
 def test_every_class_of_the_mask_has_its_name_and_colour_in_style_and_file(tmp_path):
     write_mask(tmp_path / "mask.tif", np.zeros((30, 40), np.uint8), **GRID, tags={})
     write_mask_style(tmp_path / "mask.qml")
-    entries = {int(one.get("value")): one for one in ET.parse(tmp_path / "mask.qml").iter("paletteEntry")}
-    assert {value: one.get("label") for value, one in entries.items()} == {
+    entries = {int(entry.get("value")): entry for entry in ET.parse(tmp_path / "mask.qml").iter("paletteEntry")}
+    assert {value: entry.get("label") for value, entry in entries.items()} == {
         0: "valid",
         1: "shadow",
         2: "layover",
         3: "shadow and layover",
         255: "outside, no data",
     }
-    assert [value for value, one in entries.items() if one.get("alpha") == "0"] == [0, OUTSIDE]
+    assert [value for value, entry in entries.items() if entry.get("alpha") == "0"] == [0, OUTSIDE]
     with rasterio.open(tmp_path / "mask.tif") as raster:
         colours = raster.colormap(1)
     for value, (_, colour) in CLASSES.items():
         assert entries[value].get("color") == "#{:02x}{:02x}{:02x}".format(*colour)
-        if value != OUTSIDE:  # what is no data GDAL paints as it likes
+        if value != OUTSIDE:  # GDAL chooses the colour of nodata
             assert colours[value][:3] == colour
 
 
 @pytest.mark.parametrize(
     ("values", "ends"), [((18.2, 77.4), (18, 78)), ((30, 30), (30, 31)), ((np.nan, np.nan), (0, 1))]
 )
-def test_a_layer_is_coloured_from_its_smallest_to_its_largest_value(tmp_path, values, ends):
+def test_layer_is_coloured_from_its_smallest_to_its_largest_value(tmp_path, values, ends):
     angle = np.full((30, 40), np.nan, np.float32)
     angle[0, :2] = values
     write_incidence(tmp_path / "incidence.tif", angle, **GRID, tags={})
@@ -72,13 +72,13 @@ def test_a_layer_is_coloured_from_its_smallest_to_its_largest_value(tmp_path, va
 
 
 @pytest.mark.slow
-def test_places_without_data_count_nothing_in_the_colours_of_a_file_and_of_a_mosaic(tmp_path):
+def test_nodata_is_ignored_in_the_colours_of_a_file_and_of_a_mosaic(tmp_path):
     looks = np.zeros((2050, 2100), np.float32)
     looks[3:1000, 5:900], looks[1003:2000, 1001:2003] = 4, 25
     for name, part in (("above", np.s_[:1001]), ("below", np.s_[1001:])):
-        one = np.zeros_like(looks)
-        one[part] = looks[part]
-        write_looks(tmp_path / f"{name}.tif", one, **GRID, tags={})
+        layer = np.zeros_like(looks)
+        layer[part] = looks[part]
+        write_looks(tmp_path / f"{name}.tif", layer, **GRID, tags={})
     write_looks(tmp_path / "looks.tif", looks, **GRID, tags={})
     write_mosaic(tmp_path / "both.vrt", [tmp_path / "above.tif", tmp_path / "below.tif"])
     for name in ("looks.qml", "both.qml"):
@@ -87,11 +87,11 @@ def test_places_without_data_count_nothing_in_the_colours_of_a_file_and_of_a_mos
         assert (float(items[0].get("value")), float(items[-1].get("value"))) == (4, 25)
 
 
-def test_sums_say_what_they_were_divided_by_and_which_pairs_they_hold():
-    told = of_sums({"a-a": 4.0, "a-b": 2.0, "a-c": 1.0}, {"a-a": 0.0, "a-b": 0.7})
-    assert told["coherent"].amplitude == "mean of 2 peak-normalised images, added with phase"
-    assert told["coherent"].divided_by == {"a-a": 4.0, "a-b": 2.0}
-    assert told["coherent"].phases_taken_off_rad == {"a-a": 0.0, "a-b": 0.7}
-    assert told["noncoherent"].power == "mean power of 3 peak-normalised images"
-    assert told["noncoherent"].divided_by == {"a-a": 4.0, "a-b": 2.0, "a-c": 1.0}
-    assert not told["noncoherent"].phases_taken_off_rad
+def test_radiometry_of_sums_lists_divisors_and_pairs():
+    radiometry = of_sums({"a-a": 4.0, "a-b": 2.0, "a-c": 1.0}, {"a-a": 0.0, "a-b": 0.7})
+    assert radiometry["coherent"].amplitude == "mean of 2 peak-normalised images, added with phase"
+    assert radiometry["coherent"].divided_by == {"a-a": 4.0, "a-b": 2.0}
+    assert radiometry["coherent"].phases_removed_rad == {"a-a": 0.0, "a-b": 0.7}
+    assert radiometry["noncoherent"].power == "mean power of 3 peak-normalised images"
+    assert radiometry["noncoherent"].divided_by == {"a-a": 4.0, "a-b": 2.0, "a-c": 1.0}
+    assert not radiometry["noncoherent"].phases_removed_rad

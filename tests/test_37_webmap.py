@@ -1,4 +1,4 @@
-"""The map's server gives its own page and the listed files to this machine alone; the page brings no text to HTML."""
+"""Map server: serves its page and listed files to the local machine only; the page inserts no text as HTML."""
 
 import http.client
 import json
@@ -25,7 +25,7 @@ PAGE = {name: name.encode() for name in (*SHELL, *FILES)}
 
 @pytest.fixture
 def results(tmp_path):
-    """A folder of results beside a secret, with links out of it and a pipe."""
+    """Create a folder of results next to a secret file, with links out of the folder and a pipe."""
     folder = tmp_path / "campaign" / "results"
     planted = [(f"map/{name}", b"planted") for name in PAGE]
     for name, content in ((IMAGE, CONTENT), ("f01/a-b/unlisted.tif", b"x"), ("empty", b""), *planted):
@@ -42,7 +42,7 @@ def results(tmp_path):
 
 @contextmanager
 def serving(folder, files, page=PAGE):
-    """Serve with a list of files as it is at each request, and a page of which each file holds its name."""
+    """Run a server with a list of files, and a page whose files contain their own names."""
     with MapServer(folder, lambda: files, page=page, sha256_of=lambda name: sha256_file(folder / name)) as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
@@ -60,18 +60,18 @@ def server(results):
         yield running
 
 
-def ask(server, target, method="GET", **headers):
+def request(server, target, method="GET", **headers):
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=5)
     headers = {name.replace("_", "-"): value for name, value in headers.items()}
     connection.request(method, target, headers={"Host": f"127.0.0.1:{server.server_port}", **headers})
-    answer = connection.getresponse()
-    body = answer.read()
+    response = connection.getresponse()
+    body = response.read()
     connection.close()
-    return answer, body
+    return response, body
 
 
 @pytest.mark.parametrize(
-    ("asked", "first", "end"),
+    ("byte_range", "first", "end"),
     [
         ("bytes=0-0", 0, 1),
         ("bytes=1000-1999", 1000, 2000),
@@ -81,30 +81,30 @@ def ask(server, target, method="GET", **headers):
         ("bytes=99999-200000", 99999, 100000),
     ],
 )
-def test_a_range_is_answered_with_those_bytes(server, asked, first, end):
-    answer, body = ask(server, f"/{IMAGE}", Range=asked)
-    assert answer.status == 206
+def test_byte_range_is_returned(server, byte_range, first, end):
+    response, body = request(server, f"/{IMAGE}", Range=byte_range)
+    assert response.status == 206
     assert body == CONTENT[first:end]
-    assert answer.headers["Content-Range"] == f"bytes {first}-{end - 1}/100000"
-    assert answer.headers["Content-Type"] == "image/tiff"
-    head, nothing = ask(server, f"/{IMAGE}", "HEAD", Range=asked)
-    assert (head.status, head.headers["Content-Length"], nothing) == (206, str(end - first), b"")
+    assert response.headers["Content-Range"] == f"bytes {first}-{end - 1}/100000"
+    assert response.headers["Content-Type"] == "image/tiff"
+    head, head_body = request(server, f"/{IMAGE}", "HEAD", Range=byte_range)
+    assert (head.status, head.headers["Content-Length"], head_body) == (206, str(end - first), b"")
 
 
-@pytest.mark.parametrize("asked", ["bytes=100000-", "bytes=100000-100001", "bytes=-0"])
-def test_a_range_beyond_the_file_is_refused(server, asked):
-    answer, _ = ask(server, f"/{IMAGE}", Range=asked)
-    assert answer.status == 416
-    assert answer.headers["Content-Range"] == "bytes */100000"
-    assert ask(server, "/empty", Range="bytes=0-")[0].status == 416
+@pytest.mark.parametrize("byte_range", ["bytes=100000-", "bytes=100000-100001", "bytes=-0"])
+def test_byte_range_beyond_the_file_is_refused(server, byte_range):
+    response, _ = request(server, f"/{IMAGE}", Range=byte_range)
+    assert response.status == 416
+    assert response.headers["Content-Range"] == "bytes */100000"
+    assert request(server, "/empty", Range="bytes=0-")[0].status == 416
 
 
 @pytest.mark.parametrize(
-    "asked", ["bytes=5-2", "bytes=0-1,5-6", "lines=1-2", "bytes=a-b", "bytes=٣-٤".encode(), "bytes=-"]
+    "byte_range", ["bytes=5-2", "bytes=0-1,5-6", "lines=1-2", "bytes=a-b", "bytes=٣-٤".encode(), "bytes=-"]
 )
-def test_what_is_no_single_range_gets_the_whole_file(server, asked):
-    answer, body = ask(server, f"/{IMAGE}", Range=asked)
-    assert (answer.status, body) == (200, CONTENT)
+def test_invalid_or_multiple_ranges_return_the_whole_file(server, byte_range):
+    response, body = request(server, f"/{IMAGE}", Range=byte_range)
+    assert (response.status, body) == (200, CONTENT)
 
 
 @pytest.mark.parametrize(
@@ -128,21 +128,21 @@ def test_what_is_no_single_range_gets_the_whole_file(server, asked):
         "",
     ],
 )
-def test_nothing_but_the_listed_files_is_reached_and_none_through_a_link(server, target):
-    answer, body = ask(server, target or "/nothing")
-    assert answer.status == 404
+def test_only_listed_files_are_served_and_none_through_a_link(server, target):
+    response, body = request(server, target or "/nothing")
+    assert response.status == 404
     assert b"secret" not in body
 
 
 @pytest.mark.parametrize(
     "host", ["evil.example", "evil.example:{}", "127.0.0.1", "127.0.0.1:1", "127.0.0.1.evil:{}", ""]
 )
-def test_a_page_of_another_name_that_leads_here_is_refused(server, host):
-    answer, body = ask(server, f"/{IMAGE}", Host=host.format(server.server_port))
-    assert (answer.status, CONTENT[:9] in body) == (403, False)
+def test_request_with_a_foreign_host_is_refused(server, host):
+    response, body = request(server, f"/{IMAGE}", Host=host.format(server.server_port))
+    assert (response.status, CONTENT[:9] in body) == (403, False)
 
 
-def test_two_hosts_in_one_request_are_refused(server):
+def test_request_with_two_hosts_is_refused(server):
     with socket.create_connection(("127.0.0.1", server.server_port), timeout=5) as plain:
         host = f"Host: 127.0.0.1:{server.server_port}\r\n"
         plain.sendall(f"GET /{IMAGE} HTTP/1.1\r\n{host}{host}\r\n".encode())
@@ -151,106 +151,110 @@ def test_two_hosts_in_one_request_are_refused(server):
 
 
 @pytest.mark.parametrize("body", ["Content-Length: 24\r\n\r\n", "Transfer-Encoding: chunked\r\n\r\n18\r\n"])
-def test_the_body_of_a_request_is_no_further_request(server, body):
+def test_request_body_is_not_parsed_as_a_request(server, body):
     inner = f"GET /{IMAGE} HTTP/1.1\r\n\r\n"
     with socket.create_connection(("127.0.0.1", server.server_port), timeout=5) as plain:
         plain.sendall(f"GET /empty HTTP/1.1\r\nHost: 127.0.0.1:{server.server_port}\r\n{body}{inner}".encode())
-        answered = b"".join(iter(lambda: plain.recv(1 << 16), b""))  # until the server closes
-    assert answered.startswith(b"HTTP/1.1 400 ")
-    assert answered.count(b"HTTP/1.1 ") == 1
+        received = b"".join(iter(lambda: plain.recv(1 << 16), b""))  # until the server closes
+    assert received.startswith(b"HTTP/1.1 400 ")
+    assert received.count(b"HTTP/1.1 ") == 1
 
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "BREW"])
-def test_a_map_is_only_read(server, method):
-    answer, _ = ask(server, f"/{IMAGE}", method)
-    assert (answer.status, answer.headers["Allow"]) == (405, "GET, HEAD")
+def test_only_get_and_head_are_allowed(server, method):
+    response, _ = request(server, f"/{IMAGE}", method)
+    assert (response.status, response.headers["Allow"]) == (405, "GET, HEAD")
 
 
 @pytest.mark.parametrize(("host", "other"), [("127.0.0.1", "localhost"), ("localhost", "127.0.0.1")])
 @pytest.mark.parametrize("target", ["/", "/map/index.html", f"/{IMAGE}", "/nothing", f"/{IMAGE}?sha256=0"])
-def test_every_answer_forbids_the_browser_all_other_hosts(server, target, host, other):
-    answer, _ = ask(server, target, Host=f"{host}:{server.server_port}")
-    policy, ours = answer.headers["Content-Security-Policy"], f"http://{other}:{server.server_port}"
+def test_every_response_forbids_other_hosts(server, target, host, other):
+    response, _ = request(server, target, Host=f"{host}:{server.server_port}")
+    policy, other_origin = response.headers["Content-Security-Policy"], f"http://{other}:{server.server_port}"
     assert policy.startswith("default-src 'none';")
-    assert not re.search(r"http|\*|unsafe", policy.replace(f"{ours};", ""))
+    assert not re.search(r"http|\*|unsafe", policy.replace(f"{other_origin};", ""))
     if host == "localhost":
-        assert {f"frame-src {ours}", "frame-ancestors 'none'"} <= set(policy.split("; "))
-        assert answer.headers["Connection-Allowlist"] == f'(response-origin "{ours}")'
+        assert {f"frame-src {other_origin}", "frame-ancestors 'none'"} <= set(policy.split("; "))
+        assert response.headers["Connection-Allowlist"] == f'(response-origin "{other_origin}")'
     else:
-        kept = {f"frame-ancestors {ours}", "sandbox allow-scripts allow-same-origin allow-downloads"}
-        assert kept <= set(policy.split("; "))
-        assert answer.headers["Connection-Allowlist"] == "(response-origin)"
-    assert answer.headers["Cross-Origin-Resource-Policy"] == "same-origin"
-    assert answer.headers["X-Content-Type-Options"] == "nosniff"
-    assert answer.headers["X-DNS-Prefetch-Control"] == "off"
+        required = {f"frame-ancestors {other_origin}", "sandbox allow-scripts allow-same-origin allow-downloads"}
+        assert required <= set(policy.split("; "))
+        assert response.headers["Connection-Allowlist"] == "(response-origin)"
+    assert response.headers["Cross-Origin-Resource-Policy"] == "same-origin"
+    assert response.headers["X-Content-Type-Options"] == "nosniff"
+    assert response.headers["X-DNS-Prefetch-Control"] == "off"
 
 
-def test_the_page_is_our_own_and_each_part_is_answered_under_its_own_name_alone(server):
+def test_page_files_are_served_only_from_their_own_origin(server):
     window = {"/": "shell.html", **{f"/{name}": name for name in SHELL}}
     page = {f"/map/{name}": name for name in FILES}
-    for host, here, elsewhere in (("localhost", window, page), ("127.0.0.1", page, window)):
-        for target, name in here.items():
-            answer, body = ask(server, target, Host=f"{host}:{server.server_port}")
-            assert (answer.status, body) == (200, name.encode())
-        for target in (elsewhere.keys() - {"/"}) | {"/map/shell.html", "/index.html", "/map/other.js"}:
-            assert ask(server, target, Host=f"{host}:{server.server_port}")[0].status == 404
-    assert ask(server, f"/{IMAGE}", Host=f"localhost:{server.server_port}")[0].status == 404
+    for host, own, foreign in (("localhost", window, page), ("127.0.0.1", page, window)):
+        for target, name in own.items():
+            response, body = request(server, target, Host=f"{host}:{server.server_port}")
+            assert (response.status, body) == (200, name.encode())
+        for target in (foreign.keys() - {"/"}) | {"/map/shell.html", "/index.html", "/map/other.js"}:
+            assert request(server, target, Host=f"{host}:{server.server_port}")[0].status == 404
+    assert request(server, f"/{IMAGE}", Host=f"localhost:{server.server_port}")[0].status == 404
 
 
 @pytest.mark.parametrize(
-    ("target", "wanted"), [("/", ""), ("/map/", ""), ("/map/index.html", "document"), (f"/{IMAGE}", "document")]
+    ("target", "destination"), [("/", ""), ("/map/", ""), ("/map/index.html", "document"), (f"/{IMAGE}", "document")]
 )
-def test_what_a_reader_opens_beside_the_window_leads_to_it(server, target, wanted):
-    answer, _ = ask(server, target, Sec_Fetch_Dest=wanted)
-    assert (answer.status, answer.headers["Location"]) == (302, server.url)
+def test_direct_navigation_is_redirected_to_the_map_window(server, target, destination):
+    response, _ = request(server, target, Sec_Fetch_Dest=destination)
+    assert (response.status, response.headers["Location"]) == (302, server.url)
     assert server.url == f"http://localhost:{server.server_port}/"
 
 
-def test_a_file_that_is_not_the_one_that_was_meant_is_not_given(server, results):
-    meant = sha256_file(results / IMAGE)
-    for target in (f"/{IMAGE}?sha256={meant}", f"/{IMAGE}"):
-        assert ask(server, target)[0].status == 200
-    assert ask(server, f"/{IMAGE}?sha256={'0' * 64}")[0].status == 409
+def test_file_with_another_hash_is_not_served(server, results):
+    expected_sha256 = sha256_file(results / IMAGE)
+    for target in (f"/{IMAGE}?sha256={expected_sha256}", f"/{IMAGE}"):
+        assert request(server, target)[0].status == 200
+    assert request(server, f"/{IMAGE}?sha256={'0' * 64}")[0].status == 409
     (results / IMAGE).write_bytes(CONTENT[::-1])
-    for target in (f"/{IMAGE}?sha256={meant}", f"/{IMAGE}?sha256={sha256_file(results / IMAGE)}", f"/{IMAGE}"):
-        answer, body = ask(server, target)
-        assert (answer.status, body) == (409, b"changed since the map was made: run the workflow again\n")
+    for target in (
+        f"/{IMAGE}?sha256={expected_sha256}",
+        f"/{IMAGE}?sha256={sha256_file(results / IMAGE)}",
+        f"/{IMAGE}",
+    ):
+        response, body = request(server, target)
+        assert (response.status, body) == (409, b"changed since the map was made: run the workflow again\n")
 
 
-def test_a_reader_that_goes_leaves_the_server_silent_and_up(server, capfd):
+def test_connection_reset_leaves_the_server_running_without_output(server, capfd):
     for _ in range(3):
         with socket.create_connection(("127.0.0.1", server.server_port)) as plain:
             plain.sendall(f"GET /{IMAGE} HTTP/1.1\r\nHost: 127.0.0.1:{server.server_port}\r\n\r\n".encode())
             plain.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # reset
-    assert ask(server, f"/{IMAGE}")[0].status == 200
+    assert request(server, f"/{IMAGE}")[0].status == 200
     assert capfd.readouterr().err == ""
 
 
-def test_a_port_that_is_taken_is_one_message(server, results):
+def test_port_in_use_is_reported(server, results):
     with pytest.raises(CampaignError, match=r"apertura map: port \d+: Address already in use; expected a free port"):
         MapServer(results, dict, page={}, sha256_of=str, port=server.server_port)
 
 
-def test_a_name_of_a_stranger_is_encoded_in_every_address():
-    hostile = 'a"<b>#?&%2f é'
-    layer = Layer(f"{hostile}.tif", "0f", "image", hostile, "dB", -50.0, 0.0)
-    report = {"focus": {"verdict": hostile, "why": ""}, "numerical_error_db": -60, "flags": {}}
-    entry = image_entry(hostile, "a-b", report, [layer])
+def test_untrusted_names_are_encoded_in_urls():
+    name = 'a"<b>#?&%2f é'
+    layer = Layer(f"{name}.tif", "0f", "image", name, "dB", -50.0, 0.0)
+    report = {"focus": {"verdict": name, "reason": ""}, "numerical_error_db": -60, "flags": {}}
+    entry = image_entry(name, "a-b", report, [layer])
     assert re.fullmatch(r"\.\./[\w%./-]+\.tif\?sha256=0f", entry["layers"][0]["url"], re.ASCII)
     grid = {"bounds_m": [0, 0, 1, 1], "spacing_m": 1.0, "shape": [1, 1]}
-    document = map_document(hostile, grid=grid, crs={}, images=[entry], places=[], coverage_url=None)
-    assert json.loads(json.dumps(document))["campaign"] == hostile
-    assert named_files(document) == {f"{hostile}/a-b/{hostile}.tif": "0f"}
+    document = map_document(name, grid=grid, crs={}, images=[entry], places=[], coverage_url=None)
+    assert json.loads(json.dumps(document))["campaign"] == name
+    assert named_files(document) == {f"{name}/a-b/{name}.tif": "0f"}
 
 
-def test_a_document_names_no_file_without_its_hash_and_none_in_another_format():
+def test_only_hashed_files_of_the_current_format_are_listed():
     urls = ["../f01/a-b/db.tif", "https://x/y.tif?sha256=0f", "../f01/%ff.tif?sha256=0f"]
     document = {"images": [{"layers": [{"url": url} for url in urls]}], "coverage_url": "../coverage.geojson?sha256=0f"}
     assert named_files({"format": FORMAT, **document}) == {"coverage.geojson": "0f"}
     assert named_files({"format": FORMAT + 1}) == {}
 
 
-def test_without_a_bundle_there_is_no_address_but_one_message_how_to_get_it(tmp_path):
+def test_missing_map_page_is_reported_with_a_remedy(tmp_path):
     with pytest.raises(CampaignError, match=r"no map page: pip install does not build it.*make webmap"):
         page_files(tmp_path)
     for name in PAGE:
@@ -258,27 +262,27 @@ def test_without_a_bundle_there_is_no_address_but_one_message_how_to_get_it(tmp_
     assert page_files(tmp_path) == PAGE
 
 
-def test_the_pages_code_writes_text_as_text():
+def test_page_scripts_do_not_insert_html():
     scripts = {path.name: path.read_text() for path in (SOURCES / "src").glob("*.js")}
     assert scripts.keys() >= {"app.js", "dom.js", "chart.js", "shell.js"}
-    wrong = re.compile(
+    unsafe = re.compile(
         r"innerHTML|outerHTML|insertAdjacent|document\.write|\beval\b|new Function|srcdoc|https?://(?!www\.w3\.org/2000/svg)"
     )
-    assert {name: wrong.findall(text) for name, text in scripts.items() if wrong.search(text)} == {}
+    assert {name: unsafe.findall(text) for name, text in scripts.items() if unsafe.search(text)} == {}
 
 
 @pytest.mark.parametrize(
-    ("file", "named"), [("index.html", ["data:,", "app.css", "app.js"]), ("shell.html", ["shell.css", "shell.js"])]
+    ("file", "references"), [("index.html", ["data:,", "app.css", "app.js"]), ("shell.html", ["shell.css", "shell.js"])]
 )
-def test_the_page_names_no_other_host_and_holds_no_code(file, named):
+def test_page_refers_to_no_other_host_and_contains_no_inline_code(file, references):
     page = (SOURCES / "src" / file).read_text()
-    assert re.findall(r"(?:src|href)=\"([^\"]*)\"", page) == named
+    assert re.findall(r"(?:src|href)=\"([^\"]*)\"", page) == references
     assert not re.search(r"<script(?! src=)|<style|\son\w+=|style=|https?:", page)
 
 
-def test_the_locked_libraries_come_by_hash_and_name_no_registry():
+def test_locked_libraries_have_hashes_and_no_registry():
     lock = (SOURCES / "package-lock.json").read_text()
     packages = json.loads(lock)["packages"]
     assert len(packages) > 20
-    assert all(name == "" or one["integrity"].startswith("sha512-") for name, one in packages.items())
+    assert all(name == "" or package["integrity"].startswith("sha512-") for name, package in packages.items())
     assert '"resolved"' not in lock

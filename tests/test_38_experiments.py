@@ -1,4 +1,4 @@
-"""The paper's experiments: recorded in the lab, standing and flying, processed as any campaign, judged and drawn."""
+"""Experiments of the paper (lab, static, UAV): simulated, processed as campaigns, evaluated and plotted."""
 
 import numpy as np
 import pytest
@@ -29,14 +29,14 @@ from apertura.simulation import preset, simulate
 from apertura.simulation.presets import GAP_M, SEGMENT_M
 from apertura.stages import echo, ingest
 
-pytestmark = pytest.mark.slow  # of the research, not of the product
+pytestmark = pytest.mark.slow  # research code
 
 PULSES = 16
 
 
 @pytest.fixture(scope="module")
 def campaigns(tmp_path_factory):
-    """A folder of the two experiments without motion, few pulses, as far as their echoes."""
+    """Process the two experiments without motion, with few pulses, up to their echoes."""
     folder = tmp_path_factory.mktemp("campaigns")
     for name in ("lab", "static"):
         campaign = Campaign.load(simulate(folder / name, preset(f"paper-{name}", pulses=PULSES)))
@@ -48,25 +48,25 @@ def campaigns(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", ["lab", "static"])
-def test_the_sidelink_makes_random_phases_coherent_through_cable_and_air(campaigns, name):
+def test_sidelink_restores_coherence_of_random_phases(campaigns, name):
     experiment = open_experiment(campaigns, name)
-    place = experiment.places_m[0]
-    assert coherence_factor(terms_at(experiment.uncorrected(), place)) < 0.3
-    assert coherence_factor(terms_at(experiment.history(BISTATIC), place)) > 0.95
+    target = experiment.places_m[0]
+    assert coherence_factor(terms_at(experiment.uncorrected(), target)) < 0.3
+    assert coherence_factor(terms_at(experiment.history(BISTATIC), target)) > 0.95
 
 
 @pytest.mark.parametrize("name", ["lab", "static"])
 @pytest.mark.parametrize("pair", [MONOSTATIC, BISTATIC])
-def test_a_target_stands_in_the_profile_where_it_was_put(campaigns, name, pair):
+def test_target_peaks_at_its_range_in_the_profile(campaigns, name, pair):
     experiment = open_experiment(campaigns, name)
     history = experiment.history(pair)
     true_m = float(history.aperture.path(experiment.places_m[:1]).mean()) / 2
     slant_m = true_m + np.linspace(-0.6, 0.6, 601)
-    found_m = slant_m[np.abs(profiles_at(history, slant_m)).mean(axis=0).argmax()]
-    assert found_m == pytest.approx(true_m, abs=0.08)  # clutter moves it by a fraction of a cell of 37 cm
+    peak_m = slant_m[np.abs(profiles_at(history, slant_m)).mean(axis=0).argmax()]
+    assert peak_m == pytest.approx(true_m, abs=0.08)  # clutter displaces it by a fraction of a cell of 37 cm
 
 
-def test_the_lab_is_ten_metres_of_cable_beside_five_and_no_target():
+def test_lab_experiment_has_10_m_radar_and_5_m_sidelink_cables():
     specification = preset("paper-lab")
     (joint,) = specification.targets
     tracks = specification.flights[0].tracks
@@ -81,7 +81,7 @@ def test_the_lab_is_ten_metres_of_cable_beside_five_and_no_target():
             np.testing.assert_allclose(299792458 * recorded.channels["sidelink"].paths.delay_s, 5.0, atol=1e-6)
 
 
-def test_one_receive_signal_is_split_to_both_nodes_of_the_static_recording():
+def test_static_experiment_records_one_split_signal_on_both_nodes():
     recorded, _ = recordings_of(preset("paper-static", pulses=2))
     mono, bistatic = (recorded[name].channels["radar"].paths for name in ("uav1", "uav2"))
     np.testing.assert_array_equal(mono.delay_s, bistatic.delay_s)
@@ -90,7 +90,7 @@ def test_one_receive_signal_is_split_to_both_nodes_of_the_static_recording():
     assert 20 * np.log10(first / second) == pytest.approx(7.0, abs=0.1)
 
 
-def test_coherence_is_that_of_the_printed_recordings_and_of_the_noise_of_echo_free_ranges(campaigns):
+def test_coherence_claims_match_the_paper_and_the_noise_level(campaigns):
     claims = {claim.claim: claim for claim in coherence_claims(campaigns)}
     assert {claim.verdict for claim in claims.values()} <= set(VERDICTS)
     before = claims["coherence factor without correction"]
@@ -106,14 +106,14 @@ def test_coherence_is_that_of_the_printed_recordings_and_of_the_noise_of_echo_fr
     for name, claim in claims.items():
         if name.startswith("lack of coherence"):
             assert float(claim.computed) == pytest.approx(1.0, abs=0.7)
-    alike = [claims[f"{what} monostatic, static"] for what in ("phase of bistatic less", "gain of bistatic over")]
-    assert [(claim.about, claim.verdict) for claim in alike] == [
+    pair_claims = [claims[f"{what} monostatic, static"] for what in ("phase of bistatic less", "gain of bistatic over")]
+    assert [(claim.about, claim.verdict) for claim in pair_claims] == [
         (PAPER, EXPLAINED)
     ] * 2  # one simulated signal is split
-    assert all("by construction" in claim.note for claim in alike)
+    assert all("by construction" in claim.note for claim in pair_claims)
 
 
-def test_a_profile_is_the_inner_sum_of_the_image(campaigns):
+def test_profile_equals_the_inner_sum_of_the_image(campaigns):
     experiment = open_experiment(campaigns, "static")
     history = experiment.history(BISTATIC)
     half_m = float(history.aperture.path(experiment.places_m[:1])[0, 0]) / 2
@@ -122,12 +122,12 @@ def test_a_profile_is_the_inner_sum_of_the_image(campaigns):
 
 
 @pytest.mark.parametrize("name", ["lab_profile", "lab_phase", "static_profile", "static_phase"])
-def test_figures_of_the_experiments_are_drawn_from_their_campaigns(campaigns, tmp_path, name):
+def test_figures_are_drawn_from_the_experiment_campaigns(campaigns, tmp_path, name):
     path = figures.DRAWN[name](campaigns, tmp_path / f"{name}.png")
     assert path.stat().st_size > 20_000
 
 
-def test_every_figure_of_the_paper_has_what_draws_it():
+def test_every_figure_of_the_paper_has_a_drawing_function():
     drawn = {*figures.SHOWN, "scene", *figures.DRAWN}
     assert drawn == set(commands.PAPER_FIGURES)
     assert len(drawn) == 14
@@ -140,7 +140,7 @@ def test_the_scene_is_drawn_without_a_campaign(tmp_path):
     assert figures.draw_scene(tmp_path / "scene.png").stat().st_size > 10_000
 
 
-def test_segments_of_the_flight_lie_as_far_apart_at_their_midpoints_as_stated():
+def test_flight_segments_have_the_stated_length_and_gap():
     specification = preset("paper-uav")
     (flight,) = specification.flights
     tx, rx = (np.array(flight.tracks[node].start_m) for node in ("uav1", "uav2"))
@@ -152,20 +152,20 @@ def test_segments_of_the_flight_lie_as_far_apart_at_their_midpoints_as_stated():
     assert (later - end) * speed_m_s + ahead_m == pytest.approx(GAP_M)
     assert last <= (flight.pulses - 1) / specification.waveform.prf_hz
     middle_m = tx[0] + (start + last) / 2 * speed_m_s + ahead_m / 2
-    assert middle_m == pytest.approx(0.0)  # the scene's middle is abreast of both segments together
+    assert middle_m == pytest.approx(0.0)  # the scene centre is abeam of the middle of both segments
 
 
-def test_two_adjacent_segments_have_the_sidelobe_of_one_aperture_and_a_gap_raises_it():
+def test_adjacent_segments_have_one_aperture_sidelobe_raised_by_a_gap():
     assert two_segment_sidelobe_db(1.0, 0.0) == pytest.approx(-13.26, abs=0.05)
     levels = [two_segment_sidelobe_db(3.4, gap_m) for gap_m in (0.0, 1.0, 2.0, 4.0)]
     assert (np.diff(levels) > 0).all()
 
 
-def test_magnitudes_of_two_clutters_add_up_to_half_a_decibel_less_and_smoother():
+def test_magnitude_sum_of_clutter_has_the_predicted_level_and_contrast():
     parts = np.random.default_rng(1).standard_normal((2, 200_000, 2)) @ [1, 1j] / np.sqrt(2)
     power = (np.abs(parts).sum(axis=0) / 2) ** 2
     assert -10 * np.log10(power.mean()) == pytest.approx(MAGNITUDES_DB, abs=0.02)
-    assert power.std() / power.mean() == pytest.approx(MAGNITUDES_CONTRAST, abs=0.01)  # of one image: 1
+    assert power.std() / power.mean() == pytest.approx(MAGNITUDES_CONTRAST, abs=0.01)  # contrast of a single image: 1
 
 
 def test_clutter_is_measured_away_from_every_target():
@@ -177,13 +177,13 @@ def test_clutter_is_measured_away_from_every_target():
     assert mask.mean() == pytest.approx(1 - 2 * np.pi * 15**2 / 1e4, abs=0.01)
 
 
-def test_the_flight_through_the_pipeline_fuses_as_its_segments_say(tmp_path):
+def test_processed_flight_gives_the_predicted_fusion_results(tmp_path):
     run_steps(simulate(tmp_path / "uav", "paper-uav"), exports=False)
     claims = {claim.claim: claim for claim in fusion_claims(tmp_path)}
-    comparable = claims.pop("clutter suppression by the coherent sum over that by the noncoherent one")
-    assert (comparable.about, comparable.verdict) == (PAPER, DISAGREES)
-    gained = claims["UAV experiment: width of the noncoherent sum over that of the monostatic image"]
-    assert (gained.about, gained.verdict) == (PAPER, AGREES)
+    suppression = claims.pop("clutter suppression by the coherent sum over that by the noncoherent one")
+    assert (suppression.about, suppression.verdict) == (PAPER, DISAGREES)
+    relative_width = claims["UAV experiment: width of the noncoherent sum over that of the monostatic image"]
+    assert (relative_width.about, relative_width.verdict) == (PAPER, AGREES)
     assert {claim.verdict for name, claim in claims.items() if "coherent sum" not in name} == {AGREES}
     width = float(claims["UAV experiment: cross-range width, coherent sum"].computed)
-    assert 10 < width < 14  # a third of one segment's
+    assert 10 < width < 14  # a third of that of one segment

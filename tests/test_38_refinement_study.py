@@ -1,4 +1,4 @@
-"""Loss against sigma with and without refinement, and pictures before and after: what is told is what was measured."""
+"""Study of track refinement: loss against track error with and without refinement, and figures."""
 
 from dataclasses import replace
 
@@ -33,39 +33,41 @@ from apertura.common.tables import read_table, write_table
 from apertura.core.geometry.lever_arms import TrackCorrection
 from apertura.methods.autofocus.inputs import Refinement
 
-pytestmark = pytest.mark.slow  # of the research, not of the product
+pytestmark = pytest.mark.slow  # research code
 
 QUARTER_OF_A_CELL_CM = 100 * np.sqrt(CELL_M2) / 4
 
 
-def row(sigma_cm, said, *, scene="five", seed=1, product_db=0.2):
-    return AutofocusRow(scene, sigma_cm, seed, 2.0 * sigma_cm, product_db, 0.2, said, "", "why")
+def row(sigma_cm, verdict, *, scene="five", seed=1, product_db=0.2):
+    return AutofocusRow(scene, sigma_cm, seed, 2.0 * sigma_cm, product_db, 0.2, verdict, "", "reason")
 
 
-def answer(accepted, *flags, correction=UNCORRECTED):
+def refinement(accepted, *flags, correction=UNCORRECTED):
     return Refinement(correction, {}, accepted, "because", flags=dict.fromkeys(flags, "text"))
 
 
-def test_what_the_product_said_is_one_of_four_things():
-    said = [
-        verdict_of(answer(True)),
-        verdict_of(answer(True, "prior_inconsistent")),
-        verdict_of(answer(False, "refinement_rejected", "cycle_slip_suspected")),
-        verdict_of(answer(False, "refinement_no_bright_place")),
+def test_verdict_is_one_of_four():
+    verdicts = [
+        verdict_of(refinement(True)),
+        verdict_of(refinement(True, "position_error_understated")),
+        verdict_of(refinement(False, "refinement_rejected", "cycle_slip_suspected")),
+        verdict_of(refinement(False, "refinement_no_bright_point")),
     ]
-    assert said == [ACCEPTED, FLAGGED, REFUSED, TOO_FEW] == list(VERDICTS)
+    assert verdicts == [ACCEPTED, FLAGGED, REFUSED, TOO_FEW] == list(VERDICTS)
 
 
-def test_every_kind_of_scene_is_one_of_the_cases_and_sizes_begin_at_none():
+def test_studied_scenes_are_cases_and_sizes_start_at_zero():
     assert set(KINDS) <= set(SCENES)
     assert SIGMAS_CM == (0.0, 0.5, 1.0, 2.0, 3.0, 5.0)
     assert len(SEEDS) > 1
 
 
 @compiled
-def test_a_refused_refinement_leaves_the_loss_of_the_logs_and_an_accepted_one_its_own():
-    one = case_of("five", 1.0, 1)
-    refused, accepted = (outcome_of(one, answer(yes, "f", correction=one.truth)) for yes in (False, True))
+def test_refused_refinement_keeps_the_loss_of_the_logs():
+    simulated = case_of("five", 1.0, 1)
+    refused, accepted = (
+        outcome_of(simulated, refinement(accept, "f", correction=simulated.truth)) for accept in (False, True)
+    )
     assert refused.loss_db == accepted.loss_db > 0.8
     assert (refused.product_loss_db, refused.estimate_loss_db) == (refused.loss_db, 0.0)
     assert (accepted.product_loss_db, accepted.estimate_loss_db) == (0.0, 0.0)
@@ -73,66 +75,66 @@ def test_a_refused_refinement_leaves_the_loss_of_the_logs_and_an_accepted_one_it
 
 
 @compiled
-def test_logs_without_error_are_refined_as_if_they_had_some_and_lose_nothing(monkeypatch):
+def test_exact_logs_are_refined_with_a_stated_error_and_have_no_loss(monkeypatch):
     stated = []
 
-    def looked_at(records, grid, terrain, errors):
-        stated.extend(known.std_m for known in errors.values())
-        return answer(False, "refinement_rejected")
+    def record_stated(records, grid, terrain, errors):
+        stated.extend(error.std_m for error in errors.values())
+        return refinement(False, "refinement_rejected")
 
-    monkeypatch.setattr(outcomes, "refine", looked_at)
-    right, wrong = (run_case("five", (sigma_cm, 1))[0] for sigma_cm in (0.0, 2.0))
+    monkeypatch.setattr(outcomes, "refine", record_stated)
+    exact, erroneous = (run_case("five", (sigma_cm, 1))[0] for sigma_cm in (0.0, 2.0))
     assert stated == [(0.005,) * 3] * 2 + [(0.02,) * 3] * 2
-    assert (right.loss_db, right.product_loss_db, right.verdict) == (0.0, 0.0, REFUSED)
-    assert wrong.loss_db > 3
+    assert (exact.loss_db, exact.product_loss_db, exact.verdict) == (0.0, 0.0, REFUSED)
+    assert erroneous.loss_db > 3
 
 
 @compiled
-def test_speckle_is_not_made_worse():
-    (one,) = run_case("dense", (2.0, 1))
-    assert one.loss_db > 3
-    assert one.product_loss_db <= one.loss_db
+def test_refinement_of_speckle_does_not_increase_the_loss():
+    (outcome,) = run_case("dense", (2.0, 1))
+    assert outcome.loss_db > 3
+    assert outcome.product_loss_db <= outcome.loss_db
 
 
 @compiled
 @pytest.mark.parametrize("scene", ["five", "forty"])
-def test_where_there_are_points_little_is_left_of_two_centimetres(scene):
+def test_refinement_with_points_leaves_little_loss_of_2_cm(scene):
     rows = [run_case(scene, (2.0, seed))[0] for seed in (1, 2)]
-    assert all(one.loss_db > 3 for one in rows)
-    assert np.mean([one.product_loss_db for one in rows]) < 0.5
+    assert all(outcome.loss_db > 3 for outcome in rows)
+    assert np.mean([outcome.product_loss_db for outcome in rows]) < 0.5
 
 
 @compiled
 @pytest.mark.parametrize("sigma_m", [0.02, 0.04])
-def test_among_thirty_points_in_clutter_no_place_is_made_worse(sigma_m):
+def test_refinement_in_clutter_makes_no_case_worse(sigma_m):
     for seed in (1, 2):
-        one = case("thirty", "short", "joint", sigma_m, 10.0, seed)
-        result = refine_case(one)
-        before, after = judge(one), judge(one, result.correction)
+        simulated = case("thirty", "short", "joint", sigma_m, 10.0, seed)
+        result = refine_case(simulated)
+        before, after = judge(simulated), judge(simulated, result.correction)
         assert not result.accepted or after.target_shift_cm <= before.target_shift_cm + QUARTER_OF_A_CELL_CM
         assert not result.accepted or after.target_loss_db >= before.target_loss_db
 
 
-def marks(axes, said):
-    (line,) = [line for line in axes.lines if line.get_label() == said]
+def marks(axes, label):
+    (line,) = [line for line in axes.lines if line.get_label() == label]
     return line.get_xydata()
 
 
-def test_a_chart_tells_apart_what_was_said(monkeypatch, tmp_path):
+def test_chart_distinguishes_the_verdicts(monkeypatch, tmp_path):
     rows = [row(1.0, ACCEPTED), row(2.0, FLAGGED), row(3.0, REFUSED, product_db=6.0), row(5.0, TOO_FEW, product_db=10)]
-    rows += [replace(one, scene="dense", verdict=TOO_FEW) for one in rows]
+    rows += [replace(row_of_five, scene="dense", verdict=TOO_FEW) for row_of_five in rows]
     figures = []
     monkeypatch.setattr(sweep, "save_png", lambda figure, _: figures.append(figure))
     charts.draw_losses("losses", rows, tmp_path / "losses.png")
     five, dense = figures[0].axes
-    places = [marks(five, said).tolist() for said in (*VERDICTS, "what was refused")]
+    places = [marks(five, said).tolist() for said in (*VERDICTS, "refused estimate")]
     assert places == [[[1.0, 0.2]], [[2.0, 0.2]], [[3.0, 6.0]], [[5.0, 10.0]], [[3.0, 0.2]]]
     assert marks(dense, TOO_FEW)[:, 0].tolist() == [1.0, 2.0, 3.0, 5.0]
     assert "2 of 4 accepted, 0 of them worse" in five.get_title()
     assert "0 of 4 accepted" in dense.get_title()
 
 
-def test_the_tally_counts_what_was_accepted_and_did_harm():
+def test_tally_counts_accepted_and_harmful_refinements():
     rows = [row(1.0, ACCEPTED, product_db=2.5), row(2.0, REFUSED, product_db=9.0)]
     assert charts.tally(rows) == "1 of 2 accepted, 1 of them worse than the logs"
 
@@ -145,7 +147,7 @@ def test_sweep_and_chart_are_one_command_each(monkeypatch, tmp_path):
         run = CliRunner().invoke(commands.app, [*arguments, "--folder", str(tmp_path)])
         assert run.exit_code == 0, run.output
     rows = read_table(tmp_path / "losses.csv", AutofocusRow)
-    assert [one.scene for one in rows] == list(KINDS)
+    assert [outcome.scene for outcome in rows] == list(KINDS)
     drawn_once = (tmp_path / "losses.png").read_bytes()
     write_table(tmp_path / "again.csv", rows)
     charts.draw_losses("losses", read_table(tmp_path / "again.csv", AutofocusRow), tmp_path / "again.png")
@@ -153,29 +155,31 @@ def test_sweep_and_chart_are_one_command_each(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("command", ["sweep autofocus", "autofocus-picture"])
-def test_a_scene_that_is_not_tried_is_answered_with_those_that_are(command):
+def test_unknown_scene_is_refused_with_the_list_of_scenes(command):
     error = CliRunner().invoke(commands.app, [*command.split(), "x"]).exception
     assert isinstance(error, CampaignError)
     assert "texture" in str(error)
 
 
-def linear_path_error(one, place_m):
-    """Of the bistatic pair, docs/theory/autofocus.md, eq. 2: the errors of both nodes along u_t - s and u_r + s."""
-    bistatic = one.records[1]
+def linear_path_error(simulated, point_m):
+    """Return the path error of the bistatic pair, docs/theory/autofocus.md, eq. 2: errors along u_t - s and u_r + s."""
+    bistatic = simulated.records[1]
     to_tx, to_rx, sidelink = (
         leg / np.linalg.norm(leg, axis=1)[:, None]
-        for leg in (*(phase - place_m for phase in bistatic.profiles.aperture.legs), bistatic.sidelink_m)
+        for leg in (*(phase - point_m for phase in bistatic.profiles.aperture.legs), bistatic.sidelink_m)
     )
-    tx, rx = (one.truth.at(node, bistatic.time_s) for node in ("uav1", "uav2"))
+    tx, rx = (simulated.truth.at(node, bistatic.time_s) for node in ("uav1", "uav2"))
     return ((to_tx - sidelink) * tx).sum(axis=1) + ((to_rx + sidelink) * rx).sum(axis=1)
 
 
 @compiled
-def test_a_picture_shows_three_images_on_one_scale_and_errors_that_refinement_takes_away(monkeypatch, tmp_path):
-    one = case_of("five", 2.0, 1)
-    half = TrackCorrection(one.truth.time_s, {node: 0.5 * moved for node, moved in one.truth.moved_m.items()})
+def test_figure_shows_three_images_on_one_scale_and_residual_errors(monkeypatch, tmp_path):
+    simulated = case_of("five", 2.0, 1)
+    half = TrackCorrection(
+        simulated.truth.time_s, {node: 0.5 * error_m for node, error_m in simulated.truth.moved_m.items()}
+    )
     figures = []
-    monkeypatch.setattr(charts, "refine_case", lambda _: answer(True, correction=half))
+    monkeypatch.setattr(charts, "refine_case", lambda _: refinement(True, correction=half))
     monkeypatch.setattr(charts, "save_png", lambda figure, _: figures.append(figure))
     charts.draw_case("five", tmp_path / "five.png")
     images = [axes for axes in figures[0].axes if axes.images]
@@ -185,24 +189,26 @@ def test_a_picture_shows_three_images_on_one_scale_and_errors_that_refinement_ta
     assert highest[0] < highest[1] < highest[2] == pytest.approx(0, abs=1e-9)
     errors = [axes for axes in figures[0].axes if axes.get_title() in ("east", "north", "up")]
     for number, axes in enumerate(errors):
-        log, left = axes.lines[0].get_ydata(), axes.lines[1].get_ydata()
-        np.testing.assert_allclose(log, 100 * one.truth.moved_m["uav1"][:, number])
-        np.testing.assert_allclose(left, log / 2, atol=1e-9)
-    log, left = (line.get_ydata() for line in figures[0].axes[9].lines[3:5])
-    expected = 100 * linear_path_error(one, np.array([0.0, 15.0, 0.0]))
+        log, residual = axes.lines[0].get_ydata(), axes.lines[1].get_ydata()
+        np.testing.assert_allclose(log, 100 * simulated.truth.moved_m["uav1"][:, number])
+        np.testing.assert_allclose(residual, log / 2, atol=1e-9)
+    log, residual = (line.get_ydata() for line in figures[0].axes[9].lines[3:5])
+    expected = 100 * linear_path_error(simulated, np.array([0.0, 15.0, 0.0]))
     assert np.std(log - (expected - expected.mean())) < 0.02 * np.std(log)
-    assert np.std(left - log / 2) < 0.02 * np.std(log)
+    assert np.std(residual - log / 2) < 0.02 * np.std(log)
     assert "accepted: because; no flag" in figures[0].get_suptitle()
 
 
 @compiled
-def test_a_picture_of_what_was_refused_says_so_and_shows_the_logs(monkeypatch, tmp_path):
-    one = case_of("five", 2.0, 1)
+def test_figure_of_a_refused_refinement_shows_the_image_of_the_logs(monkeypatch, tmp_path):
+    simulated = case_of("five", 2.0, 1)
     figures = []
-    monkeypatch.setattr(charts, "refine_case", lambda _: answer(False, "refinement_rejected", correction=one.truth))
+    monkeypatch.setattr(
+        charts, "refine_case", lambda _: refinement(False, "refinement_rejected", correction=simulated.truth)
+    )
     monkeypatch.setattr(charts, "save_png", lambda figure, _: figures.append(figure))
     charts.draw_case("five", tmp_path / "five.png")
     logs, after, _ = [axes for axes in figures[0].axes if axes.images][:3]
-    assert after.get_title().startswith("refused: the logs stay")
+    assert after.get_title().startswith("refused: logged tracks are used")
     assert (logs.images[0].get_array() == after.images[0].get_array()).all()
     assert "flags: refinement_rejected" in figures[0].get_suptitle()

@@ -1,4 +1,4 @@
-"""The chart of the whole: errors against seconds from raw samples to GeoTIFFs."""
+"""Chart of the whole workflow: error against processing time from raw samples to GeoTIFFs."""
 
 import csv
 
@@ -13,12 +13,12 @@ def whole(setting="a", *, loss_db=-0.1):
     return Whole(setting, 4.0, 3.9, 4.2, 11.0, 2, 5.0, -0.01, loss_db, 0.02, -70.0, "")
 
 
-def test_a_loss_of_half_the_power_spreads_half_of_it():
+def test_peak_loss_of_3_db_spreads_half_of_the_power():
     assert spread_db(-3.0103) == pytest.approx(-3.0103, abs=1e-3)
     assert spread_db(0.2) == spread_db(0.0) < -100
 
 
-def test_the_picture_is_the_same_bytes_for_the_same_rows(tmp_path):
+def test_chart_is_reproducible(tmp_path):
     rows = [whole(), whole("b", loss_db=float("nan"))]
     for name in ("a.png", "b.png"):
         draw_whole(rows, tmp_path / name, title="a campaign", refused=["presum 2"])
@@ -28,7 +28,7 @@ def test_the_picture_is_the_same_bytes_for_the_same_rows(tmp_path):
 
 
 @pytest.mark.slow
-def test_every_setting_goes_from_raw_samples_to_geotiffs_and_leaves_nothing_behind(finished_tiny, tmp_path):
+def test_every_setting_is_processed_and_intermediate_results_are_deleted(finished_tiny, tmp_path):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     image = (root / "results" / "f01" / "uav1-uav2" / "slc.tif").read_bytes()
     paths = whole_chart(Campaign.load(root), repeats=1)

@@ -239,7 +239,7 @@ def test_a_refinement_needs_points_whose_cross_section_follows_from_the_radar_eq
     ("std_m", "node", "obstacle"),
     [
         (0.06, {}, "position errors of 6 cm exceed 4.4 cm"),
-        (0.02, {"position_correlation_s": 0.2}, "a correlation time of 0.2 s, less than 0.5 s"),
+        (0.02, {"position_correlation_s": 0.2}, "the correlation time of position errors, 0.2 s, is below 0.5 s"),
     ],
 )
 def test_a_refinement_beyond_its_measured_limits_does_not_count(std_m, node, obstacle):
@@ -255,7 +255,7 @@ def test_a_coarse_grid_is_refused_for_sparse_pulses_as_the_grid_itself():
     plan = plan_of()
     plan["waveform"]["prf_hz"] = 8.0
     for coarse in (None, 2):
-        with pytest.raises(CampaignError, match="or more, the spread of Doppler over the scene, instead of 8 Hz"):
+        with pytest.raises(CampaignError, match="Hz, the Doppler spread over the scene, instead of 8 Hz"):
             designed(FlightPlan.model_validate(plan), HERE, coarse=coarse)
 
 
@@ -267,8 +267,8 @@ def test_echoes_that_fold_are_told_for_what_is_required_and_more_pulses_help(tmp
     plan["scene"] |= {"bounds_m": [-30.0, 20.0, 30.0, 80.0], "spacing_m": 1.0}
     (verdict,) = judge(designed(FlightPlan.model_validate(plan), tmp_path))
     assert not verdict.met
-    assert "Doppler spreads" in verdict.cause
-    assert "twice the pulse rate (waveform.prf_hz)" in {one.words for one in changes_of(plan, tmp_path) if one.meets}
+    assert "Doppler spread of" in verdict.cause
+    assert "double the pulse rate (waveform.prf_hz)" in {one.words for one in changes_of(plan, tmp_path) if one.meets}
 
 
 def changes_of(plan, root):
@@ -292,8 +292,8 @@ def test_the_changes_that_help_most_come_first(tmp_path):
     changes = changes_of(plan_of(require={"nesz_db": -60.0}), tmp_path)
     assert changes[0].gain_db >= changes[-1].gain_db > 0
     gains = {change.words: change.gain_db for change in changes}
-    assert gains["3 dB more power (transmit_power_dbm)"] == pytest.approx(3, abs=0.01)
-    assert gains["twice the pulse rate (waveform.prf_hz)"] == pytest.approx(3.01, abs=0.05)
+    assert gains["increase the transmit power by 3 dB (transmit_power_dbm)"] == pytest.approx(3, abs=0.01)
+    assert gains["double the pulse rate (waveform.prf_hz)"] == pytest.approx(3.01, abs=0.05)
 
 
 @pytest.mark.slow
@@ -302,7 +302,7 @@ def test_changes_that_break_what_is_met_come_last_and_say_so(tmp_path):
     changes = changes_of(plan_of(require=required), tmp_path)
     broken = {change.words: change.breaks for change in changes}
     assert broken["fly at 0.5 times the speed (speed_m_s)"] == ("flight_s",)
-    assert broken["3 dB more power (transmit_power_dbm)"] == ()
+    assert broken["increase the transmit power by 3 dB (transmit_power_dbm)"] == ()
     assert [*map(bool, broken.values())] == sorted(map(bool, broken.values()))
 
 
@@ -357,21 +357,21 @@ def test_tracks_are_moved_about_the_middle_of_the_scene():
 
 
 BAD = {
-    "through the ground": (flown(plan_of(), uav1=line(height_m=-2.0)), "in or below the ground"),
+    "through the ground": (flown(plan_of(), uav1=line(height_m=-2.0)), "at or below the terrain"),
     "too few pulses": (
         plan_of(
             waveform=plan_of()["waveform"] | {"prf_hz": 8.0},
             scene=plan_of()["scene"] | {"bounds_m": [-25.0, 5.0, 25.0, 55.0]},
         ),
-        "spread of Doppler over the scene, instead of 8 Hz",
+        "the Doppler spread over the scene, instead of 8 Hz",
     ),
-    "colliding formation": (with_second(spacing_m=1.0), "come within 1.00 m at"),
+    "colliding formation": (with_second(spacing_m=1.0), "separation of uav1 and uav2 falls to 1.00 m at"),
     "nobody flies": (with_second(formation=None), "uav2 has no track, and there is no formation"),
-    "a hover": (flown(plan_of(), uav1=line(end_m=[-20.0, 0.0])), "a hover makes no image"),
+    "a hover": (flown(plan_of(), uav1=line(end_m=[-20.0, 0.0])), "a hover gives no image"),
     "unknown key": (plan_of(requires={"nesz_db": -20}), "requires: unknown key (did you mean 'require'?)"),
     "beyond the prefix": (
         plan_of(waveform=plan_of()["waveform"] | {"cyclic_prefix_s": 1e-7}),
-        "from the tracks at least",
+        "no pulse receives an echo of the scene",
     ),
     "tracks elsewhere": (
         flown(plan_of(), uav1=line(start_m=[4840.0, 990.0], end_m=[4880.0, 990.0])),
@@ -379,10 +379,10 @@ BAD = {
     ),
     "a racetrack of one place": (
         flown(plan_of(), uav1=line(kind="racetrack", end_m=[-20.0, 0.0])),
-        "a hover makes no image",
+        "a hover gives no image",
     ),
     "GHz": (plan_of(waveform=plan_of()["waveform"] | {"carrier_hz": 1.3, "carrier_is": "band_start"}), "in Hz"),
-    "a receiver twice": (with_second(receivers=["uav1", "uav1", "uav2"]), "each once"),
+    "a receiver twice": (with_second(receivers=["uav1", "uav1", "uav2"]), "contain a duplicate"),
 }
 
 

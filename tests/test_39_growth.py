@@ -6,7 +6,7 @@ import latest
 import numpy as np
 import pytest
 from growing import contestants, scene, table
-from growing.contestants import House, SkippedError
+from growing.contestants import EngineInput, SkippedError
 
 from apertura.core.planning import plan
 
@@ -17,21 +17,23 @@ def small():
 
 
 def test_an_engine_meets_its_aim_at_the_pixels_compared(small):
-    house = House(small)
-    house.compress()
-    one = house.planned("native" if "native" in contestants.ENGINES else "numba", -60.0, 60.0)
+    engine_input = EngineInput(small)
+    engine_input.compress()
+    one = engine_input.planned("native" if "native" in contestants.ENGINES else "numba", -60.0, 60.0)
     one.go()
     assert one.error_db < -60
-    row = one.row(house.compressions[0])
+    row = one.row(engine_input.compressions[0])
     assert (row["size"], row["pulses"], row["aim_db"], row["scaled"], row["rounds"]) == (256, 128, -60.0, False, 1)
     assert row["seconds_from_echoes"] > row["seconds"] > row["seconds_shared"] > 0 < row["planning_seconds"]
 
 
 @pytest.mark.slow
 def test_blocks_of_pulses_add_up(small, monkeypatch):
-    whole = House(small).planned("numba", -60.0, 60.0).run()[0]
+    whole = EngineInput(small).planned("numba", -60.0, 60.0).run()[0]
     monkeypatch.setattr(plan, "BLOCK_BYTES", 1 << 16)
-    np.testing.assert_allclose(House(small).planned("numba", -60.0, 60.0).run()[0], whole, atol=1e-5 * abs(whole).max())
+    np.testing.assert_allclose(
+        EngineInput(small).planned("numba", -60.0, 60.0).run()[0], whole, atol=1e-5 * abs(whole).max()
+    )
 
 
 def test_the_error_is_that_after_one_complex_gain(small):
@@ -50,12 +52,12 @@ def test_a_part_of_the_tiles_gives_the_same_pixels_and_counts_for_all(monkeypatc
     halves, quarters = tiled.tiles(2), tiled.tiles(4)
     assert all(tile in halves for tile in quarters)
     assert [{tile[axis].start for tile in quarters} for axis in (0, 1)] == 2 * [{0, 128, 256, 384}]
-    house = House(tiled)
-    whole, some = (house.planned("numba", -60.0, limit_s) for limit_s in (1e3, 0.07))
+    engine_input = EngineInput(tiled)
+    whole, some = (engine_input.planned("numba", -60.0, limit_s) for limit_s in (1e3, 0.07))
     assert (whole.share, some.share) == (1.0, 0.25)
     np.testing.assert_array_equal(whole.run()[0], some.run()[0])
-    with pytest.raises(SkippedError, match="would take"):
-        house.planned("numba", -60.0, 1e-4)
+    with pytest.raises(SkippedError, match="smallest representative part takes"):
+        engine_input.planned("numba", -60.0, 1e-4)
 
 
 def test_fields_of_clutter_are_apart_and_inside_the_tiles_that_are_always_formed():
@@ -71,8 +73,8 @@ def test_fields_of_clutter_are_apart_and_inside_the_tiles_that_are_always_formed
 
 
 def test_an_engine_that_is_not_there_is_named(small):
-    with pytest.raises(SkippedError, match="warp is no engine of this version"):
-        House(small).planned("warp", -60.0, 1.0)
+    with pytest.raises(SkippedError, match="this version has no engine warp"):
+        EngineInput(small).planned("warp", -60.0, 1.0)
 
 
 def test_growth_is_the_exponent_of_a_power_law():

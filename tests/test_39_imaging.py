@@ -82,7 +82,7 @@ def test_a_stage_of_a_campaign_gives_the_image_of_its_workflow(finished_tiny):
     np.testing.assert_array_equal(front.values, campaign.image(flight, pairs[0]).values)
     assert campaign.report(flight, pairs[0])["flags"] == campaign.flags(flight, pairs[0])
     told, by_workflow = ap.judge(front), campaign.report(flight, pairs[0])["focus"]
-    for name in ("verdict", "why", "points", "parts"):
+    for name in ("verdict", "reason", "points", "parts"):
         assert told.focus[name] == by_workflow[name]
 
 
@@ -115,7 +115,7 @@ def test_a_toy_engine_is_planned_where_it_is_exact_enough(toy):
     assert rough.attrs["numerical_error_db"] < -20
     assert not ap.backproject(point_history(), TARGET_GRID, accuracy_db=-60.0).attrs["setting"].startswith("toy")
     asked = ap.backproject(point_history(), TARGET_GRID, accuracy_db=-10.0, engine_options={"toy": {"refine": 2}})
-    assert json.loads(asked.attrs["models"])["refine"] == "2: asked for; nearest sample of a refined profile"
+    assert json.loads(asked.attrs["models"])["refine"] == "2: requested; nearest sample of a refined profile"
 
 
 def test_a_setting_that_misses_on_pixels_gives_way_to_the_next(toy):
@@ -125,16 +125,16 @@ def test_a_setting_that_misses_on_pixels_gives_way_to_the_next(toy):
     assert not missed.attrs["setting"].startswith("toy")
     assert missed.attrs["numerical_error_db"] < -60
     models = json.loads(missed.attrs["models"])
-    assert "missed the accuracy asked" in models["engine"]
+    assert "missed the requested accuracy" in models["engine"]
     assert "refine" not in models
-    assert "accuracy_missed" not in json.loads(missed.attrs["flags"])
+    assert "accuracy_not_met" not in json.loads(missed.attrs["flags"])
 
 
 def test_what_no_setting_meets_is_flagged():
     """Profiles without the double sum to fall back on."""
     profiles = ap.range_compress(point_history(), TARGET_GRID, ap.FlatGround(0.0))
     flags = json.loads(ap.backproject(profiles, TARGET_GRID, accuracy_db=-120.0).attrs["flags"])
-    assert "-120 dB asked" in flags["accuracy_missed"]
+    assert "-120 dB requested" in flags["accuracy_not_met"]
 
 
 def test_an_image_can_be_written_with_its_plan_and_certificate(image, tmp_path):
@@ -146,9 +146,9 @@ def test_an_image_can_be_written_with_its_plan_and_certificate(image, tmp_path):
 @pytest.mark.parametrize(
     ("by_m", "grid", "options", "complaint"),
     [
-        (1e6, TARGET_GRID, {}, "no echo of the scene is in the samples"),
+        (1e6, TARGET_GRID, {}, "the samples contain no echo of the scene"),
         (0.0, SceneGrid("EPSG:32632", 5e5, 5e6, 0.5, (9, 9)), {"terrain": 0.0}, "no echo of the scene"),
-        (0.0, SceneGrid("EPSG:32632", 5e5, 5e6, 0.5, (9, 9)), {}, "no terrain for a grid on Earth"),
+        (0.0, SceneGrid("EPSG:32632", 5e5, 5e6, 0.5, (9, 9)), {}, "no terrain for a georeferenced grid"),
     ],
 )
 def test_a_scene_elsewhere_is_refused_with_one_message(by_m, grid, options, complaint):
@@ -163,7 +163,7 @@ def test_lists_are_taken_as_arrays():
     given = replace(history, weight=list(history.weight), reference_delay_s=[0.0] * len(history))
     np.testing.assert_array_equal(given.weight, history.weight)
     assert len(ap.Aperture([[0.0, 0, 9], [1, 0, 9]], [[0.0, 0, 9], [1, 0, 9]])) == 2
-    with pytest.raises(CampaignError, match=r"tx_m \(3,\).*x, y and z of each pulse"):
+    with pytest.raises(CampaignError, match=r"tx_m \(3,\).*one row of x, y and z per pulse"):
         ap.Aperture([0.0, 0, 9], [0.0, 0, 9])
 
 
@@ -171,7 +171,7 @@ def test_profiles_that_end_within_the_scene_are_flagged():
     profiles = ap.range_compress(point_history(), TARGET_GRID, ap.FlatGround(0.0))
     short = replace(profiles, samples=profiles.samples[:, :60])
     assert "beyond the samples" in json.loads(ap.backproject(short, TARGET_GRID).attrs["flags"])["scene_beyond_samples"]
-    with pytest.raises(CampaignError, match=r"samples \(50, .*as many pulses"):
+    with pytest.raises(CampaignError, match=r"samples \(50, .*the same number of pulses"):
         replace(profiles, samples=profiles.samples[:50])
 
 

@@ -39,7 +39,7 @@ def test_an_image_as_exact_as_asked_is_left_as_it_is(speckle):
     target = speckle.image.compute()
     before = target.copy()
     report = certify(speckle, target)
-    assert report["redone"] == []
+    assert report["recomputed"] == []
     assert report["flags"] == {}
     assert report["numerical_error_db"] < -60
     np.testing.assert_array_equal(target, before)
@@ -61,7 +61,7 @@ def test_a_tile_that_misses_is_formed_again_with_the_first_fallback_and_no_other
     spoilt[window] *= 1.01
     report = certify(speckle, spoilt)
     fallback = speckle.plan.fallbacks[0]
-    assert report["redone"] == [{"tiles": 1, "with": f"{fallback.line}, every pulse"}]
+    assert report["recomputed"] == [{"tiles": 1, "with": f"{fallback.line}, every pulse"}]
     assert report["numerical_error_db"] < -60
     assert report["flags"] == {}
     np.testing.assert_array_equal(spoilt[window], speckle.image_by(fallback)[window].compute())
@@ -73,13 +73,12 @@ def test_tiles_fall_back_until_they_are_exact_enough_and_a_rest_is_flagged(speck
     """At -125 dB only the double sum in float64, kept as complex64, is left; at -200 dB not even that suffices."""
     target = speckle.image.compute()
     report = certify(speckle, target, accuracy_db=-125.0)
-    assert report["redone"][-1]["with"] == "reference, every pulse"
+    assert report["recomputed"][-1]["with"] == "reference, every pulse"
     assert report["numerical_error_db"] < -125
-    assert len(report["redone"]) == len(speckle.plan.fallbacks)
+    assert len(report["recomputed"]) == len(speckle.plan.fallbacks)
     report = certify(speckle, target, accuracy_db=-200.0)
-    assert report["flags"] == {
-        "accuracy_missed": f"numerical error up to {report['numerical_error_db']:.1f} dB (95% sure), -200.0 dB asked"
-    }
+    bound = f"numerical error up to {report['numerical_error_db']:.1f} dB (95% confidence)"
+    assert report["flags"] == {"accuracy_not_met": f"{bound}, -200.0 dB requested"}
 
 
 def test_what_no_tile_misses_for_itself_but_the_bound_does_is_formed_again(speckle):
@@ -90,7 +89,7 @@ def test_what_no_tile_misses_for_itself_but_the_bound_does_is_formed_again(speck
     stated = certify(speckle, target, accuracy_db=np.inf)
     between_db = (stated["numerical_error_db"] + stated["numerical_error_estimate_db"]) / 2
     report = certify(speckle, target, accuracy_db=between_db)
-    assert [one["tiles"] for one in report["redone"]] == [len(speckle.windows)]
+    assert [one["tiles"] for one in report["recomputed"]] == [len(speckle.windows)]
     assert report["flags"] == {}
     assert report["numerical_error_db"] < between_db
 

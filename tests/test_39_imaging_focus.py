@@ -10,7 +10,7 @@ from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.focus_check import (
     PART_PX,
     PARTS,
-    echo_elsewhere,
+    echo_outside_scene,
     focus_report,
     joint_peak_power,
     part_images,
@@ -41,15 +41,15 @@ def echo_of(places, *, noise=1e-3, seed=1):
 
 
 def test_an_echo_that_the_scene_has_no_range_for_is_elsewhere():
-    line = echo_elsewhere(echo_of(np.array([[0.0, 40.0, 0.0]])), GRID, GROUND)
+    line = echo_outside_scene(echo_of(np.array([[0.0, 40.0, 0.0]])), GRID, GROUND)
     assert "has a total path of 12" in line  # 2·√(60² + 10²) = 121.7 m
-    assert "the scene's are" in line
+    assert "those of the scene are" in line
 
 
 def test_a_strong_echo_that_no_place_gathers_is_said_to_be():
     """Asked only where no bright point was found: a point in the scene's own ranges is then at no place."""
-    line = echo_elsewhere(echo_of(np.zeros((1, 3))), GRID, GROUND)
-    assert "no place of the image gathers it" in line
+    line = echo_outside_scene(echo_of(np.zeros((1, 3))), GRID, GROUND)
+    assert "no pixel of the image focuses it" in line
 
 
 def test_points_that_share_a_range_cell_are_no_echo_from_elsewhere():
@@ -57,11 +57,11 @@ def test_points_that_share_a_range_cell_are_no_echo_from_elsewhere():
     east = np.array([-2.6, 0.0, 2.6])
     places = np.column_stack([east, np.sqrt(400 - east**2) - 20, 0 * east])
     history = echo_of(places)
-    assert "no place of the image gathers it" in echo_elsewhere(history, GRID, GROUND)
+    assert "no pixel of the image focuses it" in echo_outside_scene(history, GRID, GROUND)
     terms = list(reference.terms(history, places).T)
-    assert echo_elsewhere(history, GRID, GROUND, points=terms) is None
+    assert echo_outside_scene(history, GRID, GROUND, points=terms) is None
     elsewhere = list(reference.terms(history, places + [1.5, 0.0, 0.0]).T)
-    assert "no place of the image gathers it" in echo_elsewhere(history, GRID, GROUND, points=elsewhere)
+    assert "no pixel of the image focuses it" in echo_outside_scene(history, GRID, GROUND, points=elsewhere)
 
 
 @pytest.mark.slow
@@ -69,7 +69,7 @@ def test_points_that_share_a_range_cell_are_no_echo_from_elsewhere():
 def test_speckle_and_noise_are_no_echo_of_a_point(noise):
     generator = np.random.default_rng(2)
     places = np.column_stack([generator.uniform(-3.2, 3.2, (400, 2)), np.zeros(400)])
-    assert echo_elsewhere(echo_of(places, noise=noise), GRID, GROUND) is None
+    assert echo_outside_scene(echo_of(places, noise=noise), GRID, GROUND) is None
 
 
 @pytest.mark.slow
@@ -86,7 +86,7 @@ def test_the_direct_path_between_two_antennas_is_not_an_echo():
     bistatic = PhaseHistory(
         (transfer + direct).astype(np.complex64), FREQUENCY_HZ, history.weight, np.zeros(PULSES), flown
     )
-    assert echo_elsewhere(bistatic, GRID, GROUND) is None
+    assert echo_outside_scene(bistatic, GRID, GROUND) is None
 
 
 def test_parts_of_the_aperture_add_up_to_the_image_of_a_place():

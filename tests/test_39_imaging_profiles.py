@@ -66,5 +66,5 @@ def test_the_window_covers_every_pixel_with_all_its_guard_samples(shape, relief_
 def test_a_scene_deeper_than_the_unambiguous_range_is_refused_with_both_numbers():
     """2 MHz between subcarriers: the total path repeats every 150 m, in 400 samples."""
     deep = SceneGrid("local", -50.0, 100.0, 1.0, (150, 100))
-    with pytest.raises(CampaignError, match=r"spans \d+ samples of range; expected at most the 400"):
+    with pytest.raises(CampaignError, match=r"spans \d+ range samples; expected at most 400"):
         range_compress(point_history(4), deep, FLAT)

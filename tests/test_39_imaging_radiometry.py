@@ -247,7 +247,7 @@ def test_a_calibration_needs_a_constant_and_the_band():
     echo = history(flown(), (0.0, 20.0, 0.0), "hann")
     with pytest.raises(CampaignError, match=r"calibration: a constant of -1\.0; expected a positive number"):
         ap.backproject(echo, GRID, calibration=-1.0)
-    with pytest.raises(CampaignError, match="expected a PhaseHistory, or a stage echo"):
+    with pytest.raises(CampaignError, match="expected a PhaseHistory, or the dataset of stage echo"):
         ap.backproject(ap.range_compress(echo, GRID, LEVEL), GRID, calibration=1.0)
 
 

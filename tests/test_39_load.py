@@ -94,9 +94,9 @@ def test_a_name_that_does_not_exist_is_answered_with_those_that_do(opened):
 
 def test_a_stage_that_is_asked_for_without_its_place_says_what_is_missing(opened):
     message = complaint(lambda: opened.stage("echo", "f01"))
-    assert "campaign.stage('echo'): given f01; expected a flight and a pair" in message
-    assert "given nothing more; expected a flight and a node" in complaint(lambda: opened.stage("raw"))
-    assert "given f01; expected the stage alone" in complaint(lambda: opened.stage("cube", "f01"))
+    assert "campaign.stage('echo'): arguments: f01; expected a flight and a pair" in message
+    assert "arguments: none; expected a flight and a node" in complaint(lambda: opened.stage("raw"))
+    assert "arguments: f01; expected no further arguments" in complaint(lambda: opened.stage("cube", "f01"))
 
 
 def test_the_plan_of_every_pair_lies_on_the_one_grid_that_the_workflow_settles(tiny):

@@ -35,9 +35,9 @@ def certified(drawn) -> tuple[float, int]:
     """Return the certified error and how often a better setting was needed, as the image step goes about it."""
     planned = make_plan(drawn.job, accuracy_db=drawn.accuracy_db)
     error = error_db(drawn, formed(drawn, planned.setting, planned.inputs(drawn.profiles)))
-    for redone, better in enumerate(planned.fallbacks):
+    for recomputed, better in enumerate(planned.fallbacks):
         if error <= drawn.accuracy_db:
-            return error, redone
+            return error, recomputed
         error = error_db(drawn, formed(drawn, better, drawn.profiles))
     return error, len(planned.fallbacks)
 
@@ -82,20 +82,20 @@ def white(seed: int, window: str, generator: np.random.Generator):
 @pytest.mark.parametrize("seed", range(6))
 def test_the_certified_error_is_met_and_the_first_setting_does(seed):
     drawn = draw(np.random.default_rng(seed), pixels=48, pulses=90)
-    error, redone = certified(drawn)
+    error, recomputed = certified(drawn)
     assert error <= drawn.accuracy_db
-    assert redone == 0
+    assert recomputed == 0
 
 
 @pytest.mark.slow
 def test_over_30_random_campaigns_the_certified_error_is_met():
-    redone = 0
+    recomputed = 0
     for seed in range(30):
         drawn = draw(np.random.default_rng(seed), pixels=80, pulses=160)
         error, tries = certified(drawn)
         assert error <= drawn.accuracy_db, drawn.name
-        redone += tries
-    assert redone <= 1
+        recomputed += tries
+    assert recomputed <= 1
 
 
 @pytest.mark.slow
@@ -144,7 +144,7 @@ def test_the_compiled_engine_is_chosen_where_it_was_built_and_numba_where_it_was
     assert plan(shape=(4000, 4000), overrides={"presum": 1}).engine == "tree"
     without_library(monkeypatch)
     assert plan().engine == "numba"
-    with pytest.raises(CampaignError, match=r"cannot run here.* a C\+\+ compiler"):
+    with pytest.raises(CampaignError, match=r"not available on this machine.* a C\+\+ compiler"):
         plan(overrides={"engine": "native"})
 
 
@@ -167,14 +167,14 @@ def test_each_choice_can_be_overridden_and_the_plan_says_so(key, value):
     planned = plan(overrides={"engine_options": {"native": {key: value}}} if option else {key: value})
     decision = next(decision for decision in planned.decisions if decision.name == key)
     assert decision.value == value
-    assert "asked for" in decision.reason
+    assert "requested" in decision.reason
 
 
 def test_an_override_that_misses_the_accuracy_is_kept_and_predicted():
     planned = plan(overrides={"engine_options": {"numba": {"oversampling": 2}}})
     assert planned.setting.options == {"oversampling": 2}
     assert planned.predicted_error_db > -60
-    assert f"predicted {planned.predicted_error_db:.1f} dB, -60 dB asked" in planned.reasons["engine"]
+    assert f"predicted {planned.predicted_error_db:.1f} dB, requested -60 dB" in planned.reasons["engine"]
     assert "predicted" not in plan().reasons["engine"]
     assert planned.fallbacks[-1].engine == "reference"
 
@@ -240,7 +240,7 @@ def test_coarse_pixels_get_a_coarser_table_that_keeps_its_windows():
     cheapest = next(setting for setting in offered if setting.engine == "native" and setting.error_db < -50)
     fine = next(s for s in offered if s.options == {"degree": 2, "oversampling": 6} and s.error_db < -70)
     assert cheapest.options["oversampling"] < 6
-    assert int(re.search(r"(\d+) % exact paths", fine.reasons["tolerance_rad"])[1]) > 90
+    assert int(re.search(r"exact paths (\d+) %", fine.reasons["tolerance_rad"])[1]) > 90
     assert cheapest.seconds < fine.seconds / 3
 
 

@@ -152,8 +152,8 @@ def test_a_circle_about_the_scene_counts_as_a_whole_and_says_so():
     assert integrate(circle, near, **requested).sector is None
     chosen = integrate(circle, near, **requested, requested={"degrees": 10.0})
     assert chosen.report["pulses_per_pixel"]["median"] == 2000
-    assert "integration_turns" in chosen.flags
-    assert "integration_turns" not in settled(straight(), requested={"degrees": 10.0}).flags
+    assert "track_turns" in chosen.flags
+    assert "track_turns" not in settled(straight(), requested={"degrees": 10.0}).flags
 
 
 def test_a_scene_beside_a_gap_of_the_flight_is_flagged_with_its_share():

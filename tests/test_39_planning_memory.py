@@ -63,7 +63,7 @@ def test_a_long_flight_is_summed_in_blocks_whatever_memory_there_is():
 @pytest.mark.slow
 def test_pulse_blocks_can_be_asked_for_and_hold_64_pulses_or_more():
     assert plan(overrides={"pulse_blocks": 3}).setting.pulse_blocks == 3
-    assert "asked for" in plan(overrides={"pulse_blocks": 3}).reasons["pulse_blocks"]
+    assert "requested" in plan(overrides={"pulse_blocks": 3}).reasons["pulse_blocks"]
     assert plan(overrides={"pulse_blocks": 100}).setting.pulse_blocks == 300 // 64
 
 

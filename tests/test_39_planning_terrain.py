@@ -61,9 +61,9 @@ def test_flat_ground_and_rough_ground_are_taken_as_they_are():
     assert plan(terrain=smooth).terrain == FlatGround(0.0)
     assert plan(terrain=rough).terrain is rough.full
     assert plan(terrain=smooth, overrides={"terrain": "dem"}).terrain is smooth.full
-    with pytest.raises(CampaignError, match="terrain is dem; expected plane or auto: the scene has no DEM"):
+    with pytest.raises(CampaignError, match="terrain model dem, but the scene has no DEM; expected plane or auto"):
         plan(overrides={"terrain": "dem"})
 
 
 def test_without_a_dem_the_plan_says_what_height_error_is_tolerated():
-    assert "no DEM; height may be wrong by" in plan().reasons["terrain"]
+    assert "no DEM; tolerated height error" in plan().reasons["terrain"]

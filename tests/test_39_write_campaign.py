@@ -76,7 +76,7 @@ GULF = {"crs": "EPSG:32631", "bounds_m": [184000, 92000, 184010, 92010], "height
 def test_a_track_in_radians_is_refused(tmp_path, scene):
     config = CONFIG | ({"scene": scene} if scene else {})
     message = complaint(lambda: write(tmp_path / "c", along(48.0, 10.0, 8.0, np.float64), config=config))
-    assert "in radians the track lies" in message
+    assert "apparently in radians, for which the" in message
     assert "expected degrees" in message
     assert not (tmp_path / "c").exists()
 
@@ -120,18 +120,18 @@ def test_samples_and_logs_may_lie_in_files(tmp_path):
         ({"samples": NODE.samples.astype(np.float64)}, "samples of float64, shape (3, 24, 1, 2); expected (sample, 1"),
         ({"samples": NODE.samples[:, :, 0]}, "samples of int16, shape (3, 24, 2)"),
         ({"channels": ("radar", "sidelink")}, "expected (sample, 2, 2) or (capture, sample, 2, 2)"),
-        ({"samples": np.zeros_like(NODE.samples)}, "3 captures of channel radar hold only zeros"),
+        ({"samples": np.zeros_like(NODE.samples)}, "3 captures of channel radar contain only zeros"),
         ({"samples": "nowhere.iq"}, "nowhere.iq: no such file"),
         ({"samples": NODE.samples.reshape(-1, 1, 2)[:-1]}, "71 samples, 3 captures; expected captures of equal length"),
         ({"time_utc": TAGS[:2]}, "2 time tags, 3 starts and 2 frame numbers"),
-        ({"time_utc": TAGS[::-1]}, "capture 1 is tagged 2025-05-14T09:30:02.5"),
-        ({"time_utc": ["yesterday"] * 3}, "time_utc: 'yesterday' is no time"),
-        ({"time_utc": [f"{tag}+02:00" for tag in TAGS]}, "time_utc: '2025-05-14T09:30:01+02:00' is no time"),
+        ({"time_utc": TAGS[::-1]}, "capture 1 has time tag 2025-05-14T09:30:02.5"),
+        ({"time_utc": ["yesterday"] * 3}, "time_utc: 'yesterday' is not a time"),
+        ({"time_utc": [f"{tag}+02:00" for tag in TAGS]}, "time_utc: '2025-05-14T09:30:01+02:00' is not a time"),
         ({"time_utc": np.array(["3025-05-14"] * 3, "datetime64[s]")}, "is not between 1980 and 2199"),
         ({"start": [0, 24, 480]}, "capture 2 starts at sample 480, the data end at 72"),
         ({"frame": [1, 2]}, "and 2 frame numbers"),
         ({"frame": [1, 2, -7]}, "captures.2.apertura:frame"),
-        ({"track": NODE.track[:, :2]}, "track of shape (2, 2); expected (2, 3)"),
+        ({"track": NODE.track[:, :2]}, "track of shape (2, 2); expected shape (2, 3)"),
         ({"track": NODE.track * np.nan}, "0 epochs (2 left out: no fix)"),
         ({"track_utc": NODE.track_utc[::-1]}, "an earlier time"),
         ({"track": "nowhere.pos"}, "nowhere.pos: no such file"),
@@ -158,7 +158,7 @@ def test_a_recording_that_cannot_be_is_named_and_nothing_is_left(tmp_path, chang
         ({"kind": "picture"}, "unknown kind 'picture', not one of bench, calibration, image"),
         (
             {"config": CONFIG | {"waveform": {"kind": "phase_history", "format": "afrl_mat"}}},
-            "waveform.kind phase_history; expected one recorded as samples",
+            "waveform.kind phase_history; expected a waveform that is recorded as samples",
         ),
         ({"config": CONFIG | {"waveform": WAVEFORM | {"codes": "../codes.npy"}}}, "leads out of the campaign folder"),
     ],
@@ -179,5 +179,5 @@ def test_the_name_of_a_flight_leads_nowhere_else(tmp_path, name):
 def test_nothing_is_written_over(tmp_path):
     made = write(tmp_path / "c")
     before = contents(made)
-    assert "something is there already" in complaint(lambda: write(tmp_path / "c"))
+    assert "already exists and is not an empty folder" in complaint(lambda: write(tmp_path / "c"))
     assert contents(made) == before

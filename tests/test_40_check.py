@@ -164,7 +164,7 @@ def test_a_campaign_without_a_flight_to_image_is_reported(tiny):
 
 def test_results_that_are_no_folder_are_reported(tiny):
     (tiny / "results").write_text("")
-    assert only(tiny).startswith("results: is no folder")
+    assert only(tiny).startswith("results: not a folder")
 
 
 def test_a_carrier_that_is_not_the_recorded_one_names_each_recording(tiny):
@@ -220,7 +220,9 @@ def test_every_second_pulse_missing_is_said_so(tiny):
     edit_config(tiny, lambda document: document["waveform"].update(prf_hz=40.0))
     line = only(tiny)
     assert line.startswith("raw/f01/uav1.sigmf-meta")  # the receiver may take every second one
-    assert "time tags 0.05 s apart, 20 Hz: only every second pulse was recorded, or waveform.prf_hz is 2 times" in line
+    assert (
+        "time tag interval 0.05 s (20 Hz): only every second pulse was recorded, or waveform.prf_hz is 2 times" in line
+    )
     assert "expected 0.025 s, 1/waveform.prf_hz (40 Hz)" in line
 
 
@@ -235,7 +237,7 @@ def test_nodes_an_hour_apart_are_reported_of_and_half_a_second_is_left_to_a_flag
     retag(np.timedelta64(3600, "s"))(tiny)
     line = only(tiny)
     assert line.startswith("raw/f01/uav1.sigmf-meta and uav2.sigmf-meta: recorded 2025-")
-    assert "s apart: local time taken for UTC?" in line
+    assert re.search(r"a difference of [\d.]+ s: local time taken for UTC\?", line)
 
 
 def test_frame_numbers_join_what_tags_do_not(tiny):
@@ -244,7 +246,7 @@ def test_frame_numbers_join_what_tags_do_not(tiny):
         renumber(0, node)(tiny)
     assert reported(tiny) == []
     renumber(1000, "uav2")(tiny)
-    assert "none in common" in only(tiny)
+    assert "without a common number" in only(tiny)
 
 
 def test_a_segment_without_a_pulse_is_reported(tiny):
@@ -301,7 +303,7 @@ def test_a_file_from_the_future_is_reported_with_what_to_do(tiny):
         os.utime(path, (time.time() + ahead_s,) * 2)
         lines = reported(tiny)
         assert len(lines) == count
-    assert "dated 2.0 h in the future; expected a time that has been, by this machine's clock" in lines[0]
+    assert "dated 2.0 h in the future; expected a modification time in the past, by this machine's clock" in lines[0]
     assert "run `touch raw/f01/uav1.sigmf-meta`" in lines[0]
 
 
@@ -310,7 +312,7 @@ def test_a_ground_height_that_is_not_configured_is_noted_and_named_in_what_follo
     (line,) = assumptions(Examination(Campaign.load(tiny)))
     assert line.startswith("note: no terrain height is configured: scene.height_m is 0 m")
     assert "the track is 625 m above the ellipsoid" in line
-    assert "scene.height_m, which is 0 m, as by default" in only(tiny)
+    assert "scene.height_m (0 m by default)" in only(tiny)
     edit_config(tiny, lambda document: document["scene"].update(height_m=620.0))
     assert [*assumptions(Examination(Campaign.load(tiny)))] == []
 
@@ -318,5 +320,5 @@ def test_a_ground_height_that_is_not_configured_is_noted_and_named_in_what_follo
 def test_a_sound_folder_is_told_with_the_next_command(tiny, capsys):
     assert print_findings(tiny) == 0
     line = capsys.readouterr().out
-    assert line.startswith("no problem found in 1 flight, 2 recordings with their logs. Next: apertura plan ")
+    assert line.startswith("No problems found in 1 flight, 2 recordings with their logs. Next: apertura plan ")
     assert line.endswith(f", then apertura run {tiny}\n")

@@ -63,9 +63,9 @@ def edit_place(root, change, node="uav1"):
 def test_a_log_18_seconds_late_is_asked_about_gpst(tiny):
     edit_track(tiny, "uav2", lambda lines: [line.replace("GPST", "UTC ") for line in lines])
     line = only(tiny)
-    assert line.startswith(f"{RX}: the log begins 1")
-    assert "pulses without a position; log and recording are 18." in line
-    assert "s apart: GPST taken for UTC?" in line
+    assert line.startswith(f"{RX}: the log starts 1")
+    assert "pulses without a position; the times of log and recording differ by 18." in line
+    assert " s: GPST taken for UTC?" in line
 
 
 @pytest.mark.parametrize(
@@ -112,14 +112,14 @@ def test_a_log_that_is_poor_while_pulses_are_sent_is_reported_unless_that_is_all
     edit_track(tiny, "uav2", lambda lines: single(lines, "09:30:19"))  # pulses from 09:30:18 to 09:30:20 GPST
     assert reported(tiny) == []
     edit_track(tiny, "uav2", lambda lines: single(lines, "09:30:17"))
-    assert "epochs while pulses were sent have a solution poorer than fix" in only(tiny)
+    assert "epochs during the pulses have a solution poorer than fix" in only(tiny)
     edit_config(tiny, lambda document: document["nodes"]["uav2"].update(worst_fix="float"))
     assert reported(tiny) == []
 
 
 def test_a_log_that_cannot_be_read_is_reported_by_its_reader(tiny):
     edit_track(tiny, "uav1", lambda lines: [*lines[:10], lines[9], *lines[10:]])
-    assert "the same time as the epoch before" in only(tiny)
+    assert "is equal to that of the previous epoch" in only(tiny)
 
 
 def test_an_epoch_at_no_place_is_left_out_of_the_log(tiny):
@@ -170,21 +170,21 @@ def test_an_attitude_is_missed_where_an_arm_needs_it(tiny):
 def test_latitude_and_longitude_swapped_in_one_log_puts_the_earth_between_nodes(tiny):
     edit_place(tiny, lambda latitude, longitude, up: (longitude, latitude, up), node="uav2")
     lines = reported(tiny)
-    assert f"{RX}: 5393 km from uav1: latitude 9.95" in "\n".join(lines)
-    assert "expected nodes in sight of each other" in "\n".join(lines)
+    assert f"{RX}: the log is 5393 km from that of uav1: latitude 9.95" in "\n".join(lines)
+    assert "expected nodes in line of sight" in "\n".join(lines)
 
 
-@pytest.mark.quick("*swapped in the logs?", "*check heights*")
+@pytest.mark.quick("*swapped in the logs.", "*check the heights*")
 @pytest.mark.parametrize(
     ("change", "remedy"),
     [
-        (lambda lat, lon, up: (lon, lat, up), "Are latitude and longitude swapped in the logs?"),
-        (lambda lat, lon, up: (lat, -lon, up), "Has longitude the wrong sign in the logs"),
-        (lambda lat, lon, up: (-lat, lon, up), "Has latitude the wrong sign in the logs"),
-        (lambda lat, lon, up: (np.radians(lat), np.radians(lon), up), "Are the logs in radians?"),
+        (lambda lat, lon, up: (lon, lat, up), "Check if latitude and longitude are swapped in the logs."),
+        (lambda lat, lon, up: (lat, -lon, up), "Check the sign of longitude in the logs"),
+        (lambda lat, lon, up: (-lat, lon, up), "Check the sign of latitude in the logs"),
+        (lambda lat, lon, up: (np.radians(lat), np.radians(lon), up), "Check if the logs are in radians."),
         (
             lambda lat, lon, up: (lat, lon, up / 0.3048),
-            "m above the ground: check heights in the logs (metres, not feet",
+            "m above the terrain: check the heights in the logs (metres, not feet",
         ),
     ],
 )
@@ -192,7 +192,7 @@ def test_logs_far_from_the_scene_are_asked_about_what_would_bring_them_there(tin
     for node in ("uav1", "uav2"):
         edit_place(tiny, change, node=node)
     line = only(tiny)
-    assert "from the track of f01 uav1-uav1, uav1-uav2: no echo travels less than" in line
+    assert "from the track of f01 uav1-uav1, uav1-uav2: the shortest total path is" in line
     assert remedy in line
 
 
@@ -205,17 +205,18 @@ def bounds_of(root):
 def test_a_scene_in_the_neighbouring_zone_is_444_km_away(tiny):
     state(tiny, "scene", crs="EPSG:32633")
     line = only(tiny)
-    assert "the scene lies 444 km from the track" in line
-    assert "Is scene.crs EPSG:32632, the zone of the track, instead of EPSG:32633?" in line
+    assert "the scene is 444 km from the track" in line
+    assert "Check if scene.crs should be EPSG:32632, the UTM zone of the track, instead of EPSG:32633." in line
 
 
 def test_bounds_in_degrees_look_like_degrees(tiny):
     state(tiny, "scene", bounds_m=[9.9545, 48.4225, 9.9555, 48.4235], spacing_m=0.0001)
-    assert "These look like degrees: give scene.bounds_m in metres of EPSG:32632." in only(tiny)
+    assert "The bounds appear to be in degrees: set scene.bounds_m in metres in EPSG:32632." in only(tiny)
     state(tiny, "scene", crs="EPSG:25832")
     line = only(tiny)
-    assert line.startswith("config/config.yaml: scene.bounds_m: bounds_m [9.9545, 48.4225, 9.9555, 48.4235] are not in")
-    assert "These look like degrees" in line
+    found = "bounds_m [9.9545, 48.4225, 9.9555, 48.4235] lie outside the area of use of"
+    assert line.startswith(f"config/config.yaml: scene.bounds_m: {found}")
+    assert "The bounds appear to be in degrees" in line
 
 
 def test_bounds_with_northing_first_are_reported_so(tiny):
@@ -236,11 +237,11 @@ def test_a_scene_is_far_where_no_echo_of_it_arrives_inside_the_prefix(tiny):
 @pytest.mark.parametrize(
     ("crs", "found"),
     [
-        ("EPSG:4326", "EPSG:4326 (WGS 84) counts in degrees"),
-        ("EPSG:2225", "counts in US survey foot"),
+        ("EPSG:4326", "EPSG:4326 (WGS 84) is in degrees"),
+        ("EPSG:2225", "is in US survey foot"),
         ("EPSG:4978", "EPSG:4978 (WGS 84) is not projected"),
         ("EPSG:99999", "'EPSG:99999' is unknown to PROJ"),
-        ("local", "local for positions on Earth, in latitude and longitude"),
+        ("local", "CRS local with positions on Earth, in latitude and longitude"),
     ],
 )
 def test_a_crs_must_be_projected_in_metres(tiny, crs, found):
@@ -249,14 +250,14 @@ def test_a_crs_must_be_projected_in_metres(tiny, crs, found):
     assert line.startswith("config/config.yaml: scene.crs: ")
     assert found in line
     if crs in {"EPSG:4326", "EPSG:2225", "EPSG:4978"}:
-        assert "Set scene.crs to EPSG:32632, and scene.bounds_m in metres of it" in line
+        assert "Set scene.crs to EPSG:32632 and scene.bounds_m to metres in this CRS" in line
 
 
 def test_a_zone_that_the_track_is_not_in_is_reported_where_bounds_are_auto(tiny):
     state(tiny, "scene", crs="EPSG:32633", bounds_m="auto")  # 2° outside: of use there
     assert reported(tiny) == []
     state(tiny, "scene", crs="EPSG:32635")
-    assert "EPSG:32635 (WGS 84 / UTM zone 35N) is not made for where the track lies" in only(tiny)
+    assert "the track lies outside the area of use of EPSG:32635 (WGS 84 / UTM zone 35N)" in only(tiny)
 
 
 @pytest.mark.quick("{'crs': 'auto', 'bounds_m': 'auto', 'spacing_m': 'auto'}", "{'crs': 'EPSG:25832'}")
@@ -290,7 +291,7 @@ def test_gotcha_is_without_problems_in_its_own_frame_alone(shared, tmp_path):
     (tmp_path / "config/flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\nf01\timage\tradar\tradar\n")
     assert reported(tmp_path) == []
     state(tmp_path, "scene", crs="EPSG:32616")
-    assert "EPSG:32616 for positions in metres of a frame of their own; expected local" in only(tmp_path)
+    assert "CRS EPSG:32616 with positions in metres of a local frame; expected local" in only(tmp_path)
 
 
 def test_a_track_must_be_above_the_ground(tiny):
@@ -298,16 +299,18 @@ def test_a_track_must_be_above_the_ground(tiny):
     assert reported(tiny) == []
     state(tiny, "scene", height_m=626.0)
     line = only(tiny)
-    assert line.startswith("config/config.yaml: scene.height_m: flight f01, uav1, uav2: -1.")
-    assert "logs may count from the geoid" in line
+    assert line.startswith(
+        "config/config.yaml: scene.height_m: flight f01, uav1, uav2: median height above the terrain -1."
+    )
+    assert "which may refer to the geoid" in line
 
 
 def test_a_track_is_not_30_km_above_the_ground(tiny):
     for height_m, high in ((-29_000.0, False), (-30_000.0, True)):
         state(tiny, "scene", height_m=height_m)
         lines = reported(tiny)
-        assert any("m above the ground: check heights in the logs" in line for line in lines)  # no echo comes back
-        assert any("expected a node above the ground, by at most 30 km" in line for line in lines) is high
+        assert any("m above the terrain: check the heights in the logs" in line for line in lines)  # no echo comes back
+        assert any("expected a node above the terrain, by at most 30 km" in line for line in lines) is high
 
 
 def write_dem(root, heights, *, post_m=1.0, east_m=0.0):
@@ -344,9 +347,9 @@ def with_post(height_m, row=30, column=30):
 )
 def test_a_post_that_stands_out_by_kilometres_is_reported_and_a_cliff_is_not(tiny, heights, spike):
     write_dem(tiny, heights)
-    lines = [line for line in reported(tiny) if "stand out so" in line]
+    lines = [line for line in reported(tiny) if "are such spikes" in line]
     assert bool(lines) is spike
-    assert all(line.startswith("dem.tif: ") and "where the land about it has 600 m" in line for line in lines)
+    assert all(line.startswith("dem.tif: ") and "where the surrounding terrain has 600 m" in line for line in lines)
 
 
 def test_needles_are_narrower_than_a_window_and_higher_than_asked():
@@ -371,7 +374,7 @@ def test_heights_that_are_not_on_earth_matter_under_the_scene_alone(tiny):
     write_dem(tiny, with_post(-32767.0, row=25))  # 5 m north of the middle of 6 m
     assert reported(tiny) == []
     write_dem(tiny, with_post(-32767.0))
-    assert "have no height on Earth" in only(tiny)
+    assert "have impossible heights" in only(tiny)
 
 
 def test_a_track_below_the_dem_is_reported(tiny):
@@ -379,7 +382,7 @@ def test_a_track_below_the_dem_is_reported(tiny):
     edit_place(tiny, lambda *place: (DEMO_ORIGIN.latitude_deg, DEMO_ORIGIN.longitude_deg, place[2]))
     still, below = reported(tiny)  # it is put at one place, which is no aperture either
     assert "no aperture" in still
-    assert below.startswith("config/config.yaml: scene.dem: flight f01, uav1: -2.")
+    assert below.startswith("config/config.yaml: scene.dem: flight f01, uav1: median height above the terrain -2.")
 
 
 def test_a_dem_that_is_none_is_reported(tiny):
@@ -404,7 +407,7 @@ def test_a_calibration_flight_calibrates_every_pair(tiny):
     assert reported(tiny) == []
     fly_nodes = (tiny / "config/flights.tsv").read_text().replace("c01\tcalibration\tuav1\tuav1,uav2", "{}")
     (tiny / "config/flights.tsv").write_text(fly_nodes.format("c01\tcalibration\tuav1\tuav1"))
-    assert "flight f01 has pairs uav1-uav2, which c01 did not calibrate" in only(tiny)
+    assert "flight f01 has pairs uav1-uav2, which are not calibrated by c01" in only(tiny)
     (tiny / "config/flights.tsv").write_text(fly_nodes.format("c01\timage\tuav1\tuav1,uav2"))
     assert "calibration.flight: flight c01 is of kind image" in only(tiny)
     (tiny / "config/flights.tsv").write_text(fly_nodes.replace("{}\n", ""))
@@ -416,7 +419,7 @@ def test_a_reflector_out_of_reach_is_reported(tiny):
     swapped = CALIBRATION | {"reflector_m": [5363700.0, 570660.0, 620.0]}
     edit_config(tiny, lambda document: document.update(calibration=swapped))
     line = only(tiny)
-    assert line.startswith("config/config.yaml: calibration.reflector_m: [5363700.0, 570660.0, 620.0] is ")
+    assert line.startswith("config/config.yaml: calibration.reflector_m: reflector [5363700.0, 570660.0, 620.0] is ")
     state(tiny, "scene", crs="EPSG:99999")
     assert "unknown to PROJ" in only(tiny)
 
@@ -440,9 +443,7 @@ def test_memory_must_hold_the_metadata_of_the_longest_recording_and_no_samples(t
     assert reported(tiny, without=["disk"]) == []
     monkeypatch.setattr(files, "_CAPTURE_BYTES", 400_000_000)
     line = reported(tiny, without=["disk"])
-    assert re.search(
-        r"\d+ captures of uav\d in f01 take at least .* GB of memory; expected at most the 0.4 GB", line[0]
-    )
+    assert re.search(r"\d+ captures of uav\d in f01 need at least .* GB of memory; expected at most 0.4 GB", line[0])
     assert reported(tiny, without=["disk", "memory"]) == []
 
 
@@ -458,8 +459,8 @@ def test_the_disk_must_hold_what_is_still_to_be_written(tiny, monkeypatch):
     assert reported(tiny) == []
     free["bytes"] = 1_000
     line = only(tiny)
-    assert re.search(r"results take at least \d+ MB more \(.*echo \d+ MB", line)
-    assert "expected at most the 0 MB that are free" in line
+    assert re.search(r"results need at least \d+ MB \(.*echo \d+ MB", line)
+    assert "expected at most 0 MB, the free disk space" in line
 
 
 @pytest.mark.parametrize(("unit", "refused"), [("degrees", False), ("radians", True)])
@@ -481,6 +482,6 @@ def test_an_attitude_in_radians_is_refused_where_the_course_proves_it_and_an_arm
 
     edit_track(tiny, "uav1", circle)
     lines = reported(tiny)
-    assert any(line.startswith(f"{TX}: angles of attitude look in radians: yaw is") for line in lines) is refused
+    assert any(line.startswith(f"{TX}: attitude angles appear to be in radians: yaw") for line in lines) is refused
     edit_config(tiny, lambda document: document["nodes"]["uav1"].update(lever_arms_m={}))
     assert not any("attitude" in line for line in reported(tiny))

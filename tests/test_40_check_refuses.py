@@ -82,7 +82,7 @@ SPOILT = {
     "an engine that is not here": (processing(engine="cuda"), "engine cuda cannot run here"),
     "an angle of one pulse": (
         processing(integration={"degrees": 0.001}),
-        "no more than 2 pulses see the scene inside",
+        "at most 2 pulses illuminate a pixel inside",
     ),
     "another's scheduler": (processing(scheduler="tcp://127.0.0.1:9999"), "DASK_SCHEDULER_ADDRESS is not set"),
     "a log with a hole": (

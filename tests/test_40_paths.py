@@ -174,7 +174,8 @@ def test_a_link_in_raw_root_is_refused_and_its_own_path_may_be_one(tiny, elsewhe
 
 
 @pytest.mark.parametrize(
-    ("stated", "found"), [("/proc/nowhere", "no folder"), ("raw", "must be the absolute path"), ("/a/../b", "without")]
+    ("stated", "found"),
+    [("/proc/nowhere", "is not a folder"), ("raw", "must be the absolute path"), ("/a/../b", "without")],
 )
 def test_a_raw_root_that_is_no_folder_is_one_message(tiny, stated, found):
     edit(tiny, "raw_root", stated, load=False)
@@ -184,4 +185,4 @@ def test_a_raw_root_that_is_no_folder_is_one_message(tiny, stated, found):
 def test_recordings_in_two_places_are_refused(tiny, tmp_path):
     shutil.copytree(tiny / "raw", tmp_path / "archive")
     edit(tiny, "raw_root", str(tmp_path / "archive"), load=False)
-    assert any("raw/ holds files" in str(one) for one in problems(tiny))
+    assert any("raw/ contains files" in str(one) for one in problems(tiny))

@@ -217,7 +217,7 @@ def test_a_product_or_document_that_is_edited_or_gone_is_made_again(finished, fi
         path.write_bytes(path.read_bytes()[:-1] + b"x")
     found = stale_results(Campaign.load(finished))
     reason = "is missing" if how == "gone" else "has changed since it was written"
-    assert [why for why in found.values() if why] == [f"{path.name} {reason}"]
+    assert [reason for reason in found.values() if reason] == [f"{path.name} {reason}"]
 
 
 @pytest.mark.quick("0")
@@ -274,7 +274,7 @@ def test_a_damaged_document_is_not_read(finished, file):
 
 
 def test_a_campaign_is_held_by_one_run_and_free_when_it_ends(tmp_path):
-    with hold(tmp_path), pytest.raises(CampaignError, match=f"another run holds this campaign: process {os.getpid()}"):
+    with hold(tmp_path), pytest.raises(CampaignError, match=f"locked by another run: process {os.getpid()}"):
         hold(tmp_path)
     hold(tmp_path).close()
 

@@ -45,7 +45,7 @@ def test_truncated_samples_are_noticed_by_their_captures(tiny):
     path = tiny / "raw" / "f01" / "uav1.sigmf-data"
     path.write_bytes(path.read_bytes()[:-4000])
     message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
-    assert "holds 3000 samples" in message
+    assert "contains 3000 samples" in message
     assert "expected 4000" in message
     assert nothing_half_written(tiny)
 
@@ -90,7 +90,7 @@ def test_a_gpst_log_taken_for_utc_misses_the_pulses_by_18_seconds(tiny):
     campaign = Campaign.load(tiny)
     ingest_all(campaign)
     message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav2"))
-    assert "begins 1" in message
+    assert "starts 1" in message
     assert "GPST is 18 s ahead" in message
 
 
@@ -98,12 +98,14 @@ def test_a_doubled_epoch_is_named(tiny):
     edit_track(tiny, "uav1", lambda lines: [*lines[:10], lines[9], *lines[10:]])
     message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
     assert "epoch 9" in message
-    assert "the same time" in message
+    assert "is equal to that of the previous epoch" in message
 
 
 def test_an_unsorted_log_is_named(tiny):
     edit_track(tiny, "uav1", lambda lines: [*lines[:10], *lines[12:14], *lines[10:12]])
-    assert "an earlier time" in complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
+    assert "is before that of the previous epoch" in complaint(
+        lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1")
+    )
 
 
 def test_a_lever_arm_without_attitude_is_refused(tiny):
@@ -155,7 +157,7 @@ def test_a_beam_with_a_log_that_holds_no_attitude_is_refused(tiny):
     campaign = Campaign.load(tiny)
     ingest_all(campaign)
     message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav1"))
-    assert "an antenna's beam but no attitude (attitude: log)" in message
+    assert "an antenna beam is configured, but there is no attitude (attitude: log)" in message
 
 
 @pytest.mark.parametrize(
@@ -374,4 +376,4 @@ def test_a_recording_that_ends_while_it_is_read_is_an_error_and_no_signal(tiny):
     with file.path.open("r+b") as stream:
         stream.truncate(4 * (whole - 2))
     message = complaint(lambda: file.read(whole - 5, whole))
-    assert f"uav1.sigmf-data: ends at sample {whole - 2}, while it is read" in message
+    assert f"uav1.sigmf-data: the file ends at sample {whole - 2}, truncated while it was read" in message

@@ -195,26 +195,26 @@ def described(meta, **changes):
     ("place", "changes", "expected"),
     [
         ("global", {"apertura:channels": 3}, "global.apertura:channels: "),
-        ("global", {"apertura:channels": ["radar", "radar"]}, "each its own"),
-        ("global", {"core:sample_rate": float("inf")}, "no JSON: "),
+        ("global", {"apertura:channels": ["radar", "radar"]}, "one unique name per channel"),
+        ("global", {"core:sample_rate": float("inf")}, "invalid JSON: "),
         ("global", {"core:sample_rate": 1e308}, "core:sample_rate: "),
         ("global", {"core:sample_rate": 1e-3}, "core:sample_rate: "),
         ("global", {"apertura:channels": ["radar", "\x1b[2J"]}, "apertura:channels.1: "),
-        ("global", {"core:num_channels": 2**70}, "no JSON: parse error: integer overflow"),
+        ("global", {"core:num_channels": 2**70}, "invalid JSON: parse error: integer overflow"),
         ("global", {"core:datatype": "\x1b[2J"}, r"core:datatype '\x1b[2J'"),
-        ("capture", {"apertura:frame": float("nan")}, "no JSON: "),
+        ("capture", {"apertura:frame": float("nan")}, "invalid JSON: "),
         ("capture", {"apertura:frame": "text"}, "apertura:frame: "),
         ("capture", {"apertura:frame": 2**62}, "captures.3.apertura:frame: "),
         ("capture", {"core:sample_start": 2**62}, "captures.3.core:sample_start: "),
-        ("capture", {"core:sample_start": 10**400}, "no JSON: "),
-        ("capture", {"core:frequency": float("nan")}, "no JSON: "),
-        ("capture", {"core:datetime": "99999-01-01T00:00:00Z"}, "is no time"),
+        ("capture", {"core:sample_start": 10**400}, "invalid JSON: "),
+        ("capture", {"core:frequency": float("nan")}, "invalid JSON: "),
+        ("capture", {"core:datetime": "99999-01-01T00:00:00Z"}, "is not a time"),
         ("capture", {"core:datetime": "2300-01-01T00:00:00Z"}, "is not between 1980 and 2199"),
         ("capture", {"core:datetime": "1600-01-01T00:00:00Z"}, "is not between 1980 and 2199"),
-        ("global", {"core:offset": 1}, "capture 0: core:sample_start 0; expected no sample before core:offset 1"),
+        ("global", {"core:offset": 1}, "capture 0: core:sample_start 0; expected at least core:offset 1"),
         ("global", {"core:extensions": [{"name": "packed", "version": "1", "optional": False}]}, "requires 'packed'"),
-        ("capture", {"core:datetime": "nowZ"}, "is no time"),
-        ("capture", {"core:datetime": "NaTZ"}, "is no time"),
+        ("capture", {"core:datetime": "nowZ"}, "is not a time"),
+        ("capture", {"core:datetime": "NaTZ"}, "is not a time"),
         ("capture", {"core:datetime": "2025-02-30T00:00:00Z"}, "core:datetime: "),
     ],
 )
@@ -307,7 +307,7 @@ LOGS = {
     ),
     "nmea: GNS without GGA": (
         "a.track.nmea", "".join(f"{logs.rmc(t)}\n{gns(t, p)}\n" for t, p in zip(TIMES, PLACES, strict=True)), {},
-        "no GGA, but 40 GNS; expected an NMEA 0183 log with GGA. Log GGA",
+        "no GGA, but 40 GNS; expected an NMEA 0183 log with GGA. Log the unmodified GGA",
     ),
     "csv: index column of pandas, all cells quoted": (
         *csv_log(
@@ -321,7 +321,7 @@ LOGS = {
         {}, ECEF,
     ),
     "csv: hemispheres behind degrees": (
-        *csv_log(*(row.replace(",9.9", "E,9.9") for row in PLAIN)), {}, "in column latitude_deg: '48.4",
+        *csv_log(*(row.replace(",9.9", "E,9.9") for row in PLAIN)), {}, "column latitude_deg: '48.4",
     ),
     "csv: seconds of GPS week alone": (
         *csv_log(*(f"{293418 + n}{row[30:]}" for n, row in enumerate(PLAIN)), heading=CSV.replace("utc", "s")), {},
@@ -329,7 +329,7 @@ LOGS = {
     ),
     "px4: two logs joined by cat": (
         "a.track.ulg", ulog(("sensor_gps", 0, ulog_receiver())) * 2, {},
-        "another log begins at byte 3821: separate logs that were joined",
+        "a second log starts at byte 3821: separate concatenated logs",
     ),
     "px4: encrypted": ("a.track.ulg", b"ULogEnc\x01" + bytes(4000), {}, "not readable (Invalid file format"),
     "ardupilot: a page of zeros before the first message": (
@@ -340,7 +340,7 @@ LOGS = {
     ),
     "airdata: saved by a German spreadsheet": (
         "a.track.csv", logs.airdata(TIMES, PLACES).replace(",", ";").replace(".", ","), {"height_offset_m": 48.0},
-        "cells between semicolons",
+        "are separated by semicolons",
     ),
     "airdata: two flights in one file": (
         "a.track.csv", logs.airdata(TIMES, PLACES) + logs.airdata(LATER, PLACES).partition("\n")[2],
@@ -457,19 +457,19 @@ RECORDINGS = {
     ),
     "npy: frames × receivers × samples": ("beat_npy", "npy", saved(BEATS[:, None]), "of shape (9, 1, 88)"),
     "npy: complex samples where waveform.iq is real": (
-        "beat_npy", "npy", saved(BEATS.astype(complex)), "complex128 samples where waveform.iq is real",
+        "beat_npy", "npy", saved(BEATS.astype(complex)), "complex128 samples, but waveform.iq is real",
     ),
     "mat: version 4": ("beat_mat", "mat", matlab("4", beat=BEATS), 9),
     "mat: times as days of MATLAB": (
         "beat_mat", "mat", matlab(beat=BEATS, time=739_751.4 + np.arange(9) * 0.01 / 86400),
-        "times as days of MATLAB (datenum); expected seconds since 1970",
+        "times in days (MATLAB datenum); expected seconds since 1970",
     ),
-    "mat: a table in place of the structure": ("afrl_mat", "mat", matlab(data=BEATS), "no structure called data"),
+    "mat: a table in place of the structure": ("afrl_mat", "mat", matlab(data=BEATS), "no structure data"),
     "mat: phase history in single precision, positions whole": (
         "afrl_mat", "mat", gotcha(fp=np.ones((8, 5), np.complex64), x=np.arange(7000, 7005, dtype=np.int16)), 5,
     ),
     "mat: frequencies that descend": (
-        "afrl_mat", "mat", gotcha(freq=9.4e9 - 1e6 * np.arange(8.0)), "frequencies that do not rise in equal steps",
+        "afrl_mat", "mat", gotcha(freq=9.4e9 - 1e6 * np.arange(8.0)), "frequencies that do not increase in equal steps",
     ),
     "wav: 24 bits, extensible header": ("beat_wav", "wav", of_24_bits(sound("i4")), 9),
     "wav: floats": ("beat_wav", "wav", sound("f4"), 9),
@@ -610,7 +610,7 @@ DEMS = {
     ),
     "ground control points alone": (
         lambda path: raster(path, crs=None, transform=Affine.identity()),
-        "no CRS on Earth",
+        "no geodetic CRS",
     ),
 }
 
@@ -659,9 +659,9 @@ SIGMF = {
     "time tags with an offset": (
         {"1.core:datetime": "2025-05-14T11:30:01+02:00"}, str.encode, "captures.1.core:datetime: ",
     ),
-    "metadata in UTF-16": ({}, lambda text: text.encode("utf-16"), "not valid SigMF: no JSON"),
-    "metadata cut off": ({}, lambda text: text[:-40].encode(), "not valid SigMF: no JSON"),
-    "captures that are not sorted": ({"2.core:sample_start": 8}, str.encode, "capture 1 holds -8 samples"),
+    "metadata in UTF-16": ({}, lambda text: text.encode("utf-16"), "not valid SigMF: invalid JSON"),
+    "metadata cut off": ({}, lambda text: text[:-40].encode(), "not valid SigMF: invalid JSON"),
+    "captures that are not sorted": ({"2.core:sample_start": 8}, str.encode, "capture 1 contains -8 samples"),
     "real samples without an intermediate frequency": (
         {"global.core:datatype": "ri16_le"}, str.encode, "core:datatype ri16_le without apertura:if_hz",
     ),

@@ -97,7 +97,7 @@ def test_a_bench_needs_no_log_and_makes_no_image(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["apertura", "bench", str(campaign.root)])
     with pytest.raises(SystemExit, match="2"):
         main()
-    assert FLAGS["link_drifts"].look in capsys.readouterr().out
+    assert FLAGS["link_drifts"].advice in capsys.readouterr().out
     made = sorted(path.name for path in campaign.result(FLIGHT).iterdir())
     assert made == sorted([REPORT, PAGE, PICTURE, "bench.manifest.json"])
     with pytest.raises(CampaignError, match="a flight of kind image"):
@@ -121,7 +121,7 @@ def test_no_path_of_a_link_that_carries_a_flag_goes_into_the_config(tmp_path, ca
     edit_config(root, lambda config: config["nodes"]["uav2"]["path_offset_m"].update(radar=0.5))
     before = (root / "config/config.yaml").read_text()
     print_bench(Campaign.load(root), write=True)
-    assert "nodes.uav2.path_offset_m: not of a link with link_incoherent" in capsys.readouterr().out
+    assert "nodes.uav2.path_offset_m: not determined, because the link has link_incoherent" in capsys.readouterr().out
     assert (root / "config/config.yaml").read_text() == before
 
 
@@ -138,7 +138,7 @@ def test_measured_paths_go_into_the_config_and_nothing_else_changes(tmp_path):
     assert changed[0][0].strip() == "radar: 0.5"
     assert float(changed[0][1].partition(": ")[2]) == pytest.approx(0.911, abs=2e-3)
     assert (RADAR_M, SIDELINK_M) == (10.0, 5.0)
-    assert "path_disagrees" not in measure_bench(Campaign.load(root), FLIGHT).flags
+    assert "path_offset_disagrees" not in measure_bench(Campaign.load(root), FLIGHT).flags
 
 
 # Images need an aperture
@@ -149,7 +149,7 @@ def test_a_radar_that_stands_still_is_refused_as_a_flight_with_the_question_whet
     flight = replace(specification.flights[0], kind="image")
     root = write_campaign(tmp_path / "c", replace(specification, flights=(flight,)), np.random.default_rng(1))
     (first, *_) = [problem for problem in problems(root) if "bench" in str(problem)]
-    assert "no aperture, its nodes moved 0 cm" in str(first)
+    assert "no aperture, the nodes moved only 0 cm" in str(first)
 
 
 @pytest.mark.parametrize(("length_m", "flagged"), [(0.3, True), (2.0, False)])
@@ -196,7 +196,7 @@ def test_an_image_without_an_aperture_cannot_tell_its_focus():
     echo = np.exp(-2j * np.pi * frequency * flown.path(np.zeros((1, 3))) / 299792458.0).astype(np.complex64)
     image = ap.backproject(ap.PhaseHistory(echo, frequency, np.full(128, 1 / 128), np.zeros(64), flown), grid)
     told = ap.judge(image)
-    assert told.verdict == "cannot tell"
-    assert told.why.startswith("no aperture: antennas moved 0 m, which resolves nothing")
+    assert told.verdict == "inconclusive"
+    assert told.reason.startswith("no aperture: antennas moved 0 m: no resolution")
     assert "no_aperture" in image.attrs["flags"]
-    assert not told.flags.keys() & {"defocused", "echo_elsewhere"}
+    assert not told.flags.keys() & {"defocused", "echo_outside_scene"}

@@ -147,7 +147,7 @@ def test_a_mixer_of_the_other_sign_is_flagged(tmp_path):
     root = written(tmp_path, flight, iq="conjugate")
     run_steps(root, exports=False)
     raised = image_of(root).attrs["quality"]["flags"]
-    assert {"echo_elsewhere", "defocused"} & set(raised)
+    assert {"echo_outside_scene", "defocused"} & set(raised)
     assert any("change waveform.iq between complex and conjugate" in line for line in raised.values())
 
 
@@ -165,5 +165,5 @@ def test_missing_sweeps_are_counted_and_flagged(tmp_path):
     beat[60:100] = 0
     np.save(root / "raw/f01/uav1.npy", beat)
     attrs = recorded_echo(Campaign.load(root), "f01", "uav1-uav1").attrs
-    assert attrs["pulses"] == {"used": 160, "dropped": 40, "reasons": {"silent": 40}}
+    assert attrs["pulses"] == {"used": 160, "dropped": 40, "reasons": {"all samples zero": 40}}
     assert set(attrs["flags"]) == {"pulses_missing"}

@@ -79,7 +79,7 @@ def test_images_of_a_far_scene_are_mended_by_one_phase_per_pulse(campaigns, pair
     assert quality["autofocus"]["accepted"]
     assert quality["autofocus"]["method"].startswith("minimum_entropy: auto: in uav1-uav1 one phase per pulse leaves")
     assert quality["models"]["autofocus_method"] == quality["autofocus"]["method"]
-    assert 1 < quality["autofocus"]["further_rms_cm"] < 5
+    assert 1 < quality["autofocus"]["extra_path_rms_cm"] < 5
     assert "rms_cm" not in quality["autofocus"]
     assert quality["focus"]["verdict"] == "focused"
     assert quality["focus"]["expected_db"] == pytest.approx(20 * np.log10(corrected / right), abs=0.2)

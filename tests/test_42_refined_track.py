@@ -75,10 +75,10 @@ def test_tracks_left_alone_have_no_knots_and_their_images_say_why(finished_tiny)
     assert stage.attrs["nodes"] == ["uav1", "uav2"]
     quality = quality_of(finished_tiny, "uav1-uav2")
     assert quality["autofocus"] == {
-        "decision": "off: auto: position accuracy of uav1 is not configured; state nodes.<node>.position_std_m to "
-        "have them refined",
+        "decision": "off: auto: position accuracy of uav1 is not configured; set nodes.<node>.position_std_m to "
+        "have the tracks refined",
         "accepted": False,
-        "why": "images are formed from the unchanged logs",
+        "reason": "images are formed from the unchanged logs",
     }
     assert quality["models"]["autofocus"].startswith("off: auto: position accuracy")
 
@@ -126,7 +126,7 @@ def test_images_of_a_corrected_track_are_those_of_the_true_one(spoilt, finished_
     campaign, found = spoilt
     likeness = {}
     for accepted in (False, True):
-        write_track(campaign, *found, accepted=accepted, flags={"prior_inconsistent": "told so"})
+        write_track(campaign, *found, accepted=accepted, flags={"position_error_understated": "told so"})
         for pair in PAIRS:
             image.image(campaign, "f01", pair)
             right, now = (image_of(one, pair) for one in (finished_tiny, campaign))
@@ -138,7 +138,7 @@ def test_images_of_a_corrected_track_are_those_of_the_true_one(spoilt, finished_
         assert quality["autofocus"]["rms_cm"]["uav1"] == pytest.approx(3 * np.sqrt(3 / 2), rel=0.15)
         assert quality["autofocus"]["gain_held_out_db"] == 3.0
         assert quality["models"]["autofocus"] == "on: asked for; as told"
-        assert quality["flags"]["prior_inconsistent"] == "told so"
+        assert quality["flags"]["position_error_understated"] == "told so"
         assert [line for line in quality["budget"] if line["cause"] == "positions"] == [
             {
                 "cause": "positions",
@@ -211,7 +211,7 @@ def test_what_refinement_costs_or_knows_makes_again_only_what_stands_on_it(finis
 
 @pytest.mark.parametrize(
     ("by_m", "told"),
-    [((4.0, 0.0, 0.0), "outside the scene"), ((0.0, 0.0, 2000.0), "whose ground lies at about 620.0 m")],
+    [((4.0, 0.0, 0.0), "outside the scene"), ((0.0, 0.0, 2000.0), "close to the terrain of the scene, about 620.0 m")],
 )
 def test_a_reference_point_outside_the_scene_is_told(finished_tiny, tmp_path, by_m, told):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
@@ -256,8 +256,8 @@ def test_right_logs_that_are_said_to_err_by_2_cm_are_left_as_they_are(tmp_path, 
     refine.refine(campaign, "f01")
     image.image(campaign, "f01", "uav1-uav1")
     quality, stage = quality_of(campaign, "uav1-uav1"), open_refined(campaign, "f01").stage
-    assert "the logs are as good" in stage.attrs["why"]
-    assert stage.attrs["flags"].keys() <= {"prior_too_wide"}
+    assert "no improvement over the logs" in stage.attrs["reason"]
+    assert stage.attrs["flags"].keys() <= {"position_error_overstated"}
     assert quality["flags"].items() >= stage.attrs["flags"].items()
     assert quality["autofocus"]["accepted"] is False
     assert quality["models"]["autofocus"].startswith("on: asked for; ")
@@ -369,7 +369,7 @@ def test_a_log_that_is_late_is_named_and_the_images_are_as_with_its_right_times(
     edit_config(campaign.root, lambda document: [node.update(stated) for node in document["nodes"].values()])
     campaign = run_steps(campaign.root)
     found = open_refined(campaign, "f01").stage.attrs
-    assert list(found["flags"]) == ["cause_found"]
+    assert list(found["flags"]) == ["cause_corrected"]
     assert found["report"]["cause"]["what"].startswith("the times of the log of uav1 are ")
     assert found["report"]["cause"]["values"] == pytest.approx([0.1], abs=0.01)
     assert max(one.error_m for one in score(campaign)) < 0.03

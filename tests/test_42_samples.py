@@ -162,7 +162,7 @@ def test_a_campaign_of_a_pulse_passes_the_checks_and_asks_for_little(tiny):
         ({"pulse": "raw/other.npy"}, "no such file"),
         ({"band_hz": [400e6, 500e6]}, "of the pulse's energy"),
         ({"carrier_hz": 1.2e9}, "waveform.carrier_hz"),
-        ({"listen_s": 0.02e-6}, "what waveform.listen_s holds"),
+        ({"listen_s": 0.02e-6}, "the limit by waveform.listen_s"),
     ],
 )
 def test_what_does_not_fit_the_recording_is_told_before_anything_runs(tiny, changed, told):
@@ -181,7 +181,7 @@ def test_captures_that_begin_in_the_direct_pulse_or_end_in_it_are_flagged(tmp_pa
     for node in ("uav1", "uav2"):
         ingest.ingest(campaign, "f01", node)
     echo.echo(campaign, "f01", "uav1-uav2")
-    assert ("pulse_cut" in PairEcho.opened(campaign, "f01", "uav1-uav2").stage.attrs["flags"]) is cut
+    assert ("pulse_truncated" in PairEcho.opened(campaign, "f01", "uav1-uav2").stage.attrs["flags"]) is cut
 
 
 def test_captures_shorter_than_a_pulse_and_its_echoes_are_refused_by_the_step(tiny):
@@ -211,7 +211,7 @@ def test_a_specification_of_a_pulse_is_read_back_as_it_was(tmp_path):
 
 @pytest.mark.parametrize(
     ("changed", "told"),
-    [({"bandwidth_hz": 2e9}, "beyond sample_rate_hz"), ({"pulse": "pn", "bandwidth_hz": 300e6}, "whole samples")],
+    [({"bandwidth_hz": 2e9}, "exceeds sample_rate_hz"), ({"pulse": "pn", "bandwidth_hz": 300e6}, "whole samples")],
 )
 def test_a_pulse_that_cannot_be_sampled_is_refused(changed, told):
     with pytest.raises(ValueError, match=told):

@@ -57,8 +57,8 @@ def test_a_solution_that_is_read_again_has_the_refined_positions_to_a_tenth_of_a
     text = (tmp_path / "uav1.pos").read_text()
     read = read_rtklib_pos(tmp_path / "uav1.pos", node="uav1")
     assert "% refined: as told" in text.splitlines()
-    assert "5 of 30 epochs lie beyond the pulses" in text
-    assert "ns, age, ratio and covariances 0: not known" in text  # a program that filters by them is told
+    assert "5 of 30 epochs lie outside the pulses" in text
+    assert "ns, age, ratio and covariances 0: unknown" in text  # for programs that filter by them
     np.testing.assert_array_equal(read.time.values, log.track.time.values)
     np.testing.assert_allclose(read.position.values, log.track.position.values + log.moved_m, atol=1e-4, rtol=0)
     np.testing.assert_allclose(read.position_std.values[:, ENU], np.nan_to_num(log.std_m), atol=5.1e-5, rtol=0)
@@ -122,7 +122,7 @@ def stage_of(*, accepted, further=()):
             "nodes": ["uav1"],
             "pairs": list(further),
             "accepted": accepted,
-            "why": "as told",
+            "reason": "as told",
             "decisions": {"autofocus": {"value": "on", "reason": "asked for"}},
         },
     )

@@ -89,8 +89,8 @@ def test_a_sidelink_is_as_long_as_its_air_at_the_height_of_the_antennas_makes_it
 def test_the_product_says_which_air_it_took_and_what_vacuum_would_have_done(finished_tiny):
     said = json.loads((finished_tiny.results / "f01/uav1-uav2/image.json").read_text())
     air = said["atmosphere"]
-    assert air["source"] == "standard atmosphere at the ground's 620 m, humidity 50 %"
-    assert air["vacuum_would_move_m"] == pytest.approx(air["refractivity_n"] * 1e-6 * 12.2, rel=0.15)
+    assert air["source"] == "standard atmosphere, terrain height 620 m, humidity 50 %"
+    assert air["vacuum_shift_m"] == pytest.approx(air["refractivity_n"] * 1e-6 * 12.2, rel=0.15)
     assert said["models"]["atmosphere"].startswith(f"N = {air['refractivity_n']:.1f}: standard atmosphere")
     (line,) = (line for line in said["budget"] if line["cause"] == "atmosphere")
     assert line["stated"].startswith("not stated; assumed standard atmosphere")

@@ -281,7 +281,7 @@ def test_a_void_undeclared_is_no_height_on_earth(tiny):
     for work in (lambda: expected_plan(campaign, *PAIR), lambda: settle_ground(campaign)):
         message = complaint(work)
         assert "dem.tif: 1 of the " in message
-        assert "no height on Earth, most often -9999 m" in message
+        assert "impossible heights, most frequently -9999 m" in message
         assert "nodata" in message
 
 
@@ -293,7 +293,7 @@ def test_a_dem_above_the_antennas_is_flagged_and_flat_ground_refused(tiny):
     message = complaint(lambda: expected_plan(campaign, *PAIR))  # no echo comes from so far
     assert "unit and datum of scene.dem" in message
     write_plane(tiny, height_m=680.0)
-    assert "below the lowest ground of the scene" in expected_plan(campaign, *PAIR).flags["platform_below_scene"]
+    assert "below the lowest terrain of the scene" in expected_plan(campaign, *PAIR).flags["platform_below_scene"]
     campaign = edit_scene(tiny, dem=None, dem_datum=None, height_m=2034.0)
     message = complaint(lambda: expected_plan(campaign, *PAIR))
     assert message.startswith("scene.height_m: ")
@@ -321,12 +321,12 @@ def test_a_platform_below_the_terrain_is_refused_with_its_pulse(hillside, tmp_pa
     campaign = edit_scene(root, bounds_m=bounds)
     planned = complaint(lambda: expected_plan(campaign, "f01", "uav1-uav1"))  # before anything ran
     assert "flight f01, pair uav1-uav1: at " in planned
-    assert "transmitter is in or below the ground" in planned
+    assert "transmitter is at or below the terrain" in planned
     shutil.copytree(str(hillside.results / "f01"), str(root / "results" / "f01"))
     settle_ground(campaign)
     message = complaint(lambda: profile.profile(campaign, "f01", "uav1-uav1"))
     assert message.split(", worst")[0].split(": at ")[0] == planned.split(": at ")[0]
-    assert "transmitter is in or below the ground" in message
+    assert "transmitter is at or below the terrain" in message
     assert "worst at pulse" in message
 
 

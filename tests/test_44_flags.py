@@ -167,7 +167,7 @@ def test_a_wrong_code_is_flagged_in_a_monostatic_image(undisturbed):
     own, secondary = (echo_of(campaign, pair).attrs for pair in ("uav1-uav1", "uav1-uav2"))
     assert "code_unconfirmed" in own["flags"]
     assert own["code"]["carried"] is secondary["code"]["carried"] is False
-    assert "right without one" in secondary["flags"]["wrong_code"]
+    assert "so this image is right" in secondary["flags"]["wrong_code"]
 
 
 def swap(samples):
@@ -188,11 +188,11 @@ def test_i_and_q_in_another_order_are_named_and_taken_by_the_key(undisturbed, ch
         edit_data(campaign.root.real(), node, change)
     ingest_all(campaign)
     flags = echo_of(campaign, "uav1-uav1").attrs["flags"]
-    assert "set waveform.iq to swapped where I and Q are swapped" in flags["spectrum_inverted"]
+    assert "set waveform.iq to swapped if I and Q are swapped" in flags["spectrum_inverted"]
     lines = [line for text in flags.values() for line in text.split("; ")]
     assert len(set(lines)) == len(lines)
     message = complaint(lambda: echo_of(campaign, "uav1-uav2"))
-    assert "the code is in the conjugates of the samples" in message
+    assert "the conjugate samples contain the code" in message
     edit_config(campaign.root.real(), lambda document: document["waveform"].update(iq=order))
     campaign = Campaign.load(campaign.root)
     ingest_all(campaign)
@@ -257,4 +257,4 @@ def test_the_double_sum_meets_the_highest_accuracy_that_may_be_asked(tmp_path):
     image.image(campaign, "f01", "uav1-uav1", threads=2)
     report = quality_of(campaign, "uav1-uav1")
     assert report["numerical_error_db"] < -120
-    assert "accuracy_missed" not in report["flags"]
+    assert "accuracy_not_met" not in report["flags"]

@@ -84,7 +84,7 @@ def test_a_good_log_leaves_nothing_out_and_states_its_error(tmp_path):
 @pytest.mark.quick("0.02-expected1")
 @pytest.mark.parametrize(
     ("asked", "expected"),
-    [(None, (None, "nobody")), (0.02, ([0.02] * 3, "config")), ([0.01, 0.02, 0.03], ([0.01, 0.02, 0.03], "config"))],
+    [(None, (None, "none")), (0.02, ([0.02] * 3, "config")), ([0.01, 0.02, 0.03], ([0.01, 0.02, 0.03], "config"))],
 )
 def test_the_config_states_the_error_where_the_log_does_not(tmp_path, asked, expected):
     campaign = small_campaign(tmp_path)
@@ -106,10 +106,10 @@ def test_pulses_of_a_float_solution_are_left_out_unless_allowed(tmp_path):
 
     edit_track(campaign.root, "b", epochs(floated))
     dataset = echo_of(campaign)
-    left_out = dataset.attrs["pulses"]["reasons"]["fix_poor"]
+    left_out = dataset.attrs["pulses"]["reasons"]["fix_quality_low"]
     assert 10 <= left_out <= 12  # 0.6 s of 20 Hz
     assert dataset.sizes["pulse"] == dataset.attrs["pulses"]["used"] == 40 - left_out
-    assert dataset.attrs["flags"]["fix_poor"].startswith(
+    assert dataset.attrs["flags"]["fix_quality_low"].startswith(
         f"b: {left_out} of 40 pulses excluded: position solution poorer than"
     )
     assert flags_of(echo_of(campaign, "a-a")) == {}
@@ -217,7 +217,7 @@ def test_a_log_on_a_coarse_grid_is_flagged_with_how_far_its_positions_err():
 def test_a_damaged_log_is_flagged():
     time_s = np.arange(400) * 0.1
     flown = np.stack([5 * time_s, 3 * np.sin(time_s), 5 + np.sin(0.7 * time_s)], -1)
-    found = "259 of 6873 bytes are no messages, from byte 2602 on; epochs there are lost"
+    found = "259 of 6873 bytes are not valid messages, from byte 2602 on; their epochs are lost"
     assert logged_flags(flown, damage=found) == {"track_log_damaged": f"a: {found}"}
 
 
@@ -295,7 +295,8 @@ def test_an_attitude_that_looks_like_radians_is_a_flag_where_it_moves_an_antenna
     flags = place(log, log, time[5:-5]).flags
     assert ("attitude_suspect" in flags) is flagged
     if flagged:
-        assert "a: angles of attitude look in radians: yaw is 0° off the course so, 88°" in flags["attitude_suspect"]
+        measured = "yaw then deviates from the course by 0°, but by 88° as degrees clockwise from north"
+        assert f"a: attitude angles appear to be in radians: {measured}" in flags["attitude_suspect"]
 
 
 @pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])

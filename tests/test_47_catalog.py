@@ -155,7 +155,7 @@ def test_a_product_made_by_other_code_or_settings_says_so(finished):
     assert f"written by code other than the installed one, whose sha256 is {installed}" in said
     assert f"written with other settings, of sha256 {'1' * 64}" in said
     assert "results/f01/uav1-uav2/layers.manifest.json" in described["#job/coverage"]
-    assert described["#job/echo/f01/uav1-uav2"] == "As the code and settings of today would make it."
+    assert described["#job/echo/f01/uav1-uav2"] == "Up to date with the current code and settings."
 
 
 @pytest.mark.quick("results/f01/uav1-uav1/db.tif", "raw/f01/uav2.sigmf-data")
@@ -276,8 +276,8 @@ def test_a_verdict_is_the_same_word_in_every_product(finished, monkeypatch):
     cube.cube(campaign)
     for name, raster, item, verdict in (
         ("uav1-uav1", "db.tif", "f01-uav1-uav1", "focused"),
-        ("uav1-uav2", "db.tif", "f01-uav1-uav2", "cannot tell"),
-        ("fused", "coherent_db.tif", "f01-coherent", "cannot tell"),
+        ("uav1-uav2", "db.tif", "f01-uav1-uav2", "inconclusive"),
+        ("fused", "coherent_db.tif", "f01-coherent", "inconclusive"),
     ):
         export.export(campaign, "f01", name)
         stac(campaign)

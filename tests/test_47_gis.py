@@ -201,7 +201,7 @@ def test_every_image_and_sum_says_what_its_values_mean(finished_tiny):
         assert fused["radiometry"][source]["divided_by"] == peaks
     for name in sums:
         assert said[name]["divided_by"] == peaks
-    assert said["fused/coherent_db.tif"]["phases_taken_off_rad"] == fused["fusion"]["phases_rad"]
+    assert said["fused/coherent_db.tif"]["phases_removed_rad"] == fused["fusion"]["phases_rad"]
 
 
 def test_a_sum_times_its_factor_is_the_echo_again(finished_tiny):

@@ -122,7 +122,7 @@ def test_a_damaged_truth_is_a_note_on_the_map_and_no_failure(finished, truth):
     (finished.root / "truth.json").write_text(truth)
     webmap(finished)
     found = document(finished)
-    assert [note[:31] for note in found["notes"]] == ["No targets are listed: truth.js"]
+    assert [note[:41] for note in found["notes"]] == ["No simulated targets are listed: truth.js"]
     assert {one["source"] for one in found["places"]} == {"found"}
 
 

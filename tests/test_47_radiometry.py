@@ -223,7 +223,7 @@ def test_mean_power_lies_on_a_coarser_grid_and_says_what_it_is(flown, tmp_path):
         with rasterio.open(str(folder / "multilook_sigma0_power.tif")) as raster:
             assert (raster.res, raster.shape) == ((pytest.approx(0.3), pytest.approx(0.3)), (20, 20))
             mean, said = raster.read(1), json.loads(raster.tags()["APERTURA_RADIOMETRY"])
-            assert raster.descriptions[0].startswith("mean sigma0, radar cross-section per area of ground of 6 x 6 pix")
+            assert raster.descriptions[0].startswith("mean sigma0, radar cross-section per ground area of 6 x 6 pix")
         with rasterio.open(str(folder / "multilook_sigma0_db.tif")) as raster:
             decibels = raster.read(1)
             assert raster.units == ("dB",)

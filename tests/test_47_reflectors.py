@@ -262,14 +262,14 @@ def test_a_constant_that_is_not_the_earlier_one_has_drifted(measured, tmp_path):
     assert flags["uav1-uav1"] == {}
     assert "since reflectors of campaign over_reflectors" in flags["uav1-uav2"]["constant_drifts"]
     message = complaint(lambda: write_constants(campaign, root / "earlier.json"))
-    assert "what processing.radiometric_calibration takes up" in message
+    assert "the file used by processing.radiometric_calibration" in message
 
 
 @pytest.mark.slow
 def test_nothing_is_measured_in_images_of_other_settings(measured, tmp_path):
     root = copy_writable(measured.root, tmp_path / "campaign")
     campaign = state(root, "processing", window="none")
-    assert "4 of 4 images are overtaken" in complaint(lambda: write_constants(campaign, root / "new.json"))
+    assert "4 of 4 images out of date" in complaint(lambda: write_constants(campaign, root / "new.json"))
     assert not (root / "new.json").exists()
 
 
@@ -478,7 +478,7 @@ def test_a_reflector_measures_no_polarisation_that_it_does_not_return(measured, 
         edit_config(root, change)
         return Campaign.load(root)
 
-    assert "HV: such a reflector sends nothing back" in complaint(lambda: measured_constants(received("V")))
+    assert "returns no echo in polarisation HV" in complaint(lambda: measured_constants(received("V")))
     constants, _ = measured_constants(received("H"))
     own = constants.pairs["uav1-uav1"].radar
     assert own.polarisation == "HH"

@@ -97,7 +97,7 @@ def test_the_brightest_target_adds_up_once_the_sidelink_took_the_clocks_out(repo
     before, after = (steadiness(phasors) for phasors in found.values())
     assert before[1] < 0.4
     assert after[1] > 0.9
-    assert list(Shown(reported, "f01", "uav1-uav1").phasors()) == ["as recorded, on the tracks of the logs"]
+    assert list(Shown(reported, "f01", "uav1-uav1").phasors()) == ["as recorded, tracks from the logs"]
 
 
 @pytest.mark.slow

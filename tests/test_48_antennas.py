@@ -167,7 +167,7 @@ def test_a_target_out_of_the_beam_for_half_the_track_is_twice_as_wide(even):
     behind = pattern(even, [(0, 7), (40, 7), (80, 7)])  # only what lies behind abeam, and 7 dB are all the same
     half, report = cross_range_m(stated(even, behind))
     assert half / whole == pytest.approx(2, rel=0.05)
-    seeing = report["antennas"]["pulses_seeing"]
+    seeing = report["antennas"]["illuminating_pulses"]
     assert seeing["of"] == PULSES
     assert seeing["median"] == pytest.approx(PULSES / 2, abs=3)
     assert report["numerical_error_db"] <= -60
@@ -216,11 +216,11 @@ def test_a_scene_partly_outside_the_beam_is_flagged_with_its_share(beamed, turn_
     campaign = stated(beamed, turned)
     pixels, report = imaged(campaign)
     dark = float(np.isnan(pixels).mean())
-    assert ("beam_misses" in report["flags"]) is misses
+    assert ("outside_beam" in report["flags"]) is misses
     assert (dark > 0) is misses
     if misses:
-        assert float(report["flags"]["beam_misses"].split()[0]) / 100 == pytest.approx(dark, abs=0.02)
-        assert report["antennas"]["pulses_seeing"]["least"] == 0
+        assert float(report["flags"]["outside_beam"].split()[0]) / 100 == pytest.approx(dark, abs=0.02)
+        assert report["antennas"]["illuminating_pulses"]["least"] == 0
         layers.layers(campaign, "f01", "uav1-uav1")
         with rasterio.open(str(campaign.result("f01", "uav1-uav1", "mask.tif"))) as mask:
             np.testing.assert_array_equal(np.isnan(pixels), mask.read(1) == OUTSIDE)
@@ -258,7 +258,8 @@ def test_what_beams_forbid_is_refused_when_asked_for_and_not_chosen_otherwise(be
     assert "config/config.yaml: processing.presum" in message
     reasons = expected_plan(stated(beamed, BEAM), "f01", "uav1-uav1").reasons
     assert "weigh every pulse" in reasons["presum"]
-    assert reasons["antenna"].startswith("transmit, receive: of 80 pulses")
+    assert reasons["antenna"].startswith("transmit, receive: each point of the scene is illuminated by ")
+    assert " of 80 pulses (median " in reasons["antenna"]
     assert "antenna" not in expected_plan(stated(beamed, None), "f01", "uav1-uav1").reasons
 
 
@@ -273,4 +274,4 @@ def test_the_phase_of_a_pattern_is_in_the_budget_and_flagged_where_it_costs_more
         line = next(one for one in report["budget"] if one["cause"] == "antenna")
         assert ("antenna_phase" in report["flags"]) is flagged
         assert (line["loss_db"] < -0.2) is flagged
-        assert "whose phase turns by" in line["stated"]
+        assert "whose phase varies by" in line["stated"]

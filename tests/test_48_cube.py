@@ -58,7 +58,7 @@ def test_images_are_selected_by_name(campaign, opened):
     assert np.isnan(missing.image).all()
     assert np.isnan(missing.incidence)
     assert missing.verdict.values.item() == ""
-    assert opened.sel(flight="f01", pair="uav1-uav2").verdict.values.item() in {"focused", "cannot tell", "defocused"}
+    assert opened.sel(flight="f01", pair="uav1-uav2").verdict.values.item() in {"focused", "inconclusive", "defocused"}
 
 
 def test_the_cube_says_what_it_is_as_cf_has_it(campaign, opened):

@@ -68,7 +68,7 @@ def test_score_summary_and_report_are_of_the_pair(alone, tmp_path, capsys):
     print_summary(alone)
     said = capsys.readouterr().out
     assert f"results/f01/{PAIR}/db.tif" in said
-    assert "not there yet" not in said
+    assert "missing or out of date" not in said
     campaign = Campaign.load(copy_writable(alone.root, tmp_path / "campaign"))
     pictures(campaign, "f01", PAIR)
     assert page(campaign, "f01") == [campaign.result("f01", "report.html")]

@@ -76,13 +76,13 @@ def test_the_summary_says_each_flag_once_and_whole(finished_sample, capsys, tmp_
     print_summary(Campaign.load(root))
     said = capsys.readouterr().out
     assert said.count("a line [with brackets]") == 1
-    assert "left out of the budget, no uncertainty is configured" in said
-    assert re.search(r"targets may be misplaced by \d\.\d+ m, mostly by heights, not stated; assumed 3 m", said)
+    assert "not in the error budget, because no uncertainty is configured" in said
+    assert re.search(r"geolocation uncertainty \d\.\d+ m, dominated by heights, not stated; assumed 3 m", said)
 
 
 def test_a_sentence_that_several_flags_have_in_common_stands_once_in_the_summary():
     cause = "4.1 of 4.5 dB are explained if the times of the log of uav1 are 0.50 s late"
-    lines = {"defocused": f"4.5 dB lost; {cause}", "pairs_apart": f"5 points lie 12 cm apart; {cause}"}
+    lines = {"defocused": f"4.5 dB lost; {cause}", "pairs_displaced": f"5 points lie 12 cm apart; {cause}"}
     reports = {"f01 a-a": {"flags": lines}, "f01 a-b": {"flags": {"defocused": f"3.2 dB lost; {cause}"}}}
     console = Console(file=StringIO(), width=200)
     _print_flags(console, reports)
@@ -107,13 +107,13 @@ def test_the_sign_of_a_lever_arm_is_seen_and_named(tmp_path):
     reports = reports_of(campaign)
     for pair in PAIRS:
         assert reports[pair]["focus"]["loss_db"] > -0.3
-        assert reports[pair]["focus"]["verdict"] == "cannot tell"
-        assert "contradicted by pairs_apart, pairs_out_of_phase" in reports[pair]["focus"]["why"]
-        assert {"pairs_apart", "pairs_out_of_phase"} <= set(reports[pair]["flags"])
+        assert reports[pair]["focus"]["verdict"] == "inconclusive"
+        assert "contradicted by pairs_displaced, pairs_out_of_phase" in reports[pair]["focus"]["reason"]
+        assert {"pairs_displaced", "pairs_out_of_phase"} <= set(reports[pair]["flags"])
     best = reports["uav1-uav1"]["hypotheses"][0]
     assert best["kind"] == "offset"  # along a straight track an arm's sign is one of several that do the same
-    assert best["what"].endswith("right axis of the lever arms of uav1 has the other sign")
-    assert best["what"] in reports["uav1-uav1"]["flags"]["pairs_apart"]
+    assert best["what"].endswith("right axis of the lever arms of uav1 has the opposite sign")
+    assert best["what"] in reports["uav1-uav1"]["flags"]["pairs_displaced"]
     left_out = reports["fused"]["fusion"]["left_out"]
     assert len(left_out) == 1
     assert next(iter(left_out)) in reports["fused"]["models"]["fusion"]
@@ -140,7 +140,7 @@ def later(seconds):
 def test_a_log_half_a_second_late_is_seen_and_named(tmp_path):
     campaign = sample(tmp_path, lambda root: edit_track(root, "uav1", later(0.5)))
     report = reports_of(campaign)["uav1-uav2"]
-    assert {"pairs_apart", "defocused", "pairs_out_of_phase"} & set(report["flags"])
+    assert {"pairs_displaced", "defocused", "pairs_out_of_phase"} & set(report["flags"])
     assert "the times of the log of uav1 are 0.50 s late" in report["hypotheses"][0]["what"]
 
 
@@ -249,12 +249,12 @@ def test_a_sum_whose_phase_nothing_tells_says_so_and_that_its_peaks_are_lost(fin
     monkeypatch.setattr("apertura.stages.assess.agreement_of", lambda *_: None)
     told = with_longer_path(root, 0.214 / 4)
     assert [*told["fusion"]["phases_rad"]] == list(PAIRS)
-    assert "is added with phase 0: it shares nothing with" in told["flags"]["phase_unmeasured"]
-    assert "peak loss for a phase error of a quarter cycle: 3 dB" in told["flags"]["phase_unmeasured"]
+    assert "is added with phase 0: it shares nothing with" in told["flags"]["phase_unobservable"]
+    assert "peak loss for a phase error of a quarter cycle: 3 dB" in told["flags"]["phase_unobservable"]
     assert told["coherence"]["mean"] == pytest.approx(0.5, abs=0.15)
     assert "sum_incoherent" in told["flags"]
     assert told["focus"]["verdict"] == "defocused"
-    assert "from phase differences between pairs" in told["focus"]["why"]
+    assert "from phase differences between pairs" in told["focus"]["reason"]
 
 
 def test_a_sum_states_what_it_gained(finished_tiny):
@@ -309,11 +309,11 @@ def test_a_path_of_the_papers_flight_that_is_wrong_is_told_by_phase_or_place(
 ):
     root = copy_writable(papers_flight.root, tmp_path / "campaign")
     told = with_longer_path(root, wavelengths * 0.2134)
-    line = told["flags"][{"phase": "pairs_out_of_phase", "place": "pairs_apart"}[flag]]
+    line = told["flags"][{"phase": "pairs_out_of_phase", "place": "pairs_displaced"}[flag]]
     assert "do not show which pairs are wrong" in line
     assert len(told["fusion"]["left_out"]) == 1
     assert told["fusion"]["ties"] == [[*told["fusion"]["left_out"]]]
-    assert "; tie: " in told["flags"]["pair_left_out"]
+    assert "; tie: " in told["flags"]["pair_excluded"]
 
 
 @pytest.mark.parametrize("height_m", [-3.0, 0.5, 3.0])

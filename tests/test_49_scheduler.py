@@ -59,8 +59,8 @@ def test_where_tiles_are_formed_makes_nothing_stale_but_the_crate_that_names_the
 @pytest.mark.parametrize(
     ("address", "named", "expected"),
     [
-        ("tcp://127.0.0.1:9", None, r"tcp://127.0.0.1:9: nobody answers there; expected a dask scheduler"),
-        ("tcp://nowhere.invalid:8786", None, r"tcp://nowhere.invalid:8786: nobody answers there"),
+        ("tcp://127.0.0.1:9", None, r"tcp://127.0.0.1:9: no scheduler is reachable there; expected a dask scheduler"),
+        ("tcp://nowhere.invalid:8786", None, r"tcp://nowhere.invalid:8786: no scheduler is reachable there"),
         ("tcp://127.0.0.1:9", "tcp://127.0.0.1:8786", r"tcp://127.0.0.1:9, but DASK_SCHEDULER_ADDRESS is tcp://127"),
     ],
 )
@@ -79,4 +79,4 @@ def test_a_scheduler_without_workers_is_told(asking):
     with distributed.SpecCluster(scheduler={"cls": distributed.Scheduler, "options": address}) as empty:
         campaign = asking(empty.scheduler_address)
         (campaign.stage("image", "f01", "uav1-uav1") / "image" / "c" / "0" / "0").unlink()
-        assert "it has no workers" in complaint(lambda: image(campaign, "f01", "uav1-uav1"))
+        assert "the scheduler has no workers" in complaint(lambda: image(campaign, "f01", "uav1-uav1"))

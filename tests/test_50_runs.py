@@ -271,7 +271,7 @@ def test_a_step_that_tells_how_far_it_is_is_believed_over_what_was_expected(tmp_
     run = RunRecord(planned={"image": 1}, jobs={1: job})
     tell(campaign, job.step, what="tiles", done=10, total=40, since=now - 90, at=now)
     bar, whole = bars(campaign, run, TimeLeft(campaign, cores=2))
-    assert (bar.told, bar.fraction) == ("10 of 40 tiles", 0.25)
+    assert (bar.counts, bar.fraction) == ("10 of 40 tiles", 0.25)
     assert bar.left_s == pytest.approx(270, rel=0.01)
     assert whole.left_s == pytest.approx(270, rel=0.01)
 
@@ -317,10 +317,10 @@ def test_without_a_terminal_each_step_has_a_line_when_it_begins_and_one_when_it_
         screen.update(reader.news())
     lines = [line.split("  ", 1)[1] for line in stream.getvalue().splitlines()]
     assert [line.split(":")[0] for line in lines] == [
-        "begun   ingest f01 uav1",
-        "done    ingest f01 uav1",
-        "begun   image f01 uav1-uav1",
-        "failed  image f01 uav1-uav1",
+        "started  ingest f01 uav1",
+        "done     ingest f01 uav1",
+        "started  image f01 uav1-uav1",
+        "failed   image f01 uav1-uav1",
     ]
     assert "1 of 5 steps, time left unknown" in lines[1]
     assert "\x1b" not in stream.getvalue()
@@ -337,11 +337,11 @@ def test_what_happened_between_two_looks_is_told_in_its_order_and_counted_one_by
         screen.update(run)
     told = [re.sub(r"^\S+  |: .* s;|, (time|about) .*", "", line) for line in stream.getvalue().splitlines()]
     assert told == [
-        "begun   ingest f01 uav1",
-        "begun   scene",
-        "done    scene 1 of 3 steps",
-        "begun   ingest f01 uav2",
-        "done    ingest f01 uav1 2 of 3 steps",
+        "started  ingest f01 uav1",
+        "started  scene",
+        "done     scene 1 of 3 steps",
+        "started  ingest f01 uav2",
+        "done     ingest f01 uav1 2 of 3 steps",
     ]
 
 
@@ -398,7 +398,7 @@ def test_a_defect_and_a_killed_step_are_told_apart(tmp_path):
     assert "internal error, please report it" in failed(
         tmp_path, "Traceback (most recent call last):\nZeroDivisionError: by zero\n"
     )
-    assert "it was killed, perhaps for lack of memory" in failed(tmp_path, "10 of 20 tiles to form\n")
+    assert "it was killed, possibly out of memory" in failed(tmp_path, "10 of 20 tiles to form\n")
 
 
 @pytest.mark.parametrize(("said", "killed"), [("10 of 20 tiles to form\n", True), ("error: codes.npy: gone\n", False)])
@@ -415,7 +415,7 @@ def test_an_executor_without_its_plugin_is_one_message_with_what_to_install(tmp_
         "usage: [-h]\nsnakemake: error: argument --executor/-e: invalid choice: 'slurm' (choose from 'local')\n"
     )
     message, _ = failures(tmp_path, RunRecord(), tmp_path / "a.log")
-    assert message.startswith("error: executor 'slurm' is not installed. Install it beside apertura: ")
+    assert message.startswith("error: executor 'slurm' is not installed. Install it with apertura: ")
     assert message.endswith("pip install snakemake-executor-plugin-slurm")
 
 
@@ -441,7 +441,7 @@ def test_with_a_writable_home_caches_stay_where_they_are(tmp_path, monkeypatch):
 
 
 def test_what_the_workflow_says_is_told_where_no_step_failed(tmp_path):
-    run = RunRecord(said=["MissingRuleException:\nno rule for \x1b[31mx"])
+    run = RunRecord(errors=["MissingRuleException:\nno rule for \x1b[31mx"])
     assert next(failures(tmp_path, run, tmp_path / "a.log")) == r"error: MissingRuleException: no rule for \x1b[31mx"
 
 
@@ -470,7 +470,7 @@ def test_clean_keeps_what_the_workflow_has_not_made_and_says_so(finished, capsys
         "f01/uav1-uav1/db.qgz",
         "f01/uav1-uav1/image.zarr/mine",
     }
-    assert "kept what it has not made: results/f01/uav1-uav1/db.qgz and 2 more" in capsys.readouterr().out
+    assert "kept files not written by the workflow: results/f01/uav1-uav1/db.qgz and 2 more" in capsys.readouterr().out
 
 
 def test_clean_of_unfinished_work_keeps_every_result(finished, capsys):
@@ -485,13 +485,13 @@ def test_clean_of_unfinished_work_keeps_every_result(finished, capsys):
 
 def test_clean_waits_for_no_run_and_no_step(finished):
     before = files(finished.results)
-    with hold(finished.root), pytest.raises(CampaignError, match="another run holds this campaign"):
+    with hold(finished.root), pytest.raises(CampaignError, match="the campaign is locked by another run"):
         clean(finished, unfinished_only=False, agreed=True)
     from apertura.campaign.store import writing
 
     with (
         writing(finished.stage("echo", "f01", "uav1-uav1")),
-        pytest.raises(CampaignError, match="a step still writes"),
+        pytest.raises(CampaignError, match="a step is still writing"),
     ):
         clean(finished, unfinished_only=False, agreed=True)
     assert len(files(finished.results)) >= len(before) - 1  # the manifest of what is written again
@@ -543,9 +543,9 @@ def test_status_tells_from_another_terminal_what_a_run_does(finished, capsys):
     with hold(finished.root):
         print_status(finished)
     said = capsys.readouterr().out
-    assert f"a run is under way: process {os.getpid()} on" in said
+    assert f"a run is in progress: process {os.getpid()} on" in said
     assert "image f01 uav1-uav1: " in said
-    assert "to come: 2 ingest, 1 image, 1 cube" in said
+    assert "waiting: 2 ingest, 1 image, 1 cube" in said
     print_status(finished)
     assert "was killed" in capsys.readouterr().out
 
@@ -562,7 +562,7 @@ def test_status_after_a_failure_says_why(finished, capsys):
     note(path, "end", status=2)
     print_status(finished)
     said = capsys.readouterr().out
-    assert "failed with 2" in said
+    assert "failed with exit status 2" in said
     assert said.count("error: the log of uav1 is empty") == 1
     assert "results finished" in said
 

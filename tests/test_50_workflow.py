@@ -295,7 +295,7 @@ def test_steps_are_forks_that_end_with_the_run_whatever_is_killed_outright(tiny,
     os.kill({"the run": run.pid, "snakemake": snakemake_itself}.get(killed, warm), signal.SIGKILL)
     code, output = finished(run, timeout=60)
     assert code == (-signal.SIGKILL if killed == "the run" else 1)
-    told = "error: SIGKILL has ended the process of the run, perhaps for lack of memory. Run again"
+    told = "error: the run was terminated by SIGKILL, possibly out of memory. Run again"
     assert (told in output, output.count("error:")) == ((False, 0) if killed == "the run" else (True, 1))
     until = time.monotonic() + 10
     while any(map(lives, processes)):
@@ -322,7 +322,7 @@ def test_a_step_that_is_killed_ends_the_run_with_status_1(tiny):
 def test_a_run_from_any_folder_tells_each_step_and_ends_with_what_its_images_say(tiny, tmp_path):
     code, output = finished(apertura("run", tiny, "-n"))
     assert code == 0
-    assert output.startswith("23 steps to do: ")
+    assert output.startswith("23 steps to run: ")
     assert output.count("\n") == 1
     assert not (tiny / "results/.run").exists()
     elsewhere = {"cwd": tmp_path, "env": {**os.environ, "PATH": "/usr/bin:/bin"}}  # without an active environment
@@ -330,7 +330,7 @@ def test_a_run_from_any_folder_tells_each_step_and_ends_with_what_its_images_say
     assert code == 0, output
     assert (tiny / "results" / "f01" / "fused" / "coherent_db.tif").is_file()
     told = [line.split("  ") for line in output.splitlines()]
-    for word, count in (("begun", 23), ("done", 23), ("failed", 0)):
+    for word, count in (("started", 23), ("done", 23), ("failed", 0)):
         assert sum(len(cells) > 2 and cells[1].strip() == word for cells in told) == count
     assert "23 steps done in " in output
     timed = list((tiny / "results/benchmarks").rglob("*.tsv"))
@@ -348,11 +348,11 @@ def test_a_run_from_any_folder_tells_each_step_and_ends_with_what_its_images_say
     assert "Building DAG" in (tiny / "results/logs/snakemake.log").read_text()
     code, output = finished(apertura("run", tiny, "-q"))
     assert code == 0
-    assert output.startswith("what to open")
+    assert output.startswith("main files")
     assert "Building DAG" in finished(apertura("run", tiny, "-v"))[1]
     assert "Building DAG" in finished(apertura("run", tiny, "-n", "-v"))[1]
     assert "digraph" in finished(apertura("run", tiny, "--forceall", "--dag"))[1]
-    assert "ended well" in finished(apertura("status", tiny))[1]
+    assert "succeeded" in finished(apertura("status", tiny))[1]
     assert not list((tiny / "results/.run").rglob("*.json"))
 
 
@@ -372,7 +372,7 @@ def test_a_second_run_says_who_holds_the_campaign(tiny):
     for second in (apertura("run", tiny), snakemake(tiny)):
         code, output = finished(second)
         assert code != 0
-        assert "another run holds this campaign: process" in output
+        assert "the campaign is locked by another run: process" in output
         assert "Traceback" not in output
     assert "Building DAG" in finished(snakemake(tiny, "-n"))[1]
     run.terminate()

@@ -111,7 +111,7 @@ WRONG_RUNS = {
     "--set-scatter tiles=0": "tiles=N, N >= 1",
     "--set-scat=tiles=0": "tiles=N, N >= 1",
     "--until imag": "ingest, bench, echo",
-    "cphd": "cphd: a step that runs only where its result is requested",
+    "cphd": "cphd: a step that runs only if its result is requested",
     "results/f01/uav2-uav2/echo.manifest.json": "one of fused, tracks, uav1, uav1-uav1, uav1-uav2, uav2",
     "results/f01/uav9/track.manifest.json": "f01 has no uav9",
     "results/f09/uav1-uav1/echo.manifest.json": "no flight 'f09'",
@@ -150,7 +150,7 @@ def test_after_a_part_of_the_workflow_a_run_says_what_is_finished_and_what_is_mi
     state(root, "processing", engine="numba")
     status, out, err = typed("run", root, "--cores", 1, "--until", "image")
     assert status == 0, err
-    told = r"^\d+ results finished, \d+ results stale, \d+ results missing: apertura run makes the rest$"
+    told = r"^\d+ results finished, \d+ results stale, \d+ results missing: `apertura run` computes the rest$"
     assert re.search(told, out, re.MULTILINE)
     assert "error" not in err
     assert typed("summary", root)[0] == 2  # no image is there
@@ -162,7 +162,7 @@ def test_an_image_that_was_overtaken_is_not_finished_although_its_report_is_ther
     assert not is_finished(Campaign.load(root))
     status, out, _ = typed("summary", root)
     assert status == 0
-    assert "not there yet: f01 uav1-uav2; apertura run" in " ".join(out.split())
+    assert "missing or out of date: f01 uav1-uav2; `apertura run` computes" in " ".join(out.split())
 
 
 @pytest.mark.quick("samples-summary", "samples-verify -q")
@@ -187,16 +187,16 @@ def test_results_are_read_where_their_recordings_are_not(finished_tiny, tmp_path
 def test_a_node_that_sends_nothing_is_not_aligned(typed, tiny, node):
     status, _, err = typed("align", tiny, "f01", node)
     assert status == 2
-    assert f"{node} does not send and receive in f01" in err
+    assert f"{node} does not transmit and receive in f01" in err
     assert "--until echo" in typed("align", tiny, "f01", "uav1")[2]
 
 
 def test_a_summary_says_how_many_results_a_setting_has_overtaken(finished_tiny, tmp_path, typed):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
-    assert "stale" not in typed("summary", root)[1]
+    assert "out of date" not in typed("summary", root)[1]
     state(root, "scene", height_m=finished_tiny.settings.scene.height_m + 0.5)
     last = typed("summary", root)[1].splitlines()[-1]
-    assert re.fullmatch(r"\d+ results are stale: apertura run", last)
+    assert re.fullmatch(r"\d+ results are out of date: `apertura run` recomputes them", last)
 
 
 @pytest.mark.quick("True")
@@ -222,7 +222,7 @@ def test_a_summary_shows_what_is_there_and_names_what_is_missing(finished_tiny, 
     status, out, err = typed("summary", tiny)
     assert (status, err) == (0, "")
     assert f"{flight} {pair}" in out
-    assert f"not there yet: f01 uav1-uav2, f01 {FUSED}; apertura run" in " ".join(out.split())
+    assert f"missing or out of date: f01 uav1-uav2, f01 {FUSED}; `apertura run` computes" in " ".join(out.split())
 
 
 def test_a_summary_of_nothing_says_what_to_run(tiny, typed):
@@ -233,8 +233,8 @@ def test_a_summary_of_nothing_says_what_to_run(tiny, typed):
 
 def test_a_plan_says_what_it_was_made_from(tiny, finished_tiny, typed):
     before, after = (typed("plan", root)[1] for root in (tiny, finished_tiny.root))
-    assert "before the samples were read" in before
-    assert "before the samples were read" not in after
+    assert "Planned from the flight logs alone" in before
+    assert "Planned from the flight logs alone" not in after
 
 
 @pytest.mark.parametrize(

@@ -106,8 +106,8 @@ def test_a_mission_becomes_a_report_layers_and_the_campaign_s_config(folder, mon
     assert any("uav1" in line and "100.0" in line for line in out.splitlines())  # seen, %
     page = (folder / "out" / "design.html").read_text()
     assert page.count("data:image/png") == 2
-    assert "GO: all of 1 requirement met" in page
-    assert out.startswith("GO: all of 1 requirement met\n")
+    assert "GO: all requirements met (1 of 1)" in page
+    assert out.startswith("GO: all requirements met (1 of 1)\n")
     with rasterio.open(folder / "out/f01/uav1-uav1/nesz.tif") as raster:
         assert raster.shape == (80, 80)
         assert raster.tags()["APERTURA_PLANNED"] == "true"
@@ -132,7 +132,7 @@ def test_what_a_plan_lacks_is_one_message(folder, monkeypatch, capsys):
 def test_an_unknown_word_of_optimise_is_one_message(folder, monkeypatch, capsys):
     status, _, err = typed(monkeypatch, capsys, "design", folder / "plan.yaml", "--optimise", "speed")
     assert status == 2
-    assert "expected some of height,offset,spacing,heading" in err
+    assert "expected one or more of height,offset,spacing,heading" in err
 
 
 def test_a_scene_beyond_the_dem_is_one_message(folder, monkeypatch, capsys):
@@ -177,13 +177,13 @@ def test_what_was_predicted_is_measured_after_the_same_plan_was_sampled_and_proc
     status, out, err = typed(monkeypatch, capsys, "compare", tmp_path / "plan.yaml", tmp_path / "flown")
     assert (status, err) == (0, "")
     assert "measured in the image" in out
-    assert "another radar" not in out
+    assert "different radar" not in out
     (width,) = (line.split() for line in out.splitlines() if "resolution_fine" in line)
     assert float(width[-1]) == pytest.approx(float(width[-2]), rel=0.1)  # of the only target, against the logs
     document["waveform"]["carrier_hz"] = 1.2e9
     (tmp_path / "plan.yaml").write_text(yaml.safe_dump(document))
     _, out, _ = typed(monkeypatch, capsys, "compare", tmp_path / "plan.yaml", tmp_path / "flown")
-    assert "another radar: waveform.carrier_hz: 1.2e+09 planned, 1.3e+09 in the campaign" in out
+    assert "different radar: waveform.carrier_hz: 1.2e+09 planned, 1.3e+09 in the campaign" in out
     from apertura.stages.layers import layers
 
     layers(campaign, "f01", "uav1-uav1")

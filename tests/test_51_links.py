@@ -64,7 +64,7 @@ def test_a_command_that_only_looks_writes_nothing_but_hashes_and_needs_no_right_
 @pytest.mark.parametrize("while_running", [False, True], ids=["before", "while it runs"])
 def test_links_pipes_and_endless_files_in_place_of_what_commands_write_change_nothing_outside(tmp_path, while_running):
     """Some trials of those of `python -m tests.attack.links`; the review's come first."""
-    names = ["list", "clean", "look", "step scene"]
+    names = ["list", "clean", "preview", "step scene"]
     outcomes = trials_of(tmp_path, names, kinds=list(KINDS), seed=1, most=2, while_running=while_running)
     assert len(outcomes) >= 2 * len(names)
     assert table([outcome for outcome in outcomes if outcome.is_fault]) == table([])

@@ -43,7 +43,7 @@ TYPED = {
     "init": "init new",
     "inspect": "inspect .",
     "list": "list",
-    "look": "look .",
+    "preview": "preview .",
     "map": "map .",
     "plan": "plan .",
     "reflectors": "reflectors .",
@@ -275,7 +275,7 @@ def test_modules_where_snakemake_installs_its_own_are_told_before_a_job_could_im
         )
     assert fired == []
     assert status != 0
-    assert f"{SNAKEMAKES_OWN}: Python modules in Snakemake's own folder" in said.replace("\n", " ")
+    assert f"{SNAKEMAKES_OWN}: Python modules in a folder of Snakemake" in said.replace("\n", " ")
     assert not any(jobs.iterdir())
 
 
@@ -350,7 +350,7 @@ def test_what_snakemake_pickled_of_the_folder_is_not_read(unfinished, option):
     with planted.fires() as fired:
         said = one_message(*run([BIN / "apertura", "run", ".", "-n", option], unfinished))
     assert fired == []
-    assert "reads a pickle of the campaign folder" in said
+    assert "would read a pickle in the campaign folder" in said
 
 
 @pytest.mark.slow

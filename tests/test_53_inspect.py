@@ -74,7 +74,7 @@ def test_a_log_in_radians_lacks_degrees_before_any_campaign_is_made(tmp_path):
         path.write_text("\n".join(["time_utc,east_m,north_m,up_m,roll_deg,pitch_deg,yaw_deg", *rows, ""]))
         said = [line for line in look(path).missing if line.startswith("an attitude in degrees")]
         assert bool(said) is lacking
-        assert not lacking or "look in radians: yaw is 0° off the course so" in said[0]
+        assert not lacking or "appear to be in radians: yaw then deviates from the course by 0°" in said[0]
 
 
 def test_the_preview_of_a_log_names_the_axes_that_it_has(shared, tmp_path):
@@ -95,7 +95,7 @@ def test_lines_taken_out_of_a_log_are_a_gap_of_their_length_at_their_time(shared
     assert report.facts["gaps"] == 1
     assert report.facts["lost_in_gaps"] == 10
     assert report.facts["longest_gaps"] == [{"after_s": 3.9, "length_s": 1.1}]
-    assert any(sentence.startswith("epochs where it has gaps (1)") for sentence in report.missing)
+    assert any(sentence.startswith("epochs in 1 gap: pulses in gaps") for sentence in report.missing)
 
 
 def test_kinds_of_fix_are_counted_and_what_is_not_fixed_is_missing(shared, tmp_path):
@@ -150,7 +150,7 @@ def test_a_log_of_another_hour_says_that_the_clock_may_be_off(tiny):
 def test_a_recording_of_one_capture_is_no_pulses(shared):
     report = look(SHARED / "sigmf_nbiot/V16-beacon-NB-IoT-uplink.sigmf-data")
     assert report.facts["captures"] == 1
-    assert any(sentence.startswith("pulses: it is one capture") for sentence in report.missing)
+    assert any(sentence.startswith("pulses: the recording is a single capture") for sentence in report.missing)
 
 
 def test_phase_history_is_reported_as_its_fields_say(shared):
@@ -178,7 +178,7 @@ def test_a_log_above_sea_level_is_refused_with_the_key_and_read_once_that_is_set
     path = next((SHARED / "dji_rtk_ansfl").glob("*Airdata.csv"))
     refused = look(path)
     assert "height_offset_m" in refused.problem.expected
-    assert "to try a value now: --set height_offset_m=VALUE" in refused.missing[0]
+    assert "to try a value: --set height_offset_m=VALUE" in refused.missing[0]
     report, higher = (look(path, [f"height_offset_m={offset}"]) for offset in (40, 50))
     rows = rows_of(path)
     latitude = [float(row["latitude"]) for row in rows if float(row["latitude"])]
@@ -253,7 +253,7 @@ def test_a_product_of_apertura_is_no_elevation_model(tmp_path):
     }
     write_power(tmp_path / "power.tif", np.ones((8, 9), "c8"), tags=tags, title="f01 uav1-uav2, power", **PRODUCT)
     write_slc(tmp_path / "slc.tif", np.ones((8, 9), "c8"), tags=tags, title="f01 uav1-uav2", **PRODUCT)
-    for name, values in (("power.tif", "linear (1)"), ("slc.tif", "carrier kept (1)")):
+    for name, values in (("power.tif", "linear (1)"), ("slc.tif", "complex, with carrier phase (1)")):
         report = look(tmp_path / name)
         assert report.kind == "product of apertura"
         assert (report.problem, report.missing) == (None, ())
@@ -378,7 +378,7 @@ def test_beats_of_a_campaign_are_reported_with_the_times_beside(tmp_path):
     np.save(raw / "uav1.time.npy", times[::-1])
     refused = look(raw / "uav1.npy")
     assert (refused.kind, refused.format) == ("phase history", "beat_npy")
-    assert "sweep 1 begins" in refused.problem.found
+    assert "sweep 1 starts" in refused.problem.found
 
 
 @pytest.mark.slow
@@ -432,4 +432,4 @@ def test_a_named_pipe_in_place_of_the_log_is_not_waited_for(tiny):
         timeout=60,
         check=False,
     )
-    assert "uav1.track.csv is no plain file" in done.stdout
+    assert "uav1.track.csv is not a regular file" in done.stdout

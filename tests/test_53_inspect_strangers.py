@@ -41,14 +41,14 @@ def test_a_broken_file_of_any_suffix_is_a_report_with_a_reason(tmp_path, suffix,
     report = look(path)
     assert report.problem is not None
     assert report.problem.remedy
-    assert "its reader failed" not in report.problem.found
+    assert "reader failed" not in report.problem.found
     json.dumps(report.as_json(), allow_nan=False)
 
 
 def test_what_a_reader_fails_of_is_reported_and_no_traceback(shared, monkeypatch):
     monkeypatch.setitem(TRACKS, "csv", LogFormat((".csv",), operator.truediv))
     report = look(F01 / "uav1.track.csv")
-    assert report.problem.found.startswith("its reader failed: TypeError")
+    assert report.problem.found.startswith("reader failed: TypeError")
 
 
 def test_samples_that_only_a_config_describes_are_asked_to_lie_in_a_campaign(tmp_path, monkeypatch):

@@ -22,8 +22,8 @@ from pyproj import Transformer
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import record_files
 from apertura.simulation import preset, simulate
-from apertura.tools.look import pair as look_pair
-from apertura.tools.look.follow import Look
+from apertura.tools.preview import pair as preview_pair
+from apertura.tools.preview.follow import Preview
 from apertura.views.webmap.server import is_built
 
 APERTURA = Path(sys.executable).parent / "apertura"
@@ -289,7 +289,7 @@ def test_text_of_strangers_stays_text(browser, finished, tmp_path):
     found["campaign"] = found["crs"]["name"] = HOSTILE
     found["notes"] = [HOSTILE]
     image = found["images"][0]
-    image |= {"flight": HOSTILE, "image": HOSTILE, "verdict": HOSTILE, "why": HOSTILE, "flags": {HOSTILE: HOSTILE}}
+    image |= {"flight": HOSTILE, "image": HOSTILE, "verdict": HOSTILE, "reason": HOSTILE, "flags": {HOSTILE: HOSTILE}}
     image["layers"][0] |= {"title": HOSTILE, "unit": HOSTILE}
     found["places"] = [{"name": HOSTILE, "source": HOSTILE, "image": None, "x_m": 0.0, "y_m": 0.0}]
     path.write_text(json.dumps(found))
@@ -491,25 +491,25 @@ def test_a_page_that_came_with_the_results_is_not_shown_and_its_address_leads_to
 
 def test_a_page_of_a_look_shows_what_came_since_and_keeps_what_the_reader_chose(browser, tmp_path, monkeypatch):
     """A campaign of which half the pulses are there, then all: the page changes without being loaded again."""
-    monkeypatch.setattr(look_pair, "AT_ONCE", 60)
+    monkeypatch.setattr(preview_pair, "AT_ONCE", 60)
     root = simulate(tmp_path / "campaign", preset("demo", pulses=120), seed=1)
-    look = Look(Campaign.load(root), follow=True, every_s=1.0, end_after_s=1e6)
-    for node in look.nodes.values():
+    preview = Preview(Campaign.load(root), follow=True, every_s=1.0, end_after_s=1e6)
+    for node in preview.nodes.values():
         node.read()
-    assert all(pair.add_next(ended=True) for pair in look.pairs)
-    look.show(ended=False, elapsed_s=1.0)
-    with serving(root, "--look") as address, shown(browser, address) as (frame, wrong):
+    assert all(pair.add_next(ended=True) for pair in preview.pairs)
+    preview.show(ended=False, elapsed_s=1.0)
+    with serving(root, "--preview") as address, shown(browser, address) as (frame, wrong):
         frame.locator("#image").select_option("f01/uav1-uav2")
         frame.locator("#low").fill(str(float(frame.locator("#low").get_attribute("min"))))
         low = frame.locator("#low").input_value()
-        while any(pair.add_next(ended=True) for pair in look.pairs):
+        while any(pair.add_next(ended=True) for pair in preview.pairs):
             pass
         before = frame.locator("#verdict").text_content()
-        document = root / "results/look/map/map.json"
-        look.show(ended=True, elapsed_s=1.0)
+        document = root / "results/preview/map/map.json"
+        preview.show(ended=True, elapsed_s=1.0)
         changed = json.loads(document.read_text())
         assert changed["again_s"] is None
-        words = next(one["why"] for one in changed["images"] if one["image"] == "uav1-uav2")
+        words = next(one["reason"] for one in changed["images"] if one["image"] == "uav1-uav2")
         assert words not in before
         until(frame, lambda: words in frame.locator("#verdict").text_content())
         assert frame.locator("#image").input_value() == "f01/uav1-uav2"

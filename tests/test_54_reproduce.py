@@ -54,7 +54,7 @@ def test_every_product_comes_out_byte_for_byte_elsewhere_and_by_another_number_o
     same, kept = capsys.readouterr().out.splitlines()[-2:]
     assert same.startswith("same     ")
     assert same.endswith(f"and {len(list(manifests(root / 'results'))) - 1} more results")
-    assert kept == f"made again in {tmp_path / 'another folder'}"
+    assert kept == f"recomputed in {tmp_path / 'another folder'}"
     assert contents(root) == before
     assert made(root).items() <= made(tmp_path / "another folder").items()
 
@@ -103,7 +103,7 @@ def test_a_file_that_was_edited_is_not_the_same(root, again, capsys, name):
         return
     assert print_reproduced(root / PAIR / name, cores=1) == 1
     first, *_, last = capsys.readouterr().out.splitlines()
-    assert first == f"changed  {PAIR}/{name}: first differs at byte {len(data) - 2}"
+    assert first == f"changed  {PAIR}/{name}: first difference at byte {len(data) - 2}"
     assert "changed after it was made" in last
 
 
@@ -111,13 +111,13 @@ def test_a_stage_that_was_edited_is_told_with_its_chunk(root, again, capsys):
     chunk = root / PAIR / "image.zarr/image/c/0/0"
     chunk.write_bytes(chunk.read_bytes() + b"more")
     assert print_reproduced(root / PAIR / "image.zarr", cores=1) == 1
-    assert capsys.readouterr().out.startswith(f"changed  {PAIR}/image.zarr/image/c/0/0: first differs at byte ")
+    assert capsys.readouterr().out.startswith(f"changed  {PAIR}/image.zarr/image/c/0/0: first difference at byte ")
 
 
 def test_a_file_that_is_gone_is_told(root, again, capsys):
     (root / PAIR / "db.tif").unlink()
     assert print_reproduced(root / PAIR / "db.tif", cores=1) == 1
-    assert f"missing  {PAIR}/db.tif: made again alone" in capsys.readouterr().out.splitlines()
+    assert f"missing  {PAIR}/db.tif: only in the recomputed results" in capsys.readouterr().out.splitlines()
 
 
 def test_the_first_result_that_differs_is_named(root, again, capsys):
@@ -155,10 +155,10 @@ def test_nothing_is_overwritten(root, again, tmp_path):
 
 def test_what_cannot_be_made_again_is_one_message(root, again, tiny, tmp_path):
     (root / PAIR / "note.tif").write_bytes(b"")
-    assert "no result that the config promises" in complaint(
+    assert "not a result of the campaign as configured" in complaint(
         lambda: print_reproduced(root / PAIR / "note.tif", cores=1)
     )
     assert "no results" in complaint(lambda: print_reproduced(tiny, cores=1))
     with hold(root):
-        assert "a run holds it" in complaint(lambda: print_reproduced(root, cores=1))
+        assert "a run is in progress" in complaint(lambda: print_reproduced(root, cores=1))
     assert again == []

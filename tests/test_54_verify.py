@@ -61,7 +61,7 @@ def test_one_byte_is_reported_at_its_link(root, touched):
 def test_one_byte_of_a_stage_is_reported_at_the_stage(root, file):
     flip(root / IMAGE / file)
     assert wrong(root) == {IMAGE: "changed"}
-    assert file in "".join(next(link for link in verify(root / DB).links if link.name == IMAGE).why)
+    assert file in "".join(next(link for link in verify(root / DB).links if link.name == IMAGE).reason)
 
 
 @pytest.mark.slow

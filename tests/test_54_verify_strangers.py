@@ -57,7 +57,7 @@ def test_a_manifest_of_an_older_version_is_told(root):
     edited(root / EXPORT, lambda document: [document.pop(key) for key in ("sources", "settings", "code")])
     (link,) = [link for link in verify(root / DB).links if link.name == EXPORT]
     assert link.state == "changed"
-    assert "versions before 0.1.0" in link.why[0]
+    assert "versions before 0.1.0" in link.reason[0]
 
 
 def test_other_versions_are_noted_and_change_nothing(root, capsys):
@@ -66,9 +66,9 @@ def test_other_versions_are_noted_and_change_nothing(root, capsys):
     edited(root / EXPORT, lambda document: document["files"].update({"db.tif": sha256_file(root / DB)}))
     assert print_verified(root / DB, quiet=True) == 0
     version, numpy, lock = capsys.readouterr().out.splitlines()
-    assert version.startswith(f"made by apertura 0.0.9, such as {DB}; ")
-    assert "numpy 1.0, here " in numpy
-    assert lock == "made under another requirements/all.txt"
+    assert version.startswith(f"apertura 0.0.9 made products such as {DB}, ")
+    assert "numpy 1.0 (installed: " in numpy
+    assert lock == "made with a different requirements/all.txt"
 
 
 def test_a_config_that_is_wrong_hides_no_other_link(root):
@@ -79,23 +79,23 @@ def test_a_config_that_is_wrong_hides_no_other_link(root):
 
 def test_a_copy_elsewhere_tells_its_tags_and_is_known_again_in_its_campaign(root, tmp_path, capsys):
     copy = shutil.copy(root / DB, tmp_path / "copy.tif")
-    assert "lies in no campaign" in complaint(lambda: print_verified(tmp_path / "copy.tif"))
+    assert "outside a campaign folder" in complaint(lambda: print_verified(tmp_path / "copy.tif"))
     assert f"APERTURA_INPUTS {RAW} {sha256_file(root / RAW)}" in capsys.readouterr().out.splitlines()
     assert print_verified(tmp_path / "copy.tif", root) == 0
     assert f"copy.tif, a copy of a file of {EXPORT}" in capsys.readouterr().out
     retag(copy, ERROR_DB="-200")
     assert print_verified(tmp_path / "copy.tif", root, quiet=True) == 1
-    assert capsys.readouterr().out.startswith("changed  copy.tif: no file of that campaign has its bytes")
+    assert capsys.readouterr().out.startswith("changed  copy.tif: not identical to any file of that campaign")
 
 
 def test_what_is_no_product_is_one_message(root, tmp_path):
     (tmp_path / "note.txt").write_text("")
     (tmp_path / "plain.tif").write_bytes(b"II*\0")
     assert "no such file" in complaint(lambda: print_verified(tmp_path / "nowhere.tif"))
-    assert "lies in no campaign" in complaint(lambda: print_verified(tmp_path / "note.txt"))
+    assert "outside a campaign folder" in complaint(lambda: print_verified(tmp_path / "note.txt"))
     assert "not readable as GeoTIFF" in complaint(lambda: print_verified(tmp_path / "plain.tif"))
-    assert "no manifest lists it" in complaint(lambda: print_verified(tmp_path / "note.txt", root))
-    assert "is no result" in complaint(lambda: print_verified(root / "results/f01"))
+    assert "not listed in any manifest" in complaint(lambda: print_verified(tmp_path / "note.txt", root))
+    assert "a folder that is not a result" in complaint(lambda: print_verified(root / "results/f01"))
 
 
 def test_a_file_beside_the_products_with_a_hostile_name_is_shown_harmlessly(root, capsys):

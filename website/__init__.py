@@ -1,1 +1,1 @@
-"""Pages of docs/ that are written from the code, and what a built site must hold."""
+"""Pages of docs/ that are generated from the code, and checks of the built site."""

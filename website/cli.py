@@ -1,4 +1,4 @@
-"""docs/cli.md, from the commands themselves."""
+"""Page docs/cli.md, generated from the commands."""
 
 import re
 from typing import Any
@@ -8,50 +8,62 @@ from typer.main import get_command
 
 from apertura.cli import app
 
-_HEAD = """# Command line
+_HEADER = """# Command line
 
-`apertura COMMAND --help` says the same. Exit codes: 0, done; 2, something for you to fix, in one message;
-130, ended by a signal; 1, what `verify`, `diff` or `reproduce` compared is not the same, or a defect of apertura.
-`[campaign]` is a campaign folder; default: the current directory. Written by `make pages` from the commands.
+`apertura COMMAND --help` shows the same text. `[campaign]` is a campaign folder (default: current directory). Generated
+by `make pages` from the commands.
+
+| exit code | meaning |
+|---|---|
+| 0 | success |
+| 1 | `verify`, `diff` or `reproduce` found a difference, or an internal error occurred |
+| 2 | an error in the input, described by one message |
+| 130 | stopped by a signal |
 """
-_SAID_ABOVE = {"campaign folder, default: current directory"}
-"""What the head says once for all commands."""
+_DESCRIBED_IN_HEADER = {"campaign folder, default: current folder", "campaign folder, default: current directory"}
+"""Help texts that the header of the page gives once for all commands."""
 
 
 def cli_page() -> str:
-    """Return docs/cli.md."""
+    """Return the text of docs/cli.md."""
     root = get_command(app)
     context = typer.Context(root, info_name="apertura")
     commands = {name: root.get_command(context, name) for name in root.list_commands(context)}
-    shown = ((name, one) for name, one in commands.items() if not one.hidden)
-    return _HEAD + "".join(_section(one, typer.Context(one, info_name=name, parent=context)) for name, one in shown)
+    visible = ((name, command) for name, command in commands.items() if not command.hidden)
+    return _HEADER + "".join(
+        _section(command, typer.Context(command, info_name=name, parent=context)) for name, command in visible
+    )
 
 
 def _section(command: Any, context: typer.Context) -> str:
     usage = " ".join(command.get_usage(context).split()).removeprefix("Usage: ").replace(" [OPTIONS]", "")
-    params = [one for one in command.params if not getattr(one, "hidden", False)]
-    lines = [_line(one, context) for one in params if getattr(one, "help", None) not in _SAID_ABOVE]
-    return f"\n## `{usage}`\n\n{_told(command.help)}\n" + ("\n" + "".join(lines) if lines else "")
+    parameters = [parameter for parameter in command.params if not getattr(parameter, "hidden", False)]
+    lines = [
+        _line(parameter, context)
+        for parameter in parameters
+        if getattr(parameter, "help", None) not in _DESCRIBED_IN_HEADER
+    ]
+    return f"\n## `{usage}`\n\n{_description(command.help)}\n" + ("\n" + "".join(lines) if lines else "")
 
 
-def _line(one: Any, context: typer.Context) -> str:
-    names, told = one.get_help_record(context) or ("", "")
-    if one.name == "cores":  # as many as the machine has, which is no property of the command
-        told = re.sub(r"\[default: \d+", "[default: all of the machine", told)
-    names = re.sub(r" <(?:path|str|int|(?:int|float) range)>", "", names)  # the text says what it is
-    return f"- `{_one_line(names)}`: {_plain(told)}\n"
+def _line(parameter: Any, context: typer.Context) -> str:
+    names, description = parameter.get_help_record(context) or ("", "")
+    if parameter.name == "cores":  # the default depends on the machine, not on the command
+        description = re.sub(r"\[default: \d+", "[default: all of the machine", description)
+    names = re.sub(r" <(?:path|str|int|(?:int|float) range)>", "", names)  # types follow from the description
+    return f"- `{_one_line(names)}`: {_escaped(description)}\n"
 
 
 def _one_line(text: str) -> str:
     return " ".join(text.split())
 
 
-def _plain(text: str) -> str:
-    """Return a text that Markdown takes for nothing else."""
+def _escaped(text: str) -> str:
+    """Return a text with characters escaped that Markdown interprets as markup."""
     return _one_line(text).replace("<", "&lt;").replace("[", "\\[")
 
 
-def _told(text: str | None) -> str:
-    """Return a docstring as Markdown, without the sections for readers of code."""
-    told = re.split(r"\n\s*(?:Parameters|Raises|Returns|Examples)\n\s*-{3}", text or "")[0]
-    return "\n\n".join(" ".join(part.split()).replace("<", "&lt;") for part in told.split("\n\n"))
+def _description(text: str | None) -> str:
+    """Return a docstring as Markdown, without its sections on parameters, exceptions, results and examples."""
+    prose = re.split(r"\n\s*(?:Parameters|Raises|Returns|Examples)\n\s*-{3}", text or "")[0]
+    return "\n\n".join(" ".join(paragraph.split()).replace("<", "&lt;") for paragraph in prose.split("\n\n"))

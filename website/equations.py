@@ -1,4 +1,4 @@
-"""Hook of mkdocs: equations are Unicode text in the sources and in the code; a page sets their indices and powers."""
+"""Hook of mkdocs: typeset indices and powers of the Unicode equations in pages of the theory."""
 
 import re
 from typing import Any
@@ -11,7 +11,7 @@ _PATHS = re.compile(r"^[\w/]+\.\w+ {2,}", re.M)
 
 _WORD = r"3dB|[a-z0-9]+(?:,[a-z0-9]+)*|[A-Z]+|[α-ωΑ-Ω∞⊥]"
 _OPERATORS = r"(?<=\bmean)|(?<=\bmax)|(?<=\bmin)|(?<=\bSNR)|(?<=∂)"
-_INDEX = re.compile(  # of a letter, what is in parentheses, or an operator; the last letter of another word is none
+_INDEX = re.compile(  # of a letter, of a parenthesis or of an operator, but not of the last letter of a longer word
     rf"(?:(?<![A-Za-z]{{2}}[^\W\d_])(?<=[^\W\d_]|[)\u0303])|{_OPERATORS})([′'*]?)_(?:\{{([^{{}}]+)\}}|({_WORD}))"
 )
 _POWER = re.compile(
@@ -20,12 +20,12 @@ _POWER = re.compile(
 
 
 def on_page_content(html: str, *, page: Any, **_: Any) -> str:
-    """Return the HTML of a page, that of a page of theory with its equations set."""
+    """Return the HTML of a page, with typeset equations if it is a page of the theory or the glossary."""
     return set_equations(html) if page.file.src_uri.startswith(("theory", "glossary")) else html
 
 
 def set_equations(html: str) -> str:
-    """Return HTML with x_n and x^n set as index and power, in indented blocks and in prose, not in code.
+    """Return HTML with x_n and x^n typeset as index and power, in indented blocks and in prose but not in code.
 
     Examples
     --------
@@ -33,20 +33,20 @@ def set_equations(html: str) -> str:
     '<p>Σ<sub>n</sub> w<sub>n+1</sub> u<sup>d</sup> of <code>w_n</code></p>'
     """
     html = _INDENTED.sub(_equation, html)
-    kept, at = [], 0
+    parts, position = [], 0
     for skipped in _SKIPPED.finditer(html):
-        kept += [_set(html[at : skipped.start()]), skipped[0]]
-        at = skipped.end()
-    return "".join([*kept, _set(html[at:])])
+        parts += [_typeset(html[position : skipped.start()]), skipped[0]]
+        position = skipped.end()
+    return "".join([*parts, _typeset(html[position:])])
 
 
-def _equation(found: re.Match[str]) -> str:
-    """Return an indented block as an equation, unless its columns say that it is a table."""
-    text = _NUMBER.sub(r'<span class="number">(\1)</span>', found[1].rstrip())
-    table = sum(bool(_COLUMNS.search(line.strip())) for line in text.splitlines()) > 1 or _PATHS.match(found[1])
-    return found[0] if table else f'<pre class="equation">{text}</pre>'
+def _equation(block: re.Match[str]) -> str:
+    """Return an indented block as an equation, unless its columns indicate a table."""
+    text = _NUMBER.sub(r'<span class="number">(\1)</span>', block[1].rstrip())
+    is_table = sum(bool(_COLUMNS.search(line.strip())) for line in text.splitlines()) > 1 or _PATHS.match(block[1])
+    return block[0] if is_table else f'<pre class="equation">{text}</pre>'
 
 
-def _set(text: str) -> str:
-    text = _INDEX.sub(lambda found: f"{found[1]}<sub>{found[2] or found[3]}</sub>", text)
-    return _POWER.sub(lambda found: f"<sup>{found[1] or found[2] or found[3]}</sup>", text)
+def _typeset(text: str) -> str:
+    text = _INDEX.sub(lambda match: f"{match[1]}<sub>{match[2] or match[3]}</sub>", text)
+    return _POWER.sub(lambda match: f"<sup>{match[1] or match[2] or match[3]}</sup>", text)

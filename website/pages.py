@@ -1,4 +1,4 @@
-"""Write the files that come from the code, pages of docs/ and the config's template: `python -m website.pages`."""
+"""Write all generated files, pages of docs/ and the config template: `python -m website.pages`."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +22,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "docs/howto/sizing.md": sizing_page,
     "docs/theory/tests.md": theory_tests_page,
 }
-"""File → what it must hold."""
+"""File → function that returns its content."""
 
 if __name__ == "__main__":
     for name, page in PAGES.items():

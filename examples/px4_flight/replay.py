@@ -12,13 +12,13 @@ import numpy as np
 from apertura.core.geometry.geodesy import geodetic_from_ecef, ned_axes
 from apertura.formats.reading import read_track
 from apertura.simulation import simulate
-from apertura.simulation.targets import Origin, PointTarget, Waypoints
 from apertura.simulation.specification import (
     CampaignSpecification,
     ImageGrid,
     SimulatedFlight,
     SimulatedNode,
 )
+from apertura.simulation.targets import Origin, PointTarget, Waypoints
 from apertura.simulation.waveform import WaveformSpecification
 
 FIRST_S, LAST_S = 5.6, 11.6

@@ -321,7 +321,7 @@ def _run(campaign: Path, cores: int, *arguments: str, paranoid: bool = False, sh
 
 
 @app.command()
-def look(
+def preview(
     campaign: CampaignFolder = HERE,
     cores: Cores = ALL_CORES,
     *,
@@ -338,9 +338,9 @@ def look(
 ) -> None:
     """Show preview images of the pulses so far; with --follow, Ctrl-C ends following and starts the workflow."""
     opened = _opened(campaign)
-    from apertura.tools.look.follow import look_at
+    from apertura.tools.preview.follow import run_preview
 
-    look_at(opened, follow=follow, every_s=every, end_after_s=end_after, threads=cores)
+    run_preview(opened, follow=follow, every_s=every, end_after_s=end_after, threads=cores)
     if follow and run_after:
         _run(campaign, cores)
 
@@ -598,7 +598,7 @@ def report(
 def map_page(
     campaign: CampaignFolder = HERE,
     port: Annotated[int, typer.Option(min=0, max=65535, help="port of the server; 0: any free port")] = 0,
-    look_: Annotated[bool, typer.Option("--look", help="show the live images of `apertura look`")] = False,
+    preview_: Annotated[bool, typer.Option("--preview", help="show the live images of `apertura preview`")] = False,
     open_: Annotated[bool, typer.Option("--open", help="open the map in the browser")] = False,
 ) -> None:
     """Show a campaign as a map in a browser; the server accepts this machine only and runs until Ctrl-C."""
@@ -607,9 +607,9 @@ def map_page(
     from apertura.views.summary import print_stale
     from apertura.views.webmap.server import served, served_look
 
-    if not look_:
+    if not preview_:
         print_stale(opened)
-    (served_look if look_ else served)(opened, port=port).show(in_browser=open_)
+    (served_look if preview_ else served)(opened, port=port).show(in_browser=open_)
 
 
 @app.command()

@@ -65,7 +65,7 @@ COMMANDS: dict[str, Command] = {
     "compare": Command("compare plan.yaml ."),
     "design": Command("design plan.yaml design"),
     "init": Command("init new"),
-    "look": Command("look ."),
+    "preview": Command("preview ."),
     "look --follow": Command("look . --follow --every 1 --end-after 1 --no-run"),
     "map": Command("map ."),
     "clean": Command("clean . --yes"),

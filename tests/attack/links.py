@@ -205,7 +205,7 @@ class Replacing:
 
 ALL_WORK, ALL_LOCKS, ALL_HASHES = "every work folder", "every lock", "every work folder of hashes"
 _LINKED_COMMANDS = (
-    *("check", "summary", "report", "chart", "map", "plan", "verify", "look", "run, finished", "reproduce"),
+    *("check", "summary", "report", "chart", "map", "plan", "verify", "preview", "run, finished", "reproduce"),
     *(name for name in COMMANDS if name.startswith("step ") and name.split()[1] not in ("bench", "whole-chart")),
 )
 _HASHED = ("list", "summary", "status", "check", "run, finished", "verify", "plan", "inspect")
@@ -219,14 +219,14 @@ REVIEW: tuple[Trial, ...] = (
     Trial("bench", "link to folder", ("results/.hashes",)),
     Trial("bench", "link to folder", ("results",)),
     Trial("step bench", "link to file", ("results/b01/bench.json",)),
-    *(Trial("clean", "link to folder", (f"results/{name}",)) for name in (".run", "logs", "benchmarks", "look")),
+    *(Trial("clean", "link to folder", (f"results/{name}",)) for name in (".run", "logs", "benchmarks", "preview")),
     Trial("clean", "link to file", ("results/.run.lock",)),
     # Findings that follow the count of 56, or that are not about links.
-    Trial("look", "link to folder", ("results/look/.status.json.wip",)),
-    Trial("look", "link to folder", ("results/look/.index.html.wip",)),
-    Trial("look", "link to folder", ("results/look/f01/uav1-uav1/.db.0.tif.wip",)),
-    Trial("look", "link to folder", ("results/look/map",)),
-    Trial("look", "link to folder", ("results/look/f01/uav1-uav1",)),
+    Trial("preview", "link to folder", ("results/preview/.status.json.wip",)),
+    Trial("preview", "link to folder", ("results/preview/.index.html.wip",)),
+    Trial("preview", "link to folder", ("results/preview/f01/uav1-uav1/.db.0.tif.wip",)),
+    Trial("preview", "link to folder", ("results/preview/map",)),
+    Trial("preview", "link to folder", ("results/preview/f01/uav1-uav1",)),
     Trial("list", "link to folder", ("results/.hashes",)),
     Trial("list", "link to folder", ("results/.hashes/raw/f01/.uav1.sigmf-data.json.wip",)),
     Trial("clean", "link to folder", ("results/.hashes",)),

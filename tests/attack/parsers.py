@@ -29,7 +29,7 @@ from apertura.formats.phase_histories.pulson import read_pulson
 from apertura.formats.reading import open_recording, read_track
 from apertura.formats.recordings.sigmf import GrowingSigmf, check_listed
 from apertura.formats.tracks import ardupilot, dataflash_fields, px4_ulog, ulog_fields
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 from apertura.formats.tracks.missions import read_mission
 from apertura.simulation.specification import read_specification
 from apertura.stages.agreement import assessment_of
@@ -151,7 +151,7 @@ def _autopilot(fields_of: Any, track_of: Any) -> Callable[[Path], Any]:
     """As a reader of an autopilot's log, in this process: whoever calls it lets it die."""
 
     def read(path: Path) -> Any:
-        return track_of(_alone(fields_of, path), node="uav1", options=AS_IT_SAYS, where=path)
+        return track_of(_alone(fields_of, path), node="uav1", options=DEFAULT_OPTIONS, where=path)
 
     return read
 

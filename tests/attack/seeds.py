@@ -454,7 +454,7 @@ ASSESSED = {
     "reference": "uav1-uav1",
     "hypotheses": {},
     "code_sha256": "0f",
-    "fusion": {"phases_rad": {"uav1-uav1": 0.0}, "left_out": {"uav1-uav2": "why"}, "unmeasured": {}, "why": {}},
+    "fusion": {"phases_rad": {"uav1-uav1": 0.0}, "excluded": {"uav1-uav2": "reason"}, "unmeasured": {}, "reason": {}},
     "pairs": {"uav1-uav1": AGREED, "uav1-uav2": AGREED},
 }
 RADAR = {"centre_hz": 1.4e9, "bandwidth_hz": 4e8, "subcarriers": 1024, "sent_power": 1024.0}

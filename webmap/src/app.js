@@ -1,4 +1,4 @@
-// The page: what is chosen in the panel goes to the map, the readout, the cross-section, the target list and the address.
+// The page: connects the panel with the map, the readout, the cross-section, the target list and the permalink.
 import 'ol/ol.css';
 import './app.css';
 import { Chart, canDraw } from './chart.js';
@@ -13,7 +13,7 @@ import { Targets } from './targets.js';
 
 const FORMAT = 1;
 const OVER = { mask: 'mask: shadow and layover', tracks: 'tracks', footprints: 'footprints', targets: 'targets' };
-const BEYOND = 0.5; // of the range between floor and peak, that the sliders reach beyond it
+const BEYOND = 0.5; // travel of the sliders beyond the value range of the layer, as a share of that range
 
 class Page {
   constructor(data) {
@@ -33,47 +33,47 @@ class Page {
     else this.untracked();
   }
 
-  /** Without a place on Earth, tracks are in no file that a map could read. */
+  /** Disable tracks and footprints: for a local frame they are not exported as GeoJSON. */
   untracked() {
-    for (const one of [this.boxes.tracks, this.boxes.footprints, byId('fit-tracks')]) one.disabled = true;
+    for (const control of [this.boxes.tracks, this.boxes.footprints, byId('fit-tracks')]) control.disabled = true;
   }
 
-  /** Words about the campaign that stay. */
+  /** Fill in the constant texts about the campaign. */
   describe() {
     const { campaign, crs } = this.data;
     document.title = `${campaign} · apertura map`;
     byId('campaign').textContent = campaign;
-    byId('crs').textContent = crs.local ? 'local axes, no place on Earth' : `${crs.name} · ${crs.code}`;
+    byId('crs').textContent = crs.local ? 'local frame, not georeferenced' : `${crs.name} · ${crs.code}`;
     const right = this.places.convergence();
     const north =
       right === null ? 'up is the local y axis' : `up is grid north; true north is ${number(Math.abs(right), 2)}° to the ${right < 0 ? 'left' : 'right'}`;
     byId('north').lastElementChild.textContent = right === null ? 'y' : 'grid N';
     byId('north').title = north;
     byId('north').setAttribute('aria-label', north);
-    const shown = Object.entries(MASK).map(([value, colour]) => {
+    const entries = Object.entries(MASK).map(([value, colour]) => {
       const swatch = element('span', { className: 'swatch' });
       swatch.style.background = colour;
       return element('li', {}, swatch, this.data.classes[value]);
     });
-    byId('mask-legend').append(...shown);
+    byId('mask-legend').append(...entries);
   }
 
-  /** Choices of the panel. */
+  /** Fill the controls of the panel. */
   fill() {
     this.list();
     byId('colours').append(...Object.keys(RAMPS).map((name) => element('option', { value: name, textContent: name })));
     this.boxes = {};
     this.overlays = {};
-    for (const [name, words] of Object.entries(OVER)) {
+    for (const [name, label] of Object.entries(OVER)) {
       const box = element('input', { type: 'checkbox', checked: name !== 'mask' });
       this.boxes[name] = box;
-      this.overlays[name] = element('span', { textContent: ` ${words}` });
+      this.overlays[name] = element('span', { textContent: ` ${label}` });
       byId('overlays').append(element('label', {}, box, this.overlays[name]));
       box.addEventListener('change', () => this.over());
     }
   }
 
-  /** Images to choose from. */
+  /** Fill the list of images. */
   list() {
     const flights = new Map();
     for (const { flight, image } of this.data.images) {
@@ -105,49 +105,49 @@ class Page {
     addEventListener('hashchange', () => this.restore(permalink.read(location.hash)));
   }
 
-  /** Show what an address asks for, as far as the campaign has it. */
-  restore(asked) {
-    if (asked.over) for (const [name, box] of Object.entries(this.boxes)) box.checked = asked.over.includes(name);
-    if (asked.view) {
-      this.chart.view.setCenter(asked.view.slice(0, 2));
-      this.chart.view.setResolution(asked.view[2]);
+  /** Show the state given by a permalink, as far as the campaign has its images and layers. */
+  restore(state) {
+    if (state.over) for (const [name, box] of Object.entries(this.boxes)) box.checked = state.over.includes(name);
+    if (state.view) {
+      this.chart.view.setCenter(state.view.slice(0, 2));
+      this.chart.view.setResolution(state.view[2]);
     }
-    this.choose(asked.image, asked.layer, asked);
-    this.section.set(asked.line);
+    this.choose(state.image, state.layer, state);
+    this.section.set(state.line);
   }
 
-  /** Choose an image and a layer of it by their names; others than there are choose the first. */
+  /** Select an image and one of its layers by name; unknown names select the first. */
   choose(image, file, { stretch = null, colours = null } = {}) {
-    this.image = this.data.images.find((one) => `${one.flight}/${one.image}` === image) ?? this.data.images[0];
-    const layers = this.image.layers.filter((one) => one.kind !== 'classes');
+    this.image = this.data.images.find((entry) => `${entry.flight}/${entry.image}` === image) ?? this.data.images[0];
+    const layers = this.image.layers.filter((layer) => layer.kind !== 'classes');
     const before = this.layer;
-    this.layer = layers.find((one) => one.file === file) ?? layers[0];
+    this.layer = layers.find((layer) => layer.file === file) ?? layers[0];
     byId('image').value = `${this.image.flight}/${this.image.image}`;
-    byId('layer').replaceChildren(...layers.map((one) => element('option', { value: one.file, textContent: one.file.replace(/\.tif$/, '').replaceAll('_', ' ').replace(/ db$/, ', dB') })));
+    byId('layer').replaceChildren(...layers.map((layer) => element('option', { value: layer.file, textContent: layer.file.replace(/\.tif$/, '').replaceAll('_', ' ').replace(/ db$/, ', dB') })));
     byId('layer').value = this.layer.file;
     byId('title').textContent = `${this.layer.title}${this.layer.unit ? `, ${this.layer.unit}` : ''}`;
     if (Object.hasOwn(RAMPS, colours ?? '')) byId('colours').value = colours;
     else if (before?.kind !== this.layer.kind) byId('colours').value = this.layer.kind === 'image' ? 'grey' : 'viridis';
-    this.maskLayer = this.image.layers.find((one) => one.kind === 'classes') ?? null;
+    this.maskLayer = this.image.layers.find((layer) => layer.kind === 'classes') ?? null;
     this.boxes.mask.disabled = !this.maskLayer;
     this.limits(...(stretch ?? [this.layer.low, this.layer.high]));
-    this.say();
+    this.showQuality();
     this.show();
     this.over();
     this.targets.list(byId('image').value);
     this.section.refresh();
   }
 
-  /** What the image says of itself. */
-  say() {
-    const { verdict, why, error_db: error, flags } = this.image;
-    const known = error === null ? '' : `; numerical error below ${number(error, 1)} dB`;
-    byId('verdict').textContent = `${verdict}: ${why}${known}`;
-    const raised = Object.entries(flags).flatMap(([name, words]) => [
+  /** Show verdict, numerical error and flags of the image. */
+  showQuality() {
+    const { verdict, reason, error_db: error, flags } = this.image;
+    const bound = error === null ? '' : `; numerical error below ${number(error, 1)} dB`;
+    byId('verdict').textContent = `${verdict}: ${reason}${bound}`;
+    const raised = Object.entries(flags).flatMap(([name, explanation]) => [
       element('dt', { textContent: name }),
-      element('dd', { textContent: words }),
+      element('dd', { textContent: explanation }),
     ]);
-    byId('flags').replaceChildren(...(raised.length ? raised : [element('dt', { className: 'none', textContent: 'no flag' })]));
+    byId('flags').replaceChildren(...(raised.length ? raised : [element('dt', { className: 'none', textContent: 'no flags raised' })]));
   }
 
   limits(low, high) {
@@ -158,7 +158,7 @@ class Page {
     this.stretch(low, high);
   }
 
-  /** Set both ends of the colours; the one that was moved pushes the other. */
+  /** Set both ends of the colour scale; the end that was moved pushes the other. */
   stretch(low, high, moved = 'low') {
     const gap = Number(byId('low').step) || 1e-6;
     this.low = moved === 'high' ? Math.min(low, high - gap) : low;
@@ -166,9 +166,9 @@ class Page {
     const decimals = Math.max(0, 1 - Math.floor(Math.log10(this.high - this.low)));
     for (const name of ['low', 'high']) {
       byId(name).value = this[name];
-      const words = `${number(this[name], Math.min(4, decimals))} ${this.layer.unit}`;
-      for (const place of [`${name}-value`, `ramp-${name}`]) byId(place).textContent = words;
-      byId(name).setAttribute('aria-valuetext', words);
+      const text = `${number(this[name], Math.min(4, decimals))} ${this.layer.unit}`;
+      for (const id of [`${name}-value`, `ramp-${name}`]) byId(id).textContent = text;
+      byId(name).setAttribute('aria-valuetext', text);
     }
     this.chart.stretch(this.low, this.high);
     this.remember();
@@ -193,30 +193,30 @@ class Page {
     this.remember();
   }
 
-  /** State beside a layer of lines that all of it lies outside the view. */
+  /** Mark overlays that are completely outside the view. */
   outside() {
     for (const name of ['tracks', 'footprints'])
       this.overlays[name].textContent = ` ${OVER[name]}${this.chart.isOutside(name) ? ' (outside the view)' : ''}`;
   }
 
-  /** Show what the campaign has become; what the reader chose stays, and so do colours that were moved. */
+  /** Show a new document; the selection and a colour scale that the user changed are kept. */
   update(data) {
     const moved = this.low !== this.layer.low || this.high !== this.layer.high;
-    const known = this.data.images.map((one) => `${one.flight}/${one.image}`);
+    const listed = this.data.images.map(({ flight, image }) => `${flight}/${image}`);
     this.data = data;
     this.rasters.clear();
     this.targets.all = data.places;
-    if (data.images.some((one) => !known.includes(`${one.flight}/${one.image}`))) this.list();
+    if (data.images.some(({ flight, image }) => !listed.includes(`${flight}/${image}`))) this.list();
     const colours = byId('colours').value;
     this.choose(`${this.image.flight}/${this.image.image}`, this.layer.file, { stretch: moved ? [this.low, this.high] : null, colours });
   }
 
-  /** Read the document again and again while the campaign flies. */
+  /** Reload the document periodically during a flight. */
   async follow() {
     let before = JSON.stringify(this.data);
     while (this.data.again_s) {
       await new Promise((done) => setTimeout(done, 1000 * this.data.again_s));
-      const data = await read().catch(() => this.data); // it is being written: next time
+      const data = await read().catch(() => this.data); // not readable at present: retried after the next interval
       const now = JSON.stringify(data);
       if (now !== before) this.update(data);
       before = now;
@@ -250,12 +250,12 @@ async function read() {
   const answer = await fetch('map.json');
   if (!answer.ok) throw new Error(`map.json: ${(await answer.text()).trim()}`);
   const data = await answer.json();
-  if (data.format !== FORMAT) throw new Error('map.json is of another version than this page: run the workflow again');
+  if (data.format !== FORMAT) throw new Error('map.json has a different format version than this page: run the workflow again');
   return data;
 }
 
 async function start() {
-  if (!canDraw()) notice('This browser has no WebGL, with which images are drawn; values, places and tracks are still told.');
+  if (!canDraw()) notice('This browser has no WebGL, so that images are not displayed; values, targets and tracks are available.');
   const page = new Page(await read());
   page.follow().catch((error) => notice(error.message));
   page.chart.map.on('rendercomplete', () => {
@@ -263,4 +263,4 @@ async function start() {
   });
 }
 
-start().catch((error) => notice(`No map: ${error.message}`));
+start().catch((error) => notice(`The map cannot be displayed: ${error.message}`));

@@ -1,4 +1,4 @@
-// The map itself: one raster, the mask over it, tracks, footprints, targets, and the line of the cross-section.
+// The map: one raster, mask overlay, tracks, footprints, targets, and the line of the cross-section.
 import Map from 'ol/Map.js';
 import View from 'ol/View.js';
 import { extend } from 'ol/extent.js';
@@ -19,7 +19,7 @@ import { byId, notice } from './dom.js';
 const FLIGHTS = ['#22d3ee', '#f472b6', '#a3e635', '#facc15', '#c084fc', '#fb7185'];
 const HALO = new Stroke({ color: '#0b1220cc', width: 4 });
 
-/** Whether the browser can draw rasters at all. */
+/** True if the browser supports WebGL, which drawing rasters requires. */
 export function canDraw() {
   const canvas = document.createElement('canvas');
   return Boolean(canvas.getContext('webgl') || canvas.getContext('experimental-webgl'));
@@ -50,7 +50,7 @@ export class Chart {
     this.map.on('postrender', () => this.scale());
   }
 
-  /** Show the whole scene, with the tracks where they are asked for. */
+  /** Fit the view to the scene, optionally including the tracks. */
   fit(tracks = false) {
     const extent = [...this.places.grid.bounds_m];
     if (tracks) extend(extent, this.tracks.getSource().getExtent());
@@ -72,43 +72,43 @@ export class Chart {
     byId('scale').textContent = `${Number((length / metre).toPrecision(2))} ${unit}`;
   }
 
-  /** Show a raster with a style instead of the one before. */
+  /** Replace the raster on display, with its colour scale. */
   show(layer, colours, low, high) {
     this.raster = this.replaced(this.raster, layer, () => rampStyle(colours, low, high), 0);
   }
 
-  /** Show a mask over the raster; null: none. */
+  /** Show a mask over the raster; null removes it. */
   mask(layer) {
     this.overlay = this.replaced(this.overlay, layer, maskStyle, 1);
     this.overlay?.setOpacity(0.55);
   }
 
   replaced(before, layer, style, zIndex) {
-    const gone = () => {
+    const removeBefore = () => {
       if (before) this.map.removeLayer(before);
       before?.dispose();
     };
     if (!layer || !canDraw()) {
-      gone();
+      removeBefore();
       return null;
     }
     const source = new GeoTIFF({
       sources: [{ url: layer.url }],
       normalize: false,
-      interpolate: false, // pixels as they are: dB between them would be an invention
+      interpolate: false, // dB values must not be interpolated linearly
       projection: this.places.projection,
       transition: 0,
     });
     source.on('change', () => {
-      if (source.getState() === 'error') explain(layer); // no value: one of false would keep the event from the layer
+      if (source.getState() === 'error') explain(layer); // returns nothing: false would stop the event's propagation
     });
-    const made = new TileLayer({ source, style: style(), zIndex });
-    this.map.addLayer(made);
-    this.map.once('rendercomplete', gone); // not before: the map would flash
-    return made;
+    const added = new TileLayer({ source, style: style(), zIndex });
+    this.map.addLayer(added);
+    this.map.once('rendercomplete', removeBefore); // removing it earlier would make the map flash
+    return added;
   }
 
-  /** Whether the raster's own file has been opened. */
+  /** True if the file of the raster has been opened. */
   get drawn() {
     return !this.raster || this.raster.getSource()?.getState() === 'ready';
   }
@@ -120,28 +120,28 @@ export class Chart {
   async cover(url) {
     const response = await fetch(url);
     if (!response.ok) throw new Error(`tracks and footprints: ${(await response.text()).trim()}`);
-    const read = new GeoJSON().readFeatures(await response.json(), {
+    const features = new GeoJSON().readFeatures(await response.json(), {
       dataProjection: 'EPSG:4326',
       featureProjection: this.places.projection,
     });
-    const flights = [...new Set(read.map((one) => one.get('flight')))];
-    for (const feature of read) {
+    const flights = [...new Set(features.map((feature) => feature.get('flight')))];
+    for (const feature of features) {
       feature.set('colour', FLIGHTS[flights.indexOf(feature.get('flight')) % FLIGHTS.length]);
       (feature.get('kind') === 'track' ? this.tracks : this.footprints).getSource().addFeature(feature);
     }
   }
 
-  /** Whether no part of a layer's lines lies in the view. */
+  /** True if a layer has lines and all of them are outside the view. */
   isOutside(name) {
-    const lines = this[name].getSource().getFeatures().map((one) => one.getGeometry()).filter(Boolean);
+    const lines = this[name].getSource().getFeatures().map((feature) => feature.getGeometry()).filter(Boolean);
     const view = this.view.calculateExtent(this.map.getSize());
-    return lines.length > 0 && !lines.some((one) => one.intersectsExtent(view));
+    return lines.length > 0 && !lines.some((line) => line.intersectsExtent(view));
   }
 
   mark(places) {
     const source = this.targets.getSource();
     source.clear();
-    source.addFeatures(places.map((one) => new Feature({ geometry: new Point([one.x_m, one.y_m]), name: one.name })));
+    source.addFeatures(places.map(({ x_m: x, y_m: y, name }) => new Feature({ geometry: new Point([x, y]), name })));
   }
 
   drawLine(ends) {
@@ -158,8 +158,8 @@ export class Chart {
 
 async function explain(layer) {
   const answer = await fetch(layer.url, { headers: { Range: 'bytes=0-0' } }).catch(() => null);
-  const why = answer === null ? 'the server does not answer' : answer.ok ? 'it is no GeoTIFF' : await answer.text();
-  notice(`${layer.file} cannot be shown: ${why.trim()}.`);
+  const reason = answer === null ? 'the server does not respond' : answer.ok ? 'not a valid GeoTIFF' : await answer.text();
+  notice(`${layer.file} cannot be displayed: ${reason.trim()}.`);
 }
 
 function vector(zIndex, style, declutter = false) {

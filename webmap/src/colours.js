@@ -1,4 +1,4 @@
-// Ramps of colours for values between two ends, and those of the mask.
+// Colour ramps for values between two limits, and colours of the mask classes.
 export const RAMPS = {
   grey: ['#000000', '#ffffff'],
   inferno: ['#000004', '#1b0c41', '#4a0c6b', '#781c6d', '#a52c60', '#cf4446', '#ed6925', '#fb9b06', '#f7d13d', '#fcffa4'],
@@ -8,16 +8,16 @@ export const MASK = { 1: '#3b82f6', 2: '#f59e0b', 3: '#d946ef' };
 
 const CLEAR = ['color', 0, 0, 0, 0];
 
-/** Style of a layer between the variables `low` and `high`; what has no value is clear. */
+/** Style of a layer between the variables `low` and `high`; pixels without a value are transparent. */
 export function rampStyle(name, low, high) {
   const share = ['clamp', ['/', ['-', ['band', 1], ['var', 'low']], ['-', ['var', 'high'], ['var', 'low']]], 0, 1];
   const ramp = RAMPS[name];
   const stops = ramp.flatMap((colour, index) => [index / (ramp.length - 1), colour]);
-  const shown = ['interpolate', ['linear'], share, ...stops];
-  return { variables: { low, high }, color: ['case', ['==', ['band', 2], 0], CLEAR, shown] };
+  const colour = ['interpolate', ['linear'], share, ...stops];
+  return { variables: { low, high }, color: ['case', ['==', ['band', 2], 0], CLEAR, colour] };
 }
 
-/** Style of the mask: what is seen plainly is clear. */
+/** Style of the mask: visible pixels are transparent. */
 export function maskStyle() {
   const cases = Object.entries(MASK).flatMap(([value, colour]) => [['==', ['band', 1], Number(value)], colour]);
   return { color: ['case', ['==', ['band', 2], 0], CLEAR, ...cases, CLEAR] };

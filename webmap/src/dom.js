@@ -1,29 +1,29 @@
-// Elements are made here, and text is only ever text: names come from strangers' files.
+// Creation of elements. Text is inserted as text only, never as markup: names come from untrusted files.
 const SVG = 'http://www.w3.org/2000/svg';
 
-/** The element of the page with this id. */
+/** Return the element with an id. */
 export const byId = (id) => document.getElementById(id);
 
-/** A new element with properties and children; strings become text. */
+/** Create an element with properties and children; strings become text. */
 export function element(name, properties = {}, ...children) {
-  const made = Object.assign(document.createElement(name), properties);
-  made.append(...children);
-  return made;
+  const created = Object.assign(document.createElement(name), properties);
+  created.append(...children);
+  return created;
 }
 
-/** A new element of SVG with attributes, which must not be a stranger's, and text. */
+/** Create an SVG element with text and attributes; attributes must not come from untrusted files. */
 export function drawn(name, attributes, text) {
-  const made = document.createElementNS(SVG, name);
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, String(value));
-  if (text !== undefined) made.textContent = text;
-  return made;
+  const created = document.createElementNS(SVG, name);
+  for (const [key, value] of Object.entries(attributes)) created.setAttribute(key, String(value));
+  if (text !== undefined) created.textContent = text;
+  return created;
 }
 
-/** Tell something that keeps the map from being what it should; each once. */
-export function notice(words) {
+/** Show a problem of the map to the user; each message once. */
+export function notice(message) {
   const box = byId('notices');
-  if ([...box.children].every((one) => one.textContent !== words)) box.append(element('p', { textContent: words }));
+  if ([...box.children].every((child) => child.textContent !== message)) box.append(element('p', { textContent: message }));
 }
 
-/** A number with a real minus sign, so many decimals. */
+/** Format a number with a given number of decimals and a true minus sign. */
 export const number = (value, decimals) => value.toFixed(decimals).replace('-', '−');

@@ -1,9 +1,9 @@
-// Where a peak of dB is highest between its pixels: a paraboloid by least squares through what lies within 3 dB of it.
-const REACH = 3; // pixels; cells are about three across
+// Subpixel position of a peak in dB: least-squares fit of a paraboloid to the pixels within 3 dB of the peak.
+const REACH = 3; // pixels; a resolution cell is about three pixels wide
 const WITHIN_DB = 3;
 const TERMS = (y, x) => [1, y, x, y * y, x * x, x * y];
 
-/** How far down and right of the highest pixel the top lies, pixels; `at(down, right)` gives dB around that pixel. */
+/** Return the offset [down, right] of the peak from the highest pixel; `at(down, right)` returns the dB value there. */
 export function top(at) {
   const around = [];
   for (let y = -REACH; y <= REACH; y++) for (let x = -REACH; x <= REACH; x++) around.push([y, x, at(y, x) - at(0, 0)]);
@@ -11,12 +11,12 @@ export function top(at) {
   const used = near.length > TERMS(0, 0).length ? near : around.filter(([y, x]) => Math.max(Math.abs(y), Math.abs(x)) <= 1);
   const [, down, right, bendY, bendX, twist] = leastSquares(used);
   const determinant = 4 * bendY * bendX - twist * twist;
-  if (!(bendY < 0 && determinant > 0)) return [0, 0]; // no top there
+  if (!(bendY < 0 && determinant > 0)) return [0, 0]; // the paraboloid has no maximum
   const offset = [(twist * right - 2 * bendX * down) / determinant, (twist * down - 2 * bendY * right) / determinant];
   return Math.max(...offset.map(Math.abs)) <= 2 ? offset : [0, 0];
 }
 
-/** Coefficients of `TERMS` that fit places and values best: normal equations, solved by elimination with pivots. */
+/** Return the least-squares coefficients of `TERMS`: normal equations, solved by elimination with pivoting. */
 function leastSquares(samples) {
   const count = TERMS(0, 0).length;
   const rows = Array.from({ length: count }, () => new Array(count + 1).fill(0));

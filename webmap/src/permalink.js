@@ -1,32 +1,32 @@
-// What is shown, in the address after '#': a link to it. Whatever stands there is checked before it is used.
+// Permalink: state of the page in the fragment of its URL. The fragment is validated before it is used.
 const numbers = (text, count) => {
-  const found = (text ?? '').split(',').map(Number);
-  return text && found.length === count && found.every(Number.isFinite) ? found : null;
+  const values = (text ?? '').split(',').map(Number);
+  return text && values.length === count && values.every(Number.isFinite) ? values : null;
 };
 
-/** What an address asks for; null for what it does not ask for, or not in numbers. */
+/** Parse a fragment; null for missing and invalid values. */
 export function read(hash) {
-  const asked = new URLSearchParams(hash.slice(1));
-  const line = numbers(asked.get('line'), 4);
-  const view = numbers(asked.get('view'), 3);
+  const parameters = new URLSearchParams(hash.slice(1));
+  const line = numbers(parameters.get('line'), 4);
+  const view = numbers(parameters.get('view'), 3);
   return {
-    image: asked.get('image'),
-    layer: asked.get('layer'),
-    colours: asked.get('colours'),
-    stretch: numbers(asked.get('stretch'), 2),
-    over: asked.has('over') ? asked.get('over').split(',') : null,
+    image: parameters.get('image'),
+    layer: parameters.get('layer'),
+    colours: parameters.get('colours'),
+    stretch: numbers(parameters.get('stretch'), 2),
+    over: parameters.has('over') ? parameters.get('over').split(',') : null,
     view: view && view[2] > 0 ? view : null,
     line: line && [line.slice(0, 2), line.slice(2)],
   };
 }
 
-/** Put what is shown into the address, and tell the window around the map; the browser's history does not grow. */
+/** Write the state into the URL and post it to the window around the map, without a new entry in the history. */
 export function write({ image, layer, colours, stretch, over, view, line }, decimals) {
   const fixed = (values, more = 0) => values.map((value) => Number(value.toFixed(decimals + more))).join(',');
-  const asked = new URLSearchParams({ image, layer, colours, stretch: stretch.join(','), over: over.join(',') });
-  asked.set('view', `${fixed(view.slice(0, 2))},${Number(view[2].toPrecision(4))}`);
-  if (line) asked.set('line', fixed(line.flat()));
-  history.replaceState(null, '', `#${asked.toString().replaceAll('%2C', ',').replaceAll('%2F', '/')}`);
-  const said = { hash: location.hash, title: document.title };
-  if (parent !== window) parent.postMessage(said, `${location.protocol}//localhost:${location.port}`);
+  const parameters = new URLSearchParams({ image, layer, colours, stretch: stretch.join(','), over: over.join(',') });
+  parameters.set('view', `${fixed(view.slice(0, 2))},${Number(view[2].toPrecision(4))}`);
+  if (line) parameters.set('line', fixed(line.flat()));
+  history.replaceState(null, '', `#${parameters.toString().replaceAll('%2C', ',').replaceAll('%2F', '/')}`);
+  const state = { hash: location.hash, title: document.title };
+  if (parent !== window) parent.postMessage(state, `${location.protocol}//localhost:${location.port}`);
 }

@@ -1,4 +1,4 @@
-// The campaign's CRS: a projection for OpenLayers, and longitude and latitude that are held against PROJ's.
+// The campaign's CRS: projection for OpenLayers, and geographic coordinates checked against PROJ at control points.
 import proj4 from 'proj4';
 import Projection from 'ol/proj/Projection.js';
 import { addProjection } from 'ol/proj.js';
@@ -6,18 +6,18 @@ import { register } from 'ol/proj/proj4.js';
 import { notice, number } from './dom.js';
 
 const CODE = 'CAMPAIGN';
-const WORST_M = 0.01; // by which longitude and latitude may differ from PROJ's, on the ground
+const WORST_M = 0.01; // tolerated difference from PROJ, metres on the ground
 const DEGREE_M = 111320;
 
 export class Places {
   constructor({ crs, grid }) {
     this.grid = grid;
     this.crs = crs;
-    // As many decimals as tell a tenth of a pixel.
+    // Enough decimals to resolve a tenth of a pixel.
     this.decimals = Math.min(4, Math.max(0, 1 + Math.ceil(-Math.log10(grid.spacing_m))));
     this.toGeographic = crs.local || !crs.proj4 ? null : proj4(crs.proj4, 'WGS84').forward;
     if (this.toGeographic && !(this.errorM() <= WORST_M)) {
-      notice(`WGS 84 is not shown: this page's arithmetic differs from PROJ's by ${number(this.errorM(), 3)} m in ${crs.name}.`);
+      notice(`WGS 84 coordinates are not displayed: this page's projection differs from PROJ by ${number(this.errorM(), 3)} m in ${crs.name}.`);
       this.toGeographic = null;
     }
     if (this.toGeographic) {
@@ -33,7 +33,7 @@ export class Places {
     if (!this.toGeographic) addProjection(this.projection);
   }
 
-  /** By how much the control places are missed at most, metres. */
+  /** Return the maximum error at the control points, metres. */
   errorM() {
     const errors = this.crs.control.map(([x, y, longitude, latitude]) => {
       const [east, north] = this.toGeographic([x, y]);
@@ -42,13 +42,13 @@ export class Places {
     return errors.length ? Math.max(...errors) : Infinity;
   }
 
-  /** Easting and northing in words; x and y where nothing is north. */
+  /** Format easting and northing, or x and y of a local frame. */
   words([x, y]) {
     if (!this.toGeographic) return `x ${number(x, this.decimals)} m  y ${number(y, this.decimals)} m`;
     return `E ${number(x, this.decimals)} m  N ${number(y, this.decimals)} m`;
   }
 
-  /** Latitude and longitude in words; empty in a frame that has no place on Earth. */
+  /** Format latitude and longitude; empty for a local frame. */
   geographicWords(at) {
     if (!this.toGeographic) return '';
     const [longitude, latitude] = this.toGeographic([...at]);
@@ -57,7 +57,7 @@ export class Places {
     return `${part(latitude, 'N', 'S')}  ${part(longitude, 'E', 'W')}`;
   }
 
-  /** By how much true north lies to the right of the map's, degrees; null where nothing is north. */
+  /** Return the angle of true north to the right of grid north, degrees; null for a local frame. */
   convergence() {
     if (!this.toGeographic) return null;
     const [west, south, east, north] = this.grid.bounds_m;
@@ -67,13 +67,13 @@ export class Places {
     return (-Math.atan2(right, to[1] - from[1]) * 180) / Math.PI;
   }
 
-  /** Row and column, with fractions, of a place; whole numbers are the middles of pixels. */
+  /** Return fractional row and column of a point; integers are pixel centres. */
   pixelOf([x, y]) {
     const [west, , , north] = this.grid.bounds_m;
     return [(north - y) / this.grid.spacing_m - 0.5, (x - west) / this.grid.spacing_m - 0.5];
   }
 
-  /** Easting and northing of a row and a column. */
+  /** Return easting and northing of a row and a column. */
   placeOf([row, column]) {
     const [west, , , north] = this.grid.bounds_m;
     return [west + (column + 0.5) * this.grid.spacing_m, north - (row + 0.5) * this.grid.spacing_m];

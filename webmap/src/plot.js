@@ -1,15 +1,15 @@
-// A plot of values along a line, as SVG with axes.
+// Plot of values along a line, as SVG with axes.
 import { drawn, number } from './dom.js';
 
 const EDGE = { left: 52, right: 14, top: 10, bottom: 34 };
 
-/** A plot of samples (distance, value) of a unit into a box of so many pixels. */
+/** Plot samples (distance, value) in a box of the given size in pixels. */
 export function plot(samples, unit, width, height) {
   const svg = drawn('svg', { width, height, viewBox: `0 0 ${width} ${height}`, role: 'img' });
   svg.append(drawn('title', {}, `values along the line, ${unit}`));
-  const seen = samples.filter((one) => Number.isFinite(one.value));
+  const values = samples.map((sample) => sample.value).filter(Number.isFinite);
   const far = samples.at(-1).distance;
-  const [low, high] = span(seen.map((one) => one.value));
+  const [low, high] = span(values);
   const x = (distance) => EDGE.left + (distance / far) * (width - EDGE.left - EDGE.right);
   const y = (value) => EDGE.top + ((high - value) / (high - low)) * (height - EDGE.top - EDGE.bottom);
   for (const [value, decimals] of ticks(low, high, Math.max(2, height / 40))) {
@@ -21,14 +21,14 @@ export function plot(samples, unit, width, height) {
     const middle = { x: x(value), y: height - EDGE.bottom + 15, 'text-anchor': 'middle' };
     svg.append(drawn('text', middle, number(value, decimals)));
   }
-  svg.append(drawn('text', { x: width - EDGE.right, y: height - 4, 'text-anchor': 'end' }, 'along the line, m'));
-  const turned = { x: 12, y: EDGE.top + 4, transform: `rotate(-90 12 ${EDGE.top + 4})`, 'text-anchor': 'end' };
-  svg.append(drawn('text', turned, unit));
+  svg.append(drawn('text', { x: width - EDGE.right, y: height - 4, 'text-anchor': 'end' }, 'distance along the line, m'));
+  const rotated = { x: 12, y: EDGE.top + 4, transform: `rotate(-90 12 ${EDGE.top + 4})`, 'text-anchor': 'end' };
+  svg.append(drawn('text', rotated, unit));
   svg.append(drawn('path', { d: path(samples, x, y), class: 'cut' }));
   return svg;
 }
 
-/** A path that stops where there is no value. */
+/** Return path data that are interrupted at samples without a value. */
 function path(samples, x, y) {
   let pen = 'M';
   return samples
@@ -46,12 +46,12 @@ function path(samples, x, y) {
 
 function span(values) {
   if (!values.length) return [0, 1];
-  const [low, high] = values.reduce(([least, most], one) => [Math.min(least, one), Math.max(most, one)], [Infinity, -Infinity]);
+  const [low, high] = values.reduce(([least, most], value) => [Math.min(least, value), Math.max(most, value)], [Infinity, -Infinity]);
   const margin = 0.05 * (high - low) || 1;
   return [low - margin, high + margin];
 }
 
-/** Round values between two ends, about so many, with the decimals that they need. */
+/** Return about `about` round tick values between two limits, each with its number of decimals. */
 export function ticks(low, high, about) {
   const raw = (high - low) / about;
   const power = 10 ** Math.floor(Math.log10(raw));
@@ -61,9 +61,9 @@ export function ticks(low, high, about) {
   return Array.from({ length: Math.floor(high / step) - first + 1 }, (_, index) => [(first + index) * step, decimals]);
 }
 
-/** Width of the highest peak where it has lost 3 dB, metres; null where the line does not hold both sides. */
+/** Return the −3 dB width of the highest peak, metres; null if the line does not contain both edges. */
 export function width3dB(samples) {
-  const best = samples.reduce((most, one, index) => (one.value > (samples[most]?.value ?? -Infinity) ? index : most), -1);
+  const best = samples.reduce((highest, sample, index) => (sample.value > (samples[highest]?.value ?? -Infinity) ? index : highest), -1);
   if (best < 0) return null;
   const level = samples[best].value - 10 * Math.log10(2);
   const side = (step) => {

@@ -1,4 +1,4 @@
-// Values of one GeoTIFF at full resolution, read by ranges of bytes: what the readout, peaks and cuts tell.
+// Values of a GeoTIFF at full resolution, read by byte ranges, for the readout, peaks and cross-sections.
 import { fromUrl } from 'geotiff';
 import { top } from './peak.js';
 
@@ -10,20 +10,20 @@ export class Raster {
     this.layer = layer;
     this.places = places;
     this.opened = this.open();
-    this.opened.catch(() => {}); // told where it is used
+    this.opened.catch(() => {}); // reported by the functions that await it
   }
 
   async open() {
     const image = await (await fromUrl(this.layer.url)).getImage();
     const { bounds_m: bounds, spacing_m: spacing, shape } = this.places.grid;
-    const off = image.getBoundingBox().map((edge, side) => Math.abs(edge - bounds[side]));
-    if (image.getHeight() !== shape[0] || image.getWidth() !== shape[1] || Math.max(...off) > spacing / 1000)
+    const offsets = image.getBoundingBox().map((edge, side) => Math.abs(edge - bounds[side]));
+    if (image.getHeight() !== shape[0] || image.getWidth() !== shape[1] || Math.max(...offsets) > spacing / 1000)
       throw new Error(`${this.layer.file} is not on the campaign's grid`);
     this.nodata = image.getGDALNoData();
     return image;
   }
 
-  /** Values of rows and columns, the last ones not included, NaN where there is none; null beyond the grid. */
+  /** Read a window, `bottom` and `right` excluded; NaN for pixels without a value, null outside the grid. */
   async window(top, left, bottom, right) {
     const [rows, columns] = this.places.grid.shape;
     const [row, column] = [Math.max(0, top), Math.max(0, left)];
@@ -40,17 +40,17 @@ export class Raster {
     return { row, column, end, last, at };
   }
 
-  /** The value of the pixel under a place, NaN where there is none. */
+  /** Return the value of the pixel at a point; NaN if it has none. */
   async value(place) {
     const [row, column] = this.places.pixelOf(place).map(Math.round);
     const window = await this.window(row, column, row + 1, column + 1);
     return window ? window.at(row, column) : NaN;
   }
 
-  /** The highest pixel around a place, and its top between the pixels. */
+  /** Return the highest pixel around a point, and its subpixel peak position. */
   async peak(place, reach) {
     const [row, column] = this.places.pixelOf(place).map(Math.round);
-    const wide = reach + 3; // of which `top` looks at the neighbours
+    const wide = reach + 3; // `top` also uses the neighbours of the highest pixel
     const window = await this.window(row - wide, column - wide, row + wide + 1, column + wide + 1);
     if (!window) return null;
     let best = null;
@@ -65,7 +65,7 @@ export class Raster {
     return { place: this.places.placeOf([y + down, x + right]), value };
   }
 
-  /** Values along a line: distance (m), place and value of each sample; half a pixel apart, or as many as are told. */
+  /** Return distance (m), point and value of samples along a line, every half pixel and at most `MOST_SAMPLES`. */
   async along(from, to) {
     const length = Math.hypot(to[0] - from[0], to[1] - from[1]);
     const count = Math.min(MOST_SAMPLES, Math.max(2, Math.ceil((2 * length) / this.places.grid.spacing_m) + 1));
@@ -93,7 +93,7 @@ export class Raster {
 
 const nearest = (at, [row, column]) => at(Math.round(row), Math.round(column));
 
-/** dB of the power between four pixels: decibels are not what adds up. */
+/** Interpolate bilinearly in linear power between four pixels; returns dB. */
 function bilinearPower(at, [row, column]) {
   const [y, x] = [Math.floor(row), Math.floor(column)];
   const [down, right] = [row - y, column - x];

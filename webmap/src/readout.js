@@ -1,12 +1,12 @@
-// Where the pointer is, in both systems of coordinates, and what the pixel there holds.
+// Position of the pointer in map and geographic coordinates, and value of the pixel there.
 import { byId, number } from './dom.js';
 
 const PAUSE_MS = 40;
 
 export class Readout {
-  /** `raster` and `mask` give what is read, or null. */
+  /** `raster` and `mask` are functions that return the rasters to read, or null. */
   constructor(chart, places, raster, mask, classes) {
-    Object.assign(this, { chart, places, raster, mask, classes, asked: 0 });
+    Object.assign(this, { chart, places, raster, mask, classes, request: 0 });
     const { map } = chart;
     map.on('pointermove', (event) => {
       if (!event.dragging) this.at(event.coordinate);
@@ -26,22 +26,22 @@ export class Readout {
     map.getViewport().addEventListener('pointerleave', () => this.place && this.at(this.place));
   }
 
-  /** Tell of a place, soon. */
+  /** Show the coordinates of a point at once, and its value after a pause. */
   at(place) {
     this.place = place;
     byId('place').textContent = this.places.words(place);
     byId('geographic').textContent = this.places.geographicWords(place);
-    const asked = ++this.asked;
-    setTimeout(() => asked === this.asked && this.tell(place, asked), PAUSE_MS);
+    const request = ++this.request;
+    setTimeout(() => request === this.request && this.showValue(place, request), PAUSE_MS);
   }
 
   refresh() {
     if (this.place) this.at(this.place);
   }
 
-  async tell(place, asked) {
-    const words = await Promise.all([this.value(place), this.masked(place)]).catch((error) => [error.message]);
-    if (asked === this.asked) byId('value').textContent = words.filter(Boolean).join(' · ');
+  async showValue(place, request) {
+    const texts = await Promise.all([this.value(place), this.masked(place)]).catch((error) => [error.message]);
+    if (request === this.request) byId('value').textContent = texts.filter(Boolean).join(' · ');
   }
 
   async value(place) {

@@ -1,4 +1,4 @@
-// The cross-section tool: a line on the map, its values below, and as CSV.
+// Cross-section tool: a line on the map, with a plot of its values and a CSV export.
 import Draw from 'ol/interaction/Draw.js';
 import { byId, element, number } from './dom.js';
 import { plot, width3dB } from './plot.js';
@@ -7,9 +7,9 @@ const NAMES = { earth: ['from E', 'from N', 'to E', 'to N'], local: ['from x', '
 const HEIGHT = 190;
 
 export class Section {
-  /** `raster` gives what is cut now; `changed` hears of a new line. */
+  /** `raster` is a function that returns the raster on display; `changed` is called after a change of the line. */
   constructor(chart, places, raster, changed) {
-    Object.assign(this, { chart, places, raster, changed, ends: null, asked: 0 });
+    Object.assign(this, { chart, places, raster, changed, ends: null, request: 0 });
     this.inputs = NAMES[places.toGeographic ? 'earth' : 'local'].map((name) => {
       const input = element('input', { type: 'number', step: 'any' });
       input.addEventListener('change', () => this.typed());
@@ -28,7 +28,7 @@ export class Section {
     this.tool = new Draw({ type: 'LineString', maxPoints: 2, source: undefined });
     this.tool.on('drawend', ({ feature }) => {
       const ends = feature.getGeometry().getCoordinates();
-      setTimeout(() => this.stop()); // the tool is still at work while it tells
+      setTimeout(() => this.stop()); // the tool must not be removed inside its own event
       this.set(ends);
     });
     this.chart.map.addInteraction(this.tool);
@@ -46,34 +46,34 @@ export class Section {
     if (values.every(Number.isFinite)) this.set([values.slice(0, 2), values.slice(2)]);
   }
 
-  /** Cut along a line, ends as [x, y]; null: no line. */
+  /** Set the line by its end points [x, y]; null, or a line of length zero, removes it. */
   set(ends) {
-    const real = ends && Math.hypot(ends[1][0] - ends[0][0], ends[1][1] - ends[0][1]) > 0 ? ends : null;
-    this.ends = real;
+    const valid = ends && Math.hypot(ends[1][0] - ends[0][0], ends[1][1] - ends[0][1]) > 0 ? ends : null;
+    this.ends = valid;
     this.inputs.forEach((input, index) => {
-      input.value = real ? real.flat()[index].toFixed(this.places.decimals) : '';
+      input.value = valid ? valid.flat()[index].toFixed(this.places.decimals) : '';
     });
-    this.chart.drawLine(real);
+    this.chart.drawLine(valid);
     this.changed();
     return this.refresh();
   }
 
-  /** Read the values again: another line, or another raster under it. */
+  /** Read the values after a change of the line or the raster. */
   async refresh() {
-    const asked = ++this.asked;
+    const request = ++this.request;
     this.samples = null;
     const raster = this.raster();
     let problem = '';
     if (this.ends && raster)
       try {
         const samples = await raster.along(...this.ends);
-        if (asked !== this.asked) return;
+        if (request !== this.request) return;
         this.samples = samples;
         this.of = raster.layer;
       } catch (error) {
         problem = error.message;
       }
-    if (asked !== this.asked) return;
+    if (request !== this.request) return;
     byId('section').hidden = !this.ends;
     byId('clear').disabled = !this.ends;
     byId('csv').disabled = !this.samples;
@@ -88,23 +88,23 @@ export class Section {
   }
 
   words() {
-    const best = this.samples.reduce((most, one) => (one.value > most.value ? one : most), { value: -Infinity });
-    if (!Number.isFinite(best.value)) return 'no value along this line';
-    const apart = this.samples[1].distance;
-    const told = [`highest ${number(best.value, 2)} ${this.of.unit} at ${number(best.distance, 3)} m`];
+    const best = this.samples.reduce((highest, sample) => (sample.value > highest.value ? sample : highest), { value: -Infinity });
+    if (!Number.isFinite(best.value)) return 'no values along this line';
+    const spacing = this.samples[1].distance;
+    const parts = [`maximum ${number(best.value, 2)} ${this.of.unit} at ${number(best.distance, 3)} m`];
     const width = this.of.unit === 'dB' ? width3dB(this.samples) : null;
-    if (width !== null) told.push(`−3 dB width ${number(width, 3)} m`);
-    const how = this.of.unit === 'dB' ? 'bilinear in power' : 'nearest pixels';
-    return `${told.join(' · ')} · samples ${number(apart, 3)} m apart, ${how}`;
+    if (width !== null) parts.push(`−3 dB width ${number(width, 3)} m`);
+    const interpolation = this.of.unit === 'dB' ? 'bilinear in power' : 'nearest pixel';
+    return `${parts.join(' · ')} · sample spacing ${number(spacing, 3)} m, ${interpolation}`;
   }
 
   save() {
     const geographic = this.places.toGeographic;
-    const onEarth = ['easting_m', 'northing_m', 'longitude_deg', 'latitude_deg'];
-    const names = ['distance_m', ...(geographic ? onEarth : ['x_m', 'y_m'])];
+    const georeferenced = ['easting_m', 'northing_m', 'longitude_deg', 'latitude_deg'];
+    const names = ['distance_m', ...(geographic ? georeferenced : ['x_m', 'y_m'])];
     const rows = this.samples.map(({ distance, place, value }) => {
-      const degrees = geographic ? geographic([...place]).map((one) => one.toFixed(9)) : [];
-      const metres = [distance, ...place].map((one) => one.toFixed(4));
+      const degrees = geographic ? geographic([...place]).map((angle) => angle.toFixed(9)) : [];
+      const metres = [distance, ...place].map((length) => length.toFixed(4));
       return [...metres, ...degrees, Number.isFinite(value) ? value.toFixed(4) : ''].join(',');
     });
     const unit = this.of.unit.toLowerCase().replace(/[^a-z0-9]/g, '') || 'value';

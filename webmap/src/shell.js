@@ -1,5 +1,5 @@
-// The window around the map. The map is a frame of another origin: where that may be led to is for this window's policy
-// to say, and it can neither lead this window elsewhere nor open another. Of it come the permalink and a title, no more.
+// The window around the map. The map is a frame of another origin: this window's policy limits the navigation of the
+// frame, which can neither navigate this window nor open another. The window receives only permalink and title from it.
 import './shell.css';
 
 const origin = `${location.protocol}//127.0.0.1:${location.port}`;
@@ -9,8 +9,8 @@ Object.assign(frame, { title: 'map', sandbox: 'allow-scripts allow-same-origin a
 document.body.append(frame);
 
 addEventListener('hashchange', () => frame.contentWindow.location.replace(address()));
-addEventListener('message', (said) => {
-  if (said.source !== frame.contentWindow || said.origin !== origin) return;
-  history.replaceState(null, '', `#${String(said.data.hash).slice(1)}`);
-  document.title = String(said.data.title);
+addEventListener('message', (message) => {
+  if (message.source !== frame.contentWindow || message.origin !== origin) return;
+  history.replaceState(null, '', `#${String(message.data.hash).slice(1)}`);
+  document.title = String(message.data.title);
 });

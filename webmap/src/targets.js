@@ -1,24 +1,24 @@
-// The target list: where points are said to be, and where the image shown has its peak near them.
+// Target list: known positions of points, and positions of the image peaks near them.
 import { byId, element, number } from './dom.js';
 
-const SOURCES = { truth: 'true place', stated: 'stated in the config', found: 'found in the image' };
-const REACH_M = 0.3; // around a place, or so many pixels
+const SOURCES = { truth: 'true position', stated: 'from the config', found: 'detected in the image' };
+const REACH_M = 0.3; // search radius around a target, at least `REACH_PX` pixels
 const REACH_PX = 4;
 
 export class Targets {
-  /** `raster` gives the image in dB that peaks are looked for in, or null. */
+  /** `raster` is a function that returns the image in dB in which peaks are searched, or null. */
   constructor(all, chart, places, raster) {
     Object.assign(this, { all, chart, places, raster });
   }
 
-  /** List the targets that an image has: those known beforehand, and those found in it. */
+  /** List the targets of an image: those of the campaign, and those detected in the image. */
   list(image) {
-    const shown = this.all.filter((one) => one.image === null || one.image === image);
+    const shown = this.all.filter((target) => target.image === null || target.image === image);
     this.chart.mark(shown);
     byId('targets-note').textContent = shown.length
-      ? 'Choose one to see it, and the peak that the image has there.'
-      : 'No points are known: the campaign has no truth.json and no reference points.';
-    byId('targets').replaceChildren(...shown.map((one) => this.row(one)));
+      ? 'Select a target to zoom to it and to measure the image peak near it.'
+      : 'No targets: the campaign has neither truth.json nor reference points.';
+    byId('targets').replaceChildren(...shown.map((target) => this.row(target)));
   }
 
   row(target) {
@@ -39,20 +39,20 @@ export class Targets {
   async measure(at, output) {
     const raster = this.raster();
     if (!raster) {
-      output.textContent = 'choose a layer in dB to measure its peak';
+      output.textContent = 'select a layer in dB to measure the peak';
       return;
     }
     const reach = Math.max(REACH_PX, Math.round(REACH_M / this.places.grid.spacing_m));
     try {
       const peak = await raster.peak(at, Math.min(reach, 64));
       if (!peak) {
-        output.textContent = 'outside the image, or no power there';
+        output.textContent = 'outside the image, or no value there';
         return;
       }
       const [east, north] = peak.place.map((value, axis) => value - at[axis]);
       const [right, up] = this.places.toGeographic ? ['east', 'north'] : ['along x', 'along y'];
-      const off = `${number(100 * east, 1)} cm ${right}, ${number(100 * north, 1)} cm ${up} of it`;
-      output.textContent = `peak ${number(peak.value, 2)} dB at ${this.places.words(peak.place)}: ${off}`;
+      const offset = `offset ${number(100 * east, 1)} cm ${right}, ${number(100 * north, 1)} cm ${up}`;
+      output.textContent = `peak ${number(peak.value, 2)} dB at ${this.places.words(peak.place)}; ${offset}`;
       output.dataset.east = peak.place[0].toFixed(6);
       output.dataset.north = peak.place[1].toFixed(6);
     } catch (error) {

@@ -1,6 +1,7 @@
-"""What is wrong with a campaign folder, all of it at once, before anything runs: headers, logs and numbers, no samples.
+"""Check of a campaign folder before a run: configuration, headers, logs and DEM, without reading samples.
 
-A problem is what cannot be imaged at all; what makes an image worse is measured by a step, and is a flag.
+All problems are reported at once. A problem prevents imaging; a condition that only degrades images is measured by a
+step, which raises a flag.
 """
 
 import shlex
@@ -71,26 +72,26 @@ CHECKS: Mapping[str, Check] = {
     "imaging": _CHECKS_OF.reach.check_imaging,
     "plan": _CHECKS_OF.reach.check_plan,
 }
-"""Name → function of an `Examination` that yields problems, or raises one."""
+"""Name of each check → function of an `Examination` that yields problems, or raises one."""
 
 LAST = frozenset({"imaging", "plan"})
-"""Of these, what is asked where nothing else is wrong: it opens pairs as steps do, and would say the same again."""
+"""Checks that run only without other problems: they open pairs as the steps do, and would repeat these problems."""
 
 
 def problems(root: str | Path, *, without: Collection[str] = ()) -> list[CampaignError]:
-    """Return what is wrong with a campaign folder; an empty list: nothing known.
+    """Check a campaign folder and return its problems; an empty list if none are found.
 
     Parameters
     ----------
     root
         The campaign folder.
     without
-        Names of checks to leave out, such as 'memory' where steps run on another machine.
+        Names of checks to omit, such as 'memory' if steps run on another machine.
 
     Examples
     --------
     >>> [str(problem) for problem in problems("nowhere")]
-    ['nowhere: no such folder; expected a campaign folder. `apertura init` makes one.']
+    ['nowhere: no such folder; expected a campaign folder. Create one with `apertura init`.']
     """
     campaign, wrong = load(Path(root))
     if campaign is None:
@@ -101,16 +102,16 @@ def problems(root: str | Path, *, without: Collection[str] = ()) -> list[Campaig
 
 
 def problems_of(examined: "Examination", *, without: Collection[str] = ()) -> list[CampaignError]:
-    """Return what is wrong with a campaign that is opened already; `without` as of `problems`."""
+    """Check an opened campaign and return its problems; `without` as for `problems`."""
     wrong: list[CampaignError] = []
     for name, function in CHECKS.items():
         if name not in without and not (name in LAST and wrong):
-            wrong += _each(function, examined)
+            wrong += _problems_of_check(function, examined)
     return list({str(problem): problem for problem in wrong}.values())
 
 
 def print_problems(root: str | Path, *, without: Collection[str] = (), stream: TextIO | None = None) -> int:
-    """Print the problems of a campaign folder, one line each, else what to know of it; return how many problems."""
+    """Print the problems of a campaign folder, one line each, or notes if there are none; return their number."""
     return _print_problems(*_examined(root), without=without, stream=stream or sys.stdout)
 
 
@@ -134,29 +135,29 @@ def _print_problems(
 
 
 def assumptions(examined: "Examination") -> Iterator[str]:
-    """Yield what is assumed where the config leaves it open, and is easily wrong."""
+    """Yield notes on uncertain assumptions that replace missing configuration."""
     from apertura.core.geometry.geodesy import LOCAL, geodetic_from_ecef
 
     scene = examined.campaign.settings.scene
     if scene.height_is_default and scene.crs != LOCAL and examined.middle_m is not None:
         above_m = float(geodetic_from_ecef(examined.middle_m)[2])
         yield (
-            f"note: {HEIGHT_DEFAULT}; the track is {above_m:.0f} m above the ellipsoid. State scene.height_m, or a "
-            "DEM by scene.dem"
+            f"note: {HEIGHT_DEFAULT}; the track is {above_m:.0f} m above the ellipsoid. Set scene.height_m, or "
+            "configure a DEM in scene.dem"
         )
 
 
 def print_findings(root: str | Path, *, products: bool = False, paranoid: bool = False) -> int:
-    """Print the problems of a campaign folder and which of its results are stale; return how many lines.
+    """Print the problems of a campaign folder and its out-of-date results; return the number of lines.
 
     Parameters
     ----------
     root
         The campaign folder.
     products
-        Read every byte of the results, too, and name what is not as it was written.
+        Read all results, too, and report damaged files.
     paranoid
-        Read every input again, also those that have not changed since they were hashed.
+        Hash all inputs again, including those with an unchanged size and modification time.
     """
     examined, wrong = _examined(root, paranoid=paranoid)
     count = _print_problems(examined, wrong, without=(), stream=sys.stdout)
@@ -165,24 +166,27 @@ def print_findings(root: str | Path, *, products: bool = False, paranoid: bool =
     from apertura.workflow.stale import absent_lines, damaged_results, stale_lines
 
     campaign = examined.campaign
-    for line in absent_lines(campaign):  # nothing is wrong with that
+    for line in absent_lines(campaign):  # notes, not problems
         print(line)
     lines = list(stale_lines(examined.stale))
     if products:
         damaged = damaged_results(campaign).items()
-        lines += [f"{manifest}: damaged, {why}. Delete it and run the workflow again." for manifest, why in damaged]
+        lines += [
+            f"{manifest}: damaged, {reason}. Delete this file and run the workflow again."
+            for manifest, reason in damaged
+        ]
     for line in lines:
         print(line)
     folder = shlex.quote(as_typed(root))
     flights, nodes = len(campaign.flights), sum(len(flight.participants) for flight in campaign.flights)
     files = f"{number_of(flights, 'flight')}, {number_of(nodes, 'recording')} with their logs"
     then = f"apertura run {folder}" if lines else f"apertura plan {folder}, then apertura run {folder}"
-    print(f"no problem found in {files}. Next: {then}")
+    print(f"No problems found in {files}. Next: {then}")
     return len(lines)
 
 
 def as_line(problem: CampaignError) -> str:
-    r"""Return a problem as one line, with the config's place where it names a key alone.
+    r"""Format a problem as one line, with the path of the configuration before a bare key.
 
     Examples
     --------
@@ -192,8 +196,8 @@ def as_line(problem: CampaignError) -> str:
     return " ".join(located(str(problem)).split())
 
 
-def _each(check: Check, examined: "Examination") -> Iterator[CampaignError]:
-    """Yield what a check yields, and what it raises in the end."""
+def _problems_of_check(check: Check, examined: "Examination") -> Iterator[CampaignError]:
+    """Yield the problems that a check yields, and the one that it raises, if any."""
     try:
         yield from check(examined)
     except CampaignError as problem:
@@ -201,14 +205,14 @@ def _each(check: Check, examined: "Examination") -> Iterator[CampaignError]:
 
 
 class _AnyNode(frozenset[str]):
-    """Stands for the nodes of a config that cannot be read: a flight may name any."""
+    """Set that contains any name: replaces the nodes of an unreadable configuration."""
 
     def __contains__(self, _: object) -> bool:
         return True
 
 
 def load(root: Path) -> tuple[Campaign | None, list[CampaignError]]:
-    """Return a campaign, or None and what is wrong with config.yaml and its tables, each read whatever the others are.
+    """Load a campaign; return it, or None, with the problems of config.yaml and of its tables, each read independently.
 
     Examples
     --------
@@ -221,7 +225,7 @@ def load(root: Path) -> tuple[Campaign | None, list[CampaignError]]:
         return None, [problem]
     root = ConfinedPath.at(root)
     if not root.is_dir():
-        remedy = "`apertura init` makes one."
+        remedy = "Create one with `apertura init`."
         return None, [CampaignError("no such folder", where=root, expected="a campaign folder", remedy=remedy)]
     wrong: list[CampaignError] = []
     settings = _tried(lambda: read_settings(root / CONFIG), wrong)
@@ -246,7 +250,7 @@ def _tried(read: Callable[[], T], wrong: list[CampaignError]) -> T | None:
 
 
 def _listed_flights(path: Path) -> tuple[Flight, ...]:
-    """Return the flights of a table with a line that is wrong, as it names them, so that segments are compared."""
+    """Return the flights of an invalid table, unvalidated, for comparison with segments and clocks."""
     rows = _tried(
         lambda: [cells for _, cells in table_rows(path, ["flight", "kind", "transmitter", "nodes"], remedy="")], []
     )

@@ -1,4 +1,4 @@
-"""A campaign's recordings, logs, ground and grid, each opened once at the first use."""
+"""Recordings, logs, terrain and grid of a campaign, each opened once on first use."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -33,20 +33,20 @@ T = TypeVar("T")
 Key = tuple[str, str]
 """Flight and node."""
 
-_SMALL_BYTES = 64 << 20  # of phase history, which is read to be checked
-_NODES = 128  # pixels along a side of a grid whose spacing is not settled yet
+_SMALL_BYTES = 64 << 20  # largest phase history that is read by the check
+_NODES = 128  # pixels along the shorter side of a grid with automatic spacing
 
 
 @dataclass(frozen=True)
 class Examination:
-    """A campaign and its files, opened; what is wrong with those that do not open stands beside.
+    """Opened files of a campaign, and the problems of files that could not be opened.
 
     Parameters
     ----------
     campaign
         Settings and flights.
     paranoid
-        Hash every input of the results again, also those that have not changed since.
+        Hash all inputs of the results again, including those with an unchanged size and modification time.
     """
 
     campaign: Campaign
@@ -54,23 +54,23 @@ class Examination:
 
     @cached_property
     def stale(self) -> dict[str, str]:
-        """Manifest of each result that is out of date → why, as `stale_results`."""
+        """Manifest of each result that is out of date → reason, as in `stale_results`."""
         return stale_results(self.campaign, paranoid=self.paranoid)
 
     @property
     def waveform(self) -> SampledWaveform | None:
         """Transmitted waveform of a campaign recorded as samples; None: phase history."""
-        stated = self.campaign.settings.waveform
-        return stated if isinstance(stated, SampledWaveform) else None
+        waveform = self.campaign.settings.waveform
+        return waveform if isinstance(waveform, SampledWaveform) else None
 
     @property
     def transmitted(self) -> "Transmitted | None":
-        """Transmitted signal; None without samples, or where the file contradicts the waveform settings."""
+        """Transmitted signal; None without samples, or if the file contradicts the waveform settings."""
         return self._transmitted[0]
 
     @property
     def transmitted_problems(self) -> list[CampaignError]:
-        """Faults of the file of the transmitted signal."""
+        """Problems of the file of the transmitted signal."""
         return self._transmitted[1]
 
     @cached_property
@@ -84,48 +84,48 @@ class Examination:
 
     @property
     def keys(self) -> tuple[Key, ...]:
-        """Every flight and node of which something was recorded, or a log is needed."""
+        """Flights and nodes with a recording, or with a log that is required."""
         every = [(flight, node) for flight in self.campaign.flights for node in flight.recorded]
         return tuple(
             (flight.name, node) for flight, node in every if self.waveform or self.campaign.logged(flight.name, node)
         )
 
     def needs_log(self, key: Key) -> bool:
-        """Test whether a flight needs the logs of its nodes: on a bench nothing moves."""
+        """Return True if a flight requires the logs of its nodes: all kinds except bench."""
         return self.campaign.flight(key[0]).kind != "bench"
 
     @property
     def recordings(self) -> dict[Key, "Recording"]:
-        """Recordings that open."""
+        """Recordings that could be opened."""
         return self._recordings[0]
 
     @cached_property
     def recorded(self) -> dict[Key, RecordingFacts]:
-        """Facts of the headers of these recordings."""
+        """Header contents of these recordings."""
         return {key: recording_facts(recording) for key, recording in self.recordings.items()}
 
     @property
     def recording_problems(self) -> list[CampaignError]:
-        """Why other recordings cannot be opened."""
+        """Problems of the recordings that could not be opened."""
         return self._recordings[1]
 
     @property
     def tracks(self) -> dict[Key, "xr.Dataset"]:
-        """Flight logs that can be read, as `track` stages."""
+        """Readable flight logs, as datasets of stage `track`."""
         return self._tracks[0]
 
     @cached_property
     def logs(self) -> dict[Key, LogFacts]:
-        """Facts of these logs."""
+        """Contents of these logs."""
         return {key: log_facts(track) for key, track in self.tracks.items()}
 
     @property
     def track_problems(self) -> list[CampaignError]:
-        """Why other logs cannot be read."""
+        """Problems of the logs that could not be read."""
         return self._tracks[1]
 
     def opens(self, flight: str, pair: str) -> bool:
-        """Test whether a pair can be opened by logs and headers, or its phase history is small."""
+        """Return True if the logs and headers of a pair were opened, or its phase history is small."""
         if self.waveform is not None:
             keys = {(flight, node) for node in pair.split("-")}
             return keys <= self.tracks.keys() & self.recordings.keys()
@@ -134,7 +134,7 @@ class Examination:
 
     @cached_property
     def history_problems(self) -> list[CampaignError]:
-        """Faults of phase history: of every pair whose files are small, and of one that states the frame."""
+        """Problems of phase histories: of all pairs with small files, and of one pair if needed for the frame."""
         if self.waveform is not None:
             return []
         from apertura.stages.transfer import recorded_echo
@@ -144,7 +144,7 @@ class Examination:
         for number, (flight, pair) in enumerate(pairs):
             try:
                 files = self.campaign.history_files(flight, pair.split("-")[1])
-            except CampaignError:  # for 'files' to name
+            except CampaignError:  # reported by check 'files'
                 continue
             size = sum(map(size_of, files))
             if not size or (size > _SMALL_BYTES and (number or self.frame)):
@@ -160,7 +160,7 @@ class Examination:
         return self._each(self.campaign.recording_files, self._opened)
 
     def _opened(self, files: tuple[Path, ...], key: Key) -> "Recording":
-        """Return a recording by the clock of its node's log."""
+        """Open a recording and convert its times to UTC by the clock of its node."""
         recording = open_recording(files)
         captures = recording.captures
         return replace(recording, captures=replace(captures, time=self.campaign.clock(*key).utc(captures.time)))
@@ -181,7 +181,7 @@ class Examination:
         open_files: Callable[[tuple[ConfinedPath, ...], Key], T],
         needed: Callable[[Key], bool] = lambda _: True,
     ) -> tuple[dict[Key, T], list[CampaignError]]:
-        """Open files that are there and not empty; the check 'files' names the others."""
+        """Open files that exist and are not empty; all others are reported by check 'files'."""
         opened: dict[Key, T] = {}
         problems: list[CampaignError] = []
         for flight, node in filter(needed, self.keys):
@@ -199,7 +199,7 @@ class Examination:
 
     @property
     def frame(self) -> str:
-        """Frame of the positions, ecef or local; empty where only the samples determine it."""
+        """Frame of the positions, ecef or local; empty if only the phase history determines it."""
         frames = [track.attrs["frame"] for track in self.tracks.values()]
         if frames or self.waveform:
             return next(iter(frames), "ecef")
@@ -207,7 +207,7 @@ class Examination:
 
     @cached_property
     def crs(self) -> str | None:
-        """CRS of the scene; `auto` is the zone of the first image flight; None if unknown or not in metres."""
+        """CRS of the scene; `auto` is the UTM zone of the first image flight; None if unknown or not in metres."""
         requested = self.campaign.settings.scene.crs
         if requested != "auto":
             return requested if requested == LOCAL or in_metres(requested) else None
@@ -218,7 +218,7 @@ class Examination:
 
     @property
     def other_frame(self) -> bool:
-        """True if the scene's CRS is another frame than positions are in."""
+        """True if the scene's CRS and the positions have different frames, ecef and local."""
         return bool(self.frame) and (self.campaign.settings.scene.crs == LOCAL) is not (self.frame == LOCAL)
 
     @cached_property
@@ -234,7 +234,7 @@ class Examination:
 
     @cached_property
     def grid(self) -> "SceneGrid | None":
-        """The scene's pixels, coarser ones where the spacing is `auto`; None where bounds are, or the CRS is wrong."""
+        """Grid of the scene, coarser with automatic spacing; None with automatic bounds or an invalid CRS."""
         from apertura.core.scene.grid import SceneGrid
 
         requested = self.campaign.settings.scene
@@ -249,17 +249,17 @@ class Examination:
 
     @property
     def ground(self) -> "ConfiguredGround | None":
-        """The ground as the config states it, opened; None where it cannot be, or the CRS is not known."""
+        """Configured terrain, opened; None if it cannot be opened, or the CRS is unknown."""
         return self._ground[0]
 
     @property
     def ground_problems(self) -> list[CampaignError]:
-        """Why the ground cannot be opened."""
+        """Problems of the configured terrain."""
         return self._ground[1]
 
     @property
     def level_m(self) -> float:
-        """Height of flat ground under the grid, metres above the ellipsoid; of the track, where a DEM says it."""
+        """Height of flat ground under the grid, metres above the ellipsoid; with a DEM, the height of the track."""
         return self._ground[2]
 
     @cached_property
@@ -282,7 +282,7 @@ class Examination:
 
 
 def in_metres(crs: str) -> bool:
-    """Test whether PROJ knows a CRS and it is projected in metres.
+    """Return True if PROJ defines a CRS and it is projected in metres.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Contents of one file as plain values: a flight log, a recording, phase history, a DEM."""
+"""Contents of input files as plain values: flight log, recording, phase history, DEM."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -28,19 +28,19 @@ if TYPE_CHECKING:
     from rasterio import DatasetReader
 
 PRODUCT_TAG = "APERTURA_VERSION"
-"""Tag of every raster that apertura writes."""
+"""Tag of every raster written by apertura."""
 
 METRES = frozenset({"", "m", "metre", "meter", "metres", "meters"})
-"""Units of heights that are metres, or not stated."""
+"""Unit names of heights in metres; an empty name is taken as metres."""
 
 WAVE_M = 0.25
-"""Wavelength that errors between epochs of a log by itself are compared with: L-band."""
+"""Wavelength for the tolerance of errors between epochs of a log without a campaign, metres: L-band."""
 
 _FIX_NAMES = {number: name for name, number in FIXES.items()}
-_ACROSS = 512  # posts along a side of a DEM that are read
+_ACROSS = 512  # largest number of DEM posts read along a side
 
 Range = list[float]
-"""Lowest and highest."""
+"""Minimum and maximum."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,32 +50,32 @@ class LogFacts:
     Attributes
     ----------
     times
-        When it was logged; a gap is longer than `LONG_GAP` intervals.
+        Times of the epochs; a gap is longer than `LONG_GAP` intervals.
     dropped
-        Reason → epochs that the reader left out.
+        Reason → number of epochs excluded by the reader.
     fixes
-        Kind of solution → epochs; None where the log says none.
+        Solution class → number of epochs; None if the log contains no solution class.
     attitude_share
-        Of the epochs, those with roll, pitch and yaw.
+        Share of epochs with roll, pitch and yaw.
     has_attitude
-        Whether any angle is logged at any epoch.
+        True if any angle is logged at any epoch.
     frame
         ecef or local.
     bounds
-        Of `bounds_of`.
+        Result of `bounds_of`.
     middle_m
-        (3,) float64: the median of each coordinate in `frame`, metres.
+        (3,) float64: median of each coordinate in `frame`, metres.
     middle_geodetic
-        (3,) float64: the median of latitude, longitude (deg) and ellipsoidal height (m); None in a local frame.
+        (3,) float64: median of latitude, longitude (deg) and ellipsoidal height (m); None in a local frame.
     length_m
-        Of the straight lines between epochs, metres.
+        Length of the track, straight between epochs, metres.
     median_speed_m_s, largest_speed_m_s
-        Between epochs, metres per second.
+        Speed between epochs, metres per second.
     stated_std_m
-        Median standard deviation to north, east and up, metres, as the log states it; None of an axis, or of all,
-        where it does not.
+        Median standard deviations north, east and up in the log, metres; None for an axis without values, or if no axis
+        has any.
     remarks
-        What a person should know of how it was read.
+        Remarks of the reader for the user.
     """
 
     times: TimeFacts
@@ -95,7 +95,7 @@ class LogFacts:
 
 
 def log_facts(track: "xr.Dataset") -> LogFacts:
-    """Return the contents of a flight log; `track` is its stage."""
+    """Summarise the contents of a flight log, from the dataset of its stage `track`."""
     times, position, frame = track.time.values, track.position.values, track.attrs["frame"]
     steps_m = np.linalg.norm(np.diff(position, axis=0), axis=1)
     speed_m_s = steps_m / np.diff(seconds_since(times, times[0]))
@@ -103,7 +103,7 @@ def log_facts(track: "xr.Dataset") -> LogFacts:
     places = geodetic_from_ecef(position) if frame == "ecef" else position
     return LogFacts(
         times=time_facts(times, longer=LONG_GAP),
-        dropped={why: int(count) for why, count in track.attrs["dropped"].items()},
+        dropped={reason: int(count) for reason, count in track.attrs["dropped"].items()},
         fixes=_fixes(track),
         attitude_share=float(logged.all(axis=1).mean()),
         has_attitude=bool(logged.any()),
@@ -127,7 +127,7 @@ def _stated_std_m(track: "xr.Dataset") -> tuple[float | None, ...] | None:
 
 
 def log_faults(track: "xr.Dataset") -> CheckedTrack:
-    """Return the sound part of a log, where errors of 1/16 of `WAVE_M` are tolerated."""
+    """Check a log with a tolerance of 1/16 of `WAVE_M`, and return its usable part."""
     from apertura.stages.node_log import poorer_fix
 
     poor = poorer_fix(track.fix.values, "auto") if "fix" in track else np.zeros(track.sizes["epoch"], bool)
@@ -140,9 +140,9 @@ def log_faults(track: "xr.Dataset") -> CheckedTrack:
 
 
 def bounds_of(position_m: NDArray[np.float64], frame: str) -> dict[str, Range]:
-    """Return lowest and highest of each coordinate of (n, 3) positions, geodetic where they are on Earth.
+    """Return minimum and maximum of each coordinate of (n, 3) positions; geodetic coordinates for frame ecef.
 
-    Longitudes are those of the west and of the east end: the first is the larger one across the antimeridian.
+    Longitudes are those of the western and the eastern end: the first is larger across the antimeridian.
 
     Examples
     --------
@@ -155,8 +155,8 @@ def bounds_of(position_m: NDArray[np.float64], frame: str) -> dict[str, Range]:
 def _bounds(places: NDArray[np.float64], frame: str) -> dict[str, Range]:
     earth = frame == "ecef"
     names = ("latitude_deg", "longitude_deg", "height_m") if earth else ("east_m", "north_m", "up_m")
-    found = {name: [float(one.min()), float(one.max())] for name, one in zip(names, places.T, strict=True)}
-    return found | ({"longitude_deg": [*longitude_range(places[:, 1])]} if earth else {})
+    bounds = {name: [float(axis.min()), float(axis.max())] for name, axis in zip(names, places.T, strict=True)}
+    return bounds | ({"longitude_deg": [*longitude_range(places[:, 1])]} if earth else {})
 
 
 def _middle(places: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -183,21 +183,21 @@ class RecordingFacts:
     Attributes
     ----------
     channels
-        Their names.
+        Names of the channels.
     sample_rate_hz
         Complex samples per second.
     carrier_hz
-        RF frequency at baseband zero; None where it is not stated.
+        RF frequency at baseband zero; None if not stated.
     samples
-        Of each channel.
+        Number of samples of each channel.
     captures, capture_samples
-        How many, and samples of each.
+        Number of captures, and samples of each.
     span
-        The first and the last capture, or the samples of a recorder that ran through.
+        First and last capture, or the time span of a continuous recording.
     times
-        Of captures; a gap is longer than `LOST_CAPTURE` intervals. None where the recorder ran through.
+        Times of captures; a gap is longer than `LOST_CAPTURE` intervals. None for a continuous recording.
     frames
-        Of captures; None where there are none.
+        Frame counter of captures; None without a counter.
     """
 
     channels: tuple[str, ...]
@@ -212,12 +212,12 @@ class RecordingFacts:
 
     @property
     def runs_through(self) -> bool:
-        """True if the recorder ran through: it was not triggered by pulses."""
+        """True for a continuous recording, not triggered by pulses."""
         return self.times is None
 
 
 def recording_facts(recording: Recording) -> RecordingFacts:
-    """Return the contents of the header of a recording; no sample is read."""
+    """Summarise the header of a recording; no sample is read."""
     captures, triggered = recording.captures, recording.framing is None
     return RecordingFacts(
         channels=tuple(recording.channels),
@@ -246,30 +246,30 @@ def _frames(numbers: NDArray[np.int64]) -> dict[str, int] | None:
 
 @dataclass(frozen=True, eq=False)
 class HistoryFacts:
-    """Contents of phase history.
+    """Contents of a phase history.
 
     Attributes
     ----------
     times
-        Of pulses; a gap is longer than `LOST_CAPTURE` intervals.
+        Times of pulses; a gap is longer than `LOST_CAPTURE` intervals.
     frequencies
-        Of each pulse.
+        Number of frequencies per pulse.
     band_hz
-        The lowest and the highest.
+        Lowest and highest frequency.
     resolution_m, unambiguous_m
-        Of the total path, metres; None of one frequency.
+        Resolution and unambiguous interval of the total path, metres; None for a single frequency.
     frame
-        Of positions, ecef or local; None where there are none.
+        Frame of the positions, ecef or local; None without positions.
     bistatic
-        Whether the antennas are apart.
+        True if the antennas are separated.
     bounds
-        tx and rx → of `bounds_of`.
+        tx and rx → result of `bounds_of`.
     dropped
-        Reason → pulses that the reader left out.
+        Reason → number of pulses excluded by the reader.
     flags
-        That the reader raised.
+        Flags raised by the reader.
     remarks
-        What a person should know of how it was read.
+        Remarks of the reader for the user.
     """
 
     times: TimeFacts
@@ -286,13 +286,14 @@ class HistoryFacts:
 
 
 def history_facts(echo: "xr.Dataset") -> HistoryFacts:
-    """Return the contents of phase history; `echo` is its stage."""
+    """Summarise the contents of a phase history, from the dataset of its stage `echo`."""
     frequency = echo.frequency.values
     band_hz = [float(frequency[0]), float(frequency[-1])]
     step_hz = (band_hz[1] - band_hz[0]) / (frequency.size - 1) if frequency.size > 1 else None
-    placed = "tx_position" in echo
-    tx, rx = (echo.tx_position.values, echo.rx_position.values) if placed else (np.zeros((1, 3)), np.zeros((1, 3)))
-    frame = echo.attrs["frame"] if placed else None
+    has_positions = "tx_position" in echo
+    none = np.zeros((1, 3))
+    tx, rx = (echo.tx_position.values, echo.rx_position.values) if has_positions else (none, none)
+    frame = echo.attrs["frame"] if has_positions else None
     return HistoryFacts(
         times=time_facts(echo.time.values, longer=LOST_CAPTURE),
         frequencies=frequency.size,
@@ -301,8 +302,8 @@ def history_facts(echo: "xr.Dataset") -> HistoryFacts:
         unambiguous_m=None if step_hz is None else SPEED_OF_LIGHT_M_S / step_hz,
         frame=frame,
         bistatic=bool(np.abs(tx - rx).max() > 0),
-        bounds={leg: bounds_of(at, str(frame)) for leg, at in (("tx", tx), ("rx", rx))} if placed else {},
-        dropped={why: int(count) for why, count in echo.attrs.get("dropped", {}).items()},
+        bounds={leg: bounds_of(at, str(frame)) for leg, at in (("tx", tx), ("rx", rx))} if has_positions else {},
+        dropped={reason: int(count) for reason, count in echo.attrs.get("dropped", {}).items()},
         flags=dict(echo.attrs.get("flags", {})),
         remarks=tuple(echo.attrs.get("remarks", ())),
     )
@@ -310,30 +311,30 @@ def history_facts(echo: "xr.Dataset") -> HistoryFacts:
 
 @dataclass(frozen=True, eq=False)
 class DemFacts:
-    """Contents of a raster of heights, or of a product of apertura.
+    """Contents of a height raster, or of a product of apertura.
 
     Attributes
     ----------
     tags
-        Of the file; `PRODUCT_TAG` is among them where it is a product of apertura.
+        Tags of the file, with `PRODUCT_TAG` for a product of apertura.
     description, values_unit
-        Of the first band; empty where the file does not state them. Of heights in a compound CRS the unit is that of
-        its vertical axis.
+        Description and unit of the first band; empty if not stated. With a compound CRS the unit is that of the
+        vertical axis.
     posts
         Rows and columns.
     crs
-        As the file states it; empty where it does not.
+        CRS stated in the file; empty if not stated.
     unit
-        Of its horizontal coordinates.
+        Unit of the horizontal coordinates.
     bounds
         Left, bottom, right, top.
     spacing
-        Of posts, to the east and to the north.
+        Post spacing, east and north.
     bands, dtype
-        How many, and the type of the first.
+        Number of bands, and data type of the first.
     heights
-        (row, column) float32 in `values_unit`, scale and offset applied: of at most 512 posts along a side, NaN where
-        there is none; None where the raster is larger than can be used, or of complex numbers.
+        (row, column) float32 in `values_unit`, scale and offset applied, at most 512 posts along a side, NaN for
+        nodata; None if the raster is too large or complex.
     """
 
     tags: Mapping[str, str]
@@ -350,16 +351,16 @@ class DemFacts:
 
 
 def dem_facts(path: Path) -> DemFacts:
-    """Return the contents of a raster of heights.
+    """Summarise the contents of a height raster.
 
     Raises
     ------
     CampaignError
-        If it is no GeoTIFF.
+        If the file is not a GeoTIFF.
     """
     from apertura.common.raster import opened_raster
 
-    with opened_raster(path, expected="a GeoTIFF of heights", remedy="Convert it.") as raster:
+    with opened_raster(path, expected="a GeoTIFF of heights", remedy="Convert it to GeoTIFF.") as raster:
         bounds, crs = raster.bounds, raster.crs
         return DemFacts(
             tags={str(name): str(value) for name, value in raster.tags().items()},
@@ -377,7 +378,7 @@ def dem_facts(path: Path) -> DemFacts:
 
 
 def _values_unit(raster: "DatasetReader") -> str:
-    """Return the unit of the first band: of the vertical axis of a compound CRS, else as the band states it."""
+    """Return the unit of the first band: that of the vertical axis of a compound CRS, else that stated for the band."""
     from pyproj import CRS
     from pyproj.exceptions import ProjError
 

@@ -1,4 +1,4 @@
-"""Check that the files of flights.tsv and the config are present and readable, and that memory and disk suffice."""
+"""Check that the files named in flights.tsv and config.yaml are readable, and that memory and disk suffice."""
 
 import json
 import os
@@ -20,31 +20,31 @@ if TYPE_CHECKING:
 
 _AHEAD_S = 5.0
 _IMPORTED = ".snakemake/pip-deployments"
-"""Relative to the working folder (snakemake 9, `PIP_DEPLOYMENTS_PATH`): for plugins that a job installs itself."""
+"""Folder for plugins installed by jobs, relative to the working folder (Snakemake 9, `PIP_DEPLOYMENTS_PATH`)."""
 
-_KEPT = "Where the echo stays as it is, transfer functions that `processing: {keep: [echo]}` has kept replace it."
+_KEPT = "If the settings of the echo are unchanged, transfer functions kept by `processing: {keep: [echo]}` replace it."
 
 _RECORDS = ("metadata", "incomplete")
-"""Folders of Snakemake's records, of no use where they are damaged, and of no harm to lose."""
+"""Folders of Snakemake's records, which are not needed and can be removed if damaged."""
 
 
 def check_flights(examined: "Examination") -> Iterator[CampaignError]:
-    """Yield a problem where no flight becomes an image, and none is measured on a bench."""
+    """Yield a problem if no flight is of kind image or bench."""
     if {flight.kind for flight in examined.campaign.flights} <= {"calibration"}:
         yield CampaignError(
             f"{number_of(len(examined.campaign.flights), 'flight')}, none of kind image",
             where=examined.campaign.root / FLIGHTS,
-            expected="at least one flight of kind image, or bench",
-            remedy="Add one, or correct its kind.",
+            expected="at least one flight of kind image or bench",
+            remedy="Add such a flight, or correct the kind of a flight.",
         )
 
 
 def check_files(examined: "Examination") -> Iterator[CampaignError]:
-    """Yield every file that is missing, empty, dated in the future or may not be read."""
+    """Yield a problem for each file that is missing, empty, dated in the future or not readable."""
     campaign = examined.campaign
-    wanted = _wanted(examined)
+    required_by = _wanted(examined)
     for flight in campaign.flights:
-        yield from _recorded(campaign, flight, wanted)
+        yield from _recorded(campaign, flight, required_by)
     lookups: list[Callable[[], dict[str, ConfinedPath]]] = [
         lambda: {f"scene.{role}": path for role, path in campaign.height_files().items()}
     ]
@@ -57,70 +57,71 @@ def check_files(examined: "Examination") -> Iterator[CampaignError]:
     for lookup in lookups:
         try:
             named = lookup()
-        except CampaignError as problem:  # a path that leaves the folder
+        except CampaignError as problem:  # a path outside the folder
             yield problem
             continue
         for key, path in named.items():
-            yield from _readable(path, f"the file of {CONFIG}: {key}", f"Copy it there, or correct {key}.")
+            remedy = f"Copy the file there, or correct {key}."
+            yield from _readable(path, f"the file named in {CONFIG}: {key}", remedy)
 
 
 def _wanted(examined: Examination) -> Callable[[str], str | None]:
-    """Return a function of a recording's file that is not there: the result that a run would make of it.
+    """Return a function from the name of an absent recording file to the result that a run would compute from it.
 
-    Empty where it would make none, None where nothing was made of it or this is unknown.
+    The result is empty if the file is not needed by a run, and None if it never was an input or this is unknown.
     """
 
     @cache
     def files() -> tuple[dict[str, str], list[str]] | None:
         try:
             return wanted_files(examined.campaign, examined.stale), absent_files(examined.campaign)
-        except CampaignError:  # other checks report it
+        except CampaignError:  # reported by other checks
             return None
 
-    def wanted(name: str) -> str | None:
+    def required_by(name: str) -> str | None:
         known = files()
         return known[0].get(name, "") if known and name in known[1] else None
 
-    return wanted
+    return required_by
 
 
-def _recorded(campaign: Campaign, flight: Flight, wanted: Callable[[str], str | None]) -> Iterator[CampaignError]:
-    """Yield faults of the files of a flight: samples and logs, or phase history."""
+def _recorded(campaign: Campaign, flight: Flight, required_by: Callable[[str], str | None]) -> Iterator[CampaignError]:
+    """Yield problems of the files of a flight: samples and logs, or phase history."""
     if not isinstance(campaign.settings.waveform, SampledWaveform):
         for node in flight.nodes:
             yield from _looked_up(lambda node=node: list(campaign.raw_files(flight.name, node).values()))  # type: ignore[misc]
         return
     for node in flight.recorded:
         expected = f"the recording of node {node} in flight {flight.name}"
-        remedy = f"Copy it there, or take {node} out of the nodes of {flight.name} in {FLIGHTS}."
+        remedy = f"Copy the recording there, or remove {node} from the nodes of {flight.name} in {FLIGHTS}."
         try:
             promised = campaign.promised_files(flight.name, node)
-        except CampaignError as problem:  # metadata that name files
+        except CampaignError as problem:  # invalid metadata
             yield problem
             promised = ()
         for path in promised:
             try:
-                there = path.is_file()
+                exists = path.is_file()
             except CampaignError as problem:  # a link
                 yield problem
                 continue
-            if there or (made := wanted(campaign.relative(path))) is None:
+            if exists or (result := required_by(campaign.relative(path))) is None:
                 yield from _readable(path, expected, remedy)
-            elif made:
-                yield from _readable(path, f"{expected}, to make {made} again", f"{remedy} {_KEPT}")
+            elif result:
+                yield from _readable(path, f"{expected}, to recompute {result}", f"{remedy} {_KEPT}")
         if flight.kind != "bench":
             yield from _looked_up(lambda node=node: [campaign.track_file(flight.name, node)])  # type: ignore[misc]
 
 
 def _looked_up(files: Callable[[], list[ConfinedPath]]) -> Iterator[CampaignError]:
-    """Yield the error of looking for files, or what is wrong with those that are there."""
+    """Yield the error of looking up files, or the problems of the files found."""
     try:
         paths = files()
     except CampaignError as problem:
         yield problem
         return
     for path in paths:
-        yield from _readable(path, "what was recorded", "Copy it again.")
+        yield from _readable(path, "the recorded file", "Copy the file again.")
 
 
 def _readable(path: ConfinedPath, expected: str, remedy: str) -> Iterator[CampaignError]:
@@ -135,39 +136,39 @@ def _readable(path: ConfinedPath, expected: str, remedy: str) -> Iterator[Campai
         yield CampaignError(
             f"dated {(state.st_mtime - time.time()) / 3600:.1f} h in the future",
             where=path,
-            expected="a time that has been, by this machine's clock",
-            remedy=f"Set the clock, or run `touch {path}`: Snakemake takes no input from the future.",
+            expected="a modification time in the past, by this machine's clock",
+            remedy=f"Set the clock, or run `touch {path}`: Snakemake rejects inputs dated in the future.",
         )
     elif state.st_size == 0:
-        yield CampaignError("empty, 0 bytes", where=path, expected=expected, remedy="Copy it again.")
+        yield CampaignError("empty, 0 bytes", where=path, expected=expected, remedy="Copy the file again.")
     elif not path.permits(os.R_OK):
-        yield CampaignError("may not be read", where=path, expected=expected, remedy=f"Run `chmod u+r {path}`.")
+        yield CampaignError("no read permission", where=path, expected=expected, remedy=f"Run `chmod u+r {path}`.")
 
 
 def check_raw_root(examined: "Examination") -> Iterator[CampaignError]:
-    """Yield a problem where the stated folder of recordings is not there, or raw/ holds files that are not read."""
+    """Yield a problem if the configured raw_root does not exist, or raw/ contains files that are not read."""
     campaign, stated = examined.campaign, examined.campaign.settings.raw_root
     if not stated:
         return
     if not Path(stated).is_dir():
         yield CampaignError(
-            f"{stated} is no folder",
+            f"{stated} is not a folder",
             where="raw_root",
-            expected="the folder that holds <flight>/<node>.*",
-            remedy="Mount or correct it, or copy the recordings to raw/ and leave raw_root out.",
+            expected="the folder that contains <flight>/<node>.*",
+            remedy="Mount the folder or correct raw_root; or copy the recordings to raw/ and remove raw_root.",
         )
     own = ConfinedPath.at(Path(campaign.root)) / "raw"
     if any(files for _, _, files in own.walk()):
         yield CampaignError(
-            f"raw/ holds files, and raw_root is {stated}",
+            f"raw/ contains files, although raw_root is {stated}",
             where="raw_root",
-            expected="recordings in one of the two",
-            remedy="Move the files there, or leave raw_root out.",
+            expected="recordings in only one of the two folders",
+            remedy="Move the files to raw_root, or remove raw_root.",
         )
 
 
 def check_links(examined: "Examination") -> Iterator[CampaignError]:
-    """Yield an error for each symbolic link that the results, or Snakemake's own records, hold or are."""
+    """Yield a problem for each symbolic link in, or in place of, the folders results and .snakemake."""
     root = examined.campaign.root
     for top in (root / "results", root / ".snakemake"):
         below = () if top.is_symlink() else (folder / name for folder, _, names in top.walk() for name in names)
@@ -177,33 +178,33 @@ def check_links(examined: "Examination") -> Iterator[CampaignError]:
                     "a symbolic link",
                     where=path,
                     expected="a folder or a file: Snakemake would write and delete through a link",
-                    remedy="Remove it; to keep results elsewhere, put the whole campaign folder there.",
+                    remedy="Remove the link; to store results elsewhere, move the whole campaign folder.",
                 )
 
 
 def check_modules(examined: "Examination") -> Iterator[CampaignError]:
-    """Yield an error where modules lie in the folder that Snakemake puts on its search path in every job."""
+    """Yield a problem if the folder that Snakemake adds to the module search path of every job contains modules."""
     folder = examined.campaign.root / _IMPORTED
     if folder.is_dir() and any(folder.iterdir()):
         yield CampaignError(
-            "Python modules in Snakemake's own folder",
+            "Python modules in a folder of Snakemake",
             where=folder,
-            expected="a campaign folder without code: every job would import them",
-            remedy="Remove that folder; plugins of Snakemake are installed beside apertura.",
+            expected="a campaign folder without code: every job would import these modules",
+            remedy="Remove the folder; install Snakemake plugins in the environment of apertura.",
         )
 
 
 def drop_damaged_records(root: ConfinedPath) -> int:
-    """Remove the records of earlier runs that Snakemake could not read; return how many.
+    """Remove the records of earlier runs that Snakemake cannot read; return their number.
 
-    Hashes say what is stale, not these records: without them, a report only lacks how long earlier jobs took.
+    Out-of-date results are detected by hashes, not by these records: only run times of earlier jobs are lost.
     """
     records = root / ".snakemake"
     damaged = [path for folder in _RECORDS for path in (records / folder).rglob("*") if _is_damaged(path)]
     for path in damaged:
         path.unlink()
     if (records / "metadata").is_dir():
-        (records / "incomplete").mkdir(exist_ok=True)  # without it Snakemake takes the records for those of version 7
+        (records / "incomplete").mkdir(exist_ok=True)  # without this folder Snakemake assumes records of version 7
     return len(damaged)
 
 
@@ -218,28 +219,28 @@ def _is_damaged(path: ConfinedPath) -> bool:
 
 
 _BASE_BYTES = 120_000_000  # the interpreter and its libraries
-_CAPTURE_BYTES = 1100  # of the metadata of a capture while they are read; samples are read in blocks
-_RAW_BYTES = 10  # of a capture in the stage raw, compressed
-_ECHO_SHARE = 0.95  # of 8 bytes per pulse and subcarrier, which are not compressed; the rest for pulses that drop out
-PIXEL_BYTES = 36  # per pixel and pair: image, its part of the cube, three rasters, compressed; 76 before
+_CAPTURE_BYTES = 1100  # memory per capture for its metadata while they are read; samples are read in blocks
+_RAW_BYTES = 10  # per capture in the stage raw, compressed
+_ECHO_SHARE = 0.95  # of 8 bytes per pulse and subcarrier, uncompressed; a share of the pulses may be excluded
+PIXEL_BYTES = 36  # per pixel and pair: image, its share of the cube, three rasters, compressed; 76 uncompressed
 MEMINFO = Path("/proc/meminfo")
 
 
 def check_writable(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a problem where neither the campaign folder nor its results may be written: a read-only disk, another's."""
+    """Yield a problem for the campaign folder or its results folder if it is not writable."""
     campaign = examined.campaign
     for folder in (campaign.root, campaign.results):
         if folder.exists() and not (folder.is_dir() and folder.permits(os.W_OK | os.X_OK)):
             yield CampaignError(
-                "may not be written" if folder.is_dir() else "is no folder",
+                "no write permission" if folder.is_dir() else "not a folder",
                 where=folder,
-                expected="a folder in which results can be made",
-                remedy="Copy the campaign to a disk of your own, or change the folder's permissions.",
+                expected="a writable folder for results",
+                remedy="Copy the campaign to a writable disk, or change the folder's permissions.",
             )
 
 
 def check_memory(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a problem where the metadata of the longest recording do not fit into memory; samples need none."""
+    """Yield a problem if the metadata of the longest recording do not fit into memory; samples are read in blocks."""
     if not examined.recorded:
         return
     key, captures = max(
@@ -248,15 +249,15 @@ def check_memory(examined: Examination) -> Iterator[CampaignError]:
     needed = _BASE_BYTES + _CAPTURE_BYTES * captures
     if needed > (free := free_memory()):
         yield CampaignError(
-            f"{captures} captures of {key[1]} in {key[0]} take at least {needed / 1e9:.1f} GB of memory",
+            f"{captures} captures of {key[1]} in {key[0]} need at least {needed / 1e9:.1f} GB of memory",
             where=examined.recordings[key].files[-1],
-            expected=f"at most the {free / 1e9:.1f} GB that this process may use now",
-            remedy="Run on a machine with more memory, end other work, or cut the recording into several flights.",
+            expected=f"at most {free / 1e9:.1f} GB, the memory available to this process",
+            remedy="Use a machine with more memory, stop other processes, or split the recording into several flights.",
         )
 
 
 def free_memory(meminfo: Path = MEMINFO) -> int:
-    """Return the bytes of memory that are free for this process: the machine's, or what its control group allows.
+    """Return the free memory of this process, bytes: that of the machine, or the limit of its control group.
 
     Examples
     --------
@@ -271,7 +272,7 @@ def free_memory(meminfo: Path = MEMINFO) -> int:
 
 
 def check_disk(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a problem where the file system of the results has less left than the stages still to be made."""
+    """Yield a problem if the free disk space is less than the size of the results that are still to be computed."""
     campaign = examined.campaign
     needed = sum(disk_bytes(examined).values())
     folder = campaign.results if campaign.results.is_dir() else campaign.root
@@ -279,20 +280,20 @@ def check_disk(examined: Examination) -> Iterator[CampaignError]:
     if needed > free:
         parts = ", ".join(f"{name} {size / 1e6:.0f} MB" for name, size in disk_bytes(examined).items() if size)
         yield CampaignError(
-            f"results take at least {needed / 1e6:.0f} MB more ({parts})",
+            f"remaining results need at least {needed / 1e6:.0f} MB ({parts})",
             where=folder,
-            expected=f"at most the {free / 1e6:.0f} MB that are free",
+            expected=f"at most {free / 1e6:.0f} MB, the free disk space",
             remedy="Free some space, copy the campaign to a larger disk, or make the scene smaller.",
         )
 
 
 def disk_bytes(examined: Examination) -> dict[str, int]:
-    """Return stage → bytes that are at least still to be written; stages with a manifest are there already."""
+    """Return stage → lower bound of the bytes to be written; stages with a manifest exist already."""
     campaign, transmitted = examined.campaign, examined.transmitted
     raw = sum(
         _RAW_BYTES * recording.captures
         for key, recording in examined.recorded.items()
-        if not recording.runs_through and not _made(examined, "raw", *key)
+        if not recording.runs_through and not _has_result(examined, "raw", *key)
     )
     pixels = examined.grid.shape[0] * examined.grid.shape[1] if examined.grid else 0
     if campaign.settings.scene.spacing_m == "auto":
@@ -302,19 +303,19 @@ def disk_bytes(examined: Examination) -> dict[str, int]:
         recorded = examined.recorded.get((flight.name, flight.transmitter))
         pulses = recorded.captures if recorded and not recorded.runs_through else 0
         for pair in flight.pairs:
-            if transmitted and not _made(examined, "echo", flight.name, pair):
+            if transmitted and not _has_result(examined, "echo", flight.name, pair):
                 echo += round(_ECHO_SHARE * 8 * pulses * transmitted.numerology.numbers.size)
-            if flight.kind == "image" and not _made(examined, "image", flight.name, pair):
+            if flight.kind == "image" and not _has_result(examined, "image", flight.name, pair):
                 images += PIXEL_BYTES * pixels
     return {"raw": raw, "echo": echo, "images": images}
 
 
-def _made(examined: Examination, stage: str, *where: str) -> bool:
+def _has_result(examined: Examination, stage: str, *where: str) -> bool:
     return (examined.campaign.root / examined.campaign.manifest(stage, *where)).is_file()
 
 
 def check_scheduler(examined: Examination) -> Iterable[CampaignError]:
-    """Raise for a scheduler that the user has not named."""
+    """Raise CampaignError for a scheduler that the user has not enabled."""
     scheduler = examined.campaign.settings.processing.scheduler
     if scheduler != "threads":
         from apertura.core.backprojection.tiles import check_named

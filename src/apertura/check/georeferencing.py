@@ -1,4 +1,4 @@
-"""Check the scene's CRS, reference points and DEM against the place where images were taken."""
+"""Check the scene's CRS, reference points and DEM against the location of the tracks."""
 
 from collections.abc import Iterator
 
@@ -17,19 +17,20 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.map_crs import check_crs, horizontal_crs
 
 _WHERE = f"{CONFIG}: scene.crs"
-_FAR_UP_M = 1000.0  # between a point and the ground: heights are known at least so well
+_FAR_UP_M = 1000.0  # largest height of a reference point above or below the terrain
 TALLEST_M = 500.0
-"""Nothing narrower than two posts stands out of all land about it by more, and by more than ten posts are wide."""
+"""Largest height by which a real feature narrower than two posts rises above its surroundings, metres; at least
+`_STEEPEST_POSTS` post widths."""
 
 _NEAR_M = 20e3
-"""A scene this close to the track is where it was meant to be, far as a mistake puts it."""
+"""Largest distance between scene and track with which a hypothetical mistake explains their separation, metres."""
 
 _STEEPEST_POSTS = 10.0
-_PER_POST = 2  # samples
+_PER_POST = 2  # samples per post
 _WINDOW = 7  # samples: three and a half posts
 _MOST_SAMPLES = 1_000_000
 _COARSE = 256
-_MARGIN = _WINDOW - 1  # samples about the scene, which are not judged
+_MARGIN = _WINDOW - 1  # samples around the scene, which are not evaluated
 
 Place = tuple[float, float]
 """Latitude and longitude, degrees."""
@@ -38,17 +39,15 @@ _NOWHERE = (np.nan, np.nan)
 
 
 def check_scene_crs(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a CRS that is not projected in metres, is not the frame of the recordings, or is not made for the place."""
+    """Yield a problem if the CRS is not in metres, has another frame than positions, or is unsuitable for the area."""
     crs = examined.campaign.settings.scene.crs
     if examined.other_frame:
         local = crs == LOCAL
-        data = (
-            "positions on Earth, in latitude and longitude" if local else "positions in metres of a frame of their own"
-        )
+        data = "positions on Earth, in latitude and longitude" if local else "positions in metres of a local frame"
         expected = "an EPSG code, or auto" if local else LOCAL
-        yield CampaignError(f"{crs} for {data}", where=_WHERE, expected=expected, remedy="Correct scene.crs.")
+        yield CampaignError(f"CRS {crs} with {data}", where=_WHERE, expected=expected, remedy="Correct scene.crs.")
     elif examined.history_problems:
-        return  # which frame they are in is not known
+        return  # the frame of the positions is unknown
     elif crs not in {LOCAL, "auto"} and examined.crs is None:
         yield _not_in_metres(examined, crs)
     elif examined.crs not in {LOCAL, None}:
@@ -56,16 +55,16 @@ def check_scene_crs(examined: Examination) -> Iterator[CampaignError]:
 
 
 def check_reference_points(examined: Examination) -> Iterator[CampaignError]:
-    """Yield each known point, or reflector, outside the scene, or so high that it is no height of the ground."""
+    """Yield a problem for each reference point or reflector outside the scene, or far above or below its terrain."""
     grid = examined.grid
     if grid is None:
         return
     scene = examined.campaign.settings.scene
     known = {"reference_points": scene.reference_points, "reflectors": scene.reflectors}
-    for key, number, point in ((key, *one) for key, points in known.items() for one in enumerate(points)):
+    for key, number, point in ((key, *item) for key, points in known.items() for item in enumerate(points)):
         west, south, east, north = grid.bounds_m
         x, y, height_m = point.position_m
-        where, remedy = f"{CONFIG}: scene.{key}[{number}]", "Correct position_m, or take the point out."
+        where, remedy = f"{CONFIG}: scene.{key}[{number}]", "Correct position_m, or remove the point."
         if not (west <= x <= east and south <= y <= north):
             swapped = west <= y <= east and south <= x <= north
             yield CampaignError(
@@ -76,15 +75,15 @@ def check_reference_points(examined: Examination) -> Iterator[CampaignError]:
             )
         elif examined.ground is not None and abs(height_m - examined.level_m) > _FAR_UP_M:
             yield CampaignError(
-                f"{point.name} is at height {height_m:.1f} m",
+                f"{point.name} has a height of {height_m:.1f} m",
                 where=where,
-                expected=f"a point of the scene, whose ground lies at about {examined.level_m:.1f} m",
-                remedy=f"Heights count from {'the ellipsoid' if grid.frame == 'ecef' else 'the local frame'}. {remedy}",
+                expected=f"a height close to the terrain of the scene, about {examined.level_m:.1f} m",
+                remedy=f"Heights refer to {'the ellipsoid' if grid.frame == 'ecef' else 'the local frame'}. {remedy}",
             )
 
 
 def _elsewhere(examined: Examination, crs: str) -> Iterator[CampaignError]:
-    """Yield bounds, or where they are `auto` a track, that lie beyond where the CRS is of use."""
+    """Yield a problem if the bounds, or with automatic bounds the track, lie outside the area of use of the CRS."""
     bounds = examined.campaign.settings.scene.bounds_m
     if bounds != "auto":
         try:
@@ -95,7 +94,7 @@ def _elsewhere(examined: Examination, crs: str) -> Iterator[CampaignError]:
                 problem
                 if not hint
                 else CampaignError(
-                    f"bounds_m {list(bounds)} are not in {crs}",
+                    f"bounds_m {list(bounds)} lie outside the area of use of {crs}",
                     where=f"{CONFIG}: scene.bounds_m",
                     expected=f"[xmin, ymin, xmax, ymax], metres in {crs}",
                     remedy=hint,
@@ -108,32 +107,32 @@ def _elsewhere(examined: Examination, crs: str) -> Iterator[CampaignError]:
         except CampaignError:
             zone, name = utm_crs(examined.middle_m), CRS(crs).name
             yield CampaignError(
-                f"{crs} ({name}) is not made for where the track lies",
+                f"the track lies outside the area of use of {crs} ({name})",
                 where=_WHERE,
-                expected="a CRS that is of use there, such as the UTM zone of the place",
+                expected="a CRS for the area of the track, such as its UTM zone",
                 remedy=f"Set scene.crs to {zone}, or to auto.",
             )
 
 
 def _not_in_metres(examined: Examination, crs: str) -> CampaignError:
-    """Return the fault of a CRS that is not in metres, with the UTM zone that fits."""
+    """Return the problem of a CRS that is not in metres, with the suitable UTM zone."""
     try:
         system = horizontal_crs(crs)
     except CampaignError as problem:
         return CampaignError(problem.found, _WHERE, problem.expected, problem.remedy)
     units = {axis.unit_name for axis in system.axis_info} - {"metre"}
-    kind = "counts in degrees" if system.is_geographic else f"counts in {', '.join(sorted(units))}"
-    zone = _zone(examined, degrees=system.is_geographic) or "the UTM zone of the place"
+    kind = "is in degrees" if system.is_geographic else f"is in {', '.join(sorted(units))}"
+    zone = _zone(examined, degrees=system.is_geographic) or "the UTM zone of the scene"
     return CampaignError(
         f"{crs} ({system.name}) {kind if units else 'is not projected'}",
         where=_WHERE,
         expected="a projected CRS in metres",
-        remedy=f"Set scene.crs to {zone}, and scene.bounds_m in metres of it; or both to auto.",
+        remedy=f"Set scene.crs to {zone} and scene.bounds_m to metres in this CRS, or set both to auto.",
     )
 
 
 def _zone(examined: Examination, *, degrees: bool) -> str:
-    """Return the UTM zone of the track, or of bounds in degrees; '' where neither is known."""
+    """Return the UTM zone of the track, or of bounds in degrees; '' if neither is available."""
     bounds = examined.campaign.settings.scene.bounds_m
     if examined.middle_m is not None:
         return utm_crs(examined.middle_m)
@@ -144,7 +143,7 @@ def _zone(examined: Examination, *, degrees: bool) -> str:
 
 
 def check_dem(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a DEM or grid of a geoid that does not open, a DEM that ends inside the scene, heights not on Earth."""
+    """Yield a problem if a DEM or geoid grid cannot be read, does not cover the scene, or has invalid heights."""
     yield from examined.ground_problems
     dem, grid = examined.ground and examined.ground.dem, examined.grid
     if dem and grid:
@@ -152,12 +151,12 @@ def check_dem(examined: Examination) -> Iterator[CampaignError]:
 
 
 def check_spikes(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a DEM with single posts under the scene that stand out of it, up or down.
+    """Yield a problem if the DEM has spikes in the scene, upward or downward.
 
-    Heights are sampled twice a post. An opening (the largest minimum over windows of seven samples that hold a place)
-    takes away what is narrower than the window and leaves slopes, ridges and cliffs, however high; a closing does so
-    from below. What is taken away must be higher than 500 m, and than ten posts are wide: steeper than 80° all round.
-    Of a scene larger than a million samples, that many about its middle are tested.
+    Heights are sampled twice per post. A morphological opening with a window of seven samples removes peaks narrower
+    than the window and preserves slopes, ridges and cliffs of any height; a closing does the same for pits. A removed
+    height is a spike if it exceeds 500 m and the width of ten posts: steeper than 80° on all sides. If the scene has
+    more than a million samples, this number about its middle is tested.
     """
     dem, grid = examined.ground and examined.ground.dem, examined.grid
     if not dem or not grid:
@@ -171,17 +170,17 @@ def check_spikes(examined: Examination) -> Iterator[CampaignError]:
     row, column = np.argwhere(spikes)[0]
     x, y = window.map_at(row, column)
     yield CampaignError(
-        f"{heights[row, column]:.0f} m at x {x:.1f}, y {y:.1f}, where the land about it has "
+        f"{heights[row, column]:.0f} m at x {x:.1f}, y {y:.1f}, where the surrounding terrain has "
         f"{np.nanmedian(heights[max(row - 6, 0) : row + 7, max(column - 6, 0) : column + 7]):.0f} m; "
-        f"{int(spikes.sum())} of {spikes.size} samples stand out so",
+        f"{int(spikes.sum())} of {spikes.size} samples are such spikes",
         where=dem.path,
-        expected=f"posts that stand out of all their neighbours by at most {TALLEST_M:.0f} m, or ten posts' width",
-        remedy="Set those posts to nodata and fill them with a GIS.",
+        expected=f"no post above or below all its neighbours by more than {TALLEST_M:.0f} m, or ten post widths",
+        remedy="Set these posts to nodata and fill them with a GIS.",
     )
 
 
 def _heights(dem: Dem, grid: SceneGrid, window: SceneGrid) -> NDArray[np.float64]:
-    """Return the heights of a window; of the scene alone where posts beside it have no height on Earth."""
+    """Return the heights of a window; NaN if posts outside the scene have invalid heights."""
     try:
         return dem.heights(window)
     except CampaignError:
@@ -202,7 +201,7 @@ def post_width_m(dem: Dem, grid: SceneGrid) -> float:
 
 
 def sampled_about(grid: SceneGrid, spacing_m: float) -> SceneGrid:
-    """Return samples of so many metres over a grid and a margin about it, at most a million in its middle."""
+    """Return a sampling grid with a given spacing over a grid and a margin, limited to a million samples."""
     (xmin, ymin, xmax, ymax), most = grid.bounds_m, int(np.sqrt(_MOST_SAMPLES))
     sides = [min(round(side / spacing_m) + 2 * _MARGIN, most) for side in (xmax - xmin, ymax - ymin)]
     west, north = (xmin + xmax - sides[0] * spacing_m) / 2, (ymin + ymax + sides[1] * spacing_m) / 2
@@ -210,9 +209,9 @@ def sampled_about(grid: SceneGrid, spacing_m: float) -> SceneGrid:
 
 
 def needles(heights: NDArray[np.float64], *, taller_than_m: float) -> NDArray[np.bool_]:
-    """Return (row, column) bool: what stands out of a surface, up or down, narrower than a window of seven samples.
+    """Return (row, column) bool, True at spikes of a surface, upward or downward, narrower than seven samples.
 
-    Within two windows' half widths of a void or of the edge nothing is reported: the land beyond is not known.
+    Samples within two half widths of the window from a void or the edge are excluded: their surroundings are unknown.
 
     Examples
     --------
@@ -225,12 +224,12 @@ def needles(heights: NDArray[np.float64], *, taller_than_m: float) -> NDArray[np
     with np.errstate(invalid="ignore"):
         up = heights - _over_windows(_over_windows(heights, np.fmin), np.fmax)
         down = _over_windows(_over_windows(heights, np.fmax), np.fmin) - heights
-        near = _over_windows(_over_windows(heights, np.maximum), np.maximum)  # NaN beside a void and an edge
+        near = _over_windows(_over_windows(heights, np.maximum), np.maximum)  # NaN next to voids and edges
         return np.asarray(((up > taller_than_m) | (down > taller_than_m)) & np.isfinite(near))
 
 
 def _over_windows(heights: NDArray[np.float64], by: np.ufunc) -> NDArray[np.float64]:
-    """Return the extreme of the window about each sample, both ways; outside is NaN, as voids are."""
+    """Return the extreme value in the window about each sample; samples outside are NaN, like voids."""
     half = _WINDOW // 2
     for axis in (0, 1):
         padded = np.pad(
@@ -242,33 +241,30 @@ def _over_windows(heights: NDArray[np.float64], by: np.ufunc) -> NDArray[np.floa
 
 
 def likely_place(examined: Examination) -> str:
-    """Return what to correct, as a sentence that names the mistake under which scene and track meet; '' if none does.
-
-    The scene lies elsewhere than the first image flight flew.
-    """
+    """Return a remedy for a scene far from the track: the mistake whose correction brings them together; '' if none."""
     bounds = examined.campaign.settings.scene.bounds_m
     if bounds == "auto" or examined.middle_m is None or examined.crs is None:
         return ""
     x, y = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
     latitude, longitude, _ = map(float, geodetic_from_ecef(examined.middle_m))
     zone, crs = utm_crs(examined.middle_m), str(examined.crs)
-    stated, flown = _place(crs, x, y), (latitude, longitude)
-    degrees = f"These look like degrees: give scene.bounds_m in metres of {crs}."
-    mistakes = [  # each with the places of scene and track if it was made
-        (degrees, (y, x), flown),
-        (degrees, (x, y), flown),
-        ("Give scene.bounds_m easting before northing: [xmin, ymin, xmax, ymax].", _place(crs, y, x), flown),
+    scene, track = _place(crs, x, y), (latitude, longitude)
+    degrees = f"The bounds appear to be in degrees: set scene.bounds_m in metres in {crs}."
+    mistakes = [  # each with the locations of scene and track after its correction
+        (degrees, (y, x), track),
+        (degrees, (x, y), track),
+        ("Set scene.bounds_m with easting before northing: [xmin, ymin, xmax, ymax].", _place(crs, y, x), track),
         (
-            f"Is scene.crs {zone}, the zone of the track, instead of {crs}?",
+            f"Check if scene.crs should be {zone}, the UTM zone of the track, instead of {crs}.",
             _place(zone, x, y) if zone != crs else _NOWHERE,
-            flown,
+            track,
         ),
-        ("Are latitude and longitude swapped in the logs?", stated, (longitude, latitude)),
-        ("Has longitude the wrong sign in the logs (east is positive)?", stated, (latitude, -longitude)),
-        ("Has latitude the wrong sign in the logs (north is positive)?", stated, (-latitude, longitude)),
-        ("Are the logs in radians?", stated, (float(np.degrees(latitude)), float(np.degrees(longitude)))),
+        ("Check if latitude and longitude are swapped in the logs.", scene, (longitude, latitude)),
+        ("Check the sign of longitude in the logs (east is positive).", scene, (latitude, -longitude)),
+        ("Check the sign of latitude in the logs (north is positive).", scene, (-latitude, longitude)),
+        ("Check if the logs are in radians.", scene, (float(np.degrees(latitude)), float(np.degrees(longitude)))),
     ]
-    return next((sentence for sentence, *places in mistakes if _apart_m(*places) < _NEAR_M), "")
+    return next((sentence for sentence, *places in mistakes if _distance_m(*places) < _NEAR_M), "")
 
 
 def _place(crs: str, x: float, y: float) -> Place:
@@ -279,9 +275,9 @@ def _place(crs: str, x: float, y: float) -> Place:
     return float(latitude), float(longitude)
 
 
-def _apart_m(*places: Place) -> float:
-    """Return the distance of two places, straight; inf where one is none on Earth."""
+def _distance_m(*places: Place) -> float:
+    """Return the straight distance of two locations; inf if one of them is not on Earth."""
     if not all(abs(latitude) <= 90 and abs(longitude) <= 180 for latitude, longitude in places):
         return np.inf
-    one, other = (ecef_from_geodetic(*(np.array(value) for value in (*place, 0.0))) for place in places)
-    return float(np.linalg.norm(one - other))
+    first, second = (ecef_from_geodetic(*(np.array(value) for value in (*place, 0.0))) for place in places)
+    return float(np.linalg.norm(first - second))

@@ -1,4 +1,4 @@
-"""Check that nodes, scene and reflector are within range and beams, and that images can be planned."""
+"""Check that nodes, scene and reflector are within range and in the beams, and that images can be planned."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -31,37 +31,37 @@ if TYPE_CHECKING:
     from apertura.stages.pair import OpenPair
     from apertura.stages.scene import OpenScene
 
-_TAGS = 256  # of a pair at which distances are taken
-_POINTS = 9  # along each side of the scene
-_CURVATURE = 0.99  # of a straight path: ground under a scene of unknown height bends away from the track
-_LEAST_M = 1e-3  # above the ground: an antenna at its height lies in it at every other pulse
-_MOSTLY = 0.9  # of the distance: then it is one of heights
+_TAGS = 256  # largest number of time tags of a pair at which distances are computed
+_POINTS = 9  # points along each side of the scene
+_CURVATURE = 0.99  # factor on the straight path: the curved ground of a scene of unknown height recedes from the track
+_LEAST_M = 1e-3  # least height above the terrain: an antenna at terrain height is below it at half of the pulses
+_MOSTLY = 0.9  # share of the distance above which a height difference is its cause
 _CHECK = (
-    "Check scene.crs and scene.bounds_m (easting before northing), the place in the logs, waveform.{key} and "
+    "Check scene.crs and scene.bounds_m (easting before northing), the positions in the logs, waveform.{key} and "
     "nodes.<node>.path_offset_m."
 )
 _HORIZON_M = 4.12e3
 """Radio horizon over a smooth Earth with refraction, metres per square root of the height in metres."""
 
-_LEAST_HEIGHT_M = 1000.0  # at which nodes are taken to be at least: heights count from the ellipsoid, not the ground
+_LEAST_HEIGHT_M = 1000.0  # least height assumed for the horizon: heights refer to the ellipsoid, not to the terrain
 
 HIGHEST_M = 30e3
-"""Above the ground of the scene no node flies higher."""
+"""Largest accepted height of a node above the terrain, metres."""
 
-_STILL_M = 0.05  # that the log of a node scatters by while it stands
-_SOME_TIME = np.timedelta64(1, "s")  # of a recording that would show whether a node flies
+_STILL_M = 0.05  # scatter of the logged positions of a stationary node
+_SOME_TIME = np.timedelta64(1, "s")  # shortest recording in which motion of a node is detectable
 
 _CALIBRATION = f"{CONFIG}: calibration"
 
 
 def check_nodes_apart(examined: Examination) -> Iterator[CampaignError]:
-    """Yield nodes of one flight between whose logs no wave goes straight: the Earth is between them."""
+    """Yield a problem for nodes of one flight beyond the radio horizon of each other, by their logs."""
     for flight in examined.campaign.flights if examined.waveform else ():
         for node in flight.nodes:
             key, other = (flight.name, flight.transmitter), (flight.name, node)
             if node == flight.transmitter or not {key, other} <= examined.logs.keys():
                 continue
-            logs = [examined.logs[one] for one in (key, other)]
+            logs = [examined.logs[node_key] for node_key in (key, other)]
             distance_m = float(np.linalg.norm(logs[0].middle_m - logs[1].middle_m))
             middles = [log.middle_geodetic for log in logs if log.middle_geodetic is not None]
             if len(middles) < 2:
@@ -70,30 +70,31 @@ def check_nodes_apart(examined: Examination) -> Iterator[CampaignError]:
             if distance_m > horizon_m:
                 (a, b, _), (c, d, _) = middles
                 yield CampaignError(
-                    f"{distance_m / 1e3:.0f} km from {flight.transmitter}: latitude {c:.4f}, longitude {d:.4f} and "
-                    f"latitude {a:.4f}, longitude {b:.4f}",
+                    f"the log is {distance_m / 1e3:.0f} km from that of {flight.transmitter}: latitude {c:.4f}, "
+                    f"longitude {d:.4f} and latitude {a:.4f}, longitude {b:.4f}",
                     where=examined.campaign.track_file(*other),
-                    expected=f"nodes in sight of each other, at most {horizon_m / 1e3:.0f} km apart",
-                    remedy="Check latitude and longitude of both logs (not swapped, signs, degrees), and their flight.",
+                    expected=f"nodes in line of sight, within a distance of {horizon_m / 1e3:.0f} km",
+                    remedy="Check latitude and longitude in both logs (order, signs, degrees), and that both belong to "
+                    "the same flight.",
                 )
 
 
 def check_distance(examined: Examination) -> Iterator[CampaignError]:
-    """Yield image flights from which no echo of the scene arrives inside the cyclic prefix of any pulse."""
+    """Yield a problem for image flights where all echoes of the scene arrive after the cyclic prefix."""
     waveform = examined.waveform
     if waveform is None or examined.grid is None:
         return
     for flight in examined.campaign.image_flights:
         pairs = [(node, _reach(examined, flight, node, waveform)) for node in flight.nodes]
-        far = [(f"{flight.transmitter}-{node}", *found) for node, found in pairs if found and found[1] > found[2]]
+        far = [(f"{flight.transmitter}-{node}", *reach) for node, reach in pairs if reach and reach[1] > reach[2]]
         if not far:
             continue
         _, distance_m, path_m, limit_m = min(far, key=lambda row: row[2])
         yield CampaignError(
-            f"the scene lies {_length(distance_m)} from the track of {flight.name} {', '.join(row[0] for row in far)}: "
-            f"no echo travels less than {_length(path_m)}",
+            f"the scene is {_length(distance_m)} from the track of {flight.name} {', '.join(row[0] for row in far)}: "
+            f"the shortest total path is {_length(path_m)}",
             where=f"{CONFIG}: scene",
-            expected=f"a total path of at most {_length(limit_m)}, what waveform.{waveform.delay_key} holds",
+            expected=f"a total path of at most {_length(limit_m)}, the limit by waveform.{waveform.delay_key}",
             remedy=_height_remedy(examined, distance_m)
             or likely_place(examined)
             or _CHECK.format(key=waveform.delay_key),
@@ -101,15 +102,15 @@ def check_distance(examined: Examination) -> Iterator[CampaignError]:
 
 
 def _height_remedy(examined: Examination, distance_m: float) -> str:
-    """Return the remedy where the height keeps scene and track apart; else ''."""
+    """Return the remedy if the distance between scene and track is mainly a height difference; else ''."""
     if examined.middle_m is None or examined.ground is None or examined.ground.dem:
         return ""
     above_m = float(geodetic_from_ecef(examined.middle_m)[2]) - examined.level_m
     if abs(above_m) < _MOSTLY * distance_m:
         return ""
-    default = ", which is 0 m, as by default" if examined.campaign.settings.scene.height_is_default else ""
+    default = " (0 m by default)" if examined.campaign.settings.scene.height_is_default else ""
     return (
-        f"The track is {above_m:.0f} m above the ground: check heights in the logs (metres, not feet, above the "
+        f"The track is {above_m:.0f} m above the terrain: check the heights in the logs (metres, not feet, above the "
         f"ellipsoid) and scene.height_m{default}."
     )
 
@@ -117,9 +118,9 @@ def _height_remedy(examined: Examination, distance_m: float) -> str:
 def _reach(
     examined: Examination, flight: Flight, node: str, waveform: SampledWaveform
 ) -> tuple[float, float, float] | None:
-    """Return distance from track to scene, shortest total path and the longest that the prefix holds, metres.
+    """Return distance from track to scene, shortest total path, and longest total path within the prefix, metres.
 
-    The first two are never longer, the last is never shorter than any pulse's.
+    The first two are lower bounds over all pulses, the last is an upper bound.
     """
     aperture, grid = pair_aperture(examined, flight, node, waveform), examined.grid
     if aperture is None or grid is None:
@@ -141,17 +142,17 @@ def _reach(
 
 
 def pair_aperture(examined: Examination, flight: Flight, node: str, waveform: SampledWaveform) -> Aperture | None:
-    """Return the positions of both nodes of a pair at some of its pulses, without lever arms; None without logs."""
+    """Return the positions of both nodes of a pair at sampled pulses, without lever arms; None without logs."""
     key, other = (flight.name, flight.transmitter), (flight.name, node)
     if not {key, other} <= examined.tracks.keys() & examined.recordings.keys():
         return None
     times = expected_pulses(examined.recordings[key], examined.recordings[other], waveform.prf_hz)
     times = times[np.unique(np.linspace(0, len(times) - 1, _TAGS).astype(int))]
-    return Aperture(*(_positions(examined, one, times) for one in (key, other)))
+    return Aperture(*(_positions(examined, node_key, times) for node_key in (key, other)))
 
 
 def _positions(examined: Examination, key: Key, times: Times) -> NDArray[np.float64]:
-    """Return (time, 3) float64 ECEF positions of a log, straight between epochs."""
+    """Return (time, 3) float64 ECEF positions of a log, interpolated linearly between epochs."""
     track = examined.tracks[key]
     epochs = track.time.values
     at_s, epoch_s = seconds_since(times, epochs[0]), seconds_since(epochs, epochs[0])
@@ -159,9 +160,9 @@ def _positions(examined: Examination, key: Key, times: Times) -> NDArray[np.floa
 
 
 def scene_points(examined: Examination) -> tuple[NDArray[np.float64], float]:
-    """Return (point, 3) float64 positions (m) on the scene, and the radius (m) about them that holds all its pixels.
+    """Return (point, 3) float64 positions (m) on the scene, and the radius (m) about them that covers all its pixels.
 
-    Where the ground's height is not one number, they lie as high as the track: so no other ground is nearer to it.
+    With a DEM the points have the height of the track, so that their distance is a lower bound for any terrain.
     """
     grid = examined.grid
     if grid is None:
@@ -176,7 +177,7 @@ def _length(metres: float) -> str:
 
 
 def check_aperture(examined: Examination) -> Iterator[CampaignError]:
-    """Yield pairs of image flights whose nodes stand still, by their logs, in reach of the scene."""
+    """Yield a problem for pairs of image flights within range of the scene whose nodes are stationary by their logs."""
     waveform, transmitted = examined.waveform, examined.transmitted
     if waveform is None or transmitted is None:
         return
@@ -192,31 +193,31 @@ def check_aperture(examined: Examination) -> Iterator[CampaignError]:
             moved_m = max(float(np.linalg.norm(leg - leg[0], axis=1).max()) for leg in aperture.legs)
             if moved_m < max(wavelength_m, _STILL_M):
                 yield CampaignError(
-                    f"flight {flight.name}, pair {flight.transmitter}-{node}: no aperture, its nodes moved "
-                    f"{100 * moved_m:.2g} cm: is this a bench recording?",
+                    f"flight {flight.name}, pair {flight.transmitter}-{node}: no aperture, the nodes moved only "
+                    f"{100 * moved_m:.2g} cm (a bench recording?)",
                     where=examined.campaign.root / FLIGHTS,
-                    expected=f"a flight past the scene, of more than a wavelength ({100 * wavelength_m:.0f} cm)",
-                    remedy="Set its kind to bench and run `apertura bench`, or check the logs of its nodes.",
+                    expected=f"a flight past the scene, longer than a wavelength ({100 * wavelength_m:.0f} cm)",
+                    remedy="Set the kind of the flight to bench and run `apertura bench`, or check its flight logs.",
                 )
 
 
 def check_ground(examined: Examination) -> Iterator[CampaignError]:
-    """Yield image flights of which a node is in or below the ground at most pulses, or higher than 30 km above it."""
+    """Yield a problem for image flights with a node at or below the terrain at most pulses, or over 30 km above it."""
     waveform, grid, ground = examined.waveform, examined.grid, examined.ground
     if grid is None or ground is None:
         return
     terrain: Terrain = ground.dem or FlatGround(examined.level_m)
     for flight in examined.campaign.image_flights:
-        places: dict[str, NDArray[np.float64]] = {}
+        positions_of: dict[str, NDArray[np.float64]] = {}
         for node in flight.nodes:
-            if waveform is None:  # pulses carry their times in files that are not read here: all epochs, then
+            if waveform is None:  # pulse times are in phase histories, which are not read here: use all epochs
                 track = examined.tracks.get((flight.name, node))
-                places |= {} if track is None else {node: track.position.values}
+                positions_of |= {} if track is None else {node: track.position.values}
                 continue
             aperture = pair_aperture(examined, flight, node, waveform)
-            places |= dict(zip((flight.transmitter, node), aperture.legs, strict=True)) if aperture else {}
+            positions_of |= dict(zip((flight.transmitter, node), aperture.legs, strict=True)) if aperture else {}
         wrong = {}
-        for node, positions in places.items():
+        for node, positions in positions_of.items():
             above, below = clearance(grid, terrain, positions)
             known = np.isfinite(above)
             arms = examined.campaign.settings.nodes[node].lever_arms_m
@@ -224,43 +225,42 @@ def check_ground(examined: Examination) -> Iterator[CampaignError]:
             if known.any() and not _LEAST_M - arm_m < np.median(above[known]) <= HIGHEST_M:
                 wrong[node] = (float(np.median(above[known])), float(np.median(below[known])))
         if wrong:
-            yield _problem(flight.name, wrong, dem=ground.dem is not None)
+            yield _height_problem(flight.name, wrong, dem=ground.dem is not None)
 
 
-def _problem(flight: str, wrong: dict[str, tuple[float, float]], *, dem: bool) -> CampaignError:
+def _height_problem(flight: str, wrong: dict[str, tuple[float, float]], *, dem: bool) -> CampaignError:
     key, source = ("scene.dem", "DEM") if dem else ("scene.height_m", "ground")
     check = "scene.dem (metres, not feet) and scene.dem_datum" if dem else "scene.height_m and scene.height_datum"
     above_m, ground_m = next(iter(wrong.values()))
     return CampaignError(
-        f"flight {flight}, {', '.join(wrong)}: {above_m:.1f} m above the ground of the scene at the median of its "
-        f"pulses, the log has {above_m + ground_m:.1f} m where the {source} has {ground_m:.1f} m",
+        f"flight {flight}, {', '.join(wrong)}: median height above the terrain {above_m:.1f} m (log "
+        f"{above_m + ground_m:.1f} m, {source} {ground_m:.1f} m)",
         where=f"{CONFIG}: {key}",
-        expected=f"a node above the ground, by at most {HIGHEST_M / 1e3:.0f} km",
-        remedy=f"Check {check}, and the heights in the flight log (logs may count from the geoid).",
+        expected=f"a node above the terrain, by at most {HIGHEST_M / 1e3:.0f} km",
+        remedy=f"Check {check}, and the heights in the flight log (which may refer to the geoid).",
     )
 
 
 def check_calibration(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a calibration flight that is none, pairs that it does not have, a reflector out of reach of the prefix."""
+    """Yield a problem if the calibration flight is invalid, lacks required pairs, or cannot reach the reflector."""
     campaign = examined.campaign
-    stated, kinds = campaign.settings.calibration, {flight.name: flight for flight in campaign.flights}
-    if stated is None:
-        flown = [flight.name for flight in campaign.flights if flight.kind == "calibration"]
-        if flown:
+    settings, flights = campaign.settings.calibration, {flight.name: flight for flight in campaign.flights}
+    calibrating = [flight.name for flight in campaign.flights if flight.kind == "calibration"]
+    if settings is None:
+        if calibrating:
             yield CampaignError(
-                f"no section calibration, and {FLIGHTS} has flight {flown[0]} of kind calibration",
+                f"no section calibration, although flight {calibrating[0]} in {FLIGHTS} is of kind calibration",
                 where=CONFIG,
                 expected="calibration.flight and calibration.reflector_m",
-                remedy="Say where the reflector stands, or take the flight out.",
+                remedy="Configure the position of the reflector, or remove the flight.",
             )
         return
-    flight = kinds.get(stated.flight)
+    flight = flights.get(settings.flight)
     if flight is None or flight.kind != "calibration":
-        named = [name for name, one in kinds.items() if one.kind == "calibration"]
         yield CampaignError(
-            f"flight {stated.flight} is {'not in the table' if flight is None else 'of kind image'}",
+            f"flight {settings.flight} is {'not in the table' if flight is None else f'of kind {flight.kind}'}",
             where=f"{_CALIBRATION}.flight",
-            expected=f"a flight of kind calibration in {FLIGHTS}, which has {', '.join(named) or 'none'}",
+            expected=f"a flight of kind calibration in {FLIGHTS} ({', '.join(calibrating) or 'none present'})",
             remedy="Correct the name or the flight's kind.",
         )
         return
@@ -268,34 +268,34 @@ def check_calibration(examined: Examination) -> Iterator[CampaignError]:
         missing = [pair for pair in image.pairs if pair not in flight.pairs]
         if missing:
             yield CampaignError(
-                f"flight {image.name} has pairs {', '.join(missing)}, which {flight.name} did not calibrate",
+                f"flight {image.name} has pairs {', '.join(missing)}, which are not calibrated by {flight.name}",
                 where=f"{_CALIBRATION}.flight",
-                expected=f"the pairs of {flight.name}: {', '.join(flight.pairs)}",
-                remedy="Fly the calibration with the same transmitter and nodes, or take out config: calibration.",
+                expected=f"only pairs of {flight.name}: {', '.join(flight.pairs)}",
+                remedy="Repeat the calibration with the same transmitter and nodes, or remove section calibration.",
             )
-    yield from _reflector(examined, flight, stated)
+    yield from _reflector(examined, flight, settings)
 
 
-def _reflector(examined: Examination, flight: Flight, stated: CalibrationSettings) -> Iterator[CampaignError]:
-    """Yield a reflector from which no echo arrives while a capture lasts."""
+def _reflector(examined: Examination, flight: Flight, settings: CalibrationSettings) -> Iterator[CampaignError]:
+    """Yield a problem if the echo of the reflector arrives after the end of a capture."""
     waveform = examined.waveform
     aperture = waveform and pair_aperture(examined, flight, flight.transmitter, waveform)
     if not waveform or not aperture or examined.crs is None:
         return
-    place = frame_from_map(examined.crs, *(np.array(value) for value in stated.reflector_m))
-    distance_m = float(np.linalg.norm(aperture.tx_m - place, axis=1).min())
+    reflector_m = frame_from_map(examined.crs, *(np.array(value) for value in settings.reflector_m))
+    distance_m = float(np.linalg.norm(aperture.tx_m - reflector_m, axis=1).min())
     reach_m = SPEED_OF_LIGHT_M_S * waveform.capture_s
     if distance_m > reach_m:
         yield CampaignError(
-            f"{list(stated.reflector_m)} is {distance_m / 1e3:.1f} km from the track of {flight.name}",
+            f"reflector {list(settings.reflector_m)} is {distance_m / 1e3:.1f} km from the track of {flight.name}",
             where=f"{_CALIBRATION}.reflector_m",
-            expected=f"a reflector within {reach_m / 1e3:.1f} km: easting, northing in {examined.crs}, height",
-            remedy="Correct reflector_m (easting before northing), or the place in the log.",
+            expected=f"a reflector within {reach_m / 1e3:.1f} km: easting and northing in {examined.crs}, height",
+            remedy="Correct reflector_m (easting before northing), or the positions in the log.",
         )
 
 
 def check_patterns(examined: Examination) -> Iterator[CampaignError]:
-    """Yield patterns that are none."""
+    """Yield the problems of invalid antenna pattern files."""
     campaign = examined.campaign
     pairs = (pair for flight in campaign.image_flights for pair in flight.pairs)
     paths = {path for pair in pairs for path in campaign.pattern_files(pair).values()}
@@ -311,7 +311,7 @@ def check_patterns(examined: Examination) -> Iterator[CampaignError]:
 
 
 def check_constants(examined: Examination) -> Iterable[CampaignError]:
-    """Raise for a file of measured constants that is none, or holds no pair of the campaign."""
+    """Raise CampaignError if the file of measured constants is invalid, or contains no pair of the campaign."""
     campaign = examined.campaign
     path = campaign.calibration_file
     if path is None or not path.is_file() or path.stat().st_size == 0:
@@ -322,12 +322,12 @@ def check_constants(examined: Examination) -> Iterable[CampaignError]:
     return ()
 
 
-_MOST_PAIRS = 16  # 0.2 s each; what is wrong with others, their own steps say
-_MOST_PIXELS = 1_000_000  # of a scene whose heights are read here, 0.5 s; of a larger one by step `terrain`
+_MOST_PAIRS = 16  # pairs opened, 0.2 s each; problems of others are reported by their steps
+_MOST_PIXELS = 1_000_000  # largest scene whose DEM heights are read here, 0.5 s; a larger one is read by step `terrain`
 
 
 def check_imaging(examined: Examination) -> Iterator[CampaignError]:
-    """Yield the errors that steps `echo`, `scene`, `profile` and `image` would raise for the first pairs."""
+    """Yield the errors that the steps `echo`, `scene`, `profile` and `image` would raise for the first pairs."""
     from apertura.stages.planning import job_of, ranges_of
 
     campaign, problems = examined.campaign, list[CampaignError]()
@@ -335,7 +335,7 @@ def check_imaging(examined: Examination) -> Iterator[CampaignError]:
     yield from problems
     if scene is None:
         return
-    # A calibration flight may find paths to be longer than the config says by as much as it searches for.
+    # A calibration may increase path offsets by up to its search range.
     search_m = campaign.settings.calibration.search_m if campaign.settings.calibration else 0.0
     for pair in pairs:
         try:
@@ -347,7 +347,7 @@ def check_imaging(examined: Examination) -> Iterator[CampaignError]:
 
 
 def check_plan(examined: Examination) -> Iterator[CampaignError]:
-    """Yield choices of the config that overrule the planner where it cannot follow: engines, models, sums of pulses."""
+    """Yield the problems of configured overrides that the planner cannot meet: engine, terrain model, presumming."""
     from apertura.stages.planning import accuracy_of, job_of, plan_job
 
     campaign, problems = examined.campaign, list[CampaignError]()
@@ -355,15 +355,16 @@ def check_plan(examined: Examination) -> Iterator[CampaignError]:
         return
     pairs, scene = _opened(examined, problems)
     yield from problems
-    if scene is not None:  # of one pair: the config is one for all
+    if scene is not None:  # one pair suffices: the configuration applies to all pairs
         job, accuracy = job_of(campaign, pairs[0], scene), accuracy_of(campaign, pairs[0], scene)
         plan_job(campaign, job, accuracy_db=float(accuracy.value))
 
 
 def _opened(examined: Examination, problems: list[CampaignError]) -> tuple[list["OpenPair"], "OpenScene | None"]:
-    """Return the first pairs as logs and headers have them, and the scene; add why others are not open.
+    """Open the first pairs, from logs and headers, and the scene; append the problems of pairs that do not open.
 
-    Of phase history what is small. No scene where it hangs on a flight of which nothing is open, or on a large DEM.
+    Large phase histories are omitted. The scene is None if no pair of the first image flight opens, or the grid is too
+    large for reading the DEM.
     """
     from apertura.core.scene.terrain import GridHeights
     from apertura.stages.pair import open_pair
@@ -391,7 +392,7 @@ def _opened(examined: Examination, problems: list[CampaignError]) -> tuple[list[
 
 
 def _recorded(examined: Examination, flight: Flight, pair: str) -> Times | None:
-    """Return the tags of pulses that surely found a partner; None of phase history, whose pulses are its own."""
+    """Return the time tags of pulses recorded by both nodes; None for phase history, which contains its pulse times."""
     if examined.waveform is None:
         return None
     tx, rx = (examined.recordings[flight.name, node] for node in pair.split("-"))

@@ -26,13 +26,13 @@ from apertura.stages.positions import inside_segments
 from apertura.stages.transmitted import check_mixing
 
 _OFF = 0.2
-"""Spacings further from 1/prf_hz than this share of it are others: tags are good to a few ms, some are whole ms."""
+"""Tolerated relative deviation of intervals from 1/prf_hz: time tags have errors of a few ms, or 1 ms resolution."""
 
-_SOME = 0.1  # share of intervals at 1/prf_hz that says that the others are pulses missed
+_SOME = 0.1  # share of intervals of 1/prf_hz from which the longer intervals are attributed to missed pulses
 
 
 def check_codes(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a problem unless codes are complex, one per subcarrier, finite, not zero; or a pulse as long as stated."""
+    """Yield the problems of the file with the codes, or with the transmitted pulse."""
     waveform = examined.waveform
     if waveform is None:
         return
@@ -42,7 +42,7 @@ def check_codes(examined: Examination) -> Iterator[CampaignError]:
 
 
 def check_recordings(examined: Examination) -> Iterator[CampaignError]:
-    """Yield recordings that do not open, or were recorded at another carrier or sample rate than the waveform's."""
+    """Yield problems of recordings that cannot be opened, or whose carrier or sample rate differs from the waveform."""
     yield from examined.recording_problems
     waveform = examined.waveform
     if waveform is None:
@@ -61,7 +61,7 @@ def check_recordings(examined: Examination) -> Iterator[CampaignError]:
 
 
 def check_receivers(examined: Examination) -> Iterator[CampaignError]:
-    """Yield receivers without the channels they need, or with captures shorter than prefix and DFT window."""
+    """Yield problems of receivers that lack a required channel, or have captures shorter than prefix and DFT window."""
     waveform = examined.waveform
     if waveform is None:
         return
@@ -80,15 +80,15 @@ def check_receivers(examined: Examination) -> Iterator[CampaignError]:
 
 
 def check_histories(examined: Examination) -> Iterator[CampaignError]:
-    """Yield phase history that cannot be read, or whose pulses have no position by log and `config/clocks.tsv`."""
-    if not examined.other_frame:  # which 'crs' reports
+    """Yield problems of phase histories that cannot be read, or whose pulses have no position in the log."""
+    if not examined.other_frame:  # reported by check 'crs'
         yield from examined.history_problems
 
 
 def check_intervals(examined: Examination) -> Iterator[CampaignError]:
-    """Yield recordings whose tags have another spacing than 1/prf_hz, unless pulses in between were missed.
+    """Yield problems of recordings whose time tag interval differs from 1/prf_hz, except by missed pulses.
 
-    A receiver may take every second or third pulse; each still finds its partner.
+    A receiver may record only every second or third pulse: each of these pulses has a match at the transmitter.
     """
     waveform = examined.waveform
     transmitters = {(flight.name, flight.transmitter) for flight in examined.campaign.flights}
@@ -101,24 +101,24 @@ def check_intervals(examined: Examination) -> Iterator[CampaignError]:
         if whole and key not in transmitters:
             continue
         ordinal = {2: "second", 3: "third"}.get(whole, f"{whole}th")
-        why = f": only every {ordinal} pulse was recorded, or waveform.prf_hz is {whole} times the true one"
+        reason = f": only every {ordinal} pulse was recorded, or waveform.prf_hz is {whole} times the true one"
         yield CampaignError(
-            f"time tags {interval_s:.6g} s apart, {1 / interval_s:.6g} Hz{why if whole else ''}",
+            f"time tag interval {interval_s:.6g} s ({1 / interval_s:.6g} Hz){reason if whole else ''}",
             where=recording.files[0],
             expected=f"{1 / waveform.prf_hz:.6g} s, 1/waveform.prf_hz ({waveform.prf_hz:g} Hz)",
-            remedy=f"Correct waveform.prf_hz in {CONFIG}, or the recorder's trigger.",
+            remedy=f"Correct waveform.prf_hz in {CONFIG}, or the trigger of the recorder.",
         )
 
 
 def odd_interval_s(times: Times, prf_hz: float) -> float | None:
-    """Return the spacing of tags where it is not 1/prf_hz, by single tags and over sixteen; None where it is.
+    """Return the interval of time tags if it differs from 1/prf_hz, singly and averaged over 16; None if it agrees.
 
     Examples
     --------
     >>> tags = np.datetime64("2025-05-14T09:30", "ns") + np.arange(40) * np.timedelta64(50, "ms")
     >>> odd_interval_s(tags, 20.0), odd_interval_s(tags, 40.0)
     (None, 0.05)
-    >>> odd_interval_s(tags[np.sort(np.random.default_rng(1).permutation(40)[:16])], 20.0)  # most are missed
+    >>> odd_interval_s(tags[np.sort(np.random.default_rng(1).permutation(40)[:16])], 20.0)  # most pulses are missed
     """
     if len(times) < 3:
         return None
@@ -133,7 +133,7 @@ def odd_interval_s(times: Times, prf_hz: float) -> float | None:
 
 
 def check_overlap(examined: Examination) -> Iterator[CampaignError]:
-    """Yield pairs of nodes without a pulse in common: by frame numbers where both have them, else by their tags."""
+    """Yield problems of pairs of nodes without a common pulse, by frame numbers if available, else by time tags."""
     waveform = examined.waveform
     for flight in examined.campaign.flights if waveform else ():
         tx = examined.recordings.get((flight.name, flight.transmitter))
@@ -147,32 +147,32 @@ def check_overlap(examined: Examination) -> Iterator[CampaignError]:
 
 def _nothing_in_common(tx: Recording, rx: Recording, prf_hz: float) -> CampaignError | None:
     if tx.framing is not None or rx.framing is not None:
-        return None  # their frame numbers are in the samples
+        return None  # continuous recordings have their frame numbers in the samples
     where, numbers = f"{tx.files[0]} and {rx.files[0].name}", (frame_numbers(tx), frame_numbers(rx))
     if all(own.size for own in numbers):
         if np.isin(*numbers).any():
             return None
         first, second = (f"{own.min()} to {own.max()}" for own in numbers)
         return CampaignError(
-            f"frame numbers {first} and {second}, none in common",
+            f"frame numbers {first} and {second}, without a common number",
             where=where,
             expected="recordings of the same pulses",
-            remedy="Check that both are of the same flight, and apertura:frame of their captures.",
+            remedy="Check that both recordings are of the same flight, and check apertura:frame of their captures.",
         )
     if seconds_between(recorded_span(tx), recorded_span(rx)) <= 1 / prf_hz:
         return None
     shift = shift_s(recorded_span(tx), recorded_span(rx))
     first, second = (" to ".join(map(iso, recorded_span(node))) for node in (tx, rx))
     return CampaignError(
-        f"recorded {first} and {second}, {abs(shift):.1f} s apart{mistaken_time(shift)}",
+        f"recorded {first} and {second}, a difference of {abs(shift):.1f} s{mistaken_time(shift)}",
         where=where,
         expected="time tags of the same pulses",
-        remedy="Check that both are of the same flight, and their core:datetime.",
+        remedy="Check that both recordings are of the same flight, and check their core:datetime.",
     )
 
 
 def check_segments(examined: Examination) -> Iterator[CampaignError]:
-    """Yield pairs of which no pulse lies inside their lines of segments.tsv."""
+    """Yield problems of pairs without a pulse inside their segments in segments.tsv."""
     campaign, waveform = examined.campaign, examined.waveform
     for flight in campaign.image_flights:
         tx = examined.recordings.get((flight.name, flight.transmitter))

@@ -1,4 +1,4 @@
-"""When something was recorded or logged: span, rate, gaps, and how the times of two recordings or logs overlap."""
+"""Times of recordings and logs: span, rate, gaps, and the overlap of two of them."""
 
 from dataclasses import dataclass
 from math import fsum
@@ -12,35 +12,35 @@ from apertura.common.units import seconds_since
 from apertura.formats.recordings.recording import Recording
 
 Span = tuple[np.datetime64, np.datetime64]
-"""First and last."""
+"""First and last time."""
 
 LOST_CAPTURE = 1.5
-"""Intervals between captures from which on one is missing between them."""
+"""Separation of captures, in intervals, above which a capture is missing between them."""
 
 LAG = 16
-"""Intervals over which a rate is measured, too: that averages out what rounds single times."""
+"""Number of intervals over which a rate is also measured, to average the rounding of single times."""
 
 _UNIX_DAYS = np.timedelta64(3650, "D")
 
 
 @dataclass(frozen=True, eq=False)
 class TimeFacts:
-    """When something was logged or recorded.
+    """Times of a log or recording.
 
     Attributes
     ----------
     count
-        How many times there are.
+        Number of times.
     span
-        The first and the last.
+        First and last time.
     clock
-        UTC; its own, where no clock was set; none, where times only count pulses.
+        'UTC'; 'its own' for a clock that was not set; 'none' for times that only count pulses.
     interval_s
-        Typical time between neighbours, seconds; inf of one alone.
+        Typical interval, seconds; inf for a single time.
     gap_at
-        (gap,) intp: numbers of the times before which there is a gap.
+        (gap,) intp: indices of the first time after each gap.
     after_s, gap_s
-        (gap,) float64: when each gap begins, seconds since the first time, and how long it is.
+        (gap,) float64: start of each gap, seconds since the first time, and its duration.
     """
 
     count: int
@@ -53,12 +53,12 @@ class TimeFacts:
 
     @property
     def duration_s(self) -> float:
-        """Seconds from the first to the last."""
+        """Seconds from the first to the last time."""
         return float((self.span[1] - self.span[0]) / np.timedelta64(1, "s"))
 
     @property
     def rate_hz(self) -> float | None:
-        """Times per second without gaps; None of one alone."""
+        """Rate outside gaps, Hz; None for a single time."""
         return 1 / self.interval_s if 0 < self.interval_s < np.inf else None
 
     @property
@@ -68,14 +68,14 @@ class TimeFacts:
 
 
 def time_facts(times: Times, *, longer: float) -> TimeFacts:
-    """Return when something was logged or recorded.
+    """Summarise the times of a log or recording.
 
     Parameters
     ----------
     times
         (time,) datetime64[ns], ascending, at least one.
     longer
-        Typical intervals from which on there is a gap.
+        Least duration of a gap, in typical intervals.
 
     Examples
     --------
@@ -97,7 +97,7 @@ def time_facts(times: Times, *, longer: float) -> TimeFacts:
 
 
 def iso(time: np.datetime64) -> str:
-    """Return a time as date and time of day to the millisecond.
+    """Format a time as date and time of day to the millisecond.
 
     Examples
     --------
@@ -108,7 +108,7 @@ def iso(time: np.datetime64) -> str:
 
 
 def utc(time: np.datetime64) -> str:
-    """Return a time to a millisecond, ISO 8601 with its zone.
+    """Format a time as ISO 8601 in UTC, to the millisecond.
 
     Examples
     --------
@@ -119,15 +119,15 @@ def utc(time: np.datetime64) -> str:
 
 
 def steps_s(times: Times, *, over: int = 1) -> NDArray[np.float64]:
-    """Return (time - over,) float64: seconds from each time to the one that is `over` intervals later."""
+    """Return (time - over,) float64: seconds from each time to the time `over` intervals later."""
     return np.asarray((times[over:] - times[:-over]) / np.timedelta64(1, "s"), np.float64)
 
 
 def interval_s(times: Times) -> float:
-    """Return the typical time between neighbours, seconds; inf of one alone.
+    """Return the typical interval, seconds; inf for a single time.
 
-    The median of single intervals says which stretches are without losses; their mean is finer than times that
-    were written coarsely.
+    The median of single intervals selects stretches without losses; the mean over these is not limited by the
+    resolution of the times.
 
     Examples
     --------
@@ -146,7 +146,7 @@ def interval_s(times: Times) -> float:
 
 
 def gaps(times: Times, longer: float) -> NDArray[np.intp]:
-    """Return the numbers of the times before which more than `longer` typical intervals are without any.
+    """Return the indices of times that follow a gap of more than `longer` typical intervals.
 
     Examples
     --------
@@ -158,7 +158,7 @@ def gaps(times: Times, longer: float) -> NDArray[np.intp]:
 
 
 def own_clock(times: Times) -> bool:
-    """Test whether times count from the epoch of the machine, as a clock that was never set does.
+    """Return True if times are within ten years of the Unix epoch, as from a clock that was never set.
 
     Examples
     --------
@@ -169,7 +169,7 @@ def own_clock(times: Times) -> bool:
 
 
 def counted(times: Times) -> bool:
-    """Test whether times count pulses from the epoch of the machine, one a second, as without a clock.
+    """Return True if times count pulses, one per second from the Unix epoch, as without a clock.
 
     Examples
     --------
@@ -180,7 +180,7 @@ def counted(times: Times) -> bool:
 
 
 def recorded_span(recording: Recording) -> Span:
-    """Return the times of the first and the last capture; of all samples where the recorder ran through."""
+    """Return the times of the first and the last capture; of the first and the last sample if continuous."""
     first, last = recording.captures.time[0], recording.captures.time[-1]
     if recording.framing is not None:
         last = last + np.timedelta64(round(len(recording.samples) / recording.sample_rate_hz * 1e9), "ns")
@@ -188,16 +188,16 @@ def recorded_span(recording: Recording) -> Span:
 
 
 def frame_numbers(recording: Recording) -> NDArray[np.int64]:
-    """Return (n,) int64: the frame numbers of the captures that have one."""
+    """Return (n,) int64, the frame numbers of the captures that have one."""
     frame = recording.captures.frame
     return np.asarray(frame[frame >= 0])
 
 
 def common_pulses(tx: Recording, rx: Recording, prf_hz: float) -> Times:
-    """Return the transmitter's tags of pulses that surely find a partner in the receiver's recording.
+    """Return the transmitter's time tags of pulses that certainly have a match in the receiver's recording.
 
-    By equal frame numbers where both nodes have them, else by tags, but for one interval at either end. None where a
-    counter wraps or the recorder ran through: their pulses are not known from headers.
+    Matched by equal frame numbers if both nodes have them, else by time tags without one interval at either end. Empty
+    if a counter wraps or a recording is continuous: the pulses are then not known from headers.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ def common_pulses(tx: Recording, rx: Recording, prf_hz: float) -> Times:
 
 
 def expected_pulses(tx: Recording, rx: Recording, prf_hz: float) -> Times:
-    """Return tags as `common_pulses`; where they are not known a series over what the transmitter recorded."""
+    """Return time tags as `common_pulses`; if they are unknown, a regular series over the transmitter's recording."""
     times = common_pulses(tx, rx, prf_hz)
     if times.size:
         return times
@@ -231,7 +231,7 @@ def expected_pulses(tx: Recording, rx: Recording, prf_hz: float) -> Times:
 
 
 def inside(times: Times, span: Span) -> NDArray[np.bool_]:
-    """Return (time,) bool: which times lie inside a span, both ends included.
+    """Return (time,) bool, True for times inside a span, both ends included.
 
     Examples
     --------
@@ -242,8 +242,8 @@ def inside(times: Times, span: Span) -> NDArray[np.bool_]:
     return np.asarray((times >= span[0]) & (times <= span[1]))
 
 
-def seconds_between(one: Span, other: Span) -> float:
-    """Return the seconds between two spans; 0 or less where they touch or overlap.
+def seconds_between(first: Span, second: Span) -> float:
+    """Return the time between two spans, seconds; 0 or less if they touch or overlap.
 
     Examples
     --------
@@ -254,11 +254,11 @@ def seconds_between(one: Span, other: Span) -> float:
     >>> seconds_between((first, second), (second, second + late))
     0.0
     """
-    second = np.timedelta64(1, "s")
-    return float(max((other[0] - one[1]) / second, (one[0] - other[1]) / second))
+    one_second = np.timedelta64(1, "s")
+    return float(max((second[0] - first[1]) / one_second, (first[0] - second[1]) / one_second))
 
 
-def shift_s(one: Span, other: Span) -> float:
-    """Return by how many seconds the middle of the other span is later."""
-    second = np.timedelta64(1, "s")
-    return float(((other[0] - one[0]) / second + (other[1] - one[1]) / second) / 2)
+def shift_s(first: Span, second: Span) -> float:
+    """Return the delay of the second span's middle relative to the first span's, seconds."""
+    one_second = np.timedelta64(1, "s")
+    return float(((second[0] - first[0]) / one_second + (second[1] - first[1]) / one_second) / 2)

@@ -14,21 +14,20 @@ from apertura.formats.tracks.track import FIXES
 from apertura.methods.causes import mistaken_time
 
 FASTEST_M_S = 340.0
-"""No node flies faster than sound: times or positions are in another unit."""
+"""Largest median speed of a node: above the speed of sound, times or positions have another unit."""
 
 
 def check_tracks(examined: Examination) -> Iterator[CampaignError]:
-    """Yield logs that cannot be read, logs of two frames, no heights, speeds beyond sound."""
+    """Yield problems of logs that cannot be read, have different frames, no heights, or a supersonic speed."""
     yield from examined.track_problems
     for key, log in examined.logs.items():
-        expected, remedy = "positions of a flight", "Drop those lines, or export the log again."
-        found = ""
+        found = expected = remedy = ""
         if log.frame != examined.frame:
-            found, expected = f"positions in frame {log.frame}", f"{examined.frame}, as the other logs"
-            remedy = "Give logs of one frame."
+            found, expected = f"positions in frame {log.frame}", f"frame {examined.frame}, like the other logs"
+            remedy = "Provide logs in one frame."
         elif log.frame == "ecef" and np.abs(log.bounds["height_m"]).max() < 1e-3:
             found, expected = "height 0 at every epoch", "metres above the ellipsoid"
-            remedy = "Export the log with its heights."
+            remedy = "Export the log with heights."
         elif log.median_speed_m_s > FASTEST_M_S:
             found, expected = f"a median speed of {log.median_speed_m_s:.0f} m/s", f"less than {FASTEST_M_S:.0f} m/s"
             remedy = "Check the units of times (seconds) and positions (decimal degrees)."
@@ -37,9 +36,9 @@ def check_tracks(examined: Examination) -> Iterator[CampaignError]:
 
 
 def check_attitude(examined: Examination) -> Iterator[CampaignError]:
-    """Yield nodes whose log holds no attitude, or one in radians or anticlockwise, where an arm or a beam needs it.
+    """Yield problems of nodes whose log lacks the required attitude, or has it in radians or anticlockwise.
 
-    Only a course through most directions is sure; else the echo is flagged.
+    A wrong unit or sense is certain only with courses in most directions; otherwise the echo is flagged.
     """
     from apertura.stages.node_log import yaw_fault_of
 
@@ -53,20 +52,20 @@ def check_attitude(examined: Examination) -> Iterator[CampaignError]:
                 fault.line,
                 where=campaign.track_file(flight, node),
                 expected="degrees, yaw clockwise from north",
-                remedy=f"Export the log with such angles, or set nodes.{node}.attitude to course.",
+                remedy=f"Export the log with these conventions, or set nodes.{node}.attitude to course.",
             )
         if not log.has_attitude:
             yield CampaignError(
                 "no roll, pitch and yaw",
                 where=campaign.track_file(flight, node),
-                expected=f"an attitude at every epoch, as {CONFIG}: nodes.{node}.attitude is log",
-                remedy="Log attitude, set the node's attitude to course, or its lever arms to zero and antennas to "
+                expected=f"an attitude at every epoch, since {CONFIG}: nodes.{node}.attitude is log",
+                remedy="Log the attitude, set the node's attitude to course, or its lever arms to zero and antennas to "
                 "null.",
             )
 
 
 def _uses_attitude(campaign: Campaign, flight: str, node: str) -> bool:
-    """Test whether a node has an antenna in this flight that its attitude moves or turns."""
+    """Return True if a node has an antenna with a lever arm or a beam in this flight."""
     arms = campaign.settings.nodes[node].lever_arms_m
     for pair in campaign.flight(flight).pairs:
         legs = dict(zip(("radar_tx", "radar_rx"), pair.split("-"), strict=True))
@@ -79,10 +78,10 @@ def _uses_attitude(campaign: Campaign, flight: str, node: str) -> bool:
 
 
 def check_coverage(examined: Examination) -> Iterator[CampaignError]:
-    """Yield logs that begin after the first pulse they must place, end before the last, or are poor throughout.
+    """Yield problems of logs that do not cover their pulses, or have only poor solutions.
 
-    Both nodes of a pulse get their positions at the transmitter's tag. Pulses beyond an end of the log whose solution
-    is poorer than fixed may be left out as the config says, and are not reported here.
+    Both nodes have their positions at the transmitter's time tags. Pulses beyond an end of the log whose solution is
+    poorer than fixed may be excluded by the configuration, and are not reported here.
     """
     waveform = examined.waveform
     reported: set[Key] = set()
@@ -107,10 +106,10 @@ def check_coverage(examined: Examination) -> Iterator[CampaignError]:
 
 
 def _no_overlap(examined: Examination, key: Key) -> CampaignError | None:
-    """Return the fault of a continuous recording, of which only its span is known, not its pulses."""
+    """Return the problem of a log without overlap with a continuous recording, whose pulse times are unknown."""
     log, recorded = examined.logs[key].times.span, recorded_span(examined.recordings[key])
     shift = shift_s(recorded, log)
-    found = f"log and recording are {abs(shift):.1f} s apart{mistaken_time(shift)}"
+    found = f"the times of log and recording differ by {abs(shift):.1f} s{mistaken_time(shift)}"
     return _problem(examined, key, found, recorded) if seconds_between(recorded, log) > 0 else None
 
 
@@ -120,25 +119,25 @@ def _uncovered(examined: Examination, key: Key, pulses: Times) -> CampaignError 
     track = examined.tracks[key]
     times = track.time.values
     before, after = pulses < times[0], pulses > times[-1]
-    for out, end in ((before, 0), (after, -1)):
+    for outside, end in ((before, 0), (after, -1)):
         if "fix" in track and int(track.fix.values[end]) not in {0, FIXES["fix"]}:
-            out[:] = False
-    lost = int((before | after).sum())
-    if not lost:
+            outside[:] = False
+    uncovered = int((before | after).sum())
+    if not uncovered:
         return None
     second = np.timedelta64(1, "s")
-    ends = [f"begins {(times[0] - pulses[0]) / second:.3f} s after the first pulse"] if before.any() else []
-    ends += [f"ends {(pulses[-1] - times[-1]) / second:.3f} s before the last"] if after.any() else []
+    ends = [f"starts {(times[0] - pulses[0]) / second:.3f} s after the first pulse"] if before.any() else []
+    ends += [f"ends {(pulses[-1] - times[-1]) / second:.3f} s before the last pulse"] if after.any() else []
     recorded = (pulses[0], pulses[-1])
     shift = shift_s(recorded, (times[0], times[-1]))
     cause = mistaken_time(shift)
-    apart = f"; log and recording are {abs(shift):.1f} s apart{cause}" if cause else ""
-    found = f"the log {' and '.join(ends)}: {lost} of {len(pulses)} pulses without a position{apart}"
+    difference = f"; the times of log and recording differ by {abs(shift):.1f} s{cause}" if cause else ""
+    found = f"the log {' and '.join(ends)}: {uncovered} of {len(pulses)} pulses without a position{difference}"
     return _problem(examined, key, found, recorded)
 
 
 def _all_poor(examined: Examination, key: Key, pulses: Times) -> CampaignError | None:
-    """Return the fault of a log of which every epoch over the pulses has a poorer fix than the config allows."""
+    """Return the problem of a log whose epochs during the pulses all have a poorer solution than configured."""
     track, node = examined.tracks[key], examined.campaign.settings.nodes[key[1]]
     worst = node.worst_fix
     if "fix" not in track or not pulses.size or worst == "any":
@@ -152,10 +151,10 @@ def _all_poor(examined: Examination, key: Key, pulses: Times) -> CampaignError |
     if not poorer_fix(fixes, worst)[during].all():
         return None
     return CampaignError(
-        f"all {int(during.sum())} epochs while pulses were sent have a solution poorer than {node.poorest_fix}",
+        f"all {int(during.sum())} epochs during the pulses have a solution poorer than {node.poorest_fix}",
         where=examined.campaign.track_file(*key),
-        expected=f"solutions that {CONFIG}: nodes.{key[1]}.worst_fix allows",
-        remedy="Process the log again, or allow poorer solutions by that key.",
+        expected=f"solutions allowed by {CONFIG}: nodes.{key[1]}.worst_fix",
+        remedy="Process the log again, or allow poorer solutions by this key.",
     )
 
 
@@ -165,6 +164,6 @@ def _problem(examined: Examination, key: Key, found: str, recorded: Span) -> Cam
         found,
         where=examined.campaign.track_file(*key),
         expected=f"a log that covers the pulses, {first} to {last} UTC",
-        remedy="Check the log's time system (GPST is 18 s ahead of UTC) and the transmitter's time tags, at which "
-        "both nodes are placed, or give the whole log.",
+        remedy="Check the log's time system (GPST is 18 s ahead of UTC) and the transmitter's time tags, at which the "
+        "positions of both nodes are evaluated, or provide the complete log.",
     )

@@ -1,6 +1,6 @@
-"""Basis of every layer: errors, flags, documents, confined paths, atomic writes, constants, contracts, provenance.
+"""Basis of all layers: errors, flags, documents, confined paths, atomic writes, constants, contracts, provenance.
 
-Offers small values and functions that know neither radar nor campaign. Imports nothing of the other layers and computes
-no pixel; `confined` is the only door to a campaign folder; `contracts` states the content of a stage, `code_imports`
-and `provenance` the code and inputs of a result.
+Provides small types and functions without radar or campaign logic. It imports none of the other layers and computes no
+pixels. All access to a campaign folder goes through `confined`. `contracts` defines the content of each stage;
+`code_imports` and `provenance` record the code and inputs of a result.
 """

@@ -1,4 +1,4 @@
-"""Types of arrays, by the names that signatures use."""
+"""Type aliases of arrays for signatures."""
 
 from numbers import Real
 from typing import Any, TypeAlias
@@ -13,7 +13,7 @@ Times: TypeAlias = NDArray[np.datetime64]
 
 
 def is_number(value: Any) -> bool:
-    """Test whether a value is one finite real number; true and false are none.
+    """Return True if a value is a finite real number and not a boolean.
 
     Examples
     --------

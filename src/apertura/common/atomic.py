@@ -1,4 +1,4 @@
-"""Files and folders that are complete or absent: written beside, brought to the disk, then renamed."""
+"""Atomic writes: a file or folder is written under a temporary name, flushed to disk and renamed."""
 
 import fcntl
 import json
@@ -14,21 +14,21 @@ from apertura.common.confined import ConfinedPath
 
 @contextmanager
 def replacement(path: Path) -> Iterator[Path]:
-    """Yield where to write a file or folder; it becomes `path` when the body ends without an error.
+    """Yield a temporary path for a file or folder that becomes `path` when the body finishes without an error.
 
-    A second writer of the same path waits: a kernel lock, which dies with its process, keeps it out. Leftovers of a
-    killed writer are removed by the next.
+    A second writer of the same path waits for a kernel lock, which is released when its process exits. Files left by a
+    killed writer are removed by the next writer.
 
     Parameters
     ----------
     path
-        File, or folder that is absent or empty; folders above it are made.
+        File, or folder that is absent or empty; missing parent folders are created.
 
     Yields
     ------
     pathlib.Path
-        In a folder that was just made, under a name that nobody can know: ``.<name>.wip/<random>/<name>``. It may hold
-        whatever else the body needs on disk. The path holds in this process and its forks.
+        Path in a new folder with a random name: ``.<name>.wip/<random>/<name>``. The body may store other temporary
+        files in that folder. The path is valid in this process and its forks.
 
     Examples
     --------
@@ -54,7 +54,7 @@ def replacement(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file, UTF-8, newlines as they are.
+    """Write a text file as UTF-8 with newlines unchanged.
 
     Examples
     --------
@@ -80,10 +80,10 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
 
 
 def write_beside(path: Path, content: bytes) -> None:
-    """Write a file that no other process writes: beside, brought to the disk, renamed; its folder is made.
+    """Write a file with a single writer under a temporary name, flush it to disk and rename it; create its folder.
 
-    After a power failure it is complete or absent. A killed writer leaves ``<name>.….partial``, to be removed by the
-    owner of the folder. `replacement` needs no owner, and is slower.
+    After a power failure the file is complete or absent. A killed writer leaves ``<name>.….partial``, which the owner
+    of the folder has to remove. `replacement` removes such files itself but is slower.
 
     Examples
     --------
@@ -109,30 +109,30 @@ def write_beside(path: Path, content: bytes) -> None:
 
 
 def rename(source: Path, target: Path) -> None:
-    """Bring a file or folder to the disk and give it its name: after a power failure `target` is complete or absent."""
+    """Flush a file or folder to disk and rename it: after a power failure `target` is complete or absent."""
     confined = ConfinedPath.of(source)
     confined.synchronise()
     confined.rename(target).parent.synchronise_folder()
 
 
 def date(paths: Iterable[ConfinedPath], *, earliest_ns: int, latest_ns: int) -> None:
-    """Bring the times of files between two, where they may be changed."""
+    """Clip the modification times of files to an interval, if permitted."""
     for path in paths:
         with suppress(OSError):
-            found = path.stat()
-            wanted_ns = min(max(found.st_mtime_ns, earliest_ns), latest_ns)
-            if wanted_ns != found.st_mtime_ns:
-                path.set_times(accessed_ns=found.st_atime_ns, modified_ns=wanted_ns)
+            state = path.stat()
+            clipped_ns = min(max(state.st_mtime_ns, earliest_ns), latest_ns)
+            if clipped_ns != state.st_mtime_ns:
+                path.set_times(accessed_ns=state.st_atime_ns, modified_ns=clipped_ns)
 
 
 def remove(path: Path) -> None:
-    """Remove a file, or a folder with its contents, if there is one; targets of links stay."""
+    """Remove a file, or a folder with its contents, if it exists; targets of links are kept."""
     ConfinedPath.of(path).remove()
 
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Add the path to an `OSError` of the body: that of a write lacks it.
+    """Add the path to an `OSError` raised in the body; errors of write calls contain none.
 
     Examples
     --------
@@ -150,14 +150,14 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def confined_target(path: Path) -> ConfinedPath:
-    """Return a path to be written as a confined one; folders above one that a caller gave whole are made."""
+    """Return an output path as a confined path; for an unconfined path, missing parent folders are created."""
     if not isinstance(path, ConfinedPath):
         path.parent.mkdir(parents=True, exist_ok=True)
     return ConfinedPath.of(path)
 
 
 def made_folder(path: Path) -> ConfinedPath:
-    """Return a folder that a caller gave whole as a confined path; it and folders above it are made."""
+    """Return an output folder as a confined path; an unconfined folder and its missing parents are created."""
     if not isinstance(path, ConfinedPath):
         path.mkdir(parents=True, exist_ok=True)
     return ConfinedPath.at(path)
@@ -165,7 +165,7 @@ def made_folder(path: Path) -> ConfinedPath:
 
 @contextmanager
 def _naming_target(folder: Path, path: Path) -> Iterator[None]:
-    """Name the target in an `OSError` of the body that names a file of the work folder, or none."""
+    """Replace the path in an `OSError` of the body by the target, if it is missing or inside the work folder."""
     try:
         yield
     except OSError as error:
@@ -182,17 +182,17 @@ def _locked(work: ConfinedPath) -> Iterator[None]:
         work.mkdir(parents=True, exist_ok=True)
         try:
             lock = name.open("a")
-        except FileNotFoundError:  # the writer before us has just removed the folder
+        except FileNotFoundError:  # the previous writer has just removed the folder
             continue
         with lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            if not _is_at(lock.fileno(), name):  # removed by the writer we waited for: not the lock any more
+            if not _is_at(lock.fileno(), name):  # the previous writer has removed this lock file: open a new one
                 continue
             try:
                 yield
             finally:
                 name.unlink(missing_ok=True)
-                with suppress(OSError):  # the next writer has made its own lock, or is done already
+                with suppress(OSError):  # the next writer has already created its lock file or removed the folder
                     work.rmdir()
             return
 
@@ -211,6 +211,6 @@ def _clear(work: ConfinedPath) -> None:
 
 
 def _plain(value: object) -> object:
-    if hasattr(value, "tolist"):  # a number or array of numpy
+    if hasattr(value, "tolist"):  # a NumPy scalar or array
         return value.tolist()
-    raise TypeError(f"{type(value).__name__} is not JSON")
+    raise TypeError(f"{type(value).__name__} is not JSON serializable")

@@ -1,7 +1,7 @@
-"""Code that a module can run: its import closure, and the source of these modules without descriptions.
+"""Import closure of a module, and the source of these modules without comments and docstrings, for code hashes.
 
-An import counts wherever it stands, also inside a function. What only describes code, comments and docstrings, does not
-count, nor do modules that decide no value of a result (`WITHOUT_EFFECT`).
+Imports inside functions are included. Comments, docstrings and modules that affect no value of a result
+(`WITHOUT_EFFECT`) are excluded.
 """
 
 import ast
@@ -20,29 +20,29 @@ from typing import Any
 PACKAGE = Path(__file__).parents[1]
 
 WITHOUT_EFFECT = (
-    "apertura.common.errors",  # texts of messages: a step that raised one has no result
-    "apertura.common.flag_table",  # texts that explain flags: they decide no value
-    "apertura.common.progress",  # lines of a log
-    "apertura.common.processes",  # where a process may look for code, and how it ends
-    "apertura.workflow.lineage",  # sources, settings and code of a result: a manifest records each, for itself
-    "apertura.workflow.rules",  # the rows that these follow from
+    "apertura.common.errors",  # message texts: a step that raises an error has no result
+    "apertura.common.flag_table",  # descriptions of flags: they affect no value
+    "apertura.common.progress",  # progress reports
+    "apertura.common.processes",  # module search path and exit of a process
+    "apertura.workflow.lineage",  # sources, settings and code of a result: each is recorded in the manifest
+    "apertura.workflow.rules",  # the rule table behind lineage
     "apertura.workflow.rule_inputs",
-    "apertura.campaign.digests",  # their hashes
+    "apertura.campaign.digests",  # hashes of the sources
 )
-"""Modules, with those below them, excluded from code hashes: nothing that they compute is in a result."""
+"""Modules, with their submodules, excluded from code hashes because no value of a result depends on them."""
 
 _TEXT_OR_COMMENT = re.compile(
     r'(?P<text>[A-Za-z]{0,2}(?:"""(?:\\.|[^\\])*?"""|"(?:\\.|[^"\\\n])*"|\'(?:\\.|[^\'\\\n])*\'))|(?P<comment>#[^\n]*)',
     re.DOTALL,
 )
 _GOES_ON = frozenset("([{,=+-*/%|&<>\\")
-"""What ends a line whose statement goes on: a text on the next line is a value, and no docstring."""
+"""Last characters of a line whose statement continues: a string on the next line is a value, not a docstring."""
 
 
 def import_closure(modules: Iterable[str], *, package: Path = PACKAGE) -> dict[str, Path]:
-    """Return dotted name → source of `modules` and of every apertura module they import.
+    """Return dotted name → source path of `modules` and of every apertura module that they import.
 
-    Parameters as of `apertura.common.provenance.code_sha256`.
+    For the parameters see `apertura.common.provenance.code_sha256`.
 
     Examples
     --------
@@ -64,7 +64,7 @@ def import_closure(modules: Iterable[str], *, package: Path = PACKAGE) -> dict[s
 
 
 def source_of(path: Path) -> str:
-    """Return the text of a source; it is read again only where its size or its time has changed."""
+    """Return the text of a source file, cached until its size or modification time changes."""
     state = path.stat()
     return _read(path, state.st_mtime_ns, state.st_size)
 
@@ -84,20 +84,20 @@ def _is_ours(name: str) -> bool:
 
 @functools.cache
 def _has_no_effect(name: str) -> bool:
-    return any(name == one or name.startswith(f"{one}.") for one in WITHOUT_EFFECT)
+    return any(name == module or name.startswith(f"{module}.") for module in WITHOUT_EFFECT)
 
 
 @functools.cache
 def _source(name: str, package: Path) -> Path | None:
     parts = name.split(".")[1:]
-    if not parts:  # the package itself only hands out public names
+    if not parts:  # the package itself only re-exports public names
         return None
     base = package.joinpath(*parts)
     return next((path for path in (base.with_suffix(".py"), base / "__init__.py") if path.is_file()), None)
 
 
 def _source_outside(name: str) -> Path | None:
-    """Find the source of a module of another distribution: a file of exports or engines, or one of their package."""
+    """Find the source of a module of another distribution: a plug-in for exports or engines, or a module it imports."""
     spec = importlib.util.find_spec(_top(name))
     if spec is None or spec.origin is None:
         return None
@@ -105,15 +105,15 @@ def _source_outside(name: str) -> Path | None:
 
 
 def _imports(name: str, path: Path) -> list[str]:
-    """Return the dotted names that a module may import, wherever the statement stands."""
+    """List the dotted names that a module may import, including imports inside functions."""
     status, kept = path.stat(), _kept()
     state = [status.st_mtime_ns, status.st_size]
     if kept.get(str(path), [])[:2] != state:
         kept[str(path)] = [*state, _parsed_imports(name, path)]
         if path.is_relative_to(PACKAGE):
             _keep_at_exit()
-    found: list[str] = kept[str(path)][2]
-    return found
+    names: list[str] = kept[str(path)][2]
+    return names
 
 
 def _parsed_imports(name: str, path: Path) -> list[str]:
@@ -133,17 +133,17 @@ def _parsed_imports(name: str, path: Path) -> list[str]:
         else:
             bodies = (getattr(statement, field, []) for field in ("body", "orelse", "finalbody"))
             handlers = (part.body for field in ("handlers", "cases") for part in getattr(statement, field, []))
-            waiting += [one for body in (*bodies, *handlers) for one in body]
-    return [one for one in names if "." in one or _is_ours(one)]
+            waiting += [nested for body in (*bodies, *handlers) for nested in body]
+    return [imported for imported in names if "." in imported or _is_ours(imported)]
 
 
 _KEPT = PACKAGE / "__pycache__" / "imports.json"
-"""Source → its time, size and imports: parsing all of them takes half a second of every process."""
+"""Cache file: source → modification time, size and imports. Parsing all sources takes half a second per process."""
 
 
 @functools.cache
 def _kept() -> dict[str, list[Any]]:
-    """Return the imports that earlier processes found, to which this one adds."""
+    """Return the cached imports of earlier processes; this process adds to them."""
     with suppress(OSError, ValueError):
         kept: dict[str, list[Any]] = json.loads(_KEPT.read_text(encoding="utf-8"))
         return kept
@@ -152,11 +152,11 @@ def _kept() -> dict[str, list[Any]]:
 
 @functools.cache
 def _keep_at_exit() -> None:
-    """Write what this process has found of the package when it ends."""
+    """Write the imports of the package's modules to the cache file when the process exits."""
 
     def keep() -> None:
-        ours = {path: found for path, found in _kept().items() if Path(path).is_relative_to(PACKAGE)}
-        with suppress(OSError):  # a package that is read only: each process parses
+        ours = {path: entry for path, entry in _kept().items() if Path(path).is_relative_to(PACKAGE)}
+        with suppress(OSError):  # in a read-only installation, each process parses the sources
             part = _KEPT.with_suffix(f".{os.getpid()}")
             part.write_text(json.dumps(ours), encoding="utf-8")
             part.replace(_KEPT)
@@ -166,7 +166,7 @@ def _keep_at_exit() -> None:
 
 @functools.cache
 def without_description(source: str) -> str:
-    r"""Return a Python source without its comments and empty lines, docstrings as ellipses.
+    r"""Strip comments and empty lines from a Python source and replace docstrings by ellipses.
 
     Examples
     --------
@@ -174,31 +174,32 @@ def without_description(source: str) -> str:
     'def two():\n    ...\n    return 2'
     """
     kept: list[str] = []
-    ends, at = "", 0  # the last character of code, and how far the source is read
-    for found in _TEXT_OR_COMMENT.finditer(source):
-        between = source[at : found.start()]
+    last_character, at = "", 0  # last character of code, and the read position in the source
+    for token in _TEXT_OR_COMMENT.finditer(source):
+        between = source[at : token.start()]
         kept.append(between)
-        ends = between.rstrip()[-1:] or ends
-        at = found.end()
-        if found["comment"]:
+        last_character = between.rstrip()[-1:] or last_character
+        at = token.end()
+        if token["comment"]:
             continue
-        begins = between.rstrip(" \t").endswith("\n") or not "".join(kept).strip()
-        if begins and found[0].startswith('"""') and ends not in _GOES_ON and source[at : at + 1] in {"\n", ""}:
+        starts_line = between.rstrip(" \t").endswith("\n") or not "".join(kept).strip()
+        is_statement = starts_line and last_character not in _GOES_ON and source[at : at + 1] in {"\n", ""}
+        if is_statement and token[0].startswith('"""'):
             kept.append("...")
         else:
-            kept.append(found[0].replace("\n", "\0"))  # lines of a text are no lines of code
-        ends = '"'
+            kept.append(token[0].replace("\n", "\0"))  # protect newlines of a string from removal of empty lines
+        last_character = '"'
     lines = (line.rstrip() for line in "".join([*kept, source[at:]]).split("\n"))
     return "\n".join(line for line in lines if line).replace("\0", "\n")
 
 
 def built_from(closure: Mapping[str, Path], package: Path) -> list[Path]:
-    """List the hashes of the sources of compiled code beside the modules; an editable install keeps them elsewhere."""
+    """List the hash files of compiled code in the modules' folders, or in site-packages for an editable install."""
     digests: dict[str, Path] = {}
     folders = {name.rpartition(".")[0] for name, path in closure.items() if path.name != "__init__.py"}
     for folder in sorted(filter(_is_ours, folders)):
         relative = Path(*folder.split(".")[1:])
-        for place in (package / relative, Path(sysconfig.get_path("platlib"), PACKAGE.name, relative)):
-            for path in sorted(place.glob("*.sha256")):
+        for location in (package / relative, Path(sysconfig.get_path("platlib"), PACKAGE.name, relative)):
+            for path in sorted(location.glob("*.sha256")):
                 digests.setdefault(path.name, path)
     return [digests[name] for name in sorted(digests)]

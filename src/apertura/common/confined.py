@@ -1,9 +1,9 @@
-"""Paths of a campaign folder: every access below the folder is relative to a descriptor and follows no link.
+"""Confined paths of a campaign folder: access below the folder is relative to a descriptor and follows no link.
 
-A campaign folder comes from a stranger, and other processes may write to it at any time. So no file of it is opened by
-its whole name, in which the kernel would follow links: each component is opened relative to the descriptor of the one
-before with ``O_NOFOLLOW`` (openat(2)), and only plain files and folders are accepted. The path of the campaign folder
-itself belongs to the user and may lead through links.
+A campaign folder is untrusted, and other processes may write to it at any time. Files in it are therefore never opened
+by their full path, in which the kernel follows links: each component is opened with ``O_NOFOLLOW`` relative to the
+descriptor of its parent (openat(2)), and only regular files and folders are accepted. The path of the campaign folder
+itself is trusted and may contain links.
 """
 
 import errno
@@ -21,11 +21,11 @@ from typing import IO, Any, NoReturn
 from apertura.common.errors import CampaignError, quoted
 
 LARGEST_READ = 1 << 30
-"""Bytes that a file may have to be read at once, as chunks of arrays are; documents have lower limits of their own."""
+"""Maximum size of a file that is read at once, such as an array chunk, bytes; documents have lower limits."""
 
 _FOLDER = os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC
 _BELOW = _FOLDER | os.O_NOFOLLOW
-_FILE = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC  # a FIFO that nobody writes to does not block
+_FILE = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC  # do not block on a FIFO without a writer
 _MODES = {
     "r": os.O_RDONLY,
     "r+": os.O_RDWR,
@@ -37,16 +37,16 @@ _MODES = {
 _WRITES = os.O_WRONLY | os.O_RDWR
 _KINDS = {stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket", stat.S_IFBLK: "a device", stat.S_IFCHR: "a device"}
 _DESCRIPTORS = Path("/proc/self/fd")
-_EXPECTED = "a plain file or folder: nothing in a campaign folder is read, written or deleted through a link"
+_EXPECTED = "a regular file or folder: nothing in a campaign folder is read, written or deleted through a link"
 _REMEDY = "Remove it. The campaign folder itself may be a link, and `raw_root` in the config may name another raw/."
 
 
 class ConfinedPath(PosixPath):
-    """A path in a campaign folder, by which no file outside can be reached.
+    """Path in a campaign folder, through which no file outside the folder can be accessed.
 
     It has the methods of `pathlib.Path` that apertura uses. Reading and writing through a symbolic link, and opening
-    what is neither a file nor a folder, raise `CampaignError`; removing a link removes the link alone. Paths that are
-    derived from it are confined, too. It is no `os.PathLike`: a library that opens files by name gets `on_disk`.
+    anything but a regular file or folder, raise `CampaignError`; removing a link does not affect its target. Derived
+    paths are confined, too. It is not an `os.PathLike`: a library that opens files by name needs `on_disk`.
 
     Examples
     --------
@@ -70,9 +70,9 @@ class ConfinedPath(PosixPath):
         Parameters
         ----------
         folder
-            It may lie behind links, and may be one.
+            The root folder; its path may contain links or be one.
         elsewhere
-            Name of a folder in it → folder that takes its place, under the same rules.
+            Name of a subfolder → folder outside the root that replaces it, under the same rules.
         """
         if isinstance(folder, ConfinedPath):
             return folder
@@ -82,27 +82,27 @@ class ConfinedPath(PosixPath):
 
     @classmethod
     def of(cls, path: Path) -> "ConfinedPath":
-        """Return a path that a user typed or a caller gave as a confined one: the folder it lies in is trusted."""
+        """Return a path from the user or a caller as a confined path whose parent folder is trusted."""
         return path if isinstance(path, ConfinedPath) else cls.at(path.parent) / path.name
 
     def with_elsewhere(self, elsewhere: Mapping[str, Path]) -> "ConfinedPath":
-        """Return the same path where folders of the root lie elsewhere, as `at` takes them."""
+        """Return the same path with replaced subfolders of the root, see `at`."""
         return ConfinedPath.at(self._top, elsewhere=elsewhere) / self.relative_to(self._top)
 
     def named(self, name: str, *, where: object) -> "ConfinedPath":
-        """Return the path of a file that a document of the campaign names.
+        """Return the path of a file named in a document of the campaign.
 
         Parameters
         ----------
         name
-            Relative to this folder, with slashes.
+            Path relative to this folder, with slashes.
         where
-            Document and key that hold the name, for the message.
+            Document and key that contain the name, for the message.
 
         Raises
         ------
         CampaignError
-            If the name is absolute, leads out of the folder, or holds a backslash or control characters.
+            If the name is absolute, leads out of the folder, or contains a backslash or control characters.
 
         Examples
         --------
@@ -111,7 +111,7 @@ class ConfinedPath(PosixPath):
         """
         wrong = None
         if not name.isprintable() or "\\" in name or not name.strip():
-            wrong = "is no plain name of a file"
+            wrong = "is empty or contains a backslash or control characters"
         elif name.startswith("/") or ".." in name.split("/"):
             wrong = "leads out of the campaign folder"
         if wrong:
@@ -119,7 +119,7 @@ class ConfinedPath(PosixPath):
                 f"path {quoted(name)} {wrong}",
                 where,
                 "a relative path to a file inside the campaign folder",
-                "Copy the file into the folder and name it from there.",
+                "Copy the file into the folder and state its path relative to the folder.",
             )
         return self / name
 
@@ -133,72 +133,72 @@ class ConfinedPath(PosixPath):
         return self._bound(super().__truediv__(key))
 
     def joinpath(self, *names: Any) -> "ConfinedPath":
-        """As `pathlib.Path.joinpath`."""
+        """Override `pathlib.Path.joinpath`."""
         return self._bound(super().joinpath(*names))
 
     def with_name(self, name: str) -> "ConfinedPath":
-        """As `pathlib.Path.with_name`."""
+        """Override `pathlib.Path.with_name`."""
         return self._bound(super().with_name(name))
 
     def with_stem(self, stem: str) -> "ConfinedPath":
-        """As `pathlib.Path.with_stem`."""
+        """Override `pathlib.Path.with_stem`."""
         return self._bound(super().with_stem(stem))
 
     def with_suffix(self, suffix: str) -> "ConfinedPath":
-        """As `pathlib.Path.with_suffix`."""
+        """Override `pathlib.Path.with_suffix`."""
         return self._bound(super().with_suffix(suffix))
 
     @property
     def parent(self) -> "ConfinedPath":
-        """As `pathlib.Path.parent`."""
+        """Override `pathlib.Path.parent`."""
         return self._bound(super().parent)
 
     @property
     def parents(self) -> Any:
-        """As `pathlib.Path.parents`."""
+        """Override `pathlib.Path.parents`."""
         return tuple(map(self._bound, super().parents))
 
     def relative_to(self, other: Any, /, *more: Any, **how: Any) -> Path:  # type: ignore[override]
-        """Return the path relative to another: a name, not confined."""
+        """Return the path relative to another, as an unconfined path."""
         return Path(self).relative_to(other, *more, **how)
 
     def is_relative_to(self, other: Any, /, *more: Any) -> bool:
-        """As `pathlib.Path.is_relative_to`."""
+        """Override `pathlib.Path.is_relative_to`."""
         return Path(self).is_relative_to(other, *more)
 
     def absolute(self) -> "ConfinedPath":
-        """As `pathlib.Path.absolute`; links stay as they are."""
+        """Override `pathlib.Path.absolute`; links are not resolved."""
         top = self._top.absolute()
         return ConfinedPath.at(top, elsewhere=self._elsewhere) / self.relative_to(self._top)
 
     @property
     def location(self) -> Path:
-        """Path that it leads to, a folder that lies elsewhere taken into account; to be shown, not to be opened."""
+        """Actual path, with replaced subfolders; for display only, not for opening."""
         first, *rest = self.parts[len(self._top.parts) :] or ("",)
         return self._elsewhere[first].joinpath(*rest) if first in self._elsewhere else Path(self)
 
     def real(self) -> Path:
-        """Return the path that it leads to on this machine, not confined: to be shown and compared alone."""
-        top, parts = self._way()
+        """Return the resolved path on this machine, unconfined; for display and comparison only."""
+        top, parts = self._components()
         return top.resolve().joinpath(*parts)
 
     def __reduce__(self) -> Any:
         return _restored, (self._top, dict(self._elsewhere), self.relative_to(self._top).as_posix())
 
     def __fspath__(self) -> NoReturn:
-        raise TypeError(f"{self}: a confined path has no name by which a library may open it; use on_disk()")
+        raise TypeError(f"{self}: a confined path cannot be opened by name; use on_disk()")
 
     # ---- Access by descriptors --------------------------------------------------------------------------------------
 
     def _refused(self, found: str) -> CampaignError:
         return CampaignError(found, where=self, expected=_EXPECTED, remedy=_REMEDY)
 
-    def _way(self) -> tuple[Path, tuple[str, ...]]:
-        """Return a trusted folder, and the components from there."""
+    def _components(self) -> tuple[Path, tuple[str, ...]]:
+        """Return the trusted folder and the path components below it."""
         count = len(self._top.parts)
         if "\0" in str(self):
             raise CampaignError(
-                "a path with a null byte", where=self, expected="the name of a file", remedy="Correct it."
+                "a path with a null byte", where=self, expected="the name of a file", remedy="Correct the path."
             )
         parts = self.parts[count:]
         if self.parts[:count] != self._top.parts or ".." in parts or "/" in parts:
@@ -209,8 +209,8 @@ class ConfinedPath(PosixPath):
 
     @contextmanager
     def _within(self, *, make: bool = False) -> Iterator[tuple[int, str]]:
-        """Yield a descriptor of the folder that holds the path, and the name there; `make` missing folders."""
-        top, parts = self._way()
+        """Yield a descriptor of the parent folder, and the name in it; create missing folders if `make`."""
+        top, parts = self._components()
         try:
             folder = os.open(top, _FOLDER)
             try:
@@ -225,7 +225,7 @@ class ConfinedPath(PosixPath):
             finally:
                 os.close(folder)
         except OSError as error:
-            if not str(error.filename or "").startswith(os.sep):  # a name in its folder alone
+            if not str(error.filename or "").startswith(os.sep):  # a name relative to its folder
                 error.filename = str(self)
             raise
 
@@ -239,13 +239,13 @@ class ConfinedPath(PosixPath):
             raise
 
     def descriptor(self, flags: int) -> int:
-        """Open a plain file as `os.open` does, and return its descriptor.
+        """Open a regular file as `os.open` does, and return its descriptor.
 
         Raises
         ------
         CampaignError
-            If it is or leads through a symbolic link, is no plain file, or is to be written and has another name: a
-            hard link, by which a file outside would be written.
+            If the path is or contains a symbolic link, is not a regular file, or is opened for writing and has further
+            hard links, through which a file outside the folder would be changed.
         """
         with self._within() as (folder, name):
             try:
@@ -255,7 +255,7 @@ class ConfinedPath(PosixPath):
                     raise self._refused("a symbolic link") from None
                 if error.errno == errno.ENXIO:
                     kind = stat.S_IFMT(os.stat(name, dir_fd=folder, follow_symlinks=False).st_mode)
-                    raise self._refused(_KINDS.get(kind, "no plain file")) from None
+                    raise self._refused(_KINDS.get(kind, "not a regular file")) from None
                 raise
         try:
             state = os.fstat(opened)
@@ -263,9 +263,9 @@ class ConfinedPath(PosixPath):
             if kind == stat.S_IFDIR:
                 raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(self))
             if kind != stat.S_IFREG:
-                raise self._refused(_KINDS.get(kind, "no plain file"))
+                raise self._refused(_KINDS.get(kind, "not a regular file"))
             if flags & _WRITES and state.st_nlink > 1:
-                raise self._refused(f"a file of {state.st_nlink} names (hard links)")
+                raise self._refused(f"a file with {state.st_nlink} hard links")
             if flags & os.O_TRUNC:
                 os.ftruncate(opened, 0)
         except BaseException:
@@ -275,7 +275,7 @@ class ConfinedPath(PosixPath):
 
     @contextmanager
     def folder(self) -> Iterator[int]:
-        """Yield a descriptor of a folder, for the calls of `os` that take one as ``dir_fd``."""
+        """Yield a descriptor of a folder, for the functions of `os` with a parameter ``dir_fd``."""
         with self._within() as (folder, name):
             entered = self._entered(folder, name)
         try:
@@ -284,30 +284,30 @@ class ConfinedPath(PosixPath):
             os.close(entered)
 
     def copy_to(self, target: Path, *, link: bool = False) -> None:
-        """Copy a file; as a hard link where that is wanted and possible."""
+        """Copy a file; if `link`, as a hard link where possible."""
         if link:
-            with suppress(OSError), self._within() as (folder, name):  # another disk, or a file of somebody else's
+            with suppress(OSError), self._within() as (folder, name):  # another disk, or a file of another user
                 os.link(name, target, src_dir_fd=folder, follow_symlinks=False)
                 return
         with self.open("rb") as source, target.open("wb") as copy:
             shutil.copyfileobj(source, copy, 1 << 20)
 
     def reference(self) -> str:
-        """Return a text for another process, from which `referenced` makes the path."""
+        """Serialize the path as text for another process, see `referenced`."""
         return json.dumps([str(self._top.absolute()), self.relative_to(self._top).as_posix()])
 
     @classmethod
     def referenced(cls, text: str) -> "ConfinedPath":
-        """Return the path that a text of `reference` states."""
+        """Restore a path from the text returned by `reference`."""
         top, name = json.loads(text)
         return cls.at(top).joinpath(name)
 
     @contextmanager
     def on_disk(self) -> Iterator[Path]:
-        """Yield a name for libraries that open files themselves; it leads to this very file or folder.
+        """Yield an ordinary path to this file or folder, for libraries that open files by name.
 
-        It holds in this process and its forks until the block ends. What such a library reads from a folder, it reads
-        by names of its own: apertura hands it files alone, and folders that it has just made.
+        The path is valid in this process and its forks until the context exits. Accesses of a library to the content
+        of a folder are not confined: apertura passes only files, and folders that it has just created.
         """
         if self.is_dir():
             with self.folder() as opened:
@@ -322,7 +322,7 @@ class ConfinedPath(PosixPath):
     # ---- Reading ----------------------------------------------------------------------------------------------------
 
     def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:
-        """As `pathlib.Path.stat`; a link is refused where it would be followed."""
+        """Override `pathlib.Path.stat`; CampaignError for a link that would be followed."""
         with self._within() as (folder, name):
             state = os.stat(name, dir_fd=folder, follow_symlinks=False)
         if follow_symlinks and stat.S_ISLNK(state.st_mode):
@@ -330,7 +330,7 @@ class ConfinedPath(PosixPath):
         return state
 
     def lstat(self) -> os.stat_result:
-        """As `pathlib.Path.lstat`."""
+        """Override `pathlib.Path.lstat`."""
         return self.stat(follow_symlinks=False)
 
     def _mode(self, *, follow_symlinks: bool = True) -> int:
@@ -340,28 +340,28 @@ class ConfinedPath(PosixPath):
             return 0
 
     def exists(self, *, follow_symlinks: bool = True) -> bool:
-        """As `pathlib.Path.exists`; CampaignError at a link."""
+        """Override `pathlib.Path.exists`; CampaignError at a link."""
         return self._mode(follow_symlinks=follow_symlinks) != 0
 
     def is_file(self, *, follow_symlinks: bool = True) -> bool:
-        """As `pathlib.Path.is_file`; CampaignError at a link."""
+        """Override `pathlib.Path.is_file`; CampaignError at a link."""
         return stat.S_ISREG(self._mode(follow_symlinks=follow_symlinks))
 
     def is_dir(self, *, follow_symlinks: bool = True) -> bool:
-        """As `pathlib.Path.is_dir`; CampaignError at a link."""
+        """Override `pathlib.Path.is_dir`; CampaignError at a link."""
         return stat.S_ISDIR(self._mode(follow_symlinks=follow_symlinks))
 
     def is_symlink(self) -> bool:
-        """As `pathlib.Path.is_symlink`."""
+        """Override `pathlib.Path.is_symlink`."""
         return stat.S_ISLNK(self._mode(follow_symlinks=False))
 
     def permits(self, mode: int) -> bool:
-        """Test the access to the file, as `os.access` does."""
+        """Check access permissions of the file, as `os.access` does."""
         with self._within() as (folder, name):
             return os.access(name, mode, dir_fd=folder, follow_symlinks=False)
 
     def free_bytes(self) -> int:
-        """Return the number of bytes that can still be written below a folder."""
+        """Return the free disk space below a folder in bytes."""
         with self.folder() as opened:
             state = os.fstatvfs(opened)
             return state.f_bavail * state.f_frsize
@@ -374,51 +374,51 @@ class ConfinedPath(PosixPath):
         errors: str | None = None,
         newline: str | None = None,
     ) -> IO[Any]:
-        """As `pathlib.Path.open`; see `descriptor` for what is refused."""
+        """Override `pathlib.Path.open`; see `descriptor` for errors."""
         opened = self.descriptor(_MODES[mode.replace("b", "").replace("t", "")])
         return os.fdopen(opened, mode, buffering, encoding, errors, newline)
 
     def read_bytes(self, largest: int = LARGEST_READ) -> bytes:
-        """Return the bytes of a file; CampaignError if they are more than `largest`."""
+        """Read the bytes of a file; CampaignError if it is larger than `largest`."""
         with self.open("rb", buffering=0) as stream:
             size = os.fstat(stream.fileno()).st_size
             if size > largest:
                 raise CampaignError(
-                    f"{size} bytes", self, f"a file of at most {largest} bytes", "Is it the right file? Remove it."
+                    f"{size} bytes", self, f"a file of at most {largest} bytes", "Remove it if it is the wrong file."
                 )
             return stream.read()  # type: ignore[no-any-return]
 
     def read_text(self, encoding: str | None = None, errors: str | None = None, newline: str | None = None) -> str:
-        """As `pathlib.Path.read_text`, with the limit of `read_bytes`."""
+        """Override `pathlib.Path.read_text`, with the limit of `read_bytes`."""
         text = self.read_bytes().decode(encoding or "utf-8", errors or "strict")
         return text if newline == "" else text.replace("\r\n", "\n").replace("\r", "\n")
 
     def _opened_folder(self) -> int:
         with self._within() as (folder, name):
-            os.close(self._entered(folder, name))  # for its error at a link
+            os.close(self._entered(folder, name))  # raises CampaignError at a link
             return os.open(name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=folder)
 
     def _entries(self) -> list[tuple[str, bool]]:
-        """Return the names in a folder, sorted, and whether each is a folder; none where there is no folder."""
+        """List the entries of a folder: sorted names, and True for folders; empty if the folder does not exist."""
         try:
             opened = self._opened_folder()
         except (FileNotFoundError, NotADirectoryError):
             return []
         try:
-            with os.scandir(opened) as found:
-                return sorted((entry.name, entry.is_dir(follow_symlinks=False)) for entry in found)
+            with os.scandir(opened) as entries:
+                return sorted((entry.name, entry.is_dir(follow_symlinks=False)) for entry in entries)
         finally:
             os.close(opened)
 
     def iterdir(self) -> Generator["ConfinedPath", None, None]:
-        """Yield what lies in a folder, sorted; links as such."""
+        """Yield the entries of a folder, sorted; links are not followed."""
         self.stat()
         yield from (self / name for name, _ in self._entries())
 
     def walk(self, *_: Any, **__: Any) -> Iterator[tuple["ConfinedPath", list[str], list[str]]]:
-        """Yield each folder, this one first, with the sorted names of its folders and of all else; none behind links.
+        """Yield each folder, this one first, with the sorted names of its folders and other entries; follow no links.
 
-        Of a folder that is not there nothing is yielded.
+        Nothing is yielded for a missing folder.
         """
         entries = self._entries()
         if not entries and not self.is_dir():
@@ -429,12 +429,12 @@ class ConfinedPath(PosixPath):
             yield from (self / name).walk()
 
     def rglob(self, pattern: str, **_: Any) -> Iterator["ConfinedPath"]:  # type: ignore[override]
-        """Yield what lies below a folder and has such a name, sorted folder by folder; links as such."""
+        """Yield the entries below a folder whose name matches, sorted folder by folder; links are not followed."""
         for folder, folders, files in self.walk():
             yield from (folder / name for name in sorted((*folders, *files)) if fnmatchcase(name, pattern))
 
     def glob(self, pattern: str, **_: Any) -> Iterator["ConfinedPath"]:  # type: ignore[override]
-        """Yield what lies below a folder at such a path, whose components hold wildcards; ``**`` is not known."""
+        """Yield the paths below a folder that match a pattern with wildcards; ``**`` is not supported."""
         first, *rest = pattern.split("/", 1)
         for name, is_folder in self._entries():
             if fnmatchcase(name, first):
@@ -446,29 +446,29 @@ class ConfinedPath(PosixPath):
     # ---- Writing ----------------------------------------------------------------------------------------------------
 
     def write_bytes(self, data: Any) -> int:
-        """As `pathlib.Path.write_bytes`."""
+        """Override `pathlib.Path.write_bytes`."""
         with self.open("wb") as stream:
             return stream.write(data)
 
     def write_text(  # type: ignore[override]
         self, data: str, encoding: str | None = None, errors: str | None = None
     ) -> int:
-        """As `pathlib.Path.write_text`; UTF-8 unless stated, newlines as they are."""
+        """Override `pathlib.Path.write_text`; UTF-8 by default, newlines unchanged."""
         return self.write_bytes(data.encode(encoding or "utf-8", errors or "strict"))
 
     def mkdir(self, mode: int = 0o777, parents: bool = False, exist_ok: bool = False) -> None:
-        """As `pathlib.Path.mkdir`."""
+        """Override `pathlib.Path.mkdir`."""
         with self._within(make=parents) as (folder, name):
             try:
                 os.mkdir(name, mode, dir_fd=folder)
             except FileExistsError:
                 if not exist_ok:
                     raise
-                with suppress(FileNotFoundError):  # another process has removed it since
+                with suppress(FileNotFoundError):  # another process has removed it meanwhile
                     os.close(self._entered(folder, name))
 
     def unlink(self, missing_ok: bool = False) -> None:
-        """As `pathlib.Path.unlink`: of a link, the link alone is removed."""
+        """Override `pathlib.Path.unlink`: a link is removed, its target is kept."""
         try:
             with self._within() as (folder, name):
                 os.unlink(name, dir_fd=folder)
@@ -477,12 +477,12 @@ class ConfinedPath(PosixPath):
                 raise
 
     def rmdir(self) -> None:
-        """As `pathlib.Path.rmdir`."""
+        """Override `pathlib.Path.rmdir`."""
         with self._within() as (folder, name):
             os.rmdir(name, dir_fd=folder)
 
     def remove(self) -> None:
-        """Remove a file, or a folder with its contents, if there is one; of links, the links alone."""
+        """Remove a file, or a folder with its contents, if it exists; targets of links are kept."""
         with suppress(FileNotFoundError), self._within() as (folder, name):
             if stat.S_ISDIR(os.stat(name, dir_fd=folder, follow_symlinks=False).st_mode):
                 shutil.rmtree(name, dir_fd=folder)
@@ -490,21 +490,21 @@ class ConfinedPath(PosixPath):
                 os.unlink(name, dir_fd=folder)
 
     def rename(self, target: Any) -> "ConfinedPath":
-        """Give a file or folder another name in the campaign; a file or empty folder of that name is replaced."""
-        there = ConfinedPath.of(target)
-        with self._within() as (folder, name), there._within() as (other, new):
+        """Rename a file or folder within the campaign; an existing file or empty folder of that name is replaced."""
+        renamed = ConfinedPath.of(target)
+        with self._within() as (folder, name), renamed._within() as (other, new):
             os.rename(name, new, src_dir_fd=folder, dst_dir_fd=other)
-        return there
+        return renamed
 
     replace = rename
 
     def set_times(self, *, accessed_ns: int, modified_ns: int) -> None:
-        """Set the times of a file."""
+        """Set the access and modification times of a file."""
         with self._within() as (folder, name):
             os.utime(name, ns=(accessed_ns, modified_ns), dir_fd=folder, follow_symlinks=False)
 
     def synchronise(self) -> None:
-        """Bring a plain file, or a folder with all plain files below it, to the disk."""
+        """Flush a regular file, or a folder with all regular files below it, to disk."""
         mode = self._mode(follow_symlinks=False)
         if stat.S_ISREG(mode):
             self._synchronised(self.descriptor(os.O_RDONLY))
@@ -514,7 +514,7 @@ class ConfinedPath(PosixPath):
             self.synchronise_folder()
 
     def synchronise_folder(self) -> None:
-        """Bring the names in a folder to the disk."""
+        """Flush the entries of a folder to disk."""
         self._synchronised(self._opened_folder())
 
     def _synchronised(self, opened: int) -> None:
@@ -528,7 +528,7 @@ class ConfinedPath(PosixPath):
 
 
 def on_disk(path: Path) -> AbstractContextManager[Path]:
-    """Return a context of a name for libraries, as `ConfinedPath.on_disk`; of another path, that path."""
+    """Return `ConfinedPath.on_disk` of a confined path; a context with the path itself otherwise."""
     return path.on_disk() if isinstance(path, ConfinedPath) else nullcontext(path)
 
 

@@ -1,13 +1,13 @@
-"""Physical constants, and codes of registers; the only place they are written."""
+"""Physical constants and EPSG codes, defined only in this module."""
 
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 """Speed of light in vacuum, m/s (exact by definition of the metre)."""
 
 LARGEST_REFRACTIVITY = 500.0
-"""N units, (n - 1)·10⁶, of air anywhere on Earth, hot, wet and low: the largest mean of ITU-R P.453's maps is 400."""
+"""Upper limit of refractivity on Earth, (n - 1)·10⁶ in N units; the largest mean on the maps of ITU-R P.453 is 400."""
 
 VERTICAL_DATUMS = {"EPSG:5773": "egm96", "EPSG:3855": "egm2008"}
-"""Vertical CRS → the datum that its heights count from, as the config calls it."""
+"""Vertical CRS → name of its vertical datum in the config."""
 BOLTZMANN_J_K = 1.380649e-23
 REFERENCE_K = 290.0
-"""Boltzmann's constant, exact in SI; temperature that noise figures refer to (IEEE Std 686)."""
+"""Boltzmann constant, J/K (exact in SI); reference temperature of noise figures, K (IEEE Std 686)."""

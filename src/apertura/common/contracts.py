@@ -1,4 +1,4 @@
-"""Contracts of the stages: dimensions, dtype and unit of every variable, and required attributes."""
+"""Contracts of the stages: dimensions, dtype and unit of each variable, and required attributes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,26 +20,26 @@ CF_SIGMA0 = "surface_backwards_scattering_coefficient_of_radar_wave"
 """Standard name of σ⁰ in CF (Standard Name Table, https://cfconventions.org); γ⁰ and β⁰ have none."""
 
 STANDARD_NAMES = {"incidence": "angle_of_incidence", "centre_frequency": "sensor_band_central_radiation_frequency"}
-"""Variable of the cube → its standard name in CF; the others have none that means what they hold."""
+"""Variable of the cube → CF standard name; CF defines none for the other variables."""
 
 Row = tuple[tuple[str, ...], str, str, str]
 
 RASTERS: dict[str, Row] = {
-    "image": (_RASTERS, "complex64", "1", "echo amplitude of every image; NaN: not flown, not formed"),
+    "image": (_RASTERS, "complex64", "1", "echo amplitude of every image; NaN: no flight or no image formed"),
     "coherent": (_SUMS, "complex64", "1", "mean of the peak-normalised images"),
     "noncoherent": (_SUMS, "float32", "1", "mean power of the peak-normalised images"),
     "magnitude": (_SUMS, "float32", "1", "mean magnitude of the peak-normalised images"),
     "pair_coherence": (_RASTERS, "float32", "1", "coherence with the flight's reference pair"),
-    "pair_phase": (_RASTERS, "float32", "rad", "phase less that of the flight's reference pair"),
+    "pair_phase": (_RASTERS, "float32", "rad", "phase relative to the flight's reference pair"),
     "flight_coherence": (_RASTERS, "float32", "1", "coherence with the pair's reference flight"),
-    "flight_phase": (_RASTERS, "float32", "rad", "phase less that of the pair's reference flight"),
+    "flight_phase": (_RASTERS, "float32", "rad", "phase relative to the pair's reference flight"),
 }
-"""Written tile by tile."""
+"""Rasters of the cube, written tile by tile."""
 
 _OF_COHERENCE = {
-    "looks": "independent samples in a window of",
-    "chance": "what images with nothing in common have for",
-    "common_band": "most that unchanged ground can show, by geometry, of",
+    "looks": "independent samples in the window of",
+    "chance": "expected value for unrelated images of",
+    "common_band": "upper limit for unchanged terrain, set by the common band, of",
 }
 
 MEASURED: dict[str, Row] = {
@@ -48,58 +48,59 @@ MEASURED: dict[str, Row] = {
         for kind in ("pair", "flight")
         for name, meaning in _OF_COHERENCE.items()
     },
-    "coherent_noise_floor": (_FLIGHTS, "float64", "dB", "median power of the coherent sum against its peak"),
-    "clutter_reduction": (_FLIGHTS, "float64", "dB", "clutter of the images over that of their coherent sum"),
+    "coherent_noise_floor": (_FLIGHTS, "float64", "dB", "median power of the coherent sum relative to its peak"),
+    "clutter_reduction": (_FLIGHTS, "float64", "dB", "clutter of the images relative to that of their coherent sum"),
 }
-"""Known when the rasters are written."""
+"""Quantities measured while the rasters are written."""
 
 SUMMED = frozenset(name for name, row in (*RASTERS.items(), *MEASURED.items()) if row[0] in {_SUMS, _FLIGHTS})
-"""Of these, what exists where a flight has two pairs to add up; NaN of flights of one pair."""
+"""Variables that require a flight with at least two pairs; NaN for flights with a single pair."""
 
 QUOTED: dict[str, Row] = {
     "heading": (_IMAGES, "float64", "degree", "direction of flight, clockwise from grid north"),
-    "look_direction": (_IMAGES, "float64", "degree", "direction to the scene's middle, clockwise from grid north"),
-    "incidence": (_IMAGES, "float64", "degree", "incidence of the transmitter at the scene's middle"),
-    "bistatic_angle": (_IMAGES, "float64", "degree", "angle between the ways to both antennas"),
-    "range": (_IMAGES, "float64", "m", "half the total path to the scene's middle, at closest approach"),
-    "height": (_IMAGES, "float64", "m", "height of the antennas' midpoint above the scene's middle"),
-    "centre_frequency": (_IMAGES, "float64", "Hz", "frequency at the middle of the band"),
+    "look_direction": (_IMAGES, "float64", "degree", "direction to the scene centre, clockwise from grid north"),
+    "incidence": (_IMAGES, "float64", "degree", "incidence angle of the transmitter at the scene centre"),
+    "bistatic_angle": (_IMAGES, "float64", "degree", "angle between the directions to both antennas"),
+    "range": (_IMAGES, "float64", "m", "half the total path to the scene centre, at closest approach"),
+    "height": (_IMAGES, "float64", "m", "height of the antennas' midpoint above the scene centre"),
+    "centre_frequency": (_IMAGES, "float64", "Hz", "centre frequency of the band"),
     "bandwidth": (_IMAGES, "float64", "Hz", "bandwidth of the echo"),
     "resolution_cell": (_IMAGES, "float64", "m", "finest resolution cell along rows or columns"),
-    "loss": (_IMAGES, "float64", "dB", "loss of the peak to phase errors, measured on the image"),
-    "numerical_error": (_IMAGES, "float64", "dB", "error of the arithmetic, at most, against the image's rms"),
+    "loss": (_IMAGES, "float64", "dB", "peak loss due to phase errors, measured on the image"),
+    "numerical_error": (_IMAGES, "float64", "dB", "upper limit of the numerical error relative to the image's rms"),
     "entropy": (_IMAGES, "float64", "1", "entropy of the image's power, nats"),
-    "noise_floor": (_IMAGES, "float64", "dB", "median power of the image against its peak"),
-    "pulses_used": (_IMAGES, "float64", "1", "pulses that make the image"),
-    "pulses_dropped": (_IMAGES, "float64", "1", "pulses that were left out"),
-    "peak": (_IMAGES, "float64", "1", "largest magnitude, which the image is divided by in sums"),
-    "phase_removed": (_IMAGES, "float64", "rad", "phase taken off before the coherent sum; NaN: not in it"),
-    "verdict": (_IMAGES, "T", "", "focus: focused, defocused or cannot tell; empty: not flown"),
-    "flags": (_IMAGES, "T", "", "names of the image's flags, with commas between"),
+    "noise_floor": (_IMAGES, "float64", "dB", "median power of the image relative to its peak"),
+    "pulses_used": (_IMAGES, "float64", "1", "pulses in the image"),
+    "pulses_dropped": (_IMAGES, "float64", "1", "pulses excluded from the image"),
+    "peak": (_IMAGES, "float64", "1", "largest magnitude; divisor of the image in sums"),
+    "phase_removed": (_IMAGES, "float64", "rad", "phase removed before the coherent sum; NaN: not in the sum"),
+    "verdict": (_IMAGES, "T", "", "focus: focused, defocused or inconclusive; empty: no flight"),
+    "flags": (_IMAGES, "T", "", "comma-separated names of the image's flags"),
 }
 """Quality of each image; NaN where not measured."""
 
 COORDINATES: dict[str, Row] = {
     "flight": (("flight",), "T", "", "name of the flight"),
     "pair": (("pair",), "T", "", "transmitter-receiver"),
-    "time": (("flight",), "datetime64[ns]", "", "UTC of the middle of the flight"),
-    "reference_pair": (("flight",), "T", "", "pair that the flight's others are compared with"),
-    "reference_flight": (("pair",), "T", "", "flight that the pair is compared with in others"),
+    "time": (("flight",), "datetime64[ns]", "", "mid-time of the flight, UTC"),
+    "reference_pair": (("flight",), "T", "", "reference for the other pairs of the flight"),
+    "reference_flight": (("pair",), "T", "", "reference for the other flights of the pair"),
 }
+"""Coordinates of the cube."""
 
 
 # ---- Contracts of all stages ----------------------------------------------------------------------------------------
 #
-# Stages are nouns and data flows one way: raw → echo → profile → image → cube → files; `track` joins at echo. `check`
-# refuses a dataset that breaks its contract.
+# Data flows in one direction: raw → echo → profile → image → cube → files; `track` is an input of echo. `check` raises
+# an error for a dataset that violates its contract.
 
 Window = tuple[slice, slice]
-"""Rows and columns of a part of an image."""
+"""Rows and columns of an image window."""
 
 
 @dataclass(frozen=True)
 class Variable:
-    """One array of a stage."""
+    """Array of a stage."""
 
     dims: tuple[str, ...]
     dtype: str
@@ -109,7 +110,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class Stage:
-    """Contract of a stage: its arrays, required attributes, and optional arrays."""
+    """Contract of a stage: required arrays, required attributes and optional arrays."""
 
     variables: Mapping[str, Variable]
     attributes: Mapping[str, str]
@@ -118,8 +119,8 @@ class Stage:
 
 _PULSE_GEOMETRY = {
     "time": Variable(("pulse",), "datetime64[ns]", "", "UTC time tag of the pulse, transmitter's clock"),
-    "tx_position": Variable(("pulse", "axis"), "float64", "m", "transmitting phase centre, in `frame`"),
-    "rx_position": Variable(("pulse", "axis"), "float64", "m", "receiving phase centre, in `frame`"),
+    "tx_position": Variable(("pulse", "axis"), "float64", "m", "phase centre of the transmit antenna, in `frame`"),
+    "rx_position": Variable(("pulse", "axis"), "float64", "m", "phase centre of the receive antenna, in `frame`"),
 }
 _CUBE = {name: Variable(*row) for part in (RASTERS, MEASURED, QUOTED, COORDINATES) for name, row in part.items()}
 _FREQUENCY = {
@@ -130,33 +131,33 @@ _TRANSFER = {
 }
 _KNOTS = "node", "knot", "axis"
 _FRAME = {
-    "frame": "'ecef' (EPSG:4978) or 'local' (the campaign's own Cartesian axes, no place on Earth)",
+    "frame": "'ecef' (EPSG:4978) or 'local' (Cartesian axes of the campaign, not georeferenced)",
     "pair": "transmitter-receiver",
-    "flags": "edges crossed so far: flag name → what was measured, in one line",
+    "flags": "flags raised so far: flag name → measured text, one line",
 }
-_WAVE = {"wave_speed_m_s": "speed of the wave along the paths, m/s: path = wave_speed_m_s · delay"}
+_WAVE = {"wave_speed_m_s": "propagation speed along the paths, m/s: path = wave_speed_m_s · delay"}
 
 STAGES: Mapping[str, Stage] = {
     "raw": Stage(
         {
             "start": Variable(("pulse",), "int64", "1", "first sample of the capture in the recorder's file"),
-            "time": Variable(("pulse",), "datetime64[ns]", "", "UTC time tag of the capture, node's own clock"),
-            "frame": Variable(("pulse",), "int64", "1", "frame number sent in the payload, -1 without"),
-            "repeats": Variable(("pulse",), "bool", "1", "whether the capture repeats an earlier one bit for bit"),
+            "time": Variable(("pulse",), "datetime64[ns]", "", "UTC time tag of the capture, clock of the node"),
+            "frame": Variable(("pulse",), "int64", "1", "frame number sent in the payload; -1: none"),
+            "repeats": Variable(("pulse",), "bool", "1", "True if the capture is bit-identical to an earlier one"),
         },
         {
             "node": "node name",
             "samples": "the recorder's file, relative to the campaign folder: channels interleaved per sample",
             "channels": "names of the channels",
-            "capture_samples": "samples of each capture",
+            "capture_samples": "samples in each capture",
             "sample_rate_hz": "complex samples per second",
-            "datatype": "of the numbers in the file, as SigMF names it",
-            "trailing_bytes": "at the end of the file that are no samples",
-            "mixing": "of real samples: if_hz, sample_rate_hz, restarts; null: they are complex",
+            "datatype": "SigMF datatype of the samples in the file",
+            "trailing_bytes": "bytes at the end of the file that are not samples",
+            "mixing": "down-conversion of real samples: if_hz, sample_rate_hz, restarts; null: complex samples",
         },
         {
-            "segment_start": Variable(("segment",), "int64", "1", "first samples behind bytes that are no samples"),
-            "segment_skipped": Variable(("segment",), "int64", "1", "how many such bytes the file holds before each"),
+            "segment_start": Variable(("segment",), "int64", "1", "first sample after bytes that are not samples"),
+            "segment_skipped": Variable(("segment",), "int64", "1", "number of such bytes before the segment"),
         },
     ),
     "track": Stage(
@@ -170,13 +171,13 @@ STAGES: Mapping[str, Stage] = {
         {
             "node": "node name",
             "frame": _FRAME["frame"],
-            "dropped": "epochs of the log that were left out: reason → how many",
+            "dropped": "excluded epochs of the log: reason → number",
         },
         {
             "position_std": Variable(
-                ("epoch", "axis"), "float64", "m", "what the log states of its error: north, east, up; NaN where none"
+                ("epoch", "axis"), "float64", "m", "logged standard deviation: north, east, up; NaN where not logged"
             ),
-            "fix": Variable(("epoch",), "int8", "1", "solution, RTKLIB's Q: 1 fix, 2 float …; 0 where not logged"),
+            "fix": Variable(("epoch",), "int8", "1", "solution type, RTKLIB's Q: 1 fix, 2 float …; 0 where not logged"),
         },
     ),
     "echo": Stage(
@@ -184,35 +185,35 @@ STAGES: Mapping[str, Stage] = {
             **_PULSE_GEOMETRY,
             **_FREQUENCY,
             "reference_delay": Variable(("pulse",), "float64", "s", "τ_ref, already removed from `transfer`"),
-            "path_limit": Variable(("pulse",), "float64", "m", "total path beyond which an echo leaves the prefix"),
+            "path_limit": Variable(("pulse",), "float64", "m", "longest total path within the cyclic prefix"),
         },
         _FRAME | _WAVE,
         {
             **_TRANSFER,
-            "capture": Variable(("pulse",), "int64", "1", "capture of the receiver's recording that `transfer` is of"),
+            "capture": Variable(("pulse",), "int64", "1", "source of `transfer`: capture in the receiver's recording"),
             "path_removed": Variable(
-                ("pulse",), "float64", "m", "electrical path beyond that by the scene, already removed from `transfer`"
+                ("pulse",), "float64", "m", "electrical path outside the scene, already removed from `transfer`"
             ),
             "clock_offset": Variable(
                 ("pulse",), "float64", "Hz", "carrier offset of the receiver, already removed from its samples"
             ),
             "sidelink_delay": Variable(
-                ("pulse",), "float64", "m", "measured delay of the sidelink times c, any constant in it; NaN: no lock"
+                ("pulse",), "float64", "m", "measured sidelink delay × c, with an arbitrary constant; NaN: no lock"
             ),
-            "sidelink_snr": Variable(("pulse",), "float64", "dB", "of the sidelink per subcarrier; NaN: no lock"),
-            "sidelink_phase": Variable(("pulse",), "float64", "rad", "of the sidelink at mid-band; NaN: no lock"),
+            "sidelink_snr": Variable(("pulse",), "float64", "dB", "sidelink SNR per subcarrier; NaN: no lock"),
+            "sidelink_phase": Variable(("pulse",), "float64", "rad", "sidelink phase at mid-band; NaN: no lock"),
             "sidelink_amplitude": Variable(
-                ("pulse",), "float64", "1", "of the sidelink per subcarrier, ADC counts; NaN: no lock"
+                ("pulse",), "float64", "1", "sidelink amplitude per subcarrier, ADC counts; NaN: no lock"
             ),
             "sidelink_vector": Variable(
-                ("pulse", "axis"), "float64", "m", "receiver's sidelink point to transmitter's"
+                ("pulse", "axis"), "float64", "m", "vector between sidelink antennas, receiver to transmitter"
             ),
         }
         | {
-            f"{leg}_axes": Variable(
-                ("pulse", "axis", "body"), "float64", "1", f"forward, right, down of the {node}'s body, in `frame`"
+            f"{end}_axes": Variable(
+                ("pulse", "axis", "body"), "float64", "1", f"body axes of the {node}: forward, right, down; in `frame`"
             )
-            for leg, node in (("tx", "transmitter"), ("rx", "receiver"))
+            for end, node in (("tx", "transmitter"), ("rx", "receiver"))
         },
     ),
     "transfer": Stage({"time": _PULSE_GEOMETRY["time"], **_FREQUENCY, **_TRANSFER}, _FRAME),
@@ -220,48 +221,62 @@ STAGES: Mapping[str, Stage] = {
         {
             **_PULSE_GEOMETRY,
             "profile": Variable(
-                ("pulse", "range"), "complex64", "1", "range profile; times exp(+j2πf_mid·path/c) it is in phase"
+                ("pulse", "range"), "complex64", "1", "range profile; in phase after × exp(+j2πf_mid·path/c)"
             ),
             "start": Variable(("pulse",), "float64", "m", "total path (tx → scene → rx) of range sample 0"),
         },
         {
             **_FRAME,
             **_WAVE,
+            "background": "echoes at constant delay: method requested, removed, and why",
+            "interference": "subcarriers with interference: how many, where, excluded or not",
             "step_m": "total path between range samples, m",
-            "centre_frequency_hz": "f_mid, to which the profile is referenced, Hz",
+            "centre_frequency_hz": "f_mid, reference frequency of the profile, Hz",
             "oversampling": "samples per resolution cell c/B of total path",
             "window": "weighting over the subcarriers",
-            "compression_error_db": "RMS error against the sum over the subcarriers, measured at some samples, dB",
+            "compression_error_db": "RMS error relative to the exact sum over subcarriers, at test samples, dB",
+        },
+        {
+            "background": Variable(
+                ("background_knot", "subcarrier"),
+                "complex64",
+                "1",
+                "removed, in delays of the recorder",
+            ),
+            "subcarrier_gain": Variable(
+                ("subcarrier",), "float32", "1", "factor of `transfer`: 0 where interference is excluded"
+            ),
+            "background_time": Variable(("background_knot",), "float64", "s", "of its knots, from the first pulse"),
         },
     ),
     "refined_track": Stage(
         {
-            "time": Variable(("knot",), "datetime64[ns]", "", "UTC, transmitter's clock; between knots linear"),
+            "time": Variable(("knot",), "datetime64[ns]", "", "UTC, transmitter's clock; linear between knots"),
             "further": Variable(
-                ("pair", "knot"), "float64", "m", "total path by which all echoes of the pair lie further, to be added"
+                ("pair", "knot"), "float64", "m", "extra total path of all echoes of the pair, to be added"
             ),
-            "correction": Variable(_KNOTS, "float64", "m", "to be added to every point of the node, in `frame`"),
-            "std": Variable(_KNOTS, "float64", "m", "standard deviation of what is left, along each axis of `frame`"),
-            "position": Variable(_KNOTS, "float64", "m", "radar phase centre as the log has it, in `frame`"),
+            "correction": Variable(_KNOTS, "float64", "m", "to be added to every position of the node, in `frame`"),
+            "std": Variable(_KNOTS, "float64", "m", "standard deviation of the residual error, per axis of `frame`"),
+            "position": Variable(_KNOTS, "float64", "m", "radar phase centre according to the log, in `frame`"),
         },
         {
             "frame": _FRAME["frame"],
-            "flags": "edges crossed by the refinement: flag name → what was measured, in one line",
+            "flags": "flags raised by the refinement: flag name → measured text, one line",
             "nodes": "names along `node`",
-            "pairs": "names along `pair`: those that have an offset of their own, or none",
-            "decisions": "autofocus, and autofocus_method where it is on: value and reason",
-            "accepted": "whether images are formed with the correction; why: a line; report: what was measured",
-            "left": "what is left of errors of position does to an image: loss_db, shift_m, phase_rad",
+            "pairs": "names along `pair`: pairs with an offset of their own; may be empty",
+            "decisions": "autofocus, and autofocus_method if enabled: value and reason",
+            "accepted": "True if images are formed with the correction; why: reason; report: measured values",
+            "left": "effect of residual position errors on an image: loss_db, shift_m, phase_rad",
         },
     ),
     "terrain": Stage(
-        {"height": Variable(("y", "x"), "float64", "m", "ground at the pixel: above the ellipsoid, or z of the frame")},
-        {"frame": _FRAME["frame"], "terrain": "the DEM: file, datum, geoid grid, lowest and highest ground"},
+        {"height": Variable(("y", "x"), "float64", "m", "terrain height: above the ellipsoid, or z of the frame")},
+        {"frame": _FRAME["frame"], "terrain": "the DEM: file, datum, geoid grid, lowest and highest terrain"},
     ),
     "image": Stage(
         {
             "image": Variable(
-                ("y", "x"), "complex64", "1", "focused scene, carrier kept; 1 is the echo's amplitude; NaN: not formed"
+                ("y", "x"), "complex64", "1", "focused image with carrier phase; 1: echo amplitude; NaN: not formed"
             )
         },
         {**_FRAME, "quality": "engine, models, errors and measures, as in image.json"},
@@ -269,8 +284,8 @@ STAGES: Mapping[str, Stage] = {
     "cube": Stage(
         {name: row for name, row in _CUBE.items() if name not in SUMMED},
         {
-            "fusion": "flight → pairs of the coherent sum with the phase taken off each, pairs left out and why",
-            "coherence_window": "pixels along a side of the window that coherence is measured in",
+            "fusion": "flight → pairs of the coherent sum with the phase removed from each; excluded pairs, reasons",
+            "coherence_window": "side length in pixels of the window for coherence estimation",
         },
         {name: row for name, row in _CUBE.items() if name in SUMMED},
     ),
@@ -278,19 +293,19 @@ STAGES: Mapping[str, Stage] = {
 
 
 def check(dataset: "xr.Dataset", stage: str) -> "xr.Dataset":
-    """Return `dataset` unchanged if it keeps the contract of `stage`.
+    """Check a dataset against the contract of `stage` and return it unchanged.
 
     Parameters
     ----------
     dataset
-        Arrays and attributes to be passed on; dask arrays are not computed.
+        Dataset to check; dask arrays are not computed.
     stage
         A key of `STAGES`.
 
     Raises
     ------
     ContractError
-        Listing every variable or attribute that is missing or has other dimensions or dtype.
+        If variables or attributes are missing or have other dimensions or dtype; lists all of them.
 
     Examples
     --------
@@ -302,14 +317,14 @@ def check(dataset: "xr.Dataset", stage: str) -> "xr.Dataset":
     """
     contract = STAGES[stage]
     wrong = [f"no variable '{name}'" for name in contract.variables if name not in dataset.variables]
-    for name, promise in {**contract.variables, **contract.optional}.items():
+    for name, variable in {**contract.variables, **contract.optional}.items():
         if name not in dataset.variables:
             continue
         array = dataset[name]
-        if array.dims != promise.dims:
-            wrong.append(f"{name} has dims {array.dims}, not {promise.dims}")
-        if array.dtype != np.dtype(promise.dtype):
-            wrong.append(f"{name} is {array.dtype}, not {promise.dtype}")
+        if array.dims != variable.dims:
+            wrong.append(f"{name} has dims {array.dims}, not {variable.dims}")
+        if array.dtype != np.dtype(variable.dtype):
+            wrong.append(f"{name} is {array.dtype}, not {variable.dtype}")
     wrong += [f"no attribute '{name}'" for name in contract.attributes if name not in dataset.attrs]
     if wrong:
         raise ContractError(f"{stage}: {'; '.join(wrong)}")

@@ -1,4 +1,4 @@
-"""Untrusted files read as text, as a document, or as a validated value; any error is one message."""
+"""Reading of untrusted files as text, YAML or JSON, and their validation; every error is reported as one message."""
 
 import difflib
 import json
@@ -16,22 +16,22 @@ from apertura.common.errors import CampaignError, quoted
 
 # ---- Text, YAML and JSON of untrusted files -------------------------------------------------------------------------
 #
-# Nothing that a file holds is trusted: sizes, depths and aliases are counted before anything is built of them.
+# No content of a file is trusted: size, nesting depth and alias expansion are checked before any object is built.
 
 LARGEST_YAML = 1_000_000
-"""Bytes of a YAML file."""
+"""Maximum size of a YAML file, bytes."""
 
 DEEPEST = 32
-"""Levels of a YAML document."""
+"""Maximum nesting depth of a YAML document."""
 
 MOST_NODES = 100_000
-"""Keys and values of a YAML document, each alias counted as all that it stands for."""
+"""Maximum number of keys and values in a YAML document, with all aliases expanded."""
 
 LARGEST_JSON = 64_000_000
-"""Bytes of a JSON file."""
+"""Maximum size of a JSON file, bytes."""
 
 DAMAGED = "Delete it and run the workflow again."
-"""What to do about a result that is not as it was written."""
+"""Remedy for a damaged result."""
 
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _KINDS = ("null", "bool", "int", "float", "str", "timestamp", "seq", "map", "merge")
@@ -40,21 +40,21 @@ _LONGEST_INTEGER = 25
 
 
 def read_text(path: Path, *, expected: str, remedy: str, largest: int) -> str:
-    """Return the UTF-8 text of a file, without its byte-order mark.
+    """Read the UTF-8 text of a file, without its byte-order mark.
 
     Parameters
     ----------
     path
         The file.
     expected, remedy
-        Of the message where there is no such file.
+        Parts of the message for a missing file.
     largest
-        Bytes that it may have.
+        Maximum size in bytes.
 
     Raises
     ------
     CampaignError
-        If it is not there, is too large or is not UTF-8.
+        If the file is missing, too large or not UTF-8.
     """
     if not path.is_file():
         raise CampaignError("no such file", where=path, expected=expected, remedy=remedy)
@@ -62,7 +62,7 @@ def read_text(path: Path, *, expected: str, remedy: str, largest: int) -> str:
         data = stream.read(largest + 1)
     if len(data) > largest:
         found = f"{path.stat().st_size} bytes"
-        raise CampaignError(found, path, f"a file of at most {largest} bytes", "Is it the right file? Shorten it.")
+        raise CampaignError(found, path, f"a file of at most {largest} bytes", "Check the path, or shorten the file.")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -72,19 +72,19 @@ def read_text(path: Path, *, expected: str, remedy: str, largest: int) -> str:
 
 
 def read_yaml(path: Path, *, expected: str, remedy: str) -> object:
-    """Return the document in a YAML file: plain values, each key once, no more than the limits above.
+    """Read a YAML document of plain values, with unique keys, within the limits above.
 
     Parameters
     ----------
     path
         The file.
     expected, remedy
-        Of the message where there is no such file.
+        Parts of the message for a missing file.
 
     Raises
     ------
     CampaignError
-        If it is not there, is not YAML, or is larger or deeper than a document of ours can be.
+        If the file is missing, is not YAML, or exceeds the limits of size or depth.
     """
     text = read_text(path, expected=expected, remedy=remedy, largest=LARGEST_YAML)
     try:
@@ -96,7 +96,7 @@ def read_yaml(path: Path, *, expected: str, remedy: str) -> object:
         document: object = yaml.constructor.SafeConstructor().construct_document(root)
     except (yaml.YAMLError, ValueError, TypeError, AttributeError, ArithmeticError, LookupError) as error:
         raise CampaignError(
-            f"not readable as YAML ({_problem(error)})", where=path, expected="YAML", remedy="Correct the line named."
+            f"not readable as YAML ({_problem(error)})", where=path, expected="YAML", remedy="Correct that line."
         ) from error
     return document
 
@@ -113,7 +113,7 @@ def _wrong(problem: str, at: Any) -> yaml.MarkedYAMLError:
 
 
 def _count_nodes(text: str) -> None:
-    """Raise YAMLError where a document is deeper or holds more than the limits, before it is built."""
+    """Raise YAMLError if a document exceeds the limits of depth or size, before any object is built."""
     sizes, names, anchors = [0], [""], dict[str, int]()
     for event in yaml.parse(text, Loader=_LOADER):
         if isinstance(event, yaml.CollectionStartEvent):
@@ -126,7 +126,7 @@ def _count_nodes(text: str) -> None:
             size, name = sizes.pop(), names.pop()
         elif isinstance(event, yaml.AliasEvent):
             if event.anchor not in anchors:
-                raise _wrong(f"alias {quoted(event.anchor)} stands for nothing before it, or for itself", event)
+                raise _wrong(f"alias {quoted(event.anchor)} refers to no complete node before it", event)
             size, name = anchors[event.anchor], ""
         elif isinstance(event, yaml.ScalarEvent):
             size, name = 1, event.anchor or ""
@@ -136,28 +136,28 @@ def _count_nodes(text: str) -> None:
             anchors[name] = size
         sizes[-1] += size
         if sizes[-1] > MOST_NODES:
-            raise _wrong(f"more than {MOST_NODES} values, with all that aliases stand for", event)
+            raise _wrong(f"more than {MOST_NODES} values with aliases expanded", event)
 
 
 def _check_nodes(root: yaml.Node) -> None:
-    """Raise YAMLError at a repeated key, a tag beyond plain values, or an infinite number."""
-    seen, waiting = set[int](), [root]
+    """Raise YAMLError at a repeated key, a tag beyond plain values, or an integer of too many digits."""
+    visited, waiting = set[int](), [root]
     while waiting:
         node = waiting.pop()
-        if id(node) in seen:
+        if id(node) in visited:
             continue
-        seen.add(id(node))
+        visited.add(id(node))
         if node.tag not in _PLAIN:
-            raise _wrong(f"tag {quoted(node.tag)}, where a plain value belongs", node)
+            raise _wrong(f"tag {quoted(node.tag)} instead of a plain value", node)
         if isinstance(node, yaml.ScalarNode):
             if node.tag.endswith(":int") and len(node.value) > _LONGEST_INTEGER:
-                raise _wrong(f"a number of {len(node.value)} digits", node)
+                raise _wrong(f"an integer of {len(node.value)} digits", node)
             continue
         if isinstance(node, yaml.MappingNode):
             keys = set[tuple[str, str]]()
             for key, _ in node.value:
                 if isinstance(key, yaml.ScalarNode) and (key.tag, key.value) in keys:
-                    raise _wrong(f"key {quoted(key.value)} a second time", key)
+                    raise _wrong(f"repeated key {quoted(key.value)}", key)
                 keys.add((key.tag, str(key.value) if isinstance(key, yaml.ScalarNode) else ""))
             waiting += [part for pair in node.value for part in pair]
         else:
@@ -165,21 +165,21 @@ def _check_nodes(root: yaml.Node) -> None:
 
 
 def read_json(path: Path, *, expected: str, remedy: str, largest: int = LARGEST_JSON) -> dict[str, Any]:
-    """Return the object in a JSON file.
+    """Read the object in a JSON file.
 
     Parameters
     ----------
     path
         The file.
     expected, remedy
-        Of the message where there is no such file.
+        Parts of the message for a missing file.
     largest
-        Bytes that it may have.
+        Maximum size in bytes.
 
     Raises
     ------
     CampaignError
-        If it is not there or is no JSON object.
+        If the file is missing or is not a JSON object.
     """
     if not path.is_file():
         raise CampaignError("no such file", where=path, expected=expected, remedy=remedy)
@@ -193,19 +193,19 @@ def read_json(path: Path, *, expected: str, remedy: str, largest: int = LARGEST_
 
 @contextmanager
 def undamaged(path: Path, *, expected: str, remedy: str) -> Iterator[None]:
-    """Turn what goes wrong while a document is taken apart into one message about its file.
+    """Convert errors raised while a document is parsed into one message about its file.
 
     Parameters
     ----------
     path
         The file that the document was read from.
     expected, remedy
-        For the message; the remedy of a result is to delete it and run again.
+        Parts of the message; the remedy for a result is to delete it and run again.
 
     Raises
     ------
     CampaignError
-        For every error that a missing key, a wrong type or a wild number causes in the block.
+        For every error that a missing key, a wrong type or a number out of range causes in the block.
     """
     try:
         yield
@@ -217,20 +217,20 @@ def undamaged(path: Path, *, expected: str, remedy: str) -> Iterator[None]:
 
 
 def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is no number of JSON")
+    raise ValueError(f"{name} is not a valid JSON number")
 
 
 CODECS = frozenset({"bytes", "transpose", "zstd", "gzip", "blosc", "crc32c", "sharding_indexed", "vlen-utf8"})
-"""How chunks of zarr may be packed. Others may do anything: that of numcodecs called pickle runs code out of them."""
+"""Permitted codecs of zarr chunks. Others may be unsafe: the pickle codec of numcodecs executes code from the chunk."""
 
 
 def other_codec(metadata: object) -> str | None:
-    """Return a codec that a document of zarr, version 3, names wherever it stands and that is none of `CODECS`.
+    """Find a codec outside `CODECS` in Zarr version 3 metadata, at any depth.
 
     Parameters
     ----------
     metadata
-        A ``zarr.json`` as it was read: of an array, or of a group that repeats those of its arrays.
+        Parsed ``zarr.json`` of an array, or of a group with consolidated metadata.
 
     Examples
     --------
@@ -256,30 +256,30 @@ def other_codec(metadata: object) -> str | None:
 T = TypeVar("T")
 
 _TYPE = r"(constrained-\w+|literal\[.*|function-.*|tuple\[.*|bool|int|float|str)$"
-"""What pydantic adds to the way to a key where it may hold one of several types."""
+"""Components that pydantic adds to the location of a key that accepts several types."""
 
 _MOST_COMPLAINTS = 12
 
 LARGEST_NUMBER = 1e15
-"""Largest length, time, frequency or count accepted: beyond, sums in float64 lose their addends."""
+"""Largest length, time, frequency or count accepted: beyond it, float64 sums lose significant digits."""
 
 
 def validated(model: type[T], document: object, *, where: object, expected: str) -> T:
-    """Return `document` as a `model`; one message names every wrong key and the nearest valid one.
+    """Validate `document` as a `model`; one message lists every invalid key with the nearest valid one.
 
     Parameters
     ----------
     model
         A pydantic model or dataclass that forbids extra keys.
     document
-        What YAML made of the file.
+        Parsed content of the YAML file.
     where, expected
-        File, and what its keys and values should be, for the message.
+        File and description of its valid keys and values, for the message.
 
     Raises
     ------
     CampaignError
-        With file, key, what was found and what was expected.
+        If keys or values are invalid; states file, key, value found and valid value.
     """
     adapter = TypeAdapter(model)
     try:
@@ -287,28 +287,28 @@ def validated(model: type[T], document: object, *, where: object, expected: str)
     except ValidationError as error:
         found = _complaints(error, adapter.json_schema())
         if all(item["type"] == "value_error" for item in error.errors(include_url=False, include_context=False)):
-            expected = "values that go together"  # keys and types are right
-        raise CampaignError(found, where=where, expected=expected, remedy="Correct what is named.") from error
-    except ArithmeticError as error:  # of numbers that are each allowed and not together
-        found = f"numbers too large or small to calculate with ({error})"
+            expected = "consistent values"  # keys and types are valid
+        raise CampaignError(found, where=where, expected=expected, remedy="Correct these keys.") from error
+    except ArithmeticError as error:  # each number is permitted, their combination is not
+        found = f"numeric overflow or underflow ({error})"
         raise CampaignError(found, where=where, expected=expected, remedy="Correct the most extreme value.") from error
     for key, number in _numbers(adapter.dump_python(value, warnings=False), ()):
         if not abs(number) <= LARGEST_NUMBER:
             found = f"{quoted(key)[1:-1]} is {quoted(number)}"
-            raise CampaignError(found, where, f"no number beyond ±{LARGEST_NUMBER:g}", "Correct what is named.")
+            raise CampaignError(found, where, f"numbers within ±{LARGEST_NUMBER:g}", "Correct this value.")
     return value
 
 
-def _numbers(value: object, way: tuple[str, ...]) -> Iterator[tuple[str, float]]:
+def _numbers(value: object, location: tuple[str, ...]) -> Iterator[tuple[str, float]]:
     """Yield key and absolute value of every number."""
     if isinstance(value, Mapping):
         for key, part in value.items():
-            yield from _numbers(part, (*way, str(key)))
+            yield from _numbers(part, (*location, str(key)))
     elif isinstance(value, list | tuple):
         for index, part in enumerate(value):
-            yield from _numbers(part, (*way, str(index)))
+            yield from _numbers(part, (*location, str(index)))
     elif isinstance(value, int | float | complex):
-        yield ".".join(way), abs(value)
+        yield ".".join(location), abs(value)
 
 
 def _complaints(error: ValidationError, schema: dict[str, Any]) -> str:
@@ -323,15 +323,15 @@ def _complaints(error: ValidationError, schema: dict[str, Any]) -> str:
 
 
 def _complaint(item: dict[str, Any], schema: dict[str, Any]) -> tuple[str, str]:
-    """Return a key and its error; names of alternative types are no keys."""
+    """Return a key and its error; names of alternative types are dropped from the location of the key."""
     tags = _collected(schema, lambda part: part.get("discriminator", {}).get("mapping", {}))
     parts, unknown = [*map(str, item["loc"])], item["type"] in {"extra_forbidden", "unexpected_keyword_argument"}
-    own = parts[-1:] if unknown else []  # a key, also where it is called as one of the alternatives
-    way = parts[:-1] if unknown else parts
-    location = [part for part in way if not (re.match(_TYPE, part) or part in tags)] + own
+    own = parts[-1:] if unknown else []  # always a key, even if it has the name of an alternative type
+    parents = parts[:-1] if unknown else parts
+    location = [part for part in parents if not (re.match(_TYPE, part) or part in tags)] + own
     key = ".".join(location) or "the whole file"
     if unknown:
-        known = sorted(_collected(schema, _properties) - {location[-1]})  # it may be a key of another section
+        known = sorted(_collected(schema, _properties) - {location[-1]})  # the key may belong to another section
         near = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.5)
         return key, "unknown key" + (f" (did you mean '{near[0]}'?)" if near else "")
     if item["type"] == "missing":

@@ -1,4 +1,4 @@
-"""Errors that a user can cause, and those of a full, read-only or broken machine."""
+"""Errors that a user can correct, and messages for errors of the machine: full, read-only or failing disk, memory."""
 
 import errno
 import logging
@@ -9,41 +9,41 @@ from pathlib import Path
 
 _LOG = logging.getLogger(__name__)
 _REMEDIES = {
-    errno.ENOSPC: "Make room there",
-    errno.EDQUOT: "Make room there, or ask for a larger quota",
-    errno.EFBIG: "Raise the limit of a file's size (ulimit -f), or write to another file system",
-    errno.EROFS: "Copy the campaign to where it may be written",
+    errno.ENOSPC: "Free disk space there",
+    errno.EDQUOT: "Free disk space there, or request a larger quota",
+    errno.EFBIG: "Raise the file size limit (ulimit -f), or write to another file system",
+    errno.EROFS: "Copy the campaign to a writable file system",
     errno.EACCES: "Make it readable and its folder writable",
     errno.EPERM: "Make it readable and its folder writable",
     errno.EIO: "Check the disk (dmesg)",
-    errno.ESTALE: "Mount its server again",
-    errno.ETIMEDOUT: "Mount its server again",
-    errno.EMFILE: "Raise the limit of open files (ulimit -n)",
+    errno.ESTALE: "Remount the network file system",
+    errno.ETIMEDOUT: "Remount the network file system",
+    errno.EMFILE: "Raise the limit on open files (ulimit -n)",
     errno.ENFILE: "Close other programs",
     errno.ENOMEM: "Give the job more memory",
-    errno.ENOENT: "Check the path; to write, name a folder that can be written to,",
-    errno.EEXIST: "Move away what stands there, or name another place,",
-    errno.ENOTDIR: "Move away what stands where a folder should be",
-    errno.EISDIR: "Move away the folder that stands where a file should be",
-    errno.ENOTEMPTY: "Move away what stands there",
+    errno.ENOENT: "Check the path (for output: a path in a writable folder)",
+    errno.EEXIST: "Move the existing file or folder, or use another path,",
+    errno.ENOTDIR: "Move the file that occupies the path of a folder",
+    errno.EISDIR: "Move the folder that occupies the path of a file",
+    errno.ENOTEMPTY: "Move the contents of that folder",
     errno.ENAMETOOLONG: "Give flights and nodes shorter names",
-    errno.EPIPE: "The reader of the output has gone",
+    errno.EPIPE: "The process that reads the output has exited",
 }
-"""Error number of the system → remedy."""
+"""Error number of the operating system → remedy."""
 
 _LONGEST = {"where": 400, "found": 1000, "expected": 1000, "remedy": 400}
-"""Characters of each part of a message; text of untrusted files may be of any length."""
+"""Maximum characters in each part of a message; text from untrusted files may be of any length."""
 
 
 def shown(text: object, longest: int = 80) -> str:
-    r"""Return a text as a terminal may show it: one line, control characters as escapes, cut where it is too long.
+    r"""Format a text for display on a terminal: one line, control characters escaped, truncated to a maximum length.
 
     Parameters
     ----------
     text
-        Of whatever origin; not printed as it stands.
+        Text or object from any source, trusted or not.
     longest
-        Characters that are kept.
+        Maximum number of characters before the ellipsis.
 
     Examples
     --------
@@ -54,26 +54,29 @@ def shown(text: object, longest: int = 80) -> str:
     whole = len(line) <= longest
     line = line[:longest]
     if not line.isprintable():
-        line = "".join(one if one.isprintable() else one.encode("unicode_escape").decode("ascii") for one in line)
+        line = "".join(
+            character if character.isprintable() else character.encode("unicode_escape").decode("ascii")
+            for character in line
+        )
     return line if whole and len(line) <= longest else line[:longest] + "…"
 
 
 @lru_cache(maxsize=1000)
 def print_remark(where: str, remark: str) -> None:
-    """Print how a file was read, once in a process: commands may read a file for each of their checks.
+    """Log a remark about a file, once per process: a command may read the same file for several checks.
 
     Parameters
     ----------
     where
         The file.
     remark
-        One line; also what an untrusted file holds.
+        One line; it may quote an untrusted file.
     """
     _LOG.warning("%s: %s", shown(where, 300), shown(remark, 500))
 
 
 def number_of(count: int, what: str) -> str:
-    """Return a count of something in words.
+    """Format a count with its noun in the singular or plural.
 
     Examples
     --------
@@ -84,7 +87,7 @@ def number_of(count: int, what: str) -> str:
 
 
 def quoted(value: object, longest: int = 80) -> str:
-    """Return a value that was read as Python writes it, in quotation marks if it is text, and no longer than that.
+    """Format a value from a file as its Python representation: text in quotation marks, truncated to a maximum length.
 
     Examples
     --------
@@ -99,25 +102,25 @@ def quoted(value: object, longest: int = 80) -> str:
 
 
 class CampaignError(ValueError):
-    """Something in the campaign folder is wrong and a person has to change it.
+    """Error in the campaign folder that the user has to correct.
 
-    It may quote an untrusted file: it is one line without control characters, of bounded length.
+    The message may quote an untrusted file. It is one line of bounded length, without control characters.
 
     Parameters
     ----------
     found
-        What is there, with its value.
+        The fault, with the value found.
     where
         File, and key, line or pulse within it.
     expected
-        What would have been right.
+        Description of a valid value.
     remedy
-        What to do about it, in one sentence.
+        Corrective action, in one sentence.
 
     Attributes
     ----------
     found, where, expected, remedy
-        The same, as shown.
+        The same, formatted for display.
 
     Examples
     --------
@@ -138,33 +141,33 @@ class CampaignError(ValueError):
 
 
 class ContractError(TypeError):
-    """A stage does not hold what its contract promises: a bug of the product, not of the campaign."""
+    """Violation of a stage's contract: an internal error of the product, not of the campaign."""
 
 
 def explained(error: BaseException) -> str | None:
-    """Return one message for an error of the machine: disk full, read-only, broken; memory, files or reader gone.
+    """Format an error of the machine (disk, memory, open files, closed output) as one message with a remedy.
 
     Parameters
     ----------
     error
-        Whatever ended the work.
+        Exception that stopped the process.
 
     Returns
     -------
     str or None
-        Message with path, free space and remedy; None for any other error, a defect of the product.
+        Message with path, free disk space and remedy; None for any other error, an internal error of the product.
 
     Examples
     --------
     >>> explained(OSError(errno.EIO, "Input/output error", "raw/f01/a.sigmf-data"))
-    'raw/f01/a.sigmf-data: Input/output error (EIO). Check the disk (dmesg) and run again: it goes on where it was.'
+    'raw/f01/a.sigmf-data: Input/output error (EIO). Check the disk (dmesg) and run again: the run resumes.'
     >>> explained(ZeroDivisionError()) is None
     True
     """
-    again = "and run again: it goes on where it was."
+    again = "and run again: the run resumes."
     if isinstance(error, MemoryError):
-        what = str(error) or "no more memory"
-        return f"out of memory: {what}. Give the job more memory, or fewer --threads or a smaller tile_px, {again}"
+        what = str(error) or "allocation failed"
+        return f"out of memory: {what}. Give the job more memory, fewer --threads or a smaller tile_px, {again}"
     number = _error_number(error)
     if number is None:
         return None
@@ -178,11 +181,11 @@ def explained(error: BaseException) -> str | None:
 
 _OF_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _OF_PLACE = {errno.ENOENT, errno.EEXIST}
-"""Without the name of a file they are defects: a person can do nothing about them."""
+"""Errors that are internal unless they name a file: the user has no means to correct them."""
 
 
 def _error_number(error: BaseException) -> int | None:
-    """Return the system's number of an error; GDAL's errors only quote its words."""
+    """Return the errno of an exception; for GDAL's errors, that of the system message they quote."""
     if isinstance(error, OSError) and error.errno is not None:
         known = error.errno in _REMEDIES and (error.filename is not None or error.errno not in _OF_PLACE)
         return error.errno if known else None
@@ -194,5 +197,5 @@ def _error_number(error: BaseException) -> int | None:
 
 def _free(path: Path) -> str:
     path = Path(path.absolute())
-    there = next(folder for folder in (path, *path.parents) if folder.exists())
-    return f"{shutil.disk_usage(there).free / 1e6:.1f} MB free there"
+    existing_folder = next(folder for folder in (path, *path.parents) if folder.exists())
+    return f"{shutil.disk_usage(existing_folder).free / 1e6:.1f} MB free there"

@@ -1,4 +1,4 @@
-"""Flags that were raised: name → lines of what was measured, and the one way to merge the flags of several parts."""
+"""Raised flags: mapping from flag name to lines of measured text, and the merging of flags from several sources."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -8,25 +8,26 @@ from apertura.common.flag_table import FLAGS
 
 
 class Flags(dict[str, str]):
-    """Flags of a stage or an image: name in `apertura.common.flag_table.FLAGS` → text of what was measured.
+    """Flags of a stage or an image: name in `apertura.common.flag_table.FLAGS` → measured text.
 
-    The text of a flag is its lines, one per part that raised it, joined by "; ". A line may contain "; " itself.
+    The text of a flag consists of one line per source (node, pair, image) that raised it, joined by "; ". A line may
+    itself contain "; ".
 
     Raises
     ------
     KeyError
-        If a name is no row of that table, however it is set.
+        If a name is not in that table.
 
     Examples
     --------
-    >>> merged = Flags.merged({"fix_poor": "3 of 90 pulses of uav1"}, {"fix_poor": "7 of 90 pulses of uav2"})
-    >>> merged["fix_poor"]
-    '3 of 90 pulses of uav1; 7 of 90 pulses of uav2'
+    >>> merged = Flags.merged({"fix_quality_low": "3 of 90 pulses of a"}, {"fix_quality_low": "7 of 90 pulses of b"})
+    >>> merged["fix_quality_low"]
+    '3 of 90 pulses of a; 7 of 90 pulses of b'
     >>> Flags.merged(merged, merged) == merged
     True
     >>> Flags({"fix_pour": "9 of 90 pulses of uav1"})
     Traceback (most recent call last):
-    KeyError: 'fix_pour is no row of apertura.common.flag_table.FLAGS'
+    KeyError: 'fix_pour is not in apertura.common.flag_table.FLAGS'
     """
 
     def __init__(self, flags: Mapping[str, str] | Iterable[tuple[str, str]] = ()) -> None:
@@ -40,7 +41,7 @@ class Flags(dict[str, str]):
 
     def _set(self, name: str, lines: list[str]) -> None:
         if name not in FLAGS:
-            raise KeyError(f"{name} is no row of apertura.common.flag_table.FLAGS")
+            raise KeyError(f"{name} is not in apertura.common.flag_table.FLAGS")
         self._lines[name] = lines
         super().__setitem__(name, "; ".join(lines))
 
@@ -49,9 +50,9 @@ class Flags(dict[str, str]):
 
     @classmethod
     def merged(cls, *several: Mapping[str, str]) -> Self:
-        """Merge the flags of several parts, in their order: a flag that several raise keeps the lines of each.
+        """Merge flags from several sources, in order; a flag raised by several sources keeps the lines of each.
 
-        A line that another line repeats as a whole, with or without an addition behind "; " or " (", is left out.
+        A line that is contained whole in another line, followed by "; ", " (" or the end, is omitted.
         """
         merged = cls()
         for flags in several:
@@ -65,5 +66,5 @@ class Flags(dict[str, str]):
 
 
 def _repeats(line: str, part: str) -> bool:
-    """Test whether a line consists of another one, or contains it between "; "."""
+    """Return True if a line equals `part` or contains it whole, delimited by "; "."""
     return re.search(rf"(?:^|; ){re.escape(part)}(?:$|; | \()", line) is not None

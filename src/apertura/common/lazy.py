@@ -1,4 +1,4 @@
-"""References to functions whose modules are imported when they are called: tables cost no import of what rows name."""
+"""Lazy references to functions: the module of a table's function is imported only when the function is called."""
 
 import pkgutil
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Lazy:
-    """A package, module or function by its dotted path; attributes are further references, and a call imports.
+    """Reference to a package, module or function by dotted path; attributes are references, and a call imports.
 
     Examples
     --------
@@ -25,12 +25,12 @@ class Lazy:
         return Lazy(f"{self.path}.{name}")
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
-        """Import the function, and call it."""
+        """Import the function and call it."""
         return pkgutil.resolve_name(self.path)(*arguments, **named)
 
 
 def module_of(function: Callable[..., Any]) -> str:
-    """Return the dotted name of the module that defines a function, which is not imported for it.
+    """Return the dotted name of the module that defines a function, without importing it.
 
     Examples
     --------
@@ -41,5 +41,5 @@ def module_of(function: Callable[..., Any]) -> str:
 
 
 def name_of(function: Callable[..., Any]) -> str:
-    """Return the name of a function, which is not imported for it."""
+    """Return the name of a function, without importing its module."""
     return function.path.rpartition(".")[2] if isinstance(function, Lazy) else function.__name__

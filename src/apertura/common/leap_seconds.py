@@ -1,4 +1,4 @@
-"""Leap seconds: offset of GPS time against UTC, and conversions between both."""
+"""Leap seconds: offset between GPS time and UTC, and conversions between both."""
 
 import logging
 
@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Times
 
 GPS_EPOCH = np.datetime64("1980-01-06T00:00:00", "ns")
-"""Where GPS time begins, without a second between it and UTC."""
+"""Epoch of GPS time, where its offset from UTC is zero."""
 
 KNOWN_UNTIL = np.datetime64("2027-06-28T00:00:00", "ns")
-"""No leap second that the table lacks comes before this date (IERS Bulletin C, as tzdata 2026.6 lists it)."""
+"""Date until which the table of leap seconds is complete (IERS Bulletin C, as listed in tzdata 2026.6)."""
 
 _BEGINNINGS = (
     *("1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01", "1990-01-01"),
@@ -21,31 +21,31 @@ _BEGINNINGS = (
 _SINCE_UTC = np.array(_BEGINNINGS, "datetime64[ns]")
 
 LATEST_S = len(_BEGINNINGS)
-"""Seconds by which GPS time is ahead of UTC since the last of them."""
+"""Seconds by which GPS time is ahead of UTC after the latest leap second."""
 
 _SECOND = np.timedelta64(1, "s")
-_SINCE_GPS = _SINCE_UTC + np.arange(LATEST_S) * _SECOND  # each begins with the leap second itself, 23:59:60 in UTC
+_SINCE_GPS = _SINCE_UTC + np.arange(LATEST_S) * _SECOND  # start of each leap second (23:59:60 UTC) in GPS time
 _WEEK = np.timedelta64(7, "D")
 _LOG = logging.getLogger(__name__)
 
 
 def gps_ahead_s(time_utc: Times | np.datetime64) -> NDArray[np.int64]:
-    """Return the seconds by which GPS time is ahead of UTC.
+    """Return the number of seconds by which GPS time is ahead of UTC.
 
     Parameters
     ----------
     time_utc
-        Of any shape, datetime64[ns], UTC.
+        UTC, datetime64[ns], any shape.
 
     Returns
     -------
     ndarray
-        Of the same shape, int64, s. After `KNOWN_UNTIL` it stays constant, with a notice.
+        Offset in s, int64, of the same shape. Constant after `KNOWN_UNTIL`, with a warning.
 
     Raises
     ------
     ValueError
-        If a time is before 1980-01-06, where GPS time begins.
+        If a time is before 1980-01-06, the epoch of GPS time.
 
     Examples
     --------
@@ -61,17 +61,17 @@ def gps_ahead_s(time_utc: Times | np.datetime64) -> NDArray[np.int64]:
 
 
 def gps_from_utc(time_utc: Times) -> Times:
-    """Return GPS time of times in UTC.
+    """Convert UTC to GPS time.
 
     Parameters
     ----------
     time_utc
-        Of any shape, datetime64[ns].
+        UTC, datetime64[ns], any shape.
 
     Raises
     ------
     ValueError
-        As `gps_ahead_s`.
+        See `gps_ahead_s`.
 
     Examples
     --------
@@ -82,18 +82,18 @@ def gps_from_utc(time_utc: Times) -> Times:
 
 
 def utc_from_gps(time_gps: Times) -> Times:
-    """Return UTC of times that a GPS receiver counts.
+    """Convert GPS time to UTC.
 
     Parameters
     ----------
     time_gps
-        Of any shape, datetime64[ns]: calendar dates of GPS time, such as ``GPS_EPOCH`` + weeks + milliseconds.
+        GPS time as calendar date, such as ``GPS_EPOCH`` + weeks + milliseconds; datetime64[ns], any shape.
 
     Returns
     -------
     ndarray
-        Of the same shape, datetime64[ns]; NaT within a leap second: 23:59:60 is a time of UTC that no datetime64 is.
-        After `KNOWN_UNTIL` no further leap second is assumed; with a notice.
+        UTC, datetime64[ns], of the same shape; NaT within a leap second, which datetime64 cannot represent (23:59:60).
+        After `KNOWN_UNTIL` no further leap second is assumed, with a warning.
 
     Raises
     ------
@@ -108,13 +108,13 @@ def utc_from_gps(time_gps: Times) -> Times:
     """
     _check(time_gps)
     ahead = np.asarray(np.searchsorted(_SINCE_GPS, time_gps, side="right"), np.int64)
-    # n − 1 s after UTC's midnight GPS time meets the n-th leap second; for a second it has not passed
+    # the n-th leap second lasts from _SINCE_GPS[n - 1] for one second
     within = (ahead > 0) & (time_gps - _SINCE_GPS[ahead - 1] < _SECOND)
     return np.where(within, np.datetime64("NaT", "ns"), time_gps - ahead * _SECOND)
 
 
 def gps_from_weeks(week: NDArray[np.int64], milliseconds: NDArray[np.int64]) -> Times:
-    """Return GPS time of weeks since 1980-01-06 (not modulo 1024) and milliseconds in them.
+    """Convert GPS week (since 1980-01-06, not modulo 1024) and millisecond of the week to GPS time.
 
     Examples
     --------
@@ -125,8 +125,8 @@ def gps_from_weeks(week: NDArray[np.int64], milliseconds: NDArray[np.int64]) -> 
 
 
 def _check(time: Times | np.datetime64) -> None:
-    """Raise ValueError of a time before GPS time began; warn of one after the table's end."""
+    """Raise ValueError at a time before the GPS epoch; warn about a time after the end of the table."""
     if np.any(~(time >= GPS_EPOCH)):
-        raise ValueError("a time before 1980-01-06, where GPS time begins")
+        raise ValueError("a time before 1980-01-06, the epoch of GPS time")
     if np.any(time >= KNOWN_UNTIL):
-        _LOG.warning("leap seconds are known until %s: %d s are taken after it", str(KNOWN_UNTIL)[:10], LATEST_S)
+        _LOG.warning("leap seconds are known until %s: %d s are assumed after it", str(KNOWN_UNTIL)[:10], LATEST_S)

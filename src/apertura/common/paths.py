@@ -1,4 +1,4 @@
-"""Paths of the campaign folder as shells take them, and of what is shipped."""
+"""Check of campaign paths for use in shell commands, and location of the shipped workflow files."""
 
 from pathlib import Path
 
@@ -6,9 +6,10 @@ from apertura.common.errors import CampaignError
 
 
 def check_shell_name(root: Path) -> None:
-    """Raise CampaignError if the path of a campaign holds what a shell would run between double quotes.
+    """Raise CampaignError if the path of a campaign contains characters that a shell interprets in double quotes.
 
-    Executors of Snakemake hand commands with that path to a shell: that of Slurm as ``sbatch --wrap="…"``.
+    Snakemake executors pass commands with that path to a shell, for example the Slurm executor as
+    ``sbatch --wrap="…"``.
 
     Examples
     --------
@@ -23,13 +24,13 @@ def check_shell_name(root: Path) -> None:
         raise CampaignError(
             f"a path with {active!r}" if active else "a path with control characters",
             where=root,
-            expected="a path that a shell takes as it stands, where steps run on other machines",
+            expected="a path without shell metacharacters, for steps that run on other machines",
             remedy="Rename the folder.",
         )
 
 
 def shipped() -> Path:
-    """Return the folder of the root Snakefile, profiles and tables: in the installed package, or beside its sources.
+    """Return the folder of the root Snakefile, profiles and tables: in the installed package or in the source tree.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Processes of a run: one at a time, apart from the folder's own code, and ended with what they opened closed."""
+"""Processes of a run: lock, isolation from an untrusted working folder, and orderly termination by signals."""
 
 import ctypes
 import fcntl
@@ -21,32 +21,32 @@ from typing import IO
 from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError, shown
 
-# ---- End of a command: signals, and the exit status for the run around it -------------------------------------------
+# ---- Termination of a command: signals, and the exit status reported to the run -------------------------------------
 
 INTERRUPTED = 130
 SIGNALLED = 128
-"""Exit status of a process that a signal has ended, as shells count: this and the number of the signal."""
+"""Base of the exit status of a process that was terminated by a signal; the signal number is added, as in shells."""
 STATUS_FILE = "APERTURA_STATUS_FILE"
-"""Environment variable: where steps leave the exit status that snakemake does not pass on, as a reference of
+"""Environment variable: file for the exit status of a step, which Snakemake does not pass on, as a reference of
 `ConfinedPath`."""
 
 ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
-"""Signals that end a run."""
+"""Signals that terminate a run."""
 
 ALGEBRA_THREADS = "OPENBLAS_NUM_THREADS"
-"""Environment variable, read when numpy is imported: 1 in every command. Only products of small matrices are left to
-OpenBLAS, whose threads wait on each other longer than they compute (simulating the demo: 6.8 CPU seconds with two, 1.9
-with one); engines have threads of their own. What is computed then has the same bits on any number of cores."""
+"""Environment variable, read when numpy is imported: 1 in every command. OpenBLAS only multiplies small matrices, for
+which its threads wait for each other longer than they compute (simulation of the demo: 6.8 CPU seconds with two
+threads, 1.9 with one). Engines have their own threads. Results are then bit-identical for any number of cores."""
 
 _PR_SET_PDEATHSIG = 1  # of prctl(2)
 
 
 class Interrupted(SystemExit):
-    """The process was ended by a signal."""
+    """Termination of the process by a signal."""
 
 
 def leave_status(status: int) -> None:
-    """Write the exit status of a step for the run that it belongs to, if any."""
+    """Report the exit status of a step to its run, if any."""
     if STATUS_FILE in os.environ and status:
         file = ConfinedPath.referenced(os.environ[STATUS_FILE])
         with suppress(OSError, CampaignError), file.open("a", encoding="utf-8") as stream:  # on another node
@@ -54,12 +54,12 @@ def leave_status(status: int) -> None:
 
 
 def die_with_parent(parent: int) -> None:
-    """Ask the kernel to end this process with its parent, also where that is killed outright.
+    """Request that the kernel terminate this process when its parent exits, even by SIGKILL.
 
     Parameters
     ----------
     parent
-        Number of the process that started this one: it may have ended by now.
+        Process ID of the parent, which may already have exited.
     """
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
@@ -68,7 +68,7 @@ def die_with_parent(parent: int) -> None:
 
 @contextmanager
 def ended_by_signals() -> Iterator[None]:
-    """Turn SIGTERM, SIGINT and SIGHUP into `Interrupted`, so that whatever is open is closed on the way out."""
+    """Convert SIGTERM, SIGINT and SIGHUP to `Interrupted`, so that open resources are closed on exit."""
 
     def end(number: int, _: FrameType | None) -> None:
         for other in ENDING:
@@ -85,24 +85,25 @@ def ended_by_signals() -> Iterator[None]:
 
 # ---- Isolation from an untrusted working folder ---------------------------------------------------------------------
 #
-# Python and libraries take modules and settings from the working folder (``yaml.py``, numba's ``.numba_config.yaml``
-# with its cache of pickled code, ``matplotlibrc``). Commands are typed in campaign folders, and Snakemake starts
-# every step in one.
+# Python and libraries load modules and settings from the working folder (``yaml.py``, numba's ``.numba_config.yaml``
+# with its cache of pickled code, ``matplotlibrc``). Users run commands in campaign folders, and Snakemake starts every
+# step in one.
 
 SAFE_PATH = "PYTHONSAFEPATH"
-"""Environment variable: Python then imports nothing from the working folder; ``python -m snakemake`` of a job, too."""
+"""Environment variable that prevents Python, including ``python -m snakemake``, from importing from the working
+folder."""
 
 _SEARCHED = ("PATH", "PYTHONPATH")
 _left: list[Path] = []
 
 
 def leave_working_folder() -> None:
-    """Make the package's own folder the working folder, and `isolate`; typed paths are then resolved by `given`.
+    """Change the working folder to the package folder, and `isolate`; `given` then resolves paths of the command line.
 
     Raises
     ------
     FileNotFoundError
-        If the working folder is gone.
+        If the working folder no longer exists.
     """
     _left[:] = [Path.cwd()]
     os.chdir(Path(__file__).parents[1])
@@ -110,10 +111,10 @@ def leave_working_folder() -> None:
 
 
 def isolate() -> None:
-    """Prevent imports and commands from the working folder, in this process and in those that it starts.
+    """Prevent imports and commands from the working folder, in this process and its child processes.
 
-    Empty and relative entries of PATH, PYTHONPATH and ``sys.path`` mean whatever folder is the working one: Snakemake
-    adds ``.snakemake/pip-deployments`` itself.
+    Removes empty and relative entries of PATH, PYTHONPATH and ``sys.path``, which refer to the working folder;
+    Snakemake itself adds ``.snakemake/pip-deployments``.
 
     Examples
     --------
@@ -133,11 +134,11 @@ _CACHE, _MATPLOTLIB = "XDG_CACHE_HOME", "MPLCONFIGDIR"
 
 
 def keep_caches_writable() -> None:
-    """Point the caches of libraries at a folder of this user in the temporary folder where the home is read-only.
+    """Redirect the caches of libraries to a private temporary folder if the home folder is read-only.
 
-    Snakemake ends without its cache; matplotlib warns, and scans all fonts in every process.
+    Without a cache, Snakemake exits, and matplotlib warns and scans all fonts in every process.
     """
-    cache, config = (_user_folder(*one) for one in ((_CACHE, ".cache"), ("XDG_CONFIG_HOME", ".config")))
+    cache, config = _user_folder(_CACHE, ".cache"), _user_folder("XDG_CONFIG_HOME", ".config")
     if not _is_writable(cache):
         os.environ[_CACHE] = str(_private_folder())
     if _MATPLOTLIB not in os.environ and not (config and _is_writable(config / "matplotlib")):
@@ -145,9 +146,9 @@ def keep_caches_writable() -> None:
 
 
 def _user_folder(variable: str, name: str) -> Path | None:
-    """Return a folder of the XDG base directory specification; None where the user has no home."""
-    if stated := os.environ.get(variable):
-        return Path(stated)
+    """Return a folder of the XDG base directory specification; None if the user has no home folder."""
+    if configured := os.environ.get(variable):
+        return Path(configured)
     try:
         return Path.home() / name
     except RuntimeError:
@@ -155,20 +156,20 @@ def _user_folder(variable: str, name: str) -> Path | None:
 
 
 def _is_writable(folder: Path | None) -> bool:
-    """Test whether a folder can be written to, or made."""
+    """Return True if a folder is writable or can be created."""
     while folder is not None and not folder.exists() and folder != folder.parent:
         folder = folder.parent
     return folder is not None and folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)
 
 
 def _private_folder() -> Path:
-    """Return this user's folder below the temporary folder; a new one where the usual name is not this user's."""
+    """Return this user's folder in the temporary folder; a new one if the standard name belongs to another user."""
     folder = Path(tempfile.gettempdir()) / f"apertura-cache-{os.getuid()}"
     with suppress(FileExistsError):
         folder.mkdir(mode=0o700)
-    found = folder.lstat()
-    private = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
-    return folder if private else Path(tempfile.mkdtemp(prefix=f"{folder.name}-"))
+    state = folder.lstat()
+    is_private = stat.S_ISDIR(state.st_mode) and state.st_uid == os.getuid() and not state.st_mode & 0o022
+    return folder if is_private else Path(tempfile.mkdtemp(prefix=f"{folder.name}-"))
 
 
 def _is_absolute(path: str) -> bool:
@@ -176,7 +177,7 @@ def _is_absolute(path: str) -> bool:
 
 
 def given(path: Path) -> Path:
-    """Return a path that a person typed as an absolute one: it counts from where the command was started.
+    """Resolve a path of the command line relative to the folder in which the command was started.
 
     Examples
     --------
@@ -187,12 +188,12 @@ def given(path: Path) -> Path:
 
 
 def started() -> Path:
-    """Return the folder that the command was started in."""
+    """Return the folder in which the command was started."""
     return _left[0] if _left else Path.cwd()
 
 
 def as_typed(text: object) -> str:
-    """Return a path, or a message with paths, as a person would type them where the command was started.
+    """Shorten the paths in a text to paths relative to the folder in which the command was started.
 
     Examples
     --------
@@ -205,41 +206,42 @@ def as_typed(text: object) -> str:
 
 # ---- Confinement of Snakemake ---------------------------------------------------------------------------------------
 #
-# Snakemake, and the shells of its jobs, write and delete by whole names, in which the kernel follows links: records in
-# .snakemake, logs, benchmarks, outputs of failed jobs. Landlock (Linux 5.19 and newer, landlock(7)) keeps a process and
-# all that it starts from changing anything outside some folders, wherever a link leads.
+# Snakemake and the shells of its jobs write and delete files by full path, in which the kernel follows links: records
+# in .snakemake, logs, benchmarks, outputs of failed jobs. Landlock (Linux 5.19 and newer, landlock(7)) prevents a
+# process and its child processes from changing anything outside a list of folders, also through links.
 
 CONFINED = "APERTURA_CONFINED"
 """Environment variable: the campaign folder to which Snakemake's changes are confined."""
 
 TEMPORARY = ("TMPDIR", "TMP", "TEMP", "TEMPDIR")
-"""Environment variables: where temporary files go; Snakemake sets all of them for its jobs."""
+"""Environment variables of the folder for temporary files; Snakemake sets all of them for its jobs."""
 
 _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446  # system calls, the same on every architecture
 _VERSION, _PATH_BENEATH, _PR_SET_NO_NEW_PRIVS = 1, 1, 38
 _CHANGES = sum(1 << right for right in (1, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13))
-"""Rights of Landlock: write a file; remove and make folders and files of every kind; move between folders."""
+"""Landlock rights: write a file; remove and create folders and files of every kind; move between folders."""
 _TRUNCATE, _MOVES, _TRUNCATES = 1 << 14, 2, 3
-"""Right to truncate, and the versions of Landlock that know moves and truncation."""
+"""Right to truncate; Landlock ABI versions that support moves and truncation."""
 
 
 def confine_changes(root: Path, *others: Path) -> bool:
-    """Keep this process, and all that it starts, from changing files but for results and caches; return whether it is.
+    """Prevent this process and its child processes from changing files outside results and caches.
 
-    What stays writable: ``results`` and ``.snakemake`` of the campaign, the latter for temporary files, too; the user's
-    cache, the package's own compiled code, and devices. Recordings and config do not.
+    Writable are ``results`` and ``.snakemake`` of the campaign (the latter also for temporary files), the user's cache,
+    the package folder with its compiled code, and devices. Recordings and config are read-only.
 
     Parameters
     ----------
     root
         The campaign folder.
     *others
-        Further folders whose files may be changed.
+        Further writable folders.
 
     Returns
     -------
     bool
-        False where the kernel has no Landlock, or too old a one: links are then found by the check before a run alone.
+        True if confined; False if the kernel has no Landlock or too old a version. Links are then detected only by the
+        check before a run.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     version = libc.syscall(_CREATE_RULESET, None, ctypes.c_size_t(0), _VERSION)
@@ -248,7 +250,7 @@ def confine_changes(root: Path, *others: Path) -> bool:
     rights = _CHANGES | (_TRUNCATE if version >= _TRUNCATES else 0)
     ruleset = libc.syscall(_CREATE_RULESET, struct.pack("=Q", rights), ctypes.c_size_t(8), 0)
     cache = _user_folder(_CACHE, ".cache") or _private_folder()
-    with suppress(OSError):  # of a new account it is not there yet, and Snakemake would make it
+    with suppress(OSError):  # create it now: Snakemake cannot once changes are confined
         cache.mkdir(parents=True, exist_ok=True)
     folders = [*others, cache, Path(__file__).parents[1], Path("/dev"), Path("/proc")]
     with ExitStack() as stack:
@@ -267,19 +269,19 @@ def confine_changes(root: Path, *others: Path) -> bool:
     return confined
 
 
-# ---- Lock of a campaign: one run at a time, released with its process -----------------------------------------------
+# ---- Lock of a campaign: one run at a time, released when its process exits -----------------------------------------
 
 _LOCK = Path("results/.run.lock")
 _TRIES, _BETWEEN_S = 20, 0.02
 
 
 def hold(root: Path) -> IO[str]:
-    """Lock a campaign folder until the returned file is closed, or its process ends.
+    """Lock a campaign folder until the returned file is closed or its process exits.
 
     Raises
     ------
     CampaignError
-        If another process holds it: which, on which machine, since when.
+        If another process holds the lock; states process ID, machine and start time.
 
     Examples
     --------
@@ -288,7 +290,7 @@ def hold(root: Path) -> IO[str]:
     ...     hold(Path(folder))
     Traceback (most recent call last):
     ...
-    apertura.common.errors.CampaignError: ...: another run holds this campaign: process ...; expected ...
+    apertura.common.errors.CampaignError: ...: the campaign is locked by another run: process ...; expected ...
     """
     path = ConfinedPath.at(root) / _LOCK
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -299,10 +301,10 @@ def hold(root: Path) -> IO[str]:
         holder = _read_holder(lock)
         lock.close()
         raise CampaignError(
-            f"another run holds this campaign: {holder}",
+            f"the campaign is locked by another run: {holder}",
             where=root,
             expected="one run at a time",
-            remedy="Wait until it ends, or end it.",
+            remedy="Wait until that run finishes, or stop it.",
         ) from None
     lock.truncate(0)
     lock.write(f"process {os.getpid()} on {socket.gethostname()} since {datetime.now(UTC):%Y-%m-%d %H:%M:%S} UTC\n")
@@ -311,7 +313,7 @@ def hold(root: Path) -> IO[str]:
 
 
 def holder(root: Path) -> str | None:
-    """Return the holder of a campaign's lock: process, machine, start; None if it is free.
+    """Return process ID, machine and start time of the holder of a campaign's lock; None if it is not locked.
 
     Examples
     --------
@@ -332,7 +334,7 @@ def holder(root: Path) -> str | None:
 
 
 def _take(lock: IO[str]) -> None:
-    """Take the lock; wait for `holder`, which has it for an instant."""
+    """Acquire the lock; retry while `holder` holds it for an instant."""
     for attempt in range(_TRIES):
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -345,4 +347,4 @@ def _take(lock: IO[str]) -> None:
 
 def _read_holder(lock: IO[str]) -> str:
     lock.seek(0)
-    return shown(lock.read(200).strip() or "one that has just begun", 200)
+    return shown(lock.read(200).strip() or "process unknown, just started", 200)

@@ -1,4 +1,4 @@
-"""Progress of a step: a small file in the campaign folder, read by the run and by `apertura status`."""
+"""Progress reports of a step: a small file in the campaign folder, read by the run and by `apertura status`."""
 
 import json
 import threading
@@ -10,7 +10,7 @@ from pathlib import Path
 from apertura.common.errors import CampaignError
 
 RUN = ".run"
-"""Folder of the results: journal of a run, and a progress file for each running step."""
+"""Subfolder of the results: journal of the run, and a progress file for each running step."""
 
 _BETWEEN_S = 1.0
 _files: list[Path] = []
@@ -18,12 +18,12 @@ _files: list[Path] = []
 
 
 def progress_path(step: Sequence[str]) -> tuple[str, ...]:
-    """Return the progress file of a step, as parts of a path below the results.
+    """Return the path of a step's progress file, as components relative to the results.
 
     Parameters
     ----------
     step
-        The words after ``apertura step``: its name, flight and pair.
+        Arguments of ``apertura step``: step name, flight and pair.
 
     Examples
     --------
@@ -36,7 +36,7 @@ def progress_path(step: Sequence[str]) -> tuple[str, ...]:
 
 @contextmanager
 def reporting_to(file: Path) -> Iterator[None]:
-    """Write the progress reported in the body to `file`; remove it at the end."""
+    """Write the progress reported in the context to `file`; remove the file on exit."""
     _files.append(file)
     try:
         yield
@@ -48,19 +48,19 @@ def reporting_to(file: Path) -> Iterator[None]:
 
 @contextmanager
 def progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Report how much of a step's work is done, at most once a second; nothing outside `reporting_to`.
+    """Report the progress of a step at most once a second; without effect outside `reporting_to`.
 
     Parameters
     ----------
     what
         Unit of work: ``tiles``, ``pulses``.
     total
-        How many there are.
+        Number of units.
 
     Yields
     ------
     callable
-        Takes how many more are done; from any thread.
+        Adds a number of finished units; callable from any thread.
 
     Examples
     --------
@@ -86,11 +86,11 @@ def progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
 
 
 def _write(what: str, done: int, total: int, since_s: float) -> None:
-    """Replace the file atomically; a failure to report never ends a step."""
+    """Replace the file atomically; a failure to write it never stops the step."""
     report = {"what": what, "done": done, "total": total, "since": since_s, "at": round(time.time(), 1)}
     for file in _files[-1:]:
-        beside = file.with_suffix(".partial")
+        partial = file.with_suffix(".partial")
         with suppress(OSError, CampaignError):
             file.parent.mkdir(parents=True, exist_ok=True)
-            beside.write_text(json.dumps(report))
-            beside.replace(file)
+            partial.write_text(json.dumps(report))
+            partial.replace(file)

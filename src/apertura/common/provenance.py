@@ -1,4 +1,4 @@
-"""Provenance of a product: settings, inputs, code and versions of software, of all stages before it."""
+"""Provenance of a product: settings, inputs, code and software versions of its stage and all upstream stages."""
 
 import hashlib
 import json
@@ -25,15 +25,14 @@ _NAME = re.compile(r"[\w.-]+")
 
 
 def packages() -> dict[str, str]:
-    """Return name → version of apertura, of Python and of each distribution that apertura requires, sorted by name.
+    """Return name → version of apertura, Python and each distribution that apertura requires, sorted by name.
 
-    Nothing is imported to learn them. What only some installations have (`extra`) is not named: where jobs run does not
-    change a result.
+    The distributions are not imported. Optional dependencies (`extra`) are excluded, because they affect no result.
 
     Examples
     --------
-    >>> found = packages()
-    >>> {"apertura", "python", "numpy", "numba", "zarr"} <= found.keys(), "pytest" in found
+    >>> versions = packages()
+    >>> {"apertura", "python", "numpy", "numba", "zarr"} <= versions.keys(), "pytest" in versions
     (True, False)
     """
     return dict(_packages())
@@ -41,20 +40,20 @@ def packages() -> dict[str, str]:
 
 @cache
 def _packages() -> tuple[tuple[str, str], ...]:
-    found = {"apertura": __version__, "python": platform.python_version()}
+    versions = {"apertura": __version__, "python": platform.python_version()}
     for requirement in requires("apertura") or ():
         if "extra ==" not in requirement and (name := _NAME.match(requirement)):
             try:
-                found[name[0].lower()] = version(name[0])
-            except PackageNotFoundError:  # such as a library that conda calls otherwise
-                found[name[0].lower()] = "unknown"
-    return tuple(sorted(found.items()))
+                versions[name[0].lower()] = version(name[0])
+            except PackageNotFoundError:  # for example a distribution with another name in conda
+                versions[name[0].lower()] = "unknown"
+    return tuple(sorted(versions.items()))
 
 
 def software() -> dict[str, str]:
-    """Return `packages`, with the libraries behind rasterio and pyproj: GDAL and PROJ.
+    """Return `packages` with the versions of GDAL (of rasterio) and PROJ (of pyproj).
 
-    Rasterio may bring a PROJ of its own; ``proj`` is that of pyproj, which places pixels.
+    ``proj`` is the library of pyproj, which computes pixel coordinates; rasterio may ship another one.
 
     Examples
     --------
@@ -69,7 +68,7 @@ def software() -> dict[str, str]:
 
 
 def lock_sha256() -> str:
-    """Return the sha256 of requirements/all.txt, which names each distribution of the tested environment and its hash.
+    """Return the SHA-256 of requirements/all.txt, the distributions of the tested environment with their hashes.
 
     Examples
     --------
@@ -85,7 +84,7 @@ _READ_BYTES = 1 << 22
 
 
 class StampedStage(Protocol):
-    """A dataset stamped by `apertura.stages.tags.stamp`: its attributes state its provenance."""
+    """Dataset stamped by `apertura.stages.tags.stamp`; its attributes contain its provenance."""
 
     @property
     def attrs(self) -> Mapping[str, Any]: ...  # noqa: D102
@@ -98,13 +97,13 @@ class Provenance:
     Attributes
     ----------
     runspec
-        Every setting that mattered to it and to the stages before it.
+        All settings that affect the stage and its upstream stages.
     inputs
-        Role → sha256 of each file read from outside the results.
+        Role → SHA-256 of each input file outside the results.
     code_sha256
-        Chain of the code hashes of the stages before it and its own.
+        Chained code hash of the stage and its upstream stages.
     software
-        Name → version of what ran, now and in the stages before it; several where those differ.
+        Name → version of the software of this and the upstream stages; several versions if they differ.
     """
 
     runspec: Mapping[str, Any]
@@ -122,24 +121,24 @@ class Provenance:
         inputs: Mapping[str, str] | None = None,
         software: Mapping[str, str] | None = None,
     ) -> "Provenance":
-        """Return the provenance of `parents` joined with the new one.
+        """Combine the provenance of `parents` with that of a new stage.
 
         Parameters
         ----------
         modules
-            Dotted names; their import closure is the code that ran.
+            Dotted names of the executed modules; their import closure is hashed.
         parents
-            Stages of one line, whose settings agree; or name → stage of several lines, such as the pairs of a flight,
-            whose settings are kept apart under their names.
+            Upstream stages of a single chain, whose settings agree; or name → stage of several chains, such as the
+            pairs of a flight, whose settings are stored separately under these names.
         settings, inputs
-            Settings used, and role → sha256 of files read, of this stage alone.
+            Settings, and role → SHA-256 of the input files, of the new stage alone.
         software
-            Name → version of what runs now.
+            Name → version of the running software.
 
         Raises
         ------
         ValueError
-            If two parents give one role different hashes.
+            If two parents have different hashes for the same role.
 
         Examples
         --------
@@ -167,7 +166,7 @@ class Provenance:
         )
 
     def tags(self) -> dict[str, str]:
-        """Return the tags of a file, name → text."""
+        """Return the provenance as file tags, name → text."""
         return {
             "APERTURA_RUNSPEC": canonical_json(self.runspec),
             "APERTURA_INPUTS": canonical_json(self.inputs),
@@ -178,7 +177,7 @@ class Provenance:
 
 
 def canonical_json(value: object) -> str:
-    """Return the one JSON text of `value`: sorted keys, no spaces, no NaN.
+    """Serialize `value` as canonical JSON: sorted keys, no spaces, no NaN.
 
     Examples
     --------
@@ -189,19 +188,19 @@ def canonical_json(value: object) -> str:
 
 
 def sha256_text(text: str) -> str:
-    """Return the sha256 of a text in UTF-8, hex."""
+    """Return the SHA-256 of a text in UTF-8, hex."""
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 LARGEST_DOCUMENT = 1_000_000_000
-"""Bytes that a JSON document may have, to be hashed; an RO-Crate names every chunk, in about 300 bytes."""
+"""Maximum size of a JSON document to be hashed, bytes; an RO-Crate lists every chunk with about 300 bytes."""
 
 LARGEST_RESULT = 1 << 36
-"""Bytes that a file of the results may have, to be hashed: the largest stages are some GB, in chunks of some MB."""
+"""Maximum size of a result file to be hashed, bytes; the largest stages have several GB, in chunks of several MB."""
 
 
 def sha256_file(path: Path) -> str:
-    """Return the sha256 of a file's bytes, hex; raise CampaignError where there are more than `LARGEST_RESULT`.
+    """Return the SHA-256 of a file, hex; raise CampaignError if it exceeds `LARGEST_RESULT`.
 
     Examples
     --------
@@ -214,44 +213,44 @@ def sha256_file(path: Path) -> str:
 
 
 def check_size(path: Path, size: int) -> None:
-    """Raise CampaignError where a file of the results is larger than any of them: it may be sparse, and endless."""
+    """Raise CampaignError if a result file exceeds the maximum size; a sparse file could take very long to hash."""
     largest = LARGEST_DOCUMENT if path.suffix == ".json" else LARGEST_RESULT
     if size > largest:
-        expected = f"a file of the results, of at most {largest} bytes"
+        expected = f"a result file of at most {largest} bytes"
         raise CampaignError(f"{size} bytes", path, expected, "Remove it and run the workflow again.")
 
 
 def hashes_of_file(path: Path, algorithms: Sequence[str]) -> dict[str, str]:
-    """Return algorithm → hash of a file's bytes, hex; read once, each hash taken by a thread of its own."""
+    """Return algorithm → hash of a file, hex; the file is read once, and each hash has its own thread."""
     digests = {name: hashlib.new(name) for name in algorithms}
     updates = list[Future[None]]()
     with path.open("rb", buffering=0) as stream, ThreadPoolExecutor(len(digests)) as pool:
-        block_bytes = min(_READ_BYTES, max(os.fstat(stream.fileno()).st_size, 1))  # of a small file, all
+        block_bytes = min(_READ_BYTES, max(os.fstat(stream.fileno()).st_size, 1))
         blocks = cycle([memoryview(bytearray(block_bytes)) for _ in range(2)])
-        while size := stream.readinto(block := next(blocks)):  # while the block before is hashed
+        while size := stream.readinto(block := next(blocks)):  # the previous block is being hashed meanwhile
             wait(updates)
             updates = [pool.submit(digest.update, block[:size]) for digest in digests.values()]
     return {name: digest.hexdigest() for name, digest in digests.items()}
 
 
 def sha256_tree(folder: Path) -> dict[str, str]:
-    """Return relative path → sha256 of every file below `folder`, sorted by path."""
+    """Return relative path → SHA-256 of every file below `folder`, sorted by path."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     return {path.relative_to(folder).as_posix(): sha256_file(path) for path in files}
 
 
 def code_sha256(*modules: str, package: Path = PACKAGE) -> str:
-    """Return the hash of the source of `modules` and of every apertura module they import, however deep.
+    """Hash the source of `modules` and of every apertura module in their import closure.
 
-    A stage's hash therefore changes when, and only when, code it can run has changed: not with a comment or a
-    docstring. Compiled code counts by what it was built from: each ``*.sha256`` that was installed beside one of the
-    modules. Of tables whose rows are `apertura.common.lazy.Lazy`, `modules` holds those that are called.
+    The hash of a stage changes if and only if executable code in that closure changes; comments and docstrings are
+    ignored. Compiled code is represented by the hash of its sources, a file ``*.sha256`` installed in the folder of
+    one of the modules. For tables of `apertura.common.lazy.Lazy` rows, `modules` contains the functions' modules.
 
     Parameters
     ----------
     *modules
-        Dotted names such as ``apertura.stages.echo``. Of a module of another package that package counts, and
-        what it imports of apertura.
+        Dotted names such as ``apertura.stages.echo``. For a module of another package, the hash includes that package
+        and the apertura modules that it imports.
     package
         Folder of apertura's sources.
 
@@ -271,22 +270,22 @@ def code_sha256(*modules: str, package: Path = PACKAGE) -> str:
 
 @cache
 def _as_run(source: str) -> str:
-    """Return the lines of a source that run."""
+    """Return the executable lines of a source."""
     return "".join(f"{line}\n" for line in without_description(source).split("\n") if line.strip() != "...")
 
 
 def chained_sha256(own: str, parents: Iterable[str]) -> str:
-    """Return one hash for a stage's own code and the chains of the stages before it."""
+    """Combine the code hash of a stage with the chained hashes of its upstream stages."""
     return hashlib.sha256("\n".join([own, *sorted(parents)]).encode()).hexdigest()
 
 
 def merged(*sources: Mapping[str, str]) -> dict[str, str]:
-    """Return the union of role → hash mappings, sorted by role.
+    """Merge role → hash mappings, sorted by role.
 
     Raises
     ------
     ValueError
-        If two sources give one role different hashes.
+        If two sources have different hashes for the same role.
     """
     union: dict[str, str] = {}
     for source in sources:
@@ -297,15 +296,15 @@ def merged(*sources: Mapping[str, str]) -> dict[str, str]:
 
 
 def joined(*sources: Mapping[str, str]) -> dict[str, str]:
-    """Return name → version, all that were found where sources differ.
+    """Merge name → version mappings; versions that differ are joined by commas.
 
     Examples
     --------
     >>> joined({"numpy": "2.4.6"}, {"numpy": "2.4.6", "zarr": "3.1.6"}, {"zarr": "3.2.0"})
     {'numpy': '2.4.6', 'zarr': '3.1.6, 3.2.0'}
     """
-    found: dict[str, set[str]] = {}
+    merged_versions: dict[str, set[str]] = {}
     for source in sources:
         for name, versions in source.items():
-            found.setdefault(name, set()).update(versions.split(", "))
-    return {name: ", ".join(sorted(versions)) for name, versions in sorted(found.items())}
+            merged_versions.setdefault(name, set()).update(versions.split(", "))
+    return {name: ", ".join(sorted(versions)) for name, versions in sorted(merged_versions.items())}

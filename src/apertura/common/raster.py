@@ -1,7 +1,7 @@
-"""Untrusted rasters, opened as GeoTIFF and nothing else, without sidecar files.
+"""Opening of untrusted rasters as GeoTIFF only, without sidecar files.
 
-GDAL would otherwise choose a driver by content: a VRT or WMS document named .tif reads other files and the network, and
-a file beside a raster changes its heights or its place.
+GDAL otherwise selects a driver by file content: a VRT or WMS document named .tif can read other files and the network,
+and a sidecar file can change the heights or the georeference of a raster.
 """
 
 import re
@@ -14,7 +14,7 @@ from apertura.common.confined import on_disk
 from apertura.common.errors import CampaignError, shown
 
 ISOLATED = {
-    "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",  # no .ovr, .msk, .tfw, .aux.xml is looked for
+    "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",  # ignore sidecar files: .ovr, .msk, .tfw, .aux.xml
     "GDAL_PAM_ENABLED": "NO",
     "GDAL_GEOREF_SOURCES": "INTERNAL",
     "GTIFF_IGNORE_READ_ERRORS": "NO",
@@ -23,25 +23,25 @@ ISOLATED = {
     "GDAL_HTTP_MAX_RETRY": "0",
     "PROJ_NETWORK": "OFF",
 }
-"""Settings of GDAL under which an untrusted raster is opened and read."""
+"""GDAL configuration options for opening and reading an untrusted raster."""
 
 LARGEST_BLOCK = 100_000_000
-"""Values of one block or strip of a raster: GDAL allocates it whole before it is decompressed."""
+"""Maximum number of values in a block or strip of a raster, which GDAL allocates whole before decompression."""
 
 LARGEST_SIDE = 1 << 30
-"""Rows or columns."""
+"""Maximum number of rows or columns."""
 
 
 @contextmanager
 def opened_raster(path: Path, *, expected: str, remedy: str) -> Iterator[Any]:
-    """Open a GeoTIFF for reading; what goes wrong meanwhile, too, becomes one message.
+    """Open a GeoTIFF for reading; errors on opening and in the context are reported as one message.
 
     Parameters
     ----------
     path
-        The file; only what it holds itself counts.
+        The file; sidecar files are ignored.
     expected, remedy
-        For the message.
+        Parts of the message.
 
     Yields
     ------
@@ -51,7 +51,7 @@ def opened_raster(path: Path, *, expected: str, remedy: str) -> Iterator[Any]:
     Raises
     ------
     CampaignError
-        If it is not there, is no GeoTIFF, has blocks or sides that no raster of ours has, or cannot be read.
+        If the file is missing, is not a GeoTIFF, exceeds the limits of block or raster size, or cannot be read.
     """
     import rasterio
 
@@ -76,5 +76,5 @@ def _opened(name: str) -> Any:
     import rasterio
 
     if name.startswith("/vsi"):  # an absolute path has no scheme
-        raise OSError("a path that GDAL takes for another file system")
+        raise OSError("a path that GDAL interprets as a virtual file system")
     return rasterio.open(name, driver="GTiff", sharing=False)

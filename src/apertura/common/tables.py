@@ -1,7 +1,7 @@
-"""Tables of the studies: one dataclass per row, one CSV file per table; a file that exists is complete.
+"""CSV tables of the studies: one dataclass per row, one file per table; a file that exists is complete.
 
-The csv module does it: a job of a study takes seconds, importing pandas alone one of them, and a column of text that
-looks like numbers stays text.
+The csv module is used instead of pandas: importing pandas takes a second of a job that takes a few, and pandas converts
+text columns that look like numbers.
 """
 
 import csv
@@ -17,16 +17,16 @@ Row = TypeVar("Row")
 
 
 def write_table(path: Path, rows: Iterable[Any], *, digits: int | None = None) -> None:
-    """Write rows as CSV, one line each; a kill leaves all of the file or none.
+    """Write rows as CSV, one line each; an interrupted process leaves a complete file or none.
 
     Parameters
     ----------
     path
-        Folders above it are made.
+        The file; missing parent folders are created.
     rows
         At least one dataclass instance or mapping, all with the columns of the first.
     digits
-        Significant digits of floats; None: as many as distinguish them.
+        Significant digits of floats; None: the shortest representation that is exact.
     """
     records = [_record(row, digits) for row in rows]
     with replacement(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
@@ -43,12 +43,12 @@ def _record(row: Any, digits: int | None) -> Mapping[str, object]:
 
 
 def read_table(path: Path, kind: type[Row]) -> list[Row]:
-    """Return the rows of a file of `write_table`, each a dataclass `kind` with fields of str, int and float.
+    """Read a file of `write_table`, each row as an instance of dataclass `kind` with str, int and float fields.
 
     Raises
     ------
     CampaignError
-        If it is not there.
+        If the file is missing.
 
     Examples
     --------
@@ -64,7 +64,7 @@ def read_table(path: Path, kind: type[Row]) -> list[Row]:
     [Loss(cause='timing', loss_db=1.5)]
     """
     if not path.is_file():
-        raise CampaignError("no such file", path, "the rows of a study", "Run the command that writes it first.")
+        raise CampaignError("no such file", path, "a table of a study", "Run the command that writes it first.")
     types = get_type_hints(kind)
     convert = {field.name: types[field.name] for field in fields(kind)}  # type: ignore[arg-type]
     with path.open(encoding="utf-8", newline="") as stream:

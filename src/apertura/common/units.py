@@ -1,4 +1,4 @@
-"""Conversions of units: powers to decibels, times to seconds."""
+"""Unit conversions: power ratios to decibels, times to seconds."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,7 +7,7 @@ from apertura.common.arrays import Floats, Times
 
 
 def decibels(power_ratio: float) -> float:
-    """Return 10 log10 of a ratio of powers; -300 of none.
+    """Convert a power ratio to decibels, with -300 dB as the lower limit.
 
     Examples
     --------
@@ -18,7 +18,7 @@ def decibels(power_ratio: float) -> float:
 
 
 def seconds_since(times: Times, start: np.datetime64) -> Floats:
-    """Return (time,) float64: seconds from `start` to each of some times.
+    """Convert times to seconds since `start`, (time,) float64.
 
     Examples
     --------
@@ -30,7 +30,7 @@ def seconds_since(times: Times, start: np.datetime64) -> Floats:
 
 
 def nanoseconds(times: Times) -> NDArray[np.int64]:
-    """Return times as nanoseconds since 1970.
+    """Convert times to nanoseconds since 1970-01-01.
 
     Examples
     --------

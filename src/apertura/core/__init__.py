@@ -1,6 +1,6 @@
-"""From captures to pixels, on arrays: geometry, scene, antenna, echo, backprojection, imaging, planning, quality.
+"""Processing on arrays, from captures to pixels: geometry, scene, antenna, echo, backprojection, imaging, quality.
 
-Offers what `ap.backproject` is made of: `geometry.aperture.Aperture`, `scene.grid.SceneGrid`, `scene.terrain.Terrain`,
-the engines of `backprojection.engines`, the planner, and what is measured on images. Imports `apertura.common` alone;
-never opens a file of a campaign, reads no settings, and knows no format.
+Provides the building blocks of `ap.backproject`: `geometry.aperture.Aperture`, `scene.grid.SceneGrid`,
+`scene.terrain.Terrain`, the engines of `backprojection.engines`, the planner, and measures of image quality. Imports
+only `apertura.common`; does not open campaign files, read settings or depend on a file format.
 """

@@ -1,4 +1,4 @@
-"""Sums of the images of one flight: which pairs are added in phase, the sums, and how well they add up."""
+"""Coherent and non-coherent sums of the images of a flight: choice of the pairs, the sums, and their coherence."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,22 +11,22 @@ from numpy.typing import NDArray
 from apertura.common.units import decibels
 from apertura.core.quality.agreement import OUT_OF_PHASE_RAD, Agreement
 
-# ---- How well the images of a sum add up
+# ---- Coherence of the images of a sum
 
 
 @dataclass(frozen=True)
 class InPhase:
-    """Share of the power of its images that a coherent sum keeps at bright places.
+    """Share of the power of its images that a coherent sum retains at bright points.
 
     Attributes
     ----------
     coherence, std
-        |Σ_i a_i|²/(n Σ_i |a_i|²) of the amplitudes a_i of n images, mean over the places by their power, and its
-        standard deviation: 1 in phase, `chance` at random.
+        |Σ_i a_i|²/(n Σ_i |a_i|²) of the amplitudes a_i of n images, power-weighted mean over the points, and its
+        standard deviation: 1 in phase, `chance` for random phases.
     chance
         1/n.
     places
-        How many.
+        Number of points.
     """
 
     coherence: float
@@ -36,7 +36,7 @@ class InPhase:
 
     @property
     def loss_db(self) -> float:
-        """Power that the peaks of the sum lack because its images are not in phase, dB, 0 or less."""
+        """Peak loss of the sum by phase differences between its images, dB, 0 or less."""
         return decibels(max(self.coherence, 1e-6))
 
     @property
@@ -46,51 +46,51 @@ class InPhase:
 
 
 def in_phase(amplitudes: NDArray[np.complex128], background: NDArray[np.float64]) -> InPhase:
-    """Measure the share of power that the images of a sum have in phase at some places.
+    """Measure the coherence of the images of a sum at given points.
 
     Parameters
     ----------
     amplitudes
-        (place, image) complex128, of images as they are added: peak-normalised, their phases taken off.
+        (point, image) complex128, of the images as they are added: peak-normalised, with their phases removed.
     background
-        (place,) float64, power of the surroundings of each relative to its own.
+        (point,) float64, power of the surroundings of each point relative to that of the point.
 
     Notes
     -----
-    Source: docs/theory/fusion.md, eq. 4. Places are to be found without the phases, in the non-coherent sum: at the
-    maxima of the coherent one images agree by selection.
+    Source: docs/theory/fusion.md, eq. 4. Points must be selected in the non-coherent sum, without the phases: at the
+    maxima of the coherent sum the images agree by selection.
 
     Examples
     --------
-    >>> told = in_phase(np.array([[1, 1j], [0.5, 0.5j]]), np.zeros(2))
-    >>> round(told.coherence, 3), told.chance, round(told.loss_db, 2)
+    >>> measured = in_phase(np.array([[1, 1j], [0.5, 0.5j]]), np.zeros(2))
+    >>> round(measured.coherence, 3), measured.chance, round(measured.loss_db, 2)
     (0.5, 0.5, -3.01)
     """
     count = amplitudes.shape[1]
     power = (np.abs(amplitudes) ** 2).sum(axis=1)
-    each = np.abs(amplitudes.sum(axis=1)) ** 2 / (count * np.maximum(power, 1e-30))
+    coherence = np.abs(amplitudes.sum(axis=1)) ** 2 / (count * np.maximum(power, 1e-30))
     share = power / power.sum()
-    mean = float((share * each).sum())
-    # Scatter from place to place; one alone is as uncertain as its surroundings make it.
-    scatter = ((each - mean) ** 2 + background**2 / 4) * share**2
+    mean = float((share * coherence).sum())
+    # Scatter between points, plus the error of each by its background, which is all there is for a single point.
+    scatter = ((coherence - mean) ** 2 + background**2 / 4) * share**2
     return InPhase(mean, float(np.sqrt(scatter.sum())), 1 / count, len(amplitudes))
 
 
 def clutter_reduction_db(single_db: Sequence[float], coherent_db: float) -> float:
-    """Return the reduction of clutter, against the peak, in a coherent sum relative to its images.
+    """Return the reduction of the clutter-to-peak ratio in a coherent sum relative to its images.
 
     Parameters
     ----------
     single_db
         (pair,) clutter of each image of the sum: its median power over its peak power, dB.
     coherent_db
-        The same of the sum.
+        Clutter of the sum, dB.
 
     Returns
     -------
     float
-        dB; 10 lg of the number of images where the targets add in phase and the clutter does not, 0 where the images
-        show one thing, less where targets do not add in phase.
+        dB; 10 lg of the number of images if the targets add in phase and the clutter does not, 0 if the images
+        are identical, less if the targets do not add in phase.
 
     Raises
     ------
@@ -107,50 +107,50 @@ def clutter_reduction_db(single_db: Sequence[float], coherent_db: float) -> floa
     3.01
     """
     if not single_db:
-        raise ValueError("no image: a sum of nothing reduces nothing")
+        raise ValueError("no image: the clutter reduction of an empty sum is undefined")
     return decibels(float(np.mean(10 ** (np.asarray(single_db) / 10)))) - coherent_db
 
 
-# ---- Choice of the pairs that are added coherently: the largest set that agrees
+# ---- Choice of the pairs that are added coherently: the largest consistent set
 
 
 MOST_SETS_OF = 12
-"""Pairs of a flight of which every set is tried, 4096 in all; of more, those that agree with most others."""
+"""Largest number of pairs of which all 4096 subsets are tried; of more pairs, those that agree with most others."""
 
 _SURE = 3.09
-"""Standard deviations of a normal number exceeded once in 1000: by so much a set must contradict itself to fail."""
+"""Standard deviations that a normal variable exceeds once in 1000: threshold at which a set is inconsistent."""
 
 
 @dataclass(frozen=True)
 class CoherentSum:
-    """The pairs of a coherent sum, and how the others differ from them.
+    """The pairs of a coherent sum, and the differences of the excluded pairs from them.
 
     Attributes
     ----------
     reference
-        The member that phases are counted from: the best of them.
+        The best focused member, the reference of the phases.
     phases_rad
-        Pair → phase removed before it is added; 0 where none was requested or needed.
-    left_out
-        Pair → why it is only in the sums without phase.
+        Pair → phase removed before it is added; 0 if none was requested or needed.
+    excluded
+        Excluded pair → reason, one line; it is part of the non-coherent sums only.
     why
-        Pair → why it is in, in one line.
+        Included pair → reason, one line.
     agreeing
-        The largest set of pairs whose differences in phase and place are measured and agree.
+        The largest set of pairs whose differences in phase and position are measured and agree.
     apart
-        Pair that was measured and is not of that set → how it lies against the set.
+        Measured pair outside that set → its difference from the set.
     unmeasured
-        Pair that is added with phase 0 although nothing tells its phase → why nothing does.
+        Pair that is added with phase 0 because its phase is not measurable → reason, one line.
     ties
-        Other sets as large that agree in themselves and contradict this one: which is right, images do not show.
+        Other consistent sets of the same size that contradict this one: the images do not show which is correct.
     misfit, freedom
-        χ² of the set's differences about one phase and place per pair, and its degrees of freedom.
+        χ² of the set's differences about one phase and position per pair, and its degrees of freedom.
     """
 
     reference: str
     phases_rad: Mapping[str, float]
-    left_out: Mapping[str, str]
-    why: Mapping[str, str]
+    excluded: Mapping[str, str]
+    reason: Mapping[str, str]
     agreeing: tuple[str, ...]
     apart: Mapping[str, Agreement]
     unmeasured: Mapping[str, str]
@@ -160,13 +160,15 @@ class CoherentSum:
 
     @property
     def report(self) -> dict[str, Any]:
-        """As JSON values."""
+        """The choice as JSON values."""
         return {
             "phases_rad": {pair: round(phase, 4) for pair, phase in self.phases_rad.items()},
-            "left_out": dict(self.left_out),
-            "why": dict(self.why),
+            "excluded": dict(self.excluded),
+            "reason": dict(self.reason),
             "agreeing": list(self.agreeing),
-            "would_align_rad": {pair: round(-one.phase_rad, 4) for pair, one in self.apart.items() if one.alignable},
+            "aligning_phase_rad": {
+                pair: round(-difference.phase_rad, 4) for pair, difference in self.apart.items() if difference.alignable
+            },
             "unmeasured": dict(self.unmeasured),
             "ties": [list(tie) for tie in self.ties],
             "misfit": round(self.misfit, 2),
@@ -182,21 +184,21 @@ def choose_fusion(
     coarse: str = "",
     align: bool,
 ) -> CoherentSum:
-    """Choose the pairs that add coherently: the largest set that agrees in phase and place.
+    """Choose the pairs that are added coherently: the largest set that agrees in phase and position.
 
     Parameters
     ----------
     rank
-        Every pair → how well its image is focused, lower is better; it chooses among sets of equal size.
+        Every pair → rank of its focus, lower is better; decides among sets of equal size.
     between
-        Two pairs, in the order of `rank` → how the second lies against the first; None where nothing tells.
+        Two pairs, in the order of `rank` → difference of the second from the first; None if not measurable.
     hidden
-        Two pairs of which the second shows none of the bright points of the first, as it should: added it would be
-        noise.
+        Two pairs of which the second should contain the bright points of the first and contains none: it would add
+        only noise.
     coarse
-        Why no two images could be compared, where their pixels are too wide for that.
+        Reason why no two images can be compared, if their pixels are too wide for a comparison.
     align
-        Whether a constant phase is removed: members may then have any.
+        True if a constant phase is removed from each pair: members may then differ by any constant phase.
 
     Notes
     -----
@@ -206,76 +208,85 @@ def choose_fusion(
     --------
     >>> alone = choose_fusion({"a-a": (0,), "a-b": (1,)}, {("a-a", "a-b"): None}, align=False)
     >>> alone.phases_rad, alone.unmeasured
-    ({'a-a': 0.0, 'a-b': 0.0}, {'a-b': 'it shares nothing with a-a that tells a phase'})
+    ({'a-a': 0.0, 'a-b': 0.0}, {'a-b': 'it shares no features with a-a from which a phase can be measured'})
     """
     pairs = list(rank)
-    compared = {two: one for two, one in between.items() if one is not None}
-    measured = {two: one for two, one in compared.items() if one.certain or one.shifted or one.incoherent}
+    compared = {two: agreement for two, agreement in between.items() if agreement is not None}
+    measured = {
+        two: agreement
+        for two, agreement in compared.items()
+        if agreement.certain or agreement.shifted or agreement.incoherent
+    }
     best, rivals = _largest(pairs, rank, measured, align=align)
     reference = min(best.pairs, key=lambda pair: (*rank[pair], pairs.index(pair)))
     agreeing = tuple(pair for pair in pairs if pair in best.pairs)
-    line = " and ".join(pair for pair in agreeing if pair != reference)
-    phases, left_out, apart, unmeasured = {reference: 0.0}, {}, {}, {}
-    why = {reference: f"it agrees with {line}" if line else "the others are measured against it"}
+    others = " and ".join(pair for pair in agreeing if pair != reference)
+    phases, excluded, apart, unmeasured = {reference: 0.0}, {}, {}, {}
+    reason = {reference: f"it agrees with {others}" if others else "it is the reference of the phases"}
     for pair in pairs:
         if pair == reference:
             continue
-        found = best.against(pair, measured, reference)
-        if pair in best.pairs and found is not None:
-            removed = found.phase_rad if align else 0.0
+        difference = best.against(pair, measured, reference)
+        if pair in best.pairs and difference is not None:
+            removed = difference.phase_rad if align else 0.0
             phases[pair] = removed
-            why[pair] = f"{_phase_line(found, reference)}{', taken off' if align else ''}"
-        elif found is not None:
-            apart[pair] = found
-            left_out[pair] = _reason(found, _named(agreeing), reference, align=align)
-        elif blind := [one for one in best.pairs if (one, pair) in hidden]:
-            left_out[pair] = f"shows none of the bright points of {_named(blind)} beyond those expected by chance"
+            reason[pair] = f"{_phase_line(difference, reference)}{', removed' if align else ''}"
+        elif difference is not None:
+            apart[pair] = difference
+            excluded[pair] = _reason(difference, _named(agreeing), reference, align=align)
+        elif unseen := [member for member in best.pairs if (member, pair) in hidden]:
+            excluded[pair] = f"its image contains no bright points of {_named(unseen)} beyond random matches"
         else:
-            phases[pair], guess = 0.0, best.against(pair, compared, reference)
+            phases[pair], uncertain = 0.0, best.against(pair, compared, reference)
             unmeasured[pair] = (
-                coarse or f"it shares nothing with {_named(agreeing)} that tells a phase"
-                if guess is None
-                else f"{_phase_line(guess, reference)} is not certain enough"
+                coarse or f"it shares no features with {_named(agreeing)} from which a phase can be measured"
+                if uncertain is None
+                else f"{_phase_line(uncertain, reference)} is not certain enough"
             )
-            why[pair] = f"phase not measured: {unmeasured[pair]}"
-    opposite = [one.pairs for one in rivals if one.contradicts(best, measured)]
-    ties = tuple(sorted(tuple(sorted(some, key=pairs.index)) for some in opposite))
+            reason[pair] = f"phase not measured: {unmeasured[pair]}"
+    opposite = [rival.pairs for rival in rivals if rival.contradicts(best, measured)]
+    ties = tuple(sorted(tuple(sorted(members, key=pairs.index)) for members in opposite))
     ordered = {pair: phases[pair] for pair in pairs if pair in phases}
-    return CoherentSum(reference, ordered, left_out, why, agreeing, apart, unmeasured, ties, best.misfit, best.freedom)
+    return CoherentSum(
+        reference, ordered, excluded, reason, agreeing, apart, unmeasured, ties, best.misfit, best.freedom
+    )
 
 
 def _named(pairs: Collection[str]) -> str:
     return " and ".join(pairs)
 
 
-def _phase_line(found: Agreement, reference: str) -> str:
-    ground = " of ground" if found.by == "looks" else ""
-    return f"{found.phase_rad:+.2f} ± {found.phase_std_rad:.2f} rad from {reference} at {found.evidence}{ground}"
+def _phase_line(difference: Agreement, reference: str) -> str:
+    """Return the phase difference, its reference and the features it was measured on, in one line."""
+    speckle = " of speckle" if difference.by == "looks" else ""
+    phase = f"{difference.phase_rad:+.2f} ± {difference.phase_std_rad:.2f} rad"
+    return f"{phase} from {reference} at {difference.evidence}{speckle}"
 
 
-def _reason(found: Agreement, agreeing: str, reference: str, *, align: bool) -> str:
-    if found.shifted:
-        return f"its bright points lie {100 * found.shift_m:.1f} cm from those of {agreeing}"
-    line = _phase_line(found, reference)
-    if found.incoherent:
-        return f"{line}, coherence {found.coherence:.2f}: no common phase"
+def _reason(difference: Agreement, agreeing: str, reference: str, *, align: bool) -> str:
+    """Return the reason to exclude a pair from the coherent sum, in one line."""
+    if difference.shifted:
+        return f"its bright points are displaced by {100 * difference.shift_m:.1f} cm from those of {agreeing}"
+    line = _phase_line(difference, reference)
+    if difference.incoherent:
+        return f"{line}, coherence {difference.coherence:.2f}: no common phase"
     if align:
         return f"{line}: its differences from {agreeing} contradict each other"
-    return f"{line}; would align with {-found.phase_rad:+.2f} rad: processing.fusion.align_phase takes it off"
+    return f"{line}; processing.fusion.align_phase would add {-difference.phase_rad:+.2f} rad to align it"
 
 
 @dataclass(frozen=True)
 class _Set:
-    """Pairs with one phase and place each, by least squares over what was measured between them.
+    """Pairs with one phase and position each, by least squares over the differences measured between them.
 
     Attributes
     ----------
     pairs
-        Of the set.
+        Members of the set.
     states
-        Pair → phase (radians), metres east and north, against the first.
+        Pair → phase (radians), metres east and north, relative to the first.
     misfit, freedom
-        χ² of what was measured, and its degrees of freedom.
+        χ² of the measured differences, and its degrees of freedom.
     """
 
     pairs: frozenset[str]
@@ -285,9 +296,9 @@ class _Set:
 
     @classmethod
     def of(cls, pairs: Sequence[str], measured: Mapping[tuple[str, str], Agreement], *, align: bool) -> "_Set | None":
-        """Return the pairs as a set; None where they contradict each other, or are not all connected."""
-        edges = {two: one for two, one in measured.items() if two[0] in pairs and two[1] in pairs}
-        if any(one.shifted or one.incoherent for one in edges.values()):
+        """Return the pairs as a set; None if they contradict each other or are not all connected."""
+        edges = {two: difference for two, difference in measured.items() if two[0] in pairs and two[1] in pairs}
+        if any(difference.shifted or difference.incoherent for difference in edges.values()):
             return None
         start = _along(pairs, edges)
         if start is None:
@@ -296,45 +307,48 @@ class _Set:
         freedom = 3 * (len(edges) - len(pairs) + 1)
         if freedom and misfit > _chi2_limit(freedom):
             return None
-        found = cls(frozenset(pairs), dict(zip(pairs, states, strict=True)), misfit, freedom)
-        within = all(
+        consistent = cls(frozenset(pairs), dict(zip(pairs, states, strict=True)), misfit, freedom)
+        in_phase_as_recorded = all(
             abs(_wrapped(states[j, 0] - states[i, 0])) <= OUT_OF_PHASE_RAD + 2 * deviation[i, j]
             for i in range(len(pairs))
             for j in range(i)
         )
-        return found if align or within else None
+        return consistent if align or in_phase_as_recorded else None
 
     def against(self, pair: str, measured: Mapping[tuple[str, str], Agreement], reference: str) -> Agreement | None:
-        """Return the agreement of a pair with the set's reference, by all that was measured between it and the set.
+        """Return the difference of a pair from the set's reference, by all measurements between it and the set.
 
-        Phase and place are weighted means over the members; None where it was measured against none.
+        The phase is the weighted mean over the members; None if the pair was measured against no member.
         """
         if pair in self.states and pair != reference:
             direct = agreement_between(measured, reference, pair)
-            turned = self.states[pair] - self.states[reference]
-            known = direct or next(one for two, one in measured.items() if pair in two and {*two} <= self.pairs)
-            return replace(known, phase_rad=_wrapped(float(turned[0])))
+            state = self.states[pair] - self.states[reference]
+            known = direct or next(edge for two, edge in measured.items() if pair in two and {*two} <= self.pairs)
+            return replace(known, phase_rad=_wrapped(float(state[0])))
         of_members = [
-            (one, self.states[member] - self.states[reference])
+            (difference, self.states[member] - self.states[reference])
             for member in self.pairs
-            if member != pair and (one := agreement_between(measured, member, pair)) is not None
+            if member != pair and (difference := agreement_between(measured, member, pair)) is not None
         ]
         if not of_members:
             return None
-        phases = np.array([one.phase_rad + state[0] for one, state in of_members])
-        weights = np.array([1 / one.phase_std_rad**2 for one, _ in of_members])
+        phases = np.array([difference.phase_rad + state[0] for difference, state in of_members])
+        weights = np.array([1 / difference.phase_std_rad**2 for difference, _ in of_members])
         phase = float(np.angle((weights * np.exp(1j * phases)).sum()))
-        # Members see the outlier's own noise alike: their mean is taken for no more certain than the best of them.
-        elsewhere = sum(one.shifted for one, _ in of_members) > len(of_members) / 2
-        nearest = min((one for one, _ in of_members if one.shifted == elsewhere), key=lambda one: one.phase_std_rad)
-        return replace(nearest, phase_rad=phase)
+        # The outlier's own noise is common to all differences: their mean is no more certain than the best of them.
+        is_displaced = sum(difference.shifted for difference, _ in of_members) > len(of_members) / 2
+        best = min(
+            (difference for difference, _ in of_members if difference.shifted == is_displaced),
+            key=lambda difference: difference.phase_std_rad,
+        )
+        return replace(best, phase_rad=phase)
 
     def contradicts(self, other: "_Set", measured: Mapping[tuple[str, str], Agreement]) -> bool:
-        """Test whether something was measured between pairs that only one of two sets holds."""
+        """Return True if a difference was measured between pairs that are each in only one of the two sets."""
         return any(
-            agreement_between(measured, one, two) is not None
-            for one in self.pairs - other.pairs
-            for two in other.pairs - self.pairs
+            agreement_between(measured, first, second) is not None
+            for first in self.pairs - other.pairs
+            for second in other.pairs - self.pairs
         )
 
 
@@ -345,21 +359,22 @@ def _largest(
     *,
     align: bool,
 ) -> tuple[_Set, list[_Set]]:
-    """Return the largest set that agrees, the best focused of several, and the others as large."""
+    """Return the largest consistent set (of several, the best focused one), and the others of the same size."""
     if len(pairs) > MOST_SETS_OF:
         pairs = _without_the_worst(pairs, measured, align=align)
     for size in range(len(pairs), 0, -1):
-        found = [one for some in combinations(pairs, size) if (one := _Set.of(some, measured, align=align)) is not None]
-        if found:
-            found.sort(key=lambda one: np.sum([rank[pair] for pair in one.pairs], axis=0).tolist())
-            return found[0], found[1:]
-    raise ValueError("no pair: there is nothing to add")
+        candidates = (_Set.of(members, measured, align=align) for members in combinations(pairs, size))
+        consistent = [candidate for candidate in candidates if candidate is not None]
+        if consistent:
+            consistent.sort(key=lambda members: np.sum([rank[pair] for pair in members.pairs], axis=0).tolist())
+            return consistent[0], consistent[1:]
+    raise ValueError("no pair: a sum needs at least one image")
 
 
 def _without_the_worst(
     pairs: Sequence[str], measured: Mapping[tuple[str, str], Agreement], *, align: bool
 ) -> list[str]:
-    """Return `MOST_SETS_OF` pairs: those dropped agree with the fewest others, two by two."""
+    """Return `MOST_SETS_OF` pairs, without those that agree pairwise with the fewest others."""
     agreeing = {
         pair: sum(_Set.of(two, measured, align=align) is not None for two in combinations(pairs, 2) if pair in two)
         for pair in pairs
@@ -369,24 +384,24 @@ def _without_the_worst(
 
 
 def agreement_between(between: Mapping[tuple[str, str], Agreement | None], first: str, second: str) -> Agreement | None:
-    """Return the agreement of a second pair with a first, in whichever order they were compared; None: unknown.
+    """Return the difference of a second pair from a first, in whichever order they were compared; None: unknown.
 
     Examples
     --------
     >>> agreement_between({("a-a", "a-b"): None}, "a-b", "a-a") is None
     True
     """
-    found = between.get((second, first))
-    return between.get((first, second)) or (found and found.reversed)
+    opposite = between.get((second, first))
+    return between.get((first, second)) or (opposite and opposite.reversed)
 
 
 def _along(pairs: Sequence[str], edges: Mapping[tuple[str, str], Agreement]) -> NDArray[np.float64] | None:
-    """Return phases of pairs against the first, along the most certain differences; None where these leave one out."""
+    """Return phases of pairs relative to the first, along the most certain differences; None if not all connected."""
     phases = {pairs[0]: 0.0}
     for _ in pairs[1:]:
         open_ends = [
-            (one.phase_std_rad, phases[known] + sign * one.phase_rad, new)
-            for (first, second), one in edges.items()
+            (difference.phase_std_rad, phases[known] + sign * difference.phase_rad, new)
+            for (first, second), difference in edges.items()
             for known, new, sign in ((first, second, 1), (second, first, -1))
             if known in phases and new not in phases
         ]
@@ -400,23 +415,23 @@ def _along(pairs: Sequence[str], edges: Mapping[tuple[str, str], Agreement]) -> 
 def _adjusted(
     pairs: Sequence[str], edges: Mapping[tuple[str, str], Agreement], start: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
-    """Return (pair, 3) phase and place of each, χ², and (pair, pair) deviations of phase differences."""
+    """Return (pair, 3) phase and position of each pair, χ², and (pair, pair) deviations of phase differences."""
     count = len(pairs)
     matrix, measured, std = np.zeros((len(edges), count)), np.zeros((len(edges), 3)), np.zeros((len(edges), 3))
-    for line, ((first, second), one) in enumerate(edges.items()):
+    for row, ((first, second), edge) in enumerate(edges.items()):
         i, j = pairs.index(first), pairs.index(second)
-        matrix[line, [i, j]] = -1, 1
-        measured[line] = _wrapped(one.phase_rad - (start[j] - start[i])), one.shift_east_m, one.shift_north_m
-        std[line] = one.phase_std_rad, one.shift_std_m, one.shift_std_m
-    # Weighted least squares of eq. 7: phase, east and north apart, the first pair fixed at 0.
+        matrix[row, [i, j]] = -1, 1
+        measured[row] = _wrapped(edge.phase_rad - (start[j] - start[i])), edge.shift_east_m, edge.shift_north_m
+        std[row] = edge.phase_std_rad, edge.shift_std_m, edge.shift_std_m
+    # Weighted least squares of eq. 7: phase, east and north separately, the first pair fixed at 0.
     states, misfit, covariance = np.zeros((count, 3)), 0.0, np.zeros((count, count))
-    for part in range(3):
-        weighted = matrix[:, 1:] / std[:, part : part + 1]
-        normal = np.linalg.pinv(weighted.T @ weighted)
-        states[1:, part] = normal @ weighted.T @ (measured[:, part] / std[:, part])
-        misfit += float((((measured - matrix @ states)[:, part] / std[:, part]) ** 2).sum())
-        if part == 0:
-            covariance[1:, 1:] = normal  # of the phases
+    for component in range(3):
+        weighted = matrix[:, 1:] / std[:, component : component + 1]
+        inverse = np.linalg.pinv(weighted.T @ weighted)
+        states[1:, component] = inverse @ weighted.T @ (measured[:, component] / std[:, component])
+        misfit += float((((measured - matrix @ states)[:, component] / std[:, component]) ** 2).sum())
+        if component == 0:
+            covariance[1:, 1:] = inverse  # of the phases
     states[:, 0] += start
     variance = np.diag(covariance)
     return states, misfit, np.sqrt(np.maximum(variance[:, None] + variance - 2 * covariance, 0.0))
@@ -427,9 +442,9 @@ def _wrapped(phase_rad: float) -> float:
 
 
 def _chi2_limit(freedom: int) -> float:
-    """Return the χ² exceeded once in 1000, by the cube root that is nearly normal (Wilson and Hilferty)."""
-    part = 2 / (9 * freedom)
-    return float(freedom * (1 - part + _SURE * np.sqrt(part)) ** 3)
+    """Return the χ² exceeded once in 1000, by the Wilson-Hilferty approximation: its cube root is nearly normal."""
+    variance = 2 / (9 * freedom)
+    return float(freedom * (1 - variance + _SURE * np.sqrt(variance)) ** 3)
 
 
 # ---- Sums
@@ -440,23 +455,23 @@ def coherent_sum(
 ) -> NDArray[np.complex64]:
     """Return the complex mean of peak-normalised images.
 
-    Their spectra lie side by side, so the sum resolves finer than either: mono- and bistatic images add in phase
-    once sidelink and path offsets are right (docs/theory.md, eq. 7).
+    The spectra of the images adjoin, so the resolution of the sum is finer than that of each image. Mono- and bistatic
+    images add in phase if sidelink correction and path offsets are right (docs/theory.md, eq. 7).
 
     Parameters
     ----------
     images
         (pair, y, x) complex64 on one grid or a block of it, carriers kept; NaN where no pulse of a pair illuminates
-        the pixel: it adds nothing.
+        the pixel: such pairs do not contribute to it.
     peaks
         (pair,) float64, largest magnitude of each whole image.
     phases_rad
-        (pair,) float64, removed from each image first.
+        (pair,) float64, phase removed from each image before it is added.
 
     Returns
     -------
     ndarray
-        (y, x) complex64, 1 where every image peaks in phase, NaN where no pair illuminates the pixel.
+        (y, x) complex64, 1 where all images peak in phase, NaN where no pair illuminates the pixel.
 
     Raises
     ------
@@ -473,9 +488,9 @@ def coherent_sum(
 
 
 def noncoherent_sum(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return the mean power of peak-normalised images: no gain in resolution, less speckle, no phase errors.
+    """Return the mean power of peak-normalised images: less speckle, no gain in resolution, no effect of phase errors.
 
-    Parameters and errors as `coherent_sum`; returns (y, x) float32, linear power.
+    Parameters and errors as for `coherent_sum`; returns (y, x) float32, linear power.
 
     Examples
     --------
@@ -487,9 +502,9 @@ def noncoherent_sum(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -
 
 
 def magnitude_sum(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return the mean magnitude of peak-normalised images, the paper's sum without phase.
+    """Return the mean magnitude of peak-normalised images, the non-coherent sum of the reference paper.
 
-    Parameters and errors as `coherent_sum`; returns (y, x) float32.
+    Parameters and errors as for `coherent_sum`; returns (y, x) float32.
 
     Examples
     --------
@@ -500,7 +515,7 @@ def magnitude_sum(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> 
 
 
 def _mean(images: NDArray[Any]) -> NDArray[Any]:
-    """Return the mean over all pairs; one without a value at a pixel counts as zero, and NaN if none has one."""
+    """Return the mean over all pairs; a missing value counts as zero, and the mean is NaN if all are missing."""
     missing = np.isnan(images)
     mean: NDArray[Any] = np.where(missing, 0, images).mean(axis=0)
     mean[missing.all(axis=0)] = np.nan
@@ -509,7 +524,7 @@ def _mean(images: NDArray[Any]) -> NDArray[Any]:
 
 def _normalised(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> NDArray[np.complex64]:
     if not (peaks > 0).all():
-        raise ValueError(f"{peaks=}: an empty image adds nothing; leave its pair out")
-    # Part by part: numpy would divide complex numbers of double precision, ten times as long, to the same values.
+        raise ValueError(f"{peaks=}: must be positive; exclude pairs whose image is empty")
+    # Real and imaginary parts as float32: numpy's complex division takes ten times as long, for the same values.
     parts = np.ascontiguousarray(images, np.complex64).view(np.float32)
     return (parts * (1 / np.asarray(peaks, np.float64))[:, None, None]).astype(np.float32).view(np.complex64)

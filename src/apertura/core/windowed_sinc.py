@@ -1,6 +1,6 @@
-"""Kaiser's window, and the sinc that it bounds as interpolator of band-limited samples.
+"""Kaiser window, and the Kaiser-windowed sinc that interpolates band-limited samples.
 
-In numpy alone: scipy.signal has the window at integer samples only, and costs a second to import.
+Implemented in numpy: scipy.signal offers the window at integer samples only, and takes a second to import.
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ from apertura.common.arrays import Floats
 
 
 def kaiser_beta(rejection_db: float) -> float:
-    """Return the β with which a filter rejects its stopband by more than 50 dB: 0.1102·(A - 8.7).
+    """Return the β of a Kaiser window for a stopband rejection A above 50 dB: 0.1102·(A - 8.7).
 
     Parameters
     ----------
@@ -28,36 +28,36 @@ def kaiser_beta(rejection_db: float) -> float:
     return 0.1102 * (rejection_db - 8.7)
 
 
-def kaiser_window(place: Floats, beta: float) -> Floats:
-    """Return I0(β·√(1 - place²))/I0(β), zero outside -1…1.
+def kaiser_window(position: Floats, beta: float) -> Floats:
+    """Return the Kaiser window I0(β·√(1 - position²))/I0(β), zero outside -1…1.
 
     Parameters
     ----------
-    place
-        (...,) float64, fraction of the window's half width from its middle.
+    position
+        (...,) float64, offset from the middle of the window as a fraction of its half width.
     beta
-        Shape; larger means wider and lower sidelobes.
+        Shape parameter; a larger value gives a wider main lobe and lower sidelobes.
 
     Examples
     --------
     >>> bool(np.allclose(kaiser_window(np.linspace(-1, 1, 9), 6.0), np.kaiser(9, 6.0)))
     True
     """
-    inside = 1 - place**2
+    inside = 1 - position**2
     return np.where(inside >= 0, np.i0(beta * np.sqrt(np.maximum(inside, 0.0))) / np.i0(beta), 0.0)
 
 
 def kaiser_sinc(distance: Floats, *, half: int, beta: float) -> Floats:
-    """Return the weights of samples in the interpolated value: sinc(distance) under Kaiser's window.
+    """Return the weights of samples in an interpolated value: sinc(distance) under a Kaiser window.
 
     Parameters
     ----------
     distance
-        (...,) float64, from the interpolated place to each sample, in samples.
+        (...,) float64, from the interpolated position to each sample, in samples.
     half
-        Samples on each side that take part.
+        Number of samples used on each side.
     beta
-        Of the window.
+        Shape parameter of the window.
 
     Examples
     --------

@@ -1,5 +1,6 @@
-"""Files of others, in and out: recordings, flight logs, phase histories, DEMs; GeoTIFF, CPHD, STAC, RO-Crate.
+"""Readers and writers of file formats: recordings, flight logs, phase histories, DEMs; GeoTIFF, CPHD, STAC, RO-Crate.
 
-`names` states which file is of which format and imports no reader; `reading` calls the reader. A new format is one file
-and one row. Imports `apertura.common` and `apertura.core`; never opens a campaign, and no format knows another.
+`names` maps files to formats without importing readers; `reading` calls the readers. A new format takes one file and
+one table row. Imports `apertura.common` and `apertura.core`, never opens a campaign; formats do not depend on each
+other.
 """

@@ -1,4 +1,4 @@
-"""Antenna patterns as CSV: cut, angle_deg, gain_db, and phase_deg where it was measured."""
+"""Reading of antenna patterns from CSV: cut, angle_deg, gain_db, and phase_deg if measured."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from apertura.core.antenna.beam import LIMITS_RAD
 from apertura.formats.tracks.csv_track import numbers, read_table
 
 Samples = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64] | None]
-"""One sampled cut: angles from boresight (deg), growing, gain (dB), and phase (deg); None: not measured."""
+"""Sampled cut: increasing angles from boresight (deg), gain (dB), and phase (deg) or None if not measured."""
 
 _LARGEST_DB, _LARGEST_DEG = 300.0, 1e5
 _COLUMNS = ["cut", "angle_deg", "gain_db"]
@@ -19,28 +19,28 @@ _PHASE = "phase_deg"
 
 
 def read_beam_pattern(path: Path) -> tuple[Samples, Samples]:
-    """Return the azimuth and elevation cuts of a CSV file.
+    """Read the azimuth and elevation cuts of a CSV file.
 
-    Its columns are cut (azimuth or elevation), angle_deg (growing within each cut, from boresight), gain_db and, where
-    it was measured, phase_deg: of the far field about the end of the lever arm, positive where the field leads.
+    The columns are cut (azimuth or elevation), angle_deg (from boresight, increasing within each cut), gain_db and, if
+    measured, phase_deg: far-field phase relative to the end of the lever arm, positive if the field leads.
 
     Raises
     ------
     CampaignError
-        If a column or a cut is missing, a cell is not a number, or angles do not grow or reach too far.
+        If a column or a cut is missing, a cell is not a number, or angles do not increase or exceed their limits.
     """
     try:
         table = read_table(path, _COLUMNS, optional=[_PHASE])
         unknown = sorted(set(table["cut"].fillna("").astype(str)) - LIMITS_RAD.keys())
         if unknown:
-            raise ValueError(f"a cut called {quoted(unknown[0])}")
+            raise ValueError(f"unknown cut {quoted(unknown[0])}")
         azimuth, elevation = (_samples(table[table["cut"] == name], name) for name in LIMITS_RAD)
     except (ValueError, ArithmeticError) as error:
         raise CampaignError(
             str(error).partition("\n")[0],
             where=path,
-            expected="columns cut (azimuth, elevation), angle_deg and gain_db, with growing angles in both cuts",
-            remedy="Correct the table: one line per sample, first one cut, then the other.",
+            expected="columns cut (azimuth, elevation), angle_deg and gain_db, with increasing angles in both cuts",
+            remedy="Correct the table: one line per sample, one cut after the other.",
         ) from error
     return azimuth, elevation
 
@@ -50,15 +50,15 @@ def _samples(cut: pd.DataFrame, name: str) -> Samples:
     phase = numbers(cut[[_PHASE]])[:, 0] if _PHASE in cut else None
     limit = np.degrees(LIMITS_RAD[name])
     if len(angle) < 3:
-        raise ValueError(f"{len(angle)} samples of the {name} cut, at least 3 are needed")
+        raise ValueError(f"{len(angle)} samples in the {name} cut, at least 3 are needed")
     if not all(np.isfinite(values).all() for values in (angle, gain, phase) if values is not None):
-        raise ValueError(f"the {name} cut holds a cell that is not a number")
+        raise ValueError(f"the {name} cut contains a cell that is not a number")
     if np.abs(gain).max() > _LARGEST_DB:
-        raise ValueError(f"a gain of {gain[np.abs(gain).argmax()]:g} dB in the {name} cut")
+        raise ValueError(f"a gain of {gain[np.abs(gain).argmax()]:g} dB in the {name} cut, beyond ±{_LARGEST_DB:g} dB")
     if not (np.diff(angle) > 0).all():
-        raise ValueError(f"angles of the {name} cut do not grow")
+        raise ValueError(f"angles of the {name} cut do not increase")
     if angle[0] < -limit or angle[-1] > limit:
-        raise ValueError(f"angles of the {name} cut go from {angle[0]:g}° to {angle[-1]:g}°, beyond ±{limit:g}°")
+        raise ValueError(f"angles of the {name} cut range from {angle[0]:g}° to {angle[-1]:g}°, beyond ±{limit:g}°")
     if phase is not None and np.abs(phase).max() > _LARGEST_DEG:
-        raise ValueError(f"a phase of {phase[np.abs(phase).argmax()]:g}° in the {name} cut")
+        raise ValueError(f"a phase of {phase[np.abs(phase).argmax()]:g}° in the {name} cut, beyond ±{_LARGEST_DEG:g}°")
     return angle, gain, phase

@@ -1,4 +1,4 @@
-"""The files of a campaign folder as they are written: config, flights, codes, SigMF recordings, flight logs."""
+"""Writers of the files of a campaign folder: config, flights, codes, SigMF recordings, flight logs."""
 
 import hashlib
 import json
@@ -17,21 +17,21 @@ from apertura.common.atomic import replacement
 from apertura.common.errors import CampaignError
 
 DATATYPES = {"int8": "ci8", "int16": "ci16_le", "int32": "ci32_le", "float32": "cf32_le"}
-"""dtype of I and Q → as SigMF names it."""
+"""dtype of I and Q → SigMF datatype."""
 
 
 @contextmanager
 def new_folder(directory: Path) -> Iterator[Path]:
-    """Yield where to write a campaign folder that is new or empty; it is renamed when complete.
+    """Yield a temporary folder for a new campaign; it is renamed to `directory` when complete.
 
     Raises
     ------
     CampaignError
-        If the folder holds something already.
+        If `directory` exists and is not an empty folder.
     """
     if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
         raise CampaignError(
-            "something is there already",
+            "the path already exists and is not an empty folder",
             where=directory,
             expected="a new or empty folder for the campaign",
             remedy="Remove it or choose another name.",
@@ -52,9 +52,9 @@ def write_config(
     root
         The campaign folder.
     document
-        The config, plain values.
+        The config, as plain values.
     flights
-        Name, kind, transmitter and nodes of each.
+        Name, kind, transmitter and nodes of each flight.
     """
     text = yaml.safe_dump(dict(document), sort_keys=False)
     (root / "config" / "config.yaml").write_text(text, encoding="utf-8")
@@ -80,14 +80,14 @@ def write_recording(
     stem
         raw/<flight>/<node>; the file name is the node's name.
     blocks
-        (sample, channel, 2), I and Q of a dtype of `DATATYPES`, in order; never all in memory at once.
+        (sample, channel, 2), I and Q with a dtype of `DATATYPES`, in order; written one by one.
     captures
-        Of each trigger the first sample, the node's own UTC tag (datetime64, written to its unit) and the frame
-        number sent, if any.
+        First sample, UTC time tag of the node's clock (datetime64, written in its unit) and transmitted frame number,
+        if any, of each trigger.
     frequency_hz
-        RF frequency at baseband zero.
+        RF frequency at zero baseband frequency.
     extra
-        More keys for the global object.
+        Additional keys of the global object.
 
     Notes
     -----
@@ -132,36 +132,37 @@ def write_csv_log(
     attitude_rad: NDArray[np.float64] | None,
     *,
     local: bool = False,
-    further: Mapping[str, NDArray[Any]] = MappingProxyType({}),
+    extra_columns: Mapping[str, NDArray[Any]] = MappingProxyType({}),
 ) -> None:
-    """Write a flight controller's log as .csv, by the names that `read_csv_track` knows.
+    """Write a flight log as .csv with the column names of `read_csv_track`.
 
     Parameters
     ----------
     time_utc
-        (epoch,) datetime64, UTC, written to its unit.
+        (epoch,) datetime64, UTC, written in its unit.
     position
         (epoch, 3) float64: latitude and longitude (degrees), metres above the ellipsoid.
     attitude_rad
-        (epoch, 3) float64: roll, pitch, yaw (clockwise from north); None: not logged. Cells are empty where one is NaN.
+        (epoch, 3) float64: roll, pitch, yaw (clockwise from north); None: not logged. NaN is written as an empty cell.
     local
-        Whether positions are metres to east, north and up in axes of the campaign's own.
-    further
-        Column → (epoch,): more of them; whole numbers and words as such, others to 10 µm, and empty cells where one is
-        NaN.
+        True if positions are metres to east, north and up in the campaign's local frame.
+    extra_columns
+        Additional columns: name → (epoch,); integers and text unchanged, floats to 10 µm, NaN as an empty cell.
     """
     axes = ("east_m", "north_m", "up_m") if local else ("latitude_deg", "longitude_deg", "height_m")
     columns = ["time_utc", *axes]
     cells = [[f"{text}Z" for text in np.datetime_as_string(time_utc)]]
     digits = (5, 5, 5) if local else (11, 11, 5)
-    cells += [[f"{one:.{few}f}" for one in column] for column, few in zip(position.T, digits, strict=True)]
+    cells += [
+        [f"{value:.{decimals}f}" for value in column] for column, decimals in zip(position.T, digits, strict=True)
+    ]
     if attitude_rad is not None:
         columns += ["roll_deg", "pitch_deg", "yaw_deg"]
-        turned = np.degrees(attitude_rad)
-        turned[:, 2] %= 360
-        cells += [[_cell(one, 4) for one in column] for column in turned.T]
-    columns += further
-    cells += [[_cell(one, 5) for one in column.tolist()] for column in further.values()]
+        attitude_deg = np.degrees(attitude_rad)
+        attitude_deg[:, 2] %= 360
+        cells += [[_cell(value, 4) for value in column] for column in attitude_deg.T]
+    columns += extra_columns
+    cells += [[_cell(value, 5) for value in column.tolist()] for column in extra_columns.values()]
     lines = [",".join(columns), *map(",".join, zip(*cells, strict=True))]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 

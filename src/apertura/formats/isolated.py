@@ -1,6 +1,6 @@
-"""Readers that may crash run in a process of their own: it may die, run out of memory or of time, and is then reported.
+"""Isolation of readers that may crash in a child process, with limits of memory and time and a report of failures.
 
-The process gets paths and gives arrays as .npy files; nothing that it writes is executed or unpickled here.
+The child process receives paths and returns arrays as .npy files; none of its output is executed or unpickled.
 """
 
 import json
@@ -24,24 +24,25 @@ from apertura.common.errors import shown
 from apertura.common.lazy import module_of, name_of
 
 SPARE_BYTES = 1 << 30
-"""Address space that a reader may have besides `BYTES_PER_BYTE` of its largest file."""
+"""Fixed part of a reader's limit of address space, bytes; `BYTES_PER_BYTE` × its largest file is added."""
 
 BYTES_PER_BYTE = 16
+"""Limit of address space per byte of the largest file."""
 
 SECONDS, SECONDS_PER_BYTE = 30.0, 1e-6
-"""Time that a reader may take, and more of it for each byte of its files."""
+"""Time limit of a reader, s: fixed part, and part per byte of its files."""
 
 _REFUSED = 3
 _THREADS = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL")}
 
 
 class UnreadableError(ValueError):
-    """A file could not be read: which one, and what became of its reader.
+    """Failure of a reader, with the file concerned.
 
     Attributes
     ----------
     path
-        The file that was being read.
+        File that was being read.
     """
 
     def __init__(self, path: Path, found: str) -> None:
@@ -56,12 +57,12 @@ def read_isolated(
     seconds: float | None = None,
     memory_bytes: int | None = None,
 ) -> list[dict[str, NDArray[Any]]]:
-    """Return the result of a reader for each file, in one process for all.
+    """Run a reader on each file in a single child process and return its arrays.
 
     Parameters
     ----------
     function
-        Of a module: path → name → array; a ValueError of it is the reason why a file is refused.
+        Module-level function: path → {name: array}; its ValueError is reported as the reason for rejecting a file.
     paths
         The files.
     seconds, memory_bytes
@@ -70,19 +71,19 @@ def read_isolated(
     Returns
     -------
     list
-        Per file name → array, memory-mapped and read-only.
+        For each file, name → array, memory-mapped and read-only.
 
     Raises
     ------
     UnreadableError
-        If the function rejects a file, or the process dies, takes too long or needs too much memory.
+        If the function rejects a file, or the process crashes, times out or exceeds its memory limit.
     """
     sizes = [path.stat().st_size for path in paths]
     seconds = SECONDS + SECONDS_PER_BYTE * sum(sizes) if seconds is None else seconds
     memory_bytes = SPARE_BYTES + BYTES_PER_BYTE * max(sizes, default=0) if memory_bytes is None else memory_bytes
     with TemporaryDirectory(prefix="apertura-") as name, ExitStack() as stack:
         folder = Path(name)
-        # -P: a module that lies in the campaign folder is not what is imported
+        # -P: do not import modules from the campaign folder
         command = [
             sys.executable,
             "-P",
@@ -107,19 +108,19 @@ def read_isolated(
             )
             found = _ended(done.returncode, done.stderr)
         except subprocess.TimeoutExpired:
-            found = f"its reader took more than {seconds:.0f} s"
+            found = f"its reader exceeded the time limit of {seconds:.0f} s"
         finished = sum((folder / f"{number}.json").is_file() for number in range(len(paths)))
         if found or finished < len(paths):
-            raise UnreadableError(paths[min(finished, len(paths) - 1)], found or "its reader wrote nothing")
+            raise UnreadableError(paths[min(finished, len(paths) - 1)], found or "its reader wrote no output")
         return [_read(folder, number) for number in range(len(paths))]
 
 
 def _ended(status: int, stderr: bytes) -> str:
-    """Return the reason why the process failed; empty if it succeeded."""
+    """Return the cause of the process's failure; empty if it succeeded."""
     if status < 0:
-        return f"its reader died of {signal.Signals(-status).name}"
+        return f"its reader was terminated by {signal.Signals(-status).name}"
     lines = stderr.decode("utf-8", errors="replace").strip().splitlines()
-    return "" if status == 0 else shown(lines[-1] if lines else f"its reader ended with status {status}", 300)
+    return "" if status == 0 else shown(lines[-1] if lines else f"its reader exited with status {status}", 300)
 
 
 def _read(folder: Path, number: int) -> dict[str, NDArray[Any]]:
@@ -131,7 +132,7 @@ def _read(folder: Path, number: int) -> dict[str, NDArray[Any]]:
 
 
 def _main(function: str, memory_bytes: str, seconds: str, folder: str, *paths: str) -> int:
-    """Read files in this process, which has limits of its own; write arrays, and their names when all are there."""
+    """Set the limits of this process and read files in it; write the arrays of each file, then their names."""
     limits = {
         resource.RLIMIT_AS: int(memory_bytes),
         resource.RLIMIT_FSIZE: int(memory_bytes),
@@ -149,7 +150,7 @@ def _main(function: str, memory_bytes: str, seconds: str, folder: str, *paths: s
             for index, array in enumerate(arrays.values()):
                 np.save(Path(folder) / f"{number}.{index}.npy", array, allow_pickle=False)
             (Path(folder) / f"{number}.json").write_text(json.dumps(list(arrays)))
-    except Exception as error:  # whatever a parser raises is why the file is not readable
+    except Exception as error:  # any exception of a parser means that the file is unreadable
         text = "its reader ran out of memory" if isinstance(error, MemoryError) else " ".join(str(error).split())
         sys.stderr.write((text or type(error).__name__).encode("ascii", "backslashreplace").decode() + "\n")
         return _REFUSED

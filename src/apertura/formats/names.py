@@ -1,8 +1,8 @@
-"""Names of recorders, flight logs and phase histories: which file is of which format, and which function reads it.
+"""Tables of recorders, flight logs and phase histories: recognition of a file's format, and its reader.
 
-Rows name their readers and import none: looking up a file's name loads no format, and the code hash of a
-result (`apertura.workflow.lineage`) holds the readers of its own campaign alone. To add a format: one file with
-its reader, one row here.
+Rows refer to readers lazily: looking up a file name imports no reader, and the code hash of a result
+(`apertura.workflow.lineage`) covers only the readers of its own campaign. A new format takes one file with its reader
+and one row in this module.
 """
 
 from collections.abc import Callable, Mapping
@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from apertura.common.atomic import naming
 from apertura.common.errors import CampaignError, quoted
 from apertura.common.lazy import Lazy
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 
 _RECORDINGS = Lazy("apertura.formats.recordings")
 _TRACKS = Lazy("apertura.formats.tracks")
@@ -24,25 +24,26 @@ RECORDERS: Mapping[tuple[str, ...], Callable[..., Any]] = {(".sigmf-meta", ".sig
 FINDERS: Mapping[tuple[str, ...], Callable[..., Any]] = {
     (".sigmf-meta", ".sigmf-data"): _RECORDINGS.sigmf.find_sigmf,
 }
-"""Row of `RECORDERS` → finder(folder, node) → files, where metadata may give them other names than <node><suffix>."""
+"""Row of `RECORDERS` → finder(folder, node) → files, for formats whose metadata may state other file names than
+<node><suffix>."""
 
 GROWING: Mapping[tuple[str, ...], Callable[..., Any]] = {
     (".sigmf-meta", ".sigmf-data"): _RECORDINGS.sigmf.GrowingSigmf,
 }
-"""Row of `RECORDERS` that can be read while it is written → class(*files) whose read() returns what is whole."""
+"""Row of `RECORDERS` that is readable while it is written → class(*files) whose read() returns complete captures."""
 
 
 class LogFormat(NamedTuple):
     """Recognition and reader of a flight log."""
 
     suffixes: tuple[str, ...]
-    """Of <node>.track.*"""
+    """Suffixes of <node>.track.*"""
     reader: Callable[..., Any]
     """reader(path, node=, options=) → `track`."""
     heading: str = ""
-    """What its first 8 KiB hold, where others have the same suffix; none: any."""
+    """Text in the first 8 KiB that distinguishes the format from others with the same suffix; empty: any."""
     by_lines: bool = False
-    """Whether epochs are lines of text, so that a log is whole up to its last line while it is written."""
+    """True if epochs are lines of text: a log that is being written is then valid up to its last complete line."""
 
 
 TRACKS: Mapping[str, LogFormat] = {
@@ -54,7 +55,7 @@ TRACKS: Mapping[str, LogFormat] = {
     "ardupilot": LogFormat((".bin", ".log"), _TRACKS.ardupilot.read_ardupilot, heading="FMT"),
     "rtklib": LogFormat((".pos",), _TRACKS.rtklib.read_rtklib_pos, by_lines=True),
 }
-"""Name of a format → how it is recognised and read; of those that fit a file the first is taken."""
+"""Name of a format → its recognition and reader; the first format that matches a file is used."""
 
 _HEADING_BYTES = 8192
 
@@ -63,29 +64,29 @@ class HistoryFormat(NamedTuple):
     """Reader of a phase history."""
 
     suffix: str
-    """Of <node>.*, or of <node> itself."""
+    """Suffix of <node>.*, or of the folder <node>."""
     reader: Callable[..., Any]
-    """reader(paths, pair=) → `echo`; without tx_position and rx_position where those are in flight logs.
+    """reader(paths, pair=) → `echo`, without tx_position and rx_position if these come from flight logs.
 
-    Of a folder paths are all its files.
+    For a folder, `paths` are all its files.
     """
     described: bool = False
-    """Whether the reader also takes described=, the section `waveform` of the config."""
+    """True if the reader also takes described=, the section `waveform` of the config."""
     frame: str = ""
-    """Of its positions, local or ecef; empty: stated by the files or a flight log."""
+    """Frame of the positions, local or ecef; empty: stated by the files or a flight log."""
     waveform: str = "phase_history"
-    """waveform.kind that it belongs to."""
+    """waveform.kind of the format."""
     beside: str = ""
-    """What ends the name of a second file of <stem><suffix>, <stem><beside>; empty: there is none."""
+    """Ending of a second file <stem><beside> next to <stem><suffix>; empty: none."""
 
     def files_of(self, path: Path) -> list[Path]:
-        """Return the files of what one file or folder belongs to, the one that all others are named after first."""
+        """List the files of the phase history that a file or folder belongs to, main file first."""
         if path.is_dir():
-            return sorted(one for one in path.rglob("*") if one.is_file())
+            return sorted(file for file in path.rglob("*") if file.is_file())
         if not self.beside:
             return [path]
         stem = path.name.removesuffix(self.beside if path.name.endswith(self.beside) else self.suffix)
-        return [one for one in (path.with_name(stem + end) for end in (self.suffix, self.beside)) if one.is_file()]
+        return [file for file in (path.with_name(stem + end) for end in (self.suffix, self.beside)) if file.is_file()]
 
 
 PHASE_HISTORIES: Mapping[str, HistoryFormat] = {
@@ -104,32 +105,32 @@ PHASE_HISTORIES: Mapping[str, HistoryFormat] = {
     "beat_mat": HistoryFormat(".mat", _HISTORIES.fmcw.read_beat_mat, described=True, waveform="fmcw"),
     "beat_wav": HistoryFormat(".wav", _HISTORIES.fmcw.read_beat_wav, described=True, waveform="fmcw"),
 }
-"""waveform.format → how it is read."""
+"""waveform.format → its reader."""
 
 
 def recording_files(folder: Path, node: str) -> tuple[Path, ...]:
-    """Return the files of a node's recording in the format of which a folder holds a file, else in the first known one.
+    """Return the files of a node's recording, in the format present in the folder (default: the first format).
 
     Raises
     ------
     CampaignError
-        If metadata that name files cannot be read.
+        If metadata that state file names cannot be read.
     """
     present = (row for row in RECORDERS if any((folder / f"{node}{suffix}").is_file() for suffix in row))
     row = next(present, next(iter(RECORDERS)))
     if row in FINDERS:
-        found: tuple[Path, ...] = FINDERS[row](folder, node)
-        return found
+        files: tuple[Path, ...] = FINDERS[row](folder, node)
+        return files
     return tuple(folder / f"{node}{suffix}" for suffix in row)
 
 
-def log_format(path: Path, options: LogOptions = AS_IT_SAYS) -> str:
-    """Return the row of `TRACKS` that reads a log: the requested one, else by suffix and heading.
+def log_format(path: Path, options: LogOptions = DEFAULT_OPTIONS) -> str:
+    """Determine the format of a log, a key of `TRACKS`: as configured, otherwise by suffix and heading.
 
     Raises
     ------
     CampaignError
-        If none does.
+        If no format matches.
     """
     if options.format in TRACKS:
         return str(options.format)
@@ -137,12 +138,12 @@ def log_format(path: Path, options: LogOptions = AS_IT_SAYS) -> str:
     known = {name: row for name, row in TRACKS.items() if suffix in row.suffixes}
     if any(row.heading for row in known.values()):
         with naming(path), path.open("rb") as stream:
-            begins = stream.read(_HEADING_BYTES).decode("utf-8", errors="replace")
-        known = {name: row for name, row in known.items() if row.heading in begins}
+            first_text = stream.read(_HEADING_BYTES).decode("utf-8", errors="replace")
+        known = {name: row for name, row in known.items() if row.heading in first_text}
     if options.format is None and known:
         return next(iter(known))
     headings = [repr(row.heading) for row in TRACKS.values() if suffix in row.suffixes]
-    found = f"a flight log of kind {path.suffix!r}"
+    found = f"a flight log with suffix {path.suffix!r}"
     if headings:
         found += f" without {' or '.join(headings)} in its first {_HEADING_BYTES} bytes"
     raise CampaignError(

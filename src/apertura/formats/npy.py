@@ -1,4 +1,4 @@
-"""Arrays in untrusted .npy files: the header is checked before anything is allocated."""
+"""Reading of arrays in untrusted .npy files; the header is checked before memory is allocated."""
 
 from pathlib import Path
 from typing import Any
@@ -13,23 +13,23 @@ _MAGIC = b"\x93NUMPY"
 
 
 def read_npy(path: Path, *, kinds: str, most: int, expected: str, remedy: str) -> NDArray[Any]:
-    """Return the array in a .npy file.
+    """Read the array in a .npy file.
 
     Parameters
     ----------
     path
         The file.
     kinds
-        Letters of the kinds of dtype that will do, such as 'c' or 'if'.
+        Letters of the accepted dtype kinds, such as 'c' or 'if'.
     most
-        Values that it may hold.
+        Maximum number of values.
     expected, remedy
-        For the message.
+        Parts of the message.
 
     Raises
     ------
     CampaignError
-        If it is no .npy file, is of another kind or larger, or ends early.
+        If the file is not a .npy file, has another kind of dtype, is too large or is truncated.
     """
     try:
         with path.open("rb") as stream:
@@ -41,7 +41,7 @@ def read_npy(path: Path, *, kinds: str, most: int, expected: str, remedy: str) -
         if mapped.dtype.kind not in kinds or mapped.dtype.names or mapped.size > most:
             found = f"{quoted(mapped.dtype.str, 20)[1:-1]} of shape {mapped.shape}"
         array = None if found else np.array(mapped)
-    except Exception as error:  # numpy evaluates the header, which may be of any kind of nonsense
+    except Exception as error:  # numpy evaluates the header; a malformed one may raise any exception
         found, array = f"not readable ({shown(error, 200)})", None
     if array is None:
         raise CampaignError(str(found), where=path, expected=expected, remedy=remedy)

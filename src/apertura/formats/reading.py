@@ -1,7 +1,7 @@
-"""Recorders and flight logs: bytes in, `raw`, `track` or `echo` out; one file and one row of `names` per format.
+"""Reading of recordings, flight logs and phase histories as stages `raw`, `track` and `echo`.
 
-Readers are imported when a file of theirs is read. The code hash of a result whose code imports this module holds the
-readers that the campaign's files name.
+Each format has one file and one row in `names`. Readers are imported when they are first used; the code hash of a
+result covers the readers of the campaign's files only.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from apertura.formats.names import PHASE_HISTORIES, RECORDERS, TRACKS, log_format
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -24,7 +24,7 @@ def open_recording(files: Sequence[Path]) -> "Recording":
     Parameters
     ----------
     files
-        In the order of a row of `RECORDERS`.
+        Files in the order of a row of `RECORDERS`.
     """
     names = [file.name for file in files]
     row = next(row for row in RECORDERS if len(row) == len(names) and names[0].endswith(row[0]))
@@ -32,13 +32,13 @@ def open_recording(files: Sequence[Path]) -> "Recording":
     return opened
 
 
-def read_track(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> "xr.Dataset":
-    """Return the `track` stage of a flight log.
+def read_track(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> "xr.Dataset":
+    """Read a flight log as `track` stage.
 
     Raises
     ------
     CampaignError
-        If no reader knows the file, or the log is not what its format promises.
+        If no format matches the file, or the log violates its format.
     """
     track: xr.Dataset = TRACKS[log_format(path, options)].reader(path, node=node, options=options)
     return track
@@ -47,20 +47,20 @@ def read_track(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> "x
 def read_phase_history(
     kind: str, paths: Sequence[Path], *, pair: str, described: Mapping[str, Any] = MappingProxyType({})
 ) -> "xr.Dataset":
-    """Return the `echo` stage of phase-history files.
+    """Read phase-history files as `echo` stage.
 
     Parameters
     ----------
     kind
         A key of `PHASE_HISTORIES`.
     paths
-        The files, joined in this order.
+        The files, concatenated in this order.
     pair
         Transmitter-receiver.
     described
-        The waveform of the config, for formats that do not state it.
+        Waveform section of the config, for formats that do not contain the waveform.
     """
     row = PHASE_HISTORIES[kind]
-    further = {"described": described} if row.described else {}
-    echo: xr.Dataset = row.reader(paths, pair=pair, **further)
+    options = {"described": described} if row.described else {}
+    echo: xr.Dataset = row.reader(paths, pair=pair, **options)
     return echo

@@ -1,4 +1,4 @@
-"""Times that recorders and logs write, within the years that any of them can have been made in."""
+"""Parsing of times in recordings and logs, restricted to plausible years."""
 
 import re
 from collections.abc import Sequence
@@ -9,18 +9,18 @@ from numpy.typing import NDArray
 from apertura.common.errors import quoted
 
 FIRST, LAST = np.datetime64("1980-01-01", "ns"), np.datetime64("2200-01-01", "ns")
-"""Years of any recording; numpy counts nanoseconds only between 1678 and 2262 and wraps beyond without a word."""
+"""Accepted interval of times; datetime64[ns] covers 1678 to 2262 and overflows outside without a warning."""
 
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d(?:[T ]\d\d:\d\d(?::\d\d(?:\.\d{1,9})?)?)?)\d*", re.ASCII)
 
 
 def utc_times(texts: Sequence[str]) -> NDArray[np.datetime64]:
-    """Return times written as ISO 8601 in UTC without saying so.
+    """Parse UTC times in ISO 8601 without a zone designator.
 
     Parameters
     ----------
     texts
-        Such as 2025-05-14T09:30:00.5; digits beyond nanoseconds are cut off.
+        For example 2025-05-14T09:30:00.5; digits beyond nanoseconds are truncated.
 
     Returns
     -------
@@ -30,7 +30,7 @@ def utc_times(texts: Sequence[str]) -> NDArray[np.datetime64]:
     Raises
     ------
     ValueError
-        If one is no time, or is before 1980 or after 2199.
+        If a text is not a time, or a time is before 1980 or after 2199.
 
     Examples
     --------
@@ -39,7 +39,7 @@ def utc_times(texts: Sequence[str]) -> NDArray[np.datetime64]:
     """
     matches = [_ISO.fullmatch(text) for text in texts]
     if None in matches:
-        raise ValueError(f"{quoted(texts[matches.index(None)], 40)} is no time such as 2025-05-14T09:30:00.5")
+        raise ValueError(f"{quoted(texts[matches.index(None)], 40)} is not a time such as 2025-05-14T09:30:00.5")
     plain = [match[1] for match in matches if match]
     years = np.array([text[:4] for text in plain], np.int64)
     beyond = np.flatnonzero((years < 1980) | (years > 2199))
@@ -49,13 +49,13 @@ def utc_times(texts: Sequence[str]) -> NDArray[np.datetime64]:
 
 
 LEAP_SECOND = "within a leap second"
-"""Reason why an epoch is left out: UTC counts 23:59:60, which no datetime64 is."""
+"""Reason for excluding an epoch: datetime64 cannot represent 23:59:60 UTC."""
 
-_LEAP_SECOND = re.compile(r"[T ]\d\d:[25]9:60(?!\d)", re.ASCII)  # minute of any zone, whole or half hours
+_LEAP_SECOND = re.compile(r"[T ]\d\d:[25]9:60(?!\d)", re.ASCII)  # zones with whole or half hours
 
 
 def in_leap_second(texts: Sequence[str]) -> NDArray[np.bool_]:
-    """Return a mask of the times, written as ISO 8601, that are within a leap second.
+    """Return a mask of the ISO 8601 times that lie within a leap second.
 
     Examples
     --------
@@ -66,7 +66,7 @@ def in_leap_second(texts: Sequence[str]) -> NDArray[np.bool_]:
 
 
 def coarsened(times: NDArray[np.datetime64]) -> NDArray[np.datetime64]:
-    """Return times in the coarsest of milli-, micro- and nanoseconds that holds them exactly, to be written.
+    """Convert times to the coarsest of milli-, micro- and nanoseconds that represents them exactly, for output.
 
     Examples
     --------
@@ -78,6 +78,6 @@ def coarsened(times: NDArray[np.datetime64]) -> NDArray[np.datetime64]:
 
 
 def outside(times: NDArray[np.datetime64]) -> NDArray[np.int64]:
-    """Return the indices of times that are none, or are before 1980 or after 2199."""
-    first, last = (bound.astype(times.dtype) for bound in (FIRST, LAST))  # nanoseconds would not hold all others
+    """Return the indices of times that are NaT, before 1980 or after 2199."""
+    first, last = (bound.astype(times.dtype) for bound in (FIRST, LAST))  # conversion to ns could overflow
     return np.flatnonzero(~((times >= first) & (times < last)))

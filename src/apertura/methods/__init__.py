@@ -1,5 +1,5 @@
-"""Methods that improve or compare images beyond forming them: autofocus, alignment of clocks, bench, interferometry.
+"""Methods beyond image formation: autofocus, clock alignment, bench measurements, interferometry.
 
-Offers estimators that take arrays, apertures and formed patches and give corrections with their uncertainty. Imports
-`apertura.common` and `apertura.core`; never opens a campaign.
+The estimators take arrays, apertures and imaged patches, and return corrections with their uncertainty. The package
+imports `apertura.common` and `apertura.core`; it never opens a campaign.
 """

@@ -1,7 +1,7 @@
-"""Causes of wrong images: quantities of the logs and of the config, the errors tried of each, and their words.
+"""Causes of wrong images: quantities of the logs and the config, the trial errors of each, and their messages.
 
-`apertura check` names those that times show, rule `assess` tries them one by one on a bright place, and rule `refine`
-fits those that move the nodes of a flight to all places.
+`apertura check` reports the causes that time tags reveal, rule `assess` tries the causes one by one on a bright point,
+and rule `refine` fits the causes that displace the nodes of a flight to all bright points.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,25 +15,25 @@ from apertura.common.arrays import Floats
 from apertura.common.leap_seconds import LATEST_S
 
 LEAST_GAIN_DB = 0.5
-"""Power of points that a cause must bring back to be named: less needs no explanation beyond the logs' errors."""
+"""Least power of points that a cause must recover to be reported, dB; errors of the logs explain smaller losses."""
 
-# ---- Times that look like those of another time system --------------------------------------------------------------
+# ---- Times of another time system -----------------------------------------------------------------------------------
 
-_TAI_S = 19  # by which TAI is ahead of GPST
+_TAI_S = 19  # TAI − GPST
 _TIME_SYSTEMS = {
     LATEST_S: ": GPST taken for UTC?",
     -LATEST_S: ": UTC taken for GPST?",
     LATEST_S + _TAI_S: ": TAI taken for UTC?",
     _TAI_S: ": TAI taken for GPST?",
 }
-_NEAR_S = 3.0  # logs and recordings of one flight begin and end within a few seconds of each other
+_NEAR_S = 3.0  # the log and the recording of a flight start and stop within a few seconds of each other
 _NEAR_ZONE_S = 120.0
 _ZONE_S = 1800.0
 _LONGEST_ZONE_S = 14 * 3600.0
 
 
 def mistaken_time(shift_s: float, *, tolerance_s: float = _NEAR_S) -> str:
-    """Return which mistake makes times late by so many seconds, as the end of a sentence; '' where none comes to mind.
+    """Return the probable mistake behind a delay of the times, to end a sentence; '' if no known mistake explains it.
 
     Examples
     --------
@@ -47,7 +47,7 @@ def mistaken_time(shift_s: float, *, tolerance_s: float = _NEAR_S) -> str:
     zones = round(size / _ZONE_S)
     if zones and size <= _LONGEST_ZONE_S + _NEAR_ZONE_S and abs(size - zones * _ZONE_S) <= _NEAR_ZONE_S:
         return ": local time taken for UTC?"
-    return ": a log of another day?" if size > 86400 else ""
+    return ": log of another day?" if size > 86400 else ""
 
 
 # ---- Table of the quantities that may be wrong ----------------------------------------------------------------------
@@ -62,15 +62,16 @@ class Quantity:
     kind
         Short name of the cause.
     sentence
-        That it is wrong: with places for the error, for its size and direction, and for further words.
+        Message template, with fields for the error, its size and direction, and other arguments.
     directions
-        Words of a positive and of a negative error.
+        Words for a positive and for a negative error.
     sizes
-        Errors that are tried with both signs, the likeliest first.
+        Trial errors, applied with both signs, the likeliest first.
     std
-        Standard deviation of an error that is fitted: as wide as hands err, so that images decide and not the prior.
+        Standard deviation of a fitted error: as wide as configuration mistakes, so that the images decide, not the
+        prior.
     question
-        Which mistake makes such an error, to end the sentence.
+        Returns the probable mistake behind an error, to end the sentence.
 
     Examples
     --------
@@ -87,11 +88,11 @@ class Quantity:
 
     @property
     def errors(self) -> list[Any]:
-        """Errors that are tried, the likeliest first."""
+        """Trial errors, the likeliest first."""
         return [sign * size for size in self.sizes for sign in (1, -1)]
 
     def line(self, *error: float, digits: int = 2, **words: str) -> str:
-        """Return the sentence of an error, whose size is given to so many digits after the point."""
+        """Return the message for an error, with `digits` decimals of its size."""
         first = error[0] if error else 0.0
         words |= {"size": f"{abs(first):.{digits}f}", "direction": self.directions[first <= 0]}
         return self.sentence.format(*error, **words) + self.question(first)
@@ -105,57 +106,57 @@ TIME = Quantity(
     std=0.3,
     question=partial(mistaken_time, tolerance_s=0.0),
 )
-ARM_SIGN = Quantity("lever arm", "{axis} axis of the lever arms of {node} has the other sign")
+ARM_SIGN = Quantity("lever arm", "{axis} axis of the lever arms of {node} has the opposite sign")
 ARM = Quantity(
     "lever arm",
-    "lever arms of {node} are wrong by [{0:+.3f}, {1:+.3f}, {2:+.3f}] m, or its attitude by a constant",
+    "the lever arms of {node} are wrong by [{0:+.3f}, {1:+.3f}, {2:+.3f}] m, or its attitude has a constant error",
     std=0.3,
 )
 TRACKS = Quantity("tracks swapped", "the tracks of {first} and {second} are swapped")
 HEIGHT = Quantity(
     "height",
-    "the ground lies {size} m {direction} where the config has it",
+    "the terrain lies {size} m {direction} its configured height",
     ("above", "below"),
     (50.0, 47.0, 20.0, 10.0, 5.0, 4.0, 3.0, 2.5, 2.0, 1.5, 1.0, 0.5),
     std=3.0,
-    # from 10 m on heights above a geoid may have been taken for ellipsoidal ones, or the reverse
+    # an error of 10 m or more may come from geoid heights taken for ellipsoidal heights, or the reverse
     question=lambda height_m: ": another vertical datum?" if abs(height_m) >= 10.0 else "",
 )
 PREFIX = Quantity(
     "prefix",
-    "paths of {pair} are {path_m} m off: captures begin {0:+d} samples from {begin}?",
+    "paths of {pair} are wrong by {path_m} m: captures start {0:+d} samples from {begin}?",
     sizes=(1, 2, 3, 5, 10, 20, 50),
 )
 RANGE = Quantity(
-    "range", "paths of {pair} are {0:+.2f} m off: a path offset?", sizes=(0.05, 0.1, 0.15, 0.3, 0.5, 1.0, 2.0, 4.0)
+    "range", "paths of {pair} are wrong by {0:+.2f} m: path offset?", sizes=(0.05, 0.1, 0.15, 0.3, 0.5, 1.0, 2.0, 4.0)
 )
 CARRIER = Quantity("carrier_is", "waveform.carrier_is is {other}")
 CHANNELS = Quantity("channels", "the channels of {node} are swapped")
 
 
 def whose(nodes: Sequence[str]) -> str:
-    """Return whose times are wrong in the sentence of `TIME`: of one node, or of all."""
+    """Return the logs with wrong times for the message of `TIME`: the log of a single node, or all logs."""
     return f"the log of {nodes[0]}" if len(nodes) == 1 else "all logs"
 
 
-# ---- Causes that move the nodes of a flight ---------------------------------------------------------------------
+# ---- Causes that displace the nodes of a flight ---------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """A wrong quantity whose error moves nodes in proportion.
+    """A wrong quantity whose error displaces nodes in proportion.
 
     Attributes
     ----------
     quantity
-        What is wrong.
+        The wrong quantity.
     time_s
         (sample,) float64, seconds of the flight's clock.
     moved_m
-        Node → (unknown, sample, 3) float64, by how much a unit of each moves the node, metres in the frame; nodes that
-        are not named stay.
+        Node → (unknown, sample, 3) float64, displacement of the node per unit of each unknown, metres in the frame;
+        nodes without an entry are not displaced.
     words
-        Of the sentence.
+        Arguments of the message template.
 
     Examples
     --------
@@ -172,48 +173,51 @@ class Cause:
 
     @property
     def std(self) -> Floats:
-        """(unknown,) float64, standard deviation of each, in its unit."""
+        """(unknown,) float64, standard deviation of each unknown, in its unit."""
         return np.full(len(next(iter(self.moved_m.values()))), self.quantity.std)
 
     def line(self, values: Floats) -> str:
-        """Describe the wrong quantity, with its error."""
+        """Describe the wrong quantity and its error."""
         return self.quantity.line(*values.tolist(), **self.words)
 
 
 def late_logs(nodes: Sequence[str], flown: Mapping[str, tuple[Floats, Floats]]) -> Cause:
-    """Return the cause that the times of some logs are late by one delay.
+    """Return the cause that the logs of the given nodes have one common time delay.
 
     Parameters
     ----------
     nodes
-        Whose logs.
+        Nodes with late logs.
     flown
-        Node → (sample,) seconds and (sample, 3) metres: where its log has it.
+        Node → (sample,) seconds and (sample, 3) metres: logged positions.
     """
     time_s, moved = flown[nodes[0]][0], dict[str, Floats]()
-    for node in nodes:  # logs differ in epochs: all at those of the first
+    for node in nodes:  # the epochs of the logs differ: interpolate to those of the first log
         own_s, speed = flown[node][0], np.gradient(flown[node][1], flown[node][0], axis=0)
         moved[node] = np.stack([np.interp(time_s, own_s, axis) for axis in speed.T], axis=-1)[None]
     return Cause(TIME, time_s, moved, {"whose": whose(nodes), "digits": 3})
 
 
 def other_arm(node: str, time_s: Floats, body_axes: Floats) -> Cause:
-    """Return the cause that a node's antennas lie elsewhere on the body, or the body is turned against its attitude.
+    """Return the cause that the lever arms of a node, or its attitude, have a constant error.
 
     Parameters
     ----------
     node
-        Its name.
+        Name of the node.
     time_s, body_axes
         (sample,) seconds, and (sample, 3, 3): columns are forward, right and down in the frame.
 
     Notes
     -----
-    A constant error δθ of attitude moves an antenna on the arm l as an arm that is wrong by δθ × l does.
+    A constant attitude error δθ displaces an antenna on the lever arm l by δθ × l, as a lever-arm error does.
     """
     return Cause(ARM, time_s, {node: np.moveaxis(body_axes, -1, 0)}, {"node": node})
 
 
 def other_height(nodes: Sequence[str], time_s: Floats, up: Floats) -> Cause:
-    """Return the cause that the ground lies higher than stated, as if all nodes flew lower; `up` (3,) in the frame."""
+    """Return the cause that the terrain lies higher than configured, as if all nodes flew lower.
+
+    `up` is the (3,) unit vector in the frame.
+    """
     return Cause(HEIGHT, time_s, {node: np.broadcast_to(-up, (1, len(time_s), 3)) for node in nodes})

@@ -1,4 +1,4 @@
-"""A run on this machine: Snakemake is started and followed, its progress shown and recorded.
+"""Run of the workflow on this machine: start and monitor Snakemake, record and display its progress.
 
-`driver.run_workflow` is what `apertura run` calls. Imports `apertura.check` and the layers below.
+`driver.run_workflow` implements `apertura run`. Imports `apertura.check` and the layers below.
 """

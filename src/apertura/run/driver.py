@@ -1,4 +1,4 @@
-"""The workflow on a campaign folder: checked first, run by one process group, and ended with all its steps."""
+"""Driver of the workflow: check a campaign folder, run Snakemake in one process group, stop it with all its steps."""
 
 import os
 import re
@@ -44,44 +44,44 @@ from apertura.workflow.stale import absent_lines, any_is_missing, forms_results,
 Show = Literal["errors", "steps", "snakemake"]
 
 _GRACE_S = 3.0
-_LOOK_S, _REST = 0.2, 20  # looking at 10^5 jobs takes time: at most a twentieth of one core
+_LOOK_S, _REST = 0.2, 20  # polling interval, and least ratio of rest to polling time: 10^5 jobs take long to poll
 _COUNTERS = Path("/proc/vmstat")
 _ELSEWHERE = ("memory", "plan")
-"""Checks of this machine, of no use where steps run on others."""
+"""Checks of this machine, omitted if steps run on other machines."""
 _HOLDS_CODE = ("--profile", "--workflow-profile", "--configfiles", "--snakefile", "--jobscript", "--js")
-"""Options of snakemake that name files which it takes code from; it knows them by their beginnings, too."""
+"""Options of Snakemake whose values are files from which it executes code; it accepts abbreviations of them."""
 _HOLDS_NONE = ("--config", "--jobs")
 _PICKLED = "--trust-io-cache"
-"""Option of snakemake: read what it knows of the folder's files from a pickle in that folder."""
+"""Option of Snakemake: read the state of files from a pickle in the working folder."""
 _SHORT = re.compile(r"(-[hntkfFlSDvpa]*s)(.*)")
-"""Short options that take no value, `-s`, which is `--snakefile`, and its value where it is written without a space."""
+"""Short options without a value, then `-s` (`--snakefile`), and its value if attached without a space."""
 _PROFILE = "SNAKEMAKE_PROFILE"
-"""Environment variable: the profile where the command line names none."""
+"""Environment variable: default profile of Snakemake."""
 _DRY_RUN = re.compile(r"-n|-np|--dry-?run")
 _SCATTER = "--set-scatter"
 _DEPLOYS = ("--sd", "--so", "--use-c", "--use-s", "--use-a", "--conda")
-"""Beginnings of options with which Snakemake installs software, wherever that is kept: its changes are not confined."""
+"""Prefixes of options with which Snakemake installs software in any folder: its file access is then not confined."""
 _BY_SHELL = (*_DEPLOYS, "--cac", "--be")
-"""Beginnings of options that concern commands of shells: software, caching between workflows, extended benchmarks."""
+"""Prefixes of options that apply to shell commands: software deployment, caching, extended benchmarks."""
 UNTIL = ("--until", "-U")
 _TARGETS = ("all", "pages", "phase_history")
-"""Rules of the workflow that only gather results of others."""
+"""Rules of the workflow that only collect results of other rules."""
 _LOG = "snakemake.log"
 
 
 @dataclass(frozen=True)
 class _Files:
-    """What a run keeps of itself."""
+    """Files of a run: journal, status and log."""
 
     journal: ConfinedPath
     status: ConfinedPath
     log: ConfinedPath
     confined: str = ""
-    """Folder of the campaign to which Snakemake's changes are confined, if they are."""
+    """Campaign folder to which file changes of Snakemake are confined; empty: not confined."""
 
     @classmethod
     def of(cls, campaign: Campaign, *, confined: bool) -> "_Files":
-        """Return those of a run that forms results; what one before left is removed."""
+        """Create the files of a run that computes results; files of an earlier run are removed."""
         folder, log = campaign.result(RUN), campaign.result("logs", _LOG)
         folder.remove()
         folder.mkdir(parents=True)
@@ -90,25 +90,25 @@ class _Files:
         return cls(*own, str(campaign.root) if confined else "")
 
     @classmethod
-    def apart(cls, folder: str, *, confined: Path | None) -> "_Files":
-        """Return those of a run that forms nothing."""
+    def temporary(cls, folder: str, *, confined: Path | None) -> "_Files":
+        """Return the files of a run that computes no results, in a temporary folder."""
         own = ConfinedPath.at(folder)
         return cls(own / "journal.jsonl", own / "status", own / _LOG, str(confined or ""))
 
     @property
     def environment(self) -> dict[str, str]:
-        """What snakemake and its steps are told; rules call `apertura`, which need not be on the caller's PATH."""
+        """Environment of Snakemake and its steps, with `apertura`, which the rules call, on the PATH."""
         isolate()
         path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
         files = {STATUS_FILE: self.status.reference(), JOURNAL: self.journal.reference()}
         return {**os.environ, "PATH": path, **files, **({CONFINED: self.confined} if self.confined else {})}
 
     def status_of(self, status: int) -> int:
-        """Return snakemake's exit status, 2 where no step has ended with a defect, or 1 where a signal has ended it."""
+        """Return the exit status of a run: Snakemake's, 2 if no step had an internal error, or 1 after a signal."""
         if _ended_by(status):
             return 1
-        told = self.status.read_text(encoding="utf-8").split() if self.status.is_file() else []
-        return 2 if status == 1 and "1" not in told else status
+        reported = self.status.read_text(encoding="utf-8").split() if self.status.is_file() else []
+        return 2 if status == 1 and "1" not in reported else status
 
 
 def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False, show: Show = "steps") -> int:
@@ -119,29 +119,29 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
     root
         The campaign folder.
     cores
-        To use.
+        Number of cores to use.
     *arguments
-        Further options and targets of snakemake.
+        Further options and targets of Snakemake.
     paranoid
-        Read every source again, also those whose state is known.
+        Hash all sources again, including those with an unchanged size and modification time.
     show
-        Errors alone; a line for each step, with bars on a terminal; or all that snakemake says.
+        'errors'; 'steps': a line per step, with progress bars on a terminal; or 'snakemake': its full output.
 
     Returns
     -------
     int
-        0; 2 where the campaign or the machine has to be seen to, 130 after a signal, and 1 for a defect.
+        0 for success, 2 for a problem of the campaign or the machine, 130 after an interrupt, 1 for an internal error.
 
     Raises
     ------
     CampaignError
-        If the campaign is not fit to run, or another run holds it.
+        If the campaign cannot be run, or is locked by another run.
     """
     elsewhere = _runs_elsewhere(arguments)
     options = _steps_as_until(code_from_outside(root, arguments))
     _check_values(options)
     if _PROFILE in os.environ:
-        os.environ[_PROFILE] = _whole(root, _PROFILE, os.environ[_PROFILE])
+        os.environ[_PROFILE] = _absolute(root, _PROFILE, os.environ[_PROFILE])
     if elsewhere:
         check_shell_name(root.absolute())
     forms = forms_results(["", *arguments])
@@ -157,8 +157,8 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
         if show == "steps":
             for line in (*absent_lines(campaign), *stale_lines(stale)):
                 print(line, file=sys.stderr, flush=True)
-        overtaken = [manifest for manifest in stale if not on_demand(campaign, manifest)]
-        forced = ["--forcerun", *overtaken] if overtaken else []  # in time for a dry run; the workflow says why
+        outdated = [manifest for manifest in stale if not on_demand(campaign, manifest)]
+        forced = ["--forcerun", *outdated] if outdated else []  # also effective in a dry run
         forks = server and not any(argument.startswith(_BY_SHELL) for argument in arguments)
         executor = ["--executor", NAME] if forks else []
         words = _words(root, cores, [*executor, *_without_inner_steps(campaign, options), *forced])
@@ -168,27 +168,27 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
             at_once = 0 if elsewhere else cores
             note(files.journal, "start", cores=at_once)
             screen = Screen(campaign, TimeLeft(campaign, at_once), quiet=show != "steps")
-            return _formed(root, words, files, screen, server, aloud=show == "snakemake")
+            return _formed(root, words, files, screen, server, verbose=show == "snakemake")
     with tempfile.TemporaryDirectory() as scratch:
         dry = any(map(_DRY_RUN.fullmatch, arguments))
-        files = _Files.apart(scratch, confined=root if dry and not elsewhere else None)
+        files = _Files.temporary(scratch, confined=root if dry and not elsewhere else None)
         if show == "errors" or (dry and show == "steps"):
-            return _looked_at(root, words, files, told=dry)
+            return _examined(root, words, files, report=dry)
         return files.status_of(_watched(_started([RECORDER, *words], files.environment)))
 
 
 @contextmanager
 def _ahead(root: Path) -> Iterator["subprocess.Popen[bytes]"]:
-    """Start the process that steps are forks of, which imports while the campaign is checked; end it in any case."""
+    """Start the fork server, which imports modules during the check of the campaign; stop it in any case."""
     isolate()
     at_once = []
-    with suppress(CampaignError):  # the check tells it
+    with suppress(CampaignError):  # reported by the check
         at_once = [AT_ONCE] if any_is_missing(Campaign.load(root)) else []
     process = _started([SERVER, *at_once], os.environ, stdin=subprocess.PIPE)
     try:
         yield process
     finally:
-        with process:  # closes what nothing was written to
+        with process:  # closes its standard input, if still open
             process.kill()
 
 
@@ -199,17 +199,17 @@ def _formed(
     screen: Screen,
     server: "subprocess.Popen[bytes] | None",
     *,
-    aloud: bool,
+    verbose: bool,
 ) -> int:
-    """Run snakemake, by the process that waits for its order if any, and show what its journal tells."""
+    """Run Snakemake, in the waiting fork server if any, and display the progress in its journal."""
     reader, killed, status, ended = JournalReader(files.journal), _killed_for_memory(), INTERRUPTED, 0
     try:
-        with files.log.open("wb") as output, files.log.open("rb") as said, screen:
+        with files.log.open("wb") as output, files.log.open("rb") as log, screen:
 
             def look() -> None:
                 screen.update(reader.news())
-                if aloud:
-                    print(said.read().decode("utf-8", "replace"), end="", file=sys.stderr, flush=True)
+                if verbose:
+                    print(log.read().decode("utf-8", "replace"), end="", file=sys.stderr, flush=True)
 
             if server and server.stdin:
                 Order(words, files.environment, files.log.reference()).give(server.stdin)
@@ -222,37 +222,35 @@ def _formed(
         note(files.journal, "end", status=status)
     killed = _killed_for_memory() - killed
     if status and not (by := _ended_by(ended)):
-        _say(*failures(root, reader.run, files.log))
+        _report(*failures(root, reader.run, files.log))
     elif status and not killed:
-        _say(f"error: {by} has ended the process of the run, perhaps for lack of memory. Run again: it goes on there.")
+        _report(f"error: the run was terminated by {by}, possibly out of memory. Run again to resume.")
     if status and killed:
-        message = (
-            f"out of memory: meanwhile the kernel has ended {killed} processes of this machine or job for lack of it"
-        )
-        _say(f"error: {message}. Give the run more memory, or fewer --cores; it goes on where it was.")
+        message = f"out of memory: the kernel killed {killed} processes of this machine or job during the run"
+        _report(f"error: {message}. Provide more memory, or use fewer --cores, and run again to resume.")
     if not status:
         screen.ended(reader.run)
     return status
 
 
-def _looked_at(root: Path, words: Sequence[str], files: "_Files", *, told: bool) -> int:
-    """Have snakemake look at the workflow, and say briefly what a run would do where that is to be `told`."""
+def _examined(root: Path, words: Sequence[str], files: "_Files", *, report: bool) -> int:
+    """Run Snakemake without computing results, and if `report` is set print a summary of the planned steps."""
     with files.log.open("wb") as output:
         status = files.status_of(_watched(_started([RECORDER, *words], files.environment, output=output)))
     run = JournalReader(files.journal).news()
     if status:
-        _say(*failures(root, run, files.log))
-    elif told:
-        print(f"{number_of(run.total, 'step')} to do: {listed(run.planned)}" if run.planned else NOTHING)
+        _report(*failures(root, run, files.log))
+    elif report:
+        print(f"{number_of(run.total, 'step')} to run: {listed(run.planned)}" if run.planned else NOTHING)
     return status
 
 
-def _say(*lines: str) -> None:
+def _report(*lines: str) -> None:
     print(*lines, sep="\n", file=sys.stderr, flush=True)
 
 
 def _words(root: Path, cores: int, arguments: Sequence[str]) -> list[str]:
-    """Return the arguments of snakemake."""
+    """Return the arguments of Snakemake."""
     folder = shipped()
     own = ["--snakefile", str(folder / "Snakefile"), "--directory", str(root), "--logger", NAME]
     own += ["--workflow-profile", str(folder / "profiles" / "default"), "--cores", str(cores)]
@@ -260,13 +258,13 @@ def _words(root: Path, cores: int, arguments: Sequence[str]) -> list[str]:
 
 
 def _ended_by(status: int) -> str:
-    """Return the signal that has ended a process, by its status or a shell's; empty: it ended itself, or by Ctrl-C."""
+    """Return the signal that terminated a process, from its or a shell's exit status; empty: exit, or interrupt."""
     number = -status if status < 0 else status - SIGNALLED
     return signal.Signals(number).name if status != INTERRUPTED and number in set(signal.Signals) else ""
 
 
 def _killed_for_memory() -> int:
-    """Return how many processes the kernel has ended for lack of memory since it started; 0 where it does not say."""
+    """Return the number of processes killed by the kernel out of memory since boot; 0 if not available."""
     try:
         counters = dict(line.split() for line in _COUNTERS.read_text(encoding="ascii").splitlines())
         return int(counters.get("oom_kill", 0))
@@ -275,9 +273,9 @@ def _killed_for_memory() -> int:
 
 
 def code_from_outside(root: Path, arguments: Sequence[str]) -> list[str]:
-    """Return options of snakemake with the whole paths of files that it takes code from, none of them in the campaign.
+    """Make the paths of files absolute from which Snakemake executes code, and refuse files in the campaign folder.
 
-    Snakemake is started in another folder than the caller's. A profile, as a config, may hold Python (YTE).
+    Snakemake is started in a different folder than the caller's. Profiles and configurations may contain Python (YTE).
 
     Parameters
     ----------
@@ -297,19 +295,19 @@ def code_from_outside(root: Path, arguments: Sequence[str]) -> list[str]:
     >>> options[:2], Path(options[2]) == shipped() / "profiles" / "slurm"
     (['-n', '--profile'], True)
     """
-    found = [word for one in arguments for word in apart(one)]
+    words = [word for argument in arguments for word in apart(argument)]
     option = ""
-    for at, word in enumerate(found):
+    for at, word in enumerate(words):
         if word.startswith("-"):
             option = word
             _refuse_pickled(option)
         elif _holds_code(option):
-            found[at] = _whole(root, option, word)
-    return found
+            words[at] = _absolute(root, option, word)
+    return words
 
 
 def apart(argument: str) -> list[str]:
-    """Return an option and its value, where they are written as one word.
+    """Split an option and its value that are written as one word.
 
     Examples
     --------
@@ -323,7 +321,7 @@ def apart(argument: str) -> list[str]:
 
 
 def _values(options: Sequence[str], *names: str) -> Iterator[int]:
-    """Yield where the values of an option stand, which snakemake knows by its beginning, too."""
+    """Yield the indices of the values of an option, also in its abbreviated forms."""
     option = ""
     for at, word in enumerate(options):
         if word.startswith("-"):
@@ -333,7 +331,7 @@ def _values(options: Sequence[str], *names: str) -> Iterator[int]:
 
 
 def _steps_as_until(options: Sequence[str]) -> list[str]:
-    """Return options with steps named as targets turned into last steps, as Snakemake takes no rule with wildcards.
+    """Convert steps named as targets to options --until, since Snakemake accepts no target rules with wildcards.
 
     Examples
     --------
@@ -345,10 +343,10 @@ def _steps_as_until(options: Sequence[str]) -> list[str]:
     for step in steps:
         if RULES[step].on_demand:
             raise CampaignError(
-                f"{step}: a step that runs only where its result is requested",
+                f"{step}: a step that runs only if its result is requested",
                 "apertura run",
-                f"a target of {', '.join(_TARGETS)}, or a file of the results",
-                "Name the file, or the target that gathers it.",
+                f"a target ({', '.join(_TARGETS)}), or a file of the results",
+                "Name the file, or the target that collects it.",
             )
     others = [word for word in options[:leading] if word not in steps]
     rest = list(options[leading:])
@@ -361,30 +359,30 @@ def _steps_as_until(options: Sequence[str]) -> list[str]:
 
 
 def _check_values(options: Sequence[str]) -> None:
-    """Refuse shares and names of steps that snakemake ignores, or explains by its own rules."""
+    """Raise CampaignError for invalid shares or step names that Snakemake ignores, or reports incomprehensibly."""
     for shares in (options[at] for at in _values(options, _SCATTER)):
         if not re.fullmatch(r"tiles=0*[1-9][0-9]*", shares):
             raise CampaignError(
                 f"{_SCATTER} {shares}",
                 "apertura run",
                 "tiles=N, N >= 1",
-                "Give the number of jobs that form each image.",
+                "Set the number of jobs per image.",
             )
     for step in (options[at] for at in _values(options, *UNTIL)):
-        if step not in (*RULES, *_TARGETS) and "/" not in step:  # a file may be named, too
+        if step not in (*RULES, *_TARGETS) and "/" not in step:  # files are accepted, too
             raise CampaignError(
                 f"{UNTIL[0]} {step}", "apertura run", f"a step: {', '.join(RULES)}", "Correct the name of the step."
             )
 
 
 def _check_targets(campaign: Campaign, options: Sequence[str]) -> None:
-    """Refuse files in the results of a flight, pair or node that is not there: rules would make some of them."""
-    asked = [path for path in map(PurePosixPath, options) if path.parts[:1] == ("results",) and len(path.parts) > 3]
-    asked = [path for path in asked if path.parts[1] not in RESERVED_NAMES]
-    made = [PurePosixPath(result.manifest).parts for _, result in results_of(campaign)] if asked else []
-    for path in asked:
+    """Raise CampaignError for result files of an unknown flight, pair or node, even if they match a rule."""
+    requested = [path for path in map(PurePosixPath, options) if path.parts[:1] == ("results",) and len(path.parts) > 3]
+    requested = [path for path in requested if path.parts[1] not in RESERVED_NAMES]
+    known = [PurePosixPath(result.manifest).parts for _, result in results_of(campaign)] if requested else []
+    for path in requested:
         flight, name = campaign.flight(path.parts[1]).name, path.parts[2]
-        own = sorted({parts[2] for parts in made if parts[1] == flight and len(parts) > 3})
+        own = sorted({parts[2] for parts in known if parts[1] == flight and len(parts) > 3})
         if name not in own:
             raise CampaignError(
                 f"{path}: {flight} has no {name}", "apertura run", f"one of {', '.join(own)}", "Correct the name."
@@ -392,36 +390,36 @@ def _check_targets(campaign: Campaign, options: Sequence[str]) -> None:
 
 
 def _without_inner_steps(campaign: Campaign, options: Sequence[str]) -> list[str]:
-    """Return the options without last steps that other last steps need: Snakemake ends in an error over both."""
-    places = [at for at in _values(options, *UNTIL) if options[at] in RULES]
-    if len(places) < 2:
+    """Return the options without --until steps that are inputs of others: Snakemake fails if both are given."""
+    indices = [at for at in _values(options, *UNTIL) if options[at] in RULES]
+    if len(indices) < 2:
         return list(options)
     results = list(results_of(campaign))
     sources = {result.manifest: result.sources for _, result in results}
 
-    def made(step: str) -> set[str]:
+    def outputs(step: str) -> set[str]:
         return {result.manifest for name, result in results if name == RULES[step].result}
 
     def needed(step: str) -> set[str]:
-        found = set() if RULES[step].shares else made(step)  # a share alone does not complete its result
-        left = [source for one in made(step) for source in sources[one]]
-        while left:
-            one = left.pop()
-            if one in sources and one not in found:
-                found.add(one)
-                left += sources[one]
-        return found
+        visited = set() if RULES[step].shares else outputs(step)  # a share alone does not complete its result
+        pending = [source for manifest in outputs(step) for source in sources[manifest]]
+        while pending:
+            manifest = pending.pop()
+            if manifest in sources and manifest not in visited:
+                visited.add(manifest)
+                pending += sources[manifest]
+        return visited
 
-    kept = list(places)
-    for at in places:
+    kept = list(indices)
+    for at in indices:
         others = [options[other] for other in kept if other != at]
-        if others and made(options[at]) <= set().union(*map(needed, others)):
+        if others and outputs(options[at]) <= set().union(*map(needed, others)):
             kept.remove(at)
-    return [word for at, word in enumerate(options) if at in kept or at not in places]
+    return [word for at, word in enumerate(options) if at in kept or at not in indices]
 
 
 def _holds_code(option: str) -> bool:
-    """Return whether the value of an option, perhaps abbreviated, is a file that snakemake takes code from."""
+    """Return True if the value of an option, also abbreviated, is a file from which Snakemake executes code."""
     if not option.startswith("--"):
         return _SHORT.fullmatch(option) is not None
     return option not in ("--", *_HOLDS_NONE) and any(name.startswith(option) for name in _HOLDS_CODE)
@@ -430,33 +428,35 @@ def _holds_code(option: str) -> bool:
 def _refuse_pickled(option: str) -> None:
     if len(option) > len("--t") and _PICKLED.startswith(option):
         raise CampaignError(
-            f"{option}: Snakemake then reads a pickle of the campaign folder, which may hold code",
+            f"{option}: Snakemake would read a pickle in the campaign folder, which may execute code",
             "apertura run",
-            "options that take data alone from the folder",
-            "Leave it out.",
+            "options with which the campaign folder is read as data only",
+            "Omit this option.",
         )
 
 
-def _whole(root: Path, option: str, name: str) -> str:
-    """Return a path whole, what is shipped before what lies where the caller is; a name that is neither as it is."""
+def _absolute(root: Path, option: str, name: str) -> str:
+    """Return the absolute path of a shipped profile or a file of the caller; any other name unchanged."""
     ours, theirs = shipped() / name, given(Path(name))
     if name.startswith("profiles/") and ours.exists():
         return str(ours)
     if not theirs.exists():
         return name
-    typed = Path(os.path.normpath(theirs))  # through a link in the folder, too: who makes that says where it leads
-    if any(way.resolve().is_relative_to(root.resolve()) for way in (theirs, typed, *typed.parents)):
+    typed = Path(
+        os.path.normpath(theirs)
+    )  # also refused: a link in the campaign folder, whose creator controls the target
+    if any(path.resolve().is_relative_to(root.resolve()) for path in (theirs, typed, *typed.parents)):
         raise CampaignError(
             f"{option} {name} lies in the campaign folder",
             "apertura run",
-            "a file of your own: Snakemake runs code that it holds, and a campaign folder brings data",
-            "Read it, and copy it out of the campaign folder if you trust it.",
+            "a file outside the campaign folder: Snakemake executes its code, but campaign folders are data",
+            "Inspect the file, and copy it out of the campaign folder if you trust it.",
         )
     return str(theirs)
 
 
 def _runs_elsewhere(arguments: Sequence[str]) -> bool:
-    """Return whether steps run on other machines than this one."""
+    """Return True if steps run on other machines."""
     named = any(argument.startswith(("--exec", "--prof", "--wo", "-e")) for argument in arguments)
     return named or _PROFILE in os.environ
 
@@ -464,10 +464,10 @@ def _runs_elsewhere(arguments: Sequence[str]) -> bool:
 def _started(
     words: Sequence[str], environment: Mapping[str, str], *, stdin: int | None = None, output: IO[bytes] | None = None
 ) -> "subprocess.Popen[bytes]":
-    """Start a module with its arguments, in a process group of its own that all which it starts is in, too."""
+    """Start a module with its arguments in a new process group, which includes all its descendants."""
     return subprocess.Popen(
         [sys.executable, "-P", "-m", *words],
-        cwd=PACKAGE,  # never the campaign's: see `apertura.common.processes`
+        cwd=PACKAGE,  # never the campaign folder: see `apertura.common.processes`
         env=environment,
         stdin=stdin,
         stdout=output,
@@ -478,12 +478,12 @@ def _started(
 
 
 def _watched(process: "subprocess.Popen[bytes]", look: Callable[[], None] = lambda: None) -> int:
-    """Wait for a process, and look at what it does; a signal ends its group within seconds."""
+    """Wait for a process and call `look` regularly; after a signal, terminate its process group within seconds."""
     try:
         while process.poll() is None:
-            began_s = time.monotonic()
+            start_s = time.monotonic()
             look()
-            time.sleep(max(_LOOK_S, _REST * (time.monotonic() - began_s)))
+            time.sleep(max(_LOOK_S, _REST * (time.monotonic() - start_s)))
     except BaseException:
         _end(process)
         raise
@@ -495,5 +495,5 @@ def _end(process: "subprocess.Popen[bytes]") -> None:
     with suppress(subprocess.TimeoutExpired):
         process.wait(_GRACE_S)
     with suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)  # steps that outlive snakemake, too: work in progress survives it
+        os.killpg(process.pid, signal.SIGKILL)  # also steps that outlive Snakemake; their completed work is kept
     process.wait()

@@ -1,6 +1,6 @@
-"""Snakemake's executor `apertura`: asks for steps at `apertura.run.fork_server`, the process that they are forks of.
+"""Snakemake executor plugin `apertura`: requests steps from `apertura.run.fork_server`, which forks them.
 
-Jobs that are no steps go to Snakemake's own local executor.
+Jobs that are not steps are passed to Snakemake's local executor.
 """
 
 import json
@@ -18,7 +18,7 @@ from snakemake_interface_executor_plugins.settings import CommonSettings, Execut
 common_settings = CommonSettings(non_local_exec=False, implies_no_shared_fs=False, job_deploy_sources=False)
 
 _COMMAND = re.compile(r"apertura (step(?: [\w.-]+)+) > ([\w./-]+) 2>&1")
-"""The command of a step; a shell does the same with it."""
+"""Shell command of a step."""
 
 _THREADS = (
     "OMP_NUM_THREADS",
@@ -28,23 +28,25 @@ _THREADS = (
     "VECLIB_MAXIMUM_THREADS",
     "NUMEXPR_NUM_THREADS",
 )
-"""Environment variables: a job's threads, as Snakemake states them to a shell."""
+"""Environment variables with the number of threads of a job, as Snakemake sets them for a shell."""
 
 
 @dataclass
 class ExecutorSettings(ExecutorSettingsBase):  # type: ignore[misc]  # the interface has no types
     """Options of the executor."""
 
-    requests: int | None = field(default=None, metadata={"help": "descriptor to ask for steps at", "type": int})
+    requests: int | None = field(
+        default=None, metadata={"help": "file descriptor of the socket for requests of steps", "type": int}
+    )
 
 
 class Executor(AbstractExecutor):  # type: ignore[misc]
-    """Runs the jobs of a workflow: requests steps, and reports to Snakemake when each has ended.
+    """Executor that requests steps from the fork server and reports their completion to Snakemake.
 
     Parameters
     ----------
     workflow, logger
-        Of Snakemake.
+        Workflow and logger of Snakemake.
     """
 
     def __init__(self, workflow: Any, logger: Any) -> None:
@@ -55,15 +57,15 @@ class Executor(AbstractExecutor):  # type: ignore[misc]
         threading.Thread(target=self._report, daemon=True).start()
 
     def run_job(self, job: Any) -> None:
-        """Begin a job."""
+        """Start a job."""
         step = None if job.is_group() or job.is_shadow else _COMMAND.fullmatch(job.shellcmd or "")
         if not step:
             self._local.run_job(job)
             return
         self.workflow.async_run(job.prepare())
         self._running[job.jobid] = info = SubmittedJobInfo(job)
-        self._local.report_job_submission(info)  # which marks its results as incomplete
-        asked = {
+        self._local.report_job_submission(info)  # marks its results as incomplete
+        request = {
             "job": job.jobid,
             "words": step[1].split(),
             "folder": str(Path.cwd()),
@@ -71,12 +73,12 @@ class Executor(AbstractExecutor):  # type: ignore[misc]
             "benchmark": str(job.benchmark or ""),
             "environment": dict.fromkeys(_THREADS, str(job.threads)),
         }
-        self._requests.send(json.dumps(asked).encode())
+        self._requests.send(json.dumps(request).encode())
 
     def _report(self) -> None:
-        """Report each step that has ended to Snakemake."""
-        while said := self._requests.recv(64):
-            job, status = json.loads(said)
+        """Report the completion of each step to Snakemake."""
+        while reply := self._requests.recv(64):
+            job, status = json.loads(reply)
             info = self._running.pop(job)
             if status:
                 self.report_job_error(info, msg=f"exit status {status}")
@@ -84,12 +86,12 @@ class Executor(AbstractExecutor):  # type: ignore[misc]
                 self.report_job_success(info)
 
     def shutdown(self) -> None:
-        """Wait for the jobs that are no steps; steps end with Snakemake's process."""
+        """Wait for the jobs that are not steps; steps are terminated with Snakemake's process."""
         self._local.shutdown()
 
     cancel = shutdown
 
     def handle_job_success(self, job: Any) -> None:
-        """Do nothing more: Snakemake has been informed."""
+        """Do nothing: the job has been reported to Snakemake."""
 
     handle_job_error = handle_job_success

@@ -1,8 +1,8 @@
-"""Steps as forks of one process that has imported what they need: what `apertura run` starts on this machine.
+"""Fork server of `apertura run`: steps are forks of one process that has imported their modules.
 
-``python -m apertura.run.fork_server`` reads what to run, forks snakemake, with a journal, and then a process for
-each step that its executor asks for; it has no thread of its own. Log, benchmark, variables, signals and exit
-status of a step are those of the command in its rule, which plain snakemake and other machines start as it stands.
+``python -m apertura.run.fork_server`` reads an order, forks Snakemake with a journal, and then forks a process for
+each step requested by its executor; it has no threads. Log, benchmark, variables, signals and exit status of a step are
+those of the shell command in its rule, which plain Snakemake and other machines run directly.
 """
 
 import gc
@@ -32,12 +32,12 @@ from apertura.run.journal import NAME as PLUGIN
 from apertura.workflow.rules import RULES
 
 NAME = "apertura.run.fork_server"
-"""This module."""
+"""Name of this module."""
 AT_ONCE = "--at-once"
-"""Argument: steps will be asked for, so import what they need without being asked."""
+"""Argument: import the modules of steps immediately, since steps will be requested."""
 
 _BOTH = ("apertura.check", "apertura.workflow.jobs", "apertura.workflow.stale")
-"""What snakemake imports, too."""
+"""Modules that are also imported in the process of Snakemake."""
 
 _LIBRARIES = (
     "dask.array",
@@ -54,25 +54,25 @@ _LIBRARIES = (
     "xarray",
     "zarr.storage",
 )
-"""What most steps import in functions."""
+"""Modules that most steps import within functions."""
 
-_LONGEST = 1 << 16  # bytes of a request
+_LONGEST = 1 << 16  # largest size of a request, bytes
 _GRACE_S = 2.0
 _fork = multiprocessing.get_context("fork").Process
 
 
 @dataclass(frozen=True)
 class Order:
-    """What snakemake is to be run with, as JSON on standard input; nothing is run where that ends without it.
+    """Order to run Snakemake, sent as JSON on standard input; without an order, nothing is run.
 
     Attributes
     ----------
     arguments
-        Of snakemake.
+        Arguments of Snakemake.
     environment
-        Variables beside those of this process.
+        Variables in addition to those of this process.
     output
-        File that all output goes to, as a reference of `ConfinedPath`.
+        File for all output, as a reference of `ConfinedPath`.
     """
 
     arguments: Sequence[str]
@@ -80,38 +80,38 @@ class Order:
     output: str
 
     def give(self, stream: IO[bytes]) -> None:
-        """Write it, and close the stream."""
+        """Write the order, and close the stream."""
         with stream:
             stream.write(json.dumps(vars(self)).encode())
 
 
 def main() -> int:
-    """Run snakemake as ordered, and its steps; return its exit status."""
-    os.environ[ALGEBRA_THREADS] = "1"  # else numpy starts threads when it is imported, and no fork is safe
-    for number in ENDING:  # the whole group gets them: this process ends when the others have
+    """Run Snakemake as ordered, and its steps; return its exit status."""
+    os.environ[ALGEBRA_THREADS] = "1"  # otherwise numpy starts threads on import, and forks are unsafe
+    for number in ENDING:  # signals reach the whole group: this process exits after the others
         signal.signal(number, signal.SIG_IGN)
-    here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    own_end, snakemake_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     for module in _BOTH:
         importlib.import_module(module)
     snakemake: BaseProcess | None = None
-    for module in _modules() if AT_ONCE in sys.argv else ():  # while the campaign is checked
+    for module in _modules() if AT_ONCE in sys.argv else ():  # during the check of the campaign
         if snakemake is None and select.select([sys.stdin], [], [], 0)[0]:
-            snakemake = _begun(there)
+            snakemake = _start_snakemake(snakemake_end)
         importlib.import_module(module)
-    snakemake = snakemake or _begun(there)
-    there.close()
+    snakemake = snakemake or _start_snakemake(snakemake_end)
+    snakemake_end.close()
     if AT_ONCE in sys.argv:
         _import()
-    _serve(here, snakemake)
+    _serve(own_end, snakemake)
     return _status(snakemake)
 
 
-def _begun(requests: socket.socket) -> BaseProcess:
-    """Start snakemake as ordered."""
-    said = sys.stdin.buffer.read()
-    if not said:  # the campaign is not fit to run
+def _start_snakemake(requests: socket.socket) -> BaseProcess:
+    """Read the order and start Snakemake."""
+    received = sys.stdin.buffer.read()
+    if not received:  # the check found problems
         sys.exit(2)
-    order = Order(**json.loads(said))
+    order = Order(**json.loads(received))
     os.environ.update(order.environment)
     _redirect(ConfinedPath.referenced(order.output))
     snakemake = _fork(target=_child, args=(os.getpid(), _snakemake, requests, order.arguments))
@@ -120,19 +120,19 @@ def _begun(requests: socket.socket) -> BaseProcess:
 
 
 def _serve(requests: socket.socket, snakemake: BaseProcess) -> None:
-    """Fork a process for each request until snakemake has ended; tell what became of each."""
+    """Fork a process for each request until Snakemake has exited, and report the exit status of each."""
     running: dict[int, tuple[BaseProcess, int]] = {}
     while snakemake.is_alive():
         for ready in wait([requests, snakemake.sentinel, *running]):
-            if ready is requests and (said := requests.recv(_LONGEST)):
+            if ready is requests and (received := requests.recv(_LONGEST)):
                 _import()
-                asked = json.loads(said)
-                begun = _fork(target=_child, args=(os.getpid(), _step, asked))
-                begun.start()
-                running[begun.sentinel] = begun, asked["job"]
+                request = json.loads(received)
+                process = _fork(target=_child, args=(os.getpid(), _step, request))
+                process.start()
+                running[process.sentinel] = process, request["job"]
             elif ready in running:
                 step, job = running.pop(ready)
-                with suppress(OSError):  # snakemake has ended
+                with suppress(OSError):  # Snakemake has exited
                     requests.send(json.dumps([job, _status(step)]).encode())
     for step, _ in running.values():
         step.terminate()
@@ -142,7 +142,7 @@ def _serve(requests: socket.socket, snakemake: BaseProcess) -> None:
 
 
 def _status(process: BaseProcess) -> int:
-    """Return the exit status of a process as a shell does."""
+    """Return the exit status of a process by the convention of shells."""
     process.join()
     code = process.exitcode or 0
     return code if code >= 0 else SIGNALLED - code
@@ -154,7 +154,7 @@ def _modules() -> Sequence[str]:
 
 
 def _import() -> None:
-    """Import what steps need, once, and do what each of them would do first."""
+    """Import the modules of steps, once, and run the initialisation common to all steps."""
     if gc.get_freeze_count():
         return
     for name in _modules():
@@ -165,15 +165,15 @@ def _import() -> None:
     from apertura.core.backprojection.engines.reference import polynomial
 
     zero = np.zeros((1, 1), np.complex128)
-    polynomial(zero, zero)  # the first call of compiled Python in a process fills numba's tables, in 0.2 s
+    polynomial(zero, zero)  # the first call of a compiled function initialises numba's tables, 0.2 s
     software()
     code_sha256(*(rule.module for rule in RULES.values()))
     gc.collect()
-    gc.freeze()  # what stands here is never looked at again: pages stay shared
+    gc.freeze()  # objects so far are excluded from garbage collection, so that their pages stay shared
 
 
 def _redirect(file: ConfinedPath) -> None:
-    """Have standard output and error go to a file."""
+    """Redirect standard output and error to a file."""
     output = file.descriptor(os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     for stream in (1, 2):
         os.dup2(output, stream)
@@ -181,7 +181,7 @@ def _redirect(file: ConfinedPath) -> None:
 
 
 def _child(parent: int, work: Callable[..., None], *arguments: Any) -> None:
-    """Do some work in a process that ends with its parent, and upon signals."""
+    """Run a function in a process that is terminated with its parent, and by signals."""
     die_with_parent(parent)
     for number in ENDING:
         signal.signal(number, signal.SIG_DFL)
@@ -192,7 +192,7 @@ def _child(parent: int, work: Callable[..., None], *arguments: Any) -> None:
 
 
 def _snakemake(requests: socket.socket, arguments: Sequence[str]) -> None:
-    """Be snakemake with a journal, whose executor asks for steps."""
+    """Run Snakemake with a journal in this process, with the executor that requests steps."""
     from snakemake_interface_executor_plugins.registry import ExecutorPluginRegistry
 
     executor = importlib.import_module("apertura.run.executor")
@@ -204,39 +204,39 @@ def _snakemake(requests: socket.socket, arguments: Sequence[str]) -> None:
 # ---- In the process of a step ---------------------------------------------------------------------------------------
 
 
-def _step(asked: Mapping[str, Any]) -> None:
-    """Be the command of a step, as if a shell had started it; write what it took where it ends well."""
-    began_s = time.monotonic()
-    os.environ.update(asked["environment"])
-    os.environ.pop(CONFINED, None)  # said to snakemake
-    os.chdir(asked["folder"])
-    sys.argv = ["apertura", *asked["words"]]
-    folder = ConfinedPath.at(asked["folder"])
+def _step(request: Mapping[str, Any]) -> None:
+    """Run the command of a step in this process as a shell would; write its benchmark if it succeeds."""
+    start_s = time.monotonic()
+    os.environ.update(request["environment"])
+    os.environ.pop(CONFINED, None)  # applies to Snakemake only
+    os.chdir(request["folder"])
+    sys.argv = ["apertura", *request["words"]]
+    folder = ConfinedPath.at(request["folder"])
     try:
-        _redirect(folder / asked["log"])
+        _redirect(folder / request["log"])
         try:
             pkgutil.resolve_name("apertura.__main__:main")()
-        except SystemExit as ended:
-            if ended.code:
+        except SystemExit as end:
+            if end.code:
                 raise
-        if asked["benchmark"]:
-            (folder / asked["benchmark"]).write_text(_benchmark(time.monotonic() - began_s), encoding="ascii")
+        if request["benchmark"]:
+            (folder / request["benchmark"]).write_text(_benchmark(time.monotonic() - start_s), encoding="ascii")
     except CampaignError as error:
         leave_status(2)
         sys.exit(f"error: {error}")
 
 
 def _benchmark(wall_s: float) -> str:
-    """Return what this process and those that it waited for took, as Snakemake's table of a job."""
-    used = [resource.getrusage(whose) for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    cpu_s = sum(one.ru_utime + one.ru_stime for one in used)
+    """Return the resource usage of this process and its children in the format of Snakemake's benchmark table."""
+    usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    cpu_s = sum(usage.ru_utime + usage.ru_stime for usage in usages)
     row = {
         "s": f"{wall_s:.2f}",
         "h:m:s": str(timedelta(seconds=int(wall_s))),
-        "max_rss": f"{max(one.ru_maxrss for one in used) / 1024:.2f}",  # MiB, of the largest process
+        "max_rss": f"{max(usage.ru_maxrss for usage in usages) / 1024:.2f}",  # MiB, of the largest process
         **dict.fromkeys(("max_vms", "max_uss", "max_pss"), "NA"),
-        "io_in": f"{sum(one.ru_inblock for one in used) / 2048:.2f}",  # blocks of 512 bytes as MiB
-        "io_out": f"{sum(one.ru_oublock for one in used) / 2048:.2f}",
+        "io_in": f"{sum(usage.ru_inblock for usage in usages) / 2048:.2f}",  # blocks of 512 bytes as MiB
+        "io_out": f"{sum(usage.ru_oublock for usage in usages) / 2048:.2f}",
         "mean_load": f"{100 * cpu_s / wall_s:.2f}",
         "cpu_time": f"{cpu_s:.2f}",
     }

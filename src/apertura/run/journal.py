@@ -1,4 +1,4 @@
-"""What happened in a run so far, by the journal that it keeps in the campaign folder; and why it failed."""
+"""Journal of a run in the campaign folder: writing, reading the state of the run, and the messages of a failed run."""
 
 import json
 import re
@@ -13,21 +13,21 @@ from typing import Any
 from apertura.common.errors import CampaignError, shown
 
 JOURNAL = "APERTURA_JOURNAL"
-"""Environment variable: where the journal of a run is written."""
+"""Environment variable: path of the journal of a run."""
 
 RECORDER, NAME = "apertura.run.recorder", "apertura"
-"""Module that is snakemake with a journal, and the name of its logger plugin."""
+"""Module that runs Snakemake with a journal, and the name of its logger plugin."""
 
 _STEP = re.compile(r"\bapertura step ((?:[\w.-]+ ?)+)")
 LAST_S = float(1 << 33)
-"""Times from here on, in the year 2242, are none."""
+"""Upper limit of valid times, seconds since the epoch: year 2242."""
 
-_LONGEST = 1 << 26  # bytes of a journal; 10^5 jobs write 3·10^7
+_LONGEST = 1 << 26  # largest journal that is read, bytes; 10^5 jobs write 3·10^7
 _NO_STEPS = {"all", "total"}
 
 
 def step_of(command: str | None, rule: str, wildcards: Sequence[str]) -> tuple[str, ...]:
-    """Return the words by which a person knows a job: those of its step.
+    """Return the step name and arguments of a job, for display.
 
     Examples
     --------
@@ -36,26 +36,26 @@ def step_of(command: str | None, rule: str, wildcards: Sequence[str]) -> tuple[s
     >>> step_of("apertura study claims", "paper_claims", ["lab"])
     ('paper_claims', 'lab')
     """
-    found = _STEP.search(command or "")
-    words = found[1].split() if found else [rule, *wildcards]
+    match = _STEP.search(command or "")
+    words = match[1].split() if match else [rule, *wildcards]
     first_option = next((at for at, word in enumerate(words) if word.startswith("-")), len(words))
     return tuple(words[:first_option])
 
 
 @dataclass
 class JobRecord:
-    """A job that began.
+    """Job that has started.
 
     Attributes
     ----------
     rule, step
-        Which rule, and the words of its step.
+        Rule, and step name and arguments.
     log
-        What the step says, relative to the campaign folder; empty if nothing.
+        Log of the step, relative to the campaign folder; empty if it has none.
     begun_s, ended_s
-        Seconds since the epoch; None while it runs.
+        Start and end, seconds since the epoch; `ended_s` is None while the job runs.
     failed
-        Whether it failed.
+        True if the job failed.
     """
 
     rule: str
@@ -67,42 +67,42 @@ class JobRecord:
 
     @property
     def name(self) -> str:
-        """The words of the step, as a terminal may show them."""
+        """Step name and arguments, safe for a terminal."""
         return shown(" ".join(self.step))
 
     @property
     def running(self) -> bool:
-        """Whether it has begun and not ended."""
+        """True if the job has not finished."""
         return self.ended_s is None
 
     def seconds(self, now_s: float | None = None) -> float:
-        """Return how long it took, or has been running."""
+        """Return the duration of the job, so far if it is running, seconds."""
         return (self.ended_s or now_s or time.time()) - self.begun_s
 
 
 @dataclass
 class RunRecord:
-    """A run as its journal tells it.
+    """State of a run from its journal.
 
     Attributes
     ----------
     planned
-        Rule → number of jobs, as planned before the first.
+        Rule → number of jobs, as planned before the first job.
     jobs
-        Number of a job → the job, of those that began.
-    said
-        Errors of the workflow itself.
+        Number of a job → the job, for jobs that have started.
+    errors
+        Error messages of Snakemake.
     cores
-        That it uses at once; 0 on a cluster.
+        Number of cores used; 0 on a cluster.
     status
-        Exit status; None while it runs, or after it was killed.
+        Exit status; None while the run is in progress, or if it was killed.
     begun_s, ended_s
-        Seconds since the epoch.
+        Start and end, seconds since the epoch.
     """
 
     planned: dict[str, int] = field(default_factory=dict)
     jobs: dict[int, JobRecord] = field(default_factory=dict)
-    said: list[str] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
     cores: int = 0
     status: int | None = None
     begun_s: float = 0.0
@@ -110,31 +110,31 @@ class RunRecord:
 
     @property
     def finished(self) -> list[JobRecord]:
-        """Jobs that ended well."""
+        """Jobs that succeeded."""
         return [job for job in self.jobs.values() if not job.running and not job.failed]
 
     @property
     def running(self) -> list[JobRecord]:
-        """Jobs under way, the oldest first."""
+        """Running jobs, the oldest first."""
         return [job for job in self.jobs.values() if job.running]
 
     @property
     def failed(self) -> list[JobRecord]:
-        """Jobs that failed, and were not tried again."""
+        """Jobs that failed and were not restarted."""
         return [job for job in self.jobs.values() if job.failed]
 
     @property
     def total(self) -> int:
-        """How many jobs there are to do."""
+        """Total number of jobs."""
         return max(sum(self.planned.values()), len(self.jobs))
 
     @property
     def waiting(self) -> Counter[str]:
-        """Rule → jobs that have not begun."""
+        """Rule → number of jobs that have not started."""
         return Counter(self.planned) - Counter(job.rule for job in self.jobs.values())
 
     def take(self, line: Mapping[str, Any]) -> None:
-        """Take a line of the journal; one that makes no sense is left out."""
+        """Apply a line of the journal; invalid lines are ignored."""
         with suppress(KeyError, TypeError, ValueError, AttributeError):
             if 0 <= (at := float(line["at"])) < LAST_S:
                 self._take(str(line["event"]), at, line)
@@ -149,7 +149,7 @@ class RunRecord:
             job = self.jobs[line["job"]]
             job.ended_s, job.failed = at, event == "failed"
         elif event == "said":
-            self.said.append(str(line["message"]))
+            self.errors.append(str(line["message"]))
         elif event == "start":
             self.begun_s, self.cores = at, int(line["cores"])
         elif event == "end":
@@ -157,12 +157,12 @@ class RunRecord:
 
 
 class JournalReader:
-    """Follows a journal as it grows.
+    """Incremental reader of a growing journal.
 
     Parameters
     ----------
     path
-        The journal; it may not be there yet.
+        The journal; it need not exist yet.
     """
 
     def __init__(self, path: Path) -> None:
@@ -170,7 +170,7 @@ class JournalReader:
         self._read, self._rest = 0, b""
 
     def news(self) -> RunRecord:
-        """Return the run as it is told by now."""
+        """Read new lines and return the current state of the run."""
         with suppress(FileNotFoundError), self.path.open("rb") as journal:
             journal.seek(self._read)
             data = journal.read(max(0, _LONGEST - self._read))
@@ -182,70 +182,70 @@ class JournalReader:
         return self.run
 
 
-def note(path: Path, event: str, **told: Any) -> None:
+def note(path: Path, event: str, **values: Any) -> None:
     """Write a line of the journal."""
     with path.open("a", encoding="utf-8") as journal:
-        journal.write(json.dumps({"at": round(time.time(), 2), "event": event, **told}) + "\n")
+        journal.write(json.dumps({"at": round(time.time(), 2), "event": event, **values}) + "\n")
 
 
 _TAIL = 1 << 16
-"""Bytes of a log that are looked at."""
-_SAID = "error: "
+"""Number of bytes at the end of a log that are read."""
+_ERROR_PREFIX = "error: "
 
 
 def failures(root: Path, run: RunRecord, log: Path) -> Iterator[str]:
-    """Yield what to tell of a run that failed: messages of steps, or what the workflow said, and the logs.
+    """Yield the error report of a failed run: messages of steps, or of Snakemake, and the logs.
 
     Parameters
     ----------
     root
         The campaign folder.
     run
-        As its journal tells it.
+        State of the run.
     log
-        Of snakemake.
+        Log of Snakemake.
     """
     messages: dict[str, list[str]] = {}
     for job in run.failed:
         messages.setdefault(_message(root / job.log if job.log else None), []).append(job.log)
     if not messages:
         last = [_installable(line) for line in _tail(log)[-1:]]
-        messages = {shown(" ".join(message.split()), 2000): [] for message in run.said or last}
+        messages = {shown(" ".join(message.split()), 2000): [] for message in run.errors or last}
     for message, logs in messages.items():
-        yield f"error: {message.removeprefix(_SAID)}"
+        yield f"error: {message.removeprefix(_ERROR_PREFIX)}"
         for name in filter(None, logs):
             yield f"  log of the step: {shown(root / name, 400)}"
-    if log.is_relative_to(root):  # that of a dry run is not kept
-        yield f"  log of snakemake: {shown(log, 400)}"
+    if log.is_relative_to(root):  # the log of a dry run is not kept
+        yield f"  log of Snakemake: {shown(log, 400)}"
 
 
 def a_step_was_killed(root: Path, run: RunRecord) -> bool:
-    """Return whether a failed step of a run has left no message in its log."""
+    """Return True if a failed step of a run has left no message in its log."""
     return any(_message(root / job.log) == _KILLED for job in run.failed if job.log)
 
 
-_KILLED = "a step exited without a message: it was killed, perhaps for lack of memory, or its machine went down"
+_KILLED = "a step exited without a message: it was killed, possibly out of memory, or its machine failed"
 _NO_EXECUTOR = re.compile(r"argument --executor/-e: invalid choice: '([\w-]+)'")
 
 
 def _installable(line: str) -> str:
-    """Return an error of snakemake's command line, or what to install for the executor that it does not have.
+    """Return an error of Snakemake's command line, with installation instructions for a missing executor.
 
     Examples
     --------
     >>> _installable("snakemake: error: argument --executor/-e: invalid choice: 'slurm' (choose from 'local')")
-    "executor 'slurm' is not installed. Install it beside apertura: pip install snakemake-executor-plugin-slurm"
+    "executor 'slurm' is not installed. Install it with apertura: pip install snakemake-executor-plugin-slurm"
     """
-    if not (named := _NO_EXECUTOR.search(line)):
+    if not (match := _NO_EXECUTOR.search(line)):
         return line
-    plugin = f"snakemake-executor-plugin-{named[1]}"
-    return f"executor {named[1]!r} is not installed. Install it beside apertura: pip install {plugin}"
+    plugin = f"snakemake-executor-plugin-{match[1]}"
+    return f"executor {match[1]!r} is not installed. Install it with apertura: pip install {plugin}"
 
 
 def _message(log: Path | None) -> str:
     lines = _tail(log) if log else []
     for line in reversed(lines):
-        if line.startswith(_SAID):
+        if line.startswith(_ERROR_PREFIX):
             return shown(line, 2000)
     if any(line.startswith("Traceback") for line in lines):
         return f"internal error, please report it with the log: {shown(lines[-1], 2000)}"
@@ -253,7 +253,7 @@ def _message(log: Path | None) -> str:
 
 
 def _tail(log: Path) -> list[str]:
-    """Return the last lines of a log that hold something."""
+    """Return the last non-empty lines of a log."""
     with suppress(OSError, CampaignError), log.open("rb") as stream:
         stream.seek(max(0, log.stat().st_size - _TAIL))
         return [line for line in stream.read().decode("utf-8", "replace").splitlines() if line.strip()]

@@ -1,7 +1,7 @@
-"""snakemake with a journal: every job that begins, ends or fails as a line of JSON.
+"""Snakemake with a journal: each start, end or failure of a job is recorded as a line of JSON.
 
-``python -m apertura.run.recorder`` is snakemake with one logger plugin more. Snakemake looks for plugins
-among installed top-level packages only, and finds none that is editable; here it is handed over.
+``python -m apertura.run.recorder`` is Snakemake with an additional logger plugin. Snakemake finds plugins only in
+installed top-level packages, not in editable ones; here the plugin is registered explicitly.
 """
 
 import os
@@ -21,7 +21,7 @@ from apertura.run.journal import JOURNAL, NAME, note, step_of
 
 
 class LogHandler(LogHandlerBase):
-    """Writes what snakemake says of jobs to the journal; its own output stays as it is."""
+    """Log handler that writes job events of Snakemake to the journal; its output is unchanged."""
 
     writes_to_stream = False
     writes_to_file = False
@@ -30,35 +30,35 @@ class LogHandler(LogHandlerBase):
     needs_rulegraph = False
 
     def emit(self, record: LogRecord) -> None:
-        """Write a line for each event that the journal keeps."""
+        """Write a line for each event recorded in the journal."""
         line = _line(getattr(record, "event", None), record.__dict__)
         if line is not None:
-            event, told = line
-            note(ConfinedPath.referenced(os.environ[JOURNAL]), event, **told)
+            event, values = line
+            note(ConfinedPath.referenced(os.environ[JOURNAL]), event, **values)
 
 
-def _line(event: LogEvent | None, said: dict[str, Any]) -> tuple[str, dict[str, Any]] | None:
-    """Return what the journal keeps of an event of snakemake."""
+def _line(event: LogEvent | None, record: dict[str, Any]) -> tuple[str, dict[str, Any]] | None:
+    """Convert an event of Snakemake to name and values of a journal line; None if it is not recorded."""
     if event == LogEvent.RUN_INFO:
-        return "planned", {"jobs": said["stats"]}
+        return "planned", {"jobs": record["stats"]}
     if event == LogEvent.JOB_INFO:
-        rule, wildcards = said["rule_name"], [*(said["wildcards"] or {}).values()]
-        log = next(map(str, said["log"]), "")
-        step = step_of(said["shellcmd"], rule, wildcards)
-        return "begun", {"job": said["jobid"], "rule": rule, "step": step, "log": log}
+        rule, wildcards = record["rule_name"], [*(record["wildcards"] or {}).values()]
+        log = next(map(str, record["log"]), "")
+        step = step_of(record["shellcmd"], rule, wildcards)
+        return "begun", {"job": record["jobid"], "rule": rule, "step": step, "log": log}
     if event == LogEvent.JOB_FINISHED:
-        return "finished", {"job": said["job_id"]}
+        return "finished", {"job": record["job_id"]}
     if event == LogEvent.JOB_ERROR:
-        return "failed", {"job": said["jobid"]}
+        return "failed", {"job": record["jobid"]}
     if event == LogEvent.ERROR:
-        return "said", {"message": said["msg"]}
+        return "said", {"message": record["msg"]}
     return None
 
 
 def record() -> None:
-    """Run snakemake with the arguments of this process."""
+    """Run Snakemake with the arguments of this process."""
     LoggerPluginRegistry().register_plugin(f"snakemake_logger_plugin_{NAME}", sys.modules[__name__])
-    sys.argv[0] = "snakemake"  # its messages begin with it
+    sys.argv[0] = "snakemake"  # prefix of its messages
     if CONFINED in os.environ:
         journal = ConfinedPath.referenced(os.environ[JOURNAL])
         confine_changes(Path(os.environ.pop(CONFINED)), journal.parent.real())

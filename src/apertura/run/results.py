@@ -1,4 +1,4 @@
-"""`apertura list` and `apertura clean`: what is finished, stale or missing, and the removal of what a run has made."""
+"""Implementation of `apertura list` (states and sizes of results) and `apertura clean` (removal of results)."""
 
 import fcntl
 import json
@@ -17,8 +17,9 @@ from apertura.common.progress import RUN
 from apertura.workflow.lineage import on_demand, results_of
 from apertura.workflow.stale import absent_lines, stale_results
 
-_HEADINGS = ("flight", "of", "finished", "stale", "missing", "size")
+_HEADINGS = ("flight", "item", "finished", "out of date", "missing", "size")
 _COLOURS = {"finished": "green", "stale": "yellow", "missing": ""}
+_LABELS = {"finished": "finished", "stale": "out of date", "missing": "missing"}
 
 _LOCK = ".zarr.lock"
 _OWN: Mapping[str, str | tuple[str, ...]] = {
@@ -26,57 +27,57 @@ _OWN: Mapping[str, str | tuple[str, ...]] = {
     "benchmarks": ".tsv",
     ".hashes": ".json",
     RUN: "",
-    "look": (".png", ".json", ".html", ".tif"),
+    "preview": (".png", ".json", ".html", ".tif"),
 }
-"""Folder of the results → how the names of the files end that a run, or a look, leaves there."""
+"""Folder of the results → suffixes of files written there by a run or by `apertura preview`."""
 
 
 def print_list(campaign: Campaign) -> None:
-    """Print a row for each place of the results: what of it is finished, stale or missing, and its size."""
+    """Print a row for each folder of the results: finished, stale and missing results, and size."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
-    found = states(campaign)
-    sizes = _sizes(campaign.results, set(found))
+    states_of = states(campaign)
+    sizes = _sizes(campaign.results, set(states_of))
     kinds = {flight.name: flight.kind for flight in campaign.flights}
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for heading in _HEADINGS:
-        table.add_column(heading, justify="right" if heading == "size" else "left", no_wrap=heading == "of")
-    for place in sorted(found, key=lambda place: (place[:1] not in {(name,) for name in kinds}, place)):
-        flight, *of = place if place and place[0] in kinds else ("", *(place or ("campaign",)))
-        mark = f" ({kinds[flight]})" if kinds.get(flight, "image") != "image" and not of else ""
-        cells = [", ".join(found[place][state]) for state in _COLOURS]
+        table.add_column(heading, justify="right" if heading == "size" else "left", no_wrap=heading == "item")
+    for folder in sorted(states_of, key=lambda folder: (folder[:1] not in {(name,) for name in kinds}, folder)):
+        flight, *item = folder if folder and folder[0] in kinds else ("", *(folder or ("campaign",)))
+        mark = f" ({kinds[flight]})" if kinds.get(flight, "image") != "image" and not item else ""
+        cells = [", ".join(states_of[folder][state]) for state in _COLOURS]
         coloured = [
             f"[{colour}]{cell}[/]" if cell and colour else cell
             for cell, colour in zip(cells, _COLOURS.values(), strict=True)
         ]
-        table.add_row(flight, (*of, f"flight{mark}")[0], *coloured, in_bytes(sizes[place]))
+        table.add_row(flight, (*item, f"flight{mark}")[0], *coloured, in_bytes(sizes[folder]))
     console = Console(highlight=False)
     console.print(table)
     wip = sum(name.endswith(".zarr.wip") for _, folders, _ in campaign.results.walk() for name in folders)
     console.print(
-        f"{in_bytes(sum(sizes.values()))} in results" + (f", {wip} stages under way or left unfinished" if wip else "")
+        f"{in_bytes(sum(sizes.values()))} in results" + (f", {wip} stages in progress or incomplete" if wip else "")
     )
     for line in absent_lines(campaign):
         console.print(line, soft_wrap=True, markup=False)
 
 
 def states(campaign: Campaign) -> dict[tuple[str, ...], dict[str, list[str]]]:
-    """Return place below the results → finished, stale, missing → names of results."""
+    """Return folder below the results → state (finished, stale, missing) → names of results."""
     stale = stale_results(campaign)
-    found: dict[tuple[str, ...], dict[str, list[str]]] = defaultdict(lambda: {state: [] for state in _COLOURS})
+    states_of: dict[tuple[str, ...], dict[str, list[str]]] = defaultdict(lambda: {state: [] for state in _COLOURS})
     for name, result in results_of(campaign):
-        there = (campaign.root / result.manifest).is_file()
-        place = Path(result.manifest).parent.parts[1:]
-        if there or result.manifest in stale or not on_demand(campaign, result.manifest):
-            state = "stale" if result.manifest in stale else "finished" if there else "missing"
-            found[place][state].append("export" if name == "fused" else name)
-    return dict(found)
+        exists = (campaign.root / result.manifest).is_file()
+        folder = Path(result.manifest).parent.parts[1:]
+        if exists or result.manifest in stale or not on_demand(campaign, result.manifest):
+            state = "stale" if result.manifest in stale else "finished" if exists else "missing"
+            states_of[folder][state].append("export" if name == "fused" else name)
+    return dict(states_of)
 
 
 def counted(found: Mapping[tuple[str, ...], Mapping[str, list[str]]]) -> str:
-    """Return how many results are in each state, of what `states` returns.
+    """Return a summary of the number of results in each state, from the result of `states`.
 
     Examples
     --------
@@ -84,11 +85,11 @@ def counted(found: Mapping[tuple[str, ...], Mapping[str, list[str]]]) -> str:
     '2 results finished, 1 result missing'
     """
     counts = {state: sum(len(names.get(state, ())) for names in found.values()) for state in _COLOURS}
-    return ", ".join(f"{number_of(count, 'result')} {state}" for state, count in counts.items() if count)
+    return ", ".join(f"{number_of(count, 'result')} {_LABELS[state]}" for state, count in counts.items() if count)
 
 
 def _sizes(results: ConfinedPath, places: set[tuple[str, ...]]) -> dict[tuple[str, ...], int]:
-    """Return how many bytes lie in each place; what lies in no other counts for the campaign."""
+    """Return the size of each folder, bytes; files in no other folder are attributed to the campaign."""
     sizes = dict.fromkeys({*places, ()}, 0)
     for folder, _, names in results.walk():
         parts = folder.relative_to(results).parts
@@ -98,31 +99,31 @@ def _sizes(results: ConfinedPath, places: set[tuple[str, ...]]) -> dict[tuple[st
 
 
 def clean(campaign: Campaign, *, unfinished_only: bool, agreed: bool) -> None:
-    """Remove what the workflow has made, and say what stays.
+    """Remove the results of the workflow, and report the files that remain.
 
     Parameters
     ----------
     campaign
-        Whose results; its recordings and config are never touched.
+        The campaign; its recordings and configuration are never changed.
     unfinished_only
-        Only work in progress.
+        Remove only incomplete results.
     agreed
-        Do not ask.
+        Do not ask for confirmation.
 
     Raises
     ------
     CampaignError
-        If a run holds the campaign, a step still writes, or nobody is there to be asked.
+        If the campaign is locked by a run, a step still writes, or confirmation is required without a terminal.
     """
     if not campaign.results.is_dir():
-        print(f"nothing to remove: {campaign.results} is not there")
+        print(f"nothing to remove: {campaign.results} does not exist")
         return
     with hold(campaign.root):
         _refuse_writers(campaign.results)
         files = sorted(set(_unfinished(campaign.results) if unfinished_only else _made(campaign.results)))
         size = sum(path.lstat().st_size for path in files)
-        told = f"{number_of(len(files), 'file')}, {in_bytes(size)}, that the workflow has made in {campaign.results}"
-        if not files or not (agreed or _is_wanted(f"remove {told}?", campaign.root)):
+        summary = f"{number_of(len(files), 'file')} ({in_bytes(size)}) written by the workflow in {campaign.results}"
+        if not files or not (agreed or _is_confirmed(f"remove {summary}?", campaign.root)):
             print("nothing removed")
             return
         for path in files:
@@ -130,17 +131,17 @@ def clean(campaign: Campaign, *, unfinished_only: bool, agreed: bool) -> None:
         if not unfinished_only:
             (campaign.root / ".snakemake").remove()
         _drop_empty(campaign.results)
-        print(f"removed {told}")
+        print(f"removed {summary}")
         kept = [] if unfinished_only else _files(campaign.results)
         if kept:
             more = f" and {len(kept) - 1} more" if len(kept) > 1 else ""
-            print(f"kept what it has not made: {shown(campaign.relative(kept[0]), 400)}{more}")
+            print(f"kept files not written by the workflow: {shown(campaign.relative(kept[0]), 400)}{more}")
         elif not unfinished_only:
-            campaign.results.remove()  # with nothing in it but the lock
+            campaign.results.remove()  # contains only the lock
 
 
 def in_bytes(size: int) -> str:
-    """Return a size as people say it.
+    """Format a size in bytes with a decimal prefix.
 
     Examples
     --------
@@ -156,31 +157,33 @@ def in_bytes(size: int) -> str:
 
 
 def _refuse_writers(results: ConfinedPath) -> None:
-    """Raise CampaignError if a step that has outlived its run still writes a stage."""
+    """Raise CampaignError if a step that outlived its run still writes a stage."""
     for path in _files(results):
         if path.name.startswith(".") and path.name.endswith(_LOCK):
             with path.open("rb") as lock:
                 try:
                     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:
-                    expected, remedy = "no step under way", "Wait until it ends, or end it."
-                    raise CampaignError("a step still writes it", path, expected, remedy) from None
+                    expected, remedy = "no running step", "Wait for the step to finish, or stop it."
+                    raise CampaignError("a step is still writing this stage", path, expected, remedy) from None
 
 
-def _is_wanted(question: str, root: Path) -> bool:
+def _is_confirmed(question: str, root: Path) -> bool:
     import typer
 
     if not sys.stdin.isatty():
-        raise CampaignError("nobody to ask", root, "a terminal, or --yes", "Say --yes to remove without being asked.")
+        raise CampaignError(
+            "confirmation required, but no terminal", root, "a terminal, or --yes", "Use --yes to skip confirmation."
+        )
     return typer.confirm(question)
 
 
 def _made(results: ConfinedPath) -> Iterator[ConfinedPath]:
-    """Yield what the workflow has made: what manifests and locks of stages list, work in progress, logs."""
+    """Yield the files written by the workflow: those listed in manifests and locks, incomplete results, and logs."""
     yield from _unfinished(results)
     for path in _files(results):
         if path.name.endswith(".manifest.json"):
-            with suppress(CampaignError):  # damaged: its files are nobody's
+            with suppress(CampaignError):  # a damaged manifest: its files are not removed
                 yield from _listed(path, read_manifest(path)["files"], below=path.parent)
                 yield path
         elif path.name.startswith(".") and path.name.endswith(_LOCK):
@@ -193,7 +196,7 @@ def _made(results: ConfinedPath) -> Iterator[ConfinedPath]:
 
 
 def _listed(where: ConfinedPath, names: dict[str, object], *, below: ConfinedPath) -> Iterator[ConfinedPath]:
-    """Yield the files that are there of those that a manifest or a lock lists; none outside, none through a link."""
+    """Yield the existing files listed in a manifest or lock, inside the folder and not through links."""
     for name in names:
         with suppress(CampaignError):
             path = below.named(name, where=where)
@@ -208,7 +211,7 @@ def _unfinished(results: ConfinedPath) -> Iterator[ConfinedPath]:
 
 
 def _files(top: ConfinedPath) -> list[ConfinedPath]:
-    """Return every file below a folder, links as such, sorted."""
+    """Return all files below a folder, sorted; links are not followed."""
     return sorted(folder / name for folder, _, names in top.walk() for name in names if name != ".run.lock")
 
 

@@ -1,4 +1,4 @@
-"""What a run shows, and `apertura status` from another terminal: lines for steps that end, bars for those under way."""
+"""Console output of a run and of `apertura status`: a line per finished step, progress bars for running steps."""
 
 import sys
 import time
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 UNKNOWN = "time left unknown"
-NOTHING = "Nothing to be done: every result is there, and up to date."
+NOTHING = "Nothing to be done: all results are up to date."
 
 _MOST_BARS = 12
-_MARGIN = 3  # a terminal shows ^C behind the last line, which must not break there
+_MARGIN = 3  # columns left free at the end of a line for ^C
 
 
 def span(seconds: float) -> str:
-    """Return a time as people say it.
+    """Format a duration.
 
     Examples
     --------
@@ -40,7 +40,7 @@ def span(seconds: float) -> str:
 
 
 def about(seconds: float) -> str:
-    """Return a time that is only expected, as coarsely as it is known.
+    """Format a predicted duration with few significant digits.
 
     Examples
     --------
@@ -56,25 +56,25 @@ def about(seconds: float) -> str:
 
 @dataclass(frozen=True)
 class Bar:
-    """A line with a bar: what it is of, how far, and the seconds left; None: unknown."""
+    """Progress bar: name, progress in words, completed fraction, and time left in seconds (None: unknown)."""
 
     name: str
-    told: str
+    counts: str
     fraction: float
     left_s: float | None
 
     @property
     def left(self) -> str:
-        """The time left, in words."""
+        """Time left, as text."""
         return UNKNOWN if self.left_s is None else f"about {about(self.left_s)} left"
 
 
 def bars(campaign: Campaign, run: RunRecord, time_left: TimeLeft) -> list[Bar]:
-    """Return a bar for each job under way, the oldest first, and in the end one of the whole run."""
+    """Return a progress bar for each running job, the oldest first, and a final bar for the whole run."""
     now_s = time.time()
-    told = {number: StepProgress.of(campaign, job) for number, job in list(_running(run).items())[:_MOST_BARS]}
-    left, whole_s = time_left.left(run, now_s, told)
-    steps = [_bar(job, told.get(number), left[number], now_s) for number, job in _running(run).items()]
+    progress = {number: StepProgress.of(campaign, job) for number, job in list(_running(run).items())[:_MOST_BARS]}
+    left, whole_s = time_left.left(run, now_s, progress)
+    steps = [_bar(job, progress.get(number), left[number], now_s) for number, job in _running(run).items()]
     done = len(run.finished) + sum(bar.fraction for bar in steps)
     whole = Bar(f"{len(run.finished)} of {run.total} steps", "", done / max(run.total, 1), whole_s)
     return [*steps, whole]
@@ -84,15 +84,16 @@ def _running(run: RunRecord) -> dict[int, JobRecord]:
     return {number: job for number, job in run.jobs.items() if job.running}
 
 
-def _bar(job: JobRecord, told: StepProgress | None, left_s: float | None, now_s: float) -> Bar:
-    if told:
-        return Bar(job.name, f"{told.done} of {told.total} {told.what}", told.done / told.total, left_s)
+def _bar(job: JobRecord, progress: StepProgress | None, left_s: float | None, now_s: float) -> Bar:
+    if progress:
+        counts = f"{progress.done} of {progress.total} {progress.what}"
+        return Bar(job.name, counts, progress.done / progress.total, left_s)
     passed = max(job.seconds(now_s), 0.0)
     return Bar(job.name, "", 0.0 if left_s is None else min(passed / max(passed + left_s, 0.1), 0.95), left_s)
 
 
 def table(rows: list[Bar]) -> "Table":
-    """Return bars as a table for a terminal, as wide as that is."""
+    """Return progress bars as a table of the width of the terminal."""
     from rich.progress_bar import ProgressBar
     from rich.table import Table
     from rich.text import Text
@@ -104,24 +105,24 @@ def table(rows: list[Bar]) -> "Table":
     grid.add_column(no_wrap=True, justify="right", min_width=len(UNKNOWN))
     *steps, whole = rows
     for row in steps[:_MOST_BARS]:
-        grid.add_row(Text(f"{'':8}{row.name}"), ProgressBar(1.0, row.fraction), Text(row.told), Text(row.left))
+        grid.add_row(Text(f"{'':9}{row.name}"), ProgressBar(1.0, row.fraction), Text(row.counts), Text(row.left))
     if len(steps) > _MOST_BARS:
-        grid.add_row(Text(f"{'':8}and {len(steps) - _MOST_BARS} more", style="dim"))
+        grid.add_row(Text(f"{'':9}and {len(steps) - _MOST_BARS} more", style="dim"))
     grid.add_row(Text(whole.name, style="bold"), ProgressBar(1.0, whole.fraction), "", Text(whole.left, style="bold"))
     return grid
 
 
 class Screen:
-    """Shows a run while it goes on: leave it with `with`, also by an error, and the terminal is as it was.
+    """Progress display of a run; as a context manager it restores the terminal on exit, also after an error.
 
     Parameters
     ----------
     campaign, time_left
-        Whose run, and how long it will take.
+        Campaign of the run, and its predicted time left.
     quiet
-        Show nothing.
+        Print nothing.
     stream
-        Where to; bars where it is a terminal, plain lines elsewhere.
+        Output stream: progress bars on a terminal, plain lines otherwise.
     """
 
     def __init__(
@@ -132,7 +133,7 @@ class Screen:
 
         self._campaign, self._time_left, self._quiet = campaign, time_left, quiet
         self._stream = stream or sys.stderr
-        self._told: dict[tuple[int, float], bool] = {}
+        self._shown: dict[tuple[int, float], bool] = {}
         console = Console(file=self._stream, highlight=False)
         moving = not quiet and self._stream.isatty() and not console.is_dumb_terminal
         self._live = Live(console=console, auto_refresh=False, transient=True) if moving else None
@@ -147,16 +148,16 @@ class Screen:
             self._live.stop()
 
     def update(self, run: RunRecord) -> None:
-        """Show what is new, in the order in which it happened."""
-        news: list[tuple[float, bool, JobRecord]] = []  # when, whether it ended
+        """Display new events in chronological order."""
+        news: list[tuple[float, bool, JobRecord]] = []  # time, True for an end, job
         for number, job in [] if self._quiet else run.jobs.items():
-            told = self._told.get((number, job.begun_s))  # a job that is tried again begins anew
-            if told is None:
+            end_shown = self._shown.get((number, job.begun_s))  # a restarted job has a new start time
+            if end_shown is None:
                 news.append((job.begun_s, False, job))
-            if not told and not job.running:
+            if not end_shown and not job.running:
                 news.append((job.ended_s or 0, True, job))
-            self._told[number, job.begun_s] = not job.running
-        news.sort(key=lambda one: one[0])
+            self._shown[number, job.begun_s] = not job.running
+        news.sort(key=lambda event: event[0])
         ended = [job for _, has_ended, job in news if has_ended]
         whole = bars(self._campaign, run, self._time_left)[-1] if ended and not self._live else None
         done = len(run.finished) - sum(not job.failed for job in ended)
@@ -165,15 +166,15 @@ class Screen:
                 done += not job.failed
                 self._ended(job, whole, f"{done} of {run.total} steps")
             elif not self._live:
-                self._line(f"{_clock(job.begun_s)}  begun   {job.name}")
+                self._line(f"{_clock(job.begun_s)}  started  {job.name}")
         if self._live:
             from rich.constrain import Constrain
 
-            rows = table(bars(self._campaign, run, self._time_left)) if run.planned else "planning what to do"
+            rows = table(bars(self._campaign, run, self._time_left)) if run.planned else "planning"
             self._live.update(Constrain(rows, self._live.console.width - _MARGIN), refresh=True)
 
     def ended(self, run: RunRecord) -> None:
-        """Say that all is done."""
+        """Print the completion of the run."""
         done = f"{number_of(run.total, 'step')} done in {span((run.ended_s or time.time()) - run.begun_s)}"
         self._line(done if run.planned else NOTHING)
 
@@ -183,7 +184,7 @@ class Screen:
             self._live.console.print(_line(word, job))
         elif whole:
             left = f", {whole.left}" if not job.failed and whole.fraction < 1 else ""
-            self._line(f"{_clock(job.ended_s or 0)}  {word:6}  {job.name}: {span(job.seconds())}; {done}{left}")
+            self._line(f"{_clock(job.ended_s or 0)}  {word:7}  {job.name}: {span(job.seconds())}; {done}{left}")
 
     def _line(self, line: str) -> None:
         if not self._quiet:
@@ -191,19 +192,19 @@ class Screen:
 
 
 def _line(word: str, job: JobRecord) -> "Table":
-    """Return the line of a job that has ended, for a terminal."""
+    """Return the line of a finished job for a terminal."""
     from rich.table import Table
     from rich.text import Text
 
     line = Table.grid(expand=True)
     line.add_column(no_wrap=True, overflow="ellipsis", ratio=1)
     line.add_column(no_wrap=True, justify="right")
-    line.add_row(Text.assemble((f"{word:8}", "red" if job.failed else "green"), job.name), span(job.seconds()))
+    line.add_row(Text.assemble((f"{word:9}", "red" if job.failed else "green"), job.name), span(job.seconds()))
     return line
 
 
 def listed(counts: Mapping[str, int]) -> str:
-    """Return rules and how many jobs each has.
+    """Format the number of jobs of each rule.
 
     Examples
     --------
@@ -218,17 +219,17 @@ def _clock(at_s: float) -> str:
 
 
 def print_status(campaign: Campaign) -> None:
-    """Print whether a run is under way, who holds it, its steps and the time left; or how the last one ended."""
+    """Print the state of a run in progress: owner, steps and time left; or the outcome of the last run."""
     run = JournalReader(campaign.result(RUN, "journal.jsonl")).news()
     held = holder(campaign.root)
     if held:
-        print(f"a run is under way: {held}")
+        print(f"a run is in progress: {held}")
         if run.planned and run.status is None:
             _print_steps(campaign, run)
         else:
-            print("it is planning, or was started without `apertura run`: nothing known of its steps")
+            print("steps unknown: the run is being planned, or was started without `apertura run`")
     else:
-        print(_how_it_ended(run))
+        print(_outcome(run))
     if run.status != INTERRUPTED and (run.failed or run.status):
         print(*failures(campaign.root, run, campaign.result("logs", "snakemake.log")), sep="\n")
     if not held:
@@ -238,22 +239,22 @@ def print_status(campaign: Campaign) -> None:
 def _print_steps(campaign: Campaign, run: RunRecord) -> None:
     from rich.console import Console
 
-    print(f"done: {listed(Counter(job.rule for job in run.finished)) or 'nothing yet'}")
+    print(f"done: {listed(Counter(job.rule for job in run.finished)) or 'no step'}")
     rows = bars(campaign, run, TimeLeft(campaign, cores=run.cores))
     console = Console(highlight=False)
     if console.is_terminal:
         console.print(table(rows))
     else:
         for row in rows:
-            print(f"{row.name}: {100 * row.fraction:.0f} %{', ' + row.told if row.told else ''}, {row.left}")
+            print(f"{row.name}: {100 * row.fraction:.0f} %{', ' + row.counts if row.counts else ''}, {row.left}")
     if run.waiting:
-        print(f"to come: {listed(run.waiting)}")
+        print(f"waiting: {listed(run.waiting)}")
 
 
-def _how_it_ended(run: RunRecord) -> str:
+def _outcome(run: RunRecord) -> str:
     if not run.begun_s:
-        return "no run is under way, and none is remembered"
-    begun = time.strftime("%Y-%m-%d %H:%M", time.localtime(run.begun_s))
+        return "no run in progress, and no earlier run recorded"
+    start = time.strftime("%Y-%m-%d %H:%M", time.localtime(run.begun_s))
     done = (
         f"{len(run.finished)} of {run.total} steps done"
         if run.planned
@@ -262,8 +263,10 @@ def _how_it_ended(run: RunRecord) -> str:
         else NOTHING
     )
     if run.ended_s is None:
-        return (
-            f"no run is under way; the last one, begun {begun}, was killed, {done}. Run again: it goes on where it was."
-        )
-    how = {0: "ended well", INTERRUPTED: "was interrupted"}.get(run.status or 0, f"failed with {run.status}")
-    return f"no run is under way; the last one, begun {begun}, {how} after {span(run.ended_s - run.begun_s)}: {done}"
+        return f"no run in progress; the last run, started {start}, was killed: {done}. Run again to resume."
+    outcome = {0: "succeeded", INTERRUPTED: "was interrupted"}.get(
+        run.status or 0, f"failed with exit status {run.status}"
+    )
+    return (
+        f"no run in progress; the last run, started {start}, {outcome} after {span(run.ended_s - run.begun_s)}: {done}"
+    )

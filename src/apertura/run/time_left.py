@@ -1,18 +1,19 @@
-"""How long what is left of a run will take, by the steps of this run that were timed; nothing where these say nothing.
+"""Prediction of the time left of a run, from the durations of its finished and reporting steps.
 
-A job of rule r takes b + w seconds by the cost of its rule: its start and what grows with its work. With ratios ρ of
-what was timed in this run to that, it is expected to take
+The cost of rule r predicts b + w seconds for a job: start-up b and work w. With ratios ρ of measured to predicted
+durations in this run, the job is expected to take
 
-    ρ_r (b + w)       where a job of its rule has ended, or tells how far it is;
-    ρ_p (b + w)       of rasters, or of sums of pulses over pixels, where those of another rule have: they are alike;
-    ρ_b b + ρ_w w     elsewhere: ρ_b by jobs that are mostly start, ρ_w by the others.
+    ρ_r (b + w)       if a job of the same rule has finished, or reports its progress;
+    ρ_p (b + w)       for raster jobs, or imaging jobs (sums of pulses over pixels), if a job of the same kind has;
+    ρ_b b + ρ_w w     otherwise, with ρ_b from jobs dominated by start-up and ρ_w from the other jobs.
 
-The last is only told of a job that is mostly start, w ≤ b, when such jobs of two rules were timed: starts are alike,
-but the first of a run wait for what all of them import. A sum over a run is told while no more than a fifth of it is of
-jobs of which that is not: where these take nothing it is 1.25 times the truth, where six times as much, half of it.
-Nothing is told of it before one that sums pulses over pixels was timed: engine and accuracy change that a thousandfold;
-nor is one told that takes half as long again as expected: its tiles are formed again. Another job that does runs on for
-as long again as it is over.
+The third prediction is displayed only for jobs dominated by start-up, w ≤ b, after such jobs of two rules were
+measured: start-up times are similar, but the first jobs of a run wait for common imports. The time left of the run is
+displayed while at most a fifth of it is due to jobs without a displayed prediction: if these took no time, it would be
+1.25 times the truth; if they took six times as long, half of it. It is not displayed before an imaging job was
+measured, since engine and accuracy change its duration a thousandfold; nor for an imaging job that takes 1.5 times as
+long as expected, since its tiles are being recomputed. Any other overdue job is expected to run on for as long as it is
+overdue.
 """
 
 import json
@@ -34,13 +35,13 @@ from apertura.workflow.rules import RULES, Cost
 
 _MOST_TIMED = 500
 _LEAST_S = 0.1
-_TELLS = 0.05  # of its work that a step has done, and two parts of it, before its pace is taken for others
-_SURE = 0.8
+_TELLS = 0.05  # least completed share of a step, and at least two parts, before its pace is used for other jobs
+_SURE = 0.8  # least share of the time left that is due to jobs with a reliable prediction
 
 
 @dataclass(frozen=True)
 class StepProgress:
-    """How far a step says it is: `done` of `total` since an instant, seconds since the epoch."""
+    """Progress reported by a step: `done` of `total`, start and time of the report, seconds since the epoch."""
 
     what: str
     done: int
@@ -50,40 +51,41 @@ class StepProgress:
 
     @classmethod
     def of(cls, campaign: Campaign, job: JobRecord) -> "StepProgress | None":
-        """Return what a job tells; None if nothing."""
+        """Read the progress report of a job; None if there is no valid one."""
         with suppress(CampaignError, OSError, ValueError, KeyError, TypeError):
-            said = json.loads(campaign.result(*progress_path(job.step)).read_text("utf-8"))
-            told = cls(shown(said["what"]), int(said["done"]), int(said["total"]), said["since"], said["at"])
-            if 0 <= told.done <= told.total and told.total and job.begun_s - 5 <= told.since_s <= told.at_s < LAST_S:
-                return told
+            file = json.loads(campaign.result(*progress_path(job.step)).read_text("utf-8"))
+            report = cls(shown(file["what"]), int(file["done"]), int(file["total"]), file["since"], file["at"])
+            has_valid_times = job.begun_s - 5 <= report.since_s <= report.at_s < LAST_S
+            if 0 <= report.done <= report.total and report.total and has_valid_times:
+                return report
         return None
 
     @property
     def tells(self) -> bool:
-        """Whether enough is done for a pace: what comes before the first part, tables, is in that of few."""
+        """True if enough is done for a reliable pace, which includes preparations such as tables."""
         return self.done >= max(_TELLS * self.total, 2)
 
     @property
     def left_s(self) -> float | None:
-        """Seconds that the rest takes at the pace so far; None before there is one."""
+        """Time left at the present pace, seconds; None before the first part is done."""
         passed = self.at_s - self.since_s
         return passed * (self.total - self.done) / self.done if self.done and passed > 0 else None
 
 
 @dataclass(frozen=True)
 class Measure:
-    """What jobs take, in the measure of what was timed.
+    """Ratios of measured to predicted durations of jobs.
 
     Attributes
     ----------
     of_rule
-        Rule → how much longer than expected its jobs take, of those that were timed.
+        Rule → ratio, for rules with measured jobs.
     of_rasters, of_imaging
-        The same of any job of rasters, and of any that sums pulses over pixels; None where none was timed.
+        Ratio of raster jobs, and of imaging jobs (sums of pulses over pixels); None if none was measured.
     of_start, of_work
-        The same of the start of any job, and of what grows with its work; None where nothing was timed.
+        Ratio of the start-up of jobs, and of their work; None if no job was measured.
     starts
-        Whether jobs of two rules were timed that are mostly start.
+        True if jobs of two rules dominated by start-up were measured.
     """
 
     of_rule: dict[str, float]
@@ -95,13 +97,13 @@ class Measure:
 
     @classmethod
     def of(cls, timed: Sequence[tuple[str, float, float, float]]) -> "Measure":
-        """Return that of jobs: rule, seconds, and the seconds expected for its start and for its work."""
+        """Compute the ratios from jobs: rule, duration, and predicted durations of start-up and work, seconds."""
         ratios: dict[str, list[float]] = defaultdict(list)
         grows: dict[str, list[bool]] = defaultdict(list)
         for rule, seconds, start_s, work_s in timed:
             ratios[rule].append(seconds / (start_s + work_s))
             grows[rule].append(work_s > start_s)
-        of_rule = {rule: median(found) for rule, found in ratios.items()}
+        of_rule = {rule: median(values) for rule, values in ratios.items()}
         starts = [ratio for rule, ratio in of_rule.items() if not any(grows[rule])]
         works = [ratio for rule, ratio in of_rule.items() if any(grows[rule])]
         rasters = [ratio for rule, ratio in of_rule.items() if _cost(rule).of_rasters]
@@ -117,7 +119,7 @@ class Measure:
         )
 
     def seconds(self, rule: str, start_s: float, work_s: float) -> tuple[float, bool]:
-        """Return what a job is expected to take, and whether that is to be told."""
+        """Return the expected duration of a job, seconds, and True if it is reliable."""
         if rule in self.of_rule:
             return self.of_rule[rule] * (start_s + work_s), True
         cost = _cost(rule)
@@ -130,14 +132,14 @@ class Measure:
 
 
 class TimeLeft:
-    """How long the steps of a run will take, as far as it can be told.
+    """Prediction of the time left of a run.
 
     Parameters
     ----------
     campaign
         The campaign.
     cores
-        How many jobs run at once; 0: as many as do, on machines of a cluster.
+        Number of cores; 0: the number of running jobs, on a cluster.
     """
 
     def __init__(self, campaign: Campaign, cores: int) -> None:
@@ -146,42 +148,42 @@ class TimeLeft:
         self._expected = cache(lambda rule, where: sizes.expected_seconds(rule, *where))
 
     def _expects(self, run: RunRecord, rule: str, where: tuple[str, ...]) -> tuple[float, float]:
-        """Return the seconds of a job's start and work by the cost of its rule; tiles of a pair may be work of many."""
+        """Return the predicted start-up and work of a job, seconds; jobs may share the work of a pair."""
         shared = rule in RULES and RULES[rule].shares
         shares = max(run.planned.get(rule, 0) / max(len(self._places(rule)), 1) if shared else 1.0, 1.0)
         start_s = _cost(rule).begin_s
         return start_s, (self._expected(rule, where[:2]) - start_s) / shares
 
     def left(
-        self, run: RunRecord, now_s: float, told: dict[int, StepProgress | None]
+        self, run: RunRecord, now_s: float, progress: dict[int, StepProgress | None]
     ) -> tuple[dict[int, float | None], float | None]:
-        """Return number of a job → seconds that it will still run, and the seconds until all is done; None: unknown.
+        """Return number of a job → its time left, and the time left of the run, seconds; None: unknown.
 
         Parameters
         ----------
         run
-            So far.
+            State of the run.
         now_s
-            Seconds since the epoch.
-        told
-            Number of a job → what it tells.
+            Present time, seconds since the epoch.
+        progress
+            Number of a job → its progress report.
         """
-        under_way = {number: job for number, job in run.jobs.items() if job.running}
-        paced = {number: report.left_s for number in under_way if (report := told.get(number))}
+        running = {number: job for number, job in run.jobs.items() if job.running}
+        paced = {number: report.left_s for number in running if (report := progress.get(number))}
         timed = [(job, max(job.seconds(), _LEAST_S)) for job in run.finished[-_MOST_TIMED:]]
         for number, left_s in paced.items():
-            report = told[number]
+            report = progress[number]
             if left_s is not None and report and report.tells:
-                timed.append((under_way[number], under_way[number].seconds(report.at_s) + left_s))
+                timed.append((running[number], running[number].seconds(report.at_s) + left_s))
         measure = Measure.of([(job.rule, took, *self._expects(run, job.rule, job.step[1:])) for job, took in timed])
         left: dict[int, tuple[float, bool]] = {}
-        for number, job in under_way.items():
+        for number, job in running.items():
             whole, sure = measure.seconds(job.rule, *self._expects(run, job.rule, job.step[1:]))
-            pace, report = paced.get(number), told.get(number)
+            pace, report = paced.get(number), progress.get(number)
             early = job.rule in measure.of_rule and report and not report.tells
             if pace is None or early:
                 over_s = job.seconds(now_s) - whole
-                # Tiles that missed the accuracy are formed again by a finer setting: in a time that nobody knows.
+                # Tiles that missed the accuracy are recomputed with a finer setting, for an unknown time.
                 left[number] = abs(over_s), sure and not (_cost(job.rule).of_imaging and over_s > whole / 2)
             else:
                 left[number] = pace, True
@@ -191,8 +193,8 @@ class TimeLeft:
             waiting[rule] = fmean(seconds for seconds, _ in each), all(sure for _, sure in each)
         whole, sure_s = (self._sum(run, left, waiting, all_of_it=all_of_it) for all_of_it in (True, False))
         of_jobs = {number: seconds if sure else None for number, (seconds, sure) in left.items()}
-        to_come = {*run.waiting, *(job.rule for job in under_way.values())}
-        guessed = measure.of_imaging is None and any(_cost(rule).of_imaging for rule in to_come)
+        unfinished = {*run.waiting, *(job.rule for job in running.values())}
+        guessed = measure.of_imaging is None and any(_cost(rule).of_imaging for rule in unfinished)
         known = measure.of_rule and sure_s >= _SURE * whole and not guessed
         return of_jobs, whole if known else None
 
@@ -204,20 +206,20 @@ class TimeLeft:
         *,
         all_of_it: bool,
     ) -> float:
-        """Return the seconds of all work over all cores, and no less than those of one step after the other."""
+        """Return the duration of all work on all cores, at least that of a sequential chain of steps, seconds."""
         running = [seconds for seconds, sure in left.values() if sure or all_of_it]
         at_once = self._cores or max(1, len(left))
         work, chain = sum(running) / at_once, max(running, default=0.0)
         for rule, (each, sure) in waiting.items():
             if sure or all_of_it:
-                turns = 1 if _cost(rule).all_cores and self._cores else at_once
-                work += ceil(run.waiting[rule] / turns) * each
+                concurrent = 1 if _cost(rule).all_cores and self._cores else at_once
+                work += ceil(run.waiting[rule] / concurrent) * each
                 chain += 0.0 if _cost(rule).last else each
         return max(work, chain)
 
     @cache  # noqa: B019 - one per run
     def _places(self, rule: str) -> Sequence[tuple[str, ...]]:
-        """Return what the jobs of a rule run on; nothing of one that the campaign does not have."""
+        """Return the flights, pairs or nodes on which the jobs of a rule run; one empty entry if there are none."""
         return (places(self._campaign, RULES[rule]) if rule in RULES else []) or [()]
 
 

@@ -1,4 +1,4 @@
-"""Campaign folders like real ones from a scene, tracks and impairments, with the truth beside them."""
+"""Simulation of campaign folders from a scene, tracks and impairments, with the true values in truth.json."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -72,29 +72,30 @@ def simulate(
     impairments: Mapping[str, Impairments] | None = None,
     seed: int | Generator = 1,
 ) -> Path:
-    """Write a simulated campaign: SigMF recordings, flight logs, codes, config, and truth.json; return its folder.
+    """Write a simulated campaign: SigMF recordings, flight logs, codes, config and truth.json; return its folder.
 
     Parameters
     ----------
     directory
-        The folder to make; it must not exist, or be empty.
+        Folder of the campaign; it must be new or empty.
     specification
-        A specification, the path of one in YAML, or a preset, a key of `PRESETS`: `demo`, `paper`, `paper-uav`, …
+        A specification, the path of a YAML specification, or a preset (a key of `PRESETS`): `demo`, `paper`,
+        `paper-uav`, …
     targets
-        What stands in the scene instead, east, north and up (m) of the specification's origin.
+        Targets that replace those of the specification, in metres east, north and up of its origin.
     tracks
-        Node → how it flies instead, in every flight; nodes that the specification lacks are perfect ones.
+        Node → track that replaces that of the specification in every flight; additional nodes have no impairments.
     waveform
-        What is transmitted instead.
+        Transmitted waveform that replaces that of the specification.
     impairments
-        Node → what is wrong with it instead.
+        Node → impairments that replace those of the specification.
     seed
-        Of everything random, or the generator itself; the same seed gives identical bytes.
+        Seed of all random draws, or the generator itself; the same seed gives identical files.
 
     Raises
     ------
     CampaignError
-        If the folder holds something already, or the specification is wrong.
+        If the folder is not empty, or the specification is invalid.
 
     Examples
     --------
@@ -107,11 +108,17 @@ def simulate(
     ['codes.npy', 'config.yaml', 'flights.tsv', 'truth.json', 'uav1.sigmf-data', 'uav1.sigmf-meta', 'uav1.track.csv']
     """
     if not isinstance(directory, str | Path):
-        raise CampaignError(quoted(directory), "simulate: directory", "the path of a folder", "Give it as text.")
+        raise CampaignError(
+            quoted(directory), "simulate: directory", "the path of a folder", "Pass a string or a pathlib.Path."
+        )
     if targets is not None and not len(targets):
-        raise CampaignError("no targets", "simulate: targets", "one or more", "Leave it out for those of the preset.")
+        raise CampaignError(
+            "no targets", "simulate: targets", "at least one target", "Omit targets to use those of the specification."
+        )
     if not isinstance(seed, Generator) and (isinstance(seed, bool) or not isinstance(seed, Integral) or seed < 0):
-        raise CampaignError(quoted(seed), "simulate: seed", "a whole number from 0 on, or a Generator", "Give one.")
+        raise CampaignError(
+            quoted(seed), "simulate: seed", "an integer of at least 0, or a numpy Generator", "Pass such a seed."
+        )
     base = specification
     if not isinstance(base, CampaignSpecification):
         base = preset(base) if isinstance(base, str) and base in PRESETS else read_specification(Path(base))
@@ -123,19 +130,19 @@ def simulate(
     if tracks is not None:
         parts["nodes"] = {name: base.nodes.get(name, SimulatedNode()) for name in tracks}
         parts["flights"] = tuple(vars(flight) | {"tracks": tracks} for flight in base.flights)
-    for name, own in (impairments or {}).items():
-        parts["nodes"][name] = replace(parts["nodes"].get(name, SimulatedNode()), impairments=own)
-    checked = validated(CampaignSpecification, parts, where="simulate", expected="parts that fit together")
+    for name, of_node in (impairments or {}).items():
+        parts["nodes"][name] = replace(parts["nodes"].get(name, SimulatedNode()), impairments=of_node)
+    checked = validated(CampaignSpecification, parts, where="simulate", expected="a consistent specification")
     return write_campaign(Path(directory), checked, default_rng(seed))
 
 
 def preset(name: str, *, pulses: int | None = None) -> CampaignSpecification:
-    """Return a preset's specification, with another number of pulses if one is given.
+    """Return the specification of a preset, optionally with another number of pulses.
 
     Raises
     ------
     CampaignError
-        If there is none of that name.
+        If there is no preset of this name.
 
     Examples
     --------
@@ -143,5 +150,7 @@ def preset(name: str, *, pulses: int | None = None) -> CampaignSpecification:
     dict_keys(['uav1', 'uav2', 'uav3', 'uav4'])
     """
     if name not in PRESETS:
-        raise CampaignError(f"preset {name!r}", "simulate", f"one of {', '.join(PRESETS)}", "Choose one of them.")
+        raise CampaignError(
+            f"unknown preset {name!r}", "simulate", f"one of {', '.join(PRESETS)}", "Use one of these presets."
+        )
     return PRESETS[name]() if pulses is None else PRESETS[name](pulses=pulses)

@@ -1,4 +1,4 @@
-"""A simulated campaign as a folder no different from a real one, with its truth beside it."""
+"""Writer of simulated campaigns, in the format of real campaign folders, with the true values in truth.json."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -29,17 +29,17 @@ from apertura.simulation.synthesis import digitize, full_scale, periodic_samples
 from apertura.simulation.targets import Origin, PointTarget, Target, phase_centre, scatterers
 
 _LOG_MARGIN_S = 2.0
-_RTK_STD_M = 0.005, 0.005, 0.01  # north, east, up: what a receiver states of a fixed solution
+_RTK_STD_M = 0.005, 0.005, 0.01  # north, east, up: accuracy that a receiver reports for a fixed solution
 _PULSES_AT_ONCE = 16
 
 
 def write_campaign(directory: Path, specification: CampaignSpecification, generator: Generator) -> Path:
-    """Simulate a specification into a folder that is new or empty; it is written beside it and renamed when complete.
+    """Simulate a specification into a new or empty folder; the folder is renamed from a temporary one when complete.
 
     Raises
     ------
     CampaignError
-        If the folder holds something already.
+        If the folder is not empty.
     """
     with new_folder(directory) as root:
         campaign = draw_campaign(specification, generator)
@@ -62,7 +62,7 @@ def _write_config(root: Path, campaign: DrawnCampaign) -> None:
             "spacing_m": scene.spacing_m,
             "height_m": specification.origin.height_m if scene.height_m is None else scene.height_m,
             "height_datum": "ellipsoid",
-            **_stated_air(specification),
+            **_atmosphere_section(specification),
         },
         **({"bench": {**specification.bench}} if specification.bench else {}),
     }
@@ -76,8 +76,8 @@ def _write_config(root: Path, campaign: DrawnCampaign) -> None:
     np.save(root / "raw" / name, sent)
 
 
-def _stated_air(specification: CampaignSpecification) -> dict[str, Any]:
-    """Return the config's section of the air: none of the standard atmosphere, which nobody had to measure."""
+def _atmosphere_section(specification: CampaignSpecification) -> dict[str, Any]:
+    """Return the section of the config on the atmosphere; empty for the standard atmosphere, which is the default."""
     if specification.atmosphere == "standard":
         return {}
     vacuum = specification.atmosphere == "vacuum"
@@ -97,19 +97,19 @@ def _write_segments(root: Path, specification: CampaignSpecification) -> None:
 
 
 def _node_section(node: SimulatedNode) -> dict[str, Any]:
-    stated = node.path_offset_m if node.stated_path_offset_m is None else node.stated_path_offset_m
+    path_offset_m = node.path_offset_m if node.stated_path_offset_m is None else node.stated_path_offset_m
     beams = {point: {key: list(pair) for key, pair in asdict(beam).items()} for point, beam in node.antennas.items()}
     return {
         **_radio_section(node, beams),
         "lever_arms_m": {name: list(arm) for name, arm in node.lever_arms_m.items()},
-        "path_offset_m": dict(stated),
+        "path_offset_m": dict(path_offset_m),
         "attitude": node.attitude,
         **({} if node.position_std_m is None else {"position_std_m": node.position_std_m}),
     }
 
 
 def _radio_section(node: SimulatedNode, beams: Mapping[Any, Any]) -> dict[str, Any]:
-    """Return the beams of a node and, where it states its radio, that as the config has it."""
+    """Return the beams of a node and the keys of its radio, if it has one, in the format of the config."""
     radio = node.radio
     if radio is None:
         return {"antennas": dict(beams)} if beams else {}
@@ -125,28 +125,29 @@ def _radio_section(node: SimulatedNode, beams: Mapping[Any, Any]) -> dict[str, A
 
 
 def _write_flights(root: Path, campaign: DrawnCampaign, generator: Generator) -> dict[str, Any]:
-    """Fly one flight after the other; return the truth."""
+    """Simulate and write the flights one after the other; return the true values."""
     specification = campaign.specification
     origin, targets = specification.origin, specification.targets
-    ground, *streams = independent_streams(generator, 1 + 2 * len(specification.flights))
-    standing = scatterers(origin, targets, ground)
+    clutter, *streams = independent_streams(generator, 1 + 2 * len(specification.flights))
+    common_scatterers = scatterers(origin, targets, clutter)
     air = specification.air
-    known = {"refractivity_n": air.atmosphere.refractivity_n if air else 0.0, "at_m": origin.height_m}
+    true_air = {"refractivity_n": air.atmosphere.refractivity_n if air else 0.0, "at_m": origin.height_m}
     truth: dict[str, Any] = targets_truth(origin, targets, specification.scene.crs)
-    truth |= {"atmosphere": known, "flights": {}}
+    truth |= {"atmosphere": true_air, "flights": {}}
     if any(node.radio is not None for node in specification.nodes.values()):
         for target in truth["targets"]:
             target["rcs_m2"] = target["amplitude"] ** 2
-    for flight, drawing, noise in zip(specification.flights, streams[::2], streams[1::2], strict=True):
+    for flight, impairments, noise in zip(specification.flights, streams[::2], streams[1::2], strict=True):
         (root / "raw" / flight.name).mkdir()
         if flight.framing:
             np.save(root / "raw" / flight.name / "preamble.npy", flight.framing.preamble())
-        here = standing if flight.targets is None else scatterers(origin, flight.targets, ground)
-        recordings = fly(campaign, flight, here, drawing)
-        for (name, recording), own in zip(recordings.items(), independent_streams(noise, len(recordings)), strict=True):
+        present = common_scatterers if flight.targets is None else scatterers(origin, flight.targets, clutter)
+        recordings = fly(campaign, flight, present, impairments)
+        node_streams = independent_streams(noise, len(recordings))
+        for (name, recording), stream in zip(recordings.items(), node_streams, strict=True):
             stem = root / "raw" / flight.name / name
             _write_log(stem, campaign, flight)
-            _write_samples(stem, campaign, flight, recording, own)
+            _write_samples(stem, campaign, flight, recording, stream)
         truth["flights"][flight.name] = flight_truth(campaign, flight, recordings)
     return truth
 
@@ -171,9 +172,9 @@ def _write_samples(
         starts = range(0, len(kept) * waveform.capture_samples, waveform.capture_samples)
         captures = list(zip(starts, _to_us(tags[kept]), frames, strict=True))
     described: dict[str, Any] = {"core:hw": "simulated direct-RF node"}
-    if framing:  # what a trigger must know
-        known = {"preamble": f"raw/{flight.name}/preamble.npy", "centre_hz": framing.centre_hz(waveform)}
-        described["apertura:framing"] = asdict(framing) | known
+    if framing:  # parameters of the trigger
+        signal = {"preamble": f"raw/{flight.name}/preamble.npy", "centre_hz": framing.centre_hz(waveform)}
+        described["apertura:framing"] = asdict(framing) | signal
     write_recording(
         stem,
         blocks,
@@ -188,15 +189,15 @@ def _write_samples(
 def _captures(
     recording: Observation, adc: Adc, kept: NDArray[np.intp], generator: Generator, *, periodic: bool
 ) -> Iterator[NDArray[np.int16]]:
-    """Yield (sample, channel, 2) counts of a few captures at a time."""
+    """Yield the counts of captures in blocks, (sample, channel, 2)."""
     channels = recording.channels
     synthesis = periodic_samples if periodic else samples
     scales = {name: full_scale(channel, adc) for name, channel in channels.items()}
     noise = dict(zip(channels, independent_streams(generator, len(channels)), strict=True))
     for start in range(0, len(kept), _PULSES_AT_ONCE):
-        some = kept[start : start + _PULSES_AT_ONCE]
+        block = kept[start : start + _PULSES_AT_ONCE]
         counts = [
-            digitize(synthesis(channel, noise[name], some), adc, scales[name]) for name, channel in channels.items()
+            digitize(synthesis(channel, noise[name], block), adc, scales[name]) for name, channel in channels.items()
         ]
         yield np.stack(counts, axis=2).reshape(-1, len(counts), 2)
 
@@ -213,7 +214,7 @@ def _write_log(stem: Path, campaign: DrawnCampaign, flight: SimulatedFlight) -> 
     else:
         write_rtklib_pos(
             stem.with_name(f"{stem.name}.track.pos"),
-            _utc(flight, time_s).astype("datetime64[ms]"),  # as RTKLIB writes them
+            _utc(flight, time_s).astype("datetime64[ms]"),  # the resolution of RTKLIB
             geodetic,
             fix=np.full(len(time_s), FIXES["fix"]),
             std_m=np.tile(_RTK_STD_M, (len(time_s), 1)),
@@ -229,12 +230,12 @@ def _utc(flight: SimulatedFlight, time_s: NDArray[np.float64]) -> NDArray[np.dat
 
 
 def _to_us(times: NDArray[np.datetime64]) -> NDArray[np.datetime64]:
-    """Return times as recorders and flight controllers write them, to microseconds."""
+    """Return times in microseconds, the resolution of recorders and flight controllers."""
     return times.astype("datetime64[us]")
 
 
 def targets_truth(origin: Origin, targets: tuple[Target, ...], crs: str) -> dict[str, Any]:
-    """Return point targets in a projected CRS with ellipsoidal heights, and what else there is in words."""
+    """Return the true point targets in a projected CRS with ellipsoidal heights, and descriptions of other targets."""
     points = tuple(target for target in targets if isinstance(target, PointTarget))
     others = [repr(target) for target in targets if not isinstance(target, PointTarget)]
     placed = scatterers(origin, points, default_rng(0))
@@ -248,7 +249,7 @@ def targets_truth(origin: Origin, targets: tuple[Target, ...], crs: str) -> dict
 def flight_truth(
     campaign: DrawnCampaign, flight: SimulatedFlight, recordings: Mapping[str, Observation]
 ) -> dict[str, Any]:
-    """Return everything that was drawn of a flight, node by node."""
+    """Return the true values of a flight, node by node, including all random draws."""
     specification = campaign.specification
     truth: dict[str, Any] = {"pulses": flight.pulses, "kind": flight.kind, "nodes": {}}
     if flight.targets is not None:
@@ -266,8 +267,11 @@ def flight_truth(
             "blocked": np.flatnonzero(draw.blocked).tolist(),
             "position_error_m": draw.position_error_m.tolist() if draw.position_error_m.any() else 0.0,
             "channels": {
-                own: {"noise_variance": one.noise_variance, "full_scale": full_scale(one, node.impairments.adc)}
-                for own, one in recording.channels.items()
+                channel_name: {
+                    "noise_variance": channel.noise_variance,
+                    "full_scale": full_scale(channel, node.impairments.adc),
+                }
+                for channel_name, channel in recording.channels.items()
             },
             "impairments": repr(node.impairments),
         }
@@ -277,5 +281,5 @@ def flight_truth(
 
 
 def _series(values: Floats) -> list[float] | float:
-    """Return a constant as one number, anything else pulse by pulse."""
+    """Return a single number if all values are equal, else the list of values."""
     return float(values[0]) if (values == values[0]).all() else values.tolist()

@@ -1,4 +1,4 @@
-"""Beat signals of an FMCW radar over point targets, to the last term: no stop and go."""
+"""Beat signals of an FMCW radar over point targets, exact in phase and without the stop-and-go approximation."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -21,26 +21,26 @@ _LOG_MARGIN_S = 1.0
 
 @dataclass(frozen=True)
 class FmcwFlight:
-    """Nodes that fly side by side on straight lines past point targets; the first transmits, one clock sweeps them all.
+    """Flight of nodes with a common clock on parallel straight tracks past point targets; the first node transmits.
 
     Attributes
     ----------
     sweep
-        What is swept, and how it is mixed.
+        Frequency sweep, mixing and sampling.
     prf_hz, sweeps
-        Sweeps per second, and how many.
+        Sweep repetition frequency, and number of sweeps.
     began
-        Of the first sweep, UTC.
+        UTC of the first sweep.
     nodes
         Node → east, north, up at half of the flight, metres from the origin.
     speed_m_s
-        Eastward.
+        Speed, eastward.
     targets
         East, north, up, metres from the origin; amplitude 1 each.
     crs, origin
-        Projected system, and easting, northing and ellipsoidal height of the origin.
+        Projected CRS, and easting, northing and ellipsoidal height of the origin.
     half_width_m, spacing_m
-        Of the scene's grid about `middle`.
+        Half width and pixel spacing of the scene about `middle`.
     middle
         East and north of the middle of the scene, metres from the origin.
     """
@@ -60,46 +60,47 @@ class FmcwFlight:
 
     @property
     def start_s(self) -> Floats:
-        """When sweeps begin, (sweep,) seconds from `began`."""
+        """Start of each sweep, (sweep,) seconds from `began`."""
         return np.arange(self.sweeps) / self.prf_hz
 
     def place(self, point: Place) -> Floats:
-        """Return a point as ECEF, (3,) float64 metres."""
+        """Return the ECEF position of a point, (3,) float64, metres."""
         east, north, up = np.add(self.origin, point)
-        at: Floats = ecef_from_projected(self.crs, np.array(east), np.array(north), np.array(up))
-        return at
+        position_m: Floats = ecef_from_projected(self.crs, np.array(east), np.array(north), np.array(up))
+        return position_m
 
     def flown(self, node: str, time_s: Floats) -> Floats:
-        """Return the position of a node, ECEF, (…, 3) float64 metres: uniform motion on a straight line."""
+        """Return the ECEF position of a node in uniform straight motion, (…, 3) float64, metres."""
         east, north, up = self.nodes[node]
-        here, later = self.place((east, north, up)), self.place((east + self.speed_m_s, north, up))
-        at: Floats = here + (time_s - self.start_s.mean())[..., None] * (later - here)
-        return at
+        middle_m, after_1_s_m = self.place((east, north, up)), self.place((east + self.speed_m_s, north, up))
+        position_m: Floats = middle_m + (time_s - self.start_s.mean())[..., None] * (after_1_s_m - middle_m)
+        return position_m
 
     def beats(self, node: str) -> NDArray[np.number]:
         """Return the beat signals that a node records, (sweep, sample)."""
-        sender = next(iter(self.nodes))
+        transmitter = next(iter(self.nodes))
 
         def path_to(target: Place) -> Callable[[Floats], Floats]:
-            at = self.place(target)
-            legs = [sender, node]
-            return lambda time: sum(np.linalg.norm(self.flown(leg, time) - at, axis=-1) for leg in legs)
+            target_m = self.place(target)
+            return lambda time: sum(
+                np.linalg.norm(self.flown(end, time) - target_m, axis=-1) for end in (transmitter, node)
+            )
 
         paths = [path_to(target) for target in self.targets]
         return beat_signal(self.sweep, self.start_s, paths, [1.0] * len(paths))
 
 
 def write_fmcw_campaign(root: Path, flight: FmcwFlight, *, waveform: Mapping[str, Any]) -> Path:
-    """Write a campaign folder of beat signals as .npy, and return it.
+    """Write a campaign folder with beat signals in .npy files; return the folder.
 
     Parameters
     ----------
     root
-        Where; it must not be there.
+        Folder of the campaign; it must not exist.
     flight
-        What is flown and swept.
+        Flight and sweep.
     waveform
-        Keys of section waveform instead of those that fit.
+        Keys of the section `waveform` that replace the correct ones.
     """
     import yaml
 
@@ -119,7 +120,7 @@ def write_fmcw_campaign(root: Path, flight: FmcwFlight, *, waveform: Mapping[str
 
 
 def _config(flight: FmcwFlight, waveform: Mapping[str, Any]) -> dict[str, Any]:
-    east, north = (one + other for one, other in zip(flight.origin, flight.middle, strict=False))
+    east, north = (origin + offset for origin, offset in zip(flight.origin, flight.middle, strict=False))
     half = flight.half_width_m
     return {
         "campaign": "fmcw",
@@ -131,7 +132,7 @@ def _config(flight: FmcwFlight, waveform: Mapping[str, Any]) -> dict[str, Any]:
             "spacing_m": flight.spacing_m,
             "height_m": flight.origin[2],
             "height_datum": "ellipsoid",
-            "atmosphere": {"refractivity_n": 0.0},  # as `beats` flies
+            "atmosphere": {"refractivity_n": 0.0},  # `beats` assumes vacuum
         },
     }
 
@@ -149,27 +150,27 @@ def _write_log(path: Path, flight: FmcwFlight, node: str, epoch_s: Floats) -> No
 def beat_signal(
     sweep: FrequencySweep, start_s: Floats, paths: Sequence[Callable[[Floats], Floats]], amplitudes: Sequence[float]
 ) -> NDArray[np.number]:
-    """Return the beat signal of some echoes, sample by sample.
+    """Compute the beat signal of echoes, sample by sample.
 
     Parameters
     ----------
     sweep
-        What is swept, and how it is mixed.
+        Frequency sweep, mixing and sampling.
     start_s
-        (pulse,) float64, when each sweep begins, seconds.
+        (pulse,) float64, start of each sweep, seconds.
     paths
-        Per target: seconds, of any shape → total path of its echo that arrives then, metres.
+        Per target: function of the time of reception (s, any shape) that gives the total path of its echo, metres.
     amplitudes
-        Per target.
+        Amplitude of each target.
 
     Returns
     -------
     ndarray
-        (pulse, sample), float64 or complex128 as `sweep.iq` says; an echo begins with its delay.
+        (pulse, sample), float64 or complex128 according to `sweep.iq`; an echo starts at its delay.
 
     Notes
     -----
-    Source: docs/theory/fmcw.md, eq. 1, from the phases of sent and received sweep, not from their expansion.
+    Source: docs/theory/fmcw.md, eq. 1, evaluated with the exact phases of the transmitted and the received sweep.
 
     Examples
     --------
@@ -179,17 +180,17 @@ def beat_signal(
     (1, 500)
     """
     elapsed = np.arange(sweep.sweep_samples) / sweep.sample_rate_hz
-    at = np.asarray(start_s)[:, None] + elapsed
+    time_s = np.asarray(start_s)[:, None] + elapsed
     reference = _phase(sweep, elapsed - sweep.reference_delay_s)
-    total = np.zeros(at.shape, np.complex128)
+    total = np.zeros(time_s.shape, np.complex128)
     for path, amplitude in zip(paths, amplitudes, strict=True):
-        own = elapsed - path(at) / SPEED_OF_LIGHT_M_S
-        total += np.where(own >= 0, amplitude * np.exp(1j * (_phase(sweep, own) - reference)), 0)
+        emission_s = elapsed - path(time_s) / SPEED_OF_LIGHT_M_S  # after the start of the sweep
+        total += np.where(emission_s >= 0, amplitude * np.exp(1j * (_phase(sweep, emission_s) - reference)), 0)
     if sweep.iq == "real":
         return total.real
     return total.conj() if sweep.iq == "conjugate" else total
 
 
 def _phase(sweep: FrequencySweep, time_s: Floats) -> Floats:
-    """Return the phase of the sweep, radians, a time after it began."""
+    """Return the phase of the sweep at a time after its start, radians."""
     return 2 * np.pi * (sweep.start_hz * time_s + sweep.slope_hz_s * time_s**2 / 2)

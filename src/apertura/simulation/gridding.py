@@ -1,8 +1,8 @@
-"""The gridded sum over thousands of scatterers: each echo over a few samples of range, one transform per pulse.
+"""Gridded sum over thousands of scatterers: echoes spread over range samples, and one FFT per pulse.
 
-H_n = Σ_j a_j·exp(-j2πf_n ρ_j/c) at equally spaced f_n is a Fourier sum at uneven delays: with the carrier of band
-centre left on each echo, its delay is spread over `_TAPS` of the samples of a range twice as long as the subcarriers
-ask for, and the spectrum is divided by that of the spread. Right to 3e-6.
+H_n = Σ_j a_j·exp(-j2πf_n ρ_j/c) at equally spaced f_n is a Fourier sum at non-uniform delays, evaluated as a
+non-uniform FFT. Each echo, with the carrier phase at band centre, is spread over `_TAPS` samples of a range profile
+with an oversampling of 2, and the spectrum is divided by that of the spreading function. Relative error 3e-6.
 """
 
 import numba
@@ -15,9 +15,9 @@ from apertura.core.windowed_sinc import kaiser_window
 
 _TAPS = 8
 _OVERSAMPLING = 2
-_BETA = np.pi * np.sqrt((_TAPS * (1 - 0.5 / _OVERSAMPLING)) ** 2 - 0.8)  # Beatty's choice
-_ENTRIES = 2048  # of the spread, between two samples
-_TURNS = 4096  # of a table of phasors
+_BETA = np.pi * np.sqrt((_TAPS * (1 - 0.5 / _OVERSAMPLING)) ** 2 - 0.8)  # Beatty et al. (2005)
+_ENTRIES = 2048  # table entries of the spreading function between two samples
+_TURNS = 4096  # table entries of phasors in one cycle
 
 
 def gridded_sum(
@@ -28,16 +28,16 @@ def gridded_sum(
     *,
     spreading: bool,
 ) -> NDArray[np.complex128]:
-    """Return (pulse, subcarrier) complex128, as `apertura.simulation.scatterers.transfer` defines it.
+    """Return the transfer functions of scatterers, (pulse, subcarrier) complex128; see `scatterers.transfer`.
 
     Parameters
     ----------
     points
         Positions (scatterer, 3) float64, metres, and amplitudes (scatterer,) complex128.
     legs
-        Transmitter and receiver, (pulse, 3) float64, metres.
+        Positions of transmitter and receiver, (pulse, 3) float64, metres.
     frequency_hz, longer_m, spreading
-        As of `transfer`.
+        As for `transfer`.
     """
     count = len(frequency_hz)
     middle, length = count // 2, _OVERSAMPLING * count
@@ -53,45 +53,45 @@ def gridded_sum(
 
 
 def _spread_table() -> Floats:
-    """Return (entry, tap): weights of the samples 1-_TAPS/2 … _TAPS/2 from an echo that lies entry/_ENTRIES after 0."""
-    at = np.arange(1 - _TAPS // 2, _TAPS // 2 + 1) - np.arange(_ENTRIES + 1)[:, None] / _ENTRIES
-    return np.asarray(kaiser_window(at / (_TAPS / 2), _BETA))
+    """Return the weights of samples 1-_TAPS/2 … _TAPS/2 for an echo at position entry/_ENTRIES, (entry, tap)."""
+    distance = np.arange(1 - _TAPS // 2, _TAPS // 2 + 1) - np.arange(_ENTRIES + 1)[:, None] / _ENTRIES
+    return np.asarray(kaiser_window(distance / (_TAPS / 2), _BETA))
 
 
 def _response(count: int) -> Floats:
-    """Return (subcarrier,): the Fourier transform of the spread at each subcarrier's distance from band centre."""
+    """Return the Fourier transform of the spreading function at each subcarrier, (subcarrier,)."""
     nodes, weights = np.polynomial.legendre.leggauss(64)
-    turns = (np.arange(count) - count // 2) / (_OVERSAMPLING * count) * _TAPS / 2
-    return np.asarray(np.cos(2 * np.pi * np.outer(turns, nodes)) @ (weights * _TAPS / 2 * kaiser_window(nodes, _BETA)))
+    cycles = (np.arange(count) - count // 2) / (_OVERSAMPLING * count) * _TAPS / 2
+    return np.asarray(np.cos(2 * np.pi * np.outer(cycles, nodes)) @ (weights * _TAPS / 2 * kaiser_window(nodes, _BETA)))
 
 
 @numba.njit(cache=True, fastmath=True)
 def _add(ranges, points, paths, per_m, tables, spreading):  # type: ignore[no-untyped-def]
-    """Add the echoes of all scatterers to the ranges (pulse, sample), of which the last taps are the first again."""
+    """Add the echoes of all scatterers to the range profiles (pulse, sample), whose last taps wrap to the first."""
     positions, amplitude = points
     tx, rx, longer = paths
-    samples_per_m, turns_per_m = per_m
+    samples_per_m, cycles_per_m = per_m
     spread, phasors = tables
     taps, entries, fine = spread.shape[1], spread.shape[0] - 1, len(phasors)
     length = ranges.shape[1] - taps
     for pulse in range(len(tx)):
-        for one in range(len(positions)):
-            there, back = 0.0, 0.0
+        for scatterer in range(len(positions)):
+            tx_range, rx_range = 0.0, 0.0
             for axis in range(3):
-                there += (positions[one, axis] - tx[pulse, axis]) ** 2
-                back += (positions[one, axis] - rx[pulse, axis]) ** 2
-            there, back = np.sqrt(there), np.sqrt(back)
-            path = there + back + longer[pulse]
-            turns = path * turns_per_m
-            turns = (turns - np.floor(turns)) * fine
-            nearest = int(turns)
-            small = -2 * np.pi * (turns - nearest) / fine
+                tx_range += (positions[scatterer, axis] - tx[pulse, axis]) ** 2
+                rx_range += (positions[scatterer, axis] - rx[pulse, axis]) ** 2
+            tx_range, rx_range = np.sqrt(tx_range), np.sqrt(rx_range)
+            path = tx_range + rx_range + longer[pulse]
+            phase = path * cycles_per_m
+            phase = (phase - np.floor(phase)) * fine
+            nearest = int(phase)
+            small = -2 * np.pi * (phase - nearest) / fine
             # the phasor of the remainder, less than 1.6 mrad, to the third order
             echo = phasors[nearest] * complex(1 - small * small / 2, small - small**3 / 6)
-            echo *= amplitude[one] / (there * back) if spreading else amplitude[one]
-            place = path * samples_per_m
-            sample = int(np.floor(place))
-            between = (place - sample) * entries
+            echo *= amplitude[scatterer] / (tx_range * rx_range) if spreading else amplitude[scatterer]
+            position = path * samples_per_m
+            sample = int(np.floor(position))
+            between = (position - sample) * entries
             entry = int(between)
             above = between - entry
             first = (sample + 1 - taps // 2) % length

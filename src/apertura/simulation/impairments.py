@@ -1,7 +1,6 @@
-"""Impairments of a node, and their draws in one flight.
+"""Impairments of a node, and their random draws in a flight.
 
-Every random impairment has its own stream of random numbers, so that switching one on leaves the others as
-they were.
+Each random impairment has its own stream of random numbers, so that enabling one does not change the others.
 """
 
 from dataclasses import dataclass as plain_dataclass
@@ -16,7 +15,7 @@ from pydantic.dataclasses import dataclass
 from apertura.common.arrays import Floats
 
 STRICT_KEYS = ConfigDict(extra="forbid", allow_inf_nan=False)
-"""Of everything that a specification may hold: unknown keys are errors."""
+"""Pydantic configuration of all parts of a specification: unknown keys are errors."""
 RadarPoint = Literal["radar_tx", "radar_rx"]
 AntennaPoint = Literal["radar_tx", "radar_rx", "sidelink"]
 ChannelName = Literal["radar", "sidelink"]
@@ -24,21 +23,21 @@ ChannelName = Literal["radar", "sidelink"]
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Clock:
-    """The receiver's clock against the transmitter's; docs/theory/simulate.md, eq. 3.
+    """Clock offset of the receiver from the transmitter; docs/theory/simulate.md, eq. 3.
 
-    The received signal turns by −cfo_hz at baseband and is sampled sfo_hz too often.
+    The received signal is shifted by −cfo_hz at baseband, and the sampling rate is too high by sfo_hz.
     """
 
-    cfo_hz: float = Field(default=0.0, description="local oscillator less its nominal frequency, Hz")
-    sfo_hz: float = Field(default=0.0, description="sampling rate less its nominal value, Hz")
+    cfo_hz: float = Field(default=0.0, description="local oscillator minus its nominal frequency, Hz")
+    sfo_hz: float = Field(default=0.0, description="sampling rate minus its nominal value, Hz")
     continuous_phase: bool = Field(
         default=False,
-        description="the oscillator runs on from pulse to pulse (-2π·cfo·t) instead of restarting at each trigger",
+        description="the oscillator runs continuously (-2π·cfo·t) instead of restarting at each trigger",
     )
 
     @classmethod
     def of_ppm(cls, ppm: float, *, carrier_hz: float, sample_rate_hz: float) -> "Clock":
-        """Return one clock that feeds both, fast by `ppm`.
+        """Return the offset of a clock that drives both oscillator and converter and is fast by `ppm`.
 
         Examples
         --------
@@ -50,71 +49,73 @@ class Clock:
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class UniformPhase:
-    """Carrier phase per pulse, uniform in ± a width."""
+    """Uniformly distributed carrier phase per pulse."""
 
-    half_width_rad: float = Field(default=np.pi, ge=0, description="half width, rad; π: unknown altogether")
+    half_width_rad: float = Field(default=np.pi, ge=0, description="half width, rad; π: completely random")
     kind: Literal["uniform"] = Field(default="uniform", kw_only=True, repr=False)
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class PhaseWalk:
-    """Carrier phase as a random walk: free-running oscillators."""
+    """Random walk of the carrier phase, as of free-running oscillators."""
 
-    rad_per_root_s: float = Field(ge=0, description="root of the variance's growth in rad²/s")
+    rad_per_root_s: float = Field(ge=0, description="square root of the variance growth in rad²/s")
     kind: Literal["walk"] = Field(default="walk", kw_only=True, repr=False)
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Timing:
-    """Start of the capture less start of the pulse."""
+    """Timing error: start of the capture minus start of the pulse."""
 
-    offset_s: float = Field(default=0.0, description="constant, s")
-    half_width_s: float = Field(default=0.0, ge=0, description="uniform in ± this per pulse, s")
-    jitter_samples: float = Field(default=0.0, ge=0, description="standard deviation of whole samples of trigger delay")
+    offset_s: float = Field(default=0.0, description="constant part, s")
+    half_width_s: float = Field(default=0.0, ge=0, description="half width of a uniform part per pulse, s")
+    jitter_samples: float = Field(
+        default=0.0, ge=0, description="standard deviation of the trigger delay, rounded to whole samples"
+    )
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class TimeTag:
     """Error of the node's UTC tags."""
 
-    offset_s: float = Field(default=0.0, description="constant, s")
-    drift_ppm: float = Field(default=0.0, description="growing, microseconds per second")
+    offset_s: float = Field(default=0.0, description="constant part, s")
+    drift_ppm: float = Field(default=0.0, description="drift, microseconds per second")
     jitter_s: float = Field(default=0.0, ge=0, description="standard deviation per pulse, s")
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Reflection:
-    """An extra sidelink path."""
+    """Reflection in the sidelink."""
 
-    excess_m: float = Field(description="length beyond the direct path, m")
+    excess_m: float = Field(description="path length in excess of the direct path, m")
     amplitude: complex = Field(description="relative to the direct path")
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Blockage:
-    """Sidelink shadowed in bursts.
+    """Shadowing of the sidelink in bursts.
 
     Notes
     -----
-    Source: E. N. Gilbert, "Capacity of a burst-noise channel", Bell Syst. Tech. J. 39 (1960): two-state chain.
+    Source: E. N. Gilbert, "Capacity of a burst-noise channel", Bell Syst. Tech. J. 39 (1960): two-state Markov chain.
     """
 
-    fraction: float = Field(ge=0, lt=1, description="share of the pulses")
+    fraction: float = Field(ge=0, lt=1, description="share of shadowed pulses")
     mean_pulses: float = Field(default=10.0, ge=1, description="mean length of a burst, pulses")
     attenuation_db: float = Field(default=60.0, ge=0, description="loss while shadowed, dB")
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Leakage:
-    """Direct coupling of the radar antennas."""
+    """Direct coupling between the radar antennas."""
 
-    level_db: float = Field(description="against the RMS echo spectrum, dB")
-    path_m: float = Field(default=0.0, description="electrical path beyond the antennas' distance, m")
+    level_db: float = Field(description="level relative to the RMS echo spectrum, dB")
+    path_m: float = Field(default=0.0, description="electrical path in excess of the antennas' distance, m")
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Ripple:
-    """An internal reflection: response 1 + ρ·exp(-j2πf·delay).
+    """Ripple by an internal reflection: response 1 + ρ·exp(-j2πf·delay).
 
     Examples
     --------
@@ -124,11 +125,11 @@ class Ripple:
     1.0
     """
 
-    peak_to_peak_db: float = Field(description="across the band, dB")
-    delay_s: float = Field(description="of the reflection, s")
+    peak_to_peak_db: float = Field(description="peak-to-peak ripple across the band, dB")
+    delay_s: float = Field(description="delay of the reflection, s")
 
     def response(self, frequency_hz: Floats) -> NDArray[np.complex128]:
-        """Return (subcarrier,) complex128 at RF frequencies (subcarrier,) float64."""
+        """Return the frequency response at RF frequencies, (subcarrier,) complex128."""
         ratio = 10 ** (self.peak_to_peak_db / 20)
         reflected = (ratio - 1) / (ratio + 1)
         return np.asarray(1 + reflected * np.exp(-2j * np.pi * frequency_hz * self.delay_s))
@@ -136,52 +137,54 @@ class Ripple:
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Adc:
-    """The converter."""
+    """Analogue-to-digital converter."""
 
     bits: int = Field(default=14, ge=1, le=16, description="bits of I and of Q")
-    backoff_db: float = Field(default=14.0, description="how far under full scale the RMS of I and of Q lies, dB")
+    backoff_db: float = Field(default=14.0, description="full scale relative to the RMS of I and of Q, dB")
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Radio:
     """Power, gains and receiver of a node in physical units; docs/theory/simulate.md, "Radio"."""
 
-    transmit_power_dbm: float = Field(description="mean power while it sends, at the antenna's port, dBm")
-    transmit_gain_dbi: float = Field(description="of its transmitting radar antenna on boresight, dBi")
-    receive_gain_dbi: float = Field(description="of its receiving radar antenna on boresight, dBi")
+    transmit_power_dbm: float = Field(description="mean power during transmission at the antenna port, dBm")
+    transmit_gain_dbi: float = Field(description="boresight gain of the transmitting radar antenna, dBi")
+    receive_gain_dbi: float = Field(description="boresight gain of the receiving radar antenna, dBi")
     full_scale_dbm: float = Field(description="power at the converter of a complex sine at full scale, dBm")
-    gain_db: float = Field(description="from the receiving antenna's port to the converter, dB")
-    noise_figure_db: float | None = Field(default=None, ge=0, description="of the receiver, dB; null: no noise")
+    gain_db: float = Field(description="gain from the port of the receiving antenna to the converter, dB")
+    noise_figure_db: float | None = Field(
+        default=None, ge=0, description="noise figure of the receiver, dB; null: no noise"
+    )
     amplitude_std_db: float | None = Field(
-        default=None, ge=0, description="what the config says of the error of all of these, dB; null: nothing"
+        default=None, ge=0, description="configured standard deviation of all of these, dB; null: not configured"
     )
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Localization:
-    """Logged position less true position: white noise after a moving average."""
+    """Localization error, logged minus true position: white noise after a moving average."""
 
     sigma_m: float = Field(ge=0, description="standard deviation per axis after the moving average, m")
     window_s: float = Field(default=1.0, gt=0, description="length of the moving average, s")
     points: tuple[AntennaPoint, ...] = Field(
-        default=("radar_tx", "radar_rx", "sidelink"), description="antennas that are elsewhere than the log says"
+        default=("radar_tx", "radar_rx", "sidelink"), description="antennas whose positions have this error"
     )
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Impairments:
-    """Everything that is wrong with one node; the default is a perfect one with a 14-bit converter.
+    """Impairments of a node; by default none, with a 14-bit converter.
 
-    SNR is per subcarrier: mean power of the unimpaired echoes (or of the direct path at gain 1) over pulses
-    and subcarriers, against the noise of one DFT bin. What else reaches the channel does not change the noise.
+    SNR is per subcarrier: mean power of the unimpaired echoes (or of the direct path at gain 1) over pulses and
+    subcarriers, relative to the noise of one DFT bin. Other signals in the channel do not change the noise.
     """
 
     clock: Clock = Field(default=Clock(), description="clock offset")
     carrier_phase: Annotated[UniformPhase | PhaseWalk, Field(discriminator="kind")] | None = Field(
         default=None, description="carrier phase per pulse: uniform or walk; null: coherent"
     )
-    timing: Timing = Field(default=Timing(), description="start of each capture")
-    missed_fraction: float = Field(default=0.0, ge=0, lt=1, description="share of the pulses without trigger")
+    timing: Timing = Field(default=Timing(), description="error of the start of each capture")
+    missed_fraction: float = Field(default=0.0, ge=0, lt=1, description="share of the pulses without a capture")
     time_tag: TimeTag = Field(default=TimeTag(), description="error of the UTC tags")
     radar_snr_db: float | None = Field(default=None, description="SNR of the radar channel, dB; null: no noise")
     sidelink_snr_db: float | None = Field(default=None, description="SNR of the sidelink, dB; null: no noise")
@@ -189,9 +192,9 @@ class Impairments:
     sidelink_multipath: tuple[Reflection, ...] = Field(default=(), description="reflections of the sidelink")
     sidelink_blockage: Blockage | None = Field(default=None, description="shadowing of the sidelink")
     leakage: Leakage | None = Field(default=None, description="direct coupling into the radar channel")
-    transmit_ripple: Ripple | None = Field(default=None, description="of the transmitter")
-    radar_ripple: Ripple | None = Field(default=None, description="of the radar receiver")
-    sidelink_ripple: Ripple | None = Field(default=None, description="of the sidelink receiver")
+    transmit_ripple: Ripple | None = Field(default=None, description="ripple of the transmitter")
+    radar_ripple: Ripple | None = Field(default=None, description="ripple of the radar receiver")
+    sidelink_ripple: Ripple | None = Field(default=None, description="ripple of the sidelink receiver")
     adc: Adc = Field(default=Adc(), description="converter")
     localization: Localization | None = Field(default=None, description="error of the logged positions")
     doppler: bool = Field(default=False, description="motion within the pulse; off: stop and go")
@@ -204,13 +207,13 @@ class ImpairmentDraw:
     Attributes
     ----------
     kept
-        (pulse,) bool, the recorder fired.
+        (pulse,) bool, True if the recorder was triggered.
     phase_rad, start_s, tag_error_s
-        (pulse,) float64: carrier phase, start of capture less start of pulse, time tag less truth.
+        (pulse,) float64: carrier phase, start of capture minus start of pulse, time tag minus true time.
     blocked
-        (pulse,) bool, sidelink shadowed.
+        (pulse,) bool, True if the sidelink is shadowed.
     position_error_m
-        (pulse, 3) float64, logged less true position, ECEF.
+        (pulse, 3) float64, logged minus true position, ECEF.
     """
 
     kept: NDArray[np.bool_]
@@ -224,12 +227,12 @@ class ImpairmentDraw:
 def draw_impairments(
     impairments: Impairments, time_s: Floats, sample_rate_hz: float, generator: Generator
 ) -> ImpairmentDraw:
-    """Draw what is random about a node at (pulse,) times; the generator advances by as much whatever is on.
+    """Draw the random impairments of a node at (pulse,) times; the generator advances equally for any impairments.
 
     Examples
     --------
-    >>> wrong = Impairments(carrier_phase=UniformPhase())
-    >>> drawn = draw_impairments(wrong, np.arange(5.0), 1e9, np.random.default_rng(1))
+    >>> impairments = Impairments(carrier_phase=UniformPhase())
+    >>> drawn = draw_impairments(impairments, np.arange(5.0), 1e9, np.random.default_rng(1))
     >>> drawn.phase_rad.round(2), drawn.start_s
     (array([...]), array([0., 0., 0., 0., 0.]))
     """
@@ -248,7 +251,7 @@ def draw_impairments(
 
 
 def independent_streams(generator: Generator, count: int) -> list[Generator]:
-    """Return `count` generators that depend on nothing but the state of `generator`, which moves on."""
+    """Return `count` generators that depend only on the state of `generator`, which is advanced."""
     root = SeedSequence([int(word) for word in generator.integers(0, 2**32, 4)])
     return [default_rng(seed) for seed in root.spawn(count)]
 
@@ -268,8 +271,8 @@ def _phases(impairments: Impairments, time_s: Floats, generator: Generator) -> F
 
 def _starts(timing: Timing, pulses: int, sample_rate_hz: float, generator: Generator) -> Floats:
     uniform = generator.uniform(-1.0, 1.0, pulses) * timing.half_width_s
-    late = np.rint(generator.standard_normal(pulses) * timing.jitter_samples) / sample_rate_hz
-    return np.asarray(timing.offset_s + uniform + late)
+    jitter = np.rint(generator.standard_normal(pulses) * timing.jitter_samples) / sample_rate_hz
+    return np.asarray(timing.offset_s + uniform + jitter)
 
 
 def _bursts(blockage: Blockage | None, pulses: int, generator: Generator) -> NDArray[np.bool_]:
@@ -279,9 +282,9 @@ def _bursts(blockage: Blockage | None, pulses: int, generator: Generator) -> NDA
     leave = 1 / blockage.mean_pulses
     enter = leave * blockage.fraction / (1 - blockage.fraction)
     state = False
-    for pulse, chance in enumerate(generator.random(pulses)):
-        limit = blockage.fraction if pulse == 0 else (1 - leave if state else enter)
-        state = bool(chance < limit)
+    for pulse, draw in enumerate(generator.random(pulses)):
+        probability = blockage.fraction if pulse == 0 else (1 - leave if state else enter)
+        state = bool(draw < probability)
         blocked[pulse] = state
     return blocked
 

@@ -1,4 +1,4 @@
-"""Observations of nodes as channels without samples yet: of a drawn flight, or of one pair of nodes given as arrays."""
+"""Observations of nodes, as channels before sampling: of a drawn flight, or of a pair of nodes given as arrays."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -20,7 +20,7 @@ from apertura.simulation.impairments import (
 )
 from apertura.simulation.specification import DrawnCampaign, SimulatedFlight
 from apertura.simulation.synthesis import Channel, Geometry, receive
-from apertura.simulation.targets import Scatterers, body_turn, logged_velocity, phase_centre
+from apertura.simulation.targets import Scatterers, body_rotation, logged_velocity, phase_centre
 from apertura.simulation.waveform import TransmitWaveform
 
 _Node = tuple[Impairments, ImpairmentDraw]
@@ -28,14 +28,15 @@ _Node = tuple[Impairments, ImpairmentDraw]
 
 @dataclass(frozen=True)
 class Observation:
-    """A node's channels in one flight, what was drawn of its impairments, and where the antennas truly were.
+    """Channels of a node in a flight, with its drawn impairments and the true antenna positions.
 
     Attributes
     ----------
     channels
-        `radar` and, of a node without the transmitter's clock, `sidelink`: for `samples` or `transfer_functions`.
+        `radar` and, for a node without the transmitter's clock, `sidelink`: input of `samples` or
+        `transfer_functions`.
     noise
-        A generator per channel, for their noise; only where arrays were given.
+        Noise generator of each channel; only for nodes given as arrays.
     """
 
     channels: Mapping[str, Channel]
@@ -47,7 +48,7 @@ class Observation:
 def fly(
     campaign: DrawnCampaign, flight: SimulatedFlight, scatterers: Scatterers, generator: Generator
 ) -> dict[str, Observation]:
-    """Observe scatterers in ECEF by each node of a flight; what is random of each has its own stream."""
+    """Simulate the observation of scatterers in ECEF by each node of a flight; each node has its own random stream."""
     nodes, time_s = campaign.specification.nodes, campaign.pulse_times(flight)
     sender, draws = flight.transmitter, {}
     for name, stream in zip(flight.tracks, independent_streams(generator, len(flight.tracks)), strict=True):
@@ -76,12 +77,12 @@ def fly(
 
 
 def physical(channel: Channel, *, transmitter: Radio, receiver: Radio) -> Channel:
-    """Return a radar channel in root watts at the converter, with the receiver's thermal noise and full scale.
+    """Convert a radar channel to root watts at the converter, with the receiver's thermal noise and full scale.
 
     Parameters
     ----------
     channel
-        Whose amplitudes are roots of cross-sections in m² over R_tx·R_rx.
+        Channel whose amplitudes are square roots of cross-sections in m² over R_tx·R_rx.
     transmitter, receiver
         Radios of both nodes.
 
@@ -104,7 +105,7 @@ def physical(channel: Channel, *, transmitter: Radio, receiver: Radio) -> Channe
 
 
 def _possible(impairments: Impairments, flight: SimulatedFlight) -> Impairments:
-    """Leave out what a recorder that runs through cannot suffer: missed triggers, and phase counted per trigger."""
+    """Remove impairments that do not apply to a continuous recorder: missed triggers, and a phase per trigger."""
     if not flight.continuous:
         return impairments
     return replace(impairments, missed_fraction=0.0, clock=replace(impairments.clock, continuous_phase=False))
@@ -135,7 +136,7 @@ def _logged(campaign: DrawnCampaign, flight: SimulatedFlight, receiver: str) -> 
 def _gain(
     campaign: DrawnCampaign, flight: SimulatedFlight, receiver: str, geometry: Geometry, scatterers: Scatterers
 ) -> Floats:
-    """Return (pulse, point) float64: the field of both radar antennas, relative to their boresights."""
+    """Return the two-way field of the radar antennas relative to their boresights, (pulse, point) float64."""
     gain = np.ones((1, 1))
     ends: tuple[tuple[str, RadarPoint, Floats], ...] = (
         (flight.transmitter, "radar_tx", geometry.radar_tx),
@@ -145,8 +146,8 @@ def _gain(
         beam = campaign.specification.nodes[name].antennas.get(point)
         if beam is not None:
             path, time_s = campaign.trajectories[flight.name, name], campaign.pulse_times(flight)
-            turn = body_turn(campaign.specification.origin, path, time_s)
-            gain = gain * beam.gain(turn, antenna_m, scatterers.position_m)
+            rotation = body_rotation(campaign.specification.origin, path, time_s)
+            gain = gain * beam.gain(rotation, antenna_m, scatterers.position_m)
     return gain
 
 
@@ -160,18 +161,18 @@ def observe(
     transmitter: Impairments | None = None,
     sidelink: bool = True,
 ) -> Observation:
-    """Observe a scene by a receiver, with its impairments drawn.
+    """Simulate the observation of a scene by a receiver, with random impairments.
 
     Parameters
     ----------
     waveform
-        What is transmitted; its repetition frequency gives the times.
+        Transmitted waveform; its repetition frequency determines the pulse times.
     scatterers, logged
-        The scene, and where the logs say the antennas are, in one frame; localization errors move the true ones.
+        The scene and the logged antenna positions, in one frame; localization errors displace the true positions.
     receiver, transmitter
-        What is wrong with each node. No transmitter: it is the receiver, with one position error.
+        Impairments of each node. If `transmitter` is None, the receiver transmits, with a common position error.
     sidelink
-        Whether the second channel is recorded.
+        True if the second channel is recorded.
 
     Examples
     --------
@@ -196,16 +197,16 @@ def observe(
 
 
 def _true(logged: Geometry, sender: _Node, receiver: _Node) -> Geometry:
-    """Return the true positions of the antennas: those of the logs, less the localization error of each node."""
+    """Return the true antenna positions: the logged ones minus the localization error of each node."""
 
-    def moved(logged_m: Floats, point: AntennaPoint, node: _Node) -> Floats:
-        wrong, error_m = node[0].localization, node[1].position_error_m
-        return logged_m - error_m if wrong and point in wrong.points else logged_m
+    def true(logged_m: Floats, point: AntennaPoint, node: _Node) -> Floats:
+        localization, error_m = node[0].localization, node[1].position_error_m
+        return logged_m - error_m if localization and point in localization.points else logged_m
 
     return replace(
         logged,
-        radar_tx=moved(logged.radar_tx, "radar_tx", sender),
-        radar_rx=moved(logged.radar_rx, "radar_rx", receiver),
-        sidelink_tx=moved(logged.sidelink_tx, "sidelink", sender),
-        sidelink_rx=moved(logged.sidelink_rx, "sidelink", receiver),
+        radar_tx=true(logged.radar_tx, "radar_tx", sender),
+        radar_rx=true(logged.radar_rx, "radar_rx", receiver),
+        sidelink_tx=true(logged.sidelink_tx, "sidelink", sender),
+        sidelink_rx=true(logged.sidelink_rx, "sidelink", receiver),
     )

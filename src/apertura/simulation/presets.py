@@ -1,7 +1,7 @@
-"""Simulations to start from, each a specification: the demo, the paper's scene and its three experiments.
+"""Presets of simulations: the demo, the scene of the reference paper and its three experiments.
 
-A docstring of an experiment says what the paper prints of it and what it does not: what is not printed is chosen here,
-plainly, and not so that a result of the paper comes out; docs/theory/study.md, "Experiments".
+The docstring of an experiment lists the parameters published in the paper, and the assumptions made for unpublished
+ones. Assumptions are not tuned to reproduce results of the paper; docs/theory/study.md, "Experiments".
 """
 
 from collections.abc import Callable, Mapping
@@ -31,55 +31,56 @@ EXPERIMENT_ORIGIN = Origin(48.42255, 9.95509, 620.0)
 _UTM = "EPSG:32632"
 STATIC_PULSES = 200
 RADAR_CABLE_M, SIDELINK_CABLE_M = 10.0, 5.0
-"""Of the lab's two paths, taken as electrical lengths."""
+"""Metres, electrical lengths of the radar path and the sidelink in the laboratory experiment."""
 
 COHERENT_SNR_DB = {"cables": 18.5, "first cylinder": 40.0, "second cylinder": 33.0}
-"""SNR per compressed pulse at which M = 200 pulses have the coherence factors that the paper prints: 0.986 of the
-cables, 0.9999 and 0.9995 of the cylinders. It prints no SNR; docs/theory/study.md, "Coherence factor"."""
+"""dB, SNR per compressed pulse at which M = 200 pulses have the published coherence factors: 0.986 for the cables,
+0.9999 and 0.9995 for the cylinders. The SNR is not published; docs/theory/study.md, "Coherence factor"."""
 
-_JOINT_M = 1e-3  # an echo needs a point: the cable ends 1 mm from its connectors, as strong as if it were none
+_JOINT_M = 1e-3  # the point target of the cable is 1 mm from its connectors, with the amplitude of a direct connection
 
 SEPARATION_M = 4.7
-"""Between the two nodes in flight."""
+"""Metres, distance between the two nodes in flight."""
 
 SEGMENT_M, GAP_M, SPEED_M_S, FLIGHT_PRF_HZ = 3.4, 2.4, 0.5, 20.0
-"""Each image's part of the track, and how far the two parts lie apart, both counted at the pair's midpoint."""
+"""Length of the track segment of each image and gap between the two segments (metres, both for the midpoint of the
+pair's antennas), speed (m/s) and pulse repetition frequency (Hz) of the flight experiment."""
 
 
 def paper_lab(*, pulses: int = STATIC_PULSES, snr_db: float = COHERENT_SNR_DB["cables"]) -> CampaignSpecification:
-    """Return the lab: nothing but coaxial cables between two nodes.
+    """Return the laboratory experiment: two nodes connected by coaxial cables.
 
     Parameters
     ----------
     pulses
-        M = 200 in the paper's coherence experiments.
+        Number of pulses; M = 200 in the paper's coherence experiments.
     snr_db
-        Of the radar channel per compressed pulse, all subcarriers weighted alike.
+        SNR of the radar channel per compressed pulse, with equal weights of all subcarriers.
 
     Notes
     -----
-    Printed, in the paper's laboratory experiment: coaxial cables, a radar path of 10 m, a sidelink of 5 m, no target; Γ
-    = 0.986 after correction. In its table of parameters: the waveform, at 100 Hz. Of its text on clocks: 10 ppb.
-    Not printed: any SNR (that of the radar channel is what Γ needs, that of the sidelink 40 dB per subcarrier),
-    start and phase of the secondary's captures (±40 ns, ±π), losses of cables and attenuators, and whether their
-    lengths are electrical (so here).
+    Published for the laboratory experiment: coaxial cables, a radar path of 10 m, a sidelink of 5 m, no target; Γ =
+    0.986 after correction. Published in the table of parameters: the waveform, at 100 Hz; in the text on clocks:
+    10 ppb. Not published: the SNR (assumed: in the radar channel that of the published Γ, in the sidelink 40 dB per
+    subcarrier), start and phase of the secondary's captures (±40 ns, ±π), losses of cables and attenuators (none), and
+    the type of the lengths (electrical).
     """
     joint = (PointTarget((0.0, 0.0, 1.0 - _JOINT_M), _JOINT_M**2),)
     cable_m = RADAR_CABLE_M - 2 * _JOINT_M
-    known: Mapping[str, float | bool] = {"radar_m": 2 * _JOINT_M, "sidelink_m": 0.0}
-    return _standing("paper-lab", joint, (0.0, 0.0, 1.0), cable_m, _per_subcarrier(snr_db), pulses, bench=known)
+    bench: Mapping[str, float | bool] = {"radar_m": 2 * _JOINT_M, "sidelink_m": 0.0}
+    return _static_pair("paper-lab", joint, (0.0, 0.0, 1.0), cable_m, _per_subcarrier(snr_db), pulses, bench=bench)
 
 
 def paper_static(*, pulses: int = STATIC_PULSES) -> CampaignSpecification:
-    """Return the chamber: two cylinders before one receiving antenna, whose signal is split to both nodes.
+    """Return the chamber experiment: two cylinders and one receiving antenna whose signal is split to both nodes.
 
     Notes
     -----
-    Printed, in the paper's static experiment: an anechoic chamber (no clutter), cylinders with a diameter of 15 cm, a
+    Published for the static experiment: an anechoic chamber (no clutter), cylinders with a diameter of 15 cm, a
     sidelink by antennas, mono- and bistatic recordings of one split receive signal; Γ = 0.9999 at the first, 0.9995
-    at the second. Not printed: where the cylinders stand (4 m and 6.5 m), their height (15 cm here; they are lines
-    without a diameter), the SNR (what each Γ needs), noise that the split signal has in common (none), the clock of
-    the secondary (the lab's). Other than printed: the sidelink is the lab's cable.
+    at the second. Not published: distances of the cylinders (assumed: 4 m and 6.5 m), their height (15 cm; lines
+    without a diameter), the SNR (that of the published Γ), common noise of the split signal (none), the clock of the
+    secondary (as in the laboratory). Different from the paper: the sidelink is the cable of the laboratory experiment.
     """
     near_m, far_m, antenna_up_m = 4.0, 6.5, 1.0
     weaker_db = COHERENT_SNR_DB["first cylinder"] - COHERENT_SNR_DB["second cylinder"]
@@ -87,10 +88,10 @@ def paper_static(*, pulses: int = STATIC_PULSES) -> CampaignSpecification:
         _cylinder(near_m - 6.0, antenna_up_m, near_m**2),
         _cylinder(far_m - 6.0, antenna_up_m, far_m**2 * 10 ** (-weaker_db / 20)),
     )
-    both_db = decibels(1 + 10 ** (-weaker_db / 10))  # of their mean power over that of the first
+    both_db = decibels(1 + 10 ** (-weaker_db / 10))  # mean power of both relative to that of the first
     snr_db = _per_subcarrier(COHERENT_SNR_DB["first cylinder"]) + both_db
-    known: Mapping[str, float | bool] = {"radar_m": 2 * near_m, "sidelink_m": 0.0, "split": True}
-    return _standing("paper-static", cylinders, (0.0, -6.0, antenna_up_m), 0.911, snr_db, pulses, bench=known)
+    bench: Mapping[str, float | bool] = {"radar_m": 2 * near_m, "sidelink_m": 0.0, "split": True}
+    return _static_pair("paper-static", cylinders, (0.0, -6.0, antenna_up_m), 0.911, snr_db, pulses, bench=bench)
 
 
 def _cylinder(north_m: float, up_m: float, amplitude: float) -> Line:
@@ -98,29 +99,28 @@ def _cylinder(north_m: float, up_m: float, amplitude: float) -> Line:
 
 
 def _per_subcarrier(compressed_db: float) -> float:
-    """Return the SNR per subcarrier (dB) of that per compressed pulse, whose subcarriers add up in phase."""
+    """Convert an SNR per compressed pulse, whose subcarriers add in phase, to an SNR per subcarrier, dB."""
     return compressed_db - decibels(PAPER_WAVEFORM.subcarriers)
 
 
 def paper_uav(*, pulses: int = 275) -> CampaignSpecification:
-    """Return the flight: a segment for each image, past 12 m × 4 m of ground with an extended target.
+    """Return the flight experiment: an extended target in a scene of 12 m × 4 m, one track segment per image.
 
-    The monostatic pair takes the first 3.4 m of the track, the bistatic pair the last; 275 pulses make 53 MB.
+    The monostatic pair uses the first 3.4 m of the track, the bistatic pair the last; 275 pulses occupy 53 MB.
 
     Notes
     -----
-    Printed, in the paper's table of the flight: 20 Hz, 0.5 m/s, height 4.5 to 5 m (4.8 m here), ground range 11.5 m, L
-    = 3.4 m, 4.7 m between the UAVs, one behind the other; of its images: 12 m × 4 m (12 m along the track here), an
-    extended target, a power generator. Not printed: its size (rough, 1.2 m × 1.2 m, here), what else stands there
-    (four points, to measure widths and phases at), the clutter (17 dB under a point per m²), any SNR (0 dB per
-    subcarrier, 30 dB in the sidelink), lever arms, wobble, and which parts of the track image: theirs lie 2.4 m
-    apart at their midpoints.
+    Published in the table of the flight: 20 Hz, 0.5 m/s, height 4.5 to 5 m (used: 4.8 m), ground range 11.5 m, L =
+    3.4 m, 4.7 m between the UAVs, one behind the other. Published on the images: 12 m × 4 m (used: 12 m along track),
+    an extended target, a power generator. Not published: its size (assumed: rough, 1.2 m × 1.2 m), other targets (four
+    points, to measure widths and phases), the clutter (17 dB below a point per m²), the SNR (0 dB per subcarrier, 30 dB
+    in the sidelink), lever arms, wobble, and the track segments of the images (a gap of 2.4 m between them).
     """
     targets = (
         PointTarget((0.0, 0.0, 0.0)),
         PointTarget((-2.0, 1.2, 0.0), 0.7),
         PointTarget((1.8, -1.6, 0.0), 0.7),
-        PointTarget((1.2, 1.8, 0.0), 0.5),  # the foot of a cylinder, where it and the ground are a dihedral
+        PointTarget((1.2, 1.8, 0.0), 0.5),  # the foot of a cylinder, which forms a dihedral with the ground
         Clutter((3.6, -0.6, 4.8, 0.6), 0.5, 60.0),
         Clutter((-7.0, -3.0, 7.0, 3.0), 0.02, 15.0),
     )
@@ -135,9 +135,9 @@ def paper_uav(*, pulses: int = 275) -> CampaignSpecification:
         "uav1": Straight((start_m, -11.5, 4.8), velocity, Wobble()),
         "uav2": Straight((start_m + SEPARATION_M, -11.5, 4.8), velocity, Wobble()),
     }
-    long_s = SEGMENT_M / SPEED_M_S
+    duration_s = SEGMENT_M / SPEED_M_S
     later_s = (GAP_M / 2 - SEPARATION_M / 2 - start_m) / SPEED_M_S  # its midpoint is half the separation ahead
-    segments = {"uav1-uav1": ((0.0, long_s),), "uav1-uav2": ((later_s, later_s + long_s),)}
+    segments = {"uav1-uav1": ((0.0, duration_s),), "uav1-uav2": ((later_s, later_s + duration_s),)}
     flight = SimulatedFlight("f01", "uav1", tracks, pulses, segments=segments)
     grid = ImageGrid(_UTM, bounds_m=(570655.3, 5363705.2, 570667.3, 5363709.2), spacing_m=0.05)  # about the origin
     waveform = replace(PAPER_WAVEFORM, prf_hz=FLIGHT_PRF_HZ)
@@ -147,7 +147,7 @@ def paper_uav(*, pulses: int = 275) -> CampaignSpecification:
 
 
 def _own_clock(radar_snr_db: float, sidelink_snr_db: float) -> Impairments:
-    """Return a secondary whose clock is 10 ppb off and which starts and turns anew with every pulse."""
+    """Return a secondary with a clock offset of 10 ppb, and a random start and phase of each capture."""
     return Impairments(
         clock=Clock(cfo_hz=12.0),
         carrier_phase=UniformPhase(),
@@ -158,27 +158,29 @@ def _own_clock(radar_snr_db: float, sidelink_snr_db: float) -> Impairments:
     )
 
 
-def _standing(
+def _static_pair(
     name: str,
     targets: tuple[Target, ...],
-    place: Vector,
+    position_m: Vector,
     radar_m: float,
     snr_db: float,
     pulses: int,
     *,
     bench: Mapping[str, float | bool],
 ) -> CampaignSpecification:
-    """Return two nodes on a table whose antennas are at one place, the sidelink a cable, SNR that of a subcarrier."""
-    wired = SimulatedNode({}, {"radar": radar_m, "sidelink": SIDELINK_CABLE_M}, impairments=_own_clock(snr_db, 40.0))
-    first = SimulatedNode({}, {"radar": radar_m}, impairments=Impairments(radar_snr_db=snr_db))
-    still = Straight(place, (0.0, 0.0, 0.0))
-    flight = SimulatedFlight("f01", "uav1", {"uav1": still, "uav2": still}, pulses, kind="bench")
+    """Return two static nodes with all antennas at one position, a cable as sidelink, and an SNR per subcarrier."""
+    secondary = SimulatedNode(
+        {}, {"radar": radar_m, "sidelink": SIDELINK_CABLE_M}, impairments=_own_clock(snr_db, 40.0)
+    )
+    primary = SimulatedNode({}, {"radar": radar_m}, impairments=Impairments(radar_snr_db=snr_db))
+    static = Straight(position_m, (0.0, 0.0, 0.0))
+    flight = SimulatedFlight("f01", "uav1", {"uav1": static, "uav2": static}, pulses, kind="bench")
     grid = ImageGrid(_UTM, half_width_m=3.0, spacing_m=0.1)
-    nodes = {"uav1": first, "uav2": wired}
+    nodes = {"uav1": primary, "uav2": secondary}
     return CampaignSpecification(name, EXPERIMENT_ORIGIN, PAPER_WAVEFORM, targets, nodes, (flight,), grid, bench=bench)
 
 
-DEMO_ORIGIN = EXPERIMENT_ORIGIN  # flat ground by the Danube
+DEMO_ORIGIN = EXPERIMENT_ORIGIN  # flat terrain by the Danube
 _DEMO_WAVEFORM = WaveformSpecification(1024, 1.2e9, 400e3, 3.125e-6, 0.78125e-6, 1.024e9, 20.0)
 _DEMO_TARGETS = (
     PointTarget((0.0, 0.0, 0.0)),
@@ -193,14 +195,15 @@ _PRIMARY = SimulatedNode(
     impairments=Impairments(radar_snr_db=25.0, missed_fraction=0.02),
 )
 _PAPER_TARGETS = ((0.0, 5.0), (-4.0, 10.0), (0.0, 15.0), (4.0, 20.0), (0.0, 25.0))
-"""Cross-range and ground range, m."""
+"""Cross-range and ground range of the targets, m."""
 
 
 def demo(*, pulses: int = 300) -> CampaignSpecification:
     """Return the campaign of `make demo`: two UAVs, one transmits, both receive, five targets on 12 m × 12 m.
 
-    The secondary has its own clock: tags off by milliseconds, random phase and start of every capture. Both
-    miss some triggers, both digitise 14 bits with noise. Pulses are at 20 Hz and 0.5 m/s; 300 make about 14 MB.
+    The secondary has its own clock: time tags have errors of milliseconds, and phase and start of each capture are
+    random. Both nodes miss some triggers and digitise 14 bits with noise. Pulses are at 20 Hz and 0.5 m/s; 300 pulses
+    occupy about 14 MB.
     """
     tracks = {"uav1": _pass_by(-1.9, pulses), "uav2": _pass_by(2.8, pulses)}
     nodes = {"uav1": _PRIMARY, "uav2": _secondary(0.911, 0.402, tag_s=3.7e-3)}
@@ -208,9 +211,9 @@ def demo(*, pulses: int = 300) -> CampaignSpecification:
 
 
 def first_flight(*, pulses: int = 150) -> CampaignSpecification:
-    """Return a first flight over the demo's targets, half as long, whose logs err by 2 cm and say so.
+    """Return a flight past the demo's targets of half the length, with logs of a (configured) accuracy of 2 cm.
 
-    Its images are out of focus from the logs, and sharp from the tracks that step `refine` finds.
+    Its images are defocused with the logged tracks, and focused with the tracks refined by step `refine`.
     """
     flown = demo(pulses=pulses)
     nodes = {
@@ -221,7 +224,7 @@ def first_flight(*, pulses: int = 150) -> CampaignSpecification:
 
 
 def swarm(*, pulses: int = 240) -> CampaignSpecification:
-    """Return one transmitter and three more receivers, each with a clock of its own, over the demo's targets."""
+    """Return one transmitter and three more receivers, each with its own clock, past the demo's targets."""
     nodes = {"uav1": _PRIMARY}
     tracks = {"uav1": _pass_by(0.0, pulses)}
     for number, (middle_m, right_m, up_m) in enumerate(((-4.5, -11.5, 4.6), (4.5, -11.0, 5.0), (9.0, -12.5, 5.4)), 2):
@@ -232,15 +235,15 @@ def swarm(*, pulses: int = 240) -> CampaignSpecification:
 
 
 def continuous(*, pulses: int = 60) -> CampaignSpecification:
-    """Return a flight whose recorders never stopped, to be triggered by the preamble before each symbol.
+    """Return a flight with continuous recordings, in which the preambles of the symbols are detected.
 
-    Pulses are at 1 kHz and 20 m/s; 60 make about 46 MB.
+    Pulses are at 1 kHz and 20 m/s; 60 pulses occupy about 46 MB.
     """
     waveform = WaveformSpecification(200, 1.2e9, 250e3, 5e-6, 2e-6, 64e6, 1000.0)
     velocity = (20.0, 0.0, 0.0)
     half_m = 10e-3 * (pulses - 1)
     tracks = {name: Straight((x - half_m, -30.0, 20.0), velocity) for name, x in (("uav1", -2.0), ("uav2", 3.0))}
-    # its own preamble, leaking in, is what triggers the transmitter to the sample; echoes alone would not
+    # the leakage of its own preamble triggers the transmitter's recorder exactly; echoes alone would not
     own = Impairments(radar_snr_db=20.0, leakage=Leakage(20.0))
     late = Impairments(
         timing=Timing(offset_s=7e-6), time_tag=TimeTag(offset_s=0.1e-3), radar_snr_db=20.0, sidelink_snr_db=20.0
@@ -259,7 +262,7 @@ def continuous(*, pulses: int = 60) -> CampaignSpecification:
 def paper(*, pulses: int = 600) -> CampaignSpecification:
     """Return the paper's simulated scene as a campaign: 4096 subcarriers, 30 m of straight track at 10 m height.
 
-    Of the paper's 3000 pulses in 30 s, 600, every 5 cm, are still unambiguous and make 38 MB.
+    The paper has 3000 pulses in 30 s; 600 pulses, one every 5 cm, are still unambiguous and occupy 38 MB.
     """
     waveform = replace(PAPER_WAVEFORM, prf_hz=pulses / 30)
     track = Straight((-0.5 * (pulses - 1) / waveform.prf_hz, -15.0, 10.0), (1.0, 0.0, 0.0))
@@ -275,7 +278,7 @@ def paper(*, pulses: int = 600) -> CampaignSpecification:
 
 
 def flight(*, pulses: int = 300_000) -> CampaignSpecification:
-    """Return a whole flight: ten minutes at 500 Hz and 5 m/s past 410 m of ground, one transmitter, two receivers.
+    """Return a long flight: ten minutes at 500 Hz and 5 m/s past a scene of 410 m, one transmitter, two receivers.
 
     A receiver records two channels of 2256 samples per pulse, 5.4 GB; the image has 4096 × 4096 pixels.
     """
@@ -284,16 +287,19 @@ def flight(*, pulses: int = 300_000) -> CampaignSpecification:
     tracks, half_m = {"uav1": Straight((0.0, -270.0, 80.0), (5.0, 0.0, 0.0))}, 5.0 * (pulses - 1) / 500.0 / 2
     for name, ahead_m in (("uav2", 12.0), ("uav3", -15.0)):
         nodes[name] = _secondary(0.4, 0.2, tag_s=0.2e-3, missed=0.0)
-        wide = replace(nodes[name].impairments, adc=Adc(backoff_db=24.0))  # echoes are strongest as targets are passed
-        nodes[name] = replace(nodes[name], impairments=wide)
+        # more backoff, because echoes are strongest at the closest approach to targets
+        with_backoff = replace(nodes[name].impairments, adc=Adc(backoff_db=24.0))
+        nodes[name] = replace(nodes[name], impairments=with_backoff)
         tracks[name] = Straight((ahead_m, -270.0, 82.0), (5.0, 0.0, 0.0))
     tracks = {
         name: replace(track, start_m=(track.start_m[0] - half_m, *track.start_m[1:])) for name, track in tracks.items()
     }
     targets = tuple(PointTarget((x, y, 0.0)) for x in (-150.0, -50.0, 50.0, 150.0) for y in (-160.0, -40.0, 80.0))
-    flown = SimulatedFlight("f01", "uav1", tracks, pulses)
+    long_flight = SimulatedFlight("f01", "uav1", tracks, pulses)
     grid = ImageGrid(_UTM, half_width_m=204.8, spacing_m=0.1)
-    return CampaignSpecification("flight", DEMO_ORIGIN, waveform, targets, nodes, (flown,), grid, synthesis="periodic")
+    return CampaignSpecification(
+        "flight", DEMO_ORIGIN, waveform, targets, nodes, (long_flight,), grid, synthesis="periodic"
+    )
 
 
 PRESETS: dict[str, Callable[..., CampaignSpecification]] = {
@@ -324,7 +330,7 @@ def _secondary(radar_m: float, sidelink_m: float, *, tag_s: float, missed: float
 
 
 def _pass_by(middle_m: float, pulses: int, *, right_m: float = -11.5, up_m: float = 4.8) -> Straight:
-    """Fly along azimuth 40° at 0.5 m/s, the scene on the right; the middle of the flight is `middle_m` ahead of it."""
+    """Return a track along azimuth 40° at 0.5 m/s, scene on the right; its middle is `middle_m` ahead of the scene."""
     along = np.array([np.sin(np.radians(40.0)), np.cos(np.radians(40.0)), 0.0])
     right = np.array([along[1], -along[0], 0.0])
     duration_s = (pulses - 1) / _DEMO_WAVEFORM.prf_hz
@@ -342,14 +348,14 @@ def paper_waveform(*, prf_hz: float = 100.0) -> TransmitWaveform:
     >>> len(wave.codes) * wave.subcarrier_spacing_hz
     409600000.0
     """
-    return replace(PAPER_WAVEFORM, prf_hz=prf_hz).drawn(np.random.default_rng(0))  # of which this code draws nothing
+    return replace(PAPER_WAVEFORM, prf_hz=prf_hz).drawn(np.random.default_rng(0))  # this code has no random part
 
 
 def paper_scene(*, pulses: int = 3000, rx_ahead_m: float = 0.0) -> tuple[Scatterers, Geometry]:
-    """Return the paper's simulated scene as arrays: five targets, straight track at 10 m, antennas at one place.
+    """Return the paper's simulated scene as arrays: five targets, straight track at 10 m, one position per node.
 
-    Both are in local Cartesian metres: cross-range (along the track, centred on zero), ground range, up. The receiver
-    flies `rx_ahead_m` ahead of the transmitter (4.7 m in the localization study).
+    Both are in local Cartesian metres: cross-range (along track, centred on zero), ground range, up. The receiver is
+    `rx_ahead_m` ahead of the transmitter (4.7 m in the localization study).
 
     Notes
     -----

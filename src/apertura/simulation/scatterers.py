@@ -1,6 +1,6 @@
-"""Paths of echoes and transfer functions of point scatterers, for simulations, studies, benchmarks and tests.
+"""Echo paths and transfer functions of point scatterers, for simulations, studies, benchmarks and tests.
 
-The exact sum costs one matrix product per pulse; for thousands of scatterers there is a gridded one.
+The exact sum takes one matrix product per pulse; a gridded sum is available for thousands of scatterers.
 """
 
 from collections.abc import Callable
@@ -15,9 +15,9 @@ from apertura.core.geometry.aperture import Aperture, distance
 from apertura.core.geometry.atmosphere import Atmosphere
 from apertura.simulation.targets import Scatterers
 
-_BLOCK = 64  # subcarriers that share one exponential
-_TERMS = 2**22  # exponentials at once in the exact sum
-_SAMPLES = 2**20  # of range at once in the gridded one
+_BLOCK = 64  # subcarriers with a common coarse exponential
+_TERMS = 2**22  # exponentials computed together in the exact sum
+_SAMPLES = 2**20  # range samples computed together in the gridded sum
 
 
 def transfer(
@@ -29,24 +29,24 @@ def transfer(
     spreading: bool = True,
     gridded: bool = False,
 ) -> NDArray[np.complex64]:
-    """Return H_pn = Σ_j a_j/(R_t·R_r)·exp(-j2πf_n(R_t + R_r + x_p)/c), the echo of scatterers per pulse and subcarrier.
+    """Compute the echo of scatterers, H_pn = Σ_j a_j/(R_t·R_r)·exp(-j2πf_n(R_t + R_r + x_p)/c).
 
-    R_t and R_r are the distances of scatterer j from transmitter and receiver at pulse p.
+    R_t and R_r are the distances of scatterer j from transmitter and receiver at pulse p; n is the subcarrier.
 
     Parameters
     ----------
     scatterers
         Positions (scatterer, 3) in the frame of the aperture, metres, and complex amplitudes at 1 m × 1 m.
     aperture
-        True phase centres, (pulse, 3) metres each; nothing moves within a pulse.
+        True phase centres, (pulse, 3) metres each, constant within a pulse.
     frequency_hz
         (subcarrier,) float64, f_n at RF, equally spaced.
     longer_m
-        (pulse,) float64, x_p, metres by which the paths of a pulse are longer than geometry; None: zero.
+        (pulse,) float64, x_p, path of each pulse in addition to the geometric path, metres; None: zero.
     spreading
-        Divide by R_t·R_r; otherwise every scatterer is as strong at any distance.
+        True to divide by R_t·R_r; otherwise the echo does not depend on the distance.
     gridded
-        Spread echoes over samples of range instead of summing exactly: fast for thousands of scatterers, right to 3e-6.
+        True to use the gridded instead of the exact sum: fast for thousands of scatterers, relative error 3e-6.
 
     Returns
     -------
@@ -65,17 +65,17 @@ def transfer(
     array([[0.0667, 0.0667]], dtype=float32)
     """
     longer = np.zeros(len(aperture)) if longer_m is None else longer_m
-    form = _gridded if gridded else _summed
+    compute = _gridded if gridded else _summed
     out = np.empty((len(aperture), len(frequency_hz)), np.complex64)
     at_once = _pulses_at_once(len(scatterers.amplitude), len(frequency_hz), gridded=gridded)
     for first in range(0, len(out), at_once):
-        part = slice(first, first + at_once)
-        out[part] = form(scatterers, aperture[part], frequency_hz, longer[part], spreading=spreading)
+        pulses = slice(first, first + at_once)
+        out[pulses] = compute(scatterers, aperture[pulses], frequency_hz, longer[pulses], spreading=spreading)
     return out
 
 
 def spectrum(delay_s: Floats, amplitude: NDArray[np.complex128], frequency_hz: Floats) -> NDArray[np.complex128]:
-    """Return Σ a·exp(-j2πf_nτ) over the last axis: (..., path) → (..., subcarrier) complex128.
+    """Sum Σ a·exp(-j2πf_nτ) over the last axis: (..., path) → (..., subcarrier) complex128.
 
     Parameters
     ----------
@@ -88,8 +88,8 @@ def spectrum(delay_s: Floats, amplitude: NDArray[np.complex128], frequency_hz: F
 
     Notes
     -----
-    Source: docs/theory/simulate.md, eq. 2. The exponential of subcarrier n = 64i + j is the product of two small ones,
-    so that many points cost one matrix product.
+    Source: docs/theory/simulate.md, eq. 2. The exponential of subcarrier n = 64i + j is the product of a coarse and a
+    fine one, so that the sum over paths is a matrix product.
 
     Examples
     --------
@@ -98,10 +98,10 @@ def spectrum(delay_s: Floats, amplitude: NDArray[np.complex128], frequency_hz: F
     """
     count = len(frequency_hz)
     spacing_hz = (frequency_hz[-1] - frequency_hz[0]) / max(count - 1, 1)
-    coarse, fine = frequency_hz[::_BLOCK], np.arange(_BLOCK) * spacing_hz
-    left = amplitude[..., None, :] * np.exp(-2j * np.pi * coarse[:, None] * delay_s[..., None, :])
-    right = np.exp(-2j * np.pi * fine * delay_s[..., :, None])
-    return np.asarray((left @ right).reshape(*delay_s.shape[:-1], -1)[..., :count])
+    coarse_hz, fine_hz = frequency_hz[::_BLOCK], np.arange(_BLOCK) * spacing_hz
+    coarse = amplitude[..., None, :] * np.exp(-2j * np.pi * coarse_hz[:, None] * delay_s[..., None, :])
+    fine = np.exp(-2j * np.pi * fine_hz * delay_s[..., :, None])
+    return np.asarray((coarse @ fine).reshape(*delay_s.shape[:-1], -1)[..., :count])
 
 
 def _pulses_at_once(scatterers: int, subcarriers: int, *, gridded: bool) -> int:
@@ -113,15 +113,15 @@ def _pulses_at_once(scatterers: int, subcarriers: int, *, gridded: bool) -> int:
 def _summed(
     scatterers: Scatterers, aperture: Aperture, frequency_hz: Floats, longer_m: Floats, *, spreading: bool
 ) -> NDArray[np.complex128]:
-    there, back = (distance(leg[:, None], scatterers.position_m) for leg in aperture.legs)
-    amplitude = np.broadcast_to(scatterers.amplitude / (there * back if spreading else 1.0), there.shape)
-    return spectrum((there + back + longer_m[:, None]) / SPEED_OF_LIGHT_M_S, amplitude, frequency_hz)
+    tx_range, rx_range = (distance(position_m[:, None], scatterers.position_m) for position_m in aperture.legs)
+    amplitude = np.broadcast_to(scatterers.amplitude / (tx_range * rx_range if spreading else 1.0), tx_range.shape)
+    return spectrum((tx_range + rx_range + longer_m[:, None]) / SPEED_OF_LIGHT_M_S, amplitude, frequency_hz)
 
 
 def _gridded(
     scatterers: Scatterers, aperture: Aperture, frequency_hz: Floats, longer_m: Floats, *, spreading: bool
 ) -> NDArray[np.complex128]:
-    from apertura.simulation.gridding import gridded_sum  # numba is slow to import, and few scatterers need none of it
+    from apertura.simulation.gridding import gridded_sum  # numba is slow to import, and the exact sum needs none
 
     points = scatterers.position_m, scatterers.amplitude
     return gridded_sum(points, aperture.legs, frequency_hz, longer_m, spreading=spreading)
@@ -134,7 +134,7 @@ class Paths:
     Attributes
     ----------
     delay_s, delay_rate
-        float64, seconds at the pulse's start, and their growth in seconds per second; zero: stop and go.
+        float64, delays at the start of the pulse, seconds, and their rates of change; zero: stop-and-go approximation.
     amplitude
         complex128.
     """
@@ -144,25 +144,25 @@ class Paths:
     delay_rate: Floats
 
     def and_also(self, other: "Paths") -> "Paths":
-        """Return both sets together."""
-        both = zip(vars(self).values(), vars(other).values(), strict=True)
-        return Paths(*(np.concatenate(pair, axis=1) for pair in both))
+        """Return the union of both sets of paths."""
+        arrays = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Paths(*(np.concatenate(pair, axis=1) for pair in arrays))
 
     def at(self, pulses: slice | NDArray[np.intp]) -> "Paths":
-        """Return those of some pulses."""
+        """Return the paths at the selected pulses."""
         return Paths(self.delay_s[pulses], self.amplitude[pulses], self.delay_rate[pulses])
 
 
 @dataclass(frozen=True)
 class TrueAir:
-    """Air that every leg of every path flies through, by the heights of its own ends.
+    """True atmosphere along each one-way path, from the heights of its ends.
 
     Attributes
     ----------
     atmosphere
-        Refractivity by height.
+        Refractivity as a function of height.
     height
-        Positions (..., 3), metres → heights (...), metres.
+        Function from positions (..., 3), metres, to heights (...), metres.
     """
 
     atmosphere: Atmosphere
@@ -189,18 +189,18 @@ def echo_paths(
     tx_velocity_m_s: Floats | float = 0.0,
     rx_velocity_m_s: Floats | float = 0.0,
 ) -> Paths:
-    """Return the echoes of scatterers: delay (n_tx·R_tx + n_rx·R_rx + offset)/c, amplitude a/(R_tx·R_rx).
+    """Return the echo paths of scatterers: delay (n_tx·R_tx + n_rx·R_rx + offset)/c, amplitude a/(R_tx·R_rx).
 
     Parameters
     ----------
     tx_position_m, rx_position_m
         (pulse, 3) float64, phase centres in the Cartesian frame of the scatterers, metres.
     path_offset_m
-        Electrical path of the receiving channel beyond geometry, metres.
+        Electrical path of the receiving channel in addition to the geometric path, metres.
     air
-        What the legs fly through; None: vacuum.
+        Atmosphere along the paths; None: vacuum.
     tx_velocity_m_s, rx_velocity_m_s
-        (pulse, 3) float64, for Doppler within the pulse; zero without.
+        (pulse, 3) float64, velocities for Doppler within the pulse; zero: no Doppler.
 
     Notes
     -----
@@ -217,7 +217,7 @@ def echo_paths(
     rx_range, rx_rate = _range_and_rate(rx_position_m, rx_velocity_m_s, scatterers.position_m)
     amplitude = scatterers.amplitude / (tx_range * rx_range)
     if air is not None:
-        tx_n, rx_n = (air.index(leg, scatterers.position_m) for leg in (tx_position_m, rx_position_m))
+        tx_n, rx_n = (air.index(antenna_m, scatterers.position_m) for antenna_m in (tx_position_m, rx_position_m))
         tx_range, rx_range, tx_rate, rx_rate = tx_range * tx_n, rx_range * rx_n, tx_rate * tx_n, rx_rate * rx_n
     return Paths(
         (tx_range + rx_range + path_offset_m) / SPEED_OF_LIGHT_M_S,
@@ -234,14 +234,14 @@ def direct_path(
     air: TrueAir | None = None,
     relative_velocity_m_s: Floats | float = 0.0,
 ) -> Paths:
-    """Return the one path from antenna to antenna: delay (n·R + offset)/c, amplitude 1/R, level inside 1 m.
+    """Return the direct path from antenna to antenna: delay (n·R + offset)/c, amplitude 1/R, constant below 1 m.
 
     Parameters
     ----------
     tx_position_m, rx_position_m, path_offset_m, air
         As for `echo_paths`.
     relative_velocity_m_s
-        (pulse, 3) float64, transmitter's less receiver's velocity.
+        (pulse, 3) float64, velocity of the transmitter relative to the receiver.
 
     Examples
     --------
@@ -255,7 +255,8 @@ def direct_path(
 
 
 def _range_and_rate(antenna_m: Floats, velocity_m_s: Floats | float, points_m: Floats) -> tuple[Floats, Floats]:
-    sight = antenna_m[:, None, :] - points_m[None, :, :]
-    distance = np.sqrt(np.einsum("pki,pki->pk", sight, sight))
+    """Return range (m) and range rate (m/s) between antennas (pulse, 3) and points (point, 3), (pulse, point) each."""
+    offset_m = antenna_m[:, None, :] - points_m[None, :, :]
+    range_m = np.sqrt(np.einsum("pki,pki->pk", offset_m, offset_m))
     velocity = np.broadcast_to(np.asarray(velocity_m_s, np.float64), antenna_m.shape)
-    return distance, np.einsum("pki,pi->pk", sight, velocity) / np.maximum(distance, 1e-9)
+    return range_m, np.einsum("pki,pi->pk", offset_m, velocity) / np.maximum(range_m, 1e-9)

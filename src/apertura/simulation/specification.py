@@ -1,4 +1,4 @@
-"""A campaign before it is simulated: the values that a YAML specification holds, and what is drawn of them first."""
+"""Specification of a simulated campaign in YAML, and the draw of its code symbols and trajectories."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -37,37 +37,38 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.]*$")]
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class SimulatedNode:
-    """One UAV: what it carries, how it logs, and what is wrong with it."""
+    """Simulated UAV: antennas, log, radio and impairments."""
 
     lever_arms_m: Mapping[AntennaPoint, Vector] = Field(
         default_factory=dict, description="forward, right, down from the logged point to each antenna, m; missing: zero"
     )
     path_offset_m: Mapping[ChannelName, float] = Field(
-        default_factory=dict, description="true electrical path beyond geometry as receiver, m; missing: zero"
+        default_factory=dict,
+        description="true electrical path of the receiver in addition to the geometric path, m; missing: zero",
     )
     stated_path_offset_m: Mapping[ChannelName, float] | None = Field(
-        default=None, description="what the config says instead; null: the truth"
+        default=None, description="path offset in the config; null: the true one"
     )
-    attitude: Literal["log", "course", "none"] = Field(default="log", description="what the config says of attitude")
+    attitude: Literal["log", "course", "none"] = Field(default="log", description="attitude in the config")
     log_format: Literal["csv", "pos", "pos_utc"] = Field(
         default="csv", description="csv with attitude, pos (RTKLIB in GPST) or pos_utc"
     )
     log_rate_hz: float = Field(default=10.0, gt=0, description="epochs of the log per second, Hz")
     position_std_m: float | None = Field(
-        default=None, gt=0, description="what the config says of the log's errors, per axis, m; null: nothing"
+        default=None, gt=0, description="position accuracy in the config, per axis, m; null: not configured"
     )
-    impairments: Impairments = Field(default=Impairments(), description="what is wrong with it")
+    impairments: Impairments = Field(default=Impairments(), description="impairments of the node")
     radio: Radio | None = Field(
         default=None,
-        description="power, gains and receiver: amplitudes of targets are then roots of their cross-sections in m²",
+        description="power, gains and receiver; target amplitudes are then square roots of cross-sections in m²",
     )
     antennas: Mapping[RadarPoint, GaussianBeam] = Field(
-        default_factory=dict, description="beams of the radar antennas; missing: the same in all directions"
+        default_factory=dict, description="beams of the radar antennas; missing: isotropic"
     )
 
 
 def _utc_text(value: Any) -> Any:
-    """Return a time that YAML has read as one as ISO 8601 again, in UTC and without saying so."""
+    """Convert a time that the YAML reader has parsed back to ISO 8601 text, in UTC without a suffix."""
     if not isinstance(value, datetime):
         return value
     return (value.astimezone(UTC) if value.tzinfo else value).replace(tzinfo=None).isoformat()
@@ -75,39 +76,43 @@ def _utc_text(value: Any) -> Any:
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class SimulatedFlight:
-    """One line of flights.tsv, and what flies."""
+    """Simulated flight: its row of flights.tsv, tracks and recording mode."""
 
-    name: Name = Field(description="as in flights.tsv")
-    transmitter: str = Field(description="node that transmits, and receives as the others do")
-    tracks: Mapping[Name, Track] = Field(min_length=1, description="track of each node that records, by its name")
+    name: Name = Field(description="name in flights.tsv")
+    transmitter: str = Field(description="node that transmits; it also receives")
+    tracks: Mapping[Name, Track] = Field(min_length=1, description="track of each recording node, by its name")
     pulses: int = Field(gt=0, description="number of pulses")
     start_utc: Annotated[
         str, BeforeValidator(_utc_text), Field(pattern=r"^\d{4}-\d\d-\d\d(T\d\d:\d\d(:[\d.]+)?)?$")
     ] = Field(default="2025-05-14T09:30:00", description="UTC of the first pulse, ISO 8601")
-    kind: Literal["image", "calibration", "bench"] = Field(default="image", description="as in flights.tsv")
+    kind: Literal["image", "calibration", "bench"] = Field(default="image", description="kind in flights.tsv")
     framing: Framing | None = Field(default=None, description="preamble and frame counter; null: no frame numbers")
     first_frame: int = Field(default=0, ge=0, description="number of the first frame")
-    continuous: bool = Field(default=False, description="recorders run through instead of being triggered")
-    targets: tuple[Target, ...] | None = Field(default=None, description="what stands there in this flight only")
+    continuous: bool = Field(default=False, description="continuous instead of triggered recordings")
+    targets: tuple[Target, ...] | None = Field(
+        default=None, description="targets of this flight instead of those of the campaign"
+    )
     segments: Mapping[str, tuple[tuple[float, float], ...]] = Field(
         default_factory=dict,
-        description="pair → start and end of what images it, s after the first pulse; missing: all",
+        description="pair → start and end of the segments it is imaged from, s after the first pulse; missing: all",
     )
 
     @model_validator(mode="after")
     def _transmitter_flies(self) -> Self:
         if self.transmitter not in self.tracks:
-            raise ValueError(f"transmitter {self.transmitter!r} has no track; tracks are of {', '.join(self.tracks)}")
+            raise ValueError(
+                f"transmitter {self.transmitter!r} has no track; nodes with a track: {', '.join(self.tracks)}"
+            )
         return self
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class ImageGrid:
-    """The `scene` section of the config."""
+    """Grid of the scene, section `scene` of the config."""
 
     crs: str = Field(pattern=r"^EPSG:\d+$", description="projected CRS, EPSG:…")
     half_width_m: float | None = Field(
-        default=None, gt=0, description="half the width of a square about the origin, m, instead of bounds_m"
+        default=None, gt=0, description="half width of a square about the origin, m, instead of bounds_m"
     )
     bounds_m: tuple[float, float, float, float] | Literal["auto"] = Field(
         default="auto", description="outer pixel edges, m"
@@ -118,7 +123,7 @@ class ImageGrid:
     @model_validator(mode="after")
     def _square_has_a_spacing(self) -> Self:
         if self.half_width_m is not None and (self.spacing_m == "auto" or self.bounds_m != "auto"):
-            raise ValueError("half_width_m needs spacing_m in metres, and no bounds_m")
+            raise ValueError("half_width_m requires spacing_m in metres, and excludes bounds_m")
         return self
 
     def bounds(self, origin: Origin) -> tuple[float, ...] | Literal["auto"]:
@@ -139,31 +144,31 @@ class ImageGrid:
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class CampaignSpecification:
-    """Everything that, with the seed, decides the bytes of a simulated campaign."""
+    """Specification that, together with the seed, determines all files of a simulated campaign."""
 
     campaign: str = Field(description="name of the campaign")
-    origin: Origin = Field(description="where east, north and up are counted from")
-    waveform: TransmittedSpecification = Field(description="what is transmitted")
-    targets: tuple[Target, ...] = Field(description="what stands in the scene")
+    origin: Origin = Field(description="origin of the east, north and up coordinates")
+    waveform: TransmittedSpecification = Field(description="transmitted waveform")
+    targets: tuple[Target, ...] = Field(description="targets of the scene")
     nodes: Mapping[Name, SimulatedNode] = Field(min_length=1, description="one section per UAV")
-    flights: tuple[SimulatedFlight, ...] = Field(description="who flies what, one after the other")
+    flights: tuple[SimulatedFlight, ...] = Field(description="flights, one after the other")
     scene: ImageGrid = Field(description="the grid on which the campaign is imaged")
     atmosphere: Literal["standard", "vacuum"] | Annotated[float, Field(ge=0, le=LARGEST_REFRACTIVITY)] = Field(
         default="standard",
-        description="air that all paths fly through: standard, at the origin's height, 50 % humidity; vacuum; or the "
-        "refractivity at the origin, (n - 1)·10⁶, which the config then states; it thins with height",
+        description="atmosphere along all paths: standard (at the height of the origin, 50 % humidity), vacuum, or the "
+        "refractivity at the origin, (n - 1)·10⁶, which decreases with height and is written to the config",
     )
     bench: Mapping[str, float | bool] = Field(
-        default_factory=dict, description="what the config says of the set-up of flights of kind bench, as it has it"
+        default_factory=dict, description="section `bench` of the config, for flights of kind bench"
     )
     synthesis: Literal["exact", "periodic"] = Field(
         default="exact",
-        description="true edges of every echo, or fast, for long flights: as if echoes did not begin or end",
+        description="exact, with the edges of each echo; or periodic, fast for long flights, with continuous echoes",
     )
 
     @property
     def air(self) -> TrueAir | None:
-        """True air between positions in ECEF; None: vacuum."""
+        """True atmosphere between positions in ECEF; None: vacuum."""
         if self.atmosphere == "vacuum":
             return None
         ground_m = self.origin.height_m
@@ -175,62 +180,68 @@ class CampaignSpecification:
 
     @model_validator(mode="after")
     def _radios_are_of_all(self) -> Self:
-        stated = [name for name, node in self.nodes.items() if node.radio is not None]
-        if stated and len(stated) < len(self.nodes):
-            raise ValueError(f"radio is stated of {', '.join(stated)} alone: state it of every node, or of none")
-        noisy = [name for name in stated if self.nodes[name].impairments.radar_snr_db is not None]
-        if noisy:
-            raise ValueError(f"{noisy[0]} has a radio, with noise by noise_figure_db, and radar_snr_db as well")
+        with_radio = [name for name, node in self.nodes.items() if node.radio is not None]
+        if with_radio and len(with_radio) < len(self.nodes):
+            raise ValueError(f"radio is specified only for {', '.join(with_radio)}: specify it for all nodes or none")
+        conflicting = [name for name in with_radio if self.nodes[name].impairments.radar_snr_db is not None]
+        if conflicting:
+            raise ValueError(
+                f"{conflicting[0]} has both a radio, whose noise follows from noise_figure_db, and radar_snr_db"
+            )
         return self
 
     @model_validator(mode="after")
     def _nodes_fly(self) -> Self:
-        flown = {name for flight in self.flights for name in flight.tracks}
-        if flown != set(self.nodes):
-            raise ValueError(f"nodes are {', '.join(sorted(self.nodes))}, but tracks are of {', '.join(sorted(flown))}")
-        once = self.waveform.kind == "samples"
-        if once and (
+        with_track = {name for flight in self.flights for name in flight.tracks}
+        if with_track != set(self.nodes):
+            raise ValueError(
+                f"the nodes are {', '.join(sorted(self.nodes))}, but the nodes with a track are "
+                f"{', '.join(sorted(with_track))}"
+            )
+        single_pulse = self.waveform.kind == "samples"
+        if single_pulse and (
             self.synthesis == "periodic" or any(flight.continuous or flight.framing for flight in self.flights)
         ):
-            raise ValueError("a pulse that is sent once needs synthesis: exact, and neither framing nor continuous")
+            raise ValueError("a pulse that is sent once requires synthesis: exact, without framing or continuous")
         if not self.flights or len({flight.name for flight in self.flights}) < len(self.flights):
-            raise ValueError("flights must be one or more, each with a name of its own")
+            raise ValueError("there must be at least one flight, and flights must have different names")
         return self
 
 
 def read_specification(path: Path) -> CampaignSpecification:
-    """Return the specification in a YAML file.
+    """Read a specification from a YAML file.
 
     Raises
     ------
     CampaignError
-        If it is not there, or with every key that is wrong and the nearest valid one.
+        If the file is missing or invalid; the error lists all wrong keys and the nearest valid ones.
     """
-    remedy = "`apertura simulate --print-spec demo` prints one to start from."
+    remedy = "Start from the output of `apertura simulate --print-spec demo`."
     document = read_yaml(path, expected="a YAML specification of a simulation", remedy=remedy)
-    expected = "keys and values such as `apertura simulate --print-spec demo` prints"
+    expected = "keys and values as in the output of `apertura simulate --print-spec demo`"
     return validated(CampaignSpecification, document, where=path, expected=expected)
 
 
 def specification_text(specification: CampaignSpecification) -> str:
-    """Return a specification as YAML, without what is at its default; `read_specification` reads it back exactly."""
+    """Return a specification as YAML without default values; `read_specification` restores it exactly."""
     return yaml.safe_dump(_plain(specification), sort_keys=False, default_flow_style=None, width=120)
 
 
 def _plain(value: Any) -> Any:
+    """Convert a part of a specification to plain YAML values, without defaults."""
     if dataclasses.is_dataclass(value):
         fields: dict[str, FieldInfo] = type(value).__pydantic_fields__  # type: ignore[union-attr]
-        own = {name: getattr(value, name) for name in fields}
-        # keyword-only: `kind`, which says to a reader of YAML what the rest is
+        values = {name: getattr(value, name) for name in fields}
+        # the keyword-only field `kind` comes first, because it determines the other keys
         return {
-            name: _plain(own[name])
+            name: _plain(values[name])
             for name, field in sorted(fields.items(), key=lambda item: not item[1].kw_only)
-            if field.kw_only or own[name] != field.get_default(call_default_factory=True)
+            if field.kw_only or values[name] != field.get_default(call_default_factory=True)
         }
     if isinstance(value, Mapping):
-        return {key: _plain(own) for key, own in value.items()}
+        return {key: _plain(entry) for key, entry in value.items()}
     if isinstance(value, tuple):
-        return [_plain(own) for own in value]
+        return [_plain(entry) for entry in value]
     if isinstance(value, complex):
         return str(value) if value.imag else value.real
     return value
@@ -238,19 +249,19 @@ def _plain(value: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class DrawnCampaign:
-    """A specification with its code symbols and trajectories, (flight, node) → how the node flies, drawn."""
+    """Specification with drawn code symbols and drawn trajectories, (flight, node) → trajectory."""
 
     specification: CampaignSpecification
     waveform: TransmitWaveform
     trajectories: Mapping[tuple[str, str], Trajectory]
 
     def pulse_times(self, flight: SimulatedFlight) -> Floats:
-        """Return (pulse,) float64, seconds from the first pulse."""
+        """Return the times of the pulses, (pulse,) float64, seconds from the first pulse."""
         return np.arange(flight.pulses) / self.waveform.prf_hz
 
 
 def draw_campaign(specification: CampaignSpecification, generator: Generator) -> DrawnCampaign:
-    """Draw code symbols, then the wobble of each track in order, each from its own stream."""
+    """Draw the code symbols and the wobble of each track, each from its own random stream."""
     tracks = {(flight.name, node): (flight, node) for flight in specification.flights for node in flight.tracks}
     codes, *streams = independent_streams(generator, 1 + len(tracks))
     trajectories = {}

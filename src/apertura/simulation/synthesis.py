@@ -1,9 +1,9 @@
-"""From geometry to counts: paths through what is wrong with a node, to samples on its own clock, digitised.
+"""Synthesis of recordings: paths, impairments of a node, samples on its own clock, and digitisation.
 
-A delay acts on each subcarrier, so all echoes are summed as one spectrum and brought to the receiver's own
-time grid by an inverse DFT, or by a chirp-z transform where its sampling rate is off. Edges are true: an
-echo is absent before it arrives and after it has ended. Captures of long flights are synthesised faster, as if echoes
-neither began nor ended.
+A delay acts on each subcarrier, so all echoes are summed in one spectrum, which is transformed to the receiver's time
+grid by an inverse DFT, or by a chirp-z transform if its sampling rate has an offset. The edges of echoes are exact: an
+echo is absent before its arrival and after its end. Captures of long flights are synthesised faster, with periodic
+echoes that have no edges.
 """
 
 from collections.abc import Callable, Mapping
@@ -27,28 +27,28 @@ from apertura.simulation.waveform import TransmitWaveform
 
 Complex = NDArray[np.complex128]
 
-_SHORT = 64  # samples; shorter stretches are summed directly, longer ones cut out of a transform
-_DOPPLER_ORDER = 3  # terms of exp(-j2πf·rate·t); at 100 m/s and 1.6 GHz the next one is below -150 dB
+_SHORT = 64  # samples, longest interval that is summed directly; longer ones are taken from a transform
+_DOPPLER_ORDER = 3  # order of the Taylor series of exp(-j2πf·rate·t); the next term is below -150 dB (100 m/s, 1.6 GHz)
 
 
 @dataclass(frozen=True)
 class Channel:
-    """One receiving channel over a flight: everything that decides its samples, drawn already.
+    """Receiving channel over a flight, with all random values drawn: it determines the samples.
 
     Attributes
     ----------
     response
         (subcarrier,) complex128, ripple of transmitter and receiver.
     phase_rad
-        (pulse,) float64, phase of the carrier against the transmitter's.
+        (pulse,) float64, carrier phase relative to the transmitter.
     start_s
-        (pulse,) float64, start of the capture less start of the pulse, seconds.
+        (pulse,) float64, start of the capture minus start of the pulse, seconds.
     cfo_hz, sfo_hz
-        The receiver's local oscillator and sampling rate less their nominal frequencies, Hz.
+        The receiver's local oscillator and sampling rate minus their nominal frequencies, Hz.
     noise_variance
         E|n|² of a complex sample.
     full_scale
-        Amplitude of I + jQ that the converter takes as full scale, where a radio is stated; None: by its backoff.
+        Full-scale amplitude of I + jQ if a radio is specified; None: derived from the backoff of the converter.
     """
 
     waveform: TransmitWaveform
@@ -63,14 +63,14 @@ class Channel:
 
 
 def transfer_functions(channel: Channel, generator: Generator | None) -> Complex:
-    """Return (pulse, subcarrier) transfer functions as an ideal demodulator would measure them, without samples.
+    """Return the transfer functions that an ideal demodulator measures, (pulse, subcarrier), without sampling.
 
-    Equal to the DFT of `samples` divided by the code while clocks run true, nothing moves within the pulse and
-    all echoes stay inside the prefix; many times faster. Without generator, without noise.
+    They equal the DFT of `samples` divided by the code if there are no clock offsets, no motion within the pulse and no
+    echoes beyond the prefix, and are computed many times faster. There is no noise if `generator` is None.
     """
     waveform, paths = channel.waveform, channel.paths
-    early = paths.delay_s - channel.start_s[:, None]
-    transfer = spectrum(early, paths.amplitude, waveform.frequency_hz) * channel.response
+    delay_s = paths.delay_s - channel.start_s[:, None]
+    transfer = spectrum(delay_s, paths.amplitude, waveform.frequency_hz) * channel.response
     transfer *= np.exp(1j * channel.phase_rad[:, None])
     if generator is not None and channel.noise_variance:
         transfer += noise(generator, transfer.shape, channel.noise_variance / waveform.dft_samples)
@@ -84,14 +84,14 @@ def samples(
     *,
     count: int | None = None,
 ) -> Complex:
-    """Return (pulse, sample) complex128 of the captures, before the ADC.
+    """Synthesise the samples of captures before the ADC, (pulse, sample) complex128.
 
     Parameters
     ----------
     generator
-        Draws the noise, pulse after pulse; None: without noise.
+        Generator of the noise, pulse by pulse; None: no noise.
     pulses, count
-        Which captures, and samples of each; prefix and symbol if None.
+        Selected captures, and number of samples of each; None: prefix and symbol.
 
     Notes
     -----
@@ -116,7 +116,7 @@ def samples(
 
 
 def _capture(channel: Channel, pulse: int, count: int) -> Complex:
-    """One capture without noise: stretches of constant set of paths, each from its own spectrum."""
+    """Synthesise a capture without noise from intervals with a constant set of paths, each with its own spectrum."""
     waveform, rate = channel.waveform, sampling_rate(channel)
     order = np.argsort(channel.paths.delay_s[pulse])
     arrival = (channel.paths.delay_s[pulse, order] - channel.start_s[pulse]) * rate
@@ -127,21 +127,21 @@ def _capture(channel: Channel, pulse: int, count: int) -> Complex:
     capture = np.zeros(count, np.complex128)
     edges = np.unique(np.clip(np.concatenate([first, end]), 0, count))
     for start, stop in pairwise(edges):
-        # Paths that have arrived less those that have ended, both in the order of their delays.
+        # The paths present are those that have arrived minus those that have ended, both in the order of delays.
         arrived, ended = np.searchsorted(first, start, "right"), np.searchsorted(end, start, "right")
         if arrived > ended:
             present = spectra[:, groups[arrived]] - spectra[:, groups[ended]]
-            capture[start:stop] = _stretch(channel, pulse, present, start, stop, count)
+            capture[start:stop] = _interval(channel, pulse, present, start, stop, count)
     return capture
 
 
 def _cumulative_spectra(channel: Channel, pulse: int, order: NDArray[np.intp], splits: NDArray[np.intp]) -> Complex:
-    """(term, group + 1, subcarrier): spectra of the paths up to each group of equal edges, per Taylor term in t."""
+    """Return cumulative spectra over groups of paths of equal edges, per Taylor term, (term, group + 1, subcarrier)."""
     waveform, paths = channel.waveform, channel.paths
     delay, rate = paths.delay_s[pulse, order], paths.delay_rate[pulse, order]
     middle_s = waveform.duration_s / 2
     terms = _DOPPLER_ORDER + 1 if rate.any() else 1
-    # delays at the middle of the pulse from the receiver's start; the carrier turns with the whole delay
+    # delays at the middle of the pulse relative to the start of the capture; they also determine the carrier phase
     late = delay + rate * middle_s - channel.start_s[pulse]
     level = paths.amplitude[pulse, order]
     factor = waveform.codes * channel.response * np.exp(-2j * np.pi * waveform.baseband_hz * waveform.cyclic_prefix_s)
@@ -155,75 +155,75 @@ def _cumulative_spectra(channel: Channel, pulse: int, order: NDArray[np.intp], s
     return out
 
 
-def _stretch(channel: Channel, pulse: int, spectra: Complex, start: int, stop: int, count: int) -> Complex:
-    """Σ_q t^q Σ_n S_qn exp(j2πnΔf·m/f_s') for start ≤ m < stop, t counted from the middle of the pulse."""
+def _interval(channel: Channel, pulse: int, spectra: Complex, start: int, stop: int, count: int) -> Complex:
+    """Evaluate Σ_q t^q Σ_n S_qn exp(j2πnΔf·m/f_s') for start ≤ m < stop; t is relative to the middle of the pulse."""
     waveform = channel.waveform
-    turns = waveform.subcarrier_spacing_hz / sampling_rate(channel)
+    cycles = waveform.subcarrier_spacing_hz / sampling_rate(channel)  # per sample and subcarrier
     index = np.arange(start, stop)
     time_s = index / sampling_rate(channel) + channel.start_s[pulse] - waveform.duration_s / 2
     numbers = waveform.first_subcarrier + np.arange(spectra.shape[1])
     if stop - start <= _SHORT:
-        table = _rotations(turns, waveform.first_subcarrier, len(numbers))[: stop - start]
-        parts = (spectra * np.exp(2j * np.pi * turns * start * numbers)) @ table.T
+        table = _rotations(cycles, waveform.first_subcarrier, len(numbers))[: stop - start]
+        terms = (spectra * np.exp(2j * np.pi * cycles * start * numbers)) @ table.T
     elif channel.sfo_hz:
-        parts = _zoom(len(numbers), count, turns)(spectra)[:, start:stop]
-        parts = parts * np.exp(2j * np.pi * turns * waveform.first_subcarrier * index)
+        terms = _chirp_z(len(numbers), count, cycles)(spectra)[:, start:stop]
+        terms = terms * np.exp(2j * np.pi * cycles * waveform.first_subcarrier * index)
     else:
         bins = np.zeros((len(spectra), waveform.dft_samples), np.complex128)
         bins[:, numbers] = spectra
-        parts = fft.ifft(bins, norm="forward")[:, index % waveform.dft_samples]
-    total = parts[-1]  # Horner's rule in t
-    for part in parts[-2::-1]:
-        total = total * time_s + part
+        terms = fft.ifft(bins, norm="forward")[:, index % waveform.dft_samples]
+    total = terms[-1]  # Horner's rule in t
+    for term in terms[-2::-1]:
+        total = total * time_s + term
     return np.asarray(total)
 
 
 @lru_cache(maxsize=4)
-def _rotations(turns: float, first: int, count: int) -> Complex:
-    return np.asarray(np.exp(2j * np.pi * turns * np.outer(np.arange(_SHORT), first + np.arange(count))))
+def _rotations(cycles: float, first: int, count: int) -> Complex:
+    return np.asarray(np.exp(2j * np.pi * cycles * np.outer(np.arange(_SHORT), first + np.arange(count))))
 
 
 @lru_cache(maxsize=8)
-def _zoom(size: int, count: int, turns: float) -> Callable[[Complex], Complex]:
-    from scipy.signal import CZT  # slow to import, and only a sampling clock that is off needs it
+def _chirp_z(size: int, count: int, cycles: float) -> Callable[[Complex], Complex]:
+    from scipy.signal import CZT  # slow to import, and only required for a sampling frequency offset
 
-    transform: Callable[[Complex], Complex] = CZT(size, count, w=np.exp(2j * np.pi * turns))
+    transform: Callable[[Complex], Complex] = CZT(size, count, w=np.exp(2j * np.pi * cycles))
     return transform
 
 
 def sampling_rate(channel: Channel) -> float:
-    """Return the rate at which the receiver truly samples, Hz."""
+    """Return the true sampling rate of the receiver, Hz."""
     return channel.waveform.sample_rate_hz + channel.sfo_hz
 
 
 def noise(generator: Generator, shape: tuple[int, ...], variance: float) -> Complex:
-    """Return circular Gaussian samples of E|n|² = variance, complex128."""
+    """Draw circular Gaussian samples with E|n|² = variance, complex128."""
     parts = generator.standard_normal((*shape, 2)) * np.sqrt(variance / 2)
     return np.asarray(parts.view(np.complex128)[..., 0])
 
 
 def periodic_samples(channel: Channel, generator: Generator | None, pulses: NDArray[np.intp]) -> NDArray[np.complex64]:
-    """Return (pulse, sample) complex64 of some captures, before the ADC: the symbol is periodic, so one spectrum does.
+    """Synthesise captures before the ADC with one spectrum of periodic echoes per pulse, (pulse, sample) complex64.
 
     Parameters
     ----------
     channel
-        Of a receiver whose clock samples true; nothing moves within a pulse.
+        Channel without sampling frequency offset and without motion within a pulse.
     generator
-        Draws the noise, pulse after pulse; None: without noise.
+        Generator of the noise, pulse by pulse; None: no noise.
     pulses
-        Which captures.
+        Selected captures.
 
     Raises
     ------
     ValueError
-        If the channel has a sampling clock that is off, or Doppler within the pulse.
+        If the channel has a sampling frequency offset, or Doppler within the pulse.
 
     Notes
     -----
-    Source: docs/theory/simulate.md, "Long flights". From the end of the prefix on equal to
-    `apertura.simulation.synthesis.samples`, to the rounding of complex64, as long as echoes arrive inside the prefix;
-    those that the window of the DFT would not hold whole are left out.
+    Source: docs/theory/simulate.md, "Long flights". After the prefix equal to
+    `apertura.simulation.synthesis.samples`, to the rounding of complex64, for echoes within the prefix; echoes that are
+    not complete within the window of the DFT are omitted.
 
     Examples
     --------
@@ -236,7 +236,7 @@ def periodic_samples(channel: Channel, generator: Generator | None, pulses: NDAr
     """
     waveform = channel.waveform
     if channel.sfo_hz or channel.paths.delay_rate[pulses].any():
-        raise ValueError("a sampling clock that is off, or Doppler within the pulse, needs exact synthesis")
+        raise ValueError("a sampling frequency offset, or Doppler within the pulse, requires exact synthesis")
     echoes = _prefixed_echoes(channel, pulses) * (
         waveform.codes * channel.response * np.exp(-2j * np.pi * waveform.baseband_hz * waveform.cyclic_prefix_s)
     ).astype(np.complex64)
@@ -246,8 +246,8 @@ def periodic_samples(channel: Channel, generator: Generator | None, pulses: NDAr
     period *= unit_phasor(channel.phase_rad[pulses, None] / (2 * np.pi))
     captures = np.take(period, np.arange(waveform.capture_samples) % waveform.dft_samples, axis=1)
     if channel.cfo_hz:
-        turns = -channel.cfo_hz / sampling_rate(channel) * np.arange(waveform.capture_samples)
-        captures = captures * unit_phasor(np.asarray(turns, np.float64))
+        cycles = -channel.cfo_hz / sampling_rate(channel) * np.arange(waveform.capture_samples)
+        captures = captures * unit_phasor(np.asarray(cycles, np.float64))
     if generator is not None and channel.noise_variance:
         parts = captures.view(np.float32)
         parts += generator.standard_normal(parts.shape, np.float32) * np.float32(np.sqrt(channel.noise_variance / 2))
@@ -255,7 +255,7 @@ def periodic_samples(channel: Channel, generator: Generator | None, pulses: NDAr
 
 
 def _prefixed_echoes(channel: Channel, pulses: NDArray[np.intp]) -> NDArray[np.complex64]:
-    """Return the spectrum of the paths that arrive inside the prefix, (pulse, subcarrier) complex64."""
+    """Return the spectrum of the paths that arrive within the prefix, (pulse, subcarrier) complex64."""
     waveform = channel.waveform
     delay_s = channel.paths.delay_s[pulses] - channel.start_s[pulses, None]
     early_s = waveform.symbol_s - 1 / waveform.subcarrier_spacing_hz
@@ -276,11 +276,11 @@ class Geometry:
     radar_tx, radar_rx, sidelink_tx, sidelink_rx
         (pulse, 3) float64, metres, Cartesian, in the frame of the scatterers; `sidelink`: ends of the direct path.
     tx_velocity, rx_velocity
-        (pulse, 3) float64, m/s, of transmitter and receiver, for Doppler within the pulse.
+        (pulse, 3) float64, m/s, velocities of transmitter and receiver, for Doppler within the pulse.
     gain
-        (pulse, point) float64, field of both radar antennas towards each scatterer, relative to their boresights.
+        (pulse, point) float64, two-way field of the radar antennas towards each scatterer, relative to boresight.
     air
-        What all paths fly through; None: vacuum.
+        Atmosphere along all paths; None: vacuum.
     """
 
     radar_tx: Floats
@@ -294,7 +294,7 @@ class Geometry:
 
 
 def straight_pair(along_m: Floats, height_m: float, *, rx_ahead_m: float = 0.0) -> Geometry:
-    """Return two nodes with their antennas at one place each, above the first axis at (pulse,) places along it."""
+    """Return two nodes on a straight track above the first axis, at (pulse,) positions along it, one point per node."""
     sender = np.column_stack([along_m, np.zeros(len(along_m)), np.full(len(along_m), height_m)])
     receiver = sender + np.array([rx_ahead_m, 0.0, 0.0])
     return Geometry(sender, receiver, sender, receiver)
@@ -311,18 +311,18 @@ def receive(
     path_offset_m: Mapping[ChannelName, float] = MappingProxyType({}),
     sidelink: bool = True,
 ) -> dict[str, Channel]:
-    """Return the channels `radar` and, of a node without the transmitter's clock, `sidelink`.
+    """Return the received channels: `radar` and, for a node without the transmitter's clock, `sidelink`.
 
     Parameters
     ----------
     scatterers, geometry
-        The scene, and where the antennas truly are.
+        The scene, and the true antenna positions.
     impairments, draw, transmitter
-        What is wrong with the receiving node, what was drawn of it, and what is wrong with the transmitting one.
+        Impairments of the receiving node, their draw, and impairments of the transmitting node.
     path_offset_m
-        Electrical path beyond geometry per channel, metres; zero where missing.
+        Channel → electrical path in addition to the geometric path, metres; zero if missing.
     sidelink
-        Whether the second channel is recorded.
+        True if the second channel is recorded.
     """
     velocity = (geometry.tx_velocity, geometry.rx_velocity) if impairments.doppler else (0.0, 0.0)
     echoes = echo_paths(
@@ -369,21 +369,21 @@ def _response(waveform: TransmitWaveform, ripple: Ripple | None) -> Complex:
 
 
 def spectral_power(waveform: TransmitWaveform, paths: Paths, response: Complex | float = 1.0) -> float:
-    """Return the mean of |Σ a·exp(-j2πfτ)|² over subcarriers and pulses; of a long flight over some, evenly spread."""
+    """Return the mean of |Σ a·exp(-j2πfτ)|² over subcarriers and pulses (evenly spaced ones of a long flight)."""
     every = -(-len(paths.delay_s) // _MOST_PULSES)
     paths = paths.at(slice(None, None, every))
     starts = range(0, len(paths.delay_s), _PULSES_AT_ONCE)
-    parts = (paths.at(slice(start, start + _PULSES_AT_ONCE)) for start in starts)
-    spectra = (spectrum(part.delay_s, part.amplitude, waveform.frequency_hz) for part in parts)
-    total = sum(float((np.abs(one * response) ** 2).sum()) for one in spectra)
+    blocks = (paths.at(slice(start, start + _PULSES_AT_ONCE)) for start in starts)
+    spectra = (spectrum(block.delay_s, block.amplitude, waveform.frequency_hz) for block in blocks)
+    total = sum(float((np.abs(echo * response) ** 2).sum()) for echo in spectra)
     return total / (len(paths.delay_s) * len(waveform.codes))
 
 
 def full_scale(channel: Channel, adc: Adc) -> float:
-    """Return the amplitude of I or Q that the converter takes as full scale, set once per flight.
+    """Return the full-scale amplitude of I or Q of the converter, which is constant during a flight.
 
-    The RMS of I and of Q over all pulses, with noise and all that leaks in, lies `adc.backoff_db` under it, unless
-    the channel has a full scale of its own.
+    It is `adc.backoff_db` above the RMS of I and of Q over all pulses, including noise and leakage, unless the channel
+    specifies its full scale.
     """
     if channel.full_scale is not None:
         return channel.full_scale
@@ -393,7 +393,7 @@ def full_scale(channel: Channel, adc: Adc) -> float:
 
 
 def digitize(samples: NDArray[np.complexfloating], adc: Adc, full_scale_amplitude: float) -> NDArray[np.int16]:
-    """Return (..., 2) int16 counts of I and Q, rounded and clipped to ±2^(bits-1).
+    """Digitise samples to counts of I and Q, (..., 2) int16, rounded and clipped to ±2^(bits-1).
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Targets of a scene and trajectories of nodes past it, east, north and up of an origin."""
+"""Targets of a scene and trajectories of nodes, in east, north and up coordinates of an origin."""
 
 from collections.abc import Callable
 from dataclasses import dataclass as plain_dataclass
@@ -21,7 +21,7 @@ _NED_FROM_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Origin:
-    """The place on Earth from which a simulation counts east, north and up (a plane, not the curved ground).
+    """Geodetic origin of the east, north and up coordinates of a simulation (a tangent plane).
 
     Examples
     --------
@@ -34,15 +34,15 @@ class Origin:
 
     latitude_deg: float = Field(ge=-90, le=90, description="WGS 84, degrees")
     longitude_deg: float = Field(ge=-180, le=180, description="WGS 84, degrees")
-    height_m: float = Field(description="above the ellipsoid, m")
+    height_m: float = Field(description="height above the ellipsoid, m")
 
     def ecef(self, enu_m: Floats) -> Floats:
-        """Return (..., 3) float64 ECEF (m) of (..., 3) east, north, up (m)."""
+        """Convert east, north, up to ECEF, (..., 3) float64, metres."""
         centre, axes = self._frame()
         return np.asarray(centre + enu_m @ axes.T)
 
     def enu(self, ecef_m: Floats) -> Floats:
-        """Return (..., 3) float64 east, north, up (m) of (..., 3) ECEF (m)."""
+        """Convert ECEF to east, north, up, (..., 3) float64, metres."""
         centre, axes = self._frame()
         return np.asarray((ecef_m - centre) @ axes)
 
@@ -53,12 +53,12 @@ class Origin:
 
 @plain_dataclass(frozen=True)
 class Scatterers:
-    """Points that scatter, whatever shape they came from.
+    """Point scatterers of all targets.
 
     Attributes
     ----------
     position_m
-        (point, 3) float64, metres, in the frame requested.
+        (point, 3) float64, metres.
     amplitude
         (point,) complex128, echo amplitude at 1 m × 1 m.
     """
@@ -69,20 +69,20 @@ class Scatterers:
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class PointTarget:
-    """A point."""
+    """Point target."""
 
     position_m: Vector = Field(description="east, north, up, m")
     amplitude: complex = Field(default=1.0, description="echo amplitude at 1 m × 1 m")
     kind: Literal["point"] = Field(default="point", kw_only=True, repr=False)
 
     def points(self, generator: Generator) -> Scatterers:  # noqa: ARG002
-        """Return the one point, east-north-up (m)."""
+        """Return the point, east-north-up (m)."""
         return Scatterers(np.array([self.position_m], np.float64), np.array([self.amplitude], np.complex128))
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Line:
-    """A wire or an edge: equal points from start to end, both included."""
+    """Line target, such as a wire or an edge: equal points from start to end, inclusive."""
 
     start_m: Vector = Field(description="east, north, up, m")
     end_m: Vector = Field(description="east, north, up, m")
@@ -99,7 +99,7 @@ class Line:
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Plate:
-    """A flat parallelogram (a facet) of points, all four corners included.
+    """Plate target: a flat parallelogram (facet) of points, including its corners.
 
     Examples
     --------
@@ -109,9 +109,11 @@ class Plate:
     """
 
     corner_m: Vector = Field(description="east, north, up, m")
-    side_m: Vector = Field(description="from the corner along one side, m")
-    other_side_m: Vector = Field(description="from the corner along the other side, m")
-    counts: tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]] = Field(description="points along each")
+    side_m: Vector = Field(description="vector from the corner along one side, m")
+    other_side_m: Vector = Field(description="vector from the corner along the other side, m")
+    counts: tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]] = Field(
+        description="number of points along each side"
+    )
     amplitude: complex = Field(default=1.0, description="echo amplitude of all points together")
     kind: Literal["plate"] = Field(default="plate", kw_only=True, repr=False)
 
@@ -125,14 +127,16 @@ class Plate:
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Clutter:
-    """Ground of random points: circular Gaussian amplitudes, so that resolved cells are Rayleigh distributed."""
+    """Clutter of random points with circular Gaussian amplitudes; magnitudes of resolution cells are Rayleigh."""
 
     bounds_m: tuple[float, float, float, float] = Field(description="east min, north min, east max, north max, m")
     reflectivity: float = Field(ge=0, description="mean power per square metre; 1: one unit point target per m²")
-    density_per_m2: float = Field(default=10.0, gt=0, description="points per m²; several per cell look like ground")
+    density_per_m2: float = Field(
+        default=10.0, gt=0, description="points per m²; several per resolution cell give developed speckle"
+    )
     up_m: float = Field(default=0.0, description="height above the origin, m")
     slope: tuple[float, float] = Field(
-        default=(0.0, 0.0), description="rise per metre east and north of the origin: a ramp"
+        default=(0.0, 0.0), description="slope eastward and northward from the origin, m/m"
     )
     kind: Literal["clutter"] = Field(default="clutter", kw_only=True, repr=False)
 
@@ -150,7 +154,7 @@ Target = Annotated[PointTarget | Line | Plate | Clutter, Field(discriminator="ki
 
 
 def scatterers(origin: Origin, targets: tuple[Target, ...], generator: Generator) -> Scatterers:
-    """Return the points of all targets in ECEF (m); the generator draws clutter.
+    """Return the point scatterers of all targets in ECEF (m); `generator` draws the clutter.
 
     Examples
     --------
@@ -164,23 +168,23 @@ def scatterers(origin: Origin, targets: tuple[Target, ...], generator: Generator
 
 
 class Trajectory(Protocol):
-    """Position (m east, north, up) and attitude (rad: roll, pitch, yaw from north) at seconds after the first pulse."""
+    """Position and attitude of a node as functions of the time after the first pulse, seconds."""
 
     def position(self, time_s: Floats) -> Floats:
-        """Return (time, 3) float64, metres east, north, up of the origin."""
+        """Return the position, (time, 3) float64, metres east, north, up of the origin."""
 
     def attitude(self, time_s: Floats) -> Floats:
-        """Return (time, 3) float64, radians."""
+        """Return roll, pitch and yaw (from north), (time, 3) float64, radians."""
 
 
 @plain_dataclass(frozen=True)
 class Sampled:
-    """A cubic spline through given epochs.
+    """Trajectory by cubic splines through epochs.
 
     Attributes
     ----------
     time_s
-        (epoch,) float64, seconds after the first pulse, increasing.
+        (epoch,) float64, seconds after the first pulse, ascending.
     position_m, attitude_rad
         (epoch, 3) float64: east, north, up of the origin; roll, pitch, yaw.
     """
@@ -190,34 +194,36 @@ class Sampled:
     attitude_rad: Floats
 
     def position(self, time_s: Floats) -> Floats:
-        """Return (time, 3) float64, metres east, north, up of the origin."""
+        """Return the position, (time, 3) float64, metres east, north, up of the origin."""
         return self._spline(self.position_m)(time_s)
 
     def attitude(self, time_s: Floats) -> Floats:
-        """Return (time, 3) float64, radians."""
+        """Return roll, pitch and yaw (from north), (time, 3) float64, radians."""
         return self._spline(np.unwrap(self.attitude_rad, axis=0))(time_s)
 
     def _spline(self, values: Floats) -> Callable[[Floats], Floats]:
-        from scipy.interpolate import CubicSpline  # slow to import, and a straight flight needs none
+        from scipy.interpolate import CubicSpline  # slow to import, and not required for a straight flight
 
         return lambda time_s: np.asarray(CubicSpline(self.time_s, values)(time_s), np.float64)
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Wobble:
-    """Smooth random motion about what was meant to be flown, as wind and a position controller leave it."""
+    """Smooth random motion about the intended track, as caused by wind and a position controller."""
 
     sigma_m: Vector = Field(default=(0.03, 0.05, 0.04), description="standard deviation east, north, up, m")
-    attitude_sigma_deg: Vector = Field(default=(2.0, 2.0, 3.0), description="the same of roll, pitch, yaw, deg")
+    attitude_sigma_deg: Vector = Field(
+        default=(2.0, 2.0, 3.0), description="standard deviation of roll, pitch, yaw, degrees"
+    )
     smoothing_s: float = Field(default=1.0, gt=0, description="standard deviation of the smoothing Gaussian, s")
 
     def around(self, path: Trajectory, duration_s: float, generator: Generator) -> Sampled:
-        """Return `path` with the motion drawn, from 10 s before the first pulse to 10 s after `duration_s`.
+        """Add a drawn motion to `path`, from 10 s before the first pulse to 10 s after `duration_s`.
 
         Examples
         --------
-        >>> shaken = Wobble().around(Straight((0, 0, 5), (1, 0, 0)), 60.0, np.random.default_rng(0))
-        >>> (shaken.position(np.arange(600) / 10)[:, 2].std() < 0.06).item()
+        >>> wobbling = Wobble().around(Straight((0, 0, 5), (1, 0, 0)), 60.0, np.random.default_rng(0))
+        >>> (wobbling.position(np.arange(600) / 10)[:, 2].std() < 0.06).item()
         True
         """
         from scipy.ndimage import gaussian_filter1d
@@ -234,7 +240,7 @@ class Wobble:
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Straight:
-    """Constant velocity, nose along the course, wings level; `wobble` is added when the flight is drawn.
+    """Track of constant velocity with level attitude along the course; `wobble` is added when the flight is drawn.
 
     Examples
     --------
@@ -247,15 +253,15 @@ class Straight:
 
     start_m: Vector = Field(description="east, north, up of the origin at the first pulse, m")
     velocity_m_s: Vector = Field(description="east, north, up, m/s")
-    wobble: Wobble | None = Field(default=None, description="random motion about it; null: none")
+    wobble: Wobble | None = Field(default=None, description="random motion about the track; null: none")
     kind: Literal["straight"] = Field(default="straight", kw_only=True, repr=False)
 
     def position(self, time_s: Floats) -> Floats:
-        """Return (time, 3) float64, metres east, north, up of the origin."""
+        """Return the position, (time, 3) float64, metres east, north, up of the origin."""
         return np.asarray(np.array(self.start_m) + np.multiply.outer(time_s, self.velocity_m_s), np.float64)
 
     def attitude(self, time_s: Floats) -> Floats:
-        """Return (time, 3) float64, radians."""
+        """Return roll, pitch and yaw (from north), (time, 3) float64, radians."""
         yaw = np.arctan2(self.velocity_m_s[0], self.velocity_m_s[1])
         return np.tile([0.0, 0.0, yaw], (np.size(time_s), 1))
 
@@ -266,7 +272,7 @@ class Straight:
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Waypoints:
-    """A cubic spline through places at given times, such as a recorded flight.
+    """Track by a cubic spline through positions at given times, such as those of a recorded flight.
 
     Examples
     --------
@@ -275,19 +281,19 @@ class Waypoints:
     (array([[0.5, 0. , 5. ]]), np.float64(90.0))
     """
 
-    time_s: tuple[float, ...] = Field(min_length=2, description="seconds after the first pulse, increasing")
-    position_m: tuple[Vector, ...] = Field(description="east, north, up of the origin at each, m")
+    time_s: tuple[float, ...] = Field(min_length=2, description="times, seconds after the first pulse, ascending")
+    position_m: tuple[Vector, ...] = Field(description="east, north, up of the origin at each time, m")
     attitude_deg: tuple[Vector, ...] | None = Field(
         default=None,
-        description="roll, pitch, yaw (clockwise from north) at each, degrees; null: level and along the course",
+        description="roll, pitch, yaw (clockwise from north) at each time, degrees; null: level and along the course",
     )
-    wobble: Wobble | None = Field(default=None, description="random motion about it; null: none")
+    wobble: Wobble | None = Field(default=None, description="random motion about the track; null: none")
     kind: Literal["waypoints"] = Field(default="waypoints", kw_only=True, repr=False)
 
     @model_validator(mode="after")
     def _one_place_per_time(self) -> Self:
         if (np.diff(self.time_s) <= 0).any():
-            raise ValueError("time_s must increase")
+            raise ValueError("time_s must be strictly ascending")
         if any(
             len(values) != len(self.time_s) for values in (self.position_m, self.attitude_deg) if values is not None
         ):
@@ -308,32 +314,32 @@ Track = Annotated[Straight | Waypoints, Field(discriminator="kind")]
 
 
 def phase_centre(origin: Origin, path: Trajectory, time_s: Floats, lever_arm_m: Vector = (0.0, 0.0, 0.0)) -> Floats:
-    """Return (time, 3) float64 ECEF (m) of an antenna `lever_arm_m` (forward, right, down) from the logged point.
+    """Return the ECEF position of an antenna at `lever_arm_m` (forward, right, down) from the logged point, (time, 3).
 
     Examples
     --------
-    >>> here = phase_centre(Origin(0, 0, 0), Straight((0, 0, 0), (1, 0, 0)), np.zeros(1), (0.0, 0.0, -1.0))
-    >>> here.round(6) + 0.0
+    >>> position_m = phase_centre(Origin(0, 0, 0), Straight((0, 0, 0), (1, 0, 0)), np.zeros(1), (0.0, 0.0, -1.0))
+    >>> position_m.round(6) + 0.0
     array([[6378138.,       0.,       0.]])
     """
     position = origin.ecef(path.position(time_s))
-    return np.asarray(position + body_turn(origin, path, time_s) @ np.array(lever_arm_m, np.float64))
+    return np.asarray(position + body_rotation(origin, path, time_s) @ np.array(lever_arm_m, np.float64))
 
 
-def body_turn(origin: Origin, path: Trajectory, time_s: Floats) -> Floats:
-    """Return (time, 3, 3) float64: forward-right-down of the body into ECEF.
+def body_rotation(origin: Origin, path: Trajectory, time_s: Floats) -> Floats:
+    """Return the rotations from body axes (forward, right, down) to ECEF, (time, 3, 3) float64.
 
     Examples
     --------
-    >>> turn = body_turn(Origin(0, 0, 0), Straight((0, 0, 0), (1, 0, 0)), np.zeros(1))
-    >>> (turn[0] @ [1.0, 0.0, 0.0]).round(6) + 0.0  # forward is east
+    >>> rotation = body_rotation(Origin(0, 0, 0), Straight((0, 0, 0), (1, 0, 0)), np.zeros(1))
+    >>> (rotation[0] @ [1.0, 0.0, 0.0]).round(6) + 0.0  # forward is east
     array([0., 1., 0.])
     """
     return np.asarray(ned_axes(origin.ecef(path.position(time_s))) @ body_axes(path.attitude(time_s)))
 
 
 def logged_velocity(origin: Origin, path: Trajectory, time_s: Floats) -> Floats:
-    """Return (time, 3) float64 ECEF velocity (m/s) of the logged point."""
+    """Return the ECEF velocity of the logged point, (time, 3) float64, m/s."""
     half_s = 1e-3
     after, before = (phase_centre(origin, path, time_s + sign * half_s) for sign in (1, -1))
     return np.asarray((after - before) / (2 * half_s))
@@ -341,26 +347,26 @@ def logged_velocity(origin: Origin, path: Trajectory, time_s: Floats) -> Floats:
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class GaussianBeam:
-    """The beam of an antenna fixed to a node's body."""
+    """Gaussian beam of an antenna that is fixed to the body of a node."""
 
     boresight_deg: tuple[float, float] = Field(
         description="azimuth clockwise from forward, elevation above the forward-right plane, degrees"
     )
     beamwidth_deg: tuple[float, float] = Field(description="full width at half power in azimuth, elevation, degrees")
 
-    def gain(self, turn: Floats, antenna_m: Floats, points_m: Floats) -> Floats:
-        """Return the field (pulse, point) float64 towards points, relative to boresight.
+    def gain(self, rotation: Floats, antenna_m: Floats, points_m: Floats) -> Floats:
+        """Return the field towards points relative to boresight, (pulse, point) float64.
 
         Parameters
         ----------
-        turn
-            (pulse, 3, 3) float64, forward-right-down of the body into the frame of the points.
+        rotation
+            (pulse, 3, 3) float64, rotations from body axes (forward, right, down) to the frame of the points.
         antenna_m, points_m
             (pulse, 3) and (point, 3) float64, metres, in that frame.
 
         Notes
         -----
-        Source: docs/theory/simulate.md, eq. 7. The antenna is turned in the body as a body is: by yaw, then pitch.
+        Source: docs/theory/simulate.md, eq. 7. The antenna is rotated relative to the body by yaw, then pitch.
 
         Examples
         --------
@@ -370,8 +376,8 @@ class GaussianBeam:
         array([[1. , 0.5]])
         """
         azimuth_deg, elevation_deg = self.boresight_deg
-        own = turn @ body_axes(np.radians([0.0, elevation_deg, azimuth_deg]))
-        ahead, right, down = np.einsum("pij,pni->jpn", own, points_m[None] - antenna_m[:, None])
+        axes = rotation @ body_axes(np.radians([0.0, elevation_deg, azimuth_deg]))
+        ahead, right, down = np.einsum("pij,pni->jpn", axes, points_m[None] - antenna_m[:, None])
         azimuth, elevation = np.arctan2(right, ahead), np.arctan2(-down, np.hypot(ahead, right))
-        parts = zip((azimuth, elevation), np.radians(self.beamwidth_deg), strict=True)
-        return np.asarray(2.0 ** (-2 * sum((angle / width) ** 2 for angle, width in parts)))
+        cuts = zip((azimuth, elevation), np.radians(self.beamwidth_deg), strict=True)
+        return np.asarray(2.0 ** (-2 * sum((angle / width) ** 2 for angle, width in cuts)))

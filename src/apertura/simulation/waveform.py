@@ -1,4 +1,4 @@
-"""Transmitted waveforms: OFDM symbols and pulses given by their samples, and the sections that specify them."""
+"""Transmitted waveforms: OFDM symbols and sampled pulses, and the sections that specify them."""
 
 from dataclasses import dataclass as plain_dataclass
 from typing import Annotated, Any, Literal, Self
@@ -16,7 +16,7 @@ from apertura.simulation.impairments import STRICT_KEYS
 
 @plain_dataclass(frozen=True)
 class TransmitWaveform:
-    """One OFDM symbol per pulse: s(t) = Σ c_n exp(j2πnΔf(t − T_cp)) for 0 ≤ t < T_cp + T.
+    """OFDM waveform, one symbol per pulse: s(t) = Σ c_n exp(j2πnΔf(t − T_cp)) for 0 ≤ t < T_cp + T.
 
     Attributes
     ----------
@@ -47,71 +47,71 @@ class TransmitWaveform:
 
     @property
     def first_subcarrier(self) -> int:
-        """The smallest n."""
+        """Smallest subcarrier number n."""
         return 0 if self.carrier_is == "band_start" else -(len(self.codes) // 2)
 
     @property
     def baseband_hz(self) -> Floats:
-        """(subcarrier,) float64, nΔf."""
+        """Baseband frequencies nΔf, (subcarrier,) float64, Hz."""
         return np.asarray((self.first_subcarrier + np.arange(len(self.codes))) * self.subcarrier_spacing_hz, np.float64)
 
     @property
     def frequency_hz(self) -> Floats:
-        """(subcarrier,) float64, RF frequency."""
+        """RF frequencies, (subcarrier,) float64, Hz."""
         return self.carrier_hz + self.baseband_hz
 
     @property
     def duration_s(self) -> float:
-        """T_cp + T."""
+        """Duration of the pulse T_cp + T, seconds."""
         return self.cyclic_prefix_s + self.symbol_s
 
     @property
     def dft_samples(self) -> int:
-        """Samples of one period 1/Δf."""
+        """Number of samples of one period 1/Δf."""
         return round(self.sample_rate_hz / self.subcarrier_spacing_hz)
 
     @property
     def prefix_samples(self) -> int:
-        """Samples of the cyclic prefix."""
+        """Number of samples of the cyclic prefix."""
         return round(self.cyclic_prefix_s * self.sample_rate_hz)
 
     @property
     def capture_samples(self) -> int:
-        """Samples of a triggered capture: prefix and symbol."""
+        """Number of samples of a triggered capture: prefix and symbol."""
         return round(self.duration_s * self.sample_rate_hz)
 
     @property
     def mean_power(self) -> float:
-        """E|s|² of codes of unit modulus."""
+        """Mean power E|s|² for codes of unit modulus."""
         return float(len(self.codes))
 
     @property
     def noise_at_unit_snr(self) -> float:
-        """E|n|² of samples whose noise in one bin of the DFT equals an echo of amplitude 1."""
+        """Noise variance E|n|² of samples at which the noise of a DFT bin equals an echo of amplitude 1."""
         return float(self.dft_samples)
 
     @property
     def sent(self) -> tuple[str, NDArray[np.complex64]]:
-        """Name and content of the file of what was sent."""
+        """Name and content of the file of the transmitted code."""
         return "codes.npy", self.codes.astype(np.complex64)
 
     def presence(self, arrival: Floats, rate_hz: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return the samples of a capture between which paths are present, (path,) each.
+        """Return the first sample of each path in a capture and the first sample after its end, (path,) each.
 
         Parameters
         ----------
         arrival
-            (path,) float64, when the pulse arrives, in samples of the capture, ascending.
+            (path,) float64, arrival of the pulse, in samples of the capture, ascending.
         rate_hz
-            At which the receiver samples.
+            Sampling rate of the receiver.
         """
-        # from its first sample up to, not including, its end; a millionth of a sample is rounding
+        # 1e-6 samples: tolerance for rounding
         first, end = (np.ceil(arrival + extra - 1e-6).astype(int) for extra in (0.0, self.duration_s * rate_hz))
         return first, end
 
 
 def qpsk_codes(count: int, generator: Generator) -> NDArray[np.complex128]:
-    """Return `count` random QPSK code symbols of unit modulus.
+    """Draw `count` random QPSK code symbols of unit modulus.
 
     Examples
     --------
@@ -122,7 +122,7 @@ def qpsk_codes(count: int, generator: Generator) -> NDArray[np.complex128]:
 
 
 def newman_codes(count: int) -> NDArray[np.complex128]:
-    """Return the quadratic-phase code exp(jπn²/N), whose symbol is nearly as flat in time as a chirp.
+    """Return the quadratic-phase code exp(jπn²/N), whose symbol has a nearly constant envelope, like a chirp.
 
     Notes
     -----
@@ -145,16 +145,16 @@ def pulse_samples(name: PulseName, *, bandwidth_hz: float, pulse_s: float, sampl
         chirp: a linear sweep over the bandwidth. pn, golay: chips of ±1 at the rate of the bandwidth, a maximum-length
         sequence of 2^k - 1 or one of a complementary pair of 2^k, the longest that fits.
     bandwidth_hz
-        Of codes: one of its whole parts is the sample rate's, so that chips are whole samples.
+        Bandwidth of the chirp, or chip rate; the sample rate must be an integer multiple of the chip rate.
     pulse_s
-        How long it lasts, at most.
+        Longest duration of the pulse, seconds.
     sample_rate_hz
         Complex samples per second.
 
     Raises
     ------
     ValueError
-        If chips are no whole samples, or fewer than three fit.
+        If a chip is not a whole number of samples, or fewer than three chips fit.
 
     Notes
     -----
@@ -172,7 +172,7 @@ def pulse_samples(name: PulseName, *, bandwidth_hz: float, pulse_s: float, sampl
     repeat = sample_rate_hz / bandwidth_hz
     chips = count // max(1, round(repeat))
     if abs(repeat - round(repeat)) > 1e-6 or repeat < 0.5 or chips < 3:
-        raise ValueError(f"{chips} chips of {repeat:g} samples: at least 3, of whole samples each, are needed")
+        raise ValueError(f"{chips} chips of {repeat:g} samples; required: at least 3 chips of whole samples")
     code = _maximum_length(int(np.log2(chips + 1))) if name == "pn" else _golay(int(np.log2(chips)))
     return np.repeat(code, round(repeat)).astype(np.complex128)
 
@@ -184,24 +184,24 @@ def _maximum_length(bits: int) -> Floats:
 
 
 def _golay(doublings: int) -> Floats:
-    one, other = np.ones(1), np.ones(1)
+    first, second = np.ones(1), np.ones(1)
     for _ in range(doublings):
-        one, other = np.concatenate([one, other]), np.concatenate([one, -other])
-    return one
+        first, second = np.concatenate([first, second]), np.concatenate([first, -second])
+    return first
 
 
 @plain_dataclass(frozen=True)
 class TransmitPulse(TransmitWaveform):
-    """A pulse that is sent once, as the tones of a period so long that a capture hears nothing of its repetition.
+    """Pulse that is sent once, represented by tones of a period so long that captures do not contain a repetition.
 
     Attributes
     ----------
     pulse
         (sample,) complex128.
     lead_s, listen_s
-        How long a capture begins before the pulse, and the longest delay whose echo it holds whole.
+        Time of the capture before the pulse, and longest delay whose echo is complete in the capture, seconds.
     band_hz
-        Baseband frequencies that it is demodulated at.
+        Band of demodulation at baseband.
 
     Notes
     -----
@@ -225,10 +225,10 @@ class TransmitPulse(TransmitWaveform):
         listen_s: float,
         band_hz: tuple[float, float],
     ) -> "TransmitPulse":
-        """Return the pulse as tones c_k = S_k/M, which begin `lead_s` after the capture."""
-        kept = round((lead_s + listen_s) * sample_rate_hz) + len(pulse)
-        # twice over: what a fractional delay leaves around the edges of a pulse has faded before it comes again
-        period = int(fft.next_fast_len(2 * (kept + len(pulse)) // 2)) * 2
+        """Return the pulse as tones c_k = S_k/M, with its start `lead_s` after that of the capture."""
+        length = round((lead_s + listen_s) * sample_rate_hz) + len(pulse)
+        # a period of twice this length, in which the ringing of a fractional delay at the edges of the pulse decays
+        period = int(fft.next_fast_len(2 * (length + len(pulse)) // 2)) * 2
         numbers = np.arange(period) - period // 2
         codes = np.roll(fft.fft(pulse, period, norm="forward"), period // 2)
         codes = codes * np.exp(-2j * np.pi * numbers * lead_s * sample_rate_hz / period)
@@ -238,17 +238,17 @@ class TransmitPulse(TransmitWaveform):
 
     @property
     def capture_samples(self) -> int:
-        """Samples of a triggered capture: what goes before the pulse, the pulse, and its longest delay."""
+        """Number of samples of a triggered capture: time before the pulse, the pulse, and the longest delay."""
         return round((self.lead_s + self.listen_s) * self.sample_rate_hz) + len(self.pulse)
 
     @property
     def mean_power(self) -> float:
-        """E|s|² while the pulse lasts."""
+        """Mean power E|s|² during the pulse."""
         return float(np.mean(np.abs(self.pulse) ** 2))
 
     @property
     def noise_at_unit_snr(self) -> float:
-        """E|n|² of samples whose noise equals an echo of amplitude 1 in a bin of the band, on average."""
+        """Noise variance E|n|² of samples at which the noise equals an echo of amplitude 1 in an average bin."""
         length = self.capture_samples
         number = fft.fftfreq(length, 1 / self.sample_rate_hz)
         inside = (number >= self.band_hz[0]) & (number <= self.band_hz[1])
@@ -256,13 +256,13 @@ class TransmitPulse(TransmitWaveform):
 
     @property
     def sent(self) -> tuple[str, NDArray[np.complex64]]:
-        """Name and content of the file of what was sent."""
+        """Name and content of the file of the transmitted pulse."""
         return "pulse.npy", self.pulse.astype(np.complex64)
 
     def presence(self, arrival: Floats, rate_hz: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return the samples of a capture between which paths are present: all, or none where it hears nothing.
+        """Return the first and last sample of each path: the whole capture, or none of it if outside the capture.
 
-        The edges of a pulse are in its tones; what a fractional delay leaves beyond them is received, too.
+        The tones contain the edges of a pulse, including the ringing of a fractional delay beyond them.
         """
         lead = self.lead_s * rate_hz
         early, late = arrival < -lead - len(self.pulse), arrival >= self.capture_samples - lead
@@ -271,19 +271,21 @@ class TransmitPulse(TransmitWaveform):
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class WaveformSpecification:
-    """One OFDM symbol per pulse; docs/theory/simulate.md, eq. 3."""
+    """Specification of an OFDM waveform, one symbol per pulse; docs/theory/simulate.md, eq. 3."""
 
     subcarriers: int = Field(gt=1, description="number of subcarriers N")
     carrier_hz: float = Field(gt=0, description="RF frequency of subcarrier n = 0, Hz")
     subcarrier_spacing_hz: float = Field(gt=0, description="subcarrier spacing Δf, Hz")
-    symbol_s: float = Field(gt=0, description="transmitted symbol T without prefix, s")
+    symbol_s: float = Field(gt=0, description="duration of the symbol T without prefix, s")
     cyclic_prefix_s: float = Field(ge=0, description="cyclic prefix T_cp, s")
     sample_rate_hz: float = Field(gt=0, description="complex sample rate f_s, Hz")
     prf_hz: float = Field(gt=0, description="pulse repetition frequency, Hz")
     carrier_is: Literal["band_start", "band_centre"] = Field(
         default="band_start", description="n = 0…N-1 (band_start) or -N/2…N/2-1 (band_centre)"
     )
-    code: Literal["qpsk", "newman"] = Field(default="qpsk", description="random QPSK, or Newman's flat symbol")
+    code: Literal["qpsk", "newman"] = Field(
+        default="qpsk", description="random QPSK, or Newman's code of nearly constant envelope"
+    )
     kind: Literal["ofdm"] = Field(default="ofdm", kw_only=True, repr=False)
 
     @model_validator(mode="after")
@@ -291,37 +293,37 @@ class WaveformSpecification:
         length = self.sample_rate_hz / self.subcarrier_spacing_hz
         if abs(length - round(length)) > 1e-6 * length or self.subcarriers > round(length):
             raise ValueError(
-                f"sample_rate_hz/subcarrier_spacing_hz = {length:.6f}, the DFT length, must be an integer "
-                f"not below subcarriers={self.subcarriers}"
+                f"sample_rate_hz/subcarrier_spacing_hz = {length:.6f}, the DFT length, must be an integer of at least "
+                f"subcarriers={self.subcarriers}"
             )
         if self.symbol_s < (1 - 1e-9) / self.subcarrier_spacing_hz:
             raise ValueError(f"symbol_s={self.symbol_s:g} is shorter than 1/subcarrier_spacing_hz")
         return self
 
     def drawn(self, generator: Generator) -> TransmitWaveform:
-        """Return the waveform with its code symbols."""
+        """Return the waveform with its code symbols, drawn if they are random."""
         codes = qpsk_codes(self.subcarriers, generator) if self.code == "qpsk" else newman_codes(self.subcarriers)
-        sent = {name: value for name, value in vars(self).items() if name not in {"subcarriers", "code", "kind"}}
-        return TransmitWaveform(codes, **sent)
+        parameters = {name: value for name, value in vars(self).items() if name not in {"subcarriers", "code", "kind"}}
+        return TransmitWaveform(codes, **parameters)
 
     def section(self, _: TransmitWaveform) -> dict[str, Any]:
         """Return the section `waveform` of the config."""
-        stated = {name: value for name, value in vars(self).items() if name not in {"code", "kind"}}
-        return {"kind": self.kind, "codes": "raw/codes.npy", **stated}
+        parameters = {name: value for name, value in vars(self).items() if name not in {"code", "kind"}}
+        return {"kind": self.kind, "codes": "raw/codes.npy", **parameters}
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class PulseSpecification:
-    """A pulse that is sent once per trigger; docs/theory/waveforms.md, "Simulated"."""
+    """Specification of a pulse that is sent once per trigger; docs/theory/waveforms.md, "Simulated"."""
 
     pulse: PulseName = Field(description="chirp, pn (maximum-length sequence) or golay")
     carrier_hz: float = Field(gt=0, description="RF frequency of baseband zero, the middle of the pulse's band, Hz")
-    bandwidth_hz: float = Field(gt=0, description="swept by the chirp, or rate of the chips, Hz")
-    pulse_s: float = Field(gt=0, description="how long it lasts, at most, s")
-    listen_s: float = Field(gt=0, description="longest delay whose echo a capture holds whole, s")
+    bandwidth_hz: float = Field(gt=0, description="bandwidth of the chirp, or chip rate, Hz")
+    pulse_s: float = Field(gt=0, description="longest duration of the pulse, s")
+    listen_s: float = Field(gt=0, description="longest delay whose echo is complete in a capture, s")
     sample_rate_hz: float = Field(gt=0, description="complex sample rate f_s, Hz")
     prf_hz: float = Field(gt=0, description="pulse repetition frequency, Hz")
-    lead_s: float = Field(default=0.0, ge=0, description="how long before the pulse captures begin, s")
+    lead_s: float = Field(default=0.0, ge=0, description="time of a capture before the pulse, s")
     band_hz: tuple[float, float] | None = Field(default=None, description="as in the config; null: ±bandwidth_hz/2")
     filter: Literal["auto", "inverse", "matched"] = Field(default="auto", description="as in the config")
     kind: Literal["samples"] = Field(default="samples", kw_only=True, repr=False)
@@ -329,7 +331,7 @@ class PulseSpecification:
     @model_validator(mode="after")
     def _can_be_sampled(self) -> Self:
         if self.bandwidth_hz > self.sample_rate_hz:
-            raise ValueError(f"bandwidth_hz={self.bandwidth_hz:g} is beyond sample_rate_hz={self.sample_rate_hz:g}")
+            raise ValueError(f"bandwidth_hz={self.bandwidth_hz:g} exceeds sample_rate_hz={self.sample_rate_hz:g}")
         self._sampled()
         return self
 
@@ -338,34 +340,34 @@ class PulseSpecification:
         return pulse_samples(self.pulse, **sizes)
 
     def drawn(self, _: Generator) -> TransmitPulse:
-        """Return the pulse; nothing of it is random."""
+        """Return the pulse, which has no random part."""
         half = self.bandwidth_hz / 2
         names = ("carrier_hz", "sample_rate_hz", "prf_hz", "lead_s", "listen_s")
-        stated = {name: getattr(self, name) for name in names}
-        return TransmitPulse.of(self._sampled(), **stated, band_hz=self.band_hz or (-half, half))
+        parameters = {name: getattr(self, name) for name in names}
+        return TransmitPulse.of(self._sampled(), **parameters, band_hz=self.band_hz or (-half, half))
 
     def section(self, sent: TransmitWaveform) -> dict[str, Any]:
-        """Return the section `waveform` of the config, for the pulse as it was drawn."""
+        """Return the section `waveform` of the config for a drawn pulse."""
         if not isinstance(sent, TransmitPulse):
-            raise TypeError("drawn from another specification")
+            raise TypeError("the waveform was drawn from another specification")
         names = ("carrier_hz", "sample_rate_hz", "prf_hz", "lead_s", "listen_s", "filter")
-        stated = {name: getattr(self, name) for name in names}
+        parameters = {name: getattr(self, name) for name in names}
         pulse_s = len(sent.pulse) / self.sample_rate_hz
         return {
             "kind": self.kind,
             "pulse": "raw/pulse.npy",
             "pulse_s": pulse_s,
             "band_hz": list(sent.band_hz),
-            **stated,
+            **parameters,
         }
 
 
 def _with_kind(value: Any) -> Any:
-    """Return the section of a waveform, with the default kind where it states none."""
+    """Add the default kind to the section of a waveform if it has none."""
     return {"kind": "ofdm", **value} if isinstance(value, dict) else value
 
 
 TransmittedSpecification = Annotated[
     Annotated[WaveformSpecification | PulseSpecification, Field(discriminator="kind")], BeforeValidator(_with_kind)
 ]
-"""By `kind`; an OFDM symbol where a specification does not say."""
+"""Specification of a waveform, selected by `kind`; by default an OFDM symbol."""

@@ -258,7 +258,7 @@ def assessment_of(campaign: Campaign, flight: str) -> dict[str, Any]:
         read = {name: document[name] for name in ("reference", "hypotheses", "code_sha256")}
         fusion, pairs = document["fusion"], document["pairs"]
         phases = {pair: float(phase_rad) for pair, phase_rad in fusion["phases_rad"].items()}
-        excluded = {name: {**fusion[name]} for name in ("left_out", "unmeasured")}
+        excluded = {name: {**fusion[name]} for name in ("excluded", "unmeasured")}
         read["fusion"] = {**fusion, **excluded, "phases_rad": phases}
         read["pairs"] = {pair: {**agreed, "flags": {**agreed["flags"]}} for pair, agreed in pairs.items()}
     return {**document, **read}

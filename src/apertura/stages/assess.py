@@ -24,7 +24,9 @@ from apertura.stages.scene import settled_scene
 from apertura.workflow.lineage import result_of
 
 _PHASE = "pairs_out_of_phase"
-_LOOKS_WRONG = frozenset({"defocused", "loss_unexpected", "echo_elsewhere", "pairs_apart", _PHASE, "pair_unconfirmed"})
+_LOOKS_WRONG = frozenset(
+    {"defocused", "loss_unexpected", "echo_outside_scene", "pairs_displaced", _PHASE, "pair_unconfirmed"}
+)
 """Flags that a wrong geometry raises; hypotheses are tried where one is raised."""
 
 _TIED = "as many pairs contradict this, and the images do not show which pairs are wrong"
@@ -178,8 +180,8 @@ def _hypotheses(
             line = flags[pair].get(name) or images[pair].attrs["flags"][name]
             flags[pair][name] = line + cause
         focus = images[pair].attrs["quality"]["focus"]
-        if causes and not names and _regained(focus, causes[0]["gain_of_pairs_db"][pair]):
-            flags[pair]["loss_unexpected"] = f"{focus['why']}{cause}"
+        if causes and not names and _regained(focus, causes[0]["pair_gain_db"][pair]):
+            flags[pair]["loss_unexpected"] = f"{focus['reason']}{cause}"
     return causes
 
 
@@ -192,9 +194,9 @@ def _regained(focus: Mapping[str, Any], gain_db: float) -> bool:
 
 def _rank(focus: Mapping[str, Any]) -> tuple[int, float]:
     """Return the sort key of a pair's focus; the best focus has the lowest key."""
-    uncertain = "cannot tell" if "loss_db" in focus else "not measured"
-    verdict = uncertain if focus["verdict"] == "cannot tell" else focus["verdict"]
-    return ["focused", "cannot tell", "defocused", "not measured"].index(verdict), -focus.get("loss_db", 0.0)
+    uncertain = "inconclusive" if "loss_db" in focus else "not measured"
+    verdict = uncertain if focus["verdict"] == "inconclusive" else focus["verdict"]
+    return ["focused", "inconclusive", "defocused", "not measured"].index(verdict), -focus.get("loss_db", 0.0)
 
 
 def _disagreement(chosen: CoherentSum, pair: str, blind: Sequence[str]) -> dict[str, str]:
@@ -209,7 +211,7 @@ def _disagreement(chosen: CoherentSum, pair: str, blind: Sequence[str]) -> dict[
     where = measured.evidence
     if measured.shifted:
         return {
-            "pairs_apart": (
+            "pairs_displaced": (
                 f"{where} of {pair} displaced by {100 * measured.shift_m:.1f} ± "
                 f"{100 * measured.shift_std_along_m:.1f} cm relative to {agreeing}, "
                 f"{100 * measured.shift_east_m:+.1f} cm east and {100 * measured.shift_north_m:+.1f} cm north"

@@ -395,7 +395,7 @@ def _between_flights(
                 f"{100 * agreement.shift_east_m:+.1f} cm east and "
                 f"{100 * agreement.shift_north_m:+.1f} cm north: a base station, datum or time system differs"
             )
-            flags[name] = Flags({"flights_apart": line})
+            flags[name] = Flags({"flights_displaced": line})
     return {"agreement": {"reference": first, "flights": between}, "flags": flags}
 
 

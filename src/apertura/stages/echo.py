@@ -250,4 +250,8 @@ def _pulse_counts(
         **positions.reasons,
         "sidelink_lost": int((~measured.kept).sum()),
     }
-    return {"used": used, "dropped": sent - used, "reasons": {why: count for why, count in reasons.items() if count}}
+    return {
+        "used": used,
+        "dropped": sent - used,
+        "reasons": {reason: count for reason, count in reasons.items() if count},
+    }

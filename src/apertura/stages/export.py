@@ -318,7 +318,7 @@ def _focus(images: Mapping[str, xr.Dataset], measured: InPhase | None, added: Se
     if len(added) == 1:
         focus = pair_focus[added[0]]
         return {name: focus[name] for name in ("verdict", "loss_db", "std_db") if name in focus} | {
-            "why": f"{added[0]} alone: {focus['why']}"
+            "reason": f"{added[0]} alone: {focus['reason']}"
         }
     focuses = [focus for focus in pair_focus.values() if "loss_db" in focus]
     if measured is None or not focuses:
@@ -327,7 +327,7 @@ def _focus(images: Mapping[str, xr.Dataset], measured: InPhase | None, added: Se
             if measured is None
             else "the focus of no pair was measured"
         )
-        return {"verdict": "cannot tell", "why": missing}
+        return {"verdict": "inconclusive", "reason": missing}
     # Images are normalised to equal peaks before they are added; in focus, each peak is higher by its loss.
     image_loss_db = -20 * float(np.log10(np.mean([10 ** (-focus["loss_db"] / 20) for focus in focuses])))
     loss_db = image_loss_db + measured.loss_db
@@ -336,7 +336,7 @@ def _focus(images: Mapping[str, xr.Dataset], measured: InPhase | None, added: Se
         "verdict": verdict_of_loss(loss_db, std_db),
         "loss_db": round(loss_db, 3),
         "std_db": round(std_db, 3),
-        "why": (
+        "reason": (
             f"peak loss of the coherent sum, {number_of(measured.places, 'bright point')}: {abs(loss_db):.2f} ± "
             f"{std_db:.2f} dB ({abs(measured.loss_db):.2f} dB from phase differences between pairs)"
         ),
@@ -371,16 +371,16 @@ def _flags_of_pairs(pair_flags: Mapping[str, Mapping[str, str]]) -> Flags:
 
 def _flags_of_choice(fusion: Mapping[str, Any]) -> Flags:
     """Return the flags of the choice of a coherent sum: excluded pairs, and pairs added with an unmeasured phase."""
-    excluded = "; ".join(f"{pair} is not in the coherent sum: {why}" for pair, why in fusion["left_out"].items())
+    excluded = "; ".join(f"{pair} is not in the coherent sum: {reason}" for pair, reason in fusion["excluded"].items())
     if ties := " or ".join(" and ".join(tie) for tie in fusion["ties"]):
         excluded += f"; tie: {ties} form an equally large set that agrees, and the better focused set was used"
-    flags = {"pair_left_out": excluded} if excluded else {}
+    flags = {"pair_excluded": excluded} if excluded else {}
     if unmeasured := fusion["unmeasured"]:
         known, unknown = len(fusion["phases_rad"]) - len(unmeasured), len(unmeasured)
         loss_db = [-20 * np.log10(abs(known + phasor * unknown) / (known + unknown) + 1e-3) for phasor in (1j, -1)]
         half_cycle = f"{loss_db[1]:.0f} dB" if known != unknown else "total, with each target split in two"
-        flags["phase_unmeasured"] = (
-            "; ".join(f"{pair} is added with phase 0: {why}" for pair, why in unmeasured.items())
+        flags["phase_unobservable"] = (
+            "; ".join(f"{pair} is added with phase 0: {reason}" for pair, reason in unmeasured.items())
             + f"; peak loss for a phase error of a quarter cycle: {loss_db[0]:.0f} dB, of half a cycle: {half_cycle}"
         )
     return Flags(flags)
@@ -390,16 +390,16 @@ def _worst(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dict[
     """Return the largest errors of the images, as those of their sum, and the error budget of each image."""
     qualities = [image.attrs["quality"] for image in images.values()]
     worst = max(qualities, key=lambda quality: quality["numerical_error_db"])
-    left_out = "".join(f"; without {pair}: {why}" for pair, why in fusion["left_out"].items())
+    without = "".join(f"; without {pair}: {reason}" for pair, reason in fusion["excluded"].items())
     return {
         "budgets": {pair: image.attrs["quality"]["budget"] for pair, image in images.items()},
         "models": {
-            "fusion": f"mean of the peak-normalised images, with and without phase{left_out}",
+            "fusion": f"mean of the peak-normalised images, with and without phase{without}",
             "numerical_error": "largest numerical error of the pairs",
         },
         "numerical_error_db": worst["numerical_error_db"],
         "numerical_error_confidence": round(1 - sum(1 - one["numerical_error_confidence"] for one in qualities), 4),
         "numerical_error_estimate_db": worst["numerical_error_estimate_db"],
         "instruction_set": ", ".join(sorted({quality["instruction_set"] for quality in qualities})),
-        "redone": [one for quality in qualities for one in quality["redone"]],
+        "recomputed": [one for quality in qualities for one in quality["recomputed"]],
     }

@@ -134,7 +134,7 @@ def hypotheses(
     -------
     list
         At most one dict: what, kind, gain_db and lost_db (gain of the joint peak power at the bright point, and its
-        loss), and gain_of_pairs_db (gain of each pair's own peak).
+        loss), and pair_gain_db (gain of each pair's own peak).
     """
     waveform = campaign.settings.waveform
     if not isinstance(waveform, SampledWaveform):  # a phase history contains its positions: there are no logs to test
@@ -143,7 +143,7 @@ def hypotheses(
     logged = {node: open_acquisition(campaign, flight, node, sent) for node in campaign.flight(flight).nodes}
     window, track = campaign.settings.processing.window, open_refined(campaign, flight)
     geometries = [
-        subset_geometry(logged, pair, PairEcho.opened(campaign, flight, pair).stage, window)
+        subset_geometry(logged, pair, PairEcho.cleaned(campaign, flight, pair).stage, window)
         for pair in campaign.flight(flight).pairs
     ]
     nodes = {name: track.node(node) for name, node in logged.items()}
@@ -175,7 +175,7 @@ def hypotheses(
         best = max(trials, key=lambda trial: trial.gain_db)
         best_grid = _grid_around(scene, _displaced(scene, brightest, geometries, best), cell_m)
         best_height_m = height_m + best.height_m
-        reports[0]["gain_of_pairs_db"] = {
+        reports[0]["pair_gain_db"] = {
             geometry.pair: round(
                 decibels(
                     joint_peak_power([after], best_grid, best_height_m)

@@ -42,7 +42,18 @@ from apertura.workflow.lineage import result_of
 _MISSING = np.complex64(complex(np.nan, np.nan))
 """Value of a tile that no pulse illuminates; it is not stored."""
 
-_QUOTED = ("pulses", "positions", "time_tags", "sidelink", "clock", "code", "calibration", "atmosphere")
+_QUOTED = (
+    "pulses",
+    "background",
+    "interference",
+    "positions",
+    "time_tags",
+    "sidelink",
+    "clock",
+    "code",
+    "calibration",
+    "atmosphere",
+)
 
 
 def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Path:
@@ -166,7 +177,7 @@ class _Work:
 
 
 def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
-    echo = PairEcho.opened(campaign, flight, pair).stage
+    echo = PairEcho.cleaned(campaign, flight, pair).stage
     profile = open_stage(campaign.stage("profile", flight, pair), "profile")
     scene, logged = open_scene(campaign), open_pair(campaign, flight, pair, echo=echo)
     track = open_refined(campaign, flight)

@@ -87,7 +87,7 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
     bands, legs, looks, antennas = [], [], [], list[FlownAntenna]()
     began: np.datetime64 | None = None
     for sign, (flight, pair) in zip((1, -1), images, strict=True):
-        echo = PairEcho.opened(campaign, flight, pair).stage
+        echo = PairEcho.cleaned(campaign, flight, pair).stage
         profile = open_stage(campaign.stage("profile", flight, pair), "profile")
         opened = open_pair(campaign, flight, pair, echo=echo)
         bands.append((float(opened.frequency_hz.min()), float(opened.frequency_hz.max())))

@@ -49,7 +49,7 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
     Returns their paths. Cross-sections of bright points and the noise figure are written to radiometry.json.
     """
     lineage = result_of(campaign, "layers", flight, pair).begin(campaign.root)
-    echo = PairEcho.opened(campaign, flight, pair).stage
+    echo = PairEcho.cleaned(campaign, flight, pair).stage
     profile = open_stage(campaign.stage("profile", flight, pair), "profile")
     scene, profiles = open_scene(campaign), profiles_of(profile, lazy=True)
     opened = open_pair(campaign, flight, pair, echo=echo)
@@ -200,7 +200,7 @@ def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noi
     """Return the link budget and noise of an image, for radiometry.json."""
     points = points_of(image.image, image.attrs["quality"], scene, list(scene.grid.tiles(BLOCK_PX)))
     constant = calibrated.calibration.constant
-    noise_report, noise_flags = calibrated.noise_report(noise, bound="pulses_sparse" in image.attrs["flags"])
+    noise_report, noise_flags = calibrated.noise_report(noise, bound="azimuth_undersampled" in image.attrs["flags"])
     return {
         "calibrated_by": calibrated.calibrated_by,
         "constant_db": round(decibels(constant), 3),

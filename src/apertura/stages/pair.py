@@ -90,7 +90,7 @@ def antennas_report(campaign: Campaign, pair: str, illumination: Illumination | 
     stated = {point: {"node": node, **beam.model_dump()} for point, (node, beam) in campaign.antennas(pair).items()}
     if illumination is None or not stated:
         return {}
-    return {"antennas": {**stated, "pulses_seeing": {**illumination.counts, "of": illumination.pulses}}}
+    return {"antennas": {**stated, "illuminating_pulses": {**illumination.counts, "of": illumination.pulses}}}
 
 
 def scene_illumination(
@@ -245,7 +245,7 @@ def open_pair(
     """
     waveform = campaign.settings.waveform
     if echo is None and recorded is None and campaign.is_current(campaign.stage("echo", flight, pair)):
-        echo = PairEcho.opened(campaign, flight, pair).stage
+        echo = PairEcho.cleaned(campaign, flight, pair).stage
     if echo is None:
         if isinstance(waveform, SampledWaveform):
             return _expected(campaign, flight, pair, waveform, recorded)
@@ -356,7 +356,7 @@ def _positions(stated: Mapping[str, Any]) -> NodePositions:
     return NodePositions(
         axes,
         float(stated.get("correlation_s", 1.0)),
-        str(stated.get("stated_by", "nobody")),
+        str(stated.get("stated_by", "none")),
         float(stated.get("drift_m", 0.0)),
         stated.get("receiver"),
     )

@@ -92,6 +92,10 @@ def budget_of(
         BudgetLine("missing pulses", stated, NO_EFFECT),
         _antenna(pair, paths),
     ]
+    background = pair.report.get("background", {})
+    if background.get("removed", "none") != "none":
+        effect = Effect(background["middle_loss_db"], 0.0, 0.0)
+        lines.append(BudgetLine("background removal", background["removed"], effect))
     if not monostatic:
         total = paths.aperture.path(paths.point_m)
         lines.append(offset_line(paths, "clock", _PPM * total, _scaled(pair.report, "clock", "std_ppm", 1), unit="ppm"))
@@ -200,17 +204,28 @@ def air_decision(pair: OpenPair) -> Decision:
     """Return the refractivity assumed on the paths of a pair, and its effect relative to vacuum."""
     air = pair.air
     cell_m = pair.wave_speed_m_s / float(np.ptp(pair.frequency_hz)) / 2
-    displaced_m, residual_m = float(air["vacuum_would_move_m"]), float(air["one_constant_leaves_m"])
+    displaced_m, residual_m = float(air["vacuum_shift_m"]), float(air["constant_refractivity_error_m"])
     reference = "vacuum"
     if not air["refractivity_n"]:
         displaced_m, reference = 1e-6 * USUAL_N * float(air["range_m"]), f"N = {USUAL_N:.0f}"
     observable = "" if displaced_m > _OBSERVABLE_CELLS * cell_m else ", not observable"
-    why = (
+    reason = (
         f"{air['source']}; mean along the paths from {air['antennas_m']:.0f} m height; displacement of the image "
         f"relative to {reference} {100 * displaced_m:.2g} cm in slant range, {displaced_m / cell_m:.2g} cells"
         f"{observable}; residual of one value for all pulses {100 * residual_m:.1g} cm of path"
     )
-    return Decision("atmosphere", f"N = {air['refractivity_n']:.1f}", why)
+    return Decision("atmosphere", f"N = {air['refractivity_n']:.1f}", reason)
+
+
+def background_decision(pair: OpenPair) -> Decision:
+    """Return the decision on the background: from stage `profile`, or what decides it once there is one."""
+    report = pair.report.get("background")
+    if report is None:
+        return Decision("background", "auto", "decided when range profiles are formed")
+    if "removed" in report:
+        return Decision("background", report["removed"], report["reason"])
+    reason = "configured" if report["requested"] == "none" else "auto: the recording has no echo at constant delay"
+    return Decision("background", "none", reason)
 
 
 def _scaled(report: Mapping[str, Any], section: str, name: str, unit: float) -> float | None:
@@ -266,7 +281,7 @@ def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: 
     plan = plan_job(campaign, job_of(campaign, pair, scene, threads=threads), accuracy_db=float(accuracy.value))
     plan = replace(
         plan,
-        decisions=(*plan.decisions, accuracy, air_decision(pair)),
+        decisions=(*plan.decisions, accuracy, air_decision(pair), background_decision(pair)),
         flags=Flags.merged(flags, scene.flags, plan.flags),
     )
     is_written = campaign.is_current(campaign.stage("image", pair.flight, pair.name))

@@ -61,7 +61,7 @@ def keep_segments(campaign: Campaign, flight: str, pair: str, echo: xr.Dataset) 
 # ---- Pulses with valid positions, and position accuracy --------------------------------------------------------------
 
 _LOG_FAULTS = {
-    "fix_poor": "position solution poorer than {poorest_fix}",
+    "fix_quality_low": "position solution poorer than {poorest_fix}",
     "track_gap": "gap in the log",
     "track_outlier": "outliers or steps in the log",
     "track_frozen": "epochs that repeat the previous position",
@@ -153,7 +153,7 @@ def position_error(track: xr.Dataset, settings: Node, at: Times) -> dict[str, An
     -------
     dict
         std_m: standard deviation [north, east, up], metres, from the config, else the median over the pulses from the
-        log, else None; stated_by: log, config or nobody (not stated); correlation_s: correlation time of the error,
+        log, else None; stated_by: log, config or none; correlation_s: correlation time of the error,
         seconds; drift_m: slow error over the flight; receiver: most frequent kind of solution, a key of
         `RECEIVER_STD_M`.
     """
@@ -183,7 +183,7 @@ def stated_error(settings: Node) -> dict[str, Any]:
     """Return the configured position accuracy of a node, in the form of `position_error`."""
     stated = settings.position_std_m
     std_m = None if stated is None else np.broadcast_to(stated, 3).tolist()
-    stated_by = "nobody" if stated is None else "config"
+    stated_by = "none" if stated is None else "config"
     return {
         "std_m": std_m,
         "correlation_s": settings.position_correlation_s,
@@ -210,7 +210,7 @@ def _flags(node: NodeLog, at: Times, excluded: dict[str, NDArray[np.bool_]]) -> 
         reason = fault.format(poorest_fix=node.settings.poorest_fix)
         lines[name] = f"{node.name}: {count} of {len(at)} pulses excluded: {reason}{longest}{worst}"
     if node.track.attrs["dropped"]:
-        counted = ", ".join(f"{count} {why}" for why, count in node.track.attrs["dropped"].items())
+        counted = ", ".join(f"{count} {reason}" for reason, count in node.track.attrs["dropped"].items())
         lines["track_epochs_dropped"] = f"{node.name}: epochs of the log excluded: {counted}"
     if node.track.attrs.get("damage"):
         lines["track_log_damaged"] = f"{node.name}: {node.track.attrs['damage']}"

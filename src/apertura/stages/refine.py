@@ -161,7 +161,7 @@ class RefinedTrack:
     @property
     def decisions(self) -> tuple[Decision, ...]:
         """Decisions on refinement and its method, with reason and outcome."""
-        outcome = {"autofocus": f"; {self.stage.attrs['why']}"}
+        outcome = {"autofocus": f"; {self.stage.attrs['reason']}"}
         return tuple(
             Decision(name, decision["value"], decision["reason"] + outcome.get(name, ""))
             for name, decision in self.stage.attrs["decisions"].items()
@@ -177,7 +177,7 @@ class RefinedTrack:
             "decision": decisions["autofocus"],
             **({"method": decisions["autofocus_method"]} if "autofocus_method" in decisions else {}),
             "accepted": attrs["accepted"],
-            "why": attrs["why"],
+            "reason": attrs["reason"],
             **{name: attrs["report"][name] for name in _QUOTED if name in attrs["report"]},
             **({} if self.correction is None else _sizes_cm(self.correction, pair)),
         }
@@ -262,7 +262,7 @@ def clock_s(pair: OpenPair, began: np.datetime64) -> NDArray[np.float64]:
 def _sizes_cm(correction: TrackCorrection, pair: str) -> dict[str, Any]:
     """Return the RMS correction of a pair: of its nodes, or of its path."""
     if pair in correction.extra_path_m:
-        return {"further_rms_cm": _rms_cm(correction.extra_path_m[pair][:, None])}
+        return {"extra_path_rms_cm": _rms_cm(correction.extra_path_m[pair][:, None])}
     nodes = dict.fromkeys(pair.split("-"))
     return {"rms_cm": {node: _rms_cm(correction.moved_m[node]) for node in nodes if node in correction.moved_m}}
 
@@ -370,11 +370,11 @@ def refine(campaign: Campaign, flight: str) -> Path:
         stage = refined_stage(refinement, decisions, inputs, scene)
     else:
         empty = {node: np.zeros((0, 3)) for pair in names for node in pair.split("-")}
-        why = "images are formed from the unchanged logs"
-        refinement = Refinement(TrackCorrection(np.zeros(0), empty), empty, accepted=False, why=why)
+        reason = "images are formed from the unchanged logs"
+        refinement = Refinement(TrackCorrection(np.zeros(0), empty), empty, accepted=False, reason=reason)
         stages, stage = {}, refined_stage(refinement, decisions, None, scene)
     lines = [f"{decision.name} {decision.value}: {decision.reason}" for decision in decisions]
-    print("; ".join([*lines, refinement.why]), flush=True)
+    print("; ".join([*lines, refinement.reason]), flush=True)
     patterns = [pattern_digests(campaign, pair) for pair in names]
     inherits: dict[str, Any] = {"parents": stages, "inputs": merged(scene.inputs, *patterns)}
     accepted = refinement.accepted
@@ -436,7 +436,7 @@ def refined_stage(
                 decision.name: {"value": decision.value, "reason": decision.reason} for decision in decisions
             },
             "accepted": refinement.accepted,
-            "why": refinement.why,
+            "reason": refinement.reason,
             "report": dict(refinement.report),
             # effect of the residual errors, by the fields of `Effect`, if it is known
             "left": {effect: refinement.report[name] for effect, name in report_names.items() if has_residual},

@@ -159,7 +159,9 @@ def acquisition_tags(campaign: Campaign, views: Mapping[str, Mapping[str, Any]])
 
 def quality_tags(report: Mapping[str, Any]) -> dict[str, str]:
     """Return instruction set, error bound, flags, models and error budget of an image as tags."""
-    reports = {name: report[name] for name in ("budget", "budgets", "focus", "fusion", "redone") if report.get(name)}
+    reports = {
+        name: report[name] for name in ("budget", "budgets", "focus", "fusion", "recomputed") if report.get(name)
+    }
     return {
         "APERTURA_INSTRUCTION_SET": report["instruction_set"],
         "APERTURA_ERROR_DB": f"{report['numerical_error_db']:.2f}",

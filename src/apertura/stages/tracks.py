@@ -75,12 +75,12 @@ def _positions(campaign: Campaign, flight: str, node: str) -> xr.Dataset:
 def outcome_of(refined: RefinedTrack) -> str:
     """Return the outcome of the refinement for the tracks of a flight, with the reason, in one line."""
     decision = refined.decisions[0]
-    why = f"autofocus {decision.value}: {decision.reason}"
+    reason = f"autofocus {decision.value}: {decision.reason}"
     if refined.correction is None:
-        return f"as logged: {why}"
+        return f"as logged: {reason}"
     if refined.correction.extra_path_m:
-        return f"as logged: the refinement estimated one path offset per pulse and pair, and no node position; {why}"
-    return f"refined: {why}"
+        return f"as logged: the refinement estimated one path offset per pulse and pair, and no node position; {reason}"
+    return f"refined: {reason}"
 
 
 def refined_log(refined: RefinedTrack, node: str, track: xr.Dataset, settings: Node) -> RefinedLog:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
@@ -15,12 +16,13 @@ from apertura.campaign.config import CONFIG, SampledWaveform
 from apertura.campaign.digests import Lineage
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import finish, open_stage, write_blocks, writing
-from apertura.common.arrays import Complexes
+from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
-from apertura.common.units import nanoseconds
+from apertura.common.units import nanoseconds, seconds_since
 from apertura.core.echo.association import missing_flags
+from apertura.core.echo.background import Background
 from apertura.core.echo.captures import Pulses, Saturation, blocks_of
 from apertura.core.echo.dechirp import sweep_motion_flags
 from apertura.core.echo.demodulate import remove_path
@@ -59,11 +61,17 @@ class PairEcho:
         Function that forms transfer functions from captures, or reads those that a recorder stored.
     saturation
         Saturation of the samples read so far.
+    removed
+        Background that `stage` is without.
+    gain
+        (subcarrier,) float32, factors of `stage`: 0 where interference is excluded.
     """
 
     dataset: xr.Dataset
     source: Form
     saturation: Saturation = field(default_factory=Saturation)
+    removed: Background | None = None
+    gain: NDArray[np.float32] | None = None
 
     @classmethod
     def recorded(cls, echo: xr.Dataset) -> "PairEcho":
@@ -106,6 +114,19 @@ class PairEcho:
 
         return cls(stage, form, saturation)
 
+    @classmethod
+    def cleaned(cls, campaign: Campaign, flight: str, pair: str) -> "PairEcho":
+        """Return a finished echo without what a finished stage `profile` removes: background and interference."""
+        echo, folder = cls.opened(campaign, flight, pair), campaign.stage("profile", flight, pair)
+        if not campaign.is_current(folder):
+            return echo
+        profile, removed = open_stage(folder, "profile"), None
+        if "background" in profile:
+            removed = Background(profile.background.values, profile.background_time.values)
+        gain = profile.subcarrier_gain.values if "subcarrier_gain" in profile else None
+        reports = {name: profile.attrs[name] for name in ("background", "interference")}
+        return replace(echo, dataset=echo.dataset.assign_attrs(reports), removed=removed, gain=gain)
+
     def within(self, campaign: Campaign, flight: str, pair: str) -> "PairEcho":
         """Return the echo without the pulses outside the segments of its pair."""
         return replace(self, dataset=keep_segments(campaign, flight, pair, self.dataset))
@@ -122,8 +143,8 @@ class PairEcho:
 
     @property
     def stage(self) -> xr.Dataset:
-        """Stage `echo`, whose `transfer` is read or formed on access."""
-        if "transfer" in self.dataset:
+        """Stage `echo`, whose `transfer` is read or formed on access, without removed background and interference."""
+        if "transfer" in self.dataset and self.removed is None and self.gain is None:
             return self.dataset
         return self.dataset.assign(transfer=xr.Variable(_HISTORY, indexing.LazilyIndexedArray(_Transfer(self))))
 
@@ -147,6 +168,38 @@ class PairEcho:
             return remove_path(measured, frequency, delay_s=path_m[pulses] / SPEED_OF_LIGHT_M_S)
 
         return form
+
+    @property
+    def time_s(self) -> Floats:
+        """(pulse,) float64, seconds from the first pulse."""
+        time = self.dataset.time.values
+        return seconds_since(time, time[0])
+
+    @property
+    def extra_s(self) -> Floats:
+        """(pulse,) float64, delay of an echo in the recorder beyond geometry."""
+        if "path_removed" not in self.dataset:
+            return np.zeros(len(self.dataset.time))
+        return np.asarray(self.dataset.path_removed.values / SPEED_OF_LIGHT_M_S)
+
+    @property
+    def delay_s(self) -> Floats:
+        """(pulse,) float64, delay that is removed from the recorder's transfer functions."""
+        return np.asarray(self.extra_s + self.dataset.reference_delay.values)
+
+    def read(self, pulses: Pulses) -> Complexes:
+        """Return the transfer functions of a few pulses, ascending, without removed background and interference."""
+        transfer = self.dataset.transfer[pulses].values if "transfer" in self.dataset else self.form(pulses)
+        if self.gain is not None:
+            transfer = transfer * self.gain
+        if self.removed is None:
+            return np.asarray(transfer)
+        frequency_hz = self.dataset.frequency.values
+        return np.asarray(transfer - self.removed.at(self.time_s[pulses], frequency_hz, self.delay_s[pulses]))
+
+    def recorded_at(self, pulses: Pulses) -> Complexes:
+        """Return the transfer functions of a few pulses, ascending, in delays of the recorder."""
+        return remove_path(self.read(pulses), self.dataset.frequency.values, delay_s=-self.delay_s[pulses])
 
     def blocks(self) -> Iterator[Complexes]:
         """Yield `transfer` from the first pulse on, in blocks of pulses."""
@@ -173,7 +226,7 @@ class _Transfer(BackendArray):
     def _formed(self, key: tuple[Any, Any]) -> Complexes:
         pulses = np.arange(self.shape[0])[key[0]]
         unique, inverse = np.unique(pulses, return_inverse=True)
-        blocks = [self._echo.form(block) for block in blocks_of(unique)]
+        blocks = [self._echo.read(block) for block in blocks_of(unique)]
         transfer = np.concatenate(blocks) if blocks else np.empty((0, self.shape[1]), np.complex64)
         if len(unique) != pulses.size or (np.diff(np.atleast_1d(pulses)) < 0).any():
             transfer = transfer[inverse]

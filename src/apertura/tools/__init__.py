@@ -1,4 +1,4 @@
-"""Commands beside the workflow, each with its view: design, bench, reflectors, align, chart, look; campaigns in Python.
+"""Commands in addition to the workflow: design, bench, reflectors, align, chart, look; access to campaigns from Python.
 
-Nothing that a run needs imports them.
+No module of the workflow's processing steps imports them.
 """

@@ -1,4 +1,4 @@
-"""`apertura align`: clock offset, drift and path of a recorder against its flight log, from its echoes."""
+"""`apertura align`: estimate clock offset, drift and path offset of a recorder against its flight log from echoes."""
 
 from dataclasses import dataclass, replace
 from decimal import Decimal
@@ -38,10 +38,10 @@ from apertura.stages.scene import ConfiguredGround, settled_scene
 from apertura.stages.transfer import PairEcho
 
 NEAR_S = 5.0
-"""Largest offset searched for a clock in UTC, seconds; of a clock without UTC every offset is searched."""
+"""Half width of the search for a UTC clock, seconds; for a free-running clock every overlapping offset is searched."""
 
 MOST_PULSES = 8192
-"""Pulses of a recording that are used, evenly spread: bounds memory."""
+"""Maximum number of evenly spread pulses of a recording that are used; limits memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,19 +51,19 @@ class Unaligned:
     Attributes
     ----------
     echo, log
-        As `apertura.methods.alignment` takes them: each by seconds of its own, from its first pulse and epoch.
+        Inputs of `apertura.methods.alignment`, with times in seconds from the first pulse and the first epoch.
     log_start_ns
-        Delay of the log's first epoch against the recorder's first pulse, nanoseconds.
+        Delay of the log's first epoch relative to the recorder's first pulse, nanoseconds.
     applied_ns
-        Offset of config/clocks.tsv that the recorder's times already contain, nanoseconds.
+        Offset of config/clocks.tsv that is included in the recorder's times, nanoseconds.
     stated_ns
-        That offset, 0 without.
+        Offset in config/clocks.tsv, nanoseconds; 0 without an entry.
     applied_ppm
-        Drift stated there that they already contain.
+        Drift of config/clocks.tsv that is included in the recorder's times, ppm.
     taken_off_m
-        Path beyond geometry that was already removed from the echoes.
+        Path offset that was already removed from the echoes, metres.
     own_clock
-        Whether the recorder's times mean nothing but differences.
+        True if the recorder has a free-running clock, of which only differences are meaningful.
     """
 
     echo: Recorded
@@ -76,34 +76,34 @@ class Unaligned:
     own_clock: bool
 
     def less_path(self, path_m: float) -> "Unaligned":
-        """Return the same without so much path beyond geometry in the echoes."""
+        """Return a copy with a given path offset removed from the echoes."""
         delay_s = self.echo.reference_delay_s - (path_m - self.taken_off_m) / SPEED_OF_LIGHT_M_S
         return replace(self, echo=replace(self.echo, reference_delay_s=delay_s), taken_off_m=path_m)
 
     def offset_ns(self, offset_s: float) -> int:
-        """Return the offset for clocks.tsv, given one between the first pulse and the first epoch."""
+        """Convert an offset between the first pulse and the first epoch into the offset for clocks.tsv."""
         return self.applied_ns + self.log_start_ns + round(offset_s * 1e9)
 
     @property
     def stated_s(self) -> float:
-        """Offset at which `offset_ns` returns the stated one, seconds."""
+        """Offset for which `offset_ns` returns `stated_ns`, seconds."""
         return (self.stated_ns - self.applied_ns - self.log_start_ns) * 1e-9
 
 
 def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
-    """Return echoes and log of a node that sends and receives.
+    """Open the echoes and the log of a node of a monostatic pair.
 
     Raises
     ------
     CampaignError
-        If the node does not send and receive in that flight, has no log, or its echoes are not there yet.
+        If the node does not transmit and receive in that flight, has no log, or its echoes have not been computed.
     """
     flown = campaign.flight(flight)
     if f"{node}-{node}" not in flown.pairs:
         raise CampaignError(
-            f"{node} does not send and receive in {flight}",
+            f"{node} does not transmit and receive in {flight}",
             where=campaign.root / FLIGHTS,
-            expected=f"a node whose own pulses come back to it; pairs of {flight}: {', '.join(flown.pairs)}",
+            expected=f"a node of a monostatic pair; pairs of {flight}: {', '.join(flown.pairs)}",
             remedy="Name such a node, or correct the line of the flight.",
         )
     clock = campaign.clock(flight, node)
@@ -113,9 +113,9 @@ def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
         path = campaign.stage("echo", flight, f"{node}-{node}")
         if not manifest_of(path).is_file():
             raise CampaignError(
-                "not there yet",
+                "no echo stage",
                 where=path,
-                expected=f"the echo of {node} by its own pulses",
+                expected=f"the echo of the monostatic pair of {node}",
                 remedy="Run `apertura run CAMPAIGN --until echo` first.",
             )
         history = _thinned(PairEcho.opened(campaign, flight, f"{node}-{node}").stage)
@@ -140,12 +140,12 @@ def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
 
 
 def _thinned(history: xr.Dataset) -> xr.Dataset:
-    """Return at most `MOST_PULSES` pulses, evenly spread."""
+    """Reduce the pulses to at most `MOST_PULSES`, evenly spread."""
     return history.isel(pulse=slice(None, None, -(-history.sizes["pulse"] // MOST_PULSES)))
 
 
 def _wave_speed(campaign: Campaign, log: NodeLog) -> float:
-    """Return the speed of the wave over a whole log: which part of it was recorded is not known before alignment."""
+    """Return the wave speed for the whole log, because the recorded part of it is unknown before alignment."""
     times = log.track.time.values[log.checked.kept]
     times = times[:: -(-len(times) // MOST_PULSES)][1:-1]
     aperture = Aperture(log.antenna("radar_tx", times), log.antenna("radar_rx", times))
@@ -154,13 +154,13 @@ def _wave_speed(campaign: Campaign, log: NodeLog) -> float:
 
 def _log_geometry(log: NodeLog) -> Logged:
     times = log.track.time.values[log.checked.kept]
-    began = log.track.time.values[0]
+    start = log.track.time.values[0]
 
-    def phase_centres(at_s: NDArray[np.float64]) -> Aperture:
-        at = began + np.round(at_s * 1e9).astype("timedelta64[ns]")
-        return Aperture(log.antenna("radar_tx", at), log.antenna("radar_rx", at))
+    def phase_centres(time_s: NDArray[np.float64]) -> Aperture:
+        time = start + np.round(time_s * 1e9).astype("timedelta64[ns]")
+        return Aperture(log.antenna("radar_tx", time), log.antenna("radar_rx", time))
 
-    first_s, last_s = seconds_since(times[[0, -1]], began)
+    first_s, last_s = seconds_since(times[[0, -1]], start)
     return Logged(phase_centres, first_s + 1e-9, last_s - 1e-9)
 
 
@@ -174,28 +174,28 @@ def align(
     search_m: float = 10.0,
     drift: bool = False,
 ) -> tuple[Alignment, dict[str, Any]]:
-    """Return the alignment of a recorder to its log, and the same as values of the campaign's config.
+    """Estimate the alignment of a recorder with its log; return it also as values for the campaign's config.
 
     Parameters
     ----------
     campaign, flight, node
-        Of a node that sends and receives.
+        Campaign, flight and a node of a monostatic pair.
     point
-        Easting, northing in the scene's CRS and ellipsoidal height (z in a local frame) of a reflector, metres; None:
-        by the sharpness of the scene.
+        Easting, northing in the scene's CRS and ellipsoidal height (z in a local frame) of a reflector, metres; None
+        maximises the sharpness of the scene instead.
     search_s
-        How far the clock may be off; None: `NEAR_S`, or overlapping where the recorder has no clock but its own.
+        Maximum clock offset, seconds; None: `NEAR_S`, or any overlap for a free-running clock.
     search_m
-        How long the electrical path may be, metres of total path; 0: as stated in the config.
+        Maximum path offset, metres of total path; 0 uses the configured one.
     drift
-        Whether to estimate the drift of the recorder's clock as well; needs a reflector.
+        Estimate the drift of the recorder's clock as well; requires a reflector.
 
     Returns
     -------
     Alignment
-        In the recorder's and the log's own seconds.
+        Alignment in the seconds of `Unaligned`.
     dict
-        offset_s, of clocks.tsv, to its last digit as text, and drift_ppm; path_offset_m, of the config.
+        offset_s for clocks.tsv as text with all digits, drift_ppm, and path_offset_m for the config.
 
     Raises
     ------
@@ -204,22 +204,23 @@ def align(
     """
     if drift and point is None:
         raise CampaignError(
-            "a drift asked for without a point",
-            where="apertura align --drift",
-            expected="the place of a reflector: sharpness alone does not determine a drift",
-            remedy="Give it by --point, or leave --drift out.",
+            "--drift without --point",
+            where="apertura align",
+            expected="the position of a reflector, because the sharpness of a scene does not determine a drift",
+            remedy="Give --point, or omit --drift.",
         )
-    given = unaligned(campaign, campaign.flight(flight).name, node)
+    inputs = unaligned(campaign, campaign.flight(flight).name, node)
     if search_m == 0.0:
-        given = given.less_path(campaign.settings.nodes[node].path_offset_m.radar)
-    within_s = _search_range(given, search_s)
+        inputs = inputs.less_path(campaign.settings.nodes[node].path_offset_m.radar)
+    within_s = _search_range(inputs, search_s)
     try:
         if point is None:
-            found = align_on_scene(given.echo, given.log, *_scene(campaign), within_s=within_s, search_m=search_m)
+            alignment = align_on_scene(inputs.echo, inputs.log, *_scene(campaign), within_s=within_s, search_m=search_m)
         else:
-            place = frame_from_map(_crs(campaign, given), *point)
-            found = align_on_point(given.echo, given.log, place, within_s=within_s, search_m=search_m)
-            found = estimate_drift(found, given.echo, given.log, place) if drift else found
+            position_m = frame_from_map(_crs(campaign, inputs), *point)
+            alignment = align_on_point(inputs.echo, inputs.log, position_m, within_s=within_s, search_m=search_m)
+            if drift:
+                alignment = estimate_drift(alignment, inputs.echo, inputs.log, position_m)
     except ValueError as error:
         raise CampaignError(
             str(error),
@@ -227,20 +228,26 @@ def align(
             expected="a recording within the times of the log of its node",
             remedy="Check that recording and log belong together, and nodes.<node>.log.",
         ) from error
-    offset = Decimal(given.offset_ns(found.offset_s)).scaleb(-9)
-    stated = {"offset_s": str(offset), "drift_ppm": round(given.applied_ppm + found.drift_ppm, 4)}
-    return found, stated | {"path_offset_m": given.taken_off_m + found.path_m}
+    offset = Decimal(inputs.offset_ns(alignment.offset_s)).scaleb(-9)
+    values = {"offset_s": str(offset), "drift_ppm": round(inputs.applied_ppm + alignment.drift_ppm, 4)}
+    return alignment, values | {"path_offset_m": inputs.taken_off_m + alignment.path_m}
 
 
 def write_clock(
     campaign: Campaign, flight: str, node: str, *, offset_s: str, std_s: float, drift_ppm: float = 0.0
 ) -> Path:
-    """Write the line of a node's clock into config/clocks.tsv; the others stay."""
+    """Write the line of a node's clock into config/clocks.tsv; other lines are kept."""
     path = campaign.root.named(CLOCKS.as_posix(), where=campaign.root)
-    others = [clock for clock in campaign.clocks if (clock.flight, clock.node) != (flight, node)]
     kept = [
-        (one.flight, one.node, Decimal(one.offset_ns).scaleb(-9), one.drift_ppm, "" if one.std_s is None else one.std_s)
-        for one in others
+        (
+            clock.flight,
+            clock.node,
+            Decimal(clock.offset_ns).scaleb(-9),
+            clock.drift_ppm,
+            "" if clock.std_s is None else clock.std_s,
+        )
+        for clock in campaign.clocks
+        if (clock.flight, clock.node) != (flight, node)
     ]
     rows = [CLOCK_COLUMNS, *kept, (flight, node, offset_s, drift_ppm, f"{std_s:.6f}")]
     write_text(path, "".join("\t".join(map(str, row)) + "\n" for row in rows))
@@ -249,60 +256,60 @@ def write_clock(
 
 def print_alignment(campaign: Campaign, flight: str, node: str, *, write: bool, **options: Any) -> None:
     """Align, print the result and the lines for the config, and with `write` write clocks.tsv."""
-    found, stated = align(campaign, flight, node, **options)
-    length = f"path beyond geometry {stated['path_offset_m']:.4f} m"
-    length += f" ± {found.path_width_m:.4f} m" if options["search_m"] > 0 else ", as the config says: not measured"
+    alignment, values = align(campaign, flight, node, **options)
+    path_text = f"path offset {values['path_offset_m']:.4f} m"
+    path_text += f" ± {alignment.path_width_m:.4f} m" if options["search_m"] > 0 else " (configured, not measured)"
     print(
-        f"{flight} {node}: the recording begins {found.offset_s:.4f} s ± {found.offset_width_s:.4f} s after the first "
-        f"epoch of the log; {length}"
+        f"{flight} {node}: the recording starts {alignment.offset_s:.4f} s ± {alignment.offset_width_s:.4f} s after "
+        f"the first epoch of the log; {path_text}"
     )
     print(
-        f"by {found.report['method']}, on {found.report['pulses']} pulses, {found.contrast_db:.1f} dB above "
-        f"{'other offsets' if options['point'] else 'the median of the image'}"
+        f"method: {alignment.report['method']}, {alignment.report['pulses']} pulses, contrast "
+        f"{alignment.contrast_db:.1f} dB above {'other offsets' if options['point'] else 'the median of the image'}"
     )
-    for name, line in found.flags.items():
-        print(f"doubtful: {name}: {line}")
+    for name, line in alignment.flags.items():
+        print(f"uncertain: {name}: {line}")
     if options["drift"]:
-        print(f"drift {found.drift_ppm:.2f} ppm: {found.report['drift']}")
-    cells = (flight, node, stated["offset_s"], stated["drift_ppm"], f"{found.offset_width_s:.6f}")
+        print(f"drift {alignment.drift_ppm:.2f} ppm: {alignment.report['drift']}")
+    cells = (flight, node, values["offset_s"], values["drift_ppm"], f"{alignment.offset_width_s:.6f}")
     print(f"{CLOCKS}: {chr(9).join(map(str, cells))}")
     if options["search_m"] > 0:
-        print(f"{CONFIG}: nodes.{node}.path_offset_m.radar: {stated['path_offset_m']:.4f}")
+        print(f"{CONFIG}: nodes.{node}.path_offset_m.radar: {values['path_offset_m']:.4f}")
     if write:
-        clock = {name: stated[name] for name in ("offset_s", "drift_ppm")}
-        written = write_clock(campaign, flight, node, std_s=found.offset_width_s, **clock)
-        print(f"{written} is written")
+        clock = {name: values[name] for name in ("offset_s", "drift_ppm")}
+        written = write_clock(campaign, flight, node, std_s=alignment.offset_width_s, **clock)
+        print(f"{written} written")
 
 
-def _search_range(given: Unaligned, search_s: float | None) -> tuple[float, float]:
-    """Return the least and largest offset between first pulse and first epoch to try, seconds."""
-    recorded_s = float(given.echo.time_s[-1])
-    overlapping = given.log.first_s - recorded_s, given.log.last_s
-    if search_s is None and given.own_clock:
+def _search_range(inputs: Unaligned, search_s: float | None) -> tuple[float, float]:
+    """Return the bounds of the search for the offset between first pulse and first epoch, seconds."""
+    recorded_s = float(inputs.echo.time_s[-1])
+    overlapping = inputs.log.first_s - recorded_s, inputs.log.last_s
+    if search_s is None and inputs.own_clock:
         return overlapping
     near_s = NEAR_S if search_s is None else search_s
-    return max(overlapping[0], given.stated_s - near_s), min(overlapping[1], given.stated_s + near_s)
+    return max(overlapping[0], inputs.stated_s - near_s), min(overlapping[1], inputs.stated_s + near_s)
 
 
-def _crs(campaign: Campaign, given: Unaligned) -> str:
-    """Return the CRS that a place is in; `auto` is as settled, and before that the UTM zone of the log."""
+def _crs(campaign: Campaign, inputs: Unaligned) -> str:
+    """Return the CRS of `point`; for `auto`, that of a finished scene stage, or else the UTM zone of the log."""
     if campaign.settings.scene.crs != "auto":
         return campaign.settings.scene.crs
     if manifest_of(campaign.result("scene.json")).is_file():
         return settled_scene(campaign).grid.crs
-    middle_s = np.array([given.log.first_s + given.log.last_s]) / 2
-    return utm_crs(given.log.phase_centres(middle_s).tx_m[0])
+    middle_s = np.array([inputs.log.first_s + inputs.log.last_s]) / 2
+    return utm_crs(inputs.log.phase_centres(middle_s).tx_m[0])
 
 
 def _scene(campaign: Campaign) -> tuple[SceneGrid, FlatGround]:
-    """Return the grid that the config states, and level ground."""
+    """Return the configured grid, and flat terrain."""
     settings = campaign.settings.scene
     if "auto" in {settings.crs, settings.bounds_m, settings.spacing_m}:
         raise CampaignError(
             "crs, bounds_m or spacing_m is auto",
             where=f"{CONFIG}: scene",
-            expected="a scene that is stated: what is settled from a flight needs its clock first",
-            remedy="State them, or give the place of a reflector by --point.",
+            expected="a configured scene, because automatic settings require an aligned clock",
+            remedy="Configure them, or give the position of a reflector with --point.",
         )
     bounds_m, spacing_m = settings.bounds_m, settings.spacing_m
     grid = SceneGrid.from_bounds(settings.crs, bounds_m, spacing_m=spacing_m)  # type: ignore[arg-type]

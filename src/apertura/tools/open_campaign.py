@@ -1,4 +1,4 @@
-"""A campaign from Python: its flights, pairs and results, by name."""
+"""Access to a campaign from Python: flights, pairs and results by name."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -20,23 +20,23 @@ if TYPE_CHECKING:
 _OF_NODES = {"raw", "track"}
 _OF_FLIGHTS = {"refined_track"}
 _OF_THE_CAMPAIGN = {"cube", "terrain"}
-"""Stages of a node in a flight, of a flight, and of the whole campaign; the others are of a pair in a flight."""
+"""Stages of a node in a flight, of a flight, and of the campaign; all others are of a pair in a flight."""
 
 
 @dataclass(frozen=True)
 class OpenCampaign:
-    """A validated campaign folder with its results; everything is read on first use.
+    """A validated campaign folder with its results, which are read on first use.
 
     Attributes
     ----------
     campaign
-        Settings, flights and where everything lies.
+        Settings, flights and paths of the campaign.
     """
 
     campaign: Campaign
 
     def __repr__(self) -> str:
-        """Return the folder, and the pairs of each flight."""
+        """Return a text with the folder and the pairs of each flight."""
         pairs = "; ".join(f"{flight}: {', '.join(names)}" for flight, names in self.pairs.items())
         return (
             f"<OpenCampaign {self.campaign.settings.campaign} in {self.campaign.root}: {pairs or 'no image flights'}>"
@@ -44,33 +44,33 @@ class OpenCampaign:
 
     @property
     def pairs(self) -> dict[str, tuple[str, ...]]:
-        """Flight that becomes images → its pairs, transmitter-receiver."""
+        """Image flight → names of its pairs, transmitter-receiver."""
         return {flight.name: flight.pairs for flight in self.campaign.image_flights}
 
     @property
     def scene(self) -> OpenScene:
-        """The grid of every raster and the ground under it."""
+        """Common grid of all rasters, and terrain."""
         return open_scene(self.campaign)
 
     def stage(self, name: str, *where: str) -> "xr.Dataset":
-        """Return a finished stage, read lazily; `transfer` of an echo is formed from the recording where it is read.
+        """Open a finished stage lazily; `transfer` of an echo stage is computed from the recording when it is read.
 
         Parameters
         ----------
         name
             A key of `apertura.common.contracts.STAGES`, such as 'echo'.
         *where
-            Flight and node (raw, track), flight and pair (echo, profile, image), flight (refined_track), nothing
+            Flight and node (raw, track), flight and pair (echo, profile, image), flight (refined_track), or no argument
             (cube, terrain).
 
         Raises
         ------
         CampaignError
-            If there is no such stage, flight, node or pair, or it is not there as the workflow left it.
+            If there is no such stage, flight, node or pair, or the stage is not finished or was modified.
         """
         _check_name(name, "stage", STAGES, where="campaign.stage")
         if name in _OF_THE_CAMPAIGN:
-            _check_count(where, 0, name, "the stage alone: it is of the whole campaign")
+            _check_count(where, 0, name, "no further arguments for a stage of the whole campaign")
         elif name in _OF_FLIGHTS:
             _check_count(where, 1, name, "a flight")
             self.campaign.flight(where[0])
@@ -81,44 +81,44 @@ class OpenCampaign:
             known = flight.nodes if kind == "node" else flight.pairs
             _check_name(where[1], kind, known, where=f"campaign.stage({name!r}, {flight.name!r})")
         if name == "echo":
-            return PairEcho.opened(self.campaign, where[0], where[1]).stage
+            return PairEcho.cleaned(self.campaign, where[0], where[1]).stage
         return open_stage(self.campaign.stage(name, *where), name)
 
     def image(self, flight: str, pair: str) -> "xr.DataArray":
-        """Return a pair's focused image, (y, x) complex64, with its CRS in the coordinate spatial_ref."""
+        """Open a pair's focused image, (y, x) complex64, with its CRS in the coordinate spatial_ref."""
         image: xr.DataArray = self.stage("image", flight, pair).image
         return image
 
     def report(self, flight: str, pair: str) -> dict[str, Any]:
-        """Return image.json of a pair or of 'fused': engine, models and reasons, errors, measures, flags."""
+        """Read image.json of a pair or of 'fused': engine, models and reasons, errors, measures, flags."""
         _check_name(pair, "pair", self.campaign.flight(flight).images, where=f"campaign.report({flight!r})")
         return report_of(self.campaign, flight, pair)
 
     def flags(self, flight: str, pair: str) -> dict[str, str]:
-        """Return the limits that an image exceeds: name → what was measured, in one line."""
+        """Return the flags of an image, name → measurement in one line."""
         flags: dict[str, str] = self.report(flight, pair)["flags"]
         return flags
 
 
-def _check_name(name: str, kind: str, known: Iterable[str], *, where: object) -> None:
-    if name not in known:
+def _check_name(name: str, kind: str, names: Iterable[str], *, where: object) -> None:
+    if name not in names:
         raise CampaignError(
-            f"no {kind} {name!r}", where=where, expected=f"one of {', '.join(known)}", remedy=f"Correct the {kind}."
+            f"no {kind} {name!r}", where=where, expected=f"one of {', '.join(names)}", remedy=f"Correct the {kind}."
         )
 
 
-def _check_count(given: tuple[str, ...], count: int, stage: str, expected: str) -> None:
-    if len(given) != count:
+def _check_count(arguments: tuple[str, ...], count: int, stage: str, expected: str) -> None:
+    if len(arguments) != count:
         raise CampaignError(
-            f"given {', '.join(given) or 'nothing more'}",
+            f"arguments: {', '.join(arguments) or 'none'}",
             where=f"campaign.stage({stage!r})",
             expected=expected,
-            remedy="Name these after the stage.",
+            remedy="Correct the arguments after the stage name.",
         )
 
 
 def open_campaign(path: str | Path) -> OpenCampaign:
-    """Return a campaign folder with its results.
+    """Open a campaign folder with its results.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def open_campaign(path: str | Path) -> OpenCampaign:
     Raises
     ------
     CampaignError
-        If that is no path, or the config is wrong.
+        If the argument is not a path, or the config is invalid.
 
     Examples
     --------
@@ -138,6 +138,6 @@ def open_campaign(path: str | Path) -> OpenCampaign:
     apertura.common.errors.CampaignError: nowhere/config/config.yaml: no such file; ...
     """
     if not isinstance(path, str | Path):
-        expected = "the path of a campaign folder, which holds config/config.yaml"
-        raise CampaignError(quoted(path), "open_campaign: path", expected, "Give it as text or a pathlib.Path.")
+        expected = "the path of a campaign folder, which contains config/config.yaml"
+        raise CampaignError(quoted(path), "open_campaign: path", expected, "Use a string or a pathlib.Path.")
     return OpenCampaign(Campaign.load(path))

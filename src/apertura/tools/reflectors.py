@@ -1,4 +1,4 @@
-"""Constants measured at reflectors, written for later campaigns and printed."""
+"""Measurement of radiometric calibration constants at reflectors, written to a file for later campaigns."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
 from apertura.common.atomic import write_json
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, number_of
 from apertura.common.flags import Flags
 from apertura.common.units import decibels
 from apertura.core.antenna.beam import Beams
@@ -45,14 +45,14 @@ from apertura.stages.scene import OpenScene, open_scene
 from apertura.workflow.stale import stale_results
 
 REACH_CELLS = 2.0
-"""Search radius about the expected place of a reflector, resolution cells, beside three standard deviations of it."""
+"""Search radius about a reflector's position, resolution cells, in addition to three standard deviations of it."""
 
 _ODD = {"HH", "VV", "LR", "RL"}
 RETURNED = {"trihedral": _ODD, "sphere": _ODD, "dihedral": {"HH", "VV", "LL", "RR"}}
-"""Polarisations, sent and received, in which the formulas hold: a reflection turns the other way round."""
+"""Polarisations (transmitted, received) returned by each kind: each reflection reverses circular polarisation."""
 
-_LEAST_CHANCE = 0.0027  # of reflectors that differ as much: three standard deviations
-_FOLLOWED_M = 1e-4  # pixels: where the place that focuses a reflector above ground is settled
+_LEAST_CHANCE = 0.0027  # significance level of the test for disagreeing reflectors: three standard deviations
+_CONVERGED_PX = 1e-4  # step in pixels at which the search for the focused position of a reflector stops
 _ROUNDS = 12
 _DB = 10 / np.log(10)  # dB per relative error of a power
 
@@ -64,17 +64,17 @@ class Measurement:
     Attributes
     ----------
     flight, pair, reflector
-        Where.
+        Names of flight, pair and reflector.
     constant_db, scatter_db, common_db
-        10 lg K, what of its standard deviation differs from image to image, and what that of the reflector is.
+        10 lg K, and its standard deviations: independent for each image, and common to all images of the reflector.
     phase_rad, phase_scatter_rad
-        Of the peak against that of the reflector's place.
+        Phase of the peak relative to that expected from the reflector's position, and its standard deviation.
     gradient
-        Of the path with the place, mean over the image, metres per metre.
+        Gradient of the path with respect to position, mean over the pulses, metres per metre.
     profile_noise
-        Of a pulse, per Σw² of the window.
+        Noise power of a pulse, per Σw² of the window.
     report
-        For the file.
+        Values for the file.
     """
 
     flight: str
@@ -91,69 +91,70 @@ class Measurement:
 
 
 def measured_constants(campaign: Campaign) -> tuple[Constants, list[str]]:
-    """Return the constants of a finished campaign's pairs, and why reflectors were left out, a line each.
+    """Measure the constants of a finished campaign's pairs; return also a line for each excluded reflector.
 
     Raises
     ------
     CampaignError
-        If the config names no reflector, images are not finished, or no reflector stands out in any image.
+        If no reflector is configured, images are not finished, or no reflector can be measured in any image.
     """
     stated = campaign.settings.scene.reflectors
     if not stated:
         raise CampaignError(
             "no reflectors",
             where="config/config.yaml: scene.reflectors",
-            expected="reflectors of known shape and place",
-            remedy="State name, position_m, std_m, kind, size_m and where each looks.",
+            expected="reflectors of known shape and position",
+            remedy="Configure name, position_m, std_m, kind, size_m and orientation of each reflector.",
         )
-    scene, left_out = open_scene(campaign), list[str]()
-    found, radars, began, images = list[Measurement](), dict[str, Radar](), dict[str, str](), dict[str, str]()
+    scene, excluded = open_scene(campaign), list[str]()
+    measurements, radars = list[Measurement](), dict[str, Radar]()
+    starts, images = dict[str, str](), dict[str, str]()
     for flight in campaign.image_flights:
         track = open_refined(campaign, flight.name)
         for pair in flight.pairs:
             opened = track.pair(open_pair(campaign, flight.name, pair))
             radars.setdefault(pair, Radar.of(campaign, opened))
             view, measured = _View.of(campaign, opened, scene), list[Measurement]()
-            for one in stated:
-                label = radars[pair].polarisation
-                if label and label not in RETURNED[one.kind]:
-                    result: Measurement | str = f"{label}: such a reflector sends nothing back in it"
+            for reflector in stated:
+                polarisation = radars[pair].polarisation
+                if polarisation and polarisation not in RETURNED[reflector.kind]:
+                    result: Measurement | str = f"a {reflector.kind} returns no echo in polarisation {polarisation}"
                 else:
-                    result = view.at(one)
+                    result = view.at(reflector)
                 if isinstance(result, str):
-                    left_out.append(f"{flight.name} {pair} {one.name}: {result}")
+                    excluded.append(f"{flight.name} {pair} {reflector.name}: {result}")
                 else:
                     measured.append(result)
             if measured:
                 manifest = campaign.manifest("image", flight.name, pair)
                 images[manifest] = digest_of(campaign.root, manifest)
-                began[flight.name] = str(np.datetime_as_string(opened.began, unit="s")) + "Z"
-            found += measured
-    if not found:
+                starts[flight.name] = str(np.datetime_as_string(opened.began, unit="s")) + "Z"
+            measurements += measured
+    if not measurements:
         raise CampaignError(
-            f"no reflector is of use in any image ({'; '.join(left_out[:3])})",
+            f"no reflector can be measured in any image ({'; '.join(excluded[:3])})",
             where=campaign.root,
-            expected=f"a peak {decibels(LEAST_CONTRAST):.0f} dB above what lies around it, within "
-            f"{REACH_CELLS:g} resolution cells of its place",
+            expected=f"a peak {decibels(LEAST_CONTRAST):.0f} dB above its surroundings, within "
+            f"{REACH_CELLS:g} resolution cells of a reflector's position",
             remedy="Check scene.reflectors, or fly closer to them.",
         )
-    reference = found[0].pair
+    reference = measurements[0].pair
     pairs = {
-        pair: _of_pair(pair, radars[pair], found, reference, campaign)
-        for pair in dict.fromkeys(one.pair for one in found)
+        pair: _of_pair(pair, radars[pair], measurements, reference, campaign)
+        for pair in dict.fromkeys(measurement.pair for measurement in measurements)
     }
     path = campaign.calibration_file
-    before = None if path is None else read_constants(path)
+    previous = None if path is None else read_constants(path)
     constants = Constants(
         software=__version__,
         campaign=campaign.settings.campaign,
-        flights=began,
+        flights=starts,
         reference=reference,
-        pairs=dict(_with_drift(pairs, before)) if before else dict(pairs),
-        measurements=tuple(one.report for one in found),
+        pairs=dict(_with_drift(pairs, previous)) if previous else dict(pairs),
+        measurements=tuple(measurement.report for measurement in measurements),
         images=images,
     )
-    return constants, left_out
+    return constants, excluded
 
 
 # ---- One reflector in one image -------------------------------------------------------------------------------------
@@ -161,7 +162,7 @@ def measured_constants(campaign: Campaign) -> tuple[Constants, list[str]]:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """An image with what is needed to say what a reflector should be in it."""
+    """An image with the data for predicting the response of a reflector in it."""
 
     opened: OpenPair
     scene: OpenScene
@@ -180,36 +181,33 @@ class _View:
     def at(self, stated: KnownReflector) -> Measurement | str:
         """Measure a reflector, or return the reason why it cannot be measured."""
         grid, quality = self.scene.grid, self.image.attrs["quality"]
-        place, axes = self._placed(stated)
-        pulses, parts, noise = point_parts(self.opened.aperture, self.beams, place[None], count=self.count)
+        position, axes = self._position_and_axes(stated)
+        pulses, parts, noise = point_parts(self.opened.aperture, self.beams, position[None], count=self.count)
         part = parts[:, 0]
         if not part.any():
-            return "in no pulse's beam"
+            return "outside the beams of all pulses"
         reflector = Reflector(stated.kind, stated.size_m, axes)
-        to_tx, to_rx = (_unit(leg - place) for leg in pulses.legs)
+        to_tx, to_rx = (_unit(leg - position) for leg in pulses.legs)
         rcs_m2, formula_db = reflector.seen(to_tx, to_rx, part, self.opened.frequency_hz)
         bistatic_deg = float(np.degrees(np.arccos(np.clip((to_tx * to_rx).sum(axis=-1), -1, 1))).max())
         if not np.isfinite(rcs_m2):
-            return (
-                f"its antennas are up to {bistatic_deg:.0f}° apart as it sees them: too much for a {stated.kind} "
-                "its size"
-            )
+            return f"bistatic angle up to {bistatic_deg:.0f}°, too large for a {stated.kind} of its size"
         if not rcs_m2 > 0:
-            return "turned away"
-        path_m = pulses.path(place)
-        if stated.kind == "sphere":  # the wave turns back at its surface, as from a convex mirror
-            skin_m = stated.size_m[0] * np.sqrt((1 + (to_tx * to_rx).sum(axis=-1)) / 2)
-            path_m, part = path_m - 2 * skin_m, part * (1 + 2 * skin_m / path_m)
+            return "not oriented towards the antennas"
+        path_m = pulses.path(position)
+        if stated.kind == "sphere":  # specular reflection at the surface: shorter path, divergence of a convex mirror
+            surface_m = stated.size_m[0] * np.sqrt((1 + (to_tx * to_rx).sum(axis=-1)) / 2)
+            path_m, part = path_m - 2 * surface_m, part * (1 + 2 * surface_m / path_m)
         row, column = self._focused(pulses, path_m, part, grid.pixel_of(*stated.position_m[:2]))
         cell_m = quality["focus"]["cell_m"]
         reach = (REACH_CELLS * cell_m + 3 * stated.std_m) / grid.spacing_m
-        if not all(reach < at < size - 1 - reach for at, size in zip((row, column), grid.shape, strict=True)):
+        if not all(reach < index < size - 1 - reach for index, size in zip((row, column), grid.shape, strict=True)):
             return "outside the image"
         peak = bright_point(self.image.image, *brightest_near(self.image.image, row, column, reach))
         off_m = float(np.hypot(peak.row - row, peak.column - column)) * grid.spacing_m
         inverse = max(float(noise[0]) * self.pulse_noise / peak.amplitude**2, peak.background)
         if inverse * LEAST_CONTRAST > 1 or off_m > (reach + 1) * grid.spacing_m:
-            return f"no peak of its own ({-decibels(inverse):.1f} dB above what lies around it)"
+            return f"no separate peak ({-decibels(inverse):.1f} dB above its surroundings)"
         power = peak.amplitude**2 - float(noise[0]) * self.pulse_noise
         amplitude = abs(self._response(pulses, path_m, part, row, column))
         constant_db = decibels(power / (rcs_m2 * amplitude**2))
@@ -240,17 +238,17 @@ class _View:
             common_db,
             phase,
             float(np.hypot(np.sqrt(inverse / 2), numerical)),
-            (part[:, None] * pulses.path_gradient(place)).sum(axis=0) / part.sum(),
+            (part[:, None] * pulses.path_gradient(position)).sum(axis=0) / part.sum(),
             self.pulse_noise / float((self.opened.weight**2).sum()),
             report,
         )
 
-    def _placed(self, stated: KnownReflector) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the place of a reflector in the frame of the pulses, and its axes right, up and ahead, as rows."""
+    def _position_and_axes(self, stated: KnownReflector) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return a reflector's position in the frame of the pulses, and its axes right, up and ahead, as rows."""
         (x, y, z), crs = stated.position_m, self.scene.grid.crs
-        place = frame_from_map(crs, x, y, z)
+        position = frame_from_map(crs, x, y, z)
         east, north, up = (
-            _unit(frame_from_map(crs, x + dx, y + dy, z + dz) - place)
+            _unit(frame_from_map(crs, x + dx, y + dy, z + dz) - position)
             for dx, dy, dz in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
         )
         azimuth, elevation, roll = (
@@ -260,43 +258,45 @@ class _View:
         ahead = np.cos(elevation) * level + np.sin(elevation) * up
         right = np.cos(azimuth) * east - np.sin(azimuth) * north
         above = np.cross(right, ahead)
-        turned = np.cos(roll) * right - np.sin(roll) * above, np.sin(roll) * right + np.cos(roll) * above
-        return place, np.array([*turned, ahead])
+        rolled = np.cos(roll) * right - np.sin(roll) * above, np.sin(roll) * right + np.cos(roll) * above
+        return position, np.array([*rolled, ahead])
 
-    def _ground(self, row: float, column: float) -> NDArray[np.float64]:
-        """Return the place of a pixel, (3,) float64; NaN off a DEM."""
+    def _pixel_position(self, row: float, column: float) -> NDArray[np.float64]:
+        """Return the position of a pixel on the terrain, (3,) float64; NaN outside the DEM."""
         height_m = float(self.scene.terrain.heights_at(self.scene.grid, row, column))
         return self.scene.grid.positions_at(row, column, height_m) if np.isfinite(height_m) else np.full(3, np.nan)
 
     def _focused(
         self, pulses: Aperture, path_m: NDArray[np.float64], part: NDArray[np.float64], start: tuple[Any, Any]
     ) -> tuple[float, float]:
-        """Return the pixel on the ground whose path is closest to a target's over the pulses, by Gauss and Newton.
+        """Return the pixel whose path fits the target's path over the pulses best, by Gauss-Newton iteration.
 
-        NaN where that leads off a DEM.
+        The result is NaN if the iteration leaves the DEM.
         """
-        at, root = np.array([float(one) for one in start]), np.sqrt(part / part.sum())
+        pixel, root = np.array([float(index) for index in start]), np.sqrt(part / part.sum())
         for _ in range(_ROUNDS):
-            here, down, right = (pulses.path(self._ground(*(at + step))) for step in ((0, 0), (1, 0), (0, 1)))
-            slope = np.stack([down - here, right - here], axis=-1)
+            current_m, down_m, right_m = (
+                pulses.path(self._pixel_position(*(pixel + step))) for step in ((0, 0), (1, 0), (0, 1))
+            )
+            slope = np.stack([down_m - current_m, right_m - current_m], axis=-1)
             if not np.isfinite(slope).all():
                 return np.nan, np.nan
-            step = np.linalg.lstsq(root[:, None] * slope, root * (path_m - here), rcond=None)[0]
-            at = at + step
-            if np.abs(step).max() < _FOLLOWED_M:
+            step = np.linalg.lstsq(root[:, None] * slope, root * (path_m - current_m), rcond=None)[0]
+            pixel = pixel + step
+            if np.abs(step).max() < _CONVERGED_PX:
                 break
-        return float(at[0]), float(at[1])
+        return float(pixel[0]), float(pixel[1])
 
     def _response(
         self, pulses: Aperture, path_m: NDArray[np.float64], part: NDArray[np.float64], row: float, column: float
     ) -> complex:
-        """Return the pixel power of a target of 1 m² with these paths where K is 1: eq. 15."""
+        """Return the complex pixel amplitude of a target of 1 m² with the given paths, for K = 1: eq. 15."""
         k = 2 * np.pi * centre_frequency(self.opened.frequency_hz) / self.opened.wave_speed_m_s
-        turned = np.exp(-1j * k * (path_m - pulses.path(self._ground(row, column))))
-        return complex((part * turned).sum())
+        phasors = np.exp(-1j * k * (path_m - pulses.path(self._pixel_position(row, column))))
+        return complex((part * phasors).sum())
 
     def _phase(self, expected: complex, peak: BrightPoint) -> float:
-        """Return the phase of a peak against what its pixel would show."""
+        """Return the phase of a peak relative to the expected pixel amplitude."""
         grid, carriers = self.scene.grid, np.array(self.image.attrs["quality"]["view"]["carriers_cycles_m"])
         east, north = carrier_at(carriers, grid.shape, peak.row, peak.column)
         carrier = (-north * grid.spacing_m, east * grid.spacing_m)
@@ -311,28 +311,38 @@ def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
 # ---- All reflectors and flights of a pair ---------------------------------------------------------------------------
 
 
-def _of_pair(pair: str, radar: Radar, found: list[Measurement], reference: str, campaign: Campaign) -> PairConstant:
-    """Return the constant of a pair, and its phase against the reference."""
-    own = [one for one in found if one.pair == pair]
+def _of_pair(
+    pair: str, radar: Radar, measurements: list[Measurement], reference: str, campaign: Campaign
+) -> PairConstant:
+    """Return the constant of a pair, and its phase relative to the reference pair."""
+    of_pair = [measurement for measurement in measurements if measurement.pair == pair]
     mean = together(
-        np.array([one.constant_db for one in own]),
-        np.array([one.scatter_db for one in own]),
-        np.array([one.common_db for one in own]),
-        [one.reflector for one in own],
-        [one.flight for one in own],
+        np.array([measurement.constant_db for measurement in of_pair]),
+        np.array([measurement.scatter_db for measurement in of_pair]),
+        np.array([measurement.common_db for measurement in of_pair]),
+        [measurement.reflector for measurement in of_pair],
+        [measurement.flight for measurement in of_pair],
     )
-    against = {(one.flight, one.reflector): one for one in found if one.pair == reference}
-    both = [(one, against[at]) for one in own if (at := (one.flight, one.reflector)) in against]
-    phase = _phase_of(both, radar.centre_hz, campaign) if both else None
+    references = {
+        (measurement.flight, measurement.reflector): measurement
+        for measurement in measurements
+        if measurement.pair == reference
+    }
+    common = [
+        (measurement, references[key])
+        for measurement in of_pair
+        if (key := (measurement.flight, measurement.reflector)) in references
+    ]
+    phase = _phase_of(common, radar.centre_hz, campaign) if common else None
     flags = Flags.merged(_flags(mean, "dB"), {} if phase is None else _flags(phase, "rad"))
-    noise = float(np.mean([one.profile_noise for one in own]))
+    noise = float(np.mean([measurement.profile_noise for measurement in of_pair]))
     return PairConstant(
         radar=radar,
         constant_db=round(mean.value, 3),
         std_db=round(mean.std, 3),
         chance=round(mean.chance, 4),
-        reflectors=len({one.reflector for one in own}),
-        flights=len({one.flight for one in own}),
+        reflectors=len({measurement.reflector for measurement in of_pair}),
+        flights=len({measurement.flight for measurement in of_pair}),
         phase_rad=None if phase is None else round(float(np.angle(np.exp(1j * phase.value))), 4),
         phase_std_rad=None if phase is None else round(phase.std, 4),
         profile_noise=float(f"{noise:.4g}") or None,
@@ -340,39 +350,39 @@ def _of_pair(pair: str, radar: Radar, found: list[Measurement], reference: str, 
     )
 
 
-def _phase_of(both: list[tuple[Measurement, Measurement]], centre_hz: float, campaign: Campaign) -> Mean | None:
-    """Return the mean phase between two pairs; None for the pair itself."""
-    if all(one is other for one, other in both):
+def _phase_of(common: list[tuple[Measurement, Measurement]], centre_hz: float, campaign: Campaign) -> Mean | None:
+    """Return the mean phase difference of two pairs at common reflectors; None for the reference pair itself."""
+    if all(measured is reference for measured, reference in common):
         return None
-    std_m = {one.name: one.std_m for one in campaign.settings.scene.reflectors}
-    turns = np.array([one.phase_rad - other.phase_rad for one, other in both])
-    middle = np.angle(np.exp(1j * turns).mean())
+    std_m = {reflector.name: reflector.std_m for reflector in campaign.settings.scene.reflectors}
+    phases_rad = np.array([measured.phase_rad - reference.phase_rad for measured, reference in common])
+    middle = np.angle(np.exp(1j * phases_rad).mean())
     return together(
-        middle + np.angle(np.exp(1j * (turns - middle))),
-        np.array([np.hypot(one.phase_scatter_rad, other.phase_scatter_rad) for one, other in both]),
+        middle + np.angle(np.exp(1j * (phases_rad - middle))),
+        np.array([np.hypot(measured.phase_scatter_rad, reference.phase_scatter_rad) for measured, reference in common]),
         np.array(
             [
                 2
                 * np.pi
                 * centre_hz
                 / SPEED_OF_LIGHT_M_S
-                * np.linalg.norm(one.gradient - other.gradient)
-                * std_m[one.reflector]
-                for one, other in both
+                * np.linalg.norm(measured.gradient - reference.gradient)
+                * std_m[measured.reflector]
+                for measured, reference in common
             ]
         ),
-        [one.reflector for one, _ in both],
-        [one.flight for one, _ in both],
+        [measured.reflector for measured, _ in common],
+        [measured.flight for measured, _ in common],
     )
 
 
 def _flags(mean: Mean, unit: str) -> dict[str, str]:
-    """Return the flags of what reflectors and flights say together."""
+    """Return the flags of a mean over reflectors and flights."""
     flags = {}
     if mean.chance < _LEAST_CHANCE:
         flags["reflectors_disagree"] = (
-            f"{mean.freedom + 1} reflectors differ in {unit} by a sum of squares of {mean.chi2:.1f}, which chance does "
-            f"{mean.chance:.1g} of the times"
+            f"{mean.freedom + 1} reflectors disagree in {unit}: χ² {mean.chi2:.1f} with "
+            f"{number_of(mean.freedom, 'degree')} of freedom, p-value {mean.chance:.1g}"
         )
     if mean.drift is not None and mean.drifts:
         first, second, difference, std = mean.drift
@@ -380,17 +390,18 @@ def _flags(mean: Mean, unit: str) -> dict[str, str]:
     return flags
 
 
-def _with_drift(pairs: Mapping[str, PairConstant], before: Constants) -> Iterator[tuple[str, PairConstant]]:
-    """Yield the constants of pairs, with a flag where they drifted since those that the campaign uses."""
-    for pair, now in pairs.items():
-        was = before.pairs.get(pair)
-        if was is None or was.radar.differs(now.radar):
-            yield pair, now
+def _with_drift(pairs: Mapping[str, PairConstant], previous: Constants) -> Iterator[tuple[str, PairConstant]]:
+    """Yield the constants of pairs, with a flag if they drifted since those used by the campaign."""
+    for pair, constant in pairs.items():
+        earlier = previous.pairs.get(pair)
+        if earlier is None or earlier.radar.differs(constant.radar):
+            yield pair, constant
             continue
-        drift_db, std_db = now.constant_db - was.constant_db, float(np.hypot(now.std_db, was.std_db))
+        drift_db = constant.constant_db - earlier.constant_db
+        std_db = float(np.hypot(constant.std_db, earlier.std_db))
         drifted = abs(drift_db) > DRIFT_SIGMAS * std_db
-        line = {"constant_drifts": f"{drift_db:+.2f} ± {std_db:.2f} dB since {before.measured}"} if drifted else {}
-        yield pair, now.model_copy(update={"flags": Flags.merged(now.flags, line)})
+        line = {"constant_drifts": f"{drift_db:+.2f} ± {std_db:.2f} dB since {previous.measured}"} if drifted else {}
+        yield pair, constant.model_copy(update={"flags": Flags.merged(constant.flags, line)})
 
 
 def write_constants(campaign: Campaign, to: Path | None = None) -> Path:
@@ -399,40 +410,42 @@ def write_constants(campaign: Campaign, to: Path | None = None) -> Path:
     Raises
     ------
     CampaignError
-        If nothing can be measured, images are overtaken, or the file is the one that the campaign itself takes up.
+        If nothing can be measured, images are out of date, or the file is the one that the campaign itself uses.
     """
     path = campaign.root / FILE if to is None else to
     used = campaign.calibration_file
     if used is not None and path.resolve() == used.real():
         raise CampaignError(
-            "is what processing.radiometric_calibration takes up",
+            "the file used by processing.radiometric_calibration",
             where=path,
-            expected="another file: what is measured is compared with it",
+            expected="a different file, because the measured constants are compared with it",
             remedy="Name one with --to.",
         )
-    images = {campaign.manifest("image", one.name, pair) for one in campaign.image_flights for pair in one.pairs}
-    overtaken = [manifest for manifest in stale_results(campaign) if manifest in images]
-    if overtaken:
+    images = {
+        campaign.manifest("image", flight.name, pair) for flight in campaign.image_flights for pair in flight.pairs
+    }
+    outdated = [manifest for manifest in stale_results(campaign) if manifest in images]
+    if outdated:
         raise CampaignError(
-            f"{len(overtaken)} of {len(images)} images are overtaken, {overtaken[0]} among them",
+            f"{len(outdated)} of {len(images)} images out of date, for example {outdated[0]}",
             where=campaign.root,
-            expected="images made from the files and settings of now",
+            expected="images that are up to date with files and settings",
             remedy="Run the workflow first.",
         )
-    constants, left_out = measured_constants(campaign)
+    constants, excluded = measured_constants(campaign)
     write_json(path, constants.model_dump(mode="json"))
     console = Console(width=120)
-    table = Table(title=f"{constants.campaign}: constants at reflectors", title_justify="left")
-    for heading in ("pair", "constant, dB", "reflectors", "flights", f"phase against {constants.reference}, rad"):
+    table = Table(title=f"{constants.campaign}: calibration constants from reflectors", title_justify="left")
+    for heading in ("pair", "constant, dB", "reflectors", "flights", f"phase relative to {constants.reference}, rad"):
         table.add_column(heading, justify="left" if heading == "pair" else "right")
-    for pair, one in constants.pairs.items():
-        phase = "" if one.phase_rad is None else f"{one.phase_rad:+.3f} ± {one.phase_std_rad:.3f}"
-        counts = str(one.reflectors), str(one.flights)
-        table.add_row(pair, f"{one.constant_db:.2f} ± {one.std_db:.2f}", *counts, phase)
+    for pair, constant in constants.pairs.items():
+        phase = "" if constant.phase_rad is None else f"{constant.phase_rad:+.3f} ± {constant.phase_std_rad:.3f}"
+        counts = str(constant.reflectors), str(constant.flights)
+        table.add_row(pair, f"{constant.constant_db:.2f} ± {constant.std_db:.2f}", *counts, phase)
     console.print(table)
-    for pair, one in constants.pairs.items():
-        for name, line in one.flags.items():
+    for pair, constant in constants.pairs.items():
+        for name, line in constant.flags.items():
             print(f"{pair}: {name}: {line}")
-    for line in left_out:
-        print(f"left out: {line}")
+    for line in excluded:
+        print(f"excluded: {line}")
     return path

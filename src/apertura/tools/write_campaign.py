@@ -1,4 +1,4 @@
-"""A campaign folder from plain arrays and files, opened once before it gets its name."""
+"""Creation of a campaign folder from plain arrays and files, with validation before it gets its final name."""
 
 import shutil
 from collections.abc import Mapping
@@ -32,20 +32,20 @@ class RecordedNode:
         I and Q, (sample, channel, 2) or (capture, sample, channel, 2) of int8, int16, int32 or float32; or the path of
         such an array as .npy, or of a file of int16, little-endian, channels interleaved per sample.
     time_utc
-        (capture,) datetime64 or ISO 8601, UTC: the node's own tag of the first sample of each capture.
+        (capture,) datetime64 or ISO 8601, UTC: the node's own time tag of the first sample of each capture.
     track
         (epoch, 3) float64: WGS 84 latitude (deg), longitude (deg), ellipsoidal height (m); or the path of a flight log,
-        which is copied under the suffix that it has.
+        which is copied with its suffix.
     track_utc
-        (epoch,) datetime64 or ISO 8601, UTC; None with a log.
+        (epoch,) datetime64 or ISO 8601, UTC; None with a flight log.
     attitude_deg
         (epoch, 3) float64: roll, pitch, yaw of forward-right-down axes, yaw clockwise from north; None: not logged.
     start
-        (capture,) int64, first sample of each capture; None: captures of equal length, one after the other.
+        (capture,) int64, first sample of each capture; None: contiguous captures of equal length.
     frame
-        (capture,) int64, frame numbers that were sent; None: none were.
+        (capture,) int64, transmitted frame numbers; None: no frame numbers.
     channels
-        Names, in the order of the samples: radar, sidelink.
+        Channel names in the order of the samples: radar, sidelink.
     """
 
     samples: NDArray[Any] | str | Path
@@ -60,14 +60,14 @@ class RecordedNode:
 
 @dataclass(frozen=True)
 class RecordedFlight:
-    """One line of flights.tsv, and what its nodes recorded.
+    """A line of flights.tsv, with the recordings of its nodes.
 
     Attributes
     ----------
     transmitter
-        Which node transmits.
+        Name of the transmitting node.
     nodes
-        Name → recording; the transmitter's among them.
+        Node → recording, including the transmitter's.
     kind
         image or calibration.
     """
@@ -84,24 +84,24 @@ def write_campaign(
     *,
     sent: NDArray[np.complexfloating] | None = None,
 ) -> Path:
-    """Write a campaign folder from plain arrays and files, open all of it, and return it.
+    """Write a campaign folder from plain arrays and files, validate it by reading it, and return its path.
 
     Parameters
     ----------
     directory
-        The folder to make; it must not exist, or be empty.
+        Folder to create; it must not exist, or must be empty.
     config
-        What stands in config/config.yaml: campaign, waveform, nodes, scene and what else is not as by default.
+        Contents of config/config.yaml: campaign, waveform, nodes, scene and all other keys without default values.
     flights
-        Name → what was recorded.
+        Flight → recordings.
     sent
-        What was transmitted, complex: (subcarriers,) code symbols of an OFDM waveform, (sample,) samples of a pulse.
+        Transmitted signal, complex: (subcarriers,) code symbols of an OFDM waveform, or (sample,) samples of a pulse.
 
     Raises
     ------
     CampaignError
-        If something is there already, a key or an array is wrong, or what was written does not open. Then nothing is
-        left behind.
+        If the folder is not empty, a key or an array is invalid, or the written campaign cannot be read. No files are
+        left behind in these cases.
 
     Notes
     -----
@@ -124,7 +124,8 @@ def write_campaign(
     directory = Path(directory)
     settings = validated(dict(config), where="write_campaign: config")
     if not isinstance(settings.waveform, SampledWaveform):
-        raise _wrong("write_campaign: config", f"waveform.kind {settings.waveform.kind}", "one recorded as samples")
+        found = f"waveform.kind {settings.waveform.kind}"
+        raise _wrong("write_campaign: config", found, "a waveform that is recorded as samples")
     lines = [(name, flight.kind, flight.transmitter, flight.nodes) for name, flight in flights.items()]
     with new_folder(directory) as root:
         try:
@@ -154,7 +155,7 @@ def _write_node(stem: Path, recorded: RecordedNode, waveform: SampledWaveform) -
     frame = [None] * len(time) if recorded.frame is None else np.asarray(recorded.frame).tolist()
     if not len(time) == len(start) == len(frame):
         found = f"{len(time)} time tags, {len(start)} starts and {len(frame)} frame numbers"
-        raise _wrong(stem, found, "as many as captures")
+        raise _wrong(stem, found, "one of each for every capture")
     flat = samples.reshape(-1, *samples.shape[-2:])
     write_recording(
         stem,
@@ -179,51 +180,56 @@ def _write_log(stem: Path, recorded: RecordedNode) -> None:
     attitude = None if recorded.attitude_deg is None else np.radians(np.asarray(recorded.attitude_deg, np.float64))
     for name, values in (("track", track), ("attitude_deg", attitude)):
         if values is not None and values.shape != (len(time), 3):
-            raise _wrong(stem, f"{name} of shape {values.shape}", f"({len(time)}, 3), as track_utc has epochs")
+            expected = f"shape ({len(time)}, 3) for the epochs of track_utc"
+            raise _wrong(stem, f"{name} of shape {values.shape}", expected)
     write_csv_log(stem.with_name(f"{stem.name}.track.csv"), time, track, attitude)
 
 
 _LARGEST_RAD = np.pi / 2, np.pi
-_FARTHEST_M = 200e3  # of a track from its scene
-_SLOWEST_M_S, _FASTEST_M_S = 1.0, 120.0  # over ground, of a flight that images
+_FARTHEST_M = 200e3  # maximum distance of a track from its scene
+_SLOWEST_M_S, _FASTEST_M_S = 1.0, 120.0  # range of ground speeds of an image flight
 
 
 def _check_degrees(stem: Path, recorded: RecordedNode, scene: Scene) -> None:
-    """Raise CampaignError where latitude and longitude of a track are in radians.
+    """Raise CampaignError if latitude and longitude of a track are in radians.
 
-    As degrees they lie in the Gulf of Guinea, where there is no land, and 57 times nearer to each other. A track there
-    is refused if it fits the scene, or without a scene on Earth a flight's speed, in radians alone.
+    Interpreted as degrees, they lie in the Gulf of Guinea, where there is no land, and distances are 57 times too
+    short. A track there is refused if it fits the scene (or, without a georeferenced scene, the speed of a flight) only
+    when interpreted as radians.
     """
     track = recorded.track
     if isinstance(track, str | Path) or (np.abs(np.asarray(track)[:, :2]) > _LARGEST_RAD).any():
         return
-    given = np.asarray(track, np.float64)
-    places = [
-        ecef_from_geodetic(factor * given[:, 0], factor * given[:, 1], given[:, 2]) for factor in (1.0, np.degrees(1.0))
+    angles = np.asarray(track, np.float64)
+    positions = [
+        ecef_from_geodetic(factor * angles[:, 0], factor * angles[:, 1], angles[:, 2])
+        for factor in (1.0, np.degrees(1.0))
     ]
     if scene.crs not in {"auto", LOCAL} and scene.bounds_m != "auto":
         xmin, ymin, xmax, ymax = scene.bounds_m
         middle = frame_from_map(scene.crs, (xmin + xmax) / 2, (ymin + ymax) / 2, 0.0)
-        fits = [float(np.linalg.norm(place - middle, axis=1).min()) < _FARTHEST_M for place in places]
-        how = f"within {_FARTHEST_M / 1e3:g} km of scene.bounds_m"
+        fits = [float(np.linalg.norm(position - middle, axis=1).min()) < _FARTHEST_M for position in positions]
+        evidence = f"the track is within {_FARTHEST_M / 1e3:g} km of scene.bounds_m"
     else:
         seconds = np.diff(_times(recorded.track_utc, stem, "track_utc")) / np.timedelta64(1, "s")
-        speeds = [float(np.median(np.linalg.norm(np.diff(place, axis=0), axis=1) / seconds)) for place in places]
+        speeds = [
+            float(np.median(np.linalg.norm(np.diff(position, axis=0), axis=1) / seconds)) for position in positions
+        ]
         fits = [_SLOWEST_M_S <= speed <= _FASTEST_M_S for speed in speeds]
-        how = f"with a median speed of {speeds[1]:.3g} m/s instead of {speeds[0]:.2g} m/s"
+        evidence = f"the median speed is {speeds[1]:.3g} m/s instead of {speeds[0]:.2g} m/s"
     if fits == [False, True]:
-        latitude, longitude = given[0, :2]
-        found = f"latitude {latitude:.6g}, longitude {longitude:.6g}: in radians the track lies {how}"
-        raise _wrong(stem, found, "degrees (a flight that is really there: state scene.crs and scene.bounds_m)")
+        latitude, longitude = angles[0, :2]
+        found = f"latitude {latitude:.6g}, longitude {longitude:.6g}, apparently in radians, for which {evidence}"
+        raise _wrong(stem, found, "degrees (for a flight at this position, configure scene.crs and scene.bounds_m)")
 
 
 def _samples(recorded: RecordedNode, stem: Path) -> NDArray[Any]:
-    """Return samples as an array, or as one that lies in a file."""
+    """Return samples as an array in memory or mapped from a file."""
     samples, channels = recorded.samples, len(recorded.channels)
     if isinstance(samples, str | Path):
         path = Path(samples)
         if not path.is_file() or not path.stat().st_size:
-            raise _wrong(path, "no such file, or an empty one", f"the samples of {stem.parent.name} {stem.name}")
+            raise _wrong(path, "no such file, or an empty file", f"the samples of {stem.parent.name} {stem.name}")
         if path.suffix == ".npy":
             try:
                 samples = np.load(path, mmap_mode="r", allow_pickle=False)
@@ -249,12 +255,12 @@ def _starts(recorded: RecordedNode, samples: NDArray[Any], stem: Path) -> NDArra
     total = int(np.prod(samples.shape[:-2]))
     captures = samples.shape[0] if samples.ndim == 4 else np.size(recorded.time_utc)
     if not captures or total % captures:
-        raise _wrong(stem, f"{total} samples, {captures} captures", "captures of equal length, or their start")
+        raise _wrong(stem, f"{total} samples, {captures} captures", "captures of equal length, or `start` indices")
     return np.arange(captures, dtype=np.int64) * (total // captures)
 
 
 def _times(given: ArrayLike | None, stem: Path, name: str) -> NDArray[np.datetime64]:
-    """Return times as datetime64[ns]; texts in another zone than UTC are rejected."""
+    """Return times as datetime64[ns]; text in time zones other than UTC is rejected."""
     times = np.asarray([] if given is None else given).reshape(-1)
     try:
         if times.dtype.kind != "M":
@@ -268,7 +274,7 @@ def _times(given: ArrayLike | None, stem: Path, name: str) -> NDArray[np.datetim
 
 
 def _check_opens(campaign: Campaign, flights: Mapping[str, RecordedFlight]) -> None:
-    """Raise CampaignError unless a run would read back the written campaign."""
+    """Raise CampaignError if the written campaign cannot be read, or its time tags differ from the given ones."""
     for flight in campaign.flights:
         for node in flight.participants:
             recording = open_recording(campaign.recording_files(flight.name, node))
@@ -276,9 +282,9 @@ def _check_opens(campaign: Campaign, flights: Mapping[str, RecordedFlight]) -> N
             recording.cut(recording.captures, node=node)
             stem, given = campaign.root / "raw" / flight.name / node, flights[flight.name].nodes[node]
             if not np.array_equal(recording.captures.time, _times(given.time_utc, stem, "time_utc")):
-                raise _wrong(stem, "time tags that did not come back", "those given")
+                raise _wrong(stem, "written time tags that differ from the given ones", "unchanged time tags")
             read_log(campaign, flight.name, node)
 
 
 def _wrong(where: object, found: str, expected: str) -> CampaignError:
-    return CampaignError(found, where, expected, "Correct what is given to write_campaign.")
+    return CampaignError(found, where, expected, "Correct the arguments of write_campaign.")

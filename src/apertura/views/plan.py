@@ -1,4 +1,4 @@
-"""`apertura plan`: how each pair will be imaged, why, how exactly and at what cost, before anything runs."""
+"""`apertura plan`: processing decisions of each pair with reasons, predicted error and cost, before any processing."""
 
 from dataclasses import replace
 from math import isfinite
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 
 def first_flight(campaign: Campaign) -> Flown:
-    """Return the joint geometry of the first image flight, from which the one grid of all images is settled."""
+    """Return the joint geometry of the first image flight, which determines the common grid of all images."""
     flight = campaign.image_flights[0]
     return Flown.together([open_pair(campaign, flight.name, pair).flown for pair in flight.pairs])
 
 
 def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
-    """Print every pair's decisions, reasons, predicted error, seconds and bytes; nothing is run or written."""
+    """Print the decisions of each pair with reasons, predicted error, run time and memory; nothing is written."""
     campaign.check_images()
     from rich.console import Console
     from rich.filesize import decimal
@@ -39,8 +39,8 @@ def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
     scene = expected_scene(campaign, lambda: first_flight(campaign))
     rows, columns = scene.grid.shape
     console.print(f"scene: {columns} × {rows} pixels of {scene.grid.spacing_m:g} m, {scene.grid.crs}", highlight=False)
-    for key, why in scene.chosen.items():
-        console.print(f"  scene.{key}: {why}", highlight=False)
+    for key, reason in scene.chosen.items():
+        console.print(f"  scene.{key}: {reason}", highlight=False)
     for flight in campaign.image_flights:
         logged = [open_pair(campaign, flight.name, pair) for pair in flight.pairs]
         pairs, autofocus = expected_track(campaign, logged, scene)
@@ -51,23 +51,24 @@ def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
             console.print(_table(plan, f"{flight.name}/{opened.name}"), budget)
             if opened.history is None:
                 console.print(
-                    "before the samples were read: by the flight logs alone. What they hold, and the pulses that are "
-                    "left, may change models, errors and engine; the same command says so after the step echo."
+                    "Planned from the flight logs alone, because step echo has not run. The recorded samples and the "
+                    "number of usable pulses may change models, errors and engine: repeat `apertura plan` after step "
+                    "echo."
                 )
             for name, line in plan.flags.items():
                 console.print(f"[yellow]{name}[/yellow]: {line}")
             seconds, disk = seconds + plan.predicted_seconds, disk + plan.disk_bytes
     console.print(
-        f"in all about {seconds:.2g} s of imaging on {number_of(threads, 'thread')}, {decimal(disk)} on disk before "
-        "compression"
+        f"total: about {seconds:.2g} s of image formation on {number_of(threads, 'thread')}, {decimal(disk)} on disk "
+        "before compression"
     )
     free = campaign.root.free_bytes()
     if disk > free and not campaign.results.is_dir():
         raise CampaignError(
             f"the results of all pairs need {decimal(disk)} on disk",
             where=campaign.root,
-            expected=f"at most the {decimal(free)} that are free",
-            remedy="Free some space, or make the scene smaller.",
+            expected=f"at most the {decimal(free)} of free space",
+            remedy="Free disk space, or make the scene smaller.",
         )
 
 
@@ -76,7 +77,7 @@ def _table(plan: Plan, title: str) -> "Table":
     from rich.table import Table
 
     table = Table(title=f"{title}: {plan.setting.line}", title_justify="left")
-    for heading in ("choice", "value", "reason", "error"):
+    for heading in ("decision", "value", "reason", "error"):
         table.add_column(heading, overflow="fold")
     for decision in plan.decisions:
         error = "" if decision.error_db is None else f"{decision.error_db:.1f} dB"
@@ -92,14 +93,14 @@ def _budget_table(lines: list[BudgetLine]) -> "Table":
     from rich.table import Table
 
     table = Table(title="error budget", title_justify="left")
-    for heading in ("cause", "stated", "loss of peak", "shift", "phase"):
+    for heading in ("cause", "size", "peak loss", "displacement", "phase"):
         table.add_column(heading, overflow="fold")
     for line in lines:
         report = line.report
-        stated = "; ".join(dict.fromkeys(report["stated"].split("; ")))  # nodes that are alike, once
+        stated = "; ".join(dict.fromkeys(report["stated"].split("; ")))  # identical text of several nodes only once
         table.add_row(report["cause"], stated, *_effect(line.effect))
     table.add_section()
-    table.add_row("sum of all expected", "", *_effect(expected(lines)))
+    table.add_row("sum of expected effects", "", *_effect(expected(lines)))
     return table
 
 
@@ -109,7 +110,7 @@ def _effect(effect: Effect) -> tuple[str, str, str]:
 
 
 def _length(metres: float) -> str:
-    """Return a length in centimetres, from a metre on in metres.
+    """Format a length in centimetres, or in metres from 1 m.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Contents of image.json as values, rows of tables and sentences: for summary, page and map."""
+"""Contents of image.json as values, table rows and sentences, for summary, report page and map."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,41 +17,41 @@ REPORT = "image.json"
 Report = Mapping[str, Any]
 Cells = tuple[str, ...]
 
-VERDICTS = ("image", "verdict", "peak lost", "expected", "numerical error", "pulses", "flags")
-DECISIONS = ("decision", "choice", "why")
-BUDGET = ("cause", "stated", "peak lost", "targets shifted", "phase")
-FLAGGED = ("flag", "images", "what was measured", "what it means", "what to look at first")
+VERDICTS = ("image", "verdict", "peak loss", "expected loss", "numerical error", "pulses", "flags")
+DECISIONS = ("decision", "value", "reason")
+BUDGET = ("cause", "size", "peak loss", "displacement", "phase")
+FLAGGED = ("flag", "images", "measurement", "meaning", "advice")
 """Headings of the tables."""
 
 
 @dataclass(frozen=True)
 class ImageValues:
-    """Values of an image report; None and empty where they are not stated.
+    """Values of an image report; None or empty if the report does not contain them.
 
     Attributes
     ----------
     verdict, why
-        Of its focus, and the reason.
+        Focus verdict, and its reason.
     loss_db, expected_db
-        Power lost from the peak, as bright points show it and as the error budget expects it, dB, 0 or less.
+        Peak loss measured at bright points, and expected by the error budget, dB, 0 or less.
     worst_cause
-        Of the causes stated, the one that the budget expects to cost most.
+        Cause with the largest expected peak loss, among those with a stated or assumed size.
     not_stated
         Causes of the budget whose size is neither stated nor assumed.
     place_m, place_cause
-        Deviation of the places of points that the budget expects, metres, and the cause that moves them most.
+        Expected displacement of points, metres, and the cause that contributes most.
     error_db
-        Bound of the numerical error, dB.
+        Upper bound of the numerical error, dB.
     used, recorded
-        Pulses that make the image, and all.
-    coherence, left_out
-        Of a sum: how much of full coherence its pairs add up with, and how many of them it leaves out.
+        Numbers of pulses used in the image, and recorded.
+    coherence, excluded
+        Coherence of the pairs of a sum, and number of pairs excluded from it.
     flags
-        Name → what was measured.
+        Flag → measurement.
     """
 
     verdict: str
-    why: str
+    reason: str
     loss_db: float | None
     expected_db: float | None
     worst_cause: str
@@ -62,7 +62,7 @@ class ImageValues:
     used: int | None
     recorded: int
     coherence: float | None
-    left_out: int
+    excluded: int
     flags: Mapping[str, str]
 
     @classmethod
@@ -70,34 +70,35 @@ class ImageValues:
         """Return the values in an image.json."""
         focus, pulses, coherence, fusion = (report.get(key) or {} for key in ("focus", "pulses", "coherence", "fusion"))
         budget = report.get("budget", ())
-        worst = min((line for line in budget if is_counted(line)), key=lambda line: line["loss_db"], default=None)
-        far = max((line for line in budget if is_counted(line)), key=lambda line: line["shift_m"] or 0.0, default=None)
+        counted = [line for line in budget if is_counted(line)]
+        most_lossy = min(counted, key=lambda line: line["loss_db"], default=None)
+        most_shifting = max(counted, key=lambda line: line["shift_m"] or 0.0, default=None)
         used = pulses.get("used")
         return cls(
             str(focus.get("verdict", "")),
-            str(focus.get("why", "")),
+            str(focus.get("reason", "")),
             focus.get("loss_db"),
             focus.get("expected_db"),
-            worst["cause"] if worst else "",
+            most_lossy["cause"] if most_lossy else "",
             tuple(line["cause"] for line in budget if not is_counted(line)),
             focus.get("expected_shift_m") or 0.0,
-            f"{far['cause']}, {far['stated']}" if far else "",
+            f"{most_shifting['cause']}, {most_shifting['stated']}" if most_shifting else "",
             float(report["numerical_error_db"]),
             used,
             (used or 0) + (pulses.get("dropped") or 0),
             coherence.get("mean"),
-            len(fusion.get("left_out", ())),
+            len(fusion.get("excluded", ())),
             report["flags"],
         )
 
 
 def read_report(campaign: Campaign, flight: str, image: str) -> dict[str, Any]:
-    """Return image.json of a pair or of the sums of a flight, with flags that can be printed.
+    """Read image.json of a pair or of the sums of a flight, with printable flags.
 
     Raises
     ------
     CampaignError
-        If it is not there, not as it was written, or lacks what every view shows.
+        If it is missing, was modified, or lacks a value that every view requires.
     """
     report = report_of(campaign, flight, image)
     with undamaged(
@@ -114,7 +115,7 @@ def printable(flags: Mapping[str, str]) -> dict[str, str]:
 
 
 def verdict_row(name: str, report: Report) -> Cells:
-    """Return the row of an image among all, under `VERDICTS`.
+    """Return the table row of an image, with the columns `VERDICTS`.
 
     Examples
     --------
@@ -135,7 +136,7 @@ def verdict_row(name: str, report: Report) -> Cells:
 
 
 def decibels(loss_db: float | None, digits: int) -> str:
-    """Return a loss as people write it; nothing where there is none.
+    """Format a loss as a positive number of dB; empty for None.
 
     Examples
     --------
@@ -146,12 +147,12 @@ def decibels(loss_db: float | None, digits: int) -> str:
 
 
 def sentences(name: str, report: Report) -> Iterator[str]:
-    """Yield sentences for a results section on an image: focus, certificate, agreement.
+    """Yield sentences on an image for a results section: focus, certificate, agreement.
 
     Parameters
     ----------
     name
-        Of the image.
+        Name of the image.
     report
         Its image.json.
     """
@@ -163,52 +164,51 @@ def sentences(name: str, report: Report) -> Iterator[str]:
     if agreement and report.get("reference") != report.get("pair"):
         shift_m = float((agreement["shift_east_m"] ** 2 + agreement["shift_north_m"] ** 2) ** 0.5)
         yield (
-            f"Against {report['reference']}, {agreement['points']:.0f} {agreement['by']} lie "
-            f"{100 * shift_m:.1f} cm apart and "
-            f"{_signed(agreement['phase_rad'], 3)} ± {agreement['phase_std_rad']:.3f} rad out of phase."
+            f"Comparison with {report['reference']} at {agreement['points']:.0f} {agreement['by']}: displacement "
+            f"{100 * shift_m:.1f} cm, phase difference "
+            f"{_signed(agreement['phase_rad'], 3)} ± {agreement['phase_std_rad']:.3f} rad."
         )
     coherence = report.get("coherence") or {}
     if coherence.get("mean") is not None:
-        yield f"The pairs add up with {coherence['mean']:.3f} of full coherence ({coherence['chance']:.2f} by chance)."
+        yield f"Coherence of the pairs: {coherence['mean']:.3f} (for random phases: {coherence['chance']:.2f})."
     if gain := report.get("gain"):
         over_db, noise_db = gain["over_best_pair_db"], gain["allowed_db"]
-        beyond = " More is gained where the pairs' sidelobes, seen from different places, cancel." * (
-            over_db > noise_db
-        )
+        sidelobes = " The additional reduction comes from sidelobes of the pairs that cancel in the sum."
         yield (
-            f"Between the targets it is {abs(over_db):.1f} dB {'lower' if over_db >= 0 else 'higher'} against the peak "
-            f"than {gain['best_pair']}, its best pair; noise that pairs do not share allows {noise_db:.1f} dB.{beyond}"
+            f"The background between targets, relative to the peak, is {abs(over_db):.1f} dB "
+            f"{'lower' if over_db >= 0 else 'higher'} than in {gain['best_pair']}, the best pair; averaging of "
+            f"uncorrelated noise accounts for up to {noise_db:.1f} dB.{sidelobes * (over_db > noise_db)}"
         )
         yield _cut_sentence(report["brightest"])
 
 
 def _cut_sentence(brightest: Mapping[str, Any]) -> str:
-    """Return widths and sidelobes of a target, where its cuts hold them."""
+    """Return a sentence with the −3 dB widths and sidelobe ratios of a target, as far as its cuts contain them."""
     parts = []
-    for name, words in (("cross_range", "along the flight"), ("ground_range", "across it")):
+    for name, direction in (("cross_range", "in cross-range"), ("ground_range", "in ground range")):
         width, pslr = brightest.get(f"{name}_width_m"), brightest.get(f"{name}_pslr_db")
         if width is not None:
-            lobe = "" if pslr is None else f", its highest sidelobe {_signed(pslr, 1)} dB"
-            parts.append(f"{100 * width:.1f} cm wide {words}{lobe}")
-    return f"Its brightest target is {' and '.join(parts) or 'wider than its cuts'}."
+            sidelobe = "" if pslr is None else f" (PSLR {_signed(pslr, 1)} dB)"
+            parts.append(f"{100 * width:.1f} cm {direction}{sidelobe}")
+    return f"−3 dB width of the brightest target: {', '.join(parts) or 'beyond the length of the cuts'}."
 
 
 def certificate(report: Report) -> str:
-    """Return the certificate of an image's arithmetic, in a sentence.
+    """Return a sentence with the certified bound of an image's numerical error.
 
     Examples
     --------
     >>> certificate({"numerical_error_db": -67.8, "numerical_error_confidence": 0.95, "certified_pixels": 272})
-    'Its numerical error lies below −67.8 dB (95 % sure), measured at 272 pixels against a double sum in float64.'
+    'Numerical error below −67.8 dB (95 % confidence), measured at 272 pixels against the exact sum in float64.'
     """
     pixels = report.get("certified_pixels")
-    where = f"measured at {pixels} pixels against a double sum in float64" if pixels else "that of its worst pair"
-    sure = f"{100 * report['numerical_error_confidence']:.0f} % sure"
-    return f"Its numerical error lies below {_signed(report['numerical_error_db'], 1)} dB ({sure}), {where}."
+    source = f"measured at {pixels} pixels against the exact sum in float64" if pixels else "that of the worst pair"
+    confidence = f"{100 * report['numerical_error_confidence']:.0f} % confidence"
+    return f"Numerical error below {_signed(report['numerical_error_db'], 1)} dB ({confidence}), {source}."
 
 
 def decision_rows(report: Report) -> list[Cells]:
-    """Return the planner's decisions, under `DECISIONS`.
+    """Return table rows of the planner's decisions, with the columns `DECISIONS`.
 
     Examples
     --------
@@ -217,28 +217,28 @@ def decision_rows(report: Report) -> list[Cells]:
     """
     rows: list[Cells] = []
     for name, line in (report.get("models") or {}).items():
-        choice, _, why = str(line).partition(": ")
-        rows.append((name.replace("_", " "), choice if why else "", why or choice))
+        value, _, reason = str(line).partition(": ")
+        rows.append((name.replace("_", " "), value if reason else "", reason or value))
     return rows
 
 
 def shared_rows(reports: Mapping[str, Report]) -> list[Cells]:
-    """Return the decisions of several images, each once, with the images that it was made for.
+    """Return table rows of the decisions of several images, each decision once with the names of its images.
 
     Examples
     --------
     >>> shared_rows({"a-a": {"models": {"degree": "1: cheap"}}, "a-b": {"models": {"degree": "1: cheap"}}})
     [('a-a, a-b', 'degree', '1', 'cheap')]
     """
-    made: dict[Cells, list[str]] = {}
+    names_of: dict[Cells, list[str]] = {}
     for name, report in reports.items():
         for row in decision_rows(report):
-            made.setdefault(row, []).append(name)
-    return [(", ".join(names), *row) for row, names in sorted(made.items())]
+            names_of.setdefault(row, []).append(name)
+    return [(", ".join(names), *row) for row, names in sorted(names_of.items())]
 
 
 def budget_rows(lines: Sequence[Report]) -> list[Cells]:
-    """Return the rows of an error budget, under `BUDGET`; in brackets what is assumed and not stated.
+    """Return table rows of an error budget, with the columns `BUDGET`; effects that do not count are in brackets.
 
     Examples
     --------
@@ -259,45 +259,45 @@ def budget_rows(lines: Sequence[Report]) -> list[Cells]:
 
 @dataclass(frozen=True)
 class RaisedFlag:
-    """A flag that some images carry.
+    """A flag that is raised for at least one image.
 
     Attributes
     ----------
     name
-        Of the flag.
+        Name of the flag.
     measured
-        What was measured → the images of which.
-    means, look
-        What it means and what to look at first; empty of a flag that another version has raised.
+        Measurement → names of its images.
+    meaning, advice
+        Meaning of the flag and advice; empty for a flag of another version of apertura.
     """
 
     name: str
     measured: Mapping[str, Sequence[str]]
-    means: str
-    look: str
+    meaning: str
+    advice: str
 
 
 def raised_flags(reports: Mapping[str, Report], *, quotes: bool = True) -> list[RaisedFlag]:
-    """Return each flag once.
+    """Return each raised flag once.
 
     Parameters
     ----------
     reports
-        Name of an image → its image.json, that of sums after those of their pairs.
+        Name of an image → its image.json, sums after their pairs.
     quotes
-        With the lines in which sums only quote their pairs.
+        Include measurements of sums that only repeat those of their pairs.
     """
     raised: dict[str, dict[str, list[str]]] = {}
     for image, report in reports.items():
         for flag, line in report["flags"].items():
             images = raised.setdefault(flag, {})
-            if quotes or not image.endswith(FUSED) or not any(known in line for known in images):
+            if quotes or not image.endswith(FUSED) or not any(earlier in line for earlier in images):
                 images.setdefault(line, []).append(image)
     return [RaisedFlag(flag, lines, *_explained(flag)) for flag, lines in raised.items()]
 
 
 def flag_rows(reports: Mapping[str, Report]) -> list[Cells]:
-    """Return each flag once, under `FLAGGED`.
+    """Return table rows of the raised flags, with the columns `FLAGGED`.
 
     Parameters
     ----------
@@ -314,15 +314,15 @@ def flag_rows(reports: Mapping[str, Report]) -> list[Cells]:
             flag.name,
             ", ".join(dict.fromkeys(image for images in flag.measured.values() for image in images)),
             "; ".join(flag.measured),
-            flag.means,
-            flag.look,
+            flag.meaning,
+            flag.advice,
         )
         for flag in raised_flags(reports)
     ]
 
 
 def explained_flags(flags: Mapping[str, str]) -> dict[str, str]:
-    """Return flag → sentences: what was measured, what it means and what to look at.
+    """Return flag → sentences with measurement, meaning and advice.
 
     Examples
     --------
@@ -331,15 +331,15 @@ def explained_flags(flags: Mapping[str, str]) -> dict[str, str]:
     """
     explained = {}
     for flag, line in flags.items():
-        means, look = _explained(flag)
-        words = [line.rstrip("."), *([means, f"look at: {look}"] if means else [])]
-        explained[flag] = " ".join(f"{sentence}." for sentence in words)
+        meaning, advice = _explained(flag)
+        sentences_of = [line.rstrip("."), *([meaning, f"Advice: {advice}"] if meaning else [])]
+        explained[flag] = " ".join(f"{sentence}." for sentence in sentences_of)
     return explained
 
 
 def _explained(flag: str) -> tuple[str, str]:
-    known = FLAGS.get(flag)  # an image of another version may carry one that is unknown here
-    return (known.means, known.look) if known else ("", "")
+    definition = FLAGS.get(flag)  # an image of another version may have a flag that this version does not define
+    return (definition.meaning, definition.advice) if definition else ("", "")
 
 
 def _size_text(value: float, unit: str) -> str:

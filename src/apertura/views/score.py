@@ -1,4 +1,4 @@
-"""Measured and true positions of the point targets of truth.json, in the exported GeoTIFFs."""
+"""`apertura score`: compare measured target positions in the exported GeoTIFFs with those of truth.json."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -25,12 +25,12 @@ from apertura.stages.scene import open_scene, settled_scene
 from apertura.views.summary import print_summary
 
 REACH_M = 1.0
-"""Radius around its true place in which a target is searched for and cut, metres."""
+"""Half length of the cuts through a target, metres; a quarter of it is the search radius about the true position."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One target in one image; lengths in metres; its cross-section as found and put, where images are calibrated."""
+    """Measurement of a target in an image: lengths in metres, radar cross-section in calibrated images."""
 
     flight: str
     image: str
@@ -45,12 +45,12 @@ class Finding:
 
     @property
     def error_m(self) -> float:
-        """Distance between where the target was found and where it was put."""
+        """Distance between measured and true position, metres."""
         return float(np.hypot(self.error_east_m, self.error_north_m))
 
 
 def score(campaign: Campaign) -> list[Finding]:
-    """Find each target of truth.json in each SLC of the campaign, with its −3 dB widths.
+    """Locate each target of truth.json in each SLC of the campaign and measure its −3 dB widths.
 
     Raises
     ------
@@ -58,11 +58,11 @@ def score(campaign: Campaign) -> list[Finding]:
         If the campaign has no truth.json or no results.
     """
     path = campaign.root.named("truth.json", where=campaign.root)
-    expected, remedy = "true target places", "Only simulated campaigns have them."
+    expected, remedy = "true target positions", "Only simulated campaigns have them."
     document = read_json(path, expected=expected, remedy=remedy)
     with undamaged(path, expected=expected, remedy=remedy):
-        known = ("x", "y", "rcs_m2")
-        targets = [{name: float(target[name]) for name in known if name in target} for target in document["targets"]]
+        keys = ("x", "y", "rcs_m2")
+        targets = [{key: float(target[key]) for key in keys if key in target} for target in document["targets"]]
     return [finding for flight in campaign.image_flights for finding in _flight(campaign, flight, targets)]
 
 
@@ -108,30 +108,31 @@ def _flight(campaign: Campaign, flight: Flight, targets: list[dict[str, float]])
 def _cross_sections(
     campaign: Campaign, flight: str, pair: str
 ) -> Callable[[BrightPoint, float | None], dict[str, Any]] | None:
-    """Return the function that measures a point's cross-section in a pair's image, beside its true one; or None."""
+    """Return a function of a point and its true cross-section that measures it in a pair's image, if calibrated."""
     if not campaign.calibrated or pair == FUSED:
         return None
     scene, path = open_scene(campaign), campaign.result(flight, pair, CROSS_SECTIONS)
     calibrated = calibrated_pair(campaign, open_pair(campaign, flight, pair), scene)
     noise = open_listed(path, campaign.root / campaign.manifest("layers", flight, pair))["noise"]["pulse"]
 
-    def found(point: BrightPoint, put_m2: float | None) -> dict[str, Any]:
+    def measure(point: BrightPoint, true_rcs_m2: float | None) -> dict[str, Any]:
         if calibrated is None:
             return {}
-        (one,) = calibrated.points([point], scene, np.nan if noise is None else float(noise))
-        put = None if not put_m2 else decibels(put_m2)
-        return {"rcs_dbsm": one["rcs_dbsm"], "rcs_std_db": one["std_db"], "rcs_put_dbsm": put}
+        (measured,) = calibrated.points([point], scene, np.nan if noise is None else float(noise))
+        true_dbsm = None if not true_rcs_m2 else decibels(true_rcs_m2)
+        return {"rcs_dbsm": measured["rcs_dbsm"], "rcs_std_db": measured["std_db"], "rcs_put_dbsm": true_dbsm}
 
-    return found
+    return measure
 
 
 def print_findings(campaign: Campaign, *, paths: bool) -> None:
-    """Print a table of what `score` finds; with `paths` also the files of all products."""
+    """Print a table of the findings of `score`; with `paths` also the files of all products."""
     campaign.check_images()
     console = Console(width=120)
     table = Table(title=f"{campaign.settings.campaign}: measured and true positions", title_justify="left")
-    calibrated = ("RCS, dBsm", "put") if campaign.calibrated else ()
-    headings = ("flight", "image", "target", "east", "north", "off by", "cross-range", "ground range", *calibrated)
+    calibrated = ("RCS, dBsm", "true RCS") if campaign.calibrated else ()
+    errors = ("error east", "error north", "error")
+    headings = ("flight", "image", "target", *errors, "cross-range", "ground range", *calibrated)
     for heading in headings:
         table.add_column(heading, justify="right" if heading not in {"flight", "image"} else "left")
     for finding in score(campaign):
@@ -140,8 +141,8 @@ def print_findings(campaign: Campaign, *, paths: bool) -> None:
         row = [f"{100 * value:+.1f} cm" for value in numbers[:2]] + [f"{100 * numbers[2]:.1f} cm"]
         row += [f"{100 * width:.1f} cm" for width in widths]
         if finding.rcs_put_dbsm is not None or finding.rcs_dbsm is not None:
-            known = finding.rcs_dbsm is not None
-            row.append(f"{finding.rcs_dbsm:.2f} ± {finding.rcs_std_db:.2f}" if known else "in noise or clutter")
+            is_measured = finding.rcs_dbsm is not None
+            row.append(f"{finding.rcs_dbsm:.2f} ± {finding.rcs_std_db:.2f}" if is_measured else "in noise or clutter")
             row.append("" if finding.rcs_put_dbsm is None else f"{finding.rcs_put_dbsm:.2f}")
         table.add_row(finding.flight, finding.image, str(finding.target), *row)
     console.print(table)

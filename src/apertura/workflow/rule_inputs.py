@@ -378,7 +378,9 @@ def grid(scope: JobScope) -> Mapping[str, Any]:
     return {"scene": {key: value for key, value in stated.items() if key not in _POINTS}}
 
 
-_BEFORE_THE_IMAGE = frozenset({"window", "sidelink", "false_alarms_per_s", "autofocus", "autofocus_method", "keep"})
+_BEFORE_THE_IMAGE = frozenset(
+    {"window", "sidelink", "background", "interference", "false_alarms_per_s", "autofocus", "autofocus_method", "keep"}
+)
 _AFTER_THE_IMAGE = frozenset({"fusion", "radiometry", "radiometric_calibration", "multilook"})
 
 

@@ -83,14 +83,14 @@ def wanted_files(campaign: Campaign, stale: Collection[str]) -> dict[str, str]:
 
     `stale`: manifests of `stale_results`.
     """
-    wanted = dict[str, str]()
+    missing = dict[str, str]()
     for name, where, result in places_of(campaign):
         is_current = (campaign.root / result.manifest).is_file() and result.manifest not in stale
         if not is_current and not on_demand(campaign, result.manifest):
             for source in files_read(campaign, name, *where):
                 if source.startswith(_RAW) and not (campaign.root / source).is_file():
-                    wanted.setdefault(source, result.manifest)
-    return wanted
+                    missing.setdefault(source, result.manifest)
+    return missing
 
 
 def absent_lines(campaign: Campaign) -> Iterator[str]:
@@ -171,12 +171,12 @@ def stale_lines(stale: Mapping[str, str]) -> Iterator[str]:
     ['a.json and 1 more: out of date, its code has changed', '1 dependent result out of date as well']
     """
     by_reason: dict[str, list[str]] = {}
-    for manifest, why in stale.items():
-        by_reason.setdefault(why, []).append(manifest)
+    for manifest, reason in stale.items():
+        by_reason.setdefault(reason, []).append(manifest)
     dependent = len(by_reason.pop("", ()))
-    for why, manifests in by_reason.items():
+    for reason, manifests in by_reason.items():
         more = f" and {len(manifests) - 1} more" if len(manifests) > 1 else ""
-        yield f"{manifests[0]}{more}: out of date, {why}"
+        yield f"{manifests[0]}{more}: out of date, {reason}"
     if dependent:
         yield f"{number_of(dependent, 'dependent result')} out of date as well"
 

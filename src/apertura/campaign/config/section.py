@@ -17,7 +17,7 @@ from apertura.common.errors import CampaignError, quoted
 RESERVED_NAMES = frozenset(
     {
         *("fused", "layers", "stac", "map", "mosaic", "interferometry", "study", "logs", "benchmarks", "tiles"),
-        *("tracks", "workflow", "look"),
+        *("tracks", "workflow", "preview"),
     }
 )
 """Names of files and folders in the results folder, which flights and nodes must not use."""

@@ -1,1 +1,1 @@
-"""Beams: where antennas look, and how they weigh pulses."""
+"""Antenna beams: patterns and axes, weights of pulses, and illumination of the scene."""

@@ -1,4 +1,4 @@
-"""Antenna patterns about their axes, and the weight of each pulse at each pixel."""
+"""Antenna patterns and axes, and the weight of each pulse at each pixel."""
 
 from copy import copy
 from dataclasses import dataclass, replace
@@ -15,14 +15,14 @@ Cut = tuple[NDArray[np.float64], NDArray[np.float64]]
 """One cut through a pattern: equally spaced angles (rad) and field relative to its peak."""
 
 LIMITS_RAD = {"azimuth": np.pi, "elevation": np.pi / 2}
-"""How far from the boresight each cut may reach."""
+"""Largest angle from the boresight of each cut, radians."""
 
-_SAMPLES = 513  # linear between them errs by -100 dB with a cutoff of -20 dB
-_FINE = 4097  # 0.09° of a whole turn
+_SAMPLES = 513  # linear interpolation has an error of -100 dB with a cutoff of -20 dB
+_FINE = 4097  # samples of a cut; 0.09° over 360°
 
 
 def antenna_axes(body_axes: NDArray[np.float64], boresight_deg: tuple[float, float]) -> NDArray[np.float64]:
-    """Return the axes of an antenna as `Beam` counts them.
+    """Return the axes of an antenna as used by `Beam`.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def antenna_axes(body_axes: NDArray[np.float64], boresight_deg: tuple[float, flo
 
 
 def gaussian_cut(width_deg: float, *, cutoff_db: float, limit_rad: float) -> Cut:
-    """Return a Gaussian cut: -12.04 (angle/width)² dB, out to where that is `cutoff_db`.
+    """Return a Gaussian cut of -12.04 (angle/width)² dB, limited to gains above `cutoff_db`.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def gaussian_cut(width_deg: float, *, cutoff_db: float, limit_rad: float) -> Cut
     cutoff_db
         Gain at which the cut ends, dB relative to its peak.
     limit_rad
-        Where it ends at the latest.
+        Largest angle of the cut.
 
     Examples
     --------
@@ -86,20 +86,20 @@ def gaussian_cut(width_deg: float, *, cutoff_db: float, limit_rad: float) -> Cut
 
 
 def sampled_cut(angle_deg: NDArray[np.float64], gain_db: NDArray[np.float64], *, cutoff_db: float) -> Cut:
-    """Return the main lobe of a sampled cut: about its peak, as far as its gain stays at or above `cutoff_db`.
+    """Return the main lobe of a sampled cut: the interval about its peak with a gain of at least `cutoff_db`.
 
     Parameters
     ----------
     angle_deg
-        (sample,) float64, growing, degrees from boresight.
+        (sample,) float64, ascending, degrees from boresight.
     gain_db
-        (sample,) float64, dB, whatever it is relative to; linear between samples.
+        (sample,) float64, dB relative to any level; linear between samples.
     cutoff_db
         Gain at which the cut ends, dB relative to its peak.
 
     Notes
     -----
-    The sign of the field changes behind a null and a gain in dB does not contain it: what lies there is left out.
+    The sign of the field changes at a null, and a gain in dB does not contain it: sidelobes are excluded.
 
     Examples
     --------
@@ -109,7 +109,7 @@ def sampled_cut(angle_deg: NDArray[np.float64], gain_db: NDArray[np.float64], *,
     """
     fine = np.linspace(angle_deg[0], angle_deg[-1], _FINE)
     level = np.interp(fine, angle_deg, gain_db - gain_db.max())
-    peak, low = int(level.argmax()), np.flatnonzero(level < cutoff_db)
+    peak, low = int(level.argmax()), np.flatnonzero(level < cutoff_db)  # `low`: samples below the cutoff
     first = int(low[low < peak].max(initial=-1)) + 1
     last = int(low[low > peak].min(initial=_FINE))
     return np.radians(fine[first:last]), 10 ** (level[first:last] / 20)
@@ -118,7 +118,7 @@ def sampled_cut(angle_deg: NDArray[np.float64], gain_db: NDArray[np.float64], *,
 def sampled_phase(
     angle_deg: NDArray[np.float64], phase_deg: NDArray[np.float64], at_rad: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the phase of a sampled cut at some angles (rad), unwrapped and linear between samples.
+    """Return the phase of a sampled cut at the angles `at_rad`, unwrapped and linear between samples, rad.
 
     Examples
     --------
@@ -133,10 +133,10 @@ def sampled_phase(
 
 @dataclass(frozen=True)
 class Beam:
-    """A separable pattern about axes that turn with the antenna; zero outside the sampled angles.
+    """Separable antenna pattern about axes that rotate with the antenna; zero outside the sampled angles.
 
     A direction with components (a, b, c) along the axes has azimuth atan2(b, a) and elevation
-    atan2(c, √(a² + b²)); its gain is the product of both patterns, linear between samples.
+    atan2(c, √(a² + b²)). The gain is the product of both cuts, linear between samples.
 
     Attributes
     ----------
@@ -144,16 +144,17 @@ class Beam:
         (pulse, 3, 3) float64, rows are unit vectors along boresight, growing azimuth and growing elevation,
         at right angles, in the frame of the pixels.
     azimuth_rad, elevation_rad
-        (n,) and (m,) float64, equally spaced and growing.
+        (n,) and (m,) float64, equally spaced and ascending.
     azimuth_gain, elevation_gain
         (n,) and (m,) float64, field (not power) relative to boresight.
     azimuth_phase_rad, elevation_phase_rad
-        (n,) and (m,) float64, phase of the field, which both add to; None: unknown. No engine takes it out.
+        (n,) and (m,) float64, phase of the field; the phases of both cuts add. None: unknown. Engines do not
+        compensate it.
 
     Raises
     ------
     ValueError
-        If shapes differ, angles are not equally spaced, or axes are no right-angled unit vectors.
+        If shapes differ, angles are not equally spaced, or axes are not orthogonal unit vectors.
 
     Notes
     -----
@@ -180,23 +181,23 @@ class Beam:
         if self.axes.ndim != 3 or self.axes.shape[1:] != (3, 3):
             raise ValueError(f"{self.axes.shape=}: must be (pulse, 3, 3)")
         if not np.allclose(self.axes @ self.axes.swapaxes(1, 2), np.eye(3), atol=1e-6):
-            raise ValueError("axes: rows must be unit vectors at right angles")
+            raise ValueError("axes: rows must be orthogonal unit vectors")
         for name, angle, gain in self._patterns():
             if angle.ndim != 1 or angle.size < 2 or gain.shape != angle.shape:
-                raise ValueError(f"{name}: {angle.shape=} and {gain.shape=} must be equal, with two samples or more")
+                raise ValueError(f"{name}: {angle.shape=} and {gain.shape=} must be equal, with at least two samples")
             step = (angle[-1] - angle[0]) / (angle.size - 1)
             if not (step > 0 and np.allclose(np.diff(angle), step, rtol=1e-6, atol=1e-9) and np.isfinite(gain).all()):
-                raise ValueError(f"{name}: angles must grow in equal steps, gains be finite")
+                raise ValueError(f"{name}: angles must ascend in equal steps, and gains must be finite")
 
     def __getitem__(self, pulses: slice | NDArray[np.int64]) -> "Beam":
-        """Return the beam over some pulses."""
-        some = copy(self)  # what holds of all of them needs no second check
-        object.__setattr__(some, "axes", self.axes[pulses])
-        return some
+        """Return the beam over the selected pulses."""
+        selected = copy(self)  # the fields have been checked: not checked again
+        object.__setattr__(selected, "axes", self.axes[pulses])
+        return selected
 
     def turned(self, vector_rad: NDArray[np.float64]) -> "Beam":
-        """Return the beam turned by a rotation vector, (3,) rad, in the frame of the pixels."""
-        from scipy.spatial.transform import Rotation  # slow to import, and few steps need it
+        """Return the beam rotated by a rotation vector, (3,) rad, in the frame of the pixels."""
+        from scipy.spatial.transform import Rotation  # slow to import, and rarely needed
 
         axes = Rotation.from_rotvec(vector_rad).apply(self.axes.reshape(-1, 3))
         return replace(self, axes=axes.reshape(self.axes.shape))
@@ -219,7 +220,7 @@ class Beam:
         Raises
         ------
         ValueError
-            If there is not one set of axes for each pulse.
+            If the number of axes differs from the number of pulses.
         """
         angles = self.angles(position_m, pixels)
         gains = [
@@ -229,7 +230,7 @@ class Beam:
         return np.asarray(gains[0] * gains[1])
 
     def phase(self, position_m: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the phase of the field of each pulse towards each pixel, (pulse, pixel) rad; 0 where unknown."""
+        """Return the phase of the field of each pulse towards each pixel, (pulse, pixel) rad; 0 if unknown."""
         azimuth, elevation = self.angles(position_m, pixels)
         total: NDArray[np.float64] = np.zeros_like(azimuth)
         for angle, samples, values in (
@@ -241,10 +242,10 @@ class Beam:
         return total
 
     def angles(self, position_m: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return azimuth and elevation of each pixel from boresight, (2, pulse, pixel) rad; else as `gain`."""
+        """Return azimuth and elevation of each pixel, (2, pulse, pixel) rad; parameters and errors as for `gain`."""
         if len(self.axes) != len(position_m):
             raise ValueError(f"{len(self.axes)=}: must be one for each of {len(position_m)} pulses")
-        # Matrix products about a nearby origin, where coordinates keep their precision.
+        # Matrix products relative to a nearby origin, to preserve the precision of the coordinates.
         offset_m, antenna_m = (pixels - position_m[:1]).T, position_m - position_m[:1]
         ahead, right, above = (
             axis @ offset_m - (axis * antenna_m).sum(axis=1)[:, None] for axis in self.axes.swapaxes(0, 1)
@@ -253,13 +254,13 @@ class Beam:
 
     @property
     def cone_rad(self) -> float:
-        """Half the angle of the narrowest cone about the boresight that holds the pattern."""
+        """Half angle of the narrowest cone about the boresight that contains the pattern."""
         widest = [float(np.cos(np.abs(angle[[0, -1]]).max())) for angle in (self.azimuth_rad, self.elevation_rad)]
         return float(np.arccos(widest[0] if widest[0] < 0 else widest[0] * max(widest[1], 0.0)))
 
     @property
     def steepest(self) -> float:
-        """The largest change of its gain, per radian: both cuts together."""
+        """Largest slope of the gain, per radian, of both cuts combined."""
         slopes = [np.abs(np.diff(gain)).max() / (angle[1] - angle[0]) for _, angle, gain in self._patterns()]
         peaks = [np.abs(gain).max() for _, _, gain in self._patterns()]
         return float(np.hypot(slopes[0] * peaks[1], slopes[1] * peaks[0]))
@@ -273,14 +274,14 @@ class Beam:
 
 @dataclass(frozen=True)
 class Beams:
-    """Weights of pulses: beams of transmitter and receiver, and the sector that pixels are integrated over.
+    """Weights of pulses: beams of transmitter and receiver, and the sector of integration of each pixel.
 
     Attributes
     ----------
     transmit, receive
-        Each over the pulses that an image is formed from; None is isotropic.
+        Beam over the pulses of an image; None is isotropic.
     sector
-        Over the same pulses; None integrates all of them.
+        Sector over the same pulses; None integrates all pulses.
 
     Examples
     --------
@@ -293,12 +294,12 @@ class Beams:
     sector: Sector | None = None
 
     def __getitem__(self, pulses: slice | NDArray[np.int64]) -> "Beams":
-        """Return the beams over some pulses."""
+        """Return the beams over the selected pulses."""
         transmit, receive = (beam and beam[pulses] for beam in (self.transmit, self.receive))
         return Beams(transmit, receive, self.sector and self.sector[pulses])
 
     def check_pulses(self, pulses: int) -> None:
-        """Raise ValueError unless all of them are of as many pulses."""
+        """Raise ValueError if beams or sector have a different number of pulses."""
         for beam in (self.transmit, self.receive):
             if beam is not None and len(beam.axes) != pulses:
                 raise ValueError(f"{len(beam.axes)=}: must be one for each of {pulses} pulses")
@@ -307,17 +308,17 @@ class Beams:
 
     @property
     def antennas(self) -> "Beams | None":
-        """The beams without the sector; None where there are none."""
+        """The beams without the sector; None if there are none."""
         return Beams(self.transmit, self.receive) if self.transmit or self.receive else None
 
     @classmethod
     def within(cls, sector: Sector | None, antennas: "Beams | None") -> "Beams | None":
-        """Return the beams of antennas inside a sector; None where there is neither."""
+        """Combine the beams of antennas with a sector; None if there is neither."""
         beams = antennas or cls()
         return cls(beams.transmit, beams.receive, sector) if antennas or sector else None
 
     def phase(self, aperture: Aperture, pixels: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return (pulse, pixel) rad, the phases of both antennas towards each pixel together; None: unknown."""
+        """Return the sum of both antennas' phases towards each pixel, (pulse, pixel) rad; None: unknown."""
         legs = zip((self.transmit, self.receive), aperture.legs, strict=True)
         known = [
             beam.phase(position_m, pixels)
@@ -327,7 +328,7 @@ class Beams:
         return np.asarray(np.sum(known, axis=0)) if known else None
 
     def weight(self, aperture: Aperture, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return (pulse, pixel) float64, the product of both gains and the sector's; else as `Beam.gain`."""
+        """Return the product of both gains and the sector's weight, (pulse, pixel) float64; else as `Beam.gain`."""
         total = np.ones((len(aperture), len(pixels)))
         for beam, position_m in zip((self.transmit, self.receive), aperture.legs, strict=True):
             if beam is not None:

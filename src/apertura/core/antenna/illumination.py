@@ -1,4 +1,4 @@
-"""Illumination of a scene by antenna beams: how many pulses illuminate each place."""
+"""Illumination of a scene by antenna beams: number of pulses that illuminate each point."""
 
 from dataclasses import dataclass
 
@@ -8,25 +8,25 @@ from numpy.typing import NDArray
 from apertura.core.antenna.beam import Beam, Beams
 from apertura.core.geometry.aperture import Aperture
 
-_PULSES = 1024  # evaluated at most, of longer apertures
-_AT_ONCE = 64  # pulses, or blocks, evaluated together: bounds memory
+_PULSES = 1024  # largest number of pulses evaluated
+_AT_ONCE = 64  # pulses, or blocks, evaluated together; limits memory
 
 
 @dataclass(frozen=True)
 class Illumination:
-    """Numbers of pulses that illuminate each point of a grid over the scene.
+    """Number of pulses that illuminate each point of a grid over the scene.
 
     Attributes
     ----------
     pulse_counts
-        (place,) int64, pulses that illuminate each place.
+        (point,) int64, number of pulses that illuminate each point.
     pulses
         Number of pulses of the aperture.
 
     Examples
     --------
     >>> Illumination(np.array([0, 20, 40, 60]), 100).line
-    'of 100 pulses a place of the scene is illuminated by 0 to 60 (median 30); 25 % of places by none'
+    'each point of the scene is illuminated by 0 to 60 of 100 pulses (median 30); 25 % of the points by no pulse'
     """
 
     pulse_counts: NDArray[np.int64]
@@ -34,12 +34,12 @@ class Illumination:
 
     @property
     def unilluminated(self) -> float:
-        """Share of the places that no pulse illuminates."""
+        """Share of the points that no pulse illuminates."""
         return float((self.pulse_counts == 0).mean())
 
     @property
     def counts(self) -> dict[str, int]:
-        """Least, median and most pulses that illuminate a place."""
+        """Minimum, median and maximum number of pulses that illuminate a point."""
         least, median, most = np.quantile(self.pulse_counts, [0, 0.5, 1]).round().astype(int)
         return {"least": int(least), "median": int(median), "most": int(most)}
 
@@ -47,29 +47,29 @@ class Illumination:
     def line(self) -> str:
         """The counts in one line."""
         least, median, most = self.counts.values()
-        line = f"of {self.pulses} pulses a place of the scene is illuminated by {least} to {most} (median {median})"
-        return f"{line}; {100 * self.unilluminated:.0f} % of places by none" if self.unilluminated else line
+        line = f"each point of the scene is illuminated by {least} to {most} of {self.pulses} pulses (median {median})"
+        return f"{line}; {100 * self.unilluminated:.0f} % of the points by no pulse" if self.unilluminated else line
 
 
-def illuminate(beams: Beams, aperture: Aperture, place_m: NDArray[np.float64]) -> Illumination:
-    """Count the pulses that illuminate each place.
+def illuminate(beams: Beams, aperture: Aperture, point_m: NDArray[np.float64]) -> Illumination:
+    """Count the pulses that illuminate each point.
 
     Parameters
     ----------
     beams
-        Of every pulse.
+        Beams of all pulses.
     aperture
-        Of more than 1024 pulses an evenly spaced sample is evaluated.
-    place_m
-        (place, 3) float64, metres.
+        Aperture of all pulses; of more than 1024 pulses an evenly spaced sample is evaluated.
+    point_m
+        (point, 3) float64, metres.
     """
-    some = slice(None, None, -(-len(aperture) // _PULSES))
-    few, beams = aperture[some], beams[some]
-    pulse_counts = np.zeros(len(place_m), np.int64)
-    for first in range(0, len(few), _AT_ONCE):
-        part = slice(first, first + _AT_ONCE)
-        pulse_counts += (beams[part].weight(few[part], place_m) != 0).sum(axis=0)
-    return Illumination(np.rint(pulse_counts * (len(aperture) / len(few))).astype(np.int64), len(aperture))
+    evaluated = slice(None, None, -(-len(aperture) // _PULSES))
+    sample, beams = aperture[evaluated], beams[evaluated]
+    pulse_counts = np.zeros(len(point_m), np.int64)
+    for first in range(0, len(sample), _AT_ONCE):
+        block = slice(first, first + _AT_ONCE)
+        pulse_counts += (beams[block].weight(sample[block], point_m) != 0).sum(axis=0)
+    return Illumination(np.rint(pulse_counts * (len(aperture) / len(sample))).astype(np.int64), len(aperture))
 
 
 def illumination_mask(
@@ -80,56 +80,56 @@ def illumination_mask(
     *,
     pulses: int,
 ) -> NDArray[np.bool_]:
-    """Return a mask of the blocks of pulses that may illuminate balls about places.
+    """Return a mask of the blocks of pulses that may illuminate spheres of the scene.
 
     Parameters
     ----------
     beams
-        Of every pulse; None illuminates everything.
+        Beams of all pulses; None illuminates everything.
     aperture
-        Of every pulse.
+        Aperture of all pulses.
     middle_m, radius_m
-        (place, 3) and (place,) float64, metres.
+        (sphere, 3) centres and (sphere,) radii, float64, metres.
     pulses
-        Of a block.
+        Block size in pulses.
 
     Returns
     -------
     ndarray
-        (block, place) bool. False where the weight of every pulse of the block is zero all over the ball.
+        (block, sphere) bool. False if the weight of every pulse of the block is zero throughout the sphere.
     """
     count = -(-len(aperture) // pulses)
     mask = np.ones((count, len(middle_m)), bool)
     if beams is None:
         return mask
     for first in range(0, count, _AT_ONCE):
-        part = slice(first * pulses, (first + _AT_ONCE) * pulses)
-        mask[first : first + _AT_ONCE] = _block_mask(beams[part], aperture[part], middle_m, radius_m, pulses)
+        selected = slice(first * pulses, (first + _AT_ONCE) * pulses)
+        mask[first : first + _AT_ONCE] = _block_mask(beams[selected], aperture[selected], middle_m, radius_m, pulses)
     return mask
 
 
 def _block_mask(
     beams: Beams, aperture: Aperture, middle_m: NDArray[np.float64], radius_m: NDArray[np.float64], pulses: int
 ) -> NDArray[np.bool_]:
-    # Balls as seen from the middle pulse of each block: as much larger as its other pulses are away from that one.
+    # For all pulses of a block, its middle pulse is evaluated, with spheres enlarged by the distance to the others.
     starts = np.arange(0, len(aperture), pulses)
     middles = np.minimum(starts + pulses // 2, len(aperture) - 1)
     block = np.arange(len(aperture)) // pulses
     middle = aperture[middles]
     radius = [
-        radius_m + np.maximum.reduceat(np.linalg.norm(leg - there[block], axis=1), starts)[:, None]
-        for leg, there in zip(aperture.legs, middle.legs, strict=True)
+        radius_m + np.maximum.reduceat(np.linalg.norm(position_m - middle_position_m[block], axis=1), starts)[:, None]
+        for position_m, middle_position_m in zip(aperture.legs, middle.legs, strict=True)
     ]
-    # Outside the integration sector, or outside either antenna's pattern, with the block's rotation as slack.
+    # Exclude spheres outside the integration sector or either pattern; tolerances for the rotation within the block.
     mask = np.ones((len(starts), len(middle_m)), bool)
     if beams.sector is not None:
-        there = beams.sector[middles]
-        rotation = beams.sector.axis_change(there[block])
-        slack = there.slack(middle, middle_m, np.maximum(*radius)) + np.maximum.reduceat(rotation, starts)[:, None]
-        mask &= np.abs(there.place(middle, middle_m)) - slack < beams.sector.outer
-    for beam, leg, around in zip((beams.transmit, beams.receive), middle.legs, radius, strict=True):
+        sector = beams.sector[middles]
+        rotation = beams.sector.axis_change(sector[block])
+        slack = sector.slack(middle, middle_m, np.maximum(*radius)) + np.maximum.reduceat(rotation, starts)[:, None]
+        mask &= np.abs(sector.place(middle, middle_m)) - slack < beams.sector.outer
+    for beam, position_m, enlarged_m in zip((beams.transmit, beams.receive), middle.legs, radius, strict=True):
         if beam is not None:
-            mask &= _in_pattern(beam, middles, starts, middle_m - leg[:, None], around)
+            mask &= _in_pattern(beam, middles, starts, middle_m - position_m[:, None], enlarged_m)
     return mask
 
 
@@ -137,22 +137,22 @@ def _in_pattern(
     beam: Beam,
     middles: NDArray[np.int64],
     starts: NDArray[np.int64],
-    away_m: NDArray[np.float64],
+    offset_m: NDArray[np.float64],
     radius_m: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Return a mask of balls (block, place) that may intersect the pattern's cone and elevations at some pulse."""
-    range_m = np.linalg.norm(away_m, axis=-1)
-    near = np.arcsin(np.minimum(1.0, radius_m / range_m)) + 1e-6
-    off, above = (np.empty(range_m.shape) for _ in range(2))
-    for axis, angle in ((0, off), (2, above)):
-        each = beam.axes[:, axis]
-        there = each[middles]
-        rotation = _angle((each * np.repeat(there, np.diff(starts, append=len(each)), axis=0)).sum(axis=1))
-        near += np.maximum.reduceat(rotation, starts)[:, None]
-        angle[:] = _angle(np.einsum("bpx,bx->bp", away_m, there) / range_m)
-    elevation = np.pi / 2 - above
-    inside = (elevation + near > beam.elevation_rad[0]) & (elevation - near < beam.elevation_rad[-1])
-    return np.asarray((radius_m >= range_m) | (inside & (off - near < beam.cone_rad)))
+    """Return a mask of the spheres, (block, sphere), that may intersect the pattern's cone and elevations."""
+    range_m = np.linalg.norm(offset_m, axis=-1)
+    tolerance = np.arcsin(np.minimum(1.0, radius_m / range_m)) + 1e-6  # half angle of the sphere, plus rotation below
+    from_boresight, from_up = (np.empty(range_m.shape) for _ in range(2))
+    for axis, angle in ((0, from_boresight), (2, from_up)):
+        vector = beam.axes[:, axis]
+        middle = vector[middles]
+        rotation = _angle((vector * np.repeat(middle, np.diff(starts, append=len(vector)), axis=0)).sum(axis=1))
+        tolerance += np.maximum.reduceat(rotation, starts)[:, None]
+        angle[:] = _angle(np.einsum("bpx,bx->bp", offset_m, middle) / range_m)
+    elevation = np.pi / 2 - from_up
+    inside = (elevation + tolerance > beam.elevation_rad[0]) & (elevation - tolerance < beam.elevation_rad[-1])
+    return np.asarray((radius_m >= range_m) | (inside & (from_boresight - tolerance < beam.cone_rad)))
 
 
 def _angle(cosine: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -162,12 +162,12 @@ def _angle(cosine: NDArray[np.float64]) -> NDArray[np.float64]:
 def decide_antennas(
     beams: Beams | None, illumination: Illumination | None
 ) -> tuple[list[tuple[str, str]], dict[str, str]]:
-    """List the antennas with beams and the illumination, and the flag `beam_misses`; empty without beams."""
+    """Return the antennas with beams and their illumination, and the flag `outside_beam`; both empty without beams."""
     if beams is None or beams.antennas is None or illumination is None:
         return [], {}
     with_beam = [name for name in ("transmit", "receive") if getattr(beams, name) is not None]
-    misses = f"{100 * illumination.unilluminated:.1f} % of the scene is illuminated by no pulse: its pixels are zero"
+    misses = f"no pulse illuminates {100 * illumination.unilluminated:.1f} % of the scene: these pixels are zero"
     return (
         [(", ".join(with_beam), illumination.line)],
-        {"beam_misses": misses} if illumination.unilluminated else {},
+        {"outside_beam": misses} if illumination.unilluminated else {},
     )

@@ -1,1 +1,1 @@
-"""From range profiles to a focused image on the campaign grid."""
+"""Backprojection of range profiles to an image on the campaign grid."""

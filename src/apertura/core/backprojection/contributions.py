@@ -1,4 +1,4 @@
-"""Contributions of pulses and blocks of pulses at single places, and their derivatives: certificates and autofocus."""
+"""Contributions of pulses and pulse blocks at single points, and their derivatives, for certificates and autofocus."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,10 +18,10 @@ from apertura.core.windowed_sinc import kaiser_sinc
 # ---- Contributions of profiles by band-limited interpolation in float64
 
 _HALF_TAPS = KERNEL.term_taps // 2
-_KAISER_BETA = 16.0  # with so many taps -148 dB at most, half the band free for the transition
-_FRACTIONS = 4096  # of a sample, at which weights are tabulated; linear between: the error of a weight is 3e-8
-_PULSES_AT_ONCE = 256  # of terms, in memory
-_ROWS_AT_ONCE = 16  # of samples gathered by numpy: what a cache holds
+_KAISER_BETA = 16.0  # with this number of taps the error is below -148 dB, with half the band as transition
+_FRACTIONS = 4096  # tabulated weights per sample; with linear interpolation the error of a weight is 3e-8
+_PULSES_AT_ONCE = 256  # pulses whose terms are in memory
+_ROWS_AT_ONCE = 16  # pulses whose samples numpy gathers at once, to fit the cache
 
 
 def band_limited_image(
@@ -38,16 +38,17 @@ def band_limited_image(
 def band_limited_terms(
     profiles: Profiles, pixels: NDArray[np.float64], *, beams: Beams | None = None
 ) -> NDArray[np.complex128]:
-    """Return p(ρ)·exp(+j2πf_mid ρ/c) of each pulse at each pixel, p between samples by a long windowed sinc.
+    """Return p(ρ)·exp(+j2πf_mid ρ/c) of each pulse at each pixel, with p interpolated by a long windowed sinc.
 
     Parameters
     ----------
     profiles
-        Twice oversampled or more, with 12 samples or more beyond the scene at both ends; samples beyond count as zero.
+        Profiles, at least twice oversampled, with 12 samples or more beyond the scene at both ends; samples outside the
+        profiles are zero.
     pixels
         (pixel, 3) float64, metres, in the frame of the phase centres.
     beams
-        Weight of each pulse at each pixel by its antennas; none by default.
+        Antenna weight of each pulse at each pixel; none by default.
 
     Returns
     -------
@@ -56,8 +57,8 @@ def band_limited_terms(
 
     Notes
     -----
-    Source: docs/theory.md, eq. 6. Errs by -148 dB of a tone at the edge of the band. In float64, by code that no engine
-    uses; without the compiled library numpy does the same.
+    Source: docs/theory.md, eq. 6. The error is -148 dB for a tone at the band edge. Computed in float64 by code that no
+    engine uses; numpy replaces the compiled library if that is not available.
     """
     terms = (_compiled_terms if available() else _terms)(profiles, np.ascontiguousarray(pixels, np.float64))
     if beams is not None:
@@ -68,7 +69,8 @@ def band_limited_terms(
 def _compiled_terms(profiles: Profiles, pixels: NDArray[np.float64]) -> NDArray[np.complex128]:
     terms = np.empty((len(profiles), len(pixels)), np.complex128)
     samples = np.ascontiguousarray(profiles.samples, np.complex64)
-    geometry = [np.ascontiguousarray(one, np.float64) for one in (*profiles.aperture.legs, profiles.start_m, pixels)]
+    inputs = (*profiles.aperture.legs, profiles.start_m, pixels)
+    geometry = [np.ascontiguousarray(values, np.float64) for values in inputs]
     arrays: list[NDArray[Any]] = [samples, _paired_weights(), *geometry, terms]
     job = TermsJob(
         *(array.ctypes.data for array in arrays),
@@ -91,51 +93,51 @@ def _terms(profiles: Profiles, pixels: NDArray[np.float64]) -> NDArray[np.comple
     for first in range(0, len(profiles), _ROWS_AT_ONCE):
         part = slice(first, first + _ROWS_AT_ONCE)
         path = profiles.aperture[part].path(pixels)
-        place = (path - profiles.start_m[part, None]) / profiles.step_m
-        base = np.nan_to_num(np.floor(place)).astype(np.int64)
-        fraction = (place - base) * _FRACTIONS
+        position = (path - profiles.start_m[part, None]) / profiles.step_m
+        base = np.nan_to_num(np.floor(position)).astype(np.int64)
+        fraction = (position - base) * _FRACTIONS
         row = np.clip(np.nan_to_num(fraction).astype(np.int64), 0, _FRACTIONS - 1)
         index = np.clip(base[..., None] + taps + _HALF_TAPS, 0, padded.shape[1] - 1)
         samples = padded[np.arange(first, first + len(path))[:, None, None], index]
-        here, next_one = (np.einsum("pxt,pxt->px", samples, table[row + more]) for more in (0, 1))
-        terms[part] = (here + (fraction - row) * (next_one - here)) * np.exp(1j * np.remainder(k * path, 2 * np.pi))
+        lower, upper = (np.einsum("pxt,pxt->px", samples, table[row + step]) for step in (0, 1))
+        terms[part] = (lower + (fraction - row) * (upper - lower)) * np.exp(1j * np.remainder(k * path, 2 * np.pi))
     return terms
 
 
 @lru_cache(maxsize=1)
 def _interpolator() -> NDArray[np.float64]:
-    """Return (fraction, tap) weights of the samples around a place that lies so far behind one."""
+    """Return (fraction, tap) weights of the samples around a position at a tabulated fraction behind a sample."""
     distance = np.arange(_FRACTIONS + 1)[:, None] / _FRACTIONS - np.arange(1 - _HALF_TAPS, _HALF_TAPS + 1)
     return kaiser_sinc(distance, half=_HALF_TAPS, beta=_KAISER_BETA)
 
 
 @lru_cache(maxsize=1)
 def _paired_weights() -> NDArray[np.float64]:
-    """Return `_interpolator` with each weight twice, for real and imaginary parts that lie side by side."""
+    """Return `_interpolator` with each weight repeated for interleaved real and imaginary parts."""
     return np.repeat(_interpolator(), 2, axis=1)
 
 
-# ---- Echoes of single pulses at single places
+# ---- Echoes of single pulses at single points
 
 TAPS, DEGREE = KERNEL.echo_taps, KERNEL.echo_degree
 
-_BYTES_AT_ONCE = 2**25  # of samples
-_VALUES_AT_ONCE = 2**17  # pulses × places: of beams, and without the compiled library
+_BYTES_AT_ONCE = 2**25  # of samples in memory
+_VALUES_AT_ONCE = 2**17  # pulses × points, for beams and without the compiled library
 
 
 @lru_cache
 def tap_polynomials() -> NDArray[np.float64]:
-    """Return the weight of each sample about a place as a polynomial of the place between its neighbours.
+    """Return the interpolation weight of each sample as a polynomial of the position between two samples.
 
     Returns
     -------
     ndarray
-        (degree + 1, tap) float64, constant term first; of -½…½ from the middle between taps 3 and 4.
+        (degree + 1, tap) float64, constant term first; the variable is -½…½ from the middle between taps 3 and 4.
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 5: least squares over the band of twice oversampled profiles, value and
-    slope steady from one sample to the next.
+    Source: docs/theory/autofocus.md, eq. 5: least squares over the band of twice oversampled profiles, with value and
+    slope continuous from one sample to the next.
 
     Examples
     --------
@@ -144,20 +146,20 @@ def tap_polynomials() -> NDArray[np.float64]:
     >>> bool(abs(weights @ tone - np.exp(0.5j * np.pi * 0.9 * 3.75)) < 1e-3)
     True
     """
-    # (5): frequencies of the band and places between two samples, these weighted for an integral.
+    # Eq. 5: frequencies of the band and positions between two samples, with Gauss-Legendre weights of the positions.
     omega = np.pi / 2 * np.cos(np.pi * (np.arange(160) + 0.5) / 160)
-    place, share = (part / 2 for part in np.polynomial.legendre.leggauss(24))
-    powers = place[:, None] ** np.arange(DEGREE + 1)
+    position, share = (values / 2 for values in np.polynomial.legendre.leggauss(24))
+    powers = position[:, None] ** np.arange(DEGREE + 1)
     tap = np.arange(TAPS) - (TAPS - 1) / 2
     root = np.sqrt(share)
-    given = np.einsum("wt,un,u->wutn", np.exp(1j * omega[:, None] * tap), powers, root).reshape(
+    design = np.einsum("wt,un,u->wutn", np.exp(1j * omega[:, None] * tap), powers, root).reshape(
         -1, powers[0].size * TAPS
     )
-    ideal = (np.exp(1j * omega[:, None] * place) * root).ravel()
-    # Least squares among polynomials whose values and slopes join.
-    left, right = (np.concatenate([part.real, part.imag]) for part in (given, ideal))
-    free = _joined()
-    coefficients = free @ np.linalg.lstsq(left @ free, right, rcond=None)[0]
+    ideal = (np.exp(1j * omega[:, None] * position) * root).ravel()
+    # Least squares among polynomials with continuous values and slopes.
+    matrix, target = (np.concatenate([values.real, values.imag]) for values in (design, ideal))
+    basis = _continuous_basis()
+    coefficients = basis @ np.linalg.lstsq(matrix @ basis, target, rcond=None)[0]
     return np.ascontiguousarray(coefficients.reshape(TAPS, DEGREE + 1).T)
 
 
@@ -166,8 +168,8 @@ def _rounded_taps() -> NDArray[np.float32]:
     return tap_polynomials().astype(np.float32)
 
 
-def _joined() -> NDArray[np.float64]:
-    """Return (tap·power, free) the polynomials with weights and slopes continuous where the nearest sample changes."""
+def _continuous_basis() -> NDArray[np.float64]:
+    """Return the (tap·power, free) basis of polynomials whose value and slope are continuous between samples."""
     power = np.arange(DEGREE + 1)
     joins: list[NDArray[np.float64]] = []
     for end in (0.5**power, power * 0.5 ** (power - 1.0)):
@@ -179,20 +181,20 @@ def _joined() -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Echoes:
-    """Samples of some pulses with zeros around them, as the compiled library reads them.
+    """Zero-padded samples of pulses in the layout of the compiled library.
 
     Attributes
     ----------
     samples
         (pulse, 2, sample) float32: real and imaginary parts.
     tx_m, rx_m
-        (3, pulse) float64, phase centres, metres, in the frame of the places.
+        (3, pulse) float64, phase centres, metres, in the frame of the points.
     start_m
         (pulse,) float64, total path of sample 0.
     step_m
         Total path between samples.
     turns_per_m
-        f_mid/v.
+        Cycles per metre of path, f_mid/v.
     """
 
     samples: NDArray[np.float32]
@@ -204,7 +206,7 @@ class Echoes:
 
     @classmethod
     def read(cls, profiles: Profiles, parts: list[slice]) -> "Echoes":
-        """Return the pulses of some slices one after the other; no other pulses are read."""
+        """Read the pulses of the given slices, concatenated; no other pulses are read."""
         read = np.concatenate([np.asarray(profiles.samples[part]) for part in parts])
         samples = np.zeros((len(read), 2, read.shape[1] + 2 * TAPS), np.float32)
         samples[:, 0, TAPS:-TAPS], samples[:, 1, TAPS:-TAPS] = read.real, read.imag
@@ -223,19 +225,19 @@ class Echoes:
         return len(self.samples)
 
     def at(self, places_m: NDArray[np.float64]) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Return s(R)·exp(j2πf_mid R/c) at some places and its derivative with respect to the path R.
+        """Return s(R)·exp(j2πf_mid R/c) at points and its derivative with respect to the path R.
 
-        The same as the compiled library, in float64.
+        The same computation as in the compiled library, in float64.
 
         Parameters
         ----------
         places_m
-            (place, 3) float64, metres.
+            (point, 3) float64, metres.
 
         Returns
         -------
         value, slope
-            (pulse, place) complex128; the slope per metre.
+            (pulse, point) complex128; the slope per metre.
 
         Notes
         -----
@@ -243,14 +245,14 @@ class Echoes:
         """
         tx, rx = (distance(leg.T[:, None], places_m) for leg in (self.tx_m, self.rx_m))
         path = tx + rx
-        at = (path - self.start_m[:, None]) / self.step_m
-        at = np.clip(at, TAPS / 2 - 0.5, self.samples.shape[-1] - TAPS / 2 - 0.5)
-        base = np.rint(at - 0.5)
+        position = (path - self.start_m[:, None]) / self.step_m
+        position = np.clip(position, TAPS / 2 - 0.5, self.samples.shape[-1] - TAPS / 2 - 0.5)
+        base = np.rint(position - 0.5)
         first = np.nan_to_num(base).astype(np.int64) - (TAPS // 2 - 1)
         near = np.clip(first, 0, None)[..., None] + np.arange(TAPS)
         pulse = np.arange(len(self))[:, None, None]
         samples = self.samples[pulse, 0, near] + 1j * self.samples[pulse, 1, near]
-        u, taps = at - 0.5 - base, tap_polynomials()
+        u, taps = position - 0.5 - base, tap_polynomials()
         powers = u[..., None] ** np.arange(DEGREE + 1)
         level = np.einsum("pxn,nt,pxt->px", powers, taps, samples)
         rate = np.einsum("pxn,nt,pxt->px", powers[..., :-1], taps[1:] * np.arange(1, DEGREE + 1)[:, None], samples)
@@ -259,16 +261,16 @@ class Echoes:
 
 
 def job_of(echoes: Echoes, places_m: NDArray[np.float64], weight: NDArray[np.float32]) -> EchoJob:
-    """Return the job of some places for the compiled library; the caller sets the outputs.
+    """Return the job of the compiled library for points; the caller sets the outputs.
 
     Parameters
     ----------
     echoes
-        Kept alive by the caller while the job runs, as are the other arrays.
+        Echoes; the caller keeps them and the other arrays alive while the job runs.
     places_m
-        (place, 3) float64, contiguous.
+        (point, 3) float64, contiguous.
     weight
-        (place or 1, pulse) float32, contiguous: of each pulse at each place, or at all.
+        (point or 1, pulse) float32, contiguous: weight of each pulse at each point, or at all points.
     """
     arrays = (echoes.samples, _rounded_taps(), echoes.tx_m, echoes.rx_m, echoes.start_m, weight, places_m)
     return EchoJob(
@@ -283,12 +285,12 @@ def job_of(echoes: Echoes, places_m: NDArray[np.float64], weight: NDArray[np.flo
 
 
 def pulses_at_once(profiles: Profiles) -> int:
-    """Return how many pulses are read at once."""
+    """Return the number of pulses to read at once."""
     return max(1, _BYTES_AT_ONCE // (8 * (int(profiles.samples.shape[1]) + 2 * TAPS)))
 
 
 def tiles(places: int, pulses: int) -> Iterator[slice]:
-    """Yield slices of places, computed together, that bound memory."""
+    """Yield slices of points that are computed together within the memory bound."""
     step = max(1, _VALUES_AT_ONCE // max(1, pulses))
     for first in range(0, places, step):
         yield slice(first, first + step)
@@ -297,7 +299,7 @@ def tiles(places: int, pulses: int) -> Iterator[slice]:
 # ---- Contributions of blocks of pulses
 
 Piece = tuple[int, slice]
-"""A block and some of its pulses."""
+"""Block number, and a slice of its pulses."""
 
 
 def block_contributions(
@@ -307,23 +309,23 @@ def block_contributions(
     edges: NDArray[np.int64],
     weights: NDArray[np.float64] | None = None,
 ) -> NDArray[np.complex64]:
-    """Return Σ w·s(R)·exp(+j2πf_mid·R/c) over the pulses of each block at each place, R the total path.
+    """Return Σ w·s(R)·exp(+j2πf_mid·R/c) over the pulses of each block at each point, with R the total path.
 
     Parameters
     ----------
     profiles
-        At least twice oversampled; samples beyond theirs count as zero. They may be read on access.
+        Profiles, at least twice oversampled; samples outside the profiles are zero. They may be read on access.
     places_m
-        (place, 3) float64, metres, in the frame of the phase centres.
+        (point, 3) float64, metres, in the frame of the phase centres.
     edges
-        (block + 1,) int64, ascending: block b is pulses edges[b] to edges[b + 1].
+        (block + 1,) int64, ascending: block b contains pulses edges[b] to edges[b + 1].
     weights
-        (pulse,) float64, of each pulse; 1 by default. Blocks without weight are not read.
+        (pulse,) float64, weight of each pulse; 1 by default. Blocks with zero weight are not read.
 
     Returns
     -------
     ndarray
-        (place, block) complex64, not divided by anything; NaN where a place is not finite.
+        (point, block) complex64, not normalised; NaN where a point is not finite.
 
     Raises
     ------
@@ -332,8 +334,9 @@ def block_contributions(
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 4 and 5: errs by less than -65 dB in the whole band of twice oversampled
-    profiles. Paths and the carrier's whole turns are float64. Without the compiled library numpy does the same.
+    Source: docs/theory/autofocus.md, eq. 4 and 5. The error is below -65 dB over the whole band of twice oversampled
+    profiles. Paths and carrier phase are computed in float64. numpy replaces the compiled library if that is not
+    available.
 
     Examples
     --------
@@ -347,9 +350,9 @@ def block_contributions(
     weights = np.ones(len(profiles)) if weights is None else weights
     edges = np.asarray(edges, np.int64)
     if places_m.ndim != 2 or places_m.shape[1] != 3 or weights.shape != (len(profiles),):
-        raise ValueError(f"{places_m.shape=}, {weights.shape=}: must be (place, 3) and ({len(profiles)},)")
+        raise ValueError(f"{places_m.shape=}, {weights.shape=}: must be (point, 3) and ({len(profiles)},)")
     if edges.size < 2 or (np.diff(edges) < 0).any() or edges[0] < 0 or edges[-1] > len(profiles):
-        raise ValueError(f"{edges=}: must ascend within {len(profiles)} pulses")
+        raise ValueError(f"{edges=}: must ascend from 0 or more to {len(profiles)} or less, the number of pulses")
     places_m = np.ascontiguousarray(places_m, np.float64)
     sums = np.zeros((len(places_m), edges.size - 1), np.complex64)
     add = _add_compiled if available() else _add
@@ -360,19 +363,19 @@ def block_contributions(
 
 
 def _chunks(edges: NDArray[np.int64], weights: NDArray[np.float64], most: int) -> Iterator[list[Piece]]:
-    """Yield the blocks with weight, cut where one chunk has `most` pulses."""
+    """Yield chunks of `most` pulses with the blocks, or parts of blocks, of nonzero weight."""
     chunk: list[Piece] = []
-    room = most
+    free = most
     for block, (first, end) in enumerate(pairwise(edges.tolist())):
-        begin = first
-        while begin < end and weights[begin:end].any():
-            taken = min(room, end - begin)
-            chunk.append((block, slice(begin, begin + taken)))
-            begin += taken
-            room -= taken
-            if not room:
+        start = first
+        while start < end and weights[start:end].any():
+            count = min(free, end - start)
+            chunk.append((block, slice(start, start + count)))
+            start += count
+            free -= count
+            if not free:
                 yield chunk
-                chunk, room = [], most
+                chunk, free = [], most
     if chunk:
         yield chunk
 
@@ -407,8 +410,8 @@ def _add(
     borders = _borders(pieces)
     for tile in tiles(len(places_m), len(echoes)):
         values = echoes.at(places_m[tile])[0] * weights[:, None]
-        for (block, _part), (begin, end) in zip(pieces, pairwise(borders), strict=True):
-            sums[tile, block] += values[begin:end].sum(axis=0)
+        for (block, _part), (start, end) in zip(pieces, pairwise(borders), strict=True):
+            sums[tile, block] += values[start:end].sum(axis=0)
 
 
 # ---- Gradient of an objective with respect to phase centres and paths: the exact adjoint of the contributions
@@ -416,13 +419,13 @@ def _add(
 
 @dataclass(frozen=True, eq=False)
 class Gradient:
-    """Derivatives of a real objective, pulse by pulse; all in the objective's unit per metre.
+    """Derivatives of a real objective for each pulse, in the objective's unit per metre.
 
     Attributes
     ----------
     tx_m, rx_m
         (pulse, 3) float64, with respect to the phase centre of transmitter and receiver, in the frame of the phase
-        centres. Where one node does both, its derivative is their sum.
+        centres. The derivative for a monostatic node is their sum.
     path_m
         (pulse,) float64, with respect to a path added to all echoes of a pulse (`Profiles.moved`).
     """
@@ -435,40 +438,40 @@ class Gradient:
 def path_gradient(
     profiles: Profiles, places_m: NDArray[np.float64], slope: NDArray[np.complexfloating], *, beams: Beams | None = None
 ) -> Gradient:
-    """Return the derivatives of an objective of Σ w·s(R)·exp(+j2πf_mid·R/c), the sum over all pulses at each place.
+    """Return the derivatives of an objective that depends on Σ w·s(R)·exp(+j2πf_mid·R/c) over all pulses at each point.
 
     Parameters
     ----------
     profiles
-        At least twice oversampled; they may be read on access.
+        Profiles, at least twice oversampled; they may be read on access.
     places_m
-        (place, 3) float64, metres, in the frame of the phase centres.
+        (point, 3) float64, metres, in the frame of the phase centres.
     slope
-        (place,) complex, G = ∂J/∂Re + j·∂J/∂Im: the objective changes by Re Σ G*·change of the sum.
+        (point,) complex, G = ∂J/∂Re + j·∂J/∂Im: the objective changes by Re Σ G*·change of the sum.
     beams
-        Weight of each pulse at each place; that it changes with the phase centres is neglected. None by default.
+        Weight of each pulse at each point, whose dependence on the phase centres is neglected. None by default.
 
     Returns
     -------
     Gradient
-        Exact for the sum as `block_contributions` forms it, rounded to float32 for each pulse and place.
+        Exact derivatives of the sum of `block_contributions`, rounded to float32 for each pulse and point.
 
     Raises
     ------
     ValueError
-        If shapes differ, or places or slopes are not finite.
+        If shapes differ, or points or slopes are not finite.
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 6 to 8. Without the compiled library numpy does the same.
+    Source: docs/theory/autofocus.md, eq. 6 to 8. numpy replaces the compiled library if that is not available.
     """
     if places_m.shape != (*slope.shape, 3) or slope.ndim != 1:
-        raise ValueError(f"{places_m.shape=}, {slope.shape=}: must be (place, 3) and (place,)")
+        raise ValueError(f"{places_m.shape=}, {slope.shape=}: must be (point, 3) and (point,)")
     if not (np.isfinite(places_m).all() and np.isfinite(slope).all()):
-        raise ValueError("places and the objective's slopes there must be finite")
+        raise ValueError("points and slopes of the objective must be finite")
     derivatives, largest = np.zeros((7, len(profiles))), float(np.abs(slope).max(initial=0.0))
     if largest:
-        # The library takes float32: an objective's own unit must not push it out of range.
+        # Normalised, as the library uses float32 and the unit of the objective is arbitrary.
         places_m, slope = np.ascontiguousarray(places_m, np.float64), (slope / largest).astype(np.complex64)
         for first in range(0, len(profiles), pulses_at_once(profiles)):
             part = slice(first, min(first + pulses_at_once(profiles), len(profiles)))
@@ -483,7 +486,7 @@ def _derivatives(
     slope: NDArray[np.complex64],
     beams: Beams | None,
 ) -> NDArray[np.float64]:
-    """Return (7, pulse): of transmitter, receiver and path."""
+    """Return (7, pulse) derivatives by transmitter, receiver and path."""
     echoes = Echoes.read(profiles, [part])
     derivatives = np.zeros((7, len(echoes)))
     add = _differentiate_compiled if available() else _differentiate

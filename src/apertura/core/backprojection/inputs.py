@@ -1,4 +1,4 @@
-"""Inputs of engines: phase history and range profiles as plain arrays, without settings or files."""
+"""Inputs of engines: phase history and range profiles as arrays, independent of settings and files."""
 
 from dataclasses import dataclass, replace
 from numbers import Real
@@ -12,50 +12,51 @@ from apertura.common.errors import CampaignError, quoted
 from apertura.core.geometry.aperture import Aperture, as_array
 
 
-def _as_arrays(one: Any, kinds: dict[str, type]) -> None:
-    """Make arrays of lists that an input was given; what is an array, such as lazy samples, stays.
+def _as_arrays(inputs: Any, kinds: dict[str, type]) -> None:
+    """Convert lists of an input to arrays; arrays, including lazily read ones, are unchanged.
 
     Raises
     ------
     CampaignError
-        If something is no array of numbers, `aperture` no `Aperture`, or the speed none of a radio wave.
+        If a value is not an array of numbers, `aperture` is not an `Aperture`, or the speed is not that of a radio
+        wave.
     """
-    where = type(one).__name__
+    where = type(inputs).__name__
     for name, kind in kinds.items():
-        object.__setattr__(one, name, as_array(getattr(one, name), kind, f"{where}: {name}"))
-    slowest, speed = SPEED_OF_LIGHT_M_S / 1.1, one.wave_speed_m_s
+        object.__setattr__(inputs, name, as_array(getattr(inputs, name), kind, f"{where}: {name}"))
+    slowest, speed = SPEED_OF_LIGHT_M_S / 1.1, inputs.wave_speed_m_s
     if not (isinstance(speed, Real) and slowest < float(speed) <= SPEED_OF_LIGHT_M_S):
         raise CampaignError(
             quoted(speed),
             where=f"{where}: wave_speed_m_s",
-            expected=f"m/s of light, {slowest:.0f} in dense air to {SPEED_OF_LIGHT_M_S} in vacuum",
-            remedy="Take apertura.wave_speed(N units).",
+            expected=f"a wave speed above {slowest:.0f} m/s, up to the speed of light, {SPEED_OF_LIGHT_M_S} m/s",
+            remedy="Use apertura.wave_speed(N units).",
         )
-    if not isinstance(one.aperture, Aperture):
+    if not isinstance(inputs.aperture, Aperture):
         raise CampaignError(
-            f"an object of type {type(one.aperture).__name__}",
+            f"an object of type {type(inputs.aperture).__name__}",
             where=f"{where}: aperture",
             expected="an Aperture: phase centres of transmitter and receiver, (pulse, 3) each",
-            remedy="Make one by Aperture(tx_m, rx_m).",
+            remedy="Create one with Aperture(tx_m, rx_m).",
         )
 
 
-def _check_shapes(one: Any, expected: dict[str, tuple[int, ...]], said: str) -> None:
-    """Raise CampaignError unless arrays have the shapes that go together."""
-    found = {name: tuple(getattr(one, name).shape) for name in expected}
-    pulses = {"aperture": len(one.aperture)} | {name: shape[0] if shape else 0 for name, shape in found.items()}
+def _check_shapes(inputs: Any, expected: dict[str, tuple[int, ...]], description: str) -> None:
+    """Raise CampaignError unless the arrays have consistent shapes."""
+    found = {name: tuple(getattr(inputs, name).shape) for name in expected}
+    pulses = {"aperture": len(inputs.aperture)} | {name: shape[0] if shape else 0 for name, shape in found.items()}
     if found != expected or pulses["aperture"] != next(iter(expected.values()))[0]:
         shapes = ", ".join(f"{name} {shape}" for name, shape in found.items())
         raise CampaignError(
             f"{shapes}, aperture of {pulses['aperture']} pulses",
-            where=f"{type(one).__name__}",
-            expected=said,
-            remedy="Transpose what lies the other way round; give one row for each pulse.",
+            where=f"{type(inputs).__name__}",
+            expected=description,
+            remedy="Transpose arrays with swapped axes; each array needs one row per pulse.",
         )
 
 
 class PhaseRotated:
-    """Samples of pulses, each times a factor of its own, computed on access.
+    """Samples of pulses, multiplied by one factor per pulse on access.
 
     Examples
     --------
@@ -73,17 +74,17 @@ class PhaseRotated:
         return len(self._samples)
 
     def __getitem__(self, pulses: slice) -> NDArray[np.complex64]:
-        """Return the samples of some pulses."""
+        """Return the samples of a slice of pulses."""
         return np.asarray(self._samples[pulses]) * self._factor[pulses, None]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        """Return all of them."""
+        """Return the samples of all pulses."""
         return np.asarray(self[:], dtype)
 
 
 @dataclass(frozen=True)
 class PhaseHistory:
-    """Calibrated transfer functions, as `reference` sums them.
+    """Calibrated transfer functions, the input of engine `reference`.
 
     Attributes
     ----------
@@ -98,12 +99,12 @@ class PhaseHistory:
     aperture
         Phase centres in the frame of the pixels.
     wave_speed_m_s
-        Speed of the wave along the paths, m/s: delay times it is path (docs/theory/atmosphere.md, eq. 4).
+        Speed of the wave along the paths, m/s: path = speed · delay (docs/theory/atmosphere.md, eq. 4).
 
     Raises
     ------
     CampaignError
-        If something is no array of numbers, the shapes do not belong together, or the wave is faster than light.
+        If a value is not an array of numbers, shapes are inconsistent, or the wave is faster than light.
     """
 
     transfer: NDArray[np.complex64]
@@ -118,18 +119,20 @@ class PhaseHistory:
         _as_arrays(self, {"transfer": np.complex64, **real})
         pulses, subcarriers = self.transfer.shape if self.transfer.ndim == 2 else (-1, -1)
         vectors = {"reference_delay_s": (pulses,), "frequency_hz": (subcarriers,), "weight": (subcarriers,)}
-        said = "transfer (pulse, subcarrier), reference_delay_s (pulse,), frequency_hz and weight (subcarrier,)"
-        _check_shapes(self, {"transfer": (pulses, subcarriers), **vectors}, f"{said}, as many pulses of the aperture")
+        shapes = "transfer (pulse, subcarrier), reference_delay_s (pulse,), frequency_hz and weight (subcarrier,)"
+        description = f"{shapes}, and an aperture with the same number of pulses"
+        _check_shapes(self, {"transfer": (pulses, subcarriers), **vectors}, description)
         if subcarriers == 0:
-            expected = "two or more subcarriers, whose width resolves range"
-            raise CampaignError("no subcarrier", "PhaseHistory: transfer", expected, "Give the samples of a band.")
+            expected = "two or more subcarriers, whose bandwidth resolves range"
+            remedy = "Provide the transfer function over a band."
+            raise CampaignError("no subcarrier", "PhaseHistory: transfer", expected, remedy)
 
     def __len__(self) -> int:
         """Return the number of pulses."""
         return len(self.transfer)
 
     def __getitem__(self, pulses: slice) -> "PhaseHistory":
-        """Return the phase history of some pulses, as views."""
+        """Return the phase history of a slice of pulses, as views."""
         return replace(
             self,
             transfer=self.transfer[pulses],
@@ -140,13 +143,13 @@ class PhaseHistory:
     def moved(self, aperture: Aperture, extra_path_m: NDArray[np.float64]) -> "PhaseHistory":
         """Return the same echoes with other phase centres and with paths longer by `extra_path_m`.
 
-        As `Profiles.moved`.
+        See `Profiles.moved`.
         """
         delay_s = self.reference_delay_s + extra_path_m / self.wave_speed_m_s
         return replace(self, reference_delay_s=delay_s, aperture=aperture)
 
     def at_speed(self, wave_speed_m_s: float) -> "PhaseHistory":
-        """Return the same delays as those of a wave of another speed, m/s."""
+        """Return the same delays for another wave speed, m/s."""
         return replace(self, wave_speed_m_s=wave_speed_m_s)
 
 
@@ -154,14 +157,14 @@ class PhaseHistory:
 class Profiles:
     """Range profiles of a band-limited signal, cropped to the scene.
 
-    Sample i of pulse p lies at total path ``start_m[p] + i·step_m`` and holds
-    Σ_n w_n H_n exp(+j2π(f_n - f_mid)·path/v) (with H_n for absolute delay), v the speed of the wave, so that
+    Sample i of pulse p at the total path ``start_m[p] + i·step_m`` has the value
+    Σ_n w_n H_n exp(+j2π(f_n - f_mid)·path/v), with H_n for absolute delay and v the speed of the wave, so that
     profile·exp(+j2π f_mid·path/v) is in phase at a target.
 
     Attributes
     ----------
     samples
-        (pulse, range) complex64, oversampled by `oversampling` ≥ 2 against v/B of total path.
+        (pulse, range) complex64, oversampled by `oversampling` ≥ 2 relative to v/B of total path.
     start_m
         (pulse,) float64, total path tx → pixel → rx of sample 0, metres.
     step_m
@@ -169,17 +172,17 @@ class Profiles:
     centre_frequency_hz
         f_mid.
     oversampling
-        Nyquist cells per sample inverted: (v/B)/step_m.
+        Samples per Nyquist cell, (v/B)/step_m.
     aperture
         Phase centres in the frame of the pixels.
     wave_speed_m_s
-        v, as of `PhaseHistory`.
+        v, as in `PhaseHistory`.
 
     Raises
     ------
     CampaignError
-        If something is no array of numbers, the shapes do not belong together, a step is not positive, samples are
-        further apart than their band allows, or the wave is faster than light.
+        If a value is not an array of numbers, shapes are inconsistent, the step is not positive, the oversampling is
+        1 or less, or the wave is faster than light.
     """
 
     samples: NDArray[np.complex64]
@@ -193,13 +196,14 @@ class Profiles:
     def __post_init__(self) -> None:
         _as_arrays(self, {"samples": np.complex64, "start_m": np.float64})
         pulses, length = self.samples.shape if self.samples.ndim == 2 else (-1, -1)
-        said = "samples (pulse, range), start_m (pulse,), as many pulses of the aperture"
-        _check_shapes(self, {"samples": (pulses, length), "start_m": (pulses,)}, said)
+        description = "samples (pulse, range), start_m (pulse,), and an aperture with the same number of pulses"
+        _check_shapes(self, {"samples": (pulses, length), "start_m": (pulses,)}, description)
         for name, least in (("step_m", 0.0), ("oversampling", 1.0), ("centre_frequency_hz", -np.inf)):
             value = getattr(self, name)
             if not (isinstance(value, Real) and least < float(value) < np.inf):
-                more = f"a number above {least:g}" if np.isfinite(least) else "a number"
-                raise CampaignError(quoted(value), f"Profiles: {name}", more, "Take those of the compression.")
+                expected = f"a number above {least:g}" if np.isfinite(least) else "a number"
+                remedy = "Use the value of the range compression."
+                raise CampaignError(quoted(value), f"Profiles: {name}", expected, remedy)
 
     @property
     def wavenumber_rad_m(self) -> float:
@@ -213,7 +217,7 @@ class Profiles:
 
     @property
     def bandwidth_hz(self) -> float:
-        """B, which one resolution cell v/B is of."""
+        """Bandwidth B of the resolution cell v/B."""
         return self.wave_speed_m_s / (self.step_m * self.oversampling)
 
     def __len__(self) -> int:
@@ -221,7 +225,7 @@ class Profiles:
         return len(self.samples)
 
     def __getitem__(self, pulses: slice) -> "Profiles":
-        """Return the profiles of some pulses, as views; images of pulse blocks add up to the image of all."""
+        """Return the profiles of a slice of pulses, as views; images of pulse blocks add up to the image of all."""
         return replace(
             self,
             samples=self.samples[pulses],
@@ -230,22 +234,22 @@ class Profiles:
         )
 
     def for_tables(self) -> tuple[NDArray[np.complex64], NDArray[np.float64], list[NDArray[np.float64]]]:
-        """Return samples, starts and phase centres of both legs as arrays that tables of polynomials can be made from.
+        """Return samples, starts and phase centres of both legs as arrays, validated for polynomial tables.
 
         Raises
         ------
         ValueError
-            If the profiles are oversampled less than 1.5 times or have no pulse, or a position or start is not finite.
+            If the oversampling is below 1.5, there is no pulse, or a position or start is not finite.
         """
         if not self.oversampling >= 1.5:
             raise ValueError(f"{self.oversampling=}: must be at least 1.5")
         if not len(self):
-            raise ValueError(f"{self.samples.shape=}: holds no pulse")
+            raise ValueError(f"{self.samples.shape=}: contains no pulse")
         start_m = np.ascontiguousarray(self.start_m, np.float64)
-        places = [np.asarray(leg, np.float64) for leg in self.aperture.legs]
-        if not all(np.isfinite(values).all() for values in (start_m, *places)):
+        phase_centres = [np.asarray(leg, np.float64) for leg in self.aperture.legs]
+        if not all(np.isfinite(values).all() for values in (start_m, *phase_centres)):
             raise ValueError("phase centres and starts of the profiles must be finite")
-        return np.ascontiguousarray(self.samples, np.complex64), start_m, places
+        return np.ascontiguousarray(self.samples, np.complex64), start_m, phase_centres
 
     def moved(self, aperture: Aperture, extra_path_m: NDArray[np.float64]) -> "Profiles":
         """Return the same echoes with other phase centres and with paths longer by `extra_path_m`.
@@ -253,13 +257,13 @@ class Profiles:
         Parameters
         ----------
         aperture
-            Of as many pulses.
+            Phase centres of the same number of pulses.
         extra_path_m
-            (pulse,) float64, metres by which the measured path of every echo of a pulse grows.
+            (pulse,) float64, growth of the measured path of every echo of a pulse, metres.
 
         Notes
         -----
-        Source: docs/theory/autofocus.md, eq. 3: an echo at path R lies at R + ∆ and has the phase of R + ∆.
+        Source: docs/theory/autofocus.md, eq. 3: an echo at path R is shifted to R + ∆ and gets the phase of R + ∆.
         """
         rotated = (
             PhaseRotated(self.samples, np.exp(-1j * self.wavenumber_rad_m * extra_path_m))
@@ -270,6 +274,6 @@ class Profiles:
         return replace(self, samples=samples, start_m=self.start_m + extra_path_m, aperture=aperture)
 
     def at_speed(self, wave_speed_m_s: float) -> "Profiles":
-        """Return the same delays as those of a wave of another speed, m/s."""
+        """Return the same delays for another wave speed, m/s."""
         scale = wave_speed_m_s / self.wave_speed_m_s
         return replace(self, start_m=scale * self.start_m, step_m=scale * self.step_m, wave_speed_m_s=wave_speed_m_s)

@@ -1,4 +1,4 @@
-"""An imaging job as numbers: the input of the planner and of the engines' predictions."""
+"""Numerical description of an imaging job, the input of the planner and of the engines' predictions."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -24,15 +24,15 @@ class Signal:
     centre_hz
         f_mid.
     oversampling
-        Samples per cell c/B.
+        Samples per range cell c/B.
     step_m
         Total path between samples.
     samples
-        Per pulse.
+        Number of samples per pulse.
     window
-        (subcarrier,) float64, weights over the band, of any scale; flat by default.
+        (subcarrier,) float64, weights over the band with any scale; flat by default.
     wave_speed_m_s
-        As of `Profiles`.
+        As in `Profiles`.
     """
 
     centre_hz: float
@@ -50,22 +50,22 @@ class Signal:
 
 @dataclass(frozen=True, eq=False)
 class Integration:
-    """Over how much of a flight pixels are integrated.
+    """Integrated part of a flight for the pixels of an image.
 
     Attributes
     ----------
     sector
-        None: every pulse counts for every pixel.
+        Integrated sector; None if every pulse contributes to every pixel.
     count
-        Pulses that the sum is divided by: all, or the most that a place of the scene takes inside the sector.
+        Divisor of the sum: number of all pulses, or the largest number inside the sector at any point of the scene.
     value, reason
-        What was chosen, and why, in a few words.
+        Selected integration and its reason, one phrase each.
     share
-        Of pixels × pulses that are summed.
+        Summed share of pixels × pulses.
     report
         Section of image.json.
     flags
-        Limits crossed → what was measured.
+        Flag → measured values, of exceeded limits.
     """
 
     sector: Sector | None
@@ -79,42 +79,43 @@ class Integration:
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """What is to be imaged.
+    """Imaging job.
 
     Attributes
     ----------
     aperture
         Phase centres in the frame of the pixels.
     ground_m
-        (row, column, 3) float64, metres: points spread evenly over the scene, corners included; rows go south.
+        (row, column, 3) float64, points spread evenly over the scene including corners, metres; rows go south.
     shape
         Rows and columns of the image.
     spacing_m
-        Of the pixels.
+        Pixel spacing.
     centre_hz, bandwidth_hz, subcarriers
-        Of the waveform.
+        Centre frequency, bandwidth and number of subcarriers of the waveform.
     signal
         Signal of the profiles.
     frame
         'ecef' or 'local'.
     tile_px, threads
-        Side of a tile; tiles formed at once.
+        Side of a tile; number of tiles formed at once.
     terrain
-        The scene's ground and its cheaper models.
+        Terrain of the scene and its cheaper models.
     path_limit_m
         Longest total path inside the cyclic prefix.
     memory_bytes
-        What the imaging step may use.
+        Memory limit of the imaging step.
     beams, illumination
-        Of the antennas, where they have any, and of the sector integrated; over all pulses.
+        Weights and illumination by antennas, if they have beams, and by the integrated sector; over all pulses.
     integration
-        Over how much of the flight; None: all of it.
+        Integrated part of the flight; None for the whole flight.
     recorded
-        Whether there is a phase history, which the double sum needs.
+        True if a phase history is available, which the double sum requires.
     patches_on
-        Ground → places of the pixels of some windows of the scene, each (y, x, 3) float64, metres; None: unknown.
+        Function of a terrain that returns pixel positions in windows of the scene, each (y, x, 3) float64, metres; None
+        if unknown.
     patches_m
-        The same on the decided model of the ground; none: planes about points of `ground_m`.
+        Pixel positions in these windows on the selected terrain model; if empty, planes about points of `ground_m`.
     """
 
     aperture: Aperture
@@ -140,37 +141,37 @@ class Job:
 
     @property
     def pixels(self) -> int:
-        """How many the image has."""
+        """Number of pixels of the image."""
         return self.shape[0] * self.shape[1]
 
     @property
     def tiles(self) -> int:
-        """How many the image is formed by."""
+        """Number of tiles of the image."""
         return -(-self.shape[0] // self.tile_px) * -(-self.shape[1] // self.tile_px)
 
     @property
     def antennas(self) -> int:
-        """How many of both antennas have a beam."""
+        """Number of antennas with a beam, 0 to 2."""
         return 0 if self.beams is None else sum(beam is not None for beam in (self.beams.transmit, self.beams.receive))
 
     @property
     def weights(self) -> int:
-        """How many weights a pulse has at a pixel."""
+        """Number of weights of a pulse at a pixel."""
         return self.antennas + (self.sector is not None)
 
     @property
     def sector(self) -> Sector | None:
-        """Inside which pulses count; None: all of them."""
+        """Integrated sector; None if every pulse contributes to every pixel."""
         return None if self.beams is None else self.beams.sector
 
     @property
     def share(self) -> float:
-        """Of pixels × pulses that are summed."""
+        """Summed share of pixels × pulses."""
         return 1.0 if self.integration is None else self.integration.share
 
     @property
     def count(self) -> int:
-        """Pulses that the sum is divided by."""
+        """Divisor of the sum, a number of pulses."""
         return len(self.aperture) if self.integration is None else self.integration.count
 
     @property
@@ -180,10 +181,10 @@ class Job:
 
     @property
     def wavelength_m(self) -> float:
-        """Of the band centre."""
+        """Wavelength at the band centre."""
         return self.signal.wave_speed_m_s / self.centre_hz
 
     @property
     def points_m(self) -> NDArray[np.float64]:
-        """`ground_m` as (point, 3), its middle in the middle."""
+        """`ground_m` as (point, 3), with the scene's middle at the middle index."""
         return self.ground_m.reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""The graph of requested tiles; apart from `tiles`, whose import does not load dask."""
+"""dask graph of the requested tiles; separate from `tiles` so that importing that does not load dask."""
 
 from collections.abc import Callable, Collection, Iterable
 from typing import Any
@@ -9,24 +9,25 @@ Place = tuple[int, int]
 
 
 class TilesLayer(MaterializedLayer):
-    """The tasks of some tiles of an image.
+    """Tasks of the requested tiles of an image.
 
-    Blocks of pulses follow one another: the next one's tables are prepared when every tile has its part of the last.
-    dask would therefore compute all tiles for the sake of one; here the graph has the requested tiles only.
+    Pulse blocks are processed in sequence: the tables of a block are prepared when every tile includes the previous
+    block. By these dependencies dask would compute all tiles to obtain one; this graph contains the requested tiles
+    only.
 
     Parameters
     ----------
     name
-        Of the array.
+        Name of the array.
     graph
-        Rows and columns of tiles → key → task.
+        Function of rows and columns of tiles that returns key → task.
     places
         Row and column of every tile.
 
     Attributes
     ----------
     origin
-        What the image is formed of, for whoever judges it; None in what a scheduler gets.
+        Inputs of the image, for its quality assessment; None in the graph sent to a scheduler.
     """
 
     def __init__(self, name: str, graph: Callable[[Collection[Place]], dict[Any, Any]], places: Iterable[Place]):

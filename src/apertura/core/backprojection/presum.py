@@ -1,8 +1,8 @@
-"""Fewer pulses for an oversampled aperture: a low-pass sum over neighbours, aligned to the middle of the scene.
+"""Presumming of pulses of an oversampled aperture by a low-pass filter, aligned to the middle of the scene.
 
-Leaving pulses out would fold noise and echoes from elsewhere into the image. Here every pulse is kept: the
-value of a pulse at a pixel is interpolated from its values at every k-th, so the sum over k times fewer virtual
-pulses equals the sum over all (docs/theory/planner.md, "Pulses").
+Decimation without a filter would alias noise and echoes into the image. Presumming uses every pulse: the value of a
+pulse at a pixel is interpolated from every k-th position, so that the sum over k times fewer virtual pulses equals the
+sum over all pulses (docs/theory/planner.md, "Pulses").
 """
 
 from dataclasses import dataclass
@@ -29,16 +29,16 @@ _KAISER_BETA = 10.0
 
 @dataclass(frozen=True)
 class Presum:
-    """A low-pass sum over pulses.
+    """Presumming filter.
 
     Attributes
     ----------
     factor
         Pulses per virtual pulse.
     at
-        (virtual,) float64, places of the virtual pulses in pulse numbers; some lie beyond both ends.
+        (virtual,) float64, positions of the virtual pulses in pulse numbers; some lie beyond both ends.
     weight
-        (virtual, pulse) sparse: the interpolation filter.
+        (virtual, pulse) sparse, interpolation filter.
     """
 
     factor: int
@@ -46,18 +46,18 @@ class Presum:
     weight: "sparse.csr_array"
 
     def part(self, virtual: slice) -> tuple["Presum", slice]:
-        """Return the low-pass sum for some of the virtual pulses, and the pulses that it takes."""
+        """Return the filter of a slice of virtual pulses, and the pulses that it requires."""
         weight = self.weight[virtual]
         first, last = int(weight.indices.min(initial=weight.shape[1] - 1)), int(weight.indices.max(initial=0))
         at = self.at[virtual]
-        # places between two pulses take both; those beyond an end go straight on from the two outermost
+        # positions between two pulses require both; positions beyond an end are extrapolated from the two outermost
         first = max(0, min(first, int(at[0]), weight.shape[1] - 2))
         last = min(weight.shape[1], max(last, int(at[-1]) + 1, 1) + 1)
         return Presum(self.factor, at - first, weight[:, first:last]), slice(first, last)
 
 
 def design(pulses: int, factor: int, *, widest_cycles: float, error_db: float = -72.0) -> Presum | None:
-    """Return the filter for a factor, or None where the scene's Doppler band leaves no room for it.
+    """Design the filter for a factor; None if the scene's Doppler band is too wide for it.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def design(pulses: int, factor: int, *, widest_cycles: float, error_db: float = 
     factor
         Pulses per virtual pulse.
     widest_cycles
-        Largest phase rate of a pixel against the scene's middle, cycles per pulse.
+        Largest phase rate of a pixel relative to the scene's middle, cycles per pulse.
     error_db
         Tolerated error of the filter.
 
@@ -78,16 +78,16 @@ def design(pulses: int, factor: int, *, widest_cycles: float, error_db: float = 
     >>> design(1000, 4, widest_cycles=0.2) is None
     True
     """
-    room = 1 / factor - 2 * widest_cycles
-    if factor < 2 or room <= 0.4 / factor:
+    transition = 1 / factor - 2 * widest_cycles
+    if factor < 2 or transition <= 0.4 / factor:
         return None
     from scipy import sparse
 
     stop_db = 12.0 - error_db
     beta = kaiser_beta(stop_db)
-    half = int(np.ceil((stop_db - 7.95) / (14.36 * room) / 2))
-    beyond = half // factor + 1
-    at = factor * np.arange(-beyond, (pulses - 1) // factor + beyond + 2, dtype=np.float64)
+    half = int(np.ceil((stop_db - 7.95) / (14.36 * transition) / 2))
+    margin = half // factor + 1
+    at = factor * np.arange(-margin, (pulses - 1) // factor + margin + 2, dtype=np.float64)
     pulse = np.arange(pulses)
     first = np.clip(np.searchsorted(at, pulse - half), 0, len(at))
     rows = first[:, None] + np.arange(2 * half // factor + 2)
@@ -100,24 +100,25 @@ def design(pulses: int, factor: int, *, widest_cycles: float, error_db: float = 
 
 
 def presum_error_db(presum: Presum, aperture: Aperture, place_m: NDArray[np.float64], *, highest_hz: float) -> float:
-    """Return the RMS error of the interpolated values at pixels, over all pulses and a grid of points, dB.
+    """Return the RMS error of the interpolated values over all pulses and a grid of points, dB.
 
     Parameters
     ----------
     presum
-        From `design`.
+        Filter from `design`.
     aperture
-        Of all pulses.
+        Aperture of all pulses.
     place_m
-        (place, 3) float64, metres: a grid of points over the scene, its middle at the middle of the array.
+        (point, 3) float64, grid of points over the scene with its middle at the middle of the array, metres.
     highest_hz
-        Upper edge of the band, where phases turn fastest.
+        Upper band edge, at which phases change fastest.
     """
     k = 2 * np.pi * highest_hz / SPEED_OF_LIGHT_M_S
-    paths = (one.path(place_m) for one in (aperture, _virtual(aperture, presum)))
-    real, virtual = (path_m - path_m[:, [path_m.shape[1] // 2]] for path_m in paths)  # against the middle of the scene
-    read = presum.weight.T @ np.exp(1j * k * virtual)
-    return decibels(float((np.abs(read - np.exp(1j * k * real)) ** 2).mean()) + 1e-16)
+    paths = (each.path(place_m) for each in (aperture, _virtual(aperture, presum)))
+    # Paths relative to the middle of the scene.
+    real, virtual = (path_m - path_m[:, [path_m.shape[1] // 2]] for path_m in paths)
+    interpolated = presum.weight.T @ np.exp(1j * k * virtual)
+    return decibels(float((np.abs(interpolated - np.exp(1j * k * real)) ** 2).mean()) + 1e-16)
 
 
 def _virtual(aperture: Aperture, presum: Presum) -> Aperture:
@@ -125,7 +126,7 @@ def _virtual(aperture: Aperture, presum: Presum) -> Aperture:
 
 
 def _positions(position_m: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return positions at pulse numbers, straight on beyond the ends."""
+    """Return positions at fractional pulse numbers, linearly extrapolated beyond the ends."""
     last = len(position_m) - 1
     inside = np.clip(at, 0, last)
     lower = np.minimum(inside.astype(int), max(0, last - 1))
@@ -136,16 +137,16 @@ def _positions(position_m: NDArray[np.float64], at: NDArray[np.float64]) -> NDAr
 
 
 def presummed(profiles: Profiles, presum: Presum, middle_m: NDArray[np.float64]) -> Profiles:
-    """Return profiles of the virtual pulses, whose image has the same sum.
+    """Return range profiles of the virtual pulses, whose sum is that of all pulses.
 
     Parameters
     ----------
     profiles
-        With ten samples or more to spare at both ends.
+        Profiles with a margin of ten samples or more at both ends.
     presum
-        From `design`.
+        Filter from `design`.
     middle_m
-        (3,) float64, metres: the place to which pulses are aligned.
+        (3,) float64, point to which pulses are aligned, metres.
 
     Notes
     -----
@@ -154,10 +155,10 @@ def presummed(profiles: Profiles, presum: Presum, middle_m: NDArray[np.float64])
     k = profiles.wavenumber_rad_m
     aperture = _virtual(profiles.aperture, presum)
     real, virtual = profiles.aperture.path(middle_m), aperture.path(middle_m)
-    begin = profiles.start_m - real
-    first, last = begin.min(), begin.max()
+    start = profiles.start_m - real
+    first, last = start.min(), start.max()
     count = profiles.samples.shape[1] + int(np.ceil((last - first) / profiles.step_m))
-    aligned = _shifted(profiles.samples, (first - begin) / profiles.step_m, count)
+    aligned = _shifted(profiles.samples, (first - start) / profiles.step_m, count)
     aligned *= np.exp(1j * np.remainder(k * real, 2 * np.pi))[:, None].astype(np.complex64)
     samples = presum.weight.astype(np.float32) @ aligned
     samples = samples * np.exp(-1j * np.remainder(k * virtual, 2 * np.pi))[:, None]
@@ -173,8 +174,8 @@ def presummed(profiles: Profiles, presum: Presum, middle_m: NDArray[np.float64])
 
 
 def _shifted(samples: NDArray[np.complex64], shift: NDArray[np.float64], count: int) -> NDArray[np.complex64]:
-    """Return sample i + shift of each pulse, i = 0…count-1, by a windowed sinc; zero beyond the ends."""
-    moved = np.zeros((len(samples), count), np.complex64)
+    """Return samples i + shift of each pulse, i = 0…count-1, interpolated by a windowed sinc; zero beyond the ends."""
+    shifted = np.zeros((len(samples), count), np.complex64)
     first = np.floor(shift).astype(int)
     taps = np.arange(1 - _HALF_TAPS, _HALF_TAPS + 1)
     distance = (shift - first)[:, None] - taps
@@ -183,5 +184,5 @@ def _shifted(samples: NDArray[np.complex64], shift: NDArray[np.float64], count: 
         padded = np.concatenate([np.zeros(_HALF_TAPS - 1, np.complex64), row, np.zeros(_HALF_TAPS, np.complex64)])
         refined = np.convolve(padded, weights[::-1], "valid")  # refined[i] = row at i + fraction
         begin, end = max(0, -start), min(count, len(refined) - start)
-        moved[pulse, begin:end] = refined[begin + start : end + start]
-    return moved
+        shifted[pulse, begin:end] = refined[begin + start : end + start]
+    return shifted

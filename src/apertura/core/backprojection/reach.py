@@ -1,4 +1,4 @@
-"""Which pulses may contribute to which pieces of a scene: no other is read, prepared or summed."""
+"""Selection of the pulses that may contribute to windows of a scene; others are not read, prepared or summed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,17 +15,17 @@ from apertura.core.scene.swath import balls
 from apertura.core.scene.terrain import Terrain
 
 PULSES = 64
-"""Pulses of a block; engines sum in blocks of as many, so leaving out blocks that add nothing changes no bit."""
+"""Pulses of a block. Engines sum in blocks of this size: skipping blocks without contribution changes no bit."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """Which blocks of 64 pulses may contribute to which pieces of a scene.
+    """Mask of the blocks of 64 pulses that may contribute to windows of a scene.
 
     Attributes
     ----------
     mask
-        (block, piece) bool.
+        (block, window) bool.
     pulses
         Number of pulses.
 
@@ -48,16 +48,16 @@ class Reach:
         terrain: Terrain,
         windows: Sequence[tuple[slice, slice]],
     ) -> "Reach":
-        """Return the reach over windows of a scene; without beams or sector every pulse contributes to all of them.
+        """Return the mask for windows of a scene; without beams or sector every pulse contributes to all windows.
 
         Parameters
         ----------
         beams, aperture
-            Of every pulse.
+            Beams and aperture of all pulses.
         grid, terrain
             The scene.
         windows
-            Its pieces.
+            Windows of the scene.
         """
         if beams is None:
             return cls(np.ones((-(-len(aperture) // PULSES), len(windows)), bool), len(aperture))
@@ -65,13 +65,13 @@ class Reach:
 
     @property
     def illuminated(self) -> NDArray[np.bool_]:
-        """(piece,) bool: whether any pulse may illuminate it."""
+        """(window,) bool, True if any pulse may illuminate the window."""
         return np.asarray(self.mask.any(axis=0))
 
     def within(self, piece: int, block: slice) -> slice | None:
-        """Return the first to the last pulse of a block that may illuminate a piece, counted from the block's start.
+        """Return the first to the last pulse of a block that may illuminate a window, counted from the block's start.
 
-        None where none does. `block` begins at a multiple of 64, unless every pulse contributes to the piece.
+        None if no pulse does. `block` starts at a multiple of 64, unless every pulse contributes to the window.
         """
         if self.mask[:, piece].all():
             return slice(0, block.stop - block.start)
@@ -83,14 +83,14 @@ class Reach:
 
 
 def pulse_blocks_of(pulses: int, count: int, *, any_start: bool) -> list[slice]:
-    """Return consecutive blocks of pulses of about one length.
+    """Return consecutive pulse blocks of approximately equal length.
 
     Parameters
     ----------
     pulses, count
-        Number of pulses, and of blocks at most.
+        Number of pulses, and largest number of blocks.
     any_start
-        Blocks may begin at any pulse, since every pulse contributes to every piece; else at multiples of 64.
+        True if blocks may start at any pulse, as every pulse contributes to every window; else at multiples of 64.
 
     Examples
     --------

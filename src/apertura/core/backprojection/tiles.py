@@ -1,4 +1,4 @@
-"""An image as a dask array of tiles: computed on request, each tile on its own, here or by workers of a cluster."""
+"""Images as dask arrays of tiles, each computed independently on request by local threads or a cluster."""
 
 import os
 import sys
@@ -35,10 +35,11 @@ if TYPE_CHECKING:
 
 KEY = "processing.scheduler"
 NAMED_BY = "DASK_SCHEDULER_ADDRESS"
-"""Environment variable, dask's own: who connects to a scheduler runs what that sends, and a config is untrusted."""
+"""dask's environment variable for the scheduler address, which must confirm the config: a client executes data from the
+scheduler, and a config is untrusted."""
 
-_CONNECT_S = 5.0  # to wait for a scheduler
-_WORKERS_S = 10.0  # to wait for its first worker
+_CONNECT_S = 5.0  # timeout for the connection to a scheduler
+_WORKERS_S = 10.0  # timeout for its first worker
 
 
 def cluster_tiles(
@@ -46,20 +47,20 @@ def cluster_tiles(
 ) -> Iterator[tuple[int, NDArray[np.complex64]]]:
     """Yield each tile with its number as soon as a worker has formed it.
 
-    Workers need this package and no file of the campaign: what they read is sent to them, and what they formed comes
-    back. Tiles of a lost worker are formed again by the others.
+    Workers need this package but no file of the campaign: inputs are sent to them, and tiles are sent back. Tiles of a
+    lost worker are recomputed by the others.
 
     Parameters
     ----------
     graph, keys
-        Tasks of an image of `apertura.core.backprojection.tiles.image_array`, and those that are tiles.
+        Tasks of an image of `apertura.core.backprojection.tiles.image_array`, and keys of its tiles.
     scheduler
         Address of a running scheduler, ``tcp://host:port``.
 
     Raises
     ------
     CampaignError
-        If the environment does not name the same scheduler, it does not answer, or has no workers with this code.
+        If the environment names another scheduler or none, it is not reachable, or it has no workers with this code.
     """
     with _connected(scheduler) as client:
         from distributed import as_completed
@@ -67,20 +68,20 @@ def cluster_tiles(
         futures = client.get(graph, list(keys), sync=False)
         numbers = {future.key: number for number, future in enumerate(futures)}
         done = as_completed(futures, loop=client.loop, with_results=True)
-        del futures  # so that a tile leaves its worker when it has come
+        del futures  # so that workers release a tile once it is received
         for future, tile in done:
             yield numbers[future.key], tile
 
 
 def check_named(scheduler: str) -> None:
-    """Raise CampaignError unless whoever runs this names the scheduler at an address, too."""
+    """Raise CampaignError unless the environment variable `NAMED_BY` confirms the scheduler's address."""
     named = os.environ.get(NAMED_BY)
     if named != scheduler:
         raise CampaignError(
             f"{scheduler}, but {NAMED_BY} is {named or 'not set'}",
             where=KEY,
-            expected="the scheduler that whoever runs this names: it may send code",
-            remedy=f"If it is yours, run `export {NAMED_BY}={scheduler}`; else set {KEY} to threads.",
+            expected=f"the scheduler named by {NAMED_BY}, as a scheduler may send code",
+            remedy=f"If you trust the scheduler, run `export {NAMED_BY}={scheduler}`; else set {KEY} to threads.",
         )
 
 
@@ -93,7 +94,8 @@ def _connected(scheduler: str) -> Any:
     try:
         client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise _unusable(scheduler, "nobody answers there", "Start `dask scheduler`, or correct the address.") from error
+        remedy = "Start `dask scheduler`, or correct the address."
+        raise _unusable(scheduler, "no scheduler is reachable there", remedy) from error
     try:
         _check_workers(client, scheduler)
     except BaseException:
@@ -106,24 +108,26 @@ def _check_workers(client: Any, scheduler: str) -> None:
     try:
         client.wait_for_workers(1, timeout=_WORKERS_S)
     except TimeoutError as error:
-        raise _unusable(scheduler, "it has no workers", f"Start some: `dask worker {scheduler}`.") from error
+        remedy = f"Start workers with `dask worker {scheduler}`."
+        raise _unusable(scheduler, "the scheduler has no workers", remedy) from error
     modules = ("apertura.core.backprojection.tiles", *ENGINES.values())
     own, theirs = code_sha256(*modules), client.run(code_sha256, *modules)
-    other = [worker for worker, code in theirs.items() if code != own]
-    if other:
-        found = f"{len(other)} of {len(theirs)} workers run other code, first {other[0]}"
-        raise _unusable(scheduler, found, "Install the same version there.")
+    differing = [worker for worker, code in theirs.items() if code != own]
+    if differing:
+        found = f"{len(differing)} of {len(theirs)} workers have a different version of the code, first {differing[0]}"
+        raise _unusable(scheduler, found, "Install the same version of apertura on the workers.")
 
 
 def _unusable(scheduler: str, found: str, remedy: str) -> CampaignError:
-    return CampaignError(f"{scheduler}: {found}", KEY, "a dask scheduler with workers that have this apertura", remedy)
+    expected = "a dask scheduler with workers of the same version of apertura"
+    return CampaignError(f"{scheduler}: {found}", KEY, expected, remedy)
 
 
 # ---- An image as a dask array of tiles
 
 
 def _forget_threads() -> None:
-    """Let dask start its threads anew in a forked child, which has none of its parent's and would wait for ever."""
+    """Reset dask's thread pools in a forked child, which inherits no threads and would wait for them forever."""
     threaded: Any = sys.modules.get("dask.threaded")
     if threaded is not None:
         threaded.default_pool, threaded.main_thread = None, threading.current_thread()
@@ -145,30 +149,30 @@ def image_array(
     side_px: int,
     weighing: "Weighing | None" = None,
 ) -> "Array":
-    """Return an image, the mean over the pulses, as a dask array whose chunks are square tiles.
+    """Return an image, the mean over the pulses, as a dask array with square tiles as chunks.
 
-    Tables are prepared once per block of pulses and shared by all tiles; with several blocks each one's tables are
-    prepared when the tiles of the block before are done, so that one block's inputs and tables are in memory at a time.
-    A tile takes of a block the pulses that may add something to it, and of a block without any nothing. It is the
-    same to the bit whichever others are computed, in whatever order, by threads, processes or a cluster.
+    Tables are prepared once per pulse block and shared by all tiles. With several blocks, the tables of a block are
+    prepared when the tiles of the previous block are done, so that only one block's inputs and tables are in memory. A
+    tile uses the pulses of a block that may contribute to it. Its bits do not depend on the other computed tiles, on
+    their order, or on the use of threads, processes or a cluster.
 
     Parameters
     ----------
     inputs
-        What the setting's engine reads.
+        Input of the setting's engine.
     setting
-        Engine, options, and into how many blocks pulses are split.
+        Engine, its options, and number of pulse blocks.
     grid, terrain
         The scene; pixels lie on the terrain.
     side_px
-        Of a tile, a multiple of 16 pixels.
+        Side of a tile, a multiple of 16 pixels.
     weighing
-        What weighs and sums pulses before and beside the engine; by default every pulse counts once.
+        Weights and presumming of pulses; by default all pulses have the weight 1.
 
     Returns
     -------
     dask.array.Array
-        (row, column) complex64; 1 is the amplitude of an echo in every pulse counted; 0 where no pulse illuminates the
+        (row, column) complex64; 1 is the amplitude of an echo in all counted pulses; 0 where no pulse illuminates the
         pixel.
     """
     from dask.array.core import Array
@@ -187,18 +191,18 @@ def image_array(
 
 @dataclass(frozen=True, eq=False)
 class Weighing:
-    """How pulses are weighted and summed.
+    """Weights and presumming of pulses.
 
     Attributes
     ----------
     beams
-        Weight of each pulse at each pixel by its antennas and the sector integrated; none by default.
+        Weight of each pulse at each pixel by its antennas and the integrated sector; none by default.
     presum
-        Low-pass sum over pulses and the point (3,) they are aligned to, metres; none by default.
+        Presumming filter and the point (3,) to which pulses are aligned, metres; none by default.
     count
-        Pulses that the sum is divided by; all of them by default.
+        Divisor of the sum; the number of all pulses by default.
     variant_counts
-        Variant of the engine's sum → pixels × pulses that took it in this process.
+        Variant of the engine's sum → pixels × pulses summed by it in this process.
     """
 
     beams: Beams | None = None
@@ -209,7 +213,7 @@ class Weighing:
 
 @dataclass(frozen=True, eq=False)
 class _Forming:
-    """What the tasks of all tiles share."""
+    """Common inputs of the tasks of all tiles."""
 
     name: str
     setting: Setting
@@ -228,20 +232,22 @@ class _Forming:
 
 
 def _graph(forming: _Forming, inputs: PhaseHistory | Profiles, places: Collection[tuple[int, int]]) -> dict[Any, Any]:
-    """Return the tasks of the tiles in some rows and columns of tiles, and of what they share."""
+    """Return the tasks of the given tiles (row and column of tiles), and of their common tables."""
     name, presum, beams = forming.name, forming.weighing.presum, forming.weighing.beams
     count = np.float32(forming.weighing.count or len(inputs))
     pulses = len(inputs) if presum is None else len(presum[0].at)
     graph: dict[Any, Any] = {f"{name}-inputs": inputs, f"{name}-beams": beams}
-    sums: dict[tuple[int, int], Any] = {}  # place → key of what the blocks so far add up to
-    before: list[Any] = []  # what must be done before the next block's tables are prepared
-    for number, some in enumerate(pulse_blocks_of(pulses, forming.setting.pulse_blocks, any_start=beams is None)):
-        parts = {place: forming.reach.within(forming.index(place), some) for place in places}
+    sums: dict[tuple[int, int], Any] = {}  # tile → key of its sum over the blocks so far
+    before: list[Any] = []  # tasks to finish before the tables of the next block are prepared
+    for number, pulse_block in enumerate(
+        pulse_blocks_of(pulses, forming.setting.pulse_blocks, any_start=beams is None)
+    ):
+        parts = {place: forming.reach.within(forming.index(place), pulse_block) for place in places}
         covering = {place: part for place, part in parts.items() if part is not None}
         if not covering:
             continue
         first, last = min(part.start for part in covering.values()), max(part.stop for part in covering.values())
-        block = slice(some.start + first, some.start + last)  # what no tile takes is not even read
+        block = slice(pulse_block.start + first, pulse_block.start + last)  # pulses of no tile are not read
         tables = f"{name}-tables-{number}"
         graph[tables] = (partial(_prepare, forming.setting, presum, block), f"{name}-inputs", before)
         before = []
@@ -268,10 +274,12 @@ def _prepare(
     inputs: PhaseHistory | Profiles,
     _before: list[None],
 ) -> Any:
-    """Return what all tiles share of a block of pulses."""
+    """Return the engine's tables of a pulse block, common to all tiles."""
     if presum is not None and isinstance(inputs, Profiles):
-        some, pulses = presum[0].part(block)
-        return load_engine(setting.engine).prepare(presummed(inputs[pulses], some, presum[1]), **setting.options)
+        block_filter, pulses = presum[0].part(block)
+        return load_engine(setting.engine).prepare(
+            presummed(inputs[pulses], block_filter, presum[1]), **setting.options
+        )
     return load_engine(setting.engine).prepare(inputs[block], **setting.options)
 
 
@@ -285,22 +293,22 @@ def _form(  # noqa: PLR0917
     beams: Beams | None,
     sum_before: NDArray[np.complex64] | None,
 ) -> NDArray[np.complex64]:
-    """Return one tile of the image of a block of pulses, added to the sum of the blocks before."""
+    """Return a tile of the image of a pulse block, added to the sum of the previous blocks."""
     setting, grid = forming.setting, forming.grid[forming.window(place)]
     if part != slice(0, block.stop - block.start):
         tables = tables[part]
-    some = beams and beams[block.start + part.start : block.start + part.stop]
+    part_beams = beams and beams[block.start + part.start : block.start + part.stop]
     engine, pixels = load_engine(setting.engine), forming.terrain.positions(grid)
     variants: tuple[str, ...] = getattr(engine, "VARIANTS", ())
-    counted = {"counts": np.zeros(len(variants), np.int64)} if variants else {}
-    image = engine.form(tables, pixels, beams=some, **setting.form_options, **counted)
-    forming.weighing.variant_counts.update({name: int(counted["counts"][n]) for n, name in enumerate(variants)})
+    counts = {"counts": np.zeros(len(variants), np.int64)} if variants else {}
+    image = engine.form(tables, pixels, beams=part_beams, **setting.form_options, **counts)
+    forming.weighing.variant_counts.update({name: int(counts["counts"][n]) for n, name in enumerate(variants)})
     tile = np.asarray(image / count, np.complex64)
     return tile if sum_before is None else sum_before + tile
 
 
 def _nothing(_done: Any) -> None:
-    """Return None once a tile is done."""
+    """Return None, as a signal without data that a tile is done."""
 
 
 def compute_tiles(
@@ -311,22 +319,22 @@ def compute_tiles(
     threads: int,
     scheduler: str = "threads",
 ) -> None:
-    """Compute some tiles of an image and write each as soon as it is done.
+    """Compute tiles of an image and write each as soon as it is done.
 
-    A pixel to which no pulse adds anything is written as NaN: nothing was measured there, and 0 would be a measure.
+    Pixels without contributing pulses are written as NaN, to distinguish them from measured values.
 
     Parameters
     ----------
     image
-        From `image_array`.
+        Image from `image_array`.
     windows
         Tiles to compute: windows of chunks of the array.
     target
-        (y, x) array that takes blocks: numpy or zarr.
+        (y, x) array to write to: numpy or zarr.
     threads
-        How many tiles are in work at once; the memory of pixel positions and results is theirs alone.
+        Number of tiles computed at once, which determines the memory for pixel positions and results.
     scheduler
-        'threads', or the address of a `distributed` scheduler whose workers form the tiles: the same bits.
+        'threads', or the address of a `distributed` scheduler whose workers form the tiles, with identical bits.
 
     Examples
     --------
@@ -339,12 +347,13 @@ def compute_tiles(
     from dask.callbacks import Callback
     from dask.threaded import get
 
-    places = [
+    tile_numbers = [
         {int(end - size): at for at, (end, size) in enumerate(zip(np.cumsum(sizes), sizes, strict=True))}
         for sizes in image.chunks
     ]
     keys = [
-        (image.name, *(place[part.start] for place, part in zip(places, window, strict=True))) for window in windows
+        (image.name, *(numbers_of[part.start] for numbers_of, part in zip(tile_numbers, window, strict=True)))
+        for window in windows
     ]
     graph = image.dask.cull(set(keys))
     if scheduler != "threads":
@@ -362,5 +371,5 @@ def compute_tiles(
 
 
 def _write(target: Any, window: Window, tile: NDArray[np.complex64]) -> None:
-    """Write one tile where it belongs."""
+    """Write a tile to its window, with NaN for 0."""
     target[window] = np.where(tile == 0, _NOTHING, tile)

@@ -1,1 +1,1 @@
-"""From captured symbols to calibrated transfer functions and range profiles."""
+"""Echo processing: captures to transfer functions and range profiles, sidelink correction, calibration."""

@@ -1,4 +1,4 @@
-"""Association of captures with the transmitter's pulses, its checks by tags and by the sidelink, and missing pulses."""
+"""Association of captures with transmitted pulses, its checks by time tags and sidelink, and missing pulses."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -15,17 +15,17 @@ from apertura.core.echo.trigger import ABSENT
 
 Integers = NDArray[np.int64]
 Pairs = tuple[Integers, Integers]
-"""Of the transmitter and of the receiver: tags, or indices of paired pulses."""
+"""Time tags, or indices of paired pulses, of the transmitter and of the receiver."""
 
 LARGEST_DRIFT_PPM = 100.0
-"""ppm, largest drift of the tags that is searched: free-running crystals stay inside."""
+"""ppm, search limit of the drift between the time tags; free-running crystals drift by less."""
 
 
-_MOST_TAGS = 16_384  # spread over the flight, of which an offset modulo the interval is told as well as of all
+_MOST_TAGS = 16_384  # spread over the flight; more do not improve the offset modulo the interval
 
 
 class TagLine(NamedTuple):
-    """Offset of the receiver's tags: offset_ns + drift·(tag - origin_ns)."""
+    """Linear model of the offset of the receiver's time tags: offset_ns + drift·(tag - origin_ns)."""
 
     offset_ns: float
     drift: float
@@ -33,11 +33,11 @@ class TagLine(NamedTuple):
 
 
 def fit_modulo_interval(tags: Pairs, interval_ns: float) -> TagLine:
-    """Return the offset line under which the receiver's tags best fall on the transmitter's, modulo the interval."""
+    """Fit the offset line that best aligns the receiver's tags with the transmitter's, modulo the interval."""
     tx, rx = tags
     rx = rx[:: -(-rx.size // _MOST_TAGS)]
-    some = np.minimum(np.searchsorted(tx, rx), tx.size - 1)  # any nearby pulse: modulo the interval all give the same
-    cycles = (rx - tx[some]) / interval_ns
+    nearby = np.minimum(np.searchsorted(tx, rx), tx.size - 1)  # any nearby pulse gives the same modulo the interval
+    cycles = (rx - tx[nearby]) / interval_ns
     elapsed_ns = (rx - rx[0]).astype(np.float64)
     reach = LARGEST_DRIFT_PPM * 1e-6 * elapsed_ns[-1] / interval_ns
     steps = int(np.ceil(4 * reach)) if reach > 0.25 else 0
@@ -48,7 +48,7 @@ def fit_modulo_interval(tags: Pairs, interval_ns: float) -> TagLine:
 
 
 def nearest_pairs(tags: Pairs, line: TagLine, interval_ns: float) -> Pairs:
-    """Return pairs that are each other's nearest, within half an interval, once the offset is taken out."""
+    """Return pairs of mutually nearest pulses, within half an interval, after removal of the offset line."""
     tx, rx = tags
     corrected = (rx - rx[0]) - _offset_ns(rx, line)
     tx_ns = (tx - rx[0]).astype(np.float64)
@@ -63,25 +63,25 @@ def nearest_pairs(tags: Pairs, line: TagLine, interval_ns: float) -> Pairs:
 
 
 def fit_pairs(tags: Pairs, pairs: Pairs, interval_ns: float) -> TagLine:
-    """Return the line (Theil-Sen, then median) through the offsets of pairs; less than half of them may be wrong."""
+    """Fit a line (Theil-Sen slope, then median) to the offsets of pairs; tolerates less than half of wrong pairs."""
     tx_tag, rx_tag = tags[0][pairs[0]], tags[1][pairs[1]]
     offset_ns = (rx_tag - tx_tag).astype(np.float64)
     elapsed_ns = (rx_tag - rx_tag[0]).astype(np.float64)
     drift = 0.0
     if LARGEST_DRIFT_PPM * 1e-6 * elapsed_ns[-1] > interval_ns / 100:  # else jitter would be fitted as drift
-        some = np.unique(np.linspace(0, rx_tag.size - 1, 300).astype(int))
-        drift = _theil_sen_slope(elapsed_ns[some], offset_ns[some])
+        sample = np.unique(np.linspace(0, rx_tag.size - 1, 300).astype(int))
+        drift = _theil_sen_slope(elapsed_ns[sample], offset_ns[sample])
     return TagLine(float(np.median(offset_ns - drift * elapsed_ns)), drift, int(rx_tag[0]))
 
 
 def _theil_sen_slope(x: Floats, y: Floats) -> float:
-    """Return the median of the slopes between all pairs of points, x ascending; scipy.stats imports for a second."""
+    """Return the median slope over all pairs of points, x ascending; importing scipy.stats would take a second."""
     first, second = np.triu_indices(x.size, 1)
     return float(np.median((y[second] - y[first]) / (x[second] - x[first])))
 
 
 def residual_ns(tags: Pairs, pairs: Pairs, line: TagLine) -> Floats:
-    """Return (pair,) float64: residual of the receiver's tag from the line, nanoseconds."""
+    """Return the residual of the receiver's tags from the line, (pair,) float64 nanoseconds."""
     rx_tag = tags[1][pairs[1]]
     return np.asarray(rx_tag - tags[0][pairs[0]] - _offset_ns(rx_tag, line), np.float64)
 
@@ -95,26 +95,27 @@ def _offset_ns(rx_tag: Integers, line: TagLine) -> Floats:
 
 @dataclass(frozen=True)
 class Association:
-    """Pulses that two nodes have in common.
+    """Pairs of a transmitted pulse and its capture by a receiver.
 
     Attributes
     ----------
     tx_index, rx_index
-        (pair,) int64, positions in the two recordings, both strictly ascending.
+        (pair,) int64, pulse indices in the two recordings, both strictly ascending.
     offset_s
         Receiver's time tag minus transmitter's at the first pair, seconds.
     drift_ppm
-        Growth of that offset, parts per million.
+        Drift of that offset, parts per million.
     residual_s
-        RMS of the tags about that line, seconds.
+        RMS residual of the tags from the offset line, seconds.
     method
-        Basis of the pairs: frame numbers or tags.
+        Basis of the pairs: frame numbers or time tags.
     outlier
-        (pair,) bool, whose tags deviate from that line by more than the error of a tag: one of the two is wrong.
+        (pair,) bool, True where the tags deviate from the line by more than the error of a tag: one of the two is
+        wrong.
     tx_dropped, rx_dropped
-        Pulses of each recording without a partner.
+        Number of unpaired pulses of each recording.
     flags
-        Edge crossed → what was measured, in one line.
+        Flag → measured values, one line.
     """
 
     tx_index: Integers
@@ -142,8 +143,8 @@ def associate(
 ) -> Association:
     """Pair the pulses of a transmitter with the captures of a receiver.
 
-    Frame numbers decide where both nodes have them. Without, the receiver's tags are taken to run ahead or
-    behind by less than half a repetition interval at its first pulse, drifting by up to 100 ppm afterwards.
+    Frame numbers decide if both nodes record them. Otherwise the receiver's tags are assumed to lead or lag by less
+    than half a repetition interval at its first pulse, and to drift by at most 100 ppm.
 
     Parameters
     ----------
@@ -152,19 +153,19 @@ def associate(
     repetition_interval_s
         Nominal time between pulses, seconds.
     tx_frame, rx_frame
-        (pulse,) int64 frame numbers, -1 where the payload was not read; None without a counter.
+        (pulse,) int64 frame numbers, -1 where the payload was not decoded; None without a counter.
     frame_modulus
-        Count at which the counter returns to zero. None: the power of two above the largest number, if
-        a counter ever steps back.
+        Count at which the counter returns to zero. None: the next power of two above the largest number, if
+        a counter steps back.
     speed_m_s
-        Of the transmitter, to state the displacement by an offset of tags, metres per second; None: unknown.
+        Speed of the transmitter, metres per second, to convert a tag offset into a displacement; None: unknown.
     where
         Name of the recordings in errors.
 
     Raises
     ------
     CampaignError
-        If tags do not ascend, the counters share no frame, or no pair lies within half a repetition interval.
+        If tags do not ascend, the counters have no frame in common, or no pair lies within half a repetition interval.
 
     Notes
     -----
@@ -186,7 +187,7 @@ def associate(
     by_frame = pairs_by_frame(tags, frames, interval_ns, frame_modulus)
     if by_frame is None:
         pairs = nearest_pairs(tags, fit_modulo_interval(tags, interval_ns), interval_ns)
-        if pairs[0].size:  # again by the line through them
+        if pairs[0].size:  # second iteration, with the line fitted to the first pairs
             pairs = nearest_pairs(tags, fit_pairs(tags, pairs, interval_ns), interval_ns)
     else:
         pairs, conflicts = _agreed_pairs(tags, by_frame, frames, interval_ns)
@@ -210,37 +211,42 @@ def associate(
 
 
 def _require_ascending(tags: Integers, node: str, where: str) -> None:
-    back = np.flatnonzero(np.diff(tags) <= 0)
-    if back.size or tags.size == 0:
-        found = f"time tag of pulse {back[0] + 1} of the {node} steps back" if tags.size else f"no pulses of the {node}"
+    descents = np.flatnonzero(np.diff(tags) <= 0)
+    if descents.size or tags.size == 0:
+        found = (
+            f"the time tag of pulse {descents[0] + 1} of the {node} is not later than the one before it"
+            if tags.size
+            else f"the recording of the {node} contains no pulses"
+        )
         raise CampaignError(
-            found, where, expected="time tags that ascend", remedy="Check core:datetime of the capture segments."
+            found, where, expected="ascending time tags", remedy="Check core:datetime of the capture segments."
         )
 
 
 def _no_common_pulse(tags: Pairs, repetition_interval_s: float, where: str) -> CampaignError:
     gap_s = [(tags[1][0] - tags[0][0]) * 1e-9, (tags[1][-1] - tags[0][-1]) * 1e-9]
     return CampaignError(
-        f"no pulse pairs: the receiver begins {gap_s[0]:+.3f} s and ends {gap_s[1]:+.3f} s from the transmitter",
+        f"no pulse pairs: the receiver's recording starts {gap_s[0]:+.3f} s and ends {gap_s[1]:+.3f} s relative to the "
+        "transmitter's",
         where=where,
         expected=f"pairs within half a repetition interval ({repetition_interval_s / 2:.4g} s)",
-        remedy="Check that both recordings are of the same flight, and their core:datetime.",
+        remedy="Check that both recordings belong to the same flight, and check their core:datetime.",
     )
 
 
 def _agreed_pairs(
     tags: Pairs, by_frame: Pairs, frames: tuple[Integers | None, Integers | None], interval_ns: float
 ) -> tuple[Pairs, int]:
-    """Drop frame pairs that the tags contradict, add pulses whose number was not read; count the dropped."""
+    """Drop frame pairs that the tags contradict, add pairs without a decoded number; count the dropped pairs."""
     if by_frame[0].size == 0:
         return by_frame, 0
     line = fit_pairs(tags, by_frame, interval_ns)
     agreed = np.abs(residual_ns(tags, by_frame, line)) < interval_ns / 2
     tx, rx = by_frame[0][agreed], by_frame[1][agreed]
-    near = nearest_pairs(tags, line, interval_ns)
-    unread = (np.asarray(frames[0])[near[0]] == ABSENT) | (np.asarray(frames[1])[near[1]] == ABSENT)
-    free = unread & ~np.isin(near[0], tx) & ~np.isin(near[1], rx)
-    tx, rx = np.concatenate([tx, near[0][free]]), np.concatenate([rx, near[1][free]])
+    by_tag = nearest_pairs(tags, line, interval_ns)
+    unread = (np.asarray(frames[0])[by_tag[0]] == ABSENT) | (np.asarray(frames[1])[by_tag[1]] == ABSENT)
+    unpaired = unread & ~np.isin(by_tag[0], tx) & ~np.isin(by_tag[1], rx)
+    tx, rx = np.concatenate([tx, by_tag[0][unpaired]]), np.concatenate([rx, by_tag[1][unpaired]])
     order = np.argsort(tx)
     tx, rx = tx[order], rx[order]
     ascending = np.concatenate([[True], rx[1:] > np.maximum.accumulate(rx)[:-1]]) if rx.size else np.zeros(0, bool)
@@ -253,7 +259,7 @@ def _agreed_pairs(
 def pairs_by_frame(
     tags: Pairs, frames: tuple[Integers | None, Integers | None], interval_ns: float, modulus: int | None
 ) -> Pairs | None:
-    """Return pairs of equal frame number, wraps undone; None where a node has no counter."""
+    """Return pairs of equal frame number after unwrapping the counters; None if a node has no counter."""
     if frames[0] is None or frames[1] is None:
         return None
     tx, rx = (np.flatnonzero(frame != ABSENT) for frame in (frames[0], frames[1]))
@@ -265,7 +271,7 @@ def pairs_by_frame(
     if modulus is not None:
         tx_count = _unwrapped(tx_count, tags[0][tx], interval_ns, modulus)
         rx_count = _unwrapped(rx_count, tags[1][rx], interval_ns, modulus)
-        # number of wraps of the counter between the nodes: the one that brings their tags closest
+        # the number of counter wraps between the nodes follows from the offset of their tags
         expected_ns = tags[0][tx[0]] + (rx_count - tx_count[0]) * interval_ns
         rx_count += modulus * int(np.rint(np.median(tags[1][rx] - expected_ns) / (modulus * interval_ns)))
     _, at_tx, at_rx = np.intersect1d(tx_count, rx_count, return_indices=True)
@@ -273,7 +279,7 @@ def pairs_by_frame(
 
 
 def _unwrapped(count: Integers, tags: Integers, interval_ns: float, modulus: int) -> Integers:
-    """Return the count without wraps; a misread number does not change those after it."""
+    """Unwrap the counter; a misread number does not affect later ones."""
     step = np.mod(np.diff(count), modulus)
     step += modulus * np.rint((np.diff(tags) / interval_ns - step) / modulus).astype(np.int64)
     return np.asarray(count[0] + np.concatenate([[0], np.cumsum(step)]), np.int64)
@@ -282,27 +288,27 @@ def _unwrapped(count: Integers, tags: Integers, interval_ns: float, modulus: int
 # ---- Flags of an association
 
 LARGEST_JITTER = 1 / 6
-"""RMS scatter of the tags, in repetition intervals, at which one pulse in 370 (3σ) reaches its neighbour."""
+"""RMS scatter of the tags, in repetition intervals, at which one pulse in 370 (3σ) is closer to its neighbour."""
 
 AMBIGUOUS_SHARE = 0.4
-"""Share of a repetition interval: offsets beyond it may belong to the neighbouring pulse, which begins at one half."""
+"""Offset as a share of a repetition interval; a larger one may be that of the neighbouring pulse (limit: one half)."""
 
 LARGEST_OFFSET_S = 20e-3
-"""Seconds, largest offset between two nodes' tags that errors of a few milliseconds each explain."""
+"""Seconds, largest offset between two nodes' tags that is explained by errors of a few milliseconds each."""
 
 OUTLIER_S = 5e-3
-"""Seconds: a single tag within this of the line is as accurate as tags are."""
+"""Seconds, deviation of a tag from the line within the accuracy of time tags."""
 
-_OUTLIER_SIGMA = 6.0  # scatters of all tags: an outlier deviates by more than this and `OUTLIER_S`
+_OUTLIER_SIGMA = 6.0  # standard deviations of all tags: an outlier exceeds both this and `OUTLIER_S`
 
 LARGEST_UNPAIRED = 0.05
 """Share of the transmitter's pulses before or after the other recording above which a flag is raised."""
 
-_FEW = 2  # pulses by which a recorder may begin late or end early
+_FEW = 2  # pulses by which a recorder may start late or stop early
 
 
 def is_outlier(residual_s: Floats) -> NDArray[np.bool_]:
-    """Return (pair,) bool: which tags deviate from the line by more than `OUTLIER_S` and six times the scatter of all.
+    """Detect tags that deviate from the line by more than `OUTLIER_S` and six standard deviations, (pair,) bool.
 
     Examples
     --------
@@ -314,7 +320,7 @@ def is_outlier(residual_s: Floats) -> NDArray[np.bool_]:
 
 
 def tag_jitter_s(time_ns: Integers) -> float:
-    """Return the RMS error of a node's own tags about equal steps, as a radar's timer makes them, seconds.
+    """Return the RMS error of a node's tags relative to the equal intervals of a radar timer, seconds.
 
     Parameters
     ----------
@@ -323,7 +329,7 @@ def tag_jitter_s(time_ns: Integers) -> float:
 
     Notes
     -----
-    Where triggers do not come in equal steps this is an upper bound. An error common to all tags is not measured.
+    The result is an upper bound if the trigger intervals are not equal. An error common to all tags is not measured.
 
     Examples
     --------
@@ -334,7 +340,7 @@ def tag_jitter_s(time_ns: Integers) -> float:
     if time_ns.size < 3:
         return 0.0
     steps = np.diff(time_ns)
-    number = np.concatenate([[0.0], np.cumsum(np.round(steps / np.median(steps)))])
+    number = np.concatenate([[0.0], np.cumsum(np.round(steps / np.median(steps)))])  # pulse number, missed ones counted
     elapsed_s = (time_ns - time_ns[0]) * 1e-9
     return round(float(np.std(elapsed_s - np.polyval(np.polyfit(number, elapsed_s, 1), number))), 9)
 
@@ -342,20 +348,20 @@ def tag_jitter_s(time_ns: Integers) -> float:
 def association_flags(
     association: "Association", tags: Pairs, interval_s: float, *, conflicts: int, speed_m_s: float | None
 ) -> dict[str, str]:
-    """Return flags: edge that an association crosses → what was measured, in one line.
+    """Return the flags of an association: flag → measured values, one line.
 
     Parameters
     ----------
     association
-        Of the pulses.
+        Association of the pulses, without flags.
     tags
         (pulse,) int64 tags of transmitter and receiver, nanoseconds.
     interval_s
         Nominal time between pulses, seconds.
     conflicts
-        Pairs that the frame counter makes and the tags contradict.
+        Number of pairs by frame counter that the tags contradict.
     speed_m_s
-        Of the transmitter; None: unknown.
+        Speed of the transmitter; None: unknown.
 
     Notes
     -----
@@ -365,29 +371,29 @@ def association_flags(
     share, by_tags = abs(association.offset_s) / interval_s, association.method == "time tags"
     if by_tags and share > AMBIGUOUS_SHARE:
         flags["association_ambiguous"] = (
-            f"tags are {association.offset_s:+.4f} s apart, {share:.2f} of a repetition interval: "
-            "every pair may be off by one pulse"
+            f"time tags differ by {association.offset_s:+.4f} s, {share:.2f} of a repetition interval: "
+            "all pairs may be wrong by one pulse"
         )
     if abs(association.offset_s) > LARGEST_OFFSET_S:
-        flags["time_tags_apart"] = _offset_line(association, speed_m_s)
+        flags["time_tag_offset"] = _offset_line(association, speed_m_s)
     if conflicts:
         flags["frame_counter_conflict"] = (
-            f"{number_of(conflicts, 'pulse')} dropped: frame counter and time tags disagree"
+            f"{number_of(conflicts, 'pulse')} excluded: frame counter and time tags disagree"
         )
     if by_tags and association.residual_s > interval_s * LARGEST_JITTER:
         flags["time_tag_jitter"] = (
             f"time tags scatter by {association.residual_s:.4f} s rms at a repetition interval of {interval_s:.4g} s: "
-            "single pulses may be paired with a neighbour"
+            "single captures may be paired with a neighbouring pulse"
         )
     if association.outlier.any():
         flags["time_tag_outlier"] = (
-            f"{int(association.outlier.sum())} of {association.outlier.size} pulses left out: "
-            f"their tags leave the line through all by more than {OUTLIER_S:g} s"
+            f"{int(association.outlier.sum())} of {association.outlier.size} pulses excluded: "
+            f"their time tags deviate from the line fitted to all tags by more than {OUTLIER_S:g} s"
         )
     pairs = association.tx_index.size
     shorter = pairs + min(association.tx_dropped, association.rx_dropped)
     if pairs < shorter / 2:
-        flags["association_sparse"] = f"{pairs} pulses paired of {shorter} in the shorter recording"
+        flags["association_sparse"] = f"{pairs} of the {shorter} pulses in the shorter recording are paired"
     unpaired = _unpaired(association, tags, interval_s)
     if unpaired:
         flags["pulses_unpaired"] = unpaired
@@ -395,37 +401,41 @@ def association_flags(
 
 
 def _offset_line(association: "Association", speed_m_s: float | None) -> str:
-    line = f"time tags of the nodes are {association.offset_s:+.4f} s apart (pairs by {association.method})"
+    line = f"time tags of the nodes differ by {association.offset_s:+.4f} s (pairs by {association.method})"
     if speed_m_s is None:
         return line
-    return f"{line}: the transmitter's decide, and moved {abs(association.offset_s) * speed_m_s:.2f} m meanwhile"
+    moved_m = abs(association.offset_s) * speed_m_s
+    return f"{line}: the transmitter's tags are used; it moved {moved_m:.2f} m in that time"
 
 
 def _unpaired(association: "Association", tags: Pairs, interval_s: float) -> str | None:
-    """Return one line on the transmitter's pulses before the first and after the last pair, if they are many."""
+    """Report the transmitter's pulses before the first and after the last pair, if above `LARGEST_UNPAIRED`."""
     tx, rx = tags
     early, late = int(association.tx_index[0]), tx.size - 1 - int(association.tx_index[-1])
     if early + late <= max(LARGEST_UNPAIRED * tx.size, _FEW):
         return None
-    line = f"{early} pulses before and {late} after the other recording, of {tx.size}"
-    begin_s, end_s = (rx[0] - tx[0]) * 1e-9, (rx[-1] - tx[-1]) * 1e-9
-    if abs(begin_s - end_s) <= 1.5 * interval_s < abs(begin_s):
-        line += f": both recordings are equally long and {begin_s:+.3f} s apart, as if the tags of one were off by that"
+    line = f"of {tx.size} transmitted pulses, {early} are before and {late} after the receiver's recording"
+    start_s, end_s = (rx[0] - tx[0]) * 1e-9, (rx[-1] - tx[-1]) * 1e-9
+    if abs(start_s - end_s) <= 1.5 * interval_s < abs(start_s):
+        line += (
+            f": the recordings are equally long and start {start_s:+.3f} s from each other, as if the time tags of one "
+            "were wrong by this offset"
+        )
     return line
 
 
-# ---- Sidelink delay against the baseline of the tracks: a check of the association
+# ---- Check of the association: sidelink delay against the baseline of the tracks
 
 EXPLAINED_M = 0.05
-"""Metres of movement of a sidelink that errors of the logged positions alone may explain."""
+"""Metres, residual of a sidelink path that errors of the logged positions alone may explain."""
 
 SIGMAS = 5.0
-"""Standard deviations of a median's noise that one of a thousand windows reaches by chance once in 3000 flights."""
+"""Threshold in standard deviations of a median's noise: 1000 windows of noise exceed it in one of 3000 flights."""
 
 _MEDIAN_PULSES = 15, 61, 241
-"""Lengths of the running medians that separate movement from jitter, odd: the longer, the less noise and the slower."""
+"""Lengths of the running medians that separate motion from jitter, odd; a longer one has less noise and bandwidth."""
 
-_ENOUGH = 64  # disjoint windows from which their noise is estimated
+_ENOUGH = 64  # disjoint windows required to estimate the noise of the median
 
 
 @dataclass(frozen=True)
@@ -437,11 +447,11 @@ class BaselineResidual:
     residual_m, noise_m
         RMS of the residual's running median, metres, and the standard deviation of that median by jitter alone.
     jitter_m
-        Standard deviation of a single pulse, metres: of the trigger, mostly.
+        Standard deviation of a single pulse, metres; mostly trigger jitter.
     largest_m, pulse
         Largest running median, metres, and its pulse.
     excess
-        `largest_m` relative to what noise and position errors explain, over running medians of several lengths.
+        `largest_m` relative to the threshold for noise and position errors, maximum over the running medians.
     """
 
     residual_m: float
@@ -453,7 +463,7 @@ class BaselineResidual:
 
 
 def baseline_residual(delay_m: Floats, baseline_m: Floats) -> BaselineResidual | None:
-    """Return the residual of a sidelink's measured path from its geometry; None of less than 30 pulses.
+    """Return the residual of a sidelink's measured path from its geometry; None for fewer than 30 pulses.
 
     Parameters
     ----------
@@ -463,8 +473,8 @@ def baseline_residual(delay_m: Floats, baseline_m: Floats) -> BaselineResidual |
 
     Notes
     -----
-    Source: docs/theory/echo_methods.md, "Association". Of each length only full windows count: a window that runs over
-    the end would repeat its last pulse.
+    Source: docs/theory/echo_methods.md, "Association". Only full windows are evaluated: a window beyond the end would
+    repeat the last pulse.
 
     Examples
     --------
@@ -478,18 +488,19 @@ def baseline_residual(delay_m: Floats, baseline_m: Floats) -> BaselineResidual |
     residual = delay_m[pulse] - baseline_m[pulse]
     jitter = 1.4826 * float(np.median(np.abs(np.diff(residual)))) / 2**0.5
     residuals = [_smoothed(pulse, residual, jitter, width) for width in _MEDIAN_PULSES if 2 * width <= pulse.size]
-    return max(residuals, key=lambda one: one.excess)
+    return max(residuals, key=lambda residual: residual.excess)
 
 
 def _smoothed(pulse: NDArray[np.intp], residual: Floats, jitter_m: float, width: int) -> BaselineResidual:
+    """Return the residual measured by a running median of `width` pulses."""
     from scipy import ndimage
 
     inside = slice(width // 2, -(width // 2))  # full windows
     smooth, middle = ndimage.median_filter(residual, width)[inside], pulse[inside]
     smooth = smooth - np.polyval(np.polyfit(middle, smooth, 1), middle)
-    noise_m = 1.2533 * jitter_m / np.sqrt(width)  # standard deviation of a median of so many Gaussian samples
+    noise_m = 1.2533 * jitter_m / np.sqrt(width)  # standard deviation of a median of `width` Gaussian samples
     steps = np.diff(smooth[::width])
-    if steps.size >= _ENOUGH:  # jitter need not be normal: the median of a uniform one is noisier
+    if steps.size >= _ENOUGH:  # jitter need not be normal: the median of uniform jitter is noisier
         noise_m = max(noise_m, 1.4826 * float(np.median(np.abs(steps))) / 2**0.5)
     worst = int(np.argmax(np.abs(smooth)))
     largest_m = float(abs(smooth[worst]))
@@ -504,7 +515,7 @@ def _smoothed(pulse: NDArray[np.intp], residual: Floats, jitter_m: float, width:
 
 
 def sigmas(windows: int) -> float:
-    """Return the threshold in standard deviations for the highest of so many windows, of equal false alarm per flight.
+    """Return the threshold of the largest of a number of windows, standard deviations, at a constant false-alarm rate.
 
     Examples
     --------
@@ -515,16 +526,16 @@ def sigmas(windows: int) -> float:
 
 
 def detect_wrong_association(residual: BaselineResidual | None) -> str | None:
-    """Return one line on where the measured sidelink deviates from the geometry of its pulses, or None.
+    """Report a deviation of the measured sidelink from the geometry of its pulses, in one line; None if there is none.
 
-    A constant and a linear drift are of the clocks. A residual that moves by more than `EXPLAINED_M` and by more than
-    five times its own noise, six of a long flight, cannot come from trigger jitter: pulses have positions of other
-    pulses, or wrong ones.
+    A constant and a linear drift are attributed to the clocks. Trigger jitter does not explain a residual above
+    `EXPLAINED_M` and above five times its own noise (six in a long flight): captures have the positions of other
+    pulses, or positions are wrong.
 
     Notes
     -----
-    Source: docs/theory/echo_methods.md, "Association". Two nodes that keep their distance give no evidence either way:
-    the baseline must change for a wrong pair to be detected.
+    Source: docs/theory/echo_methods.md, "Association". A wrong association is detectable only if the baseline changes
+    during the flight.
 
     Examples
     --------
@@ -532,24 +543,24 @@ def detect_wrong_association(residual: BaselineResidual | None) -> str | None:
     >>> detect_wrong_association(baseline_residual(distance + 3.0, distance)) is None
     True
     >>> detect_wrong_association(baseline_residual(np.roll(distance, 9), distance))
-    'sidelink leaves its geometry by ... m at pulse ... (noise ... m): pulses or positions are wrongly associated'
+    'the sidelink path deviates from its geometry by ... m at pulse ... (noise ... m): wrong association or positions'
     """
     if residual is None or residual.excess <= 1:
         return None
     return (
-        f"sidelink leaves its geometry by {residual.largest_m:.2f} m at pulse {residual.pulse} "
-        f"(noise {residual.noise_m:.3f} m): pulses or positions are wrongly associated"
+        f"the sidelink path deviates from its geometry by {residual.largest_m:.2f} m at pulse {residual.pulse} "
+        f"(noise {residual.noise_m:.3f} m): wrong association or positions"
     )
 
 
 # ---- Missing pulses
 
 LARGEST_SIDELOBE = 0.1
-"""Amplitude over the peak, largest sidelobe by missing pulses: -20 dB, of a tenth of the aperture in a row."""
+"""Largest sidelobe by missing pulses, amplitude relative to the peak: -20 dB, one gap of a tenth of the aperture."""
 
 
 def missing_pulses(time_ns: Integers) -> tuple[int, float]:
-    """Return the number of pulses missing between the first and the last, and the highest sidelobe they cause.
+    """Return the number of pulses missing between the first and the last, and the highest sidelobe that they cause.
 
     Parameters
     ----------
@@ -563,8 +574,9 @@ def missing_pulses(time_ns: Integers) -> tuple[int, float]:
 
     Notes
     -----
-    The response of the aperture is that of all pulses less that of the missing ones:
-    |Σ_missing exp(j2πkm/M)|/used at a cell or more from the peak, k ≥ 1. Source: docs/theory/planner.md, "Pulses".
+    The response of the aperture is that of all pulses minus that of the missing ones:
+    |Σ_missing exp(j2πkm/M)|/used at one resolution cell or more from the peak, k ≥ 1. Source:
+    docs/theory/planner.md, "Pulses".
 
     Examples
     --------
@@ -577,7 +589,7 @@ def missing_pulses(time_ns: Integers) -> tuple[int, float]:
     if time_ns.size < 3:
         return 0, 0.0
     steps = np.diff(time_ns)
-    usual = np.partition(steps, middle := (len(steps) - 1) // 2)[middle]  # one of the steps, however few there are
+    usual = np.partition(steps, middle := (len(steps) - 1) // 2)[middle]  # lower median: always an occurring step
     single = steps[np.abs(steps / usual - 1) < 0.25].mean()
     number = np.concatenate([[0], np.cumsum(np.maximum(np.round(steps / single), 1).astype(np.int64))])
     absent = np.ones(number[-1] + 1)
@@ -587,12 +599,12 @@ def missing_pulses(time_ns: Integers) -> tuple[int, float]:
 
 
 def missing_flags(time_ns: Integers) -> dict[str, str]:
-    """Return a flag where missing pulses add sidelobes above `LARGEST_SIDELOBE`; parameters as `missing_pulses`."""
+    """Return a flag if missing pulses cause sidelobes above `LARGEST_SIDELOBE`; parameters as for `missing_pulses`."""
     flags = {}
     missing, sidelobe = missing_pulses(time_ns)
     if sidelobe > LARGEST_SIDELOBE:
         flags["pulses_missing"] = (
-            f"{missing} of {missing + time_ns.size} pulses inside the aperture are missing: "
-            f"sidelobes of up to {20 * np.log10(sidelobe):.0f} dB along the track"
+            f"{missing} of {missing + time_ns.size} pulses within the aperture are missing: "
+            f"sidelobes of up to {20 * np.log10(sidelobe):.0f} dB along track"
         )
     return flags

@@ -1,4 +1,4 @@
-"""Calibration on a reflector at a known place: a node's path offset, and its phase from pulse to pulse."""
+"""Calibration on a reflector at a known position: the path offset of a node, and its phase from pulse to pulse."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,14 +24,14 @@ NEEDED_STD_M = 0.02
 """Metres, standard deviation of a path offset above which coherent sums of several nodes lose focus."""
 
 RIVAL_DB = -6.0
-"""dB below the reflector: a second one stronger than this makes it uncertain which of them is the known one."""
+"""dB relative to the reflector, level of a second echo above which the identity of the reflector is uncertain."""
 
 _GROUPS = 16
 _OVERSAMPLING = 8
 
 
 class Pulses(Protocol):
-    """(pulse, subcarrier) complex64: an array, or what reads slices of one."""
+    """(pulse, subcarrier) complex64: an array, or an object that reads slices of one."""
 
     def __len__(self) -> int: ...
 
@@ -40,21 +40,21 @@ class Pulses(Protocol):
 
 @dataclass(frozen=True)
 class PathOffset:
-    """Electrical path of a receiving node beyond geometry.
+    """Electrical path of a receiving node in addition to the geometric path.
 
     Attributes
     ----------
     offset_m
         Metres of total path. Monostatic: `path_offset_m.radar`. Bistatic: radar minus sidelink, the only
-        combination that echoes divided by the sidelink contain.
+        combination observable in echoes divided by the sidelink.
     std_m
         Standard deviation, from the scatter over sixteenths and quarters of the flight; infinite below 16 pulses.
     contrast_db
-        Reflector above its surroundings.
+        Power of the reflector relative to its surroundings.
     pulses
         Number of pulses used.
     flags
-        Edge crossed → what was measured, in one line.
+        Flag → measured values, one line.
     """
 
     offset_m: float
@@ -72,19 +72,19 @@ def estimate_path_offset(
     search_m: float = 10.0,
     where: str = "calibration flight",
 ) -> PathOffset:
-    """Return the path offset under which a reflector appears at its known place.
+    """Estimate the path offset of a node from the echo of a reflector at a known position.
 
     Parameters
     ----------
     transfer
-        (pulse, subcarrier) complex64: Σ a·exp(-j2πfτ), absolute delay, no path offset taken out. An array, or what
-        reads slices of one from a file.
+        (pulse, subcarrier) complex64: Σ a·exp(-j2πfτ), absolute delay, path offset not removed. An array, or an
+        object that reads slices of one from a file.
     frequency_hz
         (subcarrier,) float64, RF, equally spaced, ascending.
     path_m
-        (pulse,) float64, predicted total path: tx → reflector → rx, less the sidelink's in a bistatic pair.
+        (pulse,) float64, predicted total path: tx → reflector → rx, minus the sidelink path in a bistatic pair.
     search_m
-        Offsets of either sign up to this are considered, metres.
+        Largest offset of either sign that is searched, metres.
     where
         Name of the flight in errors.
 
@@ -96,7 +96,7 @@ def estimate_path_offset(
     Notes
     -----
     Source: docs/theory/echo_methods.md, "Calibration". Pulses are added coherently within a sixteenth of the flight,
-    over which errors of the track are constant, and in power beyond.
+    over which track errors are constant; the sixteenths are added in power.
 
     Examples
     --------
@@ -111,29 +111,30 @@ def estimate_path_offset(
     peak = int(np.argmax(power))
     surroundings = float(np.median(power)) * len(groups) / float(gammaincinv(len(groups), 0.5))  # mean of clutter
     _require_visible(power, peak, surroundings, len(groups), search_m, where)
-    parts = _refine(groups, frequency_hz, offset_m[peak])
-    mean_m, std_m = float(parts.mean()), _deviation_of_mean(parts)
+    group_offsets_m = _refine(groups, frequency_hz, offset_m[peak])
+    mean_m, std_m = float(group_offsets_m.mean()), _deviation_of_mean(group_offsets_m)
     contrast_db = decibels(float(power[peak]) / max(surroundings, 1e-30))
     flags = Flags()
     if std_m > NEEDED_STD_M:
-        flags["calibration_uncertain"] = f"path offset {mean_m:.3f} ± {std_m:.3f} m; {NEEDED_STD_M} m is needed"
+        flags["calibration_uncertain"] = f"path offset {mean_m:.3f} ± {std_m:.3f} m; ± {NEEDED_STD_M} m is required"
     rival_db, rival_m = _rival(offset_m, power, peak, frequency_hz)
     if rival_db > RIVAL_DB:
         flags["calibration_ambiguous"] = (
-            f"a second reflector {rival_db:.1f} dB beside the first, which is at {mean_m:.2f} m, at {rival_m:.2f} m"
+            f"a second reflector of {rival_db:.1f} dB relative to the first, at a path offset of {rival_m:.2f} m; "
+            f"the first is at {mean_m:.2f} m"
         )
     return PathOffset(mean_m, std_m, contrast_db, len(transfer), flags)
 
 
 def reflector_history(transfer: Pulses, frequency_hz: Floats, *, path_m: Floats) -> NDArray[np.complex128]:
-    """Return the echo (pulse,) complex128 of a reflector: its phase is constant if path and clocks are right.
+    """Return the echo of a reflector, (pulse,) complex128; its phase is constant if path and clocks are correct.
 
     Parameters
     ----------
     transfer, frequency_hz
         As for `estimate_path_offset`.
     path_m
-        (pulse,) float64, total path of the reflector, offsets included; constant in a static recording.
+        (pulse,) float64, total path of the reflector including offsets; constant in a static recording.
 
     Examples
     --------
@@ -142,33 +143,33 @@ def reflector_history(transfer: Pulses, frequency_hz: Floats, *, path_m: Floats)
     >>> reflector_history(echo, frequency, path_m=path).round(4) + 0.0
     array([2.+0.j, 2.+0.j])
     """
-    parts = (slice(first, first + AT_ONCE) for first in range(0, len(transfer), AT_ONCE))
-    return np.concatenate([_aligned(transfer[part], frequency_hz, path_m[part]).mean(axis=1) for part in parts])
+    blocks = (slice(first, first + AT_ONCE) for first in range(0, len(transfer), AT_ONCE))
+    return np.concatenate([_aligned(transfer[block], frequency_hz, path_m[block]).mean(axis=1) for block in blocks])
 
 
 def _aligned(transfer: Complexes, frequency_hz: Floats, path_m: Floats) -> NDArray[np.complex128]:
-    turns = np.outer(path_m / SPEED_OF_LIGHT_M_S, frequency_hz)
-    return np.asarray(transfer * np.exp(2j * np.pi * (turns % 1.0)))
+    cycles = np.outer(path_m / SPEED_OF_LIGHT_M_S, frequency_hz)
+    return np.asarray(transfer * np.exp(2j * np.pi * (cycles % 1.0)))
 
 
 def _aligned_groups(transfer: Pulses, frequency_hz: Floats, path_m: Floats) -> NDArray[np.complex128]:
-    """Return (group, subcarrier): pulses aligned to the predicted path, added within each part of the flight."""
+    """Return the mean of the pulses of each group, aligned to the predicted path, (group, subcarrier)."""
     taper = np.hanning(frequency_hz.size + 2)[1:-1]
     edges = np.linspace(0, len(transfer), min(_GROUPS, len(transfer)) + 1).astype(int)
     return np.array([_mean(transfer, frequency_hz, path_m, *ends) * taper for ends in pairwise(edges)])
 
 
 def _mean(transfer: Pulses, frequency_hz: Floats, path_m: Floats, first: int, last: int) -> NDArray[np.complex128]:
-    """Return (subcarrier,) the mean of pulses first to last, aligned to the predicted path, a block at a time."""
+    """Return the mean of pulses first to last, (subcarrier,), aligned to the predicted path, block by block."""
     total = np.zeros(len(frequency_hz), np.complex128)
     for start in range(first, last, AT_ONCE):
-        part = slice(start, min(start + AT_ONCE, last))
-        total += _aligned(transfer[part], frequency_hz, path_m[part]).sum(axis=0)
+        block = slice(start, min(start + AT_ONCE, last))
+        total += _aligned(transfer[block], frequency_hz, path_m[block]).sum(axis=0)
     return total / (last - first)
 
 
 def _offset_profile(groups: NDArray[np.complex128], frequency_hz: Floats, search_m: float) -> tuple[Floats, Floats]:
-    """Return offsets within the search and the mean power of the groups there."""
+    """Return the offsets searched and the mean power of the groups at each."""
     length = scipy.fft.next_fast_len(_OVERSAMPLING * frequency_hz.size)
     spacing_hz = float(frequency_hz[-1] - frequency_hz[0]) / (frequency_hz.size - 1)
     step_m = SPEED_OF_LIGHT_M_S / (spacing_hz * length)
@@ -179,31 +180,32 @@ def _offset_profile(groups: NDArray[np.complex128], frequency_hz: Floats, search
 
 
 def _require_visible(power: Floats, peak: int, surroundings: float, groups: int, search_m: float, where: str) -> None:
-    """Raise unless the peak is higher than the highest of as many cells of clutter would be, and inside."""
+    """Raise CampaignError if the peak does not exceed the highest of as many cells of clutter, or is at the edge."""
     cells = power.size / _OVERSAMPLING
     highest = gammainccinv(groups, FALSE_REFLECTOR / cells) / groups
     ratio_db, needed_db = (decibels(r) for r in (power[peak] / max(surroundings, 1e-30), highest))
     inside = 0 < peak < power.size - 1
     if ratio_db > needed_db and inside:
         return
-    place = "" if inside else " and lies at the edge of the search"
+    at_edge = "" if inside else " and lies at the edge of the search interval"
     raise CampaignError(
         f"no reflector: the highest echo within {search_m:g} m of its predicted path is {ratio_db:.1f} dB above "
-        f"the rest{place}",
+        f"the mean of its surroundings{at_edge}",
         where=where,
-        expected=f"more than {needed_db:.1f} dB, inside",
-        remedy="Check the reflector's coordinates and that it was in the beam, or widen the search.",
+        expected=f"an echo of more than {needed_db:.1f} dB inside the search interval",
+        remedy="Check that the reflector's coordinates are right and that it was in the beam; or increase "
+        "calibration.search_m.",
     )
 
 
 def _refine(groups: NDArray[np.complex128], frequency_hz: Floats, start_m: float) -> Floats:
-    """Return (group,) offsets, metres: Newton's steps on each group's power, within half a cell of the start."""
+    """Maximise the power of each group by Newton's method, within half a cell of the start; return (group,) metres."""
     cell_m = SPEED_OF_LIGHT_M_S / float(frequency_hz[-1] - frequency_hz[0])
-    turn = 2j * np.pi * (frequency_hz - frequency_hz.mean()) / SPEED_OF_LIGHT_M_S
+    phase_per_m = 2j * np.pi * (frequency_hz - frequency_hz.mean()) / SPEED_OF_LIGHT_M_S
     offset = np.full(len(groups), start_m)
     for _ in range(8):
-        aligned = groups * np.exp(np.outer(offset, turn))
-        total, first, second = aligned.sum(1), aligned @ turn, aligned @ turn**2
+        aligned = groups * np.exp(np.outer(offset, phase_per_m))
+        total, first, second = aligned.sum(1), aligned @ phase_per_m, aligned @ phase_per_m**2
         slope = 2 * np.real(total.conj() * first)
         curvature = 2 * (np.abs(first) ** 2 + np.real(total.conj() * second))
         step = np.clip(-slope / np.where(curvature < 0, curvature, -np.inf), -cell_m / 8, cell_m / 8)
@@ -211,17 +213,17 @@ def _refine(groups: NDArray[np.complex128], frequency_hz: Floats, start_m: float
     return offset
 
 
-def _deviation_of_mean(parts: Floats) -> float:
-    """Return the standard deviation of the mean of parts whose neighbours may share errors of the track."""
-    if len(parts) < _GROUPS:
+def _deviation_of_mean(offsets_m: Floats) -> float:
+    """Return the standard deviation of the mean of the group offsets, whose neighbours may have common track errors."""
+    if len(offsets_m) < _GROUPS:
         return np.inf
-    quarters = parts.reshape(4, -1).mean(1)
-    return float(max(np.std(some, ddof=1) / np.sqrt(len(some)) for some in (parts, quarters)))
+    quarters_m = offsets_m.reshape(4, -1).mean(1)
+    return float(max(np.std(values, ddof=1) / np.sqrt(len(values)) for values in (offsets_m, quarters_m)))
 
 
 def _rival(offset_m: Floats, power: Floats, peak: int, frequency_hz: Floats) -> tuple[float, float]:
-    """Return level (dB) and offset of the strongest echo beyond the main lobe, 2·c/B to either side."""
+    """Return level (dB) and offset of the strongest echo outside the main lobe of 2·c/B on each side."""
     cell_m = SPEED_OF_LIGHT_M_S / float(frequency_hz[-1] - frequency_hz[0])
-    beside = np.where(np.abs(offset_m - offset_m[peak]) > 2.5 * cell_m, power, 0.0)
-    second = int(np.argmax(beside))
-    return decibels(float(beside[second] / power[peak])), float(offset_m[second])
+    outside = np.where(np.abs(offset_m - offset_m[peak]) > 2.5 * cell_m, power, 0.0)
+    second = int(np.argmax(outside))
+    return decibels(float(outside[second] / power[peak])), float(offset_m[second])

@@ -1,4 +1,4 @@
-"""Captures of a pair: read in blocks of pulses, checked for saturation, resampled to a true clock."""
+"""Captures of a pair: reading in blocks of pulses, saturation check, and resampling to the transmitter's clock."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -18,47 +18,47 @@ Samples = NDArray[np.int16 | np.float32]
 Pulses = NDArray[np.int64]
 
 Read = Callable[[Pulses], Mapping[str, Samples]]
-"""Numbers of captures, ascending → channel → (capture, sample, 2), I and Q from the start of the prefix."""
+"""Ascending capture numbers → channel → (capture, sample, 2), I and Q from the start of the prefix."""
 
 AT_ONCE = 64
-"""Captures processed at a time: as many as fit into the caches."""
+"""Captures processed at a time; their number is limited by the processor caches."""
 
 SATURATED_SHARE = 1e-4
-"""Share of the samples at the converter's end stops above which it clips; a symbol 12 dB below has one or two."""
+"""Share of samples at the converter's end stops above which it clips; a symbol 12 dB below has one or two samples."""
 
 
 def ordered(iq: Samples, order: str) -> Samples:
-    """Return I and Q of the radar's samples, given their order as recorded: complex, swapped or conjugate.
+    """Return I and Q of samples recorded in the given order: complex, swapped or conjugate.
 
     Examples
     --------
-    >>> [ordered(np.array([3, 4], np.int16), one).tolist() for one in ("complex", "swapped", "conjugate")]
+    >>> [ordered(np.array([3, 4], np.int16), order).tolist() for order in ("complex", "swapped", "conjugate")]
     [[3, 4], [4, 3], [3, -4]]
     """
     return conjugates(iq) if order == "conjugate" else iq[..., ::-1] if order == "swapped" else iq
 
 
 def conjugates(iq: Samples) -> Samples:
-    """Return I and Q of the conjugate samples, in the same type; the lowest integer, which has none, by one less.
+    """Return I and Q of the conjugate samples, in the same type; the lowest integer saturates at the highest.
 
     Examples
     --------
     >>> conjugates(np.array([[3, -32768], [1, 5]], np.int16)).tolist()
     [[3, 32767], [1, -5]]
     """
-    turned: Any = iq.copy()
-    if turned.dtype.kind == "i":
-        turned[..., 1] = np.maximum(turned[..., 1], -np.iinfo(turned.dtype).max)
-    np.negative(turned[..., 1], out=turned[..., 1])
-    return np.asarray(turned)
+    conjugate: Any = iq.copy()
+    if conjugate.dtype.kind == "i":
+        conjugate[..., 1] = np.maximum(conjugate[..., 1], -np.iinfo(conjugate.dtype).max)
+    np.negative(conjugate[..., 1], out=conjugate[..., 1])
+    return np.asarray(conjugate)
 
 
 def blocks_of(pulses: Pulses, size: int = AT_ONCE) -> Iterator[Pulses]:
-    """Yield numbers of pulses, `size` at a time.
+    """Yield pulse numbers in blocks of `size`.
 
     Examples
     --------
-    >>> [some.tolist() for some in blocks_of(np.arange(5), 2)]
+    >>> [block.tolist() for block in blocks_of(np.arange(5), 2)]
     [[0, 1], [2, 3], [4]]
     """
     for first in range(0, len(pulses), size):
@@ -66,13 +66,13 @@ def blocks_of(pulses: Pulses, size: int = AT_ONCE) -> Iterator[Pulses]:
 
 
 def spread(count: int, *, groups: int, each: int) -> list[Pulses]:
-    """Return groups of neighbouring pulses, amid equal parts of a flight; all pulses where that is no more.
+    """Return groups of neighbouring pulses, centred in equal parts of a flight; all pulses of a short flight.
 
-    Properties common to all pulses are estimated well from some thousand of them, however long the flight.
+    A few thousand pulses suffice to estimate properties common to all pulses, for any length of the flight.
 
     Examples
     --------
-    >>> [[some.tolist() for some in spread(count, groups=2, each=3)] for count in (100, 5)]
+    >>> [[group.tolist() for group in spread(count, groups=2, each=3)] for count in (100, 5)]
     [[[23, 24, 25], [73, 74, 75]], [[0, 1, 2], [3, 4]]]
     """
     if count <= groups * each:
@@ -82,28 +82,29 @@ def spread(count: int, *, groups: int, each: int) -> list[Pulses]:
 
 
 _CREST_SAMPLES = 256
-"""Samples of a capture by which its crest factor is measured: noise alone has one below 3 in 2 of 10⁶ captures."""
+"""Samples of a capture used for its crest factor; that of noise alone is below 3 in 2 of 10⁶ captures."""
 
 _LIMITED_CREST = 3.0
-"""Peak power over mean power of a limited capture at most; noise and OFDM symbols have 6 to 10, a square wave has 1."""
+"""Largest crest factor (peak power over mean power) of a limited capture; 6 to 10 for noise and OFDM, 1 for a square
+wave."""
 
 _LIMITED_SHARE = 0.5
-"""Of the peak power and of the crest factor that captures without a limit have: a limited one has less of both."""
+"""Limit of peak power and of crest factor relative to unlimited captures: a limited capture is below it in both."""
 
 _LIMITED_CAPTURES = 0.02
-"""Share of limited captures that is tolerated: what they distort is 34 dB below the image; by chance a symbol of 128
-subcarriers, whose samples are not independent, has a low crest factor in 2 of 1000 captures."""
+"""Tolerated share of limited captures: their distortion is 34 dB below the image. The dependent samples of a symbol of
+128 subcarriers have a low crest factor in 2 of 1000 captures without a limiter."""
 
 
 class Saturation:
-    """Samples at a converter's end stops, and captures limited below them, counted block by block.
+    """Counter of samples at a converter's end stops, and of captures limited below them, block by block.
 
     Notes
     -----
-    A converter that clips accumulates samples at its end stops, whatever its number of bits; without clipping the
-    extreme values occur once or twice. A limiter in front of it lowers the peak of a capture and its crest factor,
-    max|s|²/mean|s|², alike: a weak capture has a lower peak and keeps its crest factor, a strong tone the other way
-    round. Captures are compared with the 90th percentile of all.
+    A clipping converter accumulates samples at its end stops, for any number of bits; without clipping the extreme
+    values occur once or twice. A limiter in front of the converter lowers both the peak of a capture and its crest
+    factor, max|s|²/mean|s|². A weak capture has a lower peak and an unchanged crest factor; a strong tone has a lower
+    crest factor and an unchanged peak. Captures are compared with the 90th percentile of all.
 
     Examples
     --------
@@ -124,31 +125,30 @@ class Saturation:
         self._powers: dict[str, list[Floats]] = {}
 
     def count(self, iq: Mapping[str, Samples]) -> None:
-        """Count some captures, channel → (capture, sample, 2)."""
+        """Count the samples of a block of captures, channel → (capture, sample, 2)."""
         for name, samples in iq.items():
             self._samples[name] = self._samples.get(name, 0) + samples.size
             extremes = self._extremes.setdefault(name, [_Extreme(+1), _Extreme(-1)])
             for extreme, value in zip(extremes, (samples.max().item(), samples.min().item()), strict=True):
                 extreme.count(samples, value)
-            every = max(1, samples.shape[1] // _CREST_SAMPLES)
-            some = samples[:, ::every].astype(np.float64)
-            power = (some**2).sum(axis=-1)
+            step = max(1, samples.shape[1] // _CREST_SAMPLES)
+            power = (samples[:, ::step].astype(np.float64) ** 2).sum(axis=-1)
             if power.shape[1] >= _CREST_SAMPLES:
                 self._powers.setdefault(name, []).append(np.stack([power.max(axis=1), power.mean(axis=1)]))
 
     @property
     def shares(self) -> dict[str, float]:
-        """Share of each channel's samples that repeat the largest or the smallest value that occurs."""
-        return {  # each of the two occurs once anyway
+        """Share of each channel's samples that repeat its largest or smallest value."""
+        return {  # one occurrence of each extreme is no repetition
             name: (sum(extreme.times for extreme in self._extremes[name]) - 2) / count
             for name, count in self._samples.items()
         }
 
     @property
     def flags(self) -> Flags:
-        """Flags of channels whose converter clipped, and of captures limited before it."""
+        """Flags of channels whose converter clipped, and of captures limited in front of it."""
         clipped = {
-            f"saturated_{name}": f"{share:.2%} of the samples of channel {name} sit at the converter's end stops"
+            f"saturated_{name}": f"{share:.2%} of the samples of channel {name} are at the converter's end stops"
             for name, share in self.shares.items()
             if share > SATURATED_SHARE
         }
@@ -157,7 +157,7 @@ class Saturation:
 
     @staticmethod
     def _limited(channel: str, peak: Floats, mean: Floats) -> Flags:
-        """Raise a flag where captures have a lower peak and a lower crest factor than the others."""
+        """Raise a flag if captures have both a lower peak and a lower crest factor than the others."""
         crest = peak / np.maximum(mean, np.finfo(float).tiny)
         usual_peak, usual_crest = (float(np.percentile(values, 90)) for values in (peak, crest))
         limited = (
@@ -165,16 +165,16 @@ class Saturation:
         )
         if limited.mean() <= _LIMITED_CAPTURES:
             return Flags()
-        found_db, usual_db = (decibels(float(value)) for value in (np.median(crest[limited]), usual_crest))
+        limited_db, usual_db = (decibels(float(value)) for value in (np.median(crest[limited]), usual_crest))
         line = (
-            f"{int(limited.sum())} of {len(peak)} captures of channel {channel}: crest factor {found_db:.1f} dB, "
-            f"{usual_db:.1f} dB of the others"
+            f"{int(limited.sum())} of {len(peak)} captures of channel {channel}: crest factor {limited_db:.1f} dB, "
+            f"compared with {usual_db:.1f} dB of the others"
         )
         return Flags({"captures_limited": line})
 
 
 class _Extreme:
-    """The largest or, with `sign` -1, the smallest value so far, and how often it occurred."""
+    """The largest or, with `sign` -1, the smallest value so far, and its number of occurrences."""
 
     def __init__(self, sign: int) -> None:
         self.sign, self.value, self.times = sign, -sign * np.inf, 0
@@ -182,8 +182,8 @@ class _Extreme:
     def count(self, samples: Samples, value: float) -> None:
         if self.sign * value < self.sign * self.value:
             return
-        known = self.times if value == self.value else 0
-        self.value, self.times = value, known + int(np.count_nonzero(samples == value))
+        earlier = self.times if value == self.value else 0
+        self.value, self.times = value, earlier + int(np.count_nonzero(samples == value))
 
 
 # ---- Correction of clock offsets
@@ -193,16 +193,16 @@ _REJECTION_DB = 100.0
 
 
 def correct_clock(samples: Complexes, numerology: Numerology, *, cfo_hz: Floats, sfo_ppm: float) -> Complexes:
-    """Return captures resampled to the transmitter's clock.
+    """Resample captures to the transmitter's clock.
 
     Parameters
     ----------
     samples
-        (pulse, sample) complex64 from the start of the cyclic prefix; of radar or sidelink.
+        (pulse, sample) complex64 of radar or sidelink, from the start of the cyclic prefix.
     numerology
-        Of the symbol.
+        Numerology of the symbol.
     cfo_hz
-        (pulse,) float64, receiver's oscillator minus transmitter's.
+        (pulse,) float64, receiver's oscillator frequency minus transmitter's.
     sfo_ppm
         Receiver's sampling rate above nominal, parts per million.
 
@@ -213,8 +213,8 @@ def correct_clock(samples: Complexes, numerology: Numerology, *, cfo_hz: Floats,
 
     Notes
     -----
-    Source: docs/theory/echo_methods.md, "Clock": rotation, then a Kaiser-windowed sinc at the fractional places,
-    with the occupied band moved to zero, where the sinc is shortest.
+    Source: docs/theory/echo_methods.md, "Clock": rotation, then interpolation at the fractional sample positions by a
+    Kaiser-windowed sinc, which is shortest with the occupied band centred on zero.
 
     Examples
     --------
@@ -225,23 +225,23 @@ def correct_clock(samples: Complexes, numerology: Numerology, *, cfo_hz: Floats,
     """
     count = numerology.prefix_samples + numerology.dft_samples
     rate_hz = numerology.sample_rate_hz * (1 + sfo_ppm * 1e-6)
-    taken_s, resampled_s = np.arange(samples.shape[1]) / rate_hz, np.arange(count) / numerology.sample_rate_hz
-    place, taps = _fractional_taps(resampled_s * rate_hz, numerology)
-    # beyond the capture the symbol continues as one period before
-    place = np.where(place >= samples.shape[1], place - numerology.dft_samples, place)
-    place = np.where(place < 0, place + numerology.dft_samples, place)
-    back = np.exp(2j * np.pi * numerology.middle_hz * resampled_s)
+    recorded_s, resampled_s = np.arange(samples.shape[1]) / rate_hz, np.arange(count) / numerology.sample_rate_hz
+    index, taps = _fractional_taps(resampled_s * rate_hz, numerology)
+    # beyond the ends of the capture the symbol continues periodically
+    index = np.where(index >= samples.shape[1], index - numerology.dft_samples, index)
+    index = np.where(index < 0, index + numerology.dft_samples, index)
+    to_band = np.exp(2j * np.pi * numerology.middle_hz * resampled_s)
     corrected = np.empty((len(samples), count), np.complex64)
     for pulse, capture in enumerate(samples):
-        centred = capture * np.exp(2j * np.pi * (cfo_hz[pulse] - numerology.middle_hz) * taken_s)
-        corrected[pulse] = np.einsum("kt,kt->k", centred[place], taps) * back
+        centred = capture * np.exp(2j * np.pi * (cfo_hz[pulse] - numerology.middle_hz) * recorded_s)
+        corrected[pulse] = np.einsum("kt,kt->k", centred[index], taps) * to_band
     return corrected
 
 
 def _fractional_taps(position: Floats, numerology: Numerology) -> tuple[NDArray[np.int64], Floats]:
-    """Return (wanted, tap) sample numbers and weights that interpolate at fractional `position`."""
+    """Return sample numbers and weights, (output sample, tap), that interpolate at the fractional `position`."""
     occupied = numerology.numbers.size / numerology.dft_samples
     length = (_REJECTION_DB - 8) / (2.285 * 2 * np.pi * max(1 - occupied, 0.05))  # Kaiser's rule
     half = int(np.ceil(length / 2)) + 1
-    place = np.floor(position).astype(np.int64)[:, None] + np.arange(1 - half, half + 1)
-    return place, kaiser_sinc(position[:, None] - place, half=half, beta=kaiser_beta(_REJECTION_DB))
+    index = np.floor(position).astype(np.int64)[:, None] + np.arange(1 - half, half + 1)
+    return index, kaiser_sinc(position[:, None] - index, half=half, beta=kaiser_beta(_REJECTION_DB))

@@ -1,9 +1,9 @@
-"""The receiver's clock against the transmitter's: measured on the sidelink, corrected in the samples where it matters.
+"""Clock offset of a receiver from the transmitter: measurement on the sidelink, and decision on its correction.
 
-The symbol repeats itself after 1/Δf and lasts longer than that, so the beginning of a capture repeats at its
-end: rotated by the carrier offset, and shifted by the sampling offset. Neither code nor delay need be known.
-A pulse that is sent once repeats nothing: its clock is not measured, and division needs none (docs/theory/waveforms.md,
-"Clock").
+The symbol has the period 1/Δf and is longer than one period, so the start of a capture repeats at its end, rotated by
+the carrier offset and shifted by the sampling offset. The measurement requires neither code nor delay.
+A pulse that is sent once has no repetition: its clock is not measurable, and division by the sidelink does not need it
+(docs/theory/waveforms.md, "Clock").
 """
 
 from collections.abc import Iterable
@@ -19,18 +19,18 @@ from apertura.core.echo.captures import AT_ONCE, spread
 from apertura.core.echo.demodulate import Numerology
 
 SIGMAS = 3.0
-"""Standard deviations: a smaller clock offset may be noise, and is not corrected."""
+"""Standard deviations below which a clock offset is not significant and is not corrected."""
 
 AMBIGUOUS_SHARE = 0.4
-"""Share of Δf: offsets beyond it may be of the other sign, since they wrap at one half."""
+"""Share of Δf beyond which the sign of an offset is uncertain, since offsets wrap at one half."""
 
 GROUPS = 16
-"""Parts of the flight from whose scatter the standard deviation of the clock follows."""
+"""Parts of the flight whose scatter gives the standard deviation of the clock."""
 
-_SMALLEST_REPEAT = 32  # samples of a capture that repeat, at least
+_SMALLEST_REPEAT = 32  # fewest repeated samples of a capture
 _TAPERED = 0.25
-"""Share of what repeats that a taper takes at its ends. A capture that was triggered late ends after the symbol: what
-is cut off there turned the phase of a chirp-like code by 70 standard deviations, as a tenth of a ppm or more."""
+"""Tapered share of the repeated samples, both ends together. A capture that is triggered late extends beyond the end of
+the symbol; without a taper this error was 70 standard deviations of the phase of a chirp-like code, 0.1 ppm or more."""
 
 
 @dataclass(frozen=True)
@@ -40,15 +40,15 @@ class ClockOffset:
     Attributes
     ----------
     cfo_hz
-        Receiver's oscillator minus transmitter's at the middle of the flight, hertz.
+        Receiver's oscillator frequency minus transmitter's at the middle of the flight, hertz.
     cfo_slope_hz
-        Its growth per pulse, hertz; 0 where it is not significant.
+        Its change per pulse, hertz; 0 if it is not significant.
     sfo_ppm
         Receiver's sampling rate above nominal, parts per million of the transmitter's.
     cfo_std_hz, sfo_std_ppm
-        Standard deviations, from the scatter over the flight; that of `sfo_ppm` for its own measurement.
+        Standard deviations from the scatter over the flight; that of `sfo_ppm` is of its direct measurement.
     one_clock
-        Whether `sfo_ppm` was taken from the carrier, since its own measurement does not contradict.
+        True if `sfo_ppm` is derived from the carrier offset, with which its direct measurement agrees.
     """
 
     cfo_hz: float
@@ -59,18 +59,18 @@ class ClockOffset:
     one_clock: bool
 
     def ppm(self, numerology: Numerology) -> tuple[float, float | None]:
-        """Return the oscillator's offset and its standard deviation, ppm; None where unknown."""
+        """Return the oscillator's offset and its standard deviation, ppm; None if unknown."""
         std_ppm = self.cfo_std_hz / numerology.carrier_hz * 1e6
         return self.cfo_hz / numerology.carrier_hz * 1e6, std_ppm if np.isfinite(std_ppm) else None
 
     def cfo_of_pulses_hz(self, pulses: int) -> Floats:
-        """Return (pulse,) float64, the carrier offset in each pulse of the flight, hertz."""
+        """Return the carrier offset in each pulse of the flight, (pulse,) float64, hertz."""
         return np.asarray(self.cfo_hz + self.cfo_slope_hz * (np.arange(pulses) - (pulses - 1) / 2))
 
 
 @dataclass(frozen=True)
 class ClockDecision:
-    """Whether to correct, why, and the level of the floor without correction."""
+    """Decision on the clock correction, its reason, and the interference floor without correction."""
 
     correct: bool
     reason: str
@@ -79,7 +79,7 @@ class ClockDecision:
 
 
 def estimate_clock(sidelink: Complexes, numerology: Numerology) -> ClockOffset:
-    """Measure the clock of a receiver on the (pulse, sample) complex64 sidelink of a whole flight; as `clock_of`.
+    """Measure the clock offset of a receiver on the sidelink of a whole flight, (pulse, sample); see `clock_of`.
 
     Examples
     --------
@@ -91,33 +91,35 @@ def estimate_clock(sidelink: Complexes, numerology: Numerology) -> ClockOffset:
     (5000, 0, False)
     """
     groups = spread(len(sidelink), groups=GROUPS, each=len(sidelink))
-    return clock_of((sidelink[some] for some in groups), numerology, pulses=len(sidelink))
+    return clock_of((sidelink[group] for group in groups), numerology, pulses=len(sidelink))
 
 
 def clock_of(groups: Iterable[Complexes], numerology: Numerology, *, pulses: int) -> ClockOffset:
-    """Measure the clock of a receiver on its sidelink.
+    """Measure the clock offset of a receiver on its sidelink.
 
     Parameters
     ----------
     groups
         (pulse, sample) complex64 each, captures from the start of the cyclic prefix to the end of the symbol
-        (T_cp + T), no longer, amid equal parts of the flight; pulses without signal do no harm.
+        (T_cp + T), no longer, from equal parts of the flight; pulses without signal are permitted.
     numerology
-        Of the symbol.
+        Numerology of the symbol.
     pulses
-        Of the whole flight.
+        Number of pulses of the whole flight.
 
     Raises
     ------
     ValueError
-        If captures contain too little of the repetition, or the transmitted signal does not repeat.
+        If captures contain too few repeated samples, or the transmitted signal does not repeat.
 
     Notes
     -----
     Source: docs/theory/echo_methods.md, "Clock". Unambiguous for |CFO| < Δf/2.
     """
     if not numerology.repeats:
-        raise ValueError("a pulse that is sent once repeats nothing: not measured, and division needs no clock")
+        raise ValueError(
+            "not measurable: a pulse that is sent once has no repetition (division by the sidelink needs no clock)"
+        )
     period_s = 1 / numerology.spacing_hz
     frequency_hz, parts = _repetition(groups, numerology)
     phase, slope, centre_hz = _phase_and_slope(parts.sum(0), frequency_hz, start=(0.0, 0.0))
@@ -125,11 +127,11 @@ def clock_of(groups: Iterable[Complexes], numerology: Numerology, *, pulses: int
     growth, phase_std = _line(fits[:, 0])
     ppm = 1e6 / (2 * np.pi * period_s)
     sfo_ppm, sfo_std_ppm = -slope * ppm, _line(fits[:, 1])[1] * ppm
-    joint_ppm = -phase * ppm / (numerology.carrier_hz + centre_hz)  # if one clock feeds both
+    joint_ppm = -phase * ppm / (numerology.carrier_hz + centre_hz)  # if one clock drives oscillator and converter
     one_clock = abs(sfo_ppm - joint_ppm) <= 3 * sfo_std_ppm
     sfo_ppm = joint_ppm if one_clock else sfo_ppm
     cfo_std_hz = phase_std / (2 * np.pi * period_s)
-    if not one_clock:  # the carrier is extrapolated from the middle of the band by a slope that is known so well
+    if not one_clock:  # the error of the slope adds, by which the carrier is extrapolated from the middle of the band
         cfo_std_hz = float(np.hypot(cfo_std_hz, centre_hz * sfo_std_ppm * 1e-6))
     return ClockOffset(
         cfo_hz=-phase / (2 * np.pi * period_s) - centre_hz * sfo_ppm * 1e-6,
@@ -142,7 +144,7 @@ def clock_of(groups: Iterable[Complexes], numerology: Numerology, *, pulses: int
 
 
 def decide_clock(offset: ClockOffset, numerology: Numerology, *, accuracy_db: float) -> ClockDecision:
-    """Decide whether a clock needs correction for images whose errors may reach `accuracy_db` below the peak.
+    """Decide on the correction of a clock offset for a tolerated error of `accuracy_db` relative to the peak.
 
     Examples
     --------
@@ -150,44 +152,46 @@ def decide_clock(offset: ClockOffset, numerology: Numerology, *, accuracy_db: fl
     >>> for ppm in (0.5, 8.0):
     ...     clock = ClockOffset(1200 * ppm, 0.0, ppm, cfo_std_hz=1.0, sfo_std_ppm=0.1, one_clock=True)
     ...     print(decide_clock(clock, numerology, accuracy_db=-60).reason)
-    clock 0.50 ± 0.00 ppm fast (CFO 600 Hz, SFO 0.50 ppm): floor -71.0 dB, -60 dB asked: left alone
-    clock 8.00 ± 0.00 ppm fast (CFO 9600 Hz, SFO 8.00 ppm): floor -47.0 dB, -60 dB asked: samples corrected
+    clock +0.50 ± 0.00 ppm (CFO 600 Hz, SFO 0.50 ppm): floor -71.0 dB, -60 dB tolerated: not corrected
+    clock +8.00 ± 0.00 ppm (CFO 9600 Hz, SFO 8.00 ppm): floor -47.0 dB, -60 dB tolerated: samples corrected
     """
     floor_db = interference_floor_db(offset.cfo_hz, offset.sfo_ppm, numerology)
     ppm, std_ppm = offset.ppm(numerology)
-    left_db = 0.0
+    residual_db = 0.0  # floor of the error of the correction
     if std_ppm is not None:
         sfo_std_ppm = std_ppm if offset.one_clock else offset.sfo_std_ppm
-        left_db = interference_floor_db(offset.cfo_std_hz, sfo_std_ppm, numerology)
+        residual_db = interference_floor_db(offset.cfo_std_hz, sfo_std_ppm, numerology)
     significant = abs(offset.cfo_hz) > SIGMAS * offset.cfo_std_hz or (
         not offset.one_clock and abs(offset.sfo_ppm) > SIGMAS * offset.sfo_std_ppm
     )
     correct = floor_db > accuracy_db and significant
-    what = "samples corrected" if correct else "left alone" if significant else f"left alone: below {SIGMAS:g} σ"
+    uncorrected = "not corrected" if significant else f"not corrected: below {SIGMAS:g} σ"
     reason = (
-        f"clock {ppm:.2f} ± {0 if std_ppm is None else std_ppm:.2f} ppm fast (CFO {offset.cfo_hz:.0f} Hz, "
-        f"SFO {offset.sfo_ppm:.2f} ppm): floor {floor_db:.1f} dB, {accuracy_db:g} dB asked: {what}"
+        f"clock {ppm:+.2f} ± {0 if std_ppm is None else std_ppm:.2f} ppm (CFO {offset.cfo_hz:.0f} Hz, "
+        f"SFO {offset.sfo_ppm:.2f} ppm): floor {floor_db:.1f} dB, {accuracy_db:g} dB tolerated: "
+        f"{'samples corrected' if correct else uncorrected}"
     )
     flags = {}
     if abs(offset.cfo_hz) > AMBIGUOUS_SHARE * numerology.spacing_hz:
         flags["clock_ambiguous"] = (
             f"CFO {offset.cfo_hz:+.0f} Hz is close to half a subcarrier ({numerology.spacing_hz / 2:.0f} Hz): "
-            "it may be another by whole subcarriers"
+            "it may be wrong by an integer number of subcarriers"
         )
-    if left_db > accuracy_db:
+    if residual_db > accuracy_db:
         flags["clock_uncertain"] = (
-            f"clock known to {offset.cfo_std_hz:.0f} Hz only: floor of {left_db:.1f} dB, {accuracy_db:g} dB asked"
+            f"standard deviation of the clock offset {offset.cfo_std_hz:.0f} Hz: floor of {residual_db:.1f} dB, "
+            f"{accuracy_db:g} dB tolerated"
         )
     return ClockDecision(correct, reason, floor_db, flags)
 
 
 def interference_floor_db(cfo_hz: float, sfo_ppm: float, numerology: Numerology) -> float:
-    """Return the interference floor by a clock offset in a range profile, dB below its peak.
+    """Return the interference floor of a clock offset in a range profile, dB relative to its peak.
 
     Notes
     -----
-    Source: docs/theory/echo_methods.md, "Clock": a tone δ bins off keeps sinc²(δ) of its power, the rest falls on
-    the other subcarriers, in the echo as in the sidelink, and compression spreads it over N cells.
+    Source: docs/theory/echo_methods.md, "Clock": a tone offset by δ bins retains sinc²(δ) of its power; the rest leaks
+    into the other subcarriers, in the echo and in the sidelink, and compression spreads it over N cells.
 
     Examples
     --------
@@ -195,13 +199,13 @@ def interference_floor_db(cfo_hz: float, sfo_ppm: float, numerology: Numerology)
     >>> round(interference_floor_db(10e3, 0.0, numerology), 1)
     -48.0
     """
-    off_bin = (cfo_hz + numerology.numbers * numerology.spacing_hz * sfo_ppm * 1e-6) / numerology.spacing_hz
-    lost = float(np.mean(1 - np.sinc(off_bin) ** 2))
-    return decibels(2 * lost / numerology.numbers.size)
+    offset_bins = (cfo_hz + numerology.numbers * numerology.spacing_hz * sfo_ppm * 1e-6) / numerology.spacing_hz
+    leakage = float(np.mean(1 - np.sinc(offset_bins) ** 2))
+    return decibels(2 * leakage / numerology.numbers.size)
 
 
 def _repetition(groups: Iterable[Complexes], numerology: Numerology) -> tuple[Floats, NDArray[np.complex128]]:
-    """Return occupied frequencies and, per group of pulses, the cross-spectrum of the end with its first copy."""
+    """Return the occupied frequencies and, per group of pulses, the cross-spectrum of the end with the start."""
     crosses = [_cross_spectrum(pulses, numerology) for pulses in groups]
     size = crosses[0].size
     lowest_hz = numerology.middle_hz - numerology.sample_rate_hz / 2
@@ -217,7 +221,7 @@ def _cross_spectrum(sidelink: Complexes, numerology: Numerology) -> NDArray[np.c
     start = prefix if count - period - prefix >= prefix // 2 else prefix // 2
     length = count - period - start
     if length < _SMALLEST_REPEAT:
-        raise ValueError(f"captures of {count} samples repeat only {length} of them; {_SMALLEST_REPEAT} are needed")
+        raise ValueError(f"captures of {count} samples repeat only {length} samples; {_SMALLEST_REPEAT} are required")
     taper = _taper(length)
     size = scipy.fft.next_fast_len(length)
     cross = np.zeros(size, np.complex128)
@@ -230,7 +234,7 @@ def _cross_spectrum(sidelink: Complexes, numerology: Numerology) -> NDArray[np.c
 
 
 def _taper(length: int) -> Floats:
-    """Return a Tukey window of `_TAPERED`; that of scipy.signal takes a second to import."""
+    """Return a Tukey window of tapered share `_TAPERED`; importing scipy.signal would take a second."""
     edge = np.minimum(np.arange(length), np.arange(length)[::-1]) / (_TAPERED / 2 * (length - 1))
     return np.asarray((1 - np.cos(np.pi * np.minimum(edge, 1))) / 2)
 
@@ -238,7 +242,7 @@ def _taper(length: int) -> Floats:
 def _phase_and_slope(
     cross: NDArray[np.complex128], frequency_hz: Floats, *, start: tuple[float, float]
 ) -> tuple[float, float, float]:
-    """Return phase (rad) at the power-weighted mean frequency, slope (rad/Hz) and that frequency."""
+    """Fit a line to the phase: phase (rad) at the power-weighted mean frequency, slope (rad/Hz) and that frequency."""
     weight = np.abs(cross)
     centre_hz = float(np.average(frequency_hz, weights=weight))
     off_hz = frequency_hz - centre_hz
@@ -251,12 +255,12 @@ def _phase_and_slope(
 
 
 def _line(values: Floats) -> tuple[float, float]:
-    """Return growth per step, 0 unless four times its deviation, and the standard deviation of the mean."""
+    """Return the slope per step, 0 if below four standard deviations, and the standard deviation of the mean."""
     count = values.size
     if count < 3:
         return 0.0, np.inf
     step = np.arange(count) - (count - 1) / 2
-    growth = float(step @ values / (step @ step))
-    scatter = float(np.sqrt(((values - values.mean() - growth * step) ** 2).sum() / (count - 2)))
-    growth_std = scatter / float(np.sqrt(step @ step))
-    return (growth if abs(growth) > 4 * growth_std else 0.0), scatter / float(np.sqrt(count))
+    slope = float(step @ values / (step @ step))
+    scatter = float(np.sqrt(((values - values.mean() - slope * step) ** 2).sum() / (count - 2)))
+    slope_std = scatter / float(np.sqrt(step @ step))
+    return (slope if abs(slope) > 4 * slope_std else 0.0), scatter / float(np.sqrt(count))

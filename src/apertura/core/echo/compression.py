@@ -1,4 +1,4 @@
-"""Range compression: transfer functions to range profiles, referenced to band centre and cropped to a swath."""
+"""Range compression: transfer functions to range profiles, referenced to the band centre and cropped to the swath."""
 
 from collections.abc import Callable, Mapping
 
@@ -10,44 +10,44 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.core.windowed_sinc import kaiser_window
 
-# ---- Phasors along a band of equal steps
+# ---- Phasors over equally spaced frequencies
 
 
-def unit_phasor(turns: NDArray[np.float64]) -> NDArray[np.complex64]:
-    """Return exp(j2π·turns), complex64; whole turns are removed in float64, the rest is of float32.
+def unit_phasor(cycles: NDArray[np.float64]) -> NDArray[np.complex64]:
+    """Return exp(j2π·cycles), complex64; integer cycles are removed in float64, the rest is evaluated in float32.
 
     Examples
     --------
     >>> unit_phasor(np.array([1e6 + 0.25])).round(6) + 0
     array([0.+1.j], dtype=complex64)
     """
-    angle = ((turns - np.rint(turns)) * (2 * np.pi)).astype(np.float32)
+    angle = ((cycles - np.rint(cycles)) * (2 * np.pi)).astype(np.float32)
     out = np.empty(angle.shape, np.complex64)
     np.cos(angle, out=out.real)
     np.sin(angle, out=out.imag)
     return out
 
 
-def rotated(values: NDArray[np.number], turns: NDArray[np.float64]) -> NDArray[np.complex64]:
-    """Return values·exp(j2π·turns), complex64."""
-    return np.asarray(values * unit_phasor(turns), np.complex64)
+def rotated(values: NDArray[np.number], cycles: NDArray[np.float64]) -> NDArray[np.complex64]:
+    """Return values·exp(j2π·cycles), complex64."""
+    return np.asarray(values * unit_phasor(cycles), np.complex64)
 
 
-def phasors(turns: NDArray[np.float64], count: int, *, first: float = 0.0) -> NDArray[np.complex64]:
-    """Return (pulse, count) complex64, exp(j2π·turns·n) for n = first, first + 1, ….
+def phasors(cycles: NDArray[np.float64], count: int, *, first: float = 0.0) -> NDArray[np.complex64]:
+    """Return the phasors exp(j2π·cycles·n) for n = first, first + 1, …, (pulse, count) complex64.
 
     Parameters
     ----------
-    turns
-        (pulse,) float64, from one n to the next.
+    cycles
+        (pulse,) float64, cycles from one n to the next.
     count
-        How many n.
+        Number of n.
     first
         The first n, possibly fractional.
 
     Notes
     -----
-    Products of coarse and fine phasors, exact to the rounding of complex64, since exponentials cost most.
+    Computed as products of coarse and fine phasors, exact to the rounding of complex64, to save exponentials.
 
     Examples
     --------
@@ -55,26 +55,26 @@ def phasors(turns: NDArray[np.float64], count: int, *, first: float = 0.0) -> ND
     array([[ 1.+0.j,  0.+1.j, -1.+0.j,  0.-1.j]], dtype=complex64)
     """
     side = int(np.ceil(np.sqrt(count)))
-    fine = unit_phasor(turns[:, None] * np.arange(side))
-    coarse = unit_phasor(turns[:, None] * (first + side * np.arange(-(-count // side))))
-    return (coarse[:, :, None] * fine[:, None]).reshape(len(turns), -1)[:, :count]
+    fine = unit_phasor(cycles[:, None] * np.arange(side))
+    coarse = unit_phasor(cycles[:, None] * (first + side * np.arange(-(-count // side))))
+    return (coarse[:, :, None] * fine[:, None]).reshape(len(cycles), -1)[:, :count]
 
 
 # ---- Range compression
 
-_PULSES_AT_ONCE = 32  # that fit into the caches
+_PULSES_AT_ONCE = 32  # limited by the processor caches
 
 _TAPS = 7
 _ROOM = 2.0
-"""Span of a decimated profile over the swath; with seven taps its error is below that of complex64."""
+"""Length of a decimated profile relative to the swath; with seven taps its error is below that of complex64."""
 _LARGEST_FACTOR = 64
 
 WINDOWS: Mapping[str, Callable[[int], NDArray[np.float64]]] = {"hann": np.hanning, "none": np.ones}
-"""Name → weights of that many subcarriers; Hann's is the symmetric one (docs/theory.md, eq. 4)."""
+"""Window name → function of the number of subcarriers; the Hann window is symmetric (docs/theory.md, eq. 4)."""
 
 
 def window_weights(name: str, count: int) -> NDArray[np.float64]:
-    """Return a row of `WINDOWS` for so many subcarriers, summing to 1: a profile peaks at the echo's amplitude.
+    """Return the weights of a window, normalised to the sum 1: a profile then peaks at the amplitude of the echo.
 
     Examples
     --------
@@ -86,22 +86,22 @@ def window_weights(name: str, count: int) -> NDArray[np.float64]:
 
 
 def centre_frequency(frequency_hz: NDArray[np.float64]) -> float:
-    """Return the subcarrier at the middle of the band, f_mid, to which profiles are referenced."""
+    """Return the frequency of the subcarrier at mid-band, f_mid, to which profiles are referenced."""
     return float(frequency_hz[len(frequency_hz) // 2])
 
 
 def range_step(
     frequency_hz: NDArray[np.float64], *, oversampling: float, wave_speed_m_s: float = SPEED_OF_LIGHT_M_S
 ) -> tuple[float, int]:
-    """Return the total path between range samples (m) and the length of the inverse DFT that gives it.
+    """Return the spacing of range samples (m of total path) and the corresponding length of the inverse DFT.
 
-    Of (subcarrier,) equally spaced frequencies, at least `oversampling` samples per resolution cell v/B of a wave of
-    speed v, `wave_speed_m_s`.
+    `frequency_hz`, (subcarrier,), is equally spaced; the profile has at least `oversampling` samples per resolution
+    cell v/B at the wave speed v, `wave_speed_m_s`.
 
     Raises
     ------
     CampaignError
-        If there is but one frequency, or they do not ascend in equal steps: a hundredth of one is let pass.
+        If there is only one frequency, or the frequencies do not ascend in steps that are equal within 1 %.
 
     Examples
     --------
@@ -116,8 +116,8 @@ def range_step(
             if len(steps)
             else f"{len(frequency_hz)} frequencies",
             where="frequency_hz",
-            expected="two or more that ascend in equal steps",
-            remedy="Sort subcarriers by frequency; leave none out: a missing one is 0.",
+            expected="two or more frequencies, ascending in equal steps",
+            remedy="Sort the subcarriers by frequency, and fill missing subcarriers with zeros.",
         )
     length = scipy.fft.next_fast_len(int(np.ceil(oversampling * len(frequency_hz))))
     return wave_speed_m_s / (spacing * length), length
@@ -145,15 +145,15 @@ def compress(
     weight
         (subcarrier,) float64.
     reference_delay_s
-        (pulse,) float64; added here, so that profiles are of absolute delays.
+        (pulse,) float64; added to the delays, so that profiles have absolute delays.
     start_m
         (pulse,) float64, total path of sample 0.
     count
-        Samples kept per pulse.
+        Number of samples per pulse.
     oversampling
-        Of `range_step`, whose step this profile has.
+        As for `range_step`, which gives the spacing of the samples.
     wave_speed_m_s
-        v, speed of the wave along the paths.
+        v, wave speed along the paths.
 
     Returns
     -------
@@ -167,9 +167,9 @@ def compress(
 
     Notes
     -----
-    Source: docs/theory.md, eq. 4. Referring the profile to band centre halves the bandwidth of an
-    interpolator; exp(+j2πf_mid·ρ/v) remains for backprojection. Where the swath is a part of the unambiguous range, the
-    subcarriers are decimated to it first (docs/theory.md, eq. 4a), at the accuracy of complex64.
+    Source: docs/theory.md, eq. 4. Referring the profile to the band centre halves the bandwidth that interpolation
+    must handle; backprojection applies the factor exp(+j2πf_mid·ρ/v). If the swath is only a part of the unambiguous
+    range, the subcarriers are first decimated to it (docs/theory.md, eq. 4a), at the accuracy of complex64.
 
     Examples
     --------
@@ -182,48 +182,50 @@ def compress(
     """
     _, length = range_step(frequency_hz, oversampling=oversampling)
     if count > length:
-        raise ValueError(f"{count=}: the unambiguous range holds {length} samples")
-    middle, after = len(frequency_hz) // 2, np.arange(count) - count // 2
+        raise ValueError(f"{count=}: the unambiguous range contains {length} samples")
+    middle, offset = len(frequency_hz) // 2, np.arange(count) - count // 2  # samples from the middle of the swath
     spacing_hz = float(frequency_hz[-1] - frequency_hz[0]) / (len(frequency_hz) - 1)
-    turns = (start_m / wave_speed_m_s - reference_delay_s) * spacing_hz + (count // 2) / length
+    cycles = (start_m / wave_speed_m_s - reference_delay_s) * spacing_hz + (count // 2) / length  # per subcarrier
     carrier = np.exp(-2j * np.pi * (frequency_hz[middle] * reference_delay_s % 1.0))
     filters, response = _decimation(len(frequency_hz), length, count)
     factor, blocks = len(filters), -(-len(frequency_hz) // len(filters))
     weighted = np.zeros((_PULSES_AT_ONCE, blocks * factor), np.complex64)
     profiles = np.empty((len(transfer), count), np.complex64)
     for first in range(0, len(transfer), _PULSES_AT_ONCE):
-        part = slice(first, min(first + _PULSES_AT_ONCE, len(transfer)))
-        here = weighted[: part.stop - first]
-        np.multiply(transfer[part], weight.astype(np.float32), out=here[:, : len(frequency_hz)])
-        taps = filters * phasors(turns[part], factor)[:, :, None]
-        sums = here.reshape(len(here), blocks, factor) @ taps
-        start = rotated(carrier[part], -middle * turns[part])
-        sums *= (phasors(factor * turns[part], blocks) * start[:, None])[:, :, None]
-        spectrum = np.zeros((len(here), length // factor), np.complex64)
+        pulses = slice(first, min(first + _PULSES_AT_ONCE, len(transfer)))
+        block = weighted[: pulses.stop - first]
+        np.multiply(transfer[pulses], weight.astype(np.float32), out=block[:, : len(frequency_hz)])
+        # decimation (eq. 4a): after a shift to the middle of the swath, `factor` subcarriers are summed to one
+        taps = filters * phasors(cycles[pulses], factor)[:, :, None]
+        sums = block.reshape(len(block), blocks, factor) @ taps
+        start = rotated(carrier[pulses], -middle * cycles[pulses])
+        sums *= (phasors(factor * cycles[pulses], blocks) * start[:, None])[:, :, None]
+        spectrum = np.zeros((len(block), length // factor), np.complex64)
         for tap in range(filters.shape[1]):
             spectrum[:, tap : tap + blocks] += sums[:, :, tap]
         swath = scipy.fft.ifft(spectrum, axis=1, norm="forward", overwrite_x=True)
-        profiles[part] = swath[:, after % (length // factor)] * response
+        profiles[pulses] = swath[:, offset % (length // factor)] * response
     return profiles
 
 
 def _decimation(subcarriers: int, length: int, count: int) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
-    """Return taps (factor, tap) that sum `factor` subcarriers to one, and the inverse of their response (count,).
+    """Return the decimation filter, (factor, tap), and the inverse of its response over the swath, (count,).
 
-    The factor is the largest whose range spans the swath `_ROOM` times: 1 where the swath fills the range.
+    The factor is the largest that leaves an unambiguous range of `_ROOM` times the swath; 1 if the swath fills the
+    range.
     """
-    after, middle = np.arange(count) - count // 2, subcarriers // 2
+    offset, middle = np.arange(count) - count // 2, subcarriers // 2
     factors = [factor for factor in range(4, _LARGEST_FACTOR + 1) if length % factor == 0]
     factors = [n for n in factors if length // n >= max(_ROOM * count, -(-subcarriers // n) + _TAPS - 1)]
     if not factors:
-        return np.ones((1, 1), np.complex64), rotated(np.ones(count), -middle * after / length)
+        return np.ones((1, 1), np.complex64), rotated(np.ones(count), -middle * offset / length)
     factor, reach = factors[-1], _TAPS // 2
-    beta = np.pi * np.sqrt((_TAPS * (1 - 0.5 / _ROOM)) ** 2 - 0.8)  # Beatty's choice for this room
+    beta = np.pi * np.sqrt((_TAPS * (1 - 0.5 / _ROOM)) ** 2 - 0.8)  # Beatty et al. (2005), for this oversampling
 
     within = (np.arange(factor) - (factor - 1) / 2) / factor
     taps = kaiser_window((within[:, None] - np.arange(-reach, reach + 1)) / (_TAPS / 2), beta)
     nodes, weights = np.polynomial.legendre.leggauss(64)
-    wave = np.cos(np.pi * _TAPS * np.outer(after * factor / length, nodes))
+    wave = np.cos(np.pi * _TAPS * np.outer(offset * factor / length, nodes))
     response = 1 / (wave @ (weights * _TAPS / 2 * kaiser_window(nodes, beta)))
     delay = (factor - 1) / 2 - middle - factor * reach
-    return taps.astype(np.complex64), rotated(response, delay * after / length)
+    return taps.astype(np.complex64), rotated(response, delay * offset / length)

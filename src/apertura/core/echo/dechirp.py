@@ -1,6 +1,6 @@
-"""Beat signals of a radar that mixes echoes with its own sweep: transfer functions, without residual video phase.
+"""Dechirped FMCW signals: transfer functions from beat signals, with the residual video phase removed.
 
-Equations are those of docs/theory/fmcw.md.
+Equation numbers refer to docs/theory/fmcw.md.
 """
 
 from dataclasses import dataclass
@@ -16,33 +16,34 @@ Mixing = Literal["real", "complex", "conjugate"]
 
 _SWEEPS_AT_ONCE = 256
 _BEFORE_ZERO = 1 / 16
-"""Share of the sample rate of a complex beat that is of paths before zero, which leakage of the direct path reaches."""
+"""Share of the sample rate of a complex beat signal reserved for negative paths, into which the direct path leaks."""
 
 _MOTION_WAVES = 1 / 8
-"""Wavelengths of path within a sweep that are tolerated: λ/16 flown by one antenna that sends and receives."""
+"""Tolerated change of total path within a sweep, wavelengths: a motion by λ/16 of a monostatic antenna."""
 
 _FASTEST = 95.0
-"""Percentile of speeds between pulses that counts as motion: single errors of a log do not."""
+"""Percentile of the speeds between pulses that is evaluated; single errors of a log do not affect it."""
 
 
 @dataclass(frozen=True)
 class FrequencySweep:
-    """A linear frequency sweep, and the mixing and sampling of its echoes.
+    """Linear frequency sweep, and the mixing and sampling of its echoes.
 
     Attributes
     ----------
     start_hz
         RF frequency at the first sample, or at the trigger, Hz.
     bandwidth_hz
-        Rise of the frequency in `sweep_s`, Hz; negative where it falls.
+        Change of the frequency in `sweep_s`, Hz; negative for a falling sweep.
     sweep_s
         Length of the linear part, seconds.
     sample_rate_hz
-        Of the beat signal.
+        Sample rate of the beat signal.
     iq
-        real: one mixer; complex: echo times conjugate of the sweep; conjugate: the reverse.
+        real: one mixer; complex: echo times the conjugate of the sweep; conjugate: sweep times the conjugate of the
+        echo.
     settle_s
-        Time left out at the beginning, seconds.
+        Time excluded at the start of the sweep, seconds.
     reference_path_m
         Path of the sweep to the mixer, metres.
 
@@ -63,44 +64,44 @@ class FrequencySweep:
 
     @property
     def slope_hz_s(self) -> float:
-        """γ, Hz/s, negative where frequency falls."""
+        """Sweep rate γ, Hz/s; negative for a falling sweep."""
         return self.bandwidth_hz / self.sweep_s
 
     @property
     def sweep_samples(self) -> int:
-        """Samples of a sweep from its beginning."""
+        """Number of samples of a sweep from its start."""
         return int(self.sweep_s * self.sample_rate_hz + 1e-6)
 
     @property
     def first(self) -> int:
-        """The first sample used."""
+        """Index of the first sample used."""
         return int(np.ceil(self.settle_s * self.sample_rate_hz - 1e-6))
 
     @property
     def samples(self) -> int:
-        """Samples used."""
+        """Number of samples used."""
         return self.sweep_samples - self.first
 
     @property
     def middle_s(self) -> float:
-        """The middle of the samples used, seconds after the sweep began: where phase centres belong (eq. 6)."""
+        """Middle of the samples used, seconds after the start of the sweep: the epoch of the phase centres (eq. 6)."""
         return (self.first + (self.samples - 1) / 2) / self.sample_rate_hz
 
     @property
     def reference_delay_s(self) -> float:
-        """τ_r, seconds."""
+        """Delay of the reference path τ_r, seconds."""
         return self.reference_path_m / SPEED_OF_LIGHT_M_S
 
     @property
     def frequency_hz(self) -> NDArray[np.float64]:
-        """RF frequencies that the samples are those of, ascending, (subcarrier,) Hz (eq. 2)."""
+        """RF frequencies that correspond to the samples, ascending, (subcarrier,) Hz (eq. 2)."""
         time_s = np.arange(self.first, self.sweep_samples) / self.sample_rate_hz - self.reference_delay_s
         rising = self.start_hz + self.slope_hz_s * time_s
         return rising if self.bandwidth_hz > 0 else rising[::-1]
 
     @property
     def beats_hz(self) -> tuple[float, float]:
-        """Lowest and highest unambiguous γΔ, Hz: of positive Δ, or of one sample rate (eq. 4)."""
+        """Lowest and highest unambiguous γΔ, Hz: positive Δ for real samples, else one sample rate (eq. 4)."""
         rate = self.sample_rate_hz
         if self.iq == "real":
             return 0.0, rate / 2
@@ -109,26 +110,26 @@ class FrequencySweep:
 
     @property
     def path_limit_m(self) -> float:
-        """Total path beyond which a beat is ambiguous, or lacks half of its band, metres (eq. 4)."""
-        beyond_s = min(self.beats_hz[1] / abs(self.slope_hz_s), self.samples / self.sample_rate_hz / 2)
-        return SPEED_OF_LIGHT_M_S * (self.reference_delay_s + beyond_s)
+        """Total path beyond which a beat frequency is ambiguous, or half of its band is lost, metres (eq. 4)."""
+        longest_s = min(self.beats_hz[1] / abs(self.slope_hz_s), self.samples / self.sample_rate_hz / 2)
+        return SPEED_OF_LIGHT_M_S * (self.reference_delay_s + longest_s)
 
 
 def transfer_of(
     beat: NDArray[np.number], sweep: FrequencySweep, *, late_s: NDArray[np.float64] | None = None, deskewed: bool = True
 ) -> NDArray[np.complex64]:
-    """Return transfer functions from beat signals, without residual video phase.
+    """Compute transfer functions from beat signals, with the residual video phase removed.
 
     Parameters
     ----------
     beat
-        (pulse, sample) real or complex, `sweep.sweep_samples` samples from the beginning of each sweep, or more.
+        (pulse, sample) real or complex, `sweep.sweep_samples` samples from the start of each sweep, or more.
     sweep
-        The sweep.
+        Parameters of the sweep.
     late_s
-        (pulse,) float64, seconds by which the first sample of each sweep was taken after its beginning; None: 0.
+        (pulse,) float64, delay of the first sample of each sweep after its start, seconds; None: 0.
     deskewed
-        False leaves the residual video phase, for comparison.
+        False retains the residual video phase, for comparison.
 
     Returns
     -------
@@ -137,8 +138,8 @@ def transfer_of(
 
     Notes
     -----
-    Source: docs/theory/fmcw.md, eqs. 2 to 5; W. G. Carrara, R. S. Goodman, R. M. Majewski, Spotlight Synthetic Aperture
-    Radar, Artech House 1995, on deskewing.
+    Source: docs/theory/fmcw.md, eqs. 2 to 5; for deskewing, W. G. Carrara, R. S. Goodman, R. M. Majewski, Spotlight
+    Synthetic Aperture Radar, Artech House 1995.
 
     Examples
     --------
@@ -153,21 +154,21 @@ def transfer_of(
     kept, slope = sweep.samples, sweep.slope_hz_s
     low, high = sweep.beats_hz
     farthest = min(round((high - min(low, 0.0)) / abs(slope) * sweep.sample_rate_hz) + 1, kept)
-    length = scipy.fft.next_fast_len(kept + farthest)  # room for shifts, so that none wraps around
+    length = scipy.fft.next_fast_len(kept + farthest)  # zero padding, so that no delay wraps around
     bins = -np.sign(slope) * scipy.fft.fftfreq(length, 1 / sweep.sample_rate_hz)
     shift = (bins - low) % sweep.sample_rate_hz + low  # γΔ of each bin; f_b = -γΔ, eq. 1
-    turn = np.exp(-1j * np.pi * shift**2 / slope) if deskewed else np.ones(length, np.complex128)
-    if sweep.iq == "real":
-        turn = turn * np.where(shift > high, 0.0, np.where((shift == 0) | (shift == high), 1.0, 2.0))
+    response = np.exp(-1j * np.pi * shift**2 / slope) if deskewed else np.ones(length, np.complex128)
+    if sweep.iq == "real":  # the analytic signal: one-sided spectrum
+        response = response * np.where(shift > high, 0.0, np.where((shift == 0) | (shift == high), 1.0, 2.0))
     beat_hz = -np.sign(slope) * shift
     transfer = np.empty((len(beat), kept), np.complex64)
-    for begin in range(0, len(beat), _SWEEPS_AT_ONCE):
-        part = slice(begin, begin + _SWEEPS_AT_ONCE)
-        some = np.asarray(beat[part, sweep.first : sweep.sweep_samples])
-        spectrum = scipy.fft.fft(some.conj() if sweep.iq == "conjugate" else some, length, axis=1) * turn
+    for start in range(0, len(beat), _SWEEPS_AT_ONCE):
+        sweeps = slice(start, start + _SWEEPS_AT_ONCE)
+        samples = np.asarray(beat[sweeps, sweep.first : sweep.sweep_samples])
+        spectrum = scipy.fft.fft(samples.conj() if sweep.iq == "conjugate" else samples, length, axis=1) * response
         if late_s is not None:
-            spectrum = spectrum * np.exp(-2j * np.pi * late_s[part, None] * beat_hz)
-        transfer[part] = scipy.fft.ifft(spectrum, axis=1)[:, :kept]
+            spectrum = spectrum * np.exp(-2j * np.pi * late_s[sweeps, None] * beat_hz)
+        transfer[sweeps] = scipy.fft.ifft(spectrum, axis=1)[:, :kept]
     return transfer if slope > 0 else np.ascontiguousarray(transfer[:, ::-1])
 
 
@@ -178,14 +179,14 @@ def sweep_motion_flags(
     lasting_s: float,
     frequency_hz: NDArray[np.float64],
 ) -> dict[str, str]:
-    """Return a flag where the antennas move so far during a sweep that envelopes and phases disagree.
+    """Return a flag if the motion of the antennas during a sweep displaces the envelope of an echo from its phase.
 
     Parameters
     ----------
     time
         (pulse,) datetime64[ns], the middles of the sweeps.
     antennas
-        Of transmitter and receiver, (pulse, 3) float64 metres each, one Cartesian frame.
+        Positions of transmitter and receiver, (pulse, 3) float64 metres each, in one Cartesian frame.
     lasting_s
         Length of the part of a sweep that is used, seconds; 0: no sweep.
     frequency_hz
@@ -193,18 +194,19 @@ def sweep_motion_flags(
 
     Notes
     -----
-    Source: docs/theory/fmcw.md, eq. 7. The path of an echo changes by no more than both antennas move.
+    Source: docs/theory/fmcw.md, eq. 7. The path of an echo changes by at most the sum of both antennas' motions.
     """
     if not lasting_s or len(time) < 2:
         return {}
     step_s = np.diff(time) / np.timedelta64(1, "s")
-    speed_m_s = sum(np.linalg.norm(np.diff(one, axis=0), axis=1) for one in antennas) / step_s
+    speed_m_s = sum(np.linalg.norm(np.diff(position_m, axis=0), axis=1) for position_m in antennas) / step_s
     moved_m = float(np.percentile(speed_m_s, _FASTEST)) * lasting_s
     middle_hz = float(frequency_hz[[0, -1]].mean())
     if moved_m <= _MOTION_WAVES * SPEED_OF_LIGHT_M_S / middle_hz:
         return {}
-    smeared_m = moved_m * middle_hz / float(frequency_hz[-1] - frequency_hz[0])
+    displaced_m = moved_m * middle_hz / float(frequency_hz[-1] - frequency_hz[0])
     return {
-        "sweep_motion": f"antennas move {moved_m * middle_hz / SPEED_OF_LIGHT_M_S:.2f} wavelengths of path within a "
-        f"sweep: echoes are up to {smeared_m:.2g} m of path off, one way ahead and the other astern"
+        "sweep_motion": "antenna motion changes the total path by up to "
+        f"{moved_m * middle_hz / SPEED_OF_LIGHT_M_S:.2f} wavelengths within a sweep: echoes are displaced by up to "
+        f"{displaced_m:.2g} m of total path, with opposite signs ahead and astern"
     }

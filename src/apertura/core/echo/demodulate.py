@@ -1,7 +1,7 @@
-"""Captured symbols to transfer functions: a DFT over one period of 1/Δf, and code removal.
+"""Demodulation of captured symbols: a DFT over one period 1/Δf, and removal of path delays.
 
-A subcarrier n of the symbol s(t) = Σ c_n exp(j2πnΔf(t-T_cp)) that travelled a path of delay τ arrives as
-c_n·exp(-j2π(f_c+nΔf)τ), as long as τ stays inside the cyclic prefix (docs/theory.md, eq. 1 and 2).
+Subcarrier n of the symbol s(t) = Σ c_n exp(j2πnΔf(t-T_cp)) is received over a path of delay τ as
+c_n·exp(-j2π(f_c+nΔf)τ), if τ is shorter than the cyclic prefix (docs/theory.md, eqs. 1 and 2).
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ _PULSES_AT_ONCE = 64
 
 @dataclass(frozen=True)
 class Numerology:
-    """Sampling of the transmitted signal: an OFDM symbol that repeats itself, or a pulse that is sent once.
+    """Sampling of the transmitted signal: a periodic OFDM symbol, or a pulse that is sent once.
 
     Attributes
     ----------
@@ -26,12 +26,12 @@ class Numerology:
     numbers
         (subcarrier,) int64, the n of each subcarrier in multiples of Δf from the carrier, ascending.
     prefix_samples
-        T_cp·f_s, where the DFT window begins.
+        T_cp·f_s, start of the DFT window.
     dft_samples
-        f_s/Δf, the length of the DFT window.
+        f_s/Δf, length of the DFT window.
     longest_samples
-        Of a pulse sent once: delay up to which captures contain its complete echoes. None: a symbol, which repeats
-        itself after 1/Δf, and whose echoes are complete up to the prefix.
+        Largest delay, samples, of which captures contain the complete echo of a pulse sent once. None: a symbol of
+        period 1/Δf, whose echoes are complete up to the length of the prefix.
     """
 
     carrier_hz: float
@@ -43,7 +43,7 @@ class Numerology:
 
     @property
     def spacing_hz(self) -> float:
-        """Δf."""
+        """Subcarrier spacing Δf, Hz."""
         return self.sample_rate_hz / self.dft_samples
 
     @property
@@ -58,18 +58,18 @@ class Numerology:
 
     @property
     def repeats(self) -> bool:
-        """Whether the transmitted signal repeats after 1/Δf."""
+        """True if the transmitted signal has the period 1/Δf."""
         return self.longest_samples is None
 
     @property
     def delay_cells(self) -> int:
-        """Delay cells of 1/B with complete echoes: those inside the cyclic prefix, of a symbol."""
+        """Number of delay cells of 1/B with complete echoes; for a symbol, those within the cyclic prefix."""
         samples = self.prefix_samples if self.longest_samples is None else self.longest_samples
         return round(samples * self.numbers.size / self.dft_samples)
 
 
 def subcarrier_numbers(count: int, *, carrier_is: str) -> NDArray[np.int64]:
-    """Return n of each subcarrier, ascending: 0…N-1 for band_start, -N/2…N/2-1 for band_centre.
+    """Return the number n of each subcarrier, ascending: 0…N-1 for band_start, -N/2…N/2-1 for band_centre.
 
     Examples
     --------
@@ -87,7 +87,7 @@ def demodulate(captures: NDArray[np.complex64], numerology: Numerology) -> NDArr
     captures
         (pulse, sample) complex64 ADC counts; sample 0 is the start of the cyclic prefix.
     numerology
-        Of the symbol.
+        Numerology of the symbol.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def demodulate(captures: NDArray[np.complex64], numerology: Numerology) -> NDArr
 
     Notes
     -----
-    Source: docs/theory.md, eq. 2; the DFT length is f_s/Δf, not N.
+    Source: docs/theory.md, eq. 2. The length of the DFT is f_s/Δf, not N.
 
     Examples
     --------
@@ -108,10 +108,10 @@ def demodulate(captures: NDArray[np.complex64], numerology: Numerology) -> NDArr
     pulses, samples = captures.shape
     start, stop = numerology.prefix_samples, numerology.prefix_samples + numerology.dft_samples
     if samples < stop:
-        raise ValueError(f"{samples=}: a capture needs {stop} (prefix and DFT window)")
+        raise ValueError(f"{samples=}: a capture must have at least {stop} (prefix and DFT window)")
     symbols = np.empty((pulses, numerology.numbers.size), np.complex64)
     count, lowest = numerology.numbers.size, int(numerology.numbers[0]) % numerology.dft_samples
-    below = min(count, numerology.dft_samples - lowest)  # of those from `lowest` on; the others lie at the beginning
+    below = min(count, numerology.dft_samples - lowest)  # negative frequencies; the others start at bin 0
     for first in range(0, pulses, _PULSES_AT_ONCE):
         spectrum = scipy.fft.fft(captures[first : first + _PULSES_AT_ONCE, start:stop], axis=1, norm="forward")
         rows = slice(first, first + len(spectrum))
@@ -123,9 +123,9 @@ def demodulate(captures: NDArray[np.complex64], numerology: Numerology) -> NDArr
 def remove_path(
     transfer: NDArray[np.complex64], frequency_hz: NDArray[np.float64], *, delay_s: NDArray[np.float64]
 ) -> NDArray[np.complex64]:
-    """Return (pulse, subcarrier) `transfer` with a delay per pulse removed from every echo: times exp(+j2πf·delay).
+    """Remove a delay per pulse from (pulse, subcarrier) `transfer`: multiply by exp(+j2πf·delay).
 
-    Frequencies (subcarrier,) ascend in equal steps.
+    The frequencies, (subcarrier,), ascend in equal steps.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The direct path in a sidelink: its delay, phase and amplitude in every pulse, and its detection."""
+"""Direct path of a sidelink: detection, and estimation of delay, phase and amplitude in every pulse."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -11,16 +11,16 @@ from apertura.common.arrays import Complexes, Floats
 from apertura.core.echo.compression import phasors, unit_phasor
 
 LOCK_FALSE_ALARM = 1e-3
-"""Probability that a pulse of pure noise is detected as one with a sidelink."""
+"""Probability of a lock on a pulse of noise alone."""
 
 _PULSES_AT_ONCE = 64
 _GROUPS = 32
-_NOISE_CELLS = 256  # whose median is accurate to 0.4 dB
+_NOISE_CELLS = 256  # number of cells at which their median is accurate to 0.4 dB
 
 
 @dataclass(frozen=True)
 class LineOfSight:
-    """The strongest path of each pulse, S_n = amplitude·exp(j(phase - 2π·n·delay/N)) with n counted from mid-band.
+    """Strongest path of each pulse, S_n = amplitude·exp(j(phase - 2π·n·delay/N)) with n counted from mid-band.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class LineOfSight:
     noise_power
         (pulse,) float64, per subcarrier.
     locked
-        (pulse,) bool, whether the path is detected above the noise.
+        (pulse,) bool, True if the path is detected above the noise.
     """
 
     delay_cells: Floats
@@ -43,7 +43,7 @@ class LineOfSight:
     locked: NDArray[np.bool_]
 
     def select(self, pulses: slice | NDArray[np.bool_] | NDArray[np.intp]) -> "LineOfSight":
-        """Return the path of some pulses."""
+        """Return the paths of the selected pulses."""
         return LineOfSight(*(getattr(self, field.name)[pulses] for field in fields(self)))
 
 
@@ -67,17 +67,19 @@ def fit_line_of_sight(sidelink: Complexes) -> LineOfSight:
 
 def joined(paths: Sequence[LineOfSight]) -> LineOfSight:
     """Return the concatenated paths of consecutive pulses."""
-    return LineOfSight(*(np.concatenate([getattr(one, field.name) for one in paths]) for field in fields(LineOfSight)))
+    return LineOfSight(
+        *(np.concatenate([getattr(path, field.name) for path in paths]) for field in fields(LineOfSight))
+    )
 
 
 def phasor(path: LineOfSight, subcarriers: int) -> Complexes:
-    """Return (pulse, subcarrier) complex64 exp(j(phase - 2π·n·delay/N)) of the fitted paths."""
+    """Return the phasors exp(j(phase - 2π·n·delay/N)) of the fitted paths, (pulse, subcarrier) complex64."""
     along = phasors(-path.delay_cells / subcarriers, subcarriers, first=-(subcarriers - 1) / 2)
     return np.asarray(along * np.exp(1j * path.phase_rad)[:, None], np.complex64)
 
 
 def fit_block(sidelink: Complexes) -> tuple[LineOfSight, Complexes]:
-    """Fit one path to each of a few pulses; return also their profile, aligned: the path lies in cell 0.
+    """Fit one path to each pulse of a block; return the paths and the profiles aligned so that the path is in cell 0.
 
     Parameters
     ----------
@@ -91,8 +93,9 @@ def fit_block(sidelink: Complexes) -> tuple[LineOfSight, Complexes]:
 
     Notes
     -----
-    Source: docs/theory/echo_methods.md, "Two parameters of a pulse". From the highest half cell, Newton's steps on sums
-    over groups of neighbouring subcarriers, within which a quarter of a cell turns the phase by less than 0.05 rad.
+    Source: docs/theory/echo_methods.md, "Two parameters of a pulse". Newton's method from the highest half cell, on
+    sums over groups of neighbouring subcarriers, within which a quarter of a cell changes the phase by less than
+    0.05 rad.
     """
     subcarriers = sidelink.shape[1]
     coarse = np.abs(scipy.fft.ifft(sidelink, 2 * subcarriers, axis=1)).argmax(axis=1) / 2
@@ -102,11 +105,11 @@ def fit_block(sidelink: Complexes) -> tuple[LineOfSight, Complexes]:
     delay = delay + _residual_cells(sums, (edges[:-1] + edges[1:] - subcarriers) / 2, subcarriers)
     profile = scipy.fft.ifft(_aligned(sidelink, delay), axis=1)
     direct = profile[:, 0].astype(np.complex128)
-    some = profile[:, :: max(1, subcarriers // _NOISE_CELLS)]
-    power = np.square(some.real) + np.square(some.imag)
-    # the median of an exponential variable is ln 2 of its mean; few strong cells (echoes, ripple) do not move it
+    cells = profile[:, :: max(1, subcarriers // _NOISE_CELLS)]
+    power = np.square(cells.real) + np.square(cells.imag)
+    # the median of an exponential variable is ln 2 of its mean; a few strong cells (echoes, ripple) do not affect it
     half = power.shape[1] // 2
-    power.sort(axis=1)  # five times as fast as numpy's median
+    power.sort(axis=1)  # five times as fast as numpy.median
     middle = (power[:, half] + power[:, (power.shape[1] - 1) // 2]).astype(np.float64) / 2
     noise = middle / np.log(2) * subcarriers
     amplitude = np.abs(direct)
@@ -120,9 +123,9 @@ def _aligned(sidelink: Complexes, delay_cells: Floats) -> Complexes:
 
 
 def _residual_cells(sums: NDArray[np.complex128], number: Floats, subcarriers: int) -> Floats:
-    """Return (pulse,) the residual delay in (pulse, group) sums, whose groups are centred on `number`."""
+    """Return the residual delay of (pulse, group) sums, (pulse,) cells; the groups are centred on `number`."""
     delay = np.zeros(len(sums))
-    for _ in range(4):  # Newton's steps on the power |Σ S_n exp(+j2πn·delay/N)|²
+    for _ in range(4):  # Newton's method on the power |Σ S_n exp(+j2πn·delay/N)|²
         aligned = sums * unit_phasor(np.outer(delay, number / subcarriers))
         total, first, second = aligned.sum(1), (aligned @ number), (aligned @ number**2)
         slope = -2 * np.imag(total.conj() * first)
@@ -133,9 +136,9 @@ def _residual_cells(sums: NDArray[np.complex128], number: Floats, subcarriers: i
 
 
 def _lock_threshold(subcarriers: int) -> float:
-    """Return the threshold over the mean noise of a delay cell that pure noise exceeds once in 1/P_fa pulses.
+    """Return the threshold relative to the mean noise of a delay cell that noise exceeds once in 1/P_fa pulses.
 
-    |h(τ)|² of noise of bandwidth B crosses T times its mean √(πT/3)·exp(-T) times per 1/B, and there are N of these.
+    |h(τ)|² of noise of bandwidth B crosses T times its mean √(πT/3)·exp(-T) times per cell of 1/B; there are N cells.
     """
     first_order = float(np.log(subcarriers / LOCK_FALSE_ALARM))
     threshold = first_order

@@ -1,4 +1,4 @@
-"""Checks of a node's own pulses: their code, and the stability of their phase."""
+"""Checks of the monostatic echoes of a node: code, and phase stability from pulse to pulse."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -12,25 +12,25 @@ from apertura.common.units import decibels
 # ---- Code of a node's own pulses
 
 FALSE_ALARM = 1e-5
-"""Probability that a wrong code is accepted as the right one."""
+"""Probability that a wrong code is confirmed."""
 
-_COHERENT_PULSES = 8, 32, 128  # pulses added coherently, at each Doppler
-_GUARD_CELLS = 8  # on both sides of the prefix, within reach of sidelobes of echoes inside
-_FEWEST_CELLS = 32  # outside the prefix, to estimate the floor from
-_NOISE_SIGMAS = 6.0  # above it, cells outside the prefix may scatter more than noise
-_SPREAD_SIGMAS = 10.0  # above it, they do
+_COHERENT_PULSES = 8, 32, 128  # pulses added coherently, at each Doppler frequency
+_GUARD_CELLS = 8  # on both sides of the prefix, for sidelobes of echoes inside
+_FEWEST_CELLS = 32  # outside the prefix, required to estimate the floor
+_NOISE_SIGMAS = 6.0  # excess scatter above which cells outside the prefix may contain more than noise
+_SPREAD_SIGMAS = 10.0  # excess scatter above which they certainly do
 
 
 @dataclass(frozen=True)
 class CodeEvidence:
-    """Evidence on a code.
+    """Evidence on the code of a recording.
 
     Attributes
     ----------
     carried
-        Whether the recording contains it; None without evidence.
+        True if the recording contains the code; None without evidence.
     evidence
-        One line with the numbers.
+        Measured values, one line.
     """
 
     carried: bool | None
@@ -43,19 +43,19 @@ class CodeEvidence:
 
     @property
     def flags(self) -> dict[str, str]:
-        """A flag, if the code is not carried."""
+        """A flag if the recording does not contain the code."""
         return {"code_unconfirmed": self.evidence} if self.carried is False else {}
 
 
 def own_code(transfer: NDArray[np.complex64], *, prefix_cells: int) -> CodeEvidence:
-    """Return whether own echoes, the code removed, are compressed inside the prefix as with the right code.
+    """Test the code of monostatic echoes: with the right code they are compressed inside the prefix.
 
     Parameters
     ----------
     transfer
-        (pulse, subcarrier) complex64, the code removed; echoes lie in the first `prefix_cells` of 1/B.
+        (pulse, subcarrier) complex64, code removed; echoes lie in the first `prefix_cells` cells of 1/B.
     prefix_cells
-        Cells of 1/B inside the cyclic prefix, or inside the longest delay of a pulse sent once.
+        Number of cells of 1/B in the cyclic prefix, or in the longest complete delay of a pulse sent once.
 
     Notes
     -----
@@ -65,35 +65,41 @@ def own_code(transfer: NDArray[np.complex64], *, prefix_cells: int) -> CodeEvide
     --------
     >>> rng = np.random.default_rng(1)
     >>> noise = (rng.normal(size=(64, 256)) + 1j * rng.normal(size=(64, 256))).astype(np.complex64)
-    >>> [own_code(one, prefix_cells=64).carried for one in (noise, noise + 1)]
+    >>> [own_code(transfer, prefix_cells=64).carried for transfer in (noise, noise + 1)]
     [None, True]
     """
     pulses, cells = transfer.shape
     outside = slice(prefix_cells + _GUARD_CELLS, cells - _GUARD_CELLS)
     if not prefix_cells or outside.stop - outside.start < _FEWEST_CELLS:
-        return CodeEvidence(None, f"{prefix_cells} of {cells} delay cells may hold echoes: nothing to compare with")
+        return CodeEvidence(
+            None, f"{prefix_cells} of {cells} delay cells may contain echoes: too few others to measure the floor"
+        )
     profile = scipy.fft.ifft(transfer, 2 * cells, axis=1)  # half cells, so that no echo falls between two
-    scattered, beyond = -np.inf, slice(2 * outside.start, -2 * _GUARD_CELLS, 2)
+    largest_scatter, beyond = -np.inf, slice(2 * outside.start, -2 * _GUARD_CELLS, 2)
     for run in [run for run in _COHERENT_PULSES if run <= pulses] or [pulses]:
         level, needed, scatter = _strongest(profile, run, 2 * prefix_cells, beyond)
-        scattered = max(scattered, scatter)
-        line = f"the strongest complete echo, {run} pulses added, is {decibels(level):.1f} dB above what lies beyond"
+        largest_scatter = max(largest_scatter, scatter)
+        line = (
+            f"the strongest complete echo, {run} pulses added, is {decibels(level):.1f} dB above the mean beyond the "
+            "longest delay"
+        )
         if level >= needed:
             return CodeEvidence(True, line)
-    if scattered > _SPREAD_SIGMAS:
+    if largest_scatter > _SPREAD_SIGMAS:
         return CodeEvidence(
             False,
-            f"{line}; what repeats in all pulses is spread over all delays: the code is wrong, or another transmits",
+            f"{line}; the signal common to all pulses is spread over all delays: the code is wrong, or another node "
+            "transmits",
         )
     return CodeEvidence(
-        None, f"{line}, {decibels(needed):.1f} dB needed: no echo rises above the noise, or the code is wrong"
+        None, f"{line}, {decibels(needed):.1f} dB required: no echo exceeds the noise, or the code is wrong"
     )
 
 
 def _strongest(profile: NDArray[np.complex64], run: int, inside: int, beyond: slice) -> tuple[float, float, float]:
     """Return the strongest cell inside the prefix, its threshold, and the excess scatter of cells outside, in σ.
 
-    Levels are ratios to the mean beyond the prefix at the same Doppler.
+    Levels are relative to the mean beyond the prefix at the same Doppler frequency.
     """
     blocks = len(profile) // run
     power = np.zeros((2 * run, profile.shape[1]), np.float32)
@@ -102,41 +108,46 @@ def _strongest(profile: NDArray[np.complex64], run: int, inside: int, beyond: sl
     floor = power[:, beyond].astype(np.float64)
     mean = np.maximum(floor.mean(1), 1e-30)
     scatter = floor.std(1) / mean
-    chance = FALSE_ALARM / (inside * len(power))
+    false_alarm = FALSE_ALARM / (inside * len(power))  # per cell
     sigmas = (blocks * scatter**2 - 1) / np.sqrt((2 + 6 / blocks) / floor.shape[1])
-    # a wrong code's floor repeats in all pulses, unlike noise: exponential from cell to cell, however many are added
-    noise = sigmas.max() < _NOISE_SIGMAS
-    needed = scipy.special.gammainccinv(blocks, chance) / blocks if noise else 1 - scatter * (1 + np.log(chance))
+    # The floor of a wrong code repeats in all pulses: unlike noise, it is exponentially distributed over the cells for
+    # any number of pulses added.
+    is_noise = sigmas.max() < _NOISE_SIGMAS
+    needed = (
+        scipy.special.gammainccinv(blocks, false_alarm) / blocks
+        if is_noise
+        else 1 - scatter * (1 + np.log(false_alarm))
+    )
     level = power[:, :inside].max(1) / mean
     best = int((level / needed).argmax())
     return float(level[best]), float(np.broadcast_to(needed, level.shape)[best]), float(sigmas.max())
 
 
-# ---- Phase stability of a node's own pulses
+# ---- Phase stability of monostatic echoes
 
 LEAST_COHERENCE = 0.3
-"""Coherence of second differences of phase, at which they scatter by 1.55 rad rms, white phase noise by 0.63 rad."""
+"""Least coherence of the second differences of phase: 1.55 rad rms, or white phase noise of 0.63 rad."""
 
 STEADY = 0.93
-"""Agreement of magnitudes from pulse to pulse at least: independent speckle has π/4, noise 10 dB below an echo 0.95."""
+"""Least agreement of magnitudes from pulse to pulse: it is π/4 for independent speckle, 0.95 at an SNR of 10 dB."""
 
 ECHO_DB = 13.0
-"""dB of mean power above the noise of the cells that are evaluated: phases of weaker ones scatter by noise."""
+"""dB above the noise, least mean power of the cells evaluated; noise dominates the phase of weaker cells."""
 
-_FEWEST_TRIPLES = 20  # of consecutive pulses, to estimate a coherence from
-_EVEN = 0.25  # of the usual interval: tolerated deviation; larger ones mean missing pulses
+_FEWEST_TRIPLES = 20  # triples of consecutive pulses required to estimate a coherence
+_EVEN = 0.25  # tolerated deviation from the median interval, as a share; a larger one indicates missing pulses
 
 
 @dataclass(frozen=True)
 class PhaseStability:
-    """Stability of the phase of echoes from pulse to pulse.
+    """Phase stability of echoes from pulse to pulse.
 
     Attributes
     ----------
     coherence
-        |mean exp(jφ'')| of the second differences φ'' of phase, weighted by power; 1 of smooth motion.
+        |mean exp(jφ'')| of the second differences φ'' of phase, weighted by power; 1 for smooth motion.
     steadiness
-        Agreement of magnitudes of neighbouring pulses, 1 where scatterers do not change.
+        Agreement of the magnitudes of neighbouring pulses; 1 if the scatterers do not change.
     """
 
     coherence: float
@@ -144,7 +155,7 @@ class PhaseStability:
 
     @property
     def rms_rad(self) -> float:
-        """RMS of the second differences, rad, as of a normal distribution."""
+        """RMS of the second differences, rad, assuming a normal distribution."""
         return float(np.sqrt(-2 * np.log(max(self.coherence, 1e-9))))
 
     @property
@@ -154,12 +165,13 @@ class PhaseStability:
 
     @property
     def flags(self) -> dict[str, str]:
-        """A flag if echoes of steady magnitude change their phase at random."""
+        """A flag if echoes of constant magnitude have a random phase from pulse to pulse."""
         if self.steadiness < STEADY or self.coherence >= LEAST_COHERENCE:
             return {}
         line = (
-            f"own echoes keep their magnitude from pulse to pulse ({self.steadiness:.2f}) and not their phase: second "
-            f"differences of {self.rms_rad:.1f} rad rms; a moving antenna makes less than 0.1: the image is speckle"
+            f"monostatic echoes have a constant magnitude from pulse to pulse (agreement {self.steadiness:.2f}) and an "
+            f"unstable phase: second differences of {self.rms_rad:.1f} rad rms, less than 0.1 expected from antenna "
+            "motion; the image is speckle"
         )
         return {"phase_unstable": line}
 
@@ -167,16 +179,16 @@ class PhaseStability:
 def phase_stability(
     transfer: NDArray[np.complex64], time_s: NDArray[np.float64], *, prefix_cells: int
 ) -> PhaseStability | None:
-    """Return the phase stability of own echoes, or None where no echo is above the noise.
+    """Measure the phase stability of monostatic echoes; None if no echo exceeds the noise.
 
     Parameters
     ----------
     transfer
-        (pulse, subcarrier) complex64, the code removed; echoes lie in the first `prefix_cells` of 1/B.
+        (pulse, subcarrier) complex64, code removed; echoes lie in the first `prefix_cells` cells of 1/B.
     time_s
-        (pulse,) float64, when each was sent, seconds; triples with missing pulses between them are left out.
+        (pulse,) float64, time of transmission, seconds; triples with missing pulses are excluded.
     prefix_cells
-        Cells of 1/B inside the cyclic prefix, or inside the longest delay of a pulse sent once.
+        Number of cells of 1/B in the cyclic prefix, or in the longest complete delay of a pulse sent once.
 
     Notes
     -----
@@ -195,15 +207,15 @@ def phase_stability(
         return None
     profile = scipy.fft.ifft(transfer, axis=1)
     power = (np.abs(profile) ** 2).mean(0)
-    # the median of an exponential variable's mean over many pulses is its mean
+    # averaged over the pulses, the noise power is nearly equal in all cells: its median is its mean
     strong = np.flatnonzero(power[:prefix_cells] > 10 ** (ECHO_DB / 10) * np.median(power[prefix_cells:]))
     if not strong.size:
         return None
     cells = profile[:, strong].astype(np.complex128)
-    before, here, after = cells[:-2][triples], cells[1:-1][triples], cells[2:][triples]
-    products = after * here.conj() ** 2 * before
-    both = (np.abs(here) ** 2 + np.abs(after) ** 2).sum() / 2
+    first, second, third = cells[:-2][triples], cells[1:-1][triples], cells[2:][triples]
+    products = third * second.conj() ** 2 * first  # phase φ'' of each triple
+    mean_power = (np.abs(second) ** 2 + np.abs(third) ** 2).sum() / 2
     return PhaseStability(
         round(float(np.abs(products.sum()) / np.abs(products).sum()), 6),
-        round(float((np.abs(here) * np.abs(after)).sum() / both), 6),
+        round(float((np.abs(second) * np.abs(third)).sum() / mean_power), 6),
     )

@@ -1,7 +1,7 @@
-"""The filter that removes a pulse from its echoes: its band, the choice between inverse and matched, and its loss.
+"""Compression filter of a pulse that is sent once: occupied band, choice of inverse or matched filter, and its loss.
 
-A pulse is sent once, so a capture that contains it and its echoes to their end is a linear convolution: a DFT as long
-as the capture turns it into a product, exactly, bin by bin (docs/theory/waveforms.md, eq. 1).
+A capture that contains the pulse and its complete echoes is a linear convolution. A DFT of the length of the capture
+transforms it into an exact product, bin by bin (docs/theory/waveforms.md, eq. 1).
 """
 
 from dataclasses import dataclass
@@ -15,36 +15,36 @@ from apertura.common.arrays import Floats
 from apertura.common.units import decibels
 
 BAND_FLOOR_DB = -10.0
-"""dB below the highest power of the pulse, at which a band that is not stated ends."""
+"""dB relative to the highest power of the pulse, level of the band edges if the band is not configured."""
 
 NULL_DB = -20.0
-"""dB below the mean, at which bins are attenuated, not divided: noise is amplified by a hundred at most."""
+"""dB relative to the mean, level below which bins are attenuated, not divided: limits noise amplification to 20 dB."""
 
 FLAT_DB = -30.0
-"""dB of ripple power below which a spectrum needs no division: its range sidelobes lie below."""
+"""dB, ripple power below which a spectrum is not divided: its range sidelobes are lower."""
 
 SIDELOBES_DB = -25.0
-"""dB, sidelobes above which are flagged; those of the Hann window are -31.5 dB."""
+"""dB, range sidelobes above which a flag is raised; those of the Hann window are -31.5 dB."""
 
 MOST_LOSS_DB = 6.0
-"""dB of signal to noise ratio, the largest loss of a chosen division; a requested one beyond it is flagged."""
+"""dB of SNR, largest loss at which the inverse filter is chosen; a flag is raised if a requested filter exceeds it."""
 
-_SMOOTH = 64  # parts of the sampled band over which its level is averaged
+_SMOOTH = 64  # the level is averaged over this fraction (1/64) of the sampled band
 
 
 @dataclass(frozen=True)
 class PulseFilter:
-    """The filter of echoes, and its loss.
+    """Compression filter of echoes, and its loss.
 
     Attributes
     ----------
     inverse
-        (bin,) complex64, by which the DFT of a capture is multiplied.
+        (bin,) complex64, factor of the DFT of a capture.
     report
-        Name of the filter, its reason, loss_db (of signal to noise ratio against the matched filter) and sidelobes_db
-        (the highest beside a point in range, by a Hann window).
+        Name of the filter, its reason, loss_db (of SNR relative to the matched filter) and sidelobes_db (the highest
+        range sidelobe of a point, with a Hann window).
     flags
-        Edge crossed → what was measured, in one line.
+        Flag → measured values, one line.
     """
 
     inverse: NDArray[np.complex64]
@@ -60,9 +60,9 @@ def pulse_spectrum(pulse: NDArray[np.complexfloating], *, lead: float, length: i
     pulse
         (sample,) complex.
     lead
-        Samples, possibly fractional, that a capture begins before the pulse.
+        Number of samples, possibly fractional, of the capture before the pulse.
     length
-        Samples of the capture.
+        Number of samples of the capture.
 
     Notes
     -----
@@ -78,7 +78,7 @@ def pulse_spectrum(pulse: NDArray[np.complexfloating], *, lead: float, length: i
 
 
 def occupied_band(power: Floats) -> tuple[int, int]:
-    """Return the first and the last number of the DFT's bins, counted from baseband zero, between which a pulse lies.
+    """Return the first and the last DFT bin of the occupied band of a pulse, counted from baseband zero.
 
     Parameters
     ----------
@@ -98,17 +98,18 @@ def occupied_band(power: Floats) -> tuple[int, int]:
     top = int(level.argmax())
     first = int(below[below < top].max(initial=-1)) + 1
     last = int(below[below > top].min(initial=length)) - 1
-    strong = first + np.flatnonzero(ordered[first : last + 1] >= threshold)  # the mean runs over the edges of the band
+    # the running mean widens the band at its edges: restrict it to bins that exceed the threshold themselves
+    strong = first + np.flatnonzero(ordered[first : last + 1] >= threshold)
     return int(strong[0]) - length // 2, int(strong[-1]) - length // 2
 
 
 def pulse_filter(spectrum: NDArray[np.complexfloating], *, requested: str) -> PulseFilter:
-    """Return the filter of a pulse.
+    """Choose the compression filter of a pulse.
 
     Parameters
     ----------
     spectrum
-        (bin,) complex, S over the band.
+        (bin,) complex, spectrum S of the pulse over the band.
     requested
         inverse, matched, or auto: matched for a flat spectrum, else inverse where it is adequate.
 
@@ -130,27 +131,29 @@ def pulse_filter(spectrum: NDArray[np.complexfloating], *, requested: str) -> Pu
     power = np.abs(np.asarray(spectrum, np.complex128)) ** 2
     mean = float(power.mean())
     if not mean > 0:
-        raise ValueError("the band holds no energy")
+        raise ValueError("the spectrum of the pulse has no energy in the band")
     inverse = np.conj(spectrum) / np.maximum(power, mean * 10 ** (NULL_DB / 10))
     uneven_db, loss_db = decibels(max(float(power.var() / mean**2), 1e-10)), _loss_db(spectrum, inverse)
     sidelobes_db = _sidelobes_db(spectrum * inverse)
     if requested != "auto":
-        name, reason = requested, "asked for"
+        name, reason = requested, "requested"
     elif uneven_db <= FLAT_DB:
-        name, reason = "matched", f"a flat spectrum: matched scatters {uneven_db:.1f} dB in range"
+        name, reason = "matched", f"flat spectrum: ripple of {uneven_db:.1f} dB"
     elif loss_db <= MOST_LOSS_DB and sidelobes_db <= SIDELOBES_DB:
-        name, reason = "inverse", f"matched would scatter {uneven_db:.1f} dB in range; inverse loses {loss_db:.2f} dB"
+        name = "inverse"
+        reason = f"spectrum with ripple of {uneven_db:.1f} dB; SNR loss of the inverse filter {loss_db:.2f} dB"
     else:
-        name, reason = "matched", f"inverse would lose {loss_db:.1f} dB, and leave sidelobes of {sidelobes_db:.1f} dB"
+        name = "matched"
+        reason = f"the inverse filter has an SNR loss of {loss_db:.1f} dB and sidelobes of {sidelobes_db:.1f} dB"
     chosen = inverse if name == "inverse" else np.conj(spectrum) / mean
     loss_db, sidelobes_db = _loss_db(spectrum, chosen), _sidelobes_db(spectrum * chosen)
     flags = {}
     if sidelobes_db > SIDELOBES_DB:
-        flags["waveform_sidelobes"] = f"{name} leaves sidelobes of {sidelobes_db:.1f} dB in range beside every point"
+        flags["waveform_sidelobes"] = f"range sidelobes of {sidelobes_db:.1f} dB after the {name} filter"
     if loss_db > MOST_LOSS_DB:
         flags["waveform_noise"] = (
-            f"{name} loses {loss_db:.1f} dB of the signal to noise ratio: {np.mean(power < mean / 10):.0%} of the band "
-            "lies 10 dB below its mean"
+            f"SNR loss of the {name} filter {loss_db:.1f} dB: {np.mean(power < mean / 10):.0%} of the band is 10 dB "
+            "below its mean"
         )
     report = {"filter": name, "reason": reason, "loss_db": round(loss_db, 2), "sidelobes_db": round(sidelobes_db, 1)}
     return PulseFilter(np.asarray(chosen, np.complex64), report, flags)
@@ -159,42 +162,43 @@ def pulse_filter(spectrum: NDArray[np.complexfloating], *, requested: str) -> Pu
 def truncation_flags(
     delay_s: Floats, *, lead_s: float, pulse_s: float, listen_s: float, cell_s: float
 ) -> dict[str, str]:
-    """Return the flag of captures that truncate the direct pulse; none: {}.
+    """Return the flag of captures that truncate the direct pulse; {} if there are none.
 
     Parameters
     ----------
     delay_s
-        (pulse,) float64, of the direct path, seconds after `lead_s`, modulo the length of the capture; NaN: unknown.
+        (pulse,) float64, delay of the direct path, seconds after `lead_s`, modulo the length of the capture; NaN:
+        unknown.
     lead_s, pulse_s, listen_s
-        Parts of a capture, seconds.
+        Lengths of the parts of a capture: before the pulse, the pulse, and after it, seconds.
     cell_s
-        1/B, by which a delay may err.
+        1/B, tolerated error of a delay, seconds.
 
     Examples
     --------
     >>> truncation_flags(np.array([0.1, -0.4, 1.1]), lead_s=0.2, pulse_s=1.0, listen_s=1.0, cell_s=0.05)
-    {'pulse_cut': 'captures of 2 of 3 pulses begin in the direct pulse, or end in it'}
+    {'pulse_truncated': 'captures of 2 of 3 pulses start or end within the direct pulse'}
     """
     known = delay_s[np.isfinite(delay_s)]
     length_s = lead_s + pulse_s + listen_s
     # a delay is known modulo the capture's length: half of the pulse may be missing on either side
     after_s = (known + lead_s + pulse_s / 2) % length_s - pulse_s / 2
     cut = int(((after_s < -cell_s) | (after_s > lead_s + listen_s + cell_s)).sum())
-    line = f"captures of {cut} of {len(delay_s)} pulses begin in the direct pulse, or end in it"
-    return {"pulse_cut": line} if cut else {}
+    line = f"captures of {cut} of {len(delay_s)} pulses start or end within the direct pulse"
+    return {"pulse_truncated": line} if cut else {}
 
 
 def _loss_db(spectrum: NDArray[np.complexfloating], filtered: NDArray[np.complexfloating]) -> float:
-    """Return the loss of signal to noise ratio of a filter against the matched one, dB (Schwarz: 0 or more)."""
+    """Return the SNR loss of a filter relative to the matched filter, dB; 0 or more (Cauchy-Schwarz)."""
     gain = abs(np.vdot(np.conj(filtered), spectrum)) ** 2
     kept = gain / ((np.abs(filtered) ** 2).sum() * (np.abs(spectrum) ** 2).sum())
     return -decibels(min(kept, 1.0)) + 0.0
 
 
 def _sidelobes_db(response: NDArray[np.complexfloating]) -> float:
-    """Return the highest sidelobe in range of a response over the band, dB: a Hann window's main lobe left out."""
+    """Return the highest range sidelobe of a response over the band, outside the main lobe of a Hann window, dB."""
     window = np.hanning(len(response))
     profile = np.abs(scipy.fft.ifft(response * window, 4 * len(response)))
-    lobe = 4 * 2 + 2  # two cells to its first null
-    beyond = profile[lobe:-lobe].max(initial=1e-12 * profile[0])
-    return float(20 * np.log10(beyond / profile[0]))
+    lobe = 4 * 2 + 2  # the first null is at two cells
+    highest = profile[lobe:-lobe].max(initial=1e-12 * profile[0])
+    return float(20 * np.log10(highest / profile[0]))

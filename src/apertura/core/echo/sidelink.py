@@ -1,8 +1,8 @@
-"""Corrections of an echo by the sidelink: clocks, phases, timing and transmit ripple common to both.
+"""Correction of an echo by the sidelink: removal of clock, phase, timing and transmit ripple common to both channels.
 
-Every method replaces the radar's transfer function R by R·A/S, S the sidelink or a model of it and A its amplitude
-in that pulse, so that images stay in the units of the radar channel, comparable with monostatic ones, and a
-sidelink that fades does not amplify its pulse. To add a method: one function, one row in `METHODS`, its edges.
+Every method replaces the radar's transfer function R by R·A/S. S is the sidelink or a model of it, and A is its
+amplitude in the same pulse: images remain in the units of the radar channel, comparable with monostatic images, and a
+fading sidelink does not amplify its pulse. A new method requires a function, a row in `METHODS`, and limits in `edges`.
 """
 
 from collections.abc import Callable, Mapping
@@ -25,10 +25,10 @@ WIENER_SNR_DB = 6.0
 """dB per subcarrier, least SNR for `wiener` (same source)."""
 
 RIPPLE_DB = 0.5
-"""dB peak to peak, largest ripple that a method which does not remove it may leave (same source)."""
+"""dB peak to peak, largest residual ripple of a method that does not remove ripple (same source)."""
 
 FIT_SNR_DB = 13.4
-"""dB of the whole pulse, N·SNR: below it the errors of the two fitted parameters cost more than 0.2 dB."""
+"""dB, N·SNR of the whole pulse, below which errors of the two fitted parameters cause a loss of more than 0.2 dB."""
 
 _PULSES_AT_ONCE = 64
 _Inverse = Callable[[Complexes, LineOfSight], Complexes]
@@ -37,20 +37,20 @@ _Inverse = Callable[[Complexes, LineOfSight], Complexes]
 def divide(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None) -> Complexes:
     """Return R·A/S, (pulse, subcarrier) complex64 in the units of `radar`.
 
-    Where |S| falls more than 20 dB below A, in a spectral null or by noise, S is taken as 20 dB below A: a null
-    attenuates its subcarrier, it never amplifies one more than tenfold.
+    Where |S| is more than 20 dB below A, in a spectral null or by noise, it is set to 20 dB below A: a null attenuates
+    its subcarrier, and no subcarrier is amplified more than tenfold.
 
     Parameters
     ----------
     radar, sidelink
         (pulse, subcarrier) complex64 of the same captures.
     path
-        The sidelink's direct path, where `measure` has fitted it already.
+        The sidelink's direct path, if `measure` has fitted it already.
 
     Notes
     -----
-    Source: docs/theory/echo_methods.md, "Corrections". The only method exact for any transmit ripple, and for a
-    wrong code.
+    Source: docs/theory/echo_methods.md, "Corrections". The only method that is exact for any transmit ripple and for
+    a wrong code.
 
     Examples
     --------
@@ -66,23 +66,23 @@ def divide(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = Non
 
 
 def wiener(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None) -> Complexes:
-    """Return R·A·S*/(|S|² + σ²), rescaled so that the direct path keeps its amplitude.
+    """Return R·A·S*/(|S|² + σ²), rescaled to preserve the amplitude of the direct path.
 
-    Parameters and result as `divide`; σ² is the noise per subcarrier, measured beside the direct path.
+    Parameters and result as for `divide`; σ² is the noise per subcarrier, measured outside the direct path.
 
     Notes
     -----
-    Source: docs/theory/echo_methods.md, "Corrections". Without the rescaling the peak is biased by up to
-    SNR/(SNR + 1).
+    Source: docs/theory/echo_methods.md, "Corrections". Without rescaling the peak has a bias of up to SNR/(SNR + 1).
     """
 
     def inverse(symbols: Complexes, path: LineOfSight) -> Complexes:
         amplitude = _amplitude(symbols, path)
         noise = np.where(path.locked, path.noise_power, 0.0)[:, None]  # without lock the noise is unknown
         weakest = _weakest(amplitude)
-        regular = symbols.conj() * amplitude / np.maximum(np.abs(symbols) ** 2 + noise, weakest**2)
-        kept = np.abs((regular * phasor(path, symbols.shape[1])).mean(1, keepdims=True))
-        return np.asarray(np.where(path.locked[:, None], regular / np.maximum(kept, 1e-30), regular), np.complex64)
+        regularised = symbols.conj() * amplitude / np.maximum(np.abs(symbols) ** 2 + noise, weakest**2)
+        gain = np.abs((regularised * phasor(path, symbols.shape[1])).mean(1, keepdims=True))  # of the direct path
+        rescaled = regularised / np.maximum(gain, 1e-30)
+        return np.asarray(np.where(path.locked[:, None], rescaled, regularised), np.complex64)
 
     return _correct(radar, sidelink, path, inverse)
 
@@ -90,11 +90,11 @@ def wiener(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = Non
 def gated(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None) -> Complexes:
     """Return R·A/S with S gated to 16 cells on each side of the direct path.
 
-    Parameters and result as `divide`.
+    Parameters and result as for `divide`.
 
     Notes
     -----
-    Source: docs/theory/echo_methods.md, "Corrections". Of the noise, 33 cells of N stay.
+    Source: docs/theory/echo_methods.md, "Corrections". The gate retains the noise of 33 of N cells.
     """
 
     def inverse(symbols: Complexes, path: LineOfSight) -> Complexes:
@@ -109,9 +109,9 @@ def gated(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None
 
 
 def two_parameter(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None) -> Complexes:
-    """Return R compensated for delay and phase of the direct path, one of each per pulse.
+    """Return R compensated for one delay and one phase of the direct path per pulse.
 
-    Parameters and result as `divide`.
+    Parameters and result as for `divide`.
 
     Notes
     -----
@@ -130,15 +130,15 @@ METHODS: Mapping[str, Callable[..., Complexes]] = {
     "two_parameter": two_parameter,
     "gated": gated,
 }
-"""Cheapest first."""
+"""Name → correction method, in ascending order of computational cost."""
 
 
 DIVIDING = "divide", "wiener"
-"""Methods that remove the transmitted spectrum whatever it is; the others assume a flat one and a single path."""
+"""Methods that remove any transmitted spectrum; the others assume a flat spectrum and a single path."""
 
 
 def edges(method: str, state: SidelinkState) -> dict[str, str]:
-    """Return the limits that a key of `METHODS` crosses on such a sidelink: flag → one line; empty if it is adequate.
+    """Return the limits that a method exceeds on a sidelink: flag → measured values, one line; {} if it is adequate.
 
     Notes
     -----
@@ -150,65 +150,67 @@ def edges(method: str, state: SidelinkState) -> dict[str, str]:
         "gated": (_gain_db(state, 2 * GATE_CELLS + 1), DIVIDE_SNR_DB, "inside the gate"),
         "two_parameter": (_gain_db(state, 1), FIT_SNR_DB, "of the whole pulse"),
     }
-    crossed = {}
-    measured, needed, of_what = snr_db[method]
+    exceeded = {}
+    measured, needed, reference = snr_db[method]
     if measured < needed:
-        crossed["sidelink_noisy"] = f"SNR of the sidelink {measured:.1f} dB {of_what}: {method} needs {needed:.1f} dB"
+        exceeded["sidelink_noisy"] = (
+            f"SNR of the sidelink {measured:.1f} dB {reference}: {method} requires {needed:.1f} dB"
+        )
     reach = {"divide": state.subcarriers, "wiener": state.subcarriers, "gated": GATE_CELLS, "two_parameter": 0}[method]
     if state.echo_db > ECHO_DB and 0 < abs(state.echo_cells) <= reach:
-        crossed["sidelink_echo"] = (
-            f"an echo of {state.echo_db:.1f} dB in the sidelink makes ghosts as strong after {method}"
+        exceeded["sidelink_echo"] = (
+            f"an echo of {state.echo_db:.1f} dB in the sidelink causes ghosts of the same level after {method}"
         )
     ripple_db = {"gated": state.fine_ripple_db, "two_parameter": max(state.ripple_db, state.fine_ripple_db)}
     if ripple_db.get(method, 0.0) > RIPPLE_DB:
-        crossed["sidelink_ripple"] = f"ripple of {ripple_db[method]:.1f} dB over the band stays after {method}"
+        exceeded["sidelink_ripple"] = f"residual ripple of {ripple_db[method]:.1f} dB over the band after {method}"
     if method in ("gated", "two_parameter") and "wrong_code" in state.flags:
-        crossed["sidelink_code"] = f"{method} needs the code, which the sidelink does not carry"
-    return crossed
+        exceeded["sidelink_code"] = f"{method} requires the code, which the sidelink does not contain"
+    return exceeded
 
 
 def choose(state: SidelinkState) -> tuple[str, str]:
-    """Return the cheapest adequate method and why, in one line.
+    """Choose the adequate method of lowest cost; return it and the reason, one line.
 
     Examples
     --------
     >>> noise = np.random.default_rng(1).normal(size=(2, 40, 256))
     >>> choose(measure((10 + noise[0] + 1j * noise[1]).astype(np.complex64)))
-    ('divide', 'SNR 17.0 dB per subcarrier, echoes below -41.7 dB, ripple 0.0 dB: cheapest adequate')
+    ('divide', 'SNR 17.0 dB per subcarrier, echoes below -41.7 dB, ripple 0.0 dB: adequate method of lowest cost')
     """
-    crossed = {method: edges(method, state) for method in METHODS}
-    adequate = [method for method in METHODS if not crossed[method]]
+    exceeded = {method: edges(method, state) for method in METHODS}
+    adequate = [method for method in METHODS if not exceeded[method]]
     summary = (
         f"SNR {state.snr_db:.1f} dB per subcarrier, echoes {'of' if state.echo_cells else 'below'} "
         f"{state.echo_db:.1f} dB, ripple {max(state.ripple_db, state.fine_ripple_db):.1f} dB"
     )
     if adequate:
-        return adequate[0], f"{summary}: cheapest adequate"
-    # every pulse that locks is coherent after two_parameter: it can leave ghosts, it cannot lose the image
+        return adequate[0], f"{summary}: adequate method of lowest cost"
+    # two_parameter makes every locked pulse coherent: ghosts may remain, but the image is formed
     fallback = "wiener" if "wrong_code" in state.flags else "two_parameter"
-    return fallback, f"{summary}: none adequate, least harm ({'; '.join(crossed[fallback].values())})"
+    return fallback, f"{summary}: no method is adequate, smallest error ({'; '.join(exceeded[fallback].values())})"
 
 
 def _gain_db(state: SidelinkState, cells: int) -> float:
-    """Return the SNR with all but `cells` delay cells removed."""
+    """Return the SNR after removal of all but `cells` delay cells, dB."""
     return state.snr_db + decibels(state.subcarriers / min(cells, state.subcarriers))
 
 
 def _amplitude(symbols: Complexes, path: LineOfSight) -> NDArray[np.float32]:
-    """Return (pulse, 1) amplitude of the direct path, or of the whole sidelink where it did not lock."""
+    """Return the amplitude of the direct path, or of the whole sidelink in pulses without lock, (pulse, 1)."""
     rms = np.sqrt(np.mean(np.abs(symbols) ** 2, axis=1))
     return np.asarray(np.where(path.locked, path.amplitude, rms)[:, None], np.float32)
 
 
 def _bounded_inverse(symbols: Complexes, amplitude: NDArray[np.float32]) -> Complexes:
-    """Return A/S, where |S| counts as no weaker than `_weakest`."""
+    """Return A/S, with |S| limited from below to `_weakest`."""
     power = np.square(symbols.real) + np.square(symbols.imag)
     scale = amplitude / np.maximum(power, np.square(_weakest(amplitude)))
     return np.asarray(symbols.conj() * scale, np.complex64)
 
 
 def _weakest(amplitude: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the |S| below which a subcarrier is attenuated instead of divided; never zero, nor is its square."""
+    """Return the |S| below which a subcarrier is attenuated instead of divided; it and its square are never zero."""
     return np.asarray(np.maximum(amplitude * 10 ** (NULL_DB / 20), 1e-15), np.float32)
 
 
@@ -217,6 +219,6 @@ def _correct(radar: Complexes, sidelink: Complexes, path: LineOfSight | None, in
     corrected = np.empty(radar.shape, np.complex64)
     for first in range(0, len(radar), _PULSES_AT_ONCE):
         pulses = slice(first, first + _PULSES_AT_ONCE)
-        # `out`: of large blocks numpy would reuse the inverse and swap the factors, and so round otherwise
+        # `out`: for large blocks numpy would reuse the inverse and swap the factors, which changes the rounding
         np.multiply(radar[pulses], inverse(sidelink[pulses], path.select(pulses)), out=corrected[pulses])
     return corrected

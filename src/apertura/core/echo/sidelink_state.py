@@ -1,4 +1,4 @@
-"""State of a sidelink: its average, SNR, echoes and ripple, a second path, and the pulses in which it locks."""
+"""Measurement of a sidelink: its average, SNR, echoes, ripple, a second path, and the pulses in which it locks."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -18,24 +18,24 @@ from apertura.core.echo.line_of_sight import LOCK_FALSE_ALARM, LineOfSight, fit_
 
 
 class SidelinkAverage(NamedTuple):
-    """The locked pulses of a flight, aligned to a direct path of delay 0 and amplitude 1."""
+    """Averages over the locked pulses of a flight, aligned to a direct path of delay 0 and amplitude 1."""
 
     pulses: int
-    noise: float  # mean power of the noise in a delay cell of one pulse
+    noise: float  # mean noise power in a delay cell of one pulse
     power: Floats  # (cell,) mean power
-    mean: NDArray[np.complex128]  # (cell,) mean
+    mean: NDArray[np.complex128]  # (cell,) complex mean
     spectrum: Floats  # (subcarrier,) mean power
-    second_cell: int  # typical strongest arrival of a pulse beside the direct path
+    second_cell: int  # of the pulse with the median strongest arrival outside the direct path
     second_power: float
 
 
 class Averaging:
-    """Sums over the locked pulses, block by block.
+    """Accumulator of the averages over the locked pulses, block by block.
 
     Parameters
     ----------
     subcarriers
-        Of the sidelink, and cells of its profile.
+        Number of subcarriers of the sidelink, and of cells of its profile.
     """
 
     def __init__(self, subcarriers: int) -> None:
@@ -46,39 +46,39 @@ class Averaging:
         self._levels: list[NDArray[np.float32]] = []
 
     def add(self, sidelink: Complexes, path: LineOfSight, profile: Complexes) -> None:
-        """Add some pulses, (pulse, subcarrier), their direct path, and their aligned profile, (pulse, cell)."""
+        """Add a block of pulses, (pulse, subcarrier), their direct path, and their aligned profiles, (pulse, cell)."""
         locked = path.locked
         if not locked.any():
             return
         kept = slice(None) if locked.all() else locked  # a mask copies
         direct = path.select(kept)
-        size = 1 / direct.amplitude
-        inverse = (size * np.exp(-1j * direct.phase_rad)).astype(np.complex64)
-        unit, symbols = profile[kept] * inverse[:, None], sidelink[kept]
-        power = np.square(unit.real) + np.square(unit.imag)
+        scale = 1 / direct.amplitude
+        inverse = (scale * np.exp(-1j * direct.phase_rad)).astype(np.complex64)
+        normalised, symbols = profile[kept] * inverse[:, None], sidelink[kept]
+        power = np.square(normalised.real) + np.square(normalised.imag)
         self._power += power.sum(0)
-        self._mean += unit.sum(0)
-        self._spectrum += np.square(size).astype(np.float32) @ (np.square(symbols.real) + np.square(symbols.imag))
-        self._noise.append(direct.noise_power * np.square(size))
+        self._mean += normalised.sum(0)
+        self._spectrum += np.square(scale).astype(np.float32) @ (np.square(symbols.real) + np.square(symbols.imag))
+        self._noise.append(direct.noise_power * np.square(scale))
         self._cells.append(power[:, 2:-1].argmax(1) + 2)
         self._levels.append(power[:, 2:-1].max(1))
 
     def result(self) -> SidelinkAverage:
-        """Return the average of what was added, at least one pulse."""
+        """Return the averages over the pulses added; at least one pulse is required."""
         level, noise = np.concatenate(self._levels), np.concatenate(self._noise)
-        typical, count = int(np.argsort(level, kind="stable")[level.size // 2]), level.size
+        median, count = int(np.argsort(level, kind="stable")[level.size // 2]), level.size
         return SidelinkAverage(
             count,
             float(np.mean(noise)) / self._power.size,
             self._power / count,
             self._mean / count,
             self._spectrum / count,
-            int(np.concatenate(self._cells)[typical]),
-            float(level[typical]),
+            int(np.concatenate(self._cells)[median]),
+            float(level[median]),
         )
 
 
-# ---- Echoes and ripple beside the direct path
+# ---- Echoes and ripple in addition to the direct path
 #
 # Source: docs/theory/echo_methods.md, "State of a sidelink".
 
@@ -87,19 +87,19 @@ GATE_CELLS = 16
 
 
 def strongest_echo(average: SidelinkAverage) -> tuple[float, int]:
-    """Return level (dB) and delay (cells, 0 if none) of the strongest arrival beside the direct path.
+    """Measure level (dB) and delay (cells, 0 if none) of the strongest arrival in addition to the direct path.
 
-    Ripple makes echoes on both sides of the direct path, a reflection on one; only the excess of one side counts.
+    Ripple causes echoes on both sides of the direct path, a reflection on one side. The excess of one side is measured.
     """
     cells = np.arange(2, average.power.size - 1)
     excess = average.power - average.noise
     one_sided = np.where(excess[cells] > 4 * np.abs(excess[-cells]), excess[cells] - excess[-cells], 0.0)
     best = int(np.argmax(one_sided))
     level, cell = float(one_sided[best]), int(cells[best])
-    # threshold of the highest of N averages of exponential noise, at the probability of a false lock
+    # threshold of the highest of N averages of exponentially distributed noise, at the false-alarm rate of the lock
     highest = scipy.special.gammainccinv(average.pulses, LOCK_FALSE_ALARM / average.power.size) / average.pulses
     threshold = average.noise * (float(highest) - 1)
-    # an arrival that moves from pulse to pulse averages out: another transmitter with a clock of its own
+    # an arrival whose delay changes from pulse to pulse averages out: another transmitter with its own clock
     highest_noise = average.noise * np.log(average.power.size / LOCK_FALSE_ALARM)
     if average.second_power > max(4 * average.power[average.second_cell], highest_noise, level):
         level, cell = average.second_power, average.second_cell
@@ -109,12 +109,11 @@ def strongest_echo(average: SidelinkAverage) -> tuple[float, int]:
 
 
 def ripple(average: SidelinkAverage, *, one_sided: bool) -> tuple[float, int, float]:
-    """Return ripple (peak to peak, dB) inside the gate, its strongest cell, and ripple outside.
+    """Measure the ripple inside the gate (peak to peak, dB), its strongest cell, and the ripple outside the gate.
 
-    It is measured by echoes that all pulses have in common:
-
-    cos of amplitude a makes two echoes of a/2, a reflection in the transmitter one of a. Outside the gate, and
-    inside unless `one_sided`, an echo on one side only counts as another path of the sidelink.
+    Ripple is measured by the echoes common to all pulses: a cosine of amplitude a causes two echoes of a/2, a
+    reflection in the transmitter one echo of a. Outside the gate, and inside unless `one_sided`, an echo on one side
+    only is attributed to another path of the sidelink.
     """
     power = np.abs(average.mean / average.mean[0]) ** 2
     cells = np.arange(1, power.size // 2)
@@ -130,7 +129,7 @@ def ripple(average: SidelinkAverage, *, one_sided: bool) -> tuple[float, int, fl
 
 
 def changing_near(average: SidelinkAverage) -> float:
-    """Return the power that changes between pulses within two cells of the direct path, dB; -300 where it is noise."""
+    """Return the power within two cells of the direct path that varies between pulses, dB; -300 if it is only noise."""
     near = [1, 2, -1, -2]
     excess = average.power[near] - np.abs(average.mean[near]) ** 2 - average.noise
     threshold = 5 * average.noise * np.sqrt(len(near) / average.pulses)
@@ -145,47 +144,47 @@ def _peak_to_peak_db(amplitude: float) -> float:
 # ---- State of a sidelink
 
 ECHO_DB = -20.0
-"""dB relative to the image of tolerated ghosts; an echo of the sidelink causes one as strong as itself."""
+"""dB relative to the image, tolerated level of ghosts; an echo of the sidelink causes a ghost of the same level."""
 
 SECOND_ARRIVAL_DB = -6.0
-"""dB relative to the direct path: a stronger arrival beside it is another transmitter, or a reflection as strong."""
+"""dB relative to the direct path above which another arrival indicates a second transmitter or a strong reflection."""
 
 NULL_DB = -20.0
-"""dB below the mean, at which subcarriers are nulls: divided, they would amplify noise by more than a hundred."""
+"""dB relative to the mean below which a subcarrier is a null: division would amplify its noise by more than 20 dB."""
 
 
 @dataclass(frozen=True)
 class SidelinkState:
-    """Measures of a sidelink of N `subcarriers`, from which its correction is chosen.
+    """Measurements of a sidelink of N `subcarriers`, the basis for the choice of its correction.
 
     Attributes
     ----------
     snr_db
-        Per subcarrier, median of the locked pulses.
+        SNR per subcarrier, median of the locked pulses.
     echo_db
-        Strongest arrival beside the direct path, relative to it; where `echo_cells` is 0, the detection
-        threshold.
+        Level of the strongest arrival in addition to the direct path, relative to it; the detection threshold if
+        `echo_cells` is 0.
     echo_cells
         Delay of that arrival after the direct path, in cells of 1/B; 0 if none was detected.
     echo_steady
-        Whether its phase against the direct path is the same in most pulses: then it may also be the transmitter's.
+        True if its phase relative to the direct path is the same in most pulses: its cause may be the transmitter.
     ripple_db
-        Peak-to-peak ripple of the band that repeats in every pulse and fits into the gate, as of one sinusoid.
+        Peak-to-peak ripple common to all pulses and resolved within the gate, as of one sinusoid.
     ripple_cells
-        How far from the direct path the strongest arrival behind `ripple_db` lies, in cells of 1/B; 0 without.
+        Distance of the strongest arrival of `ripple_db` from the direct path, in cells of 1/B; 0 without ripple.
     fine_ripple_db
-        The same for ripple too fine for the gate.
+        Peak-to-peak ripple outside the gate.
     near_db
-        Power that changes from pulse to pulse within two cells of the direct path, relative to it; -300 where it is
-        noise.
+        Power within two cells of the direct path that varies from pulse to pulse, relative to the direct path; -300 if
+        it is only noise.
     null_share
         Share of the subcarriers below `NULL_DB`.
     locked
-        (pulse,) bool, whether the direct path is detected above the noise.
+        (pulse,) bool, True if the direct path is detected above the noise.
     path
-        The direct path as fitted to each pulse.
+        The direct path fitted to each pulse.
     flags
-        Edge crossed → what was measured, in one line.
+        Flag → measured values, one line.
     """
 
     subcarriers: int
@@ -220,7 +219,7 @@ class SidelinkState:
 
 
 def measure(sidelink: Complexes, *, where: str = "sidelink") -> SidelinkState:
-    """Measure the sidelink of a flight, (pulse, subcarrier) complex64, the code removed; as `measure_blocks`.
+    """Measure the sidelink of a flight, (pulse, subcarrier) complex64, code removed; see `measure_blocks`.
 
     Examples
     --------
@@ -237,8 +236,8 @@ def measure(sidelink: Complexes, *, where: str = "sidelink") -> SidelinkState:
 def measure_blocks(blocks: Callable[[], Iterable[Complexes]], where: str = "sidelink") -> SidelinkState:
     """Measure the sidelink of a flight, block by block.
 
-    `blocks` gives it from its beginning, (pulse, subcarrier) complex64 each, the code removed; it is called once more
-    where no pulse locks. Errors name the recording `where`; CampaignError if it has no signal.
+    `blocks` yields the sidelink from its start, (pulse, subcarrier) complex64 each, code removed; it is called again
+    if no pulse locks. Raises CampaignError, which names the recording `where`, if there is no signal.
 
     Notes
     -----
@@ -262,7 +261,8 @@ def _state_of(path: LineOfSight, average: SidelinkAverage) -> SidelinkState:
     subcarriers = average.power.size
     snr = float(np.median(path.amplitude[path.locked] ** 2 / np.maximum(path.noise_power[path.locked], 1e-30)))
     echo_db, echo_cells = strongest_echo(average)
-    # transmit ripple and a path of constant excess look alike; hardware reflects little, the ground may a lot
+    # Transmit ripple and a path of constant excess length are not distinguishable. Reflections in the hardware are
+    # weak, those of the terrain may be strong.
     ripple_db, ripple_cells, fine_ripple_db = ripple(
         average, one_sided=not (0 < abs(echo_cells) <= GATE_CELLS and echo_db > ECHO_DB)
     )
@@ -287,15 +287,15 @@ def _state_of(path: LineOfSight, average: SidelinkAverage) -> SidelinkState:
 
 
 def _measure_without_code(blocks: Callable[[], Iterable[Complexes]], path: LineOfSight, where: str) -> SidelinkState:
-    """Distinguish a sidelink of unknown code, whose neighbouring pulses still agree, from no sidelink."""
+    """Distinguish a sidelink of unknown code, whose neighbouring pulses are equal, from a missing sidelink."""
     pulses = path.locked.size
     common = joined([fit_block(products)[0] for products in _neighbours(blocks())] or [path.select(slice(0))])
     if not common.locked.size or common.locked.mean() < 0.5:
         raise CampaignError(
-            f"a sidelink that locks in none of {pulses} pulses",
+            f"the sidelink locks in none of {pulses} pulses",
             where=where,
             expected="the direct path of the transmitter above the noise",
-            remedy="Check antenna and gain of the sidelink and which channel it was recorded on.",
+            remedy="Check antenna, gain and recorded channel of the sidelink.",
         )
     product = float(np.median((common.amplitude**2 / np.maximum(common.noise_power, 1e-30))[common.locked]))
     locked = np.zeros(pulses, bool)
@@ -303,8 +303,8 @@ def _measure_without_code(blocks: Callable[[], Iterable[Complexes]], path: LineO
     locked[:-1] |= common.locked
     snr_db = decibels(product + np.sqrt(product**2 + product))  # noise of both factors: product = snr²/(2·snr + 1)
     line = (
-        f"the sidelink ({snr_db:.0f} dB) does not carry the given code: this image is divided by it and right without "
-        "one, monostatic images of the transmitter are wrong"
+        f"the sidelink (SNR {snr_db:.0f} dB) does not contain the configured code: division by the sidelink is valid "
+        "for any code, so this image is right; monostatic images of the transmitter are wrong"
     )
     flags = {"wrong_code": line}
     subcarriers = next(iter(blocks())).shape[1]
@@ -312,28 +312,28 @@ def _measure_without_code(blocks: Callable[[], Iterable[Complexes]], path: LineO
 
 
 def _neighbours(blocks: Iterable[Complexes]) -> Iterator[Complexes]:
-    """Yield each pulse times the conjugate of the one before it, across blocks."""
+    """Yield each pulse times the conjugate of the preceding pulse, across blocks."""
     last: Complexes | None = None
     for block in blocks:
-        some = block if last is None else np.concatenate([last, block])
-        if len(some) > 1:
-            yield np.asarray(some[1:] * some[:-1].conj(), np.complex64)
-        last = some[-1:]
+        pulses = block if last is None else np.concatenate([last, block])
+        if len(pulses) > 1:
+            yield np.asarray(pulses[1:] * pulses[:-1].conj(), np.complex64)
+        last = pulses[-1:]
 
 
 def _flags(state: SidelinkState) -> dict[str, str]:
     flags = {}
-    lost = int((~state.locked).sum())
-    if lost:
-        flags["sidelink_lost"] = f"{lost} of {state.locked.size} pulses dropped: their sidelink does not lock"
+    unlocked = int((~state.locked).sum())
+    if unlocked:
+        flags["sidelink_lost"] = f"{unlocked} of {state.locked.size} pulses excluded: their sidelink does not lock"
     if state.echo_cells and state.echo_db > SECOND_ARRIVAL_DB:
         flags["second_arrival"] = (
-            f"a second arrival {state.echo_db:.1f} dB beside the direct path at {state.echo_cells:+d} cells: "
-            "two transmitters at once, or a reflection as strong as the direct path"
+            f"a second arrival of {state.echo_db:.1f} dB relative to the direct path, {state.echo_cells:+d} cells from "
+            "it: two simultaneous transmitters, or a strong reflection"
         )
     if state.null_share:
         flags["sidelink_nulls"] = (
-            f"{100 * state.null_share:.1f} % of the subcarriers lie {-NULL_DB:.0f} dB below the mean: "
+            f"{100 * state.null_share:.1f} % of the subcarriers are more than {-NULL_DB:.0f} dB below the mean: "
             "they are attenuated, not divided"
         )
     return flags
@@ -343,12 +343,12 @@ def _flags(state: SidelinkState) -> dict[str, str]:
 
 
 def second_path_flags(state: SidelinkState, *, cell_m: float) -> dict[str, str]:
-    """Return a flag where an arrival near the direct path is an echo, or may be one and no ripple of the transmitter.
+    """Return a flag if an arrival near the direct path is an echo, or is not distinguishable from transmit ripple.
 
     Parameters
     ----------
     state
-        Of the sidelink.
+        State of the sidelink.
     cell_m
         c/B, metres of path.
 
@@ -358,14 +358,16 @@ def second_path_flags(state: SidelinkState, *, cell_m: float) -> dict[str, str]:
     """
     if state.near_db > ECHO_DB:
         arrival = (
-            f"an arrival of {state.near_db:.1f} dB within {2 * cell_m:.2f} m of the direct path changes over the flight"
+            f"an arrival of {state.near_db:.1f} dB within {2 * cell_m:.2f} m of the direct path varies during the "
+            "flight and is therefore an echo"
         )
-        harm = _effect_of_echo(10 ** (state.near_db / 20), 1, cell_m)
-        return {"sidelink_ripple_or_echo": f"{arrival}, as an echo does: {harm}"}
+        effect = _effect_of_echo(10 ** (state.near_db / 20), 1, cell_m)
+        return {"sidelink_ripple_or_echo": f"{arrival}: {effect}"}
     if state.echo_db > ECHO_DB and 0 < abs(state.echo_cells) <= GATE_CELLS and state.echo_steady:
         line = (
-            f"an arrival of {state.echo_db:.1f} dB {state.echo_cells * cell_m:+.2f} m from the direct path stays over "
-            "the flight: an echo, or the transmitter's ripple; what corrects one makes ghosts as strong of the other"
+            f"an arrival of {state.echo_db:.1f} dB {state.echo_cells * cell_m:+.2f} m from the direct path is constant "
+            "over the flight: an echo or transmit ripple; the correction of the one causes ghosts of the same level if "
+            "it is the other"
         )
         return {"sidelink_ripple_or_echo": line}
     swing = 10 ** (state.ripple_db / 20)
@@ -373,15 +375,16 @@ def second_path_flags(state: SidelinkState, *, cell_m: float) -> dict[str, str]:
     if amplitude <= 10 ** (ECHO_DB / 20):
         return {}
     line = (
-        f"ripple of {state.ripple_db:.1f} dB in the sidelink is taken for the transmitter's; one channel cannot tell "
-        f"it from a second path {state.ripple_cells * cell_m:.2f} m longer that stays so; if it is one, "
+        f"ripple of {state.ripple_db:.1f} dB in the sidelink is attributed to the transmitter; a single channel does "
+        f"not distinguish it from a second path that is constantly {state.ripple_cells * cell_m:.2f} m longer; in that "
+        "case, "
     )
     return {"sidelink_ripple_or_echo": line + _effect_of_echo(amplitude, state.ripple_cells, cell_m)}
 
 
 def _effect_of_echo(amplitude: float, cells: int, cell_m: float) -> str:
-    """Return the effect of an echo of that amplitude: unresolved ones shift targets, resolved ones repeat them."""
+    """Describe the effect of an echo of given amplitude: displaced targets if unresolved, ghosts if resolved."""
     if cells > 1:
-        return f"it makes ghosts of {20 * np.log10(amplitude):.1f} dB"
+        return f"it causes ghosts of {20 * np.log10(amplitude):.1f} dB"
     path_cm, phase_rad = 100 * amplitude * cells * cell_m / np.sqrt(2), amplitude / np.sqrt(2)
-    return f"paths err by about {path_cm:.0f} cm, phases by about {phase_rad:.2f} rad"
+    return f"paths have an error of about {path_cm:.0f} cm, phases of about {phase_rad:.2f} rad"

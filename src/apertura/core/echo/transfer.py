@@ -1,8 +1,8 @@
-"""Transfer functions from the captures of a pair: by the code alone, or against the sidelink.
+"""Transfer functions from the captures of a pair: by the code alone, or corrected by the sidelink.
 
-In two passes: the first measures clock, sidelink and a few numbers per pulse, the second forms
-transfer functions, block by block, from these numbers alone: when they are needed, as often as they are. No more than a
-block of captures is in memory, however long the flight is.
+Two passes over the captures: the first measures clock and sidelink, a few numbers per pulse; the second computes
+transfer functions from these numbers, block by block and on demand. Memory holds one block of captures, for any length
+of the flight.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -36,18 +36,18 @@ from apertura.core.echo.sidelink import DIVIDING, METHODS, choose, edges
 from apertura.core.echo.sidelink_state import SidelinkState, measure_blocks, second_path_flags
 
 _INVERTED = (
-    "the code is in the conjugates of the samples: set waveform.iq to swapped where I and Q are swapped, to conjugate "
-    "where the local oscillator lies above the band; for one node alone, set nodes.<n>.iq"
+    "the conjugate samples contain the code: set waveform.iq to swapped if I and Q are swapped, or to conjugate if the "
+    "local oscillator is above the band; for a single node, set nodes.<n>.iq"
 )
-_COMPRESSED = 4.0  # times the peak of a delay profile over its mean, of conjugates against samples
+_COMPRESSED = 4.0  # least ratio of the peak-to-mean ratios of delay profiles, of conjugate samples to samples
 
-_STRETCH = 128  # neighbouring pulses on which own code and phase are checked
-_CLOCK_STRETCH = 256
+_STRETCH = 128  # consecutive pulses, of each part of the flight, in which code and phase are checked
+_CLOCK_STRETCH = 256  # consecutive pulses, of each part of the flight, in which the clock is measured
 
 
 @dataclass(frozen=True)
 class Correction:
-    """What the transfer functions of a secondary node are corrected by, pulse by pulse.
+    """Correction of the transfer functions of a secondary node, pulse by pulse.
 
     Attributes
     ----------
@@ -56,9 +56,9 @@ class Correction:
     path
         The direct path in the sidelink of each pulse.
     clock_hz
-        (pulse,) float64, carrier offset of the receiver that is taken off its samples; None: none is.
+        (pulse,) float64, carrier offset removed from the samples of the receiver; None: not corrected.
     sfo_ppm
-        Offset of its sampling rate, taken off with it.
+        Offset of its sampling rate, corrected together with the carrier offset.
     """
 
     method: str
@@ -67,21 +67,21 @@ class Correction:
     sfo_ppm: float
 
     def select(self, pulses: Pulses | NDArray[np.bool_]) -> "Correction":
-        """Return the correction of some pulses."""
+        """Return the correction of the selected pulses."""
         clock_hz = None if self.clock_hz is None else self.clock_hz[pulses]
         return replace(self, path=self.path.select(pulses), clock_hz=clock_hz)
 
 
 @dataclass(frozen=True)
 class Demodulator:
-    """What turns samples of a capture into symbols.
+    """Demodulator of captures: samples to symbols and transfer functions.
 
     Attributes
     ----------
     inverse, numerology
-        (subcarrier,) complex64 that removes the transmitted signal, 1/c_n of a symbol, and its grid.
+        (subcarrier,) complex64, inverse of the transmitted signal (1/c_n of a symbol), and its sampling.
     symbol_samples
-        (T_cp + T)·f_s, or all of a capture: nothing beyond is used.
+        (T_cp + T)·f_s, or the length of a capture; later samples are not used.
     """
 
     inverse: Complexes
@@ -89,7 +89,7 @@ class Demodulator:
     symbol_samples: int
 
     def symbols(self, iq: Samples, clock_hz: Floats | None = None, sfo_ppm: float = 0.0) -> Complexes:
-        """Return (pulse, subcarrier) complex64 of samples (pulse, sample, 2), on the transmitter's clock."""
+        """Demodulate samples, (pulse, sample, 2), on the transmitter's clock; return (pulse, subcarrier) complex64."""
         numerology = self.numerology
         if clock_hz is None:
             return demodulate(as_complex(iq), numerology) * self.inverse
@@ -98,14 +98,14 @@ class Demodulator:
         return demodulate(corrected, numerology) * self.inverse
 
     def transfer(self, iq: Mapping[str, Samples], correction: Correction | None = None) -> Complexes:
-        """Return the transfer functions of a few captures, (pulse, subcarrier) complex64.
+        """Return the transfer functions of a block of captures, (pulse, subcarrier) complex64.
 
         Parameters
         ----------
         iq
-            Channel → (pulse, sample, 2): `radar`, and `sidelink` where there is a correction.
+            Channel → (pulse, sample, 2): `radar`, and `sidelink` if there is a correction.
         correction
-            Of these pulses; None: of a node that hears itself.
+            Correction of these pulses; None for a node that receives its own echoes.
         """
         if correction is None:
             return self.symbols(iq["radar"])
@@ -116,26 +116,26 @@ class Demodulator:
 
 @dataclass(frozen=True)
 class Transfer:
-    """Transfer functions of a pair, with the measurements of its captures.
+    """Transfer functions of a pair, with the measurements on its captures.
 
     Attributes
     ----------
     kept
-        (capture,) bool, the captures that are used.
+        (capture,) bool, True for captures that are used.
     flags
-        Edge crossed → what was measured, in one line.
+        Flag → measured values, one line.
     report
         Decisions with reasons: clock, sidelink, code.
     sidelink_delay_m, sidelink_snr_db, sidelink_phase_rad
-        (pulse,) float64, measures of the sidelink in the captures kept: delay times c, metres, SNR per
+        (pulse,) float64, measurements of the sidelink in the captures used: delay times c, metres, SNR per
         subcarrier and phase at mid-band; NaN where it did not lock, None without a sidelink.
     form
-        Numbers of a few captures, ascending → their transfer functions, (pulse, subcarrier) complex64. The code is
-        removed; electrical paths are not removed.
+        Function of ascending capture numbers that returns their transfer functions, (pulse, subcarrier) complex64.
+        The code is removed; electrical paths are not removed.
     saturation
-        Of the samples of the transfer functions formed so far.
+        Saturation of the captures demodulated so far.
     correction
-        (capture,) what `form` corrects by; None of a node that hears itself.
+        Correction of all captures; None for a node that receives its own echoes.
     """
 
     kept: NDArray[np.bool_]
@@ -150,27 +150,27 @@ class Transfer:
 
 
 def transfer_by_code(read: Read, inverse: Complexes, numerology: Numerology, *, time_s: Floats) -> Transfer:
-    """Return the transfer functions of a node's own pulses, whose clock is the transmitter's.
+    """Return the monostatic transfer functions of a node, whose receiver has the clock of the transmitter.
 
     Parameters
     ----------
     read
-        Reads `radar`.
+        Reader of channel `radar`.
     inverse, numerology
-        (subcarrier,) complex64 that removes the transmitted signal, 1/c_n of a symbol, and its grid.
+        (subcarrier,) complex64, inverse of the transmitted signal (1/c_n of a symbol), and its sampling.
     time_s
-        (capture,) float64, when each was sent, seconds of any origin.
+        (capture,) float64, time of transmission, seconds from any origin.
 
     Notes
     -----
-    Code and phase are checked on up to 2048 captures, 16 stretches spread over the flight.
+    Code and phase are checked on up to 2048 captures, in 16 groups spread over the flight.
 
     Examples
     --------
     >>> numerology = Numerology(1e9, 16e6, np.arange(8), prefix_samples=4, dft_samples=16)
     >>> tone = 1000 * np.exp(2j * np.pi * 3 * np.arange(20) / 16)
     >>> iq = np.stack([tone.real, tone.imag], -1)[None].round().astype(np.int16)
-    >>> measured = transfer_by_code(lambda some: {"radar": iq[some]}, np.full(8, 0.5, np.complex64),
+    >>> measured = transfer_by_code(lambda pulses: {"radar": iq[pulses]}, np.full(8, 0.5, np.complex64),
     ...                             numerology, time_s=np.zeros(1))
     >>> abs(measured.form(np.arange(1))).round(0)
     array([[  0.,   0.,   0., 500.,   0.,   0.,   0.,   0.]], dtype=float32)
@@ -182,15 +182,15 @@ def transfer_by_code(read: Read, inverse: Complexes, numerology: Numerology, *, 
     def form(captures: Pulses) -> Complexes:
         return formed(captures, None)
 
-    some = np.concatenate(spread(len(time_s), groups=GROUPS, each=_STRETCH))
-    sample = np.concatenate([demodulator.transfer(read(block)) for block in blocks_of(some)])
+    checked = np.concatenate(spread(len(time_s), groups=GROUPS, each=_STRETCH))
+    sample = np.concatenate([demodulator.transfer(read(block)) for block in blocks_of(checked)])
     code = own_code(sample, prefix_cells=numerology.delay_cells)
     inverted: Mapping[str, str] = {}
     if not code.carried:
-        other = [demodulator.transfer({"radar": conjugates(read(block)["radar"])}) for block in blocks_of(some)]
-        if own_code(np.concatenate(other), prefix_cells=numerology.delay_cells).carried:
+        conjugate = [demodulator.transfer({"radar": conjugates(read(block)["radar"])}) for block in blocks_of(checked)]
+        if own_code(np.concatenate(conjugate), prefix_cells=numerology.delay_cells).carried:
             inverted = {"spectrum_inverted": _INVERTED}
-    phase = phase_stability(sample, time_s[some], prefix_cells=numerology.delay_cells)
+    phase = phase_stability(sample, time_s[checked], prefix_cells=numerology.delay_cells)
     flags = Flags.merged(code.flags, inverted, phase.flags if phase else {})
     report = {"code": code.report, **({"own_phase": phase.report} if phase else {})}
     return Transfer(np.ones(len(time_s), bool), flags, report, None, form, saturation)
@@ -207,18 +207,18 @@ def transfer_by_sidelink(
     accuracy_db: float,
     where: str,
 ) -> Transfer:
-    """Return the transfer functions of a secondary node, corrected for what its two channels have in common.
+    """Return the transfer functions of a secondary node, corrected by its sidelink.
 
     Parameters
     ----------
     read
-        Reads `radar` and `sidelink`.
+        Reader of channels `radar` and `sidelink`.
     inverse, numerology
-        (subcarrier,) complex64 that removes the transmitted signal, 1/c_n of a symbol, and its grid.
+        (subcarrier,) complex64, inverse of the transmitted signal (1/c_n of a symbol), and its sampling.
     symbol_samples
-        (T_cp + T)·f_s, or all of a capture: nothing beyond is used.
+        (T_cp + T)·f_s, or the length of a capture; later samples are not used.
     sidelink_m
-        (capture,) float64, distance between the antennas of the sidelink, metres; the path removed from every echo.
+        (capture,) float64, distance between the antennas of the sidelink, metres, to check the measured delay.
     method
         A key of `METHODS`, or auto.
     accuracy_db
@@ -233,10 +233,10 @@ def transfer_by_sidelink(
 
     Notes
     -----
-    Source: docs/theory/echo_methods.md. The clock is measured on up to 4096 captures, 16 stretches spread over the
-    flight, the state of the sidelink on all.
+    Source: docs/theory/echo_methods.md. The clock is measured on up to 4096 captures, in 16 groups spread over the
+    flight, the state of the sidelink on all captures.
     """
-    # First pass: the clock on a sample of captures, the state of the sidelink on all.
+    # First pass: measure the clock on a sample of captures, the state of the sidelink on all.
     demodulator = Demodulator(inverse, numerology, symbol_samples)
     receiver = _Receiver.measured(read, demodulator, len(sidelink_m), accuracy_db)
     with progress("sidelinks", len(sidelink_m)) as done:
@@ -246,20 +246,20 @@ def transfer_by_sidelink(
             if not _compresses_conjugated(read, demodulator, len(sidelink_m)):
                 raise
             expected, remedy = (
-                "samples I + jQ in the order of the recorder",
-                "Set waveform.iq, or nodes.<n>.iq of one node.",
+                "samples I + jQ with I and Q in the configured order",
+                "Set waveform.iq, or nodes.<n>.iq of a single node.",
             )
             raise CampaignError(f"{unlocked.found}; {_INVERTED}", f"{where}: sidelink", expected, remedy) from None
-    # Method, and flags of what it does not remove or what is wrong with the recording.
-    chosen, reason = choose(state) if method == "auto" else (method, "asked for")
-    unclocked = receiver.clock_flags if numerology.repeats or chosen not in DIVIDING else {}
+    # Choose the method; raise flags for errors that it does not remove and for faults of the recording.
+    chosen, reason = choose(state) if method == "auto" else (method, "requested")
+    clock_flags = receiver.clock_flags if numerology.repeats or chosen not in DIVIDING else {}
     cell_m = SPEED_OF_LIGHT_M_S / (numerology.numbers.size * numerology.spacing_hz)
     delay_m = state.delay_cells * cell_m
     inverted = "wrong_code" in state.flags and _compresses_conjugated(read, demodulator, len(sidelink_m))
     residual = baseline_residual(delay_m, sidelink_m)
     wrong = detect_wrong_association(residual)
     flags = Flags.merged(
-        unclocked,
+        clock_flags,
         state.flags,
         edges(chosen, state),
         second_path_flags(state, cell_m=cell_m),
@@ -267,7 +267,7 @@ def transfer_by_sidelink(
         {"spectrum_inverted": _INVERTED} if inverted else {},
     )
     quality = {"method": chosen, "reason": reason, **_sidelink_report(state, residual)}
-    # Second pass, block by block when asked for.
+    # Second pass, block by block on demand.
     correction = Correction(chosen, state.path, receiver.clock_hz, receiver.sfo_ppm)
     saturation = Saturation()
     formed = forming(read, demodulator, saturation)
@@ -292,7 +292,7 @@ def transfer_by_sidelink(
 def forming(
     read: Read, demodulator: Demodulator, saturation: Saturation
 ) -> Callable[[Pulses, Correction | None], Complexes]:
-    """Return what forms transfer functions of captures, given their correction, and counts their samples."""
+    """Return a function that computes the transfer functions of captures from their correction and counts samples."""
 
     def form(captures: Pulses, correction: Correction | None) -> Complexes:
         iq = read(captures)
@@ -303,14 +303,14 @@ def forming(
 
 
 def _compresses_conjugated(read: Read, demodulator: Demodulator, count: int) -> bool:
-    """Return whether the sidelink, the code removed, is a path in the conjugates of its samples, and noise in these."""
-    some = np.concatenate(spread(count, groups=4, each=16))
+    """Return True if only the conjugate samples of the sidelink compress to a path after removal of the code."""
+    pulses = np.concatenate(spread(count, groups=4, each=16))
 
     def compression(samples: Samples) -> float:
         power = np.abs(np.fft.ifft(demodulator.symbols(samples), axis=1)) ** 2
         return float(np.median(power.max(axis=1) / power.mean(axis=1)))
 
-    sidelink = read(some)["sidelink"]
+    sidelink = read(pulses)["sidelink"]
     return compression(conjugates(sidelink)) > _COMPRESSED * compression(sidelink)
 
 
@@ -321,22 +321,22 @@ def as_complex(iq: Samples) -> Complexes:
 
 @dataclass(frozen=True)
 class _Receiver:
-    """The clock of captures of a node with its own, corrected in the samples if decided."""
+    """Receiver with its own clock, whose offset is corrected in the samples if necessary."""
 
     read: Read
     demodulator: Demodulator
-    count: int  # of captures
+    count: int  # number of captures
     report: dict[str, Any]
     clock_flags: dict[str, str]
-    clock_hz: Floats | None = None  # of each capture, to be corrected
+    clock_hz: Floats | None = None  # carrier offset of each capture; None: not corrected
     sfo_ppm: float = 0.0
 
     @classmethod
     def measured(cls, read: Read, demodulator: Demodulator, count: int, accuracy_db: float) -> "_Receiver":
-        """Measure the clock, and decide whether it is corrected in the samples."""
+        """Measure the clock offset, and decide on its correction in the samples."""
         groups, numerology = spread(count, groups=GROUPS, each=_CLOCK_STRETCH), demodulator.numerology
         length = demodulator.symbol_samples
-        sidelink: Iterable[Complexes] = (as_complex(read(some)["sidelink"][:, :length]) for some in groups)
+        sidelink: Iterable[Complexes] = (as_complex(read(group)["sidelink"][:, :length]) for group in groups)
         try:
             clock = clock_of(sidelink, numerology, pulses=count)
         except ValueError as error:
@@ -357,11 +357,11 @@ class _Receiver:
         return cls(read, demodulator, count, report, decision.flags, *corrected)
 
     def sidelink(self, done: Callable[[int], None]) -> Iterator[Complexes]:
-        """Yield the symbols of the sidelink, (pulse, subcarrier) complex64, the code removed."""
-        for some in blocks_of(np.arange(self.count)):
-            clock_hz = None if self.clock_hz is None else self.clock_hz[some]
-            yield self.demodulator.symbols(self.read(some)["sidelink"], clock_hz, self.sfo_ppm)
-            done(len(some))
+        """Yield the symbols of the sidelink, (pulse, subcarrier) complex64, code removed."""
+        for block in blocks_of(np.arange(self.count)):
+            clock_hz = None if self.clock_hz is None else self.clock_hz[block]
+            yield self.demodulator.symbols(self.read(block)["sidelink"], clock_hz, self.sfo_ppm)
+            done(len(block))
 
 
 def _sidelink_report(state: SidelinkState, residual: BaselineResidual | None) -> dict[str, float]:
@@ -379,4 +379,4 @@ def _sidelink_report(state: SidelinkState, residual: BaselineResidual | None) ->
 def _sidelink_code(state: SidelinkState) -> CodeEvidence:
     if "wrong_code" in state.flags:
         return CodeEvidence(carried=False, evidence=state.flags["wrong_code"])
-    return CodeEvidence(True, f"by the code, the sidelink locks in {state.locked.mean():.0%} of the pulses")
+    return CodeEvidence(True, f"with the configured code, the sidelink locks in {state.locked.mean():.0%} of pulses")

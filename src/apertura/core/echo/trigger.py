@@ -1,4 +1,4 @@
-"""Continuous recordings: framing, detection of preambles, and extraction of captures."""
+"""Continuous recordings: pulse framing, detection of preambles, and extraction of captures."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from apertura.core.echo.captures import Samples
 # ---- Framing: preamble and frame counter
 
 ABSENT = -1
-"""Frame number of a pulse whose payload was not read."""
+"""Frame number of a pulse whose payload was not decoded."""
 
 
 @dataclass(frozen=True)
 class PulseFraming:
-    """preamble | counter bits, most significant first, then inverted | guard | cyclic prefix, symbol.
+    """Framing of a pulse: preamble | counter, most significant bit first | inverted counter | guard | prefix, symbol.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class PulseFraming:
     chip_samples
         Samples per chip.
     centre_hz
-        Baseband frequency on which the chips are keyed.
+        Baseband frequency of the carrier that the chips modulate.
     sample_rate_hz
         Complex samples per second.
     counter_bits
@@ -37,7 +37,7 @@ class PulseFraming:
     bit_chips
         Chips per payload bit, all of one sign: +1 for a one.
     guard_samples
-        Silence between payload and cyclic prefix.
+        Length of the pause between payload and cyclic prefix.
     """
 
     preamble: NDArray[np.int64]
@@ -50,20 +50,20 @@ class PulseFraming:
 
     @property
     def payload_samples(self) -> int:
-        """Samples of the counter and its inverse."""
+        """Number of samples of the counter and its inverse."""
         return 2 * self.counter_bits * self.bit_chips * self.chip_samples
 
     @property
     def lead_samples(self) -> int:
-        """Samples from the start of the preamble to the start of the cyclic prefix."""
+        """Number of samples from the start of the preamble to the start of the cyclic prefix."""
         return len(self.preamble) * self.chip_samples + self.payload_samples + self.guard_samples
 
     def template(self) -> NDArray[np.complex64]:
-        """Return (sample,) complex64, the preamble as it arrives without delay."""
+        """Return the undelayed preamble, (sample,) complex64."""
         return np.asarray(np.repeat(self.preamble, self.chip_samples) * self._carrier(0, len(self.preamble)))
 
     def read_counter(self, samples: Samples) -> int:
-        """Return the frame number of a capture that starts with its preamble, -1 where a bit is not certain.
+        """Decode the frame number of a capture that starts with its preamble; -1 if a bit is not certain.
 
         Parameters
         ----------
@@ -78,17 +78,17 @@ class PulseFraming:
         >>> framing.read_counter(capture), framing.read_counter(capture[:-8])
         (2, -1)
         """
-        keyed = len(self.preamble) * self.chip_samples
-        if self.counter_bits == 0 or len(samples) < keyed + self.payload_samples:
+        length = len(self.preamble) * self.chip_samples
+        if self.counter_bits == 0 or len(samples) < length + self.payload_samples:
             return ABSENT
-        iq = samples[: keyed + self.payload_samples, 0] + 1j * samples[: keyed + self.payload_samples, 1]
-        phase = np.vdot(self.template(), iq[:keyed])
+        iq = samples[: length + self.payload_samples, 0] + 1j * samples[: length + self.payload_samples, 1]
+        phase = np.vdot(self.template(), iq[:length])
         if phase == 0:
             return ABSENT
         carrier = self._carrier(len(self.preamble), 2 * self.counter_bits * self.bit_chips)
-        sums = (iq[keyed:] * carrier.conj()).reshape(2 * self.counter_bits, -1).sum(1)
-        soft, inverse = np.split(np.real(sums * phase.conj()) / np.abs(phase) ** 2 * keyed, 2)
-        expected = self.bit_chips * self.chip_samples  # if noise is left out
+        sums = (iq[length:] * carrier.conj()).reshape(2 * self.counter_bits, -1).sum(1)
+        soft, inverse = np.split(np.real(sums * phase.conj()) / np.abs(phase) ** 2 * length, 2)
+        expected = self.bit_chips * self.chip_samples  # magnitude of a bit without noise
         bits = soft > inverse
         if (np.sign(soft) == np.sign(inverse)).any() or (np.abs(soft - inverse) < expected).any():
             return ABSENT
@@ -99,11 +99,11 @@ class PulseFraming:
         return np.asarray(np.exp(2j * np.pi * self.centre_hz / self.sample_rate_hz * sample), np.complex64)
 
 
-# ---- Detection of preambles at a set rate of false alarms
+# ---- Detection of preambles at a constant false-alarm rate
 
 
 _SMALLEST_TRANSFORM = 2**16
-_NO_SIGNAL = 1e-10  # of the energy of a window, within a preamble: below it is rounding of the transform
+_NO_SIGNAL = 1e-10  # energy under a preamble relative to that of the window, below which rounding dominates
 
 
 @dataclass(frozen=True)
@@ -113,11 +113,11 @@ class Detection:
     Attributes
     ----------
     sample
-        Where it starts, counted from the start of the recording.
+        Its first sample, counted from the start of the recording.
     score
-        Share of the energy under the preamble that is the preamble, 0…1.
+        Squared normalised correlation: share of the energy that is due to the preamble, 0…1.
     snr_db
-        Signal to noise per sample that follows from it.
+        SNR per sample, derived from the score.
     """
 
     sample: int
@@ -128,28 +128,28 @@ class Detection:
 def find_preambles(
     blocks: Iterable[Samples], framing: PulseFraming, *, symbol_samples: int, false_alarms_per_s: float
 ) -> Iterator[Detection]:
-    """Yield the preambles of a recording in order, with a bounded number of its samples in memory.
+    """Yield the preambles of a recording in order, with a bounded number of samples in memory.
 
     Parameters
     ----------
     blocks
-        (sample, 2) each, I and Q of the trigger's channel, one after the other, of any length.
+        (sample, 2) each, consecutive blocks of any length, I and Q of the trigger channel.
     framing
         Framing of the symbols.
     symbol_samples
-        (T_cp + T)·f_s; from a preamble to the end of its symbol no other preamble is searched.
+        (T_cp + T)·f_s; no other preamble is searched from a preamble to the end of its symbol.
     false_alarms_per_s
         Tolerated rate of triggers by noise alone.
 
     Raises
     ------
     ValueError
-        If the rate of false alarms is not positive.
+        If the false-alarm rate is not positive.
 
     Notes
     -----
-    Source: docs/theory/echo_methods.md, "Trigger". The threshold does not depend on the level of the noise, which
-    is taken from the same samples.
+    Source: docs/theory/echo_methods.md, "Trigger". The threshold does not depend on the noise level, which is measured
+    in the same samples.
 
     Examples
     --------
@@ -169,10 +169,10 @@ def find_preambles(
 
 
 def score_threshold(template_samples: int, false_alarm: float) -> float:
-    """Return the score that noise passes with probability `false_alarm` at one sample.
+    """Return the score that noise exceeds with probability `false_alarm` at one sample.
 
-    Of white Gaussian noise the score is the squared cosine between two directions of which one is random: it is
-    distributed as Beta(1, L-1) whatever the level, so P(score > γ) = (1-γ)^(L-1).
+    For white Gaussian noise the score is the squared cosine between two directions, one of which is random. Its
+    distribution is Beta(1, L-1) at any noise level, so P(score > γ) = (1-γ)^(L-1).
 
     Examples
     --------
@@ -185,7 +185,7 @@ def score_threshold(template_samples: int, false_alarm: float) -> float:
 
 
 def _scores(blocks: Iterable[Samples], template: Complexes) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    """Yield first sample and score of every place the template fits, by overlap-save transforms."""
+    """Yield the first sample and the scores of each window, one score per complete template, by overlap-save FFTs."""
     length = template.size
     size = max(_SMALLEST_TRANSFORM, 1 << int(8 * length - 1).bit_length())
     matched = scipy.fft.fft(template, size).conj() / np.sqrt((np.abs(template) ** 2).sum())
@@ -195,8 +195,8 @@ def _scores(blocks: Iterable[Samples], template: Complexes) -> Iterator[tuple[in
         matches = scipy.fft.ifft(scipy.fft.fft(window, size) * matched)[:fitting]
         energy[1 : window.size + 1] = np.cumsum(_power(window), dtype=np.float64)
         under = (energy[length : window.size + 1] - energy[:fitting]).astype(np.float32)
-        silence = np.float32(_NO_SIGNAL * energy[window.size]) + np.finfo(np.float32).tiny  # samples may be of any unit
-        yield first, np.asarray(_power(matches) / np.maximum(under, silence), np.float32)
+        least = np.float32(_NO_SIGNAL * energy[window.size]) + np.finfo(np.float32).tiny  # samples may have any unit
+        yield first, np.asarray(_power(matches) / np.maximum(under, least), np.float32)
 
 
 def _power(samples: Complexes) -> NDArray[np.float32]:
@@ -204,16 +204,16 @@ def _power(samples: Complexes) -> NDArray[np.float32]:
 
 
 def _windows(blocks: Iterable[Samples], size: int, *, overlap: int) -> Iterator[tuple[int, Complexes]]:
-    """Yield first sample and samples of windows of `size` that overlap, the last one shorter."""
+    """Yield the first sample number and the samples of overlapping windows of `size`; the last may be shorter."""
     window = np.empty(size, np.complex64)
     parts = window.view(np.float32).reshape(size, 2)
     first, filled, new = 0, 0, 0
     for block in blocks:
-        taken = 0
-        while taken < len(block):
-            count = min(size - filled, len(block) - taken)
-            parts[filled : filled + count] = block[taken : taken + count]
-            taken, filled, new = taken + count, filled + count, new + count
+        copied = 0
+        while copied < len(block):
+            count = min(size - filled, len(block) - copied)
+            parts[filled : filled + count] = block[copied : copied + count]
+            copied, filled, new = copied + count, filled + count, new + count
             if filled == size:
                 yield first, window
                 window[:overlap] = window[size - overlap :].copy()
@@ -223,42 +223,45 @@ def _windows(blocks: Iterable[Samples], size: int, *, overlap: int) -> Iterator[
 
 
 class _PeakSearch:
-    """Search for the highest score within one preamble's length of the first that passes, then a dead time of a frame.
+    """Search for the highest score within one preamble length of the first above threshold, then a dead time.
 
-    The sidelobes of a strong preamble pass already; its true place follows less than its own length later.
+    The sidelobes of a strong preamble exceed the threshold before its main peak, by less than the preamble length. The
+    dead time is a frame.
     """
 
-    def __init__(self, threshold: float, reach: int, silence: int) -> None:
-        self.threshold, self.reach, self.silence = threshold, reach, silence
-        self.open_from = 0
+    def __init__(self, threshold: float, reach: int, dead_time: int) -> None:
+        self.threshold, self.reach, self.dead_time = threshold, reach, dead_time
+        self.search_from = 0
         self.best: tuple[int, float] | None = None
         self.until = 0
 
     def feed(self, first: int, scores: NDArray[np.float32]) -> Iterator[Detection]:
-        passed = np.flatnonzero(scores > self.threshold)
-        places = passed + first
+        """Add the scores of consecutive samples from `first` on; yield the detections that they complete."""
+        above = np.flatnonzero(scores > self.threshold)
+        samples = above + first
         at = 0
         while True:
             if self.best is None:
-                at = int(np.searchsorted(places, self.open_from))
-                if at == places.size:
+                at = int(np.searchsorted(samples, self.search_from))
+                if at == samples.size:
                     return
-                self.best, self.until = (int(places[at]), float(scores[passed[at]])), int(places[at]) + self.reach
-            end = int(np.searchsorted(places, self.until))
+                self.best, self.until = (int(samples[at]), float(scores[above[at]])), int(samples[at]) + self.reach
+            end = int(np.searchsorted(samples, self.until))
             if end > at:
-                top = at + int(np.argmax(scores[passed[at:end]]))
-                if scores[passed[top]] > self.best[1]:
-                    self.best = int(places[top]), float(scores[passed[top]])
+                top = at + int(np.argmax(scores[above[at:end]]))
+                if scores[above[top]] > self.best[1]:
+                    self.best = int(samples[top]), float(scores[above[top]])
             if self.until > first + scores.size:
                 return
             yield from self.finish()
 
     def finish(self) -> Iterator[Detection]:
+        """Yield the current candidate, if any, and start the dead time."""
         if self.best is None:
             return
         sample, score = self.best
-        self.best, self.open_from = None, sample + self.silence
-        # the score of a signal of SNR ρ per sample is about (ρL + 1)/(L·(ρ + 1)), L the length of the preamble
+        self.best, self.search_from = None, sample + self.dead_time
+        # the score of a signal of SNR ρ per sample is about (ρL + 1)/(L·(ρ + 1)), L: length of the preamble
         ratio = max(score * self.reach - 1, 1e-3) / (self.reach * max(1 - score, 1e-9))
         yield Detection(sample, score, decibels(ratio))
 
@@ -269,7 +272,7 @@ _SAMPLES_AT_ONCE = 2**18
 
 
 class SampleSource(Protocol):
-    """(sample, 2), I and Q: an array, or what reads slices of one from a file."""
+    """(sample, 2), I and Q: an array, or an object that reads slices of one from a file."""
 
     def __len__(self) -> int: ...
 
@@ -278,16 +281,16 @@ class SampleSource(Protocol):
 
 @dataclass(frozen=True)
 class TriggeredCaptures:
-    """Captures of a continuous recording, as by a triggered recorder.
+    """Captures extracted from a continuous recording, as a triggered recorder stores them.
 
     Attributes
     ----------
     start
         (capture,) int64, first sample of each symbol's cyclic prefix.
     frame
-        (capture,) int64, frame number sent before it, -1 where not read.
+        (capture,) int64, frame number of each symbol, -1 if not decoded.
     report
-        Captures, rate of false alarms, median SNR, duty cycle and mean data rate.
+        Number of captures, false-alarm rate, median SNR, duty cycle and mean data rate.
     """
 
     start: NDArray[np.int64]
@@ -303,16 +306,16 @@ def trigger_captures(
     false_alarms_per_s: float,
     sample_bits: int = 32,
 ) -> TriggeredCaptures:
-    """Return the symbols of a continuous recording that follow a preamble and end inside it.
+    """Extract the complete symbols after preambles from a continuous recording.
 
     Parameters
     ----------
     samples
-        (sample, 2), I and Q of the trigger's channel; read in blocks.
+        (sample, 2), I and Q of the trigger channel; read in blocks.
     framing, symbol_samples, false_alarms_per_s
         As for `find_preambles`.
     sample_bits
-        Of a sample of one channel as it was recorded.
+        Bits per recorded sample of one channel.
     """
     blocks = (samples[start : start + _SAMPLES_AT_ONCE] for start in range(0, len(samples), _SAMPLES_AT_ONCE))
     detections = [
@@ -322,14 +325,14 @@ def trigger_captures(
         )
         if detection.sample + framing.lead_samples + symbol_samples <= len(samples)
     ]
-    places = np.array([detection.sample for detection in detections], np.int64)
-    numbers = [framing.read_counter(samples[place : place + framing.lead_samples]) for place in places]
+    starts = np.array([detection.sample for detection in detections], np.int64)
+    numbers = [framing.read_counter(samples[start : start + framing.lead_samples]) for start in starts]
     duty_cycle = len(detections) * symbol_samples / len(samples)
     report = {
         "captures": len(detections),
         "false_alarms_per_s": false_alarms_per_s,
-        "snr_db": round(float(np.median([one.snr_db for one in detections])), 2) if detections else None,
+        "snr_db": round(float(np.median([detection.snr_db for detection in detections])), 2) if detections else None,
         "duty_cycle": duty_cycle,
         "mean_rate_bit_s": framing.sample_rate_hz * sample_bits * duty_cycle,  # of one channel
     }
-    return TriggeredCaptures(places + framing.lead_samples, np.array(numbers, np.int64), report)
+    return TriggeredCaptures(starts + framing.lead_samples, np.array(numbers, np.int64), report)

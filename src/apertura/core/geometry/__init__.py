@@ -1,1 +1,1 @@
-"""Coordinates, tracks, phase centres and the synthetic aperture of a pair."""
+"""Coordinates, tracks, lever arms, atmosphere, and the synthetic aperture of a pair."""

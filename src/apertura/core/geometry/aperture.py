@@ -1,4 +1,4 @@
-"""The synthetic aperture of a pair: phase centres at each pulse, total paths, phase rates and resolution."""
+"""Synthetic aperture of a pair: phase centres at each pulse, total paths, phase rates and resolution."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,27 +15,27 @@ Weigh = Callable[[slice, NDArray[np.float64]], NDArray[np.float64]]
 """Pulses and points (point, 3) → (pulse, point) float64."""
 
 _PULSES_AT_ONCE = 2048
-_STRETCHES = 64  # of the aperture, in which phase rates are compared
-_STEPS_IN_A_ROW = 63  # of which the median is taken, so that missed pulses do not count
+_STRETCHES = 64  # parts of the aperture at which phase rates are evaluated
+_STEPS_IN_A_ROW = 63  # consecutive steps whose median is used, so that missed pulses have no effect
 
 
 _COARSEST_M = 2.0**-10
-"""Metres between neighbouring numbers above which a track is refused: half of it is a hundredth of a cycle at L-band
-there and back."""
+"""Metres, spacing of floating-point numbers above which a track is rejected: its rounding error is 0.01 cycles of
+two-way path at L-band."""
 
 
 def distance(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the distance between places, (...,) float64.
+    """Return the distance between points, (...,) float64.
 
     Parameters
     ----------
     first, second
-        (..., 3) float64, in shapes that go together.
+        (..., 3) float64, in shapes that broadcast.
 
     Notes
     -----
-    To the bit `numpy.linalg.norm` of the difference, in a quarter of its time or less: axis by axis nothing is gathered
-    from rows of three.
+    Equal to `numpy.linalg.norm` of the difference to the last bit, in a quarter of its time or less, because the axes
+    are processed separately.
 
     Examples
     --------
@@ -50,21 +50,21 @@ def distance(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray
 
 
 def as_array(value: Any, kind: type, where: str) -> Any:
-    """Return what a caller gave as an array of real or complex numbers; what is one, or lazily, stays as it is.
+    """Convert an argument to an array of real or complex numbers; arrays, including lazy ones, are unchanged.
 
     Parameters
     ----------
     value
-        An array, a list, a number.
+        An array, a list or a number.
     kind
-        ``np.float64`` or ``np.complex64``; real numbers are no complex samples: they have lost their phase.
+        ``np.float64`` or ``np.complex64``; real numbers are not accepted as complex samples: their phase is lost.
     where
-        Whose, for the message.
+        Name of the argument in errors.
 
     Raises
     ------
     CampaignError
-        If it is no array of such numbers.
+        If the argument is not an array of such numbers.
 
     Examples
     --------
@@ -72,30 +72,32 @@ def as_array(value: Any, kind: type, where: str) -> Any:
     array([1., 2.])
     """
     try:
-        # What is lazy by rows (a table of another module) stays lazy; xarray's and dask's arrays become numpy's.
+        # Arrays that are lazy by rows (tables of other modules) stay lazy; those of dask are computed.
         lazy = hasattr(value, "ndim") and not hasattr(value, "__dask_graph__")
-        found = value if lazy else np.asarray(value)
-        usable = found.dtype.kind in ("c" if kind is np.complex64 else "iuf")
+        array = value if lazy else np.asarray(value)
+        usable = array.dtype.kind in ("c" if kind is np.complex64 else "iuf")
     except (TypeError, ValueError, AttributeError):
         usable = False
     if not usable:
-        of = {"i": "whole", "u": "whole", "f": "real", "c": "complex"}.get(
-            getattr(found, "dtype", np.dtype(object)).kind
+        numbers = {"i": "integer", "u": "integer", "f": "real", "c": "complex"}.get(
+            getattr(array, "dtype", np.dtype(object)).kind
         )
         raise CampaignError(
-            f"an array of {of} numbers" if of and found.ndim else quoted(value),
+            f"an array of {numbers} numbers" if numbers and array.ndim else quoted(value),
             where=where,
             expected=f"an array of {'complex numbers' if kind is np.complex64 else 'real numbers'}",
-            remedy="Keep the phase of samples: give I + jQ." if kind is np.complex64 and of else "Give a numpy array.",
+            remedy="Pass complex samples I + jQ, including their phase."
+            if kind is np.complex64 and numbers
+            else "Pass a numpy array.",
         )
     if np.ma.is_masked(value):
         raise CampaignError(
             f"{int(np.ma.getmaskarray(value).sum())} masked values",
             where=where,
-            expected="a value everywhere: a mask is not looked at",
-            remedy="Leave out the pulses with masked values, or fill them.",
+            expected="an array without masked values: masks are ignored",
+            remedy="Remove the pulses with masked values, or fill them.",
         )
-    return _native(found, kind) if isinstance(found, np.ndarray) or not found.dtype.isnative else found
+    return _native(array, kind) if isinstance(array, np.ndarray) or not array.dtype.isnative else array
 
 
 _KEPT: Mapping[type, tuple[type, ...]] = {
@@ -104,15 +106,15 @@ _KEPT: Mapping[type, tuple[type, ...]] = {
 }
 
 
-def _native(found: Any, kind: type) -> NDArray[Any]:
-    """Return a plain array in the byte order of this machine, of a precision that engines know."""
-    plain = np.asarray(found)
+def _native(array: Any, kind: type) -> NDArray[Any]:
+    """Return a numpy array in native byte order, of a precision that the engines support."""
+    plain = np.asarray(array)
     return plain if plain.dtype.isnative and plain.dtype.type in _KEPT[kind] else plain.astype(kind)
 
 
 @dataclass(frozen=True, eq=False)
 class Aperture:
-    """Phase centres of a transmitter–receiver pair, pulse by pulse; one node that does both gives them twice.
+    """Phase centres of a transmitter–receiver pair, pulse by pulse; both are equal for a monostatic node.
 
     Attributes
     ----------
@@ -122,7 +124,7 @@ class Aperture:
     Raises
     ------
     CampaignError
-        If something is no array of numbers, or shapes differ or are not (pulse, 3).
+        If an argument is not an array of numbers, or shapes differ or are not (pulse, 3).
 
     Examples
     --------
@@ -137,25 +139,25 @@ class Aperture:
 
     def __post_init__(self) -> None:
         for name in ("tx_m", "rx_m"):
-            given = getattr(self, name)
-            found = as_array(given, np.float64, f"Aperture: {name}")
-            object.__setattr__(self, name, found)
-            dtype = np.dtype(getattr(given, "dtype", np.float64))
-            farthest = float(np.abs(found).max(initial=0)) if dtype.kind == "f" and dtype.itemsize < 8 else 0.0
-            apart_m = float(np.spacing(np.array(farthest, dtype))) if farthest else 0.0
-            if apart_m >= _COARSEST_M:
+            argument = getattr(self, name)
+            position_m = as_array(argument, np.float64, f"Aperture: {name}")
+            object.__setattr__(self, name, position_m)
+            dtype = np.dtype(getattr(argument, "dtype", np.float64))
+            farthest = float(np.abs(position_m).max(initial=0)) if dtype.kind == "f" and dtype.itemsize < 8 else 0.0
+            spacing_m = float(np.spacing(np.array(farthest, dtype))) if farthest else 0.0
+            if spacing_m >= _COARSEST_M:
                 raise CampaignError(
-                    f"{dtype.name}, whose numbers near {farthest:.3g} m are {apart_m:.2g} m apart",
+                    f"{dtype.name}, whose neighbouring numbers near {farthest:.3g} m differ by {spacing_m:.2g} m",
                     where=f"Aperture: {name}",
-                    expected="float64: phase centres count to fractions of a wavelength",
-                    remedy="Keep float64 from the log on.",
+                    expected="float64: phase centres must be accurate to fractions of a wavelength",
+                    remedy="Use float64 throughout, starting with the log.",
                 )
         if self.tx_m.shape != self.rx_m.shape or self.tx_m.ndim != 2 or self.tx_m.shape[1] != 3:
             raise CampaignError(
                 f"tx_m {self.tx_m.shape}, rx_m {self.rx_m.shape}",
                 where="Aperture",
-                expected="phase centres of as many pulses, (pulse, 3) each, metres",
-                remedy="Give x, y and z of each pulse in a row; one antenna that does both is given twice.",
+                expected="phase centres of the same number of pulses, (pulse, 3) each, metres",
+                remedy="Pass one row of x, y and z per pulse; for a monostatic antenna pass the same array twice.",
             )
 
     def __len__(self) -> int:
@@ -163,12 +165,12 @@ class Aperture:
         return len(self.tx_m)
 
     def copied(self) -> "Aperture":
-        """Return the aperture with arrays of its own; one array where one node does both."""
+        """Return the aperture with copied arrays; a monostatic aperture keeps a single array."""
         tx_m = self.tx_m.copy()
         return Aperture(tx_m, tx_m if self.rx_m is self.tx_m else self.rx_m.copy())
 
     def __getitem__(self, pulses: slice | NDArray[np.bool_] | NDArray[np.int64]) -> "Aperture":
-        """Return the aperture of some pulses; slices are views."""
+        """Return the aperture of the selected pulses; slices are views."""
         return Aperture(self.tx_m[pulses], self.rx_m[pulses])
 
     @property
@@ -178,11 +180,11 @@ class Aperture:
 
     @property
     def middle_m(self) -> NDArray[np.float64]:
-        """(pulse, 3) float64, midpoints between both phase centres."""
+        """Midpoints between both phase centres, (pulse, 3) float64."""
         return (self.tx_m + self.rx_m) / 2
 
     def sample(self, most: int) -> slice:
-        """Return a slice that takes evenly spread pulses, fewer than twice `most`.
+        """Return a slice of evenly spaced pulses, fewer than twice `most`.
 
         Examples
         --------
@@ -193,7 +195,7 @@ class Aperture:
         return slice(None, None, max(1, len(self) // most))
 
     def blocks(self, count: int) -> list[slice]:
-        """Return slices of consecutive pulses that hold each pulse once, of equal length but for one pulse.
+        """Divide the pulses into `count` consecutive slices whose lengths differ by at most one.
 
         Examples
         --------
@@ -227,8 +229,8 @@ class Aperture:
     def path_gradient(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gradient of the total path with respect to the point, (pulse, ..., 3) float64, metres per metre.
 
-        The sum of the unit vectors from both phase centres to the point: times 2πf/c the spatial frequency at which a
-        pulse samples the scene (docs/theory.md, eq. 8).
+        It is the sum of the unit vectors from both phase centres to the point; multiplied by 2πf/c, it is the spatial
+        frequency at which a pulse samples the scene (docs/theory.md, eq. 8).
         """
         gradient = np.zeros((len(self), *points_m.shape))
         for leg in self.legs:
@@ -237,19 +239,19 @@ class Aperture:
         return gradient
 
     def phase_rates(self, points_m: NDArray[np.float64], *, wavelength_m: float) -> tuple[float, float]:
-        """Return the spread of phase rates over the scene, and the largest against its middle, cycles per pulse.
+        """Return the spread of phase rates over the scene, and the largest relative to its middle, cycles per pulse.
 
         Parameters
         ----------
         points_m
             (point, 3) float64, metres: spread over the scene, its middle at the middle of the array.
         wavelength_m
-            Of the highest frequency.
+            Wavelength of the highest frequency.
 
         Notes
         -----
-        Source: docs/theory/planner.md, "Pulses". A spread above 1 makes azimuth ambiguities. It is the largest median
-        of 63 steps in a row, so that missed pulses and gaps are not taken for undersampling.
+        Source: docs/theory/planner.md, "Pulses". A spread above 1 causes azimuth ambiguities. The spread is the largest
+        median of 63 consecutive steps, so that missed pulses and gaps are not mistaken for undersampling.
 
         Examples
         --------
@@ -266,28 +268,28 @@ class Aperture:
             rate = np.diff(self[first : first + _PULSES_AT_ONCE + 1].path(points_m), axis=0)
             spread[first : first + len(rate)] = np.ptp(rate, axis=1)
             widest = max(widest, float(np.abs(rate - rate[:, [len(points_m) // 2]]).max()))
-        in_a_row = np.lib.stride_tricks.sliding_window_view(spread, min(_STEPS_IN_A_ROW, len(spread)))
-        return float(np.median(in_a_row, axis=1).max()) / wavelength_m, widest / wavelength_m
+        windows = np.lib.stride_tricks.sliding_window_view(spread, min(_STEPS_IN_A_ROW, len(spread)))
+        return float(np.median(windows, axis=1).max()) / wavelength_m, widest / wavelength_m
 
     def ambiguities(self, points_m: NDArray[np.float64], *, wavelength_m: float) -> NDArray[np.float64]:
-        """Return how much of the scene's echo folds onto each of its points, relative to the point's surroundings.
+        """Return the level of azimuth ambiguities of the scene's own echo at each of its points.
 
         Parameters
         ----------
         points_m
             (point, 3) float64, metres: spread over the scene, corners included.
         wavelength_m
-            Of the highest frequency.
+            Wavelength of the highest frequency.
 
         Returns
         -------
         ndarray
-            (point,) float64: mean over the pulses of the orders n ≠ 0 for which the scene has a phase rate n cycles per
-            pulse from the point's. 0: unambiguous; 1: as much comes from elsewhere as from the place itself.
+            (point,) float64: number of orders n ≠ 0, mean over the pulses, for which the scene has a phase rate n
+            cycles per pulse from that of the point. 0: unambiguous; 1: ambiguities as strong as the surroundings.
 
         Notes
         -----
-        Source: docs/theory/planner.md, eq. 4. Rates are medians of 63 steps in a row, as in `phase_rates`.
+        Source: docs/theory/planner.md, eq. 4. Rates are medians of 63 consecutive steps, as in `phase_rates`.
 
         Examples
         --------
@@ -314,21 +316,22 @@ class Aperture:
         Parameters
         ----------
         ground_m
-            (row, column, 3) float64, metres: points spread over the scene, corners included; rows go south.
+            (row, column, 3) float64, metres: terrain points spread over the scene, corners included, rows from north
+            to south.
         band_hz
             Lowest and highest frequency.
         weigh
-            Pulses and points → weights; points whose summed weight is below one half do not count. By default all
-            count.
+            Pulses and points → weights; pulses with a weight below one half are excluded at a point. By default all
+            pulses are used.
 
         Notes
         -----
         Source: docs/theory.md, eq. 8: the inverse of the widest spatial spectrum of a point.
         """
-        points, some = ground_m.reshape(-1, 3), self.sample(64 if weigh is None else 1024)
-        gradient = self[some].path_gradient(points)
+        points, sample = ground_m.reshape(-1, 3), self.sample(64 if weigh is None else 1024)
+        gradient = self[sample].path_gradient(points)
         if weigh is not None:
-            gradient[weigh(some, points) < 0.5] = np.nan
+            gradient[weigh(sample, points) < 0.5] = np.nan
         finite = np.isfinite(gradient).all(axis=-1).any(axis=0)
         gradient, widest = gradient[:, finite], 1e-9
         for side in (ground_m[0, -1] - ground_m[0, 0], ground_m[-1, 0] - ground_m[0, 0]):
@@ -339,27 +342,28 @@ class Aperture:
         return 1 / widest
 
     def cross_cell_m(self, ground_m: NDArray[np.float64], *, wavelength_m: float) -> float:
-        """Return what changing directions to the scene's middle resolve there, metres; infinite where nothing moves.
+        """Return the cross-range resolution at the middle of the scene, metres; infinite without motion.
 
         Parameters
         ----------
         ground_m
-            (row, column, 3) float64, metres: points spread over the scene, corners included; rows go south.
+            (row, column, 3) float64, metres: terrain points spread over the scene, corners included, rows from north
+            to south.
         wavelength_m
-            Of the middle of the band.
+            Wavelength at the middle of the band.
 
         Notes
         -----
-        Source: docs/theory.md, eq. 8 at one frequency: λ over the widest spread of the path's gradient on the ground,
-        λ/2Δθ of one node that turns by Δθ about a place.
+        Source: docs/theory.md, eq. 8 at one frequency: λ over the largest spread of the path gradient on the terrain,
+        λ/2Δθ for a monostatic node that moves by an angle Δθ about the point.
         """
         middle = ground_m.reshape(-1, 3)[ground_m.size // 6]
         gradient = self[self.sample(64)].path_gradient(middle[None])[:, 0]
         sides = np.stack([ground_m[0, -1] - ground_m[0, 0], ground_m[-1, 0] - ground_m[0, 0]])
         sides = sides / np.maximum(np.linalg.norm(sides, axis=1, keepdims=True), 1e-9)
-        flat = (gradient - gradient.mean(axis=0)) @ sides.T
-        _, _, main = np.linalg.svd(flat, full_matrices=False)
-        spread = float(np.ptp(flat @ main[0]))
+        in_plane = (gradient - gradient.mean(axis=0)) @ sides.T
+        _, _, directions = np.linalg.svd(in_plane, full_matrices=False)
+        spread = float(np.ptp(in_plane @ directions[0]))
         return wavelength_m / spread if spread > 0 else float("inf")
 
     def spectrum(
@@ -370,7 +374,7 @@ class Aperture:
         frequency_hz: NDArray[np.float64],
         weigh: Weigh | None = None,
     ) -> NDArray[np.float64]:
-        """Return how wide the spatial spectrum of a point is along some axes: its covariance, cycles² per m².
+        """Return the covariance of the spatial spectrum of a point along given axes, cycles² per m².
 
         Parameters
         ----------
@@ -381,25 +385,25 @@ class Aperture:
         frequency_hz
             (frequency,) float64, samples of the band, of equal weight.
         weigh
-            As of `resolution_cell_m`.
+            As for `resolution_cell_m`.
 
         Returns
         -------
         ndarray
-            (axis, axis) float64. The peak of a point whose noise power is ε of its own scatters by
-            ε/2·(4π²·spectrum)⁻¹ (docs/theory/focus.md, eq. 6).
+            (axis, axis) float64. At a noise power of ε relative to the point, the position of its peak has the
+            covariance ε/2·(4π²·spectrum)⁻¹ (docs/theory/focus.md, eq. 6).
         """
-        some = self.sample(64 if weigh is None else 1024)
-        slope = self[some].path_gradient(point_m) @ axes.T
+        sample = self.sample(64 if weigh is None else 1024)
+        slope = self[sample].path_gradient(point_m) @ axes.T
         if weigh is not None:
-            counted = weigh(some, point_m[None])[:, 0] >= 0.5
-            slope = slope[counted] if counted.any() else slope  # a place beside all sectors: as if every pulse saw it
+            used = weigh(sample, point_m[None])[:, 0] >= 0.5
+            slope = slope[used] if used.any() else slope  # a point outside all sectors: all pulses are used
         cycles = slope[:, None] * (frequency_hz / SPEED_OF_LIGHT_M_S)[None, :, None]
         return np.asarray(np.cov(cycles.reshape(-1, len(axes)), rowvar=False, bias=True))
 
     @property
     def wobble_m(self) -> float:
-        """RMS distance of the midpoints from their straight line, metres.
+        """RMS distance of the midpoints from the best-fitting straight line, metres.
 
         Examples
         --------
@@ -414,5 +418,5 @@ class Aperture:
 
     @staticmethod
     def _against(leg_m: NDArray[np.float64], points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return phase centres with as many axes more as the points have."""
+        """Return phase centres reshaped to broadcast against the points."""
         return leg_m.reshape(-1, *(1,) * (points_m.ndim - 1), 3)

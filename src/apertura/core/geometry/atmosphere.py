@@ -1,4 +1,4 @@
-"""The speed of a wave in air: refractivity at the ground, its profile with height, its mean along a straight path."""
+"""Wave speed in the atmosphere: refractivity at the terrain, its profile with height, and its mean along a path."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,21 +12,21 @@ from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import LOCAL, geodetic_from_ecef
 
 SCALE_HEIGHT_M = 7350.0
-"""Height over which the refractivity of air falls to 1/e: ITU-R P.453, the world's mean profile."""
+"""Metres, height over which the refractivity of air decreases to 1/e: global mean profile of ITU-R P.453."""
 
 STANDARD_HUMIDITY_PERCENT = 50.0
-"""Relative humidity taken where nobody states it; the standard atmosphere has none."""
+"""Percent, relative humidity if none is configured; the standard atmosphere is dry."""
 
 USUAL_N = 300.0
-"""N units of air at the ground, which recordings of a flight are of wherever vacuum is assumed."""
+"""N units, typical refractivity at the terrain, the error if vacuum is assumed for a recorded flight."""
 
 _STANDARD_K, _STANDARD_HPA, _LAPSE_K_M, _BAROMETRIC = 288.15, 1013.25, 6.5e-3, 5.2559  # ISO 2533, below 11 km
-_HIGHEST_M = 11_000.0  # where its lapse ends
-_UNKNOWN = 10.0, 20.0, 100 / np.sqrt(12)  # K, hPa, % (any humidity alike): weather against the standard atmosphere
-_MEASURED = 1.0, 1.0, 5.0  # K, hPa, %: a thermometer, a barometer and a hygrometer in the field
-_STATED_N = 1.0  # N units: to which a refractivity is given
-_LEAST_N, _MOST_N = 20.0, 1000.0  # N units: air 20 km up has 20, the wettest and hottest at sea level 500
-_PROFILE = 0.1  # of what refractivity falls by from the ground to the path's mean: scale heights of 6.5 to 8.2 km
+_HIGHEST_M = 11_000.0  # upper limit of this lapse rate
+_UNKNOWN = 10.0, 20.0, 100 / np.sqrt(12)  # K, hPa, % (uniform): standard deviations about the standard atmosphere
+_MEASURED = 1.0, 1.0, 5.0  # K, hPa, %: accuracy of thermometer, barometer and hygrometer in the field
+_STATED_N = 1.0  # N units: accuracy of a configured refractivity
+_LEAST_N, _MOST_N = 20.0, 1000.0  # N units: 20 at an altitude of 20 km, 500 in the hottest and wettest air at sea level
+_PROFILE = 0.1  # error of the decrease from the terrain to the mean of the path: scale heights of 6.5 to 8.2 km
 
 
 def refractivity(temperature_c: float, pressure_hpa: float, relative_humidity: float) -> float:
@@ -37,14 +37,14 @@ def refractivity(temperature_c: float, pressure_hpa: float, relative_humidity: f
     temperature_c
         Degrees Celsius, -50 to 60.
     pressure_hpa
-        Total pressure at the place (not reduced to sea level), hPa.
+        Total pressure at the site (not reduced to sea level), hPa.
     relative_humidity
         Percent, over water.
 
     Notes
     -----
-    Source: ITU-R P.453, N = 77.6/T·(P + 4810·e/T), within 0.1 % up to 100 GHz, free of dispersion; its formula of the
-    saturation vapour pressure over water; docs/theory/atmosphere.md, eq. 1.
+    Source: ITU-R P.453, N = 77.6/T·(P + 4810·e/T), accurate to 0.1 % up to 100 GHz and non-dispersive, with its
+    formula of the saturation vapour pressure over water; docs/theory/atmosphere.md, eq. 1.
 
     Examples
     --------
@@ -59,7 +59,7 @@ def refractivity(temperature_c: float, pressure_hpa: float, relative_humidity: f
 
 
 def standard_weather(height_m: float) -> tuple[float, float, float]:
-    """Return temperature (°C), pressure (hPa) and humidity (%) of the standard atmosphere at a height above the sea.
+    """Return temperature (°C), pressure (hPa) and humidity (%) of the standard atmosphere at a height above sea level.
 
     Examples
     --------
@@ -72,17 +72,17 @@ def standard_weather(height_m: float) -> tuple[float, float, float]:
 
 
 def wave_speed(refractivity_n: float) -> float:
-    """Return the speed of a wave in a medium of N units, m/s; of 0 exactly that in vacuum.
+    """Return the wave speed in a medium of given refractivity, m/s; exactly that of vacuum for 0.
 
     Parameters
     ----------
     refractivity_n
-        (n - 1)·10⁶: of `Atmosphere.mean_n` along a path.
+        (n - 1)·10⁶, such as `Atmosphere.mean_n` of a path.
 
     Examples
     --------
     >>> import apertura as ap
-    >>> air = ap.Atmosphere.standard(620.0)  # at the ground; an antenna flies 300 m above it
+    >>> air = ap.Atmosphere.standard(620.0)  # terrain height; the antenna is 300 m above it
     >>> round(ap.wave_speed(float(air.mean_n(920.0, 620.0))), -3)
     299708000.0
     """
@@ -91,18 +91,18 @@ def wave_speed(refractivity_n: float) -> float:
 
 @dataclass(frozen=True)
 class Atmosphere:
-    """Air over a scene: refractivity at its ground, falling exponentially with height.
+    """Atmosphere over a scene: refractivity at the terrain, decreasing exponentially with height.
 
     Attributes
     ----------
     refractivity_n
         N units at `ground_m`; 0: vacuum.
     ground_m
-        Height that it holds at, metres; of the same datum as all heights here, taken as above the sea.
+        Terrain height, metres; all heights have one datum and are used as heights above sea level.
     source
-        Where it comes from, in a few words.
+        Source of the refractivity, a short phrase.
     std_n
-        Standard deviation at the ground, N units.
+        Standard deviation at the terrain, N units.
 
     Examples
     --------
@@ -118,56 +118,57 @@ class Atmosphere:
 
     @classmethod
     def vacuum(cls) -> "Atmosphere":
-        """Return vacuum in place of air that nobody measured: an approximation, off by all of the air's refractivity.
+        """Return vacuum as an approximation of an unknown atmosphere; its error is the refractivity of the air.
 
-        `stated(0.0)` is exact: recordings simulated in vacuum, or corrected for the air.
+        `stated(0.0)` is exact: for recordings simulated in vacuum, or corrected for the atmosphere.
         """
-        return cls(0.0, 0.0, f"vacuum, in place of air of about N = {USUAL_N:.0f}", USUAL_N)
+        return cls(0.0, 0.0, f"vacuum assumed instead of air of about N = {USUAL_N:.0f}", USUAL_N)
 
     @classmethod
     def standard(cls, ground_m: float) -> "Atmosphere":
-        """Return the standard atmosphere over ground at a height above the sea (m), with 50 % of humidity."""
+        """Return the standard atmosphere for a terrain height above sea level (m), with a humidity of 50 %."""
         weather = standard_weather(ground_m)
-        source = f"standard atmosphere at the ground's {ground_m:.0f} m, humidity {STANDARD_HUMIDITY_PERCENT:.0f} %"
+        source = f"standard atmosphere, terrain height {ground_m:.0f} m, humidity {STANDARD_HUMIDITY_PERCENT:.0f} %"
         return cls(refractivity(*weather), ground_m, source, _spread(weather, _UNKNOWN))
 
     @classmethod
     def of_weather(
         cls, temperature_c: float, pressure_hpa: float, relative_humidity: float, *, ground_m: float
     ) -> "Atmosphere":
-        """Return air as measured at the ground; parameters as `refractivity`."""
+        """Return the atmosphere of weather measured at the terrain; parameters as for `refractivity`."""
         weather = temperature_c, pressure_hpa, relative_humidity
-        source = f"{temperature_c:g} °C, {pressure_hpa:g} hPa, {relative_humidity:g} % at the ground, as stated"
+        source = f"configured: {temperature_c:g} °C, {pressure_hpa:g} hPa, {relative_humidity:g} % at the terrain"
         return cls(refractivity(*weather), ground_m, source, _spread(weather, _MEASURED))
 
     @classmethod
     def stated(cls, refractivity_n: float, *, ground_m: float) -> "Atmosphere":
-        """Return air of a refractivity that is given for the ground, N units."""
+        """Return the atmosphere of a refractivity given for the terrain, N units."""
         if not (refractivity_n == 0 or _LEAST_N <= refractivity_n <= _MOST_N):
             raise CampaignError(
                 f"a refractivity of {refractivity_n:g}",
                 where="atmosphere",
                 expected=f"N units, (n - 1)·10⁶: {_LEAST_N:g} to {_MOST_N:g}, or 0 for vacuum",
-                remedy="Of an index n give (n - 1)·10⁶.",
+                remedy="Convert a refractive index n to (n - 1)·10⁶.",
             )
-        std_n = _STATED_N if refractivity_n else 0.0  # 0: simulated in vacuum, which nobody measured
-        return cls(refractivity_n, ground_m, f"N = {refractivity_n:g} at the ground, as stated", std_n)
+        std_n = _STATED_N if refractivity_n else 0.0  # 0: simulated in vacuum, without error
+        return cls(refractivity_n, ground_m, f"configured: N = {refractivity_n:g} at the terrain", std_n)
 
     def at_n(self, height_m: Any) -> Floats:
-        """Return N at heights (m), of their shape."""
+        """Return N at heights (m), in their shape."""
         return np.asarray(self.refractivity_n * np.exp((self.ground_m - np.asarray(height_m)) / SCALE_HEIGHT_M))
 
     def mean_n(self, one_m: Any, other_m: Any) -> Floats:
-        """Return the mean of N along straight paths between heights.
+        """Return the mean of N along straight paths between two heights.
 
         Parameters
         ----------
         one_m, other_m
-            Heights of both ends, metres, of shapes that broadcast.
+            Heights of both ends, metres, in shapes that broadcast.
 
         Notes
         -----
-        Source: docs/theory/atmosphere.md, eq. 3: height is linear along a path, so that its length does not matter.
+        Source: docs/theory/atmosphere.md, eq. 3. Height is linear along a path, so the mean does not depend on its
+        length.
 
         Examples
         --------
@@ -177,54 +178,54 @@ class Atmosphere:
         """
         low, high = np.minimum(one_m, other_m), np.maximum(one_m, other_m)
         scale = (high - low) / SCALE_HEIGHT_M
-        falls = np.where(scale > 1e-9, -np.expm1(-scale) / np.maximum(scale, 1e-9), 1.0)
-        return np.asarray(self.at_n(low) * falls)
+        mean_over_lowest = np.where(scale > 1e-9, -np.expm1(-scale) / np.maximum(scale, 1e-9), 1.0)
+        return np.asarray(self.at_n(low) * mean_over_lowest)
 
     def over(self, tx_m: Floats, rx_m: Floats, range_m: tuple[Floats, Floats]) -> "FlightAir":
-        """Return the one refractivity of a pair's flight.
+        """Return the constant refractivity for the flight of a pair.
 
         Parameters
         ----------
         tx_m, rx_m
             (pulse,) float64, heights of the antennas, metres.
         range_m
-            (pulse,) float64 each: distances of both antennas from the scene, metres, which the legs are weighed by.
+            (pulse,) float64 each: distances of both antennas from the scene, metres, the weights of both one-way paths.
         """
         legs = np.stack([self.mean_n(tx_m, self.ground_m), self.mean_n(rx_m, self.ground_m)])
         length_m = np.stack(range_m)
         of_pulses = (legs * length_m).sum(axis=0) / np.maximum(length_m.sum(axis=0), 1e-9)
         mean = float(of_pulses.mean())
-        falls = abs(self.refractivity_n - mean)
-        scaled = self.std_n * (mean / self.refractivity_n if self.refractivity_n else 1.0)
-        left_m = length_m.sum(axis=0) * 1e-6 * (of_pulses - mean)
+        decrease = abs(self.refractivity_n - mean)
+        std_n = self.std_n * (mean / self.refractivity_n if self.refractivity_n else 1.0)
+        residual_m = length_m.sum(axis=0) * 1e-6 * (of_pulses - mean)
         return FlightAir(
             mean,
-            float(np.hypot(scaled, _PROFILE * falls)),
+            float(np.hypot(std_n, _PROFILE * decrease)),
             self,
             float(np.mean([tx_m.mean(), rx_m.mean()])),
             float(length_m.sum(axis=0).mean()),
-            float(np.abs(left_m).max()),
+            float(np.abs(residual_m).max()),
         )
 
 
 @dataclass(frozen=True)
 class FlightAir:
-    """Air of a pair's flight: one refractivity for all its paths.
+    """Atmosphere of the flight of a pair: a constant refractivity for all its paths.
 
     Attributes
     ----------
     refractivity_n
-        Mean of N over pulses and along both legs.
+        Mean of N over pulses and along both one-way paths.
     std_n
         Its standard deviation, N units.
     atmosphere
-        What it is the mean of.
+        Atmosphere over which it is averaged.
     antennas_m
         Mean height of the antennas, metres.
     path_m
         Mean total path to the scene, metres.
     left_m
-        Largest error of a total path by one refractivity for all pulses, metres.
+        Largest error of a total path by the constant refractivity, metres.
     """
 
     refractivity_n: float
@@ -236,12 +237,12 @@ class FlightAir:
 
     @property
     def wave_speed_m_s(self) -> float:
-        """Speed of the wave along the paths, m/s."""
+        """Wave speed along the paths, m/s."""
         return wave_speed(self.refractivity_n)
 
     @property
     def report(self) -> dict[str, Any]:
-        """As JSON values, for stages and image.json."""
+        """The refractivity as JSON values, for stages and image.json."""
         air = self.atmosphere
         return {
             "refractivity_n": round(self.refractivity_n, 3),
@@ -251,23 +252,23 @@ class FlightAir:
             "ground_m": round(air.ground_m, 1),
             "antennas_m": round(self.antennas_m, 1),
             "range_m": round(self.path_m / 2, 2),
-            "vacuum_would_move_m": round(1e-6 * self.refractivity_n * self.path_m / 2, 4),
-            "one_constant_leaves_m": float(f"{self.left_m:.2g}"),
+            "vacuum_shift_m": round(1e-6 * self.refractivity_n * self.path_m / 2, 4),
+            "constant_refractivity_error_m": float(f"{self.left_m:.2g}"),
         }
 
 
 @dataclass(frozen=True, eq=False)
 class SceneAir:
-    """Air over a scene.
+    """Atmosphere over a scene at a known position.
 
     Attributes
     ----------
     atmosphere
-        Its refractivity by height.
+        Refractivity as a function of height.
     middle_m
-        (3,) float64, metres, in the frame of the antennas: a place in the middle of the scene.
+        (3,) float64, metres, in the frame of the antennas: the middle of the scene.
     frame
-        'ecef', where heights are those above the ellipsoid, or 'local', where they are z.
+        'ecef' (heights above the ellipsoid) or 'local' (heights are z).
     """
 
     atmosphere: Atmosphere
@@ -275,15 +276,15 @@ class SceneAir:
     frame: str
 
     def over(self, aperture: Aperture) -> FlightAir:
-        """Return the one refractivity of a pair's paths to the scene."""
-        tx_m, rx_m = (self._heights(leg) for leg in aperture.legs)
-        ranges = tuple(np.linalg.norm(leg - self.middle_m, axis=1) for leg in aperture.legs)
+        """Return the constant refractivity of a pair's paths to the scene."""
+        tx_m, rx_m = (self._heights(position_m) for position_m in aperture.legs)
+        ranges = tuple(np.linalg.norm(position_m - self.middle_m, axis=1) for position_m in aperture.legs)
         return self.atmosphere.over(tx_m, rx_m, (ranges[0], ranges[1]))
 
     def electrical_m(self, one_m: Floats, other_m: Floats) -> Floats:
-        """Return the electrical length (pulse,) of straight paths between antennas (pulse, 3), metres: c times delay.
+        """Return the electrical length (c times delay) of straight paths between antennas (pulse, 3), (pulse,) metres.
 
-        By the air at their own height: that between antennas that fly is thinner than that down to the scene.
+        It uses the refractivity at the height of the antennas, which is lower than that along paths to the scene.
         """
         length_m = np.linalg.norm(one_m - other_m, axis=1)
         mean_n = self.atmosphere.mean_n(self._heights(one_m), self._heights(other_m))
@@ -293,11 +294,11 @@ class SceneAir:
         return position_m[:, 2] if self.frame == LOCAL else geodetic_from_ecef(position_m)[:, 2]
 
 
-def _spread(weather: tuple[float, float, float], off: tuple[float, float, float]) -> float:
-    """Return the standard deviation of N by independent errors of temperature, pressure and humidity."""
-    middle, changes = refractivity(*weather), []
-    for number, error in enumerate(off):
-        wrong = list(weather)
-        wrong[number] += error
-        changes.append(refractivity(*wrong) - middle)
+def _spread(weather: tuple[float, float, float], std: tuple[float, float, float]) -> float:
+    """Return the standard deviation of N for independent errors of temperature, pressure and humidity."""
+    nominal, changes = refractivity(*weather), []
+    for number, error in enumerate(std):
+        changed = list(weather)
+        changed[number] += error
+        changes.append(refractivity(*changed) - nominal)
     return float(np.hypot.reduce(changes))

@@ -1,6 +1,6 @@
 """Geodetic, projected and Earth-centred coordinates, and rotations of body axes.
 
-Positions are computed in ECEF (EPSG:4978) float64: no zone, no scale factor, no curvature to model.
+Positions are processed in ECEF (EPSG:4978), float64, which has no zones, no scale factor and no curvature to model.
 """
 
 from functools import lru_cache
@@ -16,16 +16,16 @@ GEODETIC = "EPSG:4979"
 _PLANE = "EPSG:4326"
 
 LOCAL = "local"
-"""CRS of a frame without a place on Earth: x east, y north, z up, metres."""
+"""CRS of a frame without a geodetic position: x east, y north, z up, metres."""
 
 LOCAL_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-"""North, east and down in a local frame, as columns."""
+"""North, east and down unit vectors in a local frame, as columns."""
 
 Positions = NDArray[np.float64]
 
 
 def ecef_from_geodetic(latitude_deg: Positions, longitude_deg: Positions, height_m: Positions) -> Positions:
-    """Return ECEF positions of WGS 84 latitude, longitude and ellipsoidal height.
+    """Convert WGS 84 latitude, longitude and ellipsoidal height to ECEF positions.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def ecef_from_geodetic(latitude_deg: Positions, longitude_deg: Positions, height
 
 
 def geodetic_from_ecef(position: Positions) -> Positions:
-    """Return (..., 3) float64 latitude (deg), longitude (deg), ellipsoidal height (m) of ECEF positions (m).
+    """Convert ECEF positions (m) to latitude (deg), longitude (deg) and ellipsoidal height (m), (..., 3) float64.
 
     Examples
     --------
@@ -61,21 +61,21 @@ def geodetic_from_ecef(position: Positions) -> Positions:
 
 
 def ecef_from_projected(crs: str, x: Positions, y: Positions, height_m: Positions) -> Positions:
-    """Return (..., 3) float64 ECEF positions (m) of easting, northing (m) in `crs` and ellipsoidal height (m).
+    """Convert easting, northing in `crs` and ellipsoidal height (m) to ECEF positions (m), (..., 3) float64.
 
     Parameters
     ----------
     crs
-        Anything pyproj reads, with a geographic origin.
+        Any definition that pyproj reads, with a geographic origin.
     x, y
-        (...,) float64, metres, first easting then northing whatever the order the CRS declares.
+        (...,) float64, metres, easting then northing, for any axis order of the CRS.
     height_m
-        (...,) float64, metres above the ellipsoid of WGS 84, whichever ellipsoid `crs` is on.
+        (...,) float64, metres above the ellipsoid of WGS 84, for any ellipsoid of `crs`.
 
     Raises
     ------
     CampaignError
-        If PROJ has no exact transformation from `crs` to ECEF or a position becomes infinite.
+        If PROJ has no exact transformation from `crs` to ECEF, or a transformed position is infinite.
 
     Examples
     --------
@@ -84,21 +84,21 @@ def ecef_from_projected(crs: str, x: Positions, y: Positions, height_m: Position
     """
     if is_on_wgs84(crs):
         position = np.stack(_transformer(crs, ECEF).transform(x, y, height_m), axis=-1)
-    else:  # heights of such a system's own ellipsoid are tens of metres off
+    else:  # horizontally only: heights above its own ellipsoid differ by tens of metres
         longitude, latitude = _transformer(crs, _PLANE).transform(x, y)
         position = ecef_from_geodetic(latitude, longitude, height_m)
     if not np.isfinite(position).all():
         raise CampaignError(
-            f"positions in {crs} that have no place on Earth",
+            f"positions in {crs} outside the domain of its projection",
             where="scene",
-            expected="coordinates inside the area of use of the CRS",
+            expected="coordinates within the area of use of the CRS",
             remedy="Check scene.crs and scene.bounds_m.",
         )
     return position
 
 
 def projected_from_ecef(crs: str, position: Positions) -> Positions:
-    """Return (..., 3) float64 easting and northing (m) in `crs`, height (m) above WGS 84, of ECEF positions (m)."""
+    """Convert ECEF positions (m) to easting, northing in `crs` and height above WGS 84 (m), (..., 3) float64."""
     if is_on_wgs84(crs):
         return np.stack(_transformer(ECEF, crs).transform(*np.moveaxis(position, -1, 0)), axis=-1)
     latitude, longitude, height_m = np.moveaxis(geodetic_from_ecef(position), -1, 0)
@@ -107,7 +107,7 @@ def projected_from_ecef(crs: str, position: Positions) -> Positions:
 
 @lru_cache(maxsize=64)
 def is_on_wgs84(crs: str) -> bool:
-    """Return whether the ellipsoid of a CRS is that of WGS 84, or GRS 80, which is 0.1 mm less high.
+    """Return True if the ellipsoid of a CRS is WGS 84, or GRS 80, whose semi-minor axis differs by 0.1 mm.
 
     Examples
     --------
@@ -121,24 +121,24 @@ def is_on_wgs84(crs: str) -> bool:
 
 
 def longitude_range(longitude_deg: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the westernmost and the easternmost of longitudes in -180 to 180°; west > east across the antimeridian.
+    """Return the westernmost and easternmost of longitudes in -180 to 180°; west > east across the antimeridian.
 
-    The widest gap between neighbours on the circle is outside (RFC 7946, 5.2).
+    The widest gap between neighbours on the circle lies outside the range (RFC 7946, section 5.2).
 
     Examples
     --------
     >>> longitude_range(np.array([9.0, 10.0, 9.5])), longitude_range(np.array([179.9, -179.8, 180.0]))
     ((9.0, 10.0), (179.9, -179.8))
     """
-    around = np.sort(longitude_deg)
-    gaps = np.append(np.diff(around), around[0] + 360 - around[-1])
-    last = int(gaps[::-1].argmax())  # of equal gaps that over the antimeridian
-    end = len(around) - 1 - last
-    return float(around[(end + 1) % len(around)]), float(around[end])
+    ordered = np.sort(longitude_deg)
+    gaps = np.append(np.diff(ordered), ordered[0] + 360 - ordered[-1])
+    last = int(gaps[::-1].argmax())  # among equal gaps, the one over the antimeridian
+    end = len(ordered) - 1 - last
+    return float(ordered[(end + 1) % len(ordered)]), float(ordered[end])
 
 
 def longitudes_about(longitude_deg: NDArray[np.float64], middle_deg: float) -> NDArray[np.float64]:
-    """Return longitudes without a jump about a middle: within 180° of it.
+    """Return longitudes without wraps, within 180° of a middle longitude.
 
     Examples
     --------
@@ -149,12 +149,12 @@ def longitudes_about(longitude_deg: NDArray[np.float64], middle_deg: float) -> N
 
 
 def frame_from_map(crs: str, x: ArrayLike, y: ArrayLike, height_m: ArrayLike) -> Positions:
-    """Return (..., 3) float64 positions (m) in the processing frame: ECEF, or the local axes themselves.
+    """Convert map coordinates to positions in the processing frame (ECEF or local), (..., 3) float64, metres.
 
     Parameters
     ----------
     crs
-        As `ecef_from_projected`, or 'local'.
+        As for `ecef_from_projected`, or 'local'.
     x, y
         (...,) float64, metres, easting and northing.
     height_m
@@ -163,7 +163,7 @@ def frame_from_map(crs: str, x: ArrayLike, y: ArrayLike, height_m: ArrayLike) ->
     Raises
     ------
     CampaignError
-        As `ecef_from_projected`.
+        As for `ecef_from_projected`.
 
     Examples
     --------
@@ -171,17 +171,17 @@ def frame_from_map(crs: str, x: ArrayLike, y: ArrayLike, height_m: ArrayLike) ->
     array([[1. , 5. , 0.5],
            [2. , 5. , 0.5]])
     """
-    places = np.broadcast_arrays(*(np.asarray(value, np.float64) for value in (x, y, height_m)))
-    return np.stack(places, axis=-1) if crs == LOCAL else ecef_from_projected(crs, *places)
+    coordinates = np.broadcast_arrays(*(np.asarray(value, np.float64) for value in (x, y, height_m)))
+    return np.stack(coordinates, axis=-1) if crs == LOCAL else ecef_from_projected(crs, *coordinates)
 
 
 def map_from_frame(crs: str, position: Positions) -> Positions:
-    """Return (..., 3) float64 easting, northing and height (m) of positions (..., 3) in the processing frame.
+    """Convert positions in the processing frame to easting, northing and height (m), (..., 3) float64.
 
     Examples
     --------
-    >>> place = frame_from_map("EPSG:32632", 500000.0, 5300000.0, 700.0)
-    >>> map_from_frame("EPSG:32632", place).round(6)
+    >>> position = frame_from_map("EPSG:32632", 500000.0, 5300000.0, 700.0)
+    >>> map_from_frame("EPSG:32632", position).round(6)
     array([5.0e+05, 5.3e+06, 7.0e+02])
     """
     return position if crs == LOCAL else projected_from_ecef(crs, position)
@@ -189,13 +189,13 @@ def map_from_frame(crs: str, position: Positions) -> Positions:
 
 @lru_cache(maxsize=64)
 def _transformer(source: str, target: str) -> Transformer:
-    """Return PROJ's transformer between two systems, cached: it takes milliseconds to create."""
+    """Return the PROJ transformer between two systems, cached because its creation takes milliseconds."""
     if GEODETIC in (source, target):
         return Transformer.from_crs(source, target)
     if _PLANE in (source, target):
         return Transformer.from_crs(source, target, always_xy=True, allow_ballpark=False)
-    here, there = (system if system == ECEF else CRS(system).to_3d() for system in (source, target))
-    return Transformer.from_crs(here, there, always_xy=True, allow_ballpark=False)
+    source_3d, target_3d = (system if system == ECEF else CRS(system).to_3d() for system in (source, target))
+    return Transformer.from_crs(source_3d, target_3d, always_xy=True, allow_ballpark=False)
 
 
 def ned_axes(position: Positions) -> NDArray[np.float64]:
@@ -209,7 +209,7 @@ def ned_axes(position: Positions) -> NDArray[np.float64]:
     Returns
     -------
     ndarray
-        (..., 3, 3) float64; columns are north, east, down in ECEF, so it turns NED vectors into ECEF ones.
+        (..., 3, 3) float64; columns are north, east, down in ECEF: the rotation from NED to ECEF.
 
     Examples
     --------
@@ -225,7 +225,7 @@ def ned_axes(position: Positions) -> NDArray[np.float64]:
 
 
 def body_axes(attitude_rad: Positions) -> NDArray[np.float64]:
-    """Return rotations of forward-right-down body vectors into north-east-down: Rz(yaw)·Ry(pitch)·Rx(roll).
+    """Return the rotations from body axes (forward, right, down) to NED: Rz(yaw)·Ry(pitch)·Rx(roll).
 
     Parameters
     ----------
@@ -242,7 +242,7 @@ def body_axes(attitude_rad: Positions) -> NDArray[np.float64]:
     >>> (body_axes(np.radians([0.0, 0.0, 90.0])) @ [1.0, 0.0, 0.0]).round(12) + 0.0  # nose east
     array([0., 1., 0.])
     """
-    from scipy.spatial.transform import Rotation  # slow to import, and most steps rotate no body
+    from scipy.spatial.transform import Rotation  # slow to import, and rarely needed
 
     flat = np.reshape(attitude_rad, (-1, 3))
     matrices = Rotation.from_euler("ZYX", flat[:, ::-1]).as_matrix()
@@ -250,9 +250,9 @@ def body_axes(attitude_rad: Positions) -> NDArray[np.float64]:
 
 
 def local_crs(name: str) -> str:
-    """Return an engineering CRS for a frame without a place on Earth.
+    """Return an engineering CRS for a frame without a geodetic position.
 
-    The form is WKT 1: GeoTIFF does not carry ENGCRS back and forth.
+    The format is WKT 1, because GeoTIFF does not preserve the ENGCRS of WKT 2.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Phase centres of antennas at each pulse: logged track, attitude, lever arms, and corrections by autofocus."""
+"""Phase centres of antennas at each pulse: logged track, attitude, lever arms, and track corrections by autofocus."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -21,18 +21,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class TrackCorrection:
-    """Corrections of the tracks of a flight's nodes; a node that is not named keeps its logged positions.
+    """Corrections of the tracks of a flight's nodes; positions of nodes that are not listed are unchanged.
 
     Attributes
     ----------
     time_s
-        (knot,) float64, seconds of the flight's clock, ascending; between knots corrections are linear, beyond them
-        constant.
+        (knot,) float64, seconds of the flight's clock, ascending; corrections are linear between knots and constant
+        beyond the ends.
     moved_m
-        Node → (knot, 3) float64, metres to be added to each of its points, in the frame of the phase centres.
+        Node → (knot, 3) float64, displacement of all its points, metres, in the frame of the phase centres.
     extra_path_m
-        Pair → (knot,) float64, metres of total path added to all its echoes, whatever its nodes' positions; none for
-        a pair that is not named.
+        Pair → (knot,) float64, metres of total path added to all its echoes, in addition to the positions of its
+        nodes; 0 for a pair that is not listed.
 
     Examples
     --------
@@ -46,19 +46,19 @@ class TrackCorrection:
     extra_path_m: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def at(self, node: str, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the correction of a node's positions at some times, (pulse, 3) float64, metres."""
-        moved = self.moved_m.get(node)
-        if moved is None:
+        """Return the correction of a node's positions at given times, (pulse, 3) float64, metres."""
+        displacement = self.moved_m.get(node)
+        if displacement is None:
             return np.zeros((len(time_s), 3))
-        return np.stack([np.interp(time_s, self.time_s, axis) for axis in moved.T], axis=-1)
+        return np.stack([np.interp(time_s, self.time_s, axis) for axis in displacement.T], axis=-1)
 
     def with_further(self, later: "TrackCorrection") -> "TrackCorrection":
-        """Return this and a correction, at the same knots, of tracks that it corrected."""
-        moved_m = {node: self.moved_m.get(node, 0.0) + moved for node, moved in later.moved_m.items()}
+        """Return the sum of this correction and a later one of the corrected tracks, at the same knots."""
+        moved_m = {node: self.moved_m.get(node, 0.0) + added for node, added in later.moved_m.items()}
         return TrackCorrection(self.time_s, {**self.moved_m, **moved_m}, {**self.extra_path_m, **later.extra_path_m})
 
     def aperture(self, logged: Aperture, pair: str, time_s: NDArray[np.float64]) -> Aperture:
-        """Return the phase centres of a pair, transmitter-receiver, as corrected at the times of its pulses."""
+        """Return the corrected phase centres of a pair, transmitter-receiver, at the times of its pulses."""
         tx, rx = pair.split("-")
         return Aperture(logged.tx_m + self.at(tx, time_s), logged.rx_m + self.at(rx, time_s))
 
@@ -70,12 +70,12 @@ class TrackCorrection:
         Parameters
         ----------
         pair
-            transmitter-receiver.
+            Name, transmitter-receiver.
         time_s
-            (pulse,) float64.
+            (pulse,) float64, seconds of the flight's clock.
         between_m
-            (pulse, 3) float64, metres: from the receiver's sidelink point to the transmitter's, as the logs have it;
-            None where no sidelink's length was added to the echoes.
+            (pulse, 3) float64, metres: logged vector from the receiver's sidelink antenna to the transmitter's antenna;
+            None if no sidelink path was added to the echoes.
 
         Returns
         -------
@@ -84,13 +84,13 @@ class TrackCorrection:
 
         Notes
         -----
-        Source: docs/theory/autofocus.md, eq. 2 and 34.
+        Source: docs/theory/autofocus.md, eqs. 2 and 34.
 
         Examples
         --------
-        >>> apart = np.array([[3.0, 0.0, 0.0]])
+        >>> between = np.array([[3.0, 0.0, 0.0]])
         >>> wider = TrackCorrection(np.zeros(1), {"a": np.array([[0.5, 0, 0]])}, {"a-b": np.array([0.1])})
-        >>> wider.longer_m("a-b", np.zeros(1), apart), wider.longer_m("a-a", np.zeros(1), None)
+        >>> wider.longer_m("a-b", np.zeros(1), between), wider.longer_m("a-a", np.zeros(1), None)
         (array([0.6]), array([0.]))
         """
         own = self.extra_path_m.get(pair)
@@ -134,13 +134,13 @@ def phase_centres(
     lever_arm_m
         From the logged point to the antenna, body axes forward-right-down, metres.
     attitude_from
-        Whether body axes come from the log, from the course over ground (level flight), or are not known.
+        Source of the body axes: the log, the course over ground (level flight assumed), or none.
     where
-        The log, for messages.
+        Name of the log in errors.
     frame
-        'ecef', or 'local': axes to east, north and up.
+        'ecef', or 'local' with axes to east, north and up.
     smoothing_m
-        Noise of the logged positions that a smoothing spline removes; None: the spline goes through all epochs.
+        Noise of the logged positions, removed by a smoothing spline, metres; None: the spline interpolates all epochs.
 
     Returns
     -------
@@ -154,7 +154,7 @@ def phase_centres(
 
     Notes
     -----
-    Position is a cubic spline through the epochs; R = Rz(yaw)·Ry(pitch)·Rx(roll) turns body axes to NED
+    The position is a cubic spline through the epochs; R = Rz(yaw)·Ry(pitch)·Rx(roll) rotates body axes to NED
     (docs/theory.md, "Geometry").
     """
     _check_covered(track_time, at, where)
@@ -162,9 +162,11 @@ def phase_centres(
     centres = spline(seconds_since(at, track_time[0]))
     if not any(lever_arm_m):
         return np.asarray(centres)
-    why = f"a lever arm of {list(lever_arm_m)} m"
-    turn = _turn(track_time, attitude, spline, at=at, attitude_from=attitude_from, frame=frame, why=why, where=where)
-    return np.asarray(centres + np.einsum("pij,pjk,k->pi", *turn, np.array(lever_arm_m)))
+    purpose = f"a lever arm of {list(lever_arm_m)} m"
+    rotations = _rotations(
+        track_time, attitude, spline, at=at, attitude_from=attitude_from, frame=frame, purpose=purpose, where=where
+    )
+    return np.asarray(centres + np.einsum("pij,pjk,k->pi", *rotations, np.array(lever_arm_m)))
 
 
 def attitude_axes(
@@ -178,7 +180,7 @@ def attitude_axes(
     frame: str = "ecef",
     smoothing_m: float | None = None,
 ) -> NDArray[np.float64]:
-    """Return the attitude of the body at given times; parameters as `phase_centres`.
+    """Return the attitude of the body at given times; parameters as for `phase_centres`.
 
     Returns
     -------
@@ -188,13 +190,13 @@ def attitude_axes(
     Raises
     ------
     CampaignError
-        If the track does not cover `at`, or there is no attitude in the log.
+        If the track does not cover `at`, or the log contains no attitude.
     """
     _check_covered(track_time, at, where)
     spline = position_spline(seconds_since(track_time, track_time[0]), position, smoothing_m=smoothing_m)
-    why = "an antenna's beam"
-    ned, body = _turn(
-        track_time, attitude, spline, at=at, attitude_from=attitude_from, frame=frame, why=why, where=where
+    purpose = "an antenna beam"
+    ned, body = _rotations(
+        track_time, attitude, spline, at=at, attitude_from=attitude_from, frame=frame, purpose=purpose, where=where
     )
     return ned @ body
 
@@ -202,7 +204,7 @@ def attitude_axes(
 def position_spline(
     time_s: NDArray[np.float64], position: NDArray[np.float64], *, smoothing_m: float | None = None
 ) -> "BSpline":
-    """Return the cubic spline through the epochs of a log, or near them: the positions between epochs.
+    """Fit a cubic spline to the epochs of a log, interpolating or smoothing.
 
     Parameters
     ----------
@@ -211,8 +213,8 @@ def position_spline(
     position
         (epoch, 3) float64, metres.
     smoothing_m
-        Noise of the epochs in each axis: the spline with the fewest knots that stays as near to them, rms; None: the
-        one through all of them.
+        Noise of the epochs in each axis, metres: the spline has the fewest knots with this rms residual; None: the
+        spline interpolates all epochs.
 
     Notes
     -----
@@ -224,16 +226,16 @@ def position_spline(
     >>> position_spline(np.arange(5.0), np.arange(15.0).reshape(5, 3))(2.5).round(9)
     array([7.5, 8.5, 9.5])
     """
-    from scipy.interpolate import BSpline, make_interp_spline, splprep  # slow to import, and few steps need them
+    from scipy.interpolate import BSpline, make_interp_spline, splprep  # slow to import, and rarely needed
 
     if smoothing_m is not None and len(time_s) > _CUBIC:
-        middle = position.mean(axis=0)  # of ECEF: the fit is of the differences
+        middle = position.mean(axis=0)  # subtracted for precision: ECEF coordinates are large
         knots, coefficients, degree = splprep((position - middle).T, u=time_s, s=position.size * smoothing_m**2)[0]
         return BSpline(knots, np.stack(coefficients, axis=-1) + middle, degree)
     return make_interp_spline(time_s, position, k=min(_CUBIC, len(time_s) - 1))
 
 
-def _turn(
+def _rotations(
     track_time: NDArray[np.datetime64],
     attitude: NDArray[np.float64],
     spline: "BSpline",
@@ -241,10 +243,10 @@ def _turn(
     at: NDArray[np.datetime64],
     attitude_from: Literal["log", "course", "none"],
     frame: str,
-    why: str,
+    purpose: str,
     where: object,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return NED → `frame` and body → NED at given times; `why` they are needed."""
+    """Return the rotations NED → `frame` and body → NED at given times; errors name their `purpose`."""
     pulses = seconds_since(at, track_time[0])
     ned = ned_axes(spline(pulses)) if frame == "ecef" else np.broadcast_to(LOCAL_NED, (len(pulses), 3, 3))
     angles = (
@@ -254,10 +256,11 @@ def _turn(
     )
     if not np.isfinite(angles).all():
         raise CampaignError(
-            f"{why} but no attitude (attitude: {attitude_from})",
+            f"{purpose} is configured, but there is no attitude (attitude: {attitude_from})",
             where=where,
             expected="roll, pitch and yaw at every epoch of the log",
-            remedy="Log attitude, set the node's attitude to course, or its lever arms to zero and antennas to null.",
+            remedy="Log the attitude, or set the node's attitude to course, or set its lever arms to zero and its "
+            "antennas to null.",
         )
     return ned, body_axes(angles)
 
@@ -266,18 +269,20 @@ def _check_covered(track_time: NDArray[np.datetime64], at: NDArray[np.datetime64
     early = -float(seconds_since(at.min(), track_time[0]))
     late = float(seconds_since(at.max(), track_time[-1]))
     if max(early, late) > 0:
-        ends = [f"begins {early:.3f} s after the first pulse"] if early > 0 else []
-        ends += [f"ends {late:.3f} s before the last"] if late > 0 else []
+        ends = [f"starts {early:.3f} s after the first pulse"] if early > 0 else []
+        ends += [f"ends {late:.3f} s before the last pulse"] if late > 0 else []
         raise CampaignError(
             f"the track ({track_time[0]} to {track_time[-1]}) {' and '.join(ends)}",
             where=where,
             expected=f"a track that covers the pulses, {at.min()} to {at.max()}",
-            remedy="Check the log's time system (GPST is 18 s ahead of UTC) and the transmitter's time tags, at which "
-            "both nodes are placed, or give the whole log; a recorder with a clock of its own: `apertura align`.",
+            remedy="Check the time system of the log (GPST is 18 s ahead of UTC) and the transmitter's time tags, at "
+            "which the positions of both nodes are evaluated; or provide the complete log. If the recorder has its own "
+            "clock, use `apertura align`.",
         )
 
 
 def _course(velocity: NDArray[np.float64], ned: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return level attitude with the yaw of the course over ground, (pulse, 3) rad."""
     north, east, _ = np.moveaxis(np.einsum("pij,pi->pj", ned, velocity), -1, 0)
     return np.stack([np.zeros_like(north), np.zeros_like(north), np.arctan2(east, north)], -1)
 
@@ -285,5 +290,6 @@ def _course(velocity: NDArray[np.float64], ned: NDArray[np.float64]) -> NDArray[
 def _logged(
     epochs: NDArray[np.float64], attitude: NDArray[np.float64], pulses: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    smooth = np.unwrap(attitude, axis=0)
-    return np.stack([np.interp(pulses, epochs, angle) for angle in smooth.T], -1)
+    """Return the logged attitude, interpolated linearly at the pulses, (pulse, 3) rad."""
+    unwrapped = np.unwrap(attitude, axis=0)
+    return np.stack([np.interp(pulses, epochs, angle) for angle in unwrapped.T], -1)

@@ -1,4 +1,4 @@
-"""The sector that a pixel is integrated over: weights of the pulses of a long flight at each pixel."""
+"""Sector of integration of a pixel: weights of the pulses of a long flight at each pixel."""
 
 from dataclasses import dataclass, replace
 
@@ -9,32 +9,33 @@ from apertura.common.units import decibels
 from apertura.core.geometry.aperture import Aperture, Weigh, distance
 
 TAPER = 0.1
-"""Of the half width: the weight falls from 1 to 0 between 1 - TAPER and 1 + TAPER (docs/theory/integration.md)."""
+"""Half width of an edge as a share of the sector's half width: the weight decreases from 1 to 0 between 1 - TAPER and
+1 + TAPER (docs/theory/integration.md)."""
 
-_SAMPLES = 256  # of the window: its width and sidelobe to 1e-6
-_TRIED = 256  # pulses among which those are looked for that end what was flown
-_END = 0.01  # of the half width: how well these know it
+_SAMPLES = 256  # of the window: -3 dB width and sidelobe to 1e-6
+_TRIED = 256  # pulses searched for the extremes of s
+_END = 0.01  # tolerated error of these extremes as a share of the half width
 
 
 @dataclass(frozen=True, eq=False)
 class Sector:
-    """Interval of the direction cosine to the flight within which a pulse counts for a pixel.
+    """Interval of the direction cosine to the flight in which pulses are integrated at a pixel.
 
     With u_t, u_r the unit vectors from the antennas to the pixel, s = a_t·u_t + a_r·u_r is the decrease of the total
-    path per metre that both antennas fly together: 0 at the closest approach, 1 straight ahead. A pulse counts
-    for a pixel where s is within `half` of the centre, with a smooth edge. The centre of a pixel is `centre`, or, where
-    too little of its sector was flown, the nearest one of which all was (`following`).
+    path per metre of motion of both antennas together: 0 at the closest approach, 1 straight ahead. A pulse is
+    integrated at a pixel if s is within `half` of the centre, with a smooth edge. The centre of a pixel is `centre`, or
+    the nearest centre whose sector lies within the flight (`following`).
 
     Attributes
     ----------
     tx_axis, rx_axis
-        (pulse, 3) float64: displacement of each antenna over that of both together; their lengths sum to 1, or are 0
-        where no antenna moves and every pixel is at its closest approach.
+        (pulse, 3) float64: displacement of each antenna relative to the summed displacements of both; their lengths sum
+        to 1. They are 0 if no antenna moves, so that every pixel is at its closest approach.
     centre, half
-        Of s; at the centre ± `half` the weight is one half.
+        Centre and half width of the interval of s; the weight is one half at the centre ± `half`.
     ends
-        Pulses at which s of some pixel is least or largest, and the sector of these pulses; None: `centre` is that of
-        every pixel.
+        Pulses at which s of any pixel is smallest or largest, and the sector of these pulses; None: all pixels have the
+        same `centre`.
 
     Raises
     ------
@@ -43,7 +44,7 @@ class Sector:
 
     Notes
     -----
-    Source: docs/theory/integration.md, eq. 1, 3 and 4.
+    Source: docs/theory/integration.md, eqs. 1, 3 and 4.
 
     Examples
     --------
@@ -73,25 +74,26 @@ class Sector:
         Parameters
         ----------
         aperture
-            In the frame of the pixels.
+            Aperture in the frame of the pixels.
         chord_m
-            Distance over which a direction is taken: longer than positions err, shorter than the flight turns.
+            Distance over which a direction is determined: long relative to position errors, short relative to the
+            radius of turns.
         centre, half
             As of a `Sector`.
         """
         return cls(*flight_axes(aperture, chord_m=chord_m), centre, half)
 
     def __getitem__(self, pulses: slice | NDArray[np.int64]) -> "Sector":
-        """Return the sector of some pulses."""
+        """Return the sector of the selected pulses."""
         return replace(self, tx_axis=self.tx_axis[pulses], rx_axis=self.rx_axis[pulses])
 
     def following(self, aperture: Aperture, points_m: NDArray[np.float64]) -> "Sector":
-        """Return the sector whose centres follow what was flown past each pixel.
+        """Return the sector with the centre of each pixel limited to the part of the flight past it.
 
         Parameters
         ----------
         aperture
-            Of the same pulses.
+            Aperture of the same pulses.
         points_m
             (point, 3) float64, metres, spread over the scene.
 
@@ -107,35 +109,35 @@ class Sector:
         >>> sector.weight(flown, points).sum(axis=0).round(), sector.following(flown, points).centre_at(points).round(2)
         (array([64.,  0.]), array([0.  , 0.52]))
         """
-        some = np.unique(np.append(np.arange(len(aperture))[aperture.sample(_TRIED)], len(aperture) - 1))
-        few, there = aperture[some], replace(self[some], ends=None)
-        place = there.place(few, points_m)
-        if (place.min(axis=0) <= -self.outer).all() and (place.max(axis=0) >= self.outer).all():
-            return self  # every place was passed by more than its sector
-        # The fewest pulses by which the ends of what was flown are known to a small part of the sector.
-        within = np.concatenate([place, -place], axis=1)
-        within = within <= within.min(axis=0) + _END * self.half
+        searched = np.unique(np.append(np.arange(len(aperture))[aperture.sample(_TRIED)], len(aperture) - 1))
+        sample, sector = aperture[searched], replace(self[searched], ends=None)
+        offset = sector.place(sample, points_m)
+        if (offset.min(axis=0) <= -self.outer).all() and (offset.max(axis=0) >= self.outer).all():
+            return self  # the flight contains the complete sector of every point
+        # Select the fewest pulses that contain the extremes of s of every point, to `_END` of the half width.
+        is_extreme = np.concatenate([offset, -offset], axis=1)
+        is_extreme = is_extreme <= is_extreme.min(axis=0) + _END * self.half
         ends: list[int] = []
-        while within.any():
-            ends.append(int(within.sum(axis=1).argmax()))
-            within &= ~within[ends[-1]]
-        return replace(self, ends=(few[np.array(ends)], there[np.array(ends)]))
+        while is_extreme.any():
+            ends.append(int(is_extreme.sum(axis=1).argmax()))
+            is_extreme &= ~is_extreme[ends[-1]]
+        return replace(self, ends=(sample[np.array(ends)], sector[np.array(ends)]))
 
     def centre_at(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the centre of s of each point (..., 3), in metres: (...) float64."""
+        """Return the centre of the interval of s at each point, (...) float64, of points (..., 3) in metres."""
         if self.ends is None:
             return np.full(points_m.shape[:-1], self.centre)
-        aperture, there = self.ends
-        place = there.place(aperture, points_m) + self.centre
-        first, last = place.min(axis=0), place.max(axis=0)
+        aperture, sector = self.ends
+        cosine = sector.place(aperture, points_m) + self.centre
+        first, last = cosine.min(axis=0), cosine.max(axis=0)
         middle = (first + last) / 2
         lowest, highest = np.minimum(first + self.outer, middle), np.maximum(last - self.outer, middle)
         return np.asarray(np.clip(self.centre, lowest, highest))
 
     def axis_change(self, other: "Sector") -> NDArray[np.float64]:
-        """Return the largest change of s by other axes, of a sector of as many pulses, (pulse,)."""
+        """Return the largest change of s by the axes of another sector of the same number of pulses, (pulse,)."""
         axes = ((self.tx_axis, other.tx_axis), (self.rx_axis, other.rx_axis))
-        return np.asarray(sum(np.linalg.norm(mine - theirs, axis=1) for mine, theirs in axes))
+        return np.asarray(sum(np.linalg.norm(own - others, axis=1) for own, others in axes))
 
     @property
     def inner(self) -> float:
@@ -144,56 +146,56 @@ class Sector:
 
     @property
     def outer(self) -> float:
-        """Distance from the centre from which on it is 0."""
+        """Distance from the centre beyond which the weight is 0."""
         return (1 + TAPER) * self.half
 
     def place(self, aperture: Aperture, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return s less the centre of the point, (pulse, ...) float64, of points (..., 3) in metres.
+        """Return s minus the centre of the point, (pulse, ...) float64, of points (..., 3) in metres.
 
         Raises
         ------
         ValueError
-            If the aperture is of other pulses.
+            If the aperture has a different number of pulses.
         """
         if len(self.tx_axis) != len(aperture):
             raise ValueError(f"{len(self.tx_axis)=}: must be one for each of {len(aperture)} pulses")
-        # Matrix products about a nearby origin, where squares of distances keep their precision.
-        flat, middle = points_m.reshape(-1, 3), aperture.legs[0][:1].sum(axis=0)
-        offset_m = flat - middle
-        place = np.tile(-self.centre_at(flat), (len(aperture), 1))
+        # Matrix products relative to a nearby origin, to preserve the precision of squared distances.
+        flat, origin = points_m.reshape(-1, 3), aperture.legs[0][:1].sum(axis=0)
+        offset_m = flat - origin
+        cosine = np.tile(-self.centre_at(flat), (len(aperture), 1))
         for axis, leg in zip((self.tx_axis, self.rx_axis), aperture.legs, strict=True):
-            antenna = leg - middle
+            antenna = leg - origin
             square = antenna @ (-2 * offset_m.T)
             square += (antenna**2).sum(axis=1)[:, None]
             square += (offset_m**2).sum(axis=1)
             along = axis @ offset_m.T
             along -= (antenna * axis).sum(axis=1)[:, None]
             along /= np.sqrt(square, out=square)
-            place += along
-        return place.reshape(len(aperture), *points_m.shape[:-1])
+            cosine += along
+        return cosine.reshape(len(aperture), *points_m.shape[:-1])
 
     def weight(self, aperture: Aperture, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the weight of each pulse at each point: as `place`, 0 to 1."""
+        """Return the weight of each pulse at each point, 0 to 1; parameters and shape as for `place`."""
         return edge((self.outer - np.abs(self.place(aperture, points_m))) / (self.outer - self.inner))
 
     def over(self, aperture: Aperture) -> Weigh:
-        """Return the function that weights some pulses of an aperture at points."""
+        """Return a function of a slice of pulses and points that gives their weights."""
         return lambda pulses, points_m: self[pulses].weight(aperture[pulses], points_m)
 
     def slack(
         self, aperture: Aperture, points_m: NDArray[np.float64], radius_m: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the largest change of `place` within some radius of a point.
+        """Return the largest change of `place` within given radii of points.
 
         Parameters
         ----------
         aperture, points_m
-            As `place`.
+            As for `place`.
         radius_m
-            Of balls about the points, metres, in a shape that goes with (pulse, ...).
+            Radii of spheres about the points, metres, in a shape that broadcasts with (pulse, ...).
         """
         slack = np.zeros((len(aperture), *points_m.shape[:-1]))
-        if self.ends is not None:  # a centre moves no farther than the ends of what was flown
+        if self.ends is not None:  # a centre changes by no more than the extremes of s
             slack += (
                 self.ends[1]
                 .slack(self.ends[0], points_m, np.broadcast_to(radius_m, slack.shape).max(axis=0))
@@ -202,14 +204,14 @@ class Sector:
         for axis, leg in zip((self.tx_axis, self.rx_axis), aperture.legs, strict=True):
             range_m = distance(leg.reshape(-1, *(1,) * (points_m.ndim - 1), 3), points_m)
             length = np.linalg.norm(axis, axis=1).reshape(-1, *(1,) * (points_m.ndim - 1))
-            # a direction rotates by asin(radius/range) at most; the difference of the unit vectors is less
-            turn = np.minimum(1.0, radius_m / range_m)
-            slack += length * np.where(turn < 1, np.pi / 2 * turn, 2.0)
+            # a direction rotates by at most asin(radius/range); the difference of the unit vectors is smaller
+            ratio = np.minimum(1.0, radius_m / range_m)
+            slack += length * np.where(ratio < 1, np.pi / 2 * ratio, 2.0)
         return slack
 
 
 def edge(depth: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the weight at some depth inside a sector, in widths of its edge: 0 at 0, 1 at 1, level at both.
+    """Return the weight at a depth inside a sector, in widths of its edge: smoothstep from 0 at 0 to 1 at 1.
 
     Examples
     --------
@@ -221,7 +223,7 @@ def edge(depth: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def flight_axes(aperture: Aperture, *, chord_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the axes of a `Sector`: of each pulse, over the distance `chord_m` about it, clipped at the ends.
+    """Return the axes of a `Sector` at each pulse, over a distance `chord_m` about it that is clipped at the ends.
 
     Examples
     --------
@@ -230,23 +232,23 @@ def flight_axes(aperture: Aperture, *, chord_m: float) -> tuple[NDArray[np.float
     [[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
     """
     pulses = np.arange(len(aperture))
-    way = np.cumsum(np.linalg.norm(np.diff(aperture.middle_m, axis=0, prepend=aperture.middle_m[:1]), axis=1))
-    step = float(way[-1]) / max(1, len(aperture) - 1)
+    path_m = np.cumsum(np.linalg.norm(np.diff(aperture.middle_m, axis=0, prepend=aperture.middle_m[:1]), axis=1))
+    step = float(path_m[-1]) / max(1, len(aperture) - 1)
     half = int(min(max(1.0, np.ceil(chord_m / 2 / step)), len(aperture))) if step else 1
     before, after = np.maximum(pulses - half, 0), np.minimum(pulses + half, len(aperture) - 1)
-    flown = [leg[after] - leg[before] for leg in aperture.legs]
-    together = sum(np.linalg.norm(leg, axis=1) for leg in flown)
-    tx, rx = (leg / np.where(together > 0, together, 1.0)[:, None] for leg in flown)
+    displacements = [leg[after] - leg[before] for leg in aperture.legs]
+    total = sum(np.linalg.norm(displacement, axis=1) for displacement in displacements)
+    tx, rx = (displacement / np.where(total > 0, total, 1.0)[:, None] for displacement in displacements)
     return tx, rx
 
 
 def response() -> tuple[float, float]:
-    """Return width and highest sidelobe of a point's response along the flight, by the smooth edges.
+    """Return width and highest sidelobe of the point response along the flight for the smooth edges.
 
     Returns
     -------
     width : float
-        -3 dB width times the width of the sector's spectrum between its half weights.
+        -3 dB width times the width of the sector's spectrum between its points of weight one half.
     sidelobe_db : float
         Highest sidelobe, dB.
 
@@ -259,11 +261,11 @@ def response() -> tuple[float, float]:
     >>> [round(value, 2) for value in response()]
     [0.88, -13.44]
     """
-    place = (np.arange(_SAMPLES) + 0.5) / _SAMPLES * (1 + TAPER)
-    window = edge(((1 + TAPER) - place) / (2 * TAPER))
-    at = np.linspace(0, 4, 2001)  # in inverses of the width between half weights
-    power = np.abs(np.cos(np.pi * np.multiply.outer(at, place)) @ window) ** 2
+    cosine = (np.arange(_SAMPLES) + 0.5) / _SAMPLES * (1 + TAPER)
+    window = edge(((1 + TAPER) - cosine) / (2 * TAPER))
+    position = np.linspace(0, 4, 2001)  # in inverses of the width between half weights
+    power = np.abs(np.cos(np.pi * np.multiply.outer(position, cosine)) @ window) ** 2
     power /= power[0]
     first = int(np.argmax(np.diff(power) > 0))
-    width = 2 * float(np.interp(-0.5, -power[: first + 1], at[: first + 1]))
+    width = 2 * float(np.interp(-0.5, -power[: first + 1], position[: first + 1]))
     return width, decibels(float(power[first:].max()))

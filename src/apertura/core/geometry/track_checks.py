@@ -1,4 +1,4 @@
-"""Checks of a flight log's epochs: spikes, steps, frozen positions, rounded times and positions, and gaps."""
+"""Checks of a flight log: spikes, steps, frozen positions, rounded times and positions, gaps, yaw and hovers."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -14,27 +14,27 @@ from apertura.core.geometry.lever_arms import position_spline
 
 # ---- Spikes and steps
 #
-# Thresholds follow from the log itself. An epoch is compared with the cubic through two epochs on either side; a fault
-# is what, once it is taken out, leaves its neighbours smooth. Movement that the log samples badly does not become
-# smooth that way, and is left alone.
+# Thresholds are derived from the log itself. An epoch is compared with the cubic through two epochs on either side. A
+# group of epochs is a fault if the log is smooth without it. Undersampled motion does not become smooth in this way,
+# and is not reported.
 
 
 LEAST_FAULT_M = 5e-3
-"""Metres: smaller errors of single epochs are taken as the log's noise; 5 mm is λ/48 at L-band."""
+"""Metres, smallest error of single epochs that is distinguished from noise; 5 mm is λ/48 at L-band."""
 
 FINEST_GRAIN_M = 0.01
-"""Metres, grain of the coarsest log that resolves centimetres: still epochs count as scattering by no more."""
+"""Metres, largest rounding step of a log that resolves centimetres: upper limit of the scatter of a static log."""
 
-_SIGMA = 10.0  # a fault is so many times the log's own scatter
-_SMOOTHER = {1: 7.0, 2: 12.0, 3: 20.0}  # epochs taken out → how many times smoother their neighbours must become
-_STEP_SMOOTHER = 10.0  # times smoother the neighbours of a step must become without it
-_AGILE_M_S2 = 10.0  # a node may have flown a step that takes no more than this, forth and back within an interval
+_SIGMA = 10.0  # least size of a fault relative to the scatter of the log
+_SMOOTHER = {1: 7.0, 2: 12.0, 3: 20.0}  # number of faulty epochs → least size relative to the residual misfits
+_STEP_SMOOTHER = 10.0  # least size of a step relative to the residual misfits
+_AGILE_M_S2 = 10.0  # acceleration, in both directions within an interval, that a node may fly: smaller steps are motion
 _CHI3_MEDIAN = 1.538  # median length of a vector of three standard normal components
 _MOST_ROUNDS = 20
 
 
 class Fault(NamedTuple):
-    """Epochs first…last that are wrong by `size_m`; a step lies between them."""
+    """Epochs first…last with an error of `size_m`; a step lies between them."""
 
     first: int
     last: int
@@ -42,7 +42,7 @@ class Fault(NamedTuple):
 
 
 def misfits(time_s: Floats, position_m: Floats) -> Floats:
-    """Return how far each epoch lies from the cubic through two epochs on either side.
+    """Return the deviation of each epoch from the cubic through two epochs on either side.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def misfits(time_s: Floats, position_m: Floats) -> Floats:
     Returns
     -------
     ndarray
-        (epoch, axis) float64, metres; zero at the first and last two.
+        (epoch, axis) float64, metres; zero at the first two and the last two epochs.
 
     Notes
     -----
@@ -75,9 +75,9 @@ def misfits(time_s: Floats, position_m: Floats) -> Floats:
 
 
 def scatter_m(misfit_m: Floats) -> float:
-    """Return the robust scatter of an axis of `misfits`, metres; also of a log that mostly repeats one position.
+    """Return the robust scatter of `misfits` per axis, metres, also for a log that mostly repeats one position.
 
-    Where most epochs repeat a coarse position exactly, its grain follows from the few that move.
+    If most epochs repeat a coarsely rounded position exactly, the scatter is estimated from the epochs that change.
 
     Examples
     --------
@@ -86,14 +86,14 @@ def scatter_m(misfit_m: Floats) -> float:
     0.01
     """
     size = np.linalg.norm(misfit_m[2:-2], axis=1)
-    moved = size[size > 1e-7]
-    if not moved.size:
+    nonzero = size[size > 1e-7]
+    if not nonzero.size:
         return 0.0
-    return max(float(np.median(size)), min(float(np.median(moved)), FINEST_GRAIN_M)) / _CHI3_MEDIAN
+    return max(float(np.median(size)), min(float(np.median(nonzero)), FINEST_GRAIN_M)) / _CHI3_MEDIAN
 
 
 def find_spikes(time_s: Floats, position_m: Floats) -> list[Fault]:
-    """Return spikes: one to three epochs in a row that deviate from their neighbours.
+    """Detect spikes: one to three consecutive epochs that deviate from their neighbours.
 
     Notes
     -----
@@ -109,11 +109,11 @@ def find_spikes(time_s: Floats, position_m: Floats) -> list[Fault]:
     """
     index, faults = np.arange(len(time_s)), []
     for _ in range(_MOST_ROUNDS):
-        time, place = time_s[index], position_m[index]
-        misfit = misfits(time, place)
+        time, position = time_s[index], position_m[index]
+        misfit = misfits(time, position)
         scatter = scatter_m(misfit)
-        here = [_spike(time, place, epoch, scatter) for epoch in _outlying(misfit, scatter)]
-        spikes = [spike for spike in here if spike is not None]
+        candidates = [_spike(time, position, epoch, scatter) for epoch in _outlying(misfit, scatter)]
+        spikes = [spike for spike in candidates if spike is not None]
         if not spikes:
             break
         faults += [Fault(int(index[first]), int(index[last]), size) for first, last, size in spikes]
@@ -122,7 +122,7 @@ def find_spikes(time_s: Floats, position_m: Floats) -> list[Fault]:
 
 
 def find_steps(time_s: Floats, position_m: Floats) -> list[Fault]:
-    """Return pairs of epochs between which all positions are shifted at once, as when a receiver gets a new fix.
+    """Detect steps: pairs of epochs between which the position is offset at once, as by a new GNSS fix.
 
     Examples
     --------
@@ -134,15 +134,15 @@ def find_steps(time_s: Floats, position_m: Floats) -> list[Fault]:
     misfit = misfits(time_s, position_m)
     scatter, faults = scatter_m(misfit), []
     for epoch in _outlying(misfit, scatter):
-        tried = [_step(time_s, misfit, before, scatter) for before in (epoch - 1, epoch)]
-        steps = [step for step in tried if step is not None]
+        candidates = [_step(time_s, misfit, before, scatter) for before in (epoch - 1, epoch)]
+        steps = [step for step in candidates if step is not None]
         if steps:
             faults.append(max(steps, key=lambda step: step.size_m))
     return sorted(faults)
 
 
 def _lagrange(nodes: Floats, at: Floats) -> Floats:
-    """Return (epoch, node) weights of the polynomial through `nodes` (epoch, node) at `at` (epoch,)."""
+    """Return the Lagrange weights, (epoch, node), of polynomials through `nodes` (epoch, node) at `at` (epoch,)."""
     weights = np.ones_like(nodes)
     for own in range(nodes.shape[1]):
         for other in range(nodes.shape[1]):
@@ -152,14 +152,14 @@ def _lagrange(nodes: Floats, at: Floats) -> Floats:
 
 
 def _outlying(misfit_m: Floats, scatter: float) -> list[int]:
-    """Return epochs whose misfit is large, and larger than within six epochs either way."""
+    """Return epochs whose misfit exceeds the threshold and is the largest within six epochs on either side."""
     size = np.linalg.norm(misfit_m, axis=1)
     around = np.lib.stride_tricks.sliding_window_view(np.pad(size, 6), 13).max(axis=1)
     return np.flatnonzero((size > max(0.6 * _SIGMA * scatter, 0.6 * LEAST_FAULT_M)) & (size >= around)).tolist()
 
 
 def _spike(time_s: Floats, position_m: Floats, epoch: int, scatter: float) -> Fault | None:
-    """Return the fewest epochs about an outlying one without which its neighbours are smooth."""
+    """Return the smallest group of epochs about an outlying one without which its neighbours are smooth."""
     for count, smoother in _SMOOTHER.items():
         for first in range(epoch - count, epoch + 2):
             last = first + count - 1
@@ -173,13 +173,14 @@ def _spike(time_s: Floats, position_m: Floats, epoch: int, scatter: float) -> Fa
             )
             worst = error_m[np.argmax(np.linalg.norm(error_m, axis=1))]
             size = float(np.linalg.norm(worst))
-            left = misfits(time_s[near], position_m[near])[4:8] @ (worst / max(size, 1e-12))
-            if size > max(_SIGMA * scatter, LEAST_FAULT_M, smoother * float(np.sqrt(np.mean(left**2)))):
+            residual = misfits(time_s[near], position_m[near])[4:8] @ (worst / max(size, 1e-12))
+            if size > max(_SIGMA * scatter, LEAST_FAULT_M, smoother * float(np.sqrt(np.mean(residual**2)))):
                 return Fault(first, last, size)
     return None
 
 
 def _step(time_s: Floats, misfit_m: Floats, before: int, scatter: float) -> Fault | None:
+    """Fit a step after epoch `before` to the misfits around it; None if it is not significant."""
     near = np.arange(max(before - 5, 0), min(before + 7, len(time_s)))
     pattern = misfits(time_s[near], (near > before)[:, None].astype(float))[2:-2, 0]
     power = float(pattern @ pattern)
@@ -187,21 +188,22 @@ def _step(time_s: Floats, misfit_m: Floats, before: int, scatter: float) -> Faul
         return None
     step = pattern @ misfit_m[near][2:-2] / power
     size = float(np.linalg.norm(step))
-    left = misfit_m[near][2:-2] @ (step / max(size, 1e-12)) - size * pattern
-    rough = _STEP_SMOOTHER * float(np.sqrt(np.mean(left**2) / power))
-    flown = _AGILE_M_S2 * float(time_s[before + 1] - time_s[before]) ** 2 / 4
-    return Fault(before, before + 1, size) if size > max(_SIGMA * scatter, 3 * FINEST_GRAIN_M, rough, flown) else None
+    residual = misfit_m[near][2:-2] @ (step / max(size, 1e-12)) - size * pattern
+    roughness = _STEP_SMOOTHER * float(np.sqrt(np.mean(residual**2) / power))
+    motion = _AGILE_M_S2 * float(time_s[before + 1] - time_s[before]) ** 2 / 4
+    threshold = max(_SIGMA * scatter, 3 * FINEST_GRAIN_M, roughness, motion)
+    return Fault(before, before + 1, size) if size > threshold else None
 
 
 # ---- Frozen positions, rounded times and rounded positions
 
 
 def find_frozen(time_s: Floats, position_m: Floats) -> NDArray[np.bool_]:
-    """Return (epoch,) bool: epochs that only repeat the position before them although the node flew on.
+    """Detect epochs that repeat the preceding position although the node was moving, (epoch,) bool.
 
-    A node that stops decelerates to rest and starts from rest. One that flew just before and just after, and then is as
-    far away as that speed takes it, did not stand while its log repeated a position to the last digit: if three repeats
-    or more follow each other, or every tenth epoch is one, since noise may repeat a coarse position by chance.
+    A node that stops decelerates and accelerates. If it moved just before and just after the repeated positions, and
+    the distance between them agrees with that speed, it did not stop. Noise may repeat a coarsely rounded position, so
+    at least three consecutive repeats are required, unless more than every tenth epoch is a repeat.
 
     Examples
     --------
@@ -217,28 +219,28 @@ def find_frozen(time_s: Floats, position_m: Floats) -> NDArray[np.bool_]:
     jump = np.linalg.norm(np.diff(position_m[first], axis=0), axis=1)
     speed = np.concatenate([[np.inf], jump / np.diff(time_s[first]), [np.inf]])  # before, between and after the runs
     travel = np.minimum(speed[:-2], speed[2:]) * (time_s[last] - time_s[first])[:-1]
-    still = np.append((np.minimum(travel, jump) > 3 * FINEST_GRAIN_M) & (jump > travel / 2), False)
+    is_frozen_run = np.append((np.minimum(travel, jump) > 3 * FINEST_GRAIN_M) & (jump > travel / 2), False)
     length = last - first
-    still[-1] = length[-1] <= length[still].max(initial=-1)  # a landing is longer
-    frozen = repeats & still[run]
+    is_frozen_run[-1] = length[-1] <= length[is_frozen_run].max(initial=-1)  # a landing is longer
+    frozen = repeats & is_frozen_run[run]
     return np.asarray(frozen if frozen.mean() > 0.1 else frozen & (length >= 3)[run])
 
 
 def rounded_time_m(time_s: Floats, position_m: Floats) -> float:
-    """Return the RMS error of positions along the flight by coarsely written times, metres; 0 without.
+    """Return the RMS along-track error of positions due to rounded times, metres; 0 if times are not rounded.
 
     Parameters
     ----------
     time_s
-        (epoch,) float64, seconds, integer multiples of the grain they were written with.
+        (epoch,) float64, seconds, integer multiples of the rounding step.
     position_m
         (epoch, 3) float64, metres.
 
     Notes
     -----
-    Times rounded to a grain g err by g/√12, positions by that times the speed, along the flight alone: this is
-    accepted where intervals are unequal and positions scatter along the flight as much as that and three times as
-    much as across. Source: docs/theory/tracks.md, "Rounded times".
+    Times rounded to a step g have an error of g/√12, positions an along-track error of g/√12 times the speed. Rounding
+    is detected if the intervals are unequal, and the along-track scatter is at least half of this error and more than
+    three times the cross-track scatter. Source: docs/theory/tracks.md, "Rounded times".
 
     Examples
     --------
@@ -248,7 +250,7 @@ def rounded_time_m(time_s: Floats, position_m: Floats) -> float:
     (0.23, 0.0)
     """
     steps = np.diff(time_s)
-    grains = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
+    grains = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01)  # rounding steps tested, seconds
     grain = next((g for g in grains if (np.abs(steps / g - np.round(steps / g)) < 1e-4).all()), 0.0)
     if not grain or np.ptp(steps) < grain / 2 or len(time_s) < 12:
         return 0.0
@@ -260,12 +262,12 @@ def rounded_time_m(time_s: Floats, position_m: Floats) -> float:
     across = np.sqrt(np.maximum((misfit[2:-2] ** 2).sum(axis=1) - along**2, 0)) / np.sqrt(2)
     expected = mean_m_s * grain / np.sqrt(12)
     typical = float(np.median(along))
-    believed = typical > max(0.5 * expected, 3 * float(np.median(across)), LEAST_FAULT_M)
-    return float(expected) if believed else 0.0
+    is_rounded = typical > max(0.5 * expected, 3 * float(np.median(across)), LEAST_FAULT_M)
+    return float(expected) if is_rounded else 0.0
 
 
 def rounded_position_m(time_s: Floats, position_m: Floats, *, least_m: float) -> float:
-    """Return the RMS error of positions by coarsely written coordinates, metres; 0 without.
+    """Return the RMS error of positions due to rounded coordinates, metres; 0 if they are not rounded.
 
     Parameters
     ----------
@@ -274,14 +276,14 @@ def rounded_position_m(time_s: Floats, position_m: Floats, *, least_m: float) ->
     position_m
         (epoch, 3) float64, metres: ECEF, or any Cartesian frame within 1000 km of its origin.
     least_m
-        Errors below are not looked for.
+        Smallest error that is searched, metres.
 
     Notes
     -----
-    A coordinate rounded to a grain g errs by g/√12. The grain is the greatest common divisor of the differences of all
-    values of a coordinate: of the frame's axes, and on Earth of latitude, longitude and height. It is accepted where
-    positions scatter by at least a tenth of it; grains up to 1.5 cm are those of logs that resolve centimetres, and
-    count as none. Source: docs/theory/tracks.md, "Rounded positions".
+    A coordinate rounded to a step g has an error of g/√12. The step is the greatest common divisor of the differences
+    of all values of a coordinate: of the axes of the frame and, for ECEF positions, of latitude, longitude and height.
+    It is accepted if positions scatter by at least a tenth of it. Steps up to 1.5 cm are those of logs that resolve
+    centimetres, and are ignored. Source: docs/theory/tracks.md, "Rounded positions".
 
     Examples
     --------
@@ -301,7 +303,7 @@ def rounded_position_m(time_s: Floats, position_m: Floats, *, least_m: float) ->
         scatter = np.sqrt(np.mean(misfits(time_s, frame - frame[0]) ** 2, axis=0))
         grains = [_grain(axis - axis[0], max(least_m, _COARSE_M)) for axis in frame.T]
         squared.append(
-            sum(grain**2 / 12 for grain, rough in zip(grains, scatter, strict=True) if rough > _ROUGH * grain)
+            sum(grain**2 / 12 for grain, std_m in zip(grains, scatter, strict=True) if std_m > _ROUGH * grain)
         )
     error_m = float(np.sqrt(max(squared)))
     return error_m if error_m > least_m else 0.0
@@ -309,23 +311,23 @@ def rounded_position_m(time_s: Floats, position_m: Floats, *, least_m: float) ->
 
 _ON_EARTH_M = 1e6
 _DEGREE_M = 111_195.0  # of latitude
-_ROUGH = 0.1  # of a grain: what positions scatter by at least that are rounded to it
-_SAME_M = 1e-5
-_COARSE_M = 1.5e-2  # receivers that resolve centimetres write 1e-7 degrees, 1.1 cm
+_ROUGH = 0.1  # least scatter of rounded positions as a share of the rounding step
+_SAME_M = 1e-5  # difference below which two values are equal
+_COARSE_M = 1.5e-2  # receivers that resolve centimetres write multiples of 1e-7 degrees, 1.1 cm
 _FEWEST_VALUES, _MOST_VALUES = 8, 500
 
 
 def _grain(values_m: Floats, least_m: float) -> float:
-    """Return the greatest common divisor of the differences of values, metres; 0 where it is less than `least_m`."""
+    """Return the greatest common divisor of the differences of values, metres; 0 if it is less than `least_m`."""
     steps = np.diff(np.unique(values_m))
     steps = np.unique(steps[steps > _SAME_M])[:_MOST_VALUES]
     if len(np.unique(values_m)) < _FEWEST_VALUES or not steps.size:
         return 0.0
     grain = float(steps[0])
     for step in steps.tolist():
-        rest = step % grain
-        while min(rest, grain - rest) > _SAME_M:  # Euclid's algorithm
-            grain, rest = rest, grain % rest
+        remainder = step % grain
+        while min(remainder, grain - remainder) > _SAME_M:  # Euclid's algorithm
+            grain, remainder = remainder, grain % remainder
             if grain < least_m:
                 return 0.0
     return grain if grain >= least_m else 0.0
@@ -334,14 +336,14 @@ def _grain(values_m: Floats, least_m: float) -> float:
 # ---- Valid epochs and gaps
 
 LONG_GAP = 3.5
-"""Gap in median intervals between epochs from which its interpolation error is estimated."""
+"""Gap, in median intervals between epochs, above which its interpolation error is estimated."""
 
-_TRIED = 40  # places of the log where a gap of the same length is made, to measure the spline's error
-_SUPPORT = 6  # epochs on either side of the spline of such a trial
+_TRIED = 40  # artificial gaps of the same length elsewhere in the log, to measure the error of the spline
+_SUPPORT = 6  # epochs on either side of an artificial gap
 
 
 class Hole(NamedTuple):
-    """A time without positions, seconds of the log: its cause, and the error of a spline through it (metres)."""
+    """Interval without valid positions, seconds of the log: its cause, and the error (m) of a spline through it."""
 
     start_s: float
     end_s: float
@@ -351,18 +353,18 @@ class Hole(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CheckedTrack:
-    """Valid epochs and holes of a log.
+    """Valid epochs and intervals without positions of a log.
 
     Attributes
     ----------
     kept
         (epoch,) bool, valid epochs.
     holes
-        Times at which pulses have no position.
+        Intervals in which pulses have no position.
     faults
         Flag → times (s) and sizes (m) of faults, largest first.
     interpolation_m
-        RMS error of the spline between epochs, metres; None where the log is too short.
+        RMS error of the spline between epochs, metres; None if the log is too short.
     """
 
     kept: NDArray[np.bool_]
@@ -371,7 +373,7 @@ class CheckedTrack:
     interpolation_m: float | None
 
     def excluded(self, at_s: Floats) -> dict[str, NDArray[np.bool_]]:
-        """Return cause → (pulse,) bool, pulses that fall into its holes."""
+        """Return the pulses in intervals without positions: cause → (pulse,) bool."""
         causes = dict.fromkeys(hole.cause for hole in self.holes)
         return {
             cause: np.any([(at_s > h.start_s) & (at_s < h.end_s) for h in self.holes if h.cause == cause], axis=0)
@@ -387,7 +389,7 @@ def check_track(
     tolerated_m: float,
     longest_gap_s: float = np.inf,
 ) -> CheckedTrack:
-    """Return the valid epochs and the holes of a log.
+    """Check a log for faults and gaps; return its valid epochs and the intervals without positions.
 
     Parameters
     ----------
@@ -396,11 +398,11 @@ def check_track(
     position_m
         (epoch, 3) float64, logged point, any Cartesian frame, metres.
     poor_fix
-        (epoch,) bool, epochs whose solution is worse than required.
+        (epoch,) bool, epochs whose GNSS solution is worse than required.
     tolerated_m
         Tolerated error of the spline through a gap, such as λ/16, metres.
     longest_gap_s
-        Between epochs, whatever the error of a spline through it, seconds.
+        Longest gap that is interpolated, for any error of the spline, seconds.
 
     Notes
     -----
@@ -414,20 +416,20 @@ def check_track(
     >>> [(round(hole.start_s, 1), round(hole.end_s, 1), hole.cause) for hole in checked.holes]
     [(3.9, 6.0, 'track_gap')]
     """
-    place = position_m - position_m.mean(axis=0)
-    cause, size = _classified(time_s, place, poor_fix)
+    offset_m = position_m - position_m.mean(axis=0)  # for precision
+    cause, size = _classified(time_s, offset_m, poor_fix)
     steps = [
         Hole(float(time_s[part[step.first - 1]]), float(time_s[part[step.last + 1]]), "track_outlier", step.size_m)
         for part in _parts(time_s, cause)
-        for step in find_steps(time_s[part], place[part])
+        for step in find_steps(time_s[part], offset_m[part])
     ]
-    sound = np.flatnonzero(cause == "")
+    valid = np.flatnonzero(cause == "")
     faults = {
         name: list(zip(time_s[cause == name].tolist(), size[cause == name].tolist(), strict=True))
         for name in ("track_outlier", "track_frozen")
     }
     faults["track_outlier"] += [((step.start_s + step.end_s) / 2, step.size_m) for step in steps]
-    rounded_m = rounded_time_m(time_s, place)
+    rounded_m = rounded_time_m(time_s, offset_m)
     if rounded_m > tolerated_m:
         faults["track_times"] = [(float(time_s[0]), rounded_m)]
     coarse_m = rounded_position_m(time_s, position_m, least_m=tolerated_m)
@@ -435,15 +437,15 @@ def check_track(
         faults["track_positions"] = [(float(time_s[0]), coarse_m)]
     return CheckedTrack(
         cause == "",
-        (*_holes(time_s, place, cause, tolerated_m, longest_gap_s), *steps),
-        {name: tuple(sorted(where, key=lambda fault: -fault[1])) for name, where in faults.items() if where},
-        _interpolation_m(time_s[sound], place[sound]),
+        (*_holes(time_s, offset_m, cause, tolerated_m, longest_gap_s), *steps),
+        {name: tuple(sorted(found, key=lambda fault: -fault[1])) for name, found in faults.items() if found},
+        _interpolation_m(time_s[valid], offset_m[valid]),
     )
 
 
 def _classified(time_s: Floats, position_m: Floats, poor_fix: NDArray[np.bool_]) -> tuple[NDArray[np.str_], Floats]:
-    """Return (epoch,) the flag that excludes an epoch, '' where it is valid, and the size of its error."""
-    cause, size = np.where(poor_fix, "fix_poor", "").astype("U16"), np.zeros(len(time_s))
+    """Return the flag that excludes each epoch, '' if it is valid, and the size of its error, (epoch,) each."""
+    cause, size = np.where(poor_fix, "fix_quality_low", "").astype("U16"), np.zeros(len(time_s))
     cause[find_frozen(time_s, position_m) & ~poor_fix] = "track_frozen"
     for part in _parts(time_s, cause):
         for spike in find_spikes(time_s[part], position_m[part]):
@@ -453,61 +455,61 @@ def _classified(time_s: Floats, position_m: Floats, poor_fix: NDArray[np.bool_])
 
 
 def _parts(time_s: Floats, cause: NDArray[np.str_]) -> list[NDArray[np.intp]]:
-    """Return the valid epochs between gaps: no epoch is compared with neighbours beyond one."""
-    sound = np.flatnonzero(cause == "")
-    if sound.size < 2:
+    """Return the valid epochs between gaps; epochs are not compared across a gap."""
+    valid = np.flatnonzero(cause == "")
+    if valid.size < 2:
         return []
-    lengths = np.diff(time_s[sound])
-    return np.split(sound, np.flatnonzero(lengths > LONG_GAP * np.median(lengths)) + 1)
+    lengths = np.diff(time_s[valid])
+    return np.split(valid, np.flatnonzero(lengths > LONG_GAP * np.median(lengths)) + 1)
 
 
 def _holes(
     time_s: Floats, position_m: Floats, cause: NDArray[np.str_], tolerated_m: float, longest_gap_s: float
 ) -> list[Hole]:
-    """Return the times between valid epochs where the log has no epochs for too long, or its fix is poor."""
-    sound = np.flatnonzero(cause == "")
-    if sound.size < 2:
+    """Return the intervals between valid epochs that are too long to interpolate, or have a poor fix."""
+    valid = np.flatnonzero(cause == "")
+    if valid.size < 2:
         return [Hole(-np.inf, np.inf, str(cause[0]) or "track_gap", np.inf)]
-    time, place = time_s[sound], position_m[sound]
+    time, position = time_s[valid], position_m[valid]
     interval_s = float(np.median(np.diff(time)))
-    bearable_m = max(tolerated_m, 3 * scatter_m(misfits(time, place)))
+    limit_m = max(tolerated_m, 3 * scatter_m(misfits(time, position)))
     ends = ((-np.inf, float(time[0]), 0), (float(time[-1]), np.inf, -1))
     holes = [Hole(start_s, end_s, str(cause[epoch]), np.inf) for start_s, end_s, epoch in ends if cause[epoch]]
     lengths = np.diff(time)
     shortest_s = min(LONG_GAP * interval_s, longest_gap_s)
-    for number in np.flatnonzero((lengths > shortest_s) | (np.diff(sound) > 1)):
-        inside = set(cause[sound[number] + 1 : sound[number + 1]].tolist())
-        poor, missing = "fix_poor" in inside, max(1, round(float(lengths[number]) / interval_s) - 1)
+    for number in np.flatnonzero((lengths > shortest_s) | (np.diff(valid) > 1)):
+        inside = set(cause[valid[number] + 1 : valid[number + 1]].tolist())
+        poor, missing = "fix_quality_low" in inside, max(1, round(float(lengths[number]) / interval_s) - 1)
         if not poor and lengths[number] <= shortest_s:
             continue
-        error_m = _gap_error_m(time, place, missing)
-        if poor or error_m > bearable_m or lengths[number] > longest_gap_s:
-            name = "fix_poor" if poor else min(inside, default="track_gap")
+        error_m = _gap_error_m(time, position, missing)
+        if poor or error_m > limit_m or lengths[number] > longest_gap_s:
+            name = "fix_quality_low" if poor else min(inside, default="track_gap")
             holes.append(Hole(float(time[number]), float(time[number + 1]), name, error_m))
     return holes
 
 
 def _gap_error_m(time_s: Floats, position_m: Floats, missing: int) -> float:
-    """Return the error of the spline without so many epochs in a row, by trials where the log has them, metres.
+    """Estimate the error of the spline through a gap of `missing` epochs from artificial gaps in the log, metres.
 
-    The 90 % quantile over places of the largest error inside; inf where the log is nowhere complete for so long.
+    It is the 90 % quantile of the largest error within each artificial gap; inf if no part of the log is long enough.
     """
     width = missing + 2 * _SUPPORT
     interval_s = float(np.median(np.diff(time_s)))
-    starts = np.arange(len(time_s) - width + 1)  # none where the log is shorter than the trial
+    starts = np.arange(len(time_s) - width + 1)  # empty if the log is shorter than the window
     complete = starts[time_s[starts + width - 1] - time_s[starts] < (width - 1) * interval_s * 1.2]
     errors = []
     for start in complete[:: max(1, len(complete) // _TRIED)]:
-        here = np.arange(start, start + width)
-        out = here[_SUPPORT:-_SUPPORT]
-        rest = np.setdiff1d(here, out)
-        error_m = position_spline(time_s[rest], position_m[rest])(time_s[out]) - position_m[out]
+        window = np.arange(start, start + width)
+        removed = window[_SUPPORT:-_SUPPORT]
+        kept = np.setdiff1d(window, removed)
+        error_m = position_spline(time_s[kept], position_m[kept])(time_s[removed]) - position_m[removed]
         errors.append(float(np.linalg.norm(error_m, axis=1).max()))
     return float(np.quantile(errors, 0.9)) if errors else np.inf
 
 
 def _interpolation_m(time_s: Floats, position_m: Floats) -> float | None:
-    """Return the RMS error of the spline between epochs: that of every second epoch over 2⁴, one axis, metres."""
+    """Estimate the RMS error of the spline between epochs per axis, metres: 2⁻⁴ of that through every second epoch."""
     if len(time_s) < 12:
         return None
     error_m = position_spline(time_s[::2], position_m[::2])(time_s[1:-1:2]) - position_m[1:-1:2]
@@ -517,30 +519,30 @@ def _interpolation_m(time_s: Floats, position_m: Floats) -> float | None:
 
 # ---- Yaw against the course
 
-_COURSE_STEP_M = 2.0  # over ground, from which a course is taken: 1 cm of noise turns it by 0.4°
+_COURSE_STEP_M = 2.0  # distance over ground that determines a course: 1 cm of noise is an error of 0.4°
 _LEAST_STEPS = 10
-_FOLLOWS = 0.85  # mean of phasors of yaw less course: within 33° rms, wind, slips and turns by hand included
-_LEAVES = 0.8  # the same where yaw does not follow it: 38° rms
-_CLOSER = 2.0  # times less must yaw scatter about the course by another convention than as logged
-_ROUND_DEG = 60.0  # no wider gap between courses: no heading held, or turned to the scene, does the same by chance
-_WHOLE_TURN = 1.01 * 2 * np.pi  # that no angle in radians exceeds
-_UPSIDE = 1.01 * np.pi / 2  # nor roll and pitch of a node that is not upside down
-_LEVEL = 0.6  # roll and pitch in radians stay below in level flight; in degrees none that flies stays as level
-_STILL = 1e-3  # roll and pitch that move less are those of a level, or of nothing
-_NEAR_DEG, _FAR_DEG = 20.0, 45.0  # of straight flight: yaw less course by the other convention, and as logged
+_FOLLOWS = 0.85  # least mean phasor of yaw minus course, if yaw follows it: 33° rms by wind, sideslip and manual turns
+_LEAVES = 0.8  # largest mean phasor if yaw does not follow the course: 38° rms
+_CLOSER = 2.0  # least ratio of the scatter of yaw about the course as logged to that by another convention
+_ROUND_DEG = 60.0  # widest gap between courses at which a constant heading, or one towards the scene, is excluded
+_WHOLE_TURN = 1.01 * 2 * np.pi  # limit of an angle in radians
+_UPSIDE = 1.01 * np.pi / 2  # limit of roll and pitch in radians of an upright node
+_LEVEL = 0.6  # limit of roll and pitch in radians in level flight; values in degrees exceed it in any flight
+_STILL = 1e-3  # smallest range of roll or pitch that is accepted as measured
+_NEAR_DEG, _FAR_DEG = 20.0, 45.0  # limits of yaw minus course in straight flight, by the other convention and as logged
 
 
 class YawFault(NamedTuple):
-    """Yaw that follows the course by another convention than degrees clockwise.
+    """Yaw that follows the course by another convention than degrees clockwise from north.
 
     Attributes
     ----------
     convention
         'in radians' or 'anticlockwise'.
     certain
-        Whether the course turned through so many directions that nothing else explains it.
+        True if the course covers so many directions that there is no other explanation.
     as_logged_deg, otherwise_deg
-        Scatter of yaw less course, RMS about its mean, as logged and by the convention; of a straight flight the mean.
+        Scatter of yaw minus course, RMS about its mean, as logged and by the convention; in straight flight the mean.
     """
 
     convention: str
@@ -550,25 +552,25 @@ class YawFault(NamedTuple):
 
     @property
     def line(self) -> str:
-        """What was measured, in one line."""
+        """The measured deviations in one line."""
         return (
-            f"angles of attitude look {self.convention}: yaw is {self.otherwise_deg:.0f}° off the course so, "
-            f"{self.as_logged_deg:.0f}° as degrees clockwise from north"
+            f"attitude angles appear to be {self.convention}: yaw then deviates from the course by "
+            f"{self.otherwise_deg:.0f}°, but by {self.as_logged_deg:.0f}° as degrees clockwise from north"
         )
 
 
 def check_yaw(position_m: Floats, attitude_rad: Floats, ned: Floats) -> YawFault | None:
-    """Return by which other convention yaw follows the course over ground, where it does not as logged.
+    """Detect a wrong convention of yaw: another convention follows the course over ground, and the logged yaw does not.
 
-    A node that flies sideways or backwards, in wind, or with its heading held, is none: its yaw follows the course by
-    no convention, or as well as logged.
+    A node that flies sideways, backwards, in wind or with a constant heading is not reported: its yaw does not follow
+    the course by any convention, or follows it as logged.
 
     Parameters
     ----------
     position_m
         (epoch, 3) float64, logged point, metres.
     attitude_rad
-        (epoch, 3) float64, roll, pitch, yaw as they were read, from degrees to radians.
+        (epoch, 3) float64, logged roll, pitch, yaw, converted from degrees to radians.
     ned
         (epoch, 3, 3) or (3, 3) float64, columns north, east, down in the frame of the positions.
 
@@ -588,12 +590,12 @@ def check_yaw(position_m: Floats, attitude_rad: Floats, ned: Floats) -> YawFault
     known = np.isfinite(attitude_rad).all(axis=1)
     attitude_rad, step = attitude_rad[known], np.diff(position_m[known], axis=0)
     north, east = np.einsum("...ij,...i->...j", ned[known][1:] if ned.ndim == 3 else ned, step)[:, :2].T
-    places = np.cumsum(np.column_stack([north, east]), axis=0)
-    ends = _apart(places, _COURSE_STEP_M)
+    horizontal_m = np.cumsum(np.column_stack([north, east]), axis=0)
+    ends = _thinned(horizontal_m, _COURSE_STEP_M)
     if len(ends) <= _LEAST_STEPS:
         return None
-    flown = np.diff(places[ends], axis=0)
-    course = np.arctan2(flown[:, 1], flown[:, 0])
+    displacement_m = np.diff(horizontal_m[ends], axis=0)
+    course = np.arctan2(displacement_m[:, 1], displacement_m[:, 0])
     middle = (ends[1:] + ends[:-1]) // 2 + 1
     yaw, logged = attitude_rad[middle, 2], np.degrees(attitude_rad)
     small = bool((np.abs(logged) <= np.array([_UPSIDE, _UPSIDE, _WHOLE_TURN])).all())
@@ -614,33 +616,33 @@ def check_yaw(position_m: Floats, attitude_rad: Floats, ned: Floats) -> YawFault
     return None
 
 
-def _apart(places_m: Floats, least_m: float) -> NDArray[np.intp]:
-    """Return indices of places, each at least so far from the one before."""
-    kept, places = [0], places_m.tolist()
-    for index, place in enumerate(places):
-        if math.dist(place, places[kept[-1]]) >= least_m:
+def _thinned(position_m: Floats, least_m: float) -> NDArray[np.intp]:
+    """Return indices of positions that are each at least `least_m` from the preceding one."""
+    kept, positions = [0], position_m.tolist()
+    for index, position in enumerate(positions):
+        if math.dist(position, positions[kept[-1]]) >= least_m:
             kept.append(index)
     return np.array(kept)
 
 
 def _scatter_deg(mean: complex) -> float:
-    """Return the circular standard deviation of angles whose phasors have a mean, degrees."""
+    """Return the circular standard deviation of angles from the mean of their phasors, degrees."""
     return float(np.degrees(np.sqrt(-2 * np.log(max(min(abs(mean), 1.0), 1e-9)))))
 
 
-# ---- Hovers: pulses sent while the antennas stood -------------------------------------------------------------------
+# ---- Hovers: pulses transmitted while the antennas are stationary
 
 HOVER_SPEED = 0.2
-"""Of the speed of the flight: slower than a flight that turns or climbs, faster than a hover in wind."""
+"""Limit of the speed in a hover relative to that of the flight: below a turn or climb, above a hover in wind."""
 
 HOVER_S, HOVER_SHARE = 5.0, 0.05
-"""Seconds that a hover lasts at least, and share of the pulses in all of them: fewer raise a pedestal below -26 dB."""
+"""Least duration of a hover, seconds, and least share of pulses in hovers; fewer cause a pedestal below -26 dB."""
 
-_HOVER_WINDOW_S = 2.0  # over which speeds are taken: noise of a log of 1 cm makes 1 cm/s
+_HOVER_WINDOW_S = 2.0  # interval of the speed estimate: 1 cm of log noise is an error of 1 cm/s
 
 
 def hovering(time_s: Floats, legs: Sequence[Floats]) -> NDArray[np.bool_]:
-    """Return (pulse,) bool: pulses of long hovers within a flight; none of a recording that stands all along.
+    """Detect the pulses of long hovers within a flight, (pulse,) bool; none in a recording that is static throughout.
 
     Parameters
     ----------
@@ -662,9 +664,9 @@ def hovering(time_s: Floats, legs: Sequence[Floats]) -> NDArray[np.bool_]:
     >>> float(time_s[out].min().round(1)), int(out.sum())
     (20.6, 194)
     """
-    none = np.zeros(len(time_s), bool)
+    hovers = np.zeros(len(time_s), bool)
     if len(time_s) < 2 or time_s[-1] - time_s[0] < HOVER_S:
-        return none
+        return hovers
     ends_s = [np.clip(time_s + half, time_s[0], time_s[-1]) for half in (-_HOVER_WINDOW_S / 2, _HOVER_WINDOW_S / 2)]
     moved_m = np.zeros(len(time_s))
     for leg in legs:
@@ -674,12 +676,12 @@ def hovering(time_s: Floats, legs: Sequence[Floats]) -> NDArray[np.bool_]:
     slow = speed < HOVER_SPEED * np.quantile(speed, 0.9)
     for first, last in stretches(slow):
         if time_s[last - 1] - time_s[first] >= HOVER_S:
-            none[first:last] = True
-    return none if none.mean() >= HOVER_SHARE else np.zeros(len(time_s), bool)
+            hovers[first:last] = True
+    return hovers if hovers.mean() >= HOVER_SHARE else np.zeros(len(time_s), bool)
 
 
 def stretches(marked: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return (stretch, 2) int64: first and behind the last of each run of (pulse,) bool that are marked.
+    """Return start and end (exclusive) of each run of marked pulses, (run, 2) int64.
 
     Examples
     --------

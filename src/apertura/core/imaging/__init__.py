@@ -1,1 +1,1 @@
-"""One image: its range profiles, its plan, its tiles and its certificate."""
+"""Image formation: range profiles, options, tiles, certificate, radiometry and quality checks of an image."""

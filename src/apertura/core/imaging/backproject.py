@@ -1,4 +1,4 @@
-"""Backprojection from Python: one call from profiles or phase history to a planned, certified, lazy image."""
+"""Backprojection from Python: form a planned, certified, lazy image of range profiles or a phase history."""
 
 import json
 from collections.abc import Mapping
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor completes it
+def backproject(  # noqa: PLR0913 - each choice is a keyword, for completion in editors
     profiles: "Profiles | PhaseHistory | xr.Dataset",
     grid: SceneGrid,
     accuracy_db: float = MOST_ACCURACY_DB,
@@ -61,71 +61,74 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     tile_px: int = 256,
     engine_options: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
 ) -> "xr.DataArray":
-    """Return a focused image over a grid: planned for the requested accuracy, lazy until it is computed.
+    """Form a lazy focused image over a grid, planned for the requested accuracy.
 
     Parameters
     ----------
     profiles
-        Range profiles; or calibrated transfer functions, which are compressed in range first; or a stage `profile` or
-        `echo` of a campaign. They carry the speed of the wave: that in vacuum unless stated, ``ap.wave_speed(285)`` in
-        air of so many N units, that of its config's air in a stage.
+        Range profiles; or calibrated transfer functions, which are compressed in range first; or the dataset of a
+        campaign's stage `profile` or `echo`. They contain the wave speed: that in vacuum unless stated,
+        ``ap.wave_speed(285)`` for a refractivity of 285 N units, or that of the configured atmosphere in a stage.
     grid
         Pixels; their frame is that of the phase centres: ECEF, or the local frame of a grid with ``crs="local"``.
     accuracy_db
         Requested numerical error: RMS over all pixels relative to the exact sum, dB, -120 to -10.
     terrain
-        Heights of the ground, or one height (m): above the ellipsoid of the grid's CRS; in a local frame z, and 0 by
-        default.
+        Heights of the terrain, or one height (m): above the ellipsoid of the grid's CRS, or z in a local frame
+        (default: 0).
     engine
         'auto' or a key of `apertura.core.backprojection.engines.ENGINES`.
     beams
-        Of the antennas; isotropic by default.
+        Antenna beams (default: isotropic).
     atmosphere
-        Air that the waves flew in, instead of the speed that `profiles` carry: 'auto', the standard atmosphere over the
-        ground; an `Atmosphere`; N units at the ground; 'vacuum'. One speed for the flight, by its heights.
+        Atmosphere that replaces the wave speed in `profiles`: 'auto', the standard atmosphere over the terrain; an
+        `Atmosphere`; the refractivity at the terrain, N units; 'vacuum'. It yields one wave speed for the flight, from
+        its heights.
     calibration
-        K, |H|² of a target of 1 m² whose distances from both antennas multiply to 1 m², on both boresights:
-        ``ap.Link(...).constant(...)``, or measured on a reflector. The image then has coordinates `sigma0` and `rcs`.
+        K, |H|² of a target of 1 m² on both boresights with R_tx·R_rx = 1 m²: ``ap.Link(...).constant(...)``, or
+        measured on a reflector. The image then has the coordinates `sigma0` and `rcs`.
     certified_pixels
-        Random pixels also computed exactly at once, for the certificate; 0 for none. Their bound is no lower than the
-        error predicted. A setting that misses the accuracy on them is replaced by the plan's next.
+        Number of random pixels that are also computed exactly, immediately, for the certificate; 0 for none. The error
+        bound is no lower than the predicted error. A setting that misses the accuracy at these pixels is replaced by
+        the next setting of the plan.
     judge
-        Whether the image is formed at once, beside the lazy one, and judged by its focus and by echoes that it does not
-        show, as `apertura.judge` does at any time. 'auto': where the plan takes no more than ten seconds for it.
+        If True, the image is formed immediately, in addition to the lazy image, and judged by its focus and by echoes
+        missing from it, as by `apertura.judge`. 'auto': if the predicted run time is at most ten seconds.
     terrain_model
-        'auto', 'plane', 'tilted_plane' or 'dem': model of the ground.
+        Terrain model: 'auto', 'plane', 'tilted_plane' or 'dem'.
     window
-        Weighting over the subcarriers of transfer functions; profiles have theirs.
+        Window over the subcarriers of transfer functions; profiles are already windowed.
     integration
-        How much of a pass a pixel is integrated over: 'auto', as much as the pixel spacing can represent; 'all';
+        Extent of the pass that a pixel is integrated over: 'auto', as much as the pixel spacing can represent; 'all';
         ``{"degrees": x}`` of a straight pass; ``{"resolution_m": x}`` along the flight.
     presum
-        Pulses that a low-pass sum combines into one, where the aperture is oversampled; 1 keeps all.
+        Number of pulses that a low-pass sum combines into one where the aperture is oversampled; 1: no presumming.
     pulse_blocks
-        Blocks of pulses whose tables are in memory at once, one after the other; 1 takes them all.
+        Number of pulse blocks, processed sequentially to limit the memory for tables; 1: all pulses at once.
     tile_px
         Side of a tile, pixels: a chunk of the array.
     engine_options
-        Options of engines fixed by the caller: engine → option → value.
+        Engine options fixed by the caller: engine → option → value.
 
     Returns
     -------
     xarray.DataArray
-        (y, x) complex64, carrier kept, 1 is the amplitude of an echo in every pulse; a dask array on whatever
-        scheduler the caller has. Attributes: units; `wave_speed_m_s`; the plan: `setting`, `predicted_error_db`, and
-        as JSON `models` (choice → value and reason) and `flags` (limit crossed → what was measured); the judgement:
-        `verdict`, 'not judged' where it was left for later, `verdict_why`, and as JSON `budget`; the certificate:
+        (y, x) complex64, carrier phase preserved, 1 is the amplitude of an echo present in every pulse; a dask array
+        for the scheduler of the caller. Attributes: units; `wave_speed_m_s`; the plan: `setting`, `predicted_error_db`,
+        and as JSON `models` (choice → value and reason) and `flags` (exceeded limit → measured value); the judgement:
+        `verdict` ('not judged' if deferred), `verdict_why`, and as JSON `budget`; the certificate:
         `numerical_error_db`, an upper bound at `numerical_error_confidence` for the whole image, and
-        `numerical_error_estimate_db`, against the double sum over pulses and subcarriers, or from profiles alone
-        against their band-limited interpolation in float64. With `calibration` lazy coordinates (y, x) float32:
-        `sigma0`, of ground, noise included, and `rcs`, the cross-section (m²) of a point at the pixel; NaN where no
-        pulse sees it.
+        `numerical_error_estimate_db`, relative to the double sum over pulses and subcarriers, or, for profiles alone,
+        to their band-limited interpolation in float64. With `calibration` also lazy coordinates (y, x) float32:
+        `sigma0` of terrain, noise included, and `rcs`, the cross-section (m²) of a point at the pixel; NaN where no
+        pulse illuminates the pixel.
 
     Raises
     ------
     CampaignError
-        If a choice is not one, positions, samples or heights are not finite, an antenna is in the ground, no echo of
-        the scene arrives, the scene is deeper than the unambiguous range, or what is asked cannot run here.
+        If an argument is invalid, positions, samples or heights are not finite, an antenna is below the terrain, the
+        samples contain no echo of the scene, the scene is deeper than the unambiguous range, or no setting can run on
+        this machine as requested.
 
     Notes
     -----
@@ -137,9 +140,9 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     >>> import apertura as ap
     >>> frequency = 1.2e9 + 1e6 * np.arange(256)
     >>> track = np.stack([np.linspace(-4, 4, 128), np.full(128, -20.0), np.full(128, 10.0)], -1)
-    >>> flown = ap.Aperture(track, track)
-    >>> echo = np.exp(-2j * np.pi * frequency * flown.path(np.zeros((1, 3))) / 299792458.0).astype(np.complex64)
-    >>> history = ap.PhaseHistory(echo, frequency, np.full(256, 1 / 256), np.zeros(128), flown)
+    >>> aperture = ap.Aperture(track, track)
+    >>> echo = np.exp(-2j * np.pi * frequency * aperture.path(np.zeros((1, 3))) / 299792458.0).astype(np.complex64)
+    >>> history = ap.PhaseHistory(echo, frequency, np.full(256, 1 / 256), np.zeros(128), aperture)
     >>> image = ap.backproject(history, ap.SceneGrid("local", -5.0, 5.0, 0.1, (100, 100)), tile_px=64)
     >>> image.chunks, image.attrs["numerical_error_db"] < -60
     (((64, 36), (64, 36)), True)
@@ -147,8 +150,8 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     ('focused', '{}')
     >>> abs(float(abs(image).max()) - 1) < 0.05
     True
-    >>> seen = ap.backproject(history, ap.SceneGrid("local", -1.0, 1.0, 0.1, (20, 20)), calibration=1.0)
-    >>> 0.8 < float(seen.rcs.max()) / 500**2 < 1.1  # K = 1: an amplitude of 1 where R_tx·R_rx is 500 m²
+    >>> image = ap.backproject(history, ap.SceneGrid("local", -1.0, 1.0, 0.1, (20, 20)), calibration=1.0)
+    >>> 0.8 < float(image.rcs.max()) / 500**2 < 1.1  # K = 1: an amplitude of 1 where R_tx·R_rx is 500 m²
     True
     """
     import xarray as xr
@@ -158,7 +161,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
             quoted(accuracy_db),
             "backproject: accuracy_db",
             "a number, dB relative to the RMS of the exact sum",
-            "Give -60, say.",
+            "Pass a number, such as -60.",
         )
     choices = validated(
         ImagingChoices,
@@ -174,9 +177,9 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
             "engine_options": engine_options,
         },
         where="backproject",
-        expected="choices of ImagingChoices",
+        expected="valid values of ImagingChoices",
     )
-    # Inputs and scene, checked.
+    # Check inputs and scene.
     inputs = inputs_of(profiles, choices.window)
     inputs = replace(inputs, aperture=inputs.aperture.copied())  # the image is lazy, and the caller's arrays may change
     ground = ground_of(terrain, grid)
@@ -192,7 +195,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     compressed = _compressed(inputs, grid, ground, job.beams)
     plan = make_plan(job, accuracy_db=accuracy_db, overrides=choices.planned, where="backproject")
     formation = Formation(history, compressed, grid, plan, choices.tile_px)
-    # Certificate: random pixels against the exact sum, the plan's next setting where they miss the accuracy.
+    # Certificate: compare random pixels with the exact sum; use the plan's next setting if they miss the accuracy.
     attributes: dict[str, Any] = {}
     if certified_pixels:
         formation, error = _certified(formation, accuracy_db, certified_pixels)
@@ -204,24 +207,24 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
         }
         flags = Flags.merged(flags, plan.replaced_by(formation.plan.setting, "the image"))
         if error.bound_db > accuracy_db:
-            sure = f"up to {error.bound_db:.1f} dB ({CONFIDENCE:.0%} sure)"
-            flags["accuracy_missed"] = f"{sure}, {accuracy_db:g} dB asked"
+            bound = f"numerical error up to {error.bound_db:.1f} dB ({CONFIDENCE:.0%} confidence)"
+            flags["accuracy_not_met"] = f"{bound}, {accuracy_db:g} dB requested"
     # Judgement of focus, and attributes.
     error_db = attributes.get("numerical_error_db")
     judged = _judged(formation, judge, error_db=error_db)
     flags = Flags.merged(flags, plan.flags, judged.flags)
-    focus = focus_with_flags({"verdict": judged.verdict, "why": judged.why}, flags, error_db=error_db)
+    focus = focus_with_flags({"verdict": judged.verdict, "reason": judged.reason}, flags, error_db=error_db)
     attributes |= {
         "units": "1",
         "wave_speed_m_s": inputs.wave_speed_m_s,
-        "long_name": "focused scene, carrier kept",
+        "long_name": "focused image, carrier phase preserved",
         "grid_mapping": "spatial_ref",
         "setting": formation.plan.setting.line,
         "predicted_error_db": round(formation.plan.predicted_error_db, 2),
         "models": json.dumps(formation.plan.reasons, ensure_ascii=False),
         "flags": json.dumps(flags, ensure_ascii=False),
         "verdict": focus["verdict"],
-        "verdict_why": focus["why"],
+        "verdict_reason": focus["reason"],
         "budget": json.dumps(judged.budget, ensure_ascii=False),
     }
     lazy = formation.image
@@ -233,57 +236,58 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
 
 
 def _check_kinds(inputs: PhaseHistory | Profiles, beams: Any, certified_pixels: Any) -> None:
-    """Raise CampaignError unless beams and number of pixels are such."""
+    """Raise CampaignError unless `beams` and `certified_pixels` have valid types and sizes."""
     counted = isinstance(certified_pixels, Integral) and not isinstance(certified_pixels, bool)
     if not counted or not 0 <= certified_pixels <= _MOST_CERTIFIED:
         raise CampaignError(
             quoted(certified_pixels),
             "backproject: certified_pixels",
             f"a number of pixels, 0 to {_MOST_CERTIFIED}",
-            "Give 0 for none.",
+            "Pass 0 for no certificate.",
         )
     if beams is None:
         return
     if not isinstance(beams, Beams):
         raise CampaignError(
-            f"an object of type {type(beams).__name__}", "backproject: beams", "Beams", "Leave it out, or make one."
+            f"an object of type {type(beams).__name__}", "backproject: beams", "Beams", "Pass Beams, or omit beams."
         )
     for name, beam in (("transmit", beams.transmit), ("receive", beams.receive)):
         if beam is not None and len(beam.axes) != len(inputs):
             raise CampaignError(
                 f"{len(beam.axes)} pulses",
                 where=f"backproject: Beams.{name}",
-                expected=f"the {len(inputs)} of the echo",
-                remedy="Give one set of axes for each pulse.",
+                expected=f"{len(inputs)} pulses, as in the echo",
+                remedy="Provide one set of antenna axes per pulse.",
             )
 
 
 _MOST_CERTIFIED = 1_000_000
-"""Pixels that may be compared with the exact sum: a hundredth of them bounds the error as well."""
+"""Largest number of pixels compared with the exact sum: a hundredth of them yields a practically equal bound."""
 
 _SUM = 1e-3
-"""Of 1, by which the sum of weights may be off: a hundredth of a decibel."""
+"""Tolerated deviation of the sum of weights from 1: a hundredth of a decibel."""
 
 _AT_ONCE_S = 10.0
-"""Seconds that the plan may take for an image that is formed to be judged, where the caller does not say."""
+"""Longest predicted run time (s) of an image that is formed immediately and judged with judge='auto'."""
 
 
-def _judged(formation: Formation, asked: bool | str, *, error_db: float | None) -> Judgement:
-    """Return the judgement of an image, or why there is none yet."""
-    if not (isinstance(asked, bool) or asked == "auto"):
-        raise CampaignError(quoted(asked), "backproject: judge", "True, False or 'auto'", "Take one of these.")
+def _judged(formation: Formation, judge: bool | str, *, error_db: float | None) -> Judgement:
+    """Return the judgement of an image, or the reason why it is deferred."""
+    if not (isinstance(judge, bool) or judge == "auto"):
+        raise CampaignError(quoted(judge), "backproject: judge", "True, False or 'auto'", "Use one of these values.")
     lines = budget_by_hand(formation, error_db=error_db)
     seconds = formation.plan.predicted_seconds
-    if asked is True or (asked == "auto" and seconds <= _AT_ONCE_S):
+    if judge is True or (judge == "auto" and seconds <= _AT_ONCE_S):
         return judgement(formation, np.asarray(formation.image), lines)
-    why = "not asked for" if asked is False else f"the image takes {seconds:.2g} s"
-    return Judgement("not judged", f"{why}: apertura.judge forms it", Flags(), [line.report for line in lines], {})
+    reason = "not requested" if judge is False else f"predicted run time of the image {seconds:.2g} s"
+    reason = f"{reason}; apertura.judge forms and judges the image"
+    return Judgement("not judged", reason, Flags(), [line.report for line in lines], {})
 
 
 def _wave_speed(
     atmosphere: "Atmosphere | float | Literal['auto', 'vacuum']", grid: SceneGrid, ground: Terrain, aperture: Aperture
 ) -> float:
-    """Return the speed of waves between the middle of a scene and the antennas."""
+    """Return the mean wave speed between the middle of a scene and the antennas."""
     middle_m = ground.positions_at(grid, *(np.array([size // 2]) for size in grid.shape))[0]
     frame = LOCAL if grid.crs == LOCAL else "ecef"
     ground_m = float(middle_m[2] if frame == LOCAL else geodetic_from_ecef(middle_m)[2])
@@ -291,8 +295,8 @@ def _wave_speed(
         raise CampaignError(
             quoted(atmosphere),
             where="backproject: atmosphere",
-            expected="auto, vacuum, an Atmosphere, or N units at the ground",
-            remedy="Take one of these.",
+            expected="auto, vacuum, an Atmosphere, or the refractivity at the terrain in N units",
+            remedy="Use one of these.",
         )
     if atmosphere == "auto":
         air = Atmosphere.standard(ground_m)
@@ -315,21 +319,21 @@ def _check_calibration(constant: float | None, inputs: PhaseHistory | Profiles) 
             f"a constant of {quoted(constant)}",
             where="backproject: calibration",
             expected="a positive number: |H|² of 1 m² at R_tx·R_rx = 1 m²",
-            remedy="Take that of Link.constant, or measure it on a reflector.",
+            remedy="Use the value of Link.constant, or measure it on a reflector.",
         )
     if isinstance(inputs, PhaseHistory) and abs(float(inputs.weight.sum()) - 1) > _SUM:
         raise CampaignError(
-            f"weights of the subcarriers whose sum is {float(inputs.weight.sum()):.4g}",
+            f"the subcarrier weights sum to {float(inputs.weight.sum()):.4g}",
             where="backproject: calibration",
-            expected="a sum of 1: a profile then peaks at the echo's amplitude, to which the constant refers",
+            expected="a sum of 1, so that the peak of a profile is the echo amplitude to which the constant refers",
             remedy="Divide PhaseHistory.weight by its sum.",
         )
     if isinstance(inputs, Profiles):
         raise CampaignError(
-            "range profiles, whose window over the subcarriers is not known",
+            "range profiles with an unknown window over the subcarriers",
             where="backproject: calibration",
-            expected="a PhaseHistory, or a stage echo",
-            remedy="Leave the compression in range to backproject.",
+            expected="a PhaseHistory, or the dataset of stage echo",
+            remedy="Pass the phase history; backproject compresses it in range.",
         )
 
 
@@ -338,7 +342,7 @@ def _calibrated(
 ) -> dict[str, tuple[tuple[str, str], Any, dict[str, str]]]:
     """Return lazy σ⁰ and radar cross-section of an image, as coordinates."""
     grid, level = formation.grid, isinstance(ground, FlatGround)
-    found = Calibration.of(
+    calibration = Calibration.of(
         grid,
         ground,
         history.aperture,
@@ -349,17 +353,17 @@ def _calibrated(
     )
 
     def sigma0(window: Window) -> NDArray[np.float64]:
-        return found.power(window, "sigma0", None if level else surface(grid, ground, window)[1])
+        return calibration.power(window, "sigma0", None if level else surface(grid, ground, window)[1])
 
     def scaled(block: NDArray[np.complex64], per_one: Any, block_info: Any) -> NDArray[np.float32]:
         rows, columns = (slice(*ends) for ends in block_info[0]["array-location"])
         return np.asarray(np.abs(block) ** 2 / per_one((rows, columns)), np.float32)
 
-    meaning = {
+    attributes = {
         "sigma0": {
             "standard_name": CF_SIGMA0,
             "units": "1",
-            "long_name": "radar cross-section of ground per area of ground, with noise",
+            "long_name": "radar cross-section of terrain per terrain area, noise included",
         },
         "rcs": {"units": "m2", "long_name": "radar cross-section of a point at the pixel"},
     }
@@ -367,14 +371,14 @@ def _calibrated(
         name: (
             ("y", "x"),
             image.map_blocks(scaled, per_one, dtype=np.float32, meta=np.empty((0, 0), np.float32)),
-            {**meaning[name], "grid_mapping": "spatial_ref"},
+            {**attributes[name], "grid_mapping": "spatial_ref"},
         )
-        for name, per_one in (("sigma0", sigma0), ("rcs", found.rcs_power))
+        for name, per_one in (("sigma0", sigma0), ("rcs", calibration.rcs_power))
     }
 
 
 def _certified(formation: Formation, accuracy_db: float, count: int) -> tuple[Formation, ErrorBound]:
-    """Return the formation by the plan's first setting whose error bound meets the accuracy, or by the last."""
+    """Return the image formation with the plan's first setting whose error bound meets the accuracy, else the last."""
     pixels = np.random.default_rng(0).integers(0, formation.grid.shape, (count, 2))
     exact = formation.exact(pixels)
     error = _error(formation, pixels, exact)
@@ -387,7 +391,7 @@ def _certified(formation: Formation, accuracy_db: float, count: int) -> tuple[Fo
 
 
 def _error(formation: Formation, pixels: NDArray[np.int64], exact: NDArray[np.complex128]) -> ErrorBound:
-    """Return the error at pixels drawn blindly: they may miss what is bright, so it is no lower than predicted."""
+    """Return the error bound at uniformly drawn pixels, at least the predicted error: they may miss bright points."""
     values, power = formation.values(pixels)
     error = error_bound(values, exact, np.ones(len(pixels)), power=power)
     return replace(error, bound_db=max(error.bound_db, formation.plan.predicted_error_db))

@@ -1,4 +1,4 @@
-"""Measures of a formed image: certified numerical error, statistics of its pixels, and its brightest target."""
+"""Measures of a formed image: certified numerical error, pixel statistics, and response of the brightest target."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -16,9 +16,9 @@ from apertura.core.quality.point_targets import CUT_REACH_M, cuts_report, find_p
 from apertura.core.scene.grid import SceneGrid
 
 RANDOM_PIXELS, BRIGHT_PIXELS = 160, 112
-"""Pixels recomputed by the reference: drawn evenly over the tiles, and by brightness (docs/theory.md, eq. 6a)."""
+"""Numbers of pixels recomputed exactly: drawn evenly over the tiles, and by brightness (docs/theory.md, eq. 6a)."""
 
-_MOST_TILES = 1024  # of which each has a random pixel: 8192 x 8192 pixels; a pixel costs what 500 cost by the tree
+_MOST_TILES = 1024  # tiles (8192 x 8192 pixels) with a random pixel each; an exact pixel costs as much as 500 by `tree`
 
 
 def certified(
@@ -30,7 +30,7 @@ def certified(
     scheduler: str = "threads",
     rewriting: Callable[[Sequence[Window]], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Return the error bound of an image; tiles worse than requested are first formed again with better settings.
+    """Certify the error bound of an image; tiles that miss the accuracy are first recomputed with better settings.
 
     Parameters
     ----------
@@ -41,18 +41,18 @@ def certified(
     accuracy_db
         Requested error.
     threads
-        Tiles in work at once.
+        Number of tiles computed concurrently.
     scheduler
-        Where tiles are formed again, as `compute_tiles` takes it.
+        Scheduler for recomputed tiles, as for `compute_tiles`.
     rewriting
-        Called with the tiles before they are formed again, so that a run killed meanwhile begins them as planned.
+        Called with the tiles before they are recomputed, so that a killed run resumes with their planned setting.
     """
     count = min(max(RANDOM_PIXELS, len(formation.windows)), _MOST_TILES)
     drawn, certificate = random_pixels(formation.windows, count, np.random.default_rng(0)), None
-    settings, redone, flags = iter(formation.plan.fallbacks), [], Flags()
+    settings, recomputed, flags = iter(formation.plan.fallbacks), [], Flags()
     while True:
         brightness, setting = Brightness.of(target, formation.windows), next(settings, None)
-        # Random pixels do not depend on the image, bright ones do: of the first image pulses are read once for both.
+        # Bright pixels depend on the image, random ones do not: for the first image, pulses are read once for both.
         bright = brightness.draw(target, formation.windows, BRIGHT_PIXELS, np.random.default_rng(1))
         pixels = bright if certificate else np.concatenate([drawn, bright])
         exact = formation.exact(pixels, threads=threads)
@@ -64,28 +64,28 @@ def certified(
             if error.bound_db <= accuracy_db or setting is None:
                 break
             worse = formation.windows  # each tile passes, but the bound of the image does not
-        print(f"{len(worse)} tiles are worse than {accuracy_db} dB: again with {setting.line}", flush=True)  # noqa: T201
+        print(f"{len(worse)} tiles exceed {accuracy_db} dB: recomputed with {setting.line}", flush=True)  # noqa: T201
         image = formation.image_by(setting)
         rewriting([*uncertified, *worse])
         for tiles in (uncertified, worse):
             compute_tiles(image, tiles, target, threads=threads, scheduler=scheduler)
         flags = Flags.merged(flags, formation.plan.replaced_by(setting, f"{len(worse) + len(uncertified)} tiles"))
-        redone.append({"tiles": len(worse) + len(uncertified), "with": f"{setting.line}, every pulse"})
-    line = f"numerical error up to {error.bound_db:.1f} dB ({CONFIDENCE:.0%} sure), {accuracy_db:.1f} dB asked"
+        recomputed.append({"tiles": len(worse) + len(uncertified), "with": f"{setting.line}, every pulse"})
     if error.bound_db > accuracy_db:
-        flags["accuracy_missed"] = line
+        bound = f"numerical error up to {error.bound_db:.1f} dB ({CONFIDENCE:.0%} confidence)"
+        flags["accuracy_not_met"] = f"{bound}, {accuracy_db:.1f} dB requested"
     return {
         "numerical_error_db": round(error.bound_db, 2),
         "numerical_error_confidence": CONFIDENCE,
         "numerical_error_estimate_db": round(error.estimate_db, 2),
         "certified_pixels": count + BRIGHT_PIXELS,
-        "redone": redone,
+        "recomputed": recomputed,
         "flags": flags,
     }
 
 
 def measures(formation: Formation, target: Any) -> dict[str, Any]:
-    """Return entropy, noise floor and measures of the brightest target of an image."""
+    """Measure entropy, noise floor and the brightest target of an image."""
     overview, grid = image_statistics(target, formation.windows), formation.grid
     peak = find_peak(target, overview.row, overview.column)
     x, y = map(float, grid.map_at(peak.row, peak.column))
@@ -116,8 +116,8 @@ def _flown(formation: Formation, row: float, column: float) -> NDArray[np.float6
 
 
 def _direction(grid: SceneGrid, vector_m: NDArray[np.float64], row: float, column: float) -> tuple[float, float]:
-    """Return how far (east, north) along the grid's axes a vector of the processing frame points at a pixel."""
-    here, east, north = grid.positions_at([row, row, row - 1], [column, column + 1, column], 0.0)
-    axes = np.stack([east - here, north - here])
+    """Return the components (east, north) of a vector of the processing frame along the grid's axes at a pixel."""
+    origin, east, north = grid.positions_at([row, row, row - 1], [column, column + 1, column], 0.0)
+    axes = np.stack([east - origin, north - origin])
     steps = axes @ vector_m / np.linalg.norm(axes, axis=1)
     return float(steps[0]), float(steps[1])

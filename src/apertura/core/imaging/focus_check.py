@@ -1,4 +1,4 @@
-"""Focus of an image measured on itself: bright points, subapertures, noise, and echoes from elsewhere."""
+"""Focus of an image, measured without ground truth: bright points, subapertures, and echoes from outside the scene."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -29,36 +29,36 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.swath import swath
 from apertura.core.scene.terrain import FlatGround, Terrain
 
-# ---- Subaperture images of a few places
+# ---- Subaperture images of patches
 
 PARTS = 8
-"""Subapertures (docs/theory/focus.md, "Parts of the aperture")."""
+"""Number of subapertures (docs/theory/focus.md, "Parts of the aperture")."""
 
 PART_PX = 64
-"""Places along a side of a patch: the size of a `BandLimitedPatch`."""
+"""Side of a patch, pixels: the size of a `BandLimitedPatch`."""
 
-_MARGIN_SAMPLES = 16  # that engines need beyond the places
+_MARGIN_SAMPLES = 16  # range samples beyond a patch that engines need
 
 
 def part_images(
     profiles: Profiles, places: Sequence[NDArray[np.float64]], *, beams: Beams | None = None
 ) -> NDArray[np.complex64]:
-    """Return patches of the image by subapertures; their sum over subapertures is the image.
+    """Form patches of the image by subapertures; their sum over subapertures is the image.
 
     Parameters
     ----------
     profiles
-        Of every pulse.
+        Profiles of all pulses.
     places
         Patches of (PART_PX, PART_PX, 3) float64 positions, metres, in the frame of the phase centres.
     beams
-        Of the antennas; isotropic by default.
+        Antenna beams (default: isotropic).
 
     Returns
     -------
     ndarray
-        (patch, 2, part, y, x) complex64: by even and by odd pulses of each part. Zero with fewer than four
-        pulses a part.
+        (patch, 2, subaperture, y, x) complex64: from the even and from the odd pulses of each subaperture. No patch
+        with fewer than four pulses per subaperture.
     """
     images = np.zeros((len(places), 2, PARTS, PART_PX, PART_PX), np.complex64)
     aperture = profiles.aperture
@@ -79,7 +79,7 @@ def part_images(
 
 
 def _illuminating_pulses(beams: Beams | None, aperture: Aperture, places: NDArray[np.float64]) -> slice:
-    """Return the first to the last pulse that may illuminate a patch."""
+    """Return the slice from the first to the last pulse that may illuminate a patch."""
     middle = places[PART_PX // 2, PART_PX // 2]
     radius = np.linalg.norm(places - middle, axis=-1).max()
     blocks = np.flatnonzero(illumination_mask(beams, aperture, middle[None], np.array([radius]), pulses=PULSES)[:, 0])
@@ -89,16 +89,18 @@ def _illuminating_pulses(beams: Beams | None, aperture: Aperture, places: NDArra
 
 
 def table_engine() -> Engine:
-    """Return the first engine that reads profiles and runs here."""
+    """Return the first engine that reads profiles and is available on this machine."""
     engines = (load_engine(name) for name in ENGINES)
     return next(engine for engine in engines if engine.READS == "profiles" and engine.available())
 
 
 def _around(profiles: Profiles, places: NDArray[np.float64]) -> Profiles:
-    """Return the profiles cropped to the samples that a patch needs."""
+    """Crop profiles to the samples needed by a patch."""
     corners = places[:: PART_PX - 1, :: PART_PX - 1].reshape(-1, 3)
     at = (profiles.aperture.path(corners) - profiles.start_m[:, None]) / profiles.step_m
-    reach = 2 * np.linalg.norm(places[1, 1] - places[0, 0]) * PART_PX / 2 / profiles.step_m  # nadir inside the patch
+    reach = (
+        2 * np.linalg.norm(places[1, 1] - places[0, 0]) * PART_PX / 2 / profiles.step_m
+    )  # the path minimum may lie inside the patch (nadir)
     first = max(0, int(np.nanmin(at) - reach) - _MARGIN_SAMPLES)
     last = min(profiles.samples.shape[1], int(np.nanmax(at)) + _MARGIN_SAMPLES + 1)
     start_m = profiles.start_m + first * profiles.step_m
@@ -108,26 +110,27 @@ def _around(profiles: Profiles, places: NDArray[np.float64]) -> Profiles:
 # ---- Strongest echoes outside the scene
 
 OUTSIDE_ECHO_DB = 20.0
-"""dB above the strongest echo from the scene: an echo outside this strong means a misplaced scene, no sidelobe."""
+"""Level above the strongest echo of the scene, dB: a stronger echo outside is no sidelobe; the scene is misplaced."""
 
 UNFOCUSED_ECHO_DB = 25.0
-"""dB above the median of the scene's ranges: such an echo is a point's and must focus at some place; speckle has 10."""
+"""Level above the median over the scene's ranges, dB: an echo above it is a point target, which must focus at some
+pixel; speckle reaches 10 dB."""
 
 LEAST_PULSES = 64
-"""Pulses: fewer cannot show whether a point dominates its cell (2 in each of the 32 blocks of `point_focus`)."""
+"""Least number of pulses to determine if a point dominates its cell: 2 in each of the 32 blocks of `point_focus`."""
 
-_MOST_PULSES = 64  # sampled to search echoes outside the scene
-_NEAR_CELLS = 4  # about the direct path and at the swath's edges, where responses have their sidelobes
+_MOST_PULSES = 64  # pulses sampled in the search for echoes outside the scene
+_NEAR_CELLS = 4  # range cells excluded about the direct path and at the swath's edges: sidelobes of point responses
 
 
 LEAST_GATHERED = 0.2
-"""Power of an image's points over that of the strongest echo in its pulses: where points share a range cell they add
-up to a pulse's echo and half of it may miss the count; an image 7 dB out of focus has less."""
+"""Least ratio of the focused power of an image's points to the strongest echo in its pulses. Points in one range cell
+sum to one echo, and half of it may not be counted; an image with a peak loss of 7 dB has a lower ratio."""
 
-_BY_CHANCE = 2.0  # times ln(pixels)/pulses, the largest coherence factor of contributions with random phases
+_BY_CHANCE = 2.0  # in units of ln(pixels)/pulses, the largest coherence factor of contributions with random phases
 
 
-def echo_elsewhere(
+def echo_outside_scene(
     inputs: PhaseHistory | Profiles,
     grid: SceneGrid,
     terrain: Terrain,
@@ -135,76 +138,80 @@ def echo_elsewhere(
     points: Sequence[NDArray[np.complex128]] = (),
     measured: bool = False,
 ) -> str | None:
-    """Return one line where pulses contain a strong echo that an image does not focus, else None.
+    """Detect a strong echo in the pulses that an image does not focus, and describe it in one line; None without any.
 
     Parameters
     ----------
     inputs
-        Of every pulse; a sample of them is evaluated. Profiles that are cropped to the scene show nothing beyond it.
+        Data of all pulses; a sample is evaluated. Profiles cropped to the scene contain no echo outside it.
     grid, terrain
         The scene.
     points
         `Formation.contributions` at each bright point of the image, (pulse,) complex128.
     measured
-        Whether points of the image dominate their range cells: it is then wrong only where these are sidelobes, in
-        range, of the strongest echo outside.
+        True if points of the image dominate their range cells. An echo outside is then reported only if these points
+        may be its range sidelobes.
 
     Notes
     -----
-    Source: docs/theory/focus.md, "Echo elsewhere". The direct path between the antennas does not count.
+    Source: docs/theory/focus.md, "Echo elsewhere". The direct path between the antennas is excluded.
     """
-    some = inputs[inputs.aperture.sample(_MOST_PULSES)]
-    # Power of the profiles beyond the scene's paths and a margin, the direct path left out, and inside.
-    path_m, power, cell_m, span_m = _profiles(some)
-    nearest, farthest = swath(grid, terrain, some.aperture)
+    sampled = inputs[inputs.aperture.sample(_MOST_PULSES)]
+    # Power of the profiles inside the scene's paths, and outside them and a margin, without the direct path.
+    path_m, power, cell_m, span_m = _profiles(sampled)
+    nearest, farthest = swath(grid, terrain, sampled.aperture)
     margin = _NEAR_CELLS * cell_m
     beyond = (path_m - (nearest[:, None] - margin)) % span_m > (farthest - nearest)[:, None] + 2 * margin
-    offset_m = path_m - np.linalg.norm(some.aperture.tx_m - some.aperture.rx_m, axis=1)[:, None]
+    offset_m = path_m - np.linalg.norm(sampled.aperture.tx_m - sampled.aperture.rx_m, axis=1)[:, None]
     if np.isfinite(span_m):
         offset_m = (offset_m + span_m / 2) % span_m - span_m / 2
-    beside = np.where(beyond & (np.abs(offset_m) > margin), power, 0.0)
-    outside = beside.max(axis=1)
+    power_outside = np.where(beyond & (np.abs(offset_m) > margin), power, 0.0)
+    outside = power_outside.max(axis=1)
     within = np.where(beyond, np.nan, power)
     inside = np.nanmax(within, axis=1)
-    scene = f"the scene's are {nearest.min():.1f} to {farthest.max():.1f} m"
-    # An echo outside stronger than all inside, and no sidelobe of one that the image focuses.
+    scene = f"those of the scene are {nearest.min():.1f} to {farthest.max():.1f} m"
+    # An echo outside that is stronger than all inside, and no sidelobe of an echo that the image focuses.
     above_db = _median_db(outside / np.maximum(inside, 1e-30))
     alone = min(above_db, _median_db(outside / np.maximum(np.median(power, axis=1), 1e-30))) > OUTSIDE_ECHO_DB
     if alone and measured:
-        cells = np.abs(beside.argmax(axis=1) - np.nanargmax(within, axis=1)) * (path_m[0, 1] - path_m[0, 0]) / cell_m
+        cells = (
+            np.abs(power_outside.argmax(axis=1) - np.nanargmax(within, axis=1)) * (path_m[0, 1] - path_m[0, 0]) / cell_m
+        )
         alone = _median_db(inside / outside) < _sidelobe_db(inputs, float(np.median(cells)))
     if alone:
-        at_m = float(np.median(path_m[np.arange(len(some)), beside.argmax(axis=1)]))
+        at_m = float(np.median(path_m[np.arange(len(sampled)), power_outside.argmax(axis=1)]))
         return (
-            f"the strongest echo, {above_db:.0f} dB above all from the scene, has a total path of {at_m:.1f} m, while "
-            f"{scene}: heights, positions or path offsets are wrong, or something bright is elsewhere"
+            f"the strongest echo, {above_db:.0f} dB above all echoes of the scene, has a total path of {at_m:.1f} m, "
+            f"but {scene}: heights, positions or path offsets are wrong, or a bright target lies outside the scene"
         )
     if measured:
         return None
-    # An echo inside, too strong to be speckle, that no point of the image focuses.
+    # An echo inside, too strong for speckle, that no point of the image focuses.
     alone_db = _median_db(inside / np.maximum(np.nanmedian(within, axis=1), 1e-30))
     if len(inputs) < LEAST_PULSES or alone_db <= UNFOCUSED_ECHO_DB:
         return None
     gathered = _gathered(points, pixels=grid.shape[0] * grid.shape[1]) / max(float(np.median(inside)), 1e-30)
     if gathered >= LEAST_GATHERED:
         return None
-    found = (
-        f"the image's points gather {100 * gathered:.0f} % of it" if gathered else "no place of the image gathers it"
+    share = (
+        f"the image's points focus {100 * gathered:.0f} % of its power"
+        if gathered
+        else "no pixel of the image focuses it"
     )
     return (
-        f"pulses hold an echo {alone_db:.0f} dB above the median of the scene's ranges, and {found}: times, positions "
-        "or heights are wrong, or it comes from beside the scene"
+        f"pulses contain an echo {alone_db:.0f} dB above the median over the scene's ranges, and {share}: times, "
+        "positions or heights are wrong, or it comes from outside the scene"
     )
 
 
 _SIDELOBE_MARGIN_DB = 6.0
-_LOBE_SAMPLES = 8  # of a response, per range cell
+_LOBE_SAMPLES = 8  # samples of a response per range cell
 
 
 def _sidelobe_db(inputs: PhaseHistory | Profiles, cells: float) -> float:
-    """Return the level of sidelobes, and a margin, against their echo so many range cells away; dB.
+    """Return the sidelobe level relative to the peak at a distance in range cells, plus a margin; dB.
 
-    Of profiles, whose window is not known, those without one: 1/(π·cells).
+    For profiles, with an unknown window, the level without a window: 1/(π·cells).
     """
     if isinstance(inputs, Profiles):
         return float(20 * np.log10(1 / (np.pi * max(cells, 1.0)))) + _SIDELOBE_MARGIN_DB
@@ -216,7 +223,7 @@ def _sidelobe_db(inputs: PhaseHistory | Profiles, cells: float) -> float:
 
 
 def _gathered(points: Sequence[NDArray[np.complex128]], *, pixels: int) -> float:
-    """Return the power of the points at which contributions add up more than by chance at the best of all pixels."""
+    """Return the summed power of points whose coherence exceeds the largest expected of random phases at any pixel."""
     return sum(
         abs(complex(terms.mean())) ** 2
         for terms in points
@@ -231,7 +238,7 @@ def _median_db(ratio: NDArray[np.float64]) -> float:
 def _profiles(
     inputs: PhaseHistory | Profiles,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, float]:
-    """Return total paths and powers (pulse, range), a range cell, and the path after which they repeat."""
+    """Return total paths and powers (pulse, range), the range cell, and the ambiguity interval of the path, metres."""
     if isinstance(inputs, Profiles):
         samples = np.asarray(inputs.samples)
         path_m = inputs.start_m[:, None] + inputs.step_m * np.arange(samples.shape[1])
@@ -254,7 +261,7 @@ def _profiles(
 
 # ---- Joint focus of several pairs, to compare hypotheses
 
-_EVERY = 8  # points along a side that bound the paths of a piece of ground
+_EVERY = 8  # points along a side of a patch, from which its paths are bounded
 
 
 def joint_peak_power(histories: Sequence[PhaseHistory], grid: SceneGrid, height_m: float) -> float:
@@ -263,22 +270,22 @@ def joint_peak_power(histories: Sequence[PhaseHistory], grid: SceneGrid, height_
     Parameters
     ----------
     histories
-        Of pairs that image one scene.
+        Phase histories of pairs that image the same scene.
     grid
-        Places to image; level ground.
+        Grid to image, on level ground.
     height_m
-        Of the ground above the ellipsoid (z in a local frame).
+        Height of the ground above the ellipsoid (z in a local frame).
 
     Returns
     -------
     float
-        0 to 1: mean of the non-coherent and of the coherent sum over pairs, relative to an echo with all the energy of
-        its pulses; two hypotheses about one recording compare by its ratio.
+        0 to 1: mean of the incoherent and the coherent sum over pairs, relative to an echo with all the energy of its
+        pulses. Two hypotheses about the same recording are compared by the ratio of their values.
 
     Raises
     ------
     ValueError
-        If the places are deeper than the unambiguous range.
+        If the grid is deeper than the unambiguous range.
 
     Notes
     -----
@@ -289,9 +296,9 @@ def joint_peak_power(histories: Sequence[PhaseHistory], grid: SceneGrid, height_
     >>> from apertura.core.geometry.aperture import Aperture
     >>> frequency = 1.2e9 + 1e6 * np.arange(128)
     >>> track = np.stack([np.linspace(-4, 4, 64), np.full(64, -20.0), np.full(64, 10.0)], -1)
-    >>> flown = Aperture(track, track)
-    >>> echo = np.exp(-2j * np.pi * frequency * flown.path(np.zeros((1, 3))) / 299792458.0).astype(np.complex64)
-    >>> history = PhaseHistory(echo, frequency, np.full(128, 1 / 128), np.zeros(64), flown)
+    >>> aperture = Aperture(track, track)
+    >>> echo = np.exp(-2j * np.pi * frequency * aperture.path(np.zeros((1, 3))) / 299792458.0).astype(np.complex64)
+    >>> history = PhaseHistory(echo, frequency, np.full(128, 1 / 128), np.zeros(64), aperture)
     >>> joint_peak_power([history], SceneGrid("local", -3.2, 3.2, 0.1, (64, 64)), 0.0) > 0.9
     True
     """
@@ -307,9 +314,9 @@ def joint_peak_power(histories: Sequence[PhaseHistory], grid: SceneGrid, height_
 
 
 def strongest_echo(history: PhaseHistory, grid: SceneGrid, height_m: float) -> float:
-    """Return the amplitude of the strongest echo from some places, mean over the pulses, relative to all their energy.
+    """Return the mean amplitude of the strongest echo of a grid, relative to the root of the pulse energy.
 
-    What a focused image has at most at its brightest place, whatever its geometry; parameters as `joint_peak_power`.
+    It bounds the brightest pixel of a focused image of any geometry. Parameters as for `joint_peak_power`.
     """
     window = _window(history, FlatGround(height_m).positions(grid))
     profiles = range_compress(history, grid, FlatGround(height_m), window=window)
@@ -317,11 +324,11 @@ def strongest_echo(history: PhaseHistory, grid: SceneGrid, height_m: float) -> f
 
 
 def _window(history: PhaseHistory, places: NDArray[np.float64]) -> RangeWindow:
-    """Return a window of total paths that covers a small piece of ground, from some of its points."""
+    """Return a window of total paths that covers a small patch, from a sample of its points."""
     every = max(1, min(places.shape[:2]) // _EVERY)
-    some = places[::every, ::every]
-    paths = history.aperture.path(some).reshape(len(history), -1)
-    between = 2 * float(np.linalg.norm(some[1, 1] - some[0, 0]))  # a path grows by two metres per metre at most
+    sampled = places[::every, ::every]
+    paths = history.aperture.path(sampled).reshape(len(history), -1)
+    between = 2 * float(np.linalg.norm(sampled[1, 1] - sampled[0, 0]))  # the path gradient is at most 2 m per metre
     speed = history.wave_speed_m_s
     step, length = range_step(history.frequency_hz, oversampling=OVERSAMPLING, wave_speed_m_s=speed)
     first = paths.min(axis=1) - between - GUARD_SAMPLES * step
@@ -330,22 +337,22 @@ def _window(history: PhaseHistory, places: NDArray[np.float64]) -> RangeWindow:
 
 
 def _echo_power(history: PhaseHistory) -> float:
-    """Return the profile's power of an echo with all the energy of a pulse, mean over the pulses."""
+    """Return the power in a profile of an echo with all the energy of a pulse, averaged over the pulses."""
     power: NDArray[np.float64] = (np.abs(history.transfer) ** 2).astype(np.float64) @ history.weight
     return float(power.mean()) * float(history.weight.sum())
 
 
 # ---- Focus report of an image
 
-_SQUARE_CELLS, _LEAST_PX = 2.0, 4  # side of the squares of which the brightest maximum is looked at
-_PATCHES = 4  # imaged by subapertures: the brightest places
-_PATCHES_APART = PART_PX / 2  # places between two at least: what both show twice is no second measurement
-_PLACES_PER_CELL = 2.5  # of a patch along a side
-_CELL_POINTS = 5  # along a side of the scene, at which the resolution cell is computed
-_BAND_SAMPLES = 9  # frequencies of the spatial spectrum
-_UNEXPECTED_SIGMAS = 3.0  # by which a loss must exceed the expected one to be flagged
-_RESPONSE_OVERSAMPLING = 8.0  # of the response of a pulse: between samples it is taken as linear
-_WINDOWED = 0.62  # a Hann window leaves a band as wide, in standard deviation, as this share of it without
+_SQUARE_CELLS, _LEAST_PX = 2.0, 4  # side of the squares whose brightest maximum is evaluated: cells, and least pixels
+_PATCHES = 4  # patches imaged by subapertures, at the brightest points
+_PATCHES_APART = PART_PX / 2  # least distance of two patches, in patch pixels, for independent measurements
+_PLACES_PER_CELL = 2.5  # pixels of a patch per resolution cell, along a side
+_CELL_POINTS = 5  # points along a side of the scene at which the resolution cell is computed
+_BAND_SAMPLES = 9  # frequency samples of the spatial spectrum
+_UNEXPECTED_SIGMAS = 3.0  # significance of a loss beyond the expected loss, above which it is flagged
+_RESPONSE_OVERSAMPLING = 8.0  # of a pulse's response, which is interpolated linearly between samples
+_WINDOWED = 0.62  # standard deviation of a Hann-windowed band relative to that of the unwindowed band
 
 
 def resolution_cell_m(formation: Formation) -> float:
@@ -365,16 +372,16 @@ def _sector_of(formation: Formation) -> Weigh | None:
 
 
 def _response(formation: Formation) -> PointResponse:
-    """Return what of one point the image shows at other places."""
+    """Return the point response of the image, for the sidelobes of a point at other points."""
     history, profiles = formation.history, formation.profiles
-    if history is None:  # a full and flat band, as the planner takes it
+    if history is None:  # assume a full and flat band, like the planner
         count = 2 * profiles.samples.shape[1]
         frequency_hz = profiles.centre_frequency_hz + profiles.bandwidth_hz * (np.arange(count) / count - 0.5)
         weight = np.full(count, 1 / count)
     else:
         frequency_hz, weight = history.frequency_hz, history.weight / history.weight.sum()
-    how = {"oversampling": _RESPONSE_OVERSAMPLING, "wave_speed_m_s": profiles.wave_speed_m_s}
-    step_m, length = range_step(frequency_hz, **how)
+    sampling = {"oversampling": _RESPONSE_OVERSAMPLING, "wave_speed_m_s": profiles.wave_speed_m_s}
+    step_m, length = range_step(frequency_hz, **sampling)
     envelope = compress(
         np.ones((1, len(frequency_hz)), np.complex64),
         frequency_hz,
@@ -382,32 +389,32 @@ def _response(formation: Formation) -> PointResponse:
         reference_delay_s=np.zeros(1),
         start_m=np.array([-step_m * (length // 2)]),
         count=length,
-        **how,
+        **sampling,
     )[0]
     wavelength_m, aperture, beams = profiles.wavelength_m, profiles.aperture, formation.beams
-    weigh = None if beams is None else lambda some, points_m: beams[some].weight(aperture[some], points_m)
+    weigh = None if beams is None else lambda pulses, points_m: beams[pulses].weight(aperture[pulses], points_m)
     return PointResponse(aperture, envelope, step_m, wavelength_m, weigh)
 
 
 def _shown(
     formation: Formation, response: PointResponse, pixel: NDArray[np.int64], others: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return what a point at a pixel shows at others."""
+    """Return the response of a point at a pixel, evaluated at other pixels."""
     return response.at(formation.positions_at(*pixel), formation.positions_at(*others.T))
 
 
 def _spectrum(formation: Formation) -> NDArray[np.float64]:
-    """Return the covariance of the spatial spectrum of a point in the scene's middle, east and north."""
+    """Return the covariance of a point's spatial spectrum in the scene's middle, east and north."""
     profiles, grid = formation.profiles, formation.grid
     row, column = ((size - 1) / 2 for size in grid.shape)
-    here, axes = ground_axes(formation, row, column)
+    middle_m, axes = ground_axes(formation, row, column)
     half = profiles.bandwidth_hz / 2
     band = profiles.centre_frequency_hz + half * np.linspace(-1, 1, _BAND_SAMPLES) * _WINDOWED
-    return profiles.aperture.spectrum(here, axes, frequency_hz=band, weigh=_sector_of(formation))
+    return profiles.aperture.spectrum(middle_m, axes, frequency_hz=band, weigh=_sector_of(formation))
 
 
 def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
-    """Return the focus section of image.json: verdict, loss, and each bright point.
+    """Measure focus for section `focus` of image.json: verdict, loss, and each bright point.
 
     Parameters
     ----------
@@ -431,18 +438,18 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
     ]
     parts = _parts(formation, points, cell_m)
     verdict = judge([(point.amplitude, focus) for point, focus in zip(points, measured, strict=True)])
-    inputs, found = formation.history or formation.profiles, verdict.points > 0
-    elsewhere = echo_elsewhere(inputs, grid, formation.plan.terrain, points=terms, measured=found)
+    inputs, has_points = formation.history or formation.profiles, verdict.points > 0
+    elsewhere = echo_outside_scene(inputs, grid, formation.plan.terrain, points=terms, measured=has_points)
     if elsewhere:
-        measured = [None] * len(points)  # sidelobes of it
-    if elsewhere or not found:
+        measured = [None] * len(points)  # the points may be its sidelobes
+    if elsewhere or not has_points:
         verdict = judge_parts(parts, cell_m=cell_m)
     peak = max((point.amplitude for point in points), default=0.0)
     conjugated = elsewhere or verdict.loss_db < _CONJUGATED_LOSS_DB
     return {
         "verdict": verdict.verdict,
         **({"loss_db": round(verdict.loss_db, 3), "std_db": round(verdict.std_db, 3)} if verdict.points else {}),
-        "why": verdict.why,
+        "reason": verdict.reason,
         **({"elsewhere": elsewhere} if elsewhere else {}),
         **({"conjugated": line} if conjugated and (line := _conjugated(formation, peak)) else {}),
         "cell_m": round(cell_m, 4),
@@ -455,13 +462,13 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
     }
 
 
-_CONJUGATED_LOSS_DB = -6.0  # beyond which a defocused image may be one of conjugated samples
-_CONJUGATED_DB = 10.0  # that their image must be brighter by, which no wrong track of a right image is
-_CONJUGATED_S = 60.0  # that it may take
+_CONJUGATED_LOSS_DB = -6.0  # loss beyond which the samples of a defocused image are tested for conjugation
+_CONJUGATED_DB = 10.0  # least gain in peak by conjugation; a track error does not cause such a gain
+_CONJUGATED_S = 60.0  # longest predicted run time of the image for this test
 
 
 def _conjugated(formation: Formation, peak: float) -> str | None:
-    """Return one line where the image of conjugated samples has a far brighter peak than that of the samples.
+    """Detect conjugated samples by a much brighter peak of their conjugate's image, described in one line; else None.
 
     Notes
     -----
@@ -481,55 +488,57 @@ def _conjugated(formation: Formation, peak: float) -> str | None:
     if gained_db < _CONJUGATED_DB:
         return None
     return (
-        f"with conjugated samples its brightest place is {min(gained_db, 99):.0f} dB brighter: "
-        "I and Q are swapped, or phases count the other way: change waveform.iq between complex and conjugate, of real "
-        "beats the sign of waveform.bandwidth_hz; from Python, conjugate the samples"
+        f"with conjugated samples the brightest pixel is {min(gained_db, 99):.0f} dB brighter: I and Q are swapped, "
+        "or the phase convention is opposite; change waveform.iq between complex and conjugate, or the sign of "
+        "waveform.bandwidth_hz for real beat signals; from Python, conjugate the samples"
     )
 
 
 UNEXPECTED_DB = 0.2
-"""dB of loss beyond the expected that are flagged at least: the accuracy to which images of many points tell it."""
+"""Least loss beyond the expected loss that is flagged, dB: the accuracy of the measured loss with many points."""
 
 
 def focus_flags(report: dict[str, Any], expected: Effect) -> Flags:
-    """Return the flags `defocused`, `loss_unexpected` and `echo_elsewhere`.
+    """Evaluate the flags `defocused`, `loss_unexpected` and `echo_outside_scene`.
 
     Parameters
     ----------
     report
-        From `focus_report`.
+        Result of `focus_report`.
     expected
-        Effect that the budget expects of all causes.
+        Expected effect of all causes in the error budget.
 
     Notes
     -----
-    Source: docs/theory/focus.md, "Focus of a point". Both losses have a deviation: the measured one by its points, the
-    expected one from flight to flight.
+    Source: docs/theory/focus.md, "Focus of a point". Both losses have a standard deviation: that of the measured loss
+    is estimated from its points, that of the expected loss is its variation between flights.
     """
-    flags = Flags({"echo_elsewhere": report["elsewhere"]} if "elsewhere" in report else {})
-    told = f"{abs(expected.loss_db):.1f} ± {expected.loss_std_db:.1f} dB are expected by the budget"
+    flags = Flags({"echo_outside_scene": report["elsewhere"]} if "elsewhere" in report else {})
+    budget = f"{abs(expected.loss_db):.1f} ± {expected.loss_std_db:.1f} dB expected from the error budget"
     if report["verdict"] == "defocused":
         flags["defocused"] = (
-            f"{report['why']}; {told}: positions, lever arms, heights or times are worse, or not stated"
+            f"{report['reason']}; {budget}: positions, lever arms, heights or times are less accurate than configured, "
+            "or their accuracy is not configured"
         )
     elif "loss_db" in report:
         beyond_db = expected.loss_db - report["loss_db"]
         if beyond_db > max(UNEXPECTED_DB, _UNEXPECTED_SIGMAS * float(np.hypot(report["std_db"], expected.loss_std_db))):
-            flags["loss_unexpected"] = f"{report['why']}; {told}: something is worse than the budget states"
+            flags["loss_unexpected"] = f"{report['reason']}; {budget}: an error source exceeds its entry in the budget"
     if "conjugated" in report:
         return Flags({name: f"{line}; {report['conjugated']}" for name, line in flags.items()})
     return flags
 
 
 def _parts(formation: Formation, points: list[BrightPoint], cell_m: float) -> SubApertures:
-    """Return the subaperture measures of the brightest places."""
+    """Return the subaperture measures of the brightest points."""
     spacing_m = cell_m / _PLACES_PER_CELL
-    step_px, some = spacing_m / formation.grid.spacing_m, list[BrightPoint]()
+    step_px, centres = spacing_m / formation.grid.spacing_m, list[BrightPoint]()
     for point in points:
-        near = any(np.hypot(point.row - one.row, point.column - one.column) < _PATCHES_APART * step_px for one in some)
-        if not near and len(some) < _PATCHES:
-            some.append(point)
-    places = [_places(formation, point, step_px) for point in some]
+        offsets_px = [np.hypot(point.row - other.row, point.column - other.column) for other in centres]
+        near = any(offset_px < _PATCHES_APART * step_px for offset_px in offsets_px)
+        if not near and len(centres) < _PATCHES:
+            centres.append(point)
+    places = [_places(formation, point, step_px) for point in centres]
     images = part_images(formation.profiles, places, beams=formation.beams)
     return compare_parts(images, spacing_m=spacing_m, generator=np.random.default_rng(0))
 
@@ -556,5 +565,5 @@ def _point_report(formation: Formation, point: BrightPoint, focus: PointFocus) -
         "snr_db": round(focus.snr_db, 2),
         "background": float(f"{point.background:.4g}"),
         "coherence": round(focus.coherence, 5),
-        "coherence_allowed": round(focus.coherence_allowed, 5),
+        "coherence_noise_limit": round(focus.coherence_noise_limit, 5),
     }

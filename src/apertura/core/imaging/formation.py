@@ -1,4 +1,4 @@
-"""Formation of one image: inputs, scene, antennas and plan, shared by tiles, certificate and measures."""
+"""Image formation: inputs, scene, antennas and plan of one image, shared by tiles, certificate and measures."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -26,27 +26,27 @@ if TYPE_CHECKING:
     from dask.array.core import Array
 
 PULSES_READ = 1024
-"""Pulses read at once of a phase history, or of profiles at single places: bounds memory."""
+"""Pulses read per block of a phase history, or of profiles at single points: limits memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class Formation:
-    """Everything that forms the tiles of one image.
+    """Inputs and settings of the formation of one image.
 
     Attributes
     ----------
     history
-        Phase history; None where there are only profiles.
+        Phase history; None if only profiles are available.
     profiles
-        The same as range profiles, for the engines that use tables.
+        The same data as range profiles, for the engines that use tables.
     grid
-        Of the image.
+        Grid of the image.
     plan
-        Engine, model of the ground and weights of pulses.
+        Engine, terrain model and weights of pulses.
     side_px
-        Of a tile.
+        Side of a tile.
     compression_db
-        Error of the profiles against the history, measured where they were compressed, dB; None: not measured.
+        Error of the profiles relative to the history, measured at range compression, dB; None: not measured.
     """
 
     history: PhaseHistory | None
@@ -58,17 +58,17 @@ class Formation:
 
     @property
     def summed(self) -> PhaseHistory | Profiles:
-        """Input of the double sum: the history, unless it is known how far the profiles are from it."""
+        """Input of the exact sum: the profiles if their compression error is known or there is no history."""
         return self.profiles if self.history is None or self.compression_db is not None else self.history
 
     @property
     def beams(self) -> Beams | None:
-        """Weights of pulses: antennas and the sector integrated; None where every pulse has weight 1."""
+        """Weights of pulses, from antennas and the integrated sector; None if every pulse has weight 1."""
         return self.plan.beams
 
     @property
     def count(self) -> int:
-        """Pulses that the sum is divided by."""
+        """Number of pulses by which the sum is divided."""
         return self.plan.count or len(self.profiles)
 
     @property
@@ -78,7 +78,7 @@ class Formation:
 
     @cached_property
     def windows(self) -> list[Window]:
-        """Every tile that a pulse may illuminate, a full-sized one first if any; the others are not formed: zero."""
+        """Tiles that a pulse may illuminate, a full-sized one first if any; all others are zero and not computed."""
         tiles = self.tiles
         reach = Reach.of(self.beams, self.profiles.aperture, self.grid, self.plan.terrain, tiles)
         formed = [tile for tile, illuminated in zip(tiles, reach.illuminated, strict=True) if illuminated]
@@ -88,7 +88,7 @@ class Formation:
 
     @cached_property
     def variant_counts(self) -> Counter[str]:
-        """Variant of the engine's sum → pixels × pulses that took it in this process; empty where an engine has one."""
+        """Variant of the engine's sum → pixels × pulses computed by it in this process; empty if there is only one."""
         return Counter()
 
     @cached_property
@@ -97,40 +97,40 @@ class Formation:
 
     @property
     def image(self) -> "Array":
-        """The image as planned: a dask array, (row, column) complex64, whose chunks are the tiles."""
+        """The image by the planned setting: a dask array, (row, column) complex64, whose chunks are the tiles."""
         return self._array(self.plan.setting, presum=True)
 
     def image_by(self, setting: Setting) -> "Array":
-        """Return the image by another setting, from every pulse as it is."""
+        """Return the image by another setting, without presumming."""
         return self._array(setting, presum=False)
 
     def positions_at(self, row: ArrayLike, column: ArrayLike) -> NDArray[np.float64]:
-        """Return (..., 3) float64 positions (m) of fractional pixel indices, on the ground."""
+        """Return (..., 3) float64 positions (m) of fractional pixel indices, on the terrain."""
         return self.plan.terrain.positions_at(self.grid, row, column)
 
     def exact(self, pixels: NDArray[np.int64], *, threads: int = 1) -> NDArray[np.complex128]:
-        """Return the image at (pixel, 2) rows and columns, (pixel,) complex128, by the double sum over `summed`.
+        """Return the image at (pixel, 2) rows and columns, (pixel,) complex128, by the exact sum over `summed`.
 
-        Of profiles, by their band-limited interpolation in float64. The same to the bit by any number of threads.
+        Profiles are interpolated band-limited in float64. The result does not depend on the number of threads.
         """
-        places = self.positions_at(*pixels.T)
+        points_m = self.positions_at(*pixels.T)
 
         def summed(read: tuple[slice, list[tuple[slice, NDArray[np.bool_]]]]) -> NDArray[np.complex128]:
             pulses, parts = read
-            some, total = self.summed[pulses], np.zeros(len(places), np.complex128)
+            inputs, total = self.summed[pulses], np.zeros(len(points_m), np.complex128)
             for part, inside in parts:
                 weights = self.beams and self.beams[pulses][part]
-                total[inside] += _exact_sum(some[part], places[inside], weights)
+                total[inside] += _exact_sum(inputs[part], points_m[inside], weights)
             return total
 
         with ThreadPoolExecutor(threads) as pool:
-            blocks = pool.map(summed, self.illuminating_pulses(places))
-            return np.asarray(sum(blocks, np.zeros(len(places), np.complex128)) / self.count)
+            blocks = pool.map(summed, self.illuminating_pulses(points_m))
+            return np.asarray(sum(blocks, np.zeros(len(points_m), np.complex128)) / self.count)
 
     def values(self, pixels: NDArray[np.int64]) -> tuple[NDArray[np.complex64], NDArray[np.float64]]:
-        """Return the planned image at (pixel, 2) rows and columns, forming only the piece that each needs.
+        """Return the planned image at (pixel, 2) rows and columns, computing only the pieces that contain them.
 
-        (pixel,) complex64, and mean |I|² over the pieces formed, (pixel,) float64.
+        (pixel,) complex64, and mean |I|² over each pixel's piece, (pixel,) float64.
         """
         windows = list(dict.fromkeys(self._piece(*pixel) for pixel in pixels.tolist()))
         images = self.image_of([(slice(*window[:2]), slice(*window[2:])) for window in windows])
@@ -142,7 +142,7 @@ class Formation:
         return values, power
 
     def _piece(self, row: int, column: int) -> tuple[int, int, int, int]:
-        """Return first and last row, first and last column of the piece that the planned engine forms a pixel in."""
+        """Return the row and column limits of the engine's piece that contains a pixel: first, end, first, end."""
         tile = [
             (at // self.side_px * self.side_px, size) for at, size in zip((row, column), self.grid.shape, strict=True)
         ]
@@ -159,50 +159,50 @@ class Formation:
         return self._pieces_of[shape]
 
     def image_of(self, windows: Sequence[Window]) -> list[NDArray[np.complex64]]:
-        """Return the planned image in windows that begin at patches of an engine, block of pulses by block."""
+        """Return the planned image in windows aligned to the engine's patches, accumulated over pulse blocks."""
         setting, beams, presum = self.plan.setting, self.beams, self.plan.presumming
         engine, inputs = load_engine(setting.engine), self._inputs(setting)
         if isinstance(inputs, Profiles) and presum is not None:
             inputs = self.plan.inputs(inputs)
         reach = Reach.of(beams, inputs.aperture, self.grid, self.plan.terrain, windows)
-        places = [self.plan.terrain.positions(self.grid[window]) for window in windows]
-        image = [np.zeros(place.shape[:2], np.complex64) for place in places]
+        patches_m = [self.plan.terrain.positions(self.grid[window]) for window in windows]
+        image = [np.zeros(patch_m.shape[:2], np.complex64) for patch_m in patches_m]
         for block in pulse_blocks_of(len(inputs), setting.pulse_blocks, any_start=beams is None):
             tables = engine.prepare(inputs[block], **setting.options)
-            for number, place in enumerate(places):
+            for number, patch_m in enumerate(patches_m):
                 if (part := reach.within(number, block)) is not None:
-                    some = tables if part == slice(0, block.stop - block.start) else tables[part]
+                    used = tables if part == slice(0, block.stop - block.start) else tables[part]
                     weights = beams and beams[block][part]
-                    image[number] += engine.form(some, place, beams=weights, **setting.form_options) / self.count
+                    image[number] += engine.form(used, patch_m, beams=weights, **setting.form_options) / self.count
         return image
 
     def contributions(self, row: ArrayLike, column: ArrayLike) -> list[NDArray[np.complex128]]:
         """Return the contributions of the pulses that illuminate each fractional pixel, (pulse,) complex128 each.
 
-        By the sum over a history's subcarriers, or of profiles by their band-limited interpolation.
+        Computed by the sum over a history's subcarriers, or by band-limited interpolation of profiles.
         """
-        places = self.positions_at(np.atleast_1d(row), np.atleast_1d(column))
-        terms_of: list[list[NDArray[np.complex128]]] = [[np.empty(0, np.complex128)] for _ in places]
-        for pulses, parts in self.illuminating_pulses(places):
-            some = self.summed[pulses]
+        points_m = self.positions_at(np.atleast_1d(row), np.atleast_1d(column))
+        terms_of: list[list[NDArray[np.complex128]]] = [[np.empty(0, np.complex128)] for _ in points_m]
+        for pulses, parts in self.illuminating_pulses(points_m):
+            inputs = self.summed[pulses]
             for part, inside in parts:
-                terms = _terms(some[part], places[inside], self.beams and self.beams[pulses][part])
-                for place, of_place in zip(np.flatnonzero(inside), terms.T, strict=True):
-                    terms_of[place].append(of_place[of_place != 0])
+                terms = _terms(inputs[part], points_m[inside], self.beams and self.beams[pulses][part])
+                for point, of_point in zip(np.flatnonzero(inside), terms.T, strict=True):
+                    terms_of[point].append(of_point[of_point != 0])
         return [np.concatenate(terms) for terms in terms_of]
 
     def illuminating_pulses(
-        self, places: NDArray[np.float64]
+        self, points_m: NDArray[np.float64]
     ) -> Iterator[tuple[slice, list[tuple[slice, NDArray[np.bool_]]]]]:
-        """Yield blocks of pulses to read, each with its parts that may illuminate some places, and the mask of these.
+        """Yield pulse blocks to read, each with its sub-blocks that may illuminate points, and the masks of the points.
 
         Parameters
         ----------
-        places
-            (place, 3) float64, metres.
+        points_m
+            (point, 3) float64, metres.
         """
         aperture, beams = self.profiles.aperture, self.beams
-        mask = illumination_mask(beams, aperture, places, np.zeros(len(places)), pulses=PULSES)
+        mask = illumination_mask(beams, aperture, points_m, np.zeros(len(points_m)), pulses=PULSES)
         for first in range(0, len(aperture), PULSES_READ):
             block = slice(first, min(first + PULSES_READ, len(aperture)))
             length = block.stop - block.start
@@ -219,7 +219,7 @@ class Formation:
         if load_engine(setting.engine).READS == "profiles":
             return self.profiles
         if self.history is None:
-            raise ValueError(f"engine {setting.engine} reads a phase history; there are only profiles")
+            raise ValueError(f"engine {setting.engine} requires a phase history; only profiles are available")
         return self.history
 
     def _array(self, setting: Setting, *, presum: bool) -> "Array":
@@ -235,15 +235,17 @@ class Formation:
         )
 
 
-def _terms(inputs: PhaseHistory | Profiles, places: NDArray[np.float64], beams: Beams | None) -> NDArray[np.complex128]:
+def _terms(
+    inputs: PhaseHistory | Profiles, points_m: NDArray[np.float64], beams: Beams | None
+) -> NDArray[np.complex128]:
     if isinstance(inputs, PhaseHistory):
-        return reference.terms(inputs, places, beams)
-    return band_limited_terms(inputs, places, beams=beams)
+        return reference.terms(inputs, points_m, beams)
+    return band_limited_terms(inputs, points_m, beams=beams)
 
 
 def _exact_sum(
-    inputs: PhaseHistory | Profiles, places: NDArray[np.float64], beams: Beams | None
+    inputs: PhaseHistory | Profiles, points_m: NDArray[np.float64], beams: Beams | None
 ) -> NDArray[np.complex128]:
     if isinstance(inputs, PhaseHistory):
-        return reference.form(inputs, places, beams=beams)
-    return band_limited_image(inputs, places, beams=beams)
+        return reference.form(inputs, points_m, beams=beams)
+    return band_limited_image(inputs, points_m, beams=beams)

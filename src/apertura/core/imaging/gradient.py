@@ -1,4 +1,4 @@
-"""Gradient of a caller's objective of an image with respect to phase centres and paths."""
+"""Gradient of a user-defined image objective with respect to phase centres and paths."""
 
 from typing import TYPE_CHECKING, Any, cast
 
@@ -25,51 +25,51 @@ def gradient(
     terrain: Terrain | float | None = None,
     beams: Beams | None = None,
 ) -> Gradient:
-    """Return how a real objective J of an image changes with each pulse's phase centres and with its path.
+    """Compute the gradient of a real objective J of an image with respect to phase centres and path of each pulse.
 
     Parameters
     ----------
     profiles
-        Range profiles, at least twice oversampled; or a stage `profile` of a campaign.
+        Range profiles, oversampled by at least 2, or the dataset of a campaign's stage `profile`.
     grid
         Pixels of the image, often a patch of it such as ``grid[40:60, 10:30]``.
     dj_dimage
-        (y, x) complex: G with J(I + dI) = J(I) + Re Σ conj(G)·dI, that is ∂J/∂Re I + j·∂J/∂Im I. Of Σ|I|⁴ it is
+        (y, x) complex: G with J(I + dI) = J(I) + Re Σ conj(G)·dI, that is ∂J/∂Re I + j·∂J/∂Im I; for J = Σ|I|⁴ it is
         4|I|²·I. PyTorch's gradient of a complex tensor is this G, JAX's is its conjugate. The image I is that of
-        `backproject`, carrier kept, divided by the number of pulses, all of them integrated.
+        `backproject`, with the carrier phase, divided by the number of pulses, and with integration='all'.
     terrain
-        As of `backproject`.
+        As for `backproject`.
     beams
-        As of `backproject`. That the weight of a pulse changes as its antennas move is neglected.
+        As for `backproject`. The dependence of a pulse's weight on its phase centres is neglected.
 
     Returns
     -------
     Gradient
-        `tx_m` and `rx_m`, (pulse, 3), and `path_m`, (pulse,): J's unit per metre. Path: one added to all echoes of a
-        pulse (`Profiles.moved`).
+        `tx_m` and `rx_m`, (pulse, 3), and `path_m`, (pulse,), in J's unit per metre. `path_m` refers to an extra path
+        common to all echoes of a pulse (`Profiles.moved`).
 
     Raises
     ------
     CampaignError
-        If other than profiles are given: `range_compress` makes them from a phase history. If `dj_dimage` is not of the
-        grid's shape, or a grid on Earth has no terrain.
+        If `profiles` are no range profiles (`range_compress` computes them from a phase history), `dj_dimage` does not
+        have the grid's shape, or a georeferenced grid has no terrain.
     ValueError
-        If `dj_dimage` or a position on the ground is not finite.
+        If `dj_dimage` or a position on the terrain is not finite.
 
     Notes
     -----
     Source: docs/theory/autofocus.md, eq. 6 to 8: the exact derivative of the interpolated, rotated and summed samples.
-    Finite differences of images by `backproject` agree as far as their engine's error lets them.
+    Finite differences of images by `backproject` agree within the error of their engine.
 
     Examples
     --------
-    Bright points are to be brighter: J = Σ|I|⁴, of a pulse whose receiver is logged 2 cm too high.
+    Sharpness J = Σ|I|⁴, with a logged receiver position that is 2 cm too high at one pulse.
 
     >>> import apertura as ap
     >>> frequency = 1.2e9 + 1e6 * np.arange(256)
     >>> track = np.stack([np.linspace(-4, 4, 128), np.full(128, -20.0), np.full(128, 10.0)], -1)
-    >>> flown = ap.Aperture(track, track)
-    >>> echo = np.exp(-2j * np.pi * frequency * flown.path(np.zeros((1, 3))) / 299792458.0).astype(np.complex64)
+    >>> true = ap.Aperture(track, track)
+    >>> echo = np.exp(-2j * np.pi * frequency * true.path(np.zeros((1, 3))) / 299792458.0).astype(np.complex64)
     >>> logged = ap.Aperture(track, track + 0.02 * np.eye(128)[64][:, None] * [0, 0, 1])
     >>> history = ap.PhaseHistory(echo, frequency, np.full(256, 1 / 256), np.zeros(128), logged)
     >>> grid = ap.SceneGrid("local", -2.0, 2.0, 0.1, (40, 40))
@@ -84,7 +84,8 @@ def gradient(
         profiles = profiles_of(cast("xr.Dataset", profiles), lazy=True)
     if not isinstance(profiles, Profiles):
         found = f"an object of type {type(profiles).__name__}"
-        raise CampaignError(found, "profiles", "Profiles, or a stage profile", "range_compress makes them of an echo.")
+        expected = "Profiles, or the dataset of stage profile"
+        raise CampaignError(found, "profiles", expected, "Compute them from a phase history by range_compress.")
     try:
         slope = np.asarray(dj_dimage, np.complex128)
     except (TypeError, ValueError):
@@ -92,6 +93,6 @@ def gradient(
     if slope.shape != grid.shape:
         found = f"shape {slope.shape}" if slope.size else f"an object of type {type(dj_dimage).__name__}"
         expected = f"a complex array of the grid's shape, {grid.shape}"
-        raise CampaignError(found, "dj_dimage", expected, "Derive the objective by every pixel of that grid.")
+        raise CampaignError(found, "dj_dimage", expected, "Differentiate the objective by every pixel of this grid.")
     places_m = ground.positions(grid).reshape(-1, 3)
     return path_gradient(profiles, places_m, slope.ravel() / len(profiles), beams=beams)

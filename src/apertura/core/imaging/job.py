@@ -24,14 +24,14 @@ from apertura.core.scene.terrain import FlatGround, GroundModels, Terrain
 
 # ---- Checks of inputs against the scene
 
-_POINTS = 9  # along a side of the scene, sampled
-_PULSES = 256  # sampled for total paths
-_RADIO_HZ = (1e5, 1e12)  # what radars use, and far beyond it
-_USUAL_HZ = (1e7, 1e12)  # of which a number without its unit is taken to be one
+_POINTS = 9  # sample points along a side of the scene
+_PULSES = 256  # pulses sampled for total paths
+_RADIO_HZ = (1e5, 1e12)  # accepted radio frequencies, wider than any radar band
+_USUAL_HZ = (1e7, 1e12)  # a frequency with the wrong unit is recognised if its conversion lies in this interval
 
 
 def check_inputs(inputs: PhaseHistory | Profiles, grid: SceneGrid, terrain: Terrain) -> dict[str, str]:
-    """Return flags: limit that the inputs exceed on a scene → what was measured, in one line.
+    """Check inputs against a scene and return flags: exceeded limit → measured value, in one line.
 
     Parameters
     ----------
@@ -43,9 +43,9 @@ def check_inputs(inputs: PhaseHistory | Profiles, grid: SceneGrid, terrain: Terr
     Raises
     ------
     CampaignError
-        If the grid's CRS is not one for a scene, frequencies are none of a radar, a weight is negative, a position,
-        delay, weight, sample or height is not finite, an antenna is in the ground, all weights or samples are zero, or
-        the scene lies beyond the samples of all pulses.
+        If the grid's CRS is not suitable for a scene, frequencies are not radio frequencies, a weight is negative, a
+        position, delay, weight, sample or height is not finite, an antenna is below the terrain, all weights or samples
+        are zero, or the scene lies beyond the samples of all pulses.
     """
     if grid.crs != LOCAL:
         check_crs(grid.crs, grid.bounds_m)
@@ -60,14 +60,14 @@ def check_inputs(inputs: PhaseHistory | Profiles, grid: SceneGrid, terrain: Terr
             "heights of the terrain are not finite",
             where="backproject: terrain",
             expected="a height in metres at every pixel",
-            remedy="Fill its voids, or make the grid smaller.",
+            remedy="Fill the voids of the terrain model, or make the grid smaller.",
         )
     outside = _outside(inputs, points)
     if outside == 1:
         raise CampaignError(
-            "no echo of the scene is in the samples: its total paths lie beyond them at every pulse",
+            "the samples contain no echo of the scene: its total paths lie beyond them at every pulse",
             where="backproject: grid",
-            expected="phase centres and pixels in one frame, in metres, within the range that was recorded",
+            expected="phase centres and pixels in one frame, in metres, within the recorded range",
             remedy="Check the grid's CRS and corner, the terrain's height, the frame of the positions, and that delays "
             "are in seconds.",
         )
@@ -78,7 +78,7 @@ def check_inputs(inputs: PhaseHistory | Profiles, grid: SceneGrid, terrain: Terr
 
 
 def _check_band(inputs: PhaseHistory | Profiles) -> None:
-    """Raise CampaignError unless frequencies are those of a radar, and weights and delays can be summed with."""
+    """Raise CampaignError unless frequencies are radio frequencies, and weights and delays are finite."""
     if isinstance(inputs, Profiles):
         frequency, name = np.array([inputs.centre_frequency_hz]), "centre_frequency_hz"
         finite = {"start_m": inputs.start_m}
@@ -86,23 +86,25 @@ def _check_band(inputs: PhaseHistory | Profiles) -> None:
         frequency, name = inputs.frequency_hz, "frequency_hz"
         finite = {"weight": inputs.weight, "reference_delay_s": inputs.reference_delay_s}
     low, high = (float(edge(frequency)) for edge in (np.min, np.max))
-    if not (_RADIO_HZ[0] <= low and high <= _RADIO_HZ[1]):  # NaN is neither
+    if not (_RADIO_HZ[0] <= low and high <= _RADIO_HZ[1]):  # also raised for NaN
         units = {"GHz": 1e9, "MHz": 1e6, "kHz": 1e3}
-        meant = [one for one, hz in units.items() if _USUAL_HZ[0] <= low * hz and high * hz <= _USUAL_HZ[1]]
+        likely = [unit for unit, hz in units.items() if _USUAL_HZ[0] <= low * hz and high * hz <= _USUAL_HZ[1]]
         raise CampaignError(
             f"{low:.6g} to {high:.6g}" if low != high else f"{low:.6g}",
             where=f"backproject: {name}",
             expected=f"radio frequencies in Hz, {_RADIO_HZ[0]:g} to {_RADIO_HZ[1]:g}",
-            remedy=f"Is that in {meant[0]}? Multiply by {units[meant[0]]:g}." if meant else "Give them in Hz.",
+            remedy=f"If the values are in {likely[0]}, multiply them by {units[likely[0]]:g}."
+            if likely
+            else "Pass frequencies in Hz.",
         )
     for name, values in finite.items():
         lost = np.flatnonzero(~np.isfinite(values))
         if lost.size:
             raise CampaignError(
-                f"{lost.size} of {values.size} not finite, first at {int(lost[0])}",
+                f"{lost.size} of {values.size} values not finite, first at index {int(lost[0])}",
                 where=f"backproject: {name}",
                 expected="finite numbers",
-                remedy="Leave such pulses or subcarriers out.",
+                remedy="Exclude these pulses or subcarriers.",
             )
     if isinstance(inputs, PhaseHistory):
         range_step(inputs.frequency_hz, oversampling=1.0)
@@ -110,8 +112,8 @@ def _check_band(inputs: PhaseHistory | Profiles) -> None:
         raise CampaignError(
             f"{inputs.weight.min():.6g} to {inputs.weight.max():.6g}",
             where="backproject: weight",
-            expected="a window over the subcarriers: no weight below 0, some above",
-            remedy="Take window='hann', or weights of your own.",
+            expected="a window over the subcarriers: no negative weight, at least one above 0",
+            remedy="Use window='hann', or correct the weights.",
         )
 
 
@@ -124,48 +126,49 @@ def _check_samples(inputs: PhaseHistory | Profiles) -> None:
             if lost.any()
             else "all samples are zero",
             where="backproject",
-            expected="finite samples that hold an echo",
-            remedy="Leave such pulses out.",
+            expected="finite samples that contain an echo",
+            remedy="Exclude these pulses.",
         )
 
 
 _LEAST_BAND = 0.05
-"""Of the subcarriers that hold the energy of a pulse: an echo has it in all of its band, one in time in few samples."""
+"""Least share of subcarriers that contain a pulse's energy: an echo fills its band, but only a few samples of time."""
 
 
 def _check_spectrum(history: PhaseHistory) -> None:
-    """Raise CampaignError where samples are those of time, not of frequency: a pulse's energy lies in a few of them."""
-    some = np.asarray(history[history.aperture.sample(_PULSES)].transfer)
-    power = np.abs(some).astype(np.float64) ** 2
+    """Raise CampaignError if samples appear to be in time, not in frequency: few of them contain a pulse's energy."""
+    transfer = np.asarray(history[history.aperture.sample(_PULSES)].transfer)
+    power = np.abs(transfer).astype(np.float64) ** 2
     total = power.sum(axis=1)
     used = total**2 / np.maximum((power**2).sum(axis=1), 1e-300)
-    many = float(np.median(used[total > 0])) if (total > 0).any() else 0.0
-    if many < _LEAST_BAND * power.shape[1]:
+    filled = float(np.median(used[total > 0])) if (total > 0).any() else 0.0
+    if filled < _LEAST_BAND * power.shape[1]:
         raise CampaignError(
-            f"the energy of a pulse lies in {many:.1f} of {power.shape[1]} subcarriers",
+            f"the energy of a pulse lies in {filled:.1f} of {power.shape[1]} subcarriers",
             where="backproject: transfer",
-            expected="transfer functions over frequency, which an echo fills",
-            remedy="Are these samples over time, or range? Take their DFT (numpy.fft.fft), or give Profiles.",
+            expected="transfer functions over frequency, with energy in the whole band",
+            remedy="If the samples are over time or range, pass their DFT (numpy.fft.fft), or pass Profiles.",
         )
 
 
 def _outside(inputs: PhaseHistory | Profiles, points: np.ndarray) -> float:
-    """Return the share of total paths, from some pulses to some points, that lie beyond the samples.
+    """Return the share of total paths, from sampled pulses to sampled points, that lie beyond the samples.
 
-    A phase history repeats itself every c/Δf; a scene farther than that to either side of its reference is refused.
+    A phase history is periodic with c/Δf; total paths farther than that from its reference count as beyond.
     """
-    some = inputs[inputs.aperture.sample(_PULSES)]
-    path = some.aperture.path(points)
-    if isinstance(some, PhaseHistory):
-        unambiguous_m = some.wave_speed_m_s / float(np.abs(np.diff(some.frequency_hz)).mean())
-        return float((np.abs(path - some.wave_speed_m_s * some.reference_delay_s[:, None]) > unambiguous_m).mean())
-    place = (path - some.start_m[:, None]) / some.step_m
-    return float(((place < 0) | (place > some.samples.shape[1] - 1)).mean())
+    sampled = inputs[inputs.aperture.sample(_PULSES)]
+    path_m = sampled.aperture.path(points)
+    if isinstance(sampled, PhaseHistory):
+        unambiguous_m = sampled.wave_speed_m_s / float(np.abs(np.diff(sampled.frequency_hz)).mean())
+        reference_m = sampled.wave_speed_m_s * sampled.reference_delay_s[:, None]
+        return float((np.abs(path_m - reference_m) > unambiguous_m).mean())
+    at = (path_m - sampled.start_m[:, None]) / sampled.step_m
+    return float(((at < 0) | (at > sampled.samples.shape[1] - 1)).mean())
 
 
 # ---- The planner's job of a pair and a scene
 
-_PATCH_PX = 256  # side of the windows whose positions predictions use
+_PATCH_PX = 256  # side of the windows at whose pixels the engines' errors are predicted
 
 
 def decide_integration(
@@ -177,7 +180,7 @@ def decide_integration(
     antennas: Beams | None = None,
     requested: Any = "auto",
 ) -> Integration:
-    """Return over how much of a flight the pixels of a scene are integrated.
+    """Decide the integration of a scene's pixels: the sector of the flight that contributes to them.
 
     Parameters
     ----------
@@ -186,7 +189,7 @@ def decide_integration(
     grid, level
         The scene, on level ground.
     antennas, requested
-        As of `apertura.core.planning.decisions.integrate`.
+        As for `apertura.core.planning.decisions.integrate`.
     """
     points_m = grid.sample_points(_POINTS, level.height_m)
     geometry: dict[str, Any] = {"spacing_m": grid.spacing_m, "wavelength_m": SPEED_OF_LIGHT_M_S / centre_hz}
@@ -204,7 +207,7 @@ def imaging_job(
     integration: Any = "auto",
     wave_speed_m_s: float = SPEED_OF_LIGHT_M_S,
 ) -> Job:
-    """Return the planner's job.
+    """Return the planner's job for a phase history.
 
     Parameters
     ----------
@@ -213,9 +216,9 @@ def imaging_job(
     frequency_hz, weight
         (subcarrier,) float64, RF frequency and window.
     grid, ground
-        The scene: its pixels, its ground and cheaper models of the ground.
+        The scene: its pixels, its terrain and simpler terrain models.
     beams
-        Of the antennas, where they have any.
+        Antenna beams; None: isotropic.
     integration
         As `requested` of `apertura.core.planning.decisions.integrate`.
     wave_speed_m_s
@@ -224,7 +227,7 @@ def imaging_job(
     Returns
     -------
     Job
-        With no limit of path or memory, and defaults of tiles and threads, to be replaced.
+        Without limits of path and memory, and with default tiles and threads; to be replaced by the caller.
     """
     centre, count = centre_frequency(frequency_hz), len(frequency_hz)
     ground_m = grid.sample_points(_POINTS, ground.level.height_m)
@@ -251,14 +254,14 @@ def imaging_job(
 def profiles_job(
     profiles: Profiles, grid: SceneGrid, ground: GroundModels, *, beams: Beams | None = None, integration: Any = "auto"
 ) -> Job:
-    """Return the planner's job of range profiles alone: their band is taken as full and flat.
+    """Return the planner's job for range profiles alone; their band is assumed full and flat.
 
     Parameters
     ----------
     profiles
         In the frame of the pixels.
     grid, ground, beams, integration
-        As `imaging_job`.
+        As for `imaging_job`.
     """
     centre, samples = profiles.centre_frequency_hz, profiles.samples.shape[1]
     ground_m = grid.sample_points(_POINTS, ground.level.height_m)
@@ -282,7 +285,7 @@ def profiles_job(
 
 
 def _patches(grid: SceneGrid, ground: Terrain) -> tuple[NDArray[np.float64], ...]:
-    """Return the places of the pixels of some windows: in the corners of a scene and in its middle."""
+    """Return the positions of the pixels of windows in the corners and in the middle of a scene."""
     sides = [min(_PATCH_PX, size) for size in grid.shape]
     ends = [(0, (size - side) // 2, size - side) for size, side in zip(grid.shape, sides, strict=True)]
     corners = {(ends[0][row], ends[1][column]) for row, column in ((0, 0), (0, 2), (1, 1), (2, 0), (2, 2))}

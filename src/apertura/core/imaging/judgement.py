@@ -1,4 +1,4 @@
-"""What an image says of itself: focus, echoes that it does not show, error budget, and the flags of all of them."""
+"""Quality assessment of an image without ground truth: focus, unfocused echoes, error budget, and their flags."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -33,36 +33,37 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _CM = 1e-2
-_APERTURE_S = 10.0  # taken for the time flown where nobody says it: an error of one second lasts a tenth of it
+_APERTURE_S = 10.0  # assumed duration of the aperture without times; position errors last one second, a tenth of it
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """What an image says of itself.
+    """Quality assessment of an image.
 
     Attributes
     ----------
     verdict
-        focused, defocused, or cannot tell.
+        'focused', 'defocused' or 'inconclusive' (not observable).
     why
-        One line: the reason for the verdict.
+        Reason for the verdict, one line.
     flags
-        Limit crossed → what was measured, as docs/flags.md lists them.
+        Exceeded limit → measured value, as listed in docs/flags.md.
     budget
-        Causes of error, each with what is stated or assumed, `loss_db`, `shift_m` and `phase_rad`.
+        Error sources, each with its configured or assumed size, `loss_db`, `shift_m` and `phase_rad`.
     focus
-        Section `focus` of image.json: loss, its deviation, that expected by the budget, bright points one by one.
+        Section `focus` of image.json: loss, its standard deviation, the loss expected from the budget, and each bright
+        point.
     """
 
     verdict: str
-    why: str
+    reason: str
     flags: Flags
     budget: list[dict[str, Any]]
     focus: dict[str, Any]
 
 
 def judgement(formation: Formation, target: Any, lines: Sequence[BudgetLine]) -> Judgement:
-    """Return what an image says of itself: the step `image` of a campaign and `judge` ask the same.
+    """Assess an image: common implementation of the step `image` of a campaign and of `judge`.
 
     Parameters
     ----------
@@ -73,33 +74,33 @@ def judgement(formation: Formation, target: Any, lines: Sequence[BudgetLine]) ->
     lines
         Its error budget.
     """
-    focus, spoilt = focus_report(formation, target), expected(lines)
-    focus |= {"expected_db": round(spoilt.loss_db, 3), "expected_std_db": round(spoilt.loss_std_db, 3)}
-    focus |= {"expected_shift_m": round(spoilt.shift_m, 3)}
+    focus, effect = focus_report(formation, target), expected(lines)
+    focus |= {"expected_db": round(effect.loss_db, 3), "expected_std_db": round(effect.loss_std_db, 3)}
+    focus |= {"expected_shift_m": round(effect.shift_m, 3)}
     still = formation.plan.flags.get("no_aperture")
-    if still:  # a range per echo and no place: nothing that points say of focus would be true
+    if still:  # range resolution only: the focus measures of points are meaningless
         focus = {key: value for key, value in focus.items() if key not in {"loss_db", "std_db", "elsewhere", "points"}}
-        focus |= {"verdict": "cannot tell", "why": f"no aperture: {still}", "points": []}
-    flags = Flags.merged(antenna_flags(lines), {} if still else focus_flags(focus, spoilt))
+        focus |= {"verdict": "inconclusive", "reason": f"no aperture: {still}", "points": []}
+    flags = Flags.merged(antenna_flags(lines), {} if still else focus_flags(focus, effect))
     focus = focus_with_flags(focus, flags)
-    return Judgement(focus["verdict"], focus["why"], flags, [line.report for line in lines], focus)
+    return Judgement(focus["verdict"], focus["reason"], flags, [line.report for line in lines], focus)
 
 
 def judge(
     image: "xr.DataArray", *, position_std_m: float | None = None, time_s: NDArray[np.float64] | None = None
 ) -> Judgement:
-    """Return what an image of `backproject` says of itself, without truth; forms all of it.
+    """Assess the quality of an image of `backproject` without ground truth; computes the whole image.
 
     Parameters
     ----------
     image
-        Of `apertura.backproject`, still lazy: its graph holds the echoes, the phase centres and the ground. What was
-        selected from it or computed of it, lazily, is judged by the whole image.
+        Result of `apertura.backproject`, still lazy: its graph contains the echoes, the phase centres and the terrain.
+        Any lazy selection or function of it is judged by the whole image.
     position_std_m
-        Standard deviation of the phase centres in each axis, metres: the loss that it explains is then expected. By
-        default nothing is stated, and none is.
+        Standard deviation of the phase centres in each axis, metres, from which the expected loss is computed
+        (default: not stated, no loss expected).
     time_s
-        (pulse,) float64, seconds: when pulses were sent; an error of position lasts a second.
+        (pulse,) float64, transmit times of the pulses, seconds; position errors have a correlation time of one second.
 
     Returns
     -------
@@ -109,7 +110,7 @@ def judge(
     Raises
     ------
     CampaignError
-        If the array has no image of `backproject` in its graph, or several; or a deviation is stated without times.
+        If the array has no image of `backproject` in its graph, or several; or position_std_m is given without times.
 
     Notes
     -----
@@ -120,34 +121,35 @@ def judge(
     >>> import apertura as ap
     >>> frequency = 1.2e9 + 1e6 * np.arange(256)
     >>> track = np.stack([np.linspace(-4, 4, 128), np.full(128, -20.0), np.full(128, 10.0)], -1)
-    >>> flown, grid = ap.Aperture(track, track), ap.SceneGrid("local", -5.0, 5.0, 0.1, (100, 100))
-    >>> echo = np.exp(-2j * np.pi * frequency * flown.path(np.zeros((1, 3))) / 299792458.0).astype(np.complex64)
-    >>> history = ap.PhaseHistory(echo, frequency, np.full(256, 1 / 256), np.zeros(128), flown)
+    >>> aperture, grid = ap.Aperture(track, track), ap.SceneGrid("local", -5.0, 5.0, 0.1, (100, 100))
+    >>> echo = np.exp(-2j * np.pi * frequency * aperture.path(np.zeros((1, 3))) / 299792458.0).astype(np.complex64)
+    >>> history = ap.PhaseHistory(echo, frequency, np.full(256, 1 / 256), np.zeros(128), aperture)
     >>> ap.judge(ap.backproject(history, grid)).verdict
     'focused'
-    >>> conjugated = ap.PhaseHistory(echo.conj(), frequency, np.full(256, 1 / 256), np.zeros(128), flown)
+    >>> conjugated = ap.PhaseHistory(echo.conj(), frequency, np.full(256, 1 / 256), np.zeros(128), aperture)
     >>> list(ap.judge(ap.backproject(conjugated, grid)).flags)
-    ['echo_elsewhere']
+    ['echo_outside_scene']
     """
     formation = _formation_of(image)
-    stated = position_std_m is None or (is_number(position_std_m) and position_std_m >= 0)
-    if not stated or (position_std_m is not None and time_s is None):
+    valid = position_std_m is None or (is_number(position_std_m) and position_std_m >= 0)
+    if not valid or (position_std_m is not None and time_s is None):
         raise CampaignError(
             f"position_std_m of {position_std_m!r}{' without times' if time_s is None else ''}",
             where="judge",
-            expected="metres, with time_s, when each pulse was sent: errors that change within a flight defocus",
-            remedy="Give both, or none.",
+            expected="a number of metres, with the transmit time of each pulse in time_s",
+            remedy="Pass both arguments, or neither.",
         )
     pulses = len(formation.profiles)
     if time_s is not None and np.shape(time_s) != (pulses,):
         raise CampaignError(
-            f"shape {np.shape(time_s)}", "judge: time_s", f"seconds of each of {pulses} pulses", "Give one per pulse."
+            f"shape {np.shape(time_s)}", "judge: time_s", f"times of {pulses} pulses", "Pass one time per pulse."
         )
     if time_s is not None:
         times = np.asarray(time_s)
         if times.dtype.kind not in "iuf" or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-            found = f"{times.dtype}, or not all finite and rising"
-            raise CampaignError(found, "judge: time_s", "seconds of any origin", "Subtract the first time, in seconds.")
+            expected = "finite, strictly increasing times in seconds, from any origin"
+            found = f"times of type {times.dtype}, or not finite, or not increasing"
+            raise CampaignError(found, "judge: time_s", expected, "Subtract the first time, in seconds.")
     error_db = image.attrs.get("numerical_error_db")
     lines = budget_by_hand(formation, error_db=error_db, position_std_m=position_std_m, time_s=time_s)
     return judgement(formation, np.asarray(formation.image), lines)
@@ -160,16 +162,16 @@ def budget_by_hand(
     position_std_m: float | None = None,
     time_s: NDArray[np.float64] | None = None,
 ) -> list[BudgetLine]:
-    """Return the error budget of an image of arrays: nobody states more than positions, and what is measured.
+    """Return the error budget of an image of arrays, without a campaign configuration.
 
     Parameters
     ----------
     formation
         Formation of the image.
     error_db
-        Its numerical error; None: not measured.
+        Numerical error of the image; None: not measured.
     position_std_m, time_s
-        As `judge`.
+        As for `judge`.
     """
     point_m, (east, north) = ground_axes(formation, *((size - 1) / 2 for size in formation.grid.shape))
     profiles = formation.profiles
@@ -178,8 +180,8 @@ def budget_by_hand(
     axes = np.stack([east, north, np.cross(east, north)])
     paths = PointPaths.of(aperture, seconds, point_m=point_m, axes=axes, wavelength_m=profiles.wavelength_m)
     stated = None if position_std_m is None else (position_std_m,) * 3
-    alike = aperture.tx_m is aperture.rx_m or np.array_equal(*aperture.legs)
-    nodes = [NodePositions(stated, stated_by="caller")] * (1 if alike else 2)
+    is_monostatic = aperture.tx_m is aperture.rx_m or np.array_equal(*aperture.legs)
+    nodes = [NodePositions(stated, stated_by="caller")] * (1 if is_monostatic else 2)
     cm_of_path = np.full(len(paths.time_s), _CM)
     return [
         *position_lines(paths, nodes, sidelink=False),
@@ -191,30 +193,31 @@ def budget_by_hand(
 
 
 _OTHER_N = 20.0
-"""N units by which the air of a day differs from a standard atmosphere."""
+"""Typical deviation of the refractivity from the standard atmosphere, N units."""
 
 
 def _air_line(paths: PointPaths, wave_speed_m_s: float) -> BudgetLine:
-    """Return the effect of air where the wave speed is that in vacuum, else of other air than was stated."""
+    """Return the budget line of the atmosphere: neglected refractivity, or its deviation from the assumed one."""
     in_vacuum = math.isclose(wave_speed_m_s, SPEED_OF_LIGHT_M_S, rel_tol=1e-9)
     units = USUAL_N if in_vacuum else _OTHER_N
     path_m = sum(np.linalg.norm(leg - paths.point_m, axis=1) for leg in paths.aperture.legs)
-    words = f"air of N = {units:.0f}, where vacuum is assumed," if in_vacuum else f"{units:.0f} N units"
-    return BudgetLine("atmosphere", None, paths.of_offset(1e-6 * units * path_m, common=True), unit=words)
+    unit = f"air of N = {units:.0f}, with vacuum assumed" if in_vacuum else f"{units:.0f} N units"
+    return BudgetLine("atmosphere", None, paths.of_offset(1e-6 * units * path_m, common=True), unit=unit)
 
 
 def _formation_of(image: Any) -> Formation:
-    """Return the formation that the graph of an image holds."""
+    """Return the image formation contained in the graph of an image."""
     graph = getattr(getattr(image, "data", None), "dask", None)
     layers: Iterable[Any] = getattr(graph, "layers", {}).values()
-    found = [layer.origin for layer in layers if getattr(layer, "origin", None) is not None]
-    if len(found) != 1:
-        what = "several images" if found else f"an object of type {type(image).__name__}, without one in its graph"
+    formations = [layer.origin for layer in layers if getattr(layer, "origin", None) is not None]
+    if len(formations) != 1:
         raise CampaignError(
-            what,
+            "a graph with several images"
+            if formations
+            else f"an object of type {type(image).__name__} without an image",
             where="judge",
-            expected="an image of apertura.backproject that is not computed: its graph holds what it was formed of",
-            remedy="Judge what backproject returns, then compute it.",
+            expected="one image of apertura.backproject, not yet computed",
+            remedy="Judge the lazy image returned by backproject, then compute it.",
         )
-    formation: Formation = found[0]
+    formation: Formation = formations[0]
     return formation

@@ -1,4 +1,4 @@
-"""Speckle of an image: mean power of squares of pixels, the looks that it has by correlation and as found, a filter."""
+"""Multilooking and speckle: mean power of pixel blocks, equivalent number of looks (ENL), and the Lee filter."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -12,19 +12,20 @@ from apertura.common.contracts import Window
 from apertura.core.scene.map_crs import BLOCK_PX
 
 LAGS_PX = 32
-"""Lags of the correlation of speckle, either way: a cell is 2 to 4 pixels wide, its correlation gone by ten cells."""
+"""Largest lag of the speckle correlation, pixels: a resolution cell is 2 to 4 pixels wide, and the correlation vanishes
+within ten cells."""
 
-_MEASURED_PX = 128  # side of the blocks that the correlation is measured in: all lags then have many pairs
-_MEASURED_WINDOWS = 3  # of local looks along a block, at least
-_LARGEST_PX = 4096  # along a block; of wider windows no looks are found
-_MEASURED_BLOCKS, _MOST_PX = 64, 1 << 24  # that looks are measured in, and pixels of all of them, about
+_MEASURED_PX = 128  # side of the blocks for the correlation: at least 96² pixel pairs at each lag
+_MEASURED_WINDOWS = 3  # least number of windows of the local ENL along a block
+_LARGEST_PX = 4096  # largest side of a block; with wider windows the ENL is not estimated
+_MEASURED_BLOCKS, _MOST_PX = 64, 1 << 24  # largest number of blocks, and approximate largest number of their pixels
 WINDOW = 7
-"""Side of the window of the filter and of local looks, cells of the multilooked raster; Lee's own (1980)."""
+"""Side of the window of the filter and of the local ENL, pixels of the multilooked raster, as in Lee (1980)."""
 
-_PARTS = 4  # of a block, either way, that tell how the direction of view turns across it
-_MOST_CHANCE = 0.5  # |ρ|² at far lags: of a block of two cells, or of an image that does not vary
-_FEWEST_PX = 10  # along a block: of less all lags are about zero
-_STEP, _SCATTER = 0.02, 0.2  # of ln(looks): of its histogram, and of what 49 cells tell, which smooths it
+_PARTS = 4  # subdivisions of a block per axis, for the variation of the look direction across it
+_MOST_CHANCE = 0.5  # |ρ|² at large lags: reached by blocks of two resolution cells, or a constant image
+_FEWEST_PX = 10  # least side of a block: a smaller one has only lags close to zero
+_STEP, _SCATTER = 0.02, 0.2  # of ln(ENL): histogram bin, and standard deviation of a local estimate, for smoothing
 
 
 def block_means(values: Floats, side: int) -> Floats:
@@ -33,14 +34,14 @@ def block_means(values: Floats, side: int) -> Floats:
     Parameters
     ----------
     values
-        (row, column) real; NaN is left out.
+        (row, column) real; NaN is excluded.
     side
-        Of a block, pixels. Blocks that hang over the edge are means of what they hold.
+        Side of a block, pixels. A block across the edge is the mean of its pixels inside.
 
     Returns
     -------
     ndarray
-        (block row, block column) float64, NaN where less than half of a block is known.
+        (block row, block column) float64, NaN where fewer than half of a block's pixels are valid.
 
     Examples
     --------
@@ -59,13 +60,13 @@ def block_means(values: Floats, side: int) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Speckle:
-    """Speckle of an image as its pixels are correlated.
+    """Speckle of an image, described by the correlation of its pixels.
 
     Attributes
     ----------
     correlation
-        (2·lags + 1, 2·lags + 1) float64, |ρ|² over lags of rows and columns, at most `LAGS_PX` either way: that of the
-        complex pixels, which of developed speckle is the correlation of their powers.
+        (2·lags + 1, 2·lags + 1) float64, |ρ|² over lags of rows and columns up to ±`LAGS_PX`, with ρ the correlation of
+        complex pixels; for fully developed speckle it equals the correlation of their powers.
 
     Notes
     -----
@@ -76,18 +77,18 @@ class Speckle:
 
     @classmethod
     def of(cls, blocks: Iterable[NDArray[np.complex64]]) -> "Speckle":
-        """Return the speckle of an image, the median of what blocks of it show.
+        """Estimate the speckle of an image by the median correlation over blocks.
 
         Parameters
         ----------
         blocks
-            (row, column) complex64 each, of one shape; those of which less than half is known (not NaN), or without
-            power, are left out.
+            (row, column) complex64 each, of one shape; blocks with fewer than half valid (not NaN) pixels, or without
+            power, are excluded.
 
         Raises
         ------
         ValueError
-            If no block is left, they are too small, or the correlation has no end in them.
+            If no valid block is large enough, or the correlation does not decay within the blocks.
 
         Examples
         --------
@@ -96,21 +97,21 @@ class Speckle:
         >>> round(Speckle.of(white).looks(5), 1)
         25.0
         """
-        large = (one for one in blocks if min(one.shape) >= _FEWEST_PX)
-        some = (one for one in large if 2 * np.isfinite(one).sum() >= one.size and np.nansum(np.abs(one)))
-        found = [_squared_correlation(one) for one in some]
-        if not found:
-            raise ValueError("no block of the image holds enough pixels")
-        middle = np.median(found, axis=0)
+        large = (block for block in blocks if min(block.shape) >= _FEWEST_PX)
+        valid = (block for block in large if 2 * np.isfinite(block).sum() >= block.size and np.nansum(np.abs(block)))
+        correlations = [_squared_correlation(block) for block in valid]
+        if not correlations:
+            raise ValueError("no block of the image has enough valid pixels")
+        middle = np.median(correlations, axis=0)
         corner = slice(0, len(middle) // 4)
-        floor = np.median(middle[corner, corner])  # chance: of so few pixels no correlation is nothing
+        floor = np.median(middle[corner, corner])  # bias of |ρ|² from a finite number of pixels
         if floor > _MOST_CHANCE:
-            raise ValueError(f"pixels of the image are correlated by {floor:.2f} wherever they lie")
+            raise ValueError(f"the correlation of the image's pixels is {floor:.2f} even at large lags")
         return cls(np.maximum(middle - floor, 0.0) / (1 - floor))
 
     @property
     def area_px(self) -> float:
-        """Pixels that vary as one, ∫|ρ|²."""
+        """Correlation area ∫|ρ|², pixels."""
         return float(self.correlation.sum())
 
     def looks(self, side: int) -> float:
@@ -119,7 +120,7 @@ class Speckle:
         Parameters
         ----------
         side
-            Of the square, pixels.
+            Side of the square, pixels.
         """
         most = len(self.correlation) // 2
         share = np.maximum(side - np.abs(np.arange(-most, most + 1)), 0) / side**2
@@ -127,26 +128,26 @@ class Speckle:
 
 
 def _flattened(block: NDArray[Any], parts: int) -> NDArray[Any]:
-    """Return a block without the quadratic phase that fits how fast its phase turns in parts × parts of it."""
+    """Return a block without its quadratic phase, fitted to the phase gradients in parts × parts of the block."""
     places = [np.arange(size) - (size - 1) / 2 for size in block.shape]
     rows, columns = np.meshgrid(*places, indexing="ij")
-    equations, turns, weights = list[list[float]](), list[float](), list[float]()
+    equations, gradients, weights = list[list[float]](), list[float](), list[float]()
     for row in np.array_split(np.arange(block.shape[0]), parts):
         for column in np.array_split(np.arange(block.shape[1]), parts):
             part = block[row[0] : row[-1] + 1, column[0] : column[-1] + 1]
-            r, c = (float(at[some].mean()) for at, some in zip(places, (row, column), strict=True))
+            r, c = (float(at[indices].mean()) for at, indices in zip(places, (row, column), strict=True))
             steps = (part[1:] * part[:-1].conj()).sum(), (part[:, 1:] * part[:, :-1].conj()).sum()
             equations += [[1.0, 0.0, r, 0.0, c], [0.0, 1.0, 0.0, c, r]]
-            turns += [float(np.angle(one)) for one in steps]
-            weights += [float(np.sqrt(np.abs(one))) for one in steps]
-    sized = np.array(weights)
-    down, across, d, e, f = np.linalg.lstsq(np.array(equations) * sized[:, None], np.array(turns) * sized)[0]
+            gradients += [float(np.angle(step)) for step in steps]
+            weights += [float(np.sqrt(np.abs(step))) for step in steps]
+    weight = np.array(weights)
+    down, across, d, e, f = np.linalg.lstsq(np.array(equations) * weight[:, None], np.array(gradients) * weight)[0]
     phase = (down + d * rows / 2 + f * columns) * rows + (across + e * columns / 2) * columns
     return np.asarray(block * np.exp(-1j * phase))
 
 
 def _squared_correlation(block: NDArray[np.complex64]) -> Floats:
-    """Return |ρ|² of a block, each lag over the pairs that it has."""
+    """Return |ρ|² of a block, averaged at each lag over its pixel pairs."""
     lags = min(LAGS_PX, min(block.shape) // 2 - 1)
     rows, columns = (slice(size - lags, size + lags + 1) for size in block.shape)
     known = np.isfinite(block)
@@ -161,10 +162,12 @@ def _squared_correlation(block: NDArray[np.complex64]) -> Floats:
 
 
 def _local(power: Floats, within: float) -> tuple[Floats, Floats]:
-    """Return the mean of the window about each cell, and variance over squared mean (eq. 4); NaN is left out."""
+    """Return the mean over the window about each pixel, and variance over squared mean (eq. 4); NaN is excluded."""
     from scipy.ndimage import correlate1d
 
-    def summed(values: Floats) -> Floats:  # no running sum: a bright point would leave its rounding in all that follow
+    def summed(
+        values: Floats,
+    ) -> Floats:  # not a running sum, which would propagate the rounding error of bright points
         for axis in (0, 1):
             values = correlate1d(values, np.ones(WINDOW), axis=axis, mode="constant")
         return values
@@ -178,19 +181,19 @@ def _local(power: Floats, within: float) -> tuple[Floats, Floats]:
 
 
 def found_looks(rasters: Iterable[Floats], within: float) -> float:
-    """Return the equivalent number of looks that homogeneous ground has: the commonest of local ones.
+    """Estimate the equivalent number of looks of homogeneous terrain, the mode of local estimates.
 
     Parameters
     ----------
     rasters
-        (row, column) float64, mean power of cells, of several places.
+        (row, column) float64, multilooked power in blocks of the image.
     within
         Looks of the mean over a whole window, `Speckle.looks`.
 
     Returns
     -------
     float
-        NaN where no place holds a whole window.
+        NaN if no block is as large as a window.
 
     Notes
     -----
@@ -203,30 +206,30 @@ def found_looks(rasters: Iterable[Floats], within: float) -> float:
     True
     """
     inner, values = slice(WINDOW // 2, -(WINDOW // 2), 2), np.array([])
-    for one in rasters:
-        if min(one.shape) >= WINDOW:
-            mean, spread = _local(one, within)
+    for raster in rasters:
+        if min(raster.shape) >= WINDOW:
+            mean, spread = _local(raster, within)
             values = np.append(values, -np.log(spread[inner, inner][mean[inner, inner] > 0]))
     if not values.size:
         return float("nan")
-    places = np.arange(values.min(), values.max() + _STEP, _STEP)
-    counts, _ = np.histogram(values, np.append(places - _STEP / 2, places[-1] + _STEP / 2))
+    bins = np.arange(values.min(), values.max() + _STEP, _STEP)
+    counts, _ = np.histogram(values, np.append(bins - _STEP / 2, bins[-1] + _STEP / 2))
     reach = np.arange(-3 * _SCATTER, 3 * _SCATTER + _STEP / 2, _STEP)
-    smooth = np.convolve(counts, np.exp(-0.5 * (reach / _SCATTER) ** 2))[len(reach) // 2 :][: len(places)]
-    return float(np.exp(places[smooth.argmax()]))
+    smooth = np.convolve(counts, np.exp(-0.5 * (reach / _SCATTER) ** 2))[len(reach) // 2 :][: len(bins)]
+    return float(np.exp(bins[smooth.argmax()]))
 
 
 def lee(power: Floats, *, looks: float, within: float) -> Floats:
-    """Return mean power with less speckle: the linear estimate of least square error, by local mean and variance.
+    """Filter speckle by Lee's linear minimum-mean-square-error estimate from local mean and variance.
 
     Parameters
     ----------
     power
-        (row, column) float64, mean power of cells, with its noise; NaN is left out and stays.
+        (row, column) float64, multilooked power, noise included; NaN is excluded and preserved.
     looks
-        Equivalent number of looks of a cell.
+        Equivalent number of looks of a pixel.
     within
-        That of the mean over a whole window, `Speckle.looks`.
+        Equivalent number of looks of the mean over a whole window, `Speckle.looks`.
 
     Returns
     -------
@@ -253,23 +256,23 @@ def lee(power: Floats, *, looks: float, within: float) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Multilook:
-    """Mean power of squares of an image's pixels, window by window.
+    """Mean power of square pixel blocks of an image, window by window.
 
     Attributes
     ----------
     image
-        Window of pixels → (row, column) complex64, NaN where nothing is known.
+        Window of pixels → (row, column) complex64, NaN where invalid.
     pixels
-        Rows and columns of them.
+        Rows and columns of pixels of the image.
     side
-        Of a square, pixels.
+        Side of a square, pixels.
     noise
-        Window of pixels → (row, column) float64, mean power of the noise in them, which is taken off; None: none is.
+        Window of pixels → (row, column) float64, mean noise power, which is subtracted; None: not subtracted.
     filtered
-        Whether speckle is filtered, before noise is taken off; false where looks are not known.
+        True if speckle is filtered, before noise is subtracted; False if the number of looks is unknown.
     looks, within, found
-        Equivalent number of looks of a square, of the filter's window, both by the correlation of speckle, and of a
-        square of homogeneous ground as found. NaN: too little of the image is known.
+        Equivalent number of looks of a square and of the filter's window, both from the speckle correlation, and of a
+        square of homogeneous terrain as measured. NaN if the image has too few valid pixels.
     """
 
     image: Callable[[Window], NDArray[np.complex64]]
@@ -291,43 +294,43 @@ class Multilook:
         noise: Callable[[Window], Floats] | None = None,
         filtered: bool = False,
     ) -> "Multilook":
-        """Return the mean power of an image, with its looks measured in blocks at random places.
+        """Create the multilooked power of an image, with its number of looks measured in randomly placed blocks.
 
         Parameters
         ----------
         image, pixels, side, noise, filtered
-            As of `Multilook`.
+            As for `Multilook`.
 
         Examples
         --------
         >>> white = np.random.default_rng(0).standard_normal((512, 512, 2)) @ [1, 1j]
-        >>> some = Multilook.of(lambda window: white[window], white.shape, 4)
-        >>> some.shape, round(some.looks), some.mean((slice(0, 2), slice(5, 8))).shape
+        >>> multilook = Multilook.of(lambda window: white[window], white.shape, 4)
+        >>> multilook.shape, round(multilook.looks), multilook.mean((slice(0, 2), slice(5, 8))).shape
         ((128, 128), 16, (2, 3))
         """
-        wanted = min(max(_MEASURED_PX, _MEASURED_WINDOWS * WINDOW * side), _LARGEST_PX)
-        rows, columns = (min(wanted, size) // side * side or min(wanted, size) for size in pixels)
+        size_px = min(max(_MEASURED_PX, _MEASURED_WINDOWS * WINDOW * side), _LARGEST_PX)
+        rows, columns = (min(size_px, size) // side * side or min(size_px, size) for size in pixels)
         count = max(1, min(_MEASURED_BLOCKS, min(_MOST_PX, 2 * pixels[0] * pixels[1]) // (rows * columns)))
         corners = np.random.default_rng(0).uniform(size=(count, 2)) * (pixels[0] - rows, pixels[1] - columns)
         starts = sorted({(int(row) // side * side, int(column) // side * side) for row, column in corners})
         blocks = [image((slice(row, row + rows), slice(column, column + columns))) for row, column in starts]
         looks = within = found = float("nan")
         try:
-            speckle = Speckle.of(one[:_MEASURED_PX, :_MEASURED_PX] for one in blocks)
+            speckle = Speckle.of(block[:_MEASURED_PX, :_MEASURED_PX] for block in blocks)
         except ValueError:
             return cls(image, pixels, side, noise, False, looks, within, found)
         looks, within = speckle.looks(side), speckle.looks(WINDOW * side)
-        found = found_looks([block_means(np.abs(one) ** 2, side) for one in blocks], within)
+        found = found_looks([block_means(np.abs(block) ** 2, side) for block in blocks], within)
         return cls(image, pixels, side, noise, filtered, looks, within, found)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of squares; those at the edge may hang over it."""
+        """Rows and columns of squares; the last of each may extend beyond the image."""
         rows, columns = (-(-size // self.side) for size in self.pixels)
         return rows, columns
 
     def mean(self, window: Window) -> Floats:
-        """Return the mean power of a window of squares, (row, column) float64; NaN where less than half is known."""
+        """Return the mean power in a window of squares, (row, column) float64; NaN where fewer than half are valid."""
         margin = WINDOW // 2 if self.filtered else 0
         rows, columns = (
             slice(max(0, part.start - margin), min(size, part.stop + margin))
@@ -342,11 +345,11 @@ class Multilook:
         return np.asarray((power - noise)[inner])
 
     def mean_noise(self, window: Window) -> Floats:
-        """Return the mean power of the noise of a window of squares, (row, column) float64; NaN as of `mean`."""
+        """Return the mean noise power in a window of squares, (row, column) float64; NaN as for `mean`."""
         return np.asarray(self._parts(window)[1])
 
     def _parts(self, window: Window) -> Floats:
-        """Return power and noise of a window of squares, read in parts no larger than a tile, or a square."""
+        """Return power and noise in a window of squares, read in parts no larger than a tile or a square."""
         step, (rows, columns) = max(1, BLOCK_PX // self.side), window
         values = np.zeros((2, rows.stop - rows.start, columns.stop - columns.start))
         for row in range(rows.start, rows.stop, step):
@@ -356,12 +359,12 @@ class Multilook:
                     slice(at.start * self.side, min(at.stop * self.side, size))
                     for at, size in zip(part, self.pixels, strict=True)
                 )
-                here = tuple(
+                target = tuple(
                     slice(at.start - by.start, at.stop - by.start) for at, by in zip(part, window, strict=True)
                 )
                 pixels = self.image((read[0], read[1]))
-                values[0][here] = block_means(np.abs(pixels).astype(np.float64) ** 2, self.side)
+                values[0][target] = block_means(np.abs(pixels).astype(np.float64) ** 2, self.side)
                 if self.noise is not None:
                     noise = np.where(np.isfinite(pixels), self.noise((read[0], read[1])), np.nan)
-                    values[1][here] = block_means(noise, self.side)
+                    values[1][target] = block_means(noise, self.side)
         return values

@@ -1,4 +1,4 @@
-"""Noise of a pulse: measured at Doppler frequencies that no echo of the scene has, and what a sidelink adds to it."""
+"""Noise power of a pulse, measured at Doppler frequencies outside the scene's, and the share added by a sidelink."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -18,32 +18,32 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain
 
 _PLACES, _BLOCKS = 64, 8
-"""Random places, and blocks of 64 pulses at most, that the noise is measured at."""
+"""Number of random points, and largest number of 64-pulse blocks, at which the noise is measured."""
 
 _MARGIN, _BAND = 2.0, (0.25, 0.4375)
-"""Doppler frequencies left to echoes: twice those of the scene, for what lies beside it, and limits, cycles a pulse."""
+"""Excluded Doppler band: twice the scene's, to cover echoes from its surroundings; limits in cycles per pulse."""
 
 _LEAKED_DB = 0.6
-"""dB by which echoes beside the scene raise the noise measured where pulses are too sparse for that margin: images of
-five flights of 40 pulses a second with 18 Hz of Doppler, +0.1 to +0.6 dB against their own noise."""
+"""Excess (dB) of the measured noise from echoes outside the scene where the PRF is too low for that margin: +0.1 to
++0.6 dB in images of five flights at a PRF of 40 Hz with 18 Hz of Doppler."""
 
 _LEAK = 1e-5
-"""Share of a taper's energy within that band, at most."""
+"""Largest share of a taper's energy within the excluded band."""
 
-_GROUPS, _ALIKE = 16, 8  # of pulses on which the noise of a sidelink is drawn: those of a group see a place alike
-_BLOCKS_DRAWN = 16  # of each
-_FEWEST = 16  # pulses of a block at least
-_LEAST_WEIGHT = 0.1  # of the largest weight of a block at a place: places with less are left out
+_GROUPS, _ALIKE = 16, 8  # groups on which sidelink noise is drawn, and pulses per group, which share their geometry
+_BLOCKS_DRAWN = 16  # random draws per group
+_FEWEST = 16  # least number of pulses in a block
+_LEAST_WEIGHT = 0.1  # relative to the largest weight of a block at a point; points with less are excluded
 
 
 def noise_places(grid: SceneGrid, terrain: Terrain) -> NDArray[np.float64]:
-    """Return the places at which the noise of a scene is measured, (place, 3) float64, metres: random ones."""
+    """Draw the points at which the noise of a scene is measured, (point, 3) float64, metres."""
     rows, columns = np.random.default_rng(0).integers(0, grid.shape, (_PLACES, 2)).T
     return terrain.positions_at(grid, rows, columns)
 
 
 class PulseNoise(NamedTuple):
-    """σ², the noise of one pulse at a place, in units of the profiles, and its standard deviation, dB; NaN: unknown."""
+    """Noise power σ² of a pulse at a point, in units of the profiles, and its standard deviation, dB; NaN: unknown."""
 
     power: float
     std_db: float
@@ -56,31 +56,31 @@ def noise_power(
     time_s: NDArray[np.float64] | None = None,
     beams: Beams | None = None,
 ) -> PulseNoise:
-    """Return the noise of one pulse at a place, measured where no echo of the scene is: at other Doppler frequencies.
+    """Measure the noise power of one pulse at a point, at Doppler frequencies without echoes of the scene.
 
     Parameters
     ----------
     profiles
-        Of every pulse; some are read.
+        Profiles of all pulses; a sample is read.
     places_m
-        (place, 3) float64, metres: spread over the scene.
+        (point, 3) float64, metres: distributed over the scene.
     time_s
-        (pulse,) float64, seconds, by which pulses that are missing are counted; by default none is.
+        (pulse,) float64, seconds, from which missing pulses are detected (default: no pulse is missing).
     beams
         Weights of the pulses.
 
     Returns
     -------
     PulseNoise
-        NaN where no block illuminates a place. An upper bound where pulses are so sparse that echoes of every other
-        pulse alias; where twice the scene's Doppler fills the band, the deviation holds what echoes beside it may add.
+        NaN if no block illuminates a point. An upper bound if the PRF is so low that echoes of every other pulse alias.
+        If twice the scene's Doppler fills the band, the standard deviation includes echoes from outside the scene.
 
     Notes
     -----
     Source: docs/theory/layers.md, eq. 3.
     """
-    starts, places = np.arange(0, len(profiles), PULSES), np.zeros(len(places_m))
-    illuminated = illumination_mask(beams, profiles.aperture, places_m, places, pulses=PULSES)
+    starts, radius_m = np.arange(0, len(profiles), PULSES), np.zeros(len(places_m))
+    illuminated = illumination_mask(beams, profiles.aperture, places_m, radius_m, pulses=PULSES)
     illuminating = starts[illuminated.any(axis=1) & (np.minimum(starts + PULSES, len(profiles)) - starts >= _FEWEST)]
     if not illuminating.size:
         return PulseNoise(float("nan"), float("nan"))
@@ -94,23 +94,23 @@ def noise_power(
         tapers = _tapers(tuple(number.tolist()), round(float(np.clip(_MARGIN * spread, *_BAND)), 2))
         sparse |= _MARGIN * spread > _BAND[1]
         terms, _ = Echoes.read(profiles, [block]).at(places_m)
-        seen = np.ones(terms.shape) if beams is None else beams[block].weight(aperture, places_m)
-        power.extend(np.abs(tapers @ (seen * terms)) ** 2)
-        weight.extend(tapers**2 @ seen**2)
+        beam_weight = np.ones(terms.shape) if beams is None else beams[block].weight(aperture, places_m)
+        power.extend(np.abs(tapers @ (beam_weight * terms)) ** 2)
+        weight.extend(tapers**2 @ beam_weight**2)
     powers, weights = np.array(power), np.array(weight)
     enough = weights > _LEAST_WEIGHT * weights.max()
     if not enough.any():
         return PulseNoise(float("nan"), float("nan"))
     each = np.where(enough, powers / np.where(enough, weights, 1.0), np.nan)
-    # tapers are orthogonal and blocks apart, so their noise is independent; that of places in one cell is not
-    levels = np.array([np.nanmedian(one) for one in each if np.isfinite(one).any()])
-    apart = float(levels.std(ddof=1) / levels.mean() / np.sqrt(len(levels))) if len(levels) > 1 else 1.0
-    std_db = float(np.hypot(10 / np.log(10) * apart, _LEAKED_DB if sparse else 0.0))
+    # Orthogonal tapers and disjoint blocks have independent noise; points within one resolution cell do not.
+    levels = np.array([np.nanmedian(values) for values in each if np.isfinite(values).any()])
+    relative_std = float(levels.std(ddof=1) / levels.mean() / np.sqrt(len(levels))) if len(levels) > 1 else 1.0
+    std_db = float(np.hypot(10 / np.log(10) * relative_std, _LEAKED_DB if sparse else 0.0))
     return PulseNoise(float(np.nanmedian(each) / np.log(2)), std_db)
 
 
 def _numbers(block: slice, time_s: NDArray[np.float64] | None) -> NDArray[np.float64]:
-    """Return which pulse each of a block was, counted from its first, missing ones too."""
+    """Return the pulse numbers of a block relative to its first pulse, counting missing pulses."""
     if time_s is None:
         return np.arange(float(block.stop - block.start))
     step_s = np.diff(time_s[block])
@@ -119,9 +119,9 @@ def _numbers(block: slice, time_s: NDArray[np.float64] | None) -> NDArray[np.flo
 
 @lru_cache(maxsize=8)
 def _tapers(number: tuple[float, ...], band: float) -> NDArray[np.float64]:
-    """Return tapers over pulses, (taper, pulse) float64 of norm 1, that see next to nothing of |f| < band per pulse.
+    """Return tapers over pulses, (taper, pulse) float64 of norm 1, that suppress |f| < band (cycles per pulse).
 
-    At least one, the best.
+    At least one taper, that with the least leakage.
     """
     leak, taper = np.linalg.eigh(2 * band * np.sinc(2 * band * np.subtract.outer(number, number)))
     return np.asarray(taper[:, leak <= max(_LEAK, float(leak[0]))].T)
@@ -137,48 +137,50 @@ def sidelink_noise(
     method: str,
     snr_db: float,
 ) -> float:
-    """Return the power that the noise of a sidelink has in a range profile: that of its correction, on the echoes.
+    """Estimate the noise power in a range profile that the correction by a sidelink adds to the echoes.
 
     Parameters
     ----------
     history
-        Transfer functions as they were corrected, with noise and all; some are read.
+        Corrected transfer functions, noise included; a sample is read.
     grid, terrain
         The scene.
     places_m, beams
-        As of `noise_power`, which measures it together with all other noise.
+        As for `noise_power`, which measures this noise together with all other noise.
     method
-        A key of `apertura.core.echo.sidelink.METHODS`, by which they were corrected.
+        Correction method, a key of `apertura.core.echo.sidelink.METHODS`.
     snr_db
-        Of the sidelink, per subcarrier.
+        SNR of the sidelink, per subcarrier.
 
     Notes
     -----
-    Source: docs/theory/radiometry.md, eq. 8a. Noise is drawn and goes through the correction itself, so that what each
-    method keeps, and where, is its own.
+    Source: docs/theory/radiometry.md, eq. 8a. Simulated noise passes through the correction itself, so that the share
+    and the range distribution that each method retains are included.
     """
     starts = np.unique(np.linspace(0, max(0, len(history) - _ALIKE), _GROUPS).astype(int)).tolist()
     groups, generator = [slice(first, min(first + _ALIKE, len(history))) for first in starts], np.random.default_rng(0)
-    pulses = np.concatenate([np.arange(one.start, one.stop) for one in groups])
-    some = replace(
+    pulses = np.concatenate([np.arange(group.start, group.stop) for group in groups])
+    sampled = replace(
         history,
-        transfer=np.concatenate([history.transfer[one] for one in groups]),
+        transfer=np.concatenate([history.transfer[group] for group in groups]),
         reference_delay_s=history.reference_delay_s[pulses],
         aperture=history.aperture[pulses],
     )
-    draws = generator.standard_normal((*some.transfer.shape, 2)) @ np.array([1, 1j])
+    draws = generator.standard_normal((*sampled.transfer.shape, 2)) @ np.array([1, 1j])
     noisy = 1 + draws * 10 ** (-snr_db / 20) / np.sqrt(2)
-    left = METHODS[method](np.ones(noisy.shape, np.complex64), noisy.astype(np.complex64))
-    left -= left.mean()
-    # The echoes hold such noise already, which is not to be counted twice.
-    left /= np.sqrt(1 + np.mean(np.abs(left) ** 2))
-    profiles = range_compress(replace(some, transfer=some.transfer * left), grid, terrain)
-    at = np.rint((some.aperture.path(places_m) - profiles.start_m[:, None]) / profiles.step_m).astype(np.int64)
+    residual = METHODS[method](np.ones(noisy.shape, np.complex64), noisy.astype(np.complex64))
+    residual -= residual.mean()
+    # The echoes already contain such noise, which must not be counted twice.
+    residual /= np.sqrt(1 + np.mean(np.abs(residual) ** 2))
+    profiles = range_compress(replace(sampled, transfer=sampled.transfer * residual), grid, terrain)
+    at = np.rint((sampled.aperture.path(places_m) - profiles.start_m[:, None]) / profiles.step_m).astype(np.int64)
     power = np.abs(np.take_along_axis(profiles.samples, np.clip(at, 0, profiles.samples.shape[1] - 1), axis=1)) ** 2
-    weight = np.ones(power.shape) if beams is None else beams[pulses].weight(some.aperture, places_m) ** 2
-    local, seen = (np.array([part.mean(axis=0) for part in np.array_split(of, len(groups))]) for of in (power, weight))
-    if not seen.any():
+    weight = np.ones(power.shape) if beams is None else beams[pulses].weight(sampled.aperture, places_m) ** 2
+    local, weights = (
+        np.array([part.mean(axis=0) for part in np.array_split(values, len(groups))]) for values in (power, weight)
+    )
+    if not weights.any():
         return 0.0
-    local = local[seen > _LEAST_WEIGHT * seen.max()]
-    # Summed over a block of pulses it is exponential about this mean; of all, the median is what is measured.
+    local = local[weights > _LEAST_WEIGHT * weights.max()]
+    # Summed over a pulse block the power is exponentially distributed with this mean; `noise_power` uses the median.
     return float(np.median(local * generator.exponential(size=(_BLOCKS_DRAWN, *local.shape))) / np.log(2))

@@ -1,4 +1,4 @@
-"""Choices of how an image is formed, from Python or in section `processing` of a campaign."""
+"""Options of image formation, from Python or in section `processing` of a campaign's configuration."""
 
 from typing import Annotated, Any, Literal, Self
 
@@ -16,7 +16,7 @@ class IntegrationAngle(BaseModel):
 
 
 class IntegrationResolution(BaseModel):
-    """Integration by the resolution along the flight."""
+    """Integration given by the resolution along the flight."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -24,7 +24,7 @@ class IntegrationResolution(BaseModel):
 
 
 PLANNED = ("engine", "engine_options", "presum", "pulse_blocks", "terrain")
-"""Choices that the planner makes where they are 'auto'."""
+"""Options decided by the planner where they are 'auto'."""
 
 
 def _options_of_each_engine(schema: dict[str, Any]) -> None:
@@ -33,7 +33,7 @@ def _options_of_each_engine(schema: dict[str, Any]) -> None:
 
 
 class ImagingChoices(BaseModel):
-    """How to form an image; every choice has a default.
+    """Options of image formation; each has a default.
 
     Examples
     --------
@@ -46,7 +46,8 @@ class ImagingChoices(BaseModel):
     window: Literal["hann", "none"] = Field("hann", description="weighting over the subcarriers")
     accuracy_db: Annotated[float, Field(le=-10, ge=-120)] | Literal["auto"] = Field(
         "auto",
-        description="numerical error asked of the image, dB; auto: 10 dB below what else spoils it, from -40 to -60",
+        description="requested numerical error of the image, dB; auto: 10 dB below the largest other error, between "
+        "-40 and -60",
     )
     engine: str = Field(
         "auto",
@@ -55,29 +56,31 @@ class ImagingChoices(BaseModel):
     )
     engine_options: dict[str, dict[str, Any]] = Field(
         default_factory=dict,
-        description="options of engines that the planner shall not choose: engine → option → value",
+        description="engine options that override the planner: engine → option → value",
         examples=[{}],
         json_schema_extra=_options_of_each_engine,
     )
     tile_px: int = Field(256, ge=PATCH_PX, multiple_of=PATCH_PX, description="side of a tile, pixels")
     presum: Annotated[int, Field(ge=1, le=64)] | Literal["auto"] = Field(
-        "auto", description="pulses that a low-pass sum makes one, where the aperture is oversampled; 1 keeps all"
+        "auto", description="presumming factor, for oversampled apertures; 1: no presumming"
     )
     pulse_blocks: Annotated[int, Field(ge=1, le=1024)] | Literal["auto"] = Field(
-        "auto", description="blocks of pulses whose tables are in memory at once, one after the other; 1 takes them all"
+        "auto",
+        description="number of pulse blocks that are processed one after the other, to limit memory; 1: all pulses "
+        "at once",
     )
     integration: Literal["auto", "all"] | IntegrationAngle | IntegrationResolution = Field(
         "auto",
-        description="how much of a pass a pixel is integrated over: auto, what the pixels' spacing carries; all; "
-        "{degrees: x} of a straight pass; {resolution_m: x} along the flight",
+        description="integration angle of a pixel: auto (as much as the pixel spacing can represent), all, "
+        "{degrees: x} of a straight pass, or {resolution_m: x} along the track",
     )
     terrain: Literal["auto", "plane", "tilted_plane", "dem"] = Field(
-        "auto", description="what stands for the ground; auto takes the simplest that keeps focus and place"
+        "auto", description="terrain model; auto: the simplest that preserves focus and position"
     )
 
     @property
     def planned(self) -> dict[str, Any]:
-        """Overrides of the planner: choice → value."""
+        """Overrides of the planner: option → value."""
         return {name: getattr(self, name) for name in PLANNED}
 
     @property
@@ -89,14 +92,14 @@ class ImagingChoices(BaseModel):
     @classmethod
     def _engine_is_known(cls, name: str) -> str:
         if name not in {"auto", *ENGINES}:
-            raise ValueError(f"no such engine; choose auto, {', '.join(ENGINES)}")
+            raise ValueError(f"unknown engine; choose auto, {', '.join(ENGINES)}")
         return name
 
     @model_validator(mode="after")
     def _options_are_those_of_engines(self) -> Self:
         for name, options in self.engine_options.items():
             if name not in ENGINES:
-                raise ValueError(f"engine_options.{name}: no such engine; choose {', '.join(ENGINES)}")
+                raise ValueError(f"engine_options.{name}: unknown engine; choose {', '.join(ENGINES)}")
             try:
                 load_engine(name).Options.model_validate(options)
             except ValidationError as error:

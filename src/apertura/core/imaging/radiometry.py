@@ -1,4 +1,4 @@
-"""Radiometry of an image: from the power of a pixel to the radar cross-section of a point, and to σ⁰ of ground."""
+"""Radiometry of an image: conversion of pixel power to the radar cross-section of a point and to σ⁰ of terrain."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -19,28 +19,28 @@ from apertura.core.scene.terrain import FlatGround, Terrain
 
 Quantity = Literal["sigma0", "beta0", "gamma0"]
 
-# ---- The radio link of a pair: radar cross-section to numbers recorded
+# ---- Radio link of a pair: from radar cross-section to recorded samples
 
 MOST_DBM = 90.0
-"""A megawatt: more is a slip of units."""
+"""Largest accepted transmit power, dBm: above a megawatt the unit is taken to be wrong."""
 
 
 @dataclass(frozen=True)
 class Link:
-    """What lies between the radar cross-section of a target and the numbers that a receiver records of it.
+    """Link budget of a pair: from the radar cross-section of a target to the recorded samples.
 
     Attributes
     ----------
     transmit_power_dbm
-        Mean power of the signal while it is sent, at the port of the transmitting antenna.
+        Mean power of the signal during transmission, at the port of the transmitting antenna.
     transmit_gain_dbi, receive_gain_dbi
         Peak gains of the antennas; patterns are relative to them.
     receiver_gain_db
-        From the port of the receiving antenna to the converter.
+        Gain from the port of the receiving antenna to the ADC.
     full_scale_dbm
-        Power at the converter of a complex sine whose |I + jQ| is `full_scale_counts`.
+        Power at the ADC of a complex sine whose |I + jQ| is `full_scale_counts`.
     full_scale_counts
-        In the numbers recorded.
+        Full-scale amplitude in recorded samples.
 
     Examples
     --------
@@ -57,18 +57,16 @@ class Link:
     full_scale_counts: float
 
     def __post_init__(self) -> None:
-        wrong = [one.name for one in fields(self) if not is_number(getattr(self, one.name))]
+        wrong = [field.name for field in fields(self) if not is_number(getattr(self, field.name))]
         wrong += ["full_scale_counts"] * (not wrong and self.full_scale_counts <= 0)
         wrong += ["transmit_power_dbm"] * (not wrong and self.transmit_power_dbm > MOST_DBM)
         if wrong:
-            expected = f"numbers in dB, counts above 0, and no more than {MOST_DBM:g} dBm sent"
-            raise CampaignError(
-                quoted(getattr(self, wrong[0])), f"Link: {wrong[0]}", expected, "Correct what is named."
-            )
+            expected = f"numbers in dB, counts above 0, and a transmit power of at most {MOST_DBM:g} dBm"
+            raise CampaignError(quoted(getattr(self, wrong[0])), f"Link: {wrong[0]}", expected, f"Correct {wrong[0]}.")
 
     @property
     def counts_w(self) -> float:
-        """|y|² of the numbers recorded per watt at the receiving antenna's port."""
+        """|y|² of recorded samples per watt at the receiving antenna's port."""
         return self.full_scale_counts**2 * 10 ** ((self.receiver_gain_db - self.full_scale_dbm + 30) / 10)
 
     def constant(self, *, wavelength_m: float, sent_power: float) -> float:
@@ -77,20 +75,18 @@ class Link:
         Parameters
         ----------
         wavelength_m
-            At the middle of the band.
+            Wavelength at band centre.
         sent_power
-            Mean |s|² of the transmitted signal in the units that echoes are divided by: Σ|c_n|² of an OFDM symbol.
+            Mean |s|² of the transmitted signal in the units by which echoes are divided: Σ|c_n|² of an OFDM symbol.
 
         Raises
         ------
         CampaignError
-            If one of them is no number above 0.
+            If one of them is not a number above 0.
         """
         for name, value in (("wavelength_m", wavelength_m), ("sent_power", sent_power)):
             if not (is_number(value) and value > 0):
-                raise CampaignError(
-                    quoted(value), f"Link.constant: {name}", "a number above 0", "Correct what is named."
-                )
+                raise CampaignError(quoted(value), f"Link.constant: {name}", "a number above 0", f"Correct {name}.")
         sent_dbw = self.transmit_power_dbm - 30 + self.transmit_gain_dbi + self.receive_gain_dbi
         return 10 ** (sent_dbw / 10) * wavelength_m**2 / (4 * np.pi) ** 3 * self.counts_w / sent_power
 
@@ -100,25 +96,25 @@ class Link:
         Parameters
         ----------
         noise_figure_db
-            Of the receiver, at the antenna's port.
+            Noise figure of the receiver, referred to the antenna's port.
         spacing_hz
             Δf, bandwidth of a bin.
         squares
-            Σw_n²/|c_n|²: window over the subcarriers, and codes by which echoes are divided.
+            Σw_n²/|c_n|², with the window w_n over the subcarriers and the codes c_n by which echoes are divided.
         """
         noise_w = BOLTZMANN_J_K * REFERENCE_K * 10 ** (noise_figure_db / 10) * spacing_hz
         return noise_w * self.counts_w * squares
 
 
 def cell_constant(frequency_hz: Floats, weight: Floats) -> float:
-    """Return c²/Δf · Σ w_n²/f_n, m²: what the band contributes to the area of a resolution cell (eq. 5).
+    """Return c²/Δf · Σ w_n²/f_n, m²: contribution of the band to the area of a resolution cell (eq. 5).
 
     λ·c/B of a flat band without window.
 
     Parameters
     ----------
     frequency_hz, weight
-        (subcarrier,) float64, in equal steps; weights that sum to 1.
+        (subcarrier,) float64: frequencies in equal steps, and weights that sum to 1.
 
     Examples
     --------
@@ -131,83 +127,83 @@ def cell_constant(frequency_hz: Floats, weight: Floats) -> float:
 
 
 Turn = tuple[Floats, tuple[bool, bool]]
-"""One error of attitude: rotation vector (3,), rad, and whether it turns the transmitting and the receiving antenna."""
+"""Attitude error: rotation vector (3,), rad, and flags: rotates the transmitting, rotates the receiving antenna."""
 
 
 def pointing_std_db(beams: Beams | None, aperture: Aperture, place_m: Floats, turns: Sequence[Turn]) -> float:
-    """Return what errors of attitude do to the power of a point, by beams that look elsewhere than they are taken to.
+    """Return the standard deviation of a point's power caused by mispointed beams, from attitude errors.
 
     Parameters
     ----------
     beams, aperture
-        Weights as they formed the image, and every pulse.
+        Weights used in image formation, and all pulses.
     place_m
-        (3,) float64, metres, in the frame of the aperture.
+        (3,) float64, point of the scene, metres, in the frame of the aperture.
     turns
-        Independent errors, each of one standard deviation.
+        Independent attitude errors of one standard deviation each.
 
     Returns
     -------
     float
-        Standard deviation, dB; 0 without antennas that have a beam, or where none sees the place.
+        Standard deviation, dB; 0 if no antenna has a beam, or no beam illuminates the point.
 
     Notes
     -----
     Source: docs/theory/radiometry.md, eq. 19.
     """
-    some = aperture.sample(_PULSES)
-    antennas, place = beams and beams[some].antennas, place_m[None]
+    sampled = aperture.sample(_PULSES)
+    antennas, point = beams and beams[sampled].antennas, place_m[None]
     if beams is None or antennas is None:
         return 0.0
-    aperture = aperture[some]
+    aperture = aperture[sampled]
     spread_m2 = np.prod([np.linalg.norm(place_m - leg, axis=-1) for leg in aperture.legs], axis=0)
-    weight = beams[some].weight(aperture, place)[:, 0] / spread_m2
+    weight = beams[sampled].weight(aperture, point)[:, 0] / spread_m2
 
     def amplitude(vector: Floats, turned: tuple[bool, bool]) -> float:
         both = zip((antennas.transmit, antennas.receive), turned, strict=True)
         transmit, receive = (beam.turned(vector) if beam and on else beam for beam, on in both)
-        moved = Beams(transmit, receive)
-        return float((weight * moved.weight(aperture, place)[:, 0]).sum())
+        mispointed = Beams(transmit, receive)
+        return float((weight * mispointed.weight(aperture, point)[:, 0]).sum())
 
-    right = amplitude(np.zeros(3), (False, False))
-    seen = np.array([[amplitude(sign * vector, turned) for sign in (1, -1)] for vector, turned in turns])
-    if not (right > 0 and seen.size):
+    nominal = amplitude(np.zeros(3), (False, False))
+    perturbed = np.array([[amplitude(sign * vector, turned) for sign in (1, -1)] for vector, turned in turns])
+    if not (nominal > 0 and perturbed.size):
         return 0.0
-    changes_db = 20 * np.log10(np.maximum(seen, _LEAST * right) / right)
+    changes_db = 20 * np.log10(np.maximum(perturbed, _LEAST * nominal) / nominal)
     return float(np.sqrt((changes_db**2).mean(axis=1).sum()))
 
 
 # ---- Calibration of an image, on a lattice
 
-_RANGE_SHARE = 24  # ranges to the scene: logarithms of gain and area between nodes then err by 0.1 dB in a beam of 20°
-_PULSES = 128  # summed for a block of the lattice, or up to twice as many
-_POINT_PULSES = 8192  # summed for a point, or up to twice as many
-_BINS = 32  # of the density of pulses over spatial frequency, whose square is integrated
-_LEAST = 1e-3  # of the strongest pulse: weaker ones do not decide how wide the aperture is
-_STEEPEST = 0.1  # n·n_s below which no σ⁰ is told: there 1° of error of the slope is 0.7 dB, and zero is layover
+_RANGE_SHARE = 24  # node pitch is range / 24: interpolation error of log gain and area 0.1 dB in a beam of 20°
+_PULSES = 128  # at least this number of pulses, at most twice as many, are summed for a block of the lattice
+_POINT_PULSES = 8192  # the same for a single point
+_BINS = 32  # bins of the pulse density over spatial frequency, whose square is integrated
+_LEAST = 1e-3  # weight relative to the strongest pulse, below which a pulse does not extend the aperture
+_STEEPEST = 0.1  # n·n_s below which σ⁰ is NaN: 1° of slope error is 0.7 dB there, and 0 is the onset of layover
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What turns the power of an image's pixels into radar cross-section and backscattering coefficients.
+    """Radiometric calibration of an image: pixel power to radar cross-section and backscattering coefficients.
 
     Attributes
     ----------
     grid, terrain
         The scene.
     aperture, beams
-        Every pulse, and its weights as they formed the image: antennas and sector.
+        All pulses, and their weights in image formation: antennas and sector.
     count
         M, by which the image's sum was divided.
     constant
-        K of eq. 2, stated or measured.
+        K of eq. 2, configured or measured.
     cell_m2
-        Of `cell_constant`.
+        Value of `cell_constant`.
     lattice
-        Nodes at which the following are computed.
+        Nodes at which the following arrays are computed.
     gain, area_m2, noise
         (node row, node column) float64: ln A² (eq. 3), ln of the cell's area on level ground (eq. 5), and ln Σw²/M² of
-        the pixel's noise; -inf where no pulse sees the node.
+        the pixel's noise; -inf where no pulse illuminates the node.
     directions
         (node row, node column, 3, 3) float64, unit vectors: up, normal of the slant plane, towards the bisector of
         both antennas.
@@ -251,23 +247,24 @@ class Calibration:
         Parameters
         ----------
         grid, terrain, aperture, beams, constant, cell_m2, count
-            As of `Calibration`; positions in the grid's processing frame; `count` is every pulse by default.
+            As for `Calibration`; positions in the grid's processing frame; `count` defaults to the number of pulses.
         threads
-            Blocks of the lattice in work at once.
+            Number of lattice blocks computed concurrently.
 
         Examples
         --------
         >>> grid = SceneGrid("local", -4.0, 24.0, 0.5, (8, 16))
         >>> track = np.stack([np.linspace(-9, 9, 37), np.zeros(37), np.full(37, 10.0)], -1)
-        >>> one = Calibration.of(grid, FlatGround(0.0), Aperture(track, track), None, constant=2.0, cell_m2=0.25 * 3.0)
+        >>> calibration = Calibration.of(grid, FlatGround(0.0), Aperture(track, track), None, constant=2.0,
+        ...                              cell_m2=0.25 * 3.0)
         >>> window = (slice(4, 5), slice(8, 9))
-        >>> per_m2, level = one.rcs_power(window)[0, 0], one.cell(window)[0, 0]
+        >>> per_m2, level = calibration.rcs_power(window)[0, 0], calibration.cell(window)[0, 0]
         >>> bool(abs(per_m2 / (2 / 580**2) - 1) < 0.2), level.round(2)  # about 2/R⁴
         (True, np.float64(0.28))
         """
         lattice = Lattice.of(grid.shape, pitch_px(grid, terrain, aperture, share=_RANGE_SHARE))
         gain, area, noise = (np.full(lattice.shape, -np.inf) for _ in range(3))
-        found = cls(
+        calibration = cls(
             grid,
             terrain,
             aperture,
@@ -282,34 +279,34 @@ class Calibration:
             np.zeros((*lattice.shape, 3, 3)),
             np.ones(lattice.shape),
         )
-        fill(lattice, found._fill, grid, terrain, aperture, beams, threads=threads)
-        return found
+        fill(lattice, calibration._fill, grid, terrain, aperture, beams, threads=threads)
+        return calibration
 
     def _fill(self, block: Window, reaching: NDArray[np.bool_]) -> None:
         """Compute the nodes of a block of the lattice from the pulses that may illuminate it."""
         rows, columns = (at[part] for at, part in zip(self.lattice.nodes, block, strict=True))
-        row, column = (one.ravel() for one in np.meshgrid(rows, columns, indexing="ij"))
+        row, column = (axis.ravel() for axis in np.meshgrid(rows, columns, indexing="ij"))
         height_m = np.asarray(self.terrain.heights_at(self.grid, row, column), np.float64)
         points, above = (self.grid.positions_at(row, column, height_m + more) for more in (0.0, 1.0))
         up = (above - points) / np.linalg.norm(above - points, axis=-1, keepdims=True)
         reached = pulses_of(reaching, len(self.aperture))
         every = max(1, (reached.stop - reached.start) // _PULSES)
-        some, share = slice(reached.start, reached.stop, every), every / self.count
-        gradient = self.aperture[some].path_gradient(points)
-        share_of, weight = point_weights(self.aperture[some], self.beams and self.beams[some], points)
-        amplitude = share_of.sum(axis=0) * share
-        slant, towards = _directions(gradient, share_of, up)
-        level = _spread(gradient.swapaxes(0, 1), share_of.T, up)
+        sampled, share = slice(reached.start, reached.stop, every), every / self.count
+        gradient = self.aperture[sampled].path_gradient(points)
+        parts, weight = point_weights(self.aperture[sampled], self.beams and self.beams[sampled], points)
+        amplitude = parts.sum(axis=0) * share
+        slant, towards = _directions(gradient, parts, up)
+        level = _spread(gradient.swapaxes(0, 1), parts.T, up)
         shape = (len(rows), len(columns))
         with np.errstate(divide="ignore"):
             self.gain[block] = 2 * np.log(amplitude).reshape(shape)
             self.area_m2[block] = np.log(self.cell_m2 * level).reshape(shape)
             self.noise[block] = np.log((weight**2).sum(axis=0) * share / self.count).reshape(shape)
-        self.across[block] = _across(gradient, share_of, up).reshape(shape)
+        self.across[block] = _across(gradient, parts, up).reshape(shape)
         self.directions[block] = np.stack([up, slant, towards], axis=1).reshape(*shape, 3, 3)
 
     def at(self, points: Floats) -> tuple[Floats, Floats]:
-        """Return the power of 1 m² in the image, K·A², and of the noise in units of a pulse's, at points.
+        """Return the image power of a point of 1 m², K·A², and the noise power relative to that of a pulse, at points.
 
         Parameters
         ----------
@@ -319,20 +316,20 @@ class Calibration:
         Returns
         -------
         tuple of ndarray
-            (point,) float64 each; zero where no pulse sees the point.
+            (point,) float64 each; zero where no pulse illuminates the point.
         """
         _, parts, noise = point_parts(self.aperture, self.beams, points, count=self.count)
         return self.constant * parts.sum(axis=0) ** 2, noise
 
     def _between(self, logarithms: Floats, window: Window) -> Floats:
-        """Return values at the pixels of a window, between those nodes that have any; NaN where none has."""
+        """Return values at the pixels of a window, interpolated between finite nodes; NaN where no node is finite."""
         known = np.isfinite(logarithms)
         share = self.lattice.between(known.astype(np.float64), window)
         mean = self.lattice.between(np.where(known, logarithms, 0.0), window)
         return np.where(share > 0, np.exp(mean / np.where(share > 0, share, 1.0)), np.nan)
 
     def rcs_power(self, window: Window) -> Floats:
-        """Return the power |I|² of a point of 1 m² at each pixel of a window, K·A²; NaN where nothing sees it."""
+        """Return the power |I|² of a point of 1 m² at each pixel of a window, K·A²; NaN where not illuminated."""
         return self.constant * self._between(self.gain, window)
 
     def cell(self, window: Window) -> Floats:
@@ -340,27 +337,28 @@ class Calibration:
         return self._between(self.area_m2, window)
 
     def pixel_noise(self, window: Window) -> Floats:
-        """Return the noise of each pixel of a window in units of a pulse's, Σw²/M²."""
+        """Return the noise power at each pixel of a window relative to that of a pulse, Σw²/M²."""
         return self._between(self.noise, window)
 
     def power(self, window: Window, quantity: Quantity, normal: Floats | None = None) -> Floats:
-        """Return the mean power |I|² of ground whose σ⁰, β⁰ or γ⁰ is 1, at each pixel of a window.
+        """Return the mean power |I|² of terrain whose σ⁰, β⁰ or γ⁰ is 1, at each pixel of a window.
 
         Parameters
         ----------
         window
-            Of the grid.
+            Rows and columns of the grid.
         quantity
-            sigma0, per area of ground; beta0, per area of the slant plane; gamma0, per area across the bisector.
+            sigma0, per terrain area; beta0, per area of the slant plane; gamma0, per area perpendicular to the
+            bisector.
         normal
-            (row, column, 3) float64, unit normals of the ground, upward; level ground by default.
+            (row, column, 3) float64, upward unit normals of the terrain (default: level).
 
         Returns
         -------
         ndarray
-            (row, column) float64, NaN where no pulse sees the pixel, and for sigma0 of level ground within 5.7° of
-            nadir; with normals where the ground is so near to layover that its area is hardly known, beyond it, or
-            faces away (gamma0).
+            (row, column) float64. NaN where no pulse illuminates the pixel; for sigma0 of level terrain also within
+            5.7° of nadir; with normals also at layover and close to it, where the area is ill-conditioned, and on
+            slopes that face away (gamma0).
         """
         level = self.rcs_power(window) * self.cell(window)
         if quantity == "sigma0" and (normal is None or isinstance(self.terrain, FlatGround)):
@@ -382,40 +380,40 @@ class Calibration:
 
 
 def point_weights(aperture: Aperture, beams: Beams | None, points: Floats) -> tuple[Floats, Floats]:
-    """Return what each pulse adds to a point target, w·f/(R_tx·R_rx), and w, (pulse, point) each.
+    """Return the contribution of each pulse to a point target, w·f/(R_tx·R_rx), and w, (pulse, point) each.
 
-    Parameters as of `point_parts`, which divides them by the count of pulses.
+    Parameters as for `point_parts`, which divides them by the number of pulses.
 
     Examples
     --------
     >>> track = np.array([[0.0, 0.0, 10.0]])
-    >>> [one.tolist() for one in point_weights(Aperture(track, track), None, np.zeros((1, 3)))]
+    >>> [array.tolist() for array in point_weights(Aperture(track, track), None, np.zeros((1, 3)))]
     [[[0.01]], [[1.0]]]
     """
-    there, back = (np.linalg.norm(points - leg[:, None], axis=-1) for leg in aperture.legs)
+    tx_range_m, rx_range_m = (np.linalg.norm(points - leg[:, None], axis=-1) for leg in aperture.legs)
     antennas, sector = beams and beams.antennas, beams and beams.sector
-    field = np.ones(there.shape) if antennas is None else antennas.weight(aperture, points)
+    field = np.ones(tx_range_m.shape) if antennas is None else antennas.weight(aperture, points)
     weight = field if sector is None else field * sector.weight(aperture, points)
-    return weight * field / (there * back), weight
+    return weight * field / (tx_range_m * rx_range_m), weight
 
 
 def point_parts(
     aperture: Aperture, beams: Beams | None, points: Floats, *, count: int
 ) -> tuple[Aperture, Floats, Floats]:
-    """Return what pulses add to the image of points of 1 m² where K is 1, the parts of A of eq. 3.
+    """Return the contributions of pulses to the image of points of 1 m² with K = 1: the terms of A in eq. 3.
 
     Parameters
     ----------
     aperture, beams, count
-        As of `Calibration`.
+        As for `Calibration`.
     points
         (point, 3) float64, metres, in the frame of the aperture.
 
     Returns
     -------
     tuple
-        The pulses taken, every so many; (pulse, point) float64, their parts, which add up to A; (point,) float64,
-        the noise in units of a pulse's.
+        The pulses used, a regular subsample; (pulse, point) float64, their contributions, which add up to A;
+        (point,) float64, the noise power relative to that of a pulse.
 
     Examples
     --------
@@ -424,35 +422,35 @@ def point_parts(
     >>> round(float(parts.sum()), 6), float(noise[0])
     (0.01, 0.25)
     """
-    some = aperture.sample(_POINT_PULSES)
-    taken, share = aperture[some], some.step / count
-    parts, weight = point_weights(taken, beams and beams[some], points)
-    return taken, parts * share, (weight**2).sum(axis=0) * share / count
+    sampled = aperture.sample(_POINT_PULSES)
+    pulses, share = aperture[sampled], sampled.step / count
+    parts, weight = point_weights(pulses, beams and beams[sampled], points)
+    return pulses, parts * share, (weight**2).sum(axis=0) * share / count
 
 
 def _directions(gradient: Floats, parts: Floats, up: Floats) -> tuple[Floats, Floats]:
-    """Return the normals of the slant planes, on the side of up, and directions towards the bisectors, (point, 3)."""
+    """Return the upward normals of the slant planes, and unit vectors along the bisectors, (point, 3) each."""
     size = np.abs(parts)
     weight = size / np.maximum(size.sum(axis=0), 1e-300)
     mean = np.einsum("pk,pkc->kc", weight, gradient)
-    apart = gradient - mean
-    spread = np.einsum("pk,pkc,pkd->kcd", weight, apart, apart)
+    deviation = gradient - mean
+    spread = np.einsum("pk,pkc,pkd->kcd", weight, deviation, deviation)
     slant = np.cross(mean, np.linalg.eigh(spread)[1][..., -1])
     slant *= np.where((slant * up).sum(-1, keepdims=True) < 0, -1.0, 1.0)
     return _unit(slant), _unit(-mean)
 
 
 def _across(gradient: Floats, parts: Floats, up: Floats) -> Floats:
-    """Return the sine of the incidence across the direction in which the gradient moves along the track, (point,).
+    """Return the sine of the incidence angle across the track, (point,).
 
-    Half of the rms of the level gradient's component across the main axis of its own spread over the pulses: R sin θ
-    aside a straight track, and of the same order at the middle of a circle.
+    Half the RMS of the horizontal gradient's component perpendicular to the principal axis of its spread over the
+    pulses: sin θ beside a straight track, and of the same order at the centre of a circular one.
     """
     size = np.abs(parts)
     weight = size / np.maximum(size.sum(axis=0), 1e-300)
     level = gradient - (gradient * up).sum(-1, keepdims=True) * up
-    apart = level - np.einsum("pk,pkc->kc", weight, level)
-    spread = np.einsum("pk,pkc,pkd->kcd", weight, apart, apart)
+    deviation = level - np.einsum("pk,pkc->kc", weight, level)
+    spread = np.einsum("pk,pkc,pkd->kcd", weight, deviation, deviation)
     aside = np.cross(up, np.linalg.eigh(spread)[1][..., -1])
     return np.asarray(np.sqrt(np.einsum("pk,pk->k", weight, (level * aside).sum(-1) ** 2)) / 2)
 
@@ -462,27 +460,28 @@ def _unit(vectors: Floats) -> Floats:
 
 
 def _spread(gradient: Floats, parts: Floats, up: Floats) -> Floats:
-    """Return ∫(dU/ds)² ds / U² of each place, per unit of spatial frequency on level ground: eq. 5.
+    """Return ∫(dU/ds)² ds / U² at each point, per unit of spatial frequency on level ground: eq. 5.
 
-    Pulses are sorted by azimuth, so that a track which wobbles or passes twice is counted as it adds up, and their
-    density is taken over parts of the aperture, since what is finer scatters far beyond the cell.
+    Pulses are sorted by azimuth, so that contributions of an irregular or repeated track accumulate at their spatial
+    frequency. Their density is averaged over bins of the aperture: finer structure scatters far beyond the cell.
 
     Parameters
     ----------
     gradient
-        (place, pulse, 3) float64, of the total path.
+        (point, pulse, 3) float64, of the total path.
     parts
-        (place, pulse) float64, what each pulse adds to a point target.
+        (point, pulse) float64, contribution of each pulse to a point target.
     up
-        (place, 3) float64, unit vectors.
+        (point, 3) float64, unit vectors.
 
     Returns
     -------
     ndarray
-        (place,) float64; NaN where fewer than two pulses count, or none moves the spatial frequency.
+        (point,) float64; NaN where fewer than two pulses have a significant weight, or all of these have the same
+        spatial frequency.
     """
-    # Spatial frequency of each pulse on level ground: its azimuth about the mean, and its square.
-    places, pulses = parts.shape
+    # Spatial frequency of each pulse on level ground: its azimuth relative to the mean, and its squared magnitude.
+    points, pulses = parts.shape
     size = np.abs(parts)
     counts = size > _LEAST * size.max(axis=1, initial=0.0, keepdims=True)
     many = counts.sum(axis=1)
@@ -492,31 +491,31 @@ def _spread(gradient: Floats, parts: Floats, up: Floats) -> Floats:
     ahead = _unit(mean)
     across = np.cross(up, ahead)
     azimuth = np.arctan2((level @ across[:, :, None])[..., 0], (level @ ahead[:, :, None])[..., 0])
-    # Pulses that do not count are sorted behind the others, where steps between them are nothing.
+    # Insignificant pulses are sorted behind the others, where the steps between them are set to zero.
     order = np.argsort(np.where(counts, azimuth, np.inf), axis=1, kind="stable")
-    parts, azimuth = (np.take_along_axis(one, order, axis=1) for one in (parts, azimuth))
+    parts, azimuth = (np.take_along_axis(array, order, axis=1) for array in (parts, azimuth))
     # s: ∫|f|² dφ from pulse to pulse.
     squared = np.take_along_axis((level**2).sum(axis=-1), order, axis=1)
     counted = np.arange(pulses) < many[:, None]
     steps = np.diff(azimuth, axis=1) * (squared[:, 1:] + squared[:, :-1]) / 2 * counted[:, 1:]
-    place = np.concatenate([np.zeros((places, 1)), np.cumsum(steps, axis=1)], axis=1)
-    spread, known = np.full(places, np.nan), (many > 1) & (place[:, -1] > 0)
+    arc = np.concatenate([np.zeros((points, 1)), np.cumsum(steps, axis=1)], axis=1)
+    spread, known = np.full(points, np.nan), (many > 1) & (arc[:, -1] > 0)
     if not known.any():
         return spread
-    # U(s): the running sum of the parts, from half a step before the first pulse to half a step behind the last.
-    place, parts, many = place[known], parts[known], many[known, None]
-    length, edge = place[:, -1:], 1 / (2 * (many - 1))  # a pulse stands for half a step on both sides
-    place = np.concatenate([-edge, place / length, 1 + edge], axis=1)
+    # U(s): the running sum of the contributions, from half a step before the first pulse to half a step after the last.
+    arc, parts, many = arc[known], parts[known], many[known, None]
+    length, edge = arc[:, -1:], 1 / (2 * (many - 1))  # a pulse represents half a step on both sides
+    arc = np.concatenate([-edge, arc / length, 1 + edge], axis=1)
     summed = np.cumsum(parts, axis=1)
     total = summed[:, -1:]
     summed = np.concatenate([np.zeros_like(total), summed - parts / 2, total], axis=1)
-    # All places end to end on one axis, so far apart that none reaches the next: one interpolation for all of them.
+    # One interpolation for all points: each point has its own interval of a common axis, offset by 4 from the previous.
     bins = np.minimum(_BINS, many)
     at = np.minimum(np.arange(_BINS + 1) / bins, 1.0) * (1 + 2 * edge) - edge
-    apart = 4.0 * np.arange(len(place))[:, None]
-    # dU/ds in bins, and (5).
+    offset = 4.0 * np.arange(len(arc))[:, None]
+    # dU/ds in bins, and eq. 5.
     density = np.diff(
-        np.interp((at + apart).ravel(), (place + apart).ravel(), summed.ravel()).reshape(at.shape), axis=1
+        np.interp((at + offset).ravel(), (arc + offset).ravel(), summed.ravel()).reshape(at.shape), axis=1
     )
     spread[known] = (density**2).sum(axis=1) / ((1 + 2 * edge) * length / bins * total**2)[:, 0]
     return spread

@@ -1,4 +1,4 @@
-"""Range profiles of a scene: start and length of each pulse's window, compression, and stages as arrays."""
+"""Range profiles of a scene: range window of each pulse, range compression, and datasets of stages as arrays."""
 
 from dataclasses import dataclass
 from typing import Any, cast
@@ -20,30 +20,30 @@ from apertura.core.scene.terrain import Terrain, ground_of
 # ---- Range windows and compression
 
 GUARD_SAMPLES = 32
-"""Samples beyond the swath on both sides, for the filters of the engines."""
+"""Guard samples beyond both edges of the swath, needed by the interpolation filters of the engines."""
 
 OVERSAMPLING = 2.0
-"""Of the profiles: half the band is free for the transition of whatever filter an engine refines them with."""
+"""Oversampling factor of the profiles: leaves half the band for the transition of an engine's interpolation filter."""
 
 
 @dataclass(frozen=True, eq=False)
 class RangeWindow:
-    """The total paths that profiles must cover.
+    """Interval of total paths that range profiles cover.
 
     Attributes
     ----------
     start_m
         (pulse,) float64, total path of sample 0, metres.
     samples
-        Of every pulse.
+        Number of samples per pulse.
     step_m
         Total path between samples.
     unambiguous
-        Samples after which the profile repeats itself.
+        Period of a profile, samples.
     farthest_m
         (pulse,) float64, longest total path to a pixel that the pulse contributes to, metres; -inf without any.
     wave_speed_m_s
-        Speed of the wave that `step_m` is of.
+        Wave speed by which delays are converted to paths.
     """
 
     start_m: NDArray[np.float64]
@@ -55,7 +55,7 @@ class RangeWindow:
 
     @property
     def contributing(self) -> NDArray[np.bool_]:
-        """(pulse,) bool: whether a pulse may contribute to a pixel; the profile of one that does not is never read."""
+        """(pulse,) bool, True where a pulse may contribute to a pixel; other profiles are never read."""
         return np.isfinite(self.farthest_m)
 
     @classmethod
@@ -70,7 +70,7 @@ class RangeWindow:
         wave_speed_m_s: float,
         together: int = 1,
     ) -> "RangeWindow":
-        """Return the window that a scene needs.
+        """Return the range window of a scene.
 
         Parameters
         ----------
@@ -81,12 +81,13 @@ class RangeWindow:
         frequency_hz
             (subcarrier,) float64, ascending in equal steps.
         beams
-            Weights of pulses: each pulse's window covers the pixels that it may contribute to. By default all of the
+            Weights of pulses: each pulse's window covers the pixels that it may contribute to. By default the whole
             scene.
         wave_speed_m_s
             Speed of the wave along the paths.
         together
-            Pulses whose window is bounded by one of them: wider by what the antennas move meanwhile, and sooner known.
+            Number of consecutive pulses whose windows are bounded from one of them: faster, and wider by the motion
+            of the antennas during these pulses.
 
         Notes
         -----
@@ -103,28 +104,28 @@ class RangeWindow:
 def range_compress(
     history: PhaseHistory, grid: SceneGrid, terrain: Terrain | float | None, *, window: RangeWindow | None = None
 ) -> Profiles:
-    """Return range profiles of calibrated transfer functions, cropped to a scene.
+    """Compress calibrated transfer functions to range profiles, cropped to a scene.
 
     Parameters
     ----------
     history
-        Transfer functions with their window over the subcarriers; or a stage `echo` of a campaign.
+        Transfer functions with their window over the subcarriers, or the dataset of a campaign's stage `echo`.
     grid, terrain
-        The scene; as of `backproject`.
+        The scene, as for `backproject`.
     window
-        Total paths to cover; those of the scene by default.
+        Total paths to cover (default: those of the scene).
 
     Returns
     -------
     Profiles
-        Twice oversampled, with 32 guard samples on both sides of the swath.
+        Oversampled by 2, with 32 guard samples on both sides of the swath.
 
     Raises
     ------
     CampaignError
-        If the scene is deeper than the unambiguous range, or an argument is something else.
+        If the scene is deeper than the unambiguous range, or an argument has the wrong type.
     ValueError
-        If the window is of another wave's speed.
+        If the window was computed for a different wave speed.
 
     Notes
     -----
@@ -135,25 +136,27 @@ def range_compress(
     >>> from apertura.core.scene.terrain import FlatGround
     >>> frequency = 1.2e9 + 1e6 * np.arange(128)
     >>> track = np.stack([np.linspace(-1, 1, 8), np.full(8, -20.0), np.full(8, 10.0)], -1)
-    >>> flown = Aperture(track, track)
-    >>> echo = np.exp(-2j * np.pi * frequency * flown.path(np.zeros((1, 3))) / 299792458.0).astype(np.complex64)
-    >>> history = PhaseHistory(echo, frequency, np.full(128, 1 / 128), np.zeros(8), flown)
+    >>> aperture = Aperture(track, track)
+    >>> echo = np.exp(-2j * np.pi * frequency * aperture.path(np.zeros((1, 3))) / 299792458.0).astype(np.complex64)
+    >>> history = PhaseHistory(echo, frequency, np.full(128, 1 / 128), np.zeros(8), aperture)
     >>> profiles = range_compress(history, SceneGrid("local", -5.0, 5.0, 0.5, (20, 20)), FlatGround(0.0))
     >>> len(profiles), round(float(np.abs(profiles.samples).max()), 1)
     (8, 1.0)
     """
-    ground, given = ground_of(terrain, grid), history if isinstance(history, PhaseHistory) else inputs_of(history)
-    if not isinstance(given, PhaseHistory):
-        raise CampaignError("range profiles", "history", "a PhaseHistory", "They are compressed already: use them.")
-    history, frequency, speed = given, given.frequency_hz, given.wave_speed_m_s
+    ground, inputs = ground_of(terrain, grid), history if isinstance(history, PhaseHistory) else inputs_of(history)
+    if not isinstance(inputs, PhaseHistory):
+        raise CampaignError(
+            "range profiles", "history", "a PhaseHistory", "Use the profiles: they are already compressed in range."
+        )
+    history, frequency, speed = inputs, inputs.frequency_hz, inputs.wave_speed_m_s
     window = window or RangeWindow.of(history.aperture, grid, ground, frequency, wave_speed_m_s=speed)
     if window.wave_speed_m_s != speed:
         raise ValueError(f"{window.wave_speed_m_s=}: must be {speed}, that of the history")
     if window.samples > window.unambiguous:
         raise CampaignError(
-            f"the scene spans {window.samples} samples of range",
+            f"the scene spans {window.samples} range samples",
             where="grid",
-            expected=f"at most the {window.unambiguous} after which echoes repeat themselves",
+            expected=f"at most {window.unambiguous} range samples, the unambiguous range",
             remedy="Make the scene smaller, or sample frequency more finely.",
         )
     samples = compress(
@@ -178,12 +181,12 @@ def range_compress(
 
 
 class CompressionError:
-    """Error of range profiles against their transfer functions, at some samples of some pulses of every block.
+    """Error of range profiles relative to their transfer functions, at random samples of random pulses of each block.
 
     Parameters
     ----------
     generator
-        Draws them.
+        Random generator that draws the pulses and samples.
 
     Notes
     -----
@@ -207,33 +210,33 @@ class CompressionError:
     _PULSES, _SAMPLES = 2, 16
 
     def __init__(self, generator: np.random.Generator):
-        self._generator, self._wrong, self._power = generator, 0.0, 0.0
+        self._generator, self._error_power, self._power = generator, 0.0, 0.0
 
     def add(self, history: PhaseHistory, profiles: Profiles) -> None:
-        """Compare some samples of some pulses, the same in both."""
+        """Compare random samples of random pulses of profiles with the exact sum over their transfer functions."""
         for pulse in self._generator.integers(len(history), size=self._PULSES):
-            numbers = self._generator.integers(profiles.samples.shape[1], size=self._SAMPLES)
-            path_m = profiles.start_m[pulse] + profiles.step_m * numbers
+            sample_indices = self._generator.integers(profiles.samples.shape[1], size=self._SAMPLES)
+            path_m = profiles.start_m[pulse] + profiles.step_m * sample_indices
             delay_s = path_m / history.wave_speed_m_s - history.reference_delay_s[pulse]
-            turns = history.frequency_hz[:, None] * delay_s
-            exact = (history.weight * history.transfer[pulse]) @ np.exp(2j * np.pi * (turns % 1.0))
+            cycles = history.frequency_hz[:, None] * delay_s
+            exact = (history.weight * history.transfer[pulse]) @ np.exp(2j * np.pi * (cycles % 1.0))
             carrier = np.exp(1j * np.remainder(profiles.wavenumber_rad_m * path_m, 2 * np.pi))
-            self._wrong += float((np.abs(profiles.samples[pulse, numbers] * carrier - exact) ** 2).sum())
+            self._error_power += float((np.abs(profiles.samples[pulse, sample_indices] * carrier - exact) ** 2).sum())
             self._power += float((np.abs(exact) ** 2).sum())
 
     @property
     def decibels(self) -> float:
-        """RMS error over RMS of the samples, dB; -300 of nothing."""
-        return decibels(self._wrong / max(self._power, 1e-300))
+        """RMS error relative to the RMS of the samples, dB; -300 if nothing was compared."""
+        return decibels(self._error_power / max(self._power, 1e-300))
 
 
 # ---- Stages as inputs of engines
 
-_SPARSE_STEP = 64  # pulses: at larger steps they are read one by one
+_SPARSE_STEP = 64  # pulses; at larger steps pulses are read individually
 
 
 class Rows:
-    """Samples of a stage, read on access by pulse.
+    """Samples of a stage's dataset, read on access by pulse.
 
     Parameters
     ----------
@@ -256,19 +259,19 @@ class Rows:
         return int(self.shape[0])
 
     def __getitem__(self, pulses: slice) -> NDArray[Any]:
-        """Return the samples of some pulses; of sparse pulses no others are decoded."""
+        """Return the samples of a slice of pulses; for a sparse slice no other pulses are decoded."""
         first, last, step = pulses.indices(len(self))
         if step > _SPARSE_STEP:
             return np.stack([self._array[number].values for number in range(first, last, step)])
         return np.asarray(self._array[first:last].values[::step])
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        """Return all of them."""
+        """Return the samples of all pulses."""
         return np.asarray(self._array.values, dtype)
 
 
 def phase_history_of(echo: xr.Dataset, window: str, *, lazy: bool = False) -> PhaseHistory:
-    """Return an echo stage as arrays, weighted by a window over the subcarriers; `lazy`: samples read on access."""
+    """Return the dataset of stage `echo` as arrays, windowed over the subcarriers; `lazy`: samples read on access."""
     return PhaseHistory(
         cast("NDArray[np.complex64]", Rows(echo.transfer)) if lazy else echo.transfer.values,
         echo.frequency.values,
@@ -280,7 +283,7 @@ def phase_history_of(echo: xr.Dataset, window: str, *, lazy: bool = False) -> Ph
 
 
 def profiles_of(profile: xr.Dataset, *, lazy: bool = False) -> Profiles:
-    """Return a profile stage as arrays; `lazy` as of `phase_history_of`."""
+    """Return the dataset of stage `profile` as arrays; `lazy` as for `phase_history_of`."""
     return Profiles(
         cast("NDArray[np.complex64]", Rows(profile.profile)) if lazy else profile.profile.values,
         profile.start.values,
@@ -293,22 +296,22 @@ def profiles_of(profile: xr.Dataset, *, lazy: bool = False) -> Profiles:
 
 
 def wave_speed_of(stage: xr.Dataset) -> float:
-    """Return the speed of the wave (m/s) that an echo or profile stage states."""
+    """Return the wave speed (m/s) stated in the dataset of stage `echo` or `profile`."""
     return float(stage.attrs["wave_speed_m_s"])
 
 
 def aperture_of(stage: xr.Dataset) -> Aperture:
-    """Return the phase centres of an echo or profile stage."""
+    """Return the phase centres in the dataset of stage `echo` or `profile`."""
     return Aperture(stage.tx_position.values, stage.rx_position.values)
 
 
 def inputs_of(given: PhaseHistory | Profiles | xr.Dataset, window: str = "hann") -> PhaseHistory | Profiles:
-    """Return the inputs of an engine: arrays as they are, or those of a stage `echo` or `profile`.
+    """Return the inputs of an engine: arrays unchanged, or those in the dataset of stage `echo` or `profile`.
 
     Raises
     ------
     CampaignError
-        If it is something else.
+        If the argument is none of these.
     """
     if isinstance(given, PhaseHistory | Profiles):
         return given
@@ -316,16 +319,16 @@ def inputs_of(given: PhaseHistory | Profiles | xr.Dataset, window: str = "hann")
         raise CampaignError(
             f"an object of type {type(given).__name__}",
             where="profiles",
-            expected="a PhaseHistory, Profiles, or a stage echo or profile as an xarray.Dataset",
-            remedy="Make one of its arrays.",
+            expected="PhaseHistory, Profiles, or an xarray.Dataset of stage echo or profile",
+            remedy="Construct a PhaseHistory or Profiles from its arrays.",
         )
     if "transfer" in given:
         return phase_history_of(given, window)
     if "profile" in given:
         return profiles_of(given)
     raise CampaignError(
-        f"a dataset of {', '.join(sorted(map(str, given.variables)))}",
+        f"a dataset with variables {', '.join(sorted(map(str, given.variables)))}",
         where="profiles",
-        expected="a stage echo, which holds transfer, or profile, which holds profile",
-        remedy="Open one of these.",
+        expected="a dataset of stage echo (variable transfer) or of stage profile (variable profile)",
+        remedy="Open the dataset of one of these stages.",
     )

@@ -1,4 +1,4 @@
-"""Reflectors of known shape and size: their radar cross-sections, and the constants that they give together."""
+"""Reference reflectors: radar cross-sections by shape and size, and their combined calibration constant."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,11 +14,11 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 Shape = Literal["trihedral", "dihedral", "sphere"]
 
 MOST_TURNED_DB = 1.0
-"""Loss to a second antenna beside the first, dB, beyond which a corner reflector has no cross-section by formula: the
-second order that it is taken from then lacks 0.05 dB."""
+"""Largest bistatic loss (dB) of a corner reflector for which its cross-section is computed: the second-order formula
+then has an error of 0.05 dB."""
 
 DRIFT_SIGMAS = 3.0
-"""Standard deviations of their difference beyond which two constants are not the same: by chance once in 370."""
+"""Significance level for a change of the constant, standard deviations: probability of a false alarm 1/370."""
 
 _SEAMS = np.array(
     [
@@ -27,25 +27,25 @@ _SEAMS = np.array(
         [0.0, np.sqrt(2 / 3), 1 / np.sqrt(3)],
     ]
 )
-"""Of a trihedral, (seam, axis): right, up, ahead; the third lies in the vertical plane of the boresight."""
+"""Seams of a trihedral, (seam, axis): right, up, ahead; the third lies in the vertical plane of the boresight."""
 
-_HEXAGON = 5 / (36 * np.sqrt(3))  # mean square of a coordinate over a regular hexagon, of its area
+_HEXAGON = 5 / (36 * np.sqrt(3))  # mean square of a coordinate over a regular hexagon, divided by its area
 _DB = 20 / np.log(10)  # dB per relative error of an amplitude
-_BAND = 9  # frequencies over the band at which a sphere is looked at
+_BAND = 9  # frequencies at which the cross-section of a sphere is sampled over the band
 
 # ---- Cross-sections by shape ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Reflector:
-    """A conductor of known shape.
+    """Conducting reflector of known shape.
 
     Attributes
     ----------
     shape
-        trihedral, of three right-angled triangles; dihedral, of two rectangles; sphere.
+        'trihedral' (three right-angled triangles), 'dihedral' (two rectangles) or 'sphere'.
     size_m
-        Leg of the triangles; side across and length along the seam of the rectangles; radius of the sphere.
+        Leg of the triangles; width across and length along the seam of the rectangles; radius of the sphere.
     axes
         (3, 3) float64, unit vectors right, up and ahead along the boresight, as rows, in the frame of the antennas; the
         seam of a dihedral lies to the right.
@@ -74,12 +74,13 @@ class Reflector:
         towards_tx, towards_rx
             (direction, 3) float64, unit vectors from the reflector to the antennas.
         wavelength_m
-            Of the wave.
+            Wavelength.
 
         Returns
         -------
         tuple of ndarray
-            (direction,) float64 each; 0 m² where a corner is not looked into, NaN where its antennas are too far apart.
+            (direction,) float64 each; 0 m² for directions outside the opening of a corner, NaN where the separation of
+            the antennas is too large for the formula.
         """
         tx, rx = towards_tx @ self.axes.T, towards_rx @ self.axes.T
         if self.shape == "sphere":
@@ -93,33 +94,34 @@ class Reflector:
         return np.where(turned_db <= MOST_TURNED_DB, rcs_m2, np.nan), np.hypot(turned_db, edge_db)
 
     def seen(self, towards_tx: Floats, towards_rx: Floats, weight: Floats, frequency_hz: Floats) -> tuple[float, float]:
-        """Return the cross-section that an image sees of it, m², and the standard deviation of its formula, dB.
+        """Return the effective cross-section in an image, m², and the standard deviation of its formula, dB.
 
         Parameters
         ----------
         towards_tx, towards_rx
             (pulse, 3) float64, unit vectors from the reflector to the antennas.
         weight
-            (pulse,) float64, what each pulse adds to the image of a target that looks alike from everywhere.
+            (pulse,) float64, contribution of each pulse to the image of an isotropic target.
         frequency_hz
             (subcarrier,) float64.
 
         Notes
         -----
-        Amplitudes add up in an image, not powers: the root of the cross-section is averaged over the pulses.
+        An image sums amplitudes, not powers: the root of the cross-section is averaged over the pulses.
 
         Examples
         --------
         >>> ahead = np.array([[0.0, 0.0, 1.0]])
-        >>> seen = Reflector("sphere", (0.5,), np.eye(3)).seen(ahead, ahead, np.ones(1), np.linspace(1.2e9, 1.4e9, 9))
-        >>> round(seen[0] / (np.pi * 0.5**2), 2)
+        >>> sphere = Reflector("sphere", (0.5,), np.eye(3))
+        >>> rcs_m2, _ = sphere.seen(ahead, ahead, np.ones(1), np.linspace(1.2e9, 1.4e9, 9))
+        >>> round(rcs_m2 / (np.pi * 0.5**2), 2)
         0.95
         """
         middle_hz = (frequency_hz[0] + frequency_hz[-1]) / 2
         rcs_m2, std_db = self._mean(towards_tx, towards_rx, weight, middle_hz)
         if self.shape == "sphere":
-            some_hz = np.linspace(frequency_hz[0], frequency_hz[-1], _BAND)
-            over_band = np.mean([self._mean(towards_tx, towards_rx, weight, one)[0] for one in some_hz])
+            sampled_hz = np.linspace(frequency_hz[0], frequency_hz[-1], _BAND)
+            over_band = np.mean([self._mean(towards_tx, towards_rx, weight, at_hz)[0] for at_hz in sampled_hz])
             std_db = float(np.hypot(std_db, 10 * np.log10(over_band / rcs_m2)))
         return rcs_m2, std_db
 
@@ -132,7 +134,7 @@ class Reflector:
 
 
 def _trihedral(size_m: Sequence[float], tx: Floats, rx: Floats, k: float) -> tuple[Floats, Floats, float]:
-    """Return effective area, share of the amplitude beside the first antenna, and the power of an edge: eq. 11."""
+    """Return effective area, bistatic amplitude factor, and the power of edge diffraction of a trihedral: eq. 11."""
     (leg_m,) = size_m
     first, second, third = np.sort(_unit(tx + rx) @ _SEAMS.T, axis=-1).T
     total = first + second + third
@@ -145,7 +147,7 @@ def _trihedral(size_m: Sequence[float], tx: Floats, rx: Floats, k: float) -> tup
 
 
 def _dihedral(size_m: Sequence[float], tx: Floats, rx: Floats, k: float) -> tuple[Floats, Floats, float]:
-    """Return as `_trihedral`, of a dihedral: eq. 12."""
+    """Return the same as `_trihedral` for a dihedral: eq. 12."""
     across_m, along_m = size_m
     between = _unit(tx + rx)
     off = np.abs(np.arctan2(between[:, 1], between[:, 2]))
@@ -159,7 +161,8 @@ def _dihedral(size_m: Sequence[float], tx: Floats, rx: Floats, k: float) -> tupl
 def _sphere(radius_m: float, cosine: Floats, k: float) -> tuple[Floats, Floats]:
     """Return the cross-section of a conducting sphere by Mie's series at cosines of the scattering angle: eq. 13.
 
-    The mean of both polarisations, which are the same only straight back: half of their difference is in the deviation.
+    The mean of both polarisations, which are equal only in backscattering; half of their difference is taken as the
+    standard deviation.
     """
     from scipy.special import spherical_jn, spherical_yn
 
@@ -184,21 +187,22 @@ def _unit(vectors: Floats) -> Floats:
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300))
 
 
-# ---- Constants together ---------------------------------------------------------------------------------------------
+# ---- Combined constant ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Mean:
-    """What measurements at several reflectors in several flights say together.
+    """Combined estimate from measurements at several reflectors in several flights.
 
     Attributes
     ----------
     value, std
         Mean and its standard deviation, in the unit of the measurements.
     chi2, freedom
-        Sum of squares of what reflectors differ by, in their deviations, and how many could.
+        χ² of the differences between reflectors, and its degrees of freedom.
     drift
-        Flight, flight, second less first, and its standard deviation: the two that differ most, measured by it.
+        The two flights with the most significant difference: first, second, second minus first, and its standard
+        deviation. None if no reflector was measured in two flights.
     """
 
     value: float
@@ -209,30 +213,30 @@ class Mean:
 
     @property
     def chance(self) -> float:
-        """How often reflectors would differ as much by what is stated of them; 1 where there is one alone."""
+        """Probability of a χ² as large as this under the stated standard deviations; 1 for a single reflector."""
         from scipy.stats import chi2
 
         return float(chi2.sf(self.chi2, self.freedom)) if self.freedom else 1.0
 
     @property
     def drifts(self) -> bool:
-        """Whether two flights differ by more than chance."""
+        """True if the difference between two flights is statistically significant."""
         return self.drift is not None and abs(self.drift[2]) > DRIFT_SIGMAS * self.drift[3]
 
 
 def together(value: Floats, scatter: Floats, common: Floats, reflectors: Sequence[str], flights: Sequence[str]) -> Mean:
-    """Return the mean of measurements, each at a reflector in a flight.
+    """Combine measurements, each at a reflector in a flight.
 
     Parameters
     ----------
     value
         (measurement,) float64.
     scatter
-        (measurement,) float64, standard deviation of what differs from measurement to measurement.
+        (measurement,) float64, standard deviation of the error that is independent between measurements.
     common
-        (measurement,) float64, standard deviation of what those at a reflector have in common.
+        (measurement,) float64, standard deviation of the error common to the measurements at a reflector.
     reflectors, flights
-        Of each measurement.
+        Reflector and flight of each measurement.
 
     Notes
     -----
@@ -240,8 +244,8 @@ def together(value: Floats, scatter: Floats, common: Floats, reflectors: Sequenc
 
     Examples
     --------
-    >>> one = together(np.array([1.0, 3.0]), np.full(2, 0.5), np.full(2, 0.5), ["a", "a"], ["f01", "f02"])
-    >>> one.value, round(one.std**2, 3), one.drift[2:], one.drifts
+    >>> mean = together(np.array([1.0, 3.0]), np.full(2, 0.5), np.full(2, 0.5), ["a", "a"], ["f01", "f02"])
+    >>> mean.value, round(mean.std**2, 3), mean.drift[2:], mean.drifts
     (2.0, 0.375, (2.0, 0.7071067811865476), False)
     """
     of, at = np.array(reflectors), np.array(flights)
@@ -258,7 +262,7 @@ def together(value: Floats, scatter: Floats, common: Floats, reflectors: Sequenc
         for first, second in combinations(dict.fromkeys(flights), 2)
     ]
     known = [pair for pair in pairs if pair is not None]
-    return Mean(mean, std, chi2, freedom, max(known, key=lambda one: abs(one[2]) / one[3], default=None))
+    return Mean(mean, std, chi2, freedom, max(known, key=lambda pair: abs(pair[2]) / pair[3], default=None))
 
 
 def _difference(
@@ -269,11 +273,11 @@ def _difference(
     second: NDArray[np.bool_],
     *names: str,
 ) -> tuple[str, str, float, float] | None:
-    """Return how much a second flight differs from a first at reflectors that both saw, and the deviation of that."""
+    """Return the difference between two flights at their common reflectors, and its standard deviation."""
     both = [(np.flatnonzero(first & (of == name)), np.flatnonzero(second & (of == name))) for name in np.unique(of)]
-    shared = [(one[0], two[0]) for one, two in both if one.size and two.size]
+    shared = [(in_first[0], in_second[0]) for in_first, in_second in both if in_first.size and in_second.size]
     if not shared:
         return None
-    weight = np.array([1 / (variance[one] + variance[two]) for one, two in shared])
-    apart = np.array([value[two] - value[one] for one, two in shared])
-    return (*names, float((weight * apart).sum() / weight.sum()), float(weight.sum() ** -0.5))  # type: ignore[return-value]
+    weight = np.array([1 / (variance[i] + variance[j]) for i, j in shared])
+    differences = np.array([value[j] - value[i] for i, j in shared])
+    return (*names, float((weight * differences).sum() / weight.sum()), float(weight.sum() ** -0.5))  # type: ignore[return-value]

@@ -1,4 +1,4 @@
-"""Resolution of an image at each place, from the spatial spectrum that its pulses and its band sample there."""
+"""Resolution of an image at each pixel, from the spatial spectrum sampled by its pulses and its band."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,17 +18,17 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.looks import Lattice, fill, pulses_of
 from apertura.core.scene.terrain import FlatGround, Terrain
 
-_ORDER = 4  # of moments: width by the second, the shape of the spectrum by the fourth
+_ORDER = 4  # highest order of moments: the second yields the width, the fourth the shape of the spectrum
 _ORDERS = [(east, total - east) for total in range(_ORDER + 1) for east in range(total + 1)]
-_PULSES = 128  # summed for a block of the lattice, or up to twice as many
-_HALF_POWER = np.log(2) / 2  # of -ln|p| where |p|² is one half
-_UPRIGHT = 4  # moments with the vertical, of which slopes take their part
-_LEAST_SPREAD = 1e-12  # of a spectrum's second moment, cycles² per m²: no aperture at all
+_PULSES = 128  # at least this number of pulses, at most twice as many, are summed for a block of the lattice
+_HALF_POWER = np.log(2) / 2  # -ln|p| where |p|² is one half
+_UPRIGHT = 4  # moments that involve the vertical, needed on slopes
+_LEAST_SPREAD = 1e-12  # cycles² per m²: a spectrum with a smaller second moment is treated as a single point
 
 
 @dataclass(frozen=True, eq=False)
 class Resolution:
-    """Moments of the spatial spectrum of each place, from which widths of a point follow in any direction.
+    """Moments of the spatial spectrum on a lattice, from which the width of a point follows in any direction.
 
     Attributes
     ----------
@@ -38,8 +38,8 @@ class Resolution:
         Nodes at which the moments are computed.
     moments
         (node row, node column, moment) float64, cycles per metre to their power, of the spectrum's density: those of
-        `_ORDERS` over level ground, eastward and northward, the first 1, or 0 where no pulse sees the node; then, with
-        the vertical, of u, east·u, north·u and u².
+        `_ORDERS` over level ground, eastward and northward (the first is 1, or 0 where no pulse illuminates the node),
+        then those with the vertical u: u, east·u, north·u and u².
 
     Notes
     -----
@@ -63,67 +63,69 @@ class Resolution:
         weight: Floats,
         threads: int = 1,
     ) -> "Resolution":
-        """Return the resolution of a scene.
+        """Compute the resolution of a scene.
 
         Parameters
         ----------
         grid, terrain, aperture, beams
-            As of `apertura.core.scene.looks.Looks`.
+            As for `apertura.core.scene.looks.Looks`.
         frequency_hz, weight
             (subcarrier,) float64: RF frequencies, and the window over them.
         threads
-            Blocks of the lattice in work at once.
+            Number of lattice blocks computed concurrently.
 
         Examples
         --------
-        A line of 20 m, 30 m away and as high: λR/2L across it, and along the ground c/2B over the sine of 45°, both
-        times 0.886 of a flat spectrum.
+        A straight track of 20 m, at 30 m horizontal distance and 30 m height: λR/2L along the track, and c/2B divided
+        by the sine of 45° in ground range, both times the 0.886 of a flat spectrum.
 
         >>> from apertura.core.scene.terrain import FlatGround
         >>> along = np.linspace(-10, 10, 401)
         >>> track = np.stack([along, np.full(401, -30.0), np.full(401, 30.0)], -1)
         >>> band = 1.2e9 + np.linspace(-2e8, 2e8, 64)
         >>> grid = SceneGrid("local", -0.5, 0.5, 1.0, (1, 1))
-        >>> found = Resolution.of(grid, FlatGround(0.0), Aperture(track, track), None, frequency_hz=band,
-        ...                       weight=np.full(64, 1 / 64))
-        >>> fine, coarse, azimuth = found.axes((slice(0, 1), slice(0, 1)))
+        >>> resolution = Resolution.of(grid, FlatGround(0.0), Aperture(track, track), None, frequency_hz=band,
+        ...                            weight=np.full(64, 1 / 64))
+        >>> fine, coarse, azimuth = resolution.axes((slice(0, 1), slice(0, 1)))
         >>> fine.round(2), coarse.round(2), abs(azimuth).round(0)
         (array([[0.24]]), array([[0.47]]), array([[90.]]))
         """
-        lattice = Lattice.of(grid.shape)  # one pitch for all pairs, so that their moments add node by node
+        lattice = Lattice.of(
+            grid.shape
+        )  # the same pitch for all pairs, so that their moments can be added node by node
         moments = np.zeros((*lattice.shape, len(_ORDERS) + _UPRIGHT))
         share = weight / weight.sum()
         of_band = [float((share * (frequency_hz / SPEED_OF_LIGHT_M_S) ** order).sum()) for order in range(_ORDER + 1)]
 
         def compute(block: Window, reaching: NDArray[np.bool_]) -> None:
             rows, columns = (at[part] for at, part in zip(lattice.nodes, block, strict=True))
-            row, column = (one.ravel() for one in np.meshgrid(rows, columns, indexing="ij"))
+            row, column = (axis.ravel() for axis in np.meshgrid(rows, columns, indexing="ij"))
             height_m = np.asarray(terrain.heights_at(grid, row, column), np.float64)
             points = grid.positions_at(row, column, height_m)
-            beside = [grid.positions_at(row, column + 1, height_m), grid.positions_at(row - 1, column, height_m)]
-            sides = [(one - points) / grid.spacing_m for one in beside]
+            neighbours = [grid.positions_at(row, column + 1, height_m), grid.positions_at(row - 1, column, height_m)]
+            sides = [(neighbour - points) / grid.spacing_m for neighbour in neighbours]
             sides.append(grid.positions_at(row, column, height_m + 1.0) - points)
             reached = pulses_of(reaching, len(aperture))
-            some = slice(reached.start, reached.stop, max(1, (reached.stop - reached.start) // _PULSES))
-            taken = aperture[some]
-            parts, _ = point_weights(taken, beams and beams[some], points)
+            sampled = slice(reached.start, reached.stop, max(1, (reached.stop - reached.start) // _PULSES))
+            pulses = aperture[sampled]
+            parts, _ = point_weights(pulses, beams and beams[sampled], points)
             density = np.abs(parts)
             density = density / np.maximum(density.sum(axis=0), 1e-300)
-            gradient = taken.path_gradient(points)
+            gradient = pulses.path_gradient(points)
             east, north, up = ((gradient * side).sum(axis=-1) for side in sides)
-            found = [(density * east**a * north**b).sum(axis=0) * of_band[a + b] for a, b in _ORDERS]
-            found += [(density * up).sum(axis=0) * of_band[1]]
-            found += [(density * up * other).sum(axis=0) * of_band[2] for other in (east, north, up)]
-            moments[block] = np.stack(found, axis=-1).reshape(len(rows), len(columns), -1)
+            products = [(density * east**a * north**b).sum(axis=0) * of_band[a + b] for a, b in _ORDERS]
+            products += [(density * up).sum(axis=0) * of_band[1]]
+            products += [(density * up * other).sum(axis=0) * of_band[2] for other in (east, north, up)]
+            moments[block] = np.stack(products, axis=-1).reshape(len(rows), len(columns), -1)
 
         fill(lattice, compute, grid, terrain, aperture, beams, threads=threads)
         return cls(grid, terrain, lattice, moments)
 
     @classmethod
     def summed(cls, images: Sequence["Resolution"]) -> "Resolution":
-        """Return the resolution of the coherent sum of images of one grid, each of as much amplitude at a point.
+        """Return the resolution of the coherent sum of images on one grid, assuming equal amplitudes of a point.
 
-        The spectra of pairs at different places lie side by side (docs/theory.md, eq. 7): their densities add.
+        The spectra of pairs at different positions do not overlap (docs/theory.md, eq. 7): their densities add.
         """
         total = np.sum([image.moments for image in images], axis=0)
         return replace(images[0], moments=total / np.maximum(total[..., :1], 1e-300))
@@ -134,13 +136,13 @@ class Resolution:
         Parameters
         ----------
         window
-            Of the grid.
+            Rows and columns of the grid.
 
         Returns
         -------
         tuple of ndarray
             (row, column) float64: metres, metres, and degrees clockwise from the grid's north, −90 to 90; NaN where no
-            pulse sees the place, infinite along a direction that nothing resolves.
+            pulse illuminates the pixel, infinite along a direction without resolution.
         """
         if isinstance(self.terrain, FlatGround):
             fine, coarse, azimuth = self._axes_at_nodes
@@ -157,17 +159,17 @@ class Resolution:
         return fine, coarse, np.degrees(azimuth)
 
     def look_azimuth_deg(self, window: Window) -> Floats:
-        """Return the azimuth in which paths grow fastest on the ground, degrees clockwise from grid north."""
-        east, north = (self._between(self._raw(one), window) for one in ((1, 0), (0, 1)))
+        """Return the azimuth of the steepest increase of paths on the ground, degrees clockwise from grid north."""
+        east, north = (self._between(self._raw(order), window) for order in ((1, 0), (0, 1)))
         return np.asarray(np.degrees(np.arctan2(east, north)))
 
     def _raw(self, order: tuple[int, int]) -> Floats:
-        """Return a moment at the nodes; NaN where no pulse sees them."""
-        seen = self.moments[..., 0] > 0
-        return np.where(seen, self.moments[..., _ORDERS.index(order)], np.nan)
+        """Return a moment at the nodes; NaN where no pulse illuminates them."""
+        illuminated = self.moments[..., 0] > 0
+        return np.where(illuminated, self.moments[..., _ORDERS.index(order)], np.nan)
 
     def _central(self, order: tuple[int, int]) -> Floats:
-        """Return a moment about the mean at the nodes: means move from node to node, these are smooth."""
+        """Return a central moment at the nodes: central moments vary smoothly between nodes, means do not."""
         means = self._raw((1, 0)), self._raw((0, 1))
         return np.asarray(
             sum(
@@ -179,7 +181,7 @@ class Resolution:
         )  # fmt: skip
 
     def _between(self, values: Floats, window: Window) -> Floats:
-        """Return values at the pixels of a window, between those nodes that have any; NaN where none has."""
+        """Return values at the pixels of a window, interpolated between finite nodes; NaN where no node is finite."""
         known = np.isfinite(values)
         share = self.lattice.between(known.astype(np.float64), window)
         mean = self.lattice.between(np.where(known, values, 0.0), window)
@@ -190,8 +192,8 @@ class Resolution:
         """Covariances east-east, east-north, north-north, east-up, north-up and up-up of the spectrum at the nodes."""
         mean, *products = np.moveaxis(self.moments[..., len(_ORDERS) :], -1, 0)
         means = self._raw((1, 0)), self._raw((0, 1)), mean
-        upright = [one - mean * other for one, other in zip(products, means, strict=True)]
-        return [*(self._central(one) for one in ((2, 0), (1, 1), (0, 2))), *upright]
+        upright = [product - mean * other for product, other in zip(products, means, strict=True)]
+        return [*(self._central(order) for order in ((2, 0), (1, 1), (0, 2))), *upright]
 
     @cached_property
     def _shapes_at_nodes(self) -> list[Floats]:
@@ -207,7 +209,7 @@ class Resolution:
                 for order in (2, 4)
             )
             excess = fourth / np.maximum(second, _LEAST_SPREAD) ** 2 - 3
-            # ln|p(x)| = −κ₂t²/2 + κ₄t⁴/24, t = 2πx: where that is −ln √2, in units of the spectrum's deviation
+            # Solve ln|p(x)| = −κ₂t²/2 + κ₄t⁴/24 = −ln √2, t = 2πx, in units of the spectrum's standard deviation.
             root = 0.25 - np.minimum(excess, 1.0) * _HALF_POWER / 6
             shapes.append(4 * _HALF_POWER / (1 + 2 * np.sqrt(np.maximum(root, 0.0))))
         return shapes
@@ -221,12 +223,12 @@ class Resolution:
 
 
 def _principal(east: Floats, both: Floats, north: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Return east and north of the axis of the largest variance, its azimuth (rad), and both variances."""
+    """Return the east and north components of the axis of largest variance, its azimuth (rad), and both variances."""
     mean, half = (east + north) / 2, np.hypot((east - north) / 2, both)
-    turn = np.arctan2(2 * both, east - north) / 2  # anticlockwise from east
-    azimuth = np.pi / 2 - turn
+    angle = np.arctan2(2 * both, east - north) / 2  # anticlockwise from east
+    azimuth = np.pi / 2 - angle
     azimuth = (azimuth + np.pi / 2) % np.pi - np.pi / 2
-    return np.cos(turn), np.sin(turn), azimuth, mean + half, mean - half
+    return np.cos(angle), np.sin(angle), azimuth, mean + half, mean - half
 
 
 def _width(shape: Floats, variance: Floats) -> Floats:
@@ -235,7 +237,7 @@ def _width(shape: Floats, variance: Floats) -> Floats:
 
 
 def _on_slopes(spread: list[Floats], slopes: tuple[Floats, Floats]) -> tuple[Floats, Floats, Floats]:
-    """Return covariances east-east, east-north and north-north per metre of the map along the ground."""
+    """Return covariances east-east, east-north and north-north along the sloping terrain, per metre on the map."""
     east, both, north, east_up, north_up, up_up = spread
     to_east, to_north = slopes
     return (
@@ -246,7 +248,7 @@ def _on_slopes(spread: list[Floats], slopes: tuple[Floats, Floats]) -> tuple[Flo
 
 
 def _slopes(grid: SceneGrid, terrain: Terrain, window: Window) -> tuple[Floats, Floats]:
-    """Return the rise of the ground per metre of the map eastward and northward, (row, column) each."""
+    """Return the eastward and northward slopes of the terrain, metres per metre, (row, column) each."""
     around = [
         slice(max(0, part.start - 1), min(size, part.stop + 1)) for part, size in zip(window, grid.shape, strict=True)
     ]

@@ -1,1 +1,1 @@
-"""How an image will be formed, why, and at what cost."""
+"""Planning of image formation: engine, models, their reasons and their cost."""

@@ -1,4 +1,4 @@
-"""Decisions on accuracy, autofocus, model of the ground and integration, each with its reason."""
+"""Decisions on numerical accuracy, autofocus, terrain model and integration, each with its reason."""
 
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
@@ -25,7 +25,7 @@ from apertura.core.scene.terrain import FlatGround
 
 
 def decide_accuracy(lines: Sequence[BudgetLine]) -> Decision:
-    """Return the numerical error to request, and the line of the error budget that it follows from.
+    """Decide the numerical error to request, from the dominant line of the error budget.
 
     Examples
     --------
@@ -36,34 +36,36 @@ def decide_accuracy(lines: Sequence[BudgetLine]) -> Decision:
     value, stated = accuracy_for(lines), [line for line in lines if line.stated is not None]
     largest = min(stated, key=lambda line: line.effect.loss_db, default=None)
     if largest is None or value == MOST_ACCURACY_DB:
-        return Decision("accuracy_db", value, "auto: nothing known spoils the image more, and better shows nowhere")
+        reason = "auto: the numerical error is already the smallest term of the error budget"
+        return Decision("accuracy_db", value, reason)
     cause = f"{largest.cause} ({largest.stated})"
     if value == LEAST_ACCURACY_DB:
-        return Decision("accuracy_db", value, f"auto: {cause} spoil the image more, and worse would show")
+        reason = f"auto: largest numerical error that is not visible; more than 10 dB below {cause}"
+        return Decision("accuracy_db", value, reason)
     return Decision("accuracy_db", value, f"auto: {ARITHMETIC_BELOW_DB:g} dB below {cause}")
 
 
 # ---- Autofocus
 
 TOLERATED_LOSS_DB = 0.2
-"""dB, loss of a peak by errors of position that is tolerated without autofocus.
+"""Peak loss from position errors that is tolerated without autofocus, dB.
 
-RTK at its best, half a centimetre in each log, costs 0.3 dB at L-band; less than this is not visible in any image, and
-not worth a job that reads all pairs of a flight together.
+RTK at its best, half a centimetre in each log, costs 0.3 dB at L-band. A smaller loss is not visible in an image, and
+does not justify a job that reads all pairs of a flight together.
 """
 
 
 def decide_autofocus(requested: str, loss_db: Mapping[str, float], unstated: Collection[str]) -> Decision:
-    """Decide whether tracks are refined, on or off.
+    """Decide on autofocus: refinement of the tracks on or off.
 
     Parameters
     ----------
     requested
         auto, on or off.
     loss_db
-        Pair → expected loss by stated errors of position, dB, 0 or less.
+        Pair → expected loss from configured position errors, dB, 0 or less.
     unstated
-        Nodes without stated errors of position.
+        Nodes without configured position accuracy.
 
     Examples
     --------
@@ -73,36 +75,37 @@ def decide_autofocus(requested: str, loss_db: Mapping[str, float], unstated: Col
     'off'
     """
     if requested != "auto":
-        return Decision("autofocus", requested, "asked for")
+        return Decision("autofocus", requested, "requested")
     if unstated:
         missing = f"auto: position accuracy of {' and '.join(unstated)} is not configured"
-        return Decision("autofocus", "off", f"{missing}; state nodes.<node>.position_std_m to have them refined")
-    pair, worst_db = min(loss_db.items(), key=lambda one: one[1])
+        return Decision("autofocus", "off", f"{missing}; set nodes.<node>.position_std_m to have the tracks refined")
+    pair, worst_db = min(loss_db.items(), key=lambda item: item[1])
     value, than = ("on", "more") if worst_db < -TOLERATED_LOSS_DB else ("off", "no more")
     cost = f"configured position errors cost {-worst_db:.2f} dB in {pair}"
     return Decision("autofocus", value, f"auto: {cost}, {than} than the tolerated {TOLERATED_LOSS_DB} dB")
 
 
-# ---- Model of the ground
+# ---- Terrain model
 
 FOCUS_RAD = 0.4
-"""Phase error, radians rms, that a cheaper ground may add: 0.7 dB of a peak (docs/theory/planner.md, "Terrain")."""
+"""Tolerated RMS phase error of a simpler terrain model, radians: peak loss 0.7 dB (docs/theory/planner.md, "Terrain").
+"""
 
 SHIFT_PIXELS = 0.5
-"""Shift of a pixel, in pixels, that a cheaper ground may add: a place stays in its own pixel."""
+"""Tolerated displacement by a simpler terrain model, pixels: a point stays in its own pixel."""
 
 
 def decide_terrain(job: Job, *, requested: str | None = None, where: str = "processing") -> Decision:
-    """Decide whether the ground is modelled by a plane, a tilted plane or the DEM.
+    """Decide the terrain model: a plane, a tilted plane or the DEM.
 
     Parameters
     ----------
     job
-        What is to be imaged.
+        Imaging job.
     requested
-        Requested model; None: the rule decides.
+        Requested model; None: automatic.
     where
-        Section of the config with the request, for messages.
+        Section of the configuration with the request, for messages.
 
     Raises
     ------
@@ -111,34 +114,34 @@ def decide_terrain(job: Job, *, requested: str | None = None, where: str = "proc
 
     Notes
     -----
-    Source: docs/theory/planner.md, "Terrain": a height that is wrong by δh turns the look angle by δh over the ground
-    range and shifts the pixel by δh·H over it.
+    Source: docs/theory/planner.md, "Terrain". At ground range d and platform height H, a height error δh changes the
+    look angle by δh/d and displaces the pixel by δh·H/d.
     """
-    chosen = _by_rule(job)
+    chosen = _automatic_terrain(job)
     if requested is None or requested == chosen.value:
         return chosen
     if isinstance(job.terrain.full, FlatGround):
         raise CampaignError(
-            f"terrain is {requested}",
+            f"terrain model {requested}, but the scene has no DEM",
             where=f"{where}.terrain",
-            expected="plane or auto: the scene has no DEM",
-            remedy="Name a DEM in scene.dem, or leave terrain to the planner.",
+            expected="plane or auto without a DEM",
+            remedy="Configure a DEM in scene.dem, or set terrain to auto.",
         )
-    return Decision("terrain", requested, f"asked for; the rule says {chosen.value}: {chosen.reason}")
+    return Decision("terrain", requested, f"requested; automatic choice {chosen.value}: {chosen.reason}")
 
 
-def _by_rule(job: Job) -> Decision:
-    (limit_m, rule), ground = _tolerance(job), job.terrain
+def _automatic_terrain(job: Job) -> Decision:
+    (limit_m, limits), ground = _height_tolerance(job), job.terrain
     if isinstance(ground.full, FlatGround):
-        return Decision("terrain", "plane", f"no DEM; height may be wrong by {limit_m:.3g} m: {rule}")
+        return Decision("terrain", "plane", f"no DEM; tolerated height error {limit_m:.3g} m: {limits}")
     if ground.relief_m < limit_m:
-        return Decision("terrain", "plane", f"relief {ground.relief_m:.3g} m; {rule}")
-    off_plane = f"relief {ground.relief_m:.3g} m, {ground.off_plane_m:.3g} m off a tilted plane; {rule}"
+        return Decision("terrain", "plane", f"relief {ground.relief_m:.3g} m; {limits}")
+    off_plane = f"relief {ground.relief_m:.3g} m, {ground.off_plane_m:.3g} m from a tilted plane; {limits}"
     return Decision("terrain", "tilted_plane" if ground.off_plane_m < limit_m else "dem", off_plane)
 
 
-def _tolerance(job: Job) -> tuple[float, str]:
-    """Return how far heights may be wrong, metres, and why."""
+def _height_tolerance(job: Job) -> tuple[float, str]:
+    """Return the tolerated height error, metres, and its derivation."""
     offset_m = job.aperture.middle_m[job.aperture.sample(64)][:, None] - job.points_m
     above = offset_m @ vertical(job.ground_m)
     ground = np.sqrt(np.maximum((offset_m**2).sum(-1) - above**2, 1e-6))
@@ -147,22 +150,22 @@ def _tolerance(job: Job) -> tuple[float, str]:
     focus_m = FOCUS_RAD * job.wavelength_m * nearest / (4 * np.pi * max(wobble_m, 1e-9))
     shift_m = SHIFT_PIXELS * job.spacing_m / max(steepest, 1e-9)
     return min(focus_m, shift_m), (
-        f"wobble {wobble_m:.3f} m rms and ground range from {nearest:.1f} m bear {focus_m:.3g} m (0.4 rad), "
-        f"half a pixel of shift {shift_m:.3g} m"
+        f"limits {focus_m:.3g} m by focus (0.4 rad at a track deviation of {wobble_m:.3f} m rms and a ground range of "
+        f"{nearest:.1f} m) and {shift_m:.3g} m by displacement (half a pixel)"
     )
 
 
 # ---- Integration
 
 CHORD = 0.1
-"""Share of the range to the scene over which directions of flight are taken: longer than position errors."""
+"""Chord over which the direction of flight is computed, in units of the range: long relative to position errors."""
 
 MOST_ASPECT = 1.5
-"""Aspect angle of a place over the integration angle above which `integration_turns` is raised: the track turns."""
+"""Ratio of a point's aspect angle to the integration angle, above which `track_turns` is raised."""
 
-_PULSES = 256  # sampled for the geometry
-_FEWEST = 3  # pulses of the place that takes most: of two there is no focus to be judged
-_COUNTED = 16384  # pulses sampled to count those of a pixel
+_PULSES = 256  # pulses sampled for the geometry
+_FEWEST = 3  # least pulses at the pixel with the most: focus cannot be judged from two
+_COUNTED = 16384  # pulses sampled to count the pulses per pixel
 
 
 def integrate(
@@ -175,66 +178,67 @@ def integrate(
     requested: Any = "auto",
     where: str = "processing",
 ) -> Integration:
-    """Return over how much of a flight the pixels of a scene are integrated.
+    """Decide the integration of a scene's pixels: the sector of the flight that contributes to them.
 
     Parameters
     ----------
     aperture
-        Every pulse, in the frame of the points.
+        All pulses, in the frame of the points.
     points_m
-        (row, column, 3) float64, metres: spread over the scene, corners included; rows go south.
+        (row, column, 3) float64, metres: distributed over the scene, corners included; rows go south.
     spacing_m, wavelength_m
-        Of the pixels, and of the band's middle.
+        Pixel spacing, and wavelength at band centre.
     antennas
-        Beams of the antennas, if any.
+        Antenna beams, if any.
     requested
         'auto', 'all', or a mapping with `degrees` or `resolution_m`.
     where
-        Section of the config with the request, for messages.
+        Section of the configuration with the request, for messages.
 
     Raises
     ------
     CampaignError
-        If no pulse illuminates any of the scene inside the sector.
+        If fewer than three pulses inside the sector illuminate any point of the scene.
 
     Notes
     -----
     Source: docs/theory/integration.md.
     """
     if requested == "all" or len(aperture) < 2:
-        return Integration(None, len(aperture), "all", "asked for: every pulse counts for every pixel")
+        return Integration(None, len(aperture), "all", "requested: all pulses contribute to every pixel")
     points = points_m.reshape(-1, 3)
-    some = aperture[aperture.sample(_PULSES)]
-    nearest_m = np.linalg.norm(some.middle_m[:, None] - points, axis=-1).min(axis=1)
+    pulses = aperture[aperture.sample(_PULSES)]
+    nearest_m = np.linalg.norm(pulses.middle_m[:, None] - points, axis=-1).min(axis=1)
     whole = Sector.of(aperture, chord_m=CHORD * float(np.median(nearest_m)), centre=0.0, half=2.0)
     sampled = whole[aperture.sample(_PULSES)]
-    place, squint = sampled.place(some, points), _squint(whole, antennas)
-    per_path = _gradient_per_path(some, sampled, points)
-    half, why = sector_half(requested, wavelength_m, spacing_m, per_path=per_path, squint=squint), "asked for"
+    position, squint = sampled.place(pulses, points), _squint(whole, antennas)
+    per_path = _gradient_per_path(pulses, sampled, points)
+    half, reason = sector_half(requested, wavelength_m, spacing_m, per_path=per_path, squint=squint), "requested"
     if requested == "auto":
-        why = f"pixels of {spacing_m:g} m carry no more"
-        flown = float(np.ptp(place, axis=0).max())
-        if flown <= 2 * half * (1 + TAPER):
-            cell_m = wavelength_m / (per_path * flown) if flown else np.inf
-            reason = f"every pulse counts: pixels of {spacing_m:g} m carry the {cell_m:.3g} m that was flown"
+        reason = f"finest resolution that pixels of {spacing_m:g} m can represent"
+        span = float(np.ptp(position, axis=0).max())
+        if span <= 2 * half * (1 + TAPER):
+            cell_m = wavelength_m / (per_path * span) if span else np.inf
+            resolution = f"the flight's resolution of {cell_m:.3g} m"
+            reason = f"all pulses contribute: pixels of {spacing_m:g} m suffice for {resolution}"
             return Integration(None, len(aperture), "all", reason)
     sector = Sector(whole.tx_axis, whole.rx_axis, squint, half).following(aperture, points)
-    return _integration_of(sector, aperture, points_m, wavelength_m / (2 * per_path * half), why, where)
+    return _integration_of(sector, aperture, points_m, wavelength_m / (2 * per_path * half), reason, where)
 
 
 def sector_half(
     requested: Any, wavelength_m: float, spacing_m: float, *, per_path: float = 2.0, squint: float = 0.0
 ) -> float:
-    """Return the half width in s of the sector that is asked for.
+    """Return the half width in s of the requested sector.
 
     Parameters
     ----------
     requested
         'auto', or a mapping with `degrees` or `resolution_m`.
     wavelength_m, spacing_m
-        Of the band's middle, and of the pixels.
+        Wavelength at band centre, and pixel spacing.
     per_path
-        Change of the path's gradient along the flight per change of s: 2 for antennas flying in parallel.
+        Change of the path gradient along the flight per change of s: 2 for antennas on parallel tracks.
     squint
         s of the sector's middle.
 
@@ -258,38 +262,38 @@ def _squint(whole: Sector, antennas: Beams | None) -> float:
     """Return s along the boresights, median over the pulses; 0 without beams."""
     if antennas is None:
         return 0.0
-    stated = [beam.axes[:, 0] for beam in (antennas.transmit, antennas.receive) if beam is not None]
-    tx, rx = stated[0], stated[-1]
+    boresights = [beam.axes[:, 0] for beam in (antennas.transmit, antennas.receive) if beam is not None]
+    tx, rx = boresights[0], boresights[-1]
     return float(np.median((whole.tx_axis * tx).sum(axis=1) + (whole.rx_axis * rx).sum(axis=1)))
 
 
 def _gradient_per_path(aperture: Aperture, sector: Sector, points: NDArray[np.float64]) -> float:
-    """Return the change of the path's gradient along the flight per change of s: 2 for antennas flying in parallel."""
-    flown = sector.tx_axis + sector.rx_axis
-    ahead = flown / np.maximum(np.linalg.norm(flown, axis=1, keepdims=True), 1e-9)
+    """Return the change of the path gradient along the flight per change of s: 2 for antennas on parallel tracks."""
+    heading = sector.tx_axis + sector.rx_axis
+    ahead = heading / np.maximum(np.linalg.norm(heading, axis=1, keepdims=True), 1e-9)
     along = np.einsum("pnx,px->pn", aperture.path_gradient(points), ahead)
     change_s, change = (np.abs(np.diff(each, axis=0)).sum(axis=0) for each in (sector.place(aperture, points), along))
     return float(np.median(change / np.where(change_s > 0, change_s, np.inf))) or 2.0
 
 
 def _integration_of(
-    sector: Sector, aperture: Aperture, points_m: NDArray[np.float64], resolution_m: float, why: str, where: str
+    sector: Sector, aperture: Aperture, points_m: NDArray[np.float64], resolution_m: float, reason: str, where: str
 ) -> Integration:
-    """Return the integration by a sector, with its pulses per place, resolution and flags."""
+    """Return the integration over a sector, with its pulses per pixel, resolution and flags."""
     points = points_m.reshape(-1, 3)
     total, counts = _pulses_per_place(sector, aperture, points)
     if counts.max() < _FEWEST:
-        seen = "zero" if not counts.any() else f"no more than {counts.max():.0f}"
+        pulses = "no pulses" if not counts.any() else f"at most {counts.max():.0f} pulses"
         raise CampaignError(
-            f"{seen} pulses see the scene inside the integration angle (s = {sector.centre:.3g} ± {sector.half:.3g})",
+            f"{pulses} illuminate a pixel inside the integration angle (s = {sector.centre:.3g} ± {sector.half:.3g})",
             where=f"{where}.integration",
-            expected="a scene that the flight passes, or antennas that look at it, and an angle that spans an aperture",
-            remedy="Set processing.integration to all or to more, or correct scene.bounds_m.",
+            expected=f"at least {_FEWEST} pulses: a flight past the scene, and antennas directed at it",
+            remedy="Set processing.integration to all or to a larger angle, or correct scene.bounds_m.",
         )
-    # Report: angle, response of the smooth edges, squint of the places, pulses of a place.
+    # Report: angle, response with tapered edges, squint over the scene, pulses per pixel.
     degrees = float(np.degrees(2 * np.arcsin(min(1.0, sector.half))))
     least, median, most = (round(float(np.quantile(counts, part))) for part in (0, 0.5, 1))
-    counted = f"of {len(aperture)} pulses a place takes {least} to {most} (median {median})"
+    counted = f"{least} to {most} of {len(aperture)} pulses per pixel (median {median})"
     width, sidelobe_db = response()
     squint_deg = np.degrees(np.arcsin(np.quantile(sector.centre_at(points).clip(-1, 1), (0, 0.5, 1)))).round(3)
     report = {
@@ -304,41 +308,41 @@ def _integration_of(
     flags = {}
     if not counts.all():
         outside = f"{100 * float((counts == 0).mean()):.1f} % of the scene"
-        flags["outside_swath"] = f"{outside} is passed by no pulse inside the integration angle of {degrees:.3g}°"
+        flags["outside_swath"] = f"{outside} has no pulse inside the integration angle of {degrees:.3g}°"
     aspect_deg = _aspect_deg(sector, aperture, points[counts > 0], vertical(points_m))
     if aspect_deg > MOST_ASPECT * degrees * (1 + TAPER):
-        flags["integration_turns"] = (
-            f"places are seen under {aspect_deg:.0f}° in all, {degrees:.3g}° are integrated of a straight pass: the "
-            "track turns, or passes them more than once"
+        flags["track_turns"] = (
+            f"aspect angle of a point {aspect_deg:.0f}° in total, integration angle of a straight pass {degrees:.3g}°: "
+            "the track turns, or passes the scene more than once"
         )
     value, count = f"{degrees:.3g}°, {resolution_m:.3g} m", max(1, round(float(total.max())))
     share = float(counts.mean()) / len(aperture)
-    return Integration(sector, count, value, f"{why}; {counted}", share, report, flags)
+    return Integration(sector, count, value, f"{reason}; {counted}", share, report, flags)
 
 
 def _pulses_per_place(
     sector: Sector, aperture: Aperture, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the sum of the weights and the number of pulses with weight at each point, from a sample if many."""
+    """Return the sum of weights and the number of pulses with weight at each point; estimated by subsampling."""
     every = slice(None, None, -(-len(aperture) // _COUNTED))
-    few, some = aperture[every], sector[every]
+    pulses, sampled = aperture[every], sector[every]
     total, counts = np.zeros((2, len(points)))
-    for first in range(0, len(few), _PULSES):
-        weight = some[first : first + _PULSES].weight(few[first : first + _PULSES], points)
+    for first in range(0, len(pulses), _PULSES):
+        weight = sampled[first : first + _PULSES].weight(pulses[first : first + _PULSES], points)
         total, counts = total + weight.sum(axis=0), counts + (weight > 0).sum(axis=0)
-    scale = len(aperture) / len(few)
+    scale = len(aperture) / len(pulses)
     return scale * total, scale * counts
 
 
 def _aspect_deg(sector: Sector, aperture: Aperture, points: NDArray[np.float64], up: NDArray[np.float64]) -> float:
-    """Return the aspect angle of a place over the pulses inside the sector, median over places, degrees."""
-    some = aperture.sample(4 * _PULSES)
-    few, inside = aperture[some], sector[some]
-    summed, gradient = inside.weight(few, points) >= 0.5, few.path_gradient(points)
+    """Return the aspect angle of a point over the pulses inside the sector, median over the points, degrees."""
+    sampled = aperture.sample(4 * _PULSES)
+    pulses, inside = aperture[sampled], sector[sampled]
+    summed, gradient = inside.weight(pulses, points) >= 0.5, pulses.path_gradient(points)
     east = np.cross(up, np.eye(3)[np.abs(up).argmin()])
-    turn = np.degrees(np.arctan2(gradient @ np.cross(up, east), gradient @ east))
+    azimuth = np.degrees(np.arctan2(gradient @ np.cross(up, east), gradient @ east))
     spans = []
-    for column, within in zip(turn.T, summed.T, strict=True):
+    for column, within in zip(azimuth.T, summed.T, strict=True):
         angles = np.sort(column[within])
         if len(angles) > 1:
             spans.append(360 - float(np.diff(angles, append=angles[0] + 360).max()))

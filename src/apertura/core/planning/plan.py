@@ -1,4 +1,4 @@
-"""The plan of an image: choices with reasons, memory and disk, and flags of crossed limits of imaging."""
+"""Plan of an image: decisions with reasons, memory and disk, and flags of exceeded imaging limits."""
 
 import os
 from collections.abc import Mapping
@@ -28,17 +28,17 @@ from apertura.core.scene.terrain import Terrain
 
 
 def check_geometry(job: Job) -> dict[str, str]:
-    """Return flags: limit of imaging that the job exceeds → what was measured, in one line.
+    """Check the geometry of a job and return flags: exceeded limit → measured value, in one line.
 
     Parameters
     ----------
     job
-        What is to be imaged.
+        Imaging job.
 
     Raises
     ------
     CampaignError
-        If there is no pulse, a position is not finite, or no echo of the scene arrives inside the prefix.
+        If there is no pulse, a position is not finite, or all echoes of the scene arrive after the cyclic prefix.
     """
     aperture, ground_m = job.aperture, job.ground_m
     check_positions(aperture)
@@ -49,40 +49,41 @@ def check_geometry(job: Job) -> dict[str, str]:
         over |= _over(leg, ground_m, up, job.spacing_m)
     if over.any():
         flags["platform_inside_scene"] = (
-            f"{int(over.sum())} of {len(aperture)} pulses are sent or received above the scene: echoes from both sides "
-            "mix"
+            f"{int(over.sum())} of {len(aperture)} pulses are transmitted or received above the scene: left-right "
+            "ambiguity"
         )
     weigh = None if job.sector is None else job.sector.over(aperture)
     cell_m = aperture.resolution_cell_m(ground_m, band_hz=job.band_hz, weigh=weigh)
     if job.spacing_m > WIDEST_PIXEL * cell_m:
         flags["spacing_coarse"] = (
-            f"spacing {job.spacing_m:g} m, finest resolution cell {cell_m:.3g} m: targets fall between"
+            f"pixel spacing {job.spacing_m:g} m, finest resolution cell {cell_m:.3g} m: targets may fall between pixels"
         )
     if missing := no_aperture(aperture, ground_m, wavelength_m=2 * SPEED_OF_LIGHT_M_S / sum(job.band_hz)):
         flags["no_aperture"] = missing
     if sparse := undersampling(job):
-        flags["pulses_sparse"] = sparse
+        flags["azimuth_undersampled"] = sparse
     beyond = _share_beyond(aperture, job.points_m, job.path_limit_m)
     if beyond:
         flags["beyond_cyclic_prefix"] = (
-            f"{100 * beyond:.0f} % of the scene arrives too late for all captures: after the cyclic prefix, or listen_s"
+            f"echoes from {100 * beyond:.0f} % of the scene arrive after the cyclic prefix, or after listen_s, in all "
+            "captures"
         )
     return flags
 
 
 _LEAST_CELLS = 2.0
-"""Cells across the line of sight that a scene must hold: with fewer, an image shows ranges, and no places."""
+"""Least number of resolution cells across the line of sight: with fewer, an image resolves range only."""
 
 
 def no_aperture(aperture: Aperture, ground_m: NDArray[np.float64], *, wavelength_m: float) -> str | None:
-    """Return one line where antennas move too little to resolve anything across the line of sight, else None.
+    """Detect a track too short for resolution across the line of sight, described in one line; None if sufficient.
 
     Parameters
     ----------
     aperture
-        Of a pair.
+        Aperture of a pair.
     ground_m, wavelength_m
-        As of `Aperture.cross_cell_m`.
+        As for `Aperture.cross_cell_m`.
 
     Notes
     -----
@@ -93,22 +94,23 @@ def no_aperture(aperture: Aperture, ground_m: NDArray[np.float64], *, wavelength
     if _LEAST_CELLS * cell_m <= side_m:
         return None
     moved_m = max(float(np.linalg.norm(leg - leg[0], axis=1).max()) for leg in aperture.legs)
-    resolved = f"resolves {cell_m:.3g} m" if np.isfinite(cell_m) else "resolves nothing"
+    resolution = f"a resolution of {cell_m:.3g} m" if np.isfinite(cell_m) else "no resolution"
     return (
-        f"antennas moved {moved_m:.3g} m, which {resolved} across the line of sight, in a scene of {side_m:.3g} m: is "
-        "this a bench recording?"
+        f"antennas moved {moved_m:.3g} m: {resolution} across the line of sight in a scene of {side_m:.3g} m (a bench "
+        "recording?)"
     )
 
 
 GHOST_DB, REACHED = -20.0, 0.1
-"""dB of a point's ghosts against it, and share of the scene, mean over the pulses, above which they show."""
+"""Level of ghosts relative to their point, dB, and ambiguous share of the scene, mean over the pulses, above which
+ghosts are visible."""
 
 FOLDED_DB = 1.0
-"""dB by which echoes that fold brighten the scene on average, above which they show between its targets."""
+"""Mean increase of the scene's power by aliased echoes, dB, above which they are visible between targets."""
 
 
 def undersampling(job: Job) -> str | None:
-    """Return one line where the aperture is undersampled so far that its ambiguities show, else None.
+    """Detect undersampling of the aperture with visible ambiguities, described in one line; None if not visible.
 
     Notes
     -----
@@ -120,15 +122,15 @@ def undersampling(job: Job) -> str | None:
         return None
     folded = job.aperture.ambiguities(job.points_m, wavelength_m=wavelength_m)
     pulses = len(job.aperture) if job.integration is None else job.integration.count
-    # a ghost walks a wavelength of path per pulse: through the response of a windowed band in twice f/B pulses
+    # The path of a ghost changes by a wavelength per pulse: it crosses the range response in 2·f/B pulses.
     walked = (lowest_hz + highest_hz) / max(highest_hz - lowest_hz, 1.0) / max(pulses, 1)
     ghost_db = 20 * np.log10(max(min(1.0, walked, float(folded.max())), 1e-6))
     reached, brighter_db = float(np.minimum(folded, 1).mean()), decibels(1 + float(folded.mean()))
     if not (brighter_db > FOLDED_DB or (ghost_db > GHOST_DB and reached > REACHED)):
         return None
     return (
-        f"phase rates over the scene spread {spread:.2f} cycles per pulse, 1 is unambiguous: echoes fold onto "
-        f"{100 * reached:.0f} % of it and brighten it by {brighter_db:.1f} dB on average, ghosts of points are at "
+        f"phase rates over the scene span {spread:.2f} cycles per pulse (unambiguous up to 1): echoes alias onto "
+        f"{100 * reached:.0f} % of the scene and increase its mean power by {brighter_db:.1f} dB; ghosts of points at "
         f"{ghost_db:.0f} dB"
     )
 
@@ -137,7 +139,7 @@ def check_positions(aperture: Aperture) -> None:
     """Raise CampaignError unless there is a pulse and each has finite phase centres."""
     if len(aperture) == 0:
         raise CampaignError(
-            "zero pulses", where="echo", expected="at least one", remedy="Check the triggers and the sidelink."
+            "no pulses", where="echo", expected="at least one pulse", remedy="Check the triggers and the sidelink."
         )
     lost = np.asarray(~np.isfinite(np.hstack(aperture.legs)).all(axis=1))
     if lost.any():
@@ -152,11 +154,11 @@ def check_positions(aperture: Aperture) -> None:
 def _over(
     position_m: NDArray[np.float64], ground_m: NDArray[np.float64], up: NDArray[np.float64], spacing_m: float
 ) -> NDArray[np.bool_]:
-    """Return which pulses are above the scene."""
+    """Return a mask of the pulses above the scene."""
     corner, over = ground_m[0, 0], np.ones(len(position_m), bool)
     right, down = ground_m[0, -1] - corner, ground_m[-1, 0] - corner
     lengths = [float(np.linalg.norm(side)) for side in (right, down)]
-    if not lengths[1]:  # one row or column is as wide as a pixel
+    if not lengths[1]:  # a single row or column has the width of a pixel
         down = np.cross(right if lengths[0] else np.eye(3)[np.abs(up).argmin()], up)
     if not lengths[0]:
         right = np.cross(down, up)
@@ -173,18 +175,18 @@ def _share_beyond(aperture: Aperture, points_m: NDArray[np.float64], path_limit_
     beyond = shortest > path_limit_m
     if beyond.all():
         raise CampaignError(
-            f"zero pulses see the scene: the shortest total path is {shortest.min():.1f} m, the scene "
-            f"{shortest.min() / 2000:.3g} km from the tracks at least",
+            f"no pulse receives an echo of the scene: the shortest total path is {shortest.min():.1f} m, and the scene "
+            f"is at least {shortest.min() / 2000:.3g} km from the tracks",
             where="scene.bounds_m",
-            expected=f"at most {path_limit_m:.1f} m, the cyclic prefix",
-            remedy="Correct scene.bounds_m (easting before northing), scene.crs, the tracks' places, or the height of "
-            "the ground: scene.height_m, or unit and datum of scene.dem; or make the prefix longer.",
+            expected=f"a total path of at most {path_limit_m:.1f} m, the length of the cyclic prefix",
+            remedy="Correct scene.bounds_m (easting before northing), scene.crs, the positions of the tracks, or the "
+            "terrain height (scene.height_m, or unit and datum of scene.dem); or use a longer prefix.",
         )
     return float(beyond.mean())
 
 
 def vertical(ground_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the unit normal of ground points (row, column, 3) whose rows go south and columns east.
+    """Return the upward unit normal of ground points (row, column, 3), with rows going south and columns east.
 
     Examples
     --------
@@ -204,16 +206,17 @@ def vertical(ground_m: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Decision:
-    """One choice.
+    """One decision of the planner.
 
     Attributes
     ----------
     name, value
-        What was chosen: a key of the config's `processing`, or an option of the engine, where it can be overridden.
+        Option and its value: a key of section `processing` of the configuration, or an option of the engine, by which
+        the decision can be overridden.
     reason
-        One line with the numbers.
+        Reason with its numbers, one line.
     error_db
-        Error that this choice adds, relative to the full model; None where it adds none.
+        Error added by this decision, relative to the full model; None if it adds none.
     """
 
     name: str
@@ -224,34 +227,34 @@ class Decision:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """How an image will be formed.
+    """Plan of the formation of an image.
 
     Attributes
     ----------
     setting
         Engine and options.
     fallbacks
-        Next better settings, for tiles whose certified error is worse than requested; the last one is `reference`.
+        More exact settings, for tiles whose certified error exceeds the requested one; the last one is `reference`.
     decisions
-        Every choice with its reason.
+        All decisions with their reasons.
     accuracy_db
-        The requested numerical error.
+        Requested numerical error.
     predicted_error_db
-        RMS on random pixels: of the setting and of the models.
+        Predicted RMS error at random pixels, of the setting and of the models.
     predicted_seconds
-        Tables and tiles, roughly.
+        Predicted run time for tables and tiles.
     memory_bytes, disk_bytes
-        Peak of the imaging step; what it leaves in the results folder.
+        Peak memory of the imaging step; size of its results.
     flags
-        Limits that the job exceeds: name → what was measured, in one line.
+        Limits exceeded by the job: name → measured value, in one line.
     presum, middle_m
-        The low-pass sum over pulses, and the point they are aligned to; settings of `fallbacks` do not use it.
+        Low-pass sum over pulses, and the point to which they are aligned; not used by the settings of `fallbacks`.
     terrain
-        The ground that is imaged on: as it is, a plane through it, or level.
+        Terrain model of the image: the full terrain, a plane through it, or level ground.
     beams, integration, illumination
-        Of the job.
+        Those of the job.
     fixed_engine
-        Whether the engine of `setting` was requested.
+        True if the engine of `setting` was requested.
     """
 
     setting: Setting
@@ -278,33 +281,33 @@ class Plan:
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Choice → value and reason, in one line."""
+        """Option → value and reason, in one line."""
         return {decision.name: f"{decision.value}: {decision.reason}" for decision in self.decisions}
 
     @property
     def choices(self) -> dict[str, Any]:
-        """Choice → value: all that the image's pixels depend on, and no prediction."""
+        """Option → value: all decisions on which the image's pixels depend, without predictions."""
         return {decision.name: decision.value for decision in self.decisions} | {"ground": self.terrain.spec}
 
     @property
     def count(self) -> int | None:
-        """Pulses that the sum is divided by; None: all of them."""
+        """Number of pulses by which the sum is divided; None: all pulses."""
         return None if self.integration is None or self.integration.sector is None else self.integration.count
 
     @property
     def presumming(self) -> tuple[Presum, NDArray[np.float64]] | None:
-        """The low-pass sum over pulses and the point they are aligned to; None: every pulse as it is."""
+        """Low-pass sum over pulses and the point to which they are aligned; None: no presumming."""
         return None if self.presum is None or self.middle_m is None else (self.presum, self.middle_m)
 
     def fallen_back(self, setting: Setting) -> "Plan":
-        """Return the plan with one of its fallbacks, which takes every pulse as it is."""
-        reason = f"{self.setting.line} missed the accuracy asked on the pixels compared"
+        """Return the plan with one of its fallbacks, without presumming."""
+        reason = f"{self.setting.line} missed the requested accuracy at the compared pixels"
         replaced = {"engine", "presum", "pulse_blocks", *self.setting.reasons}
         decisions = (
             Decision("engine", setting.engine, reason, setting.error_db),
-            *(Decision(name, setting.all_options[name], why) for name, why in setting.reasons.items()),
-            Decision("presum", 1, "a fallback takes every pulse"),
-            Decision("pulse_blocks", setting.pulse_blocks, "those of the fallback"),
+            *(Decision(name, setting.all_options[name], reason) for name, reason in setting.reasons.items()),
+            Decision("presum", 1, "no presumming in a fallback"),
+            Decision("pulse_blocks", setting.pulse_blocks, "number of the fallback setting"),
             *(decision for decision in self.decisions if decision.name not in replaced),
         )
         return replace(
@@ -317,62 +320,62 @@ class Plan:
         )
 
     def replaced_by(self, setting: Setting, what: str) -> Flags:
-        """Raise a flag where a requested engine is replaced for `what`, the image or some of its tiles."""
+        """Return a flag if a requested engine is replaced for `what`, the image or a number of its tiles."""
         if not self.fixed_engine or setting.engine == self.engine:
             return Flags()
-        line = f"{what} by {setting.engine}: {self.engine}, as requested, misses {self.accuracy_db:.0f} dB"
+        line = f"{what} formed by {setting.engine}: the requested {self.engine} misses {self.accuracy_db:.0f} dB"
         return Flags({"engine_replaced": line})
 
     def inputs(self, profiles: Profiles) -> Profiles:
-        """Return the profiles for the plan's setting, presummed if planned: the image's sum over pulses is the same."""
+        """Return the profiles for the plan's setting, presummed if planned."""
         return profiles if self.presumming is None else presummed(profiles, *self.presumming)
 
 
-# ---- Memory, disk and blocks of pulses
+# ---- Memory, disk and pulse blocks
 
 BLOCK_BYTES = 512 << 20
-"""Bytes of a block of pulses at most, read and as tables, so that memory does not grow with the flight."""
+"""Largest size of a pulse block in memory, samples and tables, so that memory does not grow with the flight."""
 
 _BASE_BYTES = 350_000_000  # the interpreter and its libraries
-_PULSE_BYTES = 500  # of a pulse whose samples are not in memory: phase centres, axes, copies of them
-_TILE_BYTES = 150  # per pixel in work: positions, their projection, the sum
-_READ_BYTES = 3  # per byte of a block while it is read: as stored, as decoded, where it goes
-_SUM_BYTES = 8  # per pixel of the sum of pulse blocks
-_CHECKED_PULSES, _CHECKED_BYTES = 1024, 40  # read at once for certificate and focus; bytes per subcarrier of one
-_LEAST_PULSES = 64  # of a block: the kernel sums that many at a time
-_PRODUCT_BYTES = 76  # per pixel: image, its part of the cube, three rasters with overviews, before compression
+_PULSE_BYTES = 500  # per pulse without its samples: phase centres, axes, copies of them
+_TILE_BYTES = 150  # per pixel being formed: positions, their projection, the sum
+_READ_BYTES = 3  # per byte of a block while it is read: compressed, decoded, and in its destination
+_SUM_BYTES = 8  # per pixel of the sum over pulse blocks
+_CHECKED_PULSES, _CHECKED_BYTES = 1024, 40  # pulses per read for certificate and focus; bytes per subcarrier and pulse
+_LEAST_PULSES = 64  # least pulses of a block: batch size of the kernel
+_PRODUCT_BYTES = 76  # per pixel: image, its share of the cube, three rasters with overviews, before compression
 
 
 def pulse_blocks(setting: Setting, job: Job, presum: Presum | None, *, requested: int | None = None) -> int:
-    """Return into how many blocks pulses are split: as few as fit into the job's memory, or as many as requested.
+    """Return the number of pulse blocks: the requested number, or the least that fits into the job's memory.
 
-    Where not even the smallest blocks fit, those are taken, and the plan's bytes say that the job does not fit.
+    If not even the smallest blocks fit, these are used, and the plan's memory exceeds the limit.
     """
     pulses = len(job.aperture) if presum is None else len(presum.at)
     resident = _resident_bytes(setting, job, presum)
-    room = min(BLOCK_BYTES, max(1.0, job.memory_bytes - _forming_bytes(job)))
-    if requested is None and resident <= room:
+    available = min(BLOCK_BYTES, max(1.0, job.memory_bytes - _forming_bytes(job)))
+    if requested is None and resident <= available:
         return 1
-    less = min(BLOCK_BYTES, max(1.0, job.memory_bytes - _forming_bytes(job) - _SUM_BYTES * job.pixels))
-    count = requested or -(-resident // less)
+    available = min(BLOCK_BYTES, max(1.0, job.memory_bytes - _forming_bytes(job) - _SUM_BYTES * job.pixels))
+    count = requested or -(-resident // available)
     return int(min(count, max(1, pulses // _LEAST_PULSES)))
 
 
 def block_decision(chosen: Setting, job: Job, presum: Presum | None, *, requested: bool) -> Decision:
-    """Return the choice of pulse blocks with its reason; the reason of one block does not depend on the machine."""
+    """Return the decision on pulse blocks; the reason for a single block does not depend on the machine."""
     size = f"{decimal(int(_resident_bytes(chosen, job, presum)))} of samples and tables"
     if requested:
-        why = f"asked for, in blocks of {_LEAST_PULSES} pulses or more; {size} in all"
+        reason = f"requested, with at least {_LEAST_PULSES} pulses per block; {size} in total"
     elif chosen.pulse_blocks > 1:
-        room = decimal(int(min(job.memory_bytes, BLOCK_BYTES)))
-        why = f"{size} are more than the {room} of memory that a block may take"
+        limit = decimal(int(min(job.memory_bytes, BLOCK_BYTES)))
+        reason = f"{size} exceed the memory limit of a block, {limit}"
     else:
-        why = f"{size} fit into memory"
-    return Decision("pulse_blocks", chosen.pulse_blocks, why)
+        reason = f"{size} fit into memory"
+    return Decision("pulse_blocks", chosen.pulse_blocks, reason)
 
 
 def bytes_needed(job: Job, chosen: Setting, presum: Presum | None) -> tuple[int, int]:
-    """Return peak memory of the imaging step, and what the pair leaves on disk, bytes."""
+    """Return the peak memory of the imaging step, and the disk space of the pair's results, bytes."""
     pulses = len(job.aperture)
     sums = _SUM_BYTES * job.pixels if chosen.pulse_blocks > 1 else 0
     forming = sums + _resident_bytes(chosen, job, presum) // chosen.pulse_blocks
@@ -382,28 +385,27 @@ def bytes_needed(job: Job, chosen: Setting, presum: Presum | None) -> tuple[int,
 
 
 def _resident_bytes(setting: Setting, job: Job, presum: Presum | None) -> int:
-    """Return the bytes of all pulses in memory at once, as read and as tables."""
+    """Return the memory for the samples and tables of all pulses at once, bytes."""
     samples = job.signal.samples if setting.table_bytes else job.subcarriers
     virtual = 0 if presum is None else 16 * (len(job.aperture) + len(presum.at)) * samples
     return _READ_BYTES * 8 * len(job.aperture) * samples + virtual + setting.table_bytes
 
 
 def _forming_bytes(job: Job) -> int:
-    """Return what is in memory while tiles are formed, but for the samples of pulses and their tables."""
+    """Return the memory during image formation without pulse samples and tables, bytes."""
     tiles = min(job.threads, job.tiles) * _TILE_BYTES * min(job.tile_px**2, job.pixels)
     return _BASE_BYTES + _PULSE_BYTES * len(job.aperture) + tiles
 
 
 def memory_limit(*, groups: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> int:
-    """Return the bytes of memory that this process may use: the machine's, or less where a control group says so.
+    """Return the memory available to this process, bytes: that of the machine, or the limit of its control groups.
 
-    Batch systems and containers limit a job by a control group (version 1 or 2); a limit of any group above the
-    process's own counts as well.
+    Batch systems and containers limit a job by a control group (version 1 or 2); limits of parent groups apply as well.
 
     Parameters
     ----------
     groups, root
-        Where Linux lists the groups of a process, and where their files are.
+        File with the control groups of the process, and root folder of the control groups.
 
     Notes
     -----
@@ -421,7 +423,7 @@ def memory_limit(*, groups: Path = Path("/proc/self/cgroup"), root: Path = Path(
         if controllers == "" or "memory" in controllers.split(","):
             top = root / controllers if controllers else root
             own = top / path.lstrip("/")
-            stated = [folder / name for folder in (own, *own.parents) if folder.is_relative_to(top)]
-            texts = [file.read_text(encoding="utf-8").strip() for file in stated if file.is_file()]
-            limits += [int(text) for text in texts if text.isdecimal()]  # 'max': none
+            files = [folder / name for folder in (own, *own.parents) if folder.is_relative_to(top)]
+            texts = [file.read_text(encoding="utf-8").strip() for file in files if file.is_file()]
+            limits += [int(text) for text in texts if text.isdecimal()]  # 'max': no limit
     return min(limits)

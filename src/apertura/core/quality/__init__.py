@@ -1,1 +1,1 @@
-"""Quality of an image: point targets, measures, numerical error."""
+"""Image quality: point targets, focus, agreement of images, error budget and numerical error."""

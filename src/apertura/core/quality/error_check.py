@@ -1,4 +1,4 @@
-"""Numerical error of an image: pixels recomputed exactly, an upper bound at 95 % confidence, tiles that fail."""
+"""Certificate of the numerical error: pixels recomputed exactly, upper bound at 95 % confidence, and failing tiles."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,14 +11,14 @@ from apertura.core.quality.measures import BlockRaster
 
 # ---- Error bound from drawn pixels
 
-CONFIDENCE = 0.95  # of the error bound: it held in 98.5 % of images or more (benchmarks/certificate.py)
+CONFIDENCE = 0.95  # of the error bound, which was valid in at least 98.5 % of images (benchmarks/certificate.py)
 
-_SIGMAS = 2.0  # 1.645 would leave out 5 % of a Gaussian; sums of skewed errors reach further
+_SIGMAS = 2.0  # instead of 1.645, the 95 % quantile of a Gaussian: sums of skewed errors have longer tails
 
 
 @dataclass(frozen=True)
 class ErrorBound:
-    """RMS difference of an image from the exact sum over all its pixels, relative to the RMS of the image.
+    """RMS error over all pixels of an image, as the difference from the exact sum, relative to the image's RMS.
 
     Attributes
     ----------
@@ -32,7 +32,7 @@ class ErrorBound:
     estimate_db: float
 
     def with_error(self, error_db: float | None) -> "ErrorBound":
-        """Return the bound with another error that is independent of this one, dB; None: there is none.
+        """Return the bound combined with an independent error, dB; None: no further error.
 
         Examples
         --------
@@ -53,16 +53,16 @@ def error_bound(
     *,
     power: float | NDArray[np.float64],
 ) -> ErrorBound:
-    """Return the error of a whole image from pixels drawn at random, after one complex gain.
+    """Estimate the error of a whole image from random pixels, after a common complex gain.
 
     Parameters
     ----------
     computed, exact
-        (draw,) complex, the drawn pixels; a pixel drawn twice is listed twice.
+        (draw,) complex, values at the drawn pixels; a pixel drawn twice is listed twice.
     density
-        (draw,) float64, how often a draw like this takes that pixel on average.
+        (draw,) float64, expected number of draws of that pixel.
     power
-        Σ|I|² over all pixels of the image; or (draw,) float64, |I|² around each draw.
+        Σ|I|² over all pixels of the image; or (draw,) float64, mean |I|² around each drawn pixel.
 
     Notes
     -----
@@ -89,16 +89,16 @@ def error_bound(
     largest = float(levels.max())
     error = float(errors.sum())
     if not error or total <= largest:
-        nothing = _db(0.0 if not error else np.inf)
-        return ErrorBound(nothing, nothing)
+        limit_db = _db(0.0 if not error else np.inf)
+        return ErrorBound(limit_db, limit_db)
     deviation = np.sqrt(errors.size) * float((errors - error / total * levels).std())  # √K·s
-    # q at 95 %: the draws may have missed an error as large as the largest, and hit the brightest pixel by chance.
+    # q at 95 %: an error as large as the largest may have been missed, and the brightest pixel drawn by chance.
     above = (error + float(errors.max())) / (total - largest) * np.exp(_SIGMAS * deviation / error)
     return ErrorBound(_db(above), _db(error / total))
 
 
 def _db(power: float) -> float:
-    """Return a ratio of powers that cannot exceed 1, as the difference is a part of the exact sum; 0 is -313 dB."""
+    """Return the power ratio error / (image + error) in dB, at most 0 dB and at least -313 dB."""
     least = np.finfo(np.float64).eps ** 2
     return float(10 * np.log10(max(power / (1 + power) if np.isfinite(power) else 1.0, least)))
 
@@ -109,16 +109,16 @@ _BLOCK_PX = 256
 
 
 def random_pixels(windows: Sequence[Window], count: int, generator: np.random.Generator) -> NDArray[np.int64]:
-    """Return random pixels spread evenly over the tiles, (count, 2) int64 rows and columns.
+    """Draw random pixels spread evenly over the tiles, (count, 2) int64 rows and columns.
 
     Parameters
     ----------
     windows
-        Every tile; one after the other gets a pixel until `count` are spent, in an order that is drawn.
+        All tiles; each in turn receives a pixel, in random order, until `count` pixels are drawn.
     count
-        Pixels.
+        Number of pixels.
     generator
-        Draws the pixels and, where tiles outnumber them, the tiles.
+        Random generator.
 
     Examples
     --------
@@ -127,22 +127,22 @@ def random_pixels(windows: Sequence[Window], count: int, generator: np.random.Ge
     """
     order = generator.permutation(len(windows))
     drawn = []
-    for turn in range(count):
-        window = windows[order[turn % len(windows)]]
+    for number in range(count):
+        window = windows[order[number % len(windows)]]
         drawn.append([generator.integers(part.start, part.stop) for part in window])
     return np.array(drawn, np.int64).reshape(-1, 2)
 
 
 @dataclass(frozen=True, eq=False)
 class Brightness:
-    """Power of an image by tile: the distribution that bright pixels are drawn from.
+    """Power of an image by tile: the distribution from which bright pixels are drawn.
 
     Attributes
     ----------
     power, level
-        (tile,) float64, Σ|I|² and Σ|I| over the pixels of each.
+        (tile,) float64, Σ|I|² and Σ|I| over the pixels of each tile.
     pixels
-        Of the whole image.
+        Number of pixels of the whole image.
     """
 
     power: NDArray[np.float64]
@@ -167,9 +167,9 @@ class Brightness:
     def density(
         self, pixels: NDArray[np.int64], values: NDArray[np.complexfloating], windows: Sequence[Window], *, random: int
     ) -> NDArray[np.float64]:
-        """Return the mean number of draws of each of some pixels by `random_pixels` and `draw`, (pixel,) float64.
+        """Return the expected number of draws of drawn pixels by `random_pixels` and `draw`, (pixel,) float64.
 
-        `pixels` are the (pixel, 2) int64 of both draws, those of `random_pixels` (`random` of them) first; `values` the
+        `pixels` are the (pixel, 2) int64 of both draws, the `random` pixels of `random_pixels` first; `values` the
         image there.
         """
         density = np.zeros(len(pixels))
@@ -179,7 +179,7 @@ class Brightness:
         return density + (len(pixels) - random) * self._draw_probability(_level(values))
 
     def _draw_probability(self, level: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the probability that one draw takes pixels of that |I|: half by their power, half by |I|."""
+        """Return the probability that a draw selects a pixel with amplitude |I|: half by power, half by amplitude."""
         if not self.power.any():
             return np.zeros_like(level)
         return np.asarray((level**2 / self.power.sum() + level / self.level.sum()) / 2)
@@ -187,7 +187,7 @@ class Brightness:
     def draw(
         self, image: BlockRaster, windows: Sequence[Window], count: int, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Return pixels drawn by their brightness, (count, 2) int64; none of an image that is zero everywhere."""
+        """Draw pixels with probabilities by their brightness, (count, 2) int64; none if the image is zero."""
         if not (count and self.power.any()):
             return np.empty((0, 2), np.int64)
         edges = np.cumsum((self.power / self.power.sum() + self.level / self.level.sum()) / 2)
@@ -210,16 +210,16 @@ def _level(block: NDArray[np.complexfloating]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """Exact values of the pixels that `random_pixels` drew, whatever the values of the image.
+    """Exact values at the pixels drawn by `random_pixels`, independent of the values of the image.
 
     Attributes
     ----------
     windows
-        Every tile.
+        All tiles.
     pixels
         (pixel, 2) int64 rows and columns.
     exact
-        (pixel,) complex128 from `reference`.
+        (pixel,) complex128 by the exact sum.
     """
 
     windows: Sequence[Window]
@@ -227,30 +227,30 @@ class Certificate:
     exact: NDArray[np.complex128]
 
     def failing(self, image: BlockRaster, accuracy_db: float, *, power: float) -> tuple[list[Window], list[Window]]:
-        """Return (tiles without a drawn pixel, tiles worse than requested); both empty when all tiles pass.
+        """Return (tiles without a drawn pixel, tiles that miss the accuracy); both are empty if all tiles pass.
 
-        A tile is worse when the mean squared difference at its pixels exceeds the accuracy times the larger of `power`,
-        the mean |I|² of the image, and of what is there: a pixel on a bright target may err by more than a dark one.
-        The pixels do not depend on the image, so a run that was killed while it redid tiles makes the same choice
-        again, provided the failing tiles are redone last.
+        A tile fails if the mean squared difference at its pixels exceeds the accuracy times the larger of `power`, the
+        mean |I|² of the image, and the mean exact |I|² at these pixels: errors scale with bright targets. The pixels do
+        not depend on the image, so a run that was killed while it recomputed tiles selects the same tiles again,
+        provided the failing tiles are recomputed last.
         """
-        squared, there = np.abs(values_at(image, self.pixels) - self.exact) ** 2, np.abs(self.exact) ** 2
+        squared, exact_power = np.abs(values_at(image, self.pixels) - self.exact) ** 2, np.abs(self.exact) ** 2
         tolerated = 10 ** (accuracy_db / 10)
         empty, worse = [], []
         for window in self.windows:
             inside = _inside(self.pixels, window)
             if not inside.any():
                 empty.append(window)
-            elif not squared[inside].mean() <= tolerated * max(power, float(there[inside].mean())):
+            elif not squared[inside].mean() <= tolerated * max(power, float(exact_power[inside].mean())):
                 worse.append(window)
         return (empty if worse else []), worse
 
     def error(
         self, image: BlockRaster, brightness: Brightness, bright: NDArray[np.int64], exact: NDArray[np.complex128]
     ) -> ErrorBound:
-        """Return the error of the whole image, from its random pixels and `bright` ones drawn by `brightness`.
+        """Estimate the error of the whole image from its random pixels and `bright` pixels drawn by `brightness`.
 
-        `bright` are (pixel, 2) int64 rows and columns, `exact` (pixel,) complex128 the reference's values there.
+        `bright` are (pixel, 2) int64 rows and columns, `exact` (pixel,) complex128 the exact sum there.
         """
         pixels = np.concatenate([self.pixels, bright])
         values = values_at(image, pixels)
@@ -265,7 +265,7 @@ def _inside(pixels: NDArray[np.int64], window: Window) -> NDArray[np.bool_]:
 
 
 def values_at(image: BlockRaster, pixels: NDArray[np.int64]) -> NDArray[np.complex64]:
-    """Return an image at (pixel, 2) rows and columns, 0 where no pulse illuminates it; each block is read once."""
+    """Return the values of an image at (pixel, 2) rows and columns, 0 where NaN; each block is read once."""
     values, blocks = np.empty(len(pixels), np.complex64), pixels // _BLOCK_PX
     for block in np.unique(blocks, axis=0):
         inside, first = (blocks == block).all(axis=1), block * _BLOCK_PX

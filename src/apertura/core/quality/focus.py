@@ -1,4 +1,4 @@
-"""Focus of an image, measured without truth: by contributions of pulses and by subapertures."""
+"""Focus of an image without ground truth, from pulse contributions at bright points and from subapertures."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,42 +13,43 @@ from apertura.core.quality.measures import coherence_factor, weighted_median
 
 # ---- Subapertures: noise, drift and entropy
 
-_RANDOM_DRAWS = 8  # of random phases, averaged
+_RANDOM_DRAWS = 8  # draws of random phases that are averaged
 
 
 @dataclass(frozen=True)
 class SubApertures:
-    """Measures of some patches of an image, medians over the patches; NaN where there is none.
+    """Subaperture measures of patches of an image, medians over the patches; NaN without patches.
 
     Attributes
     ----------
     snr_db
-        SNR of a pixel, by images of even and of odd pulses.
+        SNR of a pixel, from images of even and of odd pulses.
     drift_m, drift_std_m
-        RMS of the shifts of the patch between subapertures, and its uncertainty.
-    entropy, entropy_by_chance
-        Shannon entropy of the patch, nats, and that of the same parts added with random phases: where both are equal
-        the phases of the subapertures do not focus the patch.
+        RMS shift of the patch between subapertures, and its standard deviation.
+    entropy, entropy_random_phase
+        Shannon entropy of the patch, nats, and that of the sum of the same subapertures with random phases: if both are
+        equal, the patch is not focused.
     """
 
     snr_db: float
     drift_m: float
     drift_std_m: float
     entropy: float
-    entropy_by_chance: float
+    entropy_random_phase: float
 
 
 def compare_parts(parts: NDArray[np.complex64], *, spacing_m: float, generator: np.random.Generator) -> SubApertures:
-    """Return the measures of subaperture images.
+    """Measure SNR, drift and entropy of subaperture images.
 
     Parameters
     ----------
     parts
-        (patch, 2, part, y, x) complex64: patches by even and by odd pulses of each part; their sum is the image.
+        (patch, 2, subaperture, y, x) complex64: patches from the even and the odd pulses of each subaperture; their sum
+        is the image.
     spacing_m
-        Between places.
+        Pixel spacing of the patches.
     generator
-        Draws the random phases.
+        Random generator of the phases.
 
     Notes
     -----
@@ -61,7 +62,7 @@ def compare_parts(parts: NDArray[np.complex64], *, spacing_m: float, generator: 
     >>> still = np.array([[[lobe(0) for _ in range(8)]] * 2], np.complex64)
     >>> moving = np.array([[[lobe(0.5 * part) for part in range(8)]] * 2], np.complex64)
     >>> generator = np.random.default_rng(1)
-    >>> [round(compare_parts(one, spacing_m=0.1, generator=generator).drift_m, 2) for one in (still, moving)]
+    >>> [round(compare_parts(parts, spacing_m=0.1, generator=generator).drift_m, 2) for parts in (still, moving)]
     [0.0, 0.11]
     """
     if not len(parts):
@@ -75,36 +76,36 @@ def compare_parts(parts: NDArray[np.complex64], *, spacing_m: float, generator: 
         drift_m=float(np.sqrt((common**2).sum(axis=-1).mean())),
         drift_std_m=float(np.sqrt((spread**2).sum(axis=-1).mean() / len(parts))),
         entropy=float(np.median([_entropy(patch) for patch in full])),
-        entropy_by_chance=float(np.median([_entropy_by_chance(patch.sum(axis=0), generator) for patch in parts])),
+        entropy_random_phase=float(np.median([_entropy_by_chance(patch.sum(axis=0), generator) for patch in parts])),
     )
 
 
 def _snr_of_halves_db(even: NDArray[np.complex64], odd: NDArray[np.complex64]) -> float:
-    """Return signal against noise of the sum of two images that share the signal alone."""
+    """Return the SNR of the sum of two images with the same signal and independent noise."""
     signal = max(float((even * odd.conj()).real.sum()), 0.0)
     noise = float((np.abs(even - odd) ** 2).sum()) / 2
     return decibels(max(2 * signal, 1e-30) / max(noise, 1e-30))
 
 
 def _drift_px(parts: NDArray[np.complex64]) -> NDArray[np.float64]:
-    """Return (part, 2) shifts of the patch in each part against the mean over all parts, pixels down and right."""
+    """Return (subaperture, 2) shifts of a patch relative to the mean over subapertures, pixels down and right."""
     power = np.abs(parts).astype(np.float64) ** 2
     power /= np.maximum(power.sum(axis=(-2, -1), keepdims=True), 1e-30)
     mean = np.fft.rfft2(power.mean(axis=0) - power.mean())
-    shifts = np.array([_peak(np.fft.irfft2(np.fft.rfft2(one) * mean.conj(), one.shape)) for one in power])
+    shifts = np.array([_peak(np.fft.irfft2(np.fft.rfft2(part) * mean.conj(), part.shape)) for part in power])
     return np.asarray(shifts - shifts.mean(axis=0))
 
 
 def _peak(correlation: NDArray[np.float64]) -> list[float]:
-    """Return the place of the maximum of a circular correlation, to a fraction of a pixel by parabolas."""
+    """Return the position of the maximum of a circular correlation, interpolated between pixels by parabolas."""
     best = np.unravel_index(int(correlation.argmax()), correlation.shape)
-    place = []
+    position = []
     for axis, size in enumerate(correlation.shape):
         at = [np.take(correlation, (best[axis] + step) % size, axis)[best[1 - axis]] for step in (-1, 0, 1)]
         bend = at[0] - 2 * at[1] + at[2]
         fraction = 0.5 * (at[0] - at[2]) / bend if bend else 0.0
-        place.append((best[axis] + fraction + size / 2) % size - size / 2)
-    return place
+        position.append((best[axis] + fraction + size / 2) % size - size / 2)
+    return position
 
 
 def _entropy(patch: NDArray[np.complexfloating]) -> float:
@@ -118,24 +119,25 @@ def _entropy_by_chance(parts: NDArray[np.complex64], generator: np.random.Genera
     return float(np.mean([_entropy(np.tensordot(phasors, parts, 1)) for phasors in phases]))
 
 
-# ---- Focus of isolated bright points, from contributions of pulses
+# ---- Focus of isolated bright points, from pulse contributions
 
 LEAST_BLOCKS = 32
-"""Blocks of pulses that a point must dominate each: enough to separate phase errors from noise."""
+"""Least number of pulse blocks, each dominated by the point, to separate phase errors from noise."""
 
 MOST_INTERFERENCE = 0.08
 """Log-amplitude variance of a point over the aperture, above which it does not dominate its cell."""
 
 LEAST_PEAK_SHARE = 0.35
-"""Amplitude at the point over the largest that a linear phase gives: less is a sidelobe of an echo elsewhere."""
+"""Least ratio of the amplitude at the point to the largest over all linear phases: below it the point is a sidelobe of
+another echo."""
 
 DEFOCUSED_DB = -1.0
-"""dB, loss of a peak beyond which an image is called defocused."""
+"""Peak loss beyond which an image is defocused, dB."""
 
-Verdict = Literal["focused", "defocused", "cannot tell"]
+Verdict = Literal["focused", "defocused", "inconclusive"]
 
 MOST_ERROR_DB = -20.0
-"""dB, numerical error against the peak above which, where less was requested, bright points may be artefacts."""
+"""Numerical error relative to the peak, dB, above which bright points may be artefacts if the accuracy is missed."""
 
 GEOMETRY_CONTRADICTED = frozenset(
     {
@@ -144,28 +146,28 @@ GEOMETRY_CONTRADICTED = frozenset(
         "attitude_suspect",
         "code_unconfirmed",
         "cycle_slip_suspected",
-        "echo_elsewhere",
-        "flights_apart",
+        "echo_outside_scene",
+        "flights_displaced",
         "loss_unexpected",
         "pair_unconfirmed",
-        "pairs_apart",
+        "pairs_displaced",
         "pairs_out_of_phase",
-        "paths_differ",
-        "phase_unmeasured",
+        "path_offsets_differ",
+        "phase_unobservable",
         "platform_below_scene",
-        "prior_inconsistent",
+        "position_error_understated",
         "reference_point",
         "refinement_rejected",
-        "time_tags_apart",
+        "time_tag_offset",
         "wrong_code",
     }
 )
-"""Flags that contradict the geometry, the clocks or the code that an image was formed with: no image that carries one
-is called focused."""
+"""Flags that contradict the geometry, the clocks or the code of image formation: with any of them an image is not
+reported as focused."""
 
 _TREND = 5  # degree of the polynomial that models patterns, range and aspect in the log-amplitude
-_PADDING = 8  # of the spectrum of blocks, whose maximum removes a linear phase
-_SIGMAS = 5.0  # by which a drift must exceed a cell to be called defocused
+_PADDING = 8  # zero-padding factor of the spectrum of blocks, whose maximum removes a linear phase
+_SIGMAS = 5.0  # significance of a drift above a resolution cell for the verdict defocused, standard deviations
 
 
 @dataclass(frozen=True)
@@ -175,16 +177,16 @@ class PointFocus:
     Attributes
     ----------
     loss_db
-        Peak power against that of the same contributions in phase, 0 or less, with the loss by noise and neighbours
-        removed.
+        Peak power relative to that of the same contributions in phase, 0 or less, with the loss from noise and
+        neighbours removed.
     interference
-        Power of noise and neighbours over the point's: the log-amplitude variance.
+        Power of noise and neighbours relative to the point: the log-amplitude variance.
     pulses
-        Pulses of a block; phase errors faster than that are not measured.
+        Pulses per block; faster phase errors are not measured.
     snr_db
-        Of the point in the image, from its even and its odd pulses; NaN with fewer than four.
-    coherence, coherence_allowed
-        |Σ s|²/(M Σ|s|²) of the contributions of M pulses, and its value with their noise alone.
+        SNR of the point in the image, from its even and odd pulses; NaN with fewer than four pulses.
+    coherence, coherence_noise_limit
+        |Σ s|²/(M Σ|s|²) of the contributions s of M pulses, and its value with noise alone.
     """
 
     loss_db: float
@@ -192,22 +194,22 @@ class PointFocus:
     pulses: int
     snr_db: float
     coherence: float = 1.0
-    coherence_allowed: float = 1.0
+    coherence_noise_limit: float = 1.0
 
 
 def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
-    """Return the focus of a point; None where none dominates its range cell over the whole aperture.
+    """Measure the focus of a point; None if it does not dominate its range cell over the whole aperture.
 
     Parameters
     ----------
     contributions
-        (pulse,) complex128, contribution of each pulse at the point, in the order in which they were sent.
+        (pulse,) complex128, contribution of each pulse at the point, in order of transmission.
 
     Notes
     -----
-    Source: docs/theory/focus.md, eq. 1. Phase errors do not change the amplitude of a contribution, noise and
-    neighbours change phase and amplitude alike: the log-amplitude variance gives their part of the phase variance.
-    Pulses are averaged in blocks, as long as it takes for the point to dominate them.
+    Source: docs/theory/focus.md, eq. 1. Phase errors do not change the amplitude of a contribution, while noise and
+    neighbours change phase and amplitude equally: the log-amplitude variance is their share of the phase variance.
+    Pulses are averaged in the shortest blocks that the point dominates.
 
     Examples
     --------
@@ -220,7 +222,7 @@ def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
     True
     """
     pulses = 1
-    # Blocks of 1, 2, 4 … pulses, until v of eq. 1 shows that the point dominates them.
+    # Blocks of 1, 2, 4 … pulses, until v of eq. 1 is small enough for a dominant point.
     while len(contributions) // pulses >= LEAST_BLOCKS:
         count = len(contributions) // pulses
         blocks = contributions[: count * pulses].reshape(count, pulses).mean(axis=1)
@@ -231,7 +233,7 @@ def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
                 best = float(np.abs(np.fft.fft(blocks, _PADDING * count)).max())
                 if abs(complex(blocks.sum())) < LEAST_PEAK_SHARE * best:
                     return None
-                # Eq. 1: the spectrum's maximum over f, with the loss by noise and neighbours (v) taken out.
+                # Eq. 1: maximum of the spectrum over f, with the loss from noise and neighbours (v) removed.
                 loss = (best / amplitude.sum()) ** 2 * (1 + variance * (1 - 2.5 * variance) / 2) ** 2
                 snr_db = _snr_db(contributions)
                 allowed = 1 / (1 + len(contributions) * 10 ** (-snr_db / 10))
@@ -249,7 +251,7 @@ def log_amplitude_variance(log_amplitude: NDArray[np.float64]) -> float:
 
 
 def _snr_db(contributions: NDArray[np.complex128]) -> float:
-    """Return the SNR of a pixel from neighbouring pulses, which differ by noise alone."""
+    """Return the SNR of a pixel from neighbouring pulses, which differ only by noise."""
     count = len(contributions) // 2
     if count < 2:
         return float("nan")
@@ -263,47 +265,47 @@ def _snr_db(contributions: NDArray[np.complex128]) -> float:
 
 @dataclass(frozen=True)
 class Focus:
-    """Verdict of an image's bright points on its focus.
+    """Focus of an image: verdict and peak loss from its bright points.
 
     Attributes
     ----------
     verdict
-        focused, defocused, or cannot tell.
+        'focused', 'defocused' or 'inconclusive' (not observable).
     loss_db, std_db
-        Median over the points, weighted by amplitude, and its standard deviation; NaN without points.
+        Median peak loss over the points, weighted by amplitude, and its standard deviation; NaN without points.
     points
-        How many were measured.
+        Number of measured points.
     why
-        One line: reason for the verdict.
+        Reason for the verdict, one line.
     """
 
     verdict: Verdict
     loss_db: float
     std_db: float
     points: int
-    why: str
+    reason: str
 
 
 def judge(points: Sequence[tuple[float, PointFocus | None]]) -> Focus:
-    """Return the joint verdict of bright points.
+    """Judge the focus of an image from its bright points.
 
     Parameters
     ----------
     points
-        Amplitude and focus of each.
+        Amplitude and focus of each point.
 
     Examples
     --------
     >>> judge([(1.0, PointFocus(-3.0, 0.01, 1, 30.0)), (0.9, PointFocus(-3.2, 0.02, 1, 29.0))]).verdict
     'defocused'
     >>> judge([(1.0, None)]).verdict
-    'cannot tell'
+    'inconclusive'
     """
     measured = [(amplitude, focus) for amplitude, focus in points if focus is not None]
     if not measured:
-        return Focus("cannot tell", float("nan"), float("nan"), 0, "no bright point")
+        return Focus("inconclusive", float("nan"), float("nan"), 0, "no bright point")
     losses = np.array([focus.loss_db for _, focus in measured])
-    # Standard deviation of each loss by noise and neighbours.
+    # Standard deviation of each loss from noise and neighbours.
     stds = np.array(
         [10 / float(np.log(10)) * focus.interference * float(np.sqrt(2 / LEAST_BLOCKS)) + 0.02 for _, focus in measured]
     )
@@ -312,38 +314,39 @@ def judge(points: Sequence[tuple[float, PointFocus | None]]) -> Focus:
     spread = 1.4826 * weighted_median(np.abs(losses - loss), weights)
     std = float(np.hypot(spread, np.median(stds)) / np.sqrt(len(measured)))
     verdict = verdict_of_loss(loss, std)
-    line = f"{number_of(len(measured), 'bright point')} lost {abs(loss):.2f} ± {std:.2f} dB of the peak to phase errors"
-    if verdict == "cannot tell":
-        line += f": within two standard deviations, the loss may or may not exceed {-DEFOCUSED_DB:g} dB"
+    count = number_of(len(measured), "bright point")
+    line = f"peak loss {abs(loss):.2f} ± {std:.2f} dB from phase errors, {count}"
+    if verdict == "inconclusive":
+        line += f": not significantly above or below {-DEFOCUSED_DB:g} dB (two standard deviations)"
     return Focus(verdict, loss, std, len(measured), line)
 
 
 def verdict_of_loss(loss_db: float, std_db: float) -> Verdict:
-    """Return the verdict that a loss of the peak and its standard deviation allow, at two standard deviations.
+    """Return the verdict for a peak loss and its standard deviation, significant at two standard deviations.
 
     Examples
     --------
     >>> verdict_of_loss(-0.2, 0.1), verdict_of_loss(-2.0, 0.1), verdict_of_loss(-4.48, 2.85)
-    ('focused', 'defocused', 'cannot tell')
+    ('focused', 'defocused', 'inconclusive')
     """
     if loss_db < DEFOCUSED_DB - 2 * std_db:
         return "defocused"
-    return "focused" if loss_db > DEFOCUSED_DB + 2 * std_db else "cannot tell"
+    return "focused" if loss_db > DEFOCUSED_DB + 2 * std_db else "inconclusive"
 
 
 def focus_with_flags(
     focus: Mapping[str, Any], flags: Iterable[str], *, error_db: float | None = None
 ) -> dict[str, Any]:
-    """Return the section `focus` of image.json with a verdict that no flag of the image contradicts.
+    """Return the section `focus` of image.json, with the verdict 'focused' withdrawn if a flag contradicts it.
 
     Parameters
     ----------
     focus
-        With `verdict` and `why`, of the bright points alone.
+        Section with `verdict` and `why` from the bright points alone.
     flags
-        Names of the flags that the image carries.
+        Names of the flags of the image.
     error_db
-        Numerical error of the image against its peak, dB; None: not measured.
+        Numerical error of the image relative to its peak, dB; None: not measured.
 
     Notes
     -----
@@ -351,39 +354,39 @@ def focus_with_flags(
 
     Examples
     --------
-    >>> focus_with_flags({"verdict": "focused", "why": "3 bright points lost 0.02 dB"}, ["wrong_code"])["verdict"]
-    'cannot tell'
+    >>> focus_with_flags({"verdict": "focused", "why": "peak loss 0.02 dB"}, ["wrong_code"])["verdict"]
+    'inconclusive'
     """
     against = sorted(GEOMETRY_CONTRADICTED.intersection(flags))
-    if "accuracy_missed" in flags and error_db is not None and error_db > MOST_ERROR_DB:
-        against.append("accuracy_missed")
+    if "accuracy_not_met" in flags and error_db is not None and error_db > MOST_ERROR_DB:
+        against.append("accuracy_not_met")
     if focus["verdict"] != "focused" or not against:
         return dict(focus)
-    return {**focus, "verdict": "cannot tell", "why": f"{focus['why']}; contradicted by {', '.join(against)}"}
+    return {**focus, "verdict": "inconclusive", "reason": f"{focus['reason']}; contradicted by {', '.join(against)}"}
 
 
 def judge_parts(parts: SubApertures, *, cell_m: float) -> Focus:
-    """Return the verdict of subaperture images where no bright point can be measured.
+    """Judge the focus of an image from its subapertures, if no bright point can be measured.
 
     Parameters
     ----------
     parts
-        Of several patches.
+        Subaperture measures of patches.
     cell_m
-        Resolution cell: parts that show a patch further apart cannot add up to a sharp image.
+        Resolution cell: subapertures with a larger drift do not sum to a focused image.
 
     Examples
     --------
     >>> judge_parts(SubApertures(20.0, 0.9, 0.05, 7.0, 7.1), cell_m=0.3).verdict
     'defocused'
     >>> judge_parts(SubApertures(20.0, 0.9, 0.5, 7.0, 7.1), cell_m=0.3).verdict
-    'cannot tell'
+    'inconclusive'
     """
     nothing = float("nan"), float("nan"), 0
     line = "no bright point dominates its range cell"
     if parts.drift_m - _SIGMAS * parts.drift_std_m > cell_m and parts.drift_std_m > 0:
         drift = f"{parts.drift_m:.2f} ± {parts.drift_std_m:.2f} m"
-        return Focus("defocused", *nothing, f"{line}, and parts of the aperture show the scene {drift} apart")
+        return Focus("defocused", *nothing, f"{line}, and subaperture images are displaced by {drift}")
     if np.isfinite(parts.entropy):
-        line += f"; entropy {parts.entropy:.2f}, with random phases {parts.entropy_by_chance:.2f}"
-    return Focus("cannot tell", *nothing, line)
+        line += f"; entropy {parts.entropy:.2f}, {parts.entropy_random_phase:.2f} with random phases"
+    return Focus("inconclusive", *nothing, line)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 
 class BlockRaster(Protocol):
-    """A 2-D array that gives numpy blocks: numpy or zarr."""
+    """2-D array that returns numpy blocks: a numpy or zarr array."""
 
     @property
     def shape(self) -> tuple[int, ...]: ...  # noqa: D102
@@ -20,11 +20,11 @@ class BlockRaster(Protocol):
 
 
 HELD_BYTES = 1 << 27
-"""Pixels of a raster that is held in memory: 4096 x 4096 complex."""
+"""Largest raster that is kept in memory, bytes: 4096 x 4096 complex64 pixels."""
 
 
 def held(raster: BlockRaster) -> BlockRaster:
-    """Return a raster that is read more than once in memory, read once, unless it is larger than `HELD_BYTES`.
+    """Load a raster that is read repeatedly into memory, unless it is larger than `HELD_BYTES`.
 
     Examples
     --------
@@ -38,7 +38,7 @@ def held(raster: BlockRaster) -> BlockRaster:
 
 
 def numerical_error_db(computed: NDArray[np.complex64], reference: NDArray[np.complex128]) -> float:
-    """Return the RMS error of pixels, after one complex gain, over the RMS of the reference's, dB.
+    """Return the RMS error of pixels after a common complex gain, relative to the RMS of the reference, dB.
 
     Parameters
     ----------
@@ -72,11 +72,11 @@ class ImageStatistics:
     entropy
         Shannon entropy −Σ q ln q of the shares q of power, nats: the lower, the better focused.
     noise_floor_db
-        Median power over peak power, to 0.01 dB: the level between the targets.
+        Median power relative to peak power, to 0.01 dB: the level between targets.
     peak
         Largest magnitude.
     row, column
-        Its pixel.
+        Pixel of the largest magnitude.
     """
 
     entropy: float
@@ -95,9 +95,9 @@ def image_statistics(image: BlockRaster, windows: Iterable[tuple[slice, slice]])
     Parameters
     ----------
     image
-        (y, x) complex64, anything that gives a numpy array for a pair of slices; NaN is left out.
+        (y, x) complex64, any array that returns numpy blocks; NaN is excluded.
     windows
-        Windows that cover it once.
+        Windows that cover the image once.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def image_statistics(image: BlockRaster, windows: Iterable[tuple[slice, slice]])
     (4.6052, 1.0, 0.0)
     """
     total = weighted = peak = 0.0
-    place = (0, 0)
+    peak_pixel = (0, 0)
     counts = np.zeros((_HIGHEST_DB - _LOWEST_DB) * _BINS_PER_DB, np.int64)
     empty = 0
     for window in windows:
@@ -122,7 +122,7 @@ def image_statistics(image: BlockRaster, windows: Iterable[tuple[slice, slice]])
         if power.flat[best] > peak:
             peak = float(power.flat[best])
             row, column = np.unravel_index(best, power.shape)
-            place = (window[0].start + int(row), window[1].start + int(column))
+            peak_pixel = (window[0].start + int(row), window[1].start + int(column))
         # Sums Σp and Σp ln p of the entropy, and a histogram of power by 0.01 dB; pixels without power lie below it.
         present = power[power > 0]
         empty += int(np.isfinite(block).sum()) - present.size
@@ -136,12 +136,12 @@ def image_statistics(image: BlockRaster, windows: Iterable[tuple[slice, slice]])
     # Median power over the peak; −Σ q ln q = ln Σp − Σp ln p/Σp with q = p/Σp.
     floor = _LOWEST_DB + median_bin / _BINS_PER_DB - 10 * np.log10(peak)
     return ImageStatistics(
-        float(np.log(total) - weighted / total), min(0.0, round(float(floor), 2)), float(np.sqrt(peak)), *place
+        float(np.log(total) - weighted / total), min(0.0, round(float(floor), 2)), float(np.sqrt(peak)), *peak_pixel
     )
 
 
 def coherence_factor(contributions: NDArray[np.complex128]) -> float:
-    """Return Γ = |Σ s_m|² / (M Σ |s_m|²) of the contributions of pulses at a pixel: 1 in phase, 1/M at random.
+    """Return Γ = |Σ s_m|² / (M Σ |s_m|²) of pulse contributions s_m at a pixel: 1 in phase, 1/M for random phases.
 
     Notes
     -----
@@ -157,7 +157,7 @@ def coherence_factor(contributions: NDArray[np.complex128]) -> float:
 
 
 def weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
-    """Return the value with half of the weight on either side, interpolated.
+    """Return the weighted median of values, interpolated.
 
     Examples
     --------
@@ -169,12 +169,12 @@ def weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -
     return float(np.interp(weights.sum() / 2, share, values[order]))
 
 
-# ---- Sums of images as amplitudes
+# ---- Power rasters as amplitudes
 
 
 @dataclass(frozen=True)
 class Amplitude:
-    """A raster of power as complex amplitudes without phase, block by block.
+    """Raster of power presented as complex amplitudes with zero phase, block by block.
 
     Attributes
     ----------

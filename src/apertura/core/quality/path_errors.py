@@ -1,4 +1,4 @@
-"""Effect of an error of the total path on a point: loss of the peak, shift and phase."""
+"""Effect of total path errors on the image of a point: peak loss, displacement and phase."""
 
 from dataclasses import dataclass
 
@@ -8,24 +8,24 @@ from numpy.typing import NDArray
 from apertura.core.geometry.aperture import Aperture
 
 MOST_PULSES = 200
-"""Pulses of `PointPaths`, evenly spread: effects of errors that last longer than a few of them are those of all."""
+"""Largest number of evenly spaced pulses of `PointPaths`, sufficient for errors correlated over several of them."""
 
 
 def autocorrelation(lag_s: NDArray[np.float64], correlation_s: float) -> NDArray[np.float64]:
-    """Return the autocorrelation of position errors at a time lag: the definition of `position_correlation_s`.
+    """Return the autocorrelation of position errors at a time lag, which defines `position_correlation_s`.
 
     Parameters
     ----------
     lag_s
         Any shape, float64, seconds; not negative.
     correlation_s
-        Correlation time, seconds: the length of the moving average that forms the errors from white noise; 0: errors of
-        epochs are independent.
+        Correlation time, seconds: length of the moving average that forms the errors from white noise; 0: independent
+        errors at each epoch.
 
     Returns
     -------
     ndarray
-        As `lag_s`; 1 at lag 0, falling linearly to 0 at `correlation_s`.
+        Shape of `lag_s`; 1 at lag 0, decreasing linearly to 0 at `correlation_s`.
 
     Notes
     -----
@@ -37,10 +37,10 @@ def autocorrelation(lag_s: NDArray[np.float64], correlation_s: float) -> NDArray
     array([1. , 0.5, 0. , 0. ])
     """
     if correlation_s <= 0:
-        alone: NDArray[np.float64] = (lag_s == 0).astype(np.float64)
-        return alone
-    falling: NDArray[np.float64] = np.clip(1 - lag_s / correlation_s, 0, None)
-    return falling
+        white: NDArray[np.float64] = (lag_s == 0).astype(np.float64)
+        return white
+    triangle: NDArray[np.float64] = np.clip(1 - lag_s / correlation_s, 0, None)
+    return triangle
 
 
 @dataclass(frozen=True)
@@ -50,13 +50,13 @@ class Effect:
     Attributes
     ----------
     loss_db
-        Loss of the peak's power, 0 or less.
+        Change of the peak power, 0 or less.
     shift_m
-        Shift over ground, metres.
+        Horizontal displacement, metres.
     phase_rad
-        At a place on the ground, against a pair without that error; NaN where that is not predicted.
+        Phase at a point of the terrain relative to a pair without the error; NaN if not predicted.
     loss_std_db
-        Standard deviation of the loss from flight to flight, where the error is random.
+        Standard deviation of the loss between flights, for random errors.
     """
 
     loss_db: float
@@ -67,7 +67,7 @@ class Effect:
 
 @dataclass(frozen=True, eq=False)
 class PointPaths:
-    """The total paths of one point of the scene, on at most a few hundred pulses.
+    """Total paths to one point of the scene, at up to `MOST_PULSES` pulses.
 
     Attributes
     ----------
@@ -80,14 +80,14 @@ class PointPaths:
     axes
         (3, 3) float64, rows are the unit vectors east, north, up at the point.
     wavelength_m
-        Of the band's middle.
+        Wavelength at band centre.
 
     Examples
     --------
     >>> along = np.linspace(-5, 5, 101)
     >>> track = np.stack([along, np.full(101, -10.0), np.full(101, 10.0)], -1)
     >>> paths = PointPaths(Aperture(track, track), along, np.zeros(3), np.eye(3), 0.2)
-    >>> higher = paths.of_offset(-paths.gradient[:, 2])  # the point lies a metre higher than it is taken to
+    >>> higher = paths.of_offset(-paths.gradient[:, 2])  # the point lies a metre higher than assumed
     >>> round(higher.shift_m, 2), round(higher.loss_db, 2) > -0.5
     (1.0, True)
     """
@@ -108,29 +108,29 @@ class PointPaths:
         axes: NDArray[np.float64],
         wavelength_m: float,
     ) -> "PointPaths":
-        """Return the paths of a point at evenly spread pulses; parameters as the attributes, of all pulses."""
-        some = aperture.sample(MOST_PULSES)
-        return cls(aperture[some], time_s[some], point_m, axes, wavelength_m)
+        """Return the paths to a point at evenly spaced pulses; parameters as the attributes, for all pulses."""
+        sampled = aperture.sample(MOST_PULSES)
+        return cls(aperture[sampled], time_s[sampled], point_m, axes, wavelength_m)
 
     @property
     def gradient(self) -> NDArray[np.float64]:
-        """(pulse, 3) float64, growth of the path per metre that the point moves east, north, up."""
+        """(pulse, 3) float64, derivative of the path by the point's position east, north, up."""
         return self.aperture.path_gradient(self.point_m) @ self.axes.T
 
     @property
     def rate_m_s(self) -> NDArray[np.float64]:
-        """(pulse,) float64, growth of the path per second as the nodes fly, metres per second."""
+        """(pulse,) float64, rate of change of the path during the flight, metres per second."""
         return np.gradient(self.aperture.path(self.point_m), self.time_s)
 
     def by_node(self, *, same: bool, sidelink: bool) -> tuple[NDArray[np.float64], ...]:
-        """Return the growth of the measured path per metre of position error, (pulse, 3) east, north, up of each node.
+        """Return the derivatives of the measured path by position errors of each node, (pulse, 3) east, north, up.
 
         Parameters
         ----------
         same
-            Transmitter and receiver are one node, whose error acts on both legs: one array instead of two.
+            True if one node transmits and receives, so that its error acts on both one-way paths: one array, not two.
         sidelink
-            The echo was divided by a sidelink whose length comes from the same logs.
+            True if the echo was divided by a sidelink whose length is computed from the same logs.
 
         Notes
         -----
@@ -141,18 +141,18 @@ class PointPaths:
         return tuple(leg @ self.axes.T for leg in legs)
 
     def by_point(self, *, sidelink: bool) -> tuple[NDArray[np.float64], ...]:
-        """Return the growth of the measured path per metre that an antenna lies elsewhere than taken.
+        """Return the derivatives of the measured path by position errors of each antenna.
 
         Parameters
         ----------
         sidelink
-            As of `by_node`, of two nodes.
+            As for `by_node`, with two nodes.
 
         Returns
         -------
         tuple of ndarray
-            (pulse, 3) float64 each, in the frame of the phase centres: radar antennas of transmitter and receiver,
-            their sidelink antennas.
+            (pulse, 3) float64 each, in the frame of the phase centres: transmitting and receiving radar antenna, then
+            the sidelink antennas of transmitter and receiver.
 
         Notes
         -----
@@ -169,38 +169,38 @@ class PointPaths:
         return legs[0], legs[1], -along, along
 
     def of_offset(self, error_m: NDArray[np.float64], *, common: bool = False) -> Effect:
-        """Return the effect of an error of the path.
+        """Return the effect of a deterministic path error.
 
         Parameters
         ----------
         error_m
-            (pulse,) float64, metres by which paths are longer than the image takes them for.
+            (pulse,) float64, true path minus the path assumed in image formation, metres.
         common
-            All pairs share its cause, which moves their images nearly alike: the remaining phase between them is not
-            predicted.
+            True if all pairs share the cause, so that their images have nearly the same displacement: the residual
+            phase between them is not predicted.
 
         Notes
         -----
-        Source: docs/theory/focus.md, eq. 2: the part that fits a shift over ground moves the point, the rest defocuses
-        it.
+        Source: docs/theory/focus.md, eq. 2: the component that fits a horizontal shift displaces the point, the
+        residual defocuses it.
         """
         # Δx = G⁺e, r = e − GΔx and L of eq. 2.
         ground = self.gradient[:, :2]
-        moved = np.linalg.pinv(ground) @ error_m
-        rest = error_m - ground @ moved
+        shift = np.linalg.pinv(ground) @ error_m
+        residual = error_m - ground @ shift
         wavenumber = 2 * np.pi / self.wavelength_m
-        loss_db = 20 * np.log10(max(abs(np.exp(1j * wavenumber * (rest - rest.mean())).mean()), 1e-6))
+        loss_db = 20 * np.log10(max(abs(np.exp(1j * wavenumber * (residual - residual.mean())).mean()), 1e-6))
         phase_rad = float("nan") if common else float(abs(wavenumber * error_m.mean()))
-        return Effect(float(loss_db), float(np.linalg.norm(moved)), phase_rad)
+        return Effect(float(loss_db), float(np.linalg.norm(shift)), phase_rad)
 
     def of_noise(self, *parts: tuple[NDArray[np.float64], float]) -> Effect:
-        """Return the mean effect of independent random errors of the path.
+        """Return the mean effect of independent random path errors.
 
         Parameters
         ----------
         *parts
-            Standard deviation at each pulse, (pulse,) float64 metres, and correlation time, seconds, as
-            `autocorrelation`.
+            Standard deviation at each pulse, (pulse,) float64 metres, and correlation time of `autocorrelation`,
+            seconds, of each error.
 
         Notes
         -----
@@ -213,17 +213,17 @@ class PointPaths:
             covariance += autocorrelation(lag, correlation_s) * np.multiply.outer(std_m, std_m)
         ground = self.gradient[:, :2]
         inverse = np.linalg.pinv(ground)
-        moved = ground @ (inverse @ covariance)  # of a projection onto two columns no square matrix is multiplied
-        rest = covariance - moved - moved.T + (moved @ ground) @ inverse
+        projected = ground @ (inverse @ covariance)  # in this order no product of square matrices is needed
+        residual = covariance - projected - projected.T + (projected @ ground) @ inverse
         wavenumber = 2 * np.pi / self.wavelength_m
         # q, the mean variance about the mean over the pulses; N = (tr R)²/tr R²; L of eq. 3.
-        centred = rest - rest.mean(axis=0) - rest.mean(axis=1)[:, None] + rest.mean()
-        power = float(np.trace(centred)) / len(rest)
+        centred = residual - residual.mean(axis=0) - residual.mean(axis=1)[:, None] + residual.mean()
+        power = float(np.trace(centred)) / len(residual)
         independent = float(np.trace(centred) ** 2 / max((centred**2).sum(), 1e-300))
         kept = np.exp(-(wavenumber**2) * power)
         loss_db = 10 * np.log10(kept + (1 - kept) ** 2 / max(independent, 1.0))
         shift = np.sqrt(max(0.0, float(np.trace(inverse @ covariance @ inverse.T))))
-        # q is a sum of `independent` squares of equal weight: its deviation is √(2/N) of itself
+        # q is a mean of N independent squares of equal weight: its relative standard deviation is √(2/N).
         scatter_db = 10 / np.log(10) * wavenumber**2 * power * np.sqrt(2 / max(independent, 1.0))
         phase_rad = float(wavenumber * np.sqrt(covariance.mean()))
         return Effect(float(loss_db), float(shift), phase_rad, float(min(scatter_db, -loss_db)))

@@ -1,4 +1,4 @@
-"""Point targets in an image: peak, width and sidelobes."""
+"""Point target analysis: peak position, −3 dB width and sidelobe ratios."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -12,30 +12,30 @@ from apertura.core.quality.measures import BlockRaster
 PATCH_PX = 64  # side of a patch, pixels
 
 CUT_REACH_M = 3.0
-"""Metres to both sides of an image's brightest target that its cuts span: main lobe and first sidelobes."""
+"""Half length of the cuts through an image's brightest target, metres: main lobe and first sidelobes."""
 
 _REFINEMENTS = 7
-"""From one pixel to a grid of 6e-5 pixel in steps of four."""
+"""Refinement rounds by a factor of four, from one pixel to a grid of 6e-5 pixel."""
 
 
 class BandLimitedPatch:
-    """A square of an image as the band-limited function it samples.
+    """Square patch of an image, interpolated as a band-limited function.
 
     Parameters
     ----------
     image
-        (y, x) complex64, carrier kept.
+        (y, x) complex64, with the carrier phase.
     row, column
-        The pixel at its middle.
+        Pixel at the middle of the patch.
     carrier
-        Spatial frequency down and right, cycles per pixel, that the band lies about; by default the middle of the band
-        as the pixels fold it, with which phases between pixels are right up to a constant phase step per pixel.
+        Centre of the spatial frequency band, down and right, cycles per pixel. By default the centre of the aliased
+        band; phases between pixels are then correct up to a constant phase step per pixel.
 
     Notes
     -----
-    The patch's discrete Fourier transform is moved so that the signal's band, wherever the carrier aliased
-    it, lies in the middle; between pixels the trigonometric polynomial is evaluated exactly. A spline on
-    real and imaginary parts would not do: the carrier turns by more than a radian per pixel.
+    The bins of the patch's discrete Fourier transform are assigned frequencies about the centre of the band, wherever
+    the carrier aliased it; between pixels the trigonometric polynomial is evaluated exactly. Splines of real and
+    imaginary parts are unsuitable: the carrier phase changes by more than a radian per pixel.
     """
 
     def __init__(self, image: BlockRaster, row: int, column: int, carrier: tuple[float, float] | None = None) -> None:
@@ -43,19 +43,19 @@ class BandLimitedPatch:
         self._first = np.array([rows.start, columns.start], np.float64)
         square = np.nan_to_num(np.asarray(image[rows, columns])).astype(np.complex128)
         self._spectrum = np.fft.fft2(square, norm="forward")
-        self._turns = [_centred(self._spectrum, axis, carrier and carrier[axis]) for axis in (0, 1)]
+        self._frequencies = [_centred(self._spectrum, axis, carrier and carrier[axis]) for axis in (0, 1)]
 
     def at(self, row: ArrayLike, column: ArrayLike) -> NDArray[np.complex128]:
         """Return the image at fractional pixels (0-based, of the whole image), complex128 in the shape of `row`."""
         down, right = (
-            np.exp(2j * np.pi * np.multiply.outer(np.asarray(at, np.float64) - first, turns))
-            for at, first, turns in zip((row, column), self._first, self._turns, strict=True)
+            np.exp(2j * np.pi * np.multiply.outer(np.asarray(at, np.float64) - first, frequencies))
+            for at, first, frequencies in zip((row, column), self._first, self._frequencies, strict=True)
         )
         return np.asarray(((down @ self._spectrum) * right).sum(axis=-1))
 
 
 def carrier_at(carriers: NDArray[np.float64], shape: tuple[int, int], row: float, column: float) -> tuple[float, float]:
-    """Return the spatial frequency that a point's band lies about, east and north, cycles per metre.
+    """Return the centre of a point's spatial frequency band, east and north, cycles per metre.
 
     Parameters
     ----------
@@ -68,8 +68,8 @@ def carrier_at(carriers: NDArray[np.float64], shape: tuple[int, int], row: float
 
     Notes
     -----
-    By the parabolas through the nine places. The direction to an antenna turns by a small share of the angle under
-    which the scene is seen from it, so its third order is what is left out.
+    Interpolated by parabolas through the nine points: the direction to an antenna varies smoothly over the scene, and
+    its third order is neglected.
 
     Examples
     --------
@@ -97,20 +97,20 @@ def _centred(spectrum: NDArray[np.complex128], axis: int, middle: float | None) 
     bins = np.arange(count)
     if middle is None:
         middle = np.angle((power * np.exp(2j * np.pi * bins / count)).sum()) / (2 * np.pi)
-    turns = bins / count
-    return np.asarray(turns - np.round(turns - middle))
+    frequencies = bins / count
+    return np.asarray(frequencies - np.round(frequencies - middle))
 
 
 @dataclass(frozen=True)
 class Peak:
-    """A point target in an image.
+    """Peak of a point target in an image.
 
     Attributes
     ----------
     row, column
         Fractional pixel of the maximum.
     value
-        Complex amplitude there.
+        Complex amplitude at the maximum.
     """
 
     row: float
@@ -119,14 +119,14 @@ class Peak:
 
 
 def find_peak(image: BlockRaster, row: int, column: int) -> Peak:
-    """Return the maximum of the interpolated magnitude near a pixel.
+    """Locate the maximum of the interpolated magnitude near a pixel.
 
     Parameters
     ----------
     image
         (y, x) complex64.
     row, column
-        Where to begin; the nearest local maximum is refined to about 1e-4 pixel.
+        Start pixel; the nearest local maximum is refined to about 1e-4 pixel.
 
     Examples
     --------
@@ -149,7 +149,7 @@ def locate_maximum(
     rounds: int,
     counts: tuple[int, int] = (9, 9),
 ) -> tuple[tuple[float, float], float]:
-    """Locate the maximum of a function of two coordinates near a point; return its place and value.
+    """Locate the maximum of a function of two coordinates near a point; return its coordinates and value.
 
     Parameters
     ----------
@@ -158,9 +158,9 @@ def locate_maximum(
     start, reach
         The search covers `start` ± `reach` in each coordinate.
     rounds
-        Each searches a grid about the best point of the one before, one of its steps to each side.
+        Number of grids: each spans one step of the previous grid to both sides of its best point.
     counts
-        Points of the first grid along each coordinate; later ones have 9 × 9.
+        Points of the first grid along each coordinate; later grids have 9 × 9.
 
     Examples
     --------
@@ -169,7 +169,7 @@ def locate_maximum(
     (0.3, -0.1, 2.0)
     """
     for _ in range(rounds):
-        axes = (at + np.linspace(-far, far, count) for at, far, count in zip(start, reach, counts, strict=True))
+        axes = (at + np.linspace(-half, half, count) for at, half, count in zip(start, reach, counts, strict=True))
         first, second = np.meshgrid(*axes, indexing="ij")
         values = level(first, second)
         best = np.unravel_index(int(values.argmax()), values.shape)
@@ -181,12 +181,12 @@ def locate_maximum(
 
 @dataclass(frozen=True)
 class Cut:
-    """One line through a peak.
+    """Measures of a cut through a peak.
 
     Attributes
     ----------
     width_m
-        −3 dB width, metres; NaN where the main lobe leaves the line.
+        −3 dB width, metres; NaN if the main lobe extends beyond the cut.
     pslr_db, islr_db
         Peak and integrated sidelobe ratio along the line, dB; NaN without sidelobes.
     """
@@ -204,25 +204,25 @@ def cut_through(
     spacing_m: float,
     reach_m: float,
 ) -> Cut:
-    """Return width and sidelobes along a line through a peak.
+    """Measure width and sidelobe ratios along a line through a peak.
 
     Parameters
     ----------
     image
         (y, x) complex64, row 0 in the north.
     peak
-        From `find_peak`.
+        Result of `find_peak`.
     direction
-        (east, north) of the line; need not be of length one.
+        (east, north) of the line, of any length.
     spacing_m
         Pixel spacing.
     reach_m
-        How far the line goes to both sides; cut at the patch of 64 pixels.
+        Half length of the line, limited by the patch of 64 pixels.
 
     Notes
     -----
-    The main lobe ends at the first minima on both sides; PSLR is the highest sample beyond over the peak,
-    ISLR the energy beyond over the energy within.
+    The main lobe ends at the first minima on both sides. PSLR is the highest sample outside the main lobe relative to
+    the peak, ISLR the energy outside relative to the energy inside.
 
     Examples
     --------
@@ -247,9 +247,9 @@ def cut_through(
 def cuts_report(
     image: BlockRaster, peak: Peak, *, cross_range: tuple[float, float], spacing_m: float, reach_m: float
 ) -> dict[str, float | None]:
-    """Return the cuts through a peak along and across the flight for image.json; None where a line does not hold them.
+    """Report the cuts through a peak along and across the flight for image.json; None for values beyond a cut.
 
-    Parameters as `cut_through`; `cross_range` is the (east, north) direction of the flight.
+    Parameters as for `cut_through`; `cross_range` is the (east, north) direction of the flight.
 
     Examples
     --------
@@ -260,8 +260,8 @@ def cuts_report(
     [0.44, 0.71]
     """
     cuts = {
-        name: cut_through(image, peak, direction=way, spacing_m=spacing_m, reach_m=reach_m)
-        for name, way in (("cross_range", cross_range), ("ground_range", (cross_range[1], -cross_range[0])))
+        name: cut_through(image, peak, direction=direction, spacing_m=spacing_m, reach_m=reach_m)
+        for name, direction in (("cross_range", cross_range), ("ground_range", (cross_range[1], -cross_range[0])))
     }
     return {
         f"{name}_{measure}": None if np.isnan(value) else round(value, 4)
@@ -273,9 +273,9 @@ def cuts_report(
 def line_through(
     image: BlockRaster, peak: Peak, *, direction: tuple[float, float], spacing_m: float, reach_m: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return distances from a peak along a line, metres, and the power there, (sample,) float64 each.
+    """Sample a line through a peak: distances from the peak, metres, and power, (sample,) float64 each.
 
-    Parameters as `cut_through`; 32 samples per pixel, the peak is the one in the middle.
+    Parameters as for `cut_through`; 32 samples per pixel, with the peak at the middle sample.
 
     Examples
     --------
@@ -293,7 +293,7 @@ def line_through(
 
 
 def _summit(line: NDArray[np.float64]) -> int:
-    """Return the maximum that rises from the middle of a line: a wide lobe is flat there to the last digits."""
+    """Return the index of the maximum next to the middle of a line: a wide lobe is flat there within rounding."""
     middle = len(line) // 2
     for step in (-1, 1):
         while 0 < middle < len(line) - 1 and line[middle + step] > line[middle]:
@@ -307,7 +307,7 @@ def _first_minimum(line: NDArray[np.float64]) -> int:
 
 
 def half_power_width(power: NDArray[np.float64], middle: int) -> float:
-    """Return the −3 dB width in samples of a lobe that peaks at sample `middle`; NaN where it leaves the line.
+    """Return the −3 dB width, in samples, of a lobe that peaks at sample `middle`; NaN if it extends beyond the line.
 
     Examples
     --------

@@ -1,1 +1,1 @@
-"""The scene: its grid, its ground, and visibility."""
+"""The scene: grid, terrain, coordinate reference systems, and visibility."""

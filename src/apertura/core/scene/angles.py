@@ -1,4 +1,4 @@
-"""Angles under which antennas see the ground, and the surface that they are of."""
+"""Surface normals of the terrain, incidence angles and bistatic angles."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from apertura.core.scene.terrain import FlatGround, Terrain
 
 
 def surface_normals(position: Floats) -> Floats:
-    """Return the unit normals, upward, of a surface given at pixels.
+    """Return the upward unit normals of a surface given at pixels.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def surface_normals(position: Floats) -> Floats:
 
 
 def surface(grid: SceneGrid, terrain: Terrain, window: Window) -> tuple[Floats, Floats]:
-    """Return positions and unit normals of the ground in a window; its neighbours count, so that tiles leave no seams.
+    """Return positions and unit normals of the terrain in a window, seamless between windows.
 
     Parameters
     ----------
@@ -51,16 +51,17 @@ def surface(grid: SceneGrid, terrain: Terrain, window: Window) -> tuple[Floats, 
     if isinstance(terrain, FlatGround):
         position = terrain.positions(grid[window])
         return position, _unit(grid[window].positions(terrain.height_m + 1.0) - position)
-    around = [
+    # One pixel more on each side, so that the normals at the edges do not depend on the window.
+    extended = [
         np.arange(max(0, part.start - 1), max(2, min(size, part.stop + 1)))
         for part, size in zip(window, grid.shape, strict=True)
     ]
-    rows, columns = around
+    rows, columns = extended
     wider = replace(grid, first=(grid.first[0] + rows[0], grid.first[1] + columns[0]), shape=(rows.size, columns.size))
-    known = terrain.heights(grid[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1])
-    lacking = [(0, axis.size - size) for axis, size in zip(around, known.shape, strict=True)]
-    position = wider.positions(np.pad(known, lacking, mode="edge"))  # a grid of one row or column is continued level
-    inner = tuple(slice(part.start - axis[0], part.stop - axis[0]) for part, axis in zip(window, around, strict=True))
+    heights = terrain.heights(grid[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1])
+    padding = [(0, axis.size - size) for axis, size in zip(extended, heights.shape, strict=True)]
+    position = wider.positions(np.pad(heights, padding, mode="edge"))  # extends a grid of one row or column
+    inner = tuple(slice(part.start - axis[0], part.stop - axis[0]) for part, axis in zip(window, extended, strict=True))
     return position[inner], surface_normals(position)[inner]
 
 
@@ -70,14 +71,14 @@ def incidence_deg(position: Floats, normal: Floats, antenna: Floats) -> Floats:
     Parameters
     ----------
     position, normal
-        (..., 3) float64, metres and unit vectors, of one frame.
+        (..., 3) float64, metres and unit vectors, in one frame.
     antenna
         (3,) float64, metres.
 
     Returns
     -------
     ndarray
-        (...) float64 degrees, above 90 where the surface faces away.
+        (...) float64 degrees, above 90 where the surface faces away from the antenna.
 
     Examples
     --------
@@ -88,7 +89,7 @@ def incidence_deg(position: Floats, normal: Floats, antenna: Floats) -> Floats:
 
 
 def bistatic_angle_deg(position: Floats, tx: Floats, rx: Floats) -> Floats:
-    """Return the angle (degrees) at each position (..., 3) between the directions to two antennas (3,), metres.
+    """Return the angle at each position (..., 3) between the directions to two antennas (3,), metres, in degrees.
 
     Examples
     --------
@@ -98,9 +99,9 @@ def bistatic_angle_deg(position: Floats, tx: Floats, rx: Floats) -> Floats:
     return np.degrees(_angle(tx - position, rx - position))
 
 
-def _angle(one: Floats, other: Floats) -> Floats:
-    apart = _unit(one) - _unit(other)  # of small angles the arc is exact, where the cosine is not
-    return np.asarray(2 * np.arcsin(np.minimum(1.0, np.sqrt(np.einsum("...i,...i", apart, apart)) / 2)))
+def _angle(first: Floats, second: Floats) -> Floats:
+    chord = _unit(first) - _unit(second)  # exact for small angles, where the arc cosine is not
+    return np.asarray(2 * np.arcsin(np.minimum(1.0, np.sqrt(np.einsum("...i,...i", chord, chord)) / 2)))
 
 
 def _unit(vector: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""Automatic scene: UTM zone, bounds and spacing from the flight and the waveform."""
+"""Automatic grid of a scene: UTM zone, bounds and pixel spacing from the flight and the waveform."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +11,14 @@ from apertura.core.geometry.geodesy import frame_from_map, geodetic_from_ecef, m
 from apertura.core.scene.grid import SceneGrid
 
 GRAZING_LIMIT_DEG = 10.0
-"""Degrees: ground at a lower grazing angle is left out of automatic bounds; backscatter and terrain accuracy fade."""
+"""Degrees, smallest grazing angle within automatic bounds; below it backscatter and terrain accuracy decrease."""
 
-CELLS_PER_PIXEL = 3.0
-"""Pixels per finest resolution cell; 2 would be Nyquist for a band-limited magnitude."""
+PIXELS_PER_CELL = 3.0
+"""Pixels per finest resolution cell; the Nyquist limit of a band-limited magnitude is 2."""
 
 
 def utm_crs(position: NDArray[np.float64]) -> str:
-    """Return the EPSG code of the WGS 84 UTM zone at an ECEF position; near the poles, of the polar stereographic map.
+    """Return the EPSG code of the WGS 84 UTM zone, or polar stereographic CRS, at an ECEF position.
 
     Examples
     --------
@@ -41,23 +41,23 @@ def auto_bounds(
     height_m: float,
     path_limit_m: float,
 ) -> tuple[float, float, float, float]:
-    """Return bounds of the ground that every pulse illuminates inside the prefix and above the grazing limit.
+    """Return the bounds of the area within the path limit of every pulse and above the smallest grazing angle.
 
     Parameters
     ----------
     aperture
-        In ECEF or the local frame.
+        Aperture in ECEF or the local frame.
     crs
         CRS of the bounds, or 'local'.
     height_m
-        Ground height, ellipsoidal or z.
+        Terrain height, ellipsoidal or z.
     path_limit_m
-        Longest total path inside the cyclic prefix, metres; inf without.
+        Longest total path within the cyclic prefix, metres; inf if unlimited.
 
     Returns
     -------
     tuple
-        xmin, ymin, xmax, ymax, whole metres.
+        xmin, ymin, xmax, ymax, integer metres.
 
     Notes
     -----
@@ -68,14 +68,14 @@ def auto_bounds(
     slant = min(path_limit_m / 2, altitude / np.sin(np.radians(GRAZING_LIMIT_DEG)))
     reach = np.sqrt(max(slant**2 - altitude**2, 1.0))
     middle = (flat[:, :2].min(axis=0) + flat[:, :2].max(axis=0)) / 2
-    some, corners = aperture[aperture.sample(64)], np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+    sample, corners = aperture[aperture.sample(64)], np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
 
     def longest_m(reach: float) -> float:
-        east, north = (middle + (reach + 1) * corners).T  # outer corners in whole metres
-        return float(some.path(frame_from_map(crs, east, north, np.full(4, height_m))).max())
+        east, north = (middle + (reach + 1) * corners).T  # outer corners, rounded to metres
+        return float(sample.path(frame_from_map(crs, east, north, np.full(4, height_m))).max())
 
-    # The square's corners lie beyond the circle, and the ends of a track beyond its middle: it shrinks until they fit.
-    # Where nothing near the track's middle does, it stays, and what is beyond the limit is told of the scene.
+    # The paths from the ends of the track to the corners of the square may exceed the limit: reduce the square until
+    # they do not. If no size fits, the square is unchanged, and checks of the scene report paths beyond the limit.
     fitting = (reach * share for share in np.linspace(1, 0.1, 91) if longest_m(reach * share) <= path_limit_m)
     reach = next(fitting, reach)
     low, high = np.floor(middle - reach), np.ceil(middle + reach)
@@ -90,19 +90,19 @@ def auto_spacing(
     bounds_m: tuple[float, float, float, float],
     height_m: float,
 ) -> float:
-    """Return a pixel spacing (m, of the series 1-2-5) that resolves the finest cell of the scene.
+    """Return a pixel spacing (m, of the series 1-2-5) that samples the finest resolution cell of the scene.
 
-    The spatial spectrum of a pixel is spanned by the gradient of the phase 2πf·path/c over pulses and
-    frequencies; its largest extent along x or y over all pixels of a coarse grid is the inverse of the cell.
+    The spatial spectrum of a pixel is spanned by the gradient of the phase 2πf·path/c over pulses and frequencies. Its
+    largest extent along x or y over the pixels of a coarse grid is the inverse of the resolution cell.
 
     Parameters
     ----------
     aperture
-        In ECEF or the local frame.
+        Aperture in ECEF or the local frame.
     frequency_hz
         (subcarrier,) float64.
     crs, bounds_m, height_m
-        The scene.
+        CRS, bounds and terrain height of the scene.
 
     Notes
     -----
@@ -112,36 +112,38 @@ def auto_spacing(
     grid = SceneGrid(crs, xmin, ymax, max(xmax - xmin, ymax - ymin) / 8, (8, 8))
     row, column = np.mgrid[:8, :8]
     points = grid.positions_at(row, column, height_m)
-    ahead = np.stack([grid.positions_at(row, column + 1e-3, height_m), grid.positions_at(row + 1e-3, column, height_m)])
-    axes = np.moveaxis(ahead - points, 0, -2) / (1e-3 * grid.spacing_m)
+    shifted = np.stack(
+        [grid.positions_at(row, column + 1e-3, height_m), grid.positions_at(row + 1e-3, column, height_m)]
+    )
+    axes = np.moveaxis(shifted - points, 0, -2) / (1e-3 * grid.spacing_m)
     gradient = aperture[aperture.sample(64)].path_gradient(points)
     slopes = np.einsum("pyxk,yxak->pyxa", gradient, axes)
     cycles = np.stack([slopes * f / SPEED_OF_LIGHT_M_S for f in (frequency_hz[0], frequency_hz[-1])])
     widest = float(np.ptp(cycles.reshape(-1, 8, 8, 2), axis=0).max())
-    return _one_two_five(1.0 / (CELLS_PER_PIXEL * widest))
+    return _one_two_five(1.0 / (PIXELS_PER_CELL * widest))
 
 
 MOST_PIXELS = 25_000_000
-"""Of an automatic grid: 200 MB of an image."""
+"""Largest number of pixels of an automatic grid: 200 MB per image."""
 
-_FEWEST_PIXELS = 250_000  # that an automatic grid may always have
+_FEWEST_PIXELS = 250_000  # permitted for any recording
 
 
 def most_pixels(pulses: int, subcarriers: int) -> int:
-    """Return the largest number of pixels of an automatic grid: as many cells as the pass recorded samples.
+    """Return the largest number of pixels of an automatic grid: one resolution cell per recorded sample.
 
-    Each cell has `CELLS_PER_PIXEL` pixels in both axes.
+    A cell has `PIXELS_PER_CELL` pixels along each axis.
 
     Examples
     --------
     >>> most_pixels(300, 1024), most_pixels(10, 512), most_pixels(10**6, 1024)
     (2764800, 250000, 25000000)
     """
-    return min(MOST_PIXELS, max(_FEWEST_PIXELS, round(CELLS_PER_PIXEL**2) * pulses * subcarriers))
+    return min(MOST_PIXELS, max(_FEWEST_PIXELS, round(PIXELS_PER_CELL**2) * pulses * subcarriers))
 
 
 def coarsened(spacing_m: float, bounds_m: tuple[float, float, float, float], most: int) -> float:
-    """Return a spacing of the series 1-2-5, at least the given one, with which bounds hold no more pixels than `most`.
+    """Return a spacing of the series 1-2-5, at least the given one, that limits the pixels within bounds to `most`.
 
     Examples
     --------
@@ -157,5 +159,6 @@ def coarsened(spacing_m: float, bounds_m: tuple[float, float, float, float], mos
 
 
 def _one_two_five(value: float) -> float:
+    """Return the largest value of the series 1-2-5 that does not exceed `value`."""
     decade = 10.0 ** np.floor(np.log10(value))
     return float(max(step * decade for step in (1, 2, 5) if step * decade <= value * (1 + 1e-9)))

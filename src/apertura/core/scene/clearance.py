@@ -1,4 +1,4 @@
-"""Clearance of antennas above the ground, and errors for impossible heights."""
+"""Clearance of antennas above the terrain, and errors for impossible heights."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,20 +15,20 @@ _BLOCKS = 33
 def clearance(
     grid: SceneGrid, terrain: Terrain, antenna: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the height of each phase centre above the pixel under it, and the height of that pixel.
+    """Return the height of each phase centre above the pixel below it, and the height of that pixel.
 
     Parameters
     ----------
     grid, terrain
-        The scene and its ground.
+        Grid and terrain of the scene.
     antenna
         (pulse, 3) float64 phase centres, metres, in the grid's processing frame.
 
     Returns
     -------
     tuple of ndarray
-        (pulse,) float64 metres each. Beside the scene flat ground is continued; beside a DEM the height is unknown:
-        NaN.
+        (pulse,) float64 metres each. Outside the scene a flat terrain is continued; the height of a DEM is unknown
+        there: NaN.
 
     Examples
     --------
@@ -42,26 +42,26 @@ def clearance(
 
 
 def check_antennas(grid: SceneGrid, terrain: Terrain, aperture: Aperture, *, where: str) -> dict[str, str]:
-    """Refuse antennas that are not above the ground; return a flag for those that are lower than a DEM beside them.
+    """Reject antennas that are not above the terrain; return a flag for antennas below the lowest height of the DEM.
 
     Parameters
     ----------
     grid, terrain
-        The scene and its ground.
+        Grid and terrain of the scene.
     aperture
-        In the grid's processing frame.
+        Aperture in the grid's processing frame.
     where
-        Flight and pair.
+        Flight and pair, for errors.
 
     Returns
     -------
     dict
-        Name of the flag → what was measured, in one line: from beside a DEM a radar may image a hillside above it.
+        Flag → measured values, one line. Only a flag, because a radar outside the scene may image a hillside above it.
 
     Raises
     ------
     CampaignError
-        If an antenna is in or below the ground under it; it names the source of the ground's height.
+        If an antenna is at or below the terrain below it; the error names the source of the terrain height.
     """
     flags = Flags()
     for antenna, which in zip(aperture.legs, ("transmitter", "receiver"), strict=True):
@@ -81,12 +81,12 @@ def _below_ground(
     flat, pulse = isinstance(terrain, FlatGround), int(np.nanargmin(above))
     keys = "scene.height_m and scene.height_datum" if flat else "scene.dem (metres, not feet) and scene.dem_datum"
     return CampaignError(
-        f"{which} is in or below the ground of the scene, worst at pulse {pulse}: {above[pulse]:.2f} m above it, its "
-        f"height {above[pulse] + ground[pulse]:.2f} m where {'the ground' if flat else 'the DEM'} has "
+        f"{which} is at or below the terrain of the scene, worst at pulse {pulse}: clearance {above[pulse]:.2f} m, "
+        f"antenna height {above[pulse] + ground[pulse]:.2f} m, {'terrain' if flat else 'DEM'} height "
         f"{ground[pulse]:.2f} m",
         where="scene.height_m" if flat else "scene.dem",
-        expected="an antenna above the ground",
-        remedy=f"Check {keys}, and the heights in the flight log (logs may count from the geoid).",
+        expected="an antenna above the terrain",
+        remedy=f"Check {keys}, and the heights in the flight log (they may refer to the geoid).",
     )
 
 
@@ -95,6 +95,6 @@ def _below_scene(grid: SceneGrid, terrain: Terrain, antenna: NDArray[np.float64]
     if not below_m >= 0:
         return {}
     return {
-        "platform_below_scene": f"the {which} is {below_m:.1f} m below the lowest ground of the scene: check the unit "
-        "and the datum of the DEM, unless the radar looks up a hillside"
+        "platform_below_scene": f"the {which} is {below_m:.1f} m below the lowest terrain of the scene: check the unit "
+        "and the datum of the DEM, unless the radar images a hillside above it"
     }

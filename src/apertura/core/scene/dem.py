@@ -1,4 +1,4 @@
-"""A DEM in any CRS: the file opened and checked, and its ellipsoidal heights at the pixels of a grid."""
+"""DEM in any CRS: opening and checks of the file, and ellipsoidal heights at the pixels of a grid."""
 
 import re
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from apertura.core.scene.terrain import Terrain, bilinear
 # ---- Ellipsoidal heights of a DEM at the pixels of a grid
 
 LATTICE_M = 50.0
-"""Metres between nodes, within which coordinates of another CRS are bilinear to a tenth of a millimetre."""
+"""Metres between nodes at which coordinates of another CRS are computed; bilinear in between, to 0.1 mm."""
 
 COVER_NODES = 129
 """Nodes along each side of the scene at which coverage is checked."""
@@ -31,18 +31,18 @@ LOWEST_M, HIGHEST_M = -500.0, 9000.0
 """Metres, range of land heights on Earth above any datum: Dead Sea −430 m, Everest 8849 m."""
 
 MOST_POSTS = 100_000_000
-"""Posts of a DEM in memory at once, at most: 0.8 GB of float64."""
+"""Largest number of posts of a DEM in memory at once: 0.8 GB of float64."""
 
 FILLS = (0.0, -1.0, 1.0, 255.0, -99.0, 99.0, 999.0, -100.0, -499.0)
-"""Values that programs put where a raster has no height, among those that land may have."""
+"""Common fill values of voids within the range of land heights."""
 
 STEEPEST = 5.0
-"""Rise over run of the steepest ground that raises no question: 79 degrees, over `STEP_M` or a post."""
+"""Slope, rise over run, above which terrain is suspect: 79 degrees, over `STEP_M` or one post."""
 
 STEP_M = 20.0
-"""Metres on the ground over which a step is measured: 100 m of height."""
+"""Metres of horizontal distance over which a step is measured: 100 m of height at the limit."""
 
-_FILL_MARGIN = 16  # posts about those of a scene that are read to see whether a block of them is a void
+_FILL_MARGIN = 16  # posts around the scene that are read to find the edges of a void
 _MOST_STEPS = 1_000_000
 _TILE_PX = 512
 _SAME_RASTER = "the raster that was opened before"
@@ -50,24 +50,24 @@ _SAME_RASTER = "the raster that was opened before"
 
 @dataclass(frozen=True)
 class Dem(Terrain):
-    """A DEM and its vertical datum; `ap.open_dem` opens one.
+    """Raster DEM and its vertical datum; opened by `ap.open_dem`.
 
     Attributes
     ----------
     path
-        A GeoTIFF; heights in band 1.
+        GeoTIFF with heights in band 1.
     shape
         Rows and columns of the raster.
     pixel_from_map
         Affine coefficients a…f of (x, y) → (column, row), outer corner of the raster at (0, 0).
     horizontal
-        WKT of the raster's CRS without heights; empty in a local frame.
+        WKT of the raster's horizontal CRS; empty in a local frame.
     geodetic
-        What pyproj reads: the three-dimensional geodetic CRS whose ellipsoid the undulations count from.
+        Three-dimensional geodetic CRS (any pyproj definition) to whose ellipsoid the undulations refer.
     geoid
-        Grid of undulations; None where heights are ellipsoidal already.
+        Grid of undulations; None if heights are ellipsoidal.
     metres_per_unit
-        Of the raster's heights, negative where they count downward.
+        Unit of the raster's heights in metres, negative if they are positive downward.
 
     Notes
     -----
@@ -83,12 +83,12 @@ class Dem(Terrain):
     metres_per_unit: float
 
     def heights(self, grid: SceneGrid) -> Floats:
-        """Return the height of each pixel of a grid or of a window of it, reading no more of the DEM than that takes.
+        """Return the height of each pixel of a grid or of a window of it; only the required part of the DEM is read.
 
         Parameters
         ----------
         grid
-            Pixels; the result of each does not depend on the window.
+            Grid or window of it; the height of a pixel does not depend on the window.
 
         Returns
         -------
@@ -99,23 +99,23 @@ class Dem(Terrain):
         Raises
         ------
         CampaignError
-            If a post that counts has a height that no land on Earth has, or is one of a block that has one of `FILLS`
-            and steep walls all round: a void undeclared, or another unit.
+            If a height depends on a post outside the range of land heights, or on a block of posts equal to one of
+            `FILLS` with steep walls all round: an undeclared void, or another unit.
         """
         side = max(1, int(LATTICE_M / grid.spacing_m))
         rows, columns = (np.arange(size) + first for size, first in zip(grid.shape, grid.first, strict=True))
         nodes = [np.arange(axis[0] // side, axis[-1] // side + 2) for axis in (rows, columns)]
         mesh = np.meshgrid(nodes[0] * side - grid.first[0], nodes[1] * side - grid.first[1], indexing="ij")
-        place = grid.map_at(*mesh)
-        on_nodes = np.stack([*self._posts(grid.crs, place[..., 0], place[..., 1]), self._shift(grid.crs, place)])
+        xy_m = grid.map_at(*mesh)
+        on_nodes = np.stack([*self._posts(grid.crs, xy_m[..., 0], xy_m[..., 1]), self._shift(grid.crs, xy_m)])
         share = [(axis / side - node[0]) for axis, node in zip((rows, columns), nodes, strict=True)]
         column, row, shift = bilinear(on_nodes, share[0][:, None], share[1][None, :])
         return np.asarray(self._sample(row, column) + shift)
 
     def check_cover(self, grid: SceneGrid) -> None:
-        """Raise CampaignError unless the DEM covers the whole grid, with the missing share and its place."""
-        place = grid.map_at(*np.rint(grid.sample_pixels(COVER_NODES)))
-        column, row = self._posts(grid.crs, place[..., 0], place[..., 1])
+        """Raise CampaignError with the missing share and side if the DEM does not cover the whole grid."""
+        xy_m = grid.map_at(*np.rint(grid.sample_pixels(COVER_NODES)))
+        column, row = self._posts(grid.crs, xy_m[..., 0], xy_m[..., 1])
         outside = ~self._inside(row, column)
         if not outside.any():
             return
@@ -125,11 +125,11 @@ class Dem(Terrain):
         rows, columns = self.shape
         raise CampaignError(
             f"{100 * outside.mean():.1f} % of the scene lies outside the DEM, to the {', '.join(sides) or 'inside'}: "
-            f"the scene needs its columns {column.min():.1f} to {column.max():.1f} and rows {row.min():.1f} to "
+            f"the scene extends over its columns {column.min():.1f} to {column.max():.1f} and rows {row.min():.1f} to "
             f"{row.max():.1f}",
             where=self.path,
-            expected=f"a DEM under the whole scene; this one has {columns} columns and {rows} rows",
-            remedy="Get the missing part, or make scene.bounds_m smaller.",
+            expected=f"a DEM that covers the whole scene; this one has {columns} columns and {rows} rows",
+            remedy="Obtain the missing part of the DEM, or reduce scene.bounds_m.",
         )
 
     def _inside(self, row: Floats, column: Floats) -> NDArray[np.bool_]:
@@ -142,20 +142,20 @@ class Dem(Terrain):
         a, b, c, d, e, f = self.pixel_from_map
         if self.horizontal:
             x, y = _transformer(crs, self.horizontal).transform(x, y)
-            if CRS(self.horizontal).is_geographic:  # 0…360° or −180…180°, as the raster counts
+            if CRS(self.horizontal).is_geographic:  # to the longitude range of the raster, 0…360° or −180…180°
                 middle = (self.shape[1] / 2 - c) / a if a else 0.0
                 x = x + 360 * np.round((middle - x) / 360)
         return np.asarray(a * x + b * y + c - 0.5), np.asarray(d * x + e * y + f - 0.5)
 
-    def _shift(self, crs: str, place: Floats) -> Floats:
-        """Return the shift from heights of the DEM to those of a grid in `crs`, above WGS 84, metres."""
+    def _shift(self, crs: str, xy_m: Floats) -> Floats:
+        """Return the offset from heights of the DEM to those of a grid in `crs`, above WGS 84, metres."""
         if crs == LOCAL:
-            return np.zeros(place.shape[:-1])
-        longitude, latitude = _transformer(crs, CRS(self.geodetic).to_2d()).transform(place[..., 0], place[..., 1])
+            return np.zeros(xy_m.shape[:-1])
+        longitude, latitude = _transformer(crs, CRS(self.geodetic).to_2d()).transform(xy_m[..., 0], xy_m[..., 1])
         shift = np.zeros_like(longitude) if self.geoid is None else undulation(self.geoid, longitude, latitude)
         target = CRS(crs).to_3d() if is_on_wgs84(crs) else CRS(GEODETIC)
-        raised = _transformer(CRS(self.geodetic), target).transform(longitude, latitude, shift)
-        return np.asarray(raised[2], np.float64)
+        transformed = _transformer(CRS(self.geodetic), target).transform(longitude, latitude, shift)
+        return np.asarray(transformed[2], np.float64)
 
     def _sample(self, row: Floats, column: Floats) -> Floats:
         """Return the raster's heights (m, above its datum) between posts; NaN outside it."""
@@ -176,53 +176,53 @@ class Dem(Terrain):
                 f"{counts[0]} × {counts[1]} posts under {row.shape[0]} × {row.shape[1]} pixels",
                 where=self.path,
                 expected=f"at most {MOST_POSTS} posts at once",
-                remedy="Warp the DEM to a spacing near that of the scene with a GIS.",
+                remedy="Resample the DEM to a spacing similar to that of the scene with a GIS.",
             )
         with opened_raster(self.path, expected=_SAME_RASTER, remedy="Copy the DEM again.") as raster:
             window = Window(first[1], first[0], counts[1], counts[0])
             stored, posts = _heights(raster, window)
-            place = (at[0] - first[0], at[1] - first[1])
+            index = (at[0] - first[0], at[1] - first[1])
             if self.horizontal and np.isin(stored, FILLS).any():
-                self._check_fills(raster, first, counts, place)
+                self._check_fills(raster, first, counts, index)
         posts *= self.metres_per_unit
         impossible = (posts < LOWEST_M) | (posts > HIGHEST_M)
         if (
             self.horizontal
             and impossible.any()
-            and np.isnan(bilinear(np.where(impossible, np.nan, 0.0)[None], *place)).any()
+            and np.isnan(bilinear(np.where(impossible, np.nan, 0.0)[None], *index)).any()
         ):
             raise self._impossible_heights(posts, impossible, first)
-        sampled[inside] = bilinear(posts[None], *place)[0]
+        sampled[inside] = bilinear(posts[None], *index)[0]
         return sampled
 
-    def _check_fills(self, raster: Any, first: list[int], counts: list[int], place: tuple[Floats, Floats]) -> None:
-        """Raise CampaignError where a height depends on a block of posts of one value with steep walls all round.
+    def _check_fills(self, raster: Any, first: list[int], counts: list[int], index: tuple[Floats, Floats]) -> None:
+        """Raise CampaignError if a height depends on a block of posts of one fill value with steep walls all round.
 
-        Posts about those that are asked for are read, too: only a block that ends within them is known to be one.
+        Posts around the requested ones are also read, because only a block that ends within the window is a void.
         """
         from rasterio.windows import Window
 
-        begin = [max(0, one - _FILL_MARGIN) for one in first]
-        end = [min(size, one + n + _FILL_MARGIN) for one, n, size in zip(first, counts, self.shape, strict=True)]
-        stored, heights = _heights(raster, Window(begin[1], begin[0], end[1] - begin[1], end[0] - begin[0]))
+        start = [max(0, post - _FILL_MARGIN) for post in first]
+        stop = [min(size, post + n + _FILL_MARGIN) for post, n, size in zip(first, counts, self.shape, strict=True)]
+        stored, heights = _heights(raster, Window(start[1], start[0], stop[1] - start[1], stop[0] - start[0]))
         heights *= self.metres_per_unit
         wall_m = STEEPEST * max(STEP_M, self._post_m)
         for value in FILLS:
             block, lowest_m = walled(heights, stored == value, wall_m=wall_m)
-            seen = block[tuple(slice(a - b, a - b + n) for a, b, n in zip(first, begin, counts, strict=True))]
-            if seen.any() and np.isnan(bilinear(np.where(seen, np.nan, 0.0)[None], *place)).any():
-                row, column = (int(axis[0]) + one for axis, one in zip(np.nonzero(block), begin, strict=True))
+            requested = block[tuple(slice(a - b, a - b + n) for a, b, n in zip(first, start, counts, strict=True))]
+            if requested.any() and np.isnan(bilinear(np.where(requested, np.nan, 0.0)[None], *index)).any():
+                row, column = (int(axis[0]) + offset for axis, offset in zip(np.nonzero(block), start, strict=True))
                 raise CampaignError(
-                    f"{number_of(int(block.sum()), 'post')} from row {row}, column {column} on are exactly {value:g}, "
-                    f"and all posts beside at least {lowest_m:.0f} m off: a void filled with {value:g}",
+                    f"a void filled with {value:g}: {number_of(int(block.sum()), 'post')} of this value from row "
+                    f"{row}, column {column}, surrounded by posts that differ by at least {lowest_m:.0f} m",
                     where=self.path,
-                    expected="heights of the ground, and voids declared as nodata",
-                    remedy=f"Declare {value:g} as nodata of those posts and fill them with a GIS.",
+                    expected="terrain heights, and voids declared as nodata",
+                    remedy=f"Declare {value:g} as nodata for these posts, and fill them with a GIS.",
                 )
 
     @property
     def _post_m(self) -> float:
-        """Distance of posts, metres, the wider way."""
+        """Spacing of posts along the axis with the wider spacing, metres."""
         a, b, _, d, e, _ = self.pixel_from_map
         unit_m = 111_195.0 if CRS(self.horizontal).is_geographic else 1.0
         return unit_m / max(float(min(np.hypot(a, d), np.hypot(b, e))), 1e-12)
@@ -232,30 +232,31 @@ class Dem(Terrain):
         (top, left), (rows, columns) = start, posts.shape
         return CampaignError(
             f"{impossible.sum()} of the {impossible.size} posts in rows {top} to {top + rows - 1}, columns {left} to "
-            f"{left + columns - 1} have no height on Earth, most often {values[counts.argmax()]:g} m",
+            f"{left + columns - 1} have impossible heights, most frequently {values[counts.argmax()]:g} m",
             where=self.path,
             expected=f"heights between {LOWEST_M:g} m and {HIGHEST_M:g} m",
-            remedy="Declare the value that stands for a void as nodata (and fill the voids under the scene), or "
-            "correct the unit of the heights.",
+            remedy="Declare the fill value of voids as nodata (and fill the voids within the scene), or correct the "
+            "unit of the heights.",
         )
 
 
 def walled(heights: Floats, same: NDArray[np.bool_], *, wall_m: float) -> tuple[NDArray[np.bool_], float]:
-    """Return which posts are in blocks of `same` posts whose neighbours are all off by a wall, and the lowest of walls.
+    """Find blocks of `same` posts that are surrounded by steps in height, and the lowest of these steps.
 
     Parameters
     ----------
     heights
-        (row, column) float64, metres, NaN in voids, which are no neighbours.
+        (row, column) float64, metres; NaN in voids, which are ignored as neighbours.
     same
-        (row, column) bool: posts of one height.
+        (row, column) bool, posts of equal height.
     wall_m
-        Metres by which neighbours in the same row or column must be off.
+        Least height difference from all neighbours in the same row or column, metres.
 
     Returns
     -------
     tuple
-        (row, column) bool, none of a block that touches an edge; metres, infinite where there is no block.
+        (row, column) bool, posts of the blocks, without blocks that touch an edge; lowest step in metres, infinite if
+        there is no block.
 
     Examples
     --------
@@ -268,24 +269,24 @@ def walled(heights: Floats, same: NDArray[np.bool_], *, wall_m: float) -> tuple[
     from scipy.ndimage import label
 
     padded, inner = np.pad(heights, 1, constant_values=np.nan), np.pad(same, 1)
-    off_m = np.full(same.shape, np.inf)
-    for way in ((slice(None, -2), slice(1, -1)), (slice(2, None), slice(1, -1))):
-        for rows, columns in (way, way[::-1]):
-            apart_m = np.where(inner[rows, columns], np.nan, np.abs(padded[rows, columns] - heights))
-            off_m = np.fmin(off_m, np.where(same, apart_m, np.nan))
-    if not (same & np.isfinite(off_m) & (off_m > wall_m)).any():
+    step_m = np.full(same.shape, np.inf)  # smallest difference from a neighbour outside the block
+    for neighbour in ((slice(None, -2), slice(1, -1)), (slice(2, None), slice(1, -1))):
+        for rows, columns in (neighbour, neighbour[::-1]):
+            difference_m = np.where(inner[rows, columns], np.nan, np.abs(padded[rows, columns] - heights))
+            step_m = np.fmin(step_m, np.where(same, difference_m, np.nan))
+    if not (same & np.isfinite(step_m) & (step_m > wall_m)).any():
         return np.zeros_like(same), np.inf
     blocks, _ = label(same)
-    open_ones = np.unique(
-        np.concatenate([blocks[same & (off_m <= wall_m)], blocks[0], blocks[-1], blocks[:, 0], blocks[:, -1]])
+    rejected = np.unique(
+        np.concatenate([blocks[same & (step_m <= wall_m)], blocks[0], blocks[-1], blocks[:, 0], blocks[:, -1]])
     )
-    block = same & ~np.isin(blocks, open_ones)
-    return block, float(off_m[block].min(initial=np.inf))
+    block = same & ~np.isin(blocks, rejected)
+    return block, float(step_m[block].min(initial=np.inf))
 
 
 @dataclass(frozen=True)
 class UncheckedDem(Terrain):
-    """A DEM under a scene before the stage `terrain`: voids raise the same error as in that stage.
+    """DEM of a scene before the stage `terrain` has checked it: voids raise the same error as in that stage.
 
     Attributes
     ----------
@@ -297,7 +298,7 @@ class UncheckedDem(Terrain):
     grid: SceneGrid
 
     def heights(self, grid: SceneGrid) -> Floats:
-        """Return the DEM's heights; a void at pixels of the scene raises CampaignError with the count over all."""
+        """Return the DEM's heights; a void in the scene raises CampaignError with the number of pixels affected."""
         heights = self.dem.heights(grid)
         if grid.spacing_m == self.grid.spacing_m and np.isnan(heights).any():
             height_range(self.dem, self.grid, where=self.dem.path)
@@ -305,19 +306,19 @@ class UncheckedDem(Terrain):
 
 
 def height_range(terrain: Terrain, grid: SceneGrid, *, where: Path) -> tuple[float, float]:
-    """Return the lowest and the highest ground of a scene (m), read tile by tile.
+    """Return the lowest and the highest terrain height of a scene (m), read tile by tile.
 
     Parameters
     ----------
     terrain, grid
-        The ground, and the whole grid.
+        The terrain, and the whole grid.
     where
-        The DEM that the heights come from.
+        The DEM, for errors.
 
     Raises
     ------
     CampaignError
-        If a pixel has no height: how many, and where the first one is.
+        If pixels have no height; the error states their number and the position of the first.
     """
     voids, first, low, high = 0, "", np.inf, -np.inf
     for window in grid.tiles(_TILE_PX):
@@ -333,20 +334,20 @@ def height_range(terrain: Terrain, grid: SceneGrid, *, where: Path) -> tuple[flo
         raise CampaignError(
             f"no height at {voids} of {total} pixels of the scene ({100 * voids / total:.2f} %), first at {first}",
             where=where,
-            expected="a height at every post under the scene",
-            remedy="Fill the voids (NaN or nodata) of the DEM with a GIS, or make scene.bounds_m smaller.",
+            expected="a height at every post within the scene",
+            remedy="Fill the voids (NaN or nodata) of the DEM with a GIS, or reduce scene.bounds_m.",
         )
     return low, high
 
 
 def _heights(raster: Any, window: Any) -> tuple[Floats, Floats]:
-    """Return values of a window as stored, NaN in voids, and as heights of the raster's unit."""
+    """Return the stored values of a window, NaN in voids, and the heights in the raster's unit."""
     stored = raster.read(1, window=window, masked=True).astype(np.float64).filled(np.nan)
     return stored, stored * raster.scales[0] + raster.offsets[0]
 
 
 class Step(NamedTuple):
-    """The steepest step of a scene's ground: metres of height over metres on the ground, and where it is."""
+    """Steepest step of the terrain of a scene: height difference, horizontal distance, and map position, metres."""
 
     height_m: float
     over_m: float
@@ -355,17 +356,17 @@ class Step(NamedTuple):
 
 
 def steepest_step(terrain: Terrain, grid: SceneGrid) -> Step | None:
-    """Return the highest step of the ground that is steeper than `STEEPEST` over `STEP_M`; None where there is none.
+    """Return the highest step of the terrain that is steeper than `STEEPEST` over `STEP_M`; None if there is none.
 
-    Cliffs are seldom so steep; a void that is filled with a constant is, and blocks of another datum or source.
+    Cliffs are rarely as steep. Typical causes are voids filled with a constant, and parts of another datum or source.
 
     Parameters
     ----------
     terrain, grid
-        The ground, and the whole grid.
+        The terrain, and the whole grid.
     """
-    most = int(np.ceil(np.sqrt(grid.shape[0] * grid.shape[1] / _MOST_STEPS)))
-    every = max(1, round(STEP_M / 4 / grid.spacing_m), most)
+    coarsest = int(np.ceil(np.sqrt(grid.shape[0] * grid.shape[1] / _MOST_STEPS)))
+    every = max(1, round(STEP_M / 4 / grid.spacing_m), coarsest)
     rows, columns = (np.arange(every // 2, size, every) for size in grid.shape)
     heights = terrain.heights_at(grid, rows[:, None], columns[None, :])
     ahead = max(1, round(STEP_M / (every * grid.spacing_m)))
@@ -374,7 +375,7 @@ def steepest_step(terrain: Terrain, grid: SceneGrid) -> Step | None:
         if drops.size:
             drop = np.nan_to_num(np.abs(drops))
             row, column = np.unravel_index(int(drop.argmax()), drop.shape)
-            x_m, y_m = (float(one) for one in grid.map_at(rows[row], columns[column]))
+            x_m, y_m = (float(coordinate) for coordinate in grid.map_at(rows[row], columns[column]))
             steps.append(Step(float(drop[row, column]), over_m, x_m, y_m))
     highest = max(steps, default=None)
     return highest if highest is not None and highest.height_m > STEEPEST * over_m else None
@@ -386,10 +387,10 @@ def _transformer(source: str | CRS, target: str | CRS) -> Transformer:
         return Transformer.from_crs(source, target, always_xy=True, allow_ballpark=False)
     except ProjError as error:
         raise CampaignError(
-            f"PROJ knows no exact way from {CRS(source).name} to {CRS(target).name}",
+            f"PROJ has no exact transformation from {CRS(source).name} to {CRS(target).name}",
             where="scene.dem",
-            expected="a DEM whose CRS PROJ can relate to the scene's",
-            remedy="Warp the DEM into scene.crs with a GIS, and state its datum.",
+            expected="a DEM in a CRS that PROJ can transform to that of the scene",
+            remedy="Reproject the DEM to scene.crs with a GIS, and configure its datum.",
         ) from error
 
 
@@ -398,7 +399,7 @@ def _transformer(source: str | CRS, target: str | CRS) -> Transformer:
 _COLOURS = {"red", "green", "blue", "palette", "hue", "saturation", "lightness", "cyan", "magenta", "yellow"}
 _EXPECTED = "the DEM of scene.dem, a GeoTIFF of heights"
 NAMES_FILES = re.compile(r'\+proj=|grids=|init=|"PROJ4"|PARAMETERFILE\["[^"]*","[^"]*[/\\:~]', re.IGNORECASE)
-"""Parts of a CRS (WKT) that make PROJ open files other than the grids in its own folders."""
+"""Parts of a CRS (WKT) that cause PROJ to open files other than the grids in its own folders."""
 
 _REMEDY = "Correct the DEM, or scene.dem and scene.dem_datum (from Python: path and datum)."
 
@@ -406,14 +407,14 @@ _REMEDY = "Correct the DEM, or scene.dem and scene.dem_datum (from Python: path 
 def open_dem(
     path: str | Path, scene: str | SceneGrid, *, datum: str = "carried", geoid: str | Path | None = None
 ) -> Dem:
-    """Return a DEM as the ground of a scene, whatever CRS the raster is in.
+    """Open a DEM in any CRS as the terrain of a scene.
 
     Parameters
     ----------
     path
-        A GeoTIFF, heights in band 1; files beside it (.aux.xml, .ovr, .tfw) are ignored.
+        GeoTIFF with heights in band 1; sidecar files (.aux.xml, .ovr, .tfw) are ignored.
     scene
-        The grid that the DEM must reach over; or the CRS alone, what pyproj reads or 'local', of whatever grid is read.
+        The grid that the DEM must cover; or only its CRS, a pyproj definition or 'local', to skip the coverage check.
     datum
         Datum of the heights: 'ellipsoid', 'egm96', 'egm2008', or 'carried' (declared by the raster's CRS; in a local
         scene: z of the frame).
@@ -423,26 +424,26 @@ def open_dem(
     Raises
     ------
     CampaignError
-        If the file is no DEM, its CRS contradicts `datum` or declares none, the grid of undulations is missing, or
-        the DEM ends inside the scene.
+        If the file is not a DEM, its CRS contradicts `datum` or declares none, the grid of undulations is missing, or
+        the DEM does not cover the scene.
 
     Examples
     --------
-    A DEM in UTM whose heights are ellipsoidal, under a scene of 4 × 4 pixels:
+    A DEM in UTM with ellipsoidal heights, and a scene of 4 × 4 pixels:
 
     >>> import numpy as np, rasterio
     >>> from tempfile import TemporaryDirectory
-    >>> kind = {"width": 9, "height": 9, "count": 1, "dtype": "float32", "crs": "EPSG:32632"}
-    >>> place = rasterio.Affine(5, 0, 500000, 0, -5, 5400045)
+    >>> profile = {"width": 9, "height": 9, "count": 1, "dtype": "float32", "crs": "EPSG:32632"}
+    >>> transform = rasterio.Affine(5, 0, 500000, 0, -5, 5400045)
     >>> with TemporaryDirectory() as folder:
-    ...     with rasterio.open(f"{folder}/dem.tif", "w", "GTiff", transform=place, **kind) as raster:
+    ...     with rasterio.open(f"{folder}/dem.tif", "w", "GTiff", transform=transform, **profile) as raster:
     ...         raster.write(np.full((9, 9), 612.5, np.float32), 1)
     ...     grid = SceneGrid("EPSG:32632", 500020.0, 5400020.0, 0.5, (4, 4))
     ...     float(open_dem(f"{folder}/dem.tif", grid, datum="ellipsoid").heights(grid)[0, 0])
     612.5
     """
     if not isinstance(scene, str | SceneGrid):
-        raise CampaignError(quoted(scene), "open_dem: scene", "a SceneGrid, or its CRS", "Give the grid of the images.")
+        raise CampaignError(quoted(scene), "open_dem: scene", "a SceneGrid, or its CRS", "Pass the grid of the images.")
     crs = scene if isinstance(scene, str) else scene.crs
     dem = _dem(Path(path), crs, datum=datum, geoid=None if geoid is None else Path(geoid))
     if not isinstance(scene, str):
@@ -451,58 +452,65 @@ def open_dem(
 
 
 def _dem(path: Path, crs: str, *, datum: str, geoid: Path | None) -> Dem:
+    """Open a DEM for a scene in `crs`, without the coverage check; parameters as for `open_dem`."""
     pixel_from_map, shape, unit, system = _header(path)
     if crs == LOCAL:
         if system is not None and (system.is_geographic or system.is_projected):
-            raise _wrong(path, f"CRS {system.name} under a scene in the local frame", "a DEM in the frame's own axes")
+            raise _wrong(
+                path, f"CRS {system.name} for a scene in the local frame", "a DEM in the axes of the local frame"
+            )
         return Dem(path, shape, pixel_from_map, "", "", None, 1.0)
     if system is None or not (system.is_geographic or system.is_projected or system.is_compound):
-        raise _wrong(path, "no CRS on Earth", f"a georeferenced DEM, or scene.crs: {LOCAL}")
-    counted_from = _datum(path, system, datum)
+        raise _wrong(path, "no geodetic CRS", f"a georeferenced DEM, or scene.crs: {LOCAL}")
+    vertical_datum = _datum(path, system, datum)
     metres = _metres_per_unit(path, system, unit)
     horizontal = system.sub_crs_list[0] if system.is_compound else system.to_2d()
-    earth = counted_from in {"egm96", "egm2008"}
-    stated = datum == "ellipsoid" and not is_on_wgs84(horizontal.to_wkt())
-    own = None if earth or stated else horizontal.geodetic_crs
+    # Undulations of EGM96 and EGM2008, and configured ellipsoidal heights, refer to WGS 84; all others to the ellipsoid
+    # of the raster's own CRS.
+    refers_to_wgs84 = vertical_datum in {"egm96", "egm2008"} or (
+        datum == "ellipsoid" and not is_on_wgs84(horizontal.to_wkt())
+    )
+    own = None if refers_to_wgs84 else horizontal.geodetic_crs
     geodetic = CRS(GEODETIC) if own is None else own.to_3d()
     undulations = (
         None
-        if counted_from == "ellipsoid"
-        else geoid_file(counted_from, geoid, names=grid_names(system) if datum == "carried" else ())
+        if vertical_datum == "ellipsoid"
+        else geoid_file(vertical_datum, geoid, names=grid_names(system) if datum == "carried" else ())
     )
     return Dem(path, shape, pixel_from_map, horizontal.to_wkt(), geodetic.to_wkt(), undulations, metres)
 
 
 def _header(path: Path) -> tuple[tuple[float, ...], tuple[int, int], str, CRS | None]:
-    """Return (x, y) → (column, row), rows and columns, unit of the heights and CRS."""
+    """Read the transform (x, y) → (column, row), rows and columns, unit of the heights and CRS of a raster."""
     with opened_raster(path, expected=_EXPECTED, remedy=_REMEDY) as raster:
-        shape, unit, place, kind = (
+        shape, unit, transform, dtype = (
             raster.shape,
             (raster.units[0] or "metre").lower(),
             raster.transform,
             raster.dtypes[0],
         )
-        colours = [one.name for one in raster.colorinterp if one.name in _COLOURS]
+        colours = [band.name for band in raster.colorinterp if band.name in _COLOURS]
         try:
             system = CRS.from_user_input(raster.crs) if raster.crs else None
             if system and NAMES_FILES.search(system.to_wkt()):
-                raise _wrong(path, "a CRS that names a file", "a CRS that is complete in itself, or names a known grid")
+                raise _wrong(path, "a CRS that names a file", "a self-contained CRS, or one that names a known grid")
         except ProjError as error:
             raise _wrong(path, f"a CRS that PROJ does not read ({shown(error)})", "a CRS that PROJ reads") from error
     if colours:
         found = f"colours ({', '.join(colours)}), not heights"
-        raise _wrong(path, found, "a band of heights, which a shaded relief or a map has not")
+        raise _wrong(path, found, "a band of heights, not a shaded relief or a map")
     if min(shape) < 2:
         raise _wrong(path, f"{shape[0]} × {shape[1]} posts", "at least 2 × 2")
-    if not np.issubdtype(np.dtype(kind), np.integer) and not np.issubdtype(np.dtype(kind), np.floating):
-        raise _wrong(path, f"heights of type {kind}", "integers or floating-point numbers")
-    sides = (float(np.hypot(place.a, place.d)), float(np.hypot(place.b, place.e)))
-    if not np.isfinite(place[:6]).all() or abs(place.determinant) <= 1e-9 * sides[0] * sides[1]:
-        raise _wrong(path, f"a degenerate transform {[float(value) for value in place[:6]]}", "pixels with an area")
-    inverse = ~place
+    if not np.issubdtype(np.dtype(dtype), np.integer) and not np.issubdtype(np.dtype(dtype), np.floating):
+        raise _wrong(path, f"heights of type {dtype}", "integers or floating-point numbers")
+    sides = (float(np.hypot(transform.a, transform.d)), float(np.hypot(transform.b, transform.e)))
+    if not np.isfinite(transform[:6]).all() or abs(transform.determinant) <= 1e-9 * sides[0] * sides[1]:
+        found = f"a degenerate transform {[float(value) for value in transform[:6]]}"
+        raise _wrong(path, found, "pixels of finite area")
+    inverse = ~transform
     coefficients = (inverse.a, inverse.b, inverse.c, inverse.d, inverse.e, inverse.f)
     if not np.isfinite(coefficients).all():
-        raise _wrong(path, f"pixels of {sides[0]:g} × {sides[1]:g} units", "pixels of distinct position")
+        raise _wrong(path, f"pixels of {sides[0]:g} × {sides[1]:g} units", "pixels at distinct positions")
     return coefficients, shape, unit, system
 
 
@@ -515,20 +523,22 @@ def _wrong(path: Path, found: str, expected: str) -> CampaignError:
     )
 
 
-def _datum(path: Path, system: CRS, stated: str) -> str:
-    carried = declared_datum(system)
-    if stated == "carried":
-        if carried is None:
+def _datum(path: Path, system: CRS, configured: str) -> str:
+    """Return the vertical datum of a raster, checked against the configured one."""
+    declared = declared_datum(system)
+    if configured == "carried":
+        if declared is None:
             raise _wrong(
-                path, f"a CRS without heights ({system.name})", "a datum that is stated: ellipsoid, egm96 or egm2008"
+                path, f"a CRS without heights ({system.name})", "a configured datum: ellipsoid, egm96 or egm2008"
             )
-        return carried
-    if carried not in {None, stated}:
-        raise _wrong(path, f"heights of {carried} by its own CRS", f"{stated}, as stated, or carried")
-    return stated
+        return declared
+    if declared not in {None, configured}:
+        raise _wrong(path, f"heights of {declared} declared by its own CRS", f"{configured}, as configured, or carried")
+    return configured
 
 
 def _metres_per_unit(path: Path, system: CRS, unit: str) -> float:
+    """Return the unit of a raster's heights in metres, negative if they are positive downward."""
     axis = system.axis_info[-1]
     if len(system.axis_info) == 3:
         return float(axis.unit_conversion_factor * (-1 if axis.direction == "down" else 1))

@@ -1,4 +1,4 @@
-"""From heights above a geoid to heights above the ellipsoid, through a checked grid file."""
+"""Conversion of heights above a geoid to ellipsoidal heights by a checked grid of undulations."""
 
 import os
 import struct
@@ -21,32 +21,32 @@ from apertura.core.scene.terrain import bilinear
 
 # ---- Grids of undulations: checked headers and values
 #
-# PROJ reads .gtx; its TIFF reader divides by zero on a damaged file, so GDAL reads those, as it does DEMs.
+# PROJ reads .gtx. Its TIFF reader divides by zero for a damaged file, so GDAL reads TIFF grids, as it does DEMs.
 
 HIGHEST_M = 150.0
-"""Metres, largest undulation either way: it is −107 m south of India, +86 m in New Guinea."""
+"""Metres, limit of the magnitude of undulations: −107 m south of India, +86 m in New Guinea."""
 
 MOST_POSTS = 300_000_000
-"""Posts of a grid at most: a grid of one arc minute over the Earth has 233 million."""
+"""Largest number of posts of a grid: a global grid of one arc minute has 233 million."""
 
-_STEPS_DEG = (1e-4, 30.0)  # between posts, of any grid
+_STEPS_DEG = (1e-4, 30.0)  # limits of the spacing of posts
 _GTX = struct.Struct(">4d2i")
 """Latitude and longitude of the first post, steps of both, degrees; rows, columns."""
 
-_EXPECTED = "a .gtx or .tif grid of undulations, as PROJ's collection has them"
-_REMEDY = "Get that file again, or correct scene.geoid."
+_EXPECTED = "a .gtx or .tif grid of undulations in the format of PROJ's grid collection"
+_REMEDY = "Download the file again, or correct scene.geoid."
 
 
 def check_grid(path: Path) -> None:
-    """Raise CampaignError unless the size of a file is that of the grid in its header."""
+    """Raise CampaignError if the header of a grid is invalid or does not match the size of the file."""
     wrong = None
     if path.suffix.lower() == ".tif":
         with opened_raster(path, expected=_EXPECTED, remedy=_REMEDY) as raster:
-            posts, place = raster.width * raster.height, raster.transform
-        stepped = all(_STEPS_DEG[0] <= abs(step) <= _STEPS_DEG[1] for step in (place.a, place.e))  # NaN is neither
-        placed = stepped and abs(place.c) <= 2 * 360 and abs(place.f) <= 2 * 90
-        if posts > MOST_POSTS or place.b or place.d or not placed:
-            wrong = f"{posts} posts placed by {[float(value) for value in place[:6]]}"
+            posts, affine = raster.width * raster.height, raster.transform
+        valid_steps = all(_STEPS_DEG[0] <= abs(step) <= _STEPS_DEG[1] for step in (affine.a, affine.e))  # not for NaN
+        valid_origin = abs(affine.c) <= 2 * 360 and abs(affine.f) <= 2 * 90
+        if posts > MOST_POSTS or affine.b or affine.d or not (valid_steps and valid_origin):
+            wrong = f"{posts} posts with the transform {[float(value) for value in affine[:6]]}"
     elif path.suffix.lower() == ".gtx":
         with path.open("rb") as stream:
             header = stream.read(_GTX.size)
@@ -57,9 +57,9 @@ def check_grid(path: Path) -> None:
         elif not (
             abs(south) <= 90 and abs(west) <= 360 and all(_STEPS_DEG[0] <= step <= _STEPS_DEG[1] for step in steps)
         ):
-            wrong = f"a grid that begins at latitude {south:g}, longitude {west:g} in steps of {steps} degrees"
+            wrong = f"a grid that starts at latitude {south:g}, longitude {west:g} in steps of {steps} degrees"
     else:
-        wrong = f"a file of kind {quoted(path.suffix, 20)}"
+        wrong = f"a file of type {quoted(path.suffix, 20)}"
     if wrong:
         raise CampaignError(wrong, where=path, expected=_EXPECTED, remedy=_REMEDY)
 
@@ -70,7 +70,7 @@ def undulation(grid: Path, longitude_deg: Floats, latitude_deg: Floats) -> Float
     Parameters
     ----------
     grid
-        A grid as PROJ ships them (.gtx, .tif).
+        Grid of PROJ's collection (.gtx, .tif).
     longitude_deg, latitude_deg
         (...,) float64, degrees, in the geodetic CRS of the grid.
 
@@ -82,7 +82,7 @@ def undulation(grid: Path, longitude_deg: Floats, latitude_deg: Floats) -> Float
     Raises
     ------
     CampaignError
-        If the grid cannot be read or does not cover a place.
+        If the grid is not readable or does not cover a point.
 
     Notes
     -----
@@ -92,54 +92,54 @@ def undulation(grid: Path, longitude_deg: Floats, latitude_deg: Floats) -> Float
     sample = _of_tif if grid.suffix.lower() == ".tif" else _of_gtx
     shape = np.shape(longitude_deg)
     height = sample(grid, *(np.ravel(np.asarray(angle, np.float64)) for angle in (longitude_deg, latitude_deg)))
-    lost = ~(np.abs(height) <= HIGHEST_M)
-    if lost.any():
-        longitude, latitude = (np.ravel(angle)[lost.argmax()] for angle in (longitude_deg, latitude_deg))
+    invalid = ~(np.abs(height) <= HIGHEST_M)
+    if invalid.any():
+        longitude, latitude = (np.ravel(angle)[invalid.argmax()] for angle in (longitude_deg, latitude_deg))
         raise CampaignError(
-            f"has no undulation of the Earth at longitude {longitude:.4f}, latitude {latitude:.4f}",
+            f"no valid undulation at longitude {longitude:.4f}, latitude {latitude:.4f}",
             where=grid,
-            expected="a grid that reaches over the scene",
-            remedy="Get a grid of the region and name it in scene.geoid.",
+            expected="a grid that covers the scene",
+            remedy="Obtain a grid of the region and set scene.geoid to it.",
         )
     return height.reshape(shape)
 
 
 def _of_gtx(grid: Path, longitude: Floats, latitude: Floats) -> Floats:
-    """Return undulations read by PROJ; the operation names the grid, because PROJ skips a missing grid.
+    """Return undulations interpolated by PROJ.
 
-    A bare name would be searched elsewhere.
+    The operation contains the absolute path of the grid: PROJ skips missing grids, and searches bare names elsewhere.
     """
-    with on_disk(grid.absolute().parent) as folder:  # PROJ tells the format by the name
+    with on_disk(grid.absolute().parent) as folder:  # PROJ derives the format from the file name
         steps = f'+step +proj=vgridshift +grids="{folder / grid.name}" +multiplier=1'
         try:
             shift = Transformer.from_pipeline(f"+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad {steps}")
         except ProjError as error:
-            raise CampaignError("not readable as a vertical grid", grid, _EXPECTED, "Get it again.") from error
+            raise CampaignError("not readable as a vertical grid", grid, _EXPECTED, _REMEDY) from error
         return np.asarray(shift.transform(longitude, latitude, np.zeros_like(longitude))[2], np.float64)
 
 
 def _of_tif(grid: Path, longitude: Floats, latitude: Floats) -> Floats:
-    """Return band 1 between posts, NaN beyond them; a grid around the Earth wraps in longitude."""
+    """Return band 1, interpolated between posts and NaN outside the grid; a global grid wraps in longitude."""
     from rasterio.windows import Window
 
     with opened_raster(grid, expected=_EXPECTED, remedy=_REMEDY) as raster:
-        place, (rows, columns) = raster.transform, raster.shape
-        turn = 360 / abs(place.a)
-        column = np.mod((longitude - place.c) / place.a - 0.5 + 1e-6, turn) - 1e-6  # the first post is inside
-        row = (latitude - place.f) / place.e - 0.5
-        around_earth = columns >= round(turn)
+        affine, (rows, columns) = raster.transform, raster.shape
+        columns_of_circle = 360 / abs(affine.a)
+        column = np.mod((longitude - affine.c) / affine.a - 0.5 + 1e-6, columns_of_circle) - 1e-6  # includes post 0
+        row = (latitude - affine.f) / affine.e - 0.5
+        is_global = columns >= round(columns_of_circle)
         inside = (row >= -1e-6) & (row <= rows - 1 + 1e-6) & (column >= -1e-6)
-        inside &= around_earth | (column <= columns - 1 + 1e-6)
+        inside &= is_global | (column <= columns - 1 + 1e-6)
         undulations = np.full(row.shape, np.nan)
         if not inside.any():
             return undulations
         first = int(np.clip(np.floor(row[inside].min()), 0, max(rows - 2, 0)))
         last = int(np.clip(np.floor(row[inside].max()) + 2, 1, rows))
         if (last - first) * columns > LARGEST_BLOCK:
-            raise ValueError(f"{last - first} rows of {columns} posts are needed at once")
+            raise ValueError(f"{last - first} rows of {columns} posts exceed the block limit of {LARGEST_BLOCK} posts")
         values = raster.read(1, window=Window(0, first, columns, last - first), masked=True)
         values = values.astype(np.float64).filled(np.nan) * raster.scales[0] + raster.offsets[0]
-    if around_earth:
+    if is_global:
         values = np.concatenate([values, values[:, :1]], axis=1)
     undulations[inside] = bilinear(values[None], row[inside] - first, column[inside])[0]
     return undulations
@@ -148,27 +148,27 @@ def _of_tif(grid: Path, longitude: Floats, latitude: Floats) -> Floats:
 # ---- Vertical datums and their grids
 
 GRIDS = {"egm96": ("us_nga_egm96_15.tif", "egm96_15.gtx"), "egm2008": ("us_nga_egm08_25.tif", "egm08_25.gtx")}
-"""Datum → names of its grid of undulations, as PROJ ships them."""
+"""Datum → file names of its grid of undulations in PROJ's collection."""
 
 _MARKS = {"egm96": ("egm96",), "egm2008": ("egm08", "egm2008")}
 
 
 def geoid_file(datum: str, given: Path | None, *, names: Sequence[str] = ()) -> Path:
-    """Return the grid of undulations of a datum: the one given, else the one on PROJ's search path.
+    """Return the grid of undulations of a datum: the configured file, else a file on PROJ's search path.
 
     Parameters
     ----------
     datum
-        Datum of the heights, for the message and to check that the file is not another datum's.
+        Datum of the heights, for errors and to check that the file does not belong to another datum.
     given
-        What scene.geoid says, as a path that opens here.
+        Path of scene.geoid; None if it is not configured.
     names
-        File names to look for; `GRIDS` of the datum by default.
+        File names to search; by default those of the datum in `GRIDS`.
 
     Raises
     ------
     CampaignError
-        If there is no such file: heights are never taken as ellipsoidal because a grid is missing.
+        If there is no such file; heights are never processed as ellipsoidal because a grid is missing.
 
     Examples
     --------
@@ -184,32 +184,32 @@ def geoid_file(datum: str, given: Path | None, *, names: Sequence[str] = ()) -> 
         if paths:
             return paths[0]
         raise CampaignError(
-            f"heights count from {datum}, but its geoid grid is not here",
+            f"heights refer to {datum}, but its geoid grid is not installed",
             where="scene.geoid",
             expected=expected,
-            remedy=f"Get {names[0] if names else 'that grid'} from PROJ's grid collection (`projsync`), "
-            "put it beside the DEM, and name it in scene.geoid.",
+            remedy=f"Obtain {names[0] if names else 'the grid'} from PROJ's grid collection (`projsync`), "
+            "put it into the folder of the DEM, and set scene.geoid to it.",
         )
     others = [mark for other, marks in _MARKS.items() if other != datum for mark in marks]
     wrong = "no such file" if not given.is_file() else None
     if any(mark in given.name.lower() for mark in others):
-        wrong = f"the grid of another geoid than {datum}"
+        wrong = f"the grid of a geoid other than {datum}"
     if any(mark in str(given.absolute()) for mark in '",'):
         wrong = "a path with a comma or a quotation mark, which PROJ cannot open"
     if wrong:
-        raise CampaignError(wrong, where=given, expected=expected, remedy="Get that file, or correct scene.geoid.")
+        raise CampaignError(wrong, where=given, expected=expected, remedy="Obtain the file, or correct scene.geoid.")
     check_grid(given)
     return given
 
 
 def grid_folders() -> list[Path]:
-    """Return the folders in which grids of undulations are searched: PROJ's."""
+    """Return PROJ's folders, in which grids of undulations are searched."""
     listed = [*os.environ.get("PROJ_DATA", "").split(os.pathsep), *get_data_dir().split(os.pathsep)]
     return [Path(folder) for folder in [*listed, get_user_data_dir()] if folder]
 
 
 def declared_datum(crs: CRS) -> str | None:
-    """Return the vertical datum of a CRS: 'ellipsoid', 'egm96', 'egm2008', the name of another datum, or None.
+    """Return the vertical datum of a CRS: 'ellipsoid', 'egm96', 'egm2008', or another name; None if it has none.
 
     Examples
     --------
@@ -224,9 +224,10 @@ def declared_datum(crs: CRS) -> str | None:
 
 
 def grid_names(system: CRS) -> list[str]:
-    """Return the grid files that PROJ needs for the heights of a compound CRS."""
+    """Return the names of the grid files that PROJ requires for the heights of a compound CRS."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         group = TransformerGroup(system, "EPSG:4979", always_xy=True, allow_ballpark=False)
-    operations = [part for one in group.transformers for part in (one.operations or ())] + group.unavailable_operations
+    available = [operation for transformer in group.transformers for operation in (transformer.operations or ())]
+    operations = available + group.unavailable_operations
     return list(dict.fromkeys(grid.short_name for operation in operations[:1] for grid in operation.grids))

@@ -1,4 +1,4 @@
-"""The scene grid as an immutable value: CRS, origin, spacing, shape; sliceable into windows. Heights come with it."""
+"""Grid of a scene, an immutable value: CRS, origin, spacing and shape; slices are windows. Heights are separate."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -17,12 +17,12 @@ from apertura.core.scene.map_crs import BLOCK_PX, axis_attributes, block, check_
 
 @dataclass(frozen=True)
 class SceneGrid:
-    """North-up pixels on a map; `apertura.core.scene.terrain` gives their heights.
+    """North-up pixel grid on a map; `apertura.core.scene.terrain` provides the heights of its pixels.
 
     Attributes
     ----------
     crs
-        What pyproj reads, or 'local' for Cartesian axes without a place on Earth (x east, y north, z up).
+        A pyproj definition, or 'local' for Cartesian axes without a geodetic position (x east, y north, z up).
     west_m, north_m
         Outer corner of the whole grid, metres in `crs`.
     spacing_m
@@ -30,10 +30,10 @@ class SceneGrid:
     shape
         Rows, columns.
     first
-        Row and column of pixel (0, 0) in the whole grid: a window counts from the whole grid's corner, so that its
-        coordinates are the whole's to the bit.
+        Row and column of pixel (0, 0) in the whole grid. Coordinates of a window are computed from the corner of the
+        whole grid, so that they are identical to the last bit.
     name
-        What GIS software shows for a local frame.
+        Name of a local frame in GIS software.
 
     Raises
     ------
@@ -61,30 +61,33 @@ class SceneGrid:
         sides = np.asarray(self.shape, object)
         if sides.shape != (2,) or not all(isinstance(side, Integral) and int(side) > 0 for side in sides):
             raise CampaignError(
-                quoted(self.shape), "SceneGrid: shape", "numbers of rows and columns", "Give two whole numbers above 0."
+                quoted(self.shape), "SceneGrid: shape", "numbers of rows and columns", "Pass two integers above 0."
             )
-        rows, columns = map(int, sides)  # numbers of few bits overflow where they are multiplied
+        rows, columns = map(int, sides)  # products of short integers would overflow
         object.__setattr__(self, "shape", (rows, columns))
         metres = {"west_m": self.west_m, "north_m": self.north_m, "spacing_m": self.spacing_m}
-        wrong = [name for name, one in metres.items() if not (isinstance(one, Real) and np.isfinite(one))]
+        wrong = [name for name, value in metres.items() if not (isinstance(value, Real) and np.isfinite(value))]
         if wrong or self.spacing_m <= 0:
             name = wrong[0] if wrong else "spacing_m"
             above = " above 0" if name == "spacing_m" else ""
             raise CampaignError(
-                quoted(metres[name]), f"SceneGrid: {name}", f"metres, finite{above}", "Correct what is named."
+                quoted(metres[name]),
+                f"SceneGrid: {name}",
+                f"a finite number of metres{above}",
+                f"Correct {name}.",
             )
 
     @classmethod
     def from_bounds(
         cls, crs: str, bounds_m: tuple[float, float, float, float], *, spacing_m: float, name: str = LOCAL
     ) -> "SceneGrid":
-        """Return the grid anchored at (xmin, ymax) of `bounds_m` (outer pixel edges).
+        """Return the grid of the given bounds, whose outer corner is (xmin, ymax).
 
         Raises
         ------
         CampaignError
-            If the CRS is unknown, is not in metres, or its area of use does not contain the bounds; if these are not
-            [xmin, ymin, xmax, ymax] or the spacing is not positive.
+            If the CRS is unknown, is not in metres, or its area of use does not contain the bounds; if `bounds_m` is
+            not [xmin, ymin, xmax, ymax], or the spacing is not positive.
         """
         try:
             xmin, ymin, xmax, ymax = map(float, bounds_m)
@@ -95,12 +98,12 @@ class SceneGrid:
             raise CampaignError(
                 quoted(bounds_m),
                 where="SceneGrid.from_bounds: bounds_m",
-                expected="xmin, ymin, xmax, ymax in metres: outer edges, west of east and south of north",
-                remedy="Give them in that order.",
+                expected="xmin, ymin, xmax, ymax of the outer edges in metres, with xmin < xmax and ymin < ymax",
+                remedy="Pass the bounds in this order.",
             )
         if not (is_number(spacing_m) and spacing_m > 0):
             where = "SceneGrid.from_bounds: spacing_m"
-            raise CampaignError(quoted(spacing_m), where, "metres, finite above 0", "Correct what is named.")
+            raise CampaignError(quoted(spacing_m), where, "a finite number of metres above 0", "Correct spacing_m.")
         shape = (max(1, round((ymax - ymin) / spacing_m)), max(1, round((xmax - xmin) / spacing_m)))
         if crs != LOCAL:
             check_crs(crs, bounds_m)
@@ -108,19 +111,19 @@ class SceneGrid:
 
     @property
     def frame(self) -> str:
-        """'local', or 'ecef' (EPSG:4978): the frame of positions."""
+        """Frame of positions: 'local', or 'ecef' (EPSG:4978)."""
         return "local" if self.crs == LOCAL else "ecef"
 
     @property
     def crs_wkt(self) -> str:
-        """The CRS of rasters on this grid, as GDAL writes it."""
+        """CRS of rasters on this grid, WKT as written by GDAL."""
         from rasterio.crs import CRS
 
         return str(CRS.from_user_input(local_crs(self.name) if self.crs == LOCAL else self.crs).to_wkt())
 
     @property
     def coordinates(self) -> dict[str, Any]:
-        """Coordinates y, x and spatial_ref of an xarray raster on this grid, as CF wants them."""
+        """Coordinates y, x and spatial_ref of an xarray raster on this grid, following the CF conventions."""
         step, _, west, _, _, north = self.transform
         reference = {"long_name": "coordinate reference system", **grid_mapping(self.crs_wkt)}
         reference |= {"GeoTransform": f"{west} {step} 0 {north} 0 {-step}"}
@@ -135,7 +138,7 @@ class SceneGrid:
 
     @property
     def transform(self) -> tuple[float, float, float, float, float, float]:
-        """Affine coefficients a…f of (column, row) → (x, y), as rasterio takes them."""
+        """Affine coefficients a…f of (column, row) → (x, y), in rasterio's order."""
         west, north = self._corner
         return (self.spacing_m, 0.0, west, 0.0, -self.spacing_m, north)
 
@@ -161,7 +164,7 @@ class SceneGrid:
 
     def __getitem__(self, window: tuple[slice, slice]) -> "SceneGrid":
         """Return the grid of a window of rows and columns, without steps."""
-        if not (isinstance(window, tuple) and len(window) == 2 and all(isinstance(one, slice) for one in window)):
+        if not (isinstance(window, tuple) and len(window) == 2 and all(isinstance(part, slice) for part in window)):
             raise CampaignError(
                 quoted(window), "SceneGrid[…]", "slices of rows and of columns", "Write grid[0:5, 0:5]."
             )
@@ -170,7 +173,7 @@ class SceneGrid:
         return replace(self, first=first, shape=(len(rows), len(columns)))
 
     def tiles(self, side_px: int) -> Iterator[tuple[slice, slice]]:
-        """Yield the windows of square tiles, row by row; those at the south and east edges may be smaller."""
+        """Yield the windows of square tiles, row by row; tiles at the south and east edges may be smaller."""
         for row in range(0, self.shape[0], side_px):
             for column in range(0, self.shape[1], side_px):
                 yield (
@@ -179,7 +182,7 @@ class SceneGrid:
                 )
 
     def coarse(self, count: int) -> "SceneGrid":
-        """Return the grid of square blocks of pixels, at least `count` along the longer side if it has so many.
+        """Return the grid of square blocks of pixels, with at least `count` blocks along the longer side if possible.
 
         Examples
         --------
@@ -203,7 +206,7 @@ class SceneGrid:
         Returns
         -------
         ndarray
-            (row, column, 3) float64 metres: ECEF, or the local frame's own axes.
+            (row, column, 3) float64, metres, ECEF or the axes of the local frame.
         """
         height = np.asarray(height_m, np.float64)
         if self.crs == LOCAL:
@@ -215,7 +218,7 @@ class SceneGrid:
         return positions
 
     def _blocks(self) -> Iterator[tuple[slice, slice]]:
-        """Yield the parts of blocks of the whole grid inside this window."""
+        """Yield the parts of the whole grid's blocks that lie in this window."""
         rows, columns = (
             [slice(*cuts) for cuts in pairwise([0, *range(BLOCK_PX - first % BLOCK_PX, size, BLOCK_PX), size])]
             for first, size in zip(self.first, self.shape, strict=True)
@@ -231,7 +234,7 @@ class SceneGrid:
         return polynomials.positions(row, column, height_m)
 
     def positions_at(self, row: ArrayLike, column: ArrayLike, height_m: ArrayLike) -> Floats:
-        """Return (..., 3) float64 positions (m) of fractional pixel indices; (0, 0) is the first pixel's centre.
+        """Return the positions (m) of fractional pixel indices, (..., 3) float64; (0, 0) is the first pixel's centre.
 
         Examples
         --------
@@ -241,11 +244,11 @@ class SceneGrid:
         return frame_from_map(self.crs, self._easting(column), self._northing(row), height_m)
 
     def map_at(self, row: ArrayLike, column: ArrayLike) -> Floats:
-        """Return (..., 2) float64 easting and northing (m) in `crs` of fractional pixel indices."""
+        """Return easting and northing (m) in `crs` of fractional pixel indices, (..., 2) float64."""
         return np.stack([self._easting(column), self._northing(row)], -1)
 
     def pixel_of(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[Floats, Floats]:
-        """Return fractional row and column of map coordinates (m): what `map_at` takes.
+        """Return the fractional row and column of map coordinates (m), the inverse of `map_at`.
 
         Examples
         --------
@@ -258,18 +261,18 @@ class SceneGrid:
         return np.asarray(row), np.asarray(column)
 
     def pixel_below(self, position: Floats) -> Floats:
-        """Return (..., 3) float64 row, column (fractional) and height (m) of positions (..., 3) of the frame.
+        """Return fractional row and column, and height (m), of positions in the processing frame, (..., 3) float64.
 
         Examples
         --------
         >>> SceneGrid("local", 0.0, 8.0, 0.5, (16, 16)).pixel_below(np.array([0.25, 7.75, 3.0]))
         array([0., 0., 3.])
         """
-        place = map_from_frame(self.crs, position)
-        return np.stack([*self.pixel_of(place[..., 0], place[..., 1]), place[..., 2]], -1)
+        xyz_m = map_from_frame(self.crs, position)
+        return np.stack([*self.pixel_of(xyz_m[..., 0], xyz_m[..., 1]), xyz_m[..., 2]], -1)
 
     def sample_pixels(self, count: int) -> tuple[Floats, Floats]:
-        """Return rows and columns, (count, count) float64 each, of pixels evenly spread over the grid, with corners.
+        """Return rows and columns of pixels evenly spread over the grid including its corners, (count, count) float64.
 
         Examples
         --------
@@ -281,5 +284,5 @@ class SceneGrid:
         return rows, columns
 
     def sample_points(self, count: int, height_m: float) -> Floats:
-        """Return (count, count, 3) float64 positions (m) of `sample_pixels` at one height; rows go south."""
+        """Return positions (m) of `sample_pixels` at one height, (count, count, 3) float64, from north to south."""
         return self.positions_at(*self.sample_pixels(count), height_m)

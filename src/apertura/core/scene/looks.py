@@ -1,4 +1,4 @@
-"""Looks of each pixel and the centre of its aperture, computed on a lattice over the scene."""
+"""Number of looks and aperture centre of each pixel, computed on a lattice over the scene."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -22,17 +22,17 @@ from apertura.core.scene.terrain import FlatGround, Terrain
 # ---- Lattice of nodes over a raster, and interpolation between them
 
 BLOCK_PX = 256
-"""Side of the pieces in which a raster is computed."""
+"""Side of the tiles in which a raster is computed, pixels."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Nodes at every `pitch_px` pixels of a raster, and at its last row and column.
+    """Lattice of nodes at every `pitch_px` pixels of a raster, and at its last row and column.
 
     Attributes
     ----------
     nodes
-        Rows and columns of pixels, int64 each.
+        Pixel rows and columns of the nodes, int64 each.
     pitch_px
         Pixels between nodes.
 
@@ -62,7 +62,7 @@ class Lattice:
 
     @property
     def blocks(self) -> list[Window]:
-        """Windows of nodes, one for each tile of `BLOCK_PX` pixels: those in it, row by row of tiles."""
+        """Windows of the nodes in each tile of `BLOCK_PX` pixels, row by row of tiles."""
         rows, columns = (
             [
                 slice(*np.searchsorted(at, [first, first + BLOCK_PX]).tolist())
@@ -73,31 +73,32 @@ class Lattice:
         return [(row, column) for row in rows for column in columns]
 
     def between(self, values: NDArray[Any], window: Window, *, farthest: float | None = None) -> NDArray[Any]:
-        """Return values at the pixels of a window, bilinear between nodes: in float32 of float32, else in float64.
+        """Interpolate values at the pixels of a window, bilinear between nodes; float32 stays float32, else float64.
 
         Parameters
         ----------
         values
             (node row, node column, ...).
         window
-            Of pixels.
+            Window of pixels.
         farthest
-            Length of the difference (last axis) of two corners of a cell above which the nearest corner counts.
+            Length of the difference (last axis) of two corners of a cell above which the value of the nearest corner is
+            used.
         """
         (low, high, up), (left, right, across) = self._cells(window)
         extra, dtype = (1,) * (values.ndim - 2), np.float32 if values.dtype == np.float32 else np.float64
         up, across = up.reshape(-1, 1, *extra).astype(dtype), across.reshape(1, -1, *extra).astype(dtype)
         values, left, right = values[:, left[0] : right[-1] + 1], left - left[0], right - left[0]
-        # First between rows of nodes, of few columns, so that one pass over all pixels is left.
+        # First between rows of nodes, which have few columns, so that only one pass over all pixels remains.
         rows = values[low] + up * (values[high] - values[low])
         smooth: NDArray[Any] = rows.take(left, axis=1)
-        more = (rows.take(np.arange(1, rows.shape[1] + 1), axis=1, mode="clip") - rows).take(left, axis=1)
-        more *= across
-        smooth += more
+        slope = (rows.take(np.arange(1, rows.shape[1] + 1), axis=1, mode="clip") - rows).take(left, axis=1)
+        slope *= across
+        smooth += slope
         if farthest is None:
             return smooth
-        # Corners are compared once a cell.
-        (lows, row), (lefts, column) = (np.unique(one, return_inverse=True) for one in (low, left))
+        # Corners are compared once per cell.
+        (lows, row), (lefts, column) = (np.unique(nodes, return_inverse=True) for nodes in (low, left))
         highs, rights = (np.minimum(at + 1, size - 1) for at, size in zip((lows, lefts), values.shape, strict=False))
         corners = [values[np.ix_(*at)] for at in ((lows, lefts), (lows, rights), (highs, lefts), (highs, rights))]
         distance = np.max([np.linalg.norm(corner - corners[0], axis=-1) for corner in corners[1:]], axis=0)
@@ -109,7 +110,7 @@ class Lattice:
         return smooth
 
     def inside_positive(self, values: NDArray[Any], window: Window) -> NDArray[np.bool_]:
-        """Return which pixels of a window, (row, column), lie among corners that are all positive."""
+        """Return a mask of the pixels of a window, (row, column), between nodes that are all positive."""
         if (values[self.around(window)] > 0).all():
             return np.ones([part.stop - part.start for part in window], bool)
         (low, high, _), (left, right, _) = self._cells(window)
@@ -117,17 +118,18 @@ class Lattice:
         return np.asarray(np.logical_and.reduce(corners))
 
     def around(self, window: Window) -> Window:
-        """Return the window of those nodes that the pixels of a window lie between."""
+        """Return the window of the nodes that surround the pixels of a window."""
         rows, columns = (slice(int(before[0]), int(after[-1]) + 1) for before, after, _ in self._cells(window))
         return rows, columns
 
     def _cells(self, window: Window) -> "tuple[_Cells, _Cells]":
-        """Return along both axes the nodes before and after each pixel, and how far between them it lies."""
+        """Return, along both axes, the nodes before and after each pixel, and its fractional position between them."""
         return self._along(0, window[0]), self._along(1, window[1])
 
     def _along(self, axis: int, part: slice) -> "_Cells":
+        """Return the nodes before and after the pixels of `part` along an axis, and their fractional positions."""
         key, nodes = (axis, part.start, part.stop), self.nodes[axis]
-        if key not in self._known:  # tiles of one row ask for the same
+        if key not in self._known:  # cached: equal for all tiles of a row
             at = np.arange(part.start, part.stop)
             before = np.clip(np.searchsorted(nodes, at, side="right") - 1, 0, max(0, len(nodes) - 2))
             after = np.minimum(before + 1, len(nodes) - 1)
@@ -135,7 +137,7 @@ class Lattice:
         return self._known[key]
 
     def nearest(self, window: Window) -> list[tuple[tuple[int, int], Window]]:
-        """Return the nodes nearest to the pixels of a window, each with the part of the window that is its."""
+        """Return the nodes nearest to the pixels of a window, each with its part of the window."""
         owned = []
         for at, part in zip(self.nodes, window, strict=True):
             ends = np.append((at[1:] + at[:-1] + 1) // 2, at[-1] + 1)
@@ -170,54 +172,55 @@ def fill(
     lattice, grid, terrain, aperture, beams
         As of `Looks`.
     block
-        Of the window of nodes, and (block of pulses,) bool.
+        Function of a window of nodes and a mask of pulse blocks, (block,) bool.
     threads
-        Blocks in work at once.
+        Number of blocks processed in parallel.
     """
     reaching = illumination_mask(beams, aperture, *balls(grid, terrain, list(grid.tiles(BLOCK_PX))), pulses=AT_ONCE)
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(block, lattice.blocks, reaching.T))
 
 
-# ---- Looks, and centre of the aperture of each pixel
+# ---- Number of looks and aperture centre of each pixel
 
 SPREAD = 17
-"""Pulses, evenly spread over those that illuminate a pixel, from which shadow is decided."""
+"""Number of pulses, evenly spread over those that illuminate a pixel, used to decide on shadow."""
 
 PITCHES_PX = (128, 64, 32, 16)
-"""Of a lattice: the widest that is narrow enough for what lies on it."""
+"""Pitches of a lattice, pixels; the widest pitch of sufficient accuracy is used."""
 
-_RANGE_SHARE = 48  # ranges to the scene: looks between nodes then err by 0.3 % in a beam of 20°
-_PULSES = 256  # summed for a block of the lattice, or up to twice as many
-_FEWEST, _MOST = 48, 2048  # of them that half of its nodes have a weight of, at least: else more are summed, up to
-AT_ONCE = 64  # pulses of a block whose illumination is decided together
-_EXACT = (AT_ONCE, 8)  # pulses that are left out together where none of them can illuminate the pixel
-_CELL_PX = 8  # side of the cells of which it is first asked whether a pulse can reach them
-_PIXELS = 4096  # that are decided together
-_DARK_PULSES = 64  # evaluated for the centres of a block that no pulse reaches: its neighbours interpolate with them
-_NO_WEIGHT_PENALTY = 1e6  # added to the distance of a pulse without weight: it is a centre only where none has weight
-_ALIKE = 0.02  # change of Σ|w|/Σw² from node to node up to which looks are bilinear: 0.08 % off the two sums at most
-_JUMP_PITCHES = 4.0  # node pitches: centres of neighbouring nodes further apart belong to different passes
+_RANGE_SHARE = 48  # range in pitches: the number of looks between nodes then has an error of 0.3 % in a beam of 20°
+_PULSES = 256  # pulses summed for a block of the lattice, or up to twice as many
+_FEWEST, _MOST = 48, 2048  # least number with weight at half of the nodes (else more are summed), and their limit
+AT_ONCE = 64  # block size in pulses of the illumination test
+_EXACT = (AT_ONCE, 8)  # block sizes in pulses of the exact illumination test, from coarse to fine
+_CELL_PX = 8  # side, pixels, of the cells that are tested as a whole first
+_PIXELS = 4096  # pixels tested together
+_DARK_PULSES = 64  # pulses evaluated for centres of a block without illumination, with which neighbours interpolate
+_NO_WEIGHT_PENALTY = 1e6  # added to the distance of a pulse without weight: it is a centre only if none has weight
+_ALIKE = 0.02  # largest change of Σ|w|/Σw² between nodes for bilinear looks: error of 0.08 % relative to the two sums
+_JUMP_PITCHES = 4.0  # node pitches: centres of neighbouring nodes with a larger distance belong to different passes
 
 
 @dataclass(frozen=True, eq=False)
 class Looks:
-    """Looks and aperture centre of each place of an image; windows are read tile by tile.
+    """Number of looks and aperture centre of each point of an image; windows are read tile by tile.
 
     Attributes
     ----------
     grid, terrain
-        The scene.
+        Grid and terrain of the scene.
     aperture, beams
-        Every pulse, and its weights; None: all count alike.
+        Aperture of all pulses, and their weights; None: equal weights.
     lattice
-        Nodes at which the following are computed.
+        Nodes at which the following values are computed.
     total, squares
         (node row, node column) float32, Σ|w| and Σw² over the pulses.
     centres
         (node row, node column, 2, 3) float64, metres: transmitter and receiver at the closest approach.
     pulses
-        (node row, node column, `SPREAD`) int32, some of those that weigh half or more; all pulses where none does.
+        (node row, node column, `SPREAD`) int32, a selection of the pulses with at least half of the largest weight; of
+        all pulses if none has weight.
 
     Notes
     -----
@@ -239,14 +242,14 @@ class Looks:
     def of(
         cls, grid: SceneGrid, terrain: Terrain, aperture: Aperture, beams: Beams | None, *, threads: int = 1
     ) -> "Looks":
-        """Return the looks of a scene.
+        """Compute the looks and aperture centres of a scene.
 
         Parameters
         ----------
         grid, terrain, aperture, beams
             As of `Looks`; positions in the grid's processing frame.
         threads
-            Blocks of the lattice in work at once.
+            Number of lattice blocks processed in parallel.
 
         Examples
         --------
@@ -277,30 +280,30 @@ class Looks:
         """Compute the nodes of a block of the lattice from the pulses that may illuminate it."""
         rows, columns = (at[part] for at, part in zip(self.lattice.nodes, block, strict=True))
         points = self.terrain.positions_at(self.grid, *np.meshgrid(rows, columns, indexing="ij")).reshape(-1, 3)
-        some = pulses_of(reaching, len(self.aperture))
-        every = max(1, (some.stop - some.start) // (_PULSES if reaching.any() else _DARK_PULSES))
+        pulses = pulses_of(reaching, len(self.aperture))
+        every = max(1, (pulses.stop - pulses.start) // (_PULSES if reaching.any() else _DARK_PULSES))
         while True:
-            few = slice(some.start, some.stop, every)
-            aperture, beams = self.aperture[few], self.beams and self.beams[few]
+            sample = slice(pulses.start, pulses.stop, every)
+            aperture, beams = self.aperture[sample], self.beams and self.beams[sample]
             weight = np.ones((len(aperture), len(points))) if beams is None else beams.weight(aperture, points)
-            counted = (weight != 0).sum(axis=0)
-            found = int(np.median(counted[counted > 0])) if counted.any() else _FEWEST
-            if every == 1 or found >= _FEWEST or len(aperture) >= _MOST:
+            n_weighted = (weight != 0).sum(axis=0)
+            median = int(np.median(n_weighted[n_weighted > 0])) if n_weighted.any() else _FEWEST
+            if every == 1 or median >= _FEWEST or len(aperture) >= _MOST:
                 break
-            every = max(1, every * found // (2 * _FEWEST), (some.stop - some.start) // _MOST)
-        shape, pulses_each = (len(rows), len(columns)), (some.stop - some.start) / len(aperture)
+            every = max(1, every * median // (2 * _FEWEST), (pulses.stop - pulses.start) // _MOST)
+        shape, pulses_each = (len(rows), len(columns)), (pulses.stop - pulses.start) / len(aperture)
         self.total[block] = (np.abs(weight).sum(axis=0) * pulses_each).reshape(shape)
         self.squares[block] = ((weight**2).sum(axis=0) * pulses_each).reshape(shape)
         self.centres[block] = _centres(aperture, beams, points, weight).reshape(*shape, 2, 3)
-        self.pulses[block] = (some.start + every * _spread(weight)).reshape(*shape, SPREAD)
+        self.pulses[block] = (pulses.start + every * _spread(weight)).reshape(*shape, SPREAD)
 
     def illuminated(self, tile: Window) -> NDArray[np.bool_]:
-        """Return whether any pulse illuminates the pixels of a tile, exactly, (row, column) bool.
+        """Return a mask of the pixels of a tile that any pulse illuminates, (row, column) bool; evaluated exactly.
 
         Parameters
         ----------
         tile
-            One of the grid's tiles of `BLOCK_PX` pixels.
+            Tile of the grid of `BLOCK_PX` pixels.
         """
         shape = (tile[0].stop - tile[0].start, tile[1].stop - tile[1].start)
         if self.beams is None:
@@ -310,13 +313,13 @@ class Looks:
             mask = self.lattice.inside_positive(self.total, tile)
             self._fill_mask(mask, tile)
             self._masks[key] = bool(mask[0, 0]) if (mask == mask[0, 0]).all() else np.packbits(mask)
-        known = self._masks[key]
-        if isinstance(known, bool):
-            return np.full(shape, known)
-        return np.unpackbits(known, count=shape[0] * shape[1]).reshape(shape).astype(bool)
+        cached = self._masks[key]
+        if isinstance(cached, bool):
+            return np.full(shape, cached)
+        return np.unpackbits(cached, count=shape[0] * shape[1]).reshape(shape).astype(bool)
 
     def _fill_mask(self, mask: NDArray[np.bool_], tile: Window) -> None:
-        """Set the pixels of a tile that a pulse illuminates, cell by cell, from every pulse that may reach them."""
+        """Set the illuminated pixels of a tile, cell by cell, from all pulses that may illuminate them."""
         if mask.all():
             return
         part = self.grid[tile]
@@ -324,23 +327,25 @@ class Looks:
         if not cells or self.beams is None:
             return
         middle_m, radius_m = balls(part, self.terrain, cells)
-        near, mine = np.arange(len(cells)), np.arange(len(self.aperture))
+        # Exclude cells and pulses that cannot illuminate each other, with ever smaller blocks of pulses.
+        reached, pulses = np.arange(len(cells)), np.arange(len(self.aperture))
         for size in _EXACT:
             reaching = illumination_mask(
-                self.beams[mine], self.aperture[mine], middle_m[near], radius_m[near], pulses=size
+                self.beams[pulses], self.aperture[pulses], middle_m[reached], radius_m[reached], pulses=size
             )
-            near, mine = near[reaching.any(axis=0)], mine[np.repeat(reaching.any(axis=1), size)[: len(mine)]]
+            reached = reached[reaching.any(axis=0)]
+            pulses = pulses[np.repeat(reaching.any(axis=1), size)[: len(pulses)]]
         undecided = np.zeros(mask.shape, bool)
-        for number in near:
+        for number in reached:
             undecided[cells[number]] = ~mask[cells[number]]
         rows, columns = np.nonzero(undecided)
         points = self.terrain.positions_at(part, rows, columns)
         for first in range(0, len(rows), _PIXELS):
-            some = slice(first, first + _PIXELS)
-            mask[rows[some], columns[some]] = _any(self.beams, self.aperture, points[some], mine)
+            pixels = slice(first, first + _PIXELS)
+            mask[rows[pixels], columns[pixels]] = _any(self.beams, self.aperture, points[pixels], pulses)
 
     def _sums(self, tile: Window) -> list[NDArray[np.float32]]:
-        """Return Σ|w| and Σw² at the pixels of a tile, between those nodes that have pulses; 0 where none has."""
+        """Interpolate Σ|w| and Σw² at the pixels of a tile between nodes that have pulses; 0 if none has."""
         sums = [self.lattice.between(values, tile) for values in (self.total, self.squares)]
         lit = self.total[self.lattice.around(tile)] > 0
         if not lit.all():
@@ -350,9 +355,9 @@ class Looks:
         return sums
 
     def effective(self, tile: Window) -> NDArray[np.float32]:
-        """Return the looks of the pixels of a tile, (row, column) float32; 0 where no pulse illuminates them.
+        """Return the number of looks of the pixels of a tile, (row, column) float32; 0 without illumination.
 
-        Bilinear between nodes themselves where Σ|w| and Σw² change alike, else by these two.
+        It is bilinear between nodes if Σ|w| and Σw² change alike, else computed from these two interpolated sums.
         """
         if self._alike(tile):
             looks = self.lattice.between(self._node_looks, tile)
@@ -368,24 +373,24 @@ class Looks:
         return np.asarray(self.total**2 / np.where(self.squares > 0, self.squares, np.float32(np.inf)))
 
     def _alike(self, tile: Window) -> bool:
-        """Return whether both sums change alike from node to node, none to more than twice: layers.md, eq. 4."""
-        near = self.lattice.around(tile)
-        total = self.total[near]
+        """Return True if both sums change alike between nodes, and at most by a factor of two (layers.md, eq. 4)."""
+        nodes = self.lattice.around(tile)
+        total = self.total[nodes]
         if not total.all():
             return False
-        inverse = total / self.squares[near]
+        ratio = total / self.squares[nodes]
         return all(
-            (np.abs(np.diff(of, axis=axis)) <= most * of.min()).all()
-            for of, most in ((total, 1.0), (inverse, _ALIKE))
+            (np.abs(np.diff(values, axis=axis)) <= largest * values.min()).all()
+            for values, largest in ((total, 1.0), (ratio, _ALIKE))
             for axis in (0, 1)
         )
 
     def weight_squares(self, window: Window) -> Floats:
-        """Return Σw² at the pixels of a window, (row, column) float64; 0 where no node about them has pulses."""
+        """Return Σw² at the pixels of a window, (row, column) float64; 0 where no surrounding node has pulses."""
         return self._sums(window)[1].astype(np.float64)
 
     def centre(self, tile: Window) -> tuple[Floats, Floats]:
-        """Return transmitter and receiver at each pixel's closest approach, (row, column, 3) float64 metres each."""
+        """Return the antenna positions at each pixel's closest approach, (row, column, 3) float64 metres each."""
         centre = self.lattice.between(self.centres, tile, farthest=self._jump_m)
         return centre[..., 0, :], centre[..., 1, :]
 
@@ -394,41 +399,41 @@ class Looks:
         return _JUMP_PITCHES * self.lattice.pitch_px * self.grid.spacing_m
 
     def incidence_deg(self, tile: Window) -> NDArray[Any]:
-        """Return the angle from the ground's normal to the transmitter at closest approach, (row, column) degrees.
+        """Return the incidence angle of the transmitter at closest approach, (row, column) degrees.
 
-        Over level ground bilinear between nodes (docs/theory/layers.md, section 4).
+        Over level terrain it is bilinear between nodes (docs/theory/layers.md, section 4).
         """
         if self._smooth(tile):
             return self.lattice.between(self._angles_deg[0], tile)
         return incidence_deg(*surface(self.grid, self.terrain, tile), self.centre(tile)[0])
 
     def bistatic_angle_deg(self, tile: Window) -> NDArray[Any]:
-        """Return the angle between both antennas at closest approach, (row, column) degrees; as `incidence_deg`."""
+        """Return the bistatic angle at closest approach, (row, column) degrees; interpolated as `incidence_deg`."""
         if self._smooth(tile):
             return self.lattice.between(self._angles_deg[1], tile)
         return bistatic_angle_deg(self.terrain.positions(self.grid[tile]), *self.centre(tile))
 
     @cached_property
     def _angles_deg(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """(node row, node column), over level ground."""
+        """Incidence and bistatic angle at the nodes over level terrain, (node row, node column) each."""
         row, column = np.meshgrid(*self.lattice.nodes, indexing="ij")
         height_m = self.terrain.heights_at(self.grid, row, column)
-        place_m, above_m = (self.grid.positions_at(row, column, height_m + more) for more in (0.0, 1.0))
+        position_m, above_m = (self.grid.positions_at(row, column, height_m + added) for added in (0.0, 1.0))
         tx_m, rx_m = np.moveaxis(self.centres, 2, 0)
-        angles = incidence_deg(place_m, above_m - place_m, tx_m), bistatic_angle_deg(place_m, tx_m, rx_m)
+        angles = incidence_deg(position_m, above_m - position_m, tx_m), bistatic_angle_deg(position_m, tx_m, rx_m)
         return angles[0].astype(np.float32), angles[1].astype(np.float32)
 
     def _smooth(self, tile: Window) -> bool:
-        """Return whether angles are those between nodes: level ground, nodes that its range is many of, no jump."""
+        """Return True if angles can be interpolated: level terrain, a pitch small against the range, one pass."""
         if not isinstance(self.terrain, FlatGround) or self.lattice.pitch_px == PITCHES_PX[-1]:
             return False
-        near = self.lattice.around(tile)
-        steps = (np.linalg.norm(np.diff(self.centres[near], axis=axis), axis=-1) for axis in (0, 1))
+        nodes = self.lattice.around(tile)
+        steps = (np.linalg.norm(np.diff(self.centres[nodes], axis=axis), axis=-1) for axis in (0, 1))
         return all((step <= self._jump_m).all() for step in steps)
 
 
 def pulses_of(reaching: NDArray[np.bool_], pulses: int) -> slice:
-    """Return the first to the last pulse of the blocks marked; all pulses where none is."""
+    """Return the slice from the first to the last pulse of the marked blocks; all pulses if none is marked."""
     blocks = np.flatnonzero(reaching)
     if not blocks.size:
         return slice(0, pulses)
@@ -436,48 +441,48 @@ def pulses_of(reaching: NDArray[np.bool_], pulses: int) -> slice:
 
 
 def pitch_px(grid: SceneGrid, terrain: Terrain, aperture: Aperture, *, share: float) -> int:
-    """Return the pitch of a lattice whose nodes are no farther apart than a share of the range to the scene.
+    """Return the pitch of a lattice that is at most a fraction 1/`share` of the range to the scene, pixels.
 
     Parameters
     ----------
     grid, terrain, aperture
         As of `Looks`.
     share
-        Ranges hold so many pitches, if one of `PITCHES_PX` is so narrow.
+        Least ratio of range to pitch; the narrowest of `PITCHES_PX` is used if none satisfies it.
     """
     middle = terrain.positions_at(grid, *(np.array([size // 2]) for size in grid.shape))
-    few = aperture[aperture.sample(_PULSES)]
-    nearest_m = min(float(np.linalg.norm(leg - middle, axis=-1).min()) for leg in few.legs)
-    most = nearest_m / share / grid.spacing_m
-    return next((pitch for pitch in PITCHES_PX if pitch <= most), PITCHES_PX[-1])
+    sample = aperture[aperture.sample(_PULSES)]
+    nearest_m = min(float(np.linalg.norm(leg - middle, axis=-1).min()) for leg in sample.legs)
+    widest_px = nearest_m / share / grid.spacing_m
+    return next((pitch for pitch in PITCHES_PX if pitch <= widest_px), PITCHES_PX[-1])
 
 
 def _any(
     beams: Beams, aperture: Aperture, points: Floats, pulses: NDArray[np.int64], sizes: tuple[int, ...] = _EXACT
 ) -> NDArray[np.bool_]:
-    """Return at which points (point, 3) any of some pulses has a weight.
+    """Return a mask of the points (point, 3) at which any of the pulses has a weight.
 
-    A pulse of each block is tried first. Then what none of a block can illuminate is left out, block by block in ever
-    smaller ones, so that every pulse is tried near the edges of beams alone.
+    One pulse of each block is evaluated first. Blocks that cannot illuminate a point are then excluded, with ever
+    smaller blocks, so that all pulses are evaluated only near the edges of beams.
     """
     if not pulses.size or not len(points):
         return np.zeros(len(points), bool)
-    tried = pulses[sizes[0] // 2 :: sizes[0]] if sizes else pulses
-    illuminated = (beams[tried].weight(aperture[tried], points) != 0).any(axis=0)
+    sample = pulses[sizes[0] // 2 :: sizes[0]] if sizes else pulses
+    illuminated = (beams[sample].weight(aperture[sample], points) != 0).any(axis=0)
     if not sizes or illuminated.all():
         return np.asarray(illuminated)
-    left = np.flatnonzero(~illuminated)
-    near = illumination_mask(beams[pulses], aperture[pulses], points[left], np.zeros(left.size), pulses=sizes[0])
-    for number in np.flatnonzero(near.any(axis=1)):
-        undecided = left[near[number] & ~illuminated[left]]
+    dark = np.flatnonzero(~illuminated)
+    reaching = illumination_mask(beams[pulses], aperture[pulses], points[dark], np.zeros(dark.size), pulses=sizes[0])
+    for number in np.flatnonzero(reaching.any(axis=1)):
+        undecided = dark[reaching[number] & ~illuminated[dark]]
         block = pulses[number * sizes[0] : (number + 1) * sizes[0]]
         illuminated[undecided] = _any(beams, aperture, points[undecided], block, sizes[1:])
     return np.asarray(illuminated)
 
 
 def _centres(aperture: Aperture, beams: Beams | None, points: Floats, weight: Floats) -> Floats:
-    """Return both antennas (point, 2, 3) where each point is passed closest, between pulses too."""
-    # The pulse of least total path, or of the least s of a sector; one without weight only where none has.
+    """Return both antenna positions at the closest approach to each point, (point, 2, 3), interpolated over pulses."""
+    # The pulse of shortest total path, or smallest |s| in a sector; a pulse without weight only if none has weight.
     sector = None if beams is None else beams.sector
     distance = aperture.path(points) if sector is None else sector.place(aperture, points) ** 2
     dark = weight == 0
@@ -486,23 +491,23 @@ def _centres(aperture: Aperture, beams: Beams | None, points: Floats, weight: Fl
     legs = np.stack(aperture.legs, axis=1)
     if len(aperture) < 3:
         return np.asarray(legs[best])
-    # A parabola through it and its neighbours, where all three have weight or none.
+    # A parabola through it and its neighbours, if all three have weight or none has.
     inner = np.clip(best, 1, len(aperture) - 2)
-    before, here, after = (distance[inner + step, column] for step in (-1, 0, 1))
+    before, middle, after = (distance[inner + step, column] for step in (-1, 0, 1))
     same_weighting = (dark[inner - 1, column] == dark[inner, column]) & (dark[inner, column] == dark[inner + 1, column])
-    bend = before - 2 * here + after
-    fit = (inner == best) & (bend > 0) & same_weighting
-    shift = np.where(fit, (before - after) / np.where(fit, 2 * bend, 1.0), 0.0)  # in pulses, within a half
-    beside = best + np.where(fit, np.sign(shift), 0).astype(np.int64)
-    return np.asarray(legs[best] + np.abs(shift)[:, None, None] * (legs[beside] - legs[best]))
+    curvature = before - 2 * middle + after
+    fit = (inner == best) & (curvature > 0) & same_weighting
+    shift = np.where(fit, (before - after) / np.where(fit, 2 * curvature, 1.0), 0.0)  # in pulses, at most one half
+    neighbour = best + np.where(fit, np.sign(shift), 0).astype(np.int64)
+    return np.asarray(legs[best] + np.abs(shift)[:, None, None] * (legs[neighbour] - legs[best]))
 
 
 def _spread(weight: Floats) -> NDArray[np.int64]:
-    """Return pulses (point, `SPREAD`) evenly spread over those that weigh half or more of the most, of all if none."""
+    """Return pulses, (point, `SPREAD`), evenly spread over those with at least half of the largest weight."""
     size = np.abs(weight)
     count = np.cumsum(size >= size.max(axis=0) / 2, axis=0).T
     ranks = 1 + np.round(np.linspace(0, 1, SPREAD) * (count[:, -1:] - 1))
-    # Counts of all points in one row that ascends.
+    # Offsets make the counts of all points one ascending sequence, so that a single search suffices.
     point = np.arange(len(count))[:, None]
-    found = np.searchsorted((count + point * (len(size) + 1)).ravel(), ranks + point * (len(size) + 1))
-    return np.asarray(found - point * len(size))
+    index = np.searchsorted((count + point * (len(size) + 1)).ravel(), ranks + point * (len(size) + 1))
+    return np.asarray(index - point * len(size))

@@ -1,4 +1,4 @@
-"""The CRS of a scene: its checks, and positions on Earth of the pixels of a grid in it."""
+"""CRS of a scene: checks, CF attributes, and ECEF positions of the pixels of a grid."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,16 +15,16 @@ from apertura.core.geometry.geodesy import ecef_from_geodetic, ecef_from_project
 # ---- Checks of a scene's CRS
 
 MARGIN_DEG = 3.0
-"""Degrees that a projection may be used beyond its area: half a UTM zone, where scale grows by half a per cent."""
+"""Degrees beyond its area of use at which a projection is accepted: half a UTM zone, 0.5 % of scale error."""
 
 RETURN_M = 1e-3
-"""Metres of error of a place projected and back, above which it is outside the domain of the projection."""
+"""Metres, round-trip error of a projection above which a point is outside its domain."""
 
 _WHERE = "scene"
 
 
 def grid_mapping(crs_wkt: str) -> dict[str, str | float]:
-    """Return the attributes of a CF grid mapping: the CRS as it is written elsewhere, and its parameters by name.
+    """Return the attributes of a CF grid mapping: the WKT of the CRS, unchanged, and its parameters by name.
 
     Examples
     --------
@@ -37,7 +37,7 @@ def grid_mapping(crs_wkt: str) -> dict[str, str | float]:
 
 
 def axis_attributes(side: str, *, projected: bool) -> dict[str, str]:
-    """Return the attributes of coordinate 'x' or 'y' of a raster, as CF names them.
+    """Return the CF attributes of coordinate 'x' or 'y' of a raster.
 
     Examples
     --------
@@ -50,14 +50,14 @@ def axis_attributes(side: str, *, projected: bool) -> dict[str, str]:
 
 
 def horizontal_crs(crs: str) -> CRS:
-    """Return a CRS that PROJ knows and that has no heights of its own; raise CampaignError for any other.
+    """Return a horizontal CRS; raise CampaignError if PROJ does not know it or it has a vertical component.
 
     Examples
     --------
     >>> horizontal_crs("EPSG:5555")
     Traceback (most recent call last):
     ...
-    apertura.common.errors.CampaignError: scene: crs EPSG:5555 (ETRS89 / UTM zone 32N + DHHN92 height) has ...
+    apertura.common.errors.CampaignError: scene: crs EPSG:5555 (ETRS89 / UTM zone 32N + DHHN92 height) includes ...
     """
     try:
         system = CRS(crs)
@@ -71,21 +71,21 @@ def horizontal_crs(crs: str) -> CRS:
     if system.is_compound:
         horizontal = system.sub_crs_list[0]
         raise CampaignError(
-            f"crs {crs} ({system.name}) has heights of its own",
+            f"crs {crs} ({system.name}) includes a vertical CRS",
             where=_WHERE,
-            expected="the horizontal part alone: heights count from what height_datum or dem_datum says",
+            expected="only the horizontal CRS: the datum of heights is configured by height_datum or dem_datum",
             remedy=f"Set scene.crs to {':'.join(horizontal.to_authority() or (horizontal.name,))}.",
         )
     return system
 
 
 def check_crs(crs: str, bounds_m: tuple[float, float, float, float]) -> None:
-    """Raise CampaignError unless `crs` is projected in metres and usable at the bounds: near its area of use.
+    """Raise CampaignError if `crs` is not projected in metres or not usable at the bounds.
 
     Parameters
     ----------
     crs
-        What pyproj reads.
+        A pyproj definition.
     bounds_m
         xmin, ymin, xmax, ymax, metres.
 
@@ -103,22 +103,22 @@ def check_crs(crs: str, bounds_m: tuple[float, float, float, float]) -> None:
             f"crs {crs} ({system.name}) is not projected in metres",
             where=_WHERE,
             expected="a projected CRS in metres, such as a UTM zone",
-            remedy="Choose another scene.crs.",
+            remedy="Set scene.crs to such a CRS.",
         )
     try:
         _check_usable(system, bounds_m)
         projected_from_ecef(crs, ecef_from_geodetic(*(np.array(angle) for angle in (0.0, 0.0, 0.0))))
     except ProjError as error:  # such as a datum that needs a grid of shifts
         raise CampaignError(
-            f"PROJ knows no exact way here from {crs} ({system.name}) to WGS 84",
+            f"this installation of PROJ has no exact transformation from {crs} ({system.name}) to WGS 84",
             where=_WHERE,
-            expected="a CRS that is defined by an ellipsoid and a shift, or whose grids PROJ finds",
-            remedy="Get its grid with `projsync`, or choose another scene.crs, such as the UTM zone of the place.",
+            expected="a CRS with a parametric transformation to WGS 84, or whose shift grids are installed",
+            remedy="Install the grid with `projsync`, or set scene.crs to another CRS, such as the local UTM zone.",
         ) from error
 
 
 def _check_usable(system: CRS, bounds_m: tuple[float, float, float, float]) -> None:
-    """Refuse corners outside the domain of the projection, or far from its area of use."""
+    """Raise CampaignError for corners outside the domain of the projection, or far from its area of use."""
     area = system.area_of_use
     inverse = Transformer.from_crs(system, system.geodetic_crs, always_xy=True)
     xmin, ymin, xmax, ymax = bounds_m
@@ -126,22 +126,22 @@ def _check_usable(system: CRS, bounds_m: tuple[float, float, float, float]) -> N
     longitudes, latitudes = inverse.transform(corners[0], corners[1])
     returned = np.array(inverse.transform(longitudes, latitudes, direction=TransformDirection.INVERSE))
     finite = np.where(np.isfinite(returned), returned, np.nan)
-    usable = (np.abs(finite - corners) < RETURN_M).all(axis=0)  # False of what is not finite
+    usable = (np.abs(finite - corners) < RETURN_M).all(axis=0)  # False for NaN
     if area is not None:
         usable &= _near(area.bounds, longitudes, latitudes)
     if usable.all():
         return
     first = int(np.argmin(usable))
-    near = ""
+    near_area = ""
     if area is not None:
-        near = (
+        near_area = (
             f"within {MARGIN_DEG:g} degrees of the area of use of {system.name}: "
             f"longitude {area.west} to {area.east}, latitude {area.south} to {area.north}"
         )
     raise CampaignError(
         f"bounds_m {list(bounds_m)} reach longitude {longitudes[first]:.4f}, latitude {latitudes[first]:.4f}",
         where=_WHERE,
-        expected=near or f"places that {system.name} can show",
+        expected=near_area or f"bounds within the domain of {system.name}",
         remedy="Correct scene.bounds_m (easting before northing) or scene.crs.",
     )
 
@@ -149,44 +149,44 @@ def _check_usable(system: CRS, bounds_m: tuple[float, float, float, float]) -> N
 def _near(
     area_deg: tuple[float, float, float, float], longitude: NDArray[np.float64], latitude: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Return which places are within `MARGIN_DEG` of west, south, east, north, also across the 180th meridian."""
+    """Return a mask of points within `MARGIN_DEG` of an area (west, south, east, north), which may wrap at 180°."""
     west, south, east, north = area_deg
     width = (east - west) % 360 or 360.0
-    longitude = np.where(np.isfinite(longitude), longitude, np.nan)  # nowhere: near nothing
+    longitude = np.where(np.isfinite(longitude), longitude, np.nan)
     inside = (longitude - west + MARGIN_DEG) % 360 <= width + 2 * MARGIN_DEG
     return np.asarray(inside & (latitude >= south - MARGIN_DEG) & (latitude <= north + MARGIN_DEG))
 
 
 # ---- Positions of the pixels of a projected grid
 #
-# PROJ takes as long for a pixel as the sum of hundreds of pulses; Earth is so smooth that over a block of pixels
-# polynomials of degree four are as exact as positions in float64 (docs/theory/planner.md, "Pixel positions").
+# PROJ takes as long for a pixel as the integration of hundreds of pulses. Over a block of pixels, polynomials of degree
+# four are as accurate as positions in float64 (docs/theory/planner.md, "Pixel positions").
 
 BLOCK_PX = 256
 
 DEGREE = 4
 
 TOLERANCE_M = 3e-8
-"""Metres of error of a block's polynomials between nodes, above which PROJ computes each pixel: float64 has 1e-9 m."""
+"""Metres, error of a block's polynomials between nodes above which PROJ computes each pixel; float64 has 1e-9 m."""
 
-_CLIMB_M = 1e4  # ECEF is exactly linear in ellipsoidal height: positions at two heights suffice
+_CLIMB_M = 1e4  # height difference: ECEF is exactly linear in ellipsoidal height, so that two heights suffice
 _NODES = np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))
 _BETWEEN = np.array([-1.0, -0.5, 0.45, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Polynomials of the positions of BLOCK_PX × BLOCK_PX pixels over -1 ≤ u, v ≤ 1 down and right.
+    """Polynomials of the positions of BLOCK_PX × BLOCK_PX pixels over -1 ≤ u, v ≤ 1, downward and to the right.
 
     Attributes
     ----------
     middle_m
         (3,) float64, ECEF metres, on the ellipsoid.
     offset_m, normal
-        (DEGREE + 1, DEGREE + 1, 3) float64, coefficient of u^k v^l: ECEF metres from the middle, on the ellipsoid; and
-        change per metre of height.
+        (DEGREE + 1, DEGREE + 1, 3) float64, coefficients of u^k v^l: ECEF metres from the middle, on the ellipsoid; and
+        their change per metre of height.
     exact
-        Whether they are within `TOLERANCE_M` of PROJ.
+        True if the polynomials are within `TOLERANCE_M` of PROJ.
     """
 
     middle_m: NDArray[np.float64]
@@ -197,7 +197,7 @@ class Block:
     def positions(
         self, row: NDArray[np.int64], column: NDArray[np.int64], height_m: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return (row, column, 3) float64 ECEF metres.
+        """Return the positions of pixels, (row, column, 3) float64, ECEF metres.
 
         Parameters
         ----------
@@ -207,7 +207,7 @@ class Block:
             () or (row, column) float64, ellipsoidal height of all pixels or of each.
         """
         down, right = ((2 * index + 1) / BLOCK_PX - 1 for index in (row, column))
-        if height_m.ndim == 0:  # one height: one polynomial
+        if height_m.ndim == 0:  # a constant height: only one polynomial is evaluated
             return _evaluated(self.offset_m + height_m * self.normal, down, right) + self.middle_m
         offset = _evaluated(self.offset_m, down, right)
         offset += height_m[..., None] * _evaluated(self.normal, down, right)
@@ -221,11 +221,11 @@ def block(crs: str, north_west_m: tuple[float, float], spacing_m: float, index: 
     Parameters
     ----------
     crs
-        Projected, in metres.
+        Projected CRS in metres.
     north_west_m
         Northing and easting of the grid's outer corner.
     spacing_m
-        Of its pixels.
+        Pixel spacing.
     index
         Row and column of the block in the grid.
 
@@ -242,12 +242,12 @@ def block(crs: str, north_west_m: tuple[float, float], spacing_m: float, index: 
         down, right = np.meshgrid((nodes + 1) * side_m / 2, (nodes + 1) * side_m / 2, indexing="ij")
         return ecef_from_projected(crs, west_m + right, north_m - down, np.full(down.shape, height))
 
-    ground, above = proj(_NODES, 0.0), proj(_NODES, _CLIMB_M)
-    middle_m = ground[DEGREE // 2, DEGREE // 2]
+    surface, above = proj(_NODES, 0.0), proj(_NODES, _CLIMB_M)
+    middle_m = surface[DEGREE // 2, DEGREE // 2]
     inverse = np.linalg.inv(np.vander(_NODES, increasing=True))
     offset, normal = (
         np.einsum("ki,lj,ijc->klc", inverse, inverse, values)
-        for values in (ground - middle_m, (above - ground) / _CLIMB_M)
+        for values in (surface - middle_m, (above - surface) / _CLIMB_M)
     )
     between = _evaluated(offset, _BETWEEN, _BETWEEN) + middle_m
     worst = np.abs(between - proj(_BETWEEN, 0.0)).max()
@@ -257,7 +257,7 @@ def block(crs: str, north_west_m: tuple[float, float], spacing_m: float, index: 
 def _evaluated(
     coefficients: NDArray[np.float64], down: NDArray[np.float64], right: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return Σ c_kl u^k v^l by Horner's rule, element by element: the same bits whatever the window."""
+    """Evaluate Σ c_kl u^k v^l by Horner's rule, element by element: identical to the last bit in any window."""
     along = coefficients[:, -1, None]
     for power in range(DEGREE - 1, -1, -1):
         along = along * right[:, None] + coefficients[:, power, None]

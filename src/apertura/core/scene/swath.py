@@ -1,4 +1,4 @@
-"""Total paths from each pulse to the scene, bounded by blocks of pixels."""
+"""Bounds of the total path from each pulse to the scene, by blocks of pixels."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -15,35 +15,34 @@ from apertura.core.scene.terrain import Terrain
 
 _BLOCKS = 33
 _PULSES_AT_ONCE = 256
-_PIXELS_AT_ONCE = 2**20  # heights read together, for a DEM is slow to open and to read in part
-_MOST_PULSES = 4096  # whose paths are computed; others are bounded
+_PIXELS_AT_ONCE = 2**20  # heights read together, because a DEM is slow to open and to read in parts
+_MOST_PULSES = 4096  # largest number of pulses whose paths are computed; those of others are bounded
 
 
 def swath(
     grid: SceneGrid, terrain: Terrain, aperture: Aperture, *, beams: Beams | None = None, together: int = 1
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the shortest and longest total path from each pulse to the scene.
+    """Return a lower and an upper bound of the total paths from each pulse to the scene.
 
-    About 33 × 33 blocks of pixels, each a point and a radius that bounds its pixels at all their heights; the
-    total path changes by at most twice the radius. In a long flight a sample of pulses bounds those between: a path
-    changes by at most the movement of both antennas.
+    The scene is divided into about 33 × 33 blocks of pixels, each contained in a sphere; within a block the total path
+    changes by at most twice the radius. In a long flight the paths of a sample of pulses bound those in between: a path
+    changes by at most the sum of both antennas' displacements.
 
     Parameters
     ----------
     grid, terrain
-        The scene and its ground.
+        Grid and terrain of the scene.
     aperture
-        In the grid's processing frame.
+        Aperture in the grid's processing frame.
     beams
-        Weights of pulses: blocks of pixels that a pulse cannot illuminate do not count.
+        Weights of pulses: blocks of pixels that a pulse cannot illuminate are excluded.
     together
-        Pulses that are bounded by one of them, at least.
+        Least number of pulses whose paths are bounded by one of them.
 
     Returns
     -------
     tuple of ndarray
-        (pulse,) float64 metres each; never longer, never shorter than any pixel's path. Infinite and minus infinite for
-        a pulse that illuminates none.
+        (pulse,) float64 metres each. Infinite and minus infinite for a pulse that illuminates no pixel.
 
     Examples
     --------
@@ -73,24 +72,25 @@ def _spans(
     radius_m: NDArray[np.float64],
     every: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the swath of some pulses; each bounds the `every` pulses about it."""
+    """Return the swath of a block of pulses; the middle one of each `every` pulses bounds the others."""
     block = np.arange(len(aperture)) // every
     middle = aperture[np.minimum(np.arange(0, len(aperture), every) + every // 2, len(aperture) - 1)]
-    moved = sum(
-        np.linalg.norm(leg - there[block], axis=1) for leg, there in zip(aperture.legs, middle.legs, strict=True)
+    displacement = sum(
+        np.linalg.norm(position_m - middle_position_m[block], axis=1)
+        for position_m, middle_position_m in zip(aperture.legs, middle.legs, strict=True)
     )
     path = middle.path(middle_m)
     near, far = path - 2 * radius_m, path + 2 * radius_m
     if beams is not None:
         dark = ~illumination_mask(beams, aperture, middle_m, radius_m, pulses=every)
         near[dark], far[dark] = np.inf, -np.inf
-    return near.min(axis=1)[block] - moved, far.max(axis=1)[block] + moved
+    return near.min(axis=1)[block] - displacement, far.max(axis=1)[block] + displacement
 
 
 def balls(
     grid: SceneGrid, terrain: Terrain, windows: Sequence[Window]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return middles (window, 3) and radii (window,), metres, of balls that contain the pixels of windows."""
+    """Return the middles (window, 3) and radii (window,), metres, of spheres that contain the pixels of windows."""
     centre = np.array([[(part.start + part.stop - 1) / 2 for part in window] for window in windows])
     half_m = np.array([[(part.stop - part.start - 1) / 2 * grid.spacing_m for part in window] for window in windows])
     low, high = np.array([ends for strip in _strips(windows) for ends in _height_ranges(grid, terrain, strip)]).T
@@ -99,13 +99,13 @@ def balls(
 
 
 def _strips(windows: Sequence[Window]) -> Iterator[list[Window]]:
-    """Yield the windows in runs of the same rows, one right of the other, of few pixels together."""
+    """Yield the windows in runs of adjacent windows of the same rows, limited to `_PIXELS_AT_ONCE` pixels."""
     strip: list[Window] = []
     for rows, columns in windows:
         if strip:
-            (beside, before), width = strip[-1], columns.stop - strip[0][1].start
-            apart = rows != beside or columns.start != before.stop
-            if apart or width * (rows.stop - rows.start) > _PIXELS_AT_ONCE:
+            (last_rows, last_columns), width = strip[-1], columns.stop - strip[0][1].start
+            is_adjacent = rows == last_rows and columns.start == last_columns.stop
+            if not is_adjacent or width * (rows.stop - rows.start) > _PIXELS_AT_ONCE:
                 yield strip
                 strip = []
         strip.append((rows, columns))

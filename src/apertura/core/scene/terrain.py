@@ -1,4 +1,4 @@
-"""The ground under a scene: at one height, a plane, or heights from a DEM; and its two cheaper models."""
+"""Terrain of a scene: a constant height, a plane, or heights from a DEM; and its two simplified models."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,16 +11,16 @@ from apertura.common.arrays import Floats, is_number
 from apertura.common.errors import CampaignError, quoted
 from apertura.core.scene.grid import SceneGrid
 
-# ---- Ground models: flat, a plane, heights of a grid
+# ---- Terrain models: flat, a plane, heights of a grid
 #
-# A `Terrain` gives the heights of a grid, of a window of it, or of single pixels.
+# A `Terrain` provides the heights of a grid, of a window of it, or of single pixels.
 
 
-_TILE_PX = 512  # heights at single pixels are read by such tiles
+_TILE_PX = 512  # side of the tiles in which heights at single pixels are read
 
 
 class Terrain(Protocol):
-    """Heights of the ground; a subclass defines `heights`, the rest follows from it."""
+    """Terrain heights; a subclass defines `heights`, from which the other methods are derived."""
 
     def heights(self, grid: SceneGrid) -> Floats:
         """Return the height of each pixel of a grid or of a window of it.
@@ -28,7 +28,7 @@ class Terrain(Protocol):
         Parameters
         ----------
         grid
-            Pixels; each one has the same height, to the bit, in any window.
+            Grid or window of it; a pixel has the same height, to the last bit, in any window.
 
         Returns
         -------
@@ -37,7 +37,7 @@ class Terrain(Protocol):
         """
 
     def heights_at(self, grid: SceneGrid, row: ArrayLike, column: ArrayLike) -> Floats:
-        """Return (...,) float64 heights (m) at fractional pixel indices, bilinear between pixels; NaN off the grid."""
+        """Return heights (m) at fractional pixel indices, bilinear, (...,) float64; NaN outside the grid."""
         rows, columns = (np.asarray(axis, np.float64) for axis in np.broadcast_arrays(row, column))
         heights = np.full(rows.shape, np.nan)
         for tile in grid.tiles(_TILE_PX):
@@ -52,22 +52,22 @@ class Terrain(Protocol):
         return heights
 
     def positions(self, grid: SceneGrid) -> Floats:
-        """Return (row, column, 3) float64 positions (m) of the pixels in the processing frame, on the ground."""
+        """Return the positions (m) of the pixels on the terrain, (row, column, 3) float64, in the processing frame."""
         return grid.positions(self.heights(grid))
 
     def positions_at(self, grid: SceneGrid, row: ArrayLike, column: ArrayLike) -> Floats:
-        """Return (..., 3) float64 positions (m) of fractional pixel indices, on the ground."""
+        """Return the positions (m) of fractional pixel indices on the terrain, (..., 3) float64."""
         return grid.positions_at(row, column, self.heights_at(grid, row, column))
 
     @property
     def spec(self) -> dict[str, Any]:
-        """Parameters of the ground, as JSON values for provenance; none where a file or stage defines it."""
+        """Parameters of the terrain as JSON values for provenance; empty if a file or stage defines it."""
         return {}
 
 
 @dataclass(frozen=True)
 class FlatGround(Terrain):
-    """Ground at one height.
+    """Terrain of constant height.
 
     Attributes
     ----------
@@ -85,36 +85,38 @@ class FlatGround(Terrain):
 
     def __post_init__(self) -> None:
         if not is_number(self.height_m):
-            raise CampaignError(quoted(self.height_m), "FlatGround: height_m", "metres, finite", "Give one number.")
+            raise CampaignError(
+                quoted(self.height_m), "FlatGround: height_m", "a finite number of metres", "Pass one number."
+            )
 
     def heights(self, grid: SceneGrid) -> Floats:
-        """Return the height at every pixel, as a broadcast without memory."""
+        """Return the height at every pixel, as a broadcast view."""
         return np.broadcast_to(np.float64(self.height_m), grid.shape)
 
     def heights_at(self, grid: SceneGrid, row: ArrayLike, column: ArrayLike) -> Floats:  # noqa: ARG002
-        """Return the height; flat ground is continued beside the grid."""
+        """Return the constant height, also outside the grid."""
         return np.full(np.broadcast_shapes(np.shape(row), np.shape(column)), self.height_m)
 
     def positions(self, grid: SceneGrid) -> Floats:
-        """Return the pixels' positions: one polynomial for one height."""
+        """Return the positions of the pixels at the constant height, which is faster than at varying heights."""
         return grid.positions(self.height_m)
 
     @property
     def spec(self) -> dict[str, Any]:
-        """The height."""
+        """The height as JSON values."""
         return asdict(self)
 
 
 @dataclass(frozen=True)
 class Plane(Terrain):
-    """A tilted plane over the map.
+    """Tilted plane in map coordinates.
 
     Attributes
     ----------
     x_m, y_m, height_m
-        A point of it: easting and northing in the grid's CRS, height above the ellipsoid (z in a local frame).
+        A point of the plane: easting and northing in the grid's CRS, height above the ellipsoid (z in a local frame).
     east, north
-        Rise per metre eastward and northward.
+        Slope eastward and northward, metres per metre.
 
     Examples
     --------
@@ -131,7 +133,7 @@ class Plane(Terrain):
 
     @classmethod
     def through(cls, grid: SceneGrid, height_m: Floats) -> "Plane":
-        """Return the least-squares plane through heights (row, column) at the pixels of a grid, metres.
+        """Fit a plane to the heights (row, column) at the pixels of a grid, metres, by least squares.
 
         Examples
         --------
@@ -150,26 +152,26 @@ class Plane(Terrain):
         return self._over(grid.x_m, grid.y_m[:, None])
 
     def heights_at(self, grid: SceneGrid, row: ArrayLike, column: ArrayLike) -> Floats:
-        """Return the plane's heights; it is continued beside the grid."""
-        place = grid.map_at(*np.broadcast_arrays(row, column))
-        return self._over(place[..., 0], place[..., 1])
+        """Return the plane's heights, also outside the grid."""
+        xy_m = grid.map_at(*np.broadcast_arrays(row, column))
+        return self._over(xy_m[..., 0], xy_m[..., 1])
 
     def _over(self, x_m: Floats, y_m: Floats) -> Floats:
         return np.asarray(self.height_m + self.east * (x_m - self.x_m) + self.north * (y_m - self.y_m))
 
     @property
     def spec(self) -> dict[str, Any]:
-        """A point and the slope."""
+        """A point and the slopes as JSON values."""
         return asdict(self)
 
 
 def ground_of(terrain: Terrain | float | None, grid: SceneGrid) -> Terrain:
-    """Return the given ground, flat where it is one height; 0 where it is left out in a local frame.
+    """Return the terrain of an argument: flat for a number, and of height 0 by default in a local frame.
 
     Raises
     ------
     CampaignError
-        If it was left out of a grid on Earth, or is none, or the grid is none.
+        If the terrain of a georeferenced grid is missing, or an argument is of a wrong type.
 
     Examples
     --------
@@ -177,13 +179,13 @@ def ground_of(terrain: Terrain | float | None, grid: SceneGrid) -> Terrain:
     FlatGround(height_m=2.5)
     """
     if not isinstance(grid, SceneGrid):
-        raise CampaignError(quoted(grid), "grid", "a SceneGrid", "Make one by SceneGrid.from_bounds(crs, bounds_m).")
+        raise CampaignError(quoted(grid), "grid", "a SceneGrid", "Create one by SceneGrid.from_bounds(crs, bounds_m).")
     if terrain is None and grid.frame == "ecef":
         raise CampaignError(
-            "no terrain for a grid on Earth",
+            "no terrain for a georeferenced grid",
             where="terrain",
-            expected=f"how high the ground of {grid.crs} is above its ellipsoid",
-            remedy="Give a height in metres, or a terrain such as that of an opened campaign's scene.",
+            expected=f"terrain heights above the ellipsoid of {grid.crs}",
+            remedy="Pass a height in metres, or a terrain such as that of an opened campaign's scene.",
         )
     if terrain is None or (isinstance(terrain, int | float | np.floating) and not isinstance(terrain, bool)):
         return FlatGround(float(terrain or 0.0))
@@ -192,7 +194,7 @@ def ground_of(terrain: Terrain | float | None, grid: SceneGrid) -> Terrain:
             quoted(terrain) if isinstance(terrain, str | Path) else f"an object of type {type(terrain).__name__}",
             where="terrain",
             expected="a height in metres, a FlatGround, Plane or Dem",
-            remedy="Open a file of heights by apertura.open_dem(path, grid, datum=...).",
+            remedy="Open a DEM file by apertura.open_dem(path, grid, datum=...).",
         )
     return terrain
 
@@ -203,7 +205,7 @@ class _Array(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class GridHeights(Terrain):
-    """Heights at the pixels of one grid, such as the stage `terrain`.
+    """Terrain heights at the pixels of a grid, such as those of the stage `terrain`.
 
     Attributes
     ----------
@@ -223,7 +225,7 @@ class GridHeights(Terrain):
     height_m: _Array
 
     def heights(self, grid: SceneGrid) -> Floats:
-        """Return the heights of a window of the grid; of other grids bilinear between its pixels."""
+        """Return the heights of a window of the grid; those of other grids are bilinear between its pixels."""
         if (grid.crs, grid.west_m, grid.north_m, grid.spacing_m) != (
             self.grid.crs, self.grid.west_m, self.grid.north_m, self.grid.spacing_m,
         ):  # fmt: skip
@@ -233,14 +235,14 @@ class GridHeights(Terrain):
 
 
 def bilinear(values: Floats, row: Floats, column: Floats) -> Floats:
-    """Return (layer, ...) values between pixels; one without weight does not count, even if it is NaN.
+    """Interpolate (layer, ...) values bilinearly between pixels; a pixel of weight 0 may be NaN.
 
     Parameters
     ----------
     values
         (layer, row, column) float64.
     row, column
-        Fractional indices, broadcast against each other; beyond the edges by linear extrapolation.
+        Fractional indices, broadcast against each other; linear extrapolation beyond the edges.
     """
     first = [
         np.clip(np.floor(axis), 0, max(0, size - 2)).astype(np.int64)
@@ -261,21 +263,21 @@ def _within(part: slice, at: Floats) -> NDArray[np.bool_]:
     return np.asarray((at >= part.start - 0.5) & (at < part.stop - 0.5))
 
 
-# ---- The ground of a scene and its two cheaper models
+# ---- Terrain of a scene and its two simplified models
 
 _BLOCKS = 33
 
 
 @dataclass(frozen=True)
 class GroundModels:
-    """The ground of a scene and its two cheaper models, with their largest errors.
+    """Terrain of a scene and its two simplified models, with their largest errors.
 
     Attributes
     ----------
     full, level, plane
-        The ground, the same at one height, and the plane through it.
+        The terrain, its model of constant height, and its best-fitting plane.
     relief_m, off_plane_m
-        Largest difference of the ground from `level` and from `plane`, metres.
+        Largest difference of the terrain from `level` and from `plane`, metres.
     """
 
     full: Terrain
@@ -286,9 +288,9 @@ class GroundModels:
 
     @classmethod
     def of(cls, terrain: Terrain, level: FlatGround | None, grid: SceneGrid) -> "GroundModels":
-        """Return the models of a ground from its heights in the middle of blocks of pixels.
+        """Fit the models of a terrain to its heights in the middle of blocks of pixels.
 
-        Without a level it is their mean, or the ground itself where that is flat.
+        If no level is given, it is the mean of these heights, or the terrain itself if that is flat.
 
         Examples
         --------
@@ -301,17 +303,17 @@ class GroundModels:
         heights = terrain.heights(blocks)
         if level is None:
             level = terrain if isinstance(terrain, FlatGround) else FlatGround(float(np.nanmean(heights)))
-        heights = np.where(np.isfinite(heights), heights, level.height_m)  # a void between pixels is not imaged
+        heights = np.where(np.isfinite(heights), heights, level.height_m)  # voids between pixels do not matter
         plane = Plane.through(blocks, heights)
         off_m = (np.abs(heights - model.heights(blocks)).max() for model in (level, plane))
         return cls(terrain, level, plane, *map(float, off_m))
 
     @classmethod
     def flat(cls, height_m: float = 0.0) -> "GroundModels":
-        """Return the models of flat ground: all three are the same."""
+        """Return the models of a flat terrain, which are all the same."""
         level = FlatGround(height_m)
         return cls(level, level, Plane(0.0, 0.0, height_m, 0.0, 0.0), 0.0, 0.0)
 
     def model(self, name: str) -> Terrain:
-        """Return the model that a decision names: 'plane' (level), 'tilted_plane' or 'dem'."""
+        """Return the model of the given name in a decision: 'plane' (level), 'tilted_plane' or 'dem'."""
         return {"plane": self.level, "tilted_plane": self.plane, "dem": self.full}[name]

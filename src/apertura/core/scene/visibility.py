@@ -1,4 +1,4 @@
-"""Visibility of the scene: shadow and layover."""
+"""Visibility of the scene: masks of shadow and layover."""
 
 from dataclasses import dataclass
 
@@ -14,38 +14,38 @@ from apertura.core.scene.terrain import Terrain
 
 # ---- Shadow and layover along lines of sight
 #
-# Kernels (docs/theory/terrain.md, sections 3 and 4). `legs` is (pulse, leg, 3): row, column and height of each phase
-# centre; `ground` is heights (row, column) float32, spacing of the pixels and 1/2R of the Earth (metres, 1/m). Every
-# step goes one pixel along one index, so that ground is interpolated between two pixels only.
+# Kernels (docs/theory/terrain.md, sections 3 and 4). `legs` is (pulse, antenna, 3): row, column and height of each
+# phase centre. `ground` contains heights (row, column) float32, the pixel spacing (m) and 1/2R of the Earth (1/m). Each
+# step is one pixel along one index, so that the terrain is interpolated between two pixels only.
 
 SHADOW, LAYOVER = 1, 2
 """Bits of the mask."""
 
 BLOCK = 16
-"""Pixels, side of the blocks whose highest ground is computed beforehand."""
+"""Pixels, side of the blocks whose highest terrain is precomputed."""
 
 TOLERANCE_M = 1e-3
-"""Metres that ground may rise above a line of sight without blocking it: float32 rounding of a relief."""
+"""Metres, height of terrain above a line of sight that does not block it: float32 rounding of a relief."""
 
 STRAIGHT_BELOW = 0.05
-"""Slope of the path over the ground, m/m, below which the antenna is overhead and layover is undefined."""
+"""Horizontal gradient of the path, m/m, below which the antenna is overhead and layover is undefined."""
 
 
 @numba.njit(cache=True, nogil=True)
 def _interpolated(height, row, column):  # type: ignore[no-untyped-def]
-    """Height at a point of which at least one index is whole; NaN outside."""
+    """Interpolate the height at a point of which at least one index is an integer; NaN outside the scene."""
     rows, columns = height.shape
     r, c = int(np.floor(row)), int(np.floor(column))
     if row < 0 or column < 0 or row > rows - 1 or column > columns - 1:
         return np.nan
     down, right = row - r, column - c
-    # Between two pixels of the row above the point; the next column is read only where it has weight.
+    # Between two pixels of the row above the point; the next column is read only if it has weight.
     low = height[r, c]
     if right > 0:
         low = (1 - right) * low + right * height[r, c + 1]
     if down == 0:
         return low
-    # And of the row below it.
+    # Between two pixels of the row below it.
     high = height[r + 1, c]
     if right > 0:
         high = (1 - right) * high + right * height[r + 1, c + 1]
@@ -54,38 +54,38 @@ def _interpolated(height, row, column):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _steps_left(index, step):  # type: ignore[no-untyped-def]
-    """Whole steps that remain inside the block of `index`, along one axis."""
+    """Return the number of whole steps to the edge of the block of `index`, along one axis."""
     if step == 0:
         return 1 << 30
     block = np.floor(index / BLOCK) * BLOCK
-    room = block + BLOCK - index if step > 0 else index - block
-    return int(room / abs(step))
+    to_edge = block + BLOCK - index if step > 0 else index - block
+    return int(to_edge / abs(step))
 
 
 @numba.njit(cache=True, nogil=True)
 def _blocked(antenna, row, column, highest, top, ground):  # type: ignore[no-untyped-def]
-    """Whether ground rises above the straight line from a pixel to an antenna."""
+    """Return True if terrain rises above the straight line from a pixel to an antenna."""
     height, spacing, curvature = ground
     own = height[row, column]
     down, right, up = antenna[0] - row, antenna[1] - column, antenna[2] - own
-    # One step is one pixel along the longer of both axes: the line crosses the other axis between two pixels.
+    # One step is one pixel along the axis of the larger difference: the line crosses the other axis between two pixels.
     steps = max(abs(down), abs(right))
     if steps < 1:
         return False
     dr, dc = down / steps, right / steps
-    # A line of length d is s(1 − s)d²/2R below the straight rise between its ends, s = t/steps, on the curved Earth.
+    # On the curved Earth a line of length d is s(1 − s)d²/2R below the linear rise between its ends, s = t/steps.
     bend = curvature * spacing * spacing * (dr * dr + dc * dc)
     t = 1
     while t < steps:
         r, c = row + t * dr, column + t * dc
-        there = _interpolated(height, r, c)
-        if np.isnan(there):  # the line has left the scene: ground outside it blocks nothing
+        terrain = _interpolated(height, r, c)
+        if np.isnan(terrain):  # the line has left the scene: terrain outside it is ignored
             return False
         line = own + up * t / steps - bend * t * (steps - t)
-        if there > line + TOLERANCE_M:
+        if terrain > line + TOLERANCE_M:
             return True
-        # From here on a rising line is no lower than this. Above all ground of the scene it is free; above all of
-        # this block (known with one pixel around it) the walk leaps to the last step inside the block.
+        # `least` is a lower bound of a rising line from here on. Above all terrain of the scene it is not blocked.
+        # Above all terrain of this block (and one pixel around it) the search skips to the last step inside the block.
         leap, least = 1, line - bend * steps
         if up > 0 and least > top:
             return False
@@ -97,16 +97,18 @@ def _blocked(antenna, row, column, highest, top, ground):  # type: ignore[no-unt
 
 @numba.njit(cache=True, nogil=True)
 def mark_shadow(mask, first, legs, highest, ground):  # type: ignore[no-untyped-def]
-    """Set `SHADOW` in `mask`, (row, column) uint8 whose pixel (0, 0) is `first`, where most pulses are blocked."""
+    """Set `SHADOW` in `mask`, (row, column) uint8 with first pixel `first`, where most pulses are blocked.
+
+    A pulse is blocked if its line of sight to the transmitter or to the receiver is; more than half must be blocked.
+    """
     pulses, top = legs.shape[0], highest.max()
     for i in range(mask.shape[0]):
         for j in range(mask.shape[1]):
             blocked = 0
             for pulse in range(pulses):
-                # Decided: more than half are blocked already, or can no longer become so.
+                # Stop if more than half are already blocked, or can no longer be.
                 if 2 * blocked > pulses or 2 * (pulse - blocked) >= pulses:
                     break
-                # One blocked leg, to the transmitter or to the receiver, takes the pulse away.
                 for leg in range(legs.shape[1]):
                     if _blocked(legs[pulse, leg], first[0] + i, first[1] + j, highest, top, ground):
                         blocked += 1
@@ -117,13 +119,13 @@ def mark_shadow(mask, first, legs, highest, ground):  # type: ignore[no-untyped-
 
 @numba.njit(cache=True, nogil=True)
 def _total_path(legs, pixel, height_m, ground):  # type: ignore[no-untyped-def]
-    """Total path from one antenna to a pixel (row, column) at a height and to the other antenna."""
+    """Return the total path from one antenna to a pixel (row, column) at a height and to the other antenna."""
     _, spacing, curvature = ground
     path = 0.0
     for leg in range(2):
         south, east = (pixel[0] - legs[leg, 0]) * spacing, (pixel[1] - legs[leg, 1]) * spacing
         flat = south * south + east * east
-        # Below the antenna's horizontal the ground falls by d²/2R.
+        # Below the horizontal plane of the antenna the curved Earth falls by d²/2R.
         up = legs[leg, 2] - height_m + curvature * flat
         path += np.sqrt(flat + up * up)
     return path
@@ -131,30 +133,30 @@ def _total_path(legs, pixel, height_m, ground):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _in_layover(direction, legs, pixel, extreme, ground):  # type: ignore[no-untyped-def]
-    """Whether ground along `direction` (rows and columns per step, sign) shares the path of the pixel.
+    """Return True if terrain along `direction` (rows and columns per step, sign) has the same total path as the pixel.
 
-    Behind the pixel (sign +1) paths should be longer, before it (−1) shorter. `extreme` is the height that could
-    violate this from farthest away: the highest ground behind, the lowest before.
+    Without layover, paths behind the pixel (sign +1) are longer, and those in front of it (−1) shorter. `extreme` is
+    the height that violates this at the largest distance: the highest terrain behind, the lowest in front.
     """
     height, sign = ground[0], direction[2]
     own = _total_path(legs, pixel, height[pixel[0], pixel[1]], ground)
     t = 1
     while True:
-        there = (pixel[0] + t * direction[0] * sign, pixel[1] + t * direction[1] * sign)
-        height_m = _interpolated(height, there[0], there[1])
-        if np.isnan(height_m):  # the end of the scene
+        point = (pixel[0] + t * direction[0] * sign, pixel[1] + t * direction[1] * sign)
+        height_m = _interpolated(height, point[0], point[1])
+        if np.isnan(height_m):  # outside the scene
             return False
-        # Not even the most extreme ground of the scene can share the path from here on.
-        if sign * (_total_path(legs, there, extreme, ground) - own) > 0:
+        # From here on, not even the most extreme terrain of the scene can have the same path.
+        if sign * (_total_path(legs, point, extreme, ground) - own) > 0:
             return False
-        if sign * (_total_path(legs, there, height_m, ground) - own) <= 0:
+        if sign * (_total_path(legs, point, height_m, ground) - own) <= 0:
             return True
         t += 1
 
 
 @numba.njit(cache=True, nogil=True)
 def _path_gradient(legs, pixel, height_m, spacing):  # type: ignore[no-untyped-def]
-    """Horizontal gradient of the total path, along rows and columns: the line of sight over the ground."""
+    """Return the horizontal gradient of the total path along rows and columns, the horizontal line of sight."""
     down, right = 0.0, 0.0
     for leg in range(2):
         south, east = (pixel[0] - legs[leg, 0]) * spacing, (pixel[1] - legs[leg, 1]) * spacing
@@ -166,13 +168,13 @@ def _path_gradient(legs, pixel, height_m, spacing):  # type: ignore[no-untyped-d
 
 @numba.njit(cache=True, nogil=True)
 def mark_layover(mask, first, legs, extremes, ground):  # type: ignore[no-untyped-def]
-    """Set `LAYOVER` in `mask`, whose pixel (0, 0) is `first`; `extremes`: lowest and highest ground."""
+    """Set `LAYOVER` in `mask` with first pixel `first`; `extremes` are the lowest and highest terrain."""
     height, spacing = ground[0], ground[1]
     for i in range(mask.shape[0]):
         for j in range(mask.shape[1]):
             pixel = (first[0] + i, first[1] + j)
             own = height[pixel]
-            # The pulse with the shortest path: there the gradient is square to the track.
+            # Find the pulse of the shortest path, at which the gradient is perpendicular to the track.
             nearest, least = 0, np.inf
             for pulse in range(legs.shape[0]):
                 path = _total_path(legs[pulse], pixel, own, ground)
@@ -180,9 +182,9 @@ def mark_layover(mask, first, legs, extremes, ground):  # type: ignore[no-untype
                     nearest, least = pulse, path
             down, right = _path_gradient(legs[nearest], pixel, own, spacing)
             steep = max(abs(down), abs(right))
-            if steep < STRAIGHT_BELOW:  # overhead: every direction leads away
+            if steep < STRAIGHT_BELOW:  # overhead
                 continue
-            # One pixel per step along the longer axis, as for shadow; away from the antenna, then towards it.
+            # Search away from the antenna, then towards it, with one pixel per step along the steeper axis.
             dr, dc = down / steep, right / steep
             if _in_layover((dr, dc, 1), legs[nearest], pixel, extremes[1], ground) or _in_layover(
                 (dr, dc, -1), legs[nearest], pixel, extremes[0], ground
@@ -190,7 +192,7 @@ def mark_layover(mask, first, legs, extremes, ground):  # type: ignore[no-untype
                 mask[i, j] |= LAYOVER
 
 
-# ---- Incidence, bistatic angle, and visibility of a window
+# ---- Visibility of a window
 
 EARTH_RADIUS_M = 6371e3
 
@@ -199,18 +201,18 @@ _STRIP = 256  # rows of heights read at once
 
 @dataclass(frozen=True)
 class Relief:
-    """The heights of a whole scene, with block maxima for the search along lines of sight.
+    """Heights of a whole scene, with block maxima for the search along lines of sight.
 
     Attributes
     ----------
     grid, base_m
-        The scene, and the height that other heights are relative to.
+        Grid of the scene, and reference of the other heights, metres.
     height_m
         (row, column) float32, metres above `base_m`.
     highest_m
-        (block row, block column) float32: highest ground of each block of 16 × 16 pixels and one pixel around it.
+        (block row, block column) float32: highest terrain of each block of 16 × 16 pixels and one pixel around it.
     lowest_m
-        Lowest ground.
+        Lowest terrain, metres above `base_m`.
     """
 
     grid: SceneGrid
@@ -221,7 +223,7 @@ class Relief:
 
     @classmethod
     def of(cls, grid: SceneGrid, terrain: Terrain, base_m: float) -> "Relief":
-        """Return the relief of a scene above a height (m) amid its ground: float32 then is exact to micrometres."""
+        """Return the relief of a scene above a height (m) near its terrain, so that float32 resolves micrometres."""
         relative = np.empty(grid.shape, np.float32)
         for row in range(0, grid.shape[0], _STRIP):
             strip = (slice(row, min(row + _STRIP, grid.shape[0])), slice(0, grid.shape[1]))
@@ -236,11 +238,11 @@ class Relief:
 
     @property
     def curvature_per_m(self) -> float:
-        """1/2R: how fast the ground falls below a horizontal line, times distance squared; 0 in a local frame."""
+        """1/2R, fall of the Earth below a horizontal line over squared distance, 1/m; 0 in a local frame."""
         return 0.0 if self.grid.crs == LOCAL else 0.5 / EARTH_RADIUS_M
 
     def above(self, antenna: Floats) -> Floats:
-        """Return (pulse, 3) float64 row, column (fractional) and height above `base_m` (m) of phase centres.
+        """Return fractional row and column, and height above `base_m` (m), of phase centres, (pulse, 3) float64.
 
         Parameters
         ----------
@@ -251,21 +253,20 @@ class Relief:
 
 
 def visibility(relief: Relief, tx: Floats, rx: Floats, window: Window) -> NDArray[np.uint8]:
-    """Return the mask of shadow and layover of a window, for one pair.
+    """Compute the mask of shadow and layover of a window for one pair.
 
-    Shadow: at more than half of the pulses given the straight line to the transmitter or to the receiver runs through
-    ground of the scene. Layover: at the pulse with the shortest total path, the path does not grow along the line of
-    sight from all ground before the pixel to all behind, so that another place shares its range. Ground outside the
-    scene causes neither shadow nor layover.
+    Shadow: at more than half of the given pulses, terrain of the scene blocks the line of sight to the transmitter or
+    to the receiver. Layover: at the pulse with the shortest total path, another point along the line of sight has the
+    same path, because the path does not increase monotonically. Terrain outside the scene causes neither.
 
     Parameters
     ----------
     relief
-        Of the whole scene.
+        Relief of the whole scene.
     tx, rx
-        (pulse, 3) float64 from `Relief.above`: some pulses, evenly spread over the aperture.
+        (pulse, 3) float64 from `Relief.above`: a selection of pulses, evenly spread over the aperture.
     window
-        Rows and columns requested.
+        Rows and columns of the mask.
 
     Returns
     -------

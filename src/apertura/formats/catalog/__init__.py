@@ -1,7 +1,7 @@
-"""Results of a campaign described for other programs: STAC to search them, RO-Crate to check their provenance."""
+"""Metadata of the results for other programs: a STAC catalog for search, an RO-Crate for provenance."""
 
 CATALOG = "catalog.json"
-"""Where the STAC catalog begins, in its folder."""
+"""Root file of the STAC catalog, in its folder."""
 
 CRATE = "ro-crate-metadata.json"
-"""The RO-Crate, in the folder of the results."""
+"""RO-Crate metadata file, in the folder of the results."""

@@ -1,4 +1,4 @@
-"""A whole run as an RO-Crate, profile Provenance Run Crate 0.5: written, and its hashes read again."""
+"""RO-Crate of a run, profile Provenance Run Crate 0.5: creation of the document, and reading of its hashes."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,23 +15,21 @@ from apertura.common.provenance import LARGEST_DOCUMENT, canonical_json, sha256_
 from apertura.formats.catalog import CRATE
 from apertura.formats.catalog.stac import media_type
 
-# ---- A whole run as an RO-Crate, profile Provenance Run Crate 0.5: what was run, by which code, on what, made what
-
 # ---- Content of a crate: jobs, files, software ----------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Listed:
-    """A file.
+    """File listed in a crate.
 
     Attributes
     ----------
     name
-        Relative to the results; of an input, to the campaign folder.
+        Path relative to the results; for an input, relative to the campaign folder.
     sha256
-        Of its bytes, hex.
+        SHA-256 of the file, hex.
     size
-        Bytes; None where it is not there any more.
+        Size in bytes; None if the file no longer exists.
     """
 
     name: str
@@ -41,24 +39,24 @@ class Listed:
 
 @dataclass(frozen=True)
 class CrateJob:
-    """One rule that ran, once.
+    """Executed job of the workflow.
 
     Attributes
     ----------
     rule, where
-        Of the workflow; flight and pair, or whatever it ran on.
+        Rule of the workflow; flight and pair, or other wildcards.
     command
-        As a person would paste it.
+        Command line, ready to paste into a shell.
     code_sha256
-        Of the code that ran.
+        Hash of the executed code.
     settings
-        Settings that affect it.
+        Settings that affect the job.
     sources
         Names of its sources: results by their manifests (``results/…``), and inputs.
     files
-        Files that it made, manifests last.
+        Output files, manifests last.
     doubts
-        Why it would not be made so today, a line each.
+        Reasons why the result is out of date, one line each.
     """
 
     rule: str
@@ -72,7 +70,7 @@ class CrateJob:
 
     @property
     def path(self) -> str:
-        """Its name among the jobs."""
+        """Identifier of the job."""
         return "/".join([self.rule, *self.where])
 
 
@@ -83,19 +81,19 @@ class CrateRun:
     Attributes
     ----------
     campaign
-        Its name, free text.
+        Name of the campaign, free text.
     recorded_until
-        ISO 8601, UTC.
+        Time of the last recorded pulse, ISO 8601, UTC.
     software, lock_sha256
-        Name → version of what wrote the crate; hash of the lock.
+        Name → version of the software that wrote the crate; hash of the lock file.
     jobs
-        In the order in which they can run.
+        Jobs in the order of their dependencies.
     inputs
-        Files of the campaign beside its results.
+        Input files in the campaign folder.
     workflow
-        Files of the workflow, as they lie beside the crate.
+        Files of the workflow, as copied to the folder of the crate.
     author, licence, doi
-        As the campaign states them: a name, an SPDX identifier, a DOI; None: not stated.
+        Configured name, SPDX identifier and DOI; None: not configured.
     """
 
     campaign: str
@@ -112,11 +110,11 @@ class CrateRun:
 
 # ---- RO-Crate document, profile Provenance Run Crate 0.5 ------------------------------------------------------------
 #
-# The crate's root is the folder of results. What lies outside, recordings and config, stands in it by name and hash
-# as contextual entities: a crate may not point above its root, and results are passed on without their recordings.
+# The root of the crate is the folder of results. Recordings and config, which lie outside, are contextual entities with
+# name and hash: a crate must not refer to files above its root, and results are shared without their recordings.
 
 WORKFLOW = "workflow/Snakefile"
-"""The workflow as it lies beside the crate; its rules are in the folder below."""
+"""Path of the workflow in the crate; its rules are in a subfolder."""
 
 _CRATE_SPEC = "https://w3id.org/ro/crate/1.1"
 _WORKFLOW_CRATE = "https://w3id.org/workflowhub/workflow-ro-crate/1.0"
@@ -133,7 +131,7 @@ _RUN, _ORGANISED, _LOCK = "#run", "#organised", "#lock"
 
 
 def crate_document(run: CrateRun) -> dict[str, Any]:
-    """Return the metadata document of a run; the same run gives the same document.
+    """Build the metadata document of a run; the same run gives the same document.
 
     Examples
     --------
@@ -150,9 +148,9 @@ def crate_document(run: CrateRun) -> dict[str, Any]:
     crate.metadata.extra_contexts.append(_TERMS)
     crate.metadata["conformsTo"] = [{"@id": uri} for uri in (_CRATE_SPEC, _WORKFLOW_CRATE)]
     tops, data = _data(run)
-    described = [*_software(run), *_steps(run), *_jobs(run), *data, *map(_input, run.inputs)]
-    unique = {entity["@id"]: entity for entity in described}
-    actions = [entity for entity in described if str(entity["@type"]).endswith("Action")]
+    entities = [*_software(run), *_steps(run), *_jobs(run), *data, *map(_input, run.inputs)]
+    unique = {entity["@id"]: entity for entity in entities}
+    actions = [entity for entity in entities if str(entity["@type"]).endswith("Action")]
     for name, value in _root(run, tops, actions).items():
         crate.root_dataset[name] = value
     crate.add(*(Entity(crate, entity.pop("@id"), properties=entity) for entity in unique.values()))
@@ -172,15 +170,15 @@ def input_id(name: str) -> str:
 
 
 def _root(run: CrateRun, parts: Sequence[str], actions: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    about = (
-        f"Images of the campaign {run.campaign}, with every step from its recordings to them. Recordings and config "
-        "are named by hash and lie in the folder above. Actions have no times and datePublished is when the last pulse "
-        "was recorded: the same recordings, settings and code make the same crate, whenever they run. Versions are "
-        "those of the installation that wrote the crate."
+    description = (
+        f"Images of the campaign {run.campaign}, with every processing step from its recordings to the images. "
+        "Recordings and config are listed by hash; the files are in the parent folder. Actions have no times, and "
+        "datePublished is the time of the last recorded pulse: the same recordings, settings and code give the same "
+        "crate at any time. Versions are those of the installation that wrote the crate."
     )
     return {
         "name": run.campaign,
-        "description": about,
+        "description": description,
         "datePublished": run.recorded_until,
         "license": {"@id": _licence_id(run)},
         **({"author": {"@id": _AUTHOR}} if run.author else {}),
@@ -217,17 +215,17 @@ def _software(run: CrateRun) -> Iterator[dict[str, Any]]:
         "@type": "PropertyValue",
         "name": "sha256 of requirements/all.txt",
         "value": run.lock_sha256,
-        "description": "The lock that apertura ships: versions and hashes of all that it was tested with.",
+        "description": "Lock file shipped with apertura: versions and hashes of the tested environment.",
     }
     yield {"@id": "#snakemake", "@type": "ComputerLanguage", "name": "Snakemake", "version": run.software["snakemake"]}
 
 
 def _steps(run: CrateRun) -> Iterator[dict[str, Any]]:
-    """Yield the workflow, its steps, and the tools that they are: one for each rule and code that ran."""
+    """Yield the workflow, its steps and their tools, one tool for each rule and version of executed code."""
     tools: dict[str, dict[str, str]] = {}
     for job in run.jobs:
         tools.setdefault(job.rule, {})[_tool(job)] = job.code_sha256
-    needed = _refs(f"#software/{name}" for name in run.software)
+    requirements = _refs(f"#software/{name}" for name in run.software)
     yield {
         "@id": WORKFLOW,
         "@type": ["File", "SoftwareSourceCode", "ComputationalWorkflow", "HowTo"],
@@ -236,7 +234,7 @@ def _steps(run: CrateRun) -> Iterator[dict[str, Any]]:
         "programmingLanguage": {"@id": "#snakemake"},
         "hasPart": _refs(tool for codes in tools.values() for tool in codes),
         "step": _refs(f"#step/{rule}" for rule in tools),
-        "softwareRequirements": needed,
+        "softwareRequirements": requirements,
         **_bytes(next(file for file in run.workflow if file.name == WORKFLOW)),
     }
     for position, (rule, codes) in enumerate(tools.items()):
@@ -249,24 +247,24 @@ def _steps(run: CrateRun) -> Iterator[dict[str, Any]]:
                 "name": f"apertura step {rule}",
                 "version": run.software["apertura"],
                 "identifier": f"sha256:{code}",
-                "description": "The identifier is the hash of the code that this step can run.",
-                "softwareRequirements": needed,
+                "description": "The identifier is the hash of all code that this step can execute.",
+                "softwareRequirements": requirements,
             }
 
 
 def _jobs(run: CrateRun) -> Iterator[dict[str, Any]]:
-    """Yield every action, and the parameters that actions share."""
+    """Yield all actions, and the parameters shared by them."""
     manifests = [_id(file) for job in run.jobs for file in job.files if file.name.endswith(".manifest.json")]
-    all_of_it = {
+    whole_run = {
         "name": f"apertura run on {run.campaign}",
-        "description": "Every rule of the workflow, from recordings to what describes the images.",
+        "description": "All rules of the workflow, from the recordings to the metadata of the images.",
         "instrument": {"@id": WORKFLOW},
-        "object": _refs(input_id(one.name) for one in run.inputs),
+        "object": _refs(input_id(file.name) for file in run.inputs),
         "result": _refs(manifests),
         "environment": {"@id": _LOCK},
         "actionStatus": _COMPLETED,
     }
-    yield {"@id": _RUN, "@type": "CreateAction", **all_of_it}
+    yield {"@id": _RUN, "@type": "CreateAction", **whole_run}
     yield {
         "@id": _ORGANISED,
         "@type": "OrganizeAction",
@@ -286,9 +284,9 @@ def _jobs(run: CrateRun) -> Iterator[dict[str, Any]]:
             "@id": f"#job/{job.path}",
             "@type": "CreateAction",
             "name": job.command,
-            "description": "; ".join(job.doubts) or "As the code and settings of today would make it.",
+            "description": "; ".join(job.doubts) or "Up to date with the current code and settings.",
             "instrument": {"@id": _tool(job)},
-            "object": _refs([*sources, *(each["@id"] for each in parameters)]),
+            "object": _refs([*sources, *(parameter["@id"] for parameter in parameters)]),
             "result": _refs(_stage(file) or _id(file) for file in job.files),
             "environment": {"@id": _LOCK},
             "actionStatus": _COMPLETED,
@@ -303,7 +301,7 @@ def _jobs(run: CrateRun) -> Iterator[dict[str, Any]]:
 
 
 def _data(run: CrateRun) -> tuple[list[str], list[dict[str, Any]]]:
-    """Return the entities directly in the root, and all files and stages of the results."""
+    """Return the identifiers of the entities in the root, and the entities of all files and stages."""
     stages: dict[str, list[str]] = {}
     tops, entities = [], []
     for listed in [*run.workflow, *(file for job in run.jobs for file in job.files)]:
@@ -319,9 +317,9 @@ def _data(run: CrateRun) -> tuple[list[str], list[dict[str, Any]]]:
     return [*tops, *stages], entities
 
 
-def _input(one: Listed) -> dict[str, Any]:
-    about = "An input, in the campaign folder above the results."
-    return {"@id": input_id(one.name), "@type": "CreativeWork", "name": one.name, "description": about, **_bytes(one)}
+def _input(file: Listed) -> dict[str, Any]:
+    entity = {"@id": input_id(file.name), "@type": "CreativeWork", "name": file.name}
+    return {**entity, "description": "Input file, in the campaign folder (parent of the results).", **_bytes(file)}
 
 
 def _bytes(file: Listed) -> dict[str, Any]:
@@ -344,7 +342,7 @@ def _tool(job: CrateJob) -> str:
 
 
 def _stage(file: Listed) -> str | None:
-    """Return the identifier of the stage that a file is a part of."""
+    """Return the identifier of the stage that contains a file; None if there is none."""
     name, inner, _ = file.name.partition(".zarr/")
     return quote(f"{name}.zarr/") if inner else None
 
@@ -354,26 +352,26 @@ def _id(file: Listed) -> str:
 
 
 def _refs(ids: Iterable[str]) -> dict[str, str] | list[dict[str, str]]:
-    """Return references: a list, but of one a single value, as RO-Crate recommends."""
-    references = [{"@id": one} for one in dict.fromkeys(ids)]
+    """Return references as a list, or as a single value if there is only one, as RO-Crate recommends."""
+    references = [{"@id": identifier} for identifier in dict.fromkeys(ids)]
     return references[0] if len(references) == 1 else references
 
 
-# ---- The files that a crate names, with the hashes that it states of them ------------------------------------------
+# ---- Files listed in a crate, with their recorded hashes ------------------------------------------------------------
 
-_EXPECTED = "an RO-Crate as the workflow writes it"
+_EXPECTED = "an RO-Crate written by the workflow"
 
 
 @dataclass(frozen=True)
 class CrateFile:
-    """A file that a crate names.
+    """File listed in a crate with its hash.
 
     Attributes
     ----------
     path
-        Where it lies, or would.
+        Path of the file, whether or not it exists.
     sha256
-        Its hash as the crate states it, hex.
+        Hash recorded in the crate, hex.
     """
 
     path: Path
@@ -381,19 +379,19 @@ class CrateFile:
 
 
 def recorded_files(root: Path, *, inputs: bool = True) -> dict[str, CrateFile]:
-    """Return the files that a crate states hashes of, by their names in it; none is opened.
+    """Return the files with hashes in a crate, by their names in it; the files are not opened.
 
     Parameters
     ----------
     root
-        The crate's folder, a campaign's results.
+        Folder of the crate: the results of a campaign.
     inputs
-        Recordings and config, too, which lie in the folder above.
+        True to include recordings and config, which are in the parent folder.
 
     Raises
     ------
     CampaignError
-        If there is no crate, it is damaged, or it names a file outside of these folders.
+        If the crate is missing or damaged, or lists a file outside of these folders.
 
     Examples
     --------
@@ -406,13 +404,13 @@ def recorded_files(root: Path, *, inputs: bool = True) -> dict[str, CrateFile]:
     document = read_json(crate, expected=_EXPECTED, remedy="Run the workflow first.", largest=LARGEST_DOCUMENT)
     with undamaged(crate, expected=_EXPECTED, remedy=DAMAGED):
         files = [_recorded(entity, root, crate) for entity in document["@graph"] if "sha256" in entity]
-    return {name: file for name, file, outside in files if inputs or not outside}
+    return {name: file for name, file, is_input in files if inputs or not is_input}
 
 
 def _recorded(entity: dict[str, Any], root: Path, crate: Path) -> tuple[str, CrateFile, bool]:
-    """Return name and place of a file, and whether it lies above the crate."""
+    """Return name and file of an entity, and True if it is an input outside of the crate's folder."""
     identifier, prefix = str(entity["@id"]), input_id("")
-    outside = identifier.startswith(prefix)
+    is_input = identifier.startswith(prefix)
     name = unquote(identifier.removeprefix(prefix))
-    path = ConfinedPath.at(root.parent if outside else root).named(name, where=crate)
-    return name, CrateFile(path, str(entity["sha256"])), outside
+    path = ConfinedPath.at(root.parent if is_input else root).named(name, where=crate)
+    return name, CrateFile(path, str(entity["sha256"])), is_input

@@ -1,4 +1,4 @@
-"""Images as a static STAC catalog: one item for each, with footprint, time, radar, processing, files and inputs."""
+"""Static STAC catalog of images: one item per image, with footprint, time, radar, processing, files and inputs."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -30,7 +30,7 @@ EXTENSIONS: Mapping[str, str] = {
     "sar": f"{_BASE}/sar/v1.3.0/schema.json",
     "view": f"{_BASE}/view/v1.1.0/schema.json",
 }
-"""Prefix of the fields → address of the schema, which is its name: nothing is fetched."""
+"""Prefix of the fields → URI of the schema, used as identifier only; nothing is downloaded."""
 
 _BANDS_GHZ = {
     "P": (0.25, 1.0),
@@ -42,22 +42,22 @@ _BANDS_GHZ = {
     "K": (18.0, 26.5),
     "Ka": (26.5, 40.0),
 }
-"""Frequency bands of the extension; it knows none below P, nor above Ka."""
+"""Frequency bands of the SAR extension, which defines none below P and above Ka."""
 
-_FIRST_CLOCK = datetime(1980, 1, 6, tzinfo=UTC)  # GPS time begins; nothing here was recorded before
-_NO_CLOCK = "none: the recording carries no time of day, so times count pulses from 1970-01-01"
+_FIRST_CLOCK = datetime(1980, 1, 6, tzinfo=UTC)  # epoch of GPS time; earlier times are pulse counters
+_NO_CLOCK = "none: the recording contains no time of day; times are pulse numbers in seconds since 1970-01-01"
 
 
 @dataclass(frozen=True)
 class AcquisitionTime:
-    """When an image was recorded, and on which frequencies.
+    """Acquisition time and frequency band of an image.
 
     Attributes
     ----------
     start, end
         UTC of the first and of the last pulse.
     centre_hz, bandwidth_hz
-        Of the band that was received.
+        Centre frequency and bandwidth of the received band.
     """
 
     start: datetime
@@ -67,12 +67,12 @@ class AcquisitionTime:
 
     @property
     def middle(self) -> datetime:
-        """The instant half way."""
+        """Mid-time between start and end."""
         return self.start + (self.end - self.start) / 2
 
     @property
     def fields(self) -> dict[str, Any]:
-        """Fields of the extension sar that follow; without the band where it has no letter."""
+        """Fields of the SAR extension, without the frequency band if it has no letter."""
         ghz = self.centre_hz / 1e9
         band = next((name for name, (low, high) in _BANDS_GHZ.items() if low <= ghz < high), None)
         return {
@@ -84,7 +84,7 @@ class AcquisitionTime:
 
     @classmethod
     def together(cls, parts: Sequence["AcquisitionTime"]) -> "AcquisitionTime":
-        """Return that of a sum: from the first pulse to the last, over all frequencies.
+        """Combine the acquisitions of a sum: from the first to the last pulse, over all frequencies.
 
         Examples
         --------
@@ -101,16 +101,16 @@ class AcquisitionTime:
 
 
 def projection(wkt: str, shape: tuple[int, int], transform: Sequence[float]) -> dict[str, Any]:
-    """Return the properties of the projection extension of a north-up raster.
+    """Return the properties of the projection extension for a north-up raster.
 
     Parameters
     ----------
     wkt
-        Its CRS, as pyproj reads it.
+        CRS in any format supported by pyproj.
     shape
         Rows, columns.
     transform
-        The six numbers of an affine transform, row by row: column and row to easting and northing, metres.
+        Six coefficients of the affine transform, row by row: column and row to easting and northing, metres.
 
     Examples
     --------
@@ -152,7 +152,7 @@ MEDIA_TYPES: Mapping[str, str] = {
     ".xml": "application/xml",
     ".yaml": "application/yaml",
 }
-"""How the name of a file ends → its media type."""
+"""Suffix of a file → its media type."""
 
 UNKNOWN_TYPE = "application/octet-stream"
 
@@ -174,13 +174,13 @@ class FileFacts:
     Attributes
     ----------
     title
-        Title for people.
+        Title.
     bands
-        Of a raster: common fields and those of the raster extension, one mapping a band.
+        For a raster: common fields and those of the raster extension, one mapping per band.
     inputs
-        Source file of a raster → sha256.
+        For a raster: source file → SHA-256.
     place
-        Of a raster: shape and transform, fields of the projection extension.
+        For a raster: shape and transform, fields of the projection extension.
     """
 
     title: str
@@ -190,7 +190,7 @@ class FileFacts:
 
 
 def multihash(sha256: str) -> str:
-    """Return a sha256 as the file extension writes it: which hash, how many bytes, the hash.
+    """Format a SHA-256 as multihash for the file extension: code of the hash, length in bytes, hash.
 
     Examples
     --------
@@ -201,7 +201,7 @@ def multihash(sha256: str) -> str:
 
 
 def media_type(name: str) -> str:
-    """Return the media type of a file by its name.
+    """Return the media type of a file according to its name.
 
     Examples
     --------
@@ -212,16 +212,16 @@ def media_type(name: str) -> str:
 
 
 def read_facts(path: Path) -> FileFacts:
-    """Return the metadata of a file; of a GeoTIFF its bands and the sources stated in its tags.
+    """Read the metadata of a file; for a GeoTIFF, its bands and the sources stated in its tags.
 
     Raises
     ------
     CampaignError
-        If it is called a GeoTIFF and cannot be opened as one.
+        If a .tif file cannot be opened as GeoTIFF.
     """
     if path.suffix != ".tif":
         return FileFacts(path.name)
-    expected, remedy = "a GeoTIFF of the workflow", "Delete the manifest beside it and run the workflow again."
+    expected, remedy = "a GeoTIFF of the workflow", "Delete the manifest in its folder and run the workflow again."
     try:
         with opened_raster(path, expected=expected, remedy=remedy) as raster:
             bands = [_band(raster, number) for number in range(raster.count)]
@@ -234,32 +234,32 @@ def read_facts(path: Path) -> FileFacts:
 
 
 def _band(raster: Any, number: int) -> dict[str, Any]:
-    dtype, nodata, unit = (of[number] for of in (raster.dtypes, raster.nodatavals, raster.units))
+    dtype, nodata, unit = (values[number] for values in (raster.dtypes, raster.nodatavals, raster.units))
     band: dict[str, Any] = {
         "data_type": {"complex64": "cfloat32", "complex128": "cfloat64"}.get(dtype, dtype),
         "raster:sampling": "area",
         "raster:spatial_resolution": raster.res[0],
     }
     if nodata is not None:
-        band["nodata"] = "nan" if nodata != nodata else nodata  # noqa: PLR0124 - NaN alone differs from itself
+        band["nodata"] = "nan" if nodata != nodata else nodata  # noqa: PLR0124 - only NaN differs from itself
     if unit:
         band["unit"] = unit
     return band
 
 
 def asset_of(path: Path, href: str, *, sha256: str, facts: FileFacts) -> pystac.Asset:
-    """Return the asset of a file.
+    """Build the STAC asset of a file.
 
     Parameters
     ----------
     path
-        The file; only its size is looked up.
+        The file; only its size is read.
     href
         Path relative to the item, percent-encoded.
     sha256
-        Of its bytes, hex.
+        SHA-256 of the file, hex.
     facts
-        Its metadata, from `read_facts`.
+        Metadata of the file, from `read_facts`.
     """
     name = path.name
     roles = _ROLES.get(name) or _ROLES_OF_TYPE.get(path.suffix) or ("metadata",)
@@ -272,33 +272,33 @@ def asset_of(path: Path, href: str, *, sha256: str, facts: FileFacts) -> pystac.
 # ---- Static catalog: one item per image -----------------------------------------------------------------------------
 
 RECORDED = "apertura:recorded"
-"""Field of the catalog: the first and the last pulse of all images, UTC."""
+"""Field of the catalog: UTC of the first and the last pulse of all images."""
 
-_NO_PLACE = "Local axes without a place on Earth: items have no geometry, and there is no collection, which needs one."
+_NO_PLACE = "Local frame, not georeferenced: items have no geometry, and there is no collection, which requires one."
 
 
 @dataclass(frozen=True)
 class Image:
-    """One image of a flight, the content of an item.
+    """Image of a flight, the content of a STAC item.
 
     Attributes
     ----------
     flight, name
-        Which: a pair, 'coherent' or 'noncoherent'.
+        Flight, and name of the image: a pair, 'coherent' or 'noncoherent'.
     title
-        Title for people.
+        Title.
     geometry
-        GeoJSON, longitude and latitude of WGS 84; None in a local frame, or where nothing was illuminated.
+        GeoJSON, longitude and latitude of WGS 84; None in a local frame, or if nothing was illuminated.
     acquisition
-        When and on which frequencies.
+        Acquisition time and frequency band.
     properties
-        Fields of the extensions, and measures of the image.
+        Fields of the extensions, and quality measures of the image.
     assets
         Key → file.
     inputs
-        File relative to the campaign folder → sha256, as it was read.
+        File relative to the campaign folder → SHA-256 of its content when it was read.
     made_from
-        Names of images of the flight that it is the sum of.
+        Names of the flight's images that are summed in this image.
     """
 
     flight: str
@@ -313,42 +313,42 @@ class Image:
 
     @property
     def id(self) -> str:
-        """Its identifier: names hold no hyphen but the one inside a pair, so no two images share it."""
+        """Identifier, unique because names contain no hyphen except that of a pair."""
         return f"{self.flight}-{self.name}"
 
 
 def item_of(image: Image, root: str) -> pystac.Item:
-    """Return the item of an image.
+    """Build the STAC item of an image.
 
     Parameters
     ----------
     image
-        Its content.
+        Content of the item.
     root
-        The campaign folder, relative to the item.
+        Path of the campaign folder, relative to the item.
 
     Examples
     --------
     >>> from datetime import timedelta
     >>> start = datetime(2025, 5, 14, 9, tzinfo=UTC)
-    >>> flown = AcquisitionTime(start, start + timedelta(seconds=20), 1.4e9, 4e8)
+    >>> acquisition = AcquisitionTime(start, start + timedelta(seconds=20), 1.4e9, 4e8)
     >>> square = {"type": "Polygon", "coordinates": [[[9, 48], [9.1, 48], [9.1, 48.1], [9, 48.1], [9, 48]]]}
-    >>> item = item_of(Image("f01", "a-b", "a scene", square, flown, {}), "../../..")
+    >>> item = item_of(Image("f01", "a-b", "a scene", square, acquisition, {}), "../../..")
     >>> item.id, item.bbox, item.datetime.isoformat(), item.properties["sar:frequency_band"]
     ('f01-a-b', [9.0, 48.0, 9.1, 48.1], '2025-05-14T09:00:10+00:00', 'L')
     """
-    flown = image.acquisition
-    named = {"title": image.title, "apertura:flight": image.flight, "apertura:image": image.name}
-    facts = {**named, **flown.fields, **image.properties}
+    acquisition = image.acquisition
+    names = {"title": image.title, "apertura:flight": image.flight, "apertura:image": image.name}
+    properties = {**names, **acquisition.fields, **image.properties}
     item = pystac.Item(
         image.id,
         None if image.geometry is None else dict(image.geometry),
         None if image.geometry is None else bounds([image.geometry]),
-        flown.middle,
-        facts,
-        flown.start,
-        flown.end,
-        [uri for prefix, uri in EXTENSIONS.items() if prefix != "view" or "view:incidence_angle" in facts],
+        acquisition.middle,
+        properties,
+        acquisition.start,
+        acquisition.end,
+        [uri for prefix, uri in EXTENSIONS.items() if prefix != "view" or "view:incidence_angle" in properties],
     )
     for key, asset in image.assets.items():
         item.add_asset(key, asset)
@@ -363,25 +363,25 @@ def item_of(image: Image, root: str) -> pystac.Item:
 
 
 def bounds(geometries: Iterable[Mapping[str, Any]]) -> list[float]:
-    """Return west, south, east, north of GeoJSON geometries, degrees; west > east across the antimeridian.
+    """Return west, south, east, north of GeoJSON geometries in degrees; west > east across the antimeridian.
 
     Examples
     --------
     >>> bounds([{"coordinates": [[[1, 2], [3, 4]]]}, {"coordinates": [[0, 9]]}])
     [0.0, 2.0, 3.0, 9.0]
     """
-    places = [place for geometry in geometries for place in _places(geometry["coordinates"])]
-    longitudes, latitudes = zip(*places, strict=True)
+    positions = [position for geometry in geometries for position in _positions(geometry["coordinates"])]
+    longitudes, latitudes = zip(*positions, strict=True)
     west, east = longitude_range(np.array(longitudes))
     return [west, min(latitudes), east, max(latitudes)]
 
 
-def _places(nested: Sequence[Any]) -> Iterator[tuple[float, float]]:
+def _positions(nested: Sequence[Any]) -> Iterator[tuple[float, float]]:
     if isinstance(nested[0], (int, float)):
         yield float(nested[0]), float(nested[1])
     else:
         for part in nested:
-            yield from _places(part)
+            yield from _positions(part)
 
 
 def catalog_files(
@@ -392,23 +392,23 @@ def catalog_files(
     author: str | None = None,
     doi: str | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """Return every file of the catalog of some images, its path in the catalog's folder → JSON.
+    """Return all files of the catalog of images: path in the catalog's folder → JSON.
 
-    Links are relative and nothing names itself, so that the folder may be moved or served from anywhere.
+    Links are relative and there are no self links, so that the folder may be moved or served from any location.
 
     Parameters
     ----------
     campaign
-        Its name, free text.
+        Name of the campaign, free text.
     images
-        In any order; their files lie in the folder that holds the catalog's folder.
+        The images, in any order; their files are in the parent folder of the catalog's folder.
     licence, author, doi
-        Of all images: an SPDX identifier, a name, a DOI; None: not stated.
+        SPDX identifier, name and DOI for all images; None: not stated.
     """
     ordered = sorted(images, key=lambda image: (image.flight, image.name))
     times = min(image.acquisition.start for image in ordered), max(image.acquisition.end for image in ordered)
-    facts = {RECORDED: [pystac.utils.datetime_to_str(time) for time in times]}
-    catalog = pystac.Catalog("apertura", f"Images of the campaign {campaign}.", title=campaign, extra_fields=facts)
+    fields = {RECORDED: [pystac.utils.datetime_to_str(time) for time in times]}
+    catalog = pystac.Catalog("apertura", f"Images of the campaign {campaign}.", title=campaign, extra_fields=fields)
     parent = _parent(campaign, ordered, times)
     if isinstance(parent, pystac.Collection):
         parent.license = licence or "other"
@@ -423,37 +423,37 @@ def catalog_files(
     catalog.catalog_type = pystac.CatalogType.SELF_CONTAINED
     catalog.normalize_hrefs("/stac", _layout(), skip_unresolved=True)
     files = {}
-    for thing in [catalog, parent, *parent.get_items()]:
-        files[str(thing.self_href).removeprefix("/stac/")] = thing.to_dict(include_self_link=False)
+    for entry in [catalog, parent, *parent.get_items()]:
+        files[str(entry.self_href).removeprefix("/stac/")] = entry.to_dict(include_self_link=False)
     return files
 
 
 def _layout() -> CustomLayoutStrategy:
-    """Return the layout of the files: catalog.json, beside it the parent of the items, images/<flight>/<image>.json."""
+    """Return the layout of the files: catalog.json, in the same folder the parent, images/<flight>/<image>.json."""
 
-    def item(one: pystac.Item, folder: str) -> str:
-        flight, _, name = one.id.partition("-")
+    def path_of(item: pystac.Item, folder: str) -> str:
+        flight, _, name = item.id.partition("-")
         return f"{folder}/images/{flight}/{name}.json"
 
     return CustomLayoutStrategy(
         catalog_func=lambda _, folder, is_root: f"{folder}/{CATALOG if is_root else 'images.json'}",
         collection_func=lambda _, folder, _is_root: f"{folder}/collection.json",
-        item_func=item,
+        item_func=path_of,
     )
 
 
 def _parent(campaign: str, images: Sequence[Image], times: tuple[datetime, datetime]) -> pystac.Catalog:
-    """Return the parent of the items: a collection, or a catalog where the campaign has no place."""
-    placed = [image.geometry for image in images if image.geometry is not None]
+    """Return the parent of the items: a collection, or a catalog if the campaign is not georeferenced."""
+    geometries = [image.geometry for image in images if image.geometry is not None]
     title = f"{campaign} · images"
-    if not placed:
+    if not geometries:
         return pystac.Catalog("images", f"Radar images of the campaign {campaign}. {_NO_PLACE}", title)
-    extent = pystac.Extent(pystac.SpatialExtent([bounds(placed)]), pystac.TemporalExtent([list(times)]))
+    extent = pystac.Extent(pystac.SpatialExtent([bounds(geometries)]), pystac.TemporalExtent([list(times)]))
     return pystac.Collection("images", f"Radar images of the campaign {campaign}.", extent, title, license="other")
 
 
 def instant(nanoseconds: int) -> datetime:
-    """Return a time of a recording, whole microseconds.
+    """Convert nanoseconds since 1970 to a UTC datetime, truncated to microseconds.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""A static STAC catalog validated against the schemas of pystac and of this package; nothing is downloaded."""
+"""Validation of a static STAC catalog against the schemas of pystac and of this package; nothing is downloaded."""
 
 import json
 from collections.abc import Iterator
@@ -22,12 +22,12 @@ _DOWN = frozenset({"child", "item"})
 
 
 def stac_problems(folder: Path) -> list[str]:
-    """Return the errors of a catalog: a line for each file that violates its schemas or is missing.
+    """Validate a catalog; return one line for each file that violates its schemas or is missing.
 
     Parameters
     ----------
     folder
-        Which holds catalog.json.
+        Folder that contains catalog.json.
 
     Examples
     --------
@@ -38,7 +38,7 @@ def stac_problems(folder: Path) -> list[str]:
 
 
 def document_problem(document: dict[str, Any]) -> str | None:
-    """Find the error of one catalog, collection or item as JSON; None: it is valid.
+    """Validate a catalog, collection or item as JSON; return the first error, or None if it is valid.
 
     Examples
     --------
@@ -50,12 +50,12 @@ def document_problem(document: dict[str, Any]) -> str | None:
 
     kind = identify_stac_object_type(document)
     if kind is None:
-        return "neither a catalog nor a collection nor an item of STAC"
+        return "not a STAC catalog, collection or item"
     version = str(identify_stac_object(document).version_range.latest_valid_version())
     extensions = document.get("stac_extensions", [])
     unknown = [uri for uri in extensions if uri not in _schemas()]
     if unknown:
-        return f"no schema of {unknown[0]} here"
+        return f"the schema of {unknown[0]} is not available"
     try:
         _validator().validate(document, kind, version, extensions)
     except pystac.STACValidationError as error:
@@ -64,15 +64,15 @@ def document_problem(document: dict[str, Any]) -> str | None:
 
 
 def _problems(folder: Path, start: str) -> Iterator[str]:
-    waiting, seen = [start], set[str]()
+    waiting, visited = [start], set[str]()
     while waiting:
         name = waiting.pop()
-        if name in seen:
+        if name in visited:
             continue
-        seen.add(name)
+        visited.add(name)
         try:
             document = read_json(
-                ConfinedPath.at(folder).named(name, where=folder), expected="a STAC catalog", remedy="Make it again."
+                ConfinedPath.at(folder).named(name, where=folder), expected="a STAC catalog", remedy="Create it again."
             )
         except CampaignError as error:
             yield f"{name}: {error.found}"
@@ -84,13 +84,13 @@ def _problems(folder: Path, start: str) -> Iterator[str]:
 
 
 def _below(name: str, document: dict[str, Any]) -> Iterator[str]:
-    """Yield the files that a file of the catalog leads down to, relative to its folder."""
+    """Yield the child files linked in a file of the catalog, relative to the catalog's folder."""
     links = document.get("links")
     for link in links if isinstance(links, list) else ():
         if isinstance(link, dict) and link.get("rel") in _DOWN and isinstance(link.get("href"), str):
-            way = urlsplit(link["href"]).path.removeprefix("./")
-            above = name.rpartition("/")[0]
-            yield unquote(f"{above}/{way}" if above else way)
+            path = urlsplit(link["href"]).path.removeprefix("./")
+            parent = name.rpartition("/")[0]
+            yield unquote(f"{parent}/{path}" if parent else path)
 
 
 def _reason(error: pystac.STACValidationError) -> str:
@@ -99,7 +99,7 @@ def _reason(error: pystac.STACValidationError) -> str:
     causes = error.source if isinstance(error.source, list) else [error.source]
     first = causes[0] if causes else error
     if isinstance(first, ValidationError):
-        deepest = min([first, *first.context], key=lambda one: -len(one.absolute_path)) if first.context else first
+        deepest = min([first, *first.context], key=lambda part: -len(part.absolute_path)) if first.context else first
         at = "/".join(map(str, deepest.absolute_path))
         return f"{at}: {deepest.message}" if at else deepest.message
     return str(error)

@@ -1,9 +1,9 @@
-"""Files for other programs: one module per format, one row per file.
+"""Table of export products for other programs: one module per format, one row per file.
 
-A row states the file's name, its source raster and the function that writes it. Rows drive the rules of the workflow,
-the steps and the tests; nothing else names a product. To add one, write a function such as
-`apertura.formats.export.cog.write_power` and add its row to `EXPORTS`; or, from another package, register an `Export`
-as entry point of group ``apertura.exports``. Importing this module imports no format.
+A row states the name of the file, its source raster and the function that writes it. Workflow rules, steps and tests
+are all derived from these rows. To add a product, write a function such as `apertura.formats.export.cog.write_power`
+and add its row to `EXPORTS`; or, from another package, register an `Export` as entry point of group
+``apertura.exports``. Importing this module imports no format.
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -44,36 +44,37 @@ SOURCES: Mapping[str, str] = {
     "height_std": "interferogram",
     "panels": "interferogram",
 }
-"""Raster that a file may be written from → kind of folder the file lies in.
+"""Source raster of a file → kind of folder that contains the file.
 
-Those of radiometry lie beside layers where a pair is calibrated: complex, of the power that they are named after; those
-of multilook, where they are asked for: mean power of squares of pixels, real, on a coarser grid; ``multilook_noise`` is
-the mean power of the noise in those of the echoes, where it is subtracted.
-``image`` is a pair's, complex; ``coherent`` the complex and ``noncoherent`` the power sum of a flight's pairs, as a
-complex amplitude without phase, ``magnitude`` the sum of their magnitudes; layers explain a pair's image, real, and
-lie beside it; those of an interferogram are of two images, ``panels`` all of them by name.
+``image`` is the complex image of a pair. ``coherent`` is the complex sum and ``noncoherent`` the power sum of a
+flight's pairs, the latter as complex amplitude without phase; ``magnitude`` is the sum of their magnitudes. Layers are
+real rasters that describe the image of a pair, in the same folder. Rasters of radiometry exist for calibrated pairs, in
+the folder of the layers: complex amplitudes, whose power is the named coefficient. Rasters of multilook exist if
+requested: mean power of square blocks of pixels, real, on a coarser grid; ``multilook_noise`` is the mean noise power
+that is subtracted from the echo power. Rasters of an interferogram belong to two images; ``panels`` are all of them by
+name.
 """
 
 
 @dataclass(frozen=True)
 class Export:
-    """A product: one row of the table.
+    """Product: one row of the table.
 
     Attributes
     ----------
     file
-        Its name in the folder of the pair or of the fused images.
+        Name in the folder of the pair or of the fused images.
     source
         A key of `SOURCES`.
     write
-        Writes the file, as ``write(path, raster, transform=…, crs=…, tags=…, title=…)``; see
+        Function that writes the file, ``write(path, raster, transform=…, crs=…, tags=…, title=…)``; see
         `apertura.formats.export.cog.write_slc`.
     pictured
-        Whether the workflow's report shows it.
+        True if the workflow report shows the file.
     opened
-        What the summary says beside its name, how to open it; empty: the summary does not name it.
+        Hint in the summary on how to open the file; empty: the summary does not list the file.
     mosaicked
-        Whether the rasters of all flights are mosaicked: GDAL cannot mosaic complex ones.
+        True if the rasters of all flights are mosaicked; GDAL cannot mosaic complex rasters.
     """
 
     file: str
@@ -90,7 +91,7 @@ class Export:
 
     @property
     def style(self) -> bool:
-        """True if it is the style in which QGIS shows the raster of its name."""
+        """True if the file is the QGIS style of the raster with the same name."""
         return self.module == "apertura.formats.export.style"
 
 
@@ -109,7 +110,7 @@ EXPORTS: tuple[Export, ...] = (
         "image",
         _WRITERS.quicklook.write_quicklook,
         pictured=True,
-        opened="with the quality of the image",
+        opened="image with quality information",
     ),
     Export("coherent_slc.tif", "coherent", _WRITERS.cog.write_slc, mosaicked=False),
     Export("coherent_power.tif", "coherent", _WRITERS.cog.write_power),
@@ -121,7 +122,7 @@ EXPORTS: tuple[Export, ...] = (
         "coherent",
         _WRITERS.quicklook.write_quicklook,
         pictured=True,
-        opened="with the quality of the image",
+        opened="image with quality information",
     ),
     Export("noncoherent_power.tif", "noncoherent", _WRITERS.cog.write_power),
     Export("noncoherent_power.qml", "noncoherent", _WRITERS.style.write_linear_style),
@@ -129,7 +130,7 @@ EXPORTS: tuple[Export, ...] = (
         "noncoherent_db.tif",
         "noncoherent",
         _WRITERS.db.write_db,
-        opened="in a GIS, the incoherent sum",
+        opened="in a GIS (noncoherent sum)",
     ),
     Export("noncoherent_db.qml", "noncoherent", _WRITERS.style.write_db_style),
     Export("noncoherent_magnitude.tif", "magnitude", _WRITERS.cog.write_magnitude),
@@ -170,7 +171,7 @@ EXPORTS: tuple[Export, ...] = (
         "height.tif",
         "height",
         _WRITERS.interferogram.write_height,
-        opened="in a GIS, with its deviation beside it",
+        opened="in a GIS, with the standard deviation in height_std.tif",
     ),
     Export("height.qml", "height", _WRITERS.style.write_layer_style),
     Export("height_std.tif", "height_std", _WRITERS.interferogram.write_height_std),
@@ -178,24 +179,24 @@ EXPORTS: tuple[Export, ...] = (
     Export("quicklook.png", "panels", _WRITERS.interferogram.write_panels, pictured=True),
     *_ADDED,
 )
-"""Every product of a pair or of a flight's sums, in the order in which they are written."""
+"""All products of a pair or of a flight's sums, in the order in which they are written."""
 
-_OPTIONAL = ("radiometry", "multilook", "multilook_fused")  # kinds of which those rows are written that are asked for
+_OPTIONAL = ("radiometry", "multilook", "multilook_fused")  # kinds whose rows are only written if requested
 
 PHASE_HISTORY = "phase_history.cphd"
-"""Transfer functions of a pair; as large as its echo, and so written for those who ask for it."""
+"""Transfer functions of a pair; written only if requested, because the file is as large as the echo."""
 
 COVERAGE = ("coverage.png", "coverage.geojson")
-"""What shows the whole campaign."""
+"""Coverage of the whole campaign, as plot and as GeoJSON."""
 
 MOSAICS = "mosaic"
-"""Folder of the rasters of all flights."""
+"""Folder of the mosaics of all flights."""
 
-LOOK = "look"
-"""Folder of what `apertura look` shows, laid out like the results."""
+PREVIEW = "preview"
+"""Folder of the images of `apertura preview`, laid out like the results."""
 
 MAP = "map/map.json"
-"""What `apertura map` shows of all of them in a browser."""
+"""Description of the web map of `apertura map`."""
 
 
 def exports_in(folder: str) -> Iterator[Export]:
@@ -210,7 +211,7 @@ def exports_in(folder: str) -> Iterator[Export]:
 
 
 def added_exports(folder: str) -> list[Export]:
-    """Return the rows of a kind that other packages add."""
+    """Return the rows of a kind that are registered by other packages."""
     return [export for export in _ADDED if SOURCES[export.source] == folder]
 
 
@@ -226,7 +227,7 @@ def product(source: str, function: str) -> Export:
 
 
 def export_modules(folder: str) -> list[str]:
-    """Return the modules that write the files of a kind of folder: code whose change makes them again.
+    """List the modules that write the files of a kind of folder; a change of their code makes the files out of date.
 
     Examples
     --------
@@ -237,34 +238,35 @@ def export_modules(folder: str) -> list[str]:
 
 
 def mosaics(images: Mapping[str, Sequence[str]], coefficients: Sequence[str] = ()) -> dict[str, list[str]]:
-    """Return the rasters of all flights, relative to `MOSAICS` → what they are made of, relative to the results.
+    """Return the mosaics of all flights: path relative to `MOSAICS` → source rasters, relative to the results.
 
-    Images of one pair, or the sums of a flight: others are taken from other places, or mean something else.
+    Only images of the same pair, or the sums of flights, are combined; other images have different view geometry or
+    meaning.
 
     Parameters
     ----------
     images
-        Flight → its images, as `product_files`; the lowest flight first.
+        Flight → its images, as in `product_files`; the lowest flight first.
     coefficients
-        Sources of kinds ``radiometry`` and ``multilook`` that are written.
+        Written sources of kinds ``radiometry`` and ``multilook``.
 
     Examples
     --------
     >>> mosaics({"f01": ["a-b"], "f02": ["a-a", "a-b"]})["a-b/db.vrt"]
     ['f01/a-b/db.tif', 'f02/a-b/db.tif']
     """
-    found: dict[str, list[str]] = {}
+    sources: dict[str, list[str]] = {}
     for flight, folders in images.items():
         for folder in folders:
             for row in _written(folder, coefficients):
                 if row.mosaicked and row.file.endswith(".tif"):
                     name = f"{folder}/{row.file.removesuffix('.tif')}.vrt"
-                    found.setdefault(name, []).append(f"{flight}/{folder}/{row.file}")
-    return found
+                    sources.setdefault(name, []).append(f"{flight}/{folder}/{row.file}")
+    return sources
 
 
 def mosaic_files(images: Mapping[str, Sequence[str]], coefficients: Sequence[str] = ()) -> Iterator[str]:
-    """Yield the rasters of all flights and their styles, relative to the results; as `mosaics`."""
+    """Yield the paths of the mosaics and their styles, relative to the results; for the parameters see `mosaics`."""
     styles = {row.file for row in EXPORTS if row.style}
     for name in mosaics(images, coefficients):
         style = f"{name.removesuffix('.vrt')}.qml"
@@ -272,21 +274,21 @@ def mosaic_files(images: Mapping[str, Sequence[str]], coefficients: Sequence[str
 
 
 def _written(image: str, coefficients: Sequence[str]) -> Iterator[Export]:
-    """Yield the rows of the files in the folder of an image, of optional ones those of the coefficients written."""
+    """Yield the rows of the files in the folder of an image; of optional kinds, only those of the coefficients."""
     kinds = ("fused", "multilook_fused") if image == "fused" else ("pair", "layers", "radiometry", "multilook")
     rows = (row for kind in kinds for row in exports_in(kind))
     return (row for row in rows if SOURCES[row.source] not in _OPTIONAL or row.source in coefficients)
 
 
 def product_files(images: Mapping[str, Sequence[str]], coefficients: Sequence[str] = ()) -> Iterator[str]:
-    """Yield every file that a finished campaign offers its user, relative to the results.
+    """Yield the paths of all products of a finished campaign, relative to the results.
 
     Parameters
     ----------
     images
-        Flight → its images: pairs, and 'fused' where there are sums of them.
+        Flight → its images: pairs, and 'fused' if there are sums of pairs.
     coefficients
-        As of `mosaics`.
+        See `mosaics`.
 
     Examples
     --------
@@ -312,37 +314,37 @@ def write_exports(
     radiometry: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
     **shared: Any,
 ) -> list[Path]:
-    """Write every file of a kind of folder; return their paths.
+    """Write all files of a kind of folder; return their paths.
 
     Parameters
     ----------
     kind
         A value of `SOURCES`.
     folder
-        Where they go.
+        Output folder.
     rasters, titles
-        Source → (y, x) raster on the campaign's grid, and its title; of ``radiometry`` and ``multilook`` those
-        that are asked for.
+        Source → (y, x) raster on the campaign's grid, and its title; of ``radiometry`` and ``multilook`` only the
+        requested ones.
     tags
-        Of every file, name → text.
+        Tags of every file, name → text.
     radiometry
-        Source → `apertura.formats.export.radiometry.Radiometry.report`, of images.
+        Source → `apertura.formats.export.radiometry.Radiometry.report`, for images.
     **shared
-        ``transform`` and ``crs``, as `apertura.formats.export.cog.write_slc` takes them.
+        ``transform`` and ``crs``, see `apertura.formats.export.cog.write_slc`.
     """
     written = []
     for export in exports_in(kind):
         path, source = folder / export.file, export.source
         if kind in _OPTIONAL and source not in rasters:
             continue
-        means = {TAG: canonical_json(radiometry[source])} if source in radiometry else {}
-        export.write(path, rasters[source], title=titles[source], tags={**tags, **means}, **shared)
+        radiometry_tag = {TAG: canonical_json(radiometry[source])} if source in radiometry else {}
+        export.write(path, rasters[source], title=titles[source], tags={**tags, **radiometry_tag}, **shared)
         written.append(path)
     return written
 
 
 def remove_outdated(folder: Path, written: Collection[Path]) -> None:
-    """Remove optional rasters and cross-sections that an earlier run wrote into a folder and this one did not."""
+    """Remove optional rasters and cross-sections in a folder that were written by an earlier run only."""
     rows = [row.file for kind in _OPTIONAL for row in exports_in(kind)]
     mosaicked = [f"{name.removesuffix('.tif')}.vrt" for name in rows if name.endswith(".tif")]
     for name in (*rows, *mosaicked, CROSS_SECTIONS):

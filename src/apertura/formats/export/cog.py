@@ -1,7 +1,7 @@
-"""Images as cloud-optimised GeoTIFFs: `slc` keeps the carrier, `power` is for measuring.
+"""Export of images as cloud-optimised GeoTIFF: complex with carrier phase (`slc`), and power for measurements.
 
-Pixels pass through in blocks, so that an image far larger than memory can come tile by tile from
-zarr or dask. Nothing here reads a clock: identical inputs give identical bytes.
+Pixels are processed in blocks, so that an image much larger than memory can be read tile by tile from zarr or dask.
+Output contains no time stamps: identical inputs give identical bytes.
 """
 
 import json
@@ -41,7 +41,7 @@ Pixels = NDArray[Any]
 
 
 class NorthUpRaster(Protocol):
-    """A 2-D array with row 0 in the north: numpy, dask, zarr or xarray."""
+    """2-D array with row 0 in the north: numpy, dask, zarr or xarray."""
 
     @property
     def shape(self) -> tuple[int, ...]: ...  # noqa: D102
@@ -56,15 +56,15 @@ class Band:
     Attributes
     ----------
     dtype, nodata
-        Type on disk, and the value of a pixel that holds nothing.
+        Data type on disk, and value of a pixel without data.
     unit, meaning
-        Written beside the band and as a tag; see `with_radiometry`.
+        Unit and description of the band, also written as a tag; see `with_radiometry`.
     overviews
-        What an overview makes of two by two pixels: see `halved`.
+        Resampling of two by two pixels for overviews, see `halved`.
     colours
-        Value → (red, green, blue), 0 to 255, of a band of classes.
+        Value → (red, green, blue), 0 to 255, for a band of classes.
     smooth
-        Whether neighbouring pixels of floats are alike: whole differences of them are compressed, else their bytes.
+        True if neighbouring floating-point pixels have similar values; selects the predictor of the compression.
     """
 
     dtype: str
@@ -76,7 +76,7 @@ class Band:
     smooth: bool = False
 
 
-SLC = Band("complex64", np.nan, "1", "{amplitude}, complex, carrier kept", "AVERAGE_MAGPHASE")
+SLC = Band("complex64", np.nan, "1", "{amplitude}, complex, with carrier phase", "AVERAGE_MAGPHASE")
 MAGNITUDE = Band("float32", np.nan, "1", "{amplitude}", "AVERAGE")
 POWER = Band("float32", np.nan, "1", "{power}, linear", "AVERAGE")
 
@@ -84,36 +84,36 @@ POWER = Band("float32", np.nan, "1", "{power}, linear", "AVERAGE")
 def write_slc(
     path: Path, image: NorthUpRaster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write the complex image as it is, carrier kept, as a CFloat32 COG.
+    """Write the complex image unchanged, with carrier phase, as a CFloat32 COG.
 
-    Its overviews average the magnitude and take the phase of the mean: the carrier turns from pixel
-    to pixel and would cancel a plain average.
+    Overviews have the mean magnitude and the phase of the mean, because the carrier phase changes from pixel to pixel
+    and would cancel in a complex average.
 
     Parameters
     ----------
     path
         ``….tif``; complete or absent.
     image
-        (y, x) complex64, north-up, NaN where nothing was formed; read block by block.
+        (y, x) complex64, north-up, NaN where no image is formed; read block by block.
     transform
         Outer corner of the north-west pixel, and spacing; metres in `crs`.
     crs
-        Such as ``EPSG:32632``, or the result of `apertura.core.geometry.geodesy.local_crs`.
+        For example ``EPSG:32632``, or the result of `apertura.core.geometry.geodesy.local_crs`.
     tags
         Provenance, name → text.
     title
-        Title for people, the TIFF's ImageDescription.
+        Title, written as ImageDescription of the TIFF.
 
     Raises
     ------
     ContractError
         If `image` is not two-dimensional and complex, or `transform` is not north-up.
     CampaignError
-        If `crs` is no coordinate reference system.
+        If `crs` is not a coordinate reference system.
 
     Notes
     -----
-    Source: GDAL's documentation of the COG driver, OVERVIEW_RESAMPLING.
+    Source: GDAL documentation of the COG driver, OVERVIEW_RESAMPLING.
 
     Examples
     --------
@@ -131,7 +131,7 @@ def write_slc(
 def write_power(
     path: Path, image: NorthUpRaster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write |image|² as a float32 COG; overviews average the power. Parameters and errors as `write_slc`."""
+    """Write |image|² as a float32 COG with overviews of averaged power. Parameters and errors as `write_slc`."""
     write_cog(path, image, POWER, transform=transform, crs=crs, tags=tags, title=title, value=power)
 
 
@@ -145,7 +145,7 @@ def write_magnitude(
 def write_mean_power(
     path: Path, power: NorthUpRaster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write the mean power of squares of pixels, (y, x) float32: below zero where the noise subtracted exceeds it.
+    """Write a multilooked power, (y, x) float32, negative where the subtracted noise power exceeds it.
 
     Parameters and errors as `write_slc`.
     """
@@ -164,40 +164,40 @@ def write_cog(
     value: Callable[[Pixels], Pixels] = np.asarray,
     shown: Callable[[Pixels], Pixels] = np.asarray,
 ) -> None:
-    """Write any north-up raster as a COG.
+    """Write a north-up raster as a COG.
 
     Parameters
     ----------
     path, transform, crs, tags, title
-        As `write_slc`.
+        See `write_slc`.
     image
         (y, x), north-up.
     band
-        Dtype, no data, unit and description.
+        Dtype, no-data value, unit and description.
     value
-        Block of `image` → values of which overviews are made.
+        Function from a block of `image` to the values that are averaged in overviews.
     shown
-        These values, or those of an overview → block of the file, in the dtype of `band`.
+        Function from these values, at full resolution or of an overview, to pixels of the file in the dtype of `band`.
 
     Raises
     ------
     ContractError, CampaignError
-        As `write_slc`.
+        See `write_slc`.
     """
-    place = placed(image, transform, crs)
+    georeference = placed(image, transform, crs)
     band, tags = with_radiometry(band, tags)
-    words = tags | ({"TIFFTAG_IMAGEDESCRIPTION": title} if title else {})
+    all_tags = tags | ({"TIFFTAG_IMAGEDESCRIPTION": title} if title else {})
     size = int(np.prod(image.shape)) * np.dtype(band.dtype).itemsize
     with gdal_replacement(path, size=size) as temporary:
         source = temporary.with_name("source.tif")
-        checksum = _fill(source, lambda block: value(np.asarray(image[block])), shown, band, place, words)
+        checksum = _fill(source, lambda block: value(np.asarray(image[block])), shown, band, georeference, all_tags)
         _finish(source, temporary, band)
         if size > IN_MEMORY_BYTES:
-            check_written(temporary, checksum, words)
+            check_written(temporary, checksum, all_tags)
 
 
 def power(image: Pixels) -> NDArray[np.float32]:
-    """Return |image|² of complex64, as float32.
+    """Compute |image|² of complex64 as float32.
 
     Examples
     --------
@@ -210,7 +210,7 @@ def power(image: Pixels) -> NDArray[np.float32]:
 
 
 def only(dtype: str) -> Callable[[Pixels], Pixels]:
-    """Return a function that returns its block if that is of a dtype, and raises ContractError else."""
+    """Return a function that returns its argument if it has the dtype, and raises ContractError otherwise."""
 
     def check(block: Pixels) -> Pixels:
         if block.dtype != dtype:
@@ -221,14 +221,14 @@ def only(dtype: str) -> Callable[[Pixels], Pixels]:
 
 
 def with_radiometry(band: Band, tags: Mapping[str, str]) -> tuple[Band, dict[str, str]]:
-    """Return a band and tags that state the meaning of its values, from `TAG` of its source raster.
+    """Add the meaning of pixel values, from the tag `TAG` of the source raster, to a band and to the tags.
 
     Parameters
     ----------
     band
-        Its meaning may name ``{amplitude}`` or ``{power}``.
+        Band whose meaning may contain ``{amplitude}`` or ``{power}``.
     tags
-        Of the file; without `TAG` the raster is any focused scene.
+        Tags of the file; without `TAG`, a focused image is assumed.
 
     Examples
     --------
@@ -242,33 +242,33 @@ def with_radiometry(band: Band, tags: Mapping[str, str]) -> tuple[Band, dict[str
     meanings = {
         name: value for name, value in raster.items() if name not in {"amplitude", "power"} and value is not None
     }
-    words = canonical_json({**meanings, "quantity": meaning, "unit": band.unit})
-    return replace(band, meaning=meaning), {**tags, TAG: words}
+    tag = canonical_json({**meanings, "quantity": meaning, "unit": band.unit})
+    return replace(band, meaning=meaning), {**tags, TAG: tag}
 
 
 def placed(image: NorthUpRaster, transform: Affine, crs: str) -> dict[str, Any]:
-    """Return size and georeference as rasterio names them."""
+    """Return size and georeference as keyword arguments for rasterio."""
     if len(image.shape) != 2:
         raise ContractError(f"image to export has shape {image.shape}, not (y, x)")
     if transform.b or transform.d or transform.a <= 0 or transform.e >= 0:
         raise ContractError(f"image to export is not north-up: {tuple(transform)[:6]}")
     try:
-        known = CRS.from_user_input(crs)
+        parsed_crs = CRS.from_user_input(crs)
     except CRSError as error:
         raise CampaignError(
             f"crs {crs!r}",
             where="scene",
-            expected="an EPSG code, or local axes as LOCAL_CS",
+            expected="an EPSG code, or a local frame as LOCAL_CS",
             remedy="Check scene.crs.",
         ) from error
-    return {"height": image.shape[0], "width": image.shape[1], "transform": transform, "crs": known}
+    return {"height": image.shape[0], "width": image.shape[1], "transform": transform, "crs": parsed_crs}
 
 
 def halved(pixels: Pixels, band: Band) -> Pixels:
-    """Return pixels at half the resolution, each of two by two that are not no data; at an odd edge, of fewer.
+    """Resample pixels to half the resolution, from groups of two by two valid pixels, fewer at an odd edge.
 
-    Their mean (AVERAGE), their mean magnitude with the phase of their mean (AVERAGE_MAGPHASE), the commonest, of
-    equally common ones that which is so first (MODE), or the first (NEAREST).
+    The result is their mean (AVERAGE), their mean magnitude with the phase of their mean (AVERAGE_MAGPHASE), their most
+    frequent value, the first one of equally frequent values (MODE), or the first pixel (NEAREST).
 
     Examples
     --------
@@ -282,7 +282,7 @@ def halved(pixels: Pixels, band: Band) -> Pixels:
         case "AVERAGE":
             return _mean(four, band.nodata)
         case "AVERAGE_MAGPHASE":
-            mean, magnitude = _mean(four, band.nodata), _mean([np.abs(one) for one in four], band.nodata)
+            mean, magnitude = _mean(four, band.nodata), _mean([np.abs(values) for values in four], band.nodata)
             size = np.abs(mean)
             return np.where(size > 0, mean * (magnitude / np.where(size > 0, size, 1)), magnitude).astype(pixels.dtype)
         case "MODE":
@@ -292,29 +292,29 @@ def halved(pixels: Pixels, band: Band) -> Pixels:
 
 
 def _mean(four: Sequence[Pixels], nodata: float) -> Pixels:
-    """Return the mean of those of four pixels each that hold something, no data where none does."""
+    """Return the mean of the valid pixels of each group of four; no data if there are none."""
     if not np.isnan(nodata):
-        known_mean = _mean([np.where(one == nodata, np.nan, one) for one in four], np.nan)
-        return np.asarray(np.where(np.isnan(known_mean), nodata, known_mean))
+        valid_mean = _mean([np.where(values == nodata, np.nan, values) for values in four], np.nan)
+        return np.asarray(np.where(np.isnan(valid_mean), nodata, valid_mean))
     mean: Pixels = (four[0] + four[1] + (four[2] + four[3])) / 4
-    some = np.nonzero(np.isnan(mean))
-    if some[0].size:
-        few = np.array([one[some] for one in four])
-        known = ~np.isnan(few)
-        count = known.sum(axis=0)
-        mean[some] = np.where(count > 0, np.where(known, few, 0).sum(axis=0) / np.maximum(count, 1), np.nan)
+    incomplete = np.nonzero(np.isnan(mean))
+    if incomplete[0].size:
+        pixels = np.array([values[incomplete] for values in four])
+        valid = ~np.isnan(pixels)
+        count = valid.sum(axis=0)
+        mean[incomplete] = np.where(count > 0, np.where(valid, pixels, 0).sum(axis=0) / np.maximum(count, 1), np.nan)
     return mean
 
 
 def _commonest(four: Sequence[Pixels], nodata: float) -> Pixels:
-    """Return the commonest of those of four pixels each that hold something, no data where none does."""
-    if all((one == four[0][0, 0]).all() for one in four):
+    """Return the most frequent value of the valid pixels of each group of four; no data if there are none."""
+    if all((values == four[0][0, 0]).all() for values in four):
         return four[0]
-    found, most = np.full_like(four[0], nodata), np.zeros(four[0].shape, np.uint8)
-    for number, one in enumerate(four):
-        count = np.sum([one == other for other in four[: number + 1]], axis=0, dtype=np.uint8) * (one != nodata)
-        found, most = np.where(count > most, one, found), np.maximum(count, most)
-    return found
+    mode, most = np.full_like(four[0], nodata), np.zeros(four[0].shape, np.uint8)
+    for number, values in enumerate(four):
+        count = np.sum([values == other for other in four[: number + 1]], axis=0, dtype=np.uint8) * (values != nodata)
+        mode, most = np.where(count > most, values, mode), np.maximum(count, most)
+    return mode
 
 
 def _fill(
@@ -322,18 +322,18 @@ def _fill(
     read: Callable[[BlockSlices], Pixels],
     shown: Callable[[Pixels], Pixels],
     band: Band,
-    place: Mapping[str, Any],
+    georeference: Mapping[str, Any],
     tags: Mapping[str, str],
 ) -> int:
-    """Write a plain tiled GeoTIFF and its overviews block by block, tags included; return a sum over its pixels.
+    """Write a tiled GeoTIFF with tags and its overviews block by block; return a checksum of its pixels.
 
-    Blocks are halved while they pass: GDAL, which would read them again, takes several times as long.
+    Overviews are computed from the blocks in memory: GDAL reads them again and takes several times as long.
     """
-    checksum, shape = 0, (place["height"], place["width"])
+    checksum, shape = 0, (georeference["height"], georeference["width"])
     levels = min(max(0, ceil(log2(max(shape) / BLOCK))), int(log2(READ)))
     with ExitStack() as opened:
-        # GDAL finds the first overview of source.tif in source.tif.ovr, the next in source.tif.ovr.ovr, …
-        files = [opened.enter_context(_created(path, band, place))]
+        # GDAL reads the first overview of source.tif from source.tif.ovr, the next from source.tif.ovr.ovr, …
+        files = [opened.enter_context(_created(path, band, georeference))]
         for level in range(1, levels + 1):
             height, width = (-(-size // 2**level) for size in shape)
             overview = path.with_name(path.name + level * ".ovr")
@@ -354,24 +354,24 @@ def _fill(
     return checksum
 
 
-def _created(path: Path, band: Band, place: Mapping[str, Any]) -> Any:
+def _created(path: Path, band: Band, georeference: Mapping[str, Any]) -> Any:
     layout = {"tiled": True, "blockxsize": BLOCK, "blockysize": BLOCK, "BIGTIFF": "IF_SAFER"}
-    form = {"driver": "GTiff", "count": 1, "dtype": band.dtype, "nodata": band.nodata}
+    profile = {"driver": "GTiff", "count": 1, "dtype": band.dtype, "nodata": band.nodata}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)  # an overview has no georeference of its own
-        return rasterio.open(path, "w", **form, **layout, **place)
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)  # overviews have no georeference
+        return rasterio.open(path, "w", **profile, **layout, **georeference)
 
 
 def _finish(source: Path, target: Path, band: Band) -> None:
-    """Turn a GeoTIFF with overviews into a COG."""
-    differences = "STANDARD" if band.smooth else "YES"
+    """Convert a GeoTIFF with overviews to a COG."""
+    predictor = "STANDARD" if band.smooth else "YES"
     rasterio.shutil.copy(
         source,
         target,
         driver="COG",
         COMPRESS="DEFLATE",
-        LEVEL=1,  # noise is no smaller at any other, and takes twice as long
-        PREDICTOR="NO" if band.dtype.startswith("complex") else differences,
+        LEVEL=1,  # higher levels do not compress noise better and take twice as long
+        PREDICTOR="NO" if band.dtype.startswith("complex") else predictor,
         BLOCKSIZE=BLOCK,
         BIGTIFF="IF_SAFER",
     )

@@ -1,4 +1,4 @@
-"""Coverage of a campaign: looks, pairs, footprints and tracks as a picture and for a GIS."""
+"""Coverage of a campaign: number of pulses and pairs, footprints and tracks, as a plot and as GeoJSON."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,11 +22,11 @@ from apertura.common.errors import number_of
 from apertura.formats.export.map_layout import DPI, MapLayout
 
 MARGIN = 0.04
-"""Left free around tracks and scene, of the longer side."""
+"""Margin around tracks and scene, relative to the longer side."""
 
-_NAMED = 8  # flights that are told apart by colours; tracks of more are one colour
-_HALF_DEG = 180.0  # of longitude: neighbours farther apart lie on both sides of the antimeridian
-_SMALL = 0.25  # of the map's longer side: a smaller scene is drawn once more by itself
+_NAMED = 8  # largest number of flights that are distinguished by colours
+_HALF_DEG = 180.0  # a larger difference of longitude between neighbours indicates the antimeridian
+_SMALL = 0.25  # size relative to the longer side of the map, below which the scene gets an additional map
 _COLOURS = tuple(colormaps["tab10"](number) for number in range(10))
 
 Ring = NDArray[np.float64]
@@ -39,13 +39,14 @@ class Covered:
     Attributes
     ----------
     flight, pair
-        Which.
+        Names of flight and pair.
     tracks_m
-        Antenna (transmitter, receiver) → (vertex, 3) float64, easting, northing and height on the map, metres.
+        Antenna (transmitter, receiver) → (vertex, 3) float64: easting, northing and height on the map, metres.
     looks
-        (row, column) float32, pulses that make each place of the scene, 0 where none does.
+        (row, column) float32: number of pulses at each point of the scene.
     imaged_m
-        Antenna → what of its track makes the image, a list of (vertex, 2 or 3), metres; where that is not all of it.
+        Antenna → parts of its track used for the image, a list of (vertex, 2 or 3), metres; empty if the whole track is
+        used.
     """
 
     flight: str
@@ -56,9 +57,9 @@ class Covered:
 
 
 def footprint(looks: NDArray[np.float32], transform: Affine) -> list[list[Ring]]:
-    """Return polygons about the places that pulses make: rings (vertex, 2) of map metres, the outer one first.
+    """Return polygons around the pixels with pulses: rings (vertex, 2) in map metres, outer ring first.
 
-    Outer rings turn left, holes right, each ends where it begins, as GeoJSON requires.
+    Outer rings are counterclockwise, holes clockwise, and all are closed, as required by GeoJSON.
 
     Examples
     --------
@@ -67,18 +68,21 @@ def footprint(looks: NDArray[np.float32], transform: Affine) -> list[list[Ring]]
     [[102.0, 46.0], [104.0, 46.0], [104.0, 50.0], [102.0, 50.0], [102.0, 46.0]]
     """
     covered = looks > 0
-    found = shapes(covered.astype(np.uint8), mask=covered, transform=transform)
+    polygons = shapes(covered.astype(np.uint8), mask=covered, transform=transform)
     return [
-        [_turned(np.asarray(ring, np.float64), left=number == 0) for number, ring in enumerate(shape["coordinates"])]
-        for shape, _ in found
+        [
+            _oriented(np.asarray(ring, np.float64), counterclockwise=number == 0)
+            for number, ring in enumerate(shape["coordinates"])
+        ]
+        for shape, _ in polygons
     ]
 
 
-def _turned(ring: Ring, *, left: bool) -> Ring:
+def _oriented(ring: Ring, *, counterclockwise: bool) -> Ring:
     x, y = (ring - ring[0]).T
-    turns_left = float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum()) > 0
-    ring = ring if turns_left == left else ring[::-1]
-    lowest = int(np.lexsort((ring[:-1, 0], ring[:-1, 1]))[0])  # the same vertex first, however it was traced
+    is_counterclockwise = float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum()) > 0
+    ring = ring if is_counterclockwise == counterclockwise else ring[::-1]
+    lowest = int(np.lexsort((ring[:-1, 0], ring[:-1, 1]))[0])  # reproducible first vertex
     return np.concatenate([ring[lowest:-1], ring[: lowest + 1]])
 
 
@@ -94,31 +98,31 @@ def feature_collection(
     Parameters
     ----------
     covered
-        Of each pair.
+        Coverage of each pair.
     transform
-        Of its looks, on the map.
+        Georeference of the looks on the map.
     place
-        Map (n, 3), metres → longitude and latitude (deg, WGS 84) and height (m), (n, 3); None where the map has no
-        place on Earth: geometries are then null.
+        Function from map coordinates (n, 3), metres, to longitude and latitude (deg, WGS 84) and height (m), (n, 3);
+        None if the map is not georeferenced: geometries are then null.
     height_m
-        Of the footprints, for `place`.
+        Height of the footprints, for `place`.
     """
     features = []
-    for one in covered:
-        named = {"flight": one.flight, "pair": one.pair}
-        for antenna, track_m in one.tracks_m.items():
+    for coverage in covered:
+        names = {"flight": coverage.flight, "pair": coverage.pair}
+        for antenna, track_m in coverage.tracks_m.items():
             line = None
             if place is not None:
                 parts = [_rounded(part, heights=True) for part in cut_line(place(track_m))]
-                whole = len(parts) == 1
-                kind, at = ("LineString", parts[0]) if whole else ("MultiLineString", parts)
-                line = {"type": kind, "coordinates": at}
-            features.append(_feature(line, {"kind": "track", "antenna": antenna, **named}))
+                is_single = len(parts) == 1
+                kind, coordinates = ("LineString", parts[0]) if is_single else ("MultiLineString", parts)
+                line = {"type": kind, "coordinates": coordinates}
+            features.append(_feature(line, {"kind": "track", "antenna": antenna, **names}))
         area = None
         if place is not None:
-            areas = placed_footprint(one.looks, transform, place, height_m=height_m)
+            areas = placed_footprint(coverage.looks, transform, place, height_m=height_m)
             area = {"type": "MultiPolygon", "coordinates": [[_rounded(ring) for ring in rings] for rings in areas]}
-        features.append(_feature(area, {"kind": "footprint", **named, **_statistics(one.looks, transform)}))
+        features.append(_feature(area, {"kind": "footprint", **names, **_statistics(coverage.looks, transform)}))
     return {"type": "FeatureCollection", "features": features}
 
 
@@ -134,9 +138,9 @@ def placed_footprint(
     Parameters
     ----------
     looks, transform
-        As of `footprint`.
+        See `footprint`.
     place, height_m
-        As of `feature_collection`.
+        See `feature_collection`.
     """
 
     def placed(ring: Ring) -> Ring:
@@ -145,24 +149,24 @@ def placed_footprint(
     polygons = [[placed(ring) for ring in rings] for rings in footprint(looks, transform)]
     if not any(np.ptp(ring[:, 0]) > _HALF_DEG for rings in polygons for ring in rings):
         return polygons
-    # Each side has the pixels that reach into it; what of them lies beyond is moved onto the antimeridian.
+    # For each side, take the pixels that extend into it, and clip their vertices to the antimeridian.
     down, right = np.mgrid[: looks.shape[0] + 1, : looks.shape[1] + 1]
     corners = np.stack(transform @ (right.ravel(), down.ravel()), -1)
-    east_of = (placed(corners)[:, 0] % 360 - _HALF_DEG).reshape(down.shape)
-    of_pixel = np.stack([east_of[:-1, :-1], east_of[1:, :-1], east_of[:-1, 1:], east_of[1:, 1:]])
+    offset_deg = (placed(corners)[:, 0] % 360 - _HALF_DEG).reshape(down.shape)
+    corner_offsets = np.stack([offset_deg[:-1, :-1], offset_deg[1:, :-1], offset_deg[:-1, 1:], offset_deg[1:, 1:]])
     cut = []
-    for side, there in ((-1, of_pixel.min(axis=0) < 0), (1, of_pixel.max(axis=0) > 0)):
-        for rings in footprint(np.where(there, looks, 0), transform):
+    for side, on_side in ((-1, corner_offsets.min(axis=0) < 0), (1, corner_offsets.max(axis=0) > 0)):
+        for rings in footprint(np.where(on_side, looks, 0), transform):
             parts = [placed(ring) for ring in rings]
             for ring in parts:
-                beyond = ring[:, 0] % 360 - _HALF_DEG
-                ring[:, 0] = side * np.maximum(side * beyond, 0.0) - side * _HALF_DEG
+                ring_offset = ring[:, 0] % 360 - _HALF_DEG
+                ring[:, 0] = side * np.maximum(side * ring_offset, 0.0) - side * _HALF_DEG
             cut.append(parts)
     return cut
 
 
 def cut_line(places: Ring) -> list[Ring]:
-    """Return a line of longitude, latitude and height in parts that end at the antimeridian (RFC 7946, 3.1.9).
+    """Split a line of longitude, latitude and height at the antimeridian (RFC 7946, 3.1.9).
 
     Examples
     --------
@@ -199,7 +203,7 @@ def _statistics(looks: NDArray[np.float32], transform: Affine) -> dict[str, Any]
 
 
 def _rounded(places: NDArray[np.float64], *, heights: bool = False) -> list[list[float]]:
-    """Return places as GeoJSON writes them: degrees to a millimetre, and metres."""
+    """Round coordinates for GeoJSON: degrees and metres to about a millimetre."""
     return [[round(x, 8), round(y, 8), *([round(z, 3)] if heights else [])] for x, y, z in places.tolist()]
 
 
@@ -213,44 +217,44 @@ def write_coverage(
     tags: Mapping[str, str],
     local: bool = False,
 ) -> None:
-    """Draw as a PNG the pulses of all pairs at each place, and beside it how many pairs see it, or the scene by itself.
+    """Plot the pulses of all pairs at each point as a PNG, with a second map of the number of pairs or of the scene.
 
-    The number of pairs is drawn where it differs from place to place, and footprints of up to eight flights each.
+    The number of pairs is plotted if it varies within the scene. Footprints are plotted for up to eight flights.
 
     Parameters
     ----------
     path
         ``….png``; complete or absent.
     covered
-        Of each pair; their looks have one shape.
+        Coverage of each pair; their looks have the same shape.
     transform
-        Of the looks, on the map.
+        Georeference of the looks on the map.
     crs_name
-        Of the map.
+        Name of the map's CRS.
     title
-        What is drawn.
+        Title of the plot.
     tags
-        Provenance, name → text; lies in the file.
+        Provenance, name → text; stored in the file.
     local
-        Whether the map has no place on Earth.
+        True if the map is not georeferenced.
     """
-    total = np.sum([one.looks for one in covered], axis=0)
-    pairs = np.sum([one.looks > 0 for one in covered], axis=0)
-    flights = {name: number for number, name in enumerate(dict.fromkeys(one.flight for one in covered))}
+    total = np.sum([coverage.looks for coverage in covered], axis=0)
+    pairs = np.sum([coverage.looks > 0 for coverage in covered], axis=0)
+    flights = {name: number for number, name in enumerate(dict.fromkeys(coverage.flight for coverage in covered))}
     bounds, scene = _bounds(covered, total.shape, transform), array_bounds(*total.shape, transform)
     small = max(scene[2] - scene[0], scene[3] - scene[1]) < _SMALL * max(bounds[2] - bounds[0], bounds[3] - bounds[1])
     counts = np.unique(pairs[pairs > 0])
-    looks_label = f"pulses that make a pixel{', all pairs' if len(covered) > 1 else ''}"
+    looks_label = f"pulses per pixel{', all pairs' if len(covered) > 1 else ''}"
     with matplotlib.style.context("default"):
-        several, part = small or counts.size > 1, scene if small else None
-        maps = [MapLayout.for_bounds(bounds, maps=2 if several else 1, part=part, local=local)]
+        has_two_maps, part = small or counts.size > 1, scene if small else None
+        maps = [MapLayout.for_bounds(bounds, maps=2 if has_two_maps else 1, part=part, local=local)]
         _draw(maps[0], total, transform, "viridis", looks_label)
-        if several:
+        if has_two_maps:
             maps.append(maps[0].beside(part))
         if counts.size > 1:
-            _draw(maps[1], pairs, transform, "YlGnBu", f"pairs that see a pixel, of {len(covered)}", counts=True)
+            _draw(maps[1], pairs, transform, "YlGnBu", f"pairs that cover a pixel, of {len(covered)}", counts=True)
         elif small:
-            _draw(maps[1], total, transform, "viridis", f"{looks_label}, the scene alone")
+            _draw(maps[1], total, transform, "viridis", f"{looks_label}, scene only")
         for number, layout in enumerate(maps):
             if len(flights) > _NAMED:
                 _draw_overview(layout, covered, total, transform)
@@ -261,10 +265,10 @@ def write_coverage(
         if 1 < len(flights) <= _NAMED:
             samples = [Line2D([], [], color=_COLOURS[number]) for number in flights.values()]
             maps[0].draw_legend(samples, list(flights))
-        share = f"{100 * float((pairs > 0).mean()):.1f} % of the scene is seen by {number_of(len(covered), 'pair')}"
-        each = f", each place of it by {counts[0]}" if len(covered) > 1 and counts.size == 1 else ""
-        thick = ", thick: makes the image" if any(one.imaged_m for one in covered) else ""
-        footprints = "footprints" if len(flights) <= _NAMED else "edge of what is seen"
+        share = f"{100 * float((pairs > 0).mean()):.1f} % of the scene is covered by {number_of(len(covered), 'pair')}"
+        each = f", every pixel by {counts[0]}" if len(covered) > 1 and counts.size == 1 else ""
+        thick = ", thick: used for the image" if any(coverage.imaged_m for coverage in covered) else ""
+        footprints = "footprints" if len(flights) <= _NAMED else "edge of the covered area"
         lines = f"lines: tracks (dashed: receiver{thick}) and {footprints}"
         subtitle = f"{share} of {number_of(len(flights), 'flight')}{each}; {lines}"
         maps[0].write_words(title, subtitle, f"apertura {tags['APERTURA_VERSION']}")
@@ -273,11 +277,12 @@ def write_coverage(
 
 
 def _bounds(covered: Sequence[Covered], shape: tuple[int, ...], transform: Affine) -> tuple[float, float, float, float]:
-    """Return west, south, east, north of the scene and all tracks, and a margin."""
+    """Return west, south, east, north of the scene and all tracks, with a margin."""
     west, south, east, north = array_bounds(*shape, transform)
     corners = np.array([[west, south], [east, north]])
-    places = np.concatenate([corners, *(track[:, :2] for one in covered for track in one.tracks_m.values())])
-    low, high = places.min(axis=0), places.max(axis=0)
+    tracks = (track[:, :2] for coverage in covered for track in coverage.tracks_m.values())
+    points = np.concatenate([corners, *tracks])
+    low, high = points.min(axis=0), points.max(axis=0)
     margin = MARGIN * float((high - low).max())
     return (*(low - margin).tolist(), *(high + margin).tolist())
 
@@ -303,16 +308,16 @@ def _draw(
 
 def _draw_lines(layout: MapLayout, covered: Sequence[Covered], transform: Affine, flights: Mapping[str, int]) -> None:
     """Draw tracks and footprints in the colours of their flights."""
-    for one in covered:
-        colour = _COLOURS[flights[one.flight] % len(_COLOURS)]
-        for style, (antenna, track_m) in zip(("-", "--"), one.tracks_m.items(), strict=False):
-            imaged = one.imaged_m.get(antenna)
+    for coverage in covered:
+        colour = _COLOURS[flights[coverage.flight] % len(_COLOURS)]
+        for style, (antenna, track_m) in zip(("-", "--"), coverage.tracks_m.items(), strict=False):
+            imaged = coverage.imaged_m.get(antenna)
             layout.axes.plot(*track_m.T[:2], style, color=colour, linewidth=0.7 if imaged else 1.4)
             for leg_m in imaged or [track_m]:
                 if imaged:
                     layout.axes.plot(*leg_m.T[:2], style, color=colour, linewidth=2.2)
-                _draw_way(layout, leg_m, colour)
-        for rings in footprint(one.looks, transform):
+                _draw_direction(layout, leg_m, colour)
+        for rings in footprint(coverage.looks, transform):
             for ring in rings:
                 layout.axes.plot(*ring.T, color=colour, alpha=0.8, linewidth=1.2)
 
@@ -320,18 +325,18 @@ def _draw_lines(layout: MapLayout, covered: Sequence[Covered], transform: Affine
 def _draw_overview(
     layout: MapLayout, covered: Sequence[Covered], total: NDArray[np.float32], transform: Affine
 ) -> None:
-    """Draw tracks of many flights in one colour, and the edge of what any of them sees."""
+    """Draw the tracks of more than `_NAMED` flights in a single colour, and the edge of the area covered by any."""
     line: dict[str, Any] = {"color": "0.45", "alpha": 0.6, "linewidth": 0.7}
-    for one in covered:
-        for style, track_m in zip(("-", "--"), one.tracks_m.values(), strict=False):
+    for coverage in covered:
+        for style, track_m in zip(("-", "--"), coverage.tracks_m.values(), strict=False):
             layout.axes.plot(*track_m.T[:2], style, **line)
     for rings in footprint(total, transform):
         for ring in rings:
             layout.axes.plot(*ring.T, color="black", linewidth=1.0)
 
 
-def _draw_way(layout: MapLayout, leg_m: NDArray[np.float64], colour: Any) -> None:
-    """Point an arrow the way that a leg is flown, in its middle."""
+def _draw_direction(layout: MapLayout, leg_m: NDArray[np.float64], colour: Any) -> None:
+    """Draw an arrow in the direction of flight at the middle of a leg."""
     middle = max(1, len(leg_m) // 2)
     if len(leg_m) > 1 and (leg_m[middle, :2] != leg_m[middle - 1, :2]).any():
         arrow = {"arrowstyle": "-|>", "color": colour, "mutation_scale": 12}

@@ -1,4 +1,4 @@
-"""Compensated phase history (CPHD 1.1.0, NGA.STND.0068-1) of one pair, for other processors and for this one."""
+"""Export of the compensated phase history of a pair (CPHD 1.1.0, NGA.STND.0068-1)."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -15,54 +15,54 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.units import seconds_since
 from apertura.core.geometry.geodesy import geodetic_from_ecef
 
-# ---- Metadata of a CPHD file, and parameters of each pulse ----------------------------------------------------------
+# ---- Metadata of a CPHD file, and per-vector parameters -------------------------------------------------------------
 
 
 PATH_LIMIT = "APERTURA_PATH_LIMIT"
-"""Parameter of each pulse beside those of the standard: total path beyond which an echo leaves the prefix, m."""
+"""Per-vector parameter in addition to those of the standard: longest total path within the cyclic prefix, m."""
 
 _OVERSAMPLED = 1.25
-"""Oversampling of the frequencies against the swath; the standard requires 1.2."""
+"""Oversampling of the frequencies relative to the swath; the standard requires 1.2."""
 
 _RECORD = (
     *(("TxTime", 1), ("TxPos", 3), ("TxVel", 3), ("RcvTime", 1), ("RcvPos", 3), ("RcvVel", 3), ("SRPPos", 3)),
     *((name, 1) for name in ("aFDOP", "aFRR1", "aFRR2", "FX1", "FX2", "TOA1", "TOA2", "TDTropoSRP", "SC0", "SCSS")),
 )
-"""Parameters of a pulse, and how many numbers each is, in the order of the standard: sarkit writes them by place."""
+"""Per-vector parameters with number of components, in the order of the standard: sarkit writes them by position."""
 
 
 @dataclass(frozen=True, eq=False)
 class CphdCollection:
-    """Recording of a pair without its samples.
+    """Metadata of the phase history of a pair, without its samples.
 
     Attributes
     ----------
     name
-        Of the data set.
+        Name of the data set.
     pair
         Transmitter-receiver.
     time
         (pulse,) datetime64[ns], UTC.
     tx_m, rx_m
-        (pulse, 3) float64, metres, ECEF: phase centres at `time`, both at one instant as in stage echo.
+        (pulse, 3) float64: phase centres at `time`, ECEF, metres; both at the same instant as in stage echo.
     frequency_hz
         (subcarrier,) float64, in equal steps.
     path_limit_m
-        (pulse,) float64, total path beyond which an echo leaves the prefix; infinite where there is none.
+        (pulse,) float64: longest total path within the cyclic prefix; infinite without a prefix.
     point_m
-        (3,) float64, metres, ECEF: the point that samples refer to (SRP), in the middle of the scene.
+        (3,) float64: reference point of the samples (SRP) at the centre of the scene, ECEF, metres.
     origin_m
-        (3,) float64, metres, ECEF: where the scene's coordinates count from (IARP).
+        (3,) float64: origin of the scene coordinates (IARP), ECEF, metres.
     axes
-        (3, 3) float64, rows: unit vectors east, north and up there, ECEF.
+        (3, 3) float64, rows: unit vectors east, north and up at the origin, ECEF.
     area_m
-        West, south, east and north edge of the scene from the origin, metres along the axes.
+        West, south, east and north edge of the scene relative to the origin, metres along the axes.
     spacing_m
-        Of the scene's pixels.
+        Pixel spacing of the scene.
     wave_speed_m_s
-        Speed of the wave along the paths.
+        Propagation speed along the paths.
     parameters
-        Name → text that goes with the collection: where it comes from.
+        Name → text of additional collection parameters: provenance.
     """
 
     name: str
@@ -82,30 +82,30 @@ class CphdCollection:
 
     @property
     def monostatic(self) -> bool:
-        """True if one node sends and receives."""
+        """True if a single node transmits and receives."""
         tx, rx = self.pair.split("-")
         return tx == rx
 
     @property
     def reference_delay_s(self) -> Floats:
-        """Delay of the reference point, to which samples must be referred: (pulse,) float64, seconds."""
+        """Delay of the reference point, to which samples are referred: (pulse,) float64, seconds."""
         return self._point_path_m / self.wave_speed_m_s
 
     @property
     def troposphere_s(self) -> Floats:
-        """Part of it by the air: (pulse,) float64, seconds beyond the same path in vacuum."""
+        """Tropospheric part of the reference delay, in excess of vacuum: (pulse,) float64, seconds."""
         return self.reference_delay_s - self._point_path_m / SPEED_OF_LIGHT_M_S
 
     @property
     def _point_path_m(self) -> Floats:
-        legs = [np.linalg.norm(leg - self.point_m, axis=1) for leg in (self.tx_m, self.rx_m)]
-        return np.asarray(sum(legs), np.float64)
+        paths = [np.linalg.norm(antenna_m - self.point_m, axis=1) for antenna_m in (self.tx_m, self.rx_m)]
+        return np.asarray(sum(paths), np.float64)
 
     @property
     def swath_s(self) -> tuple[float, float]:
-        """First and last delay of echoes that the samples hold, from that of the reference point, seconds.
+        """First and last delay of echoes in the samples, relative to that of the reference point, seconds.
 
-        As much as their frequencies resolve, and no later than what stays inside the prefix.
+        Limited by the frequency spacing and by the cyclic prefix.
         """
         half = 0.5 / (_OVERSAMPLED * self._step_hz)
         latest = float((self.path_limit_m / self.wave_speed_m_s - self.reference_delay_s).min())
@@ -113,17 +113,17 @@ class CphdCollection:
 
     @property
     def start(self) -> np.datetime64:
-        """The microsecond at or before the first pulse, from which times count."""
+        """Time zero: the first pulse, rounded down to a microsecond."""
         return np.datetime64(self.time[0].astype("datetime64[us]"), "ns")
 
     @property
     def sent_s(self) -> Floats:
-        """(pulse,) float64, seconds from `start`."""
+        """Transmit times: (pulse,) float64, seconds from `start`."""
         return seconds_since(self.time, self.start)
 
     @property
     def exposed_s(self) -> Floats:
-        """When each pulse is at the reference point: (pulse,) float64, seconds from `start`."""
+        """Time at which each pulse reaches the reference point: (pulse,) float64, seconds from `start`."""
         return np.asarray(self.sent_s + np.linalg.norm(self.tx_m - self.point_m, axis=1) / self.wave_speed_m_s)
 
     @property
@@ -131,20 +131,20 @@ class CphdCollection:
         return float(self.frequency_hz[-1] - self.frequency_hz[0]) / (len(self.frequency_hz) - 1)
 
     def pulses(self) -> NDArray[Any]:
-        """Return the parameters of each pulse, a record each."""
+        """Return the per-vector parameters, one record per pulse."""
         limited = bool(np.isfinite(self.path_limit_m).all())
         kind = [(name, "f8", (3,)) if count == 3 else (name, "f8") for name, count in _RECORD]
         table = np.zeros(len(self.time), [*kind, ("SIGNAL", "i8"), *([(PATH_LIMIT, "f8")] if limited else [])])
         sent, delay = self.sent_s, self.reference_delay_s
         table["TDTropoSRP"] = self.troposphere_s
         table["TxTime"], table["RcvTime"] = sent, sent + delay
-        towards = 0.0
-        for leg, position in (("Tx", self.tx_m), ("Rcv", self.rx_m)):
+        path_rate = 0.0
+        for end, position in (("Tx", self.tx_m), ("Rcv", self.rx_m)):
             velocity = np.gradient(position, sent, axis=0) if len(sent) > 1 else np.zeros_like(position)
-            table[f"{leg}Pos"], table[f"{leg}Vel"] = position, velocity
+            table[f"{end}Pos"], table[f"{end}Vel"] = position, velocity
             line = position - self.point_m
-            towards = towards + (velocity * line).sum(axis=1) / np.linalg.norm(line, axis=1)
-        table["aFDOP"] = -towards / self.wave_speed_m_s
+            path_rate = path_rate + (velocity * line).sum(axis=1) / np.linalg.norm(line, axis=1)
+        table["aFDOP"] = -path_rate / self.wave_speed_m_s
         table["SRPPos"], table["SIGNAL"] = self.point_m, 1
         table["FX1"], table["FX2"] = self.frequency_hz[0], self.frequency_hz[-1]
         table["TOA1"], table["TOA2"] = self.swath_s
@@ -154,28 +154,28 @@ class CphdCollection:
         return table
 
 
-# ---- Compensated phase history of one pair (CPHD 1.1.0, NGA.STND.0068-1) --------------------------------------------
+# ---- Compensated phase history of a pair (CPHD 1.1.0, NGA.STND.0068-1) ----------------------------------------------
 #
-# Signals are Σ a·exp(-j2πf(τ-τ_ref)), SGN -1, where τ_ref is the delay of the reference point of the scene, one for
-# all pulses (docs/formats/phase_history.md, "CPHD"). Metadata and pulse parameters are written by sarkit, samples in
-# blocks.
+# Signals are Σ a·exp(-j2πf(τ-τ_ref)), SGN -1, where τ_ref is the delay of the scene reference point, the same point for
+# all pulses (docs/formats/phase_history.md, "CPHD"). sarkit writes metadata and per-vector parameters; samples are
+# written in blocks.
 
 _NAMESPACE = "http://api.nsgreg.nga.mil/schema/cphd/1.1.0"
 _CHANNEL = "1"
 
 
 def write_cphd(path: Path, collection: CphdCollection, blocks: Iterable[NDArray[np.complex64]]) -> None:
-    """Write a CPHD file, beside and renamed.
+    """Write a CPHD file under a temporary name, and rename it.
 
     Parameters
     ----------
     path
         ``….cphd``.
     collection
-        All but the samples.
+        Metadata.
     blocks
-        Transfer functions referred to `CphdCollection.reference_delay_s`, (pulse, subcarrier) complex64, some pulses
-        at a time, in order.
+        Transfer functions referred to `CphdCollection.reference_delay_s`, (pulse, subcarrier) complex64, in blocks of
+        pulses, in order.
 
     Raises
     ------
@@ -196,11 +196,11 @@ def write_cphd(path: Path, collection: CphdCollection, blocks: Iterable[NDArray[
             stream.write(np.ascontiguousarray(block, ">c8").data)
             written += len(block)
         if written != len(pulses):
-            raise ValueError(f"{written} pulses: must be {len(pulses)}")
+            raise ValueError(f"{written} pulses, must be {len(pulses)}")
 
 
 def _document(collection: CphdCollection, pulses: NDArray[Any]) -> Any:
-    """Return the XML, whose reference geometry sarkit works out."""
+    """Build the XML document, with the reference geometry computed by sarkit."""
     from lxml import etree
     from sarkit import cphd
 
@@ -238,11 +238,11 @@ def _identity(collection: CphdCollection) -> dict[str, Any]:
 
 def _overall(collection: CphdCollection, pulses: NDArray[Any]) -> dict[str, Any]:
     first, last = collection.swath_s
-    began: datetime = collection.start.astype("datetime64[us]").item()
+    start: datetime = collection.start.astype("datetime64[us]").item()
     return {
         "DomainType": "FX",
         "SGN": -1,
-        "Timeline": {"CollectionStart": began, "TxTime1": pulses["TxTime"][0], "TxTime2": pulses["TxTime"][-1]},
+        "Timeline": {"CollectionStart": start, "TxTime1": pulses["TxTime"][0], "TxTime2": pulses["TxTime"][-1]},
         "FxBand": {"FxMin": collection.frequency_hz[0], "FxMax": collection.frequency_hz[-1]},
         "TOASwath": {"TOAMin": first, "TOAMax": last},
     }
@@ -251,14 +251,14 @@ def _overall(collection: CphdCollection, pulses: NDArray[Any]) -> dict[str, Any]
 def _scene(collection: CphdCollection) -> dict[str, Any]:
     west, south, east, north = collection.area_m
     corners = [(west, south), (west, north), (east, north), (east, south)]  # clockwise
-    places = [collection.origin_m + np.array(corner) @ collection.axes[:2] for corner in corners]
+    corners_m = [collection.origin_m + np.array(corner) @ collection.axes[:2] for corner in corners]
     columns, rows = (max(1, round((high - low) / collection.spacing_m)) for low, high in ((west, east), (south, north)))
     return {
         "EarthModel": "WGS_84",
         "IARP": {"ECF": collection.origin_m, "LLH": geodetic_from_ecef(collection.origin_m)},
         "ReferenceSurface": {"Planar": {"uIAX": collection.axes[0], "uIAY": collection.axes[1]}},
         "ImageArea": {"X1Y1": (west, south), "X2Y2": (east, north)},
-        "ImageAreaCornerPoints": [geodetic_from_ecef(place)[:2] for place in places],
+        "ImageAreaCornerPoints": [geodetic_from_ecef(corner_m)[:2] for corner_m in corners_m],
         "ImageGrid": {
             "IARPLocation": (-west / collection.spacing_m - 0.5, -south / collection.spacing_m - 0.5),
             "IAXExtent": {"LineSpacing": collection.spacing_m, "FirstLine": 0, "NumLines": columns},
@@ -305,17 +305,17 @@ def _channel(collection: CphdCollection, pulses: NDArray[Any]) -> dict[str, Any]
 
 
 def _layout(pulses: NDArray[Any]) -> dict[str, Any]:
-    """Return the place of each parameter in a pulse's record, in words of 8 bytes."""
+    """Return offset and size of each per-vector parameter, in words of 8 bytes."""
     fields = {
-        name: {"Offset": place // 8, "Size": kind.itemsize // 8, "dtype": kind}
-        for name, (kind, place, *_) in (pulses.dtype.fields or {}).items()
+        name: {"Offset": offset // 8, "Size": kind.itemsize // 8, "dtype": kind}
+        for name, (kind, offset, *_) in (pulses.dtype.fields or {}).items()
     }
     added = [{"Name": name, **fields.pop(name)} for name in (PATH_LIMIT,) if name in fields]
     return {**fields, **({"AddedPVP": added} if added else {})}
 
 
 def _dwell(collection: CphdCollection) -> dict[str, Any]:
-    """Return centre and length of the exposure of the scene: all pulses illuminate all places."""
+    """Return centre time and dwell time of the scene; all pulses are assumed to illuminate all of it."""
     exposed_s = collection.exposed_s
     return {
         "NumCODTimes": 1,

@@ -1,4 +1,4 @@
-"""Images in decibels, which most users of a GIS open first."""
+"""Export of images in decibels, the product that most GIS users open first."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -21,17 +21,17 @@ def write_db(
     title: str = "",
     value: Callable[[Pixels], Pixels] = power,
 ) -> None:
-    """Write 20 log10 |image| as a float32 COG whose overviews are the dB of averaged power.
+    """Write 20 log10 |image| as a float32 COG, with overviews in dB of the averaged power.
 
-    A pixel without power has no dB: it is nodata (NaN), never -inf, yet counts as what it is in the
-    averaged power of the overviews. Parameters and errors as `write_slc`.
+    A pixel with zero power is nodata (NaN), never -inf, but counts as zero in the averaged power of the overviews. For
+    parameters and errors see `write_slc`.
 
     Parameters
     ----------
     path, image, transform, crs, tags, title
-        As `write_slc`.
+        See `write_slc`.
     value
-        Block of `image` → its power.
+        Function from a block of `image` to its power.
 
     Notes
     -----
@@ -58,9 +58,9 @@ def write_db(
 def write_mean_db(
     path: Path, power: NorthUpRaster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write 10 log10 of the mean power of squares of pixels, (y, x) float32; NaN where it is not above zero.
+    """Write 10 log10 of a multilooked power, (y, x) float32; NaN where it is not positive.
 
-    Overviews are the dB of the mean of all, those below zero included. Else as `write_db`.
+    Overviews are in dB of the mean of all pixels, including negative ones. Otherwise as `write_db`.
 
     Examples
     --------
@@ -77,7 +77,7 @@ def write_mean_db(
 
 
 def decibels(linear: Pixels) -> Pixels:
-    """Return 10 log10 of power, NaN where there is none.
+    """Convert power to decibels, NaN where it is not positive.
 
     Examples
     --------

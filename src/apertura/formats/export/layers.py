@@ -1,4 +1,4 @@
-"""Layers of an image: angles of view, mask of shadow and layover, and number of pulses."""
+"""Layers of an image: incidence and bistatic angles, shadow and layover mask, number of pulses, noise level."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -11,7 +11,7 @@ from apertura.formats.export.cog import Band, NorthUpRaster, only, write_cog
 from apertura.formats.export.radiometry import TAG
 
 SHADOW, LAYOVER, OUTSIDE = 1, 2, 255
-"""Bits of the mask, and its value where no pulse makes the pixel; 0 is visible once."""
+"""Bits of the mask, and its value for pixels without pulses; 0: imaged without shadow or layover."""
 
 CLASSES = {
     0: ("valid", (255, 255, 255)),
@@ -23,7 +23,7 @@ CLASSES = {
 """Value of the mask → meaning and colour."""
 
 INCIDENCE = Band(
-    "float32", np.nan, "deg", "incidence at closest approach, from the terrain's normal", "AVERAGE", smooth=True
+    "float32", np.nan, "deg", "incidence angle at closest approach, from the terrain normal", "AVERAGE", smooth=True
 )
 BISTATIC_ANGLE = Band(
     "float32", np.nan, "deg", "angle between transmitter and receiver at closest approach", "AVERAGE", smooth=True
@@ -36,9 +36,9 @@ MASK = Band(
     "MODE",
     {value: colour for value, (_, colour) in CLASSES.items()},
 )
-LOOKS = Band("float32", 0, "pulses", "effective number of pulses that make the pixel", "AVERAGE", smooth=True)
+LOOKS = Band("float32", 0, "pulses", "effective number of pulses in the pixel", "AVERAGE", smooth=True)
 NESZ = Band(
-    "float32", np.nan, "dB", "echo per pulse as strong as the noise: relative, no sigma0", "AVERAGE", smooth=True
+    "float32", np.nan, "dB", "noise-equivalent echo per pulse: relative, not calibrated", "AVERAGE", smooth=True
 )
 
 NESZ_ABSOLUTE = "noise-equivalent sigma0"
@@ -48,14 +48,14 @@ NESZ_ABSOLUTE = "noise-equivalent sigma0"
 def write_incidence(
     path: Path, angle_deg: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write the incidence angle, (y, x) float32 degrees, NaN outside. Else as `cog.write_slc`."""
+    """Write the incidence angle, (y, x) float32 degrees, NaN outside. Otherwise as `cog.write_slc`."""
     write_cog(path, angle_deg, INCIDENCE, transform=transform, crs=crs, tags=tags, title=title, value=only("float32"))
 
 
 def write_bistatic_angle(
     path: Path, angle_deg: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write the bistatic angle, (y, x) float32 degrees, NaN outside. Else as `cog.write_slc`."""
+    """Write the bistatic angle, (y, x) float32 degrees, NaN outside. Otherwise as `cog.write_slc`."""
     check = only("float32")
     write_cog(path, angle_deg, BISTATIC_ANGLE, transform=transform, crs=crs, tags=tags, title=title, value=check)
 
@@ -63,9 +63,9 @@ def write_bistatic_angle(
 def write_mask(
     path: Path, bits: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write where the image is in shadow or layover, (y, x) uint8 sums of `SHADOW` and `LAYOVER`, or `OUTSIDE`.
+    """Write the shadow and layover mask, (y, x) uint8 sums of `SHADOW` and `LAYOVER`, or `OUTSIDE`.
 
-    Overviews take the commonest value, so that bits never mix. Else as `cog.write_slc`.
+    Overviews have the most frequent value, so that bits are never mixed. Otherwise as `cog.write_slc`.
 
     Examples
     --------
@@ -84,16 +84,16 @@ def write_mask(
 def write_looks(
     path: Path, looks: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write how many pulses make a pixel, (y, x) float32, no data 0. Else as `cog.write_slc`."""
+    """Write the number of pulses in each pixel, (y, x) float32, no data 0. Otherwise as `cog.write_slc`."""
     write_cog(path, looks, LOOKS, transform=transform, crs=crs, tags=tags, title=title, value=only("float32"))
 
 
 def write_nesz(
     path: Path, noise_db: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write the echo that equals the noise, (y, x) float32 dB of its power, NaN outside. Else as `write_looks`.
+    """Write the noise-equivalent echo power, (y, x) float32 dB, NaN outside. Otherwise as `write_looks`.
 
-    With the tag `apertura.formats.export.radiometry.TAG` it is the σ⁰ that equals the noise.
+    With the tag `apertura.formats.export.radiometry.TAG`, values are noise-equivalent σ⁰.
     """
     band = replace(NESZ, meaning=NESZ_ABSOLUTE) if TAG in tags else NESZ
     write_cog(path, noise_db, band, transform=transform, crs=crs, tags=tags, title=title, value=only("float32"))

@@ -1,4 +1,4 @@
-"""The layout of a quicklook: metric axes, scale bar, north arrow, colour bar and words around a picture."""
+"""Layout of a quicklook: metric axes, scale bar, north arrow, colour bar and text around an image."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -17,33 +17,33 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 DPI = 150
-LONGER_SIDE = 6.4  # of the picture, inch
+LONGER_SIDE = 6.4  # of the image, inch
 PICTURE_DOTS = floor(LONGER_SIDE * DPI)
-LEFT, RIGHT, TOP, BOTTOM = 1.0, 1.4, 0.85, 1.6  # margins around the picture, inch
-LEAST_WIDTH, LEAST_HEIGHT = 4.2, 1.6  # room kept for words and colour bar beside a narrow or flat picture, inch
-PART_HEIGHT = 3.2  # and for a part of it that is drawn once more, inch
-LETTER = 0.073  # of a colour bar's label, inch
-LONGEST_FLAG = 24  # letters with the comma: so many the first of two lines may leave empty
+LEFT, RIGHT, TOP, BOTTOM = 1.0, 1.4, 0.85, 1.6  # margins around the image, inch
+LEAST_WIDTH, LEAST_HEIGHT = 4.2, 1.6  # minimum space for text and colour bar of a narrow or flat image, inch
+PART_HEIGHT = 3.2  # minimum height if a part of the map is plotted separately, inch
+LETTER = 0.073  # width of a character in the label of a colour bar, inch
+LONGEST_FLAG = 24  # longest flag name with comma, characters; the first of two lines may be that much shorter
 
 Marker = tuple[float, float, str]
 
 
 @dataclass(frozen=True)
 class MapLayout:
-    """A figure with a picture in true proportions; lengths on the figure in inches from the lower left corner.
+    """Figure with an image true to scale; lengths on the figure in inches from the lower left corner.
 
     Attributes
     ----------
     figure, axes
-        Of matplotlib; `axes` are in metres of the scene.
+        Matplotlib objects; `axes` are in metres of the scene.
     bounds
         West, south, east, north of the scene, metres.
     inch_per_m
-        Scale of the picture.
+        Scale of the image.
     left
-        Margin left of it.
+        Position of the image's left edge, inch.
     local
-        Whether its axes are x and y of a frame of its own, where no direction is north.
+        True if the axes are x and y of a local frame without a north direction.
     """
 
     figure: Figure
@@ -62,9 +62,9 @@ class MapLayout:
         part: tuple[float, float, float, float] | None = None,
         local: bool = False,
     ) -> "MapLayout":
-        """Return an empty layout on which the longer side of `bounds` is `LONGER_SIDE`, with room for `maps`.
+        """Create an empty layout in which the longer side of `bounds` is `LONGER_SIDE`, with space for `maps` maps.
 
-        The last of them is of the bounds `part`, if these are given.
+        The last map covers the bounds `part`, if given.
         """
         west, south, east, north = bounds
         scale = LONGER_SIDE / max(east - west, north - south)
@@ -80,17 +80,17 @@ class MapLayout:
         return cls(figure, axes, bounds, scale, local=local)
 
     def beside(self, bounds: tuple[float, float, float, float] | None = None) -> "MapLayout":
-        """Return the layout of the next map, right of this one: of the same place, or of a part as large as fits."""
+        """Add the next map to the right of this one: with the same bounds, or with `bounds` at the largest scale."""
         width, height = self.figure.get_size_inches()
         room = max((self.bounds[2] - self.bounds[0]) * self.inch_per_m, LEAST_WIDTH), height - TOP - BOTTOM
         left = self.left + room[0] + RIGHT + LEFT
-        shown, scale = bounds or self.bounds, self.inch_per_m if bounds is None else _scale_in(room, bounds)
-        wide, high = ((shown[2 + side] - shown[side]) * scale for side in (0, 1))
-        place = (left / width, (height - TOP - high) / height, wide / width, high / height)
-        return replace(self, axes=self.figure.add_axes(place), left=left, bounds=shown, inch_per_m=scale)
+        new_bounds, scale = bounds or self.bounds, self.inch_per_m if bounds is None else _scale_in(room, bounds)
+        wide, high = ((new_bounds[2 + side] - new_bounds[side]) * scale for side in (0, 1))
+        rectangle = (left / width, (height - TOP - high) / height, wide / width, high / height)
+        return replace(self, axes=self.figure.add_axes(rectangle), left=left, bounds=new_bounds, inch_per_m=scale)
 
     def draw_frame(self, crs_name: str) -> None:
-        """Label the axes in metres from a round number, so that UTM coordinates stay readable."""
+        """Label the axes in metres from a round offset, so that UTM coordinates are readable."""
         west, south, east, north = self.bounds
         self.axes.set(xlim=(west, east), ylim=(south, north), aspect="equal")
         for name, axis, low, high in (
@@ -106,17 +106,17 @@ class MapLayout:
         self._write(LEFT, 0.58, crs_name, size=8)
 
     def draw_colour_bar(self, picture: AxesImage, label: str, *, beyond: str = "both") -> Colorbar:
-        """Draw the colour bar at the right of the picture; values lie `beyond` 'both' ends, 'min' or 'neither'."""
+        """Draw the colour bar to the right of the image; values exceed `beyond` 'both' ends, 'min' or 'neither'."""
         width, height = self.figure.get_size_inches()
         wide, high = ((self.bounds[2 + side] - self.bounds[side]) * self.inch_per_m for side in (0, 1))
         high = max(high, LEAST_HEIGHT)
-        place = ((self.left + wide + 0.15) / width, (height - TOP - high) / height, 0.16 / width, high / height)
-        bar = self.figure.colorbar(picture, cax=self.figure.add_axes(place), extend=beyond)
+        rectangle = ((self.left + wide + 0.15) / width, (height - TOP - high) / height, 0.16 / width, high / height)
+        bar = self.figure.colorbar(picture, cax=self.figure.add_axes(rectangle), extend=beyond)
         bar.set_label("\n".join(part for line in label.split("\n") for part in wrap(line, floor(high / LETTER))))
         return bar
 
     def draw_scale_and_north(self) -> None:
-        """Draw a bar of a round length and, on a map, an arrow to grid north below the picture."""
+        """Draw a scale bar of a round length and, for a georeferenced map, a grid north arrow below the image."""
         metres = round_length(2.0 / self.inch_per_m)
         length = metres * self.inch_per_m
         for part, colour in enumerate(("black", "white")):
@@ -137,14 +137,14 @@ class MapLayout:
         self._write(x, 1.02, "N", size=10, weight="bold", ha="center")
 
     def draw_legend(self, lines: Sequence[Any], names: Sequence[str]) -> None:
-        """Draw a legend below the picture, beside the scale bar."""
+        """Draw a legend below the image, next to the scale bar."""
         width, height = self.figure.get_size_inches()
         self.figure.legend(
             lines, names, loc="center right", bbox_to_anchor=((width - 0.7) / width, 0.78 / height), ncols=3, fontsize=7
         )
 
     def draw_markers(self, markers: Iterable[Marker]) -> None:
-        """Ring and label places of the scene."""
+        """Mark points of the scene with labelled rings."""
         outline = [withStroke(linewidth=2.5, foreground="black")]
         for x, y, label in markers:
             self.axes.plot(
@@ -155,9 +155,9 @@ class MapLayout:
             )
 
     def write_words(self, title: str, subtitle: str, footer: str) -> None:
-        """Write title and subtitle above the picture, on two lines where one is too short, and its provenance below."""
+        """Write title and subtitle (up to two lines) above the image, and its provenance below."""
         width, height = self.figure.get_size_inches()
-        room = (width - LEFT - 0.1) * 72 / 0.68  # points, over the width of a bold letter in units of its size
+        room = (width - LEFT - 0.1) * 72 / 0.68  # width in points over the relative width of a bold character
         self._write(LEFT, height - 0.4, title, size=min(13, room / max(1, len(title))), weight="bold")
         lines = wrap(subtitle, floor((width - LEFT - 0.1) * 72 / (0.6 * 9)))
         for line, down in zip(lines, (0.65, 0.8) if len(lines) < 2 else (0.6, 0.76), strict=False):
@@ -166,45 +166,45 @@ class MapLayout:
         self._write(LEFT, 0.16, footer, size=min(7, room / max(1, len(footer))), color="0.3")
 
     def write_flags(self, flags: Sequence[str]) -> None:
-        """Write the number and the names of an image's flags above the footer, on two lines where one is too short."""
-        most = int((self.figure.get_size_inches()[0] - LEFT - 0.1) * 72 / (0.64 * 7))  # letters of a line
+        """Write the number and names of an image's flags above the footer, on up to two lines."""
+        most = int((self.figure.get_size_inches()[0] - LEFT - 0.1) * 72 / (0.64 * 7))  # characters in a line
         lines = wrap(flag_words(flags, 2 * most - LONGEST_FLAG), most, max_lines=2)
         style = {"size": 7, "color": "firebrick" if flags else "0.3"}
         for line, height in zip(lines, (0.42, 0.3) if len(lines) > 1 else (0.3,), strict=True):
             self._write(LEFT, height, line, **style)
 
-    def _write(self, x: float, y: float, words: str, **style: Any) -> None:
-        self.figure.text(x, y, words, transform=self.figure.dpi_scale_trans, parse_math=False, **style)
+    def _write(self, x: float, y: float, text: str, **style: Any) -> None:
+        self.figure.text(x, y, text, transform=self.figure.dpi_scale_trans, parse_math=False, **style)
 
 
 def _scale_in(room: tuple[float, float], bounds: tuple[float, float, float, float]) -> float:
-    """Return inches per metre at which bounds fill a room, inches wide and high."""
-    return min(one / (bounds[2 + side] - bounds[side]) for side, one in enumerate(room))
+    """Return the scale, inches per metre, at which bounds fit into a space of the given width and height in inches."""
+    return min(length / (bounds[2 + side] - bounds[side]) for side, length in enumerate(room))
 
 
 def flag_words(flags: Sequence[str], most: int) -> str:
-    """Return the number of flags and as many of their names as `most` letters hold, and how many are left out.
+    """Format the number and names of flags in at most `most` characters, with the number of omitted names.
 
     Examples
     --------
-    >>> flag_words([], 40), flag_words(["beam_misses"], 40)
-    ('no flags', '1 flag: beam_misses')
-    >>> flag_words(["sidelink_noisy", "pulses_sparse", "beam_misses"], 40)
+    >>> flag_words([], 40), flag_words(["outside_beam"], 40)
+    ('no flags', '1 flag: outside_beam')
+    >>> flag_words(["sidelink_noisy", "azimuth_undersampled", "outside_beam"], 40)
     '3 flags: sidelink_noisy, and 2 more in image.json'
     """
     if not flags:
         return "no flags"
     words = f"{len(flags)} flag{'s' if len(flags) > 1 else ''}: "
     for number in range(len(flags), 0, -1):
-        left = f", and {len(flags) - number} more in image.json" if number < len(flags) else ""
-        line = f"{words}{', '.join(flags[:number])}{left}"
+        omitted = f", and {len(flags) - number} more in image.json" if number < len(flags) else ""
+        line = f"{words}{', '.join(flags[:number])}{omitted}"
         if len(line) <= most:
             break
     return line
 
 
 def round_origin(low_m: float, high_m: float) -> float:
-    """Return a round number at or below `low_m` to count coordinates from; 0 where they are short as they are.
+    """Return a round offset of coordinates at or below `low_m`; 0 if the coordinates are short without one.
 
     Examples
     --------
@@ -218,7 +218,7 @@ def round_origin(low_m: float, high_m: float) -> float:
 
 
 def round_length(most_m: float) -> float:
-    """Return the longest of 1, 2, 5 × a power of ten that is no longer than `most_m`.
+    """Return the largest of 1, 2, 5 × a power of ten that does not exceed `most_m`.
 
     Examples
     --------
@@ -230,12 +230,12 @@ def round_length(most_m: float) -> float:
 
 
 def from_origin(origin: float, value: float, _position: int | None) -> str:
-    """Return the label of a tick that counts from an origin, as a formatter of matplotlib."""
+    """Format the label of a tick relative to an origin, as a Matplotlib formatter."""
     return number(value - origin)
 
 
 def number(value: float) -> str:
-    """Return a number with thin spaces between thousands and a true minus.
+    """Format a number with thin spaces between thousands and a typographic minus sign.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""One raster of the same product of several flights: a VRT, which names their files and holds no pixels."""
+"""Mosaics of the same product of several flights as GDAL virtual rasters (VRT), which refer to the flights' files."""
 
 import json
 import os
@@ -19,25 +19,25 @@ _TYPES = {"uint8": "Byte", "float32": "Float32"}
 
 
 def write_mosaic(path: Path, rasters: Sequence[Path], *, title: str = "") -> None:
-    """Write a VRT of rasters of one grid; where several hold data, the last of them is shown.
+    """Write a VRT of rasters on the same grid; where several have data, the last one is used.
 
     Parameters
     ----------
     path
-        ``….vrt``; complete or absent. It names the rasters relative to itself, so that a folder of all may be moved.
+        ``….vrt``; complete or absent. Paths of the rasters are relative to it, so that the folder may be moved.
     rasters
-        Files of one band, real, all on one grid, the lowest first.
+        Real single-band files on the same grid, lowest first.
     title
-        Title for people.
+        Title, written as ImageDescription.
 
     Raises
     ------
     ContractError
-        If they are not of one grid and one kind.
+        If the rasters differ in grid, data type or colours.
 
     Notes
     -----
-    Source: GDAL's documentation of the VRT driver, ComplexSource with NODATA.
+    Source: GDAL documentation of the VRT driver, ComplexSource with NODATA.
 
     Examples
     --------
@@ -59,7 +59,8 @@ def write_mosaic(path: Path, rasters: Sequence[Path], *, title: str = "") -> Non
     root = ET.Element("VRTDataset", rasterXSize=str(first["width"]), rasterYSize=str(first["height"]))
     ET.SubElement(root, "SRS").text = first["crs"]
     ET.SubElement(root, "GeoTransform").text = ", ".join(map(repr, first["transform"]))
-    tags_written = {"TIFFTAG_IMAGEDESCRIPTION": title, TAG: canonical_json(_common([json.loads(one) for one in tags]))}
+    radiometry = canonical_json(_common([json.loads(tag) for tag in tags]))
+    tags_written = {"TIFFTAG_IMAGEDESCRIPTION": title, TAG: radiometry}
     metadata = ET.SubElement(root, "Metadata")
     for name, value in tags_written.items():
         ET.SubElement(metadata, "MDI", key=name).text = value
@@ -77,23 +78,23 @@ def write_mosaic(path: Path, rasters: Sequence[Path], *, title: str = "") -> Non
 
 
 def _opened(rasters: Sequence[Path]) -> tuple[dict[str, Any], dict[str, Any], list[str]]:
-    """Return the grid and the kind that all rasters share, and the radiometry of each."""
+    """Return the common grid and kind of the rasters, and the radiometry of each."""
     layouts: list[tuple[dict[str, Any], dict[str, Any], dict[str, str]]] = []
     tags = []
     for path in rasters:
-        with opened_raster(path, expected="what the workflow wrote", remedy="Run it again.") as raster:
+        with opened_raster(path, expected="a raster written by the workflow", remedy="Run it again.") as raster:
             grid = {"width": raster.width, "height": raster.height, "transform": raster.transform.to_gdal()}
             kind: dict[str, Any] = {"type": _TYPES.get(raster.dtypes[0]), "NoDataValue": f"{raster.nodata:g}"}
-            # Which images were added up stands in the words of a sum: those of the last.
-            words = {"Description": raster.descriptions[0] or "", "UnitType": raster.units[0] or ""}
-            coloured = raster.colorinterp[0] == ColorInterp.palette
-            colours = [colour for _, colour in sorted(raster.colormap(1).items())] if coloured else []
-            layouts.append((grid | {"crs": raster.crs.to_wkt()}, kind | {"colours": colours}, words))
+            # descriptions of sums differ in the number of summed images: that of the last raster is used
+            description = {"Description": raster.descriptions[0] or "", "UnitType": raster.units[0] or ""}
+            has_palette = raster.colorinterp[0] == ColorInterp.palette
+            colours = [colour for _, colour in sorted(raster.colormap(1).items())] if has_palette else []
+            layouts.append((grid | {"crs": raster.crs.to_wkt()}, kind | {"colours": colours}, description))
             tags.append(raster.tags().get(TAG, "{}"))
     grid, kind, _ = layouts[0]
-    for path, (other, its, _) in zip(rasters, layouts, strict=True):
-        if other != grid or its != kind or kind["type"] is None:
-            raise ContractError(f"{path}: no real raster on the grid of {rasters[0]}")
+    for path, (other_grid, other_kind, _) in zip(rasters, layouts, strict=True):
+        if other_grid != grid or other_kind != kind or kind["type"] is None:
+            raise ContractError(f"{path}: not a real raster on the grid of {rasters[0]}")
     return grid, kind | layouts[-1][2], tags
 
 
@@ -109,12 +110,14 @@ def _source(name: str, grid: Mapping[str, Any], kind: Mapping[str, Any]) -> ET.E
 
 
 def _common(radiometries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the radiometry that all rasters share, and levels that span them all."""
+    """Return the radiometry common to all rasters, with the highest peak and the lowest noise floor."""
     common = {
-        name: value for name, value in radiometries[-1].items() if all(one.get(name) == value for one in radiometries)
+        name: value
+        for name, value in radiometries[-1].items()
+        if all(radiometry.get(name) == value for radiometry in radiometries)
     }
-    if all({"peak_db", "noise_floor_re_peak_db"} <= one.keys() for one in radiometries):
-        top = max(one["peak_db"] for one in radiometries)
-        floor = min(one["peak_db"] + one["noise_floor_re_peak_db"] for one in radiometries)
+    if all({"peak_db", "noise_floor_re_peak_db"} <= radiometry.keys() for radiometry in radiometries):
+        top = max(radiometry["peak_db"] for radiometry in radiometries)
+        floor = min(radiometry["peak_db"] + radiometry["noise_floor_re_peak_db"] for radiometry in radiometries)
         common |= {"peak_db": top, "noise_floor_re_peak_db": round(floor - top, 2)}
     return common

@@ -1,4 +1,4 @@
-"""One picture of an image for people: power in dB on metric axes, north up, its origin in the footer."""
+"""Quicklook of an image as PNG: power in dB on metric axes, north up, with provenance in the footer."""
 
 import json
 from collections.abc import Iterable, Mapping
@@ -31,34 +31,33 @@ def write_quicklook(
     markers: Iterable[Marker] = (),
     dynamic_range_db: float = 40.0,
 ) -> None:
-    """Draw power in dB relative to the peak as a PNG that a person can read without a GIS.
+    """Plot power in dB relative to the peak as a PNG for viewing without a GIS.
 
-    An image of more pixels than the picture has dots is shrunk by averaging power, so that no target
-    falls between the samples. The colours span `dynamic_range_db` downwards from the peak, or, where
-    no more than three dots lie within 20 dB of the peak, from the fourth rounded up to 5 dB, so that
-    a glitch does not blacken the scene.
+    An image with more pixels than the plot has dots is reduced by averaging power, so that no target is lost between
+    samples. The colour scale covers `dynamic_range_db` below the peak. If no more than three dots lie within 20 dB of
+    the peak, it starts at the fourth brightest dot, rounded up to 5 dB, so that an outlier does not darken the scene.
 
     Parameters
     ----------
     path
         ``….png``; complete or absent.
     image
-        (y, x) complex64, north-up, NaN (left white) where nothing was formed; read block by block.
+        (y, x) complex64, north-up, NaN (white) where no image is formed; read block by block.
     transform, crs
-        As `apertura.formats.export.cog.write_slc`.
+        See `apertura.formats.export.cog.write_slc`.
     tags
-        Provenance: flags by name, version, numerical error and code hash are drawn, all of them lie in the file.
+        Provenance, stored in the file; flags, version, numerical error and code hash are also printed in the footer.
     title, subtitle
-        Flight and pair; whatever else a reader should know at a glance.
+        Flight and pair; summary of the most important information.
     markers
         (x, y, label) in metres of `crs`, drawn as rings.
     dynamic_range_db
-        dB between the ends of the colour bar.
+        Range of the colour bar, dB.
 
     Raises
     ------
     ContractError, CampaignError
-        As `apertura.formats.export.cog.write_slc`.
+        See `apertura.formats.export.cog.write_slc`.
 
     Examples
     --------
@@ -72,7 +71,7 @@ def write_quicklook(
     placed(image, transform, crs)
     mean, factor = shrink(image, PICTURE_DOTS)
     decibel, top_db = below_peak(mean)
-    rows, columns = (factor * size for size in mean.shape)  # the last groups may reach beyond the image
+    rows, columns = (factor * size for size in mean.shape)  # the last groups may extend beyond the image
     north, west = transform.f, transform.c
     with matplotlib.style.context("default"):
         layout = MapLayout.for_bounds(
@@ -88,7 +87,7 @@ def write_quicklook(
         )
         layout.draw_frame(crs_name(crs))
         averaged = f"\nmean of {factor} × {factor} pixels" if factor > 1 else ""
-        beyond = "both" if top_db else "min"  # 0 dB is the peak: nothing lies above it
+        beyond = "both" if top_db else "min"  # no value exceeds the peak, 0 dB
         layout.draw_colour_bar(picture, f"power re peak, dB{averaged}", beyond=beyond)
         layout.draw_scale_and_north()
         layout.draw_markers(markers)
@@ -111,60 +110,60 @@ def crs_name(crs: str) -> str:
     >>> crs_name("EPSG:32632")
     'WGS 84 / UTM zone 32N'
     """
-    known = CRS.from_user_input(crs)
-    return known.name + (" (local axes, no place on Earth)" if known.is_engineering else "")
+    parsed_crs = CRS.from_user_input(crs)
+    return parsed_crs.name + (" (local frame, not georeferenced)" if parsed_crs.is_engineering else "")
 
 
 def footer(tags: Mapping[str, str]) -> str:
-    """Return the line below a picture: version, focus, numerical error and code, as far as its tags state them.
+    """Format the footer of a plot: version, focus, numerical error and code hash, if present in the tags.
 
     Examples
     --------
     >>> footer({"APERTURA_VERSION": "1.0", "APERTURA_CODE_SHA256": "0123456789abcdef"})
     'apertura 1.0 · code 0123456789ab'
     """
-    known = (
+    templates = (
         ("APERTURA_VERSION", "apertura {}"),
         ("APERTURA_ERROR_DB", "numerical error below {} dB"),
         ("APERTURA_LOOK_SIDE", "looks {}"),
         ("APERTURA_CODE_SHA256", "code {:.12}"),
     )
-    lines = [words.format(tags[tag].replace("-", "−")) for tag, words in known if tag in tags]
-    return " · ".join([*lines[:1], *_focus_words(tags), *lines[1:]])
+    parts = [template.format(tags[tag].replace("-", "−")) for tag, template in templates if tag in tags]
+    return " · ".join([*parts[:1], *_focus_words(tags), *parts[1:]])
 
 
 def _focus_words(tags: Mapping[str, str]) -> list[str]:
-    """Return the verdict on the focus, the loss measured, and the uncertainty of places where it exceeds a cell.
+    """Format focus, measured peak loss, and geolocation uncertainty if it exceeds a resolution cell.
 
     Examples
     --------
     >>> focus = {"verdict": "focused", "loss_db": -0.04, "cell_m": 0.1, "expected_shift_m": 1.24}
     >>> _focus_words({"APERTURA_FOCUS": json.dumps(focus)})
-    ['focus: focused (0.0 dB lost)', 'geolocation uncertainty 1.2 m']
+    ['focus: focused (peak loss 0.0 dB)', 'geolocation uncertainty 1.2 m']
     """
     if "APERTURA_FOCUS" not in tags:
         return []
     focus = json.loads(tags["APERTURA_FOCUS"])
-    loss = f" ({abs(focus['loss_db']):.1f} dB lost)" if "loss_db" in focus else ""
+    loss = f" (peak loss {abs(focus['loss_db']):.1f} dB)" if "loss_db" in focus else ""
     shift_m = focus.get("expected_shift_m", 0.0)
-    place = [f"geolocation uncertainty {shift_m:.2g} m"] if shift_m > focus.get("cell_m", 0.0) else []
-    return [f"focus: {focus['verdict']}{loss}", *place]
+    geolocation = [f"geolocation uncertainty {shift_m:.2g} m"] if shift_m > focus.get("cell_m", 0.0) else []
+    return [f"focus: {focus['verdict']}{loss}", *geolocation]
 
 
 def shrink(image: NorthUpRaster, most: int) -> tuple[NDArray[np.float64], int]:
-    """Return the mean power of square groups of pixels, so few that neither side exceeds `most`.
+    """Average the power of square groups of pixels, so that neither side has more than `most` groups.
 
     Parameters
     ----------
     image
-        (y, x) complex64; NaN pixels do not count.
+        (y, x) complex64; NaN pixels are ignored.
     most
-        Groups along the longer side.
+        Maximum number of groups along the longer side.
 
     Returns
     -------
     mean
-        (rows, columns) float64 power, NaN where a group holds no valid pixel.
+        (rows, columns) float64 power, NaN where a group has no valid pixel.
     factor
         Pixels along a side of a group.
 
@@ -194,19 +193,19 @@ def _mean_of_groups(linear: NDArray[np.float32], factor: int) -> NDArray[np.floa
 
 
 def below_peak(mean: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Return power relative to its peak, and the level at which the colours end.
+    """Convert power to dB relative to its peak, and return it with the upper limit of the colour scale.
 
     Parameters
     ----------
     mean
-        (rows, columns) float64 power, NaN where nothing was formed.
+        (rows, columns) float64 power, NaN where no image is formed.
 
     Returns
     -------
     decibel
-        (rows, columns) float64 dB, NaN without power.
+        (rows, columns) float64 dB, NaN where power is not positive.
     top_db
-        0, or less where only a glitch is brighter.
+        0, or less if only outliers are brighter.
 
     Notes
     -----
@@ -222,5 +221,5 @@ def below_peak(mean: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     if not brightest.size:
         return decibel, 0.0
     decibel -= brightest[-1]
-    fourth = float(brightest[0] - brightest[-1])  # a target is no single dot; a glitch may be
+    fourth = float(brightest[0] - brightest[-1])  # a target covers several dots, an outlier may be a single one
     return decibel, 0.0 if fourth > -20 else 5.0 * ceil(fourth / 5)

@@ -1,7 +1,7 @@
-"""QGIS styles: a .qml of the raster's name beside it, which QGIS takes up when it opens the raster.
+"""QGIS styles: a .qml file with the name and folder of a raster, which QGIS applies when it opens the raster.
 
-An image spans its own noise floor to its own peak. The usual 2 to 98 % of the pixels would blacken all targets of
-a scene that is mostly noise, and whiten the noise.
+The colour scale of an image ranges from its noise floor to its peak. The usual range, 2 to 98 % of the pixels,
+saturates all targets of a scene that consists mostly of noise.
 """
 
 import json
@@ -27,26 +27,26 @@ _DOCTYPE = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
 _VERSION = "3.22"
 _RAMP = ("#440154", "#3b528b", "#21918c", "#5ec962", "#fde725")  # viridis
 _GREYS = ("#000000", "#404040", "#808080", "#c0c0c0", "#ffffff")
-_STEP_DB = 5.0  # that the ends of the colours of a coefficient are whole multiples of
-_DOTS = 1024  # of the longer side of a layer, among which the ends of its colours are looked for
-_LEAST_DB = 1.0  # between black and white, of an image that is all one power
+_STEP_DB = 5.0  # the limits of the colour scale of a coefficient are multiples of this step
+_DOTS = 1024  # maximum pixels along the longer side for determining the limits of a colour scale
+_LEAST_DB = 1.0  # minimum range of a grey scale, for an image of constant power
 
 
 def write_db_style(path: Path, *_: object, **__: object) -> None:
-    """Write the style of decibels: white at the image's peak, black at its noise floor.
+    """Write the style of a raster in decibels: white at the peak, black at the noise floor of the image.
 
     Parameters
     ----------
     path
-        ``….qml``; complete or absent. A raster of that name lies beside it: its tag `radiometry.TAG` states
-        peak and noise floor.
+        ``….qml``; complete or absent. The raster of that name in the same folder has a tag `radiometry.TAG` with peak
+        and noise floor.
     *_, **__
-        What other products are written from.
+        Arguments of other export functions, ignored.
 
     Raises
     ------
     ContractError
-        If they were not measured.
+        If peak or noise floor is missing.
 
     Examples
     --------
@@ -61,39 +61,39 @@ def write_db_style(path: Path, *_: object, **__: object) -> None:
     ...     [line.strip() for line in path.read_text().splitlines() if "Value>" in line]
     ['<minValue>-17.0</minValue>', '<maxValue>32.0</maxValue>']
     """
-    with _beside(path) as raster:
-        about = json.loads(raster.tags().get(TAG, "{}"))
-    top, below = about.get("peak_db"), about.get("noise_floor_re_peak_db")
+    with _opened_raster_of(path) as raster:
+        radiometry = json.loads(raster.tags().get(TAG, "{}"))
+    top, below = radiometry.get("peak_db"), radiometry.get("noise_floor_re_peak_db")
     if top is None or below is None:
         raise ContractError(f"{path.name}: no peak and noise floor in tag {TAG}")
     _write(path, _grey(round(top + min(below, -_LEAST_DB), 2), round(top, 2), unit="dB"))
 
 
 def write_linear_style(path: Path, *_: object, **__: object) -> None:
-    """Write the style of power or magnitude: black where there is none, white from a tenth of the largest value.
+    """Write the style of power or magnitude: black at zero, white from a tenth of the largest value.
 
-    Parameters as `write_db_style`. A style of their own also keeps QGIS from measuring the raster, and from
-    writing what it measured into a mosaic or beside an image.
+    Parameters as `write_db_style`. With a style, QGIS does not compute statistics of the raster and write them into a
+    mosaic or a sidecar file.
     """
-    with _beside(path) as raster:
-        values = _few(raster)
+    with _opened_raster_of(path) as raster:
+        values = _subsampled(raster)
     largest = float(np.nanmax(values)) if np.isfinite(values).any() else 0.0
     _write(path, _grey(0.0, float(f"{largest / 10 or 1.0:.3g}")))
 
 
 def write_mask_style(path: Path, *_: object, **__: object) -> None:
-    """Write the style of the mask: a colour and a name of each class, valid pixels transparent.
+    """Write the style of the mask: a colour and a label for each class, valid pixels transparent.
 
     Parameters as `write_db_style`.
     """
     renderer = _renderer("paletted", band="1")
     palette = ET.SubElement(renderer, "colorPalette")
     for value, (name, colour) in CLASSES.items():
-        seen_through = value in {0, OUTSIDE}
+        is_transparent = value in {0, OUTSIDE}
         entry = {
             "value": str(value),
             "color": f"#{bytes(colour).hex()}",
-            "alpha": "0" if seen_through else "255",
+            "alpha": "0" if is_transparent else "255",
             "label": name,
         }
         ET.SubElement(palette, "paletteEntry", entry)
@@ -105,32 +105,32 @@ def write_layer_style(path: Path, *_: object, **__: object) -> None:
 
     Parameters as `write_db_style`.
     """
-    with _beside(path) as raster:
-        values, unit = _few(raster), raster.units[0]
-    _write_ramp(path, *_round_ends(values[np.isfinite(values)]), unit)
+    with _opened_raster_of(path) as raster:
+        values, unit = _subsampled(raster), raster.units[0]
+    _write_ramp(path, *_round_limits(values[np.isfinite(values)]), unit)
 
 
 def write_backscatter_style(path: Path, *_: object, **__: object) -> None:
-    """Write the style of a backscattering coefficient: grey over whole 5 dB that hold 2 to 99.5 % of the pixels.
+    """Write the style of a backscattering coefficient: grey scale over multiples of 5 dB, 2 to 99.5 % of the pixels.
 
-    Parameters as `write_db_style`. Speckle reaches down to nothing and reflectors far up: neither sets the colours.
+    Parameters as `write_db_style`. The percentiles exclude dark speckle and bright reflectors from the colour scale.
     """
-    with _beside(path) as raster:
-        values, unit = _few(raster), raster.units[0]
-    known = values[np.isfinite(values)]
-    low, high = np.percentile(known, (2.0, 99.5)) if known.size else (-30.0, 0.0)
+    with _opened_raster_of(path) as raster:
+        values, unit = _subsampled(raster), raster.units[0]
+    finite = values[np.isfinite(values)]
+    low, high = np.percentile(finite, (2.0, 99.5)) if finite.size else (-30.0, 0.0)
     low, high = _STEP_DB * floor(low / _STEP_DB), _STEP_DB * ceil(high / _STEP_DB)
     _write_ramp(path, low, max(high, low + _STEP_DB), unit, ramp=_GREYS)
 
 
 def _write_ramp(path: Path, low: float, high: float, unit: str, *, ramp: Sequence[str] = _RAMP) -> None:
-    """Write colours between two values, and a legend with their unit."""
+    """Write a colour ramp between two values, and a legend with their unit."""
     options = {"classificationMin": f"{low:g}", "classificationMax": f"{high:g}"}
     renderer = _renderer("singlebandpseudocolor", band="1", **options)
     ends = {"minimumValue": f"{low:g}", "maximumValue": f"{high:g}"}
     shader = ET.SubElement(ET.SubElement(renderer, "rastershader"), "colorrampshader", ends)
     shader.attrib |= {"colorRampType": "INTERPOLATED", "classificationMode": "1", "clip": "0"}
-    # Else QGIS draws the ramp with its two ends alone, and without the unit.
+    # otherwise QGIS draws a legend with the two limits only, without a unit
     ET.SubElement(shader, "rampLegendSettings", useContinuousLegend="0", suffix=f" {unit}")
     for share, colour in zip(np.linspace(0, 1, len(ramp)), ramp, strict=True):
         value = f"{low + share * (high - low):g}"
@@ -138,17 +138,17 @@ def _write_ramp(path: Path, low: float, high: float, unit: str, *, ramp: Sequenc
     _write(path, renderer)
 
 
-def _few(raster: rasterio.DatasetReader) -> NDArray[np.float32]:
-    """Return a raster averaged to few places, NaN where it holds nothing."""
-    fewer = max(1.0, max(raster.shape) / _DOTS)
-    shape = tuple(ceil(size / fewer) for size in raster.shape)
-    # Not as a masked array: for its mask rasterio reads every pixel of a mosaic.
+def _subsampled(raster: rasterio.DatasetReader) -> NDArray[np.float32]:
+    """Read a raster averaged to at most `_DOTS` pixels along the longer side, NaN for no data."""
+    factor = max(1.0, max(raster.shape) / _DOTS)
+    shape = tuple(ceil(size / factor) for size in raster.shape)
+    # not as a masked array: for its mask rasterio reads every pixel of a mosaic
     values = raster.read(1, out_shape=shape, resampling=Resampling.average)
     return np.where(values == raster.nodata, np.nan, values).astype(np.float32, copy=False)
 
 
-def _round_ends(values: NDArray[np.float32]) -> tuple[float, float]:
-    """Return the ends of some values, rounded outwards to a tenth of the power of ten below their span."""
+def _round_limits(values: NDArray[np.float32]) -> tuple[float, float]:
+    """Return minimum and maximum, rounded outwards to a tenth of the power of ten below their difference."""
     low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
     step = 10.0 ** floor(log10(high - low)) / 10 if high > low else 1.0
     return floor(low / step) * step, max(ceil(high / step), floor(low / step) + 1) * step
@@ -165,11 +165,11 @@ def _grey(low: float, high: float, *, unit: str = "") -> ET.Element:
 
 
 @contextmanager
-def _beside(path: Path) -> Iterator[rasterio.DatasetReader]:
-    """Open the raster that a style is for, of a mosaic by its whole name: its rasters are named relative to that."""
+def _opened_raster_of(path: Path) -> Iterator[rasterio.DatasetReader]:
+    """Open the raster of a style; a mosaic by its full path, to which the paths of its rasters are relative."""
     file = next(file for file in map(path.with_suffix, (".tif", ".vrt")) if file.is_file())
-    named = nullcontext(Path(file.absolute())) if file.suffix == ".vrt" else on_disk(file)
-    with named as name, rasterio.Env(**ISOLATED), rasterio.open(name) as raster:
+    opened_path = nullcontext(Path(file.absolute())) if file.suffix == ".vrt" else on_disk(file)
+    with opened_path as name, rasterio.Env(**ISOLATED), rasterio.open(name) as raster:
         yield raster
 
 
@@ -179,7 +179,7 @@ def _renderer(kind: str, **attributes: str) -> ET.Element:
 
 
 def _write(path: Path, renderer: ET.Element) -> None:
-    """Write a style that shows pixels as they are: no smoothing, and of overviews the nearest."""
+    """Write a style without resampling: nearest neighbour, also in overviews."""
     style = ET.Element("qgis", version=_VERSION, styleCategories="Symbology")
     pipe = ET.SubElement(style, "pipe")
     pipe.append(renderer)

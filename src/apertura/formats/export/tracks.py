@@ -1,4 +1,4 @@
-"""Tracks as refined, for other programs: RTKLIB solutions, tables, and a picture of what was moved and how sure."""
+"""Export of refined tracks: RTKLIB solutions, CSV tables, and a plot of corrections and standard deviations."""
 
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -27,39 +27,39 @@ from apertura.formats.tracks.track import FIXES
 
 _AXES = ("east", "north", "up")
 _NED_OF_ENU = [1, 0, 2]
-_MOVED, _STATED = "#0072B2", "#D55E00"  # told apart also by who does not see red and green (Okabe and Ito)
+_CORRECTION, _STATED = "#0072B2", "#D55E00"  # distinguishable with red-green colour blindness (Okabe and Ito)
 _CM = 100.0
-_DOTS = 4000  # of a series that are drawn; more would cover each other
+_DOTS = 4000  # maximum number of plotted points of a series
 
 
 @dataclass(frozen=True, eq=False)
 class RefinedLog:
-    """A node's log with the corrections of a refinement, epoch by epoch.
+    """Log of a node with the correction of a refinement for each epoch.
 
     Attributes
     ----------
     node
-        Its name.
+        Name of the node.
     track
         Stage `track`: the logged point, not an antenna, in the frame of the log.
     moved_m
-        (epoch, 3) float64, metres in that frame, to be added to the logged point.
+        (epoch, 3) float64: correction to be added to the logged point, metres in that frame.
     left_m
-        (epoch, 3) float64, metres along the axes of that frame: standard deviation of what the refinement leaves; NaN
-        where it did not estimate the node's error.
+        (epoch, 3) float64: standard deviation of the residual error along the axes of that frame, metres; NaN where the
+        refinement did not estimate the error of the node.
     stated_m
-        (epoch, 3) float64, metres east, north and up: standard deviation that log or config state of the log; NaN
-        where neither does.
+        (epoch, 3) float64: standard deviation of the log to east, north and up, metres, as logged or configured; NaN if
+        neither.
 
     Examples
     --------
-    >>> begun = np.datetime64("2025-05-14T09:30", "ns")
+    >>> start = np.datetime64("2025-05-14T09:30", "ns")
     >>> track = xr.Dataset(
-    ...     {"time": ("epoch", begun + np.arange(2)), "position": (("epoch", "axis"), np.zeros((2, 3)))},
+    ...     {"time": ("epoch", start + np.arange(2)), "position": (("epoch", "axis"), np.zeros((2, 3)))},
     ...     attrs={"frame": "local"},
     ... )
-    >>> moved_m, left_m = np.full((2, 3), 0.03), np.array([[0.01] * 3, [np.nan] * 3])
-    >>> RefinedLog("uav1", track, moved_m, left_m, np.full((2, 3), 0.04)).std_m  # the second epoch has no pulses
+    >>> correction_m, residual_m = np.full((2, 3), 0.03), np.array([[0.01] * 3, [np.nan] * 3])
+    >>> RefinedLog("uav1", track, correction_m, residual_m, np.full((2, 3), 0.04)).std_m  # second epoch without pulses
     array([[0.01, 0.01, 0.01],
            [0.05, 0.05, 0.05]])
     """
@@ -72,48 +72,48 @@ class RefinedLog:
 
     @property
     def local(self) -> bool:
-        """True if positions have no place on Earth."""
+        """True if positions are in a local frame that is not georeferenced."""
         return bool(self.track.attrs["frame"] == LOCAL)
 
     @property
     def refined(self) -> NDArray[np.bool_]:
-        """(epoch,) bool, whether images were evaluated there to find the node's error."""
+        """(epoch,) bool: True where the error of the node was estimated from images."""
         return np.asarray(np.isfinite(self.left_m).all(axis=1))
 
     @property
     def position_m(self) -> Floats:
-        """(epoch, 3) float64, the logged point as corrected, metres in the frame."""
+        """(epoch, 3) float64: corrected positions of the logged point, metres in the frame."""
         return np.asarray(self.track.position.values + self.moved_m)
 
     @property
     def geodetic(self) -> Floats:
-        """(epoch, 3) float64, the same as latitude and longitude (degrees) and metres above the ellipsoid."""
+        """(epoch, 3) float64: corrected latitude and longitude (degrees), and metres above the ellipsoid."""
         return geodetic_from_ecef(self.position_m)
 
     @property
     def correction_m(self) -> Floats:
-        """(epoch, 3) float64, metres east, north and up by which the logged point was moved."""
+        """(epoch, 3) float64: correction of the logged point to east, north and up, metres."""
         return np.asarray(np.einsum("nai,na->ni", self._enu, self.moved_m))
 
     @property
     def std_m(self) -> Floats:
-        """(epoch, 3) float64, metres east, north and up: standard deviation of the positions; NaN where nobody knows.
+        """(epoch, 3) float64: standard deviation of the positions to east, north and up, metres; NaN where unknown.
 
         Notes
         -----
-        Source: docs/theory/logs.md, eq. 6 where the images were evaluated, eq. 7 elsewhere.
+        Source: docs/theory/logs.md, eq. 6 at refined epochs, eq. 7 elsewhere.
         """
-        turned = np.sqrt(np.einsum("nai,na->ni", self._enu**2, self.left_m**2))
-        return np.where(self.refined[:, None], turned, np.hypot(self.stated_m, self.correction_m))
+        residual_m = np.sqrt(np.einsum("nai,na->ni", self._enu**2, self.left_m**2))
+        return np.where(self.refined[:, None], residual_m, np.hypot(self.stated_m, self.correction_m))
 
     @property
     def fix(self) -> NDArray[np.int8]:
-        """(epoch,) int8, kinds of solution as the log states them, 0 where it does not."""
+        """(epoch,) int8: solution types of the log, 0 where not logged."""
         return np.asarray(self.track.fix.values) if "fix" in self.track else np.zeros(len(self.moved_m), np.int8)
 
     @property
     def time_s(self) -> Floats:
-        """(epoch,) float64, seconds since the first epoch."""
+        """(epoch,) float64: seconds since the first epoch."""
         times = self.track.time.values
         return seconds_since(times, times[0])
 
@@ -126,26 +126,26 @@ class RefinedLog:
 
 
 def write_pos(path: Path, log: RefinedLog, *, outcome: str, version: str) -> None:
-    """Write a log as refined as an RTKLIB solution by GPS time.
+    """Write a refined log as an RTKLIB solution in GPS time.
 
     Parameters
     ----------
     path
         ``….pos``; complete or absent.
     log
-        Of a node whose frame has a place on Earth.
+        Refined log in a georeferenced frame.
     outcome
-        Whether tracks were refined, or why they are as logged: a line.
+        Result of the refinement, or the reason why tracks are unchanged, in one line.
     version
-        Of apertura.
+        Version of apertura.
     """
     unrefined = int((~log.refined).sum())
-    beyond = f"; {unrefined} of {len(log.refined)} epochs lie beyond the pulses, where the nearest correction is held"
+    outside = f"; {unrefined} of {len(log.refined)} epochs lie outside the pulses; the nearest correction is used"
     remarks = [
         outcome,
-        f"the logged point of {log.node}, no antenna{beyond if log.refined.any() else ''}",
-        "deviation 0: nobody states it; Q 5: also for kinds of solution that are not logged",
-        "ns, age, ratio and covariances 0: not known, for images moved the positions; Q is the log's; filter by none",
+        f"logged point of {log.node}, not an antenna{outside if log.refined.any() else ''}",
+        "standard deviation 0: unknown; Q 5: also for solution types that are not logged",
+        "ns, age, ratio and covariances 0: unknown (positions refined from images); Q as logged; do not filter by them",
     ]
     with replacement(path) as temporary:
         write_rtklib_pos(
@@ -160,24 +160,24 @@ def write_pos(path: Path, log: RefinedLog, *, outcome: str, version: str) -> Non
 
 
 def write_csv(path: Path, log: RefinedLog) -> None:
-    """Write a log as refined as a table, which is itself a log: attitude as logged, and what was added to it.
+    """Write a refined log as a CSV log, with logged attitude, standard deviations and corrections.
 
     Parameters
     ----------
     path
         ``….csv``; complete or absent.
     log
-        Of a node, in either frame.
+        Refined log in either frame.
     """
     std_m, correction_m, attitude = log.std_m, log.correction_m, log.track.attitude.values
-    further: dict[str, NDArray[np.generic]] = {
+    columns: dict[str, NDArray[np.generic]] = {
         f"std_{axis}_m": std_m[:, _AXES.index(axis)] for axis in ("north", "east", "up")
     }
     if log.fix.any():
         kinds = {number: name for name, number in FIXES.items()}
-        further["quality"] = np.array([kinds.get(number, "") for number in log.fix.tolist()])
-    further |= {f"correction_{axis}_m": column for axis, column in zip(_AXES, correction_m.T, strict=True)}
-    further["refined"] = log.refined.astype(np.int8)
+        columns["quality"] = np.array([kinds.get(number, "") for number in log.fix.tolist()])
+    columns |= {f"correction_{axis}_m": column for axis, column in zip(_AXES, correction_m.T, strict=True)}
+    columns["refined"] = log.refined.astype(np.int8)
     with replacement(path) as temporary:
         write_csv_log(
             temporary,
@@ -185,27 +185,27 @@ def write_csv(path: Path, log: RefinedLog) -> None:
             log.position_m if log.local else log.geodetic,
             None if np.isnan(attitude).all() else attitude,
             local=log.local,
-            further=further,
+            extra_columns=columns,
         )
 
 
 def write_picture(path: Path, logs: Sequence[RefinedLog], *, title: str, outcome: str, tags: Mapping[str, str]) -> None:
-    """Draw the correction of each log to east, north and up over time with its deviation, as a PNG.
+    """Plot the correction of each log to east, north and up over time with its standard deviation, as a PNG.
 
-    Where no log was corrected, the logs themselves: their course over ground, and their heights over time.
+    If no log is corrected, plot the logs: horizontal tracks, and heights over time.
 
     Parameters
     ----------
     path
         ``….png``; complete or absent.
     logs
-        Of a flight: a column each.
+        Logs of a flight, one per column.
     title
-        Whose tracks these are.
+        Title of the plot.
     outcome
-        Whether they were refined, or why they are as logged.
+        Result of the refinement, or the reason why tracks are unchanged.
     tags
-        Provenance, name → text; lies in the file.
+        Provenance, name → text; stored in the file.
     """
     with matplotlib.style.context("default"), matplotlib.rc_context({"font.size": 8, "text.parse_math": False}):
         corrected = any(log.refined.any() or log.moved_m.any() for log in logs)
@@ -213,12 +213,12 @@ def write_picture(path: Path, logs: Sequence[RefinedLog], *, title: str, outcome
         figure = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(figure)
         if corrected:
-            drawn = figure.subplots(3, len(logs), sharex="col", sharey=True, squeeze=False)
-            for column, log in zip(drawn.T, logs, strict=True):
+            panels = figure.subplots(3, len(logs), sharex="col", sharey=True, squeeze=False)
+            for column, log in zip(panels.T, logs, strict=True):
                 _draw(column, log)
-            for axes, name in zip(drawn[:, 0], _AXES, strict=True):
+            for axes, name in zip(panels[:, 0], _AXES, strict=True):
                 axes.set_ylabel(f"{name}, cm")
-            handles, labels = drawn[0, 0].get_legend_handles_labels()
+            handles, labels = panels[0, 0].get_legend_handles_labels()
         else:
             handles, labels = _draw_logged(figure, logs)
         figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
@@ -229,21 +229,21 @@ def write_picture(path: Path, logs: Sequence[RefinedLog], *, title: str, outcome
 
 
 def _draw_logged(figure: Figure, logs: Sequence[RefinedLog]) -> tuple[list[Any], list[str]]:
-    """Draw the course of logs over ground, and their heights; return lines and names for a legend."""
+    """Plot horizontal tracks and heights of logs; return lines and names for a legend."""
     ground, height = figure.subplots(1, 2)
     first = logs[0].track.position.values[0]
     axes_m = LOCAL_NED if logs[0].local else ned_axes(first[None])[0]
     for log in logs:
-        some = np.unique(np.linspace(0, len(log.time_s) - 1, min(len(log.time_s), _DOTS)).round().astype(int))
-        north, east, down = ((log.track.position.values[some] - first) @ axes_m).T
+        epochs = np.unique(np.linspace(0, len(log.time_s) - 1, min(len(log.time_s), _DOTS)).round().astype(int))
+        north, east, down = ((log.track.position.values[epochs] - first) @ axes_m).T
         (line,) = ground.plot(east, north, linewidth=1.2, label=log.node)
         ground.plot(east[-1:], north[-1:], "o", color=line.get_color(), markersize=4)
-        since_s = seconds_since(log.track.time.values[some], logs[0].track.time.values[0])
+        since_s = seconds_since(log.track.time.values[epochs], logs[0].track.time.values[0])
         height.plot(since_s, -down, linewidth=1.2, color=line.get_color())
     ground.set_aspect("equal", adjustable="datalim")
-    began = np.datetime_as_string(logs[0].track.time.values[0], "s")
-    ground.set(xlabel=f"east of the first epoch of {logs[0].node}, m", ylabel="north, m", title="course, dot: end")
-    height.set(xlabel=f"time after {began}Z, s", ylabel="height above that epoch, m", title="height")
+    start = np.datetime_as_string(logs[0].track.time.values[0], "s")
+    ground.set(xlabel=f"east of the first epoch of {logs[0].node}, m", ylabel="north, m", title="track (dot: end)")
+    height.set(xlabel=f"time after {start}Z, s", ylabel="height above that epoch, m", title="height")
     for axes in (ground, height):
         axes.grid(visible=True, color="0.9", linewidth=0.6)
     handles, labels = ground.get_legend_handles_labels()
@@ -251,30 +251,30 @@ def _draw_logged(figure: Figure, logs: Sequence[RefinedLog]) -> tuple[list[Any],
 
 
 def _draw(column: Sequence[Axes], log: RefinedLog) -> None:
-    """Draw the three axes of a node one below the other: over the refined epochs, if there are any, else the log."""
+    """Plot the three axes of a node one below the other, over the refined epochs if any, otherwise the whole log."""
     time_s, refined = log.time_s, log.refined
-    shown = np.flatnonzero(refined) if refined.any() else np.arange(len(time_s))
-    margin_s = 0.04 * float(time_s[shown[-1]] - time_s[shown[0]])
-    low_s, high_s = time_s[shown[0]] - margin_s, time_s[shown[-1]] + margin_s
+    epochs = np.flatnonzero(refined) if refined.any() else np.arange(len(time_s))
+    margin_s = 0.04 * float(time_s[epochs[-1]] - time_s[epochs[0]])
+    low_s, high_s = time_s[epochs[0]] - margin_s, time_s[epochs[-1]] + margin_s
     near = np.flatnonzero((time_s >= low_s) & (time_s <= high_s))
-    some = near[np.unique(np.linspace(0, len(near) - 1, min(len(near), _DOTS)).round().astype(int))]
-    at_s, moved, std, stated = (
-        values[some] for values in (time_s, _CM * log.correction_m, _CM * log.std_m, _CM * log.stated_m)
+    plotted = near[np.unique(np.linspace(0, len(near) - 1, min(len(near), _DOTS)).round().astype(int))]
+    at_s, correction, std, stated = (
+        values[plotted] for values in (time_s, _CM * log.correction_m, _CM * log.std_m, _CM * log.stated_m)
     )
     for number, axes in enumerate(column):
-        line, band = moved[:, number], std[:, number]
+        line, band = correction[:, number], std[:, number]
         axes.fill_between(
-            at_s, line - band, line + band, color=_MOVED, alpha=0.25, lw=0, label="± 1 standard deviation"
+            at_s, line - band, line + band, color=_CORRECTION, alpha=0.25, lw=0, label="± 1 standard deviation"
         )
-        axes.plot(at_s, line, color=_MOVED, linewidth=1.0, label="correction of the log")
+        axes.plot(at_s, line, color=_CORRECTION, linewidth=1.0, label="correction of the log")
         for side in (-1, 1):
-            label = "± standard deviation stated of the log" if side > 0 else None
+            label = "± standard deviation of the log (logged or configured)" if side > 0 else None
             axes.plot(at_s, side * stated[:, number], ":", color=_STATED, linewidth=1.0, label=label)
-        for begin, end in stretches(~refined[some]) if refined.any() else ():
+        for begin, end in stretches(~refined[plotted]) if refined.any() else ():
             axes.axvspan(at_s[begin], at_s[min(end, len(at_s) - 1)], color="0.92", lw=0, zorder=0)
         axes.grid(visible=True, color="0.9", linewidth=0.6)
         axes.margins(x=0)
     column[0].set_title(log.node, fontsize=9)
-    began = np.datetime_as_string(log.track.time.values[0], "ms")
-    beyond = "\n(grey: beyond the pulses)" if refined.any() else ""
-    column[-1].set_xlabel(f"time after {began}Z, s{beyond}")
+    start = np.datetime_as_string(log.track.time.values[0], "ms")
+    legend = "\n(grey: outside the pulses)" if refined.any() else ""
+    column[-1].set_xlabel(f"time after {start}Z, s{legend}")

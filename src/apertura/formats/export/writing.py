@@ -1,4 +1,4 @@
-"""Files written by GDAL: complete or absent, with errors that state their cause."""
+"""Atomic writing of files by GDAL, with error messages that state the cause."""
 
 import errno
 import os
@@ -20,34 +20,34 @@ from rasterio.windows import Window
 from apertura.common.atomic import replacement
 
 READ = 2048  # pixels along a side of a block in memory: four tiles of a COG
-GDAL = {"GDAL_CACHEMAX": 128, "GDAL_PAM_ENABLED": False}  # MB; no .aux.xml beside the file
+GDAL = {"GDAL_CACHEMAX": 128, "GDAL_PAM_ENABLED": False}  # MB; no sidecar file .aux.xml
 
 IN_MEMORY_BYTES = 1 << 27
-"""Pixels of a raster that GDAL writes in memory: 4096 x 4096 complex."""
+"""Maximum size of a raster that GDAL writes in memory, bytes: 4096 x 4096 complex pixels."""
 
-_FULL_BYTES = 1 << 20  # less than this free, and the disk counts as full
+_FULL_BYTES = 1 << 20  # free space below which the disk is reported as full
 
 BlockSlices = tuple[slice, slice]
 
 
 @contextmanager
 def gdal_replacement(path: Path, *, size: int) -> Iterator[Path]:
-    """Yield where GDAL writes what becomes `path`; what cannot be written is an `OSError`.
+    """Yield the temporary path of a GDAL output that becomes `path`; a failure to write raises `OSError`.
 
-    GDAL keeps some errors of writing to itself. What is small it writes in memory, and Python brings it to the disk;
-    what is larger it writes on the disk, where `check_written` reads it again.
+    GDAL does not report all write errors. Small rasters are therefore written in memory and copied to the disk by
+    Python; larger ones are written to the disk and read back by `check_written`.
 
     Parameters
     ----------
     path
-        Complete or absent.
+        Output file; complete or absent.
     size
-        Bytes of the raster's pixels.
+        Size of the raster's pixels in bytes.
 
     Raises
     ------
     OSError
-        With a number and `path`: `ENOSPC` where the disk is full, `EIO` where GDAL does not state the cause.
+        With errno and `path`: `ENOSPC` if the disk is full, `EIO` if GDAL does not state the cause.
     """
     with replacement(path) as temporary, rasterio.Env(**GDAL):
         if size <= IN_MEMORY_BYTES:
@@ -62,11 +62,11 @@ def gdal_replacement(path: Path, *, size: int) -> Iterator[Path]:
             if number or not type(error).__module__.startswith("rasterio"):
                 raise
             number = errno.ENOSPC if shutil.disk_usage(temporary.parent).free < _FULL_BYTES else errno.EIO
-            raise OSError(number, f"{os.strerror(number)}: GDAL says: {error}", str(path)) from error
+            raise OSError(number, f"{os.strerror(number)}: GDAL error: {error}", str(path)) from error
 
 
 def blocks_of(shape: tuple[int, ...]) -> Iterator[BlockSlices]:
-    """Yield the blocks of a raster that pass through memory one by one.
+    """Yield the blocks in which a raster is processed.
 
     Examples
     --------
@@ -78,27 +78,27 @@ def blocks_of(shape: tuple[int, ...]) -> Iterator[BlockSlices]:
 
 
 def added(checksum: int, pixels: NDArray[Any]) -> int:
-    """Return a sum over pixels with those of another block."""
+    """Update a checksum with the pixels of another block."""
     total: int = google_crc32c.extend(checksum, np.ascontiguousarray(pixels).view(np.uint8).ravel())
     return total
 
 
 def check_written(path: Path, checksum: int, tags: Mapping[str, str]) -> None:
-    """Read a raster back, overviews too, and compare its pixels and tags with what was written.
+    """Read a raster with its overviews back, and compare checksum and tags with the values written.
 
     Raises
     ------
     OSError
-        If it does not hold them.
+        If they differ.
     """
     with rasterio.open(path) as raster:
         levels = len(raster.overviews(1))
         read, tags_read = _checksum(raster), raster.tags()
     for level in range(levels):
         with rasterio.open(path, OVERVIEW_LEVEL=level) as overview:
-            _checksum(overview)  # its tiles carry sums of their own, which GDAL compares
+            _checksum(overview)  # GDAL verifies the checksums of the overview tiles
     if read != checksum or not tags.items() <= tags_read.items():
-        raise OSError(errno.EIO, "what was written does not read back", str(path))
+        raise OSError(errno.EIO, "the file differs from the data written", str(path))
 
 
 def _checksum(raster: Any) -> int:

@@ -1,1 +1,1 @@
-"""Phase histories and beat signals of other radars; rows in `apertura.formats.names.PHASE_HISTORIES`."""
+"""Readers of phase histories and beat signals of other radars; table in `apertura.formats.names.PHASE_HISTORIES`."""

@@ -1,6 +1,6 @@
-"""AFRL Gotcha phase history (.mat): frequency-domain samples and antenna positions in the scene's frame.
+"""AFRL Gotcha phase history (.mat): frequency-domain samples and antenna positions in the local frame of the scene.
 
-It enters at `echo`: there are no raw samples, no clock and no code to remove.
+It is read as stage `echo`: there are no raw samples, no clock and no code to remove.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ from apertura.formats.phase_histories.phase_history import LARGEST, History, lar
 _EXPECTED = "a Gotcha .mat file with data.fp (frequency, pulse), freq, x, y, z, r0, all finite"
 
 _LARGEST = {"fp": LARGEST, "freq": 1e12, "x": 1e7, "y": 1e7, "z": 1e7, "r0": 1e7, "r_correct": 1e4, "ph_correct": 1e4}
-"""Largest values of fields: samples, Hz, m, rad."""
+"""Largest accepted value of each field: samples, Hz, m, rad."""
 
 
 _EPOCH = np.datetime64("1970-01-01", "ns")
@@ -31,21 +31,21 @@ _EPOCH = np.datetime64("1970-01-01", "ns")
 def read_afrl_mat(
     paths: Sequence[Path], *, pair: str, described: Mapping[str, Any] = MappingProxyType({})
 ) -> xr.Dataset:
-    """Return the `echo` stage of a pass whose .mat files are joined in the order of their names.
+    """Read the .mat files of a pass, concatenated in the order of their names, as `echo` stage.
 
-    Each holds fp (subcarrier, pulse), freq (Hz), x, y, z and r0 (m). Monostatic: both phase centres are the antenna.
-    Samples are referred to a delay of 2 r0/c. The data carry no clock: `time` counts pulses from the epoch at 1 s.
-    Frame 'local': metres from the scene centre.
+    Each file contains fp (subcarrier, pulse), freq (Hz), x, y, z and r0 (m). Monostatic: both phase centres are the
+    antenna. Samples are referred to a delay of 2 r0/c. The data contain no times: `time` is the pulse number in seconds
+    since 1970. Frame 'local': metres from the scene centre.
 
-    Files may hold corrections of their passes, data.af: r_correct (m) is to be added to r0, ph_correct (rad) to the
-    phase of samples. They are applied where `described`, section `waveform`, has corrections: stored; else `remarks`
-    state them. They move targets by decimetres, and bring passes together.
+    Files may contain corrections of their passes, data.af: r_correct (m) to be added to r0, and ph_correct (rad) to be
+    added to the phase of samples. They are applied if section `waveform` (`described`) has corrections: stored;
+    otherwise they are only reported in `remarks`. They displace targets by decimetres and align the passes.
 
     Raises
     ------
     CampaignError
-        If a file lacks a field, holds NaN, or frequencies differ between files or are not equally spaced; or if
-        corrections that are to be applied are not stored.
+        If a file lacks a field or contains NaN, frequencies differ between files or are not equally spaced, or
+        corrections to be applied are missing.
 
     Notes
     -----
@@ -63,36 +63,36 @@ def read_afrl_mat(
 def joined(
     paths: Sequence[Path], passes: Sequence[dict[str, NDArray[Any]]], *, pair: str, corrected: bool = False
 ) -> xr.Dataset:
-    """Return the `echo` stage of what `apertura.formats.phase_histories.mat_fields` read of each file.
+    """Build the `echo` stage from the fields of each file.
 
     Parameters
     ----------
     paths
         Files in order, for messages.
     passes
-        Per file fp (subcarrier, pulse) complex64; freq (subcarrier,) Hz; x, y, z, r0 (pulse,) m; with or without those
-        of `CORRECTIONS`, (pulse,).
+        Fields of each file from `apertura.formats.phase_histories.mat_fields.read_fields`: fp (subcarrier, pulse)
+        complex64; freq (subcarrier,) Hz; x, y, z, r0 (pulse,) m; optionally `CORRECTIONS`, (pulse,).
     pair
         Transmitter-receiver.
     corrected
-        Whether these are applied.
+        True to apply the corrections.
 
     Raises
     ------
     CampaignError
-        If fields do not fit each other, hold NaN or values that no radar has, or frequencies differ between files.
+        If the shapes of fields are inconsistent, values are NaN or out of range, or frequencies differ between files.
     """
     histories, pulse = [], 0
     for path, fields in zip(paths, passes, strict=True):
         _check(fields, path)
         transfer, r0 = fields["fp"].T, fields["r0"]
         if corrected:
-            lacking = [name for name in CORRECTIONS if name not in fields]
-            if lacking:
+            missing = [name for name in CORRECTIONS if name not in fields]
+            if missing:
                 raise CampaignError(
-                    f"no field data.af.{lacking[0]}",
+                    f"no field data.af.{missing[0]}",
                     path,
-                    "stored corrections, as waveform.corrections says",
+                    "stored corrections, as configured in waveform.corrections",
                     "Set waveform.corrections to none.",
                 )
             transfer = transfer * np.exp(1j * fields["ph_correct"])[:, None].astype(np.complex64)
@@ -119,10 +119,10 @@ def joined(
     stored = [fields["r_correct"] for fields in passes if "r_correct" in fields]
     if corrected or not stored:
         return echo
-    moved = np.concatenate(stored)
+    r_correct = np.concatenate(stored)
     remark = (
-        f"data.af holds corrections of {moved.min():.2f} to {moved.max():.2f} m of r0, and of phases, which are not "
-        "applied: waveform.corrections: stored applies them"
+        f"data.af contains corrections of r0 ({r_correct.min():.2f} to {r_correct.max():.2f} m) and of phases, which "
+        "are not applied; to apply them, set waveform.corrections: stored"
     )
     print_remark(str(paths[0]), remark)
     return echo.assign_attrs(remarks=[remark])
@@ -130,8 +130,8 @@ def joined(
 
 def _check(fields: dict[str, NDArray[Any]], path: Path) -> None:
     size = fields["x"].size
-    pulsed = [name for name in ("y", "z", "r0", *CORRECTIONS) if name in fields]
-    if fields["fp"].shape != (fields["freq"].size, size) or any(fields[name].size != size for name in pulsed):
+    per_pulse = [name for name in ("y", "z", "r0", *CORRECTIONS) if name in fields]
+    if fields["fp"].shape != (fields["freq"].size, size) or any(fields[name].size != size for name in per_pulse):
         raise _error(
             f"fp is {fields['fp'].shape} for {fields['freq'].size} frequencies, {size} pulses (y "
             f"{fields['y'].size}, z {fields['z'].size}, r0 {fields['r0'].size})",
@@ -139,9 +139,9 @@ def _check(fields: dict[str, NDArray[Any]], path: Path) -> None:
         )
     for name, values in fields.items():
         largest_by_row(name, values, _LARGEST[name], lambda found: _error(found, path))
-    silent = np.flatnonzero(~fields["fp"].any(axis=0))
-    if silent.size:
-        raise _error(f"pulse {int(silent[0])} holds only zeros ({silent.size} in all)", path)
+    zero_pulses = np.flatnonzero(~fields["fp"].any(axis=0))
+    if zero_pulses.size:
+        raise _error(f"pulse {int(zero_pulses[0])} contains only zeros ({zero_pulses.size} such pulses)", path)
 
 
 def _error(found: str, path: Path) -> CampaignError:

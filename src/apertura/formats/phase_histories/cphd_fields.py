@@ -1,4 +1,4 @@
-"""Parameters of the pulses of a CPHD file, through sarkit; run by `read_isolated`. Samples stay in the file."""
+"""Extraction of the per-vector parameters of a CPHD file by sarkit; run by `read_isolated`. Samples are not read."""
 
 from pathlib import Path
 from typing import Any
@@ -7,21 +7,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 PULSE_FIELDS = ("TxTime", "TxPos", "RcvTime", "RcvPos", "SRPPos", "FX1", "FX2", "TOA1", "TOA2", "SC0", "SCSS")
-"""Of each pulse, what an image needs."""
+"""Per-vector parameters required for image formation."""
 
 _LONGEST_KIND = 64
 PATH_LIMIT = "APERTURA_PATH_LIMIT"
-"""Parameter of each pulse that our own files add: `path_limit` of stage echo, m."""
+"""Per-vector parameter added in files of apertura: `path_limit` of stage echo, m."""
 
 FRAME = "APERTURA_FRAME"
-"""Parameter of the collection that our own files add: frame of stage echo."""
+"""Collection parameter added in files of apertura: frame of stage echo."""
 
 OPTIONAL_FIELDS = ("AmpSF", "SIGNAL", "TDTropoSRP", "TDIonoSRP", PATH_LIMIT)
-"""Optional parameters of each pulse."""
+"""Optional per-vector parameters."""
 
 
 def read_fields(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the parameters of each pulse, where the samples lie, and what they mean.
+    """Read the per-vector parameters, and position and format of the samples.
 
     Parameters
     ----------
@@ -31,16 +31,16 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
     Returns
     -------
     dict
-        ``channels``: their names. Of channel 0, 1 … under ``0/`` …: `PULSE_FIELDS` and those of
-        `OPTIONAL_FIELDS` that are there, (pulse,) or (pulse, 3) float64; ``layout``: byte of the block where samples
-        begin, pulses, samples of each, int64. Of all: ``block``: byte of the file where that begins; ``start``:
-        datetime64[ns], UTC; ``origin`` (3,) and ``axes`` (3, 3) float64 of the image area's plane, zeros where it is
-        none; ``sign``; and as text ``format``, ``collect_type``, ``frame``.
+        ``channels``: names of the channels. For channels 0, 1 … under ``0/`` …: `PULSE_FIELDS` and the
+        `OPTIONAL_FIELDS` present, (pulse,) or (pulse, 3) float64; ``layout``: offset of the samples in the signal
+        block in bytes, number of pulses, samples per pulse, int64. For all channels: ``block``: offset of the signal
+        block in the file; ``start``: datetime64[ns], UTC; ``origin`` (3,) and ``axes`` (3, 3) float64 of the plane of
+        the image area, zeros if it is not a plane; ``sign``; and as text ``format``, ``collect_type``, ``frame``.
 
     Raises
     ------
     ValueError
-        If it is no such file, or one that cannot be imaged from.
+        If the file is not such a file, or is not suitable for image formation.
     """
     import sarkit.cphd as skcphd
     from lxml import etree
@@ -48,16 +48,16 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
     with path.open("rb") as stream:
         first = stream.readline(_LONGEST_KIND).decode("ascii", errors="replace").strip()
         if not first.startswith("CPHD/"):
-            raise ValueError(f"it begins with {first[:20]!r}, not with CPHD/ and a version")
+            raise ValueError(f"it starts with {first[:20]!r}, not with CPHD/ and a version")
         if not first.startswith("CPHD/1."):
-            raise ValueError(f"version {first!r}, and neither 1.0.1 nor 1.1.0")
+            raise ValueError(f"version {first!r}, not 1.0.1 or 1.1.0")
         stream.seek(0)
         kind, header = skcphd.read_file_header(stream)
         stream.seek(0)
         with skcphd.Reader(stream) as reader:
             tree = reader.metadata.xmltree
             if etree.QName(tree.getroot()).namespace not in skcphd.VERSION_INFO:
-                raise ValueError(f"version {kind.strip()!r}, and neither 1.0.1 nor 1.1.0")
+                raise ValueError(f"version {kind.strip()!r}, not 1.0.1 or 1.1.0")
             xml = skcphd.XmlHelper(tree)
             _check(tree)
             channels = tree.findall("{*}Data/{*}Channel")
@@ -80,25 +80,25 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _check(tree: Any) -> None:
-    """Raise ValueError unless samples are over frequency and as they are."""
+    """Raise ValueError unless samples are uncompressed and in the frequency domain."""
     domain = tree.findtext("{*}Global/{*}DomainType")
     if domain != "FX":
-        raise ValueError(f"samples over {domain}, and not over frequency (DomainType FX)")
+        raise ValueError(f"samples in domain {domain}, not in the frequency domain (DomainType FX)")
     if tree.find("{*}Data/{*}SignalCompressionID") is not None:
-        raise ValueError("compressed samples, by a method that the standard does not describe")
+        raise ValueError("compressed samples, by a method outside the standard")
 
 
 def _of_channel(channel: Any, pulses: NDArray[Any]) -> dict[str, NDArray[Any]]:
     missing = [name for name in PULSE_FIELDS if name not in (pulses.dtype.names or ())]
     if missing:
-        raise ValueError(f"no parameter {missing[0]} of pulses")
-    named = [*PULSE_FIELDS, *(name for name in OPTIONAL_FIELDS if name in (pulses.dtype.names or ()))]
+        raise ValueError(f"no per-vector parameter {missing[0]}")
+    present = [*PULSE_FIELDS, *(name for name in OPTIONAL_FIELDS if name in (pulses.dtype.names or ()))]
     layout = [int(channel.findtext(f"{{*}}{name}")) for name in ("SignalArrayByteOffset", "NumVectors", "NumSamples")]
-    return {**{name: pulses[name].astype(np.float64) for name in named}, "layout": np.array(layout, np.int64)}
+    return {**{name: pulses[name].astype(np.float64) for name in present}, "layout": np.array(layout, np.int64)}
 
 
 def _plane(xml: Any) -> dict[str, NDArray[np.float64]]:
-    """Return the image area's reference point and axes, east, north and up for our own files, ECEF."""
+    """Return reference point and axes of the image area in ECEF; in files of apertura, axes are east, north and up."""
     scene = "SceneCoordinates"
     axes = [_found(xml, f"{scene}/ReferenceSurface/Planar/{name}") for name in ("uIAX", "uIAY")]
     if axes[0] is None or axes[1] is None:
@@ -116,5 +116,5 @@ def _found(xml: Any, path: str) -> Any:
 def _required(xml: Any, path: str) -> Any:
     value = _found(xml, path)
     if value is None:
-        raise ValueError(f"no {path} in its XML")
+        raise ValueError(f"no {path} in the XML block")
     return value

@@ -1,4 +1,4 @@
-"""Beat signals of FMCW radars as arrays (.npy, .mat) or sound (.wav): they enter at `echo`, placed by flight logs."""
+"""Beat signals of FMCW radars as arrays (.npy, .mat) or audio (.wav), read as stage `echo` without positions."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -20,45 +20,45 @@ from apertura.formats.times import utc_times
 
 # ---- Beat signals of FMCW radars as arrays (.npy, .mat) -------------------------------------------------------------
 #
-# The sweep is stated by the config: section `waveform` of kind fmcw.
+# The sweep is configured in section `waveform` of kind fmcw.
 
 _TIMES = ".time.npy"
 _MOST_VALUES = 1 << 34
 _LARGEST = 1e15
-"""Largest sample: its square is a float32."""
+"""Largest sample, whose square is within the range of float32."""
 
 _FARTHEST_S = 2.0**33
-"""Since 1970, what nanoseconds can count."""
+"""Largest time since 1970 that int64 nanoseconds can represent, s."""
 
 _DATENUM = 723_181, 803_534
-"""1980 and 2200 as MATLAB counts days."""
+"""The years 1980 and 2200 as MATLAB datenum (days)."""
 
 _LEAST_STEP = 0.9
-"""Of a sweep, what at least is between the beginnings of two; float64 seconds since 1970 are good to 0.2 us."""
+"""Minimum interval between sweep starts, relative to the sweep duration; float64 seconds since 1970 resolve 0.2 us."""
 
 _MOST_INTERVALS = 1.05
-"""Of the interval between sweeps, how many samples a row may hold."""
+"""Maximum length of a row relative to the interval between sweeps."""
 
-_EXPECTED = "beat signals (sweep, sample), real or complex as waveform.iq says, all finite"
+_EXPECTED = "beat signals (sweep, sample), real or complex as configured in waveform.iq, all finite"
 _REMEDY = "Correct the file, or waveform in the config."
 
 
 @dataclass(frozen=True)
 class Sweeps:
-    """Content of one file.
+    """Sweeps of a file.
 
     Attributes
     ----------
     path
         The file.
     beat
-        (sweep, sample) from the beginning of each sweep.
+        (sweep, sample) from the start of each sweep.
     time
-        (sweep,) datetime64[ns], start of each; None: not stated by the file.
+        (sweep,) datetime64[ns], start of each sweep; None: not in the file.
     late_s
-        (sweep,) seconds by which the first sample is later than that; None: by nothing.
+        (sweep,) delay of the first sample relative to the start of the sweep, s; None: zero.
     dropped
-        Reason → sweeps that are left out.
+        Reason → number of excluded sweeps.
     """
 
     path: Path
@@ -69,50 +69,53 @@ class Sweeps:
 
 
 def read_beat_npy(paths: Sequence[Path], *, pair: str, described: Mapping[str, Any]) -> xr.Dataset:
-    """Return the `echo` stage of <node>.npy or <node>.<part>.npy, (sweep, sample), without positions.
+    """Read <node>.npy or <node>.<part>.npy, (sweep, sample), as `echo` stage without positions.
 
-    Beside <stem>.npy, <stem>.time.npy may state the start of each sweep: datetime64, or float64 seconds since 1970.
+    An additional file <stem>.time.npy may contain the start of each sweep in <stem>.npy: datetime64, or float64 seconds
+    since 1970.
 
     Raises
     ------
     CampaignError
-        If arrays do not fit each other or the waveform.
+        If arrays are inconsistent with each other or with the waveform.
     """
     by_name = {path.name: path for path in paths}
     files = [path for path in paths if not path.name.endswith(_TIMES)]
-    alone = [path for path in paths if path.name.endswith(_TIMES) and path.name[: -len(_TIMES)] + ".npy" not in by_name]
-    if alone or not files:
-        raise _error("times without beat signals", (alone or list(paths))[0])
+    orphans = [
+        path for path in paths if path.name.endswith(_TIMES) and path.name[: -len(_TIMES)] + ".npy" not in by_name
+    ]
+    if orphans or not files:
+        raise _error("times without beat signals", (orphans or list(paths))[0])
     limits: dict[str, Any] = {"most": _MOST_VALUES, "expected": _EXPECTED, "remedy": _REMEDY}
     read = []
     for path in files:
-        beside = by_name.get(path.name.removesuffix(".npy") + _TIMES)
-        time = None if beside is None else _times(read_npy(beside, kinds="Mf", **limits), beside)
+        time_path = by_name.get(path.name.removesuffix(".npy") + _TIMES)
+        time = None if time_path is None else _times(read_npy(time_path, kinds="Mf", **limits), time_path)
         read.append(Sweeps(path, read_npy(path, kinds="fiuc", **limits), time))
     return joined_sweeps(read, pair=pair, described=described)
 
 
 def read_beat_mat(paths: Sequence[Path], *, pair: str, described: Mapping[str, Any]) -> xr.Dataset:
-    """Return the `echo` stage of MATLAB files with beat (sweep, sample) and, or not, time (sweep,) in s since 1970.
+    """Read MATLAB files with beat (sweep, sample) and optionally time (sweep,) in s since 1970 as `echo` stage.
 
     Raises
     ------
     CampaignError
-        As `read_beat_npy`.
+        See `read_beat_npy`.
     """
     read = read_fields(fmcw_fields.read_beat_fields, paths)
-    return joined_sweeps([sweeps_of(path, one) for path, one in read], pair=pair, described=described)
+    return joined_sweeps([sweeps_of(path, variables) for path, variables in read], pair=pair, described=described)
 
 
 def read_fields(
     function: Callable[[Path], Any], paths: Sequence[Path]
 ) -> Iterable[tuple[Path, dict[str, NDArray[Any]]]]:
-    """Return each file, in the order of names, and what a function in a process of its own makes of it.
+    """Read files in a separate process; return each file, sorted by name, with its fields.
 
     Raises
     ------
     CampaignError
-        If it refuses one, or dies of it.
+        If the function rejects a file or its process crashes.
     """
     paths = sorted(paths)
     try:
@@ -121,23 +124,23 @@ def read_fields(
         raise _error(f"not readable ({error})", error.path) from error
 
 
-def sweeps_of(path: Path, found: Mapping[str, NDArray[Any]]) -> Sweeps:
-    """Return the variables beat and time of a MATLAB file as sweeps; raise CampaignError if time is none."""
-    return Sweeps(path, found["beat"], _times(found["time"], path) if "time" in found else None)
+def sweeps_of(path: Path, variables: Mapping[str, NDArray[Any]]) -> Sweeps:
+    """Convert the variables beat and time of a MATLAB file to sweeps; CampaignError if time is invalid."""
+    return Sweeps(path, variables["beat"], _times(variables["time"], path) if "time" in variables else None)
 
 
 def sweep_of(described: Mapping[str, Any]) -> FrequencySweep:
-    """Return the sweep of section `waveform`."""
+    """Return the sweep configured in section `waveform`."""
     return FrequencySweep(**{field.name: described[field.name] for field in fields(FrequencySweep)})
 
 
 def joined_sweeps(read: Sequence[Sweeps], *, pair: str, described: Mapping[str, Any]) -> xr.Dataset:
-    """Return the `echo` stage of sweeps, without positions; `dropped` counts those left out by reason.
+    """Build the `echo` stage of sweeps, without positions; `dropped` counts excluded sweeps by reason.
 
     Parameters
     ----------
     read
-        What files hold, in the order of time.
+        Sweeps of the files, in the order of time.
     pair
         Transmitter-receiver.
     described
@@ -146,31 +149,33 @@ def joined_sweeps(read: Sequence[Sweeps], *, pair: str, described: Mapping[str, 
     Raises
     ------
     CampaignError
-        If sweeps are too short, are not what waveform.iq says, are no finite numbers, or have no times that ascend.
+        If sweeps are too short, contradict waveform.iq, contain values that are not finite, or have no increasing
+        times.
     """
     sweep, dropped = sweep_of(described), dict[str, int]()
     times, transfers = list[Times](), list[NDArray[np.complex64]]()
-    for one in read:
-        _check(one, sweep, described)
-        began = _regular(one, described, alone=len(read) == 1) if one.time is None else one.time
-        if len(began) != len(one.beat):
-            raise _error(f"{len(began)} times for {len(one.beat)} sweeps", one.path)
-        sound = one.beat[:, sweep.first : sweep.sweep_samples].any(axis=1)
-        left_out = {**(one.dropped or {}), "silent": int((~sound).sum())}
-        dropped = {why: dropped.get(why, 0) + left_out.get(why, 0) for why in {**dropped, **left_out}}
-        late_s = None if one.late_s is None else one.late_s[sound]
-        times.append(began[sound])
-        transfers.append(transfer_of(one.beat[sound], sweep, late_s=late_s))
+    for file in read:
+        _check(file, sweep, described)
+        starts = _regular(file, described, is_single=len(read) == 1) if file.time is None else file.time
+        if len(starts) != len(file.beat):
+            raise _error(f"{len(starts)} times for {len(file.beat)} sweeps", file.path)
+        has_signal = file.beat[:, sweep.first : sweep.sweep_samples].any(axis=1)
+        excluded = {**(file.dropped or {}), "all samples zero": int((~has_signal).sum())}
+        dropped = {reason: dropped.get(reason, 0) + excluded.get(reason, 0) for reason in {**dropped, **excluded}}
+        late_s = None if file.late_s is None else file.late_s[has_signal]
+        times.append(starts[has_signal])
+        transfers.append(transfer_of(file.beat[has_signal], sweep, late_s=late_s))
     time = np.concatenate(times) + np.timedelta64(round(sweep.middle_s * 1e9), "ns")
     if not len(time):
-        raise _error("no sweep with a signal", read[0].path)
+        raise _error("no sweep with a non-zero sample", read[0].path)
     steps_s = np.diff(time) / np.timedelta64(1, "s")
     early = np.flatnonzero(steps_s < _LEAST_STEP * sweep.sweep_samples / sweep.sample_rate_hz)
     if early.size:
         found = (
-            f"sweep {int(early[0]) + 1} begins {steps_s[early[0]]:.6g} s after another that lasts {sweep.sweep_s:g} s"
+            f"sweep {int(early[0]) + 1} starts {steps_s[early[0]]:.6g} s after the previous sweep, whose duration is "
+            f"{sweep.sweep_s:g} s"
         )
-        raise _error(f"{found} ({early.size} such in all files)", read[0].path)
+        raise _error(f"{found} ({early.size} such sweeps in all files)", read[0].path)
     return xr.Dataset(
         {
             "time": ("pulse", time),
@@ -183,38 +188,40 @@ def joined_sweeps(read: Sequence[Sweeps], *, pair: str, described: Mapping[str, 
             "pair": pair,
             "flags": {},
             "wave_speed_m_s": SPEED_OF_LIGHT_M_S,
-            "dropped": {why: count for why, count in dropped.items() if count},
+            "dropped": {reason: count for reason, count in dropped.items() if count},
             "sweep_used_s": sweep.samples / sweep.sample_rate_hz,
         },
     )
 
 
-def _check(one: Sweeps, sweep: FrequencySweep, described: Mapping[str, Any]) -> None:
-    beat = one.beat
-    if beat.ndim == 2 and _is_by_columns(one, sweep, described):
+def _check(file: Sweeps, sweep: FrequencySweep, described: Mapping[str, Any]) -> None:
+    beat = file.beat
+    if beat.ndim == 2 and _is_by_columns(file, sweep, described):
         raise CampaignError(
             f"{beat.shape[0]} × {beat.shape[1]} samples, with a sweep in each column",
-            one.path,
+            file.path,
             f"a sweep in each row: (sweep, sample), at least {sweep.sweep_samples} samples",
             "Save the transpose; or correct waveform.sweep_s, waveform.sample_rate_hz and waveform.prf_hz.",
         )
     if beat.ndim != 2 or beat.dtype.kind not in "fiuc" or beat.shape[1] < sweep.sweep_samples or not len(beat):
-        raise _error(f"{beat.dtype} of shape {beat.shape}: a sweep has {sweep.sweep_samples} samples", one.path)
+        raise _error(f"{beat.dtype} of shape {beat.shape}; a sweep has {sweep.sweep_samples} samples", file.path)
     if (beat.dtype.kind == "c") != (sweep.iq != "real"):
-        raise _error(f"{beat.dtype} samples where waveform.iq is {sweep.iq}", one.path)
+        raise _error(f"{beat.dtype} samples, but waveform.iq is {sweep.iq}", file.path)
     with np.errstate(invalid="ignore"):
         bad = np.flatnonzero(~(np.abs(beat).max(axis=1) < _LARGEST))
     if bad.size:
         raise _error(
-            f"sweep {int(bad[0])} holds what is no number, or beyond {_LARGEST:g} ({bad.size} in all)", one.path
+            f"sweep {int(bad[0])} contains a sample that is not a number or exceeds {_LARGEST:g} ({bad.size} such "
+            "sweeps)",
+            file.path,
         )
 
 
-def _is_by_columns(one: Sweeps, sweep: FrequencySweep, described: Mapping[str, Any]) -> bool:
-    """Test whether columns of an array are sweeps: by its times, its sides, and the interval between sweeps."""
-    rows, columns = one.beat.shape
-    if one.time is not None and rows != columns and len(one.time) in {rows, columns}:
-        return bool(len(one.time) == columns)
+def _is_by_columns(file: Sweeps, sweep: FrequencySweep, described: Mapping[str, Any]) -> bool:
+    """Return True if the columns of an array are sweeps, judged by its times, shape and the sweep interval."""
+    rows, columns = file.beat.shape
+    if file.time is not None and rows != columns and len(file.time) in {rows, columns}:
+        return bool(len(file.time) == columns)
     exact = {sweep.sweep_samples}
     if described.get("prf_hz"):
         exact.add(round(sweep.sample_rate_hz / described["prf_hz"]))
@@ -224,21 +231,21 @@ def _is_by_columns(one: Sweeps, sweep: FrequencySweep, described: Mapping[str, A
     return bool(too_long and rows >= sweep.sweep_samples)
 
 
-def _regular(one: Sweeps, described: Mapping[str, Any], *, alone: bool) -> Times:
-    """Return when sweeps began that come at waveform.prf_hz from waveform.start_utc on."""
-    if described["prf_hz"] is None or not alone:
-        found = "no times of sweeps" if alone else "several files without times of their sweeps"
-        raise _error(found, one.path, "the file's own times, or one file and waveform.prf_hz")
-    steps_ns = np.round(np.arange(len(one.beat)) * (1e9 / described["prf_hz"]))
-    times: Times = beginning(described, one.path) + steps_ns.astype("timedelta64[ns]")
+def _regular(file: Sweeps, described: Mapping[str, Any], *, is_single: bool) -> Times:
+    """Return sweep starts at a rate of waveform.prf_hz from waveform.start_utc on."""
+    if described["prf_hz"] is None or not is_single:
+        found = "no sweep times" if is_single else "several files without sweep times"
+        raise _error(found, file.path, "sweep times in the file, or a single file and waveform.prf_hz")
+    steps_ns = np.round(np.arange(len(file.beat)) * (1e9 / described["prf_hz"]))
+    times: Times = beginning(described, file.path) + steps_ns.astype("timedelta64[ns]")
     return times
 
 
 def beginning(described: Mapping[str, Any], path: Path) -> np.datetime64:
-    """Return waveform.start_utc; without one 1970, from where a clock of the config leads to the log's times."""
-    stated = described["start_utc"]
+    """Return waveform.start_utc; default 1970, to be related to the log's times by a configured clock offset."""
+    start_utc = described["start_utc"]
     try:
-        first: np.datetime64 = np.datetime64("1970-01-01", "ns") if stated is None else utc_times([stated])[0]
+        first: np.datetime64 = np.datetime64("1970-01-01", "ns") if start_utc is None else utc_times([start_utc])[0]
     except ValueError as error:
         raise _error(f"waveform.start_utc: {error}", path, "ISO 8601 in UTC") from error
     return first
@@ -247,27 +254,27 @@ def beginning(described: Mapping[str, Any], path: Path) -> np.datetime64:
 def _times(stored: NDArray[Any], path: Path) -> Times:
     known = stored.dtype.kind in "fiu" or (stored.dtype.kind == "M" and stored.dtype != np.dtype("M8"))
     if not known or stored.ndim != 1 or not stored.size:
-        raise _error(f"times as {stored.dtype} of shape {stored.shape}", path)
+        raise _error(f"array of times is {stored.dtype} of shape {stored.shape}", path)
     if stored.dtype.kind != "M":
-        with np.errstate(invalid="ignore", over="ignore"):  # what is no number becomes no time, and is refused as such
+        with np.errstate(invalid="ignore", over="ignore"):  # NaN becomes NaT and is rejected below
             seconds = stored.astype(np.float64)
             seconds = np.where(np.abs(seconds) < _FARTHEST_S, seconds, np.nan)
             if _are_datenum(seconds):
-                found = "times as days of MATLAB (datenum)"
-                raise CampaignError(found, path, "seconds since 1970", "Write 86400 * (time - 719529).")
+                found = "times in days (MATLAB datenum)"
+                raise CampaignError(found, path, "seconds since 1970", "Save 86400 * (time - 719529).")
             whole = np.floor(seconds)
-            # apart, because float64 holds nanoseconds of one second but not of all since 1970
+            # integer and fraction separately: float64 cannot resolve nanoseconds since 1970
             rest = np.round((seconds - whole) * 1e9).astype("timedelta64[ns]")
             stored = whole.astype("datetime64[s]").astype("datetime64[ns]") + rest
     years = stored.astype("datetime64[Y]").astype(np.int64) + 1970
     wrong = np.flatnonzero(np.isnat(stored) | (years < 1970) | (years > 2199))
     if wrong.size:
-        raise _error(f"time {int(wrong[0])} is none between 1970 and 2199", path)
+        raise _error(f"time {int(wrong[0])} is not between 1970 and 2199", path)
     return stored.astype("datetime64[ns]")
 
 
 def _are_datenum(time: NDArray[np.float64]) -> bool:
-    """Test whether times are days since the year 0, of 1980 to 2199; as seconds they were of January 1970."""
+    """Return True if times are MATLAB days of 1980 to 2199; as seconds, they would lie in January 1970."""
     return bool(time.size and (time > _DATENUM[0]).all() and (time < _DATENUM[1]).all() and np.ptp(time) < 1)
 
 
@@ -275,82 +282,82 @@ def _error(found: str, path: Path, expected: str = _EXPECTED) -> CampaignError:
     return CampaignError(found, where=path, expected=expected, remedy=_REMEDY)
 
 
-# ---- Beat signals of a sound card (.wav): channels of triggers and beats --------------------------------------------
+# ---- Beat signals of a sound card (.wav): sync channel and beat channel ---------------------------------------------
 
 _EXTREMES = 0.1, 99.9
-"""Percentiles that are the levels of the sync channel: clicks of a sound card are beyond."""
+"""Percentiles used as levels of the sync channel, which exclude clicks of a sound card."""
 
 _SAME_RATE = 1e-6
 
 
 def read_beat_wav(paths: Sequence[Path], *, pair: str, described: Mapping[str, Any]) -> xr.Dataset:
-    """Return the `echo` stage of one .wav file: a sweep begins where the sync channel passes the middle of its levels.
+    """Read a .wav file as `echo` stage: a sweep starts where the sync channel crosses the mean of its two levels.
 
-    Sweeps that the next trigger or the end of the file cuts short are left out and counted.
+    Sweeps truncated by the next trigger or the end of the file are excluded and counted.
 
     Raises
     ------
     CampaignError
-        If the file is none, lacks a channel or triggers, or its rate is not waveform.sample_rate_hz.
+        If the file is not a WAV file, lacks a channel or triggers, or its rate is not waveform.sample_rate_hz.
 
     Notes
     -----
     Source: docs/theory/fmcw.md, "Triggers"; G. L. Charvat et al., MIT OpenCourseWare RES.LL-003, 2011.
     """
     if len(paths) != 1:
-        raise _bad(f"{len(paths)} files", paths[1], "one .wav file of a node and flight", "Make one file of them.")
-    path, found = next(iter(read_fields(fmcw_fields.read_wav, paths)))
-    return joined_sweeps([cut_sweeps(path, found, described)], pair=pair, described=described)
+        raise _bad(f"{len(paths)} files", paths[1], "one .wav file per node and flight", "Merge them into one file.")
+    path, recording = next(iter(read_fields(fmcw_fields.read_wav, paths)))
+    return joined_sweeps([cut_sweeps(path, recording, described)], pair=pair, described=described)
 
 
-def cut_sweeps(path: Path, found: Mapping[str, NDArray[Any]], described: Mapping[str, Any]) -> Sweeps:
-    """Return the whole sweeps of a recording.
+def cut_sweeps(path: Path, recording: Mapping[str, NDArray[Any]], described: Mapping[str, Any]) -> Sweeps:
+    """Extract the complete sweeps of a recording.
 
     Parameters
     ----------
     path
-        For messages.
-    found
-        rate (1,), Hz, and samples (sample, channel), as `apertura.formats.phase_histories.fmcw_fields` reads them.
+        The file, for messages.
+    recording
+        rate (1,), Hz, and samples (sample, channel), from `apertura.formats.phase_histories.fmcw_fields.read_wav`.
     described
         Section `waveform`.
 
     Raises
     ------
     CampaignError
-        As `read_beat_wav`.
+        See `read_beat_wav`.
     """
-    sweep, trigger, samples = sweep_of(described), described["trigger"], found["samples"]
-    rate = float(found["rate"][0])
+    sweep, trigger, samples = sweep_of(described), described["trigger"], recording["samples"]
+    rate = float(recording["rate"][0])
     if abs(rate - sweep.sample_rate_hz) > _SAME_RATE * rate:
         raise _bad(f"{rate:g} samples/s", path, f"waveform.sample_rate_hz, {sweep.sample_rate_hz:g}")
     channels = {name: trigger[f"{name}_channel"] for name in ("sync", "beat")}
     if max(channels.values()) > samples.shape[1]:
-        raise _bad(f"{samples.shape[1]} channels", path, f"waveform.trigger's channels {[*channels.values()]}")
-    with np.errstate(invalid="ignore"):  # what is no number stays none, and is refused as such
+        raise _bad(f"{samples.shape[1]} channels", path, f"channels {[*channels.values()]} of waveform.trigger")
+    with np.errstate(invalid="ignore"):  # NaN is kept and rejected later
         sync = samples[:, channels["sync"] - 1].astype(np.float64)
         beat = samples[:, channels["beat"] - 1].astype(np.float32)
     falling = trigger["edge"] == "falling"
     starts = trigger_starts(-sync if falling else sync, threshold=trigger["threshold"])
     first, whole = np.ceil(starts).astype(np.int64), _whole(starts, sweep, len(samples))
     if not whole.any():
-        raise _bad(f"{len(starts)} triggers, none with a whole sweep of {sweep.sweep_samples} samples after it", path)
+        raise _bad(f"{len(starts)} triggers, none followed by a complete sweep of {sweep.sweep_samples} samples", path)
     if samples.dtype == np.uint8:
-        beat -= 128  # of 8 bits that is zero
+        beat -= 128  # zero level of 8-bit WAV
     rows = np.lib.stride_tricks.sliding_window_view(beat, sweep.sweep_samples)[first[whole]]
     time = beginning(described, path) + np.round(starts[whole] * (1e9 / rate)).astype("timedelta64[ns]")
     return Sweeps(path, rows, time, (first - starts)[whole] / rate, {"incomplete": int((~whole).sum())})
 
 
 def trigger_starts(sync: NDArray[np.float64], *, threshold: float) -> NDArray[np.float64]:
-    """Return the places where a channel rises through the middle of its levels, in samples and fractions.
+    """Find where a channel rises through the mean of its two levels, in fractional samples.
 
     Parameters
     ----------
     sync
         (sample,) float64.
     threshold
-        Of half the distance of its levels: how far on either side of the middle it must go.
+        Minimum excursion to both sides of the mean, relative to half the difference of the levels.
 
     Examples
     --------
@@ -360,18 +367,18 @@ def trigger_starts(sync: NDArray[np.float64], *, threshold: float) -> NDArray[np
     if not sync.size or not np.isfinite(sync).all():
         return np.zeros(0)
     low, high = np.percentile(sync, _EXTREMES)
-    middle, beyond = (low + high) / 2, threshold * (high - low) / 2
-    marks = np.flatnonzero(np.abs(sync - middle) > beyond) if high > low else np.zeros(0, np.int64)
+    middle, excursion = (low + high) / 2, threshold * (high - low) / 2
+    marks = np.flatnonzero(np.abs(sync - middle) > excursion) if high > low else np.zeros(0, np.int64)
     up = sync[marks] > middle
-    rose = marks[1:][up[1:] & ~up[:-1]]
-    low_ones = np.flatnonzero(sync <= middle)
-    last = low_ones[np.searchsorted(low_ones, rose) - 1]  # there is one: the mark before `rose`
+    rises = marks[1:][up[1:] & ~up[:-1]]
+    below = np.flatnonzero(sync <= middle)
+    last = below[np.searchsorted(below, rises) - 1]  # last sample below the mean; exists, since a low mark precedes
     at: NDArray[np.float64] = last + (middle - sync[last]) / (sync[last + 1] - sync[last])
     return at
 
 
 def _whole(starts: NDArray[np.float64], sweep: FrequencySweep, count: int) -> NDArray[np.bool_]:
-    """Return a mask of sweeps that end before the next trigger and the file do."""
+    """Return a mask of sweeps that end before the next trigger and the end of the file."""
     ends = np.ceil(starts).astype(np.int64) + sweep.sweep_samples
     following = np.append(np.ceil(starts[1:]), count)
     return np.asarray(ends <= following)

@@ -1,4 +1,4 @@
-"""Beat signals in MATLAB and WAV files; run by `read_isolated`, and importing no more than that takes."""
+"""Extraction of beat signals from MATLAB and WAV files; run by `read_isolated`, with minimal imports."""
 
 import warnings
 from pathlib import Path
@@ -11,7 +11,7 @@ from apertura.formats.phase_histories.mat_fields import read_variables
 
 
 def read_beat_fields(path: Path) -> dict[str, NDArray[Any]]:
-    """Return beat (sweep, sample), and time where there is one.
+    """Read variable beat (sweep, sample), and time if present.
 
     Parameters
     ----------
@@ -21,17 +21,17 @@ def read_beat_fields(path: Path) -> dict[str, NDArray[Any]]:
     Raises
     ------
     ValueError
-        If there is no such variable.
+        If there is no variable beat.
     """
     variables = read_variables(path, ["beat", "time"])
     if "beat" not in variables:
-        raise ValueError("no variable called beat")
+        raise ValueError("no variable beat")
     fields = {name: np.asarray(values) for name, values in variables.items()}
     return {name: np.atleast_1d(values) if name == "time" else np.atleast_2d(values) for name, values in fields.items()}
 
 
 def read_wav(path: Path) -> dict[str, NDArray[Any]]:
-    """Return rate (1,) float64 Hz and samples (sample, channel) as they were written.
+    """Read rate (1,) float64 Hz and samples (sample, channel) in their original type.
 
     Parameters
     ----------
@@ -41,12 +41,12 @@ def read_wav(path: Path) -> dict[str, NDArray[Any]]:
     Raises
     ------
     ValueError
-        If it ends before the length in its header, or is otherwise no such file.
+        If the file is shorter than stated in its header, or is not a WAV file.
     """
     from scipy.io import wavfile
 
     with warnings.catch_warnings():
-        warnings.simplefilter("error", wavfile.WavFileWarning)  # a file that was cut off is no more than a warning
+        warnings.simplefilter("error", wavfile.WavFileWarning)  # scipy only warns about a truncated file
         warnings.filterwarnings("ignore", message="Chunk .* not understood", category=wavfile.WavFileWarning)
         rate, samples = wavfile.read(path)
     return {"rate": np.array([rate], np.float64), "samples": samples.reshape(len(samples), -1)}

@@ -1,4 +1,4 @@
-"""Phase history in an HDF5 file of a documented layout, through h5py in a process of its own."""
+"""Phase history in an HDF5 file of a documented layout, read by h5py in a separate process."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,32 +14,33 @@ from apertura.formats.phase_histories.phase_history import joined, refused
 if TYPE_CHECKING:
     import xarray as xr
 
-_EXPECTED = f"an HDF5 file of {EXPECTED}"
+_EXPECTED = f"an HDF5 file with {EXPECTED}"
 
 
 def read_hdf5_history(paths: Sequence[Path], *, pair: str) -> "xr.Dataset":
-    """Return the `echo` stage of HDF5 files, joined in the order of their names.
+    """Read HDF5 files, concatenated in the order of their names, as `echo` stage.
 
     Raises
     ------
     CampaignError
-        If a file is not of the layout of docs/formats/phase_history.md.
+        If a file violates the layout in docs/formats/phase_history.md.
     """
     paths = sorted(paths)
     try:
         files = read_isolated(read_fields, paths)
     except UnreadableError as error:
         raise refused(f"not readable ({error})", error.path, _EXPECTED) from error
-    return joined([history(*one) for one in zip(paths, files, strict=True)], pair=pair, expected=_EXPECTED)
+    histories = [history(path, fields) for path, fields in zip(paths, files, strict=True)]
+    return joined(histories, pair=pair, expected=_EXPECTED)
 
 
 def read_fields(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an HDF5 file that the layout names; run by `read_isolated`.
+    """Read the arrays of the layout from an HDF5 file; run by `read_isolated`.
 
     Raises
     ------
     ValueError
-        If one is missing, is not of the layout, or is kept in another file.
+        If an array is missing, violates the layout, or is stored in another file.
     """
     import h5py
 
@@ -56,10 +57,10 @@ def _array(file: Any, name: str) -> NDArray[Any]:
     link = file.get(name, getlink=True)
     if link is None:
         raise ValueError(f"no array {name}")
-    # what lies in another file is not the campaign's: a link, external storage or a virtual array could name any
+    # links, external storage and virtual arrays could read any file outside the campaign
     array = file[name] if isinstance(link, h5py.HardLink) else None
     if not isinstance(array, h5py.Dataset) or array.external or array.is_virtual:
-        raise ValueError(f"{name} is no array in this file itself")
+        raise ValueError(f"{name} is not an array stored in this file")
     check_array(name, array.shape or (), array.dtype)
-    with np.errstate(over="ignore"):  # becomes infinite, and is refused as such
+    with np.errstate(over="ignore"):  # overflow becomes infinity and is rejected later
         return np.asarray(array[...], np.complex64) if name == "transfer" else np.asarray(array[...])

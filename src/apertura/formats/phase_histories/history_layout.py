@@ -1,6 +1,6 @@
-"""The layout of a phase history in an HDF5 file or a zarr folder: that of stage `echo`, field by field.
+"""Layout of a phase history in an HDF5 file or a Zarr folder, with the fields of stage `echo`.
 
-docs/formats/phase_history.md, "HDF5 and zarr", is written from this table; readers of both bring arrays by these names.
+docs/formats/phase_history.md, "HDF5 and zarr", documents this table; the readers of both formats return these arrays.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,17 +19,17 @@ EXPECTED = (
 )
 
 TIME_UNITS = "nanoseconds since 1970-01-01"
-"""Attribute `units` of `time`, which counts in UTC."""
+"""Attribute `units` of `time`, in UTC."""
 
 
 class Field(NamedTuple):
-    """Required type and shape of an array of a file."""
+    """Required type and shape of an array in a file."""
 
     dims: tuple[str, ...]
     kinds: str
-    """Of numpy's dtypes."""
+    """Accepted dtype kinds of NumPy."""
     largest: float
-    """Range of its values."""
+    """Largest magnitude."""
     optional: bool = False
 
 
@@ -42,20 +42,20 @@ LAYOUT: Mapping[str, Field] = {
     "reference_delay": Field(("pulse",), "fiu", 1.0),
     "path_limit": Field(("pulse",), "fiu", 1e12, optional=True),
 }
-"""Name → array of the layout; Hz, metres, seconds."""
+"""Name → array of the layout; in Hz, metres, seconds."""
 
 POSITIONS = ("tx_position", "rx_position")
-"""Left out where flight logs hold them."""
+"""Arrays that are omitted if positions come from flight logs."""
 
 
 def check_array(name: str, shape: Sequence[int], dtype: np.dtype[Any]) -> None:
-    """Raise ValueError if an array of a file, not read yet, violates the layout.
+    """Raise ValueError if the shape or dtype of an array violates the layout.
 
     Examples
     --------
     >>> check_array("time", (5,), np.dtype("float64"))
     Traceback (most recent call last):
-    ValueError: time holds float64 of shape (5,), and not numbers of kind i along (pulse)
+    ValueError: time is float64 of shape (5,), not of dtype kind i along (pulse)
     """
     field = LAYOUT[name]
     least = {"pulse": 1, "subcarrier": 2, "axis": 3}
@@ -65,62 +65,62 @@ def check_array(name: str, shape: Sequence[int], dtype: np.dtype[Any]) -> None:
     )
     if dtype.kind not in field.kinds or not fits:
         raise ValueError(
-            f"{name} holds {dtype} of shape {tuple(shape)}, and not numbers of kind {field.kinds} along "
+            f"{name} is {dtype} of shape {tuple(shape)}, not of dtype kind {' or '.join(field.kinds)} along "
             f"({', '.join(field.dims)})"
         )
 
 
 def check_attributes(frame: object, units: object, *, placed: bool) -> None:
-    """Raise ValueError unless a file names the frame of its positions, where it has any, and what its times count.
+    """Raise ValueError unless a file states the frame of its positions, if `placed`, and the units of its times.
 
     Examples
     --------
     >>> check_attributes("ecef", "seconds since 1970-01-01", placed=True)
     Traceback (most recent call last):
-    ValueError: units 'seconds since 1970-01-01' of time, and not 'nanoseconds since 1970-01-01' (UTC)
+    ValueError: units of time are 'seconds since 1970-01-01', not 'nanoseconds since 1970-01-01' (UTC)
     """
     if placed and frame not in {"ecef", "local"}:
-        raise ValueError(f"frame {quoted(frame)}, and neither 'ecef' nor 'local'")
+        raise ValueError(f"frame is {quoted(frame)}, not 'ecef' or 'local'")
     if units != TIME_UNITS:
-        raise ValueError(f"units {quoted(units)} of time, and not {TIME_UNITS!r} (UTC)")
+        raise ValueError(f"units of time are {quoted(units)}, not {TIME_UNITS!r} (UTC)")
 
 
 def history(path: Path, fields: Mapping[str, NDArray[Any]]) -> History:
-    """Return the arrays of a file of this layout.
+    """Convert the arrays of a file of this layout to a phase history.
 
     Parameters
     ----------
     path
         The file or folder, for messages.
     fields
-        Arrays of `LAYOUT`, each with the dimensions that `check_array` requires, and ``frame`` as text, which counts
-        where there are positions.
+        Arrays of `LAYOUT` with the dimensions required by `check_array`, and ``frame`` as text, which is used if there
+        are positions.
 
     Raises
     ------
     CampaignError
-        If lengths do not fit each other, or a value is not a number or larger than any radar's.
+        If array lengths are inconsistent, or a value is not finite or out of range.
     """
     refuse = partial(refused, path=path, expected=EXPECTED)
-    there = {name: field for name, field in LAYOUT.items() if name in fields}
-    placed = [name for name in POSITIONS if name in fields]
-    if len(placed) == 1:
-        raise refuse(f"{placed[0]} alone, where both antennas have a position, or neither")
+    present = {name: field for name, field in LAYOUT.items() if name in fields}
+    positions = [name for name in POSITIONS if name in fields]
+    if len(positions) == 1:
+        raise refuse(f"{positions[0]} without the position of the other antenna")
     sizes: dict[str, int] = {}
-    for name, field in there.items():
+    for name, field in present.items():
         for dim, size in zip(field.dims, fields[name].shape, strict=True):
             if sizes.setdefault(dim, size) != size:
-                raise refuse(f"{name} has {size} along {dim}, where others have {sizes[dim]}")
-    loudest = {
+                raise refuse(f"{name} has length {size} along {dim}, other arrays {sizes[dim]}")
+    maxima = {
         name: largest_by_row(name, fields[name], field.largest, refuse)
-        for name, field in there.items()
+        for name, field in present.items()
         if name != "path_limit"
     }
     limit = np.asarray(fields.get("path_limit", np.full(sizes["pulse"], np.inf)), np.float64)
     if not (limit > 0).all():
         raise refuse("a path_limit that is not positive")
-    silent = loudest["transfer"] == 0
-    tx, rx = (np.asarray(fields[name], np.float64) if placed else None for name in POSITIONS)
+    is_zero = maxima["transfer"] == 0
+    tx, rx = (np.asarray(fields[name], np.float64) if positions else None for name in POSITIONS)
     return History(
         path,
         np.asarray(fields["time"], np.int64).astype("datetime64[ns]"),
@@ -130,7 +130,7 @@ def history(path: Path, fields: Mapping[str, NDArray[Any]]) -> History:
         frequency=np.asarray(fields["frequency"], np.float64),
         reference_delay=np.asarray(fields["reference_delay"], np.float64),
         path_limit=limit,
-        used=~silent,
-        frame=str(fields["frame"]) if placed else "",
-        dropped={"silent": int(silent.sum())} if silent.any() else {},
+        used=~is_zero,
+        frame=str(fields["frame"]) if positions else "",
+        dropped={"all samples zero": int(is_zero.sum())} if is_zero.any() else {},
     )

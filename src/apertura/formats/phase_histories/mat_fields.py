@@ -1,4 +1,4 @@
-"""Variables of MATLAB files, of versions 4 to 7.3; run by `read_isolated`, and importing no more than that takes."""
+"""Extraction of variables from MATLAB files, versions 4 to 7.3; run by `read_isolated`, with minimal imports."""
 
 import warnings
 from collections.abc import Mapping
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 _FIELDS = ("fp", "freq", "x", "y", "z", "r0")
 
 CORRECTIONS = ("r_correct", "ph_correct")
-"""Fields of data.af: corrections of r0 (m) and of the phase (rad) of each pulse, which the data set does not apply."""
+"""Fields of data.af: corrections of r0 (m) and of the phase (rad) of each pulse, not applied in the data set."""
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _USER_BLOCK = 512
 
 
 def read_fields(path: Path) -> dict[str, NDArray[Any]]:
-    """Return fp (subcarrier, pulse) complex64; freq, x, y, z, r0 and those of `CORRECTIONS` that are there, float64.
+    """Read fp (subcarrier, pulse) complex64; freq, x, y, z, r0 and, if present, `CORRECTIONS`, float64.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
     """
     variables = read_variables(path, ["data"])
     if not isinstance(variables.get("data"), Mapping):
-        raise ValueError("no structure called data")
+        raise ValueError("no structure data")
     data = variables["data"]
     stored = data.get("af")
     corrections = {name: stored[name] for name in CORRECTIONS if isinstance(stored, Mapping) and name in stored}
@@ -41,19 +41,19 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def read_variables(path: Path, names: list[str]) -> dict[str, Any]:
-    """Return variables of a MATLAB file: an array for each, or a mapping of field → value for a structure.
+    """Read variables of a MATLAB file: an array for each, or a mapping of field → value for a structure.
 
     Parameters
     ----------
     path
         The file.
     names
-        Variables that are wanted; missing ones are left out.
+        Requested variables; missing ones are omitted.
 
     Raises
     ------
     ValueError
-        If the file is damaged, or a part of it is kept in another file.
+        If the file is damaged, or part of it is stored in another file.
     """
     with path.open("rb") as stream:
         stream.seek(_USER_BLOCK)
@@ -67,13 +67,11 @@ def read_variables(path: Path, names: list[str]) -> dict[str, Any]:
     from scipy.io.matlab import MatReadWarning
 
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "error", MatReadWarning
-        )  # a variable that is damaged or doubled is no more than a warning
+        warnings.simplefilter("error", MatReadWarning)  # scipy only warns about a damaged or repeated variable
         try:
             document = loadmat(path, struct_as_record=False, squeeze_me=True, variable_names=names)
         except MatReadWarning as warning:
-            raise ValueError(f"a damaged or doubled variable ({warning})") from warning
+            raise ValueError(f"a damaged or repeated variable ({warning})") from warning
     return {name: _plain(document[name]) for name in names if name in document}
 
 
@@ -83,16 +81,16 @@ def _plain(value: Any) -> Any:
 
 
 def _of_hdf5(group: Any, name: str) -> Any:
-    """Return a variable of a file of version 7.3, whose arrays have the order of their axes reversed."""
+    """Read a variable of a version 7.3 file, in which the order of array axes is reversed."""
     import h5py
 
     link = group.get(name, getlink=True)
     value = group[name] if isinstance(link, h5py.HardLink) else None
     if isinstance(value, h5py.Group):
         return {field: _of_hdf5(value, field) for field in value}
-    # what lies in another file is not the campaign's: a link, external storage or a virtual array could name any
+    # links, external storage and virtual arrays could read any file outside the campaign
     if not isinstance(value, h5py.Dataset) or value.external or value.is_virtual:
-        raise ValueError(f"{name} is no array in this file itself")
+        raise ValueError(f"{name} is not an array stored in this file")
     array = np.asarray(value[()]).T
     if array.dtype.names is not None and set(array.dtype.names) == {"real", "imag"}:
         array = array["real"] + 1j * array["imag"]
@@ -103,10 +101,10 @@ def _numbers(name: str, value: object) -> NDArray[Any]:
     if value is None:
         raise ValueError(f"no field data.{name}")
     array = np.asarray(value)
-    wanted, least = ("fiuc", 2) if name == "fp" else ("fiu", 0)
-    if array.dtype.kind not in wanted or array.size == 0 or not least <= array.ndim <= max(least, 1):
-        raise ValueError(f"field data.{name} holds {array.dtype} of shape {array.shape}")
+    kinds, least = ("fiuc", 2) if name == "fp" else ("fiu", 0)
+    if array.dtype.kind not in kinds or array.size == 0 or not least <= array.ndim <= max(least, 1):
+        raise ValueError(f"field data.{name} is {array.dtype} of shape {array.shape}")
     if name != "fp":
         return np.atleast_1d(array).astype(np.float64)
-    with np.errstate(over="ignore"):  # becomes infinite, and is refused as such
+    with np.errstate(over="ignore"):  # overflow becomes infinity and is rejected later
         return array.astype(np.complex64)

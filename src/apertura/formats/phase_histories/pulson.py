@@ -1,6 +1,6 @@
-"""Scans of Time Domain PulsON P4xx radars (.out): real samples of what came back, as messages MRM_SCAN_INFO.
+"""Scans of Time Domain PulsON P4xx radars (.out): real echo samples in messages MRM_SCAN_INFO.
 
-They enter at `echo`: the radar correlates by itself, and counts milliseconds since it was switched on.
+They are read as stage `echo`: the radar itself correlates the samples. Its clock counts milliseconds since power-on.
 """
 
 from collections.abc import Sequence
@@ -16,13 +16,13 @@ from apertura.common.errors import CampaignError
 from apertura.formats.tracks.csv_track import LARGEST_LOG
 
 SAMPLE_RATE_HZ = 16.384e9
-"""Of a scan: 32 of the radar's bins of 1.907 ps."""
+"""Sample rate of a scan; a sample interval is 32 of the radar's bins of 1.907 ps."""
 
 BAND_HZ = 3.1e9, 5.3e9
-"""Band of the radar by its data sheet."""
+"""Frequency band of the radar according to its data sheet."""
 
-_CONFIG_BYTES = 32  # of the radar's configuration, which a file begins with
-_SAMPLES = 350  # of each message
+_CONFIG_BYTES = 32  # radar configuration at the start of a file
+_SAMPLES = 350  # in each message
 MESSAGE = np.dtype(
     [("type", ">u2"), ("id", ">u2"), ("source", ">u4"), ("time_ms", ">u4"), ("reserved", "V16")]
     + [("start_ps", ">i4"), ("stop_ps", ">i4"), ("step_bins", ">i2")]
@@ -36,10 +36,10 @@ _SHARED = ("source", "start_ps", "stop_ps", "step_bins", "kind", "antenna", "tot
 
 
 def read_pulson(paths: Sequence[Path], *, pair: str) -> xr.Dataset:
-    """Return scans as transfer functions over the band, without positions: a flight log has those.
+    """Read scans as `echo` stage, transfer functions over the band, without positions, which a flight log provides.
 
-    `time` counts from 1970 as the radar does from when it was switched on. Scans with a message missing or damaged, and
-    those that a file ends in, are left out and counted in flag `scans_incomplete`.
+    `time` is the time since power-on of the radar, counted from 1970. Scans with missing or damaged messages, and a
+    scan truncated by the end of its file, are excluded and counted in flag `scans_incomplete`.
 
     Parameters
     ----------
@@ -51,28 +51,28 @@ def read_pulson(paths: Sequence[Path], *, pair: str) -> xr.Dataset:
     Raises
     ------
     CampaignError
-        If a file holds no messages of that kind, or scans that differ in what they cover.
+        If a file contains no such messages, or scans with different delay windows or antennas.
 
     Notes
     -----
     Source: Time Domain, "Monostatic Radar Module Application Programming Interface (API) Specification", messages
-    MRM_SCAN_INFO and MRM_SET_CONFIG_REQUEST; docs/formats.md. A scan is the real echo at `SAMPLE_RATE_HZ`: bins of its
-    Fourier transform inside `BAND_HZ` are the transfer function, referred to where the scan begins.
+    MRM_SCAN_INFO and MRM_SET_CONFIG_REQUEST; docs/formats.md. A scan is the real echo at `SAMPLE_RATE_HZ`: the bins of
+    its Fourier transform inside `BAND_HZ` are the transfer function, referred to the start of the scan.
     """
-    found = [_scans(path) for path in sorted(paths)]
-    messages = np.concatenate([first for first, _, _ in found])
-    samples = np.concatenate([scan for _, scan, _ in found])
-    incomplete = sum(count for _, _, count in found)
+    scans = [_scans(path) for path in sorted(paths)]
+    messages = np.concatenate([first for first, _, _ in scans])
+    samples = np.concatenate([scan for _, scan, _ in scans])
+    incomplete = sum(count for _, _, count in scans)
     start_ps, total = int(messages["start_ps"][0]), int(messages["total"][0])
     time_ms = messages["time_ms"].astype(np.int64)
     backwards = np.flatnonzero(np.diff(time_ms) <= 0)
     if backwards.size:
         at = int(backwards[0]) + 1
-        raise _error(f"scan {at} at {time_ms[at]} ms is not after the one before, {time_ms[at - 1]} ms", paths[0])
+        raise _error(f"scan {at} at {time_ms[at]} ms is not later than the previous, {time_ms[at - 1]} ms", paths[0])
     frequency = np.arange(total // 2 + 1) * (SAMPLE_RATE_HZ / total)
     band = (frequency >= BAND_HZ[0]) & (frequency <= BAND_HZ[1])
     transfer = np.fft.rfft(samples, axis=1, norm="forward")[:, band].astype(np.complex64)
-    lasts_s = total / SAMPLE_RATE_HZ
+    duration_s = total / SAMPLE_RATE_HZ
     flags = {"scans_incomplete": f"{incomplete} of {incomplete + len(samples)} scans"} if incomplete else {}
     return xr.Dataset(
         {
@@ -80,16 +80,16 @@ def read_pulson(paths: Sequence[Path], *, pair: str) -> xr.Dataset:
             "transfer": (("pulse", "subcarrier"), transfer),
             "frequency": ("subcarrier", frequency[band]),
             "reference_delay": ("pulse", np.full(len(samples), start_ps * 1e-12)),
-            "path_limit": ("pulse", np.full(len(samples), (start_ps * 1e-12 + lasts_s) * SPEED_OF_LIGHT_M_S)),
+            "path_limit": ("pulse", np.full(len(samples), (start_ps * 1e-12 + duration_s) * SPEED_OF_LIGHT_M_S)),
         },
         attrs={"pair": pair, "flags": flags, "wave_speed_m_s": SPEED_OF_LIGHT_M_S},
     )
 
 
 def _scans(path: Path) -> tuple[NDArray[np.void], NDArray[np.float64], int]:
-    """Return the first message of each whole scan, their samples (scan, sample), and how many scans are not whole."""
+    """Return the first message and the samples (scan, sample) of complete scans, and the number of incomplete scans."""
     if path.stat().st_size > LARGEST_LOG:
-        raise _error(f"{path.stat().st_size} bytes, at most {LARGEST_LOG} are read", path)
+        raise _error(f"{path.stat().st_size} bytes, at most {LARGEST_LOG} are supported", path)
     with naming(path):
         content = path.read_bytes()
     messages, cut = _messages(content)
@@ -105,42 +105,42 @@ def _scans(path: Path) -> tuple[NDArray[np.void], NDArray[np.float64], int]:
     inside = following[:, -1] < len(kept)
     rows = kept[following[inside]]
     same = np.all([rows[name] == rows[name][:, :1] for name in ("id", "time_ms", *_SHARED)], axis=(0, 2))
-    whole = rows[same & (rows["index"] == np.arange(count)).all(axis=1)]
-    if not len(whole):
-        raise _error("no whole scan", path)
+    complete = rows[same & (rows["index"] == np.arange(count)).all(axis=1)]
+    if not len(complete):
+        raise _error("no complete scan", path)
     numbers = np.unique(messages["id"].astype(np.int64) << 32 | messages["time_ms"])
-    _check(whole[:, 0], path)
-    samples = whole["scan"].reshape(len(whole), -1)[:, :total].astype(np.float64)
-    # A message cut off begins another scan only behind a whole one; else its scan is counted already.
-    begins_scan = cut and messages["index"][-1] == count - 1
-    return whole[:, 0], samples, len(numbers) - len(whole) + int(begins_scan)
+    _check(complete[:, 0], path)
+    samples = complete["scan"].reshape(len(complete), -1)[:, :total].astype(np.float64)
+    # A truncated last message starts another scan only after a complete one; otherwise its scan is already counted.
+    starts_scan = cut and messages["index"][-1] == count - 1
+    return complete[:, 0], samples, len(numbers) - len(complete) + int(starts_scan)
 
 
 def _messages(content: bytes) -> tuple[NDArray[np.void], bool]:
-    """Return the messages of a file, found again behind bytes that are none, and whether it ends within one."""
+    """Return the messages of a file, skipping other bytes, and True if it ends within a message."""
     size, sign = MESSAGE.itemsize, _SCAN_INFO.to_bytes(2, "big")
-    at, found = min(_CONFIG_BYTES, len(content)), []
+    at, blocks = min(_CONFIG_BYTES, len(content)), []
     last = at
     while (at := content.find(sign, at)) >= 0 and at + size <= len(content):
         last = at
         while content[last : last + 2] == sign and last + size <= len(content):
             last += size
-        found.append(np.frombuffer(content[at:last], MESSAGE))
+        blocks.append(np.frombuffer(content[at:last], MESSAGE))
         at = last
-    messages = np.concatenate(found) if found else np.empty(0, MESSAGE)
+    messages = np.concatenate(blocks) if blocks else np.empty(0, MESSAGE)
     scans = messages[(messages["step_bins"] == _STEP_BINS) & (messages["kind"] == _RAW_SCAN)]
     return np.asarray(scans), len(content) > last and sign.startswith(content[last : last + 2])
 
 
 def _check(scans: NDArray[np.void], path: Path) -> None:
-    """Raise CampaignError unless all scans look at the same window by the same antennas."""
+    """Raise CampaignError unless all scans have the same delay window and antennas."""
     for name in _SHARED:
         other = np.flatnonzero(scans[name] != scans[name][0])
         if other.size:
             raise _error(f"scan {int(other[0])} has {name} {scans[name][other[0]]}, others {scans[name][0]}", path)
-    lasts_ps = int(scans["stop_ps"][0]) - int(scans["start_ps"][0])
-    if abs(lasts_ps * 1e-12 * SAMPLE_RATE_HZ - int(scans["total"][0])) > 2:
-        raise _error(f"{scans['total'][0]} samples for {lasts_ps} ps", path)
+    duration_ps = int(scans["stop_ps"][0]) - int(scans["start_ps"][0])
+    if abs(duration_ps * 1e-12 * SAMPLE_RATE_HZ - int(scans["total"][0])) > 2:
+        raise _error(f"{scans['total'][0]} samples for {duration_ps} ps", path)
 
 
 def _error(found: str, path: Path) -> CampaignError:
@@ -149,5 +149,5 @@ def _error(found: str, path: Path) -> CampaignError:
         where=path,
         expected=f"{_CONFIG_BYTES} bytes of configuration, then messages MRM_SCAN_INFO of {MESSAGE.itemsize} bytes, "
         "raw scans in steps of 32 bins",
-        remedy="Copy the file again, or log it by the radar's own software with these settings.",
+        remedy="Copy the file again, or record it with the radar's own software and these settings.",
     )

@@ -1,4 +1,4 @@
-"""Phase history in a zarr folder (version 3) of a documented layout, through zarr in a process of its own."""
+"""Phase history in a Zarr folder (version 3) of a documented layout, read by zarr in a separate process."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 
 SUFFIX = ".zarr"
 
-_EXPECTED = f"a zarr folder, version 3, of {EXPECTED}"
+_EXPECTED = f"a Zarr folder (version 3) with {EXPECTED}"
 _SPARE_BYTES = 4 << 30
-"""Address space for zarr, whose threads and event loop reserve much more than they use."""
+"""Additional address space for zarr, bytes, whose threads and event loop reserve much more than they use."""
 
 
 def read_zarr_history(paths: Sequence[Path], *, pair: str) -> "xr.Dataset":
-    """Return the `echo` stage of zarr folders, joined in the order of their names; `paths` are the files in them.
+    """Read Zarr folders, concatenated in the order of their names, as `echo` stage; `paths` are the files in them.
 
     Raises
     ------
     CampaignError
-        If a folder is not of the layout of docs/formats/phase_history.md.
+        If a folder violates the layout in docs/formats/phase_history.md.
     """
     folders = folders_of(paths)
     if not folders:
@@ -38,18 +38,19 @@ def read_zarr_history(paths: Sequence[Path], *, pair: str) -> "xr.Dataset":
     for folder in folders:
         for path in (folder, *ConfinedPath.of(folder).rglob("*")):
             if path.is_symlink():
-                raise refused("a symbolic link: what it leads to is not read", path, _EXPECTED)
+                raise refused("a symbolic link, which is not followed", path, _EXPECTED)
     sizes = [path.stat().st_size for path in paths]
     limits: dict[str, Any] = {"memory_bytes": _SPARE_BYTES + BYTES_PER_BYTE * sum(sizes)}
     try:
         read = read_isolated(read_fields, folders, **limits)
     except UnreadableError as error:
         raise refused(f"not readable ({error})", error.path, _EXPECTED) from error
-    return joined([history(*one) for one in zip(folders, read, strict=True)], pair=pair, expected=_EXPECTED)
+    histories = [history(folder, fields) for folder, fields in zip(folders, read, strict=True)]
+    return joined(histories, pair=pair, expected=_EXPECTED)
 
 
 def folders_of(paths: Iterable[Path]) -> list[Path]:
-    """Return the zarr folders that files lie in, sorted: of folders in each other the outermost.
+    """Return the outermost Zarr folders that contain the files, sorted.
 
     Examples
     --------
@@ -61,12 +62,12 @@ def folders_of(paths: Iterable[Path]) -> list[Path]:
 
 
 def read_fields(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a zarr folder that the layout names; run by `read_isolated`.
+    """Read the arrays of the layout from a Zarr folder; run by `read_isolated`.
 
     Raises
     ------
     ValueError
-        If one is missing, is not of the layout, or is kept in a way that may run code.
+        If an array is missing, violates the layout, or uses a codec that is not permitted.
     """
     path = ConfinedPath.at(path)
     group = _metadata(path)
@@ -87,11 +88,11 @@ def _array(folder: Path, name: str) -> NDArray[Any]:
 
     other = other_codec(_metadata(folder))
     if other is not None:
-        raise ValueError(f"{name} is kept by codec {quoted(other)}, and not by {', '.join(sorted(CODECS))}")
-    # by itself: what a group repeats of its arrays' metadata has not been looked at
+        raise ValueError(f"{name} uses codec {quoted(other)}; permitted are {', '.join(sorted(CODECS))}")
+    # open the array directly: consolidated metadata of the group has not been checked
     array = zarr.open_array(LocalStore(ConfinedPath.at(folder), read_only=True), mode="r", zarr_format=3)
     check_array(name, array.shape, np.dtype(array.dtype))
-    with np.errstate(over="ignore"):  # becomes infinite, and is refused as such
+    with np.errstate(over="ignore"):  # overflow becomes infinity and is rejected later
         return np.asarray(array[...], np.complex64) if name == "transfer" else np.asarray(array[...])
 
 
@@ -101,7 +102,7 @@ def _metadata(folder: Path) -> Mapping[str, Any]:
     path = folder / "zarr.json"
     if not path.is_file():
         raise ValueError(f"no {path.name} in {folder.name}")
-    return read_json(path, expected="metadata of zarr, version 3", remedy="Copy the folder again.")
+    return read_json(path, expected="metadata of Zarr, version 3", remedy="Copy the folder again.")
 
 
 def _mapping(document: Mapping[str, Any], key: str) -> Mapping[str, Any]:

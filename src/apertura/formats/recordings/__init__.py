@@ -1,1 +1,1 @@
-"""Samples as recorders write them; rows in `apertura.formats.names.RECORDERS`."""
+"""Readers of recordings with raw samples; table in `apertura.formats.names.RECORDERS`."""

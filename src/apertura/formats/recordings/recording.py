@@ -1,4 +1,4 @@
-"""Recordings, common to all recorders: samples to be read, captures in UTC, and what was sent before each symbol."""
+"""Recordings of any recorder: samples, captures with UTC time tags, and framing of the transmitted symbols."""
 
 import hashlib
 from collections.abc import Callable, Mapping
@@ -15,7 +15,7 @@ from apertura.common.provenance import hashes_of_file
 from apertura.formats.recordings.sample_file import SampleFile
 
 _AT_ONCE = 4096
-_FIRST = 16  # samples of a capture that show that it is not empty, and that it repeats no other
+_FIRST = 16  # samples compared first, to detect empty and repeated captures without reading them whole
 
 
 def _sha512(path: Path) -> str:
@@ -24,18 +24,18 @@ def _sha512(path: Path) -> str:
 
 @dataclass(frozen=True)
 class Captures:
-    """Segments of a recording.
+    """Capture segments of a recording.
 
     Attributes
     ----------
     start
-        (capture,) int64, first sample.
+        (capture,) int64: first sample.
     length
-        Samples of each.
+        Samples in each capture.
     time
-        (capture,) datetime64[ns], UTC time tag of the first sample.
+        (capture,) datetime64[ns]: UTC time tag of the first sample.
     frame
-        (capture,) int64, frame number, -1 without.
+        (capture,) int64: frame number; -1: none.
     """
 
     start: NDArray[np.int64]
@@ -46,22 +46,24 @@ class Captures:
 
 @dataclass(frozen=True)
 class Recording:
-    """An opened recording.
+    """Opened recording.
 
     Attributes
     ----------
     samples
-        The file of I and Q.
+        File of I and Q samples.
+    channels
+        Names of the channels.
     sample_rate_hz, frequency_hz
-        Complex samples per second and RF frequency at baseband zero.
+        Complex samples per second, and RF frequency at zero baseband frequency.
     captures
-        As the recorder was triggered; one, of all samples, if it ran through.
+        One capture per trigger; a single one with all samples for a continuous recording.
     framing
-        What was sent before each symbol, where the recorder ran through; else None.
+        Preamble and payload before each symbol of a continuous recording; otherwise None.
     files
-        Metadata first, samples last, for messages and hashes; one file may hold both.
+        Metadata first, samples last, for messages and hashes; may be a single file.
     sha512
-        Of the file of samples as the recorder stated it.
+        Hash of the sample file stated by the recorder; None: not stated.
     """
 
     samples: SampleFile
@@ -74,12 +76,12 @@ class Recording:
     sha512: str | None
 
     def captures_at(self, start: NDArray[np.int64], length: int, frame: NDArray[np.int64]) -> Captures:
-        """Return captures of a recording that never stopped, timed by their first samples."""
+        """Return captures of a continuous recording, with times derived from their first samples."""
         elapsed = np.round(start / self.sample_rate_hz * 1e9).astype(np.int64).astype("timedelta64[ns]")
         return Captures(start, length, self.captures.time[0] + elapsed, frame)
 
     def check_hash(self, sha512_of: Callable[[Path], str] = _sha512) -> None:
-        """Raise CampaignError unless the samples are those that the recorder hashed."""
+        """Raise CampaignError if the samples do not match the hash stated by the recorder."""
         if self.sha512 is None:
             return
         digest = sha512_of(self.files[-1])
@@ -92,12 +94,12 @@ class Recording:
             )
 
     def cut(self, captures: Captures, *, node: str) -> xr.Dataset:
-        """Return the `raw` stage of some captures of a node: where they lie in the file, with UTC time and frame.
+        """Build the `raw` stage of captures of a node: their position in the file, UTC time and frame number.
 
         Raises
         ------
         CampaignError
-            If a capture holds only zeros, or the file ends before the last.
+            If a capture contains only zeros, or the file ends before the last capture.
         """
         repeats = self._repeats(captures)
         layout, segments = self.samples.layout.kept()
@@ -121,42 +123,43 @@ class Recording:
         )
 
     def _repeats(self, captures: Captures) -> NDArray[np.bool_]:
-        """Find captures that repeat an earlier one bit for bit, which noise never does; (capture,) bool.
+        """Find captures that are bit-identical to an earlier one, which noise excludes; (capture,) bool.
 
-        Captures that begin like no other one are not read further.
+        Captures whose first samples are unique are not read further.
 
         Raises
         ------
         CampaignError
-            If a capture holds only zeros.
+            If a capture contains only zeros.
         """
-        start, few = captures.start, min(_FIRST, captures.length)
-        dead, alike = list[NDArray[np.bool_]](), dict[bytes, list[int]]()
+        start, head = captures.start, min(_FIRST, captures.length)
+        zero_blocks, candidates = list[NDArray[np.bool_]](), dict[bytes, list[int]]()
         for first in range(0, len(start), _AT_ONCE):
-            some = start[first : first + _AT_ONCE]
-            beginnings = self.samples.captures(some, few)
-            for number, beginning in enumerate(beginnings, first):
-                alike.setdefault(beginning.tobytes(), []).append(number)
-            silent = np.asarray(~beginnings.any(axis=(1, 3)))
-            for capture in np.flatnonzero(silent.any(axis=1)):
-                silent[capture] = ~self.samples.captures(some[capture : capture + 1], captures.length).any(
+            block = start[first : first + _AT_ONCE]
+            heads = self.samples.captures(block, head)
+            for number, samples in enumerate(heads, first):
+                candidates.setdefault(samples.tobytes(), []).append(number)
+            is_zero = np.asarray(~heads.any(axis=(1, 3)))
+            for capture in np.flatnonzero(is_zero.any(axis=1)):
+                is_zero[capture] = ~self.samples.captures(block[capture : capture + 1], captures.length).any(
                     axis=(0, 1, 3)
                 )
-            dead.append(silent)
-        for name, silent in zip(self.channels, np.concatenate(dead).T, strict=True):
-            if silent.any():
+            zero_blocks.append(is_zero)
+        for name, is_zero in zip(self.channels, np.concatenate(zero_blocks).T, strict=True):
+            if is_zero.any():
                 raise CampaignError(
-                    f"{silent.sum()} captures of channel {name} hold only zeros, first capture {int(silent.argmax())}",
+                    f"{is_zero.sum()} captures of channel {name} contain only zeros, first capture "
+                    f"{int(is_zero.argmax())}",
                     self.files[-1],
-                    "samples",
+                    "non-zero samples",
                     "The receiver or the copy failed; record or copy again, or remove those captures.",
                 )
         repeats = np.zeros(len(start), bool)
-        for numbers in alike.values():
+        for numbers in candidates.values():
             known = set[bytes]()
             for number in numbers if len(numbers) > 1 else ():
-                samples = self.samples.captures(start[number : number + 1], captures.length).tobytes()
-                digest = hashlib.blake2b(samples, digest_size=16).digest()
+                content = self.samples.captures(start[number : number + 1], captures.length).tobytes()
+                digest = hashlib.blake2b(content, digest_size=16).digest()
                 repeats[number] = digest in known
                 known.add(digest)
         return repeats

@@ -1,4 +1,4 @@
-"""Samples in a recorder's file: their layout, real ones mixed to baseband, read a bounded number at a time."""
+"""Samples in a recorder's file: their layout, mixing of real samples to baseband, and reading in bounded blocks."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -18,10 +18,10 @@ from apertura.core.echo.captures import ordered
 # ---- Real samples at an intermediate frequency to complex baseband --------------------------------------------------
 
 SETTLING = 63
-"""Samples on either side that the filter reaches: where it runs over the end of a capture, they are wrong."""
+"""Half length of the filter in samples; this number of samples at both ends of a capture is invalid."""
 
 EDGE = 0.025
-"""Of the sample rate: bands keep that far from both ends of their Nyquist zone; the mirror image is then -80 dB."""
+"""Minimum distance of a band from the ends of its Nyquist zone, relative to the sample rate; image rejection 80 dB."""
 
 _KAISER = 8.0
 
@@ -33,11 +33,12 @@ class Mixing:
     Attributes
     ----------
     if_hz
-        Where baseband zero lies in the samples, before any aliasing; negative where the mixer mirrors the spectrum.
+        Intermediate frequency: position of zero baseband frequency before aliasing; negative if the mixer inverts the
+        spectrum.
     sample_rate_hz
-        Real samples per second, and complex ones afterwards.
+        Real samples per second, equal to the complex samples per second after mixing.
     restarts
-        The phase is zero (n = 0) at the first sample of every capture; else at that of the file.
+        True: the phase is zero (n = 0) at the first sample of every capture; False: at that of the file.
 
     Notes
     -----
@@ -50,24 +51,24 @@ class Mixing:
 
     @property
     def alias_hz(self) -> float:
-        """Frequency of baseband zero after aliasing, -f_s/2 to f_s/2."""
+        """Intermediate frequency after aliasing, -f_s/2 to f_s/2."""
         half = self.sample_rate_hz / 2
         return (self.if_hz + half) % self.sample_rate_hz - half
 
     def baseband(self, real: NDArray[np.int16 | np.float32], first: int = 0) -> NDArray[np.float32]:
-        """Return stretches of samples as I and Q; right but for `SETTLING` samples at either end.
+        """Convert blocks of real samples to I and Q; `SETTLING` samples at both ends are invalid.
 
         Parameters
         ----------
         real
-            (stretch, sample, channel).
+            (block, sample, channel).
         first
             Number n of the first sample.
 
         Returns
         -------
         ndarray
-            (stretch, sample, channel, 2) float32.
+            (block, sample, channel, 2) float32.
 
         Examples
         --------
@@ -82,24 +83,24 @@ class Mixing:
         x = real.astype(np.float64)
         side = 1.0 if self.alias_hz >= 0 else -1.0
         quadrature = oaconvolve(x, _hilbert()[None, :, None], mode="full", axes=1)[:, SETTLING : SETTLING + x.shape[1]]
-        turns = self.if_hz / self.sample_rate_hz * (first + np.arange(x.shape[1]))
-        mixed = (x + 1j * side * quadrature) * np.exp(-2j * np.pi * (turns % 1.0))[None, :, None]
+        cycles = self.if_hz / self.sample_rate_hz * (first + np.arange(x.shape[1]))
+        mixed = (x + 1j * side * quadrature) * np.exp(-2j * np.pi * (cycles % 1.0))[None, :, None]
         return np.asarray(mixed.astype(np.complex64)[..., None].view(np.float32))
 
     def problem(self, lowest_hz: float, highest_hz: float, prefix_samples: int) -> str | None:
-        """Return why a band about baseband zero cannot be had of these samples, or None.
+        """Return the reason why a band cannot be extracted from these samples; None if it can.
 
         Parameters
         ----------
         lowest_hz, highest_hz
-            Edges of the band, relative to baseband zero.
+            Edges of the band at baseband.
         prefix_samples
-            At the start of each capture that nothing is measured in.
+            Samples at the start of each capture that are not used for measurements.
 
         Examples
         --------
         >>> Mixing(20e6, 64e6, restarts=True).problem(0.0, 16e6, 100)
-        'the band lies at 20 to 36 MHz in samples at 64 MHz, within 1.6 MHz of an end of a Nyquist zone'
+        'the band of 20 to 36 MHz, sampled at 64 MHz, is within 1.6 MHz of the edge of a Nyquist zone, or crosses it'
         """
         rate = self.sample_rate_hz
         low, high = self.if_hz + lowest_hz, self.if_hz + highest_hz
@@ -107,17 +108,17 @@ class Mixing:
         inside = low >= (zone / 2 + EDGE) * rate and high <= (zone / 2 + 0.5 - EDGE) * rate
         if not inside:
             return (
-                f"the band lies at {low / 1e6:g} to {high / 1e6:g} MHz in samples at {rate / 1e6:g} MHz, "
-                f"within {EDGE * rate / 1e6:g} MHz of an end of a Nyquist zone"
+                f"the band of {low / 1e6:g} to {high / 1e6:g} MHz, sampled at {rate / 1e6:g} MHz, is within "
+                f"{EDGE * rate / 1e6:g} MHz of the edge of a Nyquist zone, or crosses it"
             )
         if self.restarts and prefix_samples < SETTLING:
-            return f"a prefix of {prefix_samples} samples, in which the filter needs {SETTLING} to settle"
+            return f"a prefix of {prefix_samples} samples; the filter needs {SETTLING} to settle"
         return None
 
 
 @cache
 def _hilbert() -> NDArray[np.float64]:
-    """Return the taps of H, (2·SETTLING+1,): 2/(πk) for odd k under a Kaiser window."""
+    """Return the taps of H, (2·SETTLING+1,): 2/(πk) for odd k, with a Kaiser window."""
     k = np.arange(-SETTLING, SETTLING + 1)
     taps = np.zeros(k.size)
     odd = k % 2 == 1
@@ -128,18 +129,19 @@ def _hilbert() -> NDArray[np.float64]:
 # ---- Layout of the samples in a file --------------------------------------------------------------------------------
 
 Samples = NDArray[np.int16 | np.float32]
-"""(…, 2), I and Q: counts of up to 16 bits as int16, all others as float32."""
+"""(…, 2), I and Q: integers of up to 16 bits as int16, all others as float32."""
 
 _DATATYPE = re.compile(r"([cr])(?:([iu]8)|([iu](?:16|32)|f(?:16|32|64))_([lb])e)", re.ASCII)
 
 DATATYPES = "ci16_le: c or r (complex, real); i8, u8, or i16, u16, i32, u32, f16, f32, f64 with _le or _be"
-"""What datatypes are read, for messages."""
+"""Supported datatypes, for messages."""
 
 _EXAMINED_BYTES = 1 << 16
-_FEWEST, _DISTINCT, _TINIEST, _USUAL = 256, 32, 1e-12, 0.999  # numbers, values of them, their size, its share
+# of plausible floats: fewest non-zero numbers, fewest distinct values, smallest magnitude, share of usual magnitudes
+_FEWEST, _DISTINCT, _TINIEST, _USUAL = 256, 32, 1e-12, 0.999
 _HALF = 0.45
 
-_LARGEST = np.float64(1e15)  # of a float: sums of squares stay in float32
+_LARGEST = np.float64(1e15)  # largest float accepted; sums of squares stay within float32
 
 
 def _none() -> NDArray[np.int64]:
@@ -153,14 +155,14 @@ class SampleLayout:
     Attributes
     ----------
     datatype
-        As SigMF names it.
+        SigMF datatype.
     trailing_bytes
-        At the end of the file that are no samples.
+        Bytes at the end of the file that are not samples.
     segment_start, skipped_bytes
-        (segment,) int64: first samples of what lies behind bytes that are no samples, ascending, and how many such
-        bytes the file holds before each; none where there are no such bytes.
+        (segment,) int64: first sample after bytes that are not samples, ascending, and the total number of such bytes
+        before it in the file; empty if there are none.
     mixing
-        Of real samples; None: they are complex.
+        Mixing of real samples; None: complex samples.
 
     Examples
     --------
@@ -176,71 +178,72 @@ class SampleLayout:
 
     @cached_property
     def stored(self) -> np.dtype[Any]:
-        """Of one number in the file; ValueError if the datatype is none of those that are read."""
+        """NumPy dtype of a number in the file; ValueError if the datatype is not supported."""
         match = _DATATYPE.fullmatch(self.datatype)
         if match is None:
-            raise ValueError(f"no datatype {self.datatype}")
+            raise ValueError(f"datatype {self.datatype} is not supported")
         kind, order = match[2] or match[3], "<" if match[4] == "l" else ">"
         return np.dtype(f"{order if match[4] else '|'}{kind[0]}{int(kind[1:]) // 8}")
 
     @property
     def components(self) -> int:
-        """Numbers per sample of a channel: I and Q, or one."""
+        """Numbers per sample of a channel: 2 for I and Q, 1 for real samples."""
         return 2 if self.datatype.startswith("c") else 1
 
     def numbers(self, data: NDArray[np.uint8]) -> Samples:
-        """Return the bytes of a file as numbers, flat: int16 where that holds them, else float32.
+        """Convert the bytes of a file to a flat array: int16 for integers of up to 16 bits, otherwise float32.
 
-        Unsigned counts lose half their range: 128 of u8 is zero. Those of 32 bits are rounded to 24.
+        The zero level of unsigned integers is half their range, such as 128 for u8. Integers of 32 bits are rounded to
+        24 bits.
 
         Raises
         ------
         ValueError
-            If a float is not finite or beyond 1e15; its second argument is the index of the first.
+            If a float is not finite or exceeds 1e15; the second argument is the index of the first one.
         """
         stored = data.view(self.stored)
         if stored.dtype.kind == "u":
             stored = stored - np.float64(1 << 8 * stored.itemsize - 1)
         elif stored.dtype.kind == "f":
-            with np.errstate(invalid="ignore"):  # a NaN that signals
+            with np.errstate(invalid="ignore"):  # signalling NaN
                 good = np.abs(stored) <= _LARGEST  # false for NaN
             if not good.all():
-                raise ValueError("not finite or beyond 1e15", int(np.argmin(good)))
+                raise ValueError("not finite or exceeds 1e15", int(np.argmin(good)))
         if self.stored.kind in "iu" and self.stored.itemsize <= 2:
             return stored.astype(np.int16, copy=False)
         return stored.astype(np.float32, copy=False)
 
     def kept(self) -> tuple[dict[str, Any], dict[str, xr.Variable]]:
-        """Return attributes and variables of the `raw` stage that `of` makes a layout of again."""
+        """Return the layout as attributes and variables of the `raw` stage, see `of`."""
         attributes = {
             "datatype": self.datatype,
             "trailing_bytes": self.trailing_bytes,
             "mixing": None if self.mixing is None else asdict(self.mixing),
         }
         segments = {"segment_start": self.segment_start, "segment_skipped": self.skipped_bytes}
-        return attributes, {name: xr.Variable("segment", one) for name, one in segments.items() if one.size}
+        return attributes, {name: xr.Variable("segment", values) for name, values in segments.items() if values.size}
 
     @classmethod
     def of(cls, raw: xr.Dataset) -> "SampleLayout":
-        """Return the layout of the file that a `raw` stage refers to."""
+        """Restore the layout from a `raw` stage."""
         start, skipped = (raw[name].values if name in raw else _none() for name in ("segment_start", "segment_skipped"))
-        stated = raw.attrs["mixing"]
-        mixing = None if stated is None else Mixing(**stated)
+        parameters = raw.attrs["mixing"]
+        mixing = None if parameters is None else Mixing(**parameters)
         return cls(raw.attrs["datatype"], raw.attrs["trailing_bytes"], start, skipped, mixing)
 
 
 # ---- Samples of a file, read in bounded blocks ----------------------------------------------------------------------
 #
-# They are read and not mapped: pages of a mapped file count as memory of the process, and a file that is cut short
-# meanwhile ends the process instead of raising an error.
+# Files are read, not memory-mapped: pages of a mapped file count as memory of the process, and truncation of a mapped
+# file crashes the process instead of raising an error.
 
 Spans = Sequence[tuple[int, int]]
-"""First sample, and that behind the last."""
+"""First sample, and sample after the last, of each span."""
 
 
 def _are_samples(numbers: NDArray[np.floating[Any]]) -> bool:
-    """Test whether floats may be samples of a recorder: finite, of several values and of usual size, or 0."""
-    with np.errstate(invalid="ignore"):  # a NaN that signals
+    """Return True if floats are plausible samples: finite, with several values of usual magnitude, or 0."""
+    with np.errstate(invalid="ignore"):  # signalling NaN
         magnitude = np.abs(numbers[numbers != 0].astype(np.float64))
     if magnitude.size < _FEWEST or not np.isfinite(magnitude).all() or np.unique(magnitude).size <= _DISTINCT:
         return False
@@ -249,16 +252,16 @@ def _are_samples(numbers: NDArray[np.floating[Any]]) -> bool:
 
 @dataclass(frozen=True)
 class SampleFile:
-    """I and Q of a recording, channels interleaved per sample.
+    """File of I and Q samples of a recording, channels interleaved per sample.
 
     Attributes
     ----------
     path
         The file.
     channels
-        How many.
+        Number of channels.
     layout
-        How samples lie in it.
+        Layout of the samples.
     """
 
     path: Path
@@ -267,26 +270,26 @@ class SampleFile:
 
     @cached_property
     def sample_bytes(self) -> int:
-        """Bytes of one sample of all channels; asked for with every capture."""
+        """Bytes of one sample of all channels; cached because it is used for every capture."""
         return self.channels * self.layout.components * self.layout.stored.itemsize
 
     @property
     def other_bytes(self) -> int:
-        """Bytes of the file that are no samples."""
+        """Bytes of the file that are not samples."""
         return int(self.layout.skipped_bytes[-1:].sum()) + self.layout.trailing_bytes
 
     def __len__(self) -> int:
-        """Return the samples of each channel in the file as it is now."""
+        """Return the number of samples per channel in the file at present."""
         with naming(self.path):
             return max(0, self.path.stat().st_size - self.other_bytes) // self.sample_bytes
 
     def read(self, first: int, last: int) -> Samples:
-        """Return samples `first` to `last`, (sample, channel, 2).
+        """Read samples from `first` up to but excluding `last`, (sample, channel, 2).
 
         Raises
         ------
         CampaignError
-            If the file ends before, or holds a float that is not finite.
+            If the file ends before `last`, or contains a float that is not finite.
 
         Examples
         --------
@@ -299,83 +302,85 @@ class SampleFile:
         mixing = self.layout.mixing
         if mixing is None:
             return self._read([(first, last)]).reshape(-1, self.channels, 2)
-        begun, ended = max(0, first - SETTLING), min(len(self), last + SETTLING)
-        real = self._read([(begun, max(last, ended))]).reshape(1, -1, self.channels)
-        return mixing.baseband(real, begun)[0, first - begun : last - begun]
+        padded_first, padded_last = max(0, first - SETTLING), min(len(self), last + SETTLING)
+        real = self._read([(padded_first, max(last, padded_last))]).reshape(1, -1, self.channels)
+        return mixing.baseband(real, padded_first)[0, first - padded_first : last - padded_first]
 
     def floats_among_counts(self, first: int) -> str | None:
-        """Return the datatype, such as f32_le, of floats that the layout takes for integers; None if it does not.
+        """Detect floats in a file whose layout declares integers; return their datatype, such as f32_le, or None.
 
-        The bytes of counts are no floats: small negative ones are NaN, others beyond any sample. Those of floats are
-        finite and within a few powers of ten throughout.
+        Integer samples interpreted as floats are NaN or of implausible magnitude; floats are finite and within a few
+        orders of magnitude throughout.
 
         Parameters
         ----------
         first
-            Sample from which on some are read.
+            First sample of the examined block.
         """
         if self.layout.stored.kind == "f":
             return None
-        place, size = next(self._pieces(first, len(self)), (0, 0))
+        offset, size = next(self._pieces(first, len(self)), (0, 0))
         with naming(self.path), self.path.open("rb") as stream:
-            stream.seek(place)
+            stream.seek(offset)
             data = stream.read(min(size, _EXAMINED_BYTES))
         data = data[: len(data) // 8 * 8]
-        usual = [kind for kind in ("<f4", ">f4", "<f8", ">f8") if _are_samples(np.frombuffer(data, kind))]
-        if not usual:
+        plausible = [kind for kind in ("<f4", ">f4", "<f8", ">f8") if _are_samples(np.frombuffer(data, kind))]
+        if not plausible:
             return None
-        # every second half of doubles of few digits is zero, and the other half a float: then they are doubles
-        halved = np.mean(np.frombuffer(data, "<u4") == 0) > _HALF
-        kind = np.dtype(next((one for one in usual if one.endswith("8") == bool(halved)), usual[0]))
+        # doubles with few digits look like floats alternating with zeros
+        are_doubles = np.mean(np.frombuffer(data, "<u4") == 0) > _HALF
+        kind = np.dtype(next((kind for kind in plausible if kind.endswith("8") == bool(are_doubles)), plausible[0]))
         return f"f{8 * kind.itemsize}_{'b' if kind.str.startswith('>') else 'l'}e"
 
     def captures(self, start: NDArray[np.int64], length: int) -> Samples:
-        """Return some captures, each of `length` samples from its `start` on, (pulse, sample, channel, 2).
+        """Read captures of `length` samples from `start` on, (pulse, sample, channel, 2).
 
         Parameters
         ----------
         start
-            (pulse,) int64, first sample of each, ascending.
+            (pulse,) int64: first sample of each capture, ascending.
         length
-            Samples of each.
+            Samples in each capture.
         """
         mixing = self.layout.mixing
         if mixing is None:
             return self._stretches(start, length).reshape(len(start), length, self.channels, 2)
         if not mixing.restarts:
-            return np.stack([self.read(one, one + length) for one in start.tolist()])
+            return np.stack([self.read(first, first + length) for first in start.tolist()])
         longer = length + SETTLING
         real = self._stretches(start, longer).reshape(len(start), longer, self.channels)
         return mixing.baseband(real)[:, :length]
 
     def _stretches(self, start: NDArray[np.int64], length: int) -> Samples:
-        """Return the numbers of stretches of one length."""
+        """Read the numbers of blocks of equal length."""
         first, last = int(start[0]), int(start[-1]) + length
         if last - first == length * len(start) and (np.diff(start) == length).all():
             return self._read([(first, last)])
-        return self._read([(one, one + length) for one in start.tolist()])
+        return self._read([(start_sample, start_sample + length) for start_sample in start.tolist()])
 
     def _read(self, spans: Spans) -> Samples:
-        """Return the numbers of some spans of samples, one after the other."""
+        """Read the numbers of spans of samples, concatenated."""
         data = np.empty(sum(last - first for first, last in spans) * self.sample_bytes, np.uint8)
         with naming(self.path), self.path.open("rb", buffering=0) as stream:
-            filled = memoryview(data.data)
+            unfilled = memoryview(data.data)
             for first, last in spans:
-                for place, size in self._pieces(first, last):
-                    stream.seek(place)
+                for offset, size in self._pieces(first, last):
+                    stream.seek(offset)
                     while size:
-                        count = stream.readinto(filled[:size])
+                        count = stream.readinto(unfilled[:size])
                         if not count:
-                            raise self._cut_short(last)
-                        size, filled = size - count, filled[count:]  # noqa: PLW2901
+                            raise self._truncated(last)
+                        size, unfilled = size - count, unfilled[count:]  # noqa: PLW2901
         try:
             return self.layout.numbers(data)
         except ValueError as error:
-            why, index = error.args
-            raise self._no_number(why, spans, index * self.layout.stored.itemsize // self.sample_bytes) from error
+            reason, index = error.args
+            raise self._invalid_sample(
+                reason, spans, index * self.layout.stored.itemsize // self.sample_bytes
+            ) from error
 
     def _pieces(self, first: int, last: int) -> Iterator[tuple[int, int]]:
-        """Yield place and size of the bytes of a span of samples, in parts where other bytes lie between them."""
+        """Yield file offset and size in bytes of a span of samples, split at bytes that are not samples."""
         starts, skipped = self.layout.segment_start, self.layout.skipped_bytes
         if not starts.size:
             yield first * self.sample_bytes, (last - first) * self.sample_bytes
@@ -386,7 +391,7 @@ class SampleFile:
             before = int(skipped[segment]) if segment >= 0 else 0
             yield start * self.sample_bytes + before, (stop - start) * self.sample_bytes
 
-    def _no_number(self, why: str, spans: Spans, index: int) -> CampaignError:
+    def _invalid_sample(self, reason: str, spans: Spans, index: int) -> CampaignError:
         sample = index
         for first, last in spans:
             if index < last - first:
@@ -394,28 +399,28 @@ class SampleFile:
                 break
             index -= last - first
         return CampaignError(
-            f"sample {sample} is {why}",
+            f"sample {sample} is {reason}",
             self.path,
             f"finite numbers of datatype {self.layout.datatype}",
             "Record or copy again, or correct core:datatype.",
         )
 
-    def _cut_short(self, last: int) -> CampaignError:
+    def _truncated(self, last: int) -> CampaignError:
         return CampaignError(
-            f"ends at sample {len(self)}, while it is read",
+            f"the file ends at sample {len(self)}, truncated while it was read",
             self.path,
-            f"at least {last} samples, as there were",
-            "The file was cut short or is being copied; copy it again and run the workflow again.",
+            f"at least {last} samples",
+            "The file was truncated or is being copied; copy it again and run the workflow again.",
         )
 
     def channel(self, index: int, order: str = "complex") -> "ChannelOfFile":
-        """Return one channel, to be read by slices, with I and Q in a stated order, as `ordered`."""
+        """Return a channel that is read by slicing, with I and Q in the given order (see `ordered`)."""
         return ChannelOfFile(self, index, order)
 
 
 @dataclass(frozen=True)
 class ChannelOfFile:
-    """One channel of a file of samples; slices of it are arrays, (sample, 2)."""
+    """Channel of a sample file; its slices are arrays, (sample, 2)."""
 
     file: SampleFile
     index: int

@@ -1,4 +1,4 @@
-"""SigMF recordings: metadata, collections, one capture segment per trigger, channels interleaved per sample."""
+"""SigMF 1.2 recordings: metadata, collections, one capture segment per trigger, channels interleaved per sample."""
 
 import json
 import re
@@ -26,13 +26,13 @@ from apertura.formats.times import utc_times
 
 # ---- Metadata: global object and captures, read as a stream ---------------------------------------------------------
 #
-# Only what is read is checked: the schema of the sigmf package takes jsonschema, which costs more to import than a
-# recording to open.
+# Only the keys used are checked: the schema of the sigmf package requires jsonschema, whose import takes longer than
+# opening a recording.
 
 LARGEST_META = 256_000_000
-"""Bytes of a metadata file: some 2 million captures."""
+"""Maximum size of a metadata file, bytes: some 2 million captures."""
 
-_EXPECTED = "SigMF metadata with one capture segment per trigger, ISO 8601 UTC in the core:datetime of each"
+_EXPECTED = "SigMF metadata with one capture segment per trigger, each with core:datetime in ISO 8601 UTC"
 
 _REMEDY = "Correct the metadata or record again."
 
@@ -41,19 +41,19 @@ _AT_ONCE = 4096  # captures
 Model = TypeVar("Model")
 
 Count = Annotated[int, Field(ge=0, le=1 << 40, strict=True)]
-"""Of samples, chips, bits or bytes."""
+"""Number of samples, chips, bits or bytes."""
 
 ChannelName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_. -]{1,80}$")]
-"""Shown in messages and named in stages."""
+"""Name of a channel, as used in messages and stages."""
 
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_. ()-]{0,199}$")]
-"""In the same folder."""
+"""Name of a file in the same folder."""
 
 Frequency = Annotated[float, Field(ge=-1e12, le=1e12)]
 
 
 class SigmfFraming(BaseModel):
-    """Preamble and payload sent before each symbol."""
+    """Preamble and payload transmitted before each symbol."""
 
     preamble: str = Field(min_length=1, max_length=200)
     chip_samples: Annotated[int, Field(ge=1, le=1 << 20, strict=True)]
@@ -64,18 +64,18 @@ class SigmfFraming(BaseModel):
 
 
 class Extension(BaseModel):
-    """An extension of SigMF that metadata use."""
+    """SigMF extension used in metadata."""
 
     name: Annotated[str, Field(max_length=200)]
     optional: bool = True
 
 
 DESCRIPTIVE = frozenset({"antenna", "apertura", "capture_details", "signal", "spatial", "traceability", "volatile"})
-"""Extensions that describe a recording and change no sample or time; one that is required and unknown is refused."""
+"""Extensions that do not affect samples or times; metadata that require any other extension are rejected."""
 
 
 class Global(BaseModel):
-    """The global object."""
+    """SigMF global object."""
 
     datatype: str = Field(alias="core:datatype")
     version: str = Field(alias="core:version")
@@ -92,7 +92,7 @@ class Global(BaseModel):
 
 
 class Capture(BaseModel):
-    """One of the captures array."""
+    """Element of the SigMF captures array."""
 
     start: Count = Field(alias="core:sample_start")
     datetime: str = Field(alias="core:datetime", pattern="Z$")
@@ -105,7 +105,7 @@ _SOME_CAPTURES = TypeAdapter(list[Capture])
 
 
 class StatedCaptures(NamedTuple):
-    """Fields of the captures, (capture,) each."""
+    """Fields of the captures as arrays, (capture,)."""
 
     start: NDArray[np.int64]
     time: NDArray[np.datetime64]
@@ -114,33 +114,33 @@ class StatedCaptures(NamedTuple):
     frame: NDArray[np.int64]
 
     def first(self, count: int) -> "StatedCaptures":
-        """Return the first ones."""
+        """Return the first `count` captures."""
         return StatedCaptures._make(column[:count] for column in self)
 
     def followed_by(self, later: "StatedCaptures") -> "StatedCaptures":
-        """Return these and later ones."""
+        """Append later captures."""
         return StatedCaptures._make(np.concatenate(both) for both in zip(self, later, strict=True))
 
 
 def read_meta(path: Path) -> tuple[Global, StatedCaptures]:
-    """Return the metadata of a recording.
+    """Read the metadata of a recording.
 
-    A long flight has some hundred thousand captures: at most a few thousand of their objects are in memory at a time.
+    A long flight has some hundred thousand captures; at most a few thousand JSON objects are in memory at a time.
 
     Raises
     ------
     CampaignError
-        If they are not SigMF.
+        If the file is not valid SigMF metadata.
     """
     with _opened(path) as stream:
         header = _read_global(stream, path)
         captures = _read_captures(ijson.items(_from_start(stream), "captures.item", use_float=True), path, header)
-        deque(ijson.basic_parse(_from_start(stream)), maxlen=0)  # what follows is JSON, too
+        deque(ijson.basic_parse(_from_start(stream)), maxlen=0)  # check that the rest of the file is valid JSON
     return header, captures
 
 
 def read_global(path: Path) -> Global:
-    """Return the global object alone; raise CampaignError as `read_meta` does."""
+    """Read the global object only; for errors see `read_meta`."""
     with _opened(path) as stream:
         return _read_global(stream, path)
 
@@ -151,13 +151,13 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
         raise CampaignError("no such file", path, _EXPECTED, _REMEDY)
     if path.stat().st_size > LARGEST_META:
         found, expected = f"{path.stat().st_size} bytes", f"a file of at most {LARGEST_META} bytes"
-        raise CampaignError(found, path, expected, "Is it the right file? Shorten it.")
+        raise CampaignError(found, path, expected, "Check the path, or shorten the file.")
     try:
         with naming(path), path.open("rb") as stream:
             yield stream
     except (ijson.JSONError, UnicodeDecodeError) as error:
-        why = shown(str(error).strip().splitlines()[0])
-        raise CampaignError(f"not valid SigMF: no JSON: {why}", path, _EXPECTED, _REMEDY) from error
+        reason = shown(str(error).strip().splitlines()[0])
+        raise CampaignError(f"not valid SigMF: invalid JSON: {reason}", path, _EXPECTED, _REMEDY) from error
 
 
 def _read_global(stream: BinaryIO, path: Path) -> Global:
@@ -166,38 +166,42 @@ def _read_global(stream: BinaryIO, path: Path) -> Global:
 
 
 def _global(document: object, path: Path) -> Global:
-    """Return the global object checked; raise CampaignError where it requires an extension that is not known here."""
+    """Validate the global object; raise CampaignError if it requires an unsupported extension."""
     header = of_sigmf(TypeAdapter(Global), document, path, "global")
-    required = [one.name for one in header.extensions if not one.optional and one.name not in DESCRIPTIVE]
+    required = [
+        extension.name
+        for extension in header.extensions
+        if not extension.optional and extension.name not in DESCRIPTIVE
+    ]
     if required:
         raise CampaignError(
-            f"core:extensions requires {quoted(required[0])}",
+            f"core:extensions requires {quoted(required[0])}, which may change the interpretation of samples",
             path,
-            f"no extension beyond {', '.join(sorted(DESCRIPTIVE))}: it may change how samples are read",
-            "Convert the recording to plain SigMF; where the extension only describes, set its `optional` to true.",
+            f"no required extension other than {', '.join(sorted(DESCRIPTIVE))}",
+            "Convert the recording to plain SigMF; for a purely descriptive extension, set its `optional` to true.",
         )
     return header
 
 
 def _from_start(stream: BinaryIO) -> BinaryIO:
-    """Return a stream at its beginning, behind its byte-order mark."""
+    """Rewind a stream to the position after its byte-order mark."""
     stream.seek(0)
     stream.seek(len(BOM_UTF8) if stream.read(len(BOM_UTF8)) == BOM_UTF8 else 0)
     return stream
 
 
 def _read_captures(documents: Iterator[object], path: Path, whole: Global) -> StatedCaptures:
-    """Return the captures; their first samples count from the begin of the file (core:offset is taken off)."""
+    """Read the captures; their first samples count from the start of the file (core:offset is subtracted)."""
     parts: list[StatedCaptures] = []
-    while some := list(islice(documents, _AT_ONCE)):
-        captures = of_sigmf(_SOME_CAPTURES, some, path, "captures", first=_AT_ONCE * len(parts))
+    while batch := list(islice(documents, _AT_ONCE)):
+        captures = of_sigmf(_SOME_CAPTURES, batch, path, "captures", first=_AT_ONCE * len(parts))
         try:
             time = utc_times([capture.datetime.removesuffix("Z") for capture in captures])
         except ValueError as error:
             raise CampaignError(
-                f"core:datetime: {error}", path, "ISO 8601 UTC on every capture", "Write the time tags."
+                f"core:datetime: {error}", path, "ISO 8601 UTC in every capture", "Add the time tags."
             ) from error
-        stated = [np.nan if capture.frequency_hz is None else capture.frequency_hz for capture in captures]
+        frequency_hz = [np.nan if capture.frequency_hz is None else capture.frequency_hz for capture in captures]
         start, header, frame = (
             np.array([getattr(capture, name) for capture in captures], np.int64)
             for name in ("start", "header_bytes", "frame")
@@ -207,32 +211,32 @@ def _read_captures(documents: Iterator[object], path: Path, whole: Global) -> St
             raise CampaignError(
                 f"capture {_AT_ONCE * len(parts) + before[0]}: core:sample_start {start[before[0]]}",
                 path,
-                f"no sample before core:offset {whole.offset}, the index of the file's first",
-                "The recording was split: correct core:sample_start, or leave core:offset out where they count from 0.",
+                f"at least core:offset {whole.offset}, the index of the first sample in the file",
+                "The recording was split: correct core:sample_start, or remove core:offset if they count from 0.",
             )
         start -= whole.offset
-        parts.append(StatedCaptures(start, time, np.array(stated), header, frame))
+        parts.append(StatedCaptures(start, time, np.array(frequency_hz), header, frame))
     if not parts:
-        raise CampaignError("not valid SigMF: captures: none", path, _EXPECTED, _REMEDY)
+        raise CampaignError("not valid SigMF: captures: empty", path, _EXPECTED, _REMEDY)
     return StatedCaptures(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
 def of_sigmf(adapter: TypeAdapter[Model], document: object, path: Path, name: str, *, first: int = 0) -> Model:
-    """Return part `name` of the metadata checked; it begins with capture `first`."""
+    """Validate part `name` of the metadata; `first` is the number of its first capture."""
     try:
         return adapter.validate_python(document)
     except ValidationError as error:
         wrong = error.errors(include_url=False, include_context=False)[0]
         key = ".".join([name, *(str(at + first) if isinstance(at, int) else at for at in wrong["loc"])])
-        given = f", not {quoted(wrong['input'])}" if isinstance(wrong["input"], (str, int, float)) else ""
-        raise CampaignError(f"not valid SigMF: {key}: {wrong['msg']}{given}", path, _EXPECTED, _REMEDY) from error
+        value = f", not {quoted(wrong['input'])}" if isinstance(wrong["input"], (str, int, float)) else ""
+        raise CampaignError(f"not valid SigMF: {key}: {wrong['msg']}{value}", path, _EXPECTED, _REMEDY) from error
 
 
 # ---- Files of a node's recording: by name, collection or core:dataset -----------------------------------------------
 
 _SUFFIX = ".sigmf-collection"
-_A_COLLECTION = "a SigMF collection: core:version, core:streams (name, hash) and, where names differ, apertura:nodes"
-_CORRECT_IT = "Correct the collection, or take it out of the folder."
+_A_COLLECTION = "a SigMF collection: core:version, core:streams (name, hash) and, if names differ, apertura:nodes"
+_CORRECT_IT = "Correct the collection, or remove it from the folder."
 
 
 class _Stream(BaseModel):
@@ -241,7 +245,7 @@ class _Stream(BaseModel):
 
 
 class SigmfCollection(BaseModel):
-    """The collection object."""
+    """SigMF collection object."""
 
     version: str = Field(alias="core:version")
     streams: list[_Stream] = Field(alias="core:streams", max_length=10_000)
@@ -249,27 +253,29 @@ class SigmfCollection(BaseModel):
 
 
 def find_sigmf(folder: Path, node: str) -> tuple[Path, Path]:
-    """Return metadata and samples of a node's recording, which need not be there.
+    """Return the paths of metadata and samples of a node's recording, whether or not they exist.
 
-    The metadata are <node>.sigmf-meta, or where that is missing those of the stream that `apertura:nodes` of a
-    collection in the folder gives the node. The samples have their name, or the one of `core:dataset`.
+    The metadata are <node>.sigmf-meta, or if that is missing those of the stream that `apertura:nodes` of a collection
+    in the folder assigns to the node. The samples have the same name, or that of `core:dataset`.
 
     Raises
     ------
     CampaignError
-        If a collection is none, gives the node a stream that it does not list, or two collections give it one; or if
-        an archive lies there instead.
+        If a collection is invalid or assigns a stream that it does not list, two collections assign a stream to the
+        node, or the recording is a SigMF archive.
     """
     meta = folder / f"{node}.sigmf-meta"
     archive = folder / f"{node}{ARCHIVE}"
     if not meta.is_file() and archive.is_file():
         raise archived(archive)
     if not meta.is_file():
-        given = [(path, one.nodes[node]) for path, one in _collections(folder) if node in one.nodes]
-        if len(given) > 1:
-            found = f"node {node} is in {' and '.join(path.name for path, _ in given)}"
-            raise CampaignError(found, folder, "one recording of each node", "Take a collection out of the folder.")
-        meta = folder / f"{given[0][1]}.sigmf-meta" if given else meta
+        assigned = [
+            (path, collection.nodes[node]) for path, collection in _collections(folder) if node in collection.nodes
+        ]
+        if len(assigned) > 1:
+            found = f"node {node} is in {' and '.join(path.name for path, _ in assigned)}"
+            raise CampaignError(found, folder, "one recording per node", "Remove a collection from the folder.")
+        meta = folder / f"{assigned[0][1]}.sigmf-meta" if assigned else meta
     samples = meta.with_suffix(".sigmf-data")
     if meta.is_file() and not samples.is_file():
         dataset = read_global(meta).dataset
@@ -282,7 +288,7 @@ ARCHIVE = ".sigmf"
 
 
 def archived(path: Path) -> CampaignError:
-    """Return the error of a recording that lies in an archive.
+    """Return the error for a recording in a SigMF archive.
 
     Examples
     --------
@@ -295,7 +301,7 @@ def archived(path: Path) -> CampaignError:
 
 
 def check_listed(meta_path: Path) -> None:
-    """Raise CampaignError unless metadata are those that the collections beside them hashed, where any lists them."""
+    """Raise CampaignError if metadata do not match their hash in a collection of the same folder."""
     for path, collection in _collections(meta_path.parent):
         for stream in collection.streams:
             if stream.name != meta_path.stem:
@@ -311,15 +317,15 @@ def check_listed(meta_path: Path) -> None:
 
 
 def _collections(folder: Path) -> Iterator[tuple[Path, SigmfCollection]]:
-    for found in sorted(folder.glob(f"*{_SUFFIX}")):
-        path = ConfinedPath.at(folder).named(found.name, where=folder)
+    for file in sorted(folder.glob(f"*{_SUFFIX}")):
+        path = ConfinedPath.at(folder).named(file.name, where=folder)
         document = read_json(path, expected=_A_COLLECTION, remedy=_CORRECT_IT)
         collection = of_sigmf(TypeAdapter(SigmfCollection), document.get("collection"), path, "collection")
         listed = {stream.name for stream in collection.streams}
         for node, name in collection.nodes.items():
             if name not in listed:
-                found_there = f"apertura:nodes gives {quoted(node, 40)} the stream {quoted(name, 40)}"
-                raise CampaignError(found_there, path, f"one of core:streams {sorted(listed)}", _CORRECT_IT)
+                found = f"apertura:nodes assigns stream {quoted(name, 40)} to {quoted(node, 40)}"
+                raise CampaignError(found, path, f"one of core:streams {sorted(listed)}", _CORRECT_IT)
         yield path, collection
 
 
@@ -332,8 +338,8 @@ def open_sigmf(meta_path: Path, data_path: Path) -> Recording:
     Raises
     ------
     CampaignError
-        If the metadata are not SigMF, the data are truncated, a capture lies past their end, or the first samples are
-        floating-point numbers where core:datatype states counts.
+        If the metadata are not SigMF, the data are truncated, a capture lies after their end, or the first samples are
+        floating-point numbers although core:datatype states integers.
 
     Notes
     -----
@@ -345,19 +351,19 @@ def open_sigmf(meta_path: Path, data_path: Path) -> Recording:
         raise CampaignError(
             f"core:dataset {header.dataset}",
             meta_path,
-            f"{data_path.name}, which lies beside it",
-            "Remove one of them.",
+            f"{data_path.name}, which is in the same folder",
+            "Remove one of the two files, or correct core:dataset.",
         )
     channels, layout = _channels(header, meta_path), _layout(header, captures, meta_path)
     samples = _samples(SampleFile(data_path, len(channels), layout), captures, meta_path)
     floats = samples.floats_among_counts(int(captures.start[0]))
     if floats is not None:
-        right = f"{header.datatype[0]}{floats}"
+        datatype = f"{header.datatype[0]}{floats}"
         raise CampaignError(
-            f"core:datatype {header.datatype}, and {data_path.name} holds finite floating-point numbers",
+            f"core:datatype {header.datatype}, but {data_path.name} contains floating-point numbers",
             meta_path,
-            right,
-            f"Set core:datatype to {right}.",
+            datatype,
+            f"Set core:datatype to {datatype}.",
         )
     return Recording(
         samples=samples,
@@ -394,14 +400,16 @@ def _layout(header: Global, captures: StatedCaptures, path: Path) -> SampleLayou
         raise CampaignError(
             f"core:datatype {header.datatype} {'without' if real else 'with'} apertura:if_hz",
             path,
-            "the intermediate frequency at which baseband zero lies with real samples, and only there",
-            "Add apertura:if_hz, Hz, to the global object." if real else "Remove it, or correct core:datatype.",
+            "an intermediate frequency for real samples, none for complex samples",
+            "Add apertura:if_hz, Hz, to the global object."
+            if real
+            else "Remove apertura:if_hz, or correct core:datatype.",
         )
     return layout
 
 
 def _frequency_hz(captures: StatedCaptures, path: Path) -> float:
-    """Return the RF frequency at baseband zero, which all captures share; 0 where none is stated."""
+    """Return the RF frequency at zero baseband frequency, common to all captures; 0 if not stated."""
     stated = np.flatnonzero(~np.isnan(captures.frequency_hz))
     if not stated.size:
         return 0.0
@@ -411,7 +419,7 @@ def _frequency_hz(captures: StatedCaptures, path: Path) -> float:
         raise CampaignError(
             f"capture {stated[other[0]]}: core:frequency {hz[other[0]]:.6f}",
             path,
-            f"{hz[0]:.6f}, as capture {stated[0]} says: one carrier for the whole recording",
+            f"{hz[0]:.6f}, the frequency of capture {stated[0]}: one carrier for the whole recording",
             "Correct the metadata, or split the recording.",
         )
     return float(hz[0])
@@ -423,17 +431,17 @@ def _channels(header: Global, path: Path) -> list[str]:
         raise CampaignError(
             f"apertura:channels {names} for core:num_channels {header.num_channels}",
             path,
-            "one name per channel, each its own, 'radar' among them",
+            "one unique name per channel, including 'radar'",
             "Correct the metadata.",
         )
     return names
 
 
 def _samples(samples: SampleFile, captures: StatedCaptures, meta_path: Path) -> SampleFile:
-    """Return samples that are there, whole, and reach to the last capture."""
+    """Check that the sample file exists, is complete, and contains the last capture."""
     path, frame = samples.path, samples.sample_bytes
     if not path.is_file():
-        raise CampaignError("no such file", path, f"the samples of {meta_path.name}", "Copy it there.")
+        raise CampaignError("no such file", path, f"the samples of {meta_path.name}", "Copy the file there.")
     size = path.stat().st_size - samples.other_bytes
     if size % frame or size <= 0:
         other = f" less {samples.other_bytes} of core:header_bytes and core:trailing_bytes" * bool(samples.other_bytes)
@@ -460,21 +468,21 @@ def _length(captures: StatedCaptures, total: int, path: Path) -> int:
     if short.size:
         pulse = int(short[0])
         raise CampaignError(
-            f"capture {pulse} holds {lengths[pulse]} samples (the data end at sample {total})",
+            f"capture {pulse} contains {lengths[pulse]} samples (the data end at sample {total})",
             path,
-            f"{max(length, 1)}, as most captures do",
+            f"{max(length, 1)} samples, the median of all captures",
             "The data are truncated (copy them again) or core:sample_start is wrong.",
         )
     return length
 
 
 def _usable(length: int, layout: SampleLayout, path: Path) -> int:
-    """Return the samples of each capture that can be had: the filter of real ones runs over their end."""
+    """Return the number of usable samples per capture; real captures lose the filter's settling time at their end."""
     if layout.mixing is None or not layout.mixing.restarts:
         return length
     if length <= 2 * SETTLING:
         found = f"captures of {length} real samples"
-        raise CampaignError(found, path, f"more than {2 * SETTLING}: a filter needs them", "Record longer captures.")
+        raise CampaignError(found, path, f"more than {2 * SETTLING} samples for the filter", "Record longer captures.")
     return length - SETTLING
 
 
@@ -482,7 +490,7 @@ def _checked(tags: NDArray[np.datetime64], path: Path) -> NDArray[np.datetime64]
     backwards = np.flatnonzero(np.diff(tags) <= np.timedelta64(0, "ns"))
     if backwards.size:
         raise CampaignError(
-            f"capture {int(backwards[0]) + 1} is tagged {tags[backwards[0] + 1]}, not after the one before",
+            f"capture {int(backwards[0]) + 1} has time tag {tags[backwards[0] + 1]}, not after the previous capture",
             path,
             "increasing core:datetime",
             "Sort the captures or correct the tags.",
@@ -490,23 +498,23 @@ def _checked(tags: NDArray[np.datetime64], path: Path) -> NDArray[np.datetime64]
     return tags
 
 
-# ---- Recordings that still grow: captures as far as they are whole --------------------------------------------------
+# ---- Recordings that are being written: complete captures -----------------------------------------------------------
 
 _DECODER = json.JSONDecoder()
 _BETWEEN = re.compile(r"[\s,:]*")
-_KNOWN_BYTES = 256  # before the place read to, by which metadata are known to have only been appended to
+_KNOWN_BYTES = 256  # bytes before the read position, compared to detect that metadata were only appended to
 
 
 class GrowingSigmf:
-    """A SigMF recording while its recorder writes it: metadata and samples are read from where the last read ended.
+    """SigMF recording that is being written: each read continues at the end of the previous one.
 
-    Metadata may be written as a stream, whose captures are not closed yet, or anew each time; what is not whole, a
-    capture's object or its samples, is left for the next read.
+    The recorder may append to the metadata, whose captures array is not closed yet, or rewrite them each time.
+    Incomplete captures, in metadata or samples, are left for the next read.
 
     Parameters
     ----------
     meta_path, data_path
-        As of `open_sigmf`.
+        See `open_sigmf`.
 
     Examples
     --------
@@ -526,12 +534,12 @@ class GrowingSigmf:
     def __init__(self, meta_path: Path, data_path: Path) -> None:
         self.files = meta_path, data_path
         self.ended = False
-        """Whether the metadata are closed, state the hash of the samples, and all of these are there."""
+        """True if the metadata are complete and contain the hash of the samples, and all samples are present."""
         self._forget()
 
     @property
     def runs_through(self) -> bool:
-        """True if its recorder never stops: pulses are then found in all samples at once, and `read` returns none."""
+        """True for a continuous recording: its pulses are detected in all samples at once, and `read` returns None."""
         return self._header is not None and self._header.framing is not None
 
     def _forget(self) -> None:
@@ -540,12 +548,12 @@ class GrowingSigmf:
         self._read_to, self._known, self._closed = 0, b"", False
 
     def read(self) -> Recording | None:
-        """Return the recording as far as it is whole; None before its second capture has begun.
+        """Return the recording with its complete captures; None before its second capture has started.
 
         Raises
         ------
         CampaignError
-            If what is there is not SigMF.
+            If the content so far is not SigMF.
         """
         self._read_meta()
         header, captures, (meta, data) = self._header, self._captures, self.files
@@ -572,7 +580,7 @@ class GrowingSigmf:
         )
 
     def _read_meta(self) -> None:
-        """Read the captures that were appended; all of them where what was read before is no longer there."""
+        """Read the appended captures, or all captures if the metadata were rewritten."""
         path = self.files[0]
         if not path.is_file() or path.stat().st_size > LARGEST_META:
             return
@@ -580,15 +588,15 @@ class GrowingSigmf:
             stream.seek(self._read_to - len(self._known))
             known, appended = stream.read(len(self._known)), stream.read(LARGEST_META)
         if known != self._known:
-            if len(known) == len(self._known):  # else it is being written anew
+            if len(known) == len(self._known):  # otherwise the recorder is rewriting the file at this moment
                 self._forget()
                 self._read_meta()
             return
         mark = len(BOM_UTF8) if not self._read_to and appended.startswith(BOM_UTF8) else 0
-        text = appended[mark:].decode("utf-8", errors="ignore")  # a letter that is cut is no part of what is whole
-        at = 0 if self._header else self._begin(text)
+        text = appended[mark:].decode("utf-8", errors="ignore")  # a truncated character is after all complete objects
+        at = 0 if self._header else self._start(text)
         documents: list[object] = []
-        for document, end in _whole_objects(text, at):
+        for document, end in _complete_objects(text, at):
             documents.append(document)
             at = end
         rest = text[at:].lstrip()
@@ -598,11 +606,11 @@ class GrowingSigmf:
         if documents:
             read = _read_captures(iter(documents), path, self._header)
             self._captures = read if self._captures is None else self._captures.followed_by(read)
-        behind = appended[: mark + len(text[:at].encode())]
-        self._read_to, self._known = self._read_to + len(behind), (self._known + behind)[-_KNOWN_BYTES:]
+        consumed = appended[: mark + len(text[:at].encode())]
+        self._read_to, self._known = self._read_to + len(consumed), (self._known + consumed)[-_KNOWN_BYTES:]
 
-    def _begin(self, text: str) -> int:
-        """Read the global object; return where the captures begin, or the text's end where they have not yet."""
+    def _start(self, text: str) -> int:
+        """Read the global object; return the start of the captures, or the end of the text if they have not started."""
         path, header = self.files[0], None
         try:
             at = _at_next(text, text.index("{") + 1)
@@ -613,27 +621,27 @@ class GrowingSigmf:
                     break
                 value, at = _DECODER.raw_decode(text, at)
                 at, header = _at_next(text, at), value if key == "global" else header
-        except (ValueError, RecursionError):  # not whole yet
+        except (ValueError, RecursionError):  # incomplete
             return len(text)
         if header is None:
             raise CampaignError(
                 "captures before global",
                 path,
-                "global first, in a recording that grows",
-                "Look at it when it has ended.",
+                "global before captures, in a recording that is being written",
+                "Open the recording when it is finished.",
             )
         self._header = _global(header, path)
-        return at + 1  # behind the bracket
+        return at + 1  # after the bracket
 
 
 def _at_next(text: str, at: int) -> int:
-    """Return the place of the next value."""
-    found: Any = _BETWEEN.match(text, at)
-    return int(found.end())
+    """Return the position of the next value."""
+    separator: Any = _BETWEEN.match(text, at)
+    return int(separator.end())
 
 
-def _whole_objects(text: str, at: int) -> Iterator[tuple[object, int]]:
-    """Yield the objects of an array as far as they are whole, each with where it ends."""
+def _complete_objects(text: str, at: int) -> Iterator[tuple[object, int]]:
+    """Yield the complete objects of an array, each with its end position."""
     while text.startswith("{", at := _at_next(text, at)):
         try:
             document, at = _DECODER.raw_decode(text, at)

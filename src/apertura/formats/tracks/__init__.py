@@ -1,1 +1,1 @@
-"""Flight logs: one reader per format, each ends with `track.make_track`; rows in `apertura.formats.names.TRACKS`."""
+"""Readers of flight logs, one per format, all built on `track.make_track`; table in `apertura.formats.names.TRACKS`."""

@@ -1,4 +1,4 @@
-"""Flight logs of DJI drones as AirData exports them (CSV): whole seconds of UTC beside a clock of milliseconds."""
+"""Flight logs of DJI drones exported by AirData (CSV), with UTC in whole seconds and a clock in milliseconds."""
 
 import re
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from apertura.common.errors import CampaignError, quoted
 from apertura.common.units import seconds_since
 from apertura.formats.times import utc_times
 from apertura.formats.tracks.csv_track import cut_off, numbers, read_table
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 from apertura.formats.tracks.track import contradicted, make_track, remarked, unstated
 
 _CLOCK, _UTC = "time(millisecond)", "datetime(utc)"
@@ -21,14 +21,14 @@ _PLACE = ["latitude", "longitude"]
 _ATTITUDE = ["roll(degrees)", "pitch(degrees)", "compass_heading(degrees)"]
 _HEIGHTS = {"altitude_above_seaLevel(meters)": 1.0, "altitude_above_seaLevel(feet)": 0.3048}
 _SATELLITES = "satellites"
-_FEWEST = 4  # without them a position is dead reckoning
+_FEWEST = 4  # with fewer satellites, positions are dead reckoning
 
 _APART = 1.5
-"""Units of UTC by which it and the clock step apart where the clock stood still: a whole second is late by 1 s at
-most."""
+"""Difference between the steps of UTC and clock that indicates a stopped clock, in units of UTC; truncation to whole
+seconds explains at most 1."""
 
 _TOLERANCE_S = 0.1
-"""Seconds, accuracy of a part's clock zero, and how far an epoch may lie outside its second: AirData's
+"""Required accuracy of a segment's clock offset, and tolerance of an epoch outside its second, s: AirData's sampling
 interval."""
 
 _ROUNDING_S = 1e-6
@@ -38,26 +38,26 @@ _DATE = re.compile(
     r"(?P<hour>\d{1,2}):(?P<minute>\d\d)(?::(?P<seconds>\d\d))?(?: ?(?P<half>[AaPp][Mm]))?",
     re.ASCII,
 )
-"""Dates by the settings of an AirData account: the year first or last, month and day in either order."""
+"""Date formats of an AirData account: year first or last, month and day in either order."""
 
 _SETTING = "Set the date format of the AirData account to YYYY-MM-DD and 24 hours, and export the flight again."
 _EXPECTED = f"AirData's CSV: {_CLOCK}, {_UTC}, {', '.join(_PLACE)}, altitude_above_seaLevel, {', '.join(_ATTITUDE)}"
 
 
-def read_airdata(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
-    """Return the `track` stage of a DJI flight as AirData exports it, at 10 Hz.
+def read_airdata(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> xr.Dataset:
+    """Read a DJI flight exported by AirData, at 10 Hz, as `track` stage.
 
-    datetime(utc) holds whole seconds, or minutes where a spreadsheet saved the export, which are taken as cut off: UTC
-    is the clock time(millisecond) plus the offset with which no epoch leaves its second. Dates may have any format that
-    an account can be set to, as long as the rows determine which number is the day. The clock stands still while motors
-    are off, so every part between has an offset of its own; parts too short to determine it are left out. Misfits are
-    reported (remarks). Heights are above mean sea level: options.height_offset_m is needed. The log does not state how
-    a position was solved (RTK or not).
+    datetime(utc) contains whole seconds, or whole minutes if a spreadsheet saved the export, truncated: UTC is the
+    clock time(millisecond) plus the offset for which every epoch lies within its second. Dates may have any format of
+    an AirData account, provided that the rows determine which number is the day. The clock stops while the motors are
+    off, so each segment between stops has its own offset; segments too short to determine it are excluded. Misfits are
+    reported in the remarks. Heights are above mean sea level: options.height_offset_m is required. The log does not
+    contain the solution type (RTK or not).
 
     Raises
     ------
     CampaignError
-        If a column is missing, a cell is no number, the datum of heights is not stated, or the two clocks do not agree.
+        If a column is missing, a cell is not a number, the height offset is not configured, or the two clocks disagree.
 
     Notes
     -----
@@ -84,82 +84,85 @@ def read_airdata(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> 
         found = str(error).partition("\n")[0]
         raise CampaignError(found, path, _EXPECTED, "Export the flight from AirData again.") from error
     position = logged * [1.0, 1.0, _HEIGHTS[height]] + [0.0, 0.0, options.height_offset_m]
-    dropped |= {"line cut off": int(cut), "in a part too short to tell its time": int((~resolved).sum())}
+    dropped |= {"truncated line": int(cut), "in a segment too short to determine its time": int((~resolved).sum())}
     track = make_track(
         utc[resolved],
         position[resolved],
         attitude_deg=attitude,
-        dropped={why: count for why, count in dropped.items() if count},
+        dropped={reason: count for reason, count in dropped.items() if count},
         node=node,
         where=path,
     )
-    remark = f"{_UTC} holds whole {unit}s, {misfit_s:.2f} s off the clock of milliseconds in {parts} parts"
+    remark = (
+        f"{_UTC} contains whole {unit}s; misfit to the millisecond clock {misfit_s:.2f} s, continuous clock segments: "
+        f"{parts}"
+    )
     return remarked(track, remark, path)
 
 
 def _measured(table: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, int]]:
-    """Return the rows that hold an epoch of their own, and why others do not."""
+    """Return the rows with a measured position, without repetitions, and the number of excluded rows by reason."""
     doubled = table.duplicated([_CLOCK, _UTC, *_PLACE]).to_numpy()
     blind = np.zeros(len(table), bool)
     if _SATELLITES in table:
         blind = numbers(table[[_SATELLITES]])[:, 0] < _FEWEST
-    counts = {"said twice": doubled, f"fewer than {_FEWEST} satellites": blind & ~doubled}
-    return table[~(doubled | blind)], {why: int(rows.sum()) for why, rows in counts.items()}
+    counts = {"duplicate": doubled, f"fewer than {_FEWEST} satellites": blind & ~doubled}
+    return table[~(doubled | blind)], {reason: int(rows.sum()) for reason, rows in counts.items()}
 
 
 class _DateError(ValueError):
-    """Dates that cannot be read, or not in one way alone."""
+    """Invalid or ambiguous dates."""
 
 
 def _dates(texts: Sequence[str]) -> tuple[NDArray[np.datetime64], str]:
-    """Return times of UTC, and the unit that they are cut off to: second or minute."""
+    """Parse UTC times; return them with the unit to which they are truncated, second or minute."""
     unique = list(dict.fromkeys(texts))
     matches = [_DATE.fullmatch(text) for text in unique]
     wrong = next((text for text, match in zip(unique, matches, strict=True) if match is None), None)
     if wrong is not None:
-        raise _DateError(f"{quoted(wrong, 40)} is no date and time")
-    found = [match for match in matches if match]
-    order = _order([match.group("first", "mark", "second", "third") for match in found], unique)
+        raise _DateError(f"{quoted(wrong, 40)} is not a date and time")
+    dates = [match for match in matches if match]
+    order = _order([match.group("first", "mark", "second", "third") for match in dates], unique)
     times = {}
-    for text, match in zip(unique, found, strict=True):
+    for text, match in zip(unique, dates, strict=True):
         year, month, day = (int(match[part]) for part in order)
         hour = int(match["hour"])
         if match["half"]:
             if not 1 <= hour <= 12:
-                raise _DateError(f"{quoted(text, 40)} is no date and time")
+                raise _DateError(f"{quoted(text, 40)} is not a date and time")
             hour = hour % 12 + 12 * (match["half"].lower() == "pm")
         try:
             iso = f"{year:04d}-{month:02d}-{day:02d}T{hour:02d}:{match['minute']}:{match['seconds'] or '00'}"
             times[text] = utc_times([iso])[0]
         except ValueError as error:
-            raise _DateError(f"{quoted(text, 40)} is no date and time") from error
-    unit = "second" if any(match["seconds"] for match in found) else "minute"
+            raise _DateError(f"{quoted(text, 40)} is not a date and time") from error
+    unit = "second" if any(match["seconds"] for match in dates) else "minute"
     return np.array([times[text] for text in texts], "datetime64[ns]"), unit
 
 
 def _order(dates: Sequence[tuple[str, ...]], texts: Sequence[str]) -> tuple[str, str, str]:
-    """Return the order of year, month and day in dates."""
+    """Determine the order of year, month and day in dates."""
     if not dates or all(len(first) == 4 for first, *_ in dates):
         return "first", "second", "third"
     month_first, day_first = ("third", "first", "second"), ("third", "second", "first")
     numbers_of = [(int(first), int(second)) for first, _, second, _ in dates]
     firsts, seconds = (set(column) for column in zip(*numbers_of, strict=True))
-    if max(seconds) > 12 or (len(seconds) > 1 and len(firsts) == 1):  # days alone pass 12, or change within a flight
+    if max(seconds) > 12 or (len(seconds) > 1 and len(firsts) == 1):  # only days exceed 12 or change within a flight
         return month_first
     if max(firsts) > 12 or (len(firsts) > 1 and len(seconds) == 1) or dates[0][1] == ".":
         return day_first
     if firsts == seconds and len(firsts) == 1:
         return month_first
-    raise _DateError(f"{quoted(texts[0], 40)} may be month/day or day/month")
+    raise _DateError(f"{quoted(texts[0], 40)} is ambiguous: month/day or day/month")
 
 
 def _utc(
     clock_s: NDArray[np.float64], second: NDArray[np.datetime64], unit: str
 ) -> tuple[NDArray[np.datetime64], NDArray[np.bool_], float, int]:
-    """Return UTC of epochs from a clock and from UTC that is cut off; ValueError if they do not agree.
+    """Estimate UTC of epochs from a clock and truncated UTC; ValueError if they disagree.
 
-    Beside it, which epochs lie in a part long enough to determine it, the largest misfit in seconds, and the number of
-    parts.
+    Also returns a mask of the epochs in segments long enough to determine the clock offset, the largest misfit in
+    seconds, and the number of segments.
     """
     unit_s = {"second": 1.0, "minute": 60.0}[unit]
     if not np.isfinite(clock_s).all() or not (np.diff(clock_s) > 0).all():
@@ -179,7 +182,9 @@ def _utc(
         misfit = max(misfit, (low - high) / 2 if resolved[rows].any() else 0.0)
     if misfit > _TOLERANCE_S or not resolved.any():
         found = (
-            f"{misfit:.2f} s apart" if misfit > _TOLERANCE_S else f"one a {unit}, so that no {unit} is seen to change"
+            f"they differ by {misfit:.2f} s"
+            if misfit > _TOLERANCE_S
+            else f"the epochs are too sparse to determine when the {unit} changes"
         )
         raise ValueError(f"columns {_CLOCK} and {_UTC}: {found}")
     elapsed = np.round((clock_s + offset) * 1e9).astype("timedelta64[ns]")

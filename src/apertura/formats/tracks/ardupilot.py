@@ -1,4 +1,4 @@
-"""ArduPilot flight logs (DataFlash .bin, or .log as text): the receiver's epochs by GPS week, and attitude."""
+"""ArduPilot flight logs (DataFlash .bin, or .log as text): epochs of the receiver in GPS weeks, and attitude."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,43 +16,44 @@ from apertura.formats.tracks import dataflash_fields
 from apertura.formats.tracks.autopilot import Attitude, Epochs, autopilot_track
 from apertura.formats.tracks.damage import damage_of
 from apertura.formats.tracks.dataflash_fields import COLUMNS, DAMAGE, NEEDED
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 from apertura.formats.tracks.track import FIXES, damaged, receivers_remark, remarked
 
 Fields = Mapping[str, NDArray[Any]]
 
 _KINDS = {3: FIXES["single"], 4: FIXES["dgps"], 5: FIXES["float"], 6: FIXES["fix"]}
-"""GPS.Status; below 3 there is no height."""
+"""GPS.Status → solution type; values below 3 have no height."""
 
 _DELAYS = (("GPS_DELAY_MS", "GPS1_DELAY_MS"), ("GPS_DELAY_MS2", "GPS2_DELAY_MS"))
 _TYPES = (("GPS_TYPE", "GPS1_TYPE"), ("GPS_TYPE2", "GPS2_TYPE"))
 _DELAY_S = 0.12
-_NOVATEL = 15  # its driver has the geoid's sign reversed, and with it that of AEl
+_NOVATEL = 15  # its driver reverses the sign of the geoid undulation, so AEl is wrong
 _LAST_WEEK, _WEEK_MS = 11_000, 604_800_000
-_LOWEST_M = -1e6  # AEl is the lowest integer where it is not known
-_EXPECTED = f"an ArduPilot DataFlash log whose GPS messages hold {', '.join(NEEDED)}"
+_LOWEST_M = -1e6  # an unknown AEl is logged as the lowest integer
+_EXPECTED = f"an ArduPilot DataFlash log whose GPS messages contain {', '.join(NEEDED)}"
 
 
-def read_ardupilot(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
-    """Return the `track` stage of a DataFlash log; its attribute `source` names the receiver used, of how many.
+def read_ardupilot(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> xr.Dataset:
+    """Read a DataFlash log as `track` stage; its attribute `source` states the receiver used and all receivers.
 
-    Taken is receiver 0, or the one whose number ``options.body`` is. GPS week and milliseconds become UTC by the table
-    of leap seconds. Heights are GPA.AEl, above the ellipsoid; logs without it have GPS.Alt only, above sea level, and
-    need ``options.height_offset_m``. GPA.Und of some versions is not used: drivers differ in its sign.
+    Receiver 0 is used, or the receiver with the number ``options.body``. GPS week and milliseconds are converted to UTC
+    by the table of leap seconds. Heights are GPA.AEl, above the ellipsoid; logs without it contain only GPS.Alt, above
+    sea level, and require ``options.height_offset_m``. GPA.Und of some versions is not used, because its sign depends
+    on the driver.
 
     Parameters
     ----------
     path
         The log.
     node
-        Its node.
+        Node of the log.
     options
-        start_utc: UTC at the autopilot's start, where its receiver gave no week.
+        start_utc: UTC at the start of the autopilot, if its receiver provides no GPS week.
 
     Raises
     ------
     CampaignError
-        If the file is no DataFlash log, or holds no positions, no ellipsoidal heights or no GPS time.
+        If the file is not a DataFlash log, or contains no positions, no ellipsoidal heights or no GPS time.
 
     Notes
     -----
@@ -67,30 +68,30 @@ def read_ardupilot(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -
 
 
 def track_of(fields: Fields, *, node: str, options: LogOptions, where: Path) -> xr.Dataset:
-    """Return the `track` stage of what `apertura.formats.tracks.dataflash_fields` read.
+    """Build the `track` stage from the fields of a DataFlash log.
 
     Parameters
     ----------
     fields
-        Its answer.
+        Result of `apertura.formats.tracks.dataflash_fields.read_fields`.
     node, options, where
-        As `read_ardupilot`.
+        See `read_ardupilot`.
 
     Raises
     ------
     CampaignError
-        As `read_ardupilot`.
+        See `read_ardupilot`.
     """
     chosen, known = _receiver(fields, options, node, where)
     rows = {name: fields[f"GPS/{name}"][fields["GPS/I"] == chosen] for name in COLUMNS["GPS"]}
-    stated = _accuracy(fields, chosen, rows["TimeUS"])
-    height = _height(fields, rows["Alt"], stated["AEl"], chosen, options)
+    accuracy = _accuracy(fields, chosen, rows["TimeUS"])
+    height = _height(fields, rows["Alt"], accuracy["AEl"], chosen, options)
     if height is None:
         raise CampaignError(
-            "heights are above sea level (GPS.Alt), and none above the ellipsoid is logged that can be trusted",
+            "heights are above sea level (GPS.Alt), without reliable heights above the ellipsoid",
             where,
             "GPA.AEl of a receiver other than a NovAtel",
-            f"Set nodes.{node}.log.height_offset_m: what makes GPS.Alt ellipsoidal (the geoid's height there).",
+            f"Set nodes.{node}.log.height_offset_m to the geoid undulation, to convert GPS.Alt.",
         )
     try:
         time_utc = _utc(rows["GWk"], rows["GMS"])
@@ -103,8 +104,8 @@ def track_of(fields: Fields, *, node: str, options: LogOptions, where: Path) -> 
         geodetic=np.stack([rows["Lat"], rows["Lng"], height], -1),
         fixed=fix > 0,
         fix=fix,
-        std_m=np.stack([stated["HAcc"], stated["HAcc"], stated["VAcc"]], -1),
-        velocity=_velocity(rows, stated["VV"]),
+        std_m=np.stack([accuracy["HAcc"], accuracy["HAcc"], accuracy["VAcc"]], -1),
+        velocity=_velocity(rows, accuracy["VV"]),
     )
     delay_s = _parameter(fields, _DELAYS, chosen, 0.0) / 1e3
     delay_s = delay_s if 0 < delay_s < 1 else _DELAY_S
@@ -124,7 +125,7 @@ def _fix(status: Floats) -> NDArray[np.int8]:
 
 
 def _receiver(fields: Fields, options: LogOptions, node: str, where: Path) -> tuple[int, list[int]]:
-    """Return the number of the receiver to take, and of all."""
+    """Return the number of the selected receiver, and those of all receivers."""
     numbers = fields["GPS/I"]
     known = sorted({int(number) for number in numbers[np.isfinite(numbers)]})
     if not known:
@@ -134,28 +135,28 @@ def _receiver(fields: Fields, options: LogOptions, node: str, where: Path) -> tu
             f"no receiver {quoted(options.body)}",
             where,
             f"one of {', '.join(map(str, known))}",
-            f"Correct nodes.{node}.log.body, or leave it out.",
+            f"Correct nodes.{node}.log.body, or omit it.",
         )
     return known[0] if options.body is None else int(options.body), known
 
 
 def _accuracy(fields: Fields, receiver: int, time_us: Floats) -> dict[str, Floats]:
-    """Return HAcc, VAcc, AEl (m), VV (VZ is known) of the GPA message written with each epoch; NaN where none was."""
+    """Return HAcc, VAcc, AEl (m), VV (VZ is valid) of the GPA message of each epoch; NaN if there is none."""
     own = fields["GPA/I"] == receiver
     times, order = np.unique(fields["GPA/TimeUS"][own], return_index=True)
-    place = np.searchsorted(times, time_us)
-    there = place < times.size
-    there[there] = times[place[there]] == time_us[there]
+    index = np.searchsorted(times, time_us)
+    has_message = index < times.size
+    has_message[has_message] = times[index[has_message]] == time_us[has_message]
     accuracy = {name: np.full(time_us.size, np.nan) for name in ("HAcc", "VAcc", "VV", "AEl")}
     for name, values in accuracy.items():
-        values[there] = fields[f"GPA/{name}"][own][order][place[there]]
+        values[has_message] = fields[f"GPA/{name}"][own][order][index[has_message]]
     return accuracy
 
 
 def _height(
     fields: Fields, sea_level: Floats, ellipsoidal: Floats, receiver: int, options: LogOptions
 ) -> Floats | None:
-    """Return heights above the ellipsoid, NaN where unknown; None if the log lacks them."""
+    """Return heights above the ellipsoid, NaN where unknown; None if they are neither logged nor convertible."""
     known = ellipsoidal > _LOWEST_M
     if known.any() and _parameter(fields, _TYPES, receiver, 0) != _NOVATEL:
         return np.where(known, ellipsoidal, np.nan)
@@ -163,13 +164,13 @@ def _height(
 
 
 def _parameter(fields: Fields, names: tuple[tuple[str, ...], ...], receiver: int, default: float) -> float:
-    """Return a receiver's parameter, which versions name differently."""
-    of = names[min(receiver, len(names) - 1)]
-    return next((float(fields[f"PARM/{name}"][0]) for name in of if f"PARM/{name}" in fields), default)
+    """Return a parameter of a receiver, whose name depends on the version of ArduPilot."""
+    candidates = names[min(receiver, len(names) - 1)]
+    return next((float(fields[f"PARM/{name}"][0]) for name in candidates if f"PARM/{name}" in fields), default)
 
 
 def _utc(week: Floats, milliseconds: Floats) -> NDArray[np.datetime64]:
-    """Return UTC of GPS weeks and milliseconds; NaT where a receiver did not know them yet."""
+    """Convert GPS weeks and milliseconds to UTC; NaT where they are not yet valid."""
     known = (week > 0) & (week <= _LAST_WEEK) & (milliseconds >= 0) & (milliseconds < _WEEK_MS)
     utc = np.full(week.size, np.datetime64("NaT", "ns"), "datetime64[ns]")
     utc[known] = utc_from_gps(gps_from_weeks(week[known].astype(np.int64), milliseconds[known].astype(np.int64)))
@@ -190,8 +191,8 @@ def _attitude(fields: Fields) -> Attitude | None:
     good = np.isfinite(angles).all(axis=1) & (np.abs(angles) <= 360).all(axis=1)
     if not good.any():
         return None
-    turns = Rotation.from_euler("ZYX", angles[good], degrees=True)
-    return Attitude(fields["ATT/TimeUS"][good] * 1e-6, turns.as_quat())
+    rotations = Rotation.from_euler("ZYX", angles[good], degrees=True)
+    return Attitude(fields["ATT/TimeUS"][good] * 1e-6, rotations.as_quat())
 
 
 def _error(found: str, path: Path) -> CampaignError:

@@ -1,4 +1,4 @@
-"""Logs of autopilots: a receiver's epochs in UTC, attitude by a clock from start, Doppler velocities."""
+"""Logs of autopilots: epochs of a GNSS receiver in UTC, attitude by the autopilot's clock, Doppler velocities."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,26 +15,26 @@ from apertura.formats.times import utc_times
 from apertura.formats.tracks.log_options import LogOptions
 from apertura.formats.tracks.track import make_track
 
-# ---- Autopilot's clock against UTC: a line through its receiver's times ---------------------------------------------
+# ---- Autopilot's clock relative to UTC: a line through the times of its receiver ------------------------------------
 
 
-_AGREES_S = 0.25  # receivers' messages are late by about 0.1 s, and now and then by some tens of milliseconds more
-_FASTEST = 1e-4  # the worst of quartz clocks
+_AGREES_S = 0.25  # latency of receiver messages: about 0.1 s, occasionally some tens of milliseconds more
+_FASTEST = 1e-4  # largest rate error of a quartz clock
 _MOST_AGREE = 0.9
 
 
 @dataclass(frozen=True)
 class BootClock:
-    """The autopilot's clock against UTC: UTC = origin + offset_s + rate·boot_s, when it heard of epochs.
+    """Autopilot's clock relative to UTC: UTC = origin + offset_s + rate·boot_s at the reception of epochs.
 
     Attributes
     ----------
     origin
-        Some UTC near the log.
+        Reference UTC near the log.
     offset_s, rate
-        Of the line.
+        Offset and slope of the line.
     delay_s
-        By how much later than they were true epochs are heard of.
+        Latency between an epoch and its reception by the autopilot, s.
     """
 
     origin: np.datetime64
@@ -43,7 +43,7 @@ class BootClock:
     delay_s: float
 
     def utc(self, boot_s: Floats) -> NDArray[np.datetime64]:
-        """Return UTC of the autopilot's clock.
+        """Convert times of the autopilot's clock to UTC.
 
         Examples
         --------
@@ -55,19 +55,19 @@ class BootClock:
         return np.asarray(self.origin + np.rint(since * 1e9).astype("timedelta64[ns]"))
 
     def boot_s(self, utc: NDArray[np.datetime64]) -> Floats:
-        """Return the autopilot's clock at UTC."""
+        """Convert UTC to times of the autopilot's clock."""
         return (seconds_since(utc, self.origin) - self.offset_s) / self.rate - self.delay_s
 
 
 def clock_of(
     boot_s: Floats, time_utc: NDArray[np.datetime64], *, delay_s: float, where: Path
 ) -> tuple[BootClock, NDArray[np.bool_]]:
-    """Return the autopilot's clock against UTC as a robust line, and which epochs agree with it.
+    """Fit the autopilot's clock relative to UTC by a robust line; also return a mask of the epochs that agree with it.
 
     Parameters
     ----------
     boot_s, time_utc
-        (epoch,): the autopilot's clock when it heard of epochs, and their times.
+        (epoch,): times of the autopilot's clock at the reception of epochs, and UTC of the epochs.
     delay_s
         Latency of the receiver's messages, s.
     where
@@ -76,7 +76,8 @@ def clock_of(
     Raises
     ------
     CampaignError
-        If more than a tenth of the epochs is 0.25 s off, as where the receiver learns of a leap second late.
+        If more than a tenth of the epochs deviates by more than 0.25 s, for example because the receiver applies a leap
+        second late.
 
     Examples
     --------
@@ -87,43 +88,43 @@ def clock_of(
     """
     origin, zero = time_utc[0], float(np.median(boot_s))
     since = seconds_since(time_utc, origin)
-    ahead, beside = since - boot_s, boot_s - zero
+    ahead, centred_s = since - boot_s, boot_s - zero
     line = np.array([0.0, float(np.median(ahead))])
-    reach = _AGREES_S + _FASTEST * float(np.ptp(boot_s)) / 2
-    for _ in range(2):  # outliers of seconds are removed before the rest is fitted
-        near = np.abs(ahead - np.polyval(line, beside)) <= reach
-        if near.sum() >= 8 and np.ptp(beside[near]) * _FASTEST > 0.01:
-            line = np.polyfit(beside[near], ahead[near], 1)
+    tolerance_s = _AGREES_S + _FASTEST * float(np.ptp(boot_s)) / 2
+    for _ in range(2):  # the first pass removes outliers of seconds
+        near = np.abs(ahead - np.polyval(line, centred_s)) <= tolerance_s
+        if near.sum() >= 8 and np.ptp(centred_s[near]) * _FASTEST > 0.01:
+            line = np.polyfit(centred_s[near], ahead[near], 1)
         elif near.any():
             line = np.array([0.0, float(np.median(ahead[near]))])
-        reach = _AGREES_S
-    off = np.abs(ahead - np.polyval(line, beside))
-    agree = off <= _AGREES_S
+        tolerance_s = _AGREES_S
+    residual_s = np.abs(ahead - np.polyval(line, centred_s))
+    agree = residual_s <= _AGREES_S
     if agree.mean() < _MOST_AGREE:
         first = int(np.flatnonzero(~agree)[0])
         raise CampaignError(
-            f"{int((~agree).sum())} of {agree.size} times of the receiver do not fit the autopilot's clock; epoch "
-            f"{first} at {time_utc[first]} is {off[first]:.2f} s off",
+            f"{int((~agree).sum())} of {agree.size} times of the receiver disagree with the autopilot's clock; epoch "
+            f"{first} at {time_utc[first]} differs by {residual_s[first]:.2f} s",
             where,
-            f"one line within {_AGREES_S} s",
-            "Cut the log where the receiver corrects its time, or take another source (nodes.<node>.log.body).",
+            f"agreement within {_AGREES_S} s",
+            "Cut the log where the receiver corrects its time, or select another source (nodes.<node>.log.body).",
         )
-    slope, middle = (float(one) for one in line)
+    slope, middle = (float(coefficient) for coefficient in line)
     return BootClock(origin, middle - slope * zero, 1 + slope, delay_s), agree
 
 
-# ---- A receiver's positions against its own Doppler velocities ------------------------------------------------------
+# ---- Consistency of a receiver's positions and Doppler velocities ---------------------------------------------------
 
-_NEAR_M, _CURVED_M_S2 = 0.5, 2.5  # noise of both; an eighth of the 20 m/s² by which velocity may bend between epochs
+_NEAR_M, _CURVED_M_S2 = 0.5, 2.5  # noise of both; an eighth of the largest acceleration between epochs, 20 m/s²
 _MOST, _FEW = 0.5, 10
 
 
 def contradicted(time_utc: NDArray[np.datetime64], geodetic: Floats, velocity: Floats) -> NDArray[np.bool_]:
-    """Return a mask of the epochs that are not where their neighbours and the velocities lead.
+    """Return a mask of the epochs whose positions contradict their neighbours and the velocities.
 
-    A step that starts or ends at an epoch misses by |p_{i+1} − p_i − (v_i + v_{i+1})·Δt/2|; an epoch whose steps all
-    miss is contradicted. Where more than half of ten or more steps miss, it is the velocities that are wrong: no epoch
-    is.
+    The residual of the step from an epoch to the next is |p_{i+1} − p_i − (v_i + v_{i+1})·Δt/2|; an epoch is
+    contradicted if the residuals of all its steps are too large. If that holds for more than half of ten or more steps,
+    the velocities are assumed to be wrong, and no epoch is contradicted.
 
     Parameters
     ----------
@@ -132,7 +133,7 @@ def contradicted(time_utc: NDArray[np.datetime64], geodetic: Floats, velocity: F
     geodetic
         (epoch, 3) float64: WGS 84 latitude (deg), longitude (deg), ellipsoidal height (m).
     velocity
-        (epoch, 3) float64 to north, east and down, m/s; NaN where not known.
+        (epoch, 3) float64: velocity to north, east and down, m/s; NaN where unknown.
 
     Returns
     -------
@@ -146,28 +147,28 @@ def contradicted(time_utc: NDArray[np.datetime64], geodetic: Floats, velocity: F
     Examples
     --------
     >>> times = np.datetime64("2025-05-14T09:30", "ns") + np.arange(30) * np.timedelta64(100, "ms")
-    >>> place = np.tile([0.0, 9.0, 600.0], (30, 1))
-    >>> place[7, 2] += 1
-    >>> np.flatnonzero(contradicted(times, place, np.zeros((30, 3)))).tolist()
+    >>> geodetic = np.tile([0.0, 9.0, 600.0], (30, 1))
+    >>> geodetic[7, 2] += 1
+    >>> np.flatnonzero(contradicted(times, geodetic, np.zeros((30, 3)))).tolist()
     [7]
     """
     wrong = np.zeros(len(time_utc), bool)
     if len(wrong) < 3:
         return wrong
-    ends = velocity[:-1], velocity[1:]  # of each step; one stands in for the other where that is not known
-    with np.errstate(invalid="ignore"):  # of what is no place on Earth, which is refused later
+    ends = velocity[:-1], velocity[1:]  # at start and end of each step; an unknown one is replaced by the other
+    with np.errstate(invalid="ignore"):  # invalid coordinates are rejected later
         position = ecef_from_geodetic(*geodetic.T)
         steps = np.einsum("eij,ei->ej", ned_axes(position)[:-1], np.diff(position, axis=0))
-        lasting = (np.diff(time_utc) / np.timedelta64(1, "s"))[:, None]
+        duration_s = (np.diff(time_utc) / np.timedelta64(1, "s"))[:, None]
         before, after = (np.where(np.isnan(v), w, v) for v, w in (ends, ends[::-1]))
-        missed = steps - (before + after) / 2 * lasting
-        far = (np.abs(missed) > _NEAR_M + _CURVED_M_S2 * lasting**2).any(axis=1)  # NaN is not
-    if far.size >= _FEW and far.mean() > _MOST:
+        residual = steps - (before + after) / 2 * duration_s
+        too_large = (np.abs(residual) > _NEAR_M + _CURVED_M_S2 * duration_s**2).any(axis=1)  # False for NaN
+    if too_large.size >= _FEW and too_large.mean() > _MOST:
         return wrong
-    return np.asarray(np.concatenate([[True], far]) & np.concatenate([far, [True]]))
+    return np.asarray(np.concatenate([[True], too_large]) & np.concatenate([too_large, [True]]))
 
 
-# ---- Logs of autopilots: receiver's epochs in UTC, attitude by its clock --------------------------------------------
+# ---- Track of an autopilot's log: epochs of the receiver in UTC, attitude by the autopilot's clock ------------------
 
 _WORST_STD_M = 1e4
 _UNIT = 1e-2
@@ -182,7 +183,7 @@ class Attitude:
     Attributes
     ----------
     boot_s
-        (sample,) float64: the autopilot's clock.
+        (sample,) float64: time of the autopilot's clock.
     quaternion
         (sample, 4) float64: x, y, z, w.
     """
@@ -198,19 +199,19 @@ class Epochs:
     Attributes
     ----------
     boot_s
-        (epoch,) float64: the autopilot's clock when it heard of the epoch.
+        (epoch,) float64: time of the autopilot's clock at the reception of the epoch.
     time_utc
-        (epoch,) datetime64[ns], NaT where the log knows none.
+        (epoch,) datetime64[ns], NaT where not logged.
     geodetic
-        (epoch, 3) float64: WGS 84 latitude (deg), longitude (deg), ellipsoidal height (m), NaN where there is none.
+        (epoch, 3) float64: WGS 84 latitude (deg), longitude (deg), ellipsoidal height (m), NaN where not logged.
     fixed
-        (epoch,) bool: positions in three dimensions.
+        (epoch,) bool: True for a 3D fix.
     fix
-        (epoch,) int8: a value of `FIXES`; None: not logged.
+        (epoch,) int8: solution type, a value of `FIXES`; None: not logged.
     std_m
-        (epoch, 3) float64: to north, east and up; values that no receiver states become NaN.
+        (epoch, 3) float64: standard deviations to north, east and up, m; implausible values become NaN.
     velocity
-        (epoch, 3) float64 to north, east and down, m/s, NaN where not logged.
+        (epoch, 3) float64: velocity to north, east and down, m/s, NaN where not logged.
     """
 
     boot_s: Floats
@@ -222,58 +223,58 @@ class Epochs:
     velocity: Floats
 
     def only(self, kept: NDArray[np.bool_]) -> "Epochs":
-        """Return the epochs that are kept."""
+        """Select the epochs of a mask."""
         fix = None if self.fix is None else self.fix[kept]
-        placed = self.boot_s[kept], self.time_utc[kept], self.geodetic[kept]
-        return Epochs(*placed, self.fixed[kept], fix, self.std_m[kept], self.velocity[kept])
+        times_and_positions = self.boot_s[kept], self.time_utc[kept], self.geodetic[kept]
+        return Epochs(*times_and_positions, self.fixed[kept], fix, self.std_m[kept], self.velocity[kept])
 
 
 def autopilot_track(
     epochs: Epochs, attitude: Attitude | None, *, delay_s: float, options: LogOptions, node: str, where: Path
 ) -> xr.Dataset:
-    """Return the `track` stage of an autopilot's log.
+    """Build the `track` stage of an autopilot's log.
 
-    Epochs without a fix, height or time of their own, those that the log holds twice, whose time is not that of the
-    autopilot's clock or whose place is not where the receiver's velocity leads are left out and counted. Attitude is
-    taken where the autopilot was when an epoch was true.
+    Epochs without a fix, height or UTC, repeated epochs, and epochs whose time contradicts the autopilot's clock or
+    whose position contradicts the receiver's velocity are excluded and counted. Attitude is interpolated to the times
+    of the epochs, corrected for their latency.
 
     Parameters
     ----------
     epochs
-        As logged.
+        Epochs as logged.
     attitude
-        None: not logged.
+        Attitude; None: not logged.
     delay_s
         Latency of an epoch in the autopilot, s.
     options
-        start_utc: time zero of the autopilot's clock, where no epoch has a time.
+        start_utc: time zero of the autopilot's clock, if no epoch has UTC.
     node, where
-        As `make_track`.
+        See `make_track`.
 
     Raises
     ------
     CampaignError
-        If no epoch has a time and the config names none, or as `clock_of` and `make_track`.
+        If no epoch has UTC and start_utc is not configured; see also `clock_of` and `make_track`.
     """
     dropped: dict[str, int] = {}
 
-    def without(wrong: NDArray[np.bool_], why: str) -> Epochs:
+    def without(wrong: NDArray[np.bool_], reason: str) -> Epochs:
         if wrong.any():
-            dropped[why] = int(wrong.sum())
+            dropped[reason] = int(wrong.sum())
         return epochs.only(~wrong)
 
     epochs = without(~epochs.fixed, "no fix")
     epochs = without(~np.isfinite(epochs.geodetic.sum(axis=1)), "no ellipsoidal height")
     if epochs.time_utc.size and np.isnat(epochs.time_utc).all():
         epochs = replace(epochs, time_utc=_counted(epochs.boot_s, options, node, where))
-    epochs = without(np.asarray(np.isnat(epochs.time_utc)), "no time of the receiver")
-    epochs = without(_repeated(epochs), "held twice")
+    epochs = without(np.asarray(np.isnat(epochs.time_utc)), "no UTC from the receiver")
+    epochs = without(_repeated(epochs), "duplicate")
     angles = None
     if epochs.boot_s.size:
         clock, agree = clock_of(epochs.boot_s, epochs.time_utc, delay_s=delay_s, where=where)
-        epochs = without(~agree, "a time that is not the autopilot's")
-        moved = contradicted(epochs.time_utc, epochs.geodetic, epochs.velocity)
-        epochs = without(moved, "not where the receiver's velocity leads")
+        epochs = without(~agree, "time contradicts the autopilot's clock")
+        is_contradicted = contradicted(epochs.time_utc, epochs.geodetic, epochs.velocity)
+        epochs = without(is_contradicted, "position contradicts the receiver's velocity")
         angles = None if attitude is None else _angles_deg(attitude, clock.boot_s(epochs.time_utc))
     std_m = np.where((epochs.std_m > 0) & (epochs.std_m < _WORST_STD_M), epochs.std_m, np.nan)
     return make_track(
@@ -289,7 +290,7 @@ def autopilot_track(
 
 
 def _counted(boot_s: Floats, options: LogOptions, node: str, where: Path) -> NDArray[np.datetime64]:
-    """Return UTC of a log that has no clock but the autopilot's."""
+    """Convert times of the autopilot's clock to UTC by the configured time zero."""
     key = f"nodes.{node}.log.start_utc"
     try:
         start = utc_times([options.start_utc or ""])[0]
@@ -297,21 +298,21 @@ def _counted(boot_s: Floats, options: LogOptions, node: str, where: Path) -> NDA
         raise CampaignError(
             "no epoch has a time in UTC" if options.start_utc is None else f"{key}: {error}",
             where,
-            f"a receiver that tells UTC, or {key}: UTC at the autopilot's start, 2025-05-14T09:30:00.5",
+            f"UTC of the receiver, or {key}: UTC at the start of the autopilot, such as 2025-05-14T09:30:00.5",
             f"Set {key}.",
         ) from error
     return np.asarray(start + np.rint(boot_s * 1e9).astype("timedelta64[ns]"))
 
 
 def _repeated(epochs: Epochs) -> NDArray[np.bool_]:
-    """Return a mask of the epochs that repeat the one before."""
+    """Return a mask of the epochs that repeat the previous one."""
     same = np.zeros(epochs.boot_s.size, bool)
     same[1:] = (np.diff(epochs.geodetic, axis=0) == 0).all(axis=1) & (epochs.time_utc[1:] == epochs.time_utc[:-1])
     return same
 
 
 def _angles_deg(attitude: Attitude, boot_s: Floats) -> Floats | None:
-    """Return (epoch, 3) roll, pitch, yaw in degrees at the autopilot's clock; NaN where none was logged around it."""
+    """Interpolate (epoch, 3) roll, pitch, yaw in degrees to times of the autopilot's clock; NaN in gaps of the log."""
     from scipy.spatial.transform import Rotation, Slerp
 
     norm = np.linalg.norm(attitude.quaternion, axis=1)
@@ -319,14 +320,14 @@ def _angles_deg(attitude: Attitude, boot_s: Floats) -> Floats | None:
     time, order = np.unique(attitude.boot_s[good], return_index=True)
     if time.size < 2:
         return None
-    turns = Rotation.from_quat(attitude.quaternion[good][order])
-    # one that its neighbours, who agree, both contradict is none that was flown
-    before, after, across = ((turns[:-n].inv() * turns[n:]).magnitude() for n in (1, 1, 2))
-    alone = np.zeros(time.size, bool)
-    alone[1:-1] = np.minimum(before[:-1], after[1:]) > across + _TURN_RAD
-    time, turns = time[~alone], turns[~alone]
+    rotations = Rotation.from_quat(attitude.quaternion[good][order])
+    # outlier: it differs from both neighbours by more than these differ from each other
+    before, after, across = ((rotations[:-n].inv() * rotations[n:]).magnitude() for n in (1, 1, 2))
+    is_outlier = np.zeros(time.size, bool)
+    is_outlier[1:-1] = np.minimum(before[:-1], after[1:]) > across + _TURN_RAD
+    time, rotations = time[~is_outlier], rotations[~is_outlier]
     within_s = np.clip(boot_s, time[0], time[-1])
-    angles = Slerp(time, turns)(within_s).as_euler("ZYX", degrees=True)[:, ::-1]
+    angles = Slerp(time, rotations)(within_s).as_euler("ZYX", degrees=True)[:, ::-1]
     following = np.clip(np.searchsorted(time, within_s), 1, time.size - 1)
     unknown = (np.abs(boot_s - within_s) > _EXTRAPOLATED_S) | (time[following] - time[following - 1] > _LONGEST_S)
     return np.where(unknown[:, None], np.nan, angles)

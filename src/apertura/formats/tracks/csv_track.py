@@ -1,4 +1,4 @@
-"""Tables of comma-separated values, checked column by column, and flight logs in them, by names of ours or mapped."""
+"""Reading of CSV tables with checks of each column, and of CSV flight logs with standard or mapped column names."""
 
 import csv
 import io
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from apertura.common.errors import CampaignError, quoted
 from apertura.common.leap_seconds import GPS_EPOCH, utc_from_gps
 from apertura.formats.times import LEAP_SECOND, in_leap_second
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 from apertura.formats.tracks.track import (
     FIXES,
     GGA_KINDS,
@@ -28,19 +28,19 @@ from apertura.formats.tracks.track import (
     unstated,
 )
 
-# ---- Untrusted tables of comma-separated numbers, columns by name ---------------------------------------------------
+# ---- Untrusted CSV tables with named columns ------------------------------------------------------------------------
 
 LARGEST_LOG = 500_000_000
-"""Bytes of a flight log or a table: a day at 50 Hz."""
+"""Maximum size of a flight log or table, bytes: a day at 50 Hz."""
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf)", re.ASCII | re.IGNORECASE)
 _NOT_FINITE = re.compile(r"([+-]?)(?:nan\(\w*\)|(inf)inity|1\.#(inf)\d*|1\.#\w+)", re.ASCII | re.IGNORECASE)
-"""NaN and infinity as printf of C libraries writes them: nan(ind), infinity, 1.#INF, -1.#IND, 1.#QNAN, and 1.#J, which
-is either, rounded."""
+"""NaN and infinity as printed by C libraries: nan(ind), infinity, 1.#INF, -1.#IND, 1.#QNAN, and 1.#J (either one,
+rounded)."""
 
 
 def number(text: str) -> float:
-    """Return the number in a cell, written in ASCII without underscores; ValueError if it is none.
+    """Parse the number in a cell, in ASCII without underscores; ValueError if it is not a number.
 
     Examples
     --------
@@ -51,17 +51,17 @@ def number(text: str) -> float:
     if other:
         return float(f"{other[1]}{other[2] or other[3] or 'nan'}")
     if not _NUMBER.fullmatch(text):
-        raise ValueError(f"{quoted(text, 40)} is no number")
+        raise ValueError(f"{quoted(text, 40)} is not a number")
     return float(text)
 
 
 def cut_off(path: Path) -> bool:
-    """Test whether a file ends within a line: of the last number digits may be lost.
+    """Return True if a file ends within a line, so that the last number may have lost digits.
 
     Parameters
     ----------
     path
-        A text that ends each line; an empty one is not cut off.
+        Text file whose lines all end with a newline; an empty file is not truncated.
     """
     with path.open("rb") as stream:
         if not stream.seek(0, 2):
@@ -77,27 +77,27 @@ def read_table(
     optional: Sequence[str] = (),
     texts: Sequence[str] = ("time_utc", "quality"),
 ) -> pd.DataFrame:
-    """Return the table in a CSV file, whose columns stand under their names.
+    """Read a CSV table with named columns.
 
     Parameters
     ----------
     path
-        UTF-8, with or without byte-order mark; the first line names the columns, in capitals or not. Lines that begin
-        with # are comments; the last of them before the first row may be the heading. A heading that is repeated, as
-        where files were joined, is left out.
+        UTF-8, with or without byte-order mark; the first line contains the column names, case-insensitive. Lines that
+        start with # are comments; the last comment before the first row may be the heading. A repeated heading, as in
+        concatenated files, is skipped.
     required, optional
-        Names of columns that must be there, or may, but once.
+        Names of required and optional columns; each may occur only once.
     texts
-        Names of columns that are not read as numbers.
+        Names of columns that are read as text.
 
     Raises
     ------
     ValueError
-        If it is no table, its cells stand between semicolons or tabs, it lacks a column or has one twice, another
-        heading stands in it, or a line has more or fewer cells than the heading.
+        If the file is not a table, its cells are separated by semicolons or tabs, a column is missing or repeated, it
+        contains a second, different heading, or a line has more or fewer cells than the heading.
     """
     if path.stat().st_size > LARGEST_LOG:
-        raise ValueError(f"{path.stat().st_size} bytes, at most {LARGEST_LOG} are read")
+        raise ValueError(f"{path.stat().st_size} bytes, at most {LARGEST_LOG} are supported")
     known = list(dict.fromkeys([*required, *optional, *texts]))
     try:
         heading, others = _checked_cells(path, known)
@@ -105,7 +105,7 @@ def read_table(
         raise ValueError(_not_utf8(path)) from error
     names = _named(heading, known)
     with path.open(encoding="utf-8-sig", newline="") as stream, warnings.catch_warnings():
-        warnings.simplefilter("error", pd.errors.ParserWarning)  # cells beyond the heading would be dropped
+        warnings.simplefilter("error", pd.errors.ParserWarning)  # otherwise pandas drops cells beyond the heading
         plain = len(others) == 1
         try:
             table = pd.read_csv(
@@ -126,24 +126,24 @@ def read_table(
 
 
 def _named(heading: Sequence[str], known: Sequence[str]) -> list[str]:
-    """Return the names of columns: those that are known, in capitals or not, as they are known; each once."""
+    """Return unique column names; known names are matched case-insensitively and returned in their standard form."""
     plain = [cell.strip().casefold() for cell in heading]
     names = [cell.strip() for cell in heading]
     for name in known:
-        places = [place for place, cell in enumerate(names) if cell == name]
-        places = places or [place for place, cell in enumerate(plain) if cell == name.casefold()]
-        if len(places) > 1:
-            raise ValueError(f"column {name} a second time")
-        if places:
-            names[places[0]] = name
-    return [f"{name}.{place}" if name in names[:place] else name for place, name in enumerate(names)]
+        columns = [column for column, cell in enumerate(names) if cell == name]
+        columns = columns or [column for column, cell in enumerate(plain) if cell == name.casefold()]
+        if len(columns) > 1:
+            raise ValueError(f"repeated column {name}")
+        if columns:
+            names[columns[0]] = name
+    return [f"{name}.{column}" if name in names[:column] else name for column, name in enumerate(names)]
 
 
 def _not_utf8(path: Path) -> str:
-    """Locate the first bytes of a file that are not UTF-8 text."""
+    """Describe the first byte of a file that is not UTF-8 text."""
     with path.open("rb") as stream:
         if stream.read(2) in {b"\xff\xfe", b"\xfe\xff"}:
-            return 'text in UTF-16, as "Unicode text" of Excel; save the file as UTF-8'
+            return 'text in UTF-16, such as "Unicode text" of Excel; save the file as UTF-8'
         stream.seek(0)
         for line, data in enumerate(stream, 1):
             try:
@@ -154,34 +154,34 @@ def _not_utf8(path: Path) -> str:
 
 
 def _checked_cells(path: Path, known: Sequence[str]) -> tuple[list[str], set[int]]:
-    """Return the heading, and the numbers of rows that hold no values: comments, and the heading as often as it comes.
+    """Return the heading and the indices of rows without values: comments and all repetitions of the heading.
 
     Raises
     ------
     ValueError
-        If a line has fewer cells than the heading, so that a piece is gone, maybe of a number; or more.
+        If a line has fewer cells than the heading, so that part of a number may be lost, or more.
     """
     with path.open(encoding="utf-8-sig", newline="") as stream:
         rows = csv.reader(stream, skipinitialspace=True)
         heading, others, commented = list[str](), set[int](), list[str]()
         names = {name.casefold() for name in known}
         try:
-            for place, row in enumerate(rows):
+            for index, row in enumerate(rows):
                 if row and row[0].startswith("#"):
-                    others.add(place)
+                    others.add(index)
                     commented = [row[0].lstrip("# "), *row[1:]]
                 elif row and not heading:
                     is_comment = bool(names & {cell.strip().casefold() for cell in commented})
                     heading = commented if is_comment else row
-                    others |= set() if is_comment else {place}
+                    others |= set() if is_comment else {index}
                     for mark, name in ((";", "semicolons"), ("\t", "tabs")):
                         if len(heading) == 1 and mark in heading[0]:
-                            raise ValueError(f"line {rows.line_num} has its cells between {name}, not commas")
+                            raise ValueError(f"cells of line {rows.line_num} are separated by {name}, not commas")
                     titles = {cell.strip().casefold() for cell in heading} & names
                 elif row == heading:
-                    others.add(place)
+                    others.add(index)
                 elif row and row[0].strip().casefold() in titles:
-                    raise ValueError(f"line {rows.line_num} is another heading than the first: files were joined")
+                    raise ValueError(f"line {rows.line_num} is a second, different heading: concatenated files")
                 elif row and len(row) - (row[-1] == "") != len(heading) != len(row):  # a comma may end the line
                     raise ValueError(f"line {rows.line_num} has {len(row)} cells, the heading {len(heading)}")
         except csv.Error as error:
@@ -190,7 +190,7 @@ def _checked_cells(path: Path, known: Sequence[str]) -> tuple[list[str], set[int
 
 
 def _without(stream: TextIO, others: set[int]) -> TextIO:
-    """Return a table without some of its rows."""
+    """Remove the rows with indices `others` from a table."""
     kept = io.StringIO(newline="")
     csv.writer(kept).writerows(
         row for number, row in enumerate(csv.reader(stream, skipinitialspace=True)) if number not in others
@@ -200,19 +200,19 @@ def _without(stream: TextIO, others: set[int]) -> TextIO:
 
 
 def numbers(columns: pd.DataFrame) -> NDArray[np.float64]:
-    """Return columns as (row, column) float64, NaN where a cell is empty; ValueError names a cell that is no number."""
+    """Convert columns to (row, column) float64, NaN for empty cells; ValueError at a cell that is not a number."""
     for name in columns.columns:
         if columns[name].dtype.kind in "fiu":
             continue
         cells = columns[name].dropna().astype(str).str.strip()
         wrong = cells[~cells.map(lambda cell: bool(_NUMBER.fullmatch(cell) or _NOT_FINITE.fullmatch(cell)))]
         if len(wrong):
-            raise ValueError(f"could not convert string to a number in column {name}: {quoted(wrong.iloc[0], 40)}")
+            raise ValueError(f"column {name}: {quoted(wrong.iloc[0], 40)} is not a number")
         columns = columns.assign(**{str(name): cells.map(number).reindex(columns.index)})
     return columns.to_numpy(np.float64, na_value=np.nan)
 
 
-# ---- Flight logs as CSV: time, position in one of three frames, attitude --------------------------------------------
+# ---- CSV flight logs: time, position in one of three frames, attitude -----------------------------------------------
 
 _TIMES = ("time_utc", "time", "time_s")
 _POSITIONS: dict[Literal["geodetic", "ecef", "local"], list[str]] = {
@@ -223,48 +223,47 @@ _POSITIONS: dict[Literal["geodetic", "ecef", "local"], list[str]] = {
 _ATTITUDE = ["roll_deg", "pitch_deg", "yaw_deg"]
 _STD = ["std_north_m", "std_east_m", "std_up_m"]
 _QUALITY = "quality"
-_OURS = (*_TIMES, *(name for names in _POSITIONS.values() for name in names), *_ATTITUDE, *_STD, _QUALITY)
+_STANDARD = (*_TIMES, *(name for names in _POSITIONS.values() for name in names), *_ATTITUDE, *_STD, _QUALITY)
 _ZONE = r":[^:]*(?:Z|[+-]\d\d(?::?\d\d)?)$"
 _LONGEST_S = 4e9
 
 
 class _Log(NamedTuple):
-    """Whose log is read, and how."""
+    """File, node and options of a log."""
 
     path: Path
     node: str
     options: LogOptions
 
 
-def read_csv_track(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
-    """Return the `track` stage of a CSV log.
+def read_csv_track(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> xr.Dataset:
+    """Read a CSV flight log as `track` stage.
 
-    Its columns, or those that options.columns maps onto them, are
+    Its columns, or those that options.columns maps to them, are
 
-    - one of time_utc (ISO 8601), time (the same, whose zone each cell or options.time_system states) and time_s
+    - one of time_utc (ISO 8601), time (ISO 8601 with a zone in each cell or in options.time_system) and time_s
       (seconds since options.start_utc, or with time_system gpst since 1980-01-06, GPS time);
-    - the first that is whole of latitude_deg, longitude_deg, height_m (WGS 84, ellipsoidal, after height_offset_m);
-      x_m, y_m, z_m (ECEF); east_m, north_m, up_m (axes of the campaign's own);
-    - where known roll_deg, pitch_deg, yaw_deg; std_north_m, std_east_m, std_up_m (standard deviations); quality (kind
-      of solution: a name of `FIXES`, or a number as options.quality says). Empty cells of these are epochs without such
-      a value.
+    - the first complete set of latitude_deg, longitude_deg, height_m (WGS 84, ellipsoidal, after height_offset_m);
+      x_m, y_m, z_m (ECEF); east_m, north_m, up_m (local frame of the campaign);
+    - optionally roll_deg, pitch_deg, yaw_deg; std_north_m, std_east_m, std_up_m (standard deviations); quality
+      (solution type: a name of `FIXES`, or a number as defined by options.quality). Their cells may be empty.
 
-    Numbers are multiplied by options.scales. Epochs within a leap second are left out and counted, as are those that
-    are not measured by their quality in GGA.
+    Numbers are multiplied by options.scales. Epochs within a leap second, and those whose GGA quality states that they
+    are not measured, are excluded and counted.
 
     Raises
     ------
     CampaignError
-        If a column is missing or a cell is not a number or a time, or the epoch of times is not stated.
+        If a column is missing, a cell is not a number or a time, or time zero is not stated.
     """
     log = _Log(path, node, options)
     dropped = Counter[str]()
     try:
         table = _table(log)
         if cut_off(path):
-            table, dropped["line cut off"] = table.iloc[:-1], 1
-        for why, wrong in _left_out(table, log).items():
-            dropped[why] += int(wrong.sum())
+            table, dropped["truncated line"] = table.iloc[:-1], 1
+        for reason, wrong in _exclusions(table, log).items():
+            dropped[reason] += int(wrong.sum())
             table = table[~wrong.reindex(table.index)]
         frame = _frame(table, log)
         position = _scaled(table, _POSITIONS[frame], log)
@@ -281,7 +280,7 @@ def read_csv_track(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -
         raise _error(str(error).partition("\n")[0], log, "Correct the log or export it again.") from error
     if frame == "geodetic":
         position = position + np.array([0.0, 0.0, options.height_offset_m or 0.0])
-    attitude, std = (None if one is None else one[kept] for one in (attitude, std))
+    attitude, std = (None if values is None else values[kept] for values in (attitude, std))
     fix = None if fix is None else fix[kept]
     return make_track(
         time[kept],
@@ -290,20 +289,20 @@ def read_csv_track(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -
         attitude_deg=attitude,
         position_std_m=std,
         fix=fix,
-        dropped={why: count for why, count in dropped.items() if count},
+        dropped={reason: count for reason, count in dropped.items() if count},
         node=node,
         where=path,
     )
 
 
-def _left_out(table: pd.DataFrame, log: _Log) -> dict[str, "pd.Series[bool]"]:
-    """Return why rows are no epochs → which rows."""
+def _exclusions(table: pd.DataFrame, log: _Log) -> dict[str, "pd.Series[bool]"]:
+    """Return reason → mask of the rows to be excluded."""
     reasons = {}
     if _QUALITY in table and log.options.quality == "gga":
         quality = _words(table[_QUALITY])
-        for number, why in GGA_NOT_MEASURED.items():
+        for number, reason in GGA_NOT_MEASURED.items():
             if number:
-                reasons[f"{why} (quality {number})"] = quality == number
+                reasons[f"{reason} (quality {number})"] = quality == number
     for name in ("time_utc", "time"):
         if name in table:
             texts = table[name].fillna("").astype(str)
@@ -312,75 +311,79 @@ def _left_out(table: pd.DataFrame, log: _Log) -> dict[str, "pd.Series[bool]"]:
 
 
 def _scaled(table: pd.DataFrame, names: list[str], log: _Log) -> NDArray[np.float64]:
-    """Return columns as (row, column) float64, multiplied by the factors of the config."""
+    """Convert columns to (row, column) float64, multiplied by the factors of the config."""
     return numbers(table[names]) * [log.options.scales.get(name, 1.0) for name in names]
 
 
 def _table(log: _Log) -> pd.DataFrame:
-    """Return the table under names of ours; ValueError where names are missing or ambiguous."""
+    """Read the table with standard column names; ValueError if names are missing or ambiguous."""
     mapped = dict(log.options.columns)
-    for key, table_of in (("columns", mapped), ("scales", log.options.scales)):
-        unknown = [name for name in table_of if name not in _OURS]
+    for key, mapping in (("columns", mapped), ("scales", log.options.scales)):
+        unknown = [name for name in mapping if name not in _STANDARD]
         if unknown:
             raise CampaignError(
                 f"column {quoted(unknown[0])}",
                 f"config.yaml: nodes.{log.node}.log.{key}",
-                f"one of {', '.join(_OURS)}",
-                "Columns of apertura stand left, those of the log right."
+                f"one of {', '.join(_STANDARD)}",
+                "Use column names of apertura as keys, and column names of the log as values."
                 if key == "columns"
-                else "Columns of apertura stand left, their factors right.",
+                else "Use column names of apertura as keys, and factors as values.",
             )
-    theirs = [mapped.get(name, name) for name in _OURS]
+    log_columns = [mapped.get(name, name) for name in _STANDARD]
     texts = [mapped.get(name, name) for name in ("time_utc", "time", "quality")]
-    table = read_table(log.path, list(mapped.values()), optional=theirs, texts=texts)
+    table = read_table(log.path, list(mapped.values()), optional=log_columns, texts=texts)
     doubled = [name for name in mapped if name in table.columns and name not in mapped.values()]
     if doubled:
-        raise ValueError(f"column {doubled[0]}, besides {quoted(mapped[doubled[0]])} that config.yaml maps to it")
-    ours = {name: table[column] for name, column in zip(_OURS, theirs, strict=True) if column in table}
-    found = pd.DataFrame(ours)
-    found.attrs["heading"] = [str(column) for column in table.columns]
-    return found
+        raise ValueError(
+            f"column {doubled[0]} in addition to {quoted(mapped[doubled[0]])}, which config.yaml maps to {doubled[0]}"
+        )
+    standard = {name: table[column] for name, column in zip(_STANDARD, log_columns, strict=True) if column in table}
+    renamed = pd.DataFrame(standard)
+    renamed.attrs["heading"] = [str(column) for column in table.columns]
+    return renamed
 
 
 def _error(found: str, log: _Log, remedy: str) -> CampaignError:
     expected = (
         "columns time_utc (ISO 8601), or time or time_s, latitude_deg, longitude_deg, height_m, or x_m, y_m, z_m, or "
         f"east_m, north_m, up_m; optionally {', '.join(_ATTITUDE)}, {', '.join(_STD)}, quality ({', '.join(FIXES)}, "
-        f"or numbers as nodes.{log.node}.log.quality says); or their names in nodes.{log.node}.log.columns"
+        f"or numbers as defined by nodes.{log.node}.log.quality); or their names in nodes.{log.node}.log.columns"
     )
     return CampaignError(found, log.path, expected, remedy)
 
 
-def _lacking(name: str, table: pd.DataFrame, log: _Log) -> CampaignError:
-    """Return the error of a log without a column: what columns it has, and how one of them is named in its stead."""
+def _missing_column(name: str, table: pd.DataFrame, log: _Log) -> CampaignError:
+    """Return the error for a log without a column: its columns, and the setting that maps one of them."""
     key = f"nodes.{log.node}.log.columns"
-    remedy = f"If it has another name, say which: {key}: {{{name}: NAME}}, or to try it --set columns.{name}=NAME."
+    remedy = (
+        f"If the column has another name, set {key}: {{{name}: NAME}}; to try a name, use --set columns.{name}=NAME."
+    )
     return _error(f"no column {name} among {quoted(table.attrs['heading'], 300)}", log, remedy)
 
 
 def _frame(table: pd.DataFrame, log: _Log) -> Literal["geodetic", "ecef", "local"]:
-    """Return the first frame whose columns are whole; CampaignError names what the nearest lacks."""
-    lacks = {frame: [name for name in names if name not in table] for frame, names in _POSITIONS.items()}
-    nearest = min(lacks, key=lambda frame: len(lacks[frame]))
-    if lacks[nearest]:
-        raise _lacking(lacks[nearest][0], table, log)
+    """Return the first frame with all its columns; CampaignError names a column that the most complete frame lacks."""
+    missing = {frame: [name for name in names if name not in table] for frame, names in _POSITIONS.items()}
+    nearest = min(missing, key=lambda frame: len(missing[frame]))
+    if missing[nearest]:
+        raise _missing_column(missing[nearest][0], table, log)
     return nearest
 
 
 def _time(table: pd.DataFrame, log: _Log) -> NDArray[np.datetime64]:
-    """Return UTC; a zone stated by the column's name is not overruled by the config."""
+    """Return UTC; the config does not override a time system stated by the name of the column."""
     columns = [name for name in _TIMES if name in table]
     if not columns:
-        raise _lacking("time_utc", table, log)
+        raise _missing_column("time_utc", table, log)
     if len(columns) > 1 and columns[0] != "time_utc":
-        raise ValueError("columns time and time_s")
+        raise ValueError("both columns time and time_s")
     name, system = columns[0], log.options.time_system
     if name == "time_s":
         return _counted(_scaled(table, ["time_s"], log)[:, 0], log)
     zoned = table[name].dropna().str.strip().str.contains(_ZONE)
     if name == "time" and not zoned.all():
         if system is None or zoned.any():
-            found = "times in column time that do not say whether they are UTC or GPST"
+            found = "times in column time without a time system (UTC or GPST)"
             raise unstated("time_system", found, node=log.node, where=log.path)
         time = _iso(table[name])
         return utc_from_gps(time) if system == "gpst" else time
@@ -390,30 +393,31 @@ def _time(table: pd.DataFrame, log: _Log) -> NDArray[np.datetime64]:
 
 
 def _iso(cells: "pd.Series[str]") -> NDArray[np.datetime64]:
-    """Return times in ISO 8601, whose seconds may have a decimal comma; ValueError names the first that is none."""
+    """Parse times in ISO 8601, with decimal point or comma; ValueError at the first that is not a time."""
     texts = cells.str.strip().str.replace(",", ".", regex=False)
     time = pd.to_datetime(texts, utc=True, format="ISO8601", errors="coerce")
     wrong = cells[time.isna() & cells.notna()]
     if len(wrong):
         raise ValueError(
-            f"column {cells.name}: {quoted(wrong.iloc[0], 40)} is no time in ISO 8601 such as 2025-05-14T09:30:00.5Z"
+            f"column {cells.name}: {quoted(wrong.iloc[0], 40)} is not an ISO 8601 time such as 2025-05-14T09:30:00.5Z"
         )
     return np.asarray(time.dt.tz_localize(None).dt.as_unit("ns").to_numpy())
 
 
 def _counted(seconds: NDArray[np.float64], log: _Log) -> NDArray[np.datetime64]:
-    """Return UTC of seconds since the config's time zero, or of GPS time."""
+    """Convert seconds since the configured time zero, or since the GPS epoch, to UTC."""
     if not (np.abs(seconds) <= _LONGEST_S).all():
-        raise ValueError(f"a time of {seconds[~(np.abs(seconds) <= _LONGEST_S)][0]:g} s in column time_s")
+        wrong_s = seconds[~(np.abs(seconds) <= _LONGEST_S)][0]
+        raise ValueError(f"a time of {wrong_s:g} s in column time_s, beyond ±{_LONGEST_S:g} s")
     elapsed = np.round(seconds * 1e9).astype("timedelta64[ns]")
     if log.options.time_system == "gpst" and log.options.start_utc is None:
         return utc_from_gps(GPS_EPOCH + elapsed)
-    found = "seconds in column time_s, and nobody says since when (1970-01-01 in Unix time)"
+    found = "seconds in column time_s without a time zero (1970-01-01 for Unix time)"
     return start_time(log.options, found, node=log.node, where=log.path) + elapsed
 
 
 def _fix(quality: "pd.Series[str]", log: _Log) -> NDArray[np.int8]:
-    """Return RTKLIB's numbers of kinds of solution that are named or numbered; 0 where a cell is empty."""
+    """Convert names or numbers of solution types to RTKLIB's numbers; 0 for an empty cell."""
     words = _words(quality)
     kinds = {**FIXES, "": 0}
     if log.options.quality == "gga":
@@ -423,7 +427,7 @@ def _fix(quality: "pd.Series[str]", log: _Log) -> NDArray[np.int8]:
     counted = sorted({word for word in words if word.isdigit() and word != "0"})
     if counted and log.options.quality is None:
         column = log.options.columns.get(_QUALITY, _QUALITY)
-        found = f"kinds of solution {', '.join(counted)} in column {quoted(column)}"
+        found = f"solution types {', '.join(counted)} in column {quoted(column)} without a definition"
         numbering = ": rtklib (1 fix, 2 float, 5 single) or gga (4 fix, 5 float, 1 single)"
         raise unstated("quality", found, node=log.node, where=log.path, remedy=numbering)
     unknown = words[~words.isin(kinds)]

@@ -1,7 +1,7 @@
-"""Bytes of a binary log that are no messages: found by walking from message to message, and left out.
+"""Detection and removal of bytes in a binary log that are not valid messages, by a walk from message to message.
 
-Parsers stop at such bytes, or read on behind them, without a word: pyulog at the first message that reaches beyond the
-file, pymavlink at the first type that it does not know.
+Parsers stop at such bytes, or skip them, without a warning: pyulog at the first message that extends beyond the end of
+the file, pymavlink at the first unknown type.
 """
 
 from collections.abc import Callable, Sequence
@@ -10,30 +10,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 _CHAIN = 3
-"""Messages that must follow each other where reading resumes: chance makes one header of 256 a plausible one."""
+"""Consecutive valid messages required to resume reading; a random header is plausible with probability 1/256."""
 
 Span = tuple[int, int]
-"""First byte, and that behind the last."""
+"""Offset of the first byte, and of the byte after the last."""
 
 
 def foreign_bytes(
     data: bytes, first: int, end: int, message_bytes: Callable[[int], int], *, note: Callable[[int], None]
 ) -> tuple[list[Span], int]:
-    """Return the spans of a log that are no messages, and where the last message ends.
+    """Find the spans of a log that are not valid messages, and the end of the last message.
 
-    A message before such a span is part of it: it may have been cut, so that its last bytes are foreign ones. A message
-    that the end of the log cuts off, and bytes of one value behind the last message, are no damage.
+    The message before such a span is included in it, because it may be truncated with foreign bytes at its end. A
+    message truncated by the end of the log, and padding after the last message, are not damage.
 
     Parameters
     ----------
     data
         The log.
     first, end
-        Where messages begin and end in it.
+        Offsets of the first message and of the end of the messages.
     message_bytes
-        Length of the message at an offset, its header included; 0 where none begins.
+        Length of the message at an offset, including its header; 0 if no message starts there.
     note
-        Called with the offset of each message that is read, in order: what `message_bytes` must know of it.
+        Called in order with the offset of each valid message, to update the state of `message_bytes`.
 
     Examples
     --------
@@ -49,7 +49,7 @@ def foreign_bytes(
             note(at)
             at, last = at + size, at
             continue
-        resumed = next((place for place in range(last + 1, end) if _chain(place, end, message_bytes)), end)
+        resumed = next((offset for offset in range(last + 1, end) if _chain(offset, end, message_bytes)), end)
         tail = data[at:end]
         if resumed == end and (size or tail == tail[:1] * len(tail)):
             break
@@ -59,7 +59,7 @@ def foreign_bytes(
 
 
 def _chain(at: int, end: int, message_bytes: Callable[[int], int]) -> bool:
-    """Test whether messages follow each other from an offset on."""
+    """Return True if consecutive messages start at an offset."""
     for _ in range(_CHAIN):
         size = message_bytes(at)
         if not size or at + size > end:
@@ -71,7 +71,7 @@ def _chain(at: int, end: int, message_bytes: Callable[[int], int]) -> bool:
 
 
 def without(data: bytes, spans: Sequence[Span]) -> bytes:
-    """Return a log without some of its bytes.
+    """Remove spans of bytes from a log.
 
     Examples
     --------
@@ -83,23 +83,25 @@ def without(data: bytes, spans: Sequence[Span]) -> bytes:
 
 
 def damage_of(spans: NDArray[np.int64], unit: str = "bytes") -> str:
-    """Describe the parts of a log that are no messages, in one line; '' where there are none.
+    """Describe the spans of a log that are not valid messages in one line; empty if there are none.
 
     Parameters
     ----------
     spans
-        (span, 2) int64: first byte or line, and that behind the last; the last row is the whole log.
+        (span, 2) int64: first byte or line, and the one after the last; the last row is the whole log.
     unit
-        What is counted.
+        Unit of the spans, bytes or lines.
 
     Examples
     --------
     >>> damage_of(np.array([[5120, 5320], [0, 40000]]))
-    '200 of 40000 bytes are no messages, from byte 5120 on; epochs there are lost'
+    '200 of 40000 bytes are not valid messages, from byte 5120 on; their epochs are lost'
     """
     if len(spans) < 2:
         return ""
     lost = int(np.diff(spans[:-1], axis=1).sum())
-    places = f", in {len(spans) - 1} places" if len(spans) > 2 else ""
+    blocks = f", in {len(spans) - 1} blocks" if len(spans) > 2 else ""
     first = f"{unit.removesuffix('s')} {int(spans[0, 0])}"
-    return f"{lost} of {int(spans[-1, 1])} {unit} are no messages{places}, from {first} on; epochs there are lost"
+    return (
+        f"{lost} of {int(spans[-1, 1])} {unit} are not valid messages{blocks}, from {first} on; their epochs are lost"
+    )

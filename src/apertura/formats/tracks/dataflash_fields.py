@@ -1,4 +1,4 @@
-"""Positions, attitude and parameters in an ArduPilot DataFlash log, binary or text; run by `read_isolated`."""
+"""Extraction of positions, attitude and parameters from a DataFlash log, binary or text; run by `read_isolated`."""
 
 import math
 import tempfile
@@ -16,32 +16,32 @@ COLUMNS = {
     "GPA": ("TimeUS", "I", "HAcc", "VAcc", "VV", "AEl"),
     "ATT": ("TimeUS", "Roll", "Pitch", "Yaw"),
 }
-"""Message → its columns that are read; those that a version of ArduPilot does not log are NaN."""
+"""Message → columns that are read; NaN for columns that the version of ArduPilot does not log."""
 
 NEEDED = tuple(name for name in COLUMNS["GPS"] if name != "I")
-"""Columns of GPS that every version since 3.3 logs; one that is not there was damaged."""
+"""GPS columns that every version since 3.3 logs; a missing one indicates a damaged log."""
 
-_SECOND = {"GPS2": "GPS", "GPA2": "GPA"}  # the second receiver, before it became I = 1 of the same message
+_SECOND = {"GPS2": "GPS", "GPA2": "GPA"}  # second receiver in older versions; now I = 1 of the same message
 _BINARY = b"\xa3\x95"
 _FMT, _FMT_BYTES = 128, 89
 DAMAGE = {"bytes": "damage/bytes", "lines": "damage/lines"}
-"""Spans of bytes, or of lines of a text, that are no messages, then (0, how many there are in all)."""
+"""Spans of bytes or text lines that are not valid messages, then (0, total number)."""
 
 
 def read_fields(path: Path) -> dict[str, NDArray[Any]]:
-    """Return ``message/column`` → float64 values of every message, and ``PARM/name`` → its last value.
+    """Read ``message/column`` → float64 values of all messages, and ``PARM/name`` → its last value.
 
-    What is no message is left out (`DAMAGE`), and reading resumes behind it.
+    Bytes or lines that are not valid messages are skipped and reported (`DAMAGE`).
 
     Parameters
     ----------
     path
-        A log, binary or text by its first bytes.
+        A log; its first bytes determine whether it is binary or text.
 
     Raises
     ------
     ValueError
-        If it is neither kind, or its GPS messages are of a version without time by week.
+        If the file is neither kind of log, or its GPS messages lack required columns such as the GPS week.
     """
     from pymavlink.DFReader import DFReader_binary, DFReader_text
 
@@ -49,12 +49,12 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
     is_text = b"FMT," in data[:8192]
     is_binary = not is_text and _BINARY in data[:8192]
     if not is_binary and not is_text:
-        raise ValueError("no FMT message at its beginning")
+        raise ValueError("no FMT message at the start of the file")
     with ExitStack() as stack:
         name = str(path)
         if is_binary:
             spans, ended = _foreign(data)
-            if spans:  # the reader ends at a type that it does not know, and takes no bytes but a file's
+            if spans:  # the parser stops at an unknown type, and only reads files
                 file = stack.enter_context(tempfile.NamedTemporaryFile())
                 file.write(without(data[:ended], spans))
                 file.flush()
@@ -84,7 +84,7 @@ def _columns(log: Any) -> dict[str, NDArray[Any]]:
 
 
 def _foreign(data: bytes) -> tuple[list[Span], int]:
-    """Return the spans of a binary log that are no messages, and where the last message ends."""
+    """Find the spans of a binary log that are not valid messages, and the end of the last message."""
     lengths = {_FMT: _FMT_BYTES}
 
     def message_bytes(at: int) -> int:
@@ -98,7 +98,7 @@ def _foreign(data: bytes) -> tuple[list[Span], int]:
 
 
 def _wrong_lines(data: bytes) -> tuple[list[Span], int]:
-    """Return the lines of a text log, from 1, that are no messages: of no kind, or of too few columns."""
+    """Find the lines of a text log, numbered from 1, of unknown type or with too few columns; also count all lines."""
     columns, wrong = {"FMT": 5}, list[Span]()
     lines = data[data.find(b"FMT,") :].splitlines()
     for number, line in enumerate(lines, 1 + data[: data.find(b"FMT,")].count(b"\n")):
@@ -111,12 +111,14 @@ def _wrong_lines(data: bytes) -> tuple[list[Span], int]:
 
 
 def _row(message: Any, kind: str) -> list[float]:
-    """Return the columns of a message; NaN where its version has none."""
-    there = set(message.get_fieldnames())
+    """Return the columns of a message; NaN for columns that its version lacks."""
+    fields = set(message.get_fieldnames())
     if len(message.fmt.columns) != len(message.fmt.format):
-        raise ValueError(f"{message.get_type()} has {len(message.fmt.columns)} columns of {message.fmt.format!r}")
-    lacking = [name for name in NEEDED if kind == "GPS" and name not in there]
-    if lacking:
-        raise ValueError(f"{message.get_type()} messages without {', '.join(lacking)}")
-    values = {"I": float(message.get_type() in _SECOND), **{name: getattr(message, name) for name in there}}
+        raise ValueError(
+            f"{message.get_type()} has {len(message.fmt.columns)} columns but format {message.fmt.format!r}"
+        )
+    missing = [name for name in NEEDED if kind == "GPS" and name not in fields]
+    if missing:
+        raise ValueError(f"{message.get_type()} messages without {', '.join(missing)}")
+    values = {"I": float(message.get_type() in _SECOND), **{name: getattr(message, name) for name in fields}}
     return [float(values.get(name, math.nan)) for name in COLUMNS[kind]]

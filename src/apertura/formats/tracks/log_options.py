@@ -1,4 +1,4 @@
-"""Options of a flight log: values that the log lacks and the config states."""
+"""Options of a flight log: values that are missing in the log and stated in the config."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,31 +10,31 @@ QualityNumbers = Literal["rtklib", "gga"]
 
 @dataclass(frozen=True)
 class LogOptions:
-    """Values for what a log leaves open; those that it states are never overruled.
+    """Configured values for information that a log does not contain; information in the log is never overridden.
 
     Attributes
     ----------
     format
-        A key of `TRACKS`; None: by suffix and heading.
+        A key of `TRACKS`; None: determined by suffix and heading.
     time_system
-        Of its times; None: stated by the log, else the log is rejected.
+        Time system of the log; None: stated by the log, otherwise the log is rejected.
     start_utc
-        Time zero of a log that counts from its own beginning, or the day of one that writes times of day only:
-        ISO 8601, UTC; None: stated by the log, else the log is rejected.
+        Time zero of a log with relative times, or date of a log with times of day only: ISO 8601, UTC; None: stated by
+        the log, otherwise the log is rejected.
     columns
-        Name of a column of ours → name in the log, for CSV.
+        Standard column name → name in the log, for CSV.
     scales
-        Name of a column of ours → factor that its numbers are multiplied by, for CSV; missing ones are 1.
+        Standard column name → factor applied to its numbers, for CSV; default 1.
     quality
-        How kinds of solution are numbered in a CSV log: as RTKLIB's Q (1 fix, 2 float, 5 single) or as in GGA of NMEA
-        (4 fix, 5 float, 1 single); None: they are names, or the log is rejected.
+        Numbering of solution types in a CSV log: RTKLIB's Q (1 fix, 2 float, 5 single) or NMEA GGA (4 fix, 5 float,
+        1 single); None: they are names, otherwise the log is rejected.
     base
-        WGS 84 latitude (deg), longitude (deg) and ellipsoidal height (m) of the point that baselines begin at.
+        WGS 84 latitude (deg), longitude (deg) and ellipsoidal height (m) of the base station of logged baselines.
     body
-        Which rigid body of a motion capture, or which device of a log that holds several.
+        Rigid body of a motion capture, or device of a log with several devices.
     height_offset_m
-        What is to be added to logged heights to give ellipsoidal ones; None: they are ellipsoidal, or the log is
-        refused.
+        Offset to be added to logged heights to obtain ellipsoidal heights; None: they are ellipsoidal, otherwise the
+        log is rejected.
     """
 
     format: str | None = None
@@ -48,5 +48,5 @@ class LogOptions:
     height_offset_m: float | None = None
 
 
-AS_IT_SAYS = LogOptions()
-"""Of a log that states everything itself."""
+DEFAULT_OPTIONS = LogOptions()
+"""Default options, for a log that contains all information."""

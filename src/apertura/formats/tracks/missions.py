@@ -1,4 +1,4 @@
-"""Missions of ground stations, before they are flown: QGroundControl, ArduPilot, KML and tables of waypoints."""
+"""Reading of planned missions (QGroundControl, ArduPilot, KML, tables of waypoints), and output of plans as KML."""
 
 import math
 import re
@@ -17,32 +17,32 @@ from apertura.common.errors import CampaignError, quoted
 from apertura.formats.tracks.csv_track import read_table
 
 Reference = Literal["home", "sea", "ground", "ellipsoid"]
-"""What heights count from: the ground at the start, mean sea level, the ground below, the ellipsoid."""
+"""Height reference: terrain at the take-off point, mean sea level, terrain below the waypoint, ellipsoid."""
 
 LARGEST_MISSION = 4_000_000
-"""Bytes of a mission's file."""
+"""Maximum size of a mission file, bytes."""
 
 _MOST_WAYPOINTS = 20_000
 _FRAMES: Mapping[int, Reference] = {0: "sea", 3: "home", 5: "sea", 6: "home", 10: "ground", 11: "ground"}
-_PASSED = {16, 17, 18, 19, 22, 82}  # MAV_CMD that fly through a place: waypoints, loiters, take-off, splines
-_SPEED = 178  # MAV_CMD_DO_CHANGE_SPEED, its second parameter
-_REMEDY = "Export the mission again, or give the track as a line, racetrack or circle."
+_PASSED = {16, 17, 18, 19, 22, 82}  # MAV_CMD with a position: waypoints, loiters, take-off, splines
+_SPEED = 178  # MAV_CMD_DO_CHANGE_SPEED; the speed is its second parameter
+_REMEDY = "Export the mission again, or define the track as a line, racetrack or circle."
 
 
 @dataclass(frozen=True, eq=False)
 class Mission:
-    """The waypoints of a mission.
+    """Waypoints of a mission.
 
     Attributes
     ----------
     place
         (waypoint, 3) float64: latitude, longitude (degrees, WGS 84), metres above `reference`.
     reference
-        What the heights count from.
+        Height reference.
     speed_m_s
-        (waypoint,) float64, on the way to each; NaN where the mission does not say.
+        (waypoint,) float64: speed on the leg to each waypoint; NaN where not stated in the mission.
     home_deg
-        Latitude and longitude of the start; None where it does not say: the first waypoint.
+        Latitude and longitude of the take-off point; None: not stated, the first waypoint is used.
     """
 
     place: Floats
@@ -52,7 +52,7 @@ class Mission:
 
 
 def read_mission(path: Path) -> Mission:
-    """Return the mission in a file, by its suffix.
+    """Read a mission file in the format given by its suffix.
 
     Parameters
     ----------
@@ -63,56 +63,57 @@ def read_mission(path: Path) -> Mission:
     Raises
     ------
     CampaignError
-        If there is no such file, it is none of these, or it has fewer than two waypoints.
+        If the file is missing, has another format, or contains fewer than two waypoints.
     """
     reader = _READERS.get(path.suffix.lower())
     expected = f"a mission: {', '.join(_READERS)}"
     if reader is None:
         raise CampaignError(f"suffix {quoted(path.suffix)}", path, expected, _REMEDY)
     if not path.is_file():
-        raise CampaignError("no such file", path, expected, "Copy it beside the plan.")
+        raise CampaignError("no such file", path, expected, "Copy it to the folder of the plan.")
     try:
         mission = reader(path)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
         if isinstance(error, CampaignError):
             raise
-        why = f"no key {error}" if isinstance(error, KeyError) else str(error)
-        raise CampaignError(f"unreadable mission: {quoted(why, 200)}", path, expected, _REMEDY) from error
+        reason = f"no key {error}" if isinstance(error, KeyError) else str(error)
+        raise CampaignError(f"unreadable mission: {quoted(reason, 200)}", path, expected, _REMEDY) from error
     latitude, longitude, height = mission.place.T
     good = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 360) & (np.abs(height) < 1e5)
     if not 2 <= len(mission.place) <= _MOST_WAYPOINTS or not good.all():
-        found = f"{len(mission.place)} waypoints, {int((~good).sum())} of them nowhere"
+        found = f"{len(mission.place)} waypoints, {int((~good).sum())} of them with invalid coordinates"
         raise CampaignError(found, path, f"2 to {_MOST_WAYPOINTS} waypoints on Earth", _REMEDY)
     return mission
 
 
 def _items(mission: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
-    """Yield the simple items of a QGroundControl mission; surveys and corridors hold theirs inside."""
+    """Yield the simple items of a QGroundControl mission, including those nested in surveys and corridors."""
     for item in mission["items"]:
         if item.get("type") == "SimpleItem":
             yield item
         else:
             inside = item.get("TransectStyleComplexItem", item).get("Items", [])
             if not inside:
-                raise ValueError(f"a {item.get('complexItemType', 'complex item')} without its transects")
+                raise ValueError(f"{item.get('complexItemType', 'complex item')} without transects")
             yield from _items({"items": inside})
 
 
 def _of_commands(rows: list[tuple[int, int, list[float]]], speed: float, home: tuple[float, float] | None) -> Mission:
-    """Return the mission of MAVLink commands: command, frame, seven parameters; NaN where one is not given."""
-    places, references, speeds = [], [], []
+    """Convert MAVLink commands (command, frame, seven parameters, NaN if missing) to a mission."""
+    positions, references, speeds = [], [], []
     for command, frame, parameters in rows:
         if command == _SPEED and parameters[1] > 0:
             speed = parameters[1]
         elif command in _PASSED and frame in _FRAMES and any(parameters[4:6]):
-            places.append(parameters[4:7])
+            positions.append(parameters[4:7])
             references.append(_FRAMES[frame])
             speeds.append(speed)
     for number, reference in enumerate(references, 1):
         if reference != references[0]:
-            counted = f"heights count from {references[0]} up to waypoint {number - 1}, from {reference} at waypoint"
-            raise ValueError(f"{counted} {number}; give all waypoints one altitude frame")
-    return Mission(np.array(places, float).reshape(-1, 3), (references or ["home"])[0], np.array(speeds, float), home)
+            mixed = f"height reference {references[0]} up to waypoint {number - 1}, {reference} at waypoint {number}"
+            raise ValueError(f"{mixed}; use the same altitude frame for all waypoints")
+    place = np.array(positions, float).reshape(-1, 3)
+    return Mission(place, (references or ["home"])[0], np.array(speeds, float), home)
 
 
 def _number(value: Any) -> float:
@@ -123,7 +124,8 @@ def _plan(path: Path) -> Mission:
     document = read_json(path, expected="a QGroundControl plan", remedy=_REMEDY, largest=LARGEST_MISSION)
     mission = document["mission"]
     rows = [
-        (int(item["command"]), int(item["frame"]), [_number(one) for one in item["params"]]) for item in _items(mission)
+        (int(item["command"]), int(item["frame"]), [_number(value) for value in item["params"]])
+        for item in _items(mission)
     ]
     copter = mission.get("vehicleType") in {2, 13, 14, 15}  # MAV_TYPE of quadrotor, hexa-, octo-, tricopter
     home = mission.get("plannedHomePosition")
@@ -137,32 +139,32 @@ def _waypoints(path: Path) -> Mission:
     if not first.startswith("QGC WPL"):
         raise ValueError("the first line is not QGC WPL 110")
     cells = [line.split() for line in lines if line.strip()]
-    rows = [(int(one[3]), int(one[2]), [float(cell) for cell in one[4:11]]) for one in cells]
+    rows = [(int(row[3]), int(row[2]), [float(cell) for cell in row[4:11]]) for row in cells]
     _, _, home = rows[0]  # line 0 is home
     return _of_commands(rows[1:], math.nan, (home[4], home[5]) if any(home[4:6]) else None)
 
 
 def _kml(path: Path) -> Mission:
     text = read_text(path, expected="KML", remedy=_REMEDY, largest=LARGEST_MISSION)
-    # By its text: a parser of XML would expand entities of strangers, and an expression may look at all of it again for
-    # every element that is not closed.
+    # Plain text search: an XML parser expands entities of untrusted files, and a regular expression may rescan the
+    # whole text for every unclosed element.
     line = _element(text, "LineString")
     listed = _element(line, "coordinates")
     mode = re.search(r"<altitudeMode>\s*(\w+)\s*</altitudeMode>", line)
     references: Mapping[str, Reference] = {"absolute": "sea", "relativeToGround": "ground"}
-    named = mode[1] if mode else "clampToGround"
-    if named not in references:
-        raise ValueError(f"altitudeMode {named}: a flight has heights, absolute or relativeToGround")
-    place = np.array([[float(one) for one in triple.split(",")] for triple in listed.split()], float)
-    return Mission(place[:, [1, 0, 2]], references[named], np.full(len(place), np.nan))
+    altitude_mode = mode[1] if mode else "clampToGround"
+    if altitude_mode not in references:
+        raise ValueError(f"altitudeMode {altitude_mode}, not absolute or relativeToGround")
+    place = np.array([[float(value) for value in triple.split(",")] for triple in listed.split()], float)
+    return Mission(place[:, [1, 0, 2]], references[altitude_mode], np.full(len(place), np.nan))
 
 
 def _element(text: str, name: str) -> str:
-    """Return the content of the first element of a name."""
-    begin = text.find(f"<{name}")
-    inner, end = text.find(">", begin) + 1, text.find(f"</{name}>", begin)
-    if begin < 0 or not 0 < inner <= end:
-        raise ValueError(f"no {name} that is closed")
+    """Return the content of the first element with a name."""
+    start = text.find(f"<{name}")
+    inner, end = text.find(">", start) + 1, text.find(f"</{name}>", start)
+    if start < 0 or not 0 < inner <= end:
+        raise ValueError(f"no complete element {name}")
     return text[inner:end]
 
 
@@ -190,29 +192,29 @@ def write_kml(path: Path, name: str, lines: Mapping[str, Floats], areas: Mapping
     path
         ``….kml``.
     name
-        Of the document.
+        Name of the document.
     lines
-        Name → (vertex, 3) float64, longitude, latitude (degrees), height (m).
+        Name → (vertex, 3) float64: longitude, latitude (degrees), height (m).
     areas
-        Name → polygons, each its rings (vertex, 3) of the same, the outer one first.
+        Name → polygons, each a list of rings (vertex, 3) in these coordinates, outer ring first.
     """
 
     def ring(place: Floats) -> str:
         return " ".join(f"{east:.8f},{north:.8f},{up:.2f}" for east, north, up in place)
 
     marks = [
-        f"<Placemark><name>{escape(of)}</name><LineString><altitudeMode>absolute</altitudeMode><coordinates>"
+        f"<Placemark><name>{escape(title)}</name><LineString><altitudeMode>absolute</altitudeMode><coordinates>"
         f"{ring(place)}</coordinates></LineString></Placemark>"
-        for of, place in lines.items()
+        for title, place in lines.items()
     ]
-    for of, polygons in areas.items():
+    for title, polygons in areas.items():
         for outer, *holes in polygons:
             edges = [("outer", outer), *(("inner", hole) for hole in holes)]
             bounds = "".join(
                 f"<{side}BoundaryIs><LinearRing><coordinates>{ring(edge)}</coordinates></LinearRing></{side}BoundaryIs>"
                 for side, edge in edges
             )
-            marks.append(f"<Placemark><name>{escape(of)}</name><Polygon>{bounds}</Polygon></Placemark>")
+            marks.append(f"<Placemark><name>{escape(title)}</name><Polygon>{bounds}</Polygon></Placemark>")
     body = "\n".join(marks)
     heading = '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document>'
     write_text(path, f"{heading}<name>{escape(name)}</name>\n{body}\n</Document></kml>\n")

@@ -1,4 +1,4 @@
-"""NMEA 0183 logs: GGA for positions, RMC or ZDA for the date, GST for standard deviations; checksums are verified."""
+"""NMEA 0183 logs: positions from GGA, dates from RMC or ZDA, standard deviations from GST; checksums are verified."""
 
 import re
 from collections import Counter
@@ -14,7 +14,7 @@ from pynmea2 import NMEASentence, ParseError
 from apertura.common.errors import CampaignError, quoted
 from apertura.formats.times import LEAP_SECOND, utc_times
 from apertura.formats.tracks.csv_track import LARGEST_LOG, number
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 from apertura.formats.tracks.track import (
     FIXES,
     GGA_KINDS,
@@ -29,21 +29,21 @@ from apertura.formats.tracks.track import (
 _BODY = re.compile(rb"([A-Z]{2}[A-Z0-9]{3},[^*]{1,250})(\*[0-9A-Fa-f]{0,2})?")
 _SEALED = re.compile(rb"\$..(?:GGA|RMC|ZDA|GST),[^*$\r\n]{1,250}\*[0-9A-Fa-f]{2}")
 _PLACES = ("GNS", "GLL")
-"""Sentences with a position that are not read: GLL has no height, GNS no kind of solution for all systems together."""
+"""Sentences with a position that are not read: GLL has no height, GNS no overall solution type."""
 
 _COMMAS = {"GGA": 14, "RMC": 9, "ZDA": 4, "GST": 8}
-"""Of a whole sentence, up to the last field that is read."""
+"""Minimum number of commas in a complete sentence, up to the last field that is read."""
 _STAMP = re.compile(rb"[\s\[(\"']*\d[-\d\s:.,;/TZ+\])\"']*")
 _DATED = {"RMC", "ZDA"}
 _WANTED = re.compile(r"[^P].(?:GGA|RMC|ZDA|GST),")
 _TIME = re.compile(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d|60)(?:\.(\d{1,9})\d*)?", re.ASCII)
 _LATE_NS = 60_000_000_000
 _DAY_NS, _SECOND_NS = 86_400_000_000_000, 1_000_000_000
-_REMEDY = "Log GGA with RMC or ZDA, as the receiver sends them."
+_REMEDY = "Log the unmodified GGA and RMC or ZDA sentences of the receiver."
 
 
 class _Fix(NamedTuple):
-    """One GGA with a position."""
+    """GGA sentence with a position."""
 
     talker: str
     geodetic: tuple[float, float, float]
@@ -53,7 +53,7 @@ class _Fix(NamedTuple):
 
 @dataclass
 class _Log:
-    """Values of the sentences of a log, from which the track is made; `sealed`: there are checksums in it."""
+    """Values collected from the sentences of a log; `sealed`: the log contains checksums."""
 
     path: Path
     node: str
@@ -71,24 +71,24 @@ class _Log:
     others: Counter[str] = field(default_factory=Counter)
 
 
-def read_nmea(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
-    """Return the `track` stage of an NMEA 0183 log of any talkers.
+def read_nmea(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> xr.Dataset:
+    """Read an NMEA 0183 log of any talkers as `track` stage.
 
-    Positions, their kind and the geoid separation are those of GGA: ellipsoidal height is altitude plus separation. GGA
-    has a time of day; its date is that of the RMC (valid) or ZDA before it, or options.start_utc's where there is none,
-    and goes on over midnight; where both are, they must be of one day. GST states standard deviations. Of one epoch by
-    several talkers GN's is taken. A log without any checksum is read as it is, with a remark; in others sentences with
-    a wrong checksum, without one and broken off are counted apart.
+    Positions, solution types and geoid separation are those of GGA: ellipsoidal height is altitude plus separation. The
+    date of a GGA is that of the preceding RMC (valid) or ZDA, otherwise that of options.start_utc, and advances at
+    midnight; if both exist, they must agree. GST contains standard deviations. If several talkers report an epoch, that
+    of GN is used. A log without any checksum is read with a remark; in other logs, sentences with a wrong checksum,
+    without a checksum and truncated sentences are excluded and counted by reason.
 
     Raises
     ------
     CampaignError
-        If no sentence has a date, none a geoid separation and the config does not state it, or the
-        config states another day than they do, or times do not increase.
+        If a date or the geoid separation is neither logged nor configured, the configured date differs from the logged
+        one, or times do not increase.
 
     Notes
     -----
-    Source: NMEA 0183 4.10, GGA, GST, RMC, ZDA; quality 9 as NovAtel's GPGGA. What a host wrote before ``$`` is cut off.
+    Source: NMEA 0183 4.10, GGA, GST, RMC, ZDA; quality 9 as in NovAtel's GPGGA. Text of a host before ``$`` is ignored.
     """
     if options.time_system == "gpst":
         raise contradicted("time_system", "times of NMEA are UTC", node=node, where=path)
@@ -97,10 +97,9 @@ def read_nmea(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.
     data = path.read_bytes()
     sealed = _SEALED.search(data) is not None
     log = _Log(path, node, options, data, sealed)
-    looked_through = _sentences(
-        _Log(path, node, options, data, sealed)
-    )  # as far as the first date: epochs before it have it, too
-    dates = (_dated(sentence) for sentence in looked_through if sentence.sentence_type in _DATED)
+    # first pass up to the first date, which also applies to the epochs before it
+    scanned = _sentences(_Log(path, node, options, data, sealed))
+    dates = (_dated(sentence) for sentence in scanned if sentence.sentence_type in _DATED)
     log.now_ns = next((date for date in dates if date is not None), None)
     first_ns = log.now_ns
     for sentence in _sentences(log):
@@ -111,37 +110,38 @@ def read_nmea(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.
 
 
 def _check_day(first_ns: int, log: _Log) -> None:
-    """Raise CampaignError where the config's day is neither that of the first date nor that of the first epoch."""
+    """Raise CampaignError if the configured date is neither the first logged date nor that of the first epoch."""
     day = start_time(log.options, "", node=log.node, where=log.path).astype("datetime64[D]")
     days = [np.datetime64(time_ns, "ns").astype("datetime64[D]") for time_ns in (first_ns, *log.order[:1])]
     if day not in days:
-        raise contradicted("start_utc", f"RMC or ZDA date its first epoch {days[-1]}", node=log.node, where=log.path)
+        found = f"the date of the first epoch by RMC or ZDA is {days[-1]}"
+        raise contradicted("start_utc", found, node=log.node, where=log.path)
 
 
 def _sentences(log: _Log) -> Iterator[Any]:
-    """Yield the sentences that are wanted and whole; those that are broken are counted."""
+    """Yield the complete sentences of the types to be read; count damaged ones."""
     lines = log.data.splitlines()
     ended = not log.data or log.data[-1:] in b"\r\n"
     for row, line in enumerate(lines, 1):
         stamp, *pieces = line.split(b"$")
-        for place, piece in enumerate(pieces):
+        for index, piece in enumerate(pieces):
             match = _BODY.match(piece)
             if match:
-                log.stamped += place == 0 and bool(_STAMP.fullmatch(stamp))
-                last = place + 1 == len(pieces) and (row < len(lines) or ended)
-                yield from _whole(match[1].decode("latin-1"), match[2], log, ended=last)
+                log.stamped += index == 0 and bool(_STAMP.fullmatch(stamp))
+                last = index + 1 == len(pieces) and (row < len(lines) or ended)
+                yield from _complete(match[1].decode("latin-1"), match[2], log, ended=last)
 
 
-def _whole(text: str, checksum: bytes | None, log: _Log, *, ended: bool) -> Iterator[Any]:
-    """Yield a sentence that is wanted and whole; `ended`: a line end follows it."""
+def _complete(text: str, checksum: bytes | None, log: _Log, *, ended: bool) -> Iterator[Any]:
+    """Yield a sentence if it is complete and of a type to be read; `ended`: a line end follows it."""
     unsealed = checksum is None and ended and text.count(",") >= _COMMAS.get(text[2:5], 1)
     if unsealed and not log.sealed:
         checksum, text = b"", text.rstrip()
     elif unsealed:
-        log.dropped["sentences without a checksum, which others have"] += 1
+        log.dropped["sentences without a checksum in a log with checksums"] += 1
         return
     elif checksum is None or len(checksum) < 3:
-        log.dropped["sentences broken off"] += 1
+        log.dropped["truncated sentences"] += 1
         return
     elif int(checksum[1:], 16) != NMEASentence.checksum(text):
         log.dropped["sentences with a wrong checksum"] += 1
@@ -153,25 +153,25 @@ def _whole(text: str, checksum: bytes | None, log: _Log, *, ended: bool) -> Iter
         try:
             yield NMEASentence.parse(f"${text}{checksum.decode()}", check=bool(checksum))
         except ParseError as error:
-            raise _error(f"sentence {quoted(text, 100)}", log.path) from error
+            raise _error(f"invalid sentence {quoted(text, 100)}", log.path) from error
 
 
 def _time_of_day(text: str) -> int | None:
-    """Return nanoseconds since midnight, None where the time is empty; ValueError if it is none."""
+    """Parse a time of day to nanoseconds since midnight, None if it is empty; ValueError if it is invalid."""
     if not text:
         return None
     match = _TIME.fullmatch(text)
     if not match:
-        raise ValueError(f"time {quoted(text, 40)}")
+        raise ValueError(f"invalid time {quoted(text, 40)}")
     hour, minute, second = (int(match[part]) for part in (1, 2, 3))
     return (hour * 3600 + minute * 60 + second) * _SECOND_NS + int((match[4] or "").ljust(9, "0"))
 
 
 def _dated(sentence: Any) -> int | None:
-    """Return nanoseconds since 1970 of a sentence with a date; None where it has none or is not valid."""
+    """Return date and time of a sentence as nanoseconds since 1970; None if they are missing or invalid."""
     data = [*sentence.data, *[""] * 9]
     if sentence.sentence_type == "RMC":
-        day, month, year = (data[8][place : place + 2] for place in (0, 2, 4))
+        day, month, year = (data[8][start : start + 2] for start in (0, 2, 4))
         year = f"20{year}"
     else:
         day, month, year = data[1:4]
@@ -190,7 +190,7 @@ def _take(sentence: Any, log: _Log) -> None:
     if kind in _DATED:
         date = _dated(sentence)
         if date is not None and log.order and log.now_ns and abs(date + _DAY_NS - log.now_ns) < _LATE_NS:
-            log.late_dates += 1  # some receivers write the day before for a moment after midnight
+            log.late_dates += 1  # some receivers log the previous date for a moment after midnight
             date += _DAY_NS
         log.now_ns = date or log.now_ns
         return
@@ -211,11 +211,11 @@ def _take(sentence: Any, log: _Log) -> None:
     except (ValueError, IndexError) as error:
         if isinstance(error, CampaignError):
             raise
-        raise _error(f"sentence {quoted(str(sentence), 100)} ({error})", log.path) from error
+        raise _error(f"invalid sentence {quoted(str(sentence), 100)} ({error})", log.path) from error
 
 
 def _nearest(of_day: int, log: _Log) -> int:
-    """Return the time of that time of day that is nearest to the last one; the config has the day of the first."""
+    """Return the date and time of a time of day nearest to the previous epoch; the first date is the configured one."""
     if log.now_ns is None:
         found = "times of day only, no RMC or ZDA with a date"
         start = start_time(log.options, found, node=log.node, where=log.path)
@@ -224,7 +224,7 @@ def _nearest(of_day: int, log: _Log) -> int:
 
 
 def _fix(sentence: Any, log: _Log) -> _Fix | None:
-    """Return the position of a GGA, or None and count it where it is no measured position."""
+    """Parse the position of a GGA; if it is not a measured position, count it and return None."""
     data = sentence.data
     quality = data[5]
     reason = GGA_NOT_MEASURED.get(quality)
@@ -234,28 +234,28 @@ def _fix(sentence: Any, log: _Log) -> _Fix | None:
         log.dropped[reason] += 1
         return None
     if quality not in GGA_KINDS or data[9] != "M" or data[2] not in "NS" or data[4] not in "EW":
-        raise ValueError("a quality, unit or hemisphere that NMEA has not")
+        raise ValueError("invalid quality, unit or hemisphere")
     separation = number(data[10]) if data[10] and data[11] == "M" else np.nan
     geodetic = sentence.latitude, sentence.longitude, number(data[8])
     return _Fix(sentence.talker, geodetic, separation, FIXES[GGA_KINDS[quality]])
 
 
 def _keep(now: int, fix: _Fix, log: _Log) -> None:
-    """Add an epoch; of several talkers at one time GN's, of repeated ones one."""
+    """Add an epoch; prefer GN among several talkers with the same time, and drop repeated sentences."""
     other = log.fixes.get(now)
     if other is None:
         log.fixes[now] = fix
         log.order.append(now)
     elif other.talker != fix.talker:
-        log.dropped["of another talker"] += 1
+        log.dropped["from another talker"] += 1
         log.fixes[now] = fix if fix.talker == "GN" else other
     elif other == fix:
-        log.dropped["said twice"] += 1
+        log.dropped["duplicate"] += 1
     else:
         raise CampaignError(
             f"two positions of talker {fix.talker} at {np.datetime64(now, 'ns')}",
             log.path,
-            "one receiver's sentences",
+            "sentences of a single receiver",
             "Separate the receivers.",
         )
 
@@ -268,14 +268,14 @@ def _track(log: _Log) -> xr.Dataset:
     geodetic = np.array([fix.geodetic for fix in fixes]).reshape(-1, 3)
     separation = np.array([fix.separation for fix in fixes])
     has_separation = np.isfinite(separation)
-    if not separation[has_separation].any():  # a receiver without a model of the geoid writes 0 throughout
+    if not separation[has_separation].any():  # a receiver without a geoid model logs 0 throughout
         if fixes and log.options.height_offset_m is None:
             found = "altitudes above mean sea level, without geoid separation"
             raise unstated("height_offset_m", found, node=log.node, where=log.path)
         has_separation = np.ones(len(fixes), bool)
         separation = np.full(len(fixes), log.options.height_offset_m or 0.0)
     elif log.options.height_offset_m is not None:
-        raise contradicted("height_offset_m", "GGA states the geoid separation", node=log.node, where=log.path)
+        raise contradicted("height_offset_m", "GGA contains the geoid separation", node=log.node, where=log.path)
     if not has_separation.all():
         log.dropped["without geoid separation"] += int((~has_separation).sum())
     geodetic[:, 2] += separation
@@ -290,13 +290,13 @@ def _track(log: _Log) -> xr.Dataset:
         where=log.path,
     )
     if log.stamped:
-        track = remarked(track, f"{log.stamped} lines begin with a host's stamp, which is not used", log.path)
+        track = remarked(track, f"{log.stamped} lines start with a time stamp of the host, which is ignored", log.path)
     if log.late_dates:
-        found = f"{log.late_dates} dates after midnight are those of the day before, and are taken for the next"
-        track = remarked(track, found, log.path)
+        remark = f"{log.late_dates} dates after midnight are those of the previous day; corrected by one day"
+        track = remarked(track, remark, log.path)
     if log.unsealed:
-        found = f"none of {log.unsealed} sentences has a checksum: damaged digits are not noticed"
-        track = remarked(track, found, log.path)
+        remark = f"none of {log.unsealed} sentences has a checksum: damaged digits are not detected"
+        track = remarked(track, remark, log.path)
     return track
 
 

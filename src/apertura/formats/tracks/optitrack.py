@@ -1,4 +1,4 @@
-"""Motion captures as OptiTrack's Motive exports them (CSV): rigid bodies in a room, which is the campaign's frame."""
+"""Motion captures exported by OptiTrack's Motive (CSV): rigid bodies in a room, the local frame of the campaign."""
 
 import csv
 from pathlib import Path
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from apertura.common.documents import read_text
 from apertura.common.errors import CampaignError, quoted
 from apertura.formats.tracks.csv_track import LARGEST_LOG, number
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 from apertura.formats.tracks.track import make_track, start_time, unstated
 
 _METRES = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}
@@ -24,20 +24,21 @@ _ENU_FROM_MOTIVE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
 """Rows are east, north and up in Motive's x, y (up) and z."""
 
 _NED_FROM_MOTIVE = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""Rows are north, east and down; of a body forward, right and down: one as it was defined flies level to north."""
+"""Rows are north, east and down; for a body forward, right and down: as defined, a body is level and faces north."""
 
 
-def read_optitrack(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
-    """Return the `track` stage of a rigid body in a motion capture, options.body where there are several.
+def read_optitrack(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> xr.Dataset:
+    """Read a rigid body of a motion capture as `track` stage; options.body selects one of several bodies.
 
     Frame 'local': east is Motive's x, north its −z, up its y. Attitude is that of axes forward, right, down that were
-    −z, x and −y when the body was defined. Times are options.start_utc plus the take's seconds: its own Capture Start
-    Time is a wall clock without zone. Frames in which the body was not tracked are left out and counted.
+    −z, x and −y when the body was defined. Times are options.start_utc plus the seconds of the take, whose Capture
+    Start Time is local time without a zone. Frames in which the body was not tracked are excluded and counted.
 
     Raises
     ------
     CampaignError
-        If it is no such table, the body is not in it or not chosen, a line is not whole, or start_utc is not given.
+        If the file is not such a table, the body is missing or not selected, a line is incomplete, or start_utc is not
+        configured.
 
     Notes
     -----
@@ -51,7 +52,7 @@ def read_optitrack(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -
         raise _error(f"heading: {error}", path) from error
     first = next((row for row, cells in enumerate(heading) if cells[:1] == ["Frame"]), None)
     if first is None:
-        raise _error("no line that begins with Frame", path)
+        raise _error("no line that starts with Frame", path)
     scale = _metres(heading[0], path)
     columns = _columns(heading[: first + 1], options.body, node=node, where=path)
     cut = text[-1] not in "\r\n" and len(lines) > first + 1
@@ -59,30 +60,30 @@ def read_optitrack(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -
     tracked = np.isfinite(values).all(axis=1)
     if (np.isfinite(values).any(axis=1) & ~tracked).any():
         row = int(np.flatnonzero(np.isfinite(values).any(axis=1) & ~tracked)[0])
-        raise _error(f"half a pose at {time_s[row]:g} s", path)
+        raise _error(f"incomplete pose at {time_s[row]:g} s", path)
     quaternion, position = values[tracked, :4], values[tracked, 4:] * scale
     if (np.abs(np.linalg.norm(quaternion, axis=1) - 1) > _UNIT).any():
-        raise _error("a rotation that is no quaternion of length 1", path)
-    found = "seconds since the capture's start, which is a wall clock without zone"
+        raise _error("a rotation that is not a unit quaternion", path)
+    found = "seconds since the start of the capture, which is local time without a zone"
     start = start_time(options, found, node=node, where=path)
-    counts = {"body not seen": int((~tracked).sum()), "line cut off": int(cut)}
+    counts = {"body not tracked": int((~tracked).sum()), "truncated line": int(cut)}
     return make_track(
         start + np.round(time_s[tracked] * 1e9).astype("timedelta64[ns]"),
         position @ _ENU_FROM_MOTIVE.T,
         frame="local",
         attitude_deg=_attitude_deg(quaternion),
-        dropped={why: count for why, count in counts.items() if count},
+        dropped={reason: count for reason, count in counts.items() if count},
         node=node,
         where=path,
     )
 
 
 def _metres(cells: list[str], path: Path) -> float:
-    """Return metres of the take's unit; check the other fields of its first line."""
+    """Return the length unit of the take in metres; check the other fields of its first line."""
     fields = dict(zip(cells[::2], cells[1::2], strict=False))
-    for key, wanted in (("Rotation Type", ["quaternion"]), ("Coordinate Space", ["global"]), ("Length Units", _METRES)):
-        if fields.get(key, "").lower() not in wanted:
-            raise _error(f"{key} {quoted(fields.get(key, ''))}, not {' or '.join(wanted)}", path)
+    for key, valid in (("Rotation Type", ["quaternion"]), ("Coordinate Space", ["global"]), ("Length Units", _METRES)):
+        if fields.get(key, "").lower() not in valid:
+            raise _error(f"{key} {quoted(fields.get(key, ''))}, not {' or '.join(valid)}", path)
     return _METRES[fields["Length Units"].lower()]
 
 
@@ -93,30 +94,30 @@ def _columns(heading: list[list[str]], body: str | None, *, node: str, where: Pa
     titled = {row[1]: row for row in rows if row[0] == ""}
     kinds, names, quantities, axes = titled.get("Type"), titled.get("Name"), titled.get(""), heading[-1]
     if kinds is None or names is None or quantities is None or axes[1] != "Time (Seconds)":
-        raise _error("no lines Type, Name, Rotation and Position, Time (Seconds)", where)
-    place = {
+        raise _error("heading lines Type, Name, Rotation and Position, or Time (Seconds) missing", where)
+    column_of = {
         (name, quantity, axis): column
         for column, (kind, name, quantity, axis) in enumerate(zip(kinds, names, quantities, axes, strict=True))
         if kind == "Rigid Body"
     }
-    bodies = list(dict.fromkeys(name for name, _, _ in place))
+    bodies = list(dict.fromkeys(name for name, _, _ in column_of))
     listed = ", ".join(quoted(name, 40) for name in bodies)
     if body is None and len(bodies) != 1:
         raise unstated("body", f"rigid bodies {listed}" if bodies else "no rigid body", node=node, where=where)
     chosen = body if body is not None else bodies[0]
     if chosen not in bodies:
         raise _error(f"no rigid body {quoted(chosen, 40)} among {listed}", where)
-    lacking = [f"{quantity} {axis}" for quantity, axis in _NEEDED if (chosen, quantity, axis) not in place]
-    doubled = names.count(chosen) != len([key for key in place if key[0] == chosen])
-    if lacking or doubled:
-        raise _error(f"{lacking[0] if lacking else 'columns'} of body {quoted(chosen, 40)} missing or doubled", where)
-    return [1, *(place[chosen, quantity, axis] for quantity, axis in _NEEDED)]
+    missing = [f"{quantity} {axis}" for quantity, axis in _NEEDED if (chosen, quantity, axis) not in column_of]
+    is_repeated = names.count(chosen) != len([key for key in column_of if key[0] == chosen])
+    if missing or is_repeated:
+        raise _error(f"{missing[0] if missing else 'columns'} of body {quoted(chosen, 40)} missing or repeated", where)
+    return [1, *(column_of[chosen, quantity, axis] for quantity, axis in _NEEDED)]
 
 
 def _numbers(
     lines: list[str], width: int, columns: list[int], first: int, path: Path
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return seconds (frame,) and a pose (frame, 7), NaN where a cell is empty; `first` numbers the first line."""
+    """Parse seconds (frame,) and poses (frame, 7), NaN for empty cells; `first` is the number of the first line."""
     rows = []
     for line, text in enumerate(lines, first):
         if not text.strip():
@@ -131,16 +132,16 @@ def _numbers(
     values = np.array(rows).reshape(-1, len(columns))
     beyond = np.flatnonzero(~(np.abs(values[:, 0]) < 1e6))
     if beyond.size:
-        raise _error(f"a time of {values[beyond[0], 0]:g} s", path)
+        raise _error(f"a time of {values[beyond[0], 0]:g} s, beyond ±1e6 s", path)
     return values[:, 0], values[:, 1:]
 
 
 def _attitude_deg(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return roll, pitch and yaw of (frame, 4) x, y, z, w: Rz(yaw)·Ry(pitch)·Rx(roll) = N·Q·Nᵀ."""
+    """Convert quaternions (frame, 4) x, y, z, w to roll, pitch and yaw: Rz(yaw)·Ry(pitch)·Rx(roll) = N·Q·Nᵀ."""
     from scipy.spatial.transform import Rotation  # slow to import
 
-    turned = _NED_FROM_MOTIVE @ Rotation.from_quat(quaternion).as_matrix() @ _NED_FROM_MOTIVE.T
-    return np.asarray(Rotation.from_matrix(turned).as_euler("ZYX", degrees=True)[:, ::-1])
+    ned_from_body = _NED_FROM_MOTIVE @ Rotation.from_quat(quaternion).as_matrix() @ _NED_FROM_MOTIVE.T
+    return np.asarray(Rotation.from_matrix(ned_from_body).as_euler("ZYX", degrees=True)[:, ::-1])
 
 
 def _error(found: str, path: Path) -> CampaignError:

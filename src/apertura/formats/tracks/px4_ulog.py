@@ -1,4 +1,4 @@
-"""PX4 flight logs (.ulg): the receiver's own epochs, or positions fused with inertial ones, and attitude."""
+"""PX4 flight logs (.ulg): GNSS epochs of the receiver, or positions fused with inertial data, and attitude."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,7 +14,7 @@ from apertura.formats.isolated import UnreadableError, read_isolated
 from apertura.formats.tracks import ulog_fields
 from apertura.formats.tracks.autopilot import Attitude, Epochs, autopilot_track, clock_of
 from apertura.formats.tracks.damage import damage_of
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 from apertura.formats.tracks.track import FIXES, damaged, receivers_remark, remarked
 from apertura.formats.tracks.ulog_fields import ATTITUDE, CORRUPT, DAMAGE, DELAY, DROPOUTS, FUSED, RECEIVERS
 
@@ -24,43 +24,43 @@ _KINDS = {3: FIXES["single"], 4: FIXES["dgps"], 5: FIXES["float"], 6: FIXES["fix
 """fix_type; below 3 there is no height, 8 is extrapolated."""
 
 _STATES = {"dead_reckoning": 0, "lat_lon_valid": 1, "alt_valid": 1}
-"""What flags of fused positions are where a receiver holds them; versions of PX4 log some of them."""
+"""State flag of fused positions → its value while GNSS is used; each version of PX4 logs some of the flags."""
 
 _ALWAYS = ("fix_type", "vel_n_m_s", "vel_e_m_s", "vel_d_m_s")
-"""Fields of receivers in every version of PX4; one that is not there was damaged."""
+"""Receiver fields that every version of PX4 logs; a missing one indicates a damaged log."""
 
 _DELAY_MS = 110.0
-_FIRST_US, _LAST_US = 3.2e14, 7.2e15  # of UTC, 1980 to 2198; 0 is: not known
+_FIRST_US, _LAST_US = 3.2e14, 7.2e15  # UTC from 1980 to 2198; 0 means unknown
 _LATITUDE, _LONGITUDE = ("latitude_deg", "lat"), ("longitude_deg", "lon")
 _ELLIPSOIDAL, _SEA_LEVEL = ("altitude_ellipsoid_m", "alt_ellipsoid"), ("altitude_msl_m", "alt")
 _SCALES = {"lat": 1e-7, "lon": 1e-7, "alt": 1e-3, "alt_ellipsoid": 1e-3}
-"""Of fields that are integers; otherwise they are degrees and metres."""
+"""Factors of integer fields; other fields are in degrees and metres."""
 
 _EXPECTED = f"a PX4 ULog with positions in {', '.join((*RECEIVERS, FUSED))}"
 
 
-def read_px4_ulog(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
-    """Return the `track` stage of a PX4 ULog; its attribute `source` names the topic and instance used.
+def read_px4_ulog(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> xr.Dataset:
+    """Read a PX4 ULog as `track` stage; its attribute `source` states the topic and instance used.
 
-    Taken is the first there is of vehicle_gps_position, sensor_gps: the receiver's solution, at its own time in UTC and
-    of its own antenna; else vehicle_global_position, whose height follows a barometer and whose time is found through
-    the receiver's. ``options.body`` chooses: a topic, or one of several receivers as ``sensor_gps:1``. Attitude comes
-    from vehicle_attitude. Heights are ellipsoidal; where the driver copies those above sea level, or has none,
-    ``options.height_offset_m`` makes them so.
+    The source is vehicle_gps_position if logged, otherwise sensor_gps: the solution of the receiver for its antenna, at
+    the UTC of the receiver; otherwise vehicle_global_position, whose height follows a barometer and whose time is
+    derived from that of the receiver. ``options.body`` selects a topic, or one of several receivers as
+    ``sensor_gps:1``. Attitude is read from vehicle_attitude. Heights are ellipsoidal; if the driver logs none, or
+    copies heights above sea level, ``options.height_offset_m`` converts the latter.
 
     Parameters
     ----------
     path
         The log.
     node
-        Its node.
+        Node of the log.
     options
-        start_utc: UTC at the autopilot's start, where its receiver gave none.
+        start_utc: UTC at the start of the autopilot, if its receiver provides no UTC.
 
     Raises
     ------
     CampaignError
-        If the file is no ULog, or holds no positions, no ellipsoidal heights or no UTC.
+        If the file is not a ULog, or contains no positions, no ellipsoidal heights or no UTC.
 
     Notes
     -----
@@ -74,19 +74,19 @@ def read_px4_ulog(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) ->
 
 
 def track_of(fields: Fields, *, node: str, options: LogOptions, where: Path) -> xr.Dataset:
-    """Return the `track` stage of what `apertura.formats.tracks.ulog_fields` read.
+    """Build the `track` stage from the fields of a ULog.
 
     Parameters
     ----------
     fields
-        Its answer.
+        Result of `apertura.formats.tracks.ulog_fields.read_fields`.
     node, options, where
-        As `read_px4_ulog`.
+        See `read_px4_ulog`.
 
     Raises
     ------
     CampaignError
-        As `read_px4_ulog`.
+        See `read_px4_ulog`.
     """
     source = _source(fields, options, node, where)
     delay_s = float(fields.get(DELAY, [_DELAY_MS])[0]) / 1e3
@@ -98,7 +98,7 @@ def track_of(fields: Fields, *, node: str, options: LogOptions, where: Path) -> 
         if receiver_time is not None and receiver_time[0].size:
             clock = clock_of(*receiver_time, delay_s=delay_s, where=where)[0]
             epochs = replace(epochs, time_utc=clock.utc(epochs.boot_s))
-        delay_s = 0.0  # the estimator's positions are of the moment that it writes
+        delay_s = 0.0  # fused positions are valid at their time stamps
     track = autopilot_track(epochs, _attitude(fields), delay_s=delay_s, options=options, node=node, where=where)
     track.attrs["source"] = source
     return _with_remarks(track, fields, source, options, node, where)
@@ -107,15 +107,15 @@ def track_of(fields: Fields, *, node: str, options: LogOptions, where: Path) -> 
 def _with_remarks(
     track: xr.Dataset, fields: Fields, source: str, options: LogOptions, node: str, where: Path
 ) -> xr.Dataset:
-    """Return a track with remarks on damage, dropouts of the logger and other receivers of the log."""
+    """Add remarks on damage, dropouts of the logger and other receivers to the track of a log."""
     damage = damage_of(fields[DAMAGE]) if DAMAGE in fields else ""
     if not damage and CORRUPT in fields and fields[CORRUPT].any():
-        damage = "some messages do not fit the formats that the log states; epochs may be lost"
+        damage = "some messages do not match the message formats defined in the log; epochs may be lost"
     track = damaged(track, damage, where)
     dropouts = fields.get(DROPOUTS, np.zeros(0, np.int64))
     if dropouts.size:
-        found = f"{dropouts.size} dropouts of the logger, {dropouts.sum() / 1e3:.1f} s in all: messages are lost there"
-        track = remarked(track, found, where)
+        remark = f"{dropouts.size} dropouts of the logger, total {dropouts.sum() / 1e3:.1f} s: their messages are lost"
+        track = remarked(track, remark, where)
     receivers = [name for name in _sources(fields) if not name.startswith(FUSED)]
     several = len({name for name in receivers if name.startswith(source.partition(":")[0])}) > 1
     if several and options.body is None:
@@ -125,42 +125,42 @@ def _with_remarks(
 
 
 def _fix(fields: Fields, source: str) -> NDArray[np.int8]:
-    """Return the kind of solution of each message of a receiver; 0 without a position in three dimensions."""
+    """Return the solution type of each message of a receiver; 0 without a 3D fix."""
     kinds = fields.get(f"{source}/fix_type", np.zeros(0, np.uint8))
     return np.array([_KINDS.get(int(kind), 0) for kind in kinds], np.int8)
 
 
 def _sources(fields: Fields) -> list[str]:
-    """Return topic:instance of positions, best first."""
-    there = {name.partition("/")[0] for name in fields}
-    return [name for topic in (*RECEIVERS, FUSED) for name in sorted(there) if name.startswith(f"{topic}:")]
+    """List topic:instance of the logged positions, best first."""
+    instances = {name.partition("/")[0] for name in fields}
+    return [name for topic in (*RECEIVERS, FUSED) for name in sorted(instances) if name.startswith(f"{topic}:")]
 
 
 def _source(fields: Fields, options: LogOptions, node: str, where: Path) -> str:
     known = _sources(fields)
     matching = [name for name in known if options.body in (None, name, name.partition(":")[0])]
     if not known:
-        raise _error("no message of any of them", where)
+        raise _error("no position messages", where)
     if not matching:
         raise CampaignError(
             f"no positions of {quoted(options.body)}",
             where,
             f"one of {', '.join(known)}",
-            f"Correct nodes.{node}.log.body, or leave it out.",
+            f"Correct nodes.{node}.log.body, or omit it.",
         )
     return matching[0]
 
 
 def _epochs(fields: Fields, source: str, options: LogOptions, node: str, where: Path) -> Epochs:
-    """Return epochs of a topic; those of the fused one have no time yet."""
+    """Return the epochs of a topic; those of fused positions have no UTC yet."""
     latitude, longitude = (_first(fields, source, names) for names in (_LATITUDE, _LONGITUDE))
     if latitude is None or longitude is None:
         raise _error(f"no latitude and longitude in {source}", where)
-    of = {name: fields.get(f"{source}/{name}") for name in ("fix_type", "eph", "epv")}
-    fix = None if of["fix_type"] is None else _fix(fields, source)
-    lacking = [name for name in _ALWAYS if f"{source}/{name}" not in fields and not source.startswith(FUSED)]
-    if lacking:
-        raise _error(f"no {', '.join(lacking)} in {source}", where)
+    quality = {name: fields.get(f"{source}/{name}") for name in ("fix_type", "eph", "epv")}
+    fix = None if quality["fix_type"] is None else _fix(fields, source)
+    missing = [name for name in _ALWAYS if f"{source}/{name}" not in fields and not source.startswith(FUSED)]
+    if missing:
+        raise _error(f"no {', '.join(missing)} in {source}", where)
     has_fix = np.ones(latitude.size, bool) if fix is None else fix > 0
     for name, good in _STATES.items():
         has_fix &= np.asarray(fields.get(f"{source}/{name}", good)) == good
@@ -169,14 +169,14 @@ def _epochs(fields: Fields, source: str, options: LogOptions, node: str, where: 
     if not source.startswith(FUSED):
         boot_s, utc = _arrived(fields, source), _utc(fields, source)
     unknown = np.full(latitude.size, np.nan)
-    across, up = (unknown if one is None else _numbers(one) for one in (of["eph"], of["epv"]))
+    horizontal, up = (unknown if values is None else _numbers(values) for values in (quality["eph"], quality["epv"]))
     height = _height(fields, source, has_fix, options.height_offset_m)
     if height is None:
         raise CampaignError(
-            f"{source} holds no heights above the ellipsoid",
+            f"{source} contains no heights above the ellipsoid",
             where,
-            "altitude_ellipsoid_m or alt_ellipsoid other than the height above sea level",
-            f"Set nodes.{node}.log.height_offset_m: what makes heights above sea level ellipsoidal (the geoid's).",
+            "altitude_ellipsoid_m or alt_ellipsoid that differs from the height above sea level",
+            f"Set nodes.{node}.log.height_offset_m to the geoid undulation, to convert heights above sea level.",
         )
     return Epochs(
         boot_s,
@@ -184,7 +184,7 @@ def _epochs(fields: Fields, source: str, options: LogOptions, node: str, where: 
         np.stack([latitude, longitude, height], -1),
         has_fix,
         fix,
-        np.stack([across, across, up], -1),
+        np.stack([horizontal, horizontal, up], -1),
         _velocity(fields, source),
     )
 
@@ -195,7 +195,7 @@ def _height(
     ellipsoidal, sea_level = (_first(fields, source, names) for names in (_ELLIPSOIDAL, _SEA_LEVEL))
     copied = ellipsoidal is None or not has_fix.any()
     if ellipsoidal is not None and has_fix.any():
-        # a driver without the geoid's height writes 0, or one height twice; nowhere is the geoid flat to a millimetre
+        # a driver without geoid undulation logs 0, or the same height twice; a real undulation is never zero to 1 mm
         copied = not ellipsoidal[has_fix].any()
         copied |= sea_level is not None and bool(np.abs((ellipsoidal - sea_level)[has_fix]).max() < 1e-3)
     if not copied:
@@ -212,7 +212,7 @@ def _velocity(fields: Fields, source: str) -> NDArray[np.float64]:
 
 
 def _first(fields: Fields, source: str, names: tuple[str, ...]) -> NDArray[np.float64] | None:
-    """Return the first field that there is, in degrees or metres."""
+    """Return the first of several fields that is logged, in degrees or metres."""
     for name in names:
         values = fields.get(f"{source}/{name}")
         if values is not None:
@@ -221,14 +221,14 @@ def _first(fields: Fields, source: str, names: tuple[str, ...]) -> NDArray[np.fl
 
 
 def _numbers(values: NDArray[Any]) -> NDArray[np.float64]:
-    with np.errstate(invalid="ignore"):  # a NaN that signals stays one, and is refused as such
+    with np.errstate(invalid="ignore"):  # a signalling NaN stays NaN and is rejected later
         return np.asarray(values, np.float64)
 
 
 def _arrived(fields: Fields, source: str) -> NDArray[np.float64]:
-    """Return the autopilot's clock at the UTC time of each message."""
-    later = fields.get(f"{source}/timestamp_time_relative", np.zeros(1))
-    return np.asarray((fields[f"{source}/timestamp"].astype(np.float64) + later) * 1e-6)
+    """Return the time of the autopilot's clock at the UTC of each message."""
+    offset_us = fields.get(f"{source}/timestamp_time_relative", np.zeros(1))
+    return np.asarray((fields[f"{source}/timestamp"].astype(np.float64) + offset_us) * 1e-6)
 
 
 def _utc(fields: Fields, source: str) -> NDArray[np.datetime64]:
@@ -242,7 +242,7 @@ def _utc(fields: Fields, source: str) -> NDArray[np.datetime64]:
 
 
 def _of_receiver(fields: Fields, source: str) -> tuple[NDArray[np.float64], NDArray[np.datetime64]]:
-    """Return times of the autopilot's clock and their UTC by a receiver."""
+    """Return times of the autopilot's clock and the corresponding UTC of a receiver."""
     utc = _utc(fields, source)
     known = ~np.isnat(utc)
     return _arrived(fields, source)[known], utc[known]

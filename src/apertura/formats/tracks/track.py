@@ -1,4 +1,4 @@
-"""Stage `track`, common to all flight logs: times in UTC, positions in ECEF, attitude in radians."""
+"""Stage `track`, the common form of all flight logs: times in UTC, positions in ECEF, attitude in radians."""
 
 import re
 from collections.abc import Mapping
@@ -16,25 +16,25 @@ from apertura.formats.times import outside, utc_times
 from apertura.formats.tracks.log_options import LogOptions
 
 FIXES = {"fix": 1, "float": 2, "sbas": 3, "dgps": 4, "single": 5, "ppp": 6}
-"""Kinds of solution by RTKLIB's numbers, Q."""
+"""Solution type → RTKLIB's number, Q."""
 
 GGA_KINDS = {"1": "single", "2": "dgps", "3": "single", "4": "fix", "5": "float", "9": "sbas"}
-"""Quality of NMEA's GGA → kind of solution, a key of `FIXES`; 9 as NovAtel writes it."""
+"""Quality indicator of NMEA GGA → solution type, a key of `FIXES`; 9 as defined by NovAtel."""
 
-GGA_NOT_MEASURED = {"": "no fix", "0": "no fix", "6": "dead reckoning", "7": "typed in", "8": "simulated"}
-"""Quality of NMEA's GGA → why an epoch is no measured position."""
+GGA_NOT_MEASURED = {"": "no fix", "0": "no fix", "6": "dead reckoning", "7": "manual input", "8": "simulated"}
+"""Quality indicator of NMEA GGA → reason why the position is not a measured one."""
 
 LOWEST_M, HIGHEST_M = -1000.0, 100_000.0
-"""Heights above the ellipsoid that an aircraft or a balloon logs."""
+"""Accepted heights above the ellipsoid, m, of aircraft and balloons."""
 
 FARTHEST_M = 1e5
-"""From the origin of a local frame."""
+"""Largest accepted local coordinate, m."""
 
 _ROLLOVER = np.timedelta64(1024 * 7, "D")
-"""Period of the week number that GPS satellites send."""
+"""Period of the GPS week number as broadcast by the satellites."""
 
 _EARTH_M = 6.37e6
-_NOWHERE_DEG = 1e-7  # a receiver without a fix logs 0, 0; no flight passes within a centimetre of it
+_NOWHERE_DEG = 1e-7  # a receiver without a fix logs 0, 0; no flight passes within a centimetre of that point
 _WIDEST_DEG = 1080.0
 _WORST_STD_M = 1e7
 
@@ -51,32 +51,35 @@ def make_track(
     node: str,
     where: Path,
 ) -> xr.Dataset:
-    """Return the `track` stage of epochs that `node` logged in the file `where`.
+    """Build the `track` stage of a node from the epochs of its log.
 
     Parameters
     ----------
     time_utc
-        (epoch,) datetime64[ns], UTC, strictly increasing; or strictly decreasing, as of a filter that ran backward:
-        the epochs are then reversed, with a remark.
+        (epoch,) datetime64[ns], UTC, strictly increasing; or strictly decreasing, as from a backward filter: the epochs
+        are then reversed, with a remark.
     position
         (epoch, 3) float64 in `frame`.
     frame
         geodetic: WGS 84 latitude (deg), longitude (deg), ellipsoidal height (m); epochs at latitude 0, longitude 0 have
-        no fix, and are dropped. ecef: metres. local: metres to east, north and up in axes of the campaign's own.
+        no fix and are dropped. ecef: metres. local: metres to east, north and up in the campaign's local frame.
     attitude_deg
-        (epoch, 3) float64: roll, pitch, yaw in degrees, yaw clockwise from north; NaN or None where not logged.
+        (epoch, 3) float64: roll, pitch, yaw in degrees, yaw clockwise from north; NaN or None: not logged.
     position_std_m
-        (epoch, 3) float64: standard deviations to north, east and up, metres, NaN or infinite where not known; None:
-        nowhere.
+        (epoch, 3) float64: standard deviations to north, east and up, m; NaN or infinite: unknown; None: not logged.
     fix
-        (epoch,) int8: kind of solution, a value of `FIXES`, 0 where not logged; None: nowhere.
+        (epoch,) int8: solution type, a value of `FIXES`; 0 or None: not logged.
     dropped
-        Reason → how many epochs of the log the reader left out.
+        Reason → number of epochs excluded by the reader.
+    node
+        Node name.
+    where
+        The log, for messages.
 
     Raises
     ------
     CampaignError
-        If times do not increase, or a value is not finite or is none that a flight on Earth has.
+        If times do not increase, or a value is not finite or outside the range of a flight on Earth.
 
     Examples
     --------
@@ -86,18 +89,24 @@ def make_track(
     array([      0., 6378138.,       0.])
     """
     has_fix = (np.abs(position[:, :2]) >= _NOWHERE_DEG).any(axis=1) | (frame != "geodetic")
-    left_out = {**(dropped or {}), **({"no fix": int((~has_fix).sum())} if not has_fix.all() else {})}
+    excluded = {**(dropped or {}), **({"no fix": int((~has_fix).sum())} if not has_fix.all() else {})}
     time_utc, position = time_utc[has_fix], position[has_fix]
-    attitude_deg, position_std_m = (None if one is None else one[has_fix] for one in (attitude_deg, position_std_m))
+    attitude_deg, position_std_m = (
+        None if values is None else values[has_fix] for values in (attitude_deg, position_std_m)
+    )
     fix = None if fix is None else fix[has_fix]
     if len(time_utc) < 2:
-        without = f" ({', '.join(f'{count} left out: {why}' for why, count in left_out.items())})" if left_out else ""
+        without = (
+            f" ({', '.join(f'{count} excluded: {reason}' for reason, count in excluded.items())})" if excluded else ""
+        )
         raise CampaignError(f"{len(time_utc)} epochs{without}", where, "at least two", "Export the whole log.")
     remarks = []
     if len(time_utc) > 2 and (np.diff(time_utc) < np.timedelta64(0, "ns")).all():
-        remarks.append("times descend, as of a filter that ran backward: the epochs are read in reverse")
+        remarks.append("times decrease, as from a backward filter: the epochs are read in reverse order")
         time_utc, position = time_utc[::-1], position[::-1]
-        attitude_deg, position_std_m = (None if one is None else one[::-1] for one in (attitude_deg, position_std_m))
+        attitude_deg, position_std_m = (
+            None if values is None else values[::-1] for values in (attitude_deg, position_std_m)
+        )
         fix = None if fix is None else fix[::-1]
     _check_times(time_utc, where)
     remarks += _rolled_over(time_utc)
@@ -117,10 +126,10 @@ def make_track(
         "position": (("epoch", "axis"), ecef_from_geodetic(*position.T) if frame == "geodetic" else position),
         "attitude": (("epoch", "axis"), attitude),
     }
-    # Plain arrays: xarray would import dask and scipy to check whether they are theirs.
+    # fastpath: otherwise xarray imports dask and scipy to check the array types
     track = xr.Dataset(
         {name: xr.Variable(dims, values, fastpath=True) for name, (dims, values) in variables.items()},
-        attrs={"node": node, "frame": "local" if frame == "local" else "ecef", "dropped": left_out},
+        attrs={"node": node, "frame": "local" if frame == "local" else "ecef", "dropped": excluded},
     )
     for remark in remarks:
         track = remarked(track, remark, where)
@@ -128,12 +137,12 @@ def make_track(
 
 
 def remarked(track: xr.Dataset, remark: str, where: Path) -> xr.Dataset:
-    """Return a track with remarks on how its log was read, in its `remarks`; they are also printed.
+    """Add a remark on the reading of a log to the attribute `remarks` of its track, and print it.
 
     Parameters
     ----------
     track
-        Of `make_track`.
+        Result of `make_track`.
     remark
         One line.
     where
@@ -144,36 +153,36 @@ def remarked(track: xr.Dataset, remark: str, where: Path) -> xr.Dataset:
 
 
 def damaged(track: xr.Dataset, found: str, where: Path) -> xr.Dataset:
-    """Return a track whose log is damaged, with that as a remark and in `damage`, which images of it are flagged by.
+    """Add a remark on damage of a log to its track, and set its attribute `damage`, which raises a flag on its images.
 
     Parameters
     ----------
     track
-        Of `make_track`.
+        Result of `make_track`.
     found
-        One line; '' where nothing is damaged.
+        Description of the damage in one line; empty if there is none.
     where
         The log.
     """
     return remarked(track, found, where).assign_attrs(damage=found) if found else track
 
 
-def receivers_remark(kinds: Mapping[str, NDArray[np.int8]], taken: str, node: str) -> str:
-    """Return the remark on a log of several receivers, of which the config chooses none.
+def receivers_remark(kinds: Mapping[str, NDArray[np.int8]], selected: str, node: str) -> str:
+    """Format the remark on a log with several receivers, none of which is selected in the config.
 
     Parameters
     ----------
     kinds
-        Receiver → (epoch,) kinds of solution, values of `FIXES` or 0.
-    taken
-        The one that is read.
+        Receiver → (epoch,) solution types, values of `FIXES` or 0.
+    selected
+        Receiver that is read.
     node
-        Whose log.
+        Node of the log.
 
     Examples
     --------
     >>> receivers_remark({"0": np.array([5, 5]), "1": np.array([1, 0])}, "0", "uav1")
-    'the log holds 0 (single 2) and 1 (fix 1, no fix 1); 0 is read: set nodes.uav1.log.body to choose'
+    'the log contains receivers 0 (single 2) and 1 (fix 1, no fix 1); 0 is used: select with nodes.uav1.log.body'
     """
     names = {number: name for name, number in FIXES.items()} | {0: "no fix"}
     listed = []
@@ -181,23 +190,23 @@ def receivers_remark(kinds: Mapping[str, NDArray[np.int8]], taken: str, node: st
         counted = {name: int((fix == number).sum()) for number, name in names.items()}
         solutions = ", ".join(f"{name} {count}" for name, count in counted.items() if count)
         listed.append(f"{receiver} ({solutions or 'no epochs'})")
-    return f"the log holds {' and '.join(listed)}; {taken} is read: set nodes.{node}.log.body to choose"
+    return f"the log contains receivers {' and '.join(listed)}; {selected} is used: select with nodes.{node}.log.body"
 
 
 def _rolled_over(time_utc: NDArray[np.datetime64]) -> list[str]:
-    """Return a remark where times are so old that a receiver may have counted GPS weeks modulo 1024."""
+    """Return a remark if times are old enough for a GPS week rollover: a receiver that counts weeks modulo 1024."""
     periods = (KNOWN_UNTIL - time_utc[-1]) // _ROLLOVER
     if periods < 1:
         return []
     meant = (time_utc[0] + periods * _ROLLOVER).astype("datetime64[D]")
     return [
-        f"the log begins on {time_utc[0].astype('datetime64[D]')}; if its receiver counts GPS weeks modulo 1024, the "
+        f"the log starts on {time_utc[0].astype('datetime64[D]')}; if its receiver counts GPS weeks modulo 1024, the "
         f"flight was {periods * 1024} weeks later, on {meant}: correct the times of the log"
     ]
 
 
 def _check_positions(position: NDArray[np.float64], frame: str, where: Path) -> None:
-    """Raise CampaignError where an epoch is nowhere that a node flies."""
+    """Raise CampaignError if a position is not finite or outside the range of a flight."""
     if frame == "geodetic":
         latitude, longitude, height = position.T
         good = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 360) & (height >= LOWEST_M) & (height <= HIGHEST_M)
@@ -211,12 +220,12 @@ def _check_positions(position: NDArray[np.float64], frame: str, where: Path) -> 
         expected = f"finite local coordinates within {FARTHEST_M:g} m"
     if not good.all():
         first = int(np.flatnonzero(~good)[0])
-        lacking = number_of(int((~good).sum()), "epoch")
+        epochs = number_of(int((~good).sum()), "epoch")
         raise CampaignError(
-            f"{lacking} without a position, first epoch {first}: {position[first].tolist()}",
+            f"{epochs} without a valid position, first epoch {first}: {position[first].tolist()}",
             where,
             expected,
-            "Drop those lines or export again.",
+            "Remove those lines, or export the log again.",
         )
 
 
@@ -226,12 +235,12 @@ def _check_stated(
     fix: NDArray[np.int8] | None,
     where: Path,
 ) -> None:
-    """Raise CampaignError where a stated value is outside the range of a flight's log; NaN is ignored."""
+    """Raise CampaignError if a logged value is outside its range; NaN is ignored."""
     std, kinds = "a standard deviation", sorted(FIXES.values())
     for name, values, low, high in (
-        ("an angle of attitude", attitude_deg, -_WIDEST_DEG, _WIDEST_DEG),
+        ("an attitude angle", attitude_deg, -_WIDEST_DEG, _WIDEST_DEG),
         (std, position_std_m, 0.0, _WORST_STD_M),
-        ("a kind of solution", fix, 0, kinds[-1]),
+        ("a solution type", fix, 0, kinds[-1]),
     ):
         wrong = None if values is None else np.argwhere((values < low) | (values > high))
         if values is not None and wrong is not None and wrong.size:
@@ -239,7 +248,7 @@ def _check_stated(
                 f"{name} of {values[tuple(wrong[0])]:g} in epoch {int(wrong[0][0])}",
                 where,
                 f"{low:g} to {high:g}",
-                "Drop those lines or export again.",
+                "Remove those lines, or export the log again.",
             )
 
 
@@ -254,33 +263,34 @@ def _check_times(time_utc: NDArray[np.datetime64], where: Path) -> None:
     wrong = np.flatnonzero(steps <= np.timedelta64(0, "ns"))
     if wrong.size:
         epoch = int(wrong[0]) + 1
-        kind = "the same time as the epoch before" if steps[wrong[0]] == np.timedelta64(0, "ns") else "an earlier time"
+        relation = "equal to" if steps[wrong[0]] == np.timedelta64(0, "ns") else "before"
         raise CampaignError(
-            f"epoch {epoch} ({time_utc[epoch]}) has {kind} ({time_utc[epoch - 1]})",
+            f"the time of epoch {epoch} ({time_utc[epoch]}) is {relation} that of the previous epoch "
+            f"({time_utc[epoch - 1]})",
             where,
             "strictly increasing times",
-            "Remove doubled or unsorted lines from the log.",
+            "Remove repeated lines from the log, or sort it.",
         )
 
 
-# ---- Values that only the config states, and contradictions with the log --------------------------------------------
+# ---- Values from the config, and contradictions between log and config ----------------------------------------------
 
 _UNIX = re.compile(r"1970-01-01(?:[T ]00:00(?::00(?:\.0+)?)?)?", re.ASCII)
 
 
 def unstated(key: str, found: str, *, node: str, where: Path, remedy: str = "") -> CampaignError:
-    """Return the error of a log that lacks a value, which the config must state.
+    """Return the error for a log without a value that the config must then state.
 
     Parameters
     ----------
     key
         Field of `LogOptions`.
     found
-        Value that the log lacks.
+        Description of the log without the value.
     node, where
-        Whose log, and its file.
+        Node and file of the log.
     remedy
-        What else would do.
+        Alternative remedy, or details.
 
     Examples
     --------
@@ -291,31 +301,31 @@ def unstated(key: str, found: str, *, node: str, where: Path, remedy: str = "") 
 
 
 def contradicted(key: str, found: str, *, node: str, where: Path) -> CampaignError:
-    """Return the error of a log that contradicts the config; parameters as `unstated`.
+    """Return the error for a log that contradicts the config; for the parameters see `unstated`.
 
     Examples
     --------
     >>> print(contradicted("base", "ref pos 48 9 600", node="uav1", where=Path("a.pos")))
-    a.pos: ref pos 48 9 600; expected what config.yaml says, nodes.uav1.log.base. Remove the key, if the log is right.
+    a.pos: ref pos 48 9 600; expected nodes.uav1.log.base of config.yaml. Remove the key if the log is correct.
     """
-    expected = f"what config.yaml says, nodes.{node}.log.{key}"
-    return CampaignError(found, where, expected, "Remove the key, if the log is right.")
+    expected = f"nodes.{node}.log.{key} of config.yaml"
+    return CampaignError(found, where, expected, "Remove the key if the log is correct.")
 
 
 def start_time(options: LogOptions, found: str, *, node: str, where: Path) -> np.datetime64:
-    """Return time zero of a log, or its day, stated by the config: datetime64[ns], UTC.
+    """Return the configured time zero or date of a log: datetime64[ns], UTC.
 
     Parameters
     ----------
     options
-        With or without start_utc.
+        Options with or without start_utc.
     found, node, where
-        As of `unstated`.
+        See `unstated`.
 
     Raises
     ------
     CampaignError
-        If it is not there, or no time.
+        If start_utc is missing or is not a time.
 
     Examples
     --------
@@ -325,7 +335,7 @@ def start_time(options: LogOptions, found: str, *, node: str, where: Path) -> np
     if options.start_utc is None:
         raise unstated("start_utc", found, node=node, where=where)
     text = options.start_utc.strip().removesuffix("Z").removesuffix("+00:00")
-    if _UNIX.fullmatch(text):  # no recording is that old, but seconds are counted from there
+    if _UNIX.fullmatch(text):  # older than any recording, but valid as the epoch of Unix time
         return np.datetime64(0, "ns")
     try:
         return np.datetime64(utc_times([text])[0])
@@ -334,5 +344,5 @@ def start_time(options: LogOptions, found: str, *, node: str, where: Path) -> np
             quoted(options.start_utc),
             f"config.yaml: nodes.{node}.log.start_utc",
             "a time in UTC such as 2025-05-14T09:30:00",
-            "Correct it.",
+            "Correct the key.",
         ) from error

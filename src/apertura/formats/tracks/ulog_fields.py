@@ -1,4 +1,4 @@
-"""Positions, attitude and what places them in time in a PX4 ULog; run by `read_isolated`."""
+"""Extraction of positions, attitude and timing fields from a PX4 ULog; run by `read_isolated`."""
 
 import io
 import itertools
@@ -15,11 +15,11 @@ from apertura.formats.tracks.damage import Span, foreign_bytes, without
 RECEIVERS, FUSED, ATTITUDE = ("vehicle_gps_position", "sensor_gps"), "vehicle_global_position", "vehicle_attitude"
 
 DELAY = "EKF2_GPS_DELAY"
-"""Parameter: by how many milliseconds the autopilot takes its receiver to be late."""
+"""Parameter: latency of the receiver assumed by the autopilot, ms."""
 
 DAMAGE, DROPOUTS, CORRUPT = "damage", "dropouts", "corrupt"
-"""Spans of bytes that are no messages, then (0, bytes in all); milliseconds of each dropout of the logger; whether
-pyulog finds damage besides."""
+"""Spans of bytes that are not valid messages, then (0, total bytes); duration of each logger dropout, ms; True if
+pyulog reports damage."""
 
 _BYTES = {
     **dict.fromkeys(("int8_t", "uint8_t", "bool", "char"), 1),
@@ -35,9 +35,9 @@ _LONGEST = 10_000
 
 
 def read_fields(path: Path) -> dict[str, NDArray[Any]]:
-    """Return ``topic:instance/field`` → values of every message, and `DELAY` where it is logged.
+    """Read ``topic:instance/field`` → values of all messages, and `DELAY` if logged.
 
-    Bytes that are no messages are left out (`DAMAGE`), and reading resumes behind them.
+    Bytes that are not valid messages are skipped and reported (`DAMAGE`).
 
     Parameters
     ----------
@@ -47,18 +47,18 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
     Raises
     ------
     ValueError
-        If fields of a topic do not belong together.
+        If the fields of a topic have different numbers of values, or the file contains a second log.
     """
     from pyulog import ULog
 
     data = path.read_bytes()
     second = data.find(_MAGIC, 1)
-    if second > 0:  # whose subscriptions would replace those of the first, and their messages with them
-        raise ValueError(f"another log begins at byte {second}: separate logs that were joined")
+    if second > 0:  # its subscriptions would replace those of the first log
+        raise ValueError(f"a second log starts at byte {second}: separate concatenated logs")
     spans, unread = _foreign(data)
-    # where every byte is a message the parser reads the file by itself, data that were appended included
-    left_out = sorted([*spans, *unread])
-    source: Any = io.BytesIO(without(_joined(data), left_out)) if left_out else str(path)
+    # the parser reads an undamaged file directly, including appended data
+    skipped = sorted([*spans, *unread])
+    source: Any = io.BytesIO(without(_joined(data), skipped)) if skipped else str(path)
     log = ULog(source, message_name_filter_list=[*RECEIVERS, FUSED, ATTITUDE])
     fields: dict[str, list[NDArray[Any]]] = {}
     for topic in log.data_list:
@@ -66,8 +66,9 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
             fields.setdefault(f"{topic.name}:{topic.multi_id}/{name}", []).append(values)
     arrays = {name: np.concatenate(parts) for name, parts in fields.items()}
     for name, values in arrays.items():
-        if values.size != arrays.get(f"{name.partition('/')[0]}/timestamp", values[:0]).size:
-            raise ValueError(f"{name} has {values.size} values, its topic's timestamp another number")
+        timestamps = arrays.get(f"{name.partition('/')[0]}/timestamp", values[:0]).size
+        if values.size != timestamps:
+            raise ValueError(f"{name} has {values.size} values, but its topic {timestamps} timestamps")
     delay = log.initial_parameters.get(DELAY)
     return {
         **arrays,
@@ -79,12 +80,12 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _keyed(data: bytes, at: int, size: int) -> bool:
-    """Test whether a payload begins with the length of a key, and the key."""
+    """Return True if a payload starts with the length of a key and the key."""
     return 0 < data[at] < size and data[at + 1 : at + 1 + data[at]].isascii()
 
 
 def _levelled(data: bytes, at: int, size: int) -> bool:
-    """Test whether a payload may be a logged text: its level, "0" to "7", its time, the text."""
+    """Return True if a payload may be a logged text: level "0" to "7", time, text."""
     return size > 9 and 0x30 <= data[at] <= 0x37
 
 
@@ -102,11 +103,11 @@ _PLAUSIBLE: Mapping[str, Callable[[bytes, int, int], bool]] = {
     "S": lambda _, __, size: size == 8,
     "O": lambda _, __, size: size == 2,
 }
-"""Kind of a message, but for data → whether a payload of so many bytes at an offset may be one."""
+"""Message type other than data → predicate(data, offset, size) that a payload is plausible."""
 
 
 class _Messages:
-    """The messages of a ULog, as far as it has been walked through."""
+    """Message formats and topics of a ULog that are known up to the current offset."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
@@ -114,18 +115,18 @@ class _Messages:
         self._sizes: dict[int, tuple[int, int]] = {}
 
     def note(self, at: int) -> None:
-        """Take up the format or the topic that a message describes."""
+        """Store the format or topic that a message defines."""
         kind, text = self._data[at + 2], self._data[at + _MESSAGE : at + self.size(at)]
         if kind == ord("F"):
-            name, _, described = text.decode("latin-1").partition(":")
-            self._formats[name] = [_field(one) for one in described.split(";") if one]
+            name, _, listed = text.decode("latin-1").partition(":")
+            self._formats[name] = [_field(field) for field in listed.split(";") if field]
         elif kind == ord("A"):
             size = _sizes(text[3:].decode("latin-1"), self._formats)
             if size is not None:
                 self._sizes[text[1] | text[2] << 8] = size
 
     def size(self, at: int) -> int:
-        """Return the length of a message, header included; of a kind or topic that is not known by what follows it."""
+        """Return the length of a message with header; an unknown type or topic must be followed by a known message."""
         size = self._known(at)
         if size or at + _MESSAGE + 2 > len(self._data):
             return size
@@ -136,7 +137,7 @@ class _Messages:
         return size if unknown and _MESSAGE < size <= _LONGEST and followed else 0
 
     def _known(self, at: int) -> int:
-        """Return the length of a message that is as its kind must be; 0 if it is none."""
+        """Return the length of a message if it is valid for its type, otherwise 0."""
         if at + _MESSAGE + 2 > len(self._data):
             return 0
         size, kind = self._data[at] | self._data[at + 1] << 8, chr(self._data[at + 2])
@@ -151,25 +152,25 @@ class _Messages:
 
 
 def _foreign(data: bytes) -> tuple[list[Span], list[Span]]:
-    """Return the spans of a ULog that are no messages, and what its sections end with: data may have been appended."""
+    """Return the spans of a ULog that are not valid messages, and the unread ends of its sections (appended data)."""
     messages, edges = _Messages(data), [_HEADER, *_appended(data), len(data)]
     spans, unread = list[Span](), list[Span]()
     for first, end in itertools.pairwise(edges):
-        found, ended = foreign_bytes(data, first, end, messages.size, note=messages.note)
-        spans += found
+        foreign, ended = foreign_bytes(data, first, end, messages.size, note=messages.note)
+        spans += foreign
         unread += [(ended, end)] if ended < end else []
     return spans, unread
 
 
 def _field(text: str) -> tuple[str, int, str]:
-    """Return type, count and name of a field."""
+    """Parse type, count and name of a field."""
     kind, _, name = text.partition(" ")
     kind, bracket, count = kind.partition("[")
     return kind, int(count.rstrip("]")) if bracket and count.rstrip("]").isdigit() else 1, name
 
 
 def _sizes(name: str, formats: dict[str, list[tuple[str, int, str]]], depth: int = 0) -> tuple[int, int] | None:
-    """Return the bytes of a topic's fields, without and with padding at the end; None where they are not known."""
+    """Return the size of a topic's fields in bytes, without and with trailing padding; None if unknown."""
     if name not in formats or depth > _DEEPEST:
         return None
     total = padded = 0
@@ -183,16 +184,16 @@ def _sizes(name: str, formats: dict[str, list[tuple[str, int, str]]], depth: int
 
 
 def _appended(data: bytes) -> list[int]:
-    """Return the offsets of appended data, as the first message states them."""
+    """Return the offsets of appended data stated in the first message."""
     flags = data[_HEADER + _MESSAGE :][:_FLAGS_BYTES]
     if data[_HEADER + 2 : _HEADER + 3] != b"B" or len(flags) < _FLAGS_BYTES or not flags[8] & 1:
         return []
     offsets = struct.unpack("<3Q", flags[16:])
-    return [one for one in offsets if _HEADER < one < len(data)]
+    return [offset for offset in offsets if _HEADER < offset < len(data)]
 
 
 def _joined(data: bytes) -> bytes:
-    """Return a ULog that states no appended data: those follow the others once foreign bytes are left out."""
+    """Remove the offsets of appended data from a ULog: without foreign bytes, these follow the other messages."""
     if not _appended(data):
         return data
     at = _HEADER + _MESSAGE

@@ -1,1 +1,1 @@
-"""Clock of a recorder against its flight log, from echoes: on a bright point, or on the sharpness of the ground."""
+"""Recorder clock relative to the flight log, estimated from echoes of a known point or from the image sharpness."""

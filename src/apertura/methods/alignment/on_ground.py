@@ -1,4 +1,4 @@
-"""Offset and path of a recorder without a known point: those at which the image of the ground is sharpest."""
+"""Clock offset and path of a recorder without a known point, by maximum sharpness of the image of the terrain."""
 
 from dataclasses import dataclass, replace
 
@@ -22,28 +22,28 @@ from apertura.methods.alignment.on_point import (
 from apertura.methods.autofocus.motion import Logged, Recorded, plausible_offsets
 
 MOST_PIXELS = 96
-"""Along a side of the coarse image on which offsets are tried."""
+"""Maximum pixels along a side of the coarse image on which offsets are tried."""
 
 _OVERSAMPLING = 2.0  # of range profiles
-_ABOUT_CELLS = 8  # of range: half a side of the fine image about the brightest place
-_FINE = 4  # pixels per cell of the fine image
-_MAXIMA = 3  # of the coarse search that are refined
+_ABOUT_CELLS = 8  # range cells: half a side of the fine image about the brightest point
+_FINE = 4  # pixels per range cell of the fine image
+_MAXIMA = 3  # number of maxima of the coarse search that are refined
 
 
 @dataclass(frozen=True, eq=False)
 class SceneSharpness:
-    """Sharpness of an image of some places, by offset and path.
+    """Sharpness of an image as a function of clock offset and path.
 
     Attributes
     ----------
     profiles
-        Of the recorder, (pulse, range), over all of its range; their aperture is a placeholder.
+        Range profiles of the recorder, (pulse, range), over its whole range; their aperture is a placeholder.
     time_s
-        (pulse,) float64, seconds by the recorder.
+        (pulse,) float64, seconds of the recorder's clock.
     log
-        Antennas by the log's clock.
+        Antenna positions on the log's clock.
     places_m
-        (y, x, 3) float64, metres in the frame of the antennas.
+        (y, x, 3) float64, pixel positions in metres, in the frame of the antennas.
     """
 
     profiles: Profiles
@@ -53,7 +53,7 @@ class SceneSharpness:
 
     @classmethod
     def of(cls, echo: Recorded, log: Logged, places_m: Floats) -> "SceneSharpness":
-        """Return the sharpness of echoes; pulses are compressed once."""
+        """Return the sharpness function of echoes; pulses are compressed once."""
         frequency = echo.frequency_hz
         speed = echo.wave_speed_m_s
         step_m, length = range_step(frequency, oversampling=_OVERSAMPLING, wave_speed_m_s=speed)
@@ -74,7 +74,7 @@ class SceneSharpness:
         return cls(profiles, echo.time_s, log, places_m)
 
     def image(self, offset_s: float, path_m: float) -> NDArray[np.complex64]:
-        """Return the image of the places, pulses weighed by the way flown."""
+        """Return the image at the pixels; pulses are weighted by the distance flown between them."""
         at_s = self.time_s + offset_s
         kept = self.log.inside(at_s)
         speed = self.log.speeds_m_s(at_s)[kept]
@@ -91,7 +91,7 @@ class SceneSharpness:
         return np.asarray(np.nan_to_num(engine.form(engine.prepare(at_offset), self.places_m)))
 
     def value(self, offset_s: float, path_m: float) -> float:
-        """Return the sharpness: mean square power over the mean power squared; 2 for speckle, more for points."""
+        """Return the sharpness: mean squared power over squared mean power; 2 for speckle, larger for points."""
         power = np.abs(self.image(offset_s, path_m)).astype(np.float64) ** 2
         return float((power**2).mean() / max(float(power.mean()) ** 2, 1e-300))
 
@@ -105,18 +105,18 @@ def align_on_scene(
     within_s: tuple[float, float],
     search_m: float,
 ) -> Alignment:
-    """Return the offset and the path at which the image of the ground is sharpest, without a known point.
+    """Estimate the clock offset and path at which the image of the terrain is sharpest, without a known point.
 
     Parameters
     ----------
     echo, log
-        Echoes by the recorder's clock; antennas by the log's.
+        Echoes on the recorder's clock; antenna positions on the log's clock.
     grid, terrain
-        The scene, which must contain bright places.
+        The scene, which must contain bright points.
     within_s
-        Least and largest offset to consider, seconds.
+        Smallest and largest offset to search, seconds.
     search_m
-        Paths of either sign up to this are searched, metres; 0: the path is fixed.
+        Largest path of either sign to search, metres; 0 keeps the path fixed.
 
     Raises
     ------
@@ -126,38 +126,38 @@ def align_on_scene(
     Notes
     -----
     Source: docs/theory/tracks.md, "Clock of the recorder". Only the curvature of a point's phase history separates
-    paths from offsets, and places from paths: the aperture must not be short against the distance.
+    path from offset, and position from path: the aperture must not be short against the distance.
     """
-    some = echo.moving()[:: -(-len(echo) // MOST_PULSES)]
+    pulses = echo.moving()[:: -(-len(echo) // MOST_PULSES)]
     low, high = plausible_offsets(echo, log, within_s)
     bandwidth_hz = float(echo.frequency_hz[-1] - echo.frequency_hz[0])
     cell_m = echo.wave_speed_m_s / (2 * bandwidth_hz)
     # Sharpness of a coarse image of the scene over offsets and paths.
-    coarse = SceneSharpness.of(some, log, _coarse(grid, terrain, cell_m))
-    offsets_s = offset_steps(some, log, low, high)[::2]
+    coarse = SceneSharpness.of(pulses, log, _coarse(grid, terrain, cell_m))
+    offsets_s = offset_steps(pulses, log, low, high)[::2]
     paths_m = np.arange(-search_m, search_m + cell_m, 2 * cell_m) if search_m > 0 else np.zeros(1)
     values = np.array([[coarse.value(offset_s, path_m) for path_m in paths_m] for offset_s in offsets_s])
     steps = float(offsets_s[1] - offsets_s[0]), 2 * cell_m if search_m > 0 else 0.0
-    # Its best maxima, each refined about the brightest places of its image; the brightest point decides.
+    # Best maxima of the coarse search, each refined about the brightest point of its image; the brightest one is kept.
     maxima = []
-    for place in np.argsort(-values, axis=None)[:_MAXIMA]:
-        row, column = np.unravel_index(int(place), values.shape)
+    for index in np.argsort(-values, axis=None)[:_MAXIMA]:
+        row, column = np.unravel_index(int(index), values.shape)
         start = refine_maximum(coarse.value, float(offsets_s[row]), float(paths_m[column]), steps)
         fine = replace(coarse, places_m=_about(coarse, start, grid, terrain, cell_m))
-        found = refine_maximum(fine.value, *start, (steps[0] / 2, steps[1] / 2))
-        maxima.append((float(np.abs(fine.image(*found)).max()), fine, found))
-    peak, fine, found = max(maxima, key=lambda top: top[0])
-    widths = peak_widths(fine.value, *found, steps)
-    image = np.abs(fine.image(*found))
-    contrast_db = 20 * float(np.log10(peak / max(float(np.median(np.abs(coarse.image(*found)))), 1e-300)))
+        refined = refine_maximum(fine.value, *start, (steps[0] / 2, steps[1] / 2))
+        maxima.append((float(np.abs(fine.image(*refined)).max()), fine, refined))
+    peak, fine, refined = max(maxima, key=lambda maximum: maximum[0])
+    widths = peak_widths(fine.value, *refined, steps)
+    image = np.abs(fine.image(*refined))
+    contrast_db = 20 * float(np.log10(peak / max(float(np.median(np.abs(coarse.image(*refined)))), 1e-300)))
     brightest = fine.places_m[np.unravel_index(int(image.argmax()), image.shape)]
-    report = {"method": "sharpness", "plausible_s": [round(low, 3), round(high, 3)], "pulses": len(some)}
-    flags = alignment_flags(values.max(axis=1), offsets_s, found[0], widths[0], contrast_db)
-    return Alignment(*found, *widths, contrast_db, report | {"brightest_m": brightest.tolist()}, flags=flags)
+    report = {"method": "sharpness", "plausible_s": [round(low, 3), round(high, 3)], "pulses": len(pulses)}
+    flags = alignment_flags(values.max(axis=1), offsets_s, refined[0], widths[0], contrast_db)
+    return Alignment(*refined, *widths, contrast_db, report | {"brightest_m": brightest.tolist()}, flags=flags)
 
 
 def _coarse(grid: SceneGrid, terrain: Terrain, cell_m: float) -> Floats:
-    """Return places (y, x, 3) a cell apart, or farther where the scene has more of them than are tried."""
+    """Return pixels (y, x, 3) spaced by a range cell, or more if the scene exceeds `MOST_PIXELS` on a side."""
     step = max(1, round(cell_m / grid.spacing_m), -(-max(grid.shape) // MOST_PIXELS))
     rows, columns = (np.arange(step // 2, size, step) for size in grid.shape)
     return terrain.positions_at(grid, *np.meshgrid(rows, columns, indexing="ij"))
@@ -166,11 +166,11 @@ def _coarse(grid: SceneGrid, terrain: Terrain, cell_m: float) -> Floats:
 def _about(
     coarse: SceneSharpness, start: tuple[float, float], grid: SceneGrid, terrain: Terrain, cell_m: float
 ) -> Floats:
-    """Return fine places about the brightest of an image."""
+    """Return fine pixels about the brightest point of the coarse image."""
     image = np.abs(coarse.image(*start))
     down, right = np.unravel_index(int(image.argmax()), image.shape)
     step = max(1, round(cell_m / grid.spacing_m), -(-max(grid.shape) // MOST_PIXELS))
     step_px = cell_m / (_FINE * grid.spacing_m)
     around = np.arange(-_ABOUT_CELLS * _FINE, _ABOUT_CELLS * _FINE + 1) * step_px
-    row, column = (step // 2 + step * place for place in (down, right))
+    row, column = (step // 2 + step * index for index in (down, right))
     return terrain.positions_at(grid, *np.meshgrid(row + around, column + around, indexing="ij"))

@@ -1,1 +1,1 @@
-"""Autofocus: tracks refined by the image itself, with acceptance by patches that were not fitted."""
+"""Autofocus: refinement of tracks from the images, validated on held-out patches."""

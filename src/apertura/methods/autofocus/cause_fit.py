@@ -1,4 +1,4 @@
-"""One wrong quantity as the only error of a flight, fitted to all its bright places against errors of the logs."""
+"""Fit of one wrong quantity, as the only error of a flight, to all bright points, compared with errors of the logs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,26 +12,27 @@ from apertura.methods.autofocus.solve import Gauge, Problem, prominent_point_sta
 from apertura.methods.causes import ARM, LEAST_GAIN_DB, Cause
 
 NEAR = 10.0
-"""Objective by which two causes, or a cause and chance, must differ to be told apart."""
+"""Least difference of the objective between two causes, or between a cause and random tracks, to distinguish them."""
 
 LEAST_EVIDENCE = 40.0
-"""Objective by which a cause beside errors of the logs must lie below these alone: of 54 flights without a cause one
-reached 26, at 4 cm and with three points; wrong arms of 20 cm reach 250 to 1300."""
+"""Least reduction of the objective by a cause together with errors of the logs, relative to errors of the logs alone.
+Of 54 flights without a cause one reached 26, at 4 cm and with three points; lever arms wrong by 20 cm reach 250 to
+1300."""
 
 CHANCES = 6
-"""Wrong tracks drawn at random, each of three unknowns, as a lever arm has."""
+"""Number of wrong tracks drawn at random for comparison, each with three unknowns like a lever arm."""
 
-_STAGES = 2  # of caching contributions and sharpening
+_STAGES = 2  # iterations of caching contributions and maximising sharpness
 
 
 @dataclass(frozen=True, eq=False)
 class CausePrior(Prior):
-    """Tracks of a flight that only a cause moves.
+    """Prior of a flight whose tracks only a cause displaces.
 
     Attributes
     ----------
     shapes_m
-        Node → (unknown, knot, 3) float64, metres for a standard deviation of each unknown.
+        Node → (unknown, knot, 3) float64, displacement in metres per standard deviation of each unknown.
     """
 
     shapes_m: Mapping[str, Floats]
@@ -55,7 +56,7 @@ class CausePrior(Prior):
         return {node: np.tensordot(unknowns, shape, axes=(-1, 0)) for node, shape in self.shapes_m.items()}
 
     def adjoint(self, gradient: Mapping[str, Floats]) -> Floats:
-        """Return (..., size) derivatives by the unknowns of what has those by the corrections of each node."""
+        """Return (..., size) derivatives by the unknowns from derivatives by the corrections of each node."""
         return np.asarray(
             sum(np.tensordot(gradient[node], shape, axes=((-2, -1), (1, 2))) for node, shape in self.shapes_m.items())
         )
@@ -63,20 +64,20 @@ class CausePrior(Prior):
 
 @dataclass(frozen=True, eq=False)
 class CauseFit:
-    """A cause at the values at which all places are sharpest.
+    """A cause with the errors at which all bright points are sharpest.
 
     Attributes
     ----------
     cause, values
-        What is wrong, and by how much: (unknown,) in its unit.
+        The wrong quantity, and its error: (unknown,) in its unit.
     correction
-        Of the tracks.
+        Correction of the tracks.
     objective
-        Of eq. 11.
+        Objective of eq. 11.
     gain_db
-        Power that points gain by it, mean over places and pairs.
+        Power that points gain by the correction, mean over points and pairs.
     alike
-        Lines on other causes that explain as much: the images cannot tell them apart.
+        Descriptions of other causes that explain the images equally well.
     """
 
     cause: Cause
@@ -89,17 +90,18 @@ class CauseFit:
     @classmethod
     def of(cls, problem: Problem, cause: Cause, axes: Floats) -> "CauseFit":
         """Fit a cause to a problem; `axes` are rows east, north, up."""
-        used, prior = np.ones(len(problem.patches), bool), CausePrior.of(cause, problem.prior, problem.knots_s)
+        all_used = np.ones(len(problem.patches), bool)
+        prior = CausePrior.of(cause, problem.prior, problem.knots_s)
         alone = replace(problem, prior=prior, gauge=Gauge.none(prior.size))
         start = alone.state(np.zeros(prior.size))
-        starts = (start, prominent_point_start(alone, start, used, axes))
-        states = [alone.sharper(one, used, stages=_STAGES) for one in starts]
-        values = [alone.value(state, used, start.statistics) for state in states]
+        starts = (start, prominent_point_start(alone, start, all_used, axes))
+        states = [alone.sharper(each, all_used, stages=_STAGES) for each in starts]
+        values = [alone.value(state, all_used, start.statistics) for state in states]
         best = int(np.argmin(values))
         state = states[best]
-        # dB by which points are stronger: of Σ|I|⁴, half; places from which the points move lose all
+        # Gain of points in dB, from √(Σ|I|⁴); the floor is for patches that their points leave.
         before, after = (
-            np.array([np.sqrt(one.contrast) * one.energy for of_pair in each.statistics for one in of_pair])
+            np.array([np.sqrt(image.contrast) * image.energy for images in each.statistics for image in images])
             for each in (start, state)
         )
         gain_db = float(10 * np.log10(np.maximum(after, 1e-9 * before) / before).mean())
@@ -108,34 +110,34 @@ class CauseFit:
 
     @property
     def what(self) -> str:
-        """In one line."""
+        """Description of the cause and of equally good ones, one line."""
         return ", or ".join([self.cause.line(self.values), *self.alike])
 
     @property
     def energy(self) -> float:
-        """Half the squared unknowns, in standard deviations."""
+        """Half the sum of the squared unknowns, in standard deviations."""
         return 0.5 * float(((self.values / self.cause.std) ** 2).sum())
 
     def more(self, problem: Problem, axes: Floats) -> "CauseFit":
-        """Return the cause with what is left of it in a problem whose logs are corrected for it."""
-        left = CauseFit.of(problem, self.cause, axes)
-        if left.gain_db <= 0:
+        """Return the fit with the residual error added, fitted to a problem with logs corrected for this cause."""
+        residual = CauseFit.of(problem, self.cause, axes)
+        if residual.gain_db <= 0:
             return self
-        correction, gain_db = self.correction.with_further(left.correction), self.gain_db + left.gain_db
-        return replace(self, values=self.values + left.values, correction=correction, gain_db=gain_db)
+        correction, gain_db = self.correction.with_further(residual.correction), self.gain_db + residual.gain_db
+        return replace(self, values=self.values + residual.values, correction=correction, gain_db=gain_db)
 
     def with_rest(self, rest: Refinement, evidence: float) -> Refinement:
-        """Return the refinement by this cause and what was refined, or not, of logs corrected for it.
+        """Return the refinement by this cause, followed by the refinement of the corrected logs if it is accepted.
 
         Parameters
         ----------
         rest
-            Of logs corrected for the cause.
+            Refinement of logs corrected for the cause.
         evidence
-            By which the objective of errors of the logs alone lies above that of these beside the cause.
+            Reduction of the objective by the cause, relative to errors of the logs alone.
         """
         total = self.correction.with_further(rest.correction) if rest.accepted else self.correction
-        line = f"{self.what}: points gain {self.gain_db:.1f} dB by that alone"
+        line = f"{self.what}: correcting this alone raises the power of points by {self.gain_db:.1f} dB"
         report = {
             "what": self.what,
             "kind": self.cause.quantity.kind,
@@ -143,33 +145,35 @@ class CauseFit:
             "gain_db": round(self.gain_db, 2),
             "evidence": round(evidence, 1),
         }
-        rejected = {"refinement_rejected", "refinement_no_bright_place"}  # then this is all there is to mend
-        flags = {name: text for name, text in rest.flags.items() if name not in rejected} | {"cause_found": line}
-        return Refinement(total, rest.std_m, True, f"{line}; {rest.why}", {**rest.report, "cause": report}, flags)
+        rejected = {"refinement_rejected", "refinement_no_bright_point"}  # the cause alone is then corrected
+        flags = {name: text for name, text in rest.flags.items() if name not in rejected} | {"cause_corrected": line}
+        return Refinement(total, rest.std_m, True, f"{line}; {rest.reason}", {**rest.report, "cause": report}, flags)
 
 
 def explained(
     problem: Problem, causes: Sequence[Cause], axes: Floats, generator: np.random.Generator
 ) -> CauseFit | None:
-    """Return the cause that explains more than others, of equals the one of fewest unknowns; None where chance does.
+    """Return the cause that explains the images best, of equally good ones the one with the fewest unknowns.
+
+    The result is None if no cause gains `LEAST_GAIN_DB`, or random tracks explain the images equally well.
 
     Parameters
     ----------
     problem
-        Bright places of all pairs along the logs, with the prior of their errors.
+        Bright points of all pairs along the logs, with the prior of the logs' errors.
     causes
-        That may be.
+        Candidate causes.
     axes
         (3, 3) float64, rows are east, north, up.
     generator
-        Draws wrong tracks.
+        Random generator for the wrong tracks.
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 16b. A cause has at most three unknowns and stands against all places of all
-    pairs: by how much wrong tracks of as many unknowns gain is measured, not derived.
+    Source: docs/theory/autofocus.md, eq. 16b. A cause has at most three unknowns and is fitted to all bright points of
+    all pairs; the gain of random tracks with as many unknowns is measured, not derived.
     """
-    fits = [CauseFit.of(problem, one, axes) for one in causes]
+    fits = [CauseFit.of(problem, cause, axes) for cause in causes]
     lowest = min((fit.objective for fit in fits), default=np.inf)
     near = [fit for fit in fits if fit.objective < lowest + NEAR]
     best = min(near, key=lambda fit: (len(fit.values), fit.objective), default=None)
@@ -183,12 +187,12 @@ def explained(
 
 
 def _drawn(problem: Problem, generator: np.random.Generator) -> Cause:
-    """Return smooth wrong tracks of one node: offset, inclined and bent in directions that are drawn."""
+    """Return smooth wrong tracks of a random node: offset, slope and undulation in random directions."""
     nodes = list(problem.prior.nodes)
     node, along = nodes[generator.integers(len(nodes))], np.linspace(-1, 1, len(problem.knots_s))
     periods, phase = generator.uniform(0.25, 1.5), generator.uniform(0, 2 * np.pi)
     shapes = np.stack([np.ones_like(along), along, np.sin(np.pi * periods * along + phase)])
-    ways = generator.standard_normal((3, 3))
-    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-    moved = shapes[:, :, None] * ways[:, None, :]
+    directions = generator.standard_normal((3, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    moved = shapes[:, :, None] * directions[:, None, :]
     return Cause(ARM, problem.knots_s, {node: moved})

@@ -1,4 +1,4 @@
-"""Acceptance of refined tracks, measured without truth, and the errors that remain."""
+"""Acceptance of refined tracks without ground truth, and residual track errors after a refinement."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -17,28 +17,28 @@ from apertura.methods.autofocus.objective import Blocks, PatchEcho, PatchImage, 
 from apertura.methods.autofocus.patches import Patch
 from apertura.methods.autofocus.solve import Problem, State
 
-# ---- Errors that remain after a refinement --------------------------------------------------------------------------
+# ---- Residual errors after a refinement -----------------------------------------------------------------------------
 
 
 MOST_RATIO = 1e3
-"""Peak to surroundings, power: above, a point's neighbours and not its noise bound the accuracy of its phase."""
+"""Peak-to-background power ratio above which neighbours of a point, not noise, limit the accuracy of its phase."""
 
 FOLDS = 4
-"""Of cross-validation: a quarter of the patches is left out of a fit, and decides on what was fitted to the others."""
+"""Folds of the cross-validation: a quarter of the patches is held out of a fit and validates it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Remaining:
-    """Errors that are expected to be left.
+    """Expected residual errors.
 
     Attributes
     ----------
     std_m
-        Node → (knot, 3) float64, metres, along the axes of the frame.
+        Node → (knot, 3) float64, standard deviation of positions in metres, along the axes of the frame.
     phase_rad
-        RMS of what is left of the phase at the patches.
+        Residual phase at the patches, rms.
     shift_m
-        By which the log alone, or reference points, leave the image to be moved, rms over patches.
+        Uncertainty of the image position, which only the logs and reference points determine, rms over patches.
     """
 
     std_m: Mapping[str, Floats]
@@ -47,7 +47,7 @@ class Remaining:
 
     @property
     def report(self) -> dict[str, Any]:
-        """As JSON values."""
+        """Residual errors as JSON values."""
         return {
             "left_rad": round(self.phase_rad, 4),
             "left_db": round(noise_loss(self.phase_rad**2).loss_db, 3),
@@ -56,96 +56,100 @@ class Remaining:
 
 
 def remaining(problem: Problem, state: State) -> Remaining:
-    """Return the errors that remain: per knot, the log's prior combined with all phases measured while errors last.
+    """Estimate the residual errors per knot from the logs' prior and all phases within an error's correlation time.
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 18. What the gauge leaves is added to the standard deviations.
+    Source: docs/theory/autofocus.md, eq. 18. The uncertainty of the gauge is added to the standard deviations.
     """
     nodes, knots = problem.prior.nodes, len(problem.knots_s)
-    column = {node: slice(3 * number, 3 * number + 3) for number, node in enumerate(nodes)}
-    # Information on the errors of all nodes at each knot: of the logs, and of all phases measured while an error lasts.
+    columns_of = {node: slice(3 * number, 3 * number + 3) for number, node in enumerate(nodes)}
+    # Information on the errors of all nodes at each knot: from the logs, and from all phases within a correlation time.
     information = np.zeros((knots, 3 * len(nodes), 3 * len(nodes)))
     for node, prior in nodes.items():
-        information[:, column[node], column[node]] += prior.axes.T @ np.diag(1 / prior.std_m**2) @ prior.axes
+        information[:, columns_of[node], columns_of[node]] += prior.axes.T @ np.diag(1 / prior.std_m**2) @ prior.axes
     rows: list[tuple[slice, Floats]] = []
     smooth = max(prior.smooth for prior in nodes.values())
     for patches, statistics in zip(state.cached, state.statistics, strict=True):
-        for patch, now in zip(patches, statistics, strict=True):
-            ratio = min(now.ratio, MOST_RATIO)
+        for patch, image in zip(patches, statistics, strict=True):
+            ratio = min(image.ratio, MOST_RATIO)
             row = np.zeros((patch.blocks.stop - patch.blocks.start, 3 * len(nodes)))
             for node, slope in patch.slopes.items():
-                row[:, column[node]] = patch.wavenumber * slope
+                row[:, columns_of[node]] = patch.wavenumber * slope
             if len(row):
                 information[patch.blocks] += 2 * ratio / len(row) * smooth * row[:, :, None] * row[:, None, :]
                 rows.append((patch.blocks, row))
-    # Covariance that is left; the phases that it makes at the patches, and the deviations, with the gauge's own.
+    # Residual covariance; the phase variances at the patches, and the standard deviations including the gauge's.
     covariance = np.linalg.inv(information)
-    phases = [np.einsum("bi,bij,bj->b", row, covariance[blocks], row).mean() for blocks, row in rows]
-    moved = problem.prior.tracks(problem.gauge.modes)
+    phase_variances = [np.einsum("bi,bij,bj->b", row, covariance[blocks], row).mean() for blocks, row in rows]
+    gauge_tracks = problem.prior.tracks(problem.gauge.modes)
     std_m = {
-        node: np.sqrt(np.diagonal(covariance[:, part, part], axis1=1, axis2=2) + (moved[node] ** 2).sum(axis=0))
-        for node, part in column.items()
+        node: np.sqrt(
+            np.diagonal(covariance[:, columns, columns], axis1=1, axis2=2) + (gauge_tracks[node] ** 2).sum(axis=0)
+        )
+        for node, columns in columns_of.items()
     }
-    return Remaining(std_m, float(np.sqrt(np.mean(phases))) if phases else float("nan"), problem.gauge.std_m)
+    return Remaining(
+        std_m, float(np.sqrt(np.mean(phase_variances))) if phase_variances else float("nan"), problem.gauge.std_m
+    )
 
 
 # ---- Acceptance of refined tracks -----------------------------------------------------------------------------------
 
 LEAST_GAIN_DB = 0.1
-"""Contrast that places which were not fitted must have gained beyond doubt, dB: less shows in no image."""
+"""Least contrast gain of held-out patches, net of its uncertainty, dB; a smaller gain is not visible in an image."""
 
 DOUBT = 2.0
-"""Standard deviations of the mean gain that are taken off it."""
+"""Standard deviations subtracted from the mean gain."""
 
 _SCATTER, _SCATTER_DB, _DEGREES = 0.5, 0.5, 2
-"""Scatter of the gains before it is measured: half of their mean and half a dB, as certain as two places make it. Few
-places are judged by it, many by their own."""
+"""Prior scatter of the gains: half of their mean, and 0.5 dB, with the weight of two patches. It dominates for few
+patches; for many the measured scatter does."""
 
 LEAST_FITTED_DB = 0.3
-"""Contrast that places which are points by themselves must gain, dB: a fit to noise at 10 dB a pulse gains 0.1."""
+"""Least contrast gain of fitted patches that are confirmed points, dB; a fit to noise gains 0.1 dB at 10 dB a pulse."""
 
 MOST_APART_SIGMA = 4.0
-"""Standard deviations of their places by which pairs may disagree on points: more means slipped tracks."""
+"""Largest disagreement of point positions between pairs, in standard deviations; more indicates cycle slips."""
 
 PARTS = 8
-"""Of the aperture, whose images of a point are compared in range, to detect cycle slips."""
+"""Number of subapertures whose images of a point are compared in range to detect cycle slips."""
 
-_BY_CHANCE = 1e-3  # false alarm rate of the test against the log's stated errors
-_SLACK = 1.5  # factor on the variance: the image determines its modes not wholly
-_REACH_CELLS, _STEPS = 3.0, 37  # of the line in range on which a point is searched: cells on either side, samples
-_SLIP_SIGMA = 4.0  # standard deviations from which a shift in range is a slip
+_BY_CHANCE = 1e-3  # false alarm rate of the test of the configured log errors
+_SLACK = 1.5  # factor on the variance: the image does not fully determine its modes
+_REACH_CELLS, _STEPS = 3.0, 37  # search line for a point in range: range cells on either side, samples
+_SLIP_SIGMA = 4.0  # least shift in range of a slip, standard deviations
 _NEARER, _NEARER_OF_FEW = 0.6, 0.75
-"""Wavelengths: from here a shift is nearer to a whole turn than to none; noise is allowed for, more of few points."""
-_NOTHING = 1e-9  # contrast over contrast, of a patch out of what the pulses hold
+"""Least shift of a slip in wavelengths, of many and of few points: half a wavelength, and a margin for noise."""
+_NOTHING = 1e-9  # floor of the contrast ratio, for a patch without echoes
 _SCATTERING_POINTS, _POINT_STD_CELLS = 3, 0.055
-"""Points from which their scatter says how well a shift is known; and that of one of fewer, in cells c/B of path: a
-point some 20 dB out of the noise of a part."""
-_DOMINATES = 4.0  # peak power of a part's image of a point against the median of a line through it
-_LEAST_SLOPE = 0.05  # of the path over ground: a point illuminated from all sides has no direction of range
+"""Least number of points from whose scatter the deviation of a shift is estimated; and the deviation assumed for each
+point of fewer, in cells c/B of path, that of a point 20 dB above the noise of a subaperture."""
+_DOMINATES = 4.0  # least peak power of a point in a subaperture image over the median of the search line
+_LEAST_SLOPE = 0.05  # least gradient of the path over ground: a point seen from all sides has no range direction
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Measures of refined tracks.
+    """Quality measures of refined tracks.
 
     Attributes
     ----------
     fitted_db, held_out_db
-        (pair, patch) float64, contrast gained by the patches that were fitted and by those that were not.
+        (pair, patch) float64, contrast gain of the fitted patches and of the held-out patches.
     settled
-        (mode,) float64, unknowns that the image alone determines: of unit variance if the log states its errors
-        rightly.
+        (mode,) float64, unknowns that the image alone determines; their variance is 1 if the errors of the logs are
+        configured correctly.
     before, after
-        Shifts of points in range between parts of the aperture.
+        Shifts of points in range between subapertures.
     wavelength_m
-        Of the band's middle.
+        Wavelength at the band centre.
     steady
-        Variance of the log-amplitude along the aperture, in the pair where it is least, of the place where it is most:
-        noise of a point that dominates its cell; speckle has 0.4. Infinite where blocks are too few to tell.
+        Variance of the log-amplitude along the aperture: least of the pairs, most of the patches. A point that
+        dominates its cell has that of its noise, speckle 0.4. Infinite if the blocks are too few.
     apart_sigma
-        How far pairs show points apart that tracks within the log's errors do not bring together, rms, in standard
-        deviations of their places.
+        Disagreement of point positions between pairs that no tracks within the errors of the logs resolve, rms, in
+        standard deviations.
     """
 
     fitted_db: Floats
@@ -159,12 +163,12 @@ class Evidence:
 
     @property
     def gain(self) -> "MeanGain":
-        """Contrast gained by the patches that were not fitted."""
+        """Contrast gain of the held-out patches."""
         return mean_gain(self.held_out_db)
 
     @property
     def believed(self) -> bool:
-        """True if places that were not fitted, or a place that nothing else explains, show that tracks are better."""
+        """True if held-out patches, or fitted patches that are confirmed points, show that the tracks are better."""
         points = self.steady <= MOST_INTERFERENCE and float(self.fitted_db.mean()) > LEAST_FITTED_DB
         return self.gain.certain or points
 
@@ -175,51 +179,49 @@ class Evidence:
 
     @property
     def promising(self) -> bool:
-        """True if there was anything to gain: where even fitted places gained nothing, the logs are as good."""
+        """True if fitted patches gained contrast or a slip was found; else the logs are as good as the tracks."""
         return bool(self.slip) or float(self.fitted_db.mean()) > LEAST_GAIN_DB
 
     @property
-    def why(self) -> str:
-        """In one line."""
-        places = self.fitted_db.shape[1]
-        line = (
-            f"{places} bright {'place' if places == 1 else 'places'} gained {self.fitted_db.mean():.2f} dB of contrast"
-        )
+    def reason(self) -> str:
+        """Reason of acceptance or rejection, one line."""
+        count = self.fitted_db.shape[1]
+        line = f"{count} bright {'point' if count == 1 else 'points'} gained {self.fitted_db.mean():.2f} dB of contrast"
         if self.held_out_db.size:
-            line += f", {self.gain.mean_db:.2f} ± {self.gain.std_db:.2f} dB while they were not fitted"
+            line += f" when fitted, {self.gain.mean_db:.2f} ± {self.gain.std_db:.2f} dB when held out of the fit"
         if np.isfinite(self.steady):
-            line += f"; log-amplitudes along the aperture vary by {self.steady:.2f}"
+            line += f"; variance of the log-amplitude along the aperture {self.steady:.2f}"
         if self.accepted:
             return line
         if self.slip:
             return f"{line}; {self.slip}"
         if not self.promising:
-            return f"{line}: the logs are as good"
+            return f"{line}: no improvement over the logs"
         return (
-            f"{line}; required are {LEAST_GAIN_DB:g} dB beyond {DOUBT:g} standard deviations, or places that are "
-            f"points, {MOST_INTERFERENCE:g} at most, and gained {LEAST_FITTED_DB:g} dB"
+            f"{line}; acceptance requires {LEAST_GAIN_DB:g} dB plus {DOUBT:g} standard deviations when held out, or "
+            f"{LEAST_FITTED_DB:g} dB when fitted at a variance of {MOST_INTERFERENCE:g} at most"
         )
 
     @cached_property
     def slip(self) -> str:
-        """Line on parts of the aperture whose images are shifted by a wavelength of path; empty if none is."""
+        """Description of cycle slips: points shifted between pairs or subapertures; empty if there are none."""
         if self.apart_sigma > MOST_APART_SIGMA:
             return (
-                f"pairs show the same points {self.apart_sigma:.1f} standard deviations of their places apart: tracks "
-                "are wrong by more than their logs' errors"
+                f"point positions differ between pairs by {self.apart_sigma:.1f} standard deviations: the tracks are "
+                "wrong by more than the errors of their logs"
             )
         slipped = self.after.slipped(self.wavelength_m)
         if not slipped.any():
             return ""
-        off_m = float(np.abs(self.after.shift_m[slipped]).max())
+        shift_m = float(np.abs(self.after.shift_m[slipped]).max())
         return (
-            f"{int(slipped.sum())} of {slipped.size} parts of the apertures see the points up to {off_m:.2f} m of path "
-            f"from where most have them; the wavelength is {self.wavelength_m:.2f} m"
+            f"{int(slipped.sum())} of {slipped.size} subapertures show the points displaced by up to {shift_m:.2f} m "
+            f"of path relative to most subapertures; the wavelength is {self.wavelength_m:.2f} m"
         )
 
     @cached_property
     def inconsistent(self) -> str:
-        """Contradiction between the errors that the logs state and those found; empty where they fit."""
+        """Contradiction between configured and estimated errors of the logs; empty if they are consistent."""
         from scipy.stats import chi2  # slow to import
 
         count = len(self.settled)
@@ -229,30 +231,32 @@ class Evidence:
         low, high = chi2.ppf([_BY_CHANCE, 1 - _BY_CHANCE], count) / count
         if low / _SLACK < power < high * _SLACK:
             return ""
-        verdict = "is stated too large" if power < 1 else "is stated too small, or something else is wrong"
+        verdict = "too large" if power < 1 else "too small, or there is another error"
         return (
-            f"the {count} motions that the image settles are {np.sqrt(power):.2f} times as large as the logs' errors "
-            f"allow: what they err by {verdict}"
+            f"the {count} motion modes that the image determines are {np.sqrt(power):.2f} times the configured errors "
+            f"of the logs: the configured errors are {verdict}"
         )
 
     @property
     def _motion_power(self) -> float:
-        """Mean square of the motions that the image determines, in variances that the log states."""
+        """Mean square of the motion modes that the image determines, relative to the configured variance."""
         return float((self.settled**2).mean())
 
     @property
     def flags(self) -> dict[str, str]:
-        """Edges crossed."""
-        flags = {} if self.accepted or not self.promising else {"refinement_rejected": self.why}
+        """Flag → measured values, of exceeded limits."""
+        flags = {} if self.accepted or not self.promising else {"refinement_rejected": self.reason}
         if self.inconsistent:
-            flags["prior_too_wide" if self._motion_power < 1 else "prior_inconsistent"] = self.inconsistent
+            flags["position_error_overstated" if self._motion_power < 1 else "position_error_understated"] = (
+                self.inconsistent
+            )
         if self.slip:
             flags["cycle_slip_suspected"] = self.slip
         return flags
 
     @property
     def report(self) -> dict[str, Any]:
-        """As JSON values."""
+        """Quality measures as JSON values."""
         return {
             "gain_fitted_db": round(float(self.fitted_db.mean()), 3),
             **(
@@ -270,7 +274,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class MeanGain:
-    """Mean gain of contrast of patches that were not fitted, and its standard deviation, dB; NaN without any."""
+    """Mean contrast gain of held-out patches and its standard deviation, dB; NaN without held-out patches."""
 
     mean_db: float
     std_db: float
@@ -282,11 +286,11 @@ class MeanGain:
 
 
 def mean_gain(held_out_db: Floats) -> MeanGain:
-    """Return the mean of (pair, patch) gains.
+    """Return the mean of (pair, patch) gains and its standard deviation.
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 16a. Pairs of a patch share its neighbours and are one sample.
+    Source: docs/theory/autofocus.md, eq. 16a. The images of a patch by several pairs share its neighbours: one sample.
 
     Examples
     --------
@@ -303,30 +307,30 @@ def mean_gain(held_out_db: Floats) -> MeanGain:
 
 
 def unsteady(initial: State, state: State) -> float:
-    """Return the variance of the log-amplitude along the aperture at patches' peaks: least of pairs, most of patches.
+    """Return the log-amplitude variance along the aperture at the patches' peaks: least of pairs, most of patches.
 
     Parameters
     ----------
     initial, state
-        Along the logs, and as solved.
+        State along the logs, and the solved state.
 
     Notes
     -----
-    Source: docs/theory/focus.md, eq. 1. Blocks are averaged as the logs have them, as `point_focus` averages pulses:
-    phases that are fitted would make averages of speckle steady, whose amplitudes no fit changes.
+    Source: docs/theory/focus.md, eq. 1. Blocks are averaged along the logs, as `point_focus` averages pulses: fitted
+    phases would make averages of speckle steady, although no fit changes the amplitudes.
     """
     worst = []
     for number in range(len(state.images[0])):
         by_pair = []
         for logged, images in zip(initial.cached, state.images, strict=True):
-            along = logged[number].values[int(np.abs(images[number]).argmax())].astype(np.complex128)
-            by_pair.append(steadiness(along))
+            contributions = logged[number].values[int(np.abs(images[number]).argmax())].astype(np.complex128)
+            by_pair.append(steadiness(contributions))
         worst.append(min(by_pair))
     return max(worst)
 
 
 def steadiness(along: NDArray[np.complex128]) -> float:
-    """Return the least variance of the log-amplitude of contributions (block,), over averages of 1, 2, 4 … blocks."""
+    """Return the log-amplitude variance of contributions (block,): the least over averages of 1, 2, 4, … blocks."""
     least = float("inf")
     while len(along) >= LEAST_BLOCKS:
         amplitude = np.abs(along)
@@ -337,7 +341,7 @@ def steadiness(along: NDArray[np.complex128]) -> float:
 
 
 def gains_db(before: Sequence[Sequence[PatchImage]], after: Sequence[Sequence[PatchImage]]) -> Floats:
-    """Return (pair, patch) float64, dB by which the contrast Σ|I|⁴/(Σ|I|²)² has grown.
+    """Return (pair, patch) float64, the growth of the contrast Σ|I|⁴/(Σ|I|²)² in dB.
 
     Examples
     --------
@@ -353,12 +357,12 @@ def gains_db(before: Sequence[Sequence[PatchImage]], after: Sequence[Sequence[Pa
 
 @dataclass(frozen=True, eq=False)
 class RangeShifts:
-    """Shifts of points in range between images of parts of the aperture, from where most parts have them.
+    """Range shifts of points in subaperture images, relative to their range in most subapertures.
 
     Attributes
     ----------
     by_point_m
-        (pair, patch, part) float64, metres of total path; NaN where the part does not show the point.
+        (pair, patch, part) float64, metres of total path; NaN where the point is not visible in the subaperture.
     cell_m
         Range cell of the pairs, c/B of total path.
     """
@@ -368,19 +372,19 @@ class RangeShifts:
 
     @cached_property
     def points(self) -> NDArray[np.int64]:
-        """(pair, part) int64, how many were measured."""
+        """(pair, part) int64, number of measured points."""
         return np.asarray(np.isfinite(self.by_point_m).sum(axis=1), np.int64)
 
     @cached_property
     def shift_m(self) -> Floats:
         """(pair, part) float64, metres of total path: median over points; NaN where no point was measured."""
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # a part without a measured point is NaN
+            warnings.simplefilter("ignore", RuntimeWarning)  # a subaperture without a measured point is NaN
             return np.asarray(np.nanmedian(self.by_point_m, axis=1), np.float64)
 
     @cached_property
     def std_m(self) -> Floats:
-        """(pair, part) float64, its standard deviation, by the scatter of points; of one or two as stated."""
+        """(pair, part) float64, standard deviation of the shift: from the scatter of points, or assumed for few."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
             spread = 1.4826 * np.nanmedian(np.abs(self.by_point_m - self.shift_m[:, None]), axis=1)
@@ -394,29 +398,29 @@ class RangeShifts:
         return round(float(np.sqrt((known**2).mean())), 5) if known.size else None
 
     def slipped(self, wavelength_m: float) -> NDArray[np.bool_]:
-        """Return (pair, part) bool: parts whose shift is significantly nearer to a whole turn than to none."""
-        off = np.abs(self.shift_m)
-        nearer = np.where(self.points < _SCATTERING_POINTS, _NEARER_OF_FEW, _NEARER)
-        agreed = (self.points > 0) & (self.std_m < wavelength_m / 2 / np.sqrt(np.maximum(self.points, 1)))
-        return np.asarray(agreed & (off > nearer * wavelength_m) & (off > _SLIP_SIGMA * self.std_m))
+        """Return (pair, part) bool, True for subapertures shifted significantly closer to a wavelength than to 0."""
+        size_m = np.abs(self.shift_m)
+        least = np.where(self.points < _SCATTERING_POINTS, _NEARER_OF_FEW, _NEARER)
+        consistent = (self.points > 0) & (self.std_m < wavelength_m / 2 / np.sqrt(np.maximum(self.points, 1)))
+        return np.asarray(consistent & (size_m > least * wavelength_m) & (size_m > _SLIP_SIGMA * self.std_m))
 
 
 def range_shifts(problem: Problem, state: State, axes: Floats, *, parts: int = PARTS) -> RangeShifts:
-    """Return shifts in range of the brightest point of every patch, by part of the aperture.
+    """Measure the range shifts of the brightest point of every patch between subapertures.
 
     Parameters
     ----------
     problem, state
-        As solved.
+        Solved problem and its state.
     axes
         (3, 3) float64, rows are east, north, up.
     parts
-        Of the aperture.
+        Number of subapertures.
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 16. A path that is wrong by a wavelength over a part of the aperture keeps its
-    phase, but not its delay.
+    Source: docs/theory/autofocus.md, eq. 16. A path error of one wavelength over a subaperture leaves the phase
+    unchanged, but not the delay.
     """
     pairs = zip(problem.pairs, problem.echoes, state.images, strict=True)
     by_part = [
@@ -430,7 +434,10 @@ def range_shifts(problem: Problem, state: State, axes: Floats, *, parts: int = P
 
 
 def _of_most(shifts_m: Floats, within_m: float) -> Floats:
-    """Return (pair, patch, 1), the mean of the most parts that agree; a pixel, and the phase, lie off the delay."""
+    """Return (pair, patch, 1), the mean shift of the largest set of subapertures that agree within `within_m`.
+
+    It is the offset of the delay from the brightest pixel, common to all subapertures.
+    """
     near = np.abs(shifts_m[..., None] - shifts_m[..., None, :]) < within_m
     most = np.take_along_axis(near, near.sum(axis=-1).argmax(axis=-1)[..., None, None], axis=-2)[..., 0, :]
     total = np.where(most, shifts_m, 0.0).sum(axis=-1, keepdims=True)
@@ -440,18 +447,21 @@ def _of_most(shifts_m: Floats, within_m: float) -> Floats:
 def _by_part(
     blocks: Blocks, echo: PatchEcho, image: NDArray[np.complex64], tracks: Tracks, axes: Floats, parts: int
 ) -> Floats:
-    """Return (part,) float64, metres of total path by which each part's image shows a point farther; NaN if not."""
+    """Return (part,) float64, range shift of a point in each subaperture image, metres of total path.
+
+    The shift is NaN where the point is not visible.
+    """
     nothing = np.full(parts, np.nan)
-    place = echo.patch.pixels_m[int(np.abs(image).argmax())]
-    # The line through the point over level ground along which its path grows fastest.
-    slope = blocks.aperture.path_gradient(place).mean(axis=0)
+    point_m = echo.patch.pixels_m[int(np.abs(image).argmax())]
+    # Horizontal line through the point along which its path grows fastest.
+    slope = blocks.aperture.path_gradient(point_m).mean(axis=0)
     level = axes[:2].T @ (axes[:2] @ slope)
-    steep = float(level @ slope)
-    if steep < _LEAST_SLOPE or len(echo.profiles) < parts:
+    gradient = float(level @ slope)
+    if gradient < _LEAST_SLOPE or len(echo.profiles) < parts:
         return nothing
     extra_path_m = np.linspace(-_REACH_CELLS, _REACH_CELLS, _STEPS) * SPEED_OF_LIGHT_M_S / echo.profiles.bandwidth_hz
-    line = Patch(echo.patch.place_m, place + extra_path_m[:, None] / steep * level)
-    # Power along it in the image of each part, and its maximum by a parabola.
+    line = Patch(echo.patch.place_m, point_m + extra_path_m[:, None] / gradient * level)
+    # Power along the line in each subaperture image, and its maximum by a parabola.
     values = blocks.contribution(replace(echo, patch=line), blocks.moves(tracks)).values
     ends = np.linspace(0, values.shape[1], parts + 1).astype(np.int64)[:-1]
     power = np.abs(np.add.reduceat(values, ends, axis=1)).astype(np.float64) ** 2

@@ -6,38 +6,38 @@ from collections.abc import Iterable
 from apertura.methods.autofocus.inputs import TrackErrors
 
 LARGEST_ERROR_WAVES = 0.19
-"""Standard deviation of positions per axis over the wavelength, above which refinements fail: 4 cm at 21 cm."""
+"""Standard deviation of positions per axis, in wavelengths, above which refinements fail: 4 cm at 21 cm."""
 
 SHORTEST_ERROR_S, SHORTEST_ERROR_PULSES = 0.5, 10
 """Correlation time of position errors below which refinements fail, seconds and pulses."""
 
 LEAST_POINTS, LEAST_SNR_DB = 3, 10.0
-"""Bright points in the scene, and SNR of each in one pulse, at which refinements succeeded."""
+"""Number of bright points in the scene, and single-pulse SNR of each, at which refinements succeeded."""
 
 _REMAINDERS_DB = ((0.096, -0.3), (LARGEST_ERROR_WAVES, -0.5))
-"""Error over the wavelength → loss that remains at places no fit uses: 2 and 4 cm at 21 cm."""
+"""Position error in wavelengths → residual loss at points outside the fit: 2 and 4 cm at 21 cm."""
 
 
 def expected_remainder(
     errors: Iterable[TrackErrors], *, wavelength_m: float, pulse_interval_s: float
 ) -> tuple[float, list[str]]:
-    """Return the loss that a refinement of tracks is expected to leave, and what prevents the refinement.
+    """Return the expected residual loss after a refinement of tracks, and the limits that prevent a refinement.
 
     Parameters
     ----------
     errors
-        Of the logs of all nodes of a flight.
+        Error statistics of the logs of all nodes of a flight.
     wavelength_m
-        Of the band centre.
+        Wavelength at the band centre.
     pulse_interval_s
-        Between pulses that make the image.
+        Interval of the pulses used for the image.
 
     Returns
     -------
     loss_db
-        By position errors after the refinement, 0 or less; NaN where something prevents it.
+        Loss by position errors after the refinement, 0 or less; NaN if a limit is exceeded.
     obstacles
-        Measured limits that the flight exceeds, one phrase each; empty where none is exceeded.
+        Measured limits that the flight exceeds, one phrase each; empty if none is exceeded.
 
     Examples
     --------
@@ -55,7 +55,7 @@ def expected_remainder(
         obstacles.append(f"position errors of {100 * largest_m:.2g} cm exceed {most}")
     least_s = max(SHORTEST_ERROR_S, SHORTEST_ERROR_PULSES * pulse_interval_s)
     if shortest_s < least_s:
-        obstacles.append(f"position errors with a correlation time of {shortest_s:.2g} s, less than {least_s:.2g} s")
+        obstacles.append(f"the correlation time of position errors, {shortest_s:.2g} s, is below {least_s:.2g} s")
     if obstacles:
         return math.nan, obstacles
     return next(db for waves, db in _REMAINDERS_DB if largest_m <= waves * wavelength_m * (1 + 1e-9)), []

@@ -1,4 +1,4 @@
-"""Inputs and outcome of a refinement of tracks: data of each pair, prior of track errors, corrections."""
+"""Inputs and result of a track refinement: data of each pair, prior of track errors, corrections."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -23,16 +23,16 @@ class PairRecord:
     Attributes
     ----------
     pair
-        Its name, transmitter-receiver.
+        Name of the pair, transmitter-receiver.
     profiles
         Range profiles; their samples may be read lazily.
     time_s
-        (pulse,) float64, seconds of the flight's clock, which all its pairs share.
+        (pulse,) float64, seconds of the flight's clock, common to all pairs.
     sidelink_m
-        (pulse, 3) float64, metres: from the receiver's sidelink point to the transmitter's, as the logs have them;
-        None where echoes do not count from a sidelink.
+        (pulse, 3) float64, logged vector from the receiver's sidelink antenna to the transmitter's, metres; None if
+        delays are not measured relative to a sidelink.
     beams
-        Antenna weights of pulses in the image; None where all count alike.
+        Antenna weights of pulses in the image; None for equal weights.
     """
 
     pair: str
@@ -47,8 +47,8 @@ class PairRecord:
         tx, rx = self.pair.split("-")
         return tx, rx
 
-    def turned(self, errors: Mapping[str, "TrackErrors"]) -> tuple[float, float]:
-        """Return the correlation time of its nodes' shortest error, s, and the phase of the largest, radians rms."""
+    def extreme_errors(self, errors: Mapping[str, "TrackErrors"]) -> tuple[float, float]:
+        """Return the shortest correlation time of the nodes' errors, s, and the phase of the largest error, rad rms."""
         of_nodes = [errors[node] for node in self.nodes]
         largest_m = max(max(error.std_m) for error in of_nodes)
         return min(error.correlation_s for error in of_nodes), 2 * self.profiles.wavenumber_rad_m * largest_m
@@ -59,7 +59,7 @@ class PairRecord:
         return self.profiles.moved(aperture, correction.longer_m(self.pair, self.time_s, self.sidelink_m))
 
     def corrected(self, correction: TrackCorrection) -> "PairRecord":
-        """Return the record as if its logs had been corrected."""
+        """Return the record along corrected logs."""
         tx, rx = self.nodes
         between_m = self.sidelink_m
         if between_m is not None:
@@ -74,11 +74,11 @@ class TrackErrors:
     Attributes
     ----------
     std_m
-        East, north, up, metres: of what changes along the flight.
+        Standard deviations east, north and up of the error that varies along the flight, metres.
     correlation_s
-        How long an error lasts: its autocorrelation falls linearly to zero over this.
+        Correlation time: the autocorrelation of the error falls linearly to zero within it.
     drift_std_m
-        Of a slow error over the whole flight, in each axis: offset, slope and a slow bow.
+        Standard deviation per axis of a slow error over the whole flight: offset, slope and curvature.
     """
 
     std_m: tuple[float, float, float]
@@ -86,7 +86,7 @@ class TrackErrors:
     drift_std_m: float = 0.0
 
     def along(self, axes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return (3,) float64, metres, `std_m` along the frame's axes; rows of `axes` are east, north, up in the frame.
+        """Return (3,) float64, `std_m` along the frame's axes, metres; rows of `axes` are east, north, up in the frame.
 
         Examples
         --------
@@ -98,16 +98,16 @@ class TrackErrors:
 
 @dataclass(frozen=True)
 class ReferencePoint:
-    """A point of the scene whose place is known.
+    """Point of the scene with a known position.
 
     Attributes
     ----------
     name
-        Of the point.
+        Name of the point.
     place_m
-        (3,) metres, in the frame of the phase centres.
+        (3,) position in metres, in the frame of the phase centres.
     std_m
-        Of each coordinate.
+        Standard deviation of each coordinate, metres.
     """
 
     name: str
@@ -119,23 +119,23 @@ class ReferencePoint:
 
 
 SLOW_MODES = 4
-"""Offset, slope, and half a sine and cosine over the flight."""
+"""Number of slow modes: offset, slope, and half a period of a sine and a cosine over the flight."""
 
 
 @dataclass(frozen=True, eq=False)
 class NodePrior:
-    """Corrections of one node as smoothed white noise: m = σ·(mean of w neighbours)·√w, and slow modes.
+    """Prior of the corrections of one node: smoothed white noise m = σ·(mean of w neighbours)·√w, and slow modes.
 
     Attributes
     ----------
     std_m
-        (3,) float64, along the axes.
+        (3,) float64, standard deviations along the axes, metres.
     axes
         (3, 3) float64, rows are the unit vectors east, north, up in the frame of the phase centres.
     smooth
-        w, knots that an error lasts.
+        w, correlation time in knots.
     slow
-        (knot, mode) float64, slow modes with their standard deviation; no columns where there are none.
+        (knot, mode) float64, slow modes scaled by their standard deviation; no columns without a slow error.
 
     Notes
     -----
@@ -158,7 +158,7 @@ class NodePrior:
 
     @classmethod
     def of(cls, errors: TrackErrors, time_s: Floats, axes: Floats) -> "NodePrior":
-        """Return the prior of a node whose knots stand at equally spaced times."""
+        """Return the prior of a node with knots at equally spaced times."""
         step_s = float(time_s[1] - time_s[0])
         smooth = max(1, round(errors.correlation_s / step_s))
         along = np.linspace(-1, 1, len(time_s))
@@ -180,24 +180,24 @@ class NodePrior:
         return np.asarray((smoothed * self.std_m + self.slow @ slow) @ self.axes)
 
     def adjoint(self, gradient: Floats) -> Floats:
-        """Return (..., size) derivatives by the unknowns of what has (..., knot, 3) derivatives by the corrections."""
-        turned = gradient @ self.axes.T
-        scaled = turned * self.std_m / np.sqrt(self.smooth)
+        """Return (..., size) derivatives by the unknowns from (..., knot, 3) derivatives by the corrections."""
+        along_axes = gradient @ self.axes.T
+        scaled = along_axes * self.std_m / np.sqrt(self.smooth)
         nothing = np.zeros((*scaled.shape[:-2], self.smooth, 3))
         total = np.cumsum(np.concatenate([nothing, scaled, nothing[..., 1:, :]], axis=-2), axis=-2)
         noise = total[..., self.smooth :, :] - total[..., : -self.smooth, :]
-        both = np.concatenate([noise, self.slow.T @ turned], axis=-2)
+        both = np.concatenate([noise, self.slow.T @ along_axes], axis=-2)
         return np.asarray(both.reshape(*both.shape[:-2], -1))
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """The nodes of a flight, each with its own unknowns, one after the other.
+    """Prior of all nodes of a flight, with the unknowns of the nodes concatenated.
 
     Attributes
     ----------
     nodes
-        Name → its prior.
+        Node → prior.
     """
 
     nodes: Mapping[str, NodePrior]
@@ -212,7 +212,7 @@ class Prior:
         return {name: node.tracks(unknowns[..., part]) for (name, node), part in self._parts()}
 
     def adjoint(self, gradient: Mapping[str, Floats]) -> Floats:
-        """Return (..., size) derivatives by the unknowns of what has those by the corrections of each node."""
+        """Return (..., size) derivatives by the unknowns from derivatives by the corrections of each node."""
         return np.concatenate([node.adjoint(gradient[name]) for name, node in self.nodes.items()], axis=-1)
 
     def _parts(self) -> list[tuple[tuple[str, NodePrior], slice]]:
@@ -221,7 +221,7 @@ class Prior:
         return list(zip(self.nodes.items(), parts, strict=True))
 
 
-# ---- Outcome: corrections, and whether they are accepted ------------------------------------------------------------
+# ---- Result: corrections and their acceptance -----------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,22 +231,22 @@ class Refinement:
     Attributes
     ----------
     correction
-        Estimated, accepted or not.
+        Estimated correction, accepted or rejected.
     std_m
-        Node → (knot, 3) float64, metres: errors expected to remain, along the axes of the frame.
+        Node → (knot, 3) float64, expected residual errors along the axes of the frame, metres.
     accepted
-        Whether images are formed with the correction: as a whole or not at all.
+        True if images are formed with the correction, for all nodes and pairs.
     why
         Reason of acceptance or rejection, one line.
     report
-        As JSON values: what was measured.
+        Measured values, as JSON values.
     flags
-        Flag → what was measured, in one line.
+        Flag → measured values, one line.
     """
 
     correction: TrackCorrection
     std_m: Mapping[str, NDArray[np.float64]]
     accepted: bool
-    why: str
+    reason: str
     report: Mapping[str, Any] = field(default_factory=dict)
     flags: Mapping[str, str] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Sharpness of the patches as a function of the tracks: blocks of pulses, contributions, value and gradient."""
+"""Sharpness of patches as a function of the tracks: pulse blocks, their contributions, value and gradient."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,23 +22,22 @@ if TYPE_CHECKING:
 
 Tracks = Mapping[str, Floats]
 
-_PULSES = 4096  # read at once
-_MARGIN = 10  # samples beyond a patch, for the interpolation and for tracks that move
+_PULSES = 4096  # pulses read at once
+_MARGIN = 10  # range samples beyond a patch, for interpolation and for displaced tracks
 
 
 @dataclass(frozen=True, eq=False)
 class PatchEcho:
-    """Echoes of a patch in the blocks of a pair that illuminate it, summed towards its middle.
+    """Echoes of a patch, summed over the pulses of each illuminating block of a pair with focus on the patch's middle.
 
     Attributes
     ----------
     patch
-        Where.
+        The patch.
     blocks
-        Which of the pair's blocks.
+        Illuminating blocks of the pair.
     profiles
-        Over those blocks: range profiles about the patch, as one pulse at the mean place of each block's would have
-        them.
+        Range profiles about the patch, one virtual pulse per block at the mean position of its pulses.
     """
 
     patch: Patch
@@ -47,26 +46,26 @@ class PatchEcho:
 
     @property
     def values(self) -> int:
-        """Number of complex values of its contributions."""
+        """Number of complex values of the contributions."""
         return len(self.patch.pixels_m) * len(self.profiles)
 
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """The pulses of one pair, by the knots of the corrections.
+    """Pulse blocks of one pair, one block per knot of the corrections.
 
     Attributes
     ----------
     record
-        The pair.
+        Record of the pair.
     edges
         (knot + 1,) int64, first pulse of each block, and the number of pulses.
     average
-        (block, knot) sparse float64: mean over the pulses of a block of what is linear between knots.
+        (block, knot) sparse float64, operator from values at knots to means over block pulses, linear between knots.
     aperture
-        Mean phase centres of each block's pulses, as the logs have them.
+        Mean logged phase centres of each block.
     sidelink_m
-        (block, 3) float64, mean of the pair's; None where it has none.
+        (block, 3) float64, mean of `PairRecord.sidelink_m`; None if the pair has none.
     """
 
     record: PairRecord
@@ -77,7 +76,7 @@ class Blocks:
 
     @classmethod
     def of(cls, record: PairRecord, knots_s: Floats) -> "Blocks":
-        """Return the blocks of a pair about equally spaced knots."""
+        """Return the blocks of a pair, centred on equally spaced knots."""
         from scipy.sparse import csr_array  # slow to import
 
         count, step_s, pulses = len(knots_s), float(knots_s[1] - knots_s[0]), len(record.time_s)
@@ -88,11 +87,11 @@ class Blocks:
         share = 1 / np.diff(edges)[block]
         mean = csr_array((share, (block, np.arange(pulses))), shape=(count, pulses))
         # Linear interpolation of knots at the pulses, (pulse, knot).
-        place = np.clip((record.time_s - knots_s[0]) / step_s, 0, count - 1)
-        left = np.minimum(place.astype(np.int64), count - 2)
+        position = np.clip((record.time_s - knots_s[0]) / step_s, 0, count - 1)
+        left = np.minimum(position.astype(np.int64), count - 2)
         rows = np.tile(np.arange(pulses), 2)
         between = csr_array(
-            (np.concatenate([1 - (place - left), place - left]), (rows, np.concatenate([left, left + 1]))),
+            (np.concatenate([1 - (position - left), position - left]), (rows, np.concatenate([left, left + 1]))),
             shape=(pulses, count),
         )
         aperture = Aperture(*(mean @ leg for leg in record.profiles.aperture.legs))
@@ -106,7 +105,7 @@ class Blocks:
         return np.moveaxis((self.average @ flat).reshape(knots, modes, 3), 0, 1)
 
     def moves(self, tracks: Tracks) -> Tracks:
-        """Return node → (block, 3) float64, metres, of the nodes of the pair."""
+        """Return node → (block, 3) float64, mean displacement of the pair's nodes in each block, metres."""
         return {node: np.asarray(self.average @ tracks[node]) for node in dict.fromkeys(self.record.nodes)}
 
     def echoes(self, patches: Sequence[Patch]) -> list[PatchEcho]:
@@ -114,14 +113,14 @@ class Blocks:
 
         Notes
         -----
-        Source: docs/theory/autofocus.md, eq. 9: about the middle of a patch paths of a block differ by what they do at
-        the middle.
+        Source: docs/theory/autofocus.md, eq. 9: within a patch, path differences between the pulses of a block are
+        those at the patch's middle.
         """
         profiles, beams, edges = self.record.profiles, self.record.beams, self.edges
         starts = [self._offsets(patch) for patch in patches]
         sums = [np.zeros((len(offsets), len(edges) - 1), np.complex64) for offsets in starts]
         first = 0
-        # S_b(δ) of eq. 9, for as many whole blocks at a time as have `_PULSES` pulses.
+        # S_b(δ) of eq. 9, in groups of whole blocks with up to `_PULSES` pulses.
         while first < len(edges) - 1:
             last = max(first + 1, int(np.searchsorted(edges, edges[first] + _PULSES, side="right")) - 1)
             last = min(last, len(edges) - 1)
@@ -136,12 +135,12 @@ class Blocks:
                     inside = edges[first : last + 1] - edges[first]
                     total[:, first:last] = _towards(part, patch.place_m, offsets, inside, weights)
             first = last
-        return [self._echo(*one) for one in zip(patches, starts, sums, strict=True)]
+        return [self._echo(*arguments) for arguments in zip(patches, starts, sums, strict=True)]
 
     def _offsets(self, patch: Patch) -> Floats:
-        """Return (sample,) float64, metres of total path about a patch's middle."""
-        some = self.record.profiles.aperture.sample(64)
-        aperture, step_m = self.record.profiles.aperture[some], self.record.profiles.step_m
+        """Return (sample,) float64, path offsets that cover a patch about its middle, metres of total path."""
+        pulses = self.record.profiles.aperture.sample(64)
+        aperture, step_m = self.record.profiles.aperture[pulses], self.record.profiles.step_m
         corners = patch.pixels_m[:: max(1, len(patch.pixels_m) - 1)]
         corners = np.concatenate(
             [corners, 2 * patch.place_m - corners, patch.pixels_m[:: max(1, len(patch.pixels_m) // 8)]]
@@ -151,21 +150,21 @@ class Blocks:
         return np.asarray(np.arange(-half, half + 1) * step_m, np.float64)
 
     def _echo(self, patch: Patch, offsets: Floats, sums: NDArray[np.complex64]) -> PatchEcho:
-        illuminating = np.flatnonzero(np.abs(sums).any(axis=0))  # blocks
+        illuminating = np.flatnonzero(np.abs(sums).any(axis=0))
         blocks = slice(int(illuminating[0]), int(illuminating[-1]) + 1) if illuminating.size else slice(0, 1)
         whole, aperture = self.record.profiles, self.aperture[blocks]
         middle = aperture.path(patch.place_m)
-        turned = sums[:, blocks].T * np.exp(-1j * whole.wavenumber_rad_m * (middle[:, None] + offsets))
+        referred = sums[:, blocks].T * np.exp(-1j * whole.wavenumber_rad_m * (middle[:, None] + offsets))
         return PatchEcho(
             patch,
             blocks,
-            replace(whole, samples=turned.astype(np.complex64), start_m=middle + offsets[0], aperture=aperture),
+            replace(whole, samples=referred.astype(np.complex64), start_m=middle + offsets[0], aperture=aperture),
         )
 
     def contribution(self, echo: PatchEcho, moved: Tracks) -> "Contribution":
-        """Return the contribution of each block to the pixels of a patch where its nodes have moved by so much."""
+        """Return the contribution of each block to the pixels of a patch, with the nodes displaced by `moved`."""
         tx, rx = self.record.nodes
-        # Antennas as corrected; by the sidelink path of eq. 3 echoes are delayed by as much as it has grown.
+        # Corrected antennas; echo delays grow by the change of the sidelink path (eq. 3).
         moves = [moved[node][echo.blocks] for node in (tx, rx)]
         logged = echo.profiles.aperture
         aperture = Aperture(logged.tx_m + moves[0], logged.rx_m + moves[1])
@@ -176,9 +175,9 @@ class Blocks:
             length = np.linalg.norm(corrected, axis=1)
             extra_path_m = length - np.linalg.norm(between, axis=1)
             along = corrected / np.maximum(length, 1e-9)[:, None]
-        # Slopes ∂ρ/∂m of eq. 2: unit vectors from the patch to the antennas, ∓s of the sidelink.
+        # Slopes ∂ρ/∂m of eq. 2: unit vectors from the patch to the antennas, ∓s for the sidelink.
         away = [leg - echo.patch.place_m for leg in aperture.legs]
-        unit = [one / np.maximum(np.linalg.norm(one, axis=1, keepdims=True), 1e-9) for one in away]
+        unit = [vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-9) for vector in away]
         slopes = {tx: unit[0] + unit[1]} if tx == rx else {tx: unit[0] - along, rx: unit[1] + along}
         # B_b(x) of eq. 9 at the pixels.
         profiles = echo.profiles.moved(aperture, extra_path_m)
@@ -193,20 +192,20 @@ class Blocks:
 
 @dataclass(frozen=True, eq=False)
 class Contribution:
-    """Contributions of the blocks of a pair that illuminate a patch.
+    """Contributions of the illuminating blocks of a pair to the pixels of a patch.
 
     Attributes
     ----------
     values
         (pixel, block) complex64.
     blocks
-        Which of the pair's blocks those are.
+        Illuminating blocks of the pair.
     slopes
-        Node → (block, 3) float64, growth of the path at the patch per metre that the node moves (eq. 2).
+        Node → (block, 3) float64, gradient of the path to the patch by the node's position (eq. 2).
     wavenumber
-        2πf_mid/c.
+        2πf_mid/c, rad/m.
     band
-        The same of the band's standard deviation, taken as flat.
+        2πσ_f/c with the standard deviation σ_f of a flat band, rad/m.
     """
 
     values: NDArray[np.complex64]
@@ -219,9 +218,9 @@ class Contribution:
 def _towards(
     profiles: Profiles, place_m: Floats, offsets: Floats, edges: NDArray[np.int64], weights: Floats | None
 ) -> NDArray[np.complex64]:
-    """Return Σ s(R + δ)·exp(jk(R + δ)) over the pulses of each block, (offset, block), R the path of a place.
+    """Return Σ s(R + δ)·exp(jk(R + δ)) over the pulses of each block, (offset, block), with R the path to a point.
 
-    The path from antennas on a line at -R/2 to places at δ/2 on it is R + δ.
+    R + δ is realised as the path from antennas at -R/2 on a line to points at δ/2 on the same line.
     """
     on_line = np.zeros((len(profiles), 3))
     on_line[:, 0] = -profiles.aperture.path(place_m) / 2
@@ -233,10 +232,10 @@ def _towards(
 
 # ---- Sharpness as a function of the tracks, from cached contributions -----------------------------------------------
 
-MOST_WEIGHT = 1e4  # of a patch: bounds the influence of one bright point (eq. 11)
-_WEIGHT_OF_RATIO = 3.0  # weight of a patch over its ratio of peak power to surroundings (eq. 11)
+MOST_WEIGHT = 1e4  # largest weight of a patch, which limits the influence of one bright point (eq. 11)
+_WEIGHT_OF_RATIO = 3.0  # weight of a patch per peak-to-background power ratio (eq. 11)
 _SIDELOBES = 1e-3
-"""Power of a point's sidelobes beyond its own patch, of an aperture without weights, whatever its tracks."""
+"""Relative power of a point's sidelobes outside its patch, of an unweighted aperture with any tracks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,11 +245,11 @@ class PatchImage:
     Attributes
     ----------
     energy
-        Σ|I|², which stays as it was when the contributions were cached.
+        Σ|I|² at the time of caching.
     contrast
         Σ|I|⁴/(Σ|I|²)².
     ratio
-        Peak power against that of what lies about it: speckle, median/ln 2, or sidelobes of brighter points.
+        Peak-to-background power ratio; the background is speckle, median/ln 2, or the sidelobes of brighter points.
     """
 
     energy: float
@@ -259,34 +258,34 @@ class PatchImage:
 
     @classmethod
     def of(cls, image: NDArray[np.complex64], brightest: float = 0.0) -> "PatchImage":
-        """Return those of an image (pixel,); `brightest` is the power of the brightest pixel of all patches."""
+        """Return the statistics of an image (pixel,); `brightest` is the largest pixel power of all patches."""
         power = np.abs(image).astype(np.float64) ** 2
-        energy = max(float(power.sum()), 1e-150)  # its square is more than nothing, also where pulses hold nothing
-        about = max(float(np.median(power)) / np.log(2), _SIDELOBES * brightest, 1e-300)
-        return cls(energy, float((power**2).sum()) / energy**2, float(power.max()) / about)
+        energy = max(float(power.sum()), 1e-150)  # its square must not underflow for pulses without echoes
+        background = max(float(np.median(power)) / np.log(2), _SIDELOBES * brightest, 1e-300)
+        return cls(energy, float((power**2).sum()) / energy**2, float(power.max()) / background)
 
     @property
     def weight(self) -> float:
-        """Weight of its sharpness, by how far its point stands out (eq. 11)."""
+        """Weight of the patch's sharpness by its peak-to-background ratio (eq. 11)."""
         return min(_WEIGHT_OF_RATIO * self.ratio, MOST_WEIGHT)
 
 
 @dataclass(frozen=True, eq=False)
 class Sharpness:
-    """-½ Σ w·log(Σ|I|⁴/S²) over pairs and patches.
+    """Objective -½ Σ w·log(Σ|I|⁴/S²) over pairs and patches.
 
     Attributes
     ----------
     pairs
         Blocks of each pair.
     cached
-        Pair → patch → what its blocks add.
+        Pair → patch → block contributions.
     reference
-        Node → (knot, 3) float64, metres: corrections that the contributions were cached at.
+        Node → (knot, 3) float64, metres: track corrections of the cached contributions.
     statistics
-        Pair → patch → what it showed then.
+        Pair → patch → image statistics at the time of caching.
     used
-        (patch,) bool, patches that count.
+        (patch,) bool, True for patches in the objective.
 
     Notes
     -----
@@ -306,9 +305,9 @@ class Sharpness:
         for blocks, patches, statistics in zip(self.pairs, self.cached, self.statistics, strict=True):
             moved = blocks.moves({node: tracks[node] - self.reference[node] for node in blocks.record.nodes})
             slopes = {node: np.zeros_like(move) for node, move in moved.items()}
-            for patch, now, counts in zip(patches, statistics, self.used, strict=True):
-                if counts:
-                    value, by_phase = _patch(patch, now, moved)
+            for patch, image, is_used in zip(patches, statistics, self.used, strict=True):
+                if is_used:
+                    value, by_phase = _patch(patch, image, moved)
                     total += value
                     for node, slope in patch.slopes.items():
                         slopes[node][patch.blocks] += patch.wavenumber * by_phase[:, None] * slope
@@ -318,22 +317,22 @@ class Sharpness:
 
 
 def phases(patch: Contribution, moved: Tracks) -> Floats:
-    """Return (block,) float64, rad by which contributions turn where the nodes of each block have moved."""
+    """Return (block,) float64, phase change of the contributions by the displacements of the nodes, rad."""
     path = np.zeros(patch.blocks.stop - patch.blocks.start)
     for node, slope in patch.slopes.items():
         path += np.einsum("bi,bi->b", slope, moved[node][patch.blocks])
     return patch.wavenumber * path
 
 
-def _patch(patch: Contribution, now: PatchImage, moved: Tracks) -> tuple[float, Floats]:
-    """Return the value of a patch and its derivative by the phase of each block."""
-    turn = np.exp(1j * phases(patch, moved)).astype(np.complex64)
-    image = patch.values @ turn  # I = B e^{jθ}
+def _patch(patch: Contribution, cached: PatchImage, moved: Tracks) -> tuple[float, Floats]:
+    """Return the objective of a patch and its derivative by the phase of each block."""
+    rotation = np.exp(1j * phases(patch, moved)).astype(np.complex64)
+    image = patch.values @ rotation  # I = B e^{jθ}
     power = (image.real**2 + image.imag**2).astype(np.float64)
     fourth = float((power**2).sum())
     if not fourth:
-        return 0.0, np.zeros(len(turn))
+        return 0.0, np.zeros(len(rotation))
     # G and ∂J/∂θ of eq. 12; J of eq. 11, with S² as cached.
-    by_image = (-now.weight * power / fourth * image).astype(np.complex64)
-    by_phase = -2 * (turn * (by_image.conj() @ patch.values)).imag
-    return -0.5 * now.weight * float(np.log(fourth / now.energy**2)), by_phase.astype(np.float64)
+    by_image = (-cached.weight * power / fourth * image).astype(np.complex64)
+    by_phase = -2 * (rotation * (by_image.conj() @ patch.values)).imag
+    return -0.5 * cached.weight * float(np.log(fourth / cached.energy**2)), by_phase.astype(np.float64)

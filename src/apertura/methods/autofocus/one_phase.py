@@ -1,4 +1,4 @@
-"""One phase per block of pulses for the whole scene: phase gradient, minimum entropy, and when it suffices."""
+"""One phase per pulse block for the whole scene: space-variance test, phase gradient and minimum entropy autofocus."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,23 +12,23 @@ from apertura.common.arrays import Floats
 from apertura.core.quality.path_errors import PointPaths
 from apertura.methods.autofocus.inputs import NodePrior, TrackErrors
 
-# ---- Space variance: path errors of the scene's edges against its middle --------------------------------------------
+# ---- Space variance: path errors at the scene's edges relative to its middle ----------------------------------------
 
 
 MOST_LOSS_DB = 0.1
-"""Loss of peak power at the scene's edges up to which one phase per pulse suffices."""
+"""Largest peak loss at the scene's edges for which one phase per pulse suffices, dB."""
 
 
 @dataclass(frozen=True)
 class SpaceVariance:
-    """Path errors at places of a scene after correction by those of its middle.
+    """Residual path errors at points of a scene after correction by the path errors at its middle.
 
     Attributes
     ----------
     residual_rad
-        RMS over pulses and places.
+        Residual phase, rms over pulses and points.
     loss_db
-        Of the peak's power, mean over the places, 0 or less; without what only shifts them.
+        Peak loss, mean over the points, 0 or less; errors that only shift a point are excluded.
     """
 
     residual_rad: float
@@ -36,33 +36,33 @@ class SpaceVariance:
 
     @property
     def method(self) -> Literal["one_phase", "tracks"]:
-        """The simplest method that suffices."""
+        """Simplest sufficient method."""
         return "one_phase" if self.loss_db >= -MOST_LOSS_DB else "tracks"
 
     @property
     def reason(self) -> str:
-        """Of the choice, in one line."""
+        """Reason of the choice, one line."""
         return (
-            f"one phase per pulse leaves {self.residual_rad:.2g} rad rms and {-self.loss_db:.2g} dB at the scene's "
-            f"edges, {MOST_LOSS_DB:g} dB are accepted"
+            f"one phase per pulse leaves {self.residual_rad:.2g} rad rms and a loss of {-self.loss_db:.2g} dB at the "
+            f"scene's edges; {MOST_LOSS_DB:g} dB are tolerated"
         )
 
 
 def space_variance(middle: PointPaths, points_m: Floats, errors: Sequence[TrackErrors]) -> SpaceVariance:
-    """Return the errors at other places after correction by one phase per pulse, that of the scene's middle.
+    """Estimate the residual errors at points after correction by one phase per pulse, that of the scene's middle.
 
     Parameters
     ----------
     middle
-        A pair's paths to the middle of the scene.
+        Paths of a pair to the middle of the scene.
     points_m
-        (point, 3) float64, metres in the frame of the phase centres: the scene's corners.
+        (point, 3) float64, corners of the scene, metres in the frame of the phase centres.
     errors
-        Of the logs: one where the pair is one node, else the transmitter's and the receiver's.
+        Error statistics of the logs: one for a monostatic pair, else those of transmitter and receiver.
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 30. A sidelink turns all places alike.
+    Source: docs/theory/autofocus.md, eq. 30. A sidelink changes the phase of all points equally.
 
     Examples
     --------
@@ -81,40 +81,40 @@ def space_variance(middle: PointPaths, points_m: Floats, errors: Sequence[TrackE
 
 
 def _at(middle: PointPaths, point_m: Floats, errors: Sequence[TrackErrors]) -> tuple[float, float]:
-    """Return the mean square of what is left at a place, rad², and the loss that it makes, dB."""
-    place = replace(middle, point_m=point_m)
-    grows = (paths.by_node(same=len(errors) == 1, sidelink=False) for paths in (place, middle))
-    parts: list[tuple[Floats, float]] = []
-    for there, here, error in zip(*grows, errors, strict=True):
+    """Return the mean square residual phase at a point, rad², and the loss that it causes, dB."""
+    point = replace(middle, point_m=point_m)
+    gradients = (paths.by_node(same=len(errors) == 1, sidelink=False) for paths in (point, middle))
+    residuals: list[tuple[Floats, float]] = []
+    for at_point, at_middle, error in zip(*gradients, errors, strict=True):
         slow = NodePrior.of(error, middle.time_s, middle.axes).slow
-        for std_m, differs in zip(error.std_m, (there - here).T, strict=True):
-            parts.append((std_m * differs, error.correlation_s))
-            parts += [(mode * differs, float("inf")) for mode in slow.T]
-    power = sum(float((std_m**2).mean()) for std_m, _ in parts)
-    return power * (2 * np.pi / middle.wavelength_m) ** 2, place.of_noise(*parts).loss_db
+        for std_m, difference in zip(error.std_m, (at_point - at_middle).T, strict=True):
+            residuals.append((std_m * difference, error.correlation_s))
+            residuals += [(mode * difference, float("inf")) for mode in slow.T]
+    power = sum(float((std_m**2).mean()) for std_m, _ in residuals)
+    return power * (2 * np.pi / middle.wavelength_m) ** 2, point.of_noise(*residuals).loss_db
 
 
 # ---- Estimators of one phase per block: phase gradient and minimum entropy ------------------------------------------
 
 Patches = Sequence[NDArray[np.complex64]]
-"""Contributions of blocks to the pixels of each patch, (pixel, block)."""
+"""Block contributions to the pixels of each patch, (pixel, block)."""
 
-_SHRINK = 0.7  # of the window, from one pass to the next
-_EDGE_DB, _WIDER = 10.0, 1.5  # the window holds what is brighter below the peak, and half as much again
-_LEAST_VARIANCE = 0.02  # floor of a line's amplitude variance, over its mean squared
-_SETTLED_RAD = 0.05  # rms change of the phases below which passes end
-_MOST_PASSES = 30  # of phase gradient
-_CHOICES = 2  # of the brightest pixels, before and after they have been sharpened
-_MOST_STEPS = 100  # of L-BFGS-B in minimum entropy
+_SHRINK = 0.7  # ratio of the window widths of consecutive passes
+_EDGE_DB, _WIDER = 10.0, 1.5  # least window: extent of the blurred points down to this level, times this factor
+_LEAST_VARIANCE = 0.02  # floor of a line's amplitude variance relative to its squared mean
+_SETTLED_RAD = 0.05  # rms phase change below which the passes stop
+_MOST_PASSES = 30  # maximum passes of phase gradient
+_CHOICES = 2  # selections of the brightest pixels: from the initial and from the sharpened image
+_MOST_STEPS = 100  # maximum steps of L-BFGS-B in minimum entropy
 
 
 def phase_gradient(patches: Patches) -> Floats:
-    """Return the phases that correct the blocks, from phase steps of the brightest pixels.
+    """Estimate the correction phases of the blocks by phase gradient autofocus on the brightest pixels.
 
     Parameters
     ----------
     patches
-        What blocks add, (pixel, block) complex64 each.
+        Block contributions, (pixel, block) complex64 each.
 
     Returns
     -------
@@ -128,34 +128,34 @@ def phase_gradient(patches: Patches) -> Floats:
 
     Examples
     --------
-    >>> wrong = np.exp(2j * np.sin(np.arange(64) / 5))
-    >>> corrected = wrong * np.exp(1j * phase_gradient([wrong[None].astype(np.complex64)]))
-    >>> [round(float(np.abs(np.fft.fft(one, 1024)).max()) / 64, 1) for one in (wrong, corrected)]
+    >>> blurred = np.exp(2j * np.sin(np.arange(64) / 5))
+    >>> corrected = blurred * np.exp(1j * phase_gradient([blurred[None].astype(np.complex64)]))
+    >>> [round(float(np.abs(np.fft.fft(line, 1024)).max()) / 64, 1) for line in (blurred, corrected)]
     [0.6, 1.0]
     """
     count = patches[0].shape[1]
     cycles = np.abs(np.fft.fftfreq(2 * count, 1 / count))
     phase, window = np.zeros(count), float(count)
     for _ in range(_MOST_PASSES):
-        # Window about each line's point, 0.7 of the last and no narrower than the blurred point.
+        # Window about each line's point: 0.7 of the previous width, but no narrower than the blurred point.
         spectrum = np.fft.fft(_lines(patches, phase), 2 * count, axis=1)
         least = _spread(spectrum, cycles)
-        narrow = window <= least
-        window = min(window, least) if narrow else max(window * _SHRINK, least)
+        is_narrow = window <= least
+        window = min(window, least) if is_narrow else max(window * _SHRINK, least)
         windowed = np.fft.ifft(np.where(cycles <= window / 2, spectrum, 0), axis=1)[:, :count]
         # Eq. 32, summed over m, without mean and slope.
         steps = (windowed[:, 1:] * windowed[:, :-1].conj() / _amplitude_variance(windowed)).sum(axis=0)
-        wrong = _level(np.append(0.0, np.cumsum(np.angle(steps))))
-        phase = phase - wrong
-        if narrow and wrong.std() < _SETTLED_RAD:
+        error = _level(np.append(0.0, np.cumsum(np.angle(steps))))
+        phase = phase - error
+        if is_narrow and error.std() < _SETTLED_RAD:
             break
     return phase
 
 
 def minimum_entropy(patches: Patches) -> Floats:
-    """Return the phases at which the lines through the brightest pixels have the least entropy.
+    """Estimate the correction phases of the blocks by minimum entropy of the lines through the brightest pixels.
 
-    Parameters and result as `phase_gradient`.
+    Parameters and result as for `phase_gradient`.
 
     Notes
     -----
@@ -163,9 +163,9 @@ def minimum_entropy(patches: Patches) -> Floats:
 
     Examples
     --------
-    >>> wrong = np.exp(2j * np.sin(np.arange(64) / 5))
-    >>> corrected = wrong * np.exp(1j * minimum_entropy([wrong[None].astype(np.complex64)]))
-    >>> [round(float(np.abs(np.fft.fft(one, 1024)).max()) / 64, 1) for one in (wrong, corrected)]
+    >>> blurred = np.exp(2j * np.sin(np.arange(64) / 5))
+    >>> corrected = blurred * np.exp(1j * minimum_entropy([blurred[None].astype(np.complex64)]))
+    >>> [round(float(np.abs(np.fft.fft(line, 1024)).max()) / 64, 1) for line in (blurred, corrected)]
     [0.6, 1.0]
     """
     from scipy.optimize import minimize  # slow to import
@@ -174,31 +174,30 @@ def minimum_entropy(patches: Patches) -> Floats:
     options = {"maxiter": _MOST_STEPS, "maxcor": 20}
     for _ in range(_CHOICES):
         lines = _lines(patches, phase)
-        found = minimize(partial(entropy, lines), np.zeros_like(phase), jac=True, method="L-BFGS-B", options=options)
-        phase = _level(phase + np.unwrap(found.x))
+        result = minimize(partial(entropy, lines), np.zeros_like(phase), jac=True, method="L-BFGS-B", options=options)
+        phase = _level(phase + np.unwrap(result.x))
     return phase
 
 
 def entropy(lines: NDArray[np.complex128], phase: Floats) -> tuple[float, Floats]:
-    """Return the entropy of lines of the image and its derivative by the phase of each block.
+    """Return the entropy of image lines and its derivative by the phase of each block.
 
     Parameters
     ----------
     lines
-        (line, block) complex128, what blocks add to a pixel of each line.
+        (line, block) complex128, block contributions to a pixel of each line.
     phase
-        (block,) float64, radians by which blocks are turned.
+        (block,) float64, phases applied to the blocks, radians.
 
     Returns
     -------
     tuple
-        nats; (block,) float64, nats per radian.
+        Entropy in nats; (block,) float64, derivative in nats per radian.
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 33. Blocks are followed by as many zeros, so that
-    neither a peak between two samples nor one at the line's end is blurred; the energy is that of the blocks whatever
-    their phases.
+    Source: docs/theory/autofocus.md, eq. 33. The blocks are zero-padded to twice their number, so that neither a peak
+    between two samples nor a peak at the end of a line is blurred; the energy does not depend on the phases.
 
     Examples
     --------
@@ -208,39 +207,39 @@ def entropy(lines: NDArray[np.complex128], phase: Floats) -> tuple[float, Floats
     (0.114494, 0.114494)
     """
     # I_i and q of eq. 33, then H and ∂H/∂θ.
-    turned = lines * np.exp(1j * phase)
-    blocks = turned.shape[1]
-    image = np.fft.fft(turned, 2 * blocks, axis=1, norm="ortho")
+    rotated = lines * np.exp(1j * phase)
+    blocks = rotated.shape[1]
+    image = np.fft.fft(rotated, 2 * blocks, axis=1, norm="ortho")
     power = np.abs(image) ** 2
     total = max(float(power.sum()), 1e-300)
     share = power / total
     logarithm = np.log(np.maximum(share, 1e-300))
     by_image = -(logarithm + 1) * image / total
-    by_turned = np.fft.ifft(by_image, axis=1, norm="ortho")[:, :blocks]
-    return -float((share * logarithm).sum()), -2 * (turned * by_turned.conj()).imag.sum(axis=0)
+    by_rotated = np.fft.ifft(by_image, axis=1, norm="ortho")[:, :blocks]
+    return -float((share * logarithm).sum()), -2 * (rotated * by_rotated.conj()).imag.sum(axis=0)
 
 
 def _lines(patches: Patches, phase: Floats) -> NDArray[np.complex128]:
-    """Return (patch, block), contributions of turned blocks to the brightest pixel of each patch."""
-    turn = np.exp(1j * phase)
-    brightest = (int(np.abs(patch @ turn.astype(np.complex64)).argmax()) for patch in patches)
-    return np.stack([patch[pixel] * turn for patch, pixel in zip(patches, brightest, strict=True)])
+    """Return (patch, block), phase-corrected block contributions to the brightest pixel of each patch."""
+    rotation = np.exp(1j * phase)
+    brightest = (int(np.abs(patch @ rotation.astype(np.complex64)).argmax()) for patch in patches)
+    return np.stack([patch[pixel] * rotation for patch, pixel in zip(patches, brightest, strict=True)])
 
 
 def _spread(spectrum: NDArray[np.complex128], cycles: Floats) -> float:
-    """Return the width of the window that contains the blurred points, cycles over the aperture."""
+    """Return the width of a window that contains the blurred points, cycles over the aperture."""
     power = (np.abs(spectrum) ** 2).sum(axis=0)
     return 2 * _WIDER * max(float(cycles[power > power.max() * 10 ** (-_EDGE_DB / 10)].max(initial=0.0)), 1.0)
 
 
 def _amplitude_variance(windowed: NDArray[np.complex128]) -> Floats:
-    """Return (line, 1), amplitude variance of each line: clutter and noise beside its point."""
+    """Return (line, 1), amplitude variance of each line, caused by clutter and noise in addition to its point."""
     level = np.abs(windowed)
     return np.asarray(level.var(axis=1) + _LEAST_VARIANCE * level.mean(axis=1) ** 2)[:, None] + 1e-300
 
 
 def _level(phase: Floats) -> Floats:
-    """Return phases without what only shifts a line and turns it."""
+    """Return phases without mean and slope, which only rotate and shift a line."""
     at = np.linspace(-1, 1, len(phase))
     return np.asarray(phase - phase.mean() - at * (at @ phase) / (at @ at))
 
@@ -249,4 +248,4 @@ METHODS: Mapping[str, Callable[[Patches], Floats]] = {
     "phase_gradient": phase_gradient,
     "minimum_entropy": minimum_entropy,
 }
-"""Value of `processing.autofocus_method` → estimator, where one phase per pulse suffices."""
+"""Value of `processing.autofocus_method` → estimator of one phase per pulse."""

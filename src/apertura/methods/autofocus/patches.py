@@ -1,4 +1,4 @@
-"""Patches of the scene about bright places: which places may be points, and the pixels about each."""
+"""Patches of the scene about bright points: detection of candidate points, and the pixels about each."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,35 +20,35 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain
 from apertura.methods.autofocus.inputs import PairRecord, Refinement, TrackErrors
 
-# ---- Patches about bright places and their pixels -------------------------------------------------------------------
+# ---- Patches about bright points and their pixels -------------------------------------------------------------------
 
 
 MOST_PATCHES, CLEAR = 32, 20.0
-"""Most patches; and peak to surroundings, power: patches are taken until their sum is that of a dozen such points."""
+"""Maximum number of patches; and peak-to-background power ratio of a clear point, a dozen of which suffice."""
 
 MOST_VALUES = 2**27
-"""Complex values, a gigabyte, of what blocks add to patches: with more, fewer patches are used."""
+"""Maximum number of complex values of block contributions, a gigabyte; it limits the number of patches."""
 
-_ENOUGH = 12 * CLEAR  # sum of the ratios at which no more patches are taken
-_SAMPLING = 0.7  # of Nyquist of the image: at 0.5 no better, at 0.85 places are less accurate
-_RANGE_CELLS = 1.5  # half of a patch along the line of sight
-_LEAST_CELLS, _MOST_CELLS = 6.0, 24.0  # half of a patch across it
-_BANDWIDTH = 0.66  # of an error that lasts τ, in 1/τ: its sidelobes should stay in the patch
+_ENOUGH = 12 * CLEAR  # sum of the ratios at which the selection of patches stops
+_SAMPLING = 0.7  # pixel spacing in resolution cells: 0.5 gains nothing, at 0.85 positions are less accurate
+_RANGE_CELLS = 1.5  # half the size of a patch along the line of sight
+_LEAST_CELLS, _MOST_CELLS = 6.0, 24.0  # half the size of a patch across the line of sight
+_BANDWIDTH = 0.66  # bandwidth of errors with correlation time τ, in 1/τ: their sidelobes shall lie in the patch
 _MOST_PIXELS = 1000  # of a patch
-_PULSES = 256  # sampled for the directions and cells of a patch
-_SHARE = 0.4  # of all patches, at most, in one ninth of the scene
+_PULSES = 256  # pulses sampled for the directions and cells of a patch
+_SHARE = 0.4  # largest share of all patches in one ninth of the scene
 
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """A bright place.
+    """Bright point with the pixels about it.
 
     Attributes
     ----------
     place_m
-        (3,) float64, metres in the frame.
+        (3,) float64, position of the point, metres in the frame.
     pixels_m
-        (pixel, 3) float64, metres, level about the place.
+        (pixel, 3) float64, horizontal pixels about the point, metres in the frame.
     """
 
     place_m: Floats
@@ -56,18 +56,18 @@ class Patch:
 
 
 def separated(places_m: Floats, ratio: Floats, axes: Floats, *, apart_m: float) -> Floats:
-    """Return as many places as are needed, clearest first, apart from each other and spread over the scene.
+    """Select a sufficient number of points, clearest first, that are separated and spread over the scene.
 
     Parameters
     ----------
     places_m
-        (place, 3) float64, metres in the frame, clearest first.
+        (point, 3) float64, metres in the frame, clearest first.
     ratio
-        (place,) float64, power of each against what lies about it.
+        (point,) float64, peak-to-background power ratio of each point.
     axes
         (3, 3) float64, rows are east, north, up.
     apart_m
-        Least distance between two.
+        Least distance between two points, metres.
 
     Returns
     -------
@@ -82,42 +82,42 @@ def separated(places_m: Floats, ratio: Floats, axes: Floats, *, apart_m: float) 
     """
     level = (places_m - places_m.mean(axis=0)) @ axes[:2].T
     low, extent = level.min(axis=0), np.maximum(np.ptp(level, axis=0), 1e-9)
-    # The scene in nine parts, of which none may provide more than its share of the places.
+    # The scene in nine parts, each of which contributes no more than its share of the points.
     ninth = np.minimum((level - low) / extent * 3, 2.999).astype(int) @ np.array([3, 1])
-    taken: list[int] = []
+    selected: list[int] = []
     for number in range(len(places_m)):
-        information = float(np.minimum(ratio[taken], CLEAR).sum())
-        if len(taken) == MOST_PATCHES or information >= _ENOUGH:
+        information = float(np.minimum(ratio[selected], CLEAR).sum())
+        if len(selected) == MOST_PATCHES or information >= _ENOUGH:
             break
         most = max(2, int(np.ceil(_SHARE * min(MOST_PATCHES, _ENOUGH / min(CLEAR, ratio[number])))))
-        near = any(np.linalg.norm(level[number] - level[other]) < apart_m for other in taken)
-        if not near and sum(ninth[other] == ninth[number] for other in taken) < most:
-            taken.append(number)
-    return places_m[taken]
+        is_near = any(np.linalg.norm(level[number] - level[other]) < apart_m for other in selected)
+        if not is_near and sum(ninth[other] == ninth[number] for other in selected) < most:
+            selected.append(number)
+    return places_m[selected]
 
 
 def patch_at(place_m: Floats, records: Sequence[PairRecord], axes: Floats, *, correlation_s: float) -> Patch:
-    """Return the pixels about a place: as fine as the sharpest pair needs, as wide as errors spread its energy.
+    """Return the patch about a point: as fine as the sharpest pair requires, as wide as errors spread its energy.
 
     Parameters
     ----------
     place_m
-        (3,) float64, metres in the frame.
+        (3,) float64, position of the point, metres in the frame.
     records
-        Of all pairs.
+        Records of all pairs.
     axes
         (3, 3) float64, rows are east, north, up.
     correlation_s
-        How long an error of the tracks lasts.
+        Correlation time of track errors.
 
     Notes
     -----
     Source: docs/theory/autofocus.md, "Patches".
     """
     spans = [_spans(place_m, record, axes, correlation_s) for record in records]
-    across = max(spans, key=lambda one: one[1][1])[0]
-    cell = np.min([one[1] for one in spans], axis=0)
-    half = np.max([one[2] for one in spans], axis=0)
+    directions = max(spans, key=lambda span: span[1][1])[0]
+    cell = np.min([span[1] for span in spans], axis=0)
+    half = np.max([span[2] for span in spans], axis=0)
     counts = 2 * np.ceil(half / _SAMPLING) + 1
     shrink = min(1.0, np.sqrt(_MOST_PIXELS / counts.prod()))
     sides = [
@@ -125,7 +125,7 @@ def patch_at(place_m: Floats, records: Sequence[PairRecord], axes: Floats, *, co
         for reach, size in zip(half, cell, strict=True)
     ]
     along, aside = np.meshgrid(*sides, indexing="ij")
-    level = along[..., None] * across[0] + aside[..., None] * across[1]
+    level = along[..., None] * directions[0] + aside[..., None] * directions[1]
     return Patch(place_m, place_m + level.reshape(-1, 2) @ axes[:2])
 
 
@@ -141,64 +141,66 @@ def count_in_memory(values: Sequence[int]) -> int:
 
 
 def _spans(place_m: Floats, record: PairRecord, axes: Floats, correlation_s: float) -> tuple[Floats, Floats, Floats]:
-    """Return the directions along and across the line of sight, the cells along both, half a patch in cells."""
+    """Return the directions along and across the line of sight, cell sizes and half patch sizes (cells) along both."""
     profiles = record.profiles
-    some = profiles.aperture.sample(_PULSES)
-    slope, time_s = profiles.aperture[some].path_gradient(place_m) @ axes[:2].T, record.time_s[some]
+    pulses = profiles.aperture.sample(_PULSES)
+    slope, time_s = profiles.aperture[pulses].path_gradient(place_m) @ axes[:2].T, record.time_s[pulses]
     if record.beams is not None:
-        illuminated = record.beams[some].weight(profiles.aperture[some], place_m[None])[:, 0] > 0
+        illuminated = record.beams[pulses].weight(profiles.aperture[pulses], place_m[None])[:, 0] > 0
         slope, time_s = (slope[illuminated], time_s[illuminated]) if illuminated.sum() > 2 else (slope, time_s)
-    # Cycles per metre along and across the mean line of sight, over pulses and band: cells are their inverse extents.
-    ahead = slope.mean(axis=0)
-    ahead = ahead / np.linalg.norm(ahead) if np.linalg.norm(ahead) > 1e-3 else np.array([0.0, 1.0])
-    turned = np.stack([ahead, [-ahead[1], ahead[0]]])
-    by_time = slope @ turned.T
+    # Cycles per metre along and across the mean line of sight, over pulses and band; cells are their inverse extents.
+    along_sight = slope.mean(axis=0)
+    along_sight = (
+        along_sight / np.linalg.norm(along_sight) if np.linalg.norm(along_sight) > 1e-3 else np.array([0.0, 1.0])
+    )
+    directions = np.stack([along_sight, [-along_sight[1], along_sight[0]]])
+    by_time = slope @ directions.T
     band = profiles.centre_frequency_hz + np.array([-0.5, 0.5]) * profiles.bandwidth_hz
     cycles = np.concatenate([by_time * frequency / SPEED_OF_LIGHT_M_S for frequency in band])
     cell = 1 / np.maximum(np.ptp(cycles, axis=0), 1e-9)
     spread = np.clip(_BANDWIDTH * float(np.ptp(time_s)) / correlation_s, _LEAST_CELLS, _MOST_CELLS)
-    turning = np.ptp(by_time, axis=0)
-    half = np.array([max(_RANGE_CELLS, spread * min(1.0, turning[0] / max(turning[1], 1e-9)) ** 2), spread])
-    return turned, cell, half
+    extent = np.ptp(by_time, axis=0)
+    half = np.array([max(_RANGE_CELLS, spread * min(1.0, extent[0] / max(extent[1], 1e-9)) ** 2), spread])
+    return directions, cell, half
 
 
-# ---- Bright places in images of short parts of the aperture ---------------------------------------------------------
+# ---- Bright points in images of short subapertures ------------------------------------------------------------------
 
 LEAST_RATIO = 5.0
-"""Peak power over its surroundings, summed over parts of the aperture: less is no point."""
+"""Least peak-to-background power ratio of a point, summed over subapertures."""
 
 HELPFUL_RATIO = 3.5
-"""The same of weaker places that are used as well where there are points."""
+"""Least ratio of weaker points, which are used in addition if the scene has points."""
 
-_SHARE_OF_CLEAREST = 0.05  # beside clear points faint places are their sidelobes
-_APART = 0.6  # least distance of patches, in halves of a patch
+_SHARE_OF_CLEAREST = 0.05  # least ratio relative to the clearest point; fainter points may be its sidelobes
+_APART = 0.6  # least distance of patches, in half patch sizes
 
 MOST_LOOKS = 128
-"""Parts of what a place is seen from, at most: the shorter, the coarser their images."""
+"""Maximum number of subapertures from which a point is visible: the shorter, the coarser their images."""
 
 REFINED_LOOKS = 4
-"""Parts once tracks are refined, at least: long parts separate neighbours, several average their sidelobes."""
+"""Least number of subapertures for refined tracks: long ones resolve neighbours, several average their sidelobes."""
 
-_BLURRED_RAD2 = 3.0  # growth of the phase errors' variance over a part: its image keeps most of a point's power
-_BY_CHANCE = 1e-3  # that speckle anywhere in the scene passes for a point
-_SIDE_PX = 256  # of parts of the image formed at once
-_WEIGHED_PX, _WEIGHED_PULSES = 16, 8  # pixels from one weight of a part by antennas and sector to the next; its pulses
-_TREE_PULSES = 256  # of a part, from which trees are faster than the direct sum
-_ABOUT_CELLS = 12  # of range: radius of the surroundings
-_SIDELOBES = 1e-3  # of the brightest: fainter places may be its sidelobes
-_MOST_PLACES = 500  # of candidates kept
+_BLURRED_RAD2 = 3.0  # growth of the phase-error variance in a subaperture whose image keeps most of a point's power
+_BY_CHANCE = 1e-3  # false alarm rate of points from speckle, per scene
+_SIDE_PX = 256  # side of image tiles, pixels
+_WEIGHED_PX, _WEIGHED_PULSES = 16, 8  # spacing of antenna and sector weights in pixels; pulses averaged for a weight
+_TREE_PULSES = 256  # pulses of a subaperture from which engine tree is faster than the direct sum
+_ABOUT_CELLS = 12  # radius of the background in range cells
+_SIDELOBES = 1e-3  # power relative to the brightest point, below which points may be its sidelobes
+_MOST_PLACES = 500  # maximum number of candidates
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Places of a scene by which tracks can be refined.
+    """Candidate points of a scene for the refinement of tracks.
 
     Attributes
     ----------
     patches
-        About places that stand out and apart, clearest first; none where too few are points.
+        Patches about separated bright points, clearest first; empty if the scene has no point.
     points
-        How many places are points.
+        Number of points above the detection threshold.
     axes
         (3, 3) float64, rows are east, north, up at the scene in the frame.
     """
@@ -217,32 +219,34 @@ class Candidates:
         *,
         looks: int | None = None,
     ) -> "Candidates":
-        """Return those of a scene.
+        """Detect the candidate points of a scene.
 
         Parameters
         ----------
         records
-            Of every pair.
+            Records of all pairs.
         grid, terrain
             The scene.
         errors
             Node → error statistics of its log.
         looks
-            Parts of what a place is seen from, or as many as the pixels want that are looked at; by default of those
-            that the logs' errors may require the shortest that show half as many bright places as any.
+            Least number of subapertures; the pixel spacing may require more. By default the shortest subapertures
+            that the errors of the logs may require and that show at least half as many bright points as any others.
         """
         correlation_s = min(one.correlation_s for one in errors.values())
         if looks:
             looks = max(looks, sampled_looks(records, grid, terrain))
         by_looks = [
             (
-                *bright_places(records, grid, terrain, looks=some),
-                least_ratio(some * len(records), grid.shape[0] * grid.shape[1]),
+                *bright_places(records, grid, terrain, looks=count),
+                least_ratio(count * len(records), grid.shape[0] * grid.shape[1]),
             )
-            for some in ([looks] if looks else looks_of(records, errors, _middle(grid, terrain)))
+            for count in ([looks] if looks else looks_of(records, errors, _middle(grid, terrain)))
         ]
         clear = [float(np.minimum(ratio[ratio > least], CLEAR).sum()) for _, ratio, least in by_looks]
-        places_m, ratio, least = next(one for one, sum_ in zip(by_looks, clear, strict=True) if 2 * sum_ >= max(clear))
+        places_m, ratio, least = next(
+            detected for detected, total in zip(by_looks, clear, strict=True) if 2 * total >= max(clear)
+        )
         axes = east_north_up(grid, places_m)
         points = int((ratio > least).sum())
         if not points:
@@ -254,58 +258,61 @@ class Candidates:
         return cls([patch_at(place, records, axes, correlation_s=correlation_s) for place in chosen], points, axes)
 
     def rejected(self, errors: Mapping[str, TrackErrors], by_speckle: Refinement | None = None) -> Refinement:
-        """Return a rejected refinement: no bright place, and why speckle does not do; no node is moved."""
-        line = f"no place of the scene stands {decibels(LEAST_RATIO):.0f} dB out of what lies about it"
+        """Return a rejected refinement without corrections: no bright point, and the reason against speckle."""
+        line = f"no point of the scene exceeds its background by {decibels(LEAST_RATIO):.0f} dB"
         report: dict[str, Any] = {"patches": self.points}
         if by_speckle is not None:
-            line, report = f"{line}; {by_speckle.why}", {**report, "speckle": dict(by_speckle.report)}
-        still = TrackCorrection(np.zeros(1), {node: np.zeros((1, 3)) for node in errors})
-        std_m = {node: one.along(self.axes)[None] for node, one in errors.items()}
-        return Refinement(still, std_m, False, line, report, {"refinement_no_bright_place": line})
+            line, report = f"{line}; {by_speckle.reason}", {**report, "speckle": dict(by_speckle.report)}
+        unchanged = TrackCorrection(np.zeros(1), {node: np.zeros((1, 3)) for node in errors})
+        std_m = {node: error.along(self.axes)[None] for node, error in errors.items()}
+        return Refinement(unchanged, std_m, False, line, report, {"refinement_no_bright_point": line})
 
 
 def looks_of(records: Sequence[PairRecord], errors: Mapping[str, TrackErrors], place_m: Floats) -> list[int]:
-    """Return into how many parts the time may be cut for which a place is seen, shortest parts first.
+    """Return candidate numbers of subapertures of the time in which a point is visible, shortest subapertures first.
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 10a: from parts over which the variance of the errors' phase grows by three,
-    and whose images nothing blurs, to parts as long as an error lasts, whose images hold more of a point against
-    clutter.
+    Source: docs/theory/autofocus.md, eq. 10a: from subapertures over which the variance of the phase errors grows by
+    3 rad², whose images are not blurred, to subapertures as long as the correlation time of the errors, whose images
+    have a better contrast of points against clutter.
     """
     spans_s, shortest_s, longest_s = [], [], []
-    for one in records:
-        lasts_s, turned = one.turned(errors)
-        longest_s.append(lasts_s)
-        shortest_s.append(lasts_s * min(1.0, _BLURRED_RAD2 / (2 * turned**2)))
-        spans_s.append(float(one.time_s[-1] - one.time_s[0]) * _seen(one, place_m))
-    most, least = (int(np.clip(max(spans_s) / max(min(one), 1e-9), 1, MOST_LOOKS)) for one in (shortest_s, longest_s))
+    for record in records:
+        correlation_s, phase_rad = record.extreme_errors(errors)
+        longest_s.append(correlation_s)
+        shortest_s.append(correlation_s * min(1.0, _BLURRED_RAD2 / (2 * phase_rad**2)))
+        spans_s.append(float(record.time_s[-1] - record.time_s[0]) * _visible_share(record, place_m))
+    most, least = (
+        int(np.clip(max(spans_s) / max(min(lengths_s), 1e-9), 1, MOST_LOOKS)) for lengths_s in (shortest_s, longest_s)
+    )
     steps = max(1, int(np.ceil(np.log2(most / least)))) if most > least else 0
     return [round(most * (least / most) ** (step / max(steps, 1))) for step in range(steps + 1)]
 
 
 def sampled_looks(records: Sequence[PairRecord], grid: SceneGrid, terrain: Terrain) -> int:
-    """Return the number of parts from which on no image is finer than the pixels that `bright_places` looks at.
+    """Return the least number of subapertures whose image resolution is no finer than the pixels of `bright_places`.
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 10b. Longer parts, of which pulses are the more the longer a flight is, would
-    show points between pixels and hold all of the flight in memory.
+    Source: docs/theory/autofocus.md, eq. 10b. Images of longer subapertures would have points between pixels, and
+    their pulses would occupy memory in proportion to the flight.
     """
     place_m, step_m = _middle(grid, terrain), _step(records, grid) * grid.spacing_m
     most = 1.0
-    for one in records:
-        some = one.profiles.aperture.sample(_PULSES)
-        slope = one.profiles.aperture[some].path_gradient(place_m)
-        turned = np.linalg.norm(np.diff(slope, axis=0), axis=1) * one.profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
-        lasts = np.diff(one.time_s[some])
-        fastest = float((turned / np.maximum(lasts, 1e-9)).max(initial=0.0))
-        most = max(most, 2 * fastest * step_m * float(one.time_s[-1] - one.time_s[0]) * _seen(one, place_m))
+    for record in records:
+        pulses = record.profiles.aperture.sample(_PULSES)
+        slope = record.profiles.aperture[pulses].path_gradient(place_m)
+        change = np.linalg.norm(np.diff(slope, axis=0), axis=1)
+        cycles_per_m = change * record.profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
+        interval_s, span_s = np.diff(record.time_s[pulses]), float(record.time_s[-1] - record.time_s[0])
+        fastest = float((cycles_per_m / np.maximum(interval_s, 1e-9)).max(initial=0.0))
+        most = max(most, 2 * fastest * step_m * span_s * _visible_share(record, place_m))
     return int(np.ceil(most))
 
 
 def least_ratio(looks: int, cells: int) -> float:
-    """Return the power over the mean that speckle, averaged over looks, exceeds in one scene of a thousand.
+    """Return the power ratio to the mean that speckle, averaged over looks, exceeds in one scene of a thousand.
 
     Examples
     --------
@@ -320,29 +327,29 @@ def least_ratio(looks: int, cells: int) -> float:
 def bright_places(
     records: Sequence[PairRecord], grid: SceneGrid, terrain: Terrain, *, looks: int
 ) -> tuple[Floats, Floats]:
-    """Return places brighter than their surroundings in the images of all pairs, and by how much.
+    """Detect local maxima in the summed images of all pairs, with their peak-to-background power ratio.
 
     Parameters
     ----------
     records
-        Of every pair.
+        Records of all pairs.
     grid, terrain
         The scene.
     looks
-        Parts of the aperture whose images are summed.
+        Number of subapertures whose images are summed.
 
     Returns
     -------
     places_m : ndarray
-        (place, 3) float64, metres in the frame, those that stand out most first.
+        (point, 3) float64, metres in the frame, largest ratio first.
     ratio : ndarray
-        (place,) float64, power over that of the surroundings, summed over parts of the aperture.
+        (point,) float64, peak-to-background power ratio, summed over subapertures.
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, "Patches". Power is summed over images of parts of the aperture, on every
-    so many-th pixel of the grid; a part that is short against the errors is focused whatever they are. Pulses of a part
-    have Hann weights: sidelobes across the line of sight, which would pass for points, fall below −31 dB.
+    Source: docs/theory/autofocus.md, "Patches". Power is summed over images of subapertures on a thinned pixel grid;
+    a subaperture that is short against the correlation time of the errors is focused for any errors. The pulses of a
+    subaperture have Hann weights: cross-range sidelobes, which could pass for points, fall below −31 dB.
     """
     from scipy.ndimage import maximum_filter, median_filter  # slow to import
 
@@ -350,25 +357,25 @@ def bright_places(
     step = _step(records, grid)
     rows, columns = (np.arange(step // 2, size, step) for size in grid.shape)
     power = np.zeros((len(rows), len(columns)))
-    places = [
-        (part, terrain.positions_at(grid, *np.meshgrid(rows[part[0]], columns[part[1]], indexing="ij")))
-        for part in _parts(len(rows), len(columns))
+    tiles = [
+        (window, terrain.positions_at(grid, *np.meshgrid(rows[window[0]], columns[window[1]], indexing="ij")))
+        for window in _windows(len(rows), len(columns))
     ]
-    # Power summed over the looks of each pair, each pair by its mean.
-    for one in records:
+    # Power summed over the looks of each pair and normalised by the pair's mean.
+    for record in records:
         image = np.zeros_like(power)
-        for power_of in _looks(one, looks, _middle(grid, terrain)):
-            for part, pixels in places:
-                image[part] += power_of(pixels)
+        for power_of in _looks(record, looks, _middle(grid, terrain)):
+            for window, pixels in tiles:
+                image[window] += power_of(pixels)
         power += image / max(float(np.nanmean(image)), 1e-300)
     power = np.nan_to_num(power)
-    # Surroundings: median over some range cells, on a thinned lattice; or sidelobes of the brightest place.
+    # Background: median within `_ABOUT_CELLS` on a thinned lattice, or sidelobes of the brightest point.
     reach = max(3, round(_ABOUT_CELLS * cell_m / (step * grid.spacing_m)))
     thin = max(1, reach // 3)
-    about = median_filter(power[::thin, ::thin], size=7, mode="nearest")
-    about = np.repeat(np.repeat(about, thin, 0), thin, 1)[: power.shape[0], : power.shape[1]]
-    ratio = power / np.maximum(about, _SIDELOBES * power.max())
-    # Local maxima, by their power over the surroundings.
+    background = median_filter(power[::thin, ::thin], size=7, mode="nearest")
+    background = np.repeat(np.repeat(background, thin, 0), thin, 1)[: power.shape[0], : power.shape[1]]
+    ratio = power / np.maximum(background, _SIDELOBES * power.max())
+    # Local maxima, sorted by their ratio to the background.
     top = (maximum_filter(power, 2 * max(1, reach // 6) + 1) == power) & (power > 0)
     down, right = np.nonzero(top)
     order = np.argsort(-ratio[down, right], kind="stable")[:_MOST_PLACES]
@@ -384,65 +391,66 @@ def east_north_up(grid: SceneGrid, places_m: Floats) -> Floats:
     return np.stack([east, north, -down])
 
 
-def _parts(rows: int, columns: int) -> Iterator[tuple[slice, slice]]:
+def _windows(rows: int, columns: int) -> Iterator[tuple[slice, slice]]:
     for row in range(0, rows, _SIDE_PX):
         for column in range(0, columns, _SIDE_PX):
             yield slice(row, row + _SIDE_PX), slice(column, column + _SIDE_PX)
 
 
 def _step(records: Sequence[PairRecord], grid: SceneGrid) -> int:
-    """Return the distance of pixels that bright places are looked for in, in pixels of the grid: half a range cell."""
-    cell_m = min(SPEED_OF_LIGHT_M_S / one.profiles.bandwidth_hz for one in records) / 2
+    """Return the pixel step for the detection of bright points, half a range cell, in pixels of the grid."""
+    cell_m = min(SPEED_OF_LIGHT_M_S / record.profiles.bandwidth_hz for record in records) / 2
     return max(1, int(cell_m / 2 / grid.spacing_m))
 
 
 def _middle(grid: SceneGrid, terrain: Terrain) -> Floats:
-    """Return (3,) float64, metres in the frame, the middle of the scene."""
+    """Return (3,) float64, middle of the scene, metres in the frame."""
     return np.asarray(terrain.positions_at(grid, (grid.shape[0] - 1) / 2, (grid.shape[1] - 1) / 2))
 
 
-def _seen(one: PairRecord, place_m: Floats) -> float:
-    """Return the share of a flight that a place is seen from, by antennas and sector: 1 of all of it, more than 0."""
-    if one.beams is None:
+def _visible_share(record: PairRecord, place_m: Floats) -> float:
+    """Return the share of pulses from which antennas and sector show a point; 1 also if no sampled pulse does."""
+    if record.beams is None:
         return 1.0
-    some = one.profiles.aperture.sample(_PULSES)
-    share = float((one.beams[some].weight(one.profiles.aperture[some], place_m[None]) > 0).mean())
+    pulses = record.profiles.aperture.sample(_PULSES)
+    share = float((record.beams[pulses].weight(record.profiles.aperture[pulses], place_m[None]) > 0).mean())
     return share or 1.0
 
 
-def _looks(one: PairRecord, looks: int, place_m: Floats) -> Iterator[Callable[[Floats], Floats]]:
-    """Yield what gives the power of pixels (y, x, 3) in each part of a flight.
+def _looks(record: PairRecord, looks: int, place_m: Floats) -> Iterator[Callable[[Floats], Floats]]:
+    """Yield, for each subaperture of a flight, the function that returns the power at pixels (y, x, 3).
 
-    Parts are of equal length, half of each in the next; their pulses have Hann weights. Antennas and sector weigh the
-    image of a part as in the mean over it: they change slowly. Tables are made once for each, and serve all places.
+    Subapertures have equal length and overlap by a half; their pulses have Hann weights. The image of a subaperture is
+    weighted by the mean antenna and sector weight, which changes slowly. The tables of a subaperture are computed once
+    for all pixels.
     """
-    count = max(1, round(looks / _seen(one, place_m)))
-    ends = np.linspace(0, len(one.time_s), count + 2 if count > 1 else 2).astype(int)
+    count = max(1, round(looks / _visible_share(record, place_m)))
+    ends = np.linspace(0, len(record.time_s), count + 2 if count > 1 else 2).astype(int)
     for first, last in zip(ends, ends[2:] if count > 1 else ends[1:], strict=False):
         if last == first:
             continue
-        part, many = one.profiles[int(first) : int(last)], last - first >= _TREE_PULSES
+        subaperture, is_long = record.profiles[int(first) : int(last)], last - first >= _TREE_PULSES
         engine = next(
-            each for name in ("tree", "native", "numba")[not many :] if (each := load_engine(name)).available()
+            each for name in ("tree", "native", "numba")[not is_long :] if (each := load_engine(name)).available()
         )
         taper = np.hanning(last - first + 2)[1:-1, None].astype(np.float32)
-        tables = engine.prepare(replace(part, samples=np.asarray(part.samples) * taper))
-        some = np.linspace(first, last - 1, _WEIGHED_PULSES + 2)[1:-1].astype(int)
-        beams = None if one.beams is None else one.beams[some]
-        yield partial(_power, partial(engine.form, tables), beams, one.profiles.aperture[some])
+        tables = engine.prepare(replace(subaperture, samples=np.asarray(subaperture.samples) * taper))
+        pulses = np.linspace(first, last - 1, _WEIGHED_PULSES + 2)[1:-1].astype(int)
+        beams = None if record.beams is None else record.beams[pulses]
+        yield partial(_power, partial(engine.form, tables), beams, record.profiles.aperture[pulses])
 
 
 def _power(
-    form: Callable[[Floats], NDArray[np.complex64]], beams: Beams | None, some: Aperture, pixels: Floats
+    form: Callable[[Floats], NDArray[np.complex64]], beams: Beams | None, aperture: Aperture, pixels: Floats
 ) -> Floats:
-    """Return (y, x) float64, power of an image, weighted as `beams` do over some pulses; nothing is formed unseen."""
+    """Return (y, x) float64, image power with the mean weight of `beams` over `aperture`; 0 if no pixel is visible."""
     weight: Floats = np.ones((1, 1))
     if beams is not None:
         rows, columns = (
             np.minimum(np.arange(0, size, _WEIGHED_PX) + _WEIGHED_PX // 2, size - 1) for size in pixels.shape[:2]
         )
         coarse = pixels[np.ix_(rows, columns)]
-        mean = beams.weight(some, coarse.reshape(-1, 3)).mean(axis=0).reshape(coarse.shape[:2])
+        mean = beams.weight(aperture, coarse.reshape(-1, 3)).mean(axis=0).reshape(coarse.shape[:2])
         weight = np.repeat(np.repeat(mean, _WEIGHED_PX, 0), _WEIGHED_PX, 1)[: pixels.shape[0], : pixels.shape[1]]
         if not weight.any():
             return np.zeros(pixels.shape[:2])

@@ -1,4 +1,4 @@
-"""Tracks of a flight refined by the images of all its pairs, and by reference points of known place."""
+"""Refinement of the tracks of a flight by the images of all its pairs and by reference points of known position."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -49,18 +49,18 @@ from apertura.methods.causes import Cause
 # ---- Gauge fixed by points common to pairs and by reference points --------------------------------------------------
 
 
-_LEAST_RATIO = 30.0  # peak power of a point over its surroundings, for a measured place
-_LEAST_STD_M = 0.01  # of a point's place between pairs: bistatic scattering centres differ
-_ZOOMS, _SIDE = 3, 9  # of the search for a point's place: rounds, samples along a side
-_MEDIAN_OF_TWO = 2 * np.log(2)  # of the sum of two squared standard normal values
-_ROUNDS = 3  # of least squares in the gauge, linearised anew
+_LEAST_RATIO = 30.0  # least peak-to-background power ratio of a point for a position measurement
+_LEAST_STD_M = 0.01  # of point positions between pairs, as bistatic scattering centres differ
+_ZOOMS, _SIDE = 3, 9  # search for the position of a point: rounds, samples along a side
+_MEDIAN_OF_TWO = 2 * np.log(2)  # median of the sum of two squared standard normal values
+_ROUNDS = 3  # least-squares iterations in the gauge, each with a new linearisation
 
 
 @dataclass(frozen=True, eq=False)
-class _MeasuredPlace:
-    """A point's place in a pair's image, east and north (m), its deviation, and its shift.
+class _MeasuredPosition:
+    """Position of a point in the image of a pair, east and north (m), its standard deviation, and its shifts.
 
-    By the gauge's modes (2, mode), and per metre by which all paths are longer (2, 1).
+    `shift_m` (2, mode) is the shift per unit of the gauge's modes, `longer` (2, 1) per metre of common path change.
     """
 
     place_m: Floats
@@ -72,12 +72,12 @@ class _MeasuredPlace:
 def fix_gauge(
     problem: Problem, unknowns: Floats, points: Sequence[ReferencePoint], axes: Floats
 ) -> tuple[Floats, dict[str, Any]]:
-    """Return the unknowns with their gauge fixed by points, and a report.
+    """Fix the gauge of the unknowns by points common to pairs and by reference points; return unknowns and report.
 
     Parameters
     ----------
     problem, unknowns
-        As solved.
+        Solved problem and its unknowns.
     points
         Reference points.
     axes
@@ -85,8 +85,8 @@ def fix_gauge(
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 15: least squares in the gauge alone, with the log's prior. All pairs image
-    one scene, so that a point has one place.
+    Source: docs/theory/autofocus.md, eq. 15: least squares in the gauge alone, with the prior of the logs. A point has
+    the same position in the images of all pairs.
     """
     if not len(problem.gauge.modes) or not (points or len(problem.pairs) > 1):
         return unknowns, {}
@@ -96,35 +96,35 @@ def fix_gauge(
     step: Floats = np.zeros(modes + len(problem.pairs) - 1)
     report: dict[str, Any] = {}
     for number in range(_ROUNDS):
-        # S/σ and d/σ of eq. 15 about the tracks of the round: between pairs, and against reference points.
+        # S/σ and d/σ of eq. 15 at the tracks of the iteration: between pairs, and relative to reference points.
         tracks = problem.prior.tracks(unknowns + step[:modes] @ problem.gauge.modes)
         matrix, residuals = _pair_residuals(problem, tracks, axes)
         reference_rows, reference_residuals, position_errors = _reference_residuals(
             problem, points, echoes, tracks, axes
         )
         if not number:
-            report = {"pairs_apart_sigma": _apart(residuals)} | (
+            report = {"pairs_apart_sigma": _distance_sigma(residuals)} | (
                 {"reference_points": position_errors} if points else {}
             )
         matrix = np.concatenate([matrix, reference_rows])
         residuals = np.concatenate([residuals, reference_residuals])
-        # Normal equations of eq. 15, with the prior |y|². `residuals` already hold the shift by the modes so far, which
-        # is added back; path lengths are no part of the tracks, so what they explain is still in the residuals.
+        # Normal equations of eq. 15, with the prior |y|². The shift by the modes of previous iterations is added back
+        # to `residuals`; path lengths are not part of the tracks, so that the residuals still contain their effect.
         normal = matrix.T @ matrix + np.eye(len(step))
         target = matrix[:, :modes] @ step[:modes] - residuals
         step = np.asarray(np.linalg.solve(normal, matrix.T @ target), np.float64)
     std = np.sqrt(np.diag(np.linalg.inv(normal)))
     report["paths_longer_m"] = {
-        blocks.record.pair: [round(float(PATH_STD_M * one[modes + number]), 4) for one in (step, std)]
+        blocks.record.pair: [round(float(PATH_STD_M * values[modes + number]), 4) for values in (step, std)]
         for number, blocks in enumerate(problem.pairs[1:])
     }
     return unknowns + step[:modes] @ problem.gauge.modes, report
 
 
 def path_std_m(problem: Problem) -> dict[str, float]:
-    """Return the deviation of the mean path of each pair but the first from the first's by errors of the logs.
+    """Return the standard deviation of each pair's mean path relative to the first pair's, by errors of the logs.
 
-    Standard deviations at the first patch, metres, over draws from the prior.
+    Pair → metres at the first patch, from random draws of the prior.
     """
     draws = problem.prior.tracks(np.random.default_rng(0).standard_normal((_DRAWS, problem.prior.size)))
     paths = []
@@ -141,36 +141,37 @@ def path_std_m(problem: Problem) -> dict[str, float]:
 
 
 def pair_disagreement(problem: Problem, tracks: Tracks, axes: Floats) -> tuple[float, float]:
-    """Return the residual of eq. 15 between pairs.
+    """Return the residual disagreement between pairs (eq. 15).
 
     Returns
     -------
     tuple
-        Half of it, as an objective; and how far pairs are still apart, in standard deviations.
+        Half the residual of eq. 15, as an objective; and the residual distance of points between pairs in standard
+        deviations.
     """
     matrix, residuals = _pair_residuals(problem, tracks, axes)
     step = np.linalg.solve(matrix.T @ matrix + np.eye(matrix.shape[1]), -matrix.T @ residuals)
-    left = residuals + matrix @ step
-    return 0.5 * float(step @ step + left @ left), _apart(left)
+    remaining_residuals = residuals + matrix @ step
+    return 0.5 * float(step @ step + remaining_residuals @ remaining_residuals), _distance_sigma(remaining_residuals)
 
 
 def _pair_residuals(problem: Problem, tracks: Tracks, axes: Floats) -> tuple[Floats, Floats]:
-    """Return rows and misses, in standard deviations, of each pair's points against those of the first.
+    """Return design rows and residuals, in standard deviations, of each pair's points relative to the first pair.
 
-    Rows have a column for each mode of the gauge, and one for the paths of each pair but the first.
+    Rows have a column for each mode of the gauge, and one for the path offset of each pair but the first.
     """
     rows, residuals = [np.zeros((0, len(problem.gauge.modes) + len(problem.pairs) - 1))], [np.zeros(0)]
     modes = problem.prior.tracks(problem.gauge.modes)
     for number in range(len(problem.patches)):
-        places = [
-            _measured_place(blocks, echoes[number], tracks, modes, axes)
+        positions = [
+            _measured_position(blocks, echoes[number], tracks, modes, axes)
             for blocks, echoes in zip(problem.pairs, problem.echoes, strict=True)
         ]
-        first = places[0]
-        for at, other in enumerate(places[1:], 1):
+        first = positions[0]
+        for at, other in enumerate(positions[1:], 1):
             if first is not None and other is not None:
                 std_m = float(np.hypot(first.std_m, other.std_m))
-                rows.append(np.hstack([other.shift_m - first.shift_m, _of_pair(other, at, problem)]) / std_m)
+                rows.append(np.hstack([other.shift_m - first.shift_m, _path_columns(other, at, problem)]) / std_m)
                 residuals.append((other.place_m - first.place_m) / std_m)
     return np.concatenate(rows), np.concatenate(residuals)
 
@@ -187,49 +188,49 @@ def _reference_residuals(
     modes = problem.prior.tracks(problem.gauge.modes)
     for at, (blocks, of_pair) in enumerate(zip(problem.pairs, echoes, strict=True)):
         for point, echo in zip(points, of_pair, strict=True):
-            place = _measured_place(blocks, echo, tracks, modes, axes)
-            if place is not None:
-                error_m = place.place_m - axes[:2] @ np.array(point.place_m)
-                rows.append(np.hstack([place.shift_m, _of_pair(place, at, problem)]) / point.std_m)
+            position = _measured_position(blocks, echo, tracks, modes, axes)
+            if position is not None:
+                error_m = position.place_m - axes[:2] @ np.array(point.place_m)
+                rows.append(np.hstack([position.shift_m, _path_columns(position, at, problem)]) / point.std_m)
                 residuals.append(error_m / point.std_m)
-                rounded = [round(float(one), 4) for one in error_m]
+                rounded = [round(float(value), 4) for value in error_m]
                 report.append({"name": point.name, "pair": blocks.record.pair, "apart_m": rounded})
     return np.concatenate(rows), np.concatenate(residuals), report
 
 
-def _of_pair(place: _MeasuredPlace, number: int, problem: Problem) -> Floats:
-    """Return the shift of a place per deviation of the paths of each pair but the first, (2, pair)."""
+def _path_columns(position: _MeasuredPosition, number: int, problem: Problem) -> Floats:
+    """Return (2, pair), shift of a position per standard deviation of the path offset of each pair but the first."""
     columns = np.zeros((2, len(problem.pairs) - 1))
     if number:
-        columns[:, number - 1] = PATH_STD_M * place.longer[:, 0]
+        columns[:, number - 1] = PATH_STD_M * position.longer[:, 0]
     return columns
 
 
-def _measured_place(
+def _measured_position(
     blocks: Blocks, echo: PatchEcho, tracks: Tracks, modes: Tracks, axes: Floats
-) -> _MeasuredPlace | None:
-    """Return the measured place of a patch's point in a pair's image; None where none is visible."""
+) -> _MeasuredPosition | None:
+    """Measure the position of a patch's point in the image of a pair; None if no point is visible."""
     moved = blocks.moves(tracks)
     patch = blocks.contribution(echo, moved)
     image = patch.values.sum(axis=1)
     ratio = PatchImage.of(image).ratio
     if ratio < _LEAST_RATIO:
         return None
-    # Shift of the point per unit of each mode, S of eq. 14, and per metre of path that is common to all pulses.
+    # Shift of the point per unit of each mode, S of eq. 14, and per metre of path offset common to all pulses.
     modes_of = {node: blocks.average_of(modes[node]) for node in moved}
     _, shift_m = effects(patch, modes_of, axes)
     _, longer = effects_of_paths(patch, np.ones((patch.values.shape[1], 1)), axes)
-    # Maximum of the image about the brightest pixel, on ever finer lattices.
-    place, reach_m = echo.patch.pixels_m[int(np.abs(image).argmax())], _cell_m(echo) / 4
+    # Maximum of the image about the brightest pixel, on successively finer lattices.
+    position_m, reach_m = echo.patch.pixels_m[int(np.abs(image).argmax())], _cell_m(echo) / 4
     for _ in range(_ZOOMS):
         side = np.linspace(-reach_m, reach_m, _SIDE)
         east, north = np.meshgrid(side, side)
-        pixels = place + np.stack([east.ravel(), north.ravel()], axis=1) @ axes[:2]
+        pixels = position_m + np.stack([east.ravel(), north.ravel()], axis=1) @ axes[:2]
         near = replace(echo, patch=Patch(echo.patch.place_m, pixels))
-        place = pixels[int(np.abs(blocks.contribution(near, moved).values.sum(axis=1)).argmax())]
+        position_m = pixels[int(np.abs(blocks.contribution(near, moved).values.sum(axis=1)).argmax())]
         reach_m *= 2 / (_SIDE - 1)
     std_m = float(np.hypot(_LEAST_STD_M, _cell_m(echo) / (np.pi * np.sqrt(ratio))))
-    return _MeasuredPlace(axes[:2] @ place, std_m, shift_m, longer)
+    return _MeasuredPosition(axes[:2] @ position_m, std_m, shift_m, longer)
 
 
 def _patch_of(problem: Problem, point: ReferencePoint, axes: Floats) -> Patch:
@@ -244,10 +245,11 @@ def _cell_m(echo: PatchEcho) -> float:
     return SPEED_OF_LIGHT_M_S / echo.profiles.bandwidth_hz / 2
 
 
-def _apart(residuals: Floats) -> float:
-    """Return the distance of pairs, in standard deviations, from two residuals a point; 0 where there is none.
+def _distance_sigma(residuals: Floats) -> float:
+    """Return the distance of points between pairs, in standard deviations; 0 without points.
 
-    By the median over points: two neighbours in a patch, of which either pair shows another, are one point.
+    `residuals` contains two values per point. The median is robust against patches in which each pair shows a different
+    one of two neighbouring points.
     """
     if not residuals.size:
         return 0.0
@@ -259,31 +261,33 @@ def _apart(residuals: Floats) -> float:
 
 
 PATH_STD_M = 0.1
-"""Metres of path by which one pair may differ from another for other reasons than tracks: offsets wrong by fractions of
-a wavelength must not bend tracks, and of ties between pairs along range little is lost."""
+"""Prior standard deviation of path offsets between pairs for other reasons than tracks, metres. Path offsets wrong by
+fractions of a wavelength must not bend tracks; the ties between pairs along range lose little."""
 
 PATH_SIGMAS = 3.0
-"""Standard deviations beyond which a difference of paths between pairs is none of the tracks."""
+"""Standard deviations above which a path difference between pairs is not attributed to the tracks."""
 
-_DRAWS = 200  # of the prior, from which the deviation of a mean path is taken
+_DRAWS = 200  # random draws of the prior for the standard deviation of a mean path
 
-_KNOTS_PER_CORRELATION_TIME = 10  # of corrections, by the shortest correlation time of an error
-_LEAST_KNOTS = 64  # of a flight
-_FEW = 8  # patches: with fewer, each quarter is left out of one fit
-_LOST_TO_TIES_DB = 0.1  # contrast that fixing the gauge may cost
-_SLIPS = 3  # searches from delays where parts of the tracks are a wavelength off
-_STAGES = 3  # of caching contributions and sharpening
+_KNOTS_PER_CORRELATION_TIME = 10  # least knots of corrections within the shortest correlation time
+_LEAST_KNOTS = 64  # least knots of a flight
+_FEW = 8  # patches; with fewer, every quarter of the patches is held out in turn
+_LOST_TO_TIES_DB = 0.1  # largest loss of contrast by fixing the gauge
+_SLIPS = 3  # searches from delays while subapertures have cycle slips
+_STAGES = 3  # iterations of caching contributions and maximising sharpness
 
 MOST_ROUNDS = 4
-"""Of searching the refined image for bright places, which errors may have hidden, and refining with them all."""
+"""Maximum rounds of detecting bright points, which errors may have hidden, in the refined image and refining by all."""
 
 LEAST_FURTHER_DB = 0.05
-"""Contrast that places which were not fitted must gain on the round before, for another round."""
+"""Least contrast gain of held-out patches over the previous round for another round, dB."""
 
 _BETWEEN_KNOTS_RAD2 = 0.05
-"""Variance of the phase that errors make between knots: 0.2 dB."""
+"""Phase variance by errors between knots, which costs 0.2 dB."""
 
-_MOST_KNOTS_PER_CORRELATION_TIME = 32  # which 4 cm at L-band want; what errors beyond leave is said in the budget
+_MOST_KNOTS_PER_CORRELATION_TIME = (
+    32  # sufficient for 4 cm at L-band; the budget contains the residual of larger errors
+)
 
 
 def refine(
@@ -295,39 +299,39 @@ def refine(
     reference_points: Sequence[ReferencePoint] = (),
     causes: Sequence[Cause] = (),
 ) -> Refinement:
-    """Return the corrections of a flight's tracks that make its images sharpest, and whether they are accepted.
+    """Estimate the corrections of a flight's tracks that maximise the sharpness of its images, and validate them.
 
     Parameters
     ----------
     records
-        Of every pair.
+        Records of all pairs.
     grid, terrain
         The scene.
     errors
         Node → error statistics of its log.
     reference_points
-        Points of known place, which fix the image's position.
+        Points of known position, which fix the position of the image.
     causes
-        Constants of the config that may be wrong, tried where errors of the logs alone do not explain the images.
+        Possible errors of configured constants, tried if errors of the logs alone do not explain the images.
 
     Notes
     -----
     Source: docs/theory/autofocus.md. A rejected refinement keeps its corrections; images are formed without them.
     """
-    plain = _Model.of(records, grid, terrain, errors)
-    found = plain.refinement(errors, reference_points)
-    cause = plain.search.cause(grid, terrain, errors, causes)
+    logs_only = _Model.of(records, grid, terrain, errors)
+    result = logs_only.refinement(errors, reference_points)
+    cause = logs_only.search.cause(grid, terrain, errors, causes)
     if cause is None:
-        return found
-    other = _Model.of([one.corrected(cause.correction) for one in records], grid, terrain, errors)
-    rest = other.refinement(errors, reference_points)
-    evidence = other.evidence_against(plain, cause)
-    return found if evidence < LEAST_EVIDENCE else cause.with_rest(rest, evidence)
+        return result
+    with_cause = _Model.of([record.corrected(cause.correction) for record in records], grid, terrain, errors)
+    rest = with_cause.refinement(errors, reference_points)
+    evidence = with_cause.evidence_against(logs_only, cause)
+    return result if evidence < LEAST_EVIDENCE else cause.with_rest(rest, evidence)
 
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """Errors of the logs as the only ones, or beside a cause: the search, and where it ended."""
+    """Error model with errors of the logs alone or together with a cause: its search and the results."""
 
     search: "TrackSearch"
     best: "Round | None"
@@ -339,7 +343,7 @@ class _Model:
     ) -> "_Model":
         search = TrackSearch.begin(records, grid, terrain, errors)
         best = search.rounds(grid, terrain, errors) if search.problem.patches else None
-        # Speckle is tried where few bright places give no accepted tracks.
+        # Speckle is tried if the tracks from few bright points are not accepted.
         if best is not None and (best.evidence.accepted or len(best.search.problem.patches) >= _FEW):
             return cls(search, best, None)
         return cls(search, best, search.by_speckle(grid, terrain, errors))
@@ -351,85 +355,85 @@ class _Model:
         if self.best is None:
             return self.search.candidates.rejected(errors, self.by_speckle)
         search, state, evidence = self.best.search, self.best.state, self.best.evidence
-        left = remaining(search.problem, state)
+        residual = remaining(search.problem, state)
         unknowns, ties = search.fix_gauge(state, points, apart_sigma=evidence.apart_sigma)
-        found = {"patches": len(search.problem.patches), "rounds": self.best.number}
-        turn = 2 * np.pi / search.wavelength_m
-        phases = {pair: round(turn * std_m, 4) for pair, std_m in path_std_m(search.problem).items()}
-        report = {**evidence.report, **left.report, **ties, **found, "pair_phase_std_rad": phases}
+        counts = {"patches": len(search.problem.patches), "rounds": self.best.number}
+        wavenumber = 2 * np.pi / search.wavelength_m
+        phases = {pair: round(wavenumber * std_m, 4) for pair, std_m in path_std_m(search.problem).items()}
+        report = {**evidence.report, **residual.report, **ties, **counts, "pair_phase_std_rad": phases}
         correction = search.problem.correction(unknowns)
         flags = dict(evidence.flags)
         longer = ties.get("paths_longer_m", {}) if evidence.accepted else {}
-        differing = [one for one, (longer_m, std_m) in longer.items() if abs(longer_m) > PATH_SIGMAS * std_m]
+        differing = [pair for pair, (longer_m, std_m) in longer.items() if abs(longer_m) > PATH_SIGMAS * std_m]
         if differing:
-            lines = (f"{one} by {100 * longer[one][0]:+.1f} ± {100 * longer[one][1]:.1f} cm" for one in differing)
-            flags["paths_differ"] = f"against {search.problem.pairs[0].record.pair}: {', '.join(lines)}"
-        return Refinement(correction, left.std_m, evidence.accepted, evidence.why, report, flags)
+            lines = (f"{pair} by {100 * longer[pair][0]:+.1f} ± {100 * longer[pair][1]:.1f} cm" for pair in differing)
+            flags["path_offsets_differ"] = f"relative to {search.problem.pairs[0].record.pair}: {', '.join(lines)}"
+        return Refinement(correction, residual.std_m, evidence.accepted, evidence.reason, report, flags)
 
-    def evidence_against(self, plain: "_Model", cause: CauseFit) -> float:
-        """Return the objective of the logs' errors alone less that of these beside a cause.
+    def evidence_against(self, logs_only: "_Model", cause: CauseFit) -> float:
+        """Return the reduction of the objective by the cause, relative to errors of the logs alone.
 
         Notes
         -----
-        Source: docs/theory/autofocus.md, eq. 16b: over the places that either model sees; what is sharp along the logs
-        must not be given up for others.
+        Source: docs/theory/autofocus.md, eq. 16b: evaluated over the bright points of both models. A cause must not
+        blur points that are sharp along the logs.
         """
-        if self.best is None or plain.best is None:
+        if self.best is None or logs_only.best is None:
             return -np.inf
-        # Tracks of both models over the places of either search: with the cause, and without.
-        moved = cause.correction.moved_m
-        rest, alone = self.best.state.tracks, plain.best.state.tracks
-        both = {node: moved[node] + track for node, track in rest.items()}
-        less = {node: track - moved[node] for node, track in alone.items()}
-        still = {node: np.zeros_like(track) for node, track in alone.items()}
-        if plain.search.blur(both) > plain.search.blur(still):
+        # Tracks of both models at the points of either search: with the cause, and without.
+        by_cause = cause.correction.moved_m
+        rest, alone = self.best.state.tracks, logs_only.best.state.tracks
+        total = {node: by_cause[node] + track for node, track in rest.items()}
+        alone_less_cause = {node: track - by_cause[node] for node, track in alone.items()}
+        logged = {node: np.zeros_like(track) for node, track in alone.items()}
+        if logs_only.search.blur(total) > logs_only.search.blur(logged):
             return -np.inf
-        searches = ((plain.best.search, alone, both), (self.best.search, less, rest))
-        sharper = sum(search.blur(one) - search.blur(other) for search, one, other in searches)
-        unknowns = plain.best.state.unknowns, self.best.state.unknowns
+        searches = ((logs_only.best.search, alone, total), (self.best.search, alone_less_cause, rest))
+        sharper = sum(search.blur(without) - search.blur(corrected) for search, without, corrected in searches)
+        unknowns = logs_only.best.state.unknowns, self.best.state.unknowns
         energy = 0.5 * (float(unknowns[0] @ unknowns[0]) - float(unknowns[1] @ unknowns[1]))
         return sharper + energy - cause.energy
 
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """Tracks fitted to the bright places that were visible from the tracks of the round before.
+    """Tracks fitted to the bright points that are visible along the tracks of the previous round.
 
     Attributes
     ----------
     search
-        The problem of these places.
+        Search over these points.
     state, evidence
-        Tracks fitted to all of them; what those show that were not fitted.
-    further_db
-        Contrast that places gained, while they were not fitted, on the tracks of the round before; 0 in the first.
+        Tracks fitted to all points; and their evidence, including held-out points.
+    gain_db
+        Contrast gain of held-out points relative to the tracks of the previous round; 0 in the first.
     number
-        Of rounds so far.
+        Number of rounds so far.
     """
 
     search: "TrackSearch"
     state: State
     evidence: Evidence
-    further_db: float
+    gain_db: float
     number: int = 1
 
 
 @dataclass(frozen=True, eq=False)
 class TrackSearch:
-    """The problem, its state along the logs, and that of the round before.
+    """Search for the tracks of a flight: the problem and its initial states.
 
     Attributes
     ----------
     problem
-        Pairs, patches, prior.
+        Pairs, patches and prior.
     candidates
-        Bright places.
+        Bright points.
     initial
-        The patches imaged along the logs.
+        State along the logs.
     before
-        The same along the tracks of the round before; None in the first.
+        State along the tracks of the previous round; None in the first.
     wavelength_m
-        Of the band's middle.
+        Wavelength at the band centre.
     """
 
     problem: Problem
@@ -442,10 +446,10 @@ class TrackSearch:
     def begin(
         cls, records: Sequence[PairRecord], grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]
     ) -> "TrackSearch":
-        """Return the search of a flight, started along its logs."""
+        """Start the search of a flight along its logs."""
         candidates = Candidates.of(records, grid, terrain, errors)
         knots_s = _knots(records, errors)
-        prior = Prior({node: NodePrior.of(one, knots_s, candidates.axes) for node, one in sorted(errors.items())})
+        prior = Prior({node: NodePrior.of(error, knots_s, candidates.axes) for node, error in sorted(errors.items())})
         pairs = [Blocks.of(record, knots_s) for record in records]
         wavelength_m = SPEED_OF_LIGHT_M_S / records[0].profiles.centre_frequency_hz
         return cls._over(Problem(pairs, [], knots_s, prior, Gauge.none(prior.size)), candidates, None, wavelength_m)
@@ -454,10 +458,10 @@ class TrackSearch:
     def _over(
         cls, problem: Problem, candidates: Candidates, unknowns: Floats | None, wavelength_m: float
     ) -> "TrackSearch":
-        """Return the search over some patches; `unknowns` of the round before."""
+        """Return the search over the candidates' patches; `unknowns` are those of the previous round."""
         pairs, prior = problem.pairs, problem.prior
         echoes = [blocks.echoes(candidates.patches) for blocks in pairs]
-        values = [sum(one.values for one in of_pairs) for of_pairs in zip(*echoes, strict=True)]
+        values = [sum(echo.values for echo in of_pairs) for of_pairs in zip(*echoes, strict=True)]
         problem = replace(problem, echoes=echoes).of(range(count_in_memory(values)))
         initial = problem.state(np.zeros(prior.size))
         before = None if unknowns is None else problem.state(unknowns)
@@ -469,7 +473,7 @@ class TrackSearch:
     def again(
         self, state: State, grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]
     ) -> "TrackSearch | None":
-        """Return the search over the places that are bright in the image of refined tracks; None where none is."""
+        """Return the search over bright points in the image along refined tracks; None if there are no new points."""
         correction = self.problem.correction(state.unknowns)
         refined = [blocks.record.corrected(correction) for blocks in self.problem.pairs]
         candidates = Candidates.of(refined, grid, terrain, errors, looks=REFINED_LOOKS)
@@ -478,34 +482,32 @@ class TrackSearch:
         return self._over(self.problem, candidates, state.unknowns, self.wavelength_m)
 
     def rounds(self, grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]) -> Round:
-        """Return the last round that was worth it."""
+        """Run rounds of detection and refinement; return the last round with a gain."""
         best = self.solve()
-        # Tracks that sharpen nothing leave the image as it is: looking for places in it again would find the same ones.
+        # Tracks without a gain leave the image unchanged: another detection would find the same points.
         while best.number < MOST_ROUNDS and mean_gain(best.evidence.fitted_db).mean_db >= LEAST_FURTHER_DB:
             search = best.search.again(best.state, grid, terrain, errors)
             if search is None:
                 break
-            found = replace(search.solve(), number=best.number + 1)
-            if found.further_db < -LEAST_FURTHER_DB:
+            refined = replace(search.solve(), number=best.number + 1)
+            if refined.gain_db < -LEAST_FURTHER_DB:
                 break
-            best = found
-            if found.further_db < LEAST_FURTHER_DB:
+            best = refined
+            if refined.gain_db < LEAST_FURTHER_DB:
                 break
         return best
 
     def _known(self, candidates: Candidates) -> bool:
-        """Test whether some bright places are those of this round: each in a patch of its own."""
+        """Return True if the candidates are the points of this round, each in a patch of its own."""
         patches = self.problem.patches
         if len(patches) != len(candidates.patches):
             return False
-        apart_m = np.linalg.norm(
-            np.array([one.place_m for one in candidates.patches])[:, None] - np.array([one.place_m for one in patches]),
-            axis=2,
-        )
-        half_m = [float(np.linalg.norm(one.pixels_m - one.place_m, axis=1).max()) / 2 for one in patches]
-        nearest = apart_m.argmin(axis=1)
+        candidates_m, points_m = (np.array([patch.place_m for patch in each]) for each in (candidates.patches, patches))
+        distance_m = np.linalg.norm(candidates_m[:, None] - points_m, axis=2)
+        half_m = [float(np.linalg.norm(patch.pixels_m - patch.place_m, axis=1).max()) / 2 for patch in patches]
+        nearest = distance_m.argmin(axis=1)
         return len({*nearest.tolist()}) == len(patches) and bool(
-            (apart_m.min(axis=1) < np.array(half_m)[nearest]).all()
+            (distance_m.min(axis=1) < np.array(half_m)[nearest]).all()
         )
 
     @property
@@ -514,25 +516,25 @@ class TrackSearch:
         return self.candidates.axes
 
     def solve(self) -> Round:
-        """Return the tracks fitted to all patches, and the evidence of patches that were not fitted."""
+        """Return the tracks fitted to all patches, and the evidence of held-out patches."""
         problem, initial = self.problem, self.initial
         held_out_db = np.full((len(problem.pairs), len(problem.patches)), np.nan)
-        further_db = np.full_like(held_out_db, np.nan)
+        round_gain_db = np.full_like(held_out_db, np.nan)
         everything, fold = np.ones(len(problem.patches), bool), np.arange(len(problem.patches)) % FOLDS
         few = len(problem.patches) < _FEW
         lowest = self.before if len(problem.patches) > 1 else self._fitted(everything)
-        # Each quarter of the patches is left out of a fit, in turn (eq. 16a); the fit of lowest objective is kept.
+        # Each quarter of the patches is held out of a fit in turn (eq. 16a); the fit of lowest objective is kept.
         for number in range(min(FOLDS, len(problem.patches)) if len(problem.patches) > 1 else 0):
             fitted = fold != (number + 2) % min(FOLDS, len(problem.patches))
             state = self._fitted(fitted)
             held_out_db[:, ~fitted] = gains_db(initial.statistics, state.statistics)[:, ~fitted]
             if self.before is not None:
-                further_db[:, ~fitted] = gains_db(self.before.statistics, state.statistics)[:, ~fitted]
+                round_gain_db[:, ~fitted] = gains_db(self.before.statistics, state.statistics)[:, ~fitted]
             lowest = self._lowest([state] if lowest is None else [lowest, state], everything)
             if not few and mean_gain(held_out_db[:, np.isfinite(held_out_db[0])]).certain:
                 break
-        # All patches, from the best of these fits; parts a wavelength off are searched again (eq. 16).
-        assert lowest is not None  # one place is fitted, of more some are
+        # Fit of all patches from the best of these fits; the search is repeated for cycle slips (eq. 16).
+        assert lowest is not None  # a single patch is fitted directly, of several patches at least one fold is
         state = problem.sharper(lowest, everything, stages=_STAGES - 1 if few else 1)
         state, shifts = self._unslipped(state, everything)
         apart_sigma = self._apart_sigma(state)
@@ -547,51 +549,51 @@ class TrackSearch:
             steady=unsteady(initial, state),
             apart_sigma=apart_sigma,
         )
-        measured = np.isfinite(further_db)
-        return Round(self, state, evidence, float(further_db[measured].mean()) if measured.any() else 0.0)
+        measured = np.isfinite(round_gain_db)
+        return Round(self, state, evidence, float(round_gain_db[measured].mean()) if measured.any() else 0.0)
 
     def fix_gauge(
         self, state: State, points: Sequence[ReferencePoint], *, apart_sigma: float
     ) -> tuple[Floats, dict[str, Any]]:
-        """Return the unknowns with the gauge fixed by points, unless that blurs images or separates pairs."""
+        """Fix the gauge of the unknowns by points, unless this blurs images or displaces points between pairs."""
         unknowns, report = fix_gauge(self.problem, state.unknowns, points, self.axes)
         if unknowns is state.unknowns:
             return unknowns, report
         after = self.problem.state(unknowns)
         lost_db = -float(gains_db(state.statistics, after.statistics).mean())
         if self._apart_sigma(after) > max(apart_sigma, 1.0) or lost_db > _LOST_TO_TIES_DB:
-            return state.unknowns, {**report, "ties": "left out: they blurred points or parted pairs"}
+            return state.unknowns, {**report, "ties": "excluded: they blur points or displace them between pairs"}
         return unknowns, report
 
     def _apart_sigma(self, state: State) -> float:
-        """Return the distance of points between pairs, in standard deviations of their places."""
+        """Return the distance of points between pairs, in standard deviations."""
         return pair_disagreement(self.problem, state.tracks, self.axes)[1]
 
     def _fitted(self, used: Bools) -> State:
-        """Return the tracks fitted to some patches, from the start with the lowest objective."""
+        """Return the tracks fitted to the used patches, from the start with the lowest objective."""
         problem, initial = self.problem, self.initial
         starts = (initial, prominent_point_start(problem, initial, used, self.axes))
         best = self._lowest([problem.sharper(start, used) for start in starts], used)
         return problem.sharper(best, used, stages=_STAGES - 1)
 
     def _unslipped(self, state: State, used: Bools) -> tuple[State, RangeShifts]:
-        """Return the tracks, searched again from where delays put them while parts are a wavelength off, and shifts."""
+        """Repeat the search from tracks corrected by delays while there are cycle slips; return tracks and shifts."""
         problem = self.problem
         shifts = range_shifts(problem, state, self.axes)
         for _ in range(_SLIPS):
-            wrong = int(shifts.slipped(self.wavelength_m).sum())
-            if not wrong:
+            slip_count = int(shifts.slipped(self.wavelength_m).sum())
+            if not slip_count:
                 break
             finer = range_shifts(problem, state, self.axes, parts=2 * PARTS)
-            other = problem.sharper(unslipped_start(problem, state, finer.by_point_m), used, stages=_STAGES - 1)
-            after = range_shifts(problem, other, self.axes)
-            if int(after.slipped(self.wavelength_m).sum()) >= wrong:
+            unslipped = problem.sharper(unslipped_start(problem, state, finer.by_point_m), used, stages=_STAGES - 1)
+            after = range_shifts(problem, unslipped, self.axes)
+            if int(after.slipped(self.wavelength_m).sum()) >= slip_count:
                 break
-            state, shifts = other, after
+            state, shifts = unslipped, after
         return state, shifts
 
     def _lowest(self, states: Sequence[State], used: Bools) -> State:
-        """Return the state of lowest objective: sharp patches, at one place in all pairs."""
+        """Return the state of lowest objective: sharp patches at the same positions in all pairs."""
         problem = self.problem
         values = [
             problem.value(state, used, (self.before or self.initial).statistics)
@@ -603,34 +605,34 @@ class TrackSearch:
     def cause(
         self, grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors], causes: Sequence[Cause]
     ) -> CauseFit | None:
-        """Return the cause that explains most of what a flight lost, its size found in rounds as places come out."""
+        """Return the cause that explains the images best, with its error refined in rounds as points become visible."""
         if not causes or not self.problem.patches:
             return None
-        found = explained(self.problem, causes, self.axes, np.random.default_rng(0))
-        if found is None:
+        fit = explained(self.problem, causes, self.axes, np.random.default_rng(0))
+        if fit is None:
             return None
         for _ in range(MOST_ROUNDS - 1):
-            moved = [blocks.record.corrected(found.correction) for blocks in self.problem.pairs]
-            again = TrackSearch.begin(moved, grid, terrain, errors)
-            improved = found.more(again.problem, again.axes) if again.problem.patches else found
-            if improved.gain_db - found.gain_db < LEAST_FURTHER_DB:
+            corrected = [blocks.record.corrected(fit.correction) for blocks in self.problem.pairs]
+            again = TrackSearch.begin(corrected, grid, terrain, errors)
+            improved = fit.more(again.problem, again.axes) if again.problem.patches else fit
+            if improved.gain_db - fit.gain_db < LEAST_FURTHER_DB:
                 break
-            found = improved
-        return found
+            fit = improved
+        return fit
 
     def blur(self, tracks: Tracks) -> float:
-        """Return the objective of some tracks without their prior, as seen at the places of this search."""
+        """Return the objective of tracks without their prior, at the points of this search."""
         value = self.problem.value(
             self.problem.at(tracks), np.ones(len(self.problem.patches), bool), self.initial.statistics
         )
         return value + pair_disagreement(self.problem, tracks, self.axes)[0]
 
     def by_speckle(self, grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]) -> Refinement | None:
-        """Return the refinement by speckle; None of one pair alone."""
+        """Return the refinement by speckle; None for a single pair."""
         problem = self.problem
         if len(problem.pairs) < 2:
             return None
-        correlation_s = min(one.correlation_s for one in errors.values())
+        correlation_s = min(error.correlation_s for error in errors.values())
         scene_tiles = tiles([blocks.record for blocks in problem.pairs], grid, terrain, correlation_s=correlation_s)
         pixels = sum(len(tile.patch.pixels_m) for tile in scene_tiles)
         every = 1 + pixels * len(problem.knots_s) * len(problem.pairs) // MOST_VALUES
@@ -638,20 +640,20 @@ class TrackSearch:
 
 
 def _knots(records: Sequence[PairRecord], errors: Mapping[str, TrackErrors]) -> Floats:
-    """Return equally spaced times: several to an error's correlation time, none closer than pulses."""
-    first = min(float(one.time_s[0]) for one in records)
-    last = max(float(one.time_s[-1]) for one in records)
-    pulse_s = max(float(np.median(np.diff(one.time_s))) for one in records)
-    of_pairs = [one.turned(errors) for one in records]
-    correlation_s, turned = min(lasts for lasts, _ in of_pairs), max(turned for _, turned in of_pairs)
-    # White noise averaged over τ bends between knots Δ apart by σ²Δ/3τ.
-    lasts = float(
+    """Return equally spaced knot times: several within the correlation time, but not closer than pulses."""
+    first = min(float(record.time_s[0]) for record in records)
+    last = max(float(record.time_s[-1]) for record in records)
+    pulse_s = max(float(np.median(np.diff(record.time_s))) for record in records)
+    correlations_s, phases_rad = zip(*(record.extreme_errors(errors) for record in records), strict=True)
+    correlation_s, phase_rad = min(correlations_s), max(phases_rad)
+    # White noise averaged over τ deviates from linear interpolation between knots spaced by Δ with variance σ²Δ/3τ.
+    share = float(
         np.clip(
-            3 * _BETWEEN_KNOTS_RAD2 / max(turned**2, 1e-12),
+            3 * _BETWEEN_KNOTS_RAD2 / max(phase_rad**2, 1e-12),
             1 / _MOST_KNOTS_PER_CORRELATION_TIME,
             1 / _KNOTS_PER_CORRELATION_TIME,
         )
     )
-    step_s = max(min(correlation_s * lasts, (last - first) / _LEAST_KNOTS), pulse_s)
+    step_s = max(min(correlation_s * share, (last - first) / _LEAST_KNOTS), pulse_s)
     count = max(2, int(np.ceil((last - first) / step_s)))
     return first + (np.arange(count) + 0.5) * (last - first) / count

@@ -1,4 +1,4 @@
-"""Tracks that make the patches sharpest: search, its two starts, and the gauge that only the log determines."""
+"""Search for the tracks of maximum sharpness: gauge modes, optimisation, and its starting points."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,31 +17,31 @@ from apertura.methods.autofocus.patches import Patch
 
 
 LEAST_PHASE_RAD = 0.03
-"""Radians rms over the aperture, per standard deviation of the log: a mode below leaves focus as it is."""
+"""Radians rms over the aperture, per standard deviation of the log, below which a mode does not affect the focus."""
 
 LEAST_SHIFT_M = 3e-4
-"""Metres per standard deviation of the log: modes that move patches by less are left to the solver."""
+"""Metres per standard deviation of the log; modes that shift patches by less are no gauge modes."""
 
 LEAST_INFORMATION = 10.0
-"""Information of the image over that of the log, 1, from which the image alone determines a mode."""
+"""Least information of the image, relative to the log's (1), on a mode that the image alone determines."""
 
-_MODES = 32  # smooth motions that are followed at once
-_PIECES = 5  # cubic pieces of a smooth mode in the time for which a patch is illuminated
+_MODES = 32  # smooth motions evaluated at once
+_PIECES = 5  # cubic pieces of a smooth mode within the illumination time of a patch
 
 
 @dataclass(frozen=True, eq=False)
 class Gauge:
-    """Modes of the tracks that move patches without blurring them.
+    """Track modes that shift patches without blurring them.
 
     Attributes
     ----------
     modes
         (mode, unknown) float64, orthonormal, in the prior's unknowns.
     shift_m
-        (mode, pair and patch, 2) float64, metres per unit of each: how the image of every patch moves east and north.
+        (mode, pair and patch, 2) float64, shift of every patch's image east and north, metres per unit of a mode.
     blurs_rad2, shapes, smooth
-        (other,) mean square of the phase that orthonormal modes turn, largest last; (other, smooth) float64, each as a
-        sum of smooth motions, and these.
+        (other,) mean square phase error by orthonormal modes, largest last; (other, smooth) float64, these modes as
+        sums of smooth motions; and the smooth motions.
 
     Notes
     -----
@@ -55,17 +55,17 @@ class Gauge:
     smooth: "SmoothMotions"
 
     def project_out(self, unknowns: Floats) -> Floats:
-        """Return unknowns, or a gradient, without their part along the modes."""
+        """Return unknowns, or a gradient, without their component along the modes."""
         return np.asarray(unknowns - self.modes.T @ (self.modes @ unknowns))
 
     @property
     def std_m(self) -> float:
-        """Deviation of the whole image that the log alone leaves, metres: rms over patches."""
+        """Standard deviation of the image position by the errors of the logs, metres, rms over patches."""
         return float(np.sqrt((self.shift_m**2).sum(axis=(0, 2)).mean())) if len(self.modes) else 0.0
 
     @classmethod
     def none(cls, unknowns: int) -> "Gauge":
-        """Return the gauge without modes."""
+        """Return a gauge without modes."""
         return cls(
             np.zeros((0, unknowns)), np.zeros((0, 1, 2)), np.zeros(0), np.zeros((0, 0)), SmoothMotions([], unknowns)
         )
@@ -76,9 +76,9 @@ class Gauge:
         Parameters
         ----------
         unknowns
-            As solved.
+            Solved unknowns.
         information
-            Information of the phases on a mode that turns them by a radian: 2·power of points over their surroundings,
+            Information of the phases on a mode with a phase effect of 1 rad: twice the peak-to-background power ratios,
             summed over pairs and patches.
         """
         return np.asarray(self.shapes[self.blurs_rad2 * information > LEAST_INFORMATION] @ self.smooth.parts(unknowns))
@@ -91,7 +91,7 @@ def find_gauge(
     knots_s: Floats,
     axes: Floats,
 ) -> Gauge:
-    """Return the gauge of patches over pairs; rows of `axes` are east, north, up.
+    """Find the gauge of the patches of all pairs; rows of `axes` are east, north, up.
 
     Notes
     -----
@@ -99,16 +99,16 @@ def find_gauge(
     """
     smooth = SmoothMotions.of(pairs, cached, prior, knots_s)
     count = sum(len(patches) for patches in cached)
-    # F and S of eq. 14 over smooth motions: mean blur² of eq. 13 as a quadratic form, and shifts of the patches.
+    # F and S of eq. 14 for smooth motions: mean blur² of eq. 13 as a quadratic form, and shifts of the patches.
     blur_form, shifts = np.zeros((len(smooth), len(smooth))), []
     for blocks, patches in zip(pairs, cached, strict=True):
-        # Δρ of every block by each smooth motion, a few motions at a time.
+        # Δρ of every block by each smooth motion, `_MODES` motions at a time.
         paths = [np.empty((patch.blocks.stop - patch.blocks.start, len(smooth))) for patch in patches]
-        for some, unknowns in smooth.rows():
+        for columns, unknowns in smooth.rows():
             tracks = prior.tracks(unknowns)
             moved = {node: blocks.average_of(tracks[node]) for node in dict.fromkeys(blocks.record.nodes)}
             for patch, path in zip(patches, paths, strict=True):
-                path[:, some] = longer_paths(patch, moved)
+                path[:, columns] = longer_paths(patch, moved)
         for patch, path in zip(patches, paths, strict=True):
             blur, shift = effects_of_paths(patch, path, axes)
             blur_form += blur.T @ blur / count
@@ -118,24 +118,24 @@ def find_gauge(
     conditional = np.linalg.solve(blur_form + LEAST_PHASE_RAD**2 * np.eye(len(blur_form)), shift.T)
     eigenvalues, eigenvectors = np.linalg.eigh(shift @ conditional)
     keep = eigenvalues * LEAST_PHASE_RAD**2 > LEAST_SHIFT_M**2
-    # Modes (F + ε²)⁻¹Sᵀv of σ_s > 0.3 mm, made orthonormal, and by how much each moves every patch.
+    # Modes (F + ε²)⁻¹Sᵀv with σ_s > 0.3 mm, orthonormalised, and their shifts of every patch.
     modes, _ = np.linalg.qr(conditional @ eigenvectors[:, keep])
-    shift_by_mode = np.stack([one @ modes for one in shifts])
-    # Eigenvectors of F: motions by how much they blur, for the test of the logs' stated errors (17).
+    shift_by_mode = np.stack([patch_shift @ modes for patch_shift in shifts])
+    # Eigenvectors of F: motions sorted by their blur, for the test of the configured log errors (eq. 17).
     blurs_rad2, shapes = np.linalg.eigh(blur_form)
     return Gauge(smooth.sums(modes.T), np.moveaxis(shift_by_mode, -1, 0), blurs_rad2, shapes.T, smooth)
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothMotions:
-    """Smooth tracks of each node, and those that turn and stretch its own, orthonormal in the prior's unknowns.
+    """Smooth motions of each node, including rotation and scaling of its track, orthonormal in the prior's unknowns.
 
     Attributes
     ----------
     of_nodes
-        First of a node's unknowns, and (mode, unknown of the node) float64: modes of one node move no other.
+        Index of a node's first unknown, and (mode, unknown of the node) float64: each mode displaces one node only.
     size
-        How many unknowns all nodes have.
+        Number of unknowns of all nodes.
     """
 
     of_nodes: Sequence[tuple[int, Floats]]
@@ -145,11 +145,11 @@ class SmoothMotions:
     def of(
         cls, pairs: Sequence[Blocks], cached: Sequence[Sequence[Contribution]], prior: Prior, knots_s: Floats
     ) -> "SmoothMotions":
-        """Return those that patches can tell apart while they are illuminated."""
+        """Return the smooth motions that patches can resolve within their illumination time."""
         from scipy.interpolate import BSpline
 
         lengths = [patch.blocks.stop - patch.blocks.start for patches in cached for patch in patches]
-        length = max(4, int(np.median([one for one in lengths if one] or [len(knots_s)])) // _PIECES)
+        length = max(4, int(np.median([count for count in lengths if count] or [len(knots_s)])) // _PIECES)
         # Cubic B-splines over pieces of `length` knots, (knot, spline).
         pieces = max(1, round(len(knots_s) / length))
         grid = np.linspace(knots_s[0], knots_s[-1], pieces + 1)
@@ -157,47 +157,47 @@ class SmoothMotions:
         ends = np.concatenate([grid[0] - step * np.arange(3, 0, -1), grid, grid[-1] + step * np.arange(1, 4)])
         inside = np.clip(knots_s, grid[0], np.nextafter(grid[-1], grid[0]))
         splines = BSpline.design_matrix(inside, ends, 3).toarray()
-        flown = _logged_places(pairs)
-        found, first = [], 0
+        logged = _logged_places(pairs)
+        of_nodes, first = [], 0
         for node, own in prior.nodes.items():
-            # Splines and the logged shape along each axis, as unknowns of the prior; an SVD makes them orthonormal.
-            shape = flown[node] - flown[node].mean(axis=0)
+            # Splines and the logged shape along each axis, as unknowns of the prior, orthonormalised by an SVD.
+            shape = logged[node] - logged[node].mean(axis=0)
             basis = np.concatenate([splines, shape / max(float(np.abs(shape).max()), 1e-9)], axis=1)
             motions = np.concatenate([own.adjoint(basis.T[:, :, None] * axis) for axis in np.eye(3)])
-            found.append((first, *np.linalg.svd(motions, full_matrices=False)[1:]))
+            of_nodes.append((first, *np.linalg.svd(motions, full_matrices=False)[1:]))
             first += own.size
-        largest = max(float(size[0]) for _, size, _ in found)
-        return cls([(begin, modes[size > 1e-6 * largest]) for begin, size, modes in found], first)
+        largest = max(float(size[0]) for _, size, _ in of_nodes)
+        return cls([(start, modes[size > 1e-6 * largest]) for start, size, modes in of_nodes], first)
 
     def __len__(self) -> int:
         """Return the number of modes."""
         return sum(len(modes) for _, modes in self.of_nodes)
 
     def rows(self) -> Iterator[tuple[slice, Floats]]:
-        """Yield which modes, a few at a time, and (some, unknown) float64, what they are."""
+        """Yield slices of at most `_MODES` modes, and these modes as (mode, unknown) float64."""
         row = 0
         for first, modes in self.of_nodes:
             for begin in range(0, len(modes), _MODES):
-                some = modes[begin : begin + _MODES]
-                unknowns = np.zeros((len(some), self.size))
-                unknowns[:, first : first + some.shape[1]] = some
-                yield slice(row, row + len(some)), unknowns
-                row += len(some)
+                modes_slice = modes[begin : begin + _MODES]
+                unknowns = np.zeros((len(modes_slice), self.size))
+                unknowns[:, first : first + modes_slice.shape[1]] = modes_slice
+                yield slice(row, row + len(modes_slice)), unknowns
+                row += len(modes_slice)
 
     def parts(self, unknowns: Floats) -> Floats:
-        """Return (mode,) float64, how much of each is in some unknowns."""
-        some = [modes @ unknowns[first : first + modes.shape[1]] for first, modes in self.of_nodes]
-        return np.concatenate([np.zeros(0), *some])
+        """Return (mode,) float64, components of the unknowns along each mode."""
+        components = [modes @ unknowns[first : first + modes.shape[1]] for first, modes in self.of_nodes]
+        return np.concatenate([np.zeros(0), *components])
 
-    def sums(self, shares: Floats) -> Floats:
-        """Return (sum, unknown) float64 of (sum, mode) shares."""
+    def sums(self, coefficients: Floats) -> Floats:
+        """Return (sum, unknown) float64, sums of the modes with (sum, mode) coefficients."""
         split = np.cumsum([len(modes) for _, modes in self.of_nodes])[:-1]
-        of_nodes = zip(np.split(shares, split, axis=1), self.of_nodes, strict=True)
-        return np.concatenate([some @ modes for some, (_, modes) in of_nodes], axis=1)
+        of_nodes = zip(np.split(coefficients, split, axis=1), self.of_nodes, strict=True)
+        return np.concatenate([of_node @ modes for of_node, (_, modes) in of_nodes], axis=1)
 
 
 def _logged_places(pairs: Sequence[Blocks]) -> Mapping[str, Floats]:
-    """Return node → (knot, 3) float64, where its log has it."""
+    """Return node → (knot, 3) float64, logged positions."""
     places: dict[str, Floats] = {}
     for blocks in pairs:
         record = blocks.record
@@ -208,36 +208,36 @@ def _logged_places(pairs: Sequence[Blocks]) -> Mapping[str, Floats]:
 
 
 def effects(patch: Contribution, moved: Mapping[str, Floats], axes: Floats) -> tuple[Floats, Floats]:
-    """Return the effects of modes on a patch: blur (row, mode), rad rms in the whole, and shift (2, mode), metres.
+    """Return the effects of modes on a patch: blur (row, mode), whose norm is in rad rms, and shift (2, mode), metres.
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 13: a constant phase does not blur, but over the band the path itself must be
-    what a shift explains.
+    Source: docs/theory/autofocus.md, eq. 13: a constant phase does not blur, but over the band a shift must explain the
+    path itself.
     """
     return effects_of_paths(patch, longer_paths(patch, moved), axes)
 
 
 def longer_paths(patch: Contribution, moved: Mapping[str, Floats]) -> Floats:
-    """Return (block, mode) float64, metres by which paths grow with modes of the nodes, (mode, block, 3) each."""
+    """Return (block, mode) float64, path changes in metres by displacements of the nodes, (mode, block, 3) each."""
     grown = (np.einsum("bi,mbi->bm", slope, moved[node][:, patch.blocks]) for node, slope in patch.slopes.items())
     return np.asarray(sum(grown), np.float64)
 
 
 def effects_of_paths(patch: Contribution, path: Floats, axes: Floats) -> tuple[Floats, Floats]:
-    """Return as `effects`, of paths that are longer by (block, mode) metres."""
-    ground = np.asarray(sum(patch.slopes.values())) @ axes[:2].T
+    """Return blur and shift, as `effects`, for path changes (block, mode) in metres."""
+    slope = np.asarray(sum(patch.slopes.values())) @ axes[:2].T
     weight = np.linalg.norm(patch.values, axis=0).astype(np.float64)
     weight = (weight / max(weight.sum(), 1e-300))[:, None]
 
     # Rows of eq. 13: k(Δρ − mean), then bΔρ, weighted by the blocks' amplitudes.
     def weighted(paths: Floats) -> Floats:
         centred = paths - (weight * paths).sum(axis=0)
-        parts = [np.sqrt(weight) * one for one in (patch.wavenumber * centred, patch.band * paths)]
-        return np.asarray(np.concatenate(parts), np.float64)
+        rows = [np.sqrt(weight) * phase for phase in (patch.wavenumber * centred, patch.band * paths)]
+        return np.asarray(np.concatenate(rows), np.float64)
 
-    # Least squares in a, the shift over ground; what it leaves blurs.
-    by_shift, errors = (weighted(np.asarray(one)) for one in (ground, path))
+    # Least squares for a, the shift over ground; the residual is blur.
+    by_shift, errors = (weighted(np.asarray(paths)) for paths in (slope, path))
     shift = np.linalg.pinv(by_shift) @ errors
     return errors - by_shift @ shift, shift
 
@@ -246,7 +246,7 @@ def effects_of_paths(patch: Contribution, path: Floats, axes: Floats) -> tuple[F
 
 
 ITERATIONS = 20
-"""Steps of L-BFGS-B before contributions are computed anew."""
+"""Steps of L-BFGS-B before contributions are recomputed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,13 +258,13 @@ class Problem:
     pairs
         Blocks of each pair.
     echoes
-        Pair → patch → its summed echoes.
+        Pair → patch → summed echoes.
     knots_s
         (knot,) float64, times of the corrections.
     prior
-        Of the nodes.
+        Prior of the nodes.
     gauge
-        Modes that stay at the log's value.
+        Modes that keep the value of the logs.
     """
 
     pairs: Sequence[Blocks]
@@ -274,15 +274,15 @@ class Problem:
     gauge: Gauge
 
     def correction(self, unknowns: Floats) -> TrackCorrection:
-        """Return the corrections of some unknowns."""
+        """Return the track corrections for given unknowns."""
         return TrackCorrection(self.knots_s, self.prior.tracks(unknowns))
 
     def state(self, unknowns: Floats) -> "State":
-        """Return contributions of the blocks to the patches from corrected tracks."""
+        """Return the state of the tracks for given unknowns, with the block contributions to the patches."""
         return replace(self.at(self.prior.tracks(unknowns)), unknowns=unknowns)
 
     def at(self, tracks: Tracks) -> "State":
-        """Return the same of tracks that have no unknowns."""
+        """Return the state of given tracks, without unknowns."""
         cached = []
         for blocks, echoes in zip(self.pairs, self.echoes, strict=True):
             moved = blocks.moves(tracks)
@@ -291,15 +291,15 @@ class Problem:
 
     @property
     def patches(self) -> list[Patch]:
-        """Of the scene."""
+        """Patches of the scene."""
         return [echo.patch for echo in self.echoes[0]]
 
     def of(self, patches: Sequence[int]) -> "Problem":
-        """Return the problem of some of its patches."""
+        """Return the problem restricted to the numbered patches."""
         return replace(self, echoes=[[echoes[number] for number in patches] for echoes in self.echoes])
 
     def sharper(self, state: "State", used: Bools, *, stages: int = 1) -> "State":
-        """Return the tracks at which the patches used are sharpest, searched from `state`."""
+        """Return the tracks of maximum sharpness of the used patches, searched from `state`."""
         for _ in range(stages):
             sharpness = Sharpness(self.pairs, state.cached, state.tracks, state.statistics, used)
             state = self.state(minimise(sharpness, self.prior, self.gauge, state.unknowns))
@@ -313,16 +313,16 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Tracks, and the patches imaged from them.
+    """Track corrections, and the patches imaged along the corrected tracks.
 
     Attributes
     ----------
     unknowns
-        (unknown,) float64, of the prior.
+        (unknown,) float64, unknowns of the prior.
     tracks
-        Node → (knot, 3) float64, metres: the corrections.
+        Node → (knot, 3) float64, corrections in metres.
     cached
-        Pair → patch → what its blocks add.
+        Pair → patch → block contributions.
     """
 
     unknowns: Floats
@@ -331,7 +331,7 @@ class State:
 
     @cached_property
     def images(self) -> list[list[NDArray[np.complex64]]]:
-        """Pair → patch → (pixel,) complex64."""
+        """Pair → patch → image (pixel,) complex64."""
         return [[patch.values.sum(axis=1) for patch in patches] for patches in self.cached]
 
     @cached_property
@@ -344,7 +344,7 @@ class State:
         return statistics
 
     def of(self, patches: Sequence[int]) -> "State":
-        """Return the state of some patches."""
+        """Return the state restricted to the numbered patches."""
         return replace(self, cached=[[cached[number] for number in patches] for cached in self.cached])
 
 
@@ -356,29 +356,31 @@ def minimise(
     *,
     iterations: int = ITERATIONS,
 ) -> Floats:
-    """Return the unknowns that minimise a function of the tracks plus half their own square; the gauge is fixed."""
+    """Minimise a function of the tracks plus half the squared unknowns, with fixed gauge; return the unknowns."""
     from scipy.optimize import minimize  # slow to import
 
     fixed = gauge.modes.T @ (gauge.modes @ start)
 
     def objective(unknowns: Floats) -> tuple[float, Floats]:
         free = gauge.project_out(unknowns) + fixed
-        some, by_tracks = value(prior.tracks(free))
-        return some + 0.5 * float(unknowns @ unknowns), gauge.project_out(prior.adjoint(by_tracks)) + unknowns
+        objective_value, by_tracks = value(prior.tracks(free))
+        return objective_value + 0.5 * float(unknowns @ unknowns), gauge.project_out(
+            prior.adjoint(by_tracks)
+        ) + unknowns
 
     options = {"maxiter": iterations, "maxfun": 2 * iterations, "maxcor": 20}
-    found = minimize(objective, gauge.project_out(start), jac=True, method="L-BFGS-B", options=options)
-    return np.asarray(gauge.project_out(found.x) + fixed)
+    result = minimize(objective, gauge.project_out(start), jac=True, method="L-BFGS-B", options=options)
+    return np.asarray(gauge.project_out(result.x) + fixed)
 
 
 # ---- Second start of the search: unwrapped phases of the brightest points -------------------------------------------
 
 SMOOTHED = (2.0, 1.5, 1.0)
-"""Standard deviation, in blocks, of the filter before phases are unwrapped, one per round."""
+"""Standard deviation of the smoothing filter before phase unwrapping in each round, blocks."""
 
 
 def prominent_point_start(problem: Problem, start: State, used: NDArray[np.bool_], axes: Floats) -> State:
-    """Return the tracks that explain the phases of the patches' brightest pixels, least squares with the prior.
+    """Fit tracks to the unwrapped phases of the patches' brightest pixels by least squares with the prior.
 
     Notes
     -----
@@ -394,7 +396,7 @@ def prominent_point_start(problem: Problem, start: State, used: NDArray[np.bool_
 
 @dataclass(frozen=True, eq=False)
 class _History:
-    """The unwrapped phase of a patch's brightest pixel over the blocks, and what of it is place and constant."""
+    """Unwrapped phase of a patch's brightest pixel over the blocks, and the subspace of position and constant phase."""
 
     patch: Contribution
     phase: Floats
@@ -409,14 +411,14 @@ class _History:
         smooth = gaussian_filter1d(brightest.real, smoothed) + 1j * gaussian_filter1d(brightest.imag, smoothed)
         power = np.abs(smooth) ** 2
         weight = 1 / np.sqrt(0.5 + 0.5 * np.median(power) / (power + 1e-30))
-        ground = np.asarray(sum(patch.slopes.values())) @ axes[:2].T
-        columns = np.concatenate([np.ones((len(ground), 1)), ground], axis=1) * weight[:, None]
+        slope = np.asarray(sum(patch.slopes.values())) @ axes[:2].T
+        columns = np.concatenate([np.ones((len(slope), 1)), slope], axis=1) * weight[:, None]
         return cls(patch, np.unwrap(np.angle(smooth)), weight, np.linalg.qr(columns)[0])
 
 
 @dataclass(frozen=True, eq=False)
 class _PhaseFit:
-    """Half the squared phases that tracks leave, over pairs and patches."""
+    """Half the sum of squared residual phases of the tracks, over pairs and patches."""
 
     pairs: Sequence[Blocks]
     histories: Sequence[Sequence[_History]]
@@ -427,72 +429,73 @@ class _PhaseFit:
         total, gradient = 0.0, {node: np.zeros_like(track) for node, track in tracks.items()}
         for blocks, histories in zip(self.pairs, self.histories, strict=True):
             moved = blocks.moves({node: tracks[node] - self.reference[node] for node in blocks.record.nodes})
-            for one, counts in zip(histories, self.used, strict=True):
-                if not counts:
+            for history, is_used in zip(histories, self.used, strict=True):
+                if not is_used:
                     continue
-                patch = one.patch
-                left = one.weight * (phases(patch, moved) + one.phase)
-                left -= one.known @ (one.known.T @ left)
-                total += 0.5 * float(left @ left)
+                patch = history.patch
+                residual = history.weight * (phases(patch, moved) + history.phase)
+                residual -= history.known @ (history.known.T @ residual)
+                total += 0.5 * float(residual @ residual)
                 for node, slope in patch.slopes.items():
                     by_block = np.zeros_like(moved[node])
-                    by_block[patch.blocks] = patch.wavenumber * (one.weight * left)[:, None] * slope
+                    by_block[patch.blocks] = patch.wavenumber * (history.weight * residual)[:, None] * slope
                     gradient[node] += blocks.average.T @ by_block
         return total, gradient
 
 
-# ---- Start of the search beyond a slip: delays of the points in parts of the aperture -------------------------------
+# ---- Start of the search after a cycle slip: delays of the points in subapertures -----------------------------------
 
 _DELAY_STD_M = 0.03
-"""Metres of total path, of a point's delay in a part of the aperture: against the prior of the tracks."""
+"""Standard deviation of a point's delay in a subaperture, metres of total path, for the balance with the prior."""
 
 
-def unslipped_start(problem: Problem, state: State, further_m: Floats) -> State:
-    """Return the tracks that bring points to one range in all parts of the aperture, least squares with the prior.
+def unslipped_start(problem: Problem, state: State, shifts_m: Floats) -> State:
+    """Fit tracks that equalise the range of points in all subapertures by least squares with the prior.
 
     Parameters
     ----------
     problem, state
-        As solved.
-    further_m
-        (pair, patch, part) float64, metres of total path by which a part shows a point farther; NaN where it does not.
+        Solved problem and its state.
+    shifts_m
+        (pair, patch, part) float64, range shift of a point in a subaperture, metres of total path; NaN where the point
+        is not visible.
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 16: delays have no cycles. What they leave is less than half a wavelength.
+    Source: docs/theory/autofocus.md, eq. 16: delays are unambiguous. The residual path error is below λ/2.
     """
-    fit = _DelayFit(problem.pairs, state.cached, state.tracks, further_m)
+    fit = _DelayFit(problem.pairs, state.cached, state.tracks, shifts_m)
     return problem.state(minimise(fit, problem.prior, problem.gauge, state.unknowns, iterations=40))
 
 
 @dataclass(frozen=True, eq=False)
 class _DelayFit:
-    """Half the squared delays, in standard deviations, that tracks leave between parts, over pairs and patches."""
+    """Half the sum of squared residual delays between subapertures, in standard deviations, over pairs and patches."""
 
     pairs: Sequence[Blocks]
     cached: Sequence[Sequence[Contribution]]
     reference: Tracks
-    further_m: Floats
+    shifts_m: Floats
 
     def __call__(self, tracks: Tracks) -> tuple[float, dict[str, Floats]]:
         total, gradient = 0.0, {node: np.zeros_like(track) for node, track in tracks.items()}
-        for blocks, patches, by_patch in zip(self.pairs, self.cached, self.further_m, strict=True):
+        for blocks, patches, by_patch in zip(self.pairs, self.cached, self.shifts_m, strict=True):
             moved = blocks.moves({node: tracks[node] - self.reference[node] for node in blocks.record.nodes})
-            for patch, further_m in zip(patches, by_patch, strict=True):
-                measured = np.isfinite(further_m)
+            for patch, shift_m in zip(patches, by_patch, strict=True):
+                measured = np.isfinite(shift_m)
                 if measured.sum() < 2:
                     continue
-                # Mean path of each part of the aperture by the tracks, less the delay measured there, about their mean.
+                # Mean path change of each subaperture by the tracks less its measured shift, about their mean.
                 path = phases(patch, moved) / patch.wavenumber
-                ends = np.linspace(0, len(path), len(further_m) + 1).astype(np.int64)
+                ends = np.linspace(0, len(path), len(shift_m) + 1).astype(np.int64)
                 size = np.diff(ends)
                 part = np.repeat(np.arange(len(size)), size)
-                left = np.where(measured, np.add.reduceat(path, ends[:-1]) / size - np.nan_to_num(further_m), 0.0)
-                left = np.where(measured, left - left.sum() / measured.sum(), 0.0) / _DELAY_STD_M
-                total += 0.5 * float(left @ left)
-                # Its derivative: the part's residual, shared by its blocks, along the slope of each node.
+                residual = np.where(measured, np.add.reduceat(path, ends[:-1]) / size - np.nan_to_num(shift_m), 0.0)
+                residual = np.where(measured, residual - residual.sum() / measured.sum(), 0.0) / _DELAY_STD_M
+                total += 0.5 * float(residual @ residual)
+                # Derivative: the residual of a subaperture, divided over its blocks, along the slope of each node.
                 for node, slope in patch.slopes.items():
                     by_block = np.zeros_like(moved[node])
-                    by_block[patch.blocks] = (left / size / _DELAY_STD_M)[part][:, None] * slope
+                    by_block[patch.blocks] = (residual / size / _DELAY_STD_M)[part][:, None] * slope
                     gradient[node] += blocks.average.T @ by_block
         return total, gradient

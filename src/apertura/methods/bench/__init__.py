@@ -1,1 +1,1 @@
-"""Channels, clocks and links of a radar that stands still, measured on its recordings."""
+"""Bench measurements of a stationary radar from its recordings: channels, clocks and links."""

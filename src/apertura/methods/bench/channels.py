@@ -1,6 +1,6 @@
-"""Pulses and channels of a recording: what the trigger missed, and what the converter saw.
+"""Triggers and channels of a recording: missed and false triggers, level, DC offset, I/Q imbalance and stuck bits.
 
-Equations in docs/theory/bench.md; limits below with their reasons.
+The equations are in docs/theory/bench.md; the limits and their reasons are below.
 """
 
 from collections.abc import Iterable
@@ -16,34 +16,34 @@ from apertura.core.echo.demodulate import Numerology
 # ---- Limits ---------------------------------------------------------------------------------------------------------
 
 SIGMAS = 5.0
-"""Standard deviations of a measurement beyond which it is no chance: some dozen lines, never one in 10⁴ benches."""
+"""Standard deviations of a significant measurement: less than one false flag in 10⁴ bench reports of a dozen lines."""
 
 MISSED_SHARE = 0.01
-"""Of the pulses that a node should have recorded."""
+"""Largest share of missed pulses among the pulses due at a node."""
 
 DC_DB = -20.0
-"""dB of the mean of I and Q against the signal: over N = 1000 subcarriers it leaves a floor of −50 dB in range."""
+"""Largest mean of I and Q relative to the signal, dB; over N = 1000 subcarriers it is a floor of −50 dB in range."""
 
 IMAGE_DB = -25.0
-"""dB of the mirror image by unequal I and Q: of a subcarrier it falls on another, as noise of that level."""
+"""Largest mirror image by I/Q imbalance, dB; the image of a subcarrier is noise of this level on another one."""
 
 FEWEST_COUNTS = 4.0
-"""Counts rms of a channel of integers: quantisation lies 22 dB below."""
+"""Least level of a channel with integer samples, counts rms; quantisation noise is 22 dB below it."""
 
 
-# ---- Pulses: which were recorded ------------------------------------------------------------------------------------
+# ---- Triggers: recorded, missed and false ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Triggers:
-    """When a node was triggered.
+    """Trigger counts of a node.
 
     Attributes
     ----------
     recorded, missed, false
-        Captures; pulses between them that are not there; captures that lie between two pulses.
+        Number of captures; of missing pulses between them; of captures between two pulses.
     beyond
-        Pulses that another node recorded before its first capture, or after its last.
+        Pulses that another node recorded before the first or after the last capture of this node.
     """
 
     recorded: int
@@ -53,12 +53,12 @@ class Triggers:
 
     @property
     def due(self) -> int:
-        """Pulses from its first capture to its last."""
+        """Number of pulses from the first to the last capture."""
         return self.recorded - self.false + self.missed
 
     @property
     def flags(self) -> dict[str, str]:
-        """Flags of limits that are crossed."""
+        """Flag → measured values, of exceeded limits."""
         flags, due, lost = {}, self.due + self.beyond, self.missed + self.beyond
         if lost > MISSED_SHARE * due:
             ends = f", {self.beyond} of them before its first capture or after its last" if self.beyond else ""
@@ -69,7 +69,7 @@ class Triggers:
 
 
 def triggers(time_s: Floats, *, prf_hz: float) -> Triggers:
-    """Count pulses missed and captures too many, by (capture,) float64 ascending time tags, seconds.
+    """Count missed pulses and false captures from (capture,) float64 ascending time tags in seconds.
 
     Examples
     --------
@@ -79,7 +79,7 @@ def triggers(time_s: Floats, *, prf_hz: float) -> Triggers:
     missed, false, last = 0, 0, float(time_s[0])
     for time in time_s[1:].tolist():
         steps = (time - last) * prf_hz
-        # Tags are good to a few milliseconds, some to whole ones: a quarter of an interval is no pulse of the radar.
+        # Time tags have errors of a few milliseconds: captures off by more than a quarter of an interval are false.
         if steps < 0.75 or abs(steps - round(steps)) > 0.25:
             false += 1
             continue
@@ -88,29 +88,29 @@ def triggers(time_s: Floats, *, prf_hz: float) -> Triggers:
     return Triggers(len(time_s), missed, false)
 
 
-# ---- Channels: what the converter saw -------------------------------------------------------------------------------
+# ---- Channels: samples of the converter -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class MeasuredChannel:
-    """The samples of one channel.
+    """Measurements of the samples of one channel.
 
     Attributes
     ----------
     name
         radar or sidelink.
     counts
-        Root of the mean power, in counts of the converter.
+        Level, counts rms of the converter.
     dc_db
-        Mean of I and Q, dB of the mean power.
+        Mean of I and Q relative to the mean power, dB.
     image_db
         Mirror image, dB; eq. 2.
     image_floor_db
-        What the code itself looks like where both sidebands are occupied, dB.
+        Detection limit of the mirror image, which the code itself sets if both sidebands are occupied, dB.
     integers
-        Whether samples are integers.
+        True if samples are integers.
     stuck
-        Bits that never change while both a lower and a higher one do, 0 for the least significant; eq. 1a.
+        Numbers of bits that never change while a lower and a higher bit do, 0 for the least significant; eq. 1a.
     """
 
     name: str
@@ -123,14 +123,14 @@ class MeasuredChannel:
 
     @property
     def flags(self) -> dict[str, str]:
-        """Flags of limits that are crossed."""
+        """Flag → measured values, of exceeded limits."""
         flags = {}
         if self.integers and self.counts < FEWEST_COUNTS:
-            flags["channel_weak"] = f"channel {self.name}: {self.counts:.1f} counts rms"
+            flags["channel_weak"] = f"channel {self.name}: level {self.counts:.1f} counts rms"
         if self.dc_db > DC_DB:
-            flags["channel_dc"] = f"channel {self.name}: mean of I and Q {self.dc_db:.1f} dB of the signal"
+            flags["channel_dc"] = f"channel {self.name}: mean of I and Q {self.dc_db:.1f} dB relative to the signal"
         if self.image_db > max(IMAGE_DB, self.image_floor_db):
-            flags["channel_image"] = f"channel {self.name}: mirror image at {self.image_db:.1f} dB"
+            flags["channel_image"] = f"channel {self.name}: mirror image {self.image_db:.1f} dB relative to the signal"
         if self.stuck:
             flags["channel_bits_stuck"] = f"channel {self.name}: {', '.join(f'bit {bit}' for bit in self.stuck)}"
         return flags
@@ -142,11 +142,11 @@ def measure_channel(name: str, blocks: Iterable[Samples], numerology: Numerology
     Parameters
     ----------
     name
-        Of the channel.
+        Name of the channel.
     blocks
         (capture, sample, 2) each, I and Q from the start of the prefix.
     numerology
-        Of the symbol: over one period of it, unlike subcarriers are orthogonal.
+        Numerology of the symbol, over one period of which different subcarriers are orthogonal.
 
     Notes
     -----
@@ -163,7 +163,7 @@ def measure_channel(name: str, blocks: Iterable[Samples], numerology: Numerology
     """
     window = slice(numerology.prefix_samples, numerology.prefix_samples + numerology.dft_samples)
     captures, power, square, mean, integers = 0, 0.0, 0j, 0.0, True
-    ones, zeros = 0, 0  # bits that were 1, and 0, in any sample
+    ones, zeros = 0, 0  # bits that are 1, and 0, in any sample
     # Sums over the blocks: mean of I and Q (eq. 1), power and mean of the squares (eq. 2), bits (eq. 1a).
     for block in blocks:
         if integers := block.dtype.kind == "i":
@@ -177,11 +177,11 @@ def measure_channel(name: str, blocks: Iterable[Samples], numerology: Numerology
         power += float((np.abs(rest) ** 2).mean(axis=1).sum())
         square += complex((rest**2).mean(axis=1).sum())
     mirrored = np.isin(-numerology.numbers % numerology.dft_samples, numerology.numbers % numerology.dft_samples)
-    # Where the image of a subcarrier falls on another, products of code symbols do not add up to zero: of N random
-    # ones √N are left, and three times as much is no chance.
+    # If the image of a subcarrier coincides with another one, products of code symbols do not cancel: the sum of N
+    # random products is about √N, and three times this is significant.
     floor = 3 / (2 * np.sqrt(numerology.numbers.size)) if mirrored.mean() > 0.5 else 0.0
     power = max(power, 1e-30)
-    # Eq. 1a: bits that stay between bits that change; below the lowest that changes, samples are shifted up.
+    # Eq. 1a: constant bits between changing bits; constant bits below the lowest changing one are padding.
     changing = ones & zeros
     stuck = tuple(
         bit for bit in range(changing.bit_length()) if changing & ((1 << bit) - 1) != 0 and not changing >> bit & 1

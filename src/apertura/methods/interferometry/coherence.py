@@ -1,4 +1,4 @@
-"""Coherence and phase of two images of one scene over a window, the common band, and what chance makes of them."""
+"""Coherence and phase of two images of one scene over a window, their common band, and the bias of coherence."""
 
 from collections.abc import Iterable
 from math import exp, lgamma
@@ -16,19 +16,19 @@ from apertura.common.contracts import Window
 def common_band(
     carriers: tuple[NDArray[np.float64], NDArray[np.float64]], spectra: tuple[NDArray[np.float64], NDArray[np.float64]]
 ) -> float:
-    """Return the coherence of unchanged ground in two images of Gaussian bands.
+    """Return the coherence of unchanged terrain in two images with Gaussian bands.
 
     Parameters
     ----------
     carriers
-        (2,) float64 each, cycles per metre east and north, the middle of the image's band.
+        (2,) float64 each, centre of the image's band, cycles per metre east and north.
     spectra
-        (2, 2) float64 each, cycles² per m², the covariance of that band.
+        (2, 2) float64 each, covariance of the image's band, cycles² per m².
 
     Returns
     -------
     float
-        0 to 1, within 0.09 of what equally wide bands with sharp edges share.
+        0 to 1, within 0.09 of the overlap of equally wide bands with sharp edges.
 
     Notes
     -----
@@ -37,7 +37,7 @@ def common_band(
     Examples
     --------
     >>> flat = np.eye(2) / 12  # as wide as a band of one cycle per metre
-    >>> [round(common_band((np.zeros(2), np.array([apart, 0.0])), (flat, flat)), 2) for apart in (0, 0.2, 0.5, 1)]
+    >>> [round(common_band((np.zeros(2), np.array([shift, 0.0])), (flat, flat)), 2) for shift in (0, 0.2, 0.5, 1)]
     [1.0, 0.89, 0.47, 0.05]
     """
     difference, both = carriers[1] - carriers[0], (spectra[0] + spectra[1]) / 2
@@ -46,19 +46,19 @@ def common_band(
 
 
 def window_px(spectrum: NDArray[np.float64], spacing_m: float, *, looks: float = 16, most: int = 65) -> int:
-    """Return the side of the smallest window of at least `looks` independent samples, pixels, odd.
+    """Return the side of the smallest window with at least `looks` independent samples, pixels, odd.
 
     Parameters
     ----------
     spectrum
-        (2, 2) float64, cycles² per m², the covariance of the image's band: of one with sharp edges a look is
+        (2, 2) float64, covariance of the image's band, cycles² per m²; with sharp band edges, the area of a look is
         1/(12 √det) m².
     spacing_m
-        Between pixels.
+        Pixel spacing.
     looks
-        Independent samples that coherence is estimated from.
+        Independent samples for the coherence estimate.
     most
-        A window is not wider than so many pixels.
+        Largest side of a window, pixels.
 
     Examples
     --------
@@ -76,29 +76,28 @@ def window_px(spectrum: NDArray[np.float64], spacing_m: float, *, looks: float =
 def coherence(
     first: NDArray[np.complex64], second: NDArray[np.complex64], *, window: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
-    """Return coherence and phase of two images over a window about each pixel, and how many looks that window has.
+    """Return coherence and phase of two images over a window about each pixel, and the number of looks of the window.
 
-    Both images are backprojected to one ground, so neither flat earth nor terrain is left in their phase difference,
-    and its mean over a window has no carrier although each image keeps its own: no slope is taken off.
+    Both images are backprojected to the same terrain: their phase difference contains neither flat-earth nor terrain
+    phase, and no carrier although each image has one. No slope is removed.
 
     Parameters
     ----------
     first, second
-        (y, x) complex64 on one grid, or one block of it with `window` // 2 pixels more on each side. NaN in either:
-        the pixel counts in no window.
+        (y, x) complex64 on one grid, or one block of it with `window` // 2 pixels more on each side. Pixels that are
+        NaN in either image are excluded from all windows.
     window
-        Pixels along a side, odd. What of it lies outside the block does not count.
+        Pixels along a side, odd. Pixels outside the block are excluded.
 
     Returns
     -------
     magnitude
-        (y, x) float32, 0 to 1, as estimated: of images that have nothing in common it is `chance(looks)` in the mean,
-        `unbiased` takes that off. NaN where either image is NaN, or the window empty of one of them.
+        (y, x) float32, 0 to 1, biased estimate: its mean for independent images is `chance(looks)`, which `unbiased`
+        removes. NaN where either image is NaN or zero within the window.
     phase
-        (y, x) float32, rad, of the first less that of the second; NaN with the magnitude.
+        (y, x) float32, phase of the first image minus that of the second, rad; NaN where the magnitude is.
     looks
-        Independent samples in a whole window, by the autocorrelation of each image; NaN of blocks
-        without a value.
+        Independent samples in a whole window, from the autocorrelation of each image; NaN for blocks without a value.
 
     Raises
     ------
@@ -107,8 +106,8 @@ def coherence(
 
     Notes
     -----
-    Source: docs/theory/interferometry.md, eqs. 2 and 3. Each sum is added pixel by pixel in one order, so that a block
-    with its margin gives what the whole image gives, to the bit.
+    Source: docs/theory/interferometry.md, eqs. 2 and 3. The order of each sum is fixed, so that a block with its margin
+    reproduces the values of the whole image bit by bit.
 
     Examples
     --------
@@ -118,12 +117,14 @@ def coherence(
     '1.000 1.571'
     """
     if first.shape != second.shape or window < 1 or window % 2 == 0:
-        raise ValueError(f"{first.shape=}, {second.shape=}, {window=}: one shape and an odd window are needed")
-    there = np.isfinite(first) & np.isfinite(second)
-    one, other = (np.where(there, image, 0).astype(np.complex128) for image in (first, second))
+        raise ValueError(
+            f"{first.shape=}, {second.shape=}, {window=}: equal shapes and an odd, positive window are required"
+        )
+    finite = np.isfinite(first) & np.isfinite(second)
+    one, other = (np.where(finite, image, 0).astype(np.complex128) for image in (first, second))
     crossed = box_sum(one * other.conj(), window)
     power = box_sum(np.abs(one) ** 2, window) * box_sum(np.abs(other) ** 2, window)
-    valid = there & (power > 0)
+    valid = finite & (power > 0)
     magnitude, phase = np.full(first.shape, np.nan, np.float32), np.full(first.shape, np.nan, np.float32)
     magnitude[valid] = np.minimum(np.abs(crossed[valid]) / np.sqrt(power[valid]), 1)
     phase[valid] = np.angle(crossed[valid])
@@ -131,7 +132,7 @@ def coherence(
 
 
 def chance(looks: float) -> float:
-    """Return the mean coherence that is measured where there is none, docs/theory/interferometry.md, eq. 4.
+    """Return the mean estimated coherence of independent images, docs/theory/interferometry.md, eq. 4.
 
     Examples
     --------
@@ -142,24 +143,24 @@ def chance(looks: float) -> float:
 
 
 def unbiased(magnitude: NDArray[np.float32], looks: float) -> NDArray[np.float32]:
-    """Return coherence without what chance adds to it, docs/theory/interferometry.md, eq. 5.
+    """Remove the bias of estimated coherence, docs/theory/interferometry.md, eq. 5.
 
     Parameters
     ----------
     magnitude
         (...) float32, from `coherence`.
     looks
-        More than 1.
+        Number of looks, more than 1.
 
     Returns
     -------
     ndarray
-        (...) float32, 0 to 1: 0 where the measured coherence is less than chance gives in the root of the mean square.
+        (...) float32, 0 to 1; 0 where the estimate is below the rms value for independent images.
 
     Raises
     ------
     ValueError
-        If there is one look: any two numbers are coherent.
+        If `looks` is 1 or less: any two samples are coherent.
 
     Examples
     --------
@@ -167,15 +168,15 @@ def unbiased(magnitude: NDArray[np.float32], looks: float) -> NDArray[np.float32
     array([0.   , 0.468, 1.   ], dtype=float32)
     """
     if not looks > 1:
-        raise ValueError(f"{looks=}: coherence of one look is 1 whatever the images hold; take a wider window")
+        raise ValueError(f"{looks=}: the coherence of a single look is 1 for any images; use a wider window")
     square = (looks * magnitude.astype(np.float64) ** 2 - 1) / (looks - 1)
     return np.sqrt(np.maximum(square, 0)).astype(np.float32)
 
 
 def box_sum(values: NDArray[Any], window: int) -> NDArray[Any]:
-    """Return the sum over a window about each element of a plane; beside the plane there is nothing.
+    """Return the sum over a window about each element of a plane, with zeros outside the plane.
 
-    No running sum: that would leave rounding of a bright point in all that follows it.
+    A running sum is not used: it would propagate the rounding error of a bright point to all following elements.
     """
     for axis in (0, 1):
         lines = np.swapaxes(values, 0, axis)
@@ -188,25 +189,25 @@ def box_sum(values: NDArray[Any], window: int) -> NDArray[Any]:
 
 
 def _looks(one: NDArray[np.complex128], other: NDArray[np.complex128], window: int) -> float:
-    """Return a window's independent samples, docs/theory/interferometry.md, eq. 3, to 1e-6 of them."""
-    alike = _correlation(one, window) * _correlation(other, window).conj()
+    """Return the independent samples of a window, docs/theory/interferometry.md, eq. 3, accurate to 1e-6."""
+    product = _correlation(one, window) * _correlation(other, window).conj()
     lag = window - np.abs(np.arange(1 - window, window))
     weight = np.multiply.outer(lag, lag)
-    return float(window**4 / max((alike * weight).sum().real, 1)) if np.isfinite(alike).all() else float("nan")
+    return float(window**4 / max((product * weight).sum().real, 1)) if np.isfinite(product).all() else float("nan")
 
 
 def _correlation(image: NDArray[np.complex128], window: int) -> NDArray[np.complex128]:
-    """Return the autocorrelation at lags below `window`: (2 `window` - 1,) twice, 1 in the middle."""
-    # Longer, else the correlation would be circular.
-    longer = [scipy.fft.next_fast_len(size + window - 1) for size in image.shape]
-    near = np.arange(1 - window, window)
+    """Return the autocorrelation at lags below `window` along both axes, 1 at lag 0."""
+    # Zero-padded, else the correlation would be circular.
+    padded = [scipy.fft.next_fast_len(size + window - 1) for size in image.shape]
+    lags = np.arange(1 - window, window)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # In single precision, as the image came: its peak at 1, so that powers of any image fit.
-        spectrum = scipy.fft.fft2((image / np.abs(image).max()).astype(np.complex64), longer)
-        alike = spectrum.real**2 + spectrum.imag**2
+        # Single precision suffices, as the image has it; a peak of 1 avoids overflow of the power.
+        spectrum = scipy.fft.fft2((image / np.abs(image).max()).astype(np.complex64), padded)
+        correlation = spectrum.real**2 + spectrum.imag**2
         for axis in (0, 1):
-            alike = np.take(scipy.fft.ifft(alike, axis=axis), near, axis=axis)
-        return np.asarray(alike / alike[window - 1, window - 1].real, np.complex128)
+            correlation = np.take(scipy.fft.ifft(correlation, axis=axis), lags, axis=axis)
+        return np.asarray(correlation / correlation[window - 1, window - 1].real, np.complex128)
 
 
 # ---- Coherence and phase of whole images, tile by tile --------------------------------------------------------------
@@ -215,31 +216,31 @@ def _correlation(image: NDArray[np.complex128], window: int) -> NDArray[np.compl
 def map_coherence(
     first: NDArray[np.complex64], second: NDArray[np.complex64], tiles: Iterable[Window], *, window: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], float, NDArray[np.float32]]:
-    """Return coherence and phase of whole images, tile by tile, as `coherence` has them.
+    """Return coherence and phase of whole images, computed tile by tile by `coherence`.
 
     Parameters
     ----------
     first, second
-        (y, x) complex64 on one grid, NaN where nothing was formed; read a tile with its margin at a time.
+        (y, x) complex64 on one grid, NaN where no image was formed; read one tile with its margin at a time.
     tiles
-        Windows that make up the grid.
+        Windows that cover the grid.
     window
         Pixels along a side, odd.
 
     Returns
     -------
     magnitude, phase, looks
-        As of `coherence`; looks are the median of the tiles', NaN where none has any.
+        As from `coherence`; looks are the median over tiles, NaN without a finite value.
     shared
-        (y, x) float32, pixels that a window's energy is spread over, as a share of it: about 1/2 of ground, 1/`looks`
-        of a point (docs/theory/interferometry.md, eq. 6).
+        (y, x) float32, effective share of a window's pixels that contribute its energy: about 1/2 for terrain,
+        1/`looks` for a point (docs/theory/interferometry.md, eq. 6).
 
     Examples
     --------
     >>> image = np.exp(1j * np.arange(64.0).reshape(8, 8) ** 2).astype(np.complex64)
     >>> halves = [(slice(0, 8), slice(0, 4)), (slice(0, 8), slice(4, 8))]
-    >>> apart, whole = map_coherence(image, 1j * image, halves, window=3), coherence(image, 1j * image, window=3)
-    >>> bool((apart[0] == whole[0]).all() and (apart[1] == whole[1]).all())
+    >>> tiled, whole = map_coherence(image, 1j * image, halves, window=3), coherence(image, 1j * image, window=3)
+    >>> bool((tiled[0] == whole[0]).all() and (tiled[1] == whole[1]).all())
     True
     """
     shape, margin = first.shape, window // 2
@@ -258,14 +259,18 @@ def map_coherence(
         looks.append(looks_of_tile)
         planes[0][tile], planes[1][tile] = magnitude[inner], phase[inner]
         planes[2][tile] = _shared(one, other, window)[inner]
-    there = [one for one in looks if np.isfinite(one)]
-    return planes[0], planes[1], float(np.median(there)) if there else float("nan"), planes[2]
+    finite = [value for value in looks if np.isfinite(value)]
+    return planes[0], planes[1], float(np.median(finite)) if finite else float("nan"), planes[2]
 
 
 def _shared(one: NDArray[np.complex64], other: NDArray[np.complex64], window: int) -> NDArray[np.float64]:
-    """Return (Σp)²/(N Σp²) over a window about each pixel, p the magnitude of the images' product."""
+    """Return (Σp)²/(N Σp²) over a window about each pixel, with p the magnitude of the product of the images."""
     power = np.abs(one.astype(np.complex128) * other)
-    there = np.isfinite(power)
-    power = np.where(there, power, 0)
-    total, squares, count = box_sum(power, window), box_sum(power**2, window), box_sum(there.astype(np.float64), window)
+    finite = np.isfinite(power)
+    power = np.where(finite, power, 0)
+    total, squares, count = (
+        box_sum(power, window),
+        box_sum(power**2, window),
+        box_sum(finite.astype(np.float64), window),
+    )
     return np.asarray(total**2 / np.maximum(count * squares, np.finfo(np.float64).tiny))

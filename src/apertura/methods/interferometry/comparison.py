@@ -1,4 +1,4 @@
-"""Interferogram of two images of one scene: coherence, phase, heights, and the limits that it exceeds."""
+"""Interferogram of two images of one scene: coherence, phase, heights, and exceeded limits."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -38,23 +38,23 @@ class InterferogramCounts:
     Attributes
     ----------
     common
-        Pixels visible to both images, without shadow or layover.
+        Number of pixels visible in both images, without shadow or layover.
     coherent
-        Of them, those more coherent than chance; `sensitive`: those whose phase a height turns enough.
+        Number of common pixels with significant coherence; `sensitive`: with sufficient sensitivity to height.
     coherence, chance
-        Median of the common pixels as measured, and the mean where there is none.
+        Median estimated coherence of the common pixels, and expected value for independent images.
     overlap
         Median share of the spectrum that both images sample.
     ambiguity_m
-        Median height of one turn, metres.
-    told
-        Pixels whose phase was unwrapped; `apart`: those of them in parts without a level.
+        Median height of ambiguity, metres.
+    unwrapped
+        Number of pixels with unwrapped phase; `apart`: in components without a reference level.
     residues, loops, jumps, by
-        As of `apertura.methods.interferometry.heights.Unwrapped`.
+        As in `apertura.methods.interferometry.heights.Unwrapped`.
     folded
-        As of `apertura.methods.interferometry.heights.PlacedHeights`.
+        As in `apertura.methods.interferometry.heights.PlacedHeights`.
     points
-        Points of known height that give the level.
+        Number of points of known height that determine the level.
     """
 
     common: int
@@ -64,7 +64,7 @@ class InterferogramCounts:
     chance: float
     overlap: float
     ambiguity_m: float
-    told: int = 0
+    unwrapped: int = 0
     apart: int = 0
     residues: int = 0
     loops: int = 0
@@ -75,88 +75,91 @@ class InterferogramCounts:
 
 
 MOST_INCOHERENT = 0.5
-"""Share of the common pixels that may be no more coherent than chance: more is flagged."""
+"""Largest share of common pixels without significant coherence."""
 
 MOST_RESIDUES = 1e-3
-"""Residues per loop of four pixels: more is flagged."""
+"""Largest number of residues per loop of four pixels."""
 
 MOST_FOLDED = 0.01
-"""Share of the unwrapped pixels whose places several pixels show: more is flagged."""
+"""Largest number of points imaged by several pixels, as a share of the unwrapped pixels."""
 
 
 def interferogram_flags(measured: InterferogramCounts) -> Flags:
-    """Return the limits that an interferogram exceeds: flag → what was measured.
+    """Return flag → measured values, of the limits that an interferogram exceeds.
 
     Examples
     --------
     >>> sorted(interferogram_flags(InterferogramCounts(100, 10, 100, 0.2, 0.18, 0.0, 2.0)))
     ['interferogram_decorrelated']
     """
-    one, flags = measured, Flags()
-    if one.common - one.coherent > MOST_INCOHERENT * one.common or not one.common:
-        beyond = ": the tracks lie further apart than any coherence reaches" if one.overlap == 0 else ""
+    counts, flags = measured, Flags()
+    if counts.common - counts.coherent > MOST_INCOHERENT * counts.common or not counts.common:
+        no_overlap = "; the spectra of the two images do not overlap" if counts.overlap == 0 else ""
         flags["interferogram_decorrelated"] = (
-            f"{one.coherent} of {one.common} pixels visible to both are more coherent than chance; in the median "
-            f"coherence is {one.coherence:.2f} where chance makes {one.chance:.2f} and geometry leaves "
-            f"{one.overlap:.2f} of the spectrum in common{beyond}"
+            f"{counts.coherent} of {counts.common} common pixels have significant coherence; median coherence "
+            f"{counts.coherence:.2f} ({counts.chance:.2f} expected for independent images), spectral overlap "
+            f"{counts.overlap:.2f}{no_overlap}"
         )
-    if one.sensitive < one.common:
+    if counts.sensitive < counts.common:
         flags["height_insensitive"] = (
-            f"at {one.common - one.sensitive} of {one.common} pixels one turn of the phase is more height than the "
-            "range is long: the tracks lie too close together for a height"
+            f"at {counts.common - counts.sensitive} of {counts.common} pixels the height of ambiguity exceeds the "
+            "range: the baseline is too short for heights"
         )
     ambiguous = []
-    if one.apart:
-        ambiguous.append(f"{one.apart} of {one.told} pixels lie in parts apart, whole turns from the others: left out")
-    if one.jumps and not one.by:
+    if counts.apart:
         ambiguous.append(
-            f"snaphu is not installed and the phase jumps by a turn at {number_of(one.jumps, 'place')}: heights are "
-            f"known up to multiples of {one.ambiguity_m:.3g} m"
+            f"{counts.apart} of {counts.unwrapped} unwrapped pixels lie in other components, "
+            "with unknown multiples of 2π: excluded"
+        )
+    if counts.jumps and not counts.by:
+        ambiguous.append(
+            f"snaphu is not installed and the phase has {number_of(counts.jumps, 'jump')} of 2π: heights are ambiguous "
+            f"by multiples of {counts.ambiguity_m:.3g} m"
         )
     if ambiguous:
         flags["height_ambiguous"] = "; ".join(ambiguous)
     inconsistent = []
-    if one.residues > MOST_RESIDUES * one.loops:
-        inconsistent.append(f"around {one.residues} of {one.loops} loops of four pixels the phase does not come back")
-    if one.folded > MOST_FOLDED * one.told:
-        inconsistent.append(f"places shown by several pixels are left out: {one.folded}")
+    if counts.residues > MOST_RESIDUES * counts.loops:
+        inconsistent.append(f"{counts.residues} phase residues in {counts.loops} loops of four pixels")
+    if counts.folded > MOST_FOLDED * counts.unwrapped:
+        inconsistent.append(f"{number_of(counts.folded, 'point')} imaged by several pixels, excluded")
     if inconsistent:
         flags["unwrapping_inconsistent"] = (
-            f"{'; '.join(inconsistent)}: heights may err by multiples of {one.ambiguity_m:.3g} m"
+            f"{'; '.join(inconsistent)}: heights may have errors of multiples of {counts.ambiguity_m:.3g} m"
         )
-    if one.told and not one.points:
+    if counts.unwrapped and not counts.points:
         flags["height_relative"] = (
-            "no point of known height shows: the median of the phase is taken for the height that the terrain has, and "
-            "an error of it is another height wherever one turn is another height"
+            "no point of known height is visible: the median phase is assigned to the terrain height, and its error is "
+            "a height error that varies with the height of ambiguity"
         )
     return flags
 
 
-# ---- Interferogram: coherence, phase, and heights at their own places -----------------------------------------------
+# ---- Interferogram: coherence, phase, and geocoded heights ----------------------------------------------------------
 
 LEAST_LOOKS = 4.0
-"""Looks that a window's energy must be spread over: with fewer a point beside its middle decides its phase."""
+"""Least number of looks over which the energy of a window is spread; with fewer, a point off its middle dominates."""
 
 
 @dataclass(frozen=True, eq=False)
 class AssumedGround:
-    """Ground that both images assume at each pixel.
+    """Terrain assumed by both images, and its properties at each pixel.
 
     Attributes
     ----------
     height_m
         (y, x) float64, metres.
     visible
-        (y, x) bool, visible to both images, without shadow or layover.
+        (y, x) bool, True for pixels visible in both images, without shadow or layover.
     sensed
-        Of the phase to height there.
+        Sensitivity of the phase to height.
     shift_px
-        (y, x, 2) float64, rows and columns from a pixel to the ground it shows, per metre of height.
+        (y, x, 2) float64, rows and columns from a pixel to the terrain imaged there, per metre of height.
     known
         Points of known height.
     track_std
-        From the points that heights count from to the deviation of the phase by errors of the tracks, (y, x) float64
-        rad; None where nobody knows these.
+        Function of the reference points of the heights that returns the standard deviation of the phase by track
+        errors, (y, x) float64 rad; None if the track errors are unknown.
     """
 
     height_m: Floats
@@ -174,12 +177,12 @@ class Interferogram:
     Attributes
     ----------
     panels
-        ``phase``, ``coherence`` and ``unwrapped`` where the images show it, ``height`` and ``height_std`` where the
-        ground lies: (y, x) float32, NaN where they are not valid.
+        ``phase``, ``coherence`` and ``unwrapped`` at image pixels, ``height`` and ``height_std`` at the position of the
+        terrain: (y, x) float32, NaN where not valid.
     looks
-        Independent samples of a window; NaN where there is none.
+        Independent samples of a window; NaN without valid pixels.
     measured
-        Counts that decide on the flags.
+        Counts for the flags.
     level
         Reference of the heights, and the constant removed from the phase; None without a valid pixel.
     """
@@ -198,14 +201,14 @@ def form_interferogram(
     *,
     window: int,
 ) -> Interferogram:
-    """Return the interferogram of two images on one grid.
+    """Form the interferogram of two images on one grid.
 
     Parameters
     ----------
     first, second, tiles, window
-        As of `apertura.methods.interferometry.coherence.map_coherence`.
+        As for `apertura.methods.interferometry.coherence.map_coherence`.
     ground
-        Assumed by both.
+        Terrain assumed by both images.
 
     Notes
     -----
@@ -213,7 +216,7 @@ def form_interferogram(
 
     Examples
     --------
-    An image against itself: coherent everywhere, and its phase is insensitive to height.
+    An image with itself is coherent everywhere, and the phase is insensitive to height.
 
     >>> generator, one = np.random.default_rng(0), np.ones((32, 32))
     >>> image = (generator.normal(size=(32, 32)) + 1j * generator.normal(size=(32, 32))).astype(np.complex64)
@@ -223,11 +226,11 @@ def form_interferogram(
     >>> own.measured.coherent, own.measured.sensitive, bool(np.isnan(own.panels["height"]).all())
     (1024, 0, True)
     """
-    # Coherence, phase and looks of every window (eqs. 2 to 6); pixels whose phase gives a height.
+    # Coherence, phase and looks of every window (eqs. 2 to 6); pixels whose phase determines a height.
     magnitude, phase, looks, shared = map_coherence(first, second, tiles, window=window)
     common = ground.visible & np.isfinite(magnitude)
-    enough = looks > 1  # coherence of a single look is 1 whatever the images hold
-    energy = looks * shared.astype(np.float64)  # looks that the window's energy is spread over
+    enough = looks > 1  # the coherence of a single look is 1 for any images
+    energy = looks * shared.astype(np.float64)  # looks over which the energy of the window is spread
     dominated = energy < LEAST_LOOKS
     valid = (
         common & ~dominated & height_valid(ground.sensed, magnitude, looks) if enough else np.zeros(common.shape, bool)
@@ -237,47 +240,47 @@ def form_interferogram(
     centred = np.where(valid, np.angle(np.exp(1j * (phase - centre))), np.nan).astype(np.float32)
     unwrapped = unwrap(centred, magnitude, looks=looks)
     effective_looks = np.minimum(looks, 2 * energy)
-    # The constant between both images by points of known height (eq. 15), else by the median.
+    # Phase constant between the images from points of known height (eq. 15), else from the median.
     known = [
         replace(
-            one,
-            measured_rad=float(phase[one.row, one.column]) - centre,
-            # what decorrelates a window about a point is spread over all its looks, of which the point takes one; the
-            # window does not cut the response in its middle
-            std_rad=float(phase_std(unbiased(magnitude[one.row, one.column], looks), looks)) / MARGIN,
+            point,
+            measured_rad=float(phase[point.row, point.column]) - centre,
+            # decorrelation about a point is spread over all looks of the window, of which the point occupies one; the
+            # point response lies in the middle of the window and is not truncated
+            std_rad=float(phase_std(unbiased(magnitude[point.row, point.column], looks), looks)) / MARGIN,
         )
-        for one in ground.known
-        if common[one.row, one.column]
+        for point in ground.known
+        if common[point.row, point.column]
     ]
     reference = level(unwrapped, known)
-    alone = remove_level(unwrapped, reference) if reference else np.full(common.shape, np.nan, np.float32)
-    # σ_φ of eq. 8, with the level's and the tracks' own deviations; heights at the places they belong to (eq. 16).
+    height_phase = remove_level(unwrapped, reference) if reference else np.full(common.shape, np.nan, np.float32)
+    # σ_φ of eq. 8, combined with the deviations of the level and of the tracks; geocoded heights (eq. 16).
     scatter = phase_std(unbiased(magnitude, looks), effective_looks).astype(np.float64)
     if reference:
         scatter = np.hypot(scatter, reference.std_rad or 0.0)
     if reference and ground.track_std:
-        scatter = np.hypot(scatter, ground.track_std([one for one in known if one.name in reference.points]))
-    at_place = _placed(ground, alone, scatter)
+        scatter = np.hypot(scatter, ground.track_std([point for point in known if point.name in reference.points]))
+    geocoded = _placed(ground, height_phase, scatter)
     panels = {
         "phase": np.where(common, phase, np.nan).astype(np.float32),
         "coherence": np.where(common, magnitude, np.nan).astype(np.float32),
-        "unwrapped": alone,
-        "height": at_place.height.astype(np.float32),
-        "height_std": at_place.std.astype(np.float32),
+        "unwrapped": height_phase,
+        "height": geocoded.height.astype(np.float32),
+        "height_std": geocoded.std.astype(np.float32),
     }
     coherent = magnitude > least_coherence(looks) if enough else np.zeros(common.shape, bool)
     counted = _measured(ground.sensed, common, coherent, magnitude, chance(looks) if enough else 1.0)
-    return Interferogram(panels, looks, _unwrapping(counted, unwrapped, alone, reference, at_place), reference)
+    return Interferogram(panels, looks, _unwrapping(counted, unwrapped, height_phase, reference, geocoded), reference)
 
 
-def _placed(ground: AssumedGround, alone: NDArray[np.float32], phase_std_rad: Floats) -> PlacedHeights:
-    """Return heights at their own places from the phase due to height and its deviation."""
-    rise = ground.sensed.height(alone.astype(np.float64))
+def _placed(ground: AssumedGround, height_phase: NDArray[np.float32], phase_std_rad: Floats) -> PlacedHeights:
+    """Return geocoded heights from the height phase and its standard deviation."""
+    rise = ground.sensed.height(height_phase.astype(np.float64))
     std = np.full(rise.shape, np.nan)
-    there = np.isfinite(rise)
-    if there.any():
-        steep = np.abs(ground.sensed.slope + 2 * ground.sensed.bend * rise)[there]
-        std[there] = phase_std_rad[there] / steep
+    finite = np.isfinite(rise)
+    if finite.any():
+        slope = np.abs(ground.sensed.slope + 2 * ground.sensed.bend * rise)[finite]
+        std[finite] = phase_std_rad[finite] / slope
     return place_heights(ground.height_m, rise, std, ground.shift_px)
 
 
@@ -286,42 +289,42 @@ def _measured(
     common: NDArray[np.bool_],
     coherent: NDArray[np.bool_],
     magnitude: NDArray[np.float32],
-    by_chance: float,
+    chance_level: float,
 ) -> InterferogramCounts:
-    """Return counts and medians of the pixels visible to both images."""
+    """Return counts and medians of the common pixels."""
     count = int(common.sum())
 
-    def middle(values: NDArray[np.floating]) -> float:
+    def median(values: NDArray[np.floating]) -> float:
         return float(np.median(values[common])) if count else 0.0
 
     return InterferogramCounts(
         common=count,
         coherent=int((common & coherent).sum()),
         sensitive=int((common & height_sensitive(sensed)).sum()),
-        coherence=middle(magnitude),
-        chance=by_chance,
-        overlap=middle(sensed.overlap),
-        ambiguity_m=min(middle(sensed.ambiguity_m), 1e9),  # JSON has no infinity
+        coherence=median(magnitude),
+        chance=chance_level,
+        overlap=median(sensed.overlap),
+        ambiguity_m=min(median(sensed.ambiguity_m), 1e9),  # JSON has no infinity
     )
 
 
 def _unwrapping(
     counted: InterferogramCounts,
     phase: Unwrapped,
-    alone: NDArray[np.float32],
+    height_phase: NDArray[np.float32],
     reference: Level | None,
-    at_place: PlacedHeights,
+    geocoded: PlacedHeights,
 ) -> InterferogramCounts:
-    """Return the counts completed by those of unwrapping."""
-    unwrapped, kept = int(np.isfinite(phase.phase).sum()), int(np.isfinite(alone).sum())
+    """Return the counts with those of unwrapping added."""
+    unwrapped, kept = int(np.isfinite(phase.phase).sum()), int(np.isfinite(height_phase).sum())
     return replace(
         counted,
-        told=unwrapped,
+        unwrapped=unwrapped,
         apart=unwrapped - kept,
         residues=phase.residues,
         loops=phase.loops,
         jumps=phase.jumps,
         by=phase.by,
-        folded=at_place.folded,
+        folded=geocoded.folded,
         points=len(reference.points) if reference else 0,
     )

@@ -1,4 +1,4 @@
-"""From phase to height: unwrapping, reference level, valid pixels, accuracy, and the places of the heights."""
+"""Phase-to-height conversion: unwrapping, reference level, valid pixels, accuracy, and geocoding of heights."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,27 +12,27 @@ from apertura.methods.interferometry.sensitivity import Sensitivity
 
 # ---- Unwrapping and residues ----------------------------------------------------------------------------------------
 
-_LEAST_SHARE = 0.01  # of all pixels, least size of a connected part: snaphu's default
+_LEAST_SHARE = 0.01  # least size of a connected component as a share of all pixels: snaphu's default
 
 
 @dataclass(frozen=True, eq=False)
 class Unwrapped:
-    """Phase without jumps of a turn, part by part.
+    """Unwrapped phase by connected components.
 
     Attributes
     ----------
     phase
-        (y, x) float32, rad; NaN where it is not valid.
+        (y, x) float32, rad; NaN where not valid.
     part
-        (y, x) uint32, 0 outside; between two parts any number of turns may lie.
+        (y, x) uint32, connected component, 0 outside; the multiple of 2π between components is unknown.
     by
-        The library and its version; empty: not unwrapped, the phase is within half a turn of its reference.
+        Library and version; empty: not unwrapped, the phase is within π of its reference.
     residues
-        Loops of four pixels around which the wrapped phase does not come back to itself.
+        Number of loops of four pixels with a nonzero sum of wrapped phase differences.
     loops
-        Loops of four valid pixels.
+        Number of loops of four valid pixels.
     jumps
-        Neighbours whose wrapped phases lie more than half a turn apart: turns that unwrapping must decide on.
+        Number of neighbours with wrapped phases that differ by more than π, which unwrapping must resolve.
     """
 
     phase: NDArray[np.float32]
@@ -44,16 +44,16 @@ class Unwrapped:
 
 
 def unwrap(phase: NDArray[np.float32], coherence: NDArray[np.float32], *, looks: float) -> Unwrapped:
-    """Return the phase unwrapped by snaphu, where that is installed; else as it is, within a turn.
+    """Unwrap the phase by snaphu if it is installed; else return the wrapped phase.
 
     Parameters
     ----------
     phase
-        (y, x) float32, rad, NaN where it is not valid.
+        (y, x) float32, rad, NaN where not valid.
     coherence
         (y, x) float32, 0 to 1.
     looks
-        Independent samples that one phase is the mean of.
+        Independent samples averaged for a phase.
 
     Notes
     -----
@@ -79,10 +79,10 @@ def unwrap(phase: NDArray[np.float32], coherence: NDArray[np.float32], *, looks:
         wrapped, weight, max(1.0, looks), cost="smooth", mask=valid, min_conncomp_frac=_LEAST_SHARE
     )
     known = valid & (part > 0)
-    # its own phase is rounded: whole turns are taken from it, and the phase that was measured stays
-    turns = np.round((np.where(known, whole, 0) - np.where(known, phase, 0)) / (2 * np.pi))
+    # snaphu's phase is rounded: only its multiples of 2π are used, added to the measured phase
+    cycles = np.round((np.where(known, whole, 0) - np.where(known, phase, 0)) / (2 * np.pi))
     return Unwrapped(
-        np.where(known, phase + 2 * np.pi * turns, np.nan).astype(np.float32),
+        np.where(known, phase + 2 * np.pi * cycles, np.nan).astype(np.float32),
         np.where(known, part, 0).astype(np.uint32),
         by,
         residues,
@@ -92,7 +92,7 @@ def unwrap(phase: NDArray[np.float32], coherence: NDArray[np.float32], *, looks:
 
 
 def count_residues(phase: NDArray[np.float32]) -> tuple[int, int, int]:
-    """Return residues, loops of four valid pixels, and neighbours more than half a turn apart.
+    """Count residues, loops of four valid pixels, and neighbours whose phases differ by more than π.
 
     Examples
     --------
@@ -100,16 +100,16 @@ def count_residues(phase: NDArray[np.float32]) -> tuple[int, int, int]:
     (1, 1, 1)
     """
     down, right = np.diff(phase, axis=0), np.diff(phase, axis=1)
-    turns_down, turns_right = (np.round(difference / (2 * np.pi)) for difference in (down, right))
-    # Whole turns around each loop of four pixels.
-    around = turns_right[:-1] + turns_down[:, 1:] - turns_right[1:] - turns_down[:, :-1]
-    there = np.isfinite(around)
-    jumps = sum(int(np.count_nonzero(turns[np.isfinite(turns)])) for turns in (turns_down, turns_right))
-    return int(np.count_nonzero(around[there])), int(there.sum()), jumps
+    cycles_down, cycles_right = (np.round(difference / (2 * np.pi)) for difference in (down, right))
+    # Integer cycles around each loop of four pixels.
+    around = cycles_right[:-1] + cycles_down[:, 1:] - cycles_right[1:] - cycles_down[:, :-1]
+    finite = np.isfinite(around)
+    jumps = sum(int(np.count_nonzero(cycles[np.isfinite(cycles)])) for cycles in (cycles_down, cycles_right))
+    return int(np.count_nonzero(around[finite])), int(finite.sum()), jumps
 
 
 def _library() -> str:
-    """Return name and version of the library that unwraps; nothing where it is not installed."""
+    """Return name and version of the unwrapping library; empty if it is not installed."""
     try:
         return f"snaphu {version('snaphu')}"
     except PackageNotFoundError:
@@ -121,20 +121,20 @@ def _library() -> str:
 
 @dataclass(frozen=True)
 class KnownHeight:
-    """A point of known height, where the images show it.
+    """Point of known height at its position in the images.
 
     Attributes
     ----------
     name
-        What it is called.
+        Name of the point.
     row, column
-        The pixel nearest to where it shows.
+        Pixel nearest to the point in the images.
     phase_rad
-        The phase due to its height there.
+        Phase due to the height of the point.
     measured_rad
-        The phase that is measured there, within a turn; NaN where none is.
+        Measured wrapped phase at the pixel; NaN without a measurement.
     std_rad
-        Its standard deviation.
+        Standard deviation of the measured phase.
     """
 
     name: str
@@ -147,20 +147,20 @@ class KnownHeight:
 
 @dataclass(frozen=True)
 class Level:
-    """The constant removed from the phase, the level that heights count from.
+    """Phase constant between the images, the reference level of the heights.
 
     Attributes
     ----------
     phase_rad
-        The constant.
+        Phase constant.
     part
-        The part of the unwrapped phase that it holds for; heights of others are unknown by whole turns.
+        Component of the unwrapped phase for which it is valid; other components have unknown multiples of 2π.
     points
-        The points of known height that give it; none: the median of the phase does.
+        Points of known height that determine it; empty if it is the median of the phase.
     spread_rad
-        Largest distance of such a point from the constant; None of fewer than two.
+        Largest distance of a point from the constant; None for fewer than two points.
     std_rad
-        Standard deviation of the constant: one error that all heights share; None without points, where it is unknown.
+        Standard deviation of the constant, an error common to all heights; None without points, as it is unknown.
     """
 
     phase_rad: float
@@ -171,14 +171,14 @@ class Level:
 
 
 def level(phase: Unwrapped, known: Sequence[KnownHeight]) -> Level | None:
-    """Return the constant between two images, docs/theory/interferometry.md, eq. 15; None where no phase is valid.
+    """Return the phase constant between two images, docs/theory/interferometry.md, eq. 15; None without valid phase.
 
     Parameters
     ----------
     phase
-        Unwrapped.
+        Unwrapped phase.
     known
-        Points of known height; those whose own phase is not known do not count.
+        Points of known height; points without a measured phase are ignored.
 
     Examples
     --------
@@ -190,22 +190,22 @@ def level(phase: Unwrapped, known: Sequence[KnownHeight]) -> Level | None:
     valid = np.argwhere(np.isfinite(phase.phase) & (phase.part > 0))
     if not len(valid):
         return None
-    measured = [(one, *_unwrapped(one, phase, valid)) for one in known if np.isfinite(one.measured_rad)]
+    measured = [(point, *_unwrapped(point, phase, valid)) for point in known if np.isfinite(point.measured_rad)]
     if not measured:
         sizes = np.bincount(phase.part[tuple(valid.T)])
         part = int(np.argmax(sizes[1:])) + 1
         return Level(round(float(np.median(phase.phase[phase.part == part])), 6), part)
     parts = [part for *_, part in measured]
     part = max(sorted(set(parts)), key=parts.count)
-    constants = {one.name: value - one.phase_rad for one, value, of in measured if of == part}
+    constants = {point.name: value - point.phase_rad for point, value, own_part in measured if own_part == part}
     constant = float(np.median(list(constants.values())))
     spread = max(abs(value - constant) for value in constants.values()) if len(constants) > 1 else None
-    std = _level_std(list(constants.values()), [one.std_rad for one, _, of in measured if of == part])
+    std = _level_std(list(constants.values()), [point.std_rad for point, _, own_part in measured if own_part == part])
     return Level(round(constant, 6), part, tuple(constants), spread, round(std, 6))
 
 
 def _level_std(constants: Sequence[float], stds: Sequence[float]) -> float:
-    """Return the standard deviation of the median of some constants: by their own deviations, or by their scatter.
+    """Return the standard deviation of the median of constants, from their deviations or, if larger, their scatter.
 
     Source: docs/theory/interferometry.md, eq. 15a.
     """
@@ -215,15 +215,15 @@ def _level_std(constants: Sequence[float], stds: Sequence[float]) -> float:
     return float(max(by_points, by_scatter) * (np.sqrt(np.pi / 2) if count > 2 else 1.0))
 
 
-def _unwrapped(one: KnownHeight, phase: Unwrapped, valid: NDArray[np.int64]) -> tuple[float, int]:
-    """Return the phase measured at a point, by the turns and in the part of the valid pixel nearest to it."""
-    near = tuple(valid[np.argmin(((valid - (one.row, one.column)) ** 2).sum(axis=1))])
-    turns = np.round((float(phase.phase[near]) - one.measured_rad) / (2 * np.pi))
-    return float(one.measured_rad + 2 * np.pi * turns), int(phase.part[near])
+def _unwrapped(point: KnownHeight, phase: Unwrapped, valid: NDArray[np.int64]) -> tuple[float, int]:
+    """Return the unwrapped phase measured at a point, and the component, both from the nearest valid pixel."""
+    near = tuple(valid[np.argmin(((valid - (point.row, point.column)) ** 2).sum(axis=1))])
+    cycles = np.round((float(phase.phase[near]) - point.measured_rad) / (2 * np.pi))
+    return float(point.measured_rad + 2 * np.pi * cycles), int(phase.part[near])
 
 
 def remove_level(phase: Unwrapped, reference: Level) -> NDArray[np.float32]:
-    """Return the phase due to height, (y, x) float32 rad: of one part, within half a turn if not unwrapped.
+    """Return the phase due to height in the reference component, (y, x) float32 rad; wrapped if not unwrapped.
 
     Examples
     --------
@@ -235,21 +235,21 @@ def remove_level(phase: Unwrapped, reference: Level) -> NDArray[np.float32]:
     return of_height if phase.by or not phase.jumps else np.angle(np.exp(1j * of_height)).astype(np.float32)
 
 
-# ---- Valid pixels, accuracy, and places of the heights --------------------------------------------------------------
+# ---- Valid pixels, accuracy, and geocoding of the heights -----------------------------------------------------------
 BY_CHANCE = 1e-3
-"""False alarm rate: share of incoherent pixels that still count as coherent."""
+"""False alarm rate: share of incoherent pixels that are accepted as coherent."""
 
 MARGIN = 1.4
-"""Factor on the Cramér-Rao bound of the phase: simulated ground scatters at most so much more."""
+"""Factor on the Cramér-Rao bound of the phase; the phase scatter of simulated terrain stays below it."""
 
 
-_STEPS = 30  # of the fixed-point search for the pixel that shows a place
-_MOST_COVERED = 1.5  # pixels that may show one place: 2 mean layover
-_TOLERANCE_PX = 0.05  # tolerance of that search
+_STEPS = 30  # iterations of the fixed-point search for the pixel that images a point
+_MOST_COVERED = 1.5  # largest number of pixels that image a point; 2 is layover
+_TOLERANCE_PX = 0.05  # tolerance of the fixed-point search
 
 
 def least_coherence(looks: float) -> float:
-    """Return the coherence that `BY_CHANCE` of pixels reach where there is none, docs/theory/interferometry.md, eq. 7.
+    """Return the coherence threshold at the false alarm rate `BY_CHANCE`, docs/theory/interferometry.md, eq. 7.
 
     Examples
     --------
@@ -265,9 +265,9 @@ def phase_std(coherence: NDArray[np.float32], looks: float | NDArray[np.float64]
     Parameters
     ----------
     coherence
-        (...) float32, without what chance adds to it.
+        (...) float32, unbiased.
     looks
-        Independent samples that the phase is the mean of, of all or of each.
+        Independent samples averaged for the phase, of all pixels or of each.
 
     Examples
     --------
@@ -277,42 +277,42 @@ def phase_std(coherence: NDArray[np.float32], looks: float | NDArray[np.float64]
     square = np.square(coherence.astype(np.float64))
     with np.errstate(divide="ignore"):
         bound = MARGIN * np.sqrt((1 - square) / (2 * looks * square))
-    return np.asarray(np.minimum(bound, np.pi / np.sqrt(3)), np.float32)  # that of any phase at all
+    return np.asarray(np.minimum(bound, np.pi / np.sqrt(3)), np.float32)  # π/√3 for a uniformly distributed phase
 
 
 def height_valid(sensed: Sensitivity, coherence: NDArray[np.float32], looks: float) -> NDArray[np.bool_]:
-    """Return a mask of the pixels that give a height: coherent beyond chance, and sensitive enough to height.
+    """Return a mask of pixels with a valid height: significant coherence, and sufficient sensitivity to height.
 
     Parameters
     ----------
     sensed
-        At the pixels.
+        Sensitivity at the pixels.
     coherence
-        (...) float32, as measured.
+        (...) float32, biased estimate.
     looks
-        As of `phase_std`.
+        As for `phase_std`.
     """
     with np.errstate(invalid="ignore"):
         return np.asarray(height_sensitive(sensed) & (sensed.overlap > 0) & (coherence > least_coherence(looks)))
 
 
 def height_sensitive(sensed: Sensitivity) -> NDArray[np.bool_]:
-    """Return a mask of a height of ambiguity below the height range: docs/theory/interferometry.md, section 5."""
+    """Return a mask of pixels with a height of ambiguity below the range: docs/theory/interferometry.md, section 5."""
     return np.asarray(sensed.ambiguity_m < sensed.range_m)
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedHeights:
-    """Heights at their own places.
+    """Geocoded heights.
 
     Attributes
     ----------
     height
-        (y, x) float64, metres, of the ground at the middle of each pixel; NaN where no pixel shows it, or several do.
+        (y, x) float64, terrain height at the middle of each pixel, metres; NaN if no pixel or several pixels image it.
     std
-        (y, x) float64, metres, by the phase's scatter and by that of the level.
+        (y, x) float64, standard deviation by the scatter of phase and level, metres.
     folded
-        Places that more than one pixel shows by these heights: layover, or errors of unwrapping by whole turns.
+        Number of points imaged by more than one pixel at these heights, by layover or unwrapping errors.
     """
 
     height: Floats
@@ -321,16 +321,17 @@ class PlacedHeights:
 
 
 def place_heights(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Floats) -> PlacedHeights:
-    """Return heights at the places that they belong to: ground that is higher than assumed shows where it is not.
+    """Geocode heights: terrain that is higher than assumed is imaged at a displaced pixel.
 
     Parameters
     ----------
     ground_m
-        (y, x) float64, heights that the images assume.
+        (y, x) float64, heights assumed by the images.
     rise_m, std_m
-        (y, x) float64, how much higher the ground shown by a pixel is, NaN where that is not known; its deviation.
+        (y, x) float64, height of the terrain imaged by a pixel above the assumed one, NaN if unknown; and its standard
+        deviation.
     shift_px
-        (y, x, 2) float64, rows and columns from a pixel to the ground it shows, per metre of rise.
+        (y, x, 2) float64, rows and columns from a pixel to the terrain imaged there, per metre of rise.
 
     Notes
     -----
@@ -349,39 +350,40 @@ def place_heights(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Flo
     if not known.any():
         return PlacedHeights(np.full(rise_m.shape, np.nan), np.full(rise_m.shape, np.nan), 0)
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
-    # The pixel that shows each place, eq. 16, by fixed-point iteration.
-    moved = np.moveaxis(shift_px, -1, 0) * rise_m[tuple(nearest)]  # a pixel beside all that are known leads on to them
-    place = np.stack(np.meshgrid(*map(np.arange, rise_m.shape), indexing="ij")).astype(np.float64)
-    shown, error_px = place, np.full(rise_m.shape, np.inf)
+    # Pixel that images each point, eq. 16, by fixed-point iteration; unknown rises are the nearest known ones.
+    shift = np.moveaxis(shift_px, -1, 0) * rise_m[tuple(nearest)]
+    position = np.stack(np.meshgrid(*map(np.arange, rise_m.shape), indexing="ij")).astype(np.float64)
+    imaged_at, error_px = position, np.full(rise_m.shape, np.inf)
     for _ in range(_STEPS):
-        target = place - [map_coordinates(one, shown, order=1, mode="nearest") for one in moved]
-        error_px, shown = np.abs(target - shown).max(axis=0), target
+        target = position - [map_coordinates(axis, imaged_at, order=1, mode="nearest") for axis in shift]
+        error_px, imaged_at = np.abs(target - imaged_at).max(axis=0), target
         if not (error_px > _TOLERANCE_PX).any():
             break
-    # Places that several pixels show, and places where the iteration has not converged, have no height.
-    folds = _covered(place + moved, np.abs(_stretch(moved)) * known) > _MOST_COVERED
+    # Points imaged by several pixels, and points without convergence, have no height.
+    folds = _covered(position + shift, np.abs(_stretch(shift)) * known) > _MOST_COVERED
     converged = (error_px <= _TOLERANCE_PX) & ~folds
-    height, std = (map_coordinates(one, shown, order=1, cval=np.nan) for one in (ground_m + rise_m, std_m))
+    height, std = (map_coordinates(values, imaged_at, order=1, cval=np.nan) for values in (ground_m + rise_m, std_m))
     folded = int(((error_px > _TOLERANCE_PX) | folds)[np.isfinite(height)].sum())
     return PlacedHeights(np.where(converged, height, np.nan), np.where(converged, std, np.nan), folded)
 
 
-def _covered(to: Floats, area: Floats) -> Floats:
-    """Return the cover of each place: the mean over 3 × 3 of the areas of the pixels that show it."""
+def _covered(positions: Floats, area: Floats) -> Floats:
+    """Return the number of pixels that image each point: mean over 3 × 3 pixels of the areas mapped to the point."""
     from scipy.ndimage import uniform_filter
 
     inside = np.logical_and.reduce(
-        [(np.round(at) >= 0) & (np.round(at) < size) for at, size in zip(to, area.shape, strict=True)]
+        [(np.round(at) >= 0) & (np.round(at) < size) for at, size in zip(positions, area.shape, strict=True)]
     )
-    row, column = (np.round(at[inside]).astype(np.int64) for at in to)
+    row, column = (np.round(at[inside]).astype(np.int64) for at in positions)
     cover = np.bincount(row * area.shape[1] + column, area[inside], minlength=area.size).reshape(area.shape)
     return np.asarray(uniform_filter(cover, 3, mode="nearest"))
 
 
-def _stretch(moved: Floats) -> Floats:
-    """Return the area of ground that a pixel shows, in pixels: negative where it is folded over."""
-    size = moved.shape[1:]
+def _stretch(shift: Floats) -> Floats:
+    """Return the terrain area imaged by a pixel, in pixels; negative in layover."""
+    size = shift.shape[1:]
     rows, columns = (
-        [np.gradient(one, axis=axis) if size[axis] > 1 else np.zeros(size) for axis in (0, 1)] for one in moved
+        [np.gradient(component, axis=axis) if size[axis] > 1 else np.zeros(size) for axis in (0, 1)]
+        for component in shift
     )
     return np.asarray((1 + rows[0]) * (1 + columns[1]) - rows[1] * columns[0])

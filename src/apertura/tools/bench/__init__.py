@@ -1,1 +1,1 @@
-"""A radar that stands still: channels, clocks and links are measured (`measurement`) and reported (`report`)."""
+"""Bench test of a stationary radar: measurement of channels, clocks and links (`measurement`), and its `report`."""

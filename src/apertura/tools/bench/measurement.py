@@ -1,4 +1,4 @@
-"""A flight of kind bench as measured: channels and clocks of its nodes, links of its pairs, and a verdict per line."""
+"""Measurement of a flight of kind bench: channels and clocks of its nodes, links of its pairs, verdict lines."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -64,14 +64,14 @@ from apertura.stages.ingest import captures_of, checked_recording
 from apertura.stages.transmitted import Transmitted, transmitted
 
 _CHANNELS = ("radar", "sidelink")
-_STRETCH = 256  # neighbouring captures, amid each of 16 parts of a recording
+_STRETCH = 256  # consecutive captures in each of 16 groups of a recording
 _EVERY_CAPTURE = 4096
-"""Captures of a node whose samples are looked at one by one; of longer recordings so many, evenly spread."""
+"""Maximum number of captures of a node whose samples are analysed; longer recordings are sampled evenly."""
 
 
 @dataclass(frozen=True)
 class VerdictLine:
-    """One line of the verdict.
+    """A line of the verdict: quantity, measurement, limit and flags.
 
     Attributes
     ----------
@@ -80,9 +80,9 @@ class VerdictLine:
     what
         Quantity.
     measured, limit
-        With units.
+        Measured value and limit, with units.
     flags
-        Names of the flags that it carries; none: nothing to look at.
+        Names of the raised flags; empty if the value is within its limit.
     """
 
     of: str
@@ -99,19 +99,19 @@ class BenchNode:
     Attributes
     ----------
     name
-        Of the node.
+        Name of the node.
     triggers, channels, saturated
-        Pulses recorded; samples by channel; share of them at the end stops.
+        Recorded pulses; state of each channel; share of saturated samples by channel.
     clock
-        Against the transmitter's; None of the transmitter, and where it cannot be measured.
+        Clock offset to the transmitter; None for the transmitter, and if it cannot be measured.
     sidelink, contact
-        State of the sidelink as measured for the correction, and its amplitude; None without.
+        State of the sidelink as measured for the correction, and stability of its amplitude; None without a sidelink.
     link
-        Its strongest path: own echo of the transmitter, else the echo divided by the sidelink; None where none locks.
+        Strongest path: the transmitter's own echo, else the echo divided by the sidelink; None if no path locks.
     coherence_before
-        Γ of the radar channel as if there were no sidelink.
+        Γ of the radar channel without sidelink correction.
     flags
-        Of all that.
+        Flags of all measurements.
     """
 
     name: str
@@ -128,20 +128,20 @@ class BenchNode:
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """A flight of kind bench as measured.
+    """Measurements of a flight of kind bench.
 
     Attributes
     ----------
     flight, transmitter
-        Names.
+        Names of the flight and the transmitting node.
     nodes
-        Those that recorded, the transmitter first.
+        Recording nodes, the transmitter first.
     offsets
-        Node → path of its radar channel, less that of its sidelink, beyond the set-up.
+        Node → path offset of its radar channel, less that of its sidelink, relative to the set-up.
     splits
-        Pair → its radar channel against the transmitter's, where one signal feeds both.
+        Pair → comparison of its radar channel with the transmitter's, if one signal is split to both.
     carrier_hz, interval_s
-        Nominal carrier, and time between pulses.
+        Nominal carrier frequency, and pulse interval.
     """
 
     flight: str
@@ -159,12 +159,12 @@ class Bench:
 
     @property
     def flags(self) -> Flags:
-        """All flags."""
+        """Flags of all nodes and pairs."""
         return Flags.merged(*(node.flags for node in self.nodes), self.pair_flags)
 
     @property
     def lines(self) -> list[VerdictLine]:
-        """The verdict, line by line."""
+        """Lines of the verdict on all nodes."""
         return [line for node in self.nodes for line in self._lines(node)]
 
     def _lines(self, node: BenchNode) -> Iterator[VerdictLine]:
@@ -174,62 +174,65 @@ class Bench:
             return VerdictLine(of, what, measured, limit, tuple(name for name in names if name in raised))
 
         count = node.triggers
-        lost, due = count.missed + count.beyond, count.due + count.beyond
+        missed, expected = count.missed + count.beyond, count.due + count.beyond
         yield line(
             node.name,
             "pulses",
-            f"{count.recorded} recorded, {lost} of {due} missed, {count.false} false",
+            f"{count.recorded} recorded, {missed} of {expected} missed, {count.false} false",
             f"missed {100 * MISSED_SHARE:g} %, false 0",
             "triggers_missed",
             "triggers_false",
         )
         for channel in node.channels:
-            of, mine = f"{node.name} {channel.name}", channel.flags
+            of, flags = f"{node.name} {channel.name}", {*channel.flags}
             level = f"{channel.counts:.0f} counts rms" if channel.integers else f"{channel.counts:.3g} rms"
             share = node.saturated.get(channel.name, 0.0)
-            yield line(of, "level", level, f"at least {FEWEST_COUNTS:g}", *({"channel_weak"} & {*mine}))
+            yield line(of, "level", level, f"at least {FEWEST_COUNTS:g}", *({"channel_weak"} & flags))
             yield line(
                 of,
-                "samples at the end stops",
+                "saturated samples",
                 f"{100 * share:.3f} %",
                 f"{100 * SATURATED_SHARE:g} %",
                 *([f"saturated_{channel.name}"] if share > SATURATED_SHARE else []),
             )
             if channel.stuck:
                 bits = ", ".join(map(str, channel.stuck))
-                yield line(of, "bits that never change", bits, "none", *({"channel_bits_stuck"} & {*mine}))
-            yield line(of, "DC", f"{channel.dc_db:.1f} dB", f"{DC_DB:g} dB", *({"channel_dc"} & {*mine}))
-            worst = max(IMAGE_DB, channel.image_floor_db)
+                yield line(of, "constant bits", bits, "none", *({"channel_bits_stuck"} & flags))
+            yield line(of, "DC", f"{channel.dc_db:.1f} dB", f"{DC_DB:g} dB", *({"channel_dc"} & flags))
+            limit_db = max(IMAGE_DB, channel.image_floor_db)
             yield line(
-                of, "mirror image", f"{channel.image_db:.1f} dB", f"{worst:.0f} dB", *({"channel_image"} & {*mine})
+                of, "I/Q image", f"{channel.image_db:.1f} dB", f"{limit_db:.0f} dB", *({"channel_image"} & flags)
             )
         yield from self._received(node, line)
         if node.link is not None:
             yield from self._link(node, node.link, line)
         else:
-            yield line(self.pair(node.name), "path", "none above the noise", "one", "link_weak", "sidelink_lost")
+            yield line(
+                self.pair(node.name), "path", "no path above the noise", "one path", "link_weak", "sidelink_lost"
+            )
 
     def _received(self, node: BenchNode, line: Any) -> Iterator[VerdictLine]:
-        """Yield facts of a receiver's sidelink and clock."""
+        """Yield lines on a receiver's clock and sidelink."""
         if node.name == self.transmitter:
             return
         if node.clock is not None:
             ppm, std = node.clock.cfo_hz / self.carrier_hz * 1e6, node.clock.cfo_std_hz / self.carrier_hz * 1e6
             sampling = f"{node.clock.sfo_ppm:+.4f} ± {node.clock.sfo_std_ppm:.4f} ppm of the sampling rate"
-            yield line(node.name, "clock, carrier", f"{ppm:+.4f} ± {std:.4f} ppm", f"{UNLOCKED_PPM:g} ppm",
+            yield line(node.name, "carrier frequency offset", f"{ppm:+.4f} ± {std:.4f} ppm", f"{UNLOCKED_PPM:g} ppm",
                        "clock_unlocked", "clock_ambiguous")  # fmt: skip
-            yield line(node.name, "clock, sampling", sampling, "as the carrier")
-            moved = node.clock.cfo_slope_hz * node.triggers.recorded / self.carrier_hz * 1e6
-            yield line(node.name, "clock, change over the recording", f"{moved:+.4f} ppm", f"{DRIFT_PPM:g} ppm",
-                       "clock_drifts")  # fmt: skip
+            yield line(node.name, "sampling frequency offset", sampling, "equal to that of the carrier")
+            change_ppm = node.clock.cfo_slope_hz * node.triggers.recorded / self.carrier_hz * 1e6
+            yield line(node.name, "change of the carrier offset over the recording", f"{change_ppm:+.4f} ppm",
+                       f"{DRIFT_PPM:g} ppm", "clock_drifts")  # fmt: skip
         of = f"{node.name} sidelink"
         if node.sidelink is not None:
             state = node.sidelink
-            yield line(of, "SNR", f"{state['snr_db']:.1f} dB per subcarrier", "by the correction", "sidelink_noisy")
+            method = "depends on the correction"
+            yield line(of, "SNR", f"{state['snr_db']:.1f} dB per subcarrier", method, "sidelink_noisy")
             yield line(of, "lock", f"{100 * state['lock_rate']:.1f} % of the pulses", "100 %", "sidelink_lost")
-            yield line(of, "echo beside the direct path", f"at most {state['echo_db']:.1f} dB", "by the correction",
+            yield line(of, "echoes besides the direct path", f"at most {state['echo_db']:.1f} dB", method,
                        "sidelink_echo", "second_arrival", "sidelink_ripple_or_echo")  # fmt: skip
-            yield line(of, "ripple of the band", f"{state['ripple_db']:.2f} dB", "by the correction",
+            yield line(of, "ripple over the band", f"{state['ripple_db']:.2f} dB", method,
                        "sidelink_ripple", "sidelink_nulls")  # fmt: skip
             yield line(of, "correction", f"{state['method']}: {state['reason']}", "", "wrong_code")
         if node.contact is not None:
@@ -241,14 +244,14 @@ class Bench:
                     tuple(contact.flags))  # fmt: skip
 
     def _link(self, node: BenchNode, link: MeasuredLink, line: Any) -> Iterator[VerdictLine]:
-        pair, drift, moved = self.pair(node.name), link.phase_drift_rad, link.delay_drift_ps
+        pair, phase_drift, delay_drift = self.pair(node.name), link.phase_drift_rad, link.delay_drift_ps
         if node.coherence_before is not None:
-            yield line(pair, "coherence Γ without the sidelink", f"{node.coherence_before:.4f}", "none")
+            yield line(pair, "coherence Γ without sidelink correction", f"{node.coherence_before:.4f}", "no limit")
         yield line(
             pair,
             "coherence Γ",
             f"{link.coherence:.6f}",
-            f"{link.coherence_limit:.6f} ± {link.coherence_std:.6f} by the SNR",
+            f"{link.coherence_limit:.6f} ± {link.coherence_std:.6f}, from the SNR",
             "link_incoherent",
             "phase_unstable",
         )
@@ -257,50 +260,50 @@ class Bench:
         yield line(
             pair,
             "phase",
-            f"{link.phase_excess_rad:.4f} rad rms beyond noise of {link.noise_rad:.4f}",
+            f"{link.phase_excess_rad:.4f} rad rms in excess of noise ({link.noise_rad:.4f} rad)",
             f"{PHASE_RAD:g} rad",
             "link_incoherent",
         )
         yield line(
             pair,
             "drift over the recording",
-            f"{drift[0]:+.4f} ± {drift[1]:.4f} rad, {moved[0]:+.2f} ± {moved[1]:.2f} ps",
+            f"{phase_drift[0]:+.4f} ± {phase_drift[1]:.4f} rad, {delay_drift[0]:+.2f} ± {delay_drift[1]:.2f} ps",
             f"{PHASE_RAD:g} rad",
             "link_drifts",
         )
         yield self._steady(link.contact, pair)
         path = f"{link.path_m:+.4f} ± {link.path_std_m:.4f} m"
-        yield line(pair, "path", path, "one of all pulses", "channels_swapped", "delay_jumps")
+        yield line(pair, "path", path, "equal for all pulses", "channels_swapped", "delay_jumps")
         yield line(pair, "strongest tone", f"{link.tone_db:.1f} dB at {link.tone_hz / 1e6:.2f} MHz",
-                   f"{TONE_DB:g} dB of the noise", "interference")  # fmt: skip
+                   f"{TONE_DB:g} dB re noise", "interference")  # fmt: skip
         if (offset := self.offsets.get(node.name)) is not None:
             yield line(
                 pair,
-                "path beyond the set-up",
+                "path offset relative to the set-up",
                 f"{offset.offset_m:+.4f} ± {offset.std_m:.4f} m, config {offset.stated_m:+.4f} m",
                 f"{PATH_CELLS * offset.cell_m:.3f} m",
-                "path_disagrees",
+                "path_offset_disagrees",
             )
         if link.direct_db is not None:
-            yield line(pair, "sidelink in the radar channel", f"{link.direct_db:.1f} dB of the path",
-                       f"{LEAKAGE_DB:g} dB", "channel_leaks")  # fmt: skip
+            yield line(pair, "sidelink in the radar channel", f"{link.direct_db:.1f} dB re path",
+                       f"{LEAKAGE_DB:g} dB", "channel_crosstalk")  # fmt: skip
         if link.arrivals:
-            others = ", ".join(f"{one.level_db:.1f} dB {one.later_m:+.2f} m" for one in link.arrivals)
+            others = ", ".join(f"{arrival.level_db:.1f} dB {arrival.later_m:+.2f} m" for arrival in link.arrivals)
             yield line(pair, "other arrivals", others, "")
         if (split := self.splits.get(pair)) is not None:
             yield line(
                 pair,
-                f"against {self.pair(self.transmitter)}, one signal",
-                f"{split.gain_db:+.2f} dB, {split.phase_rad:+.3f} ± {split.phase_std_rad:.3f} rad, paths "
-                f"{split.path_m:+.3f} m apart, the receiver's beyond its "
-                f"sidelink; over the band {split.band_db:.2f} dB, {split.band_rad:.3f} rad rms",
+                f"difference to {self.pair(self.transmitter)} with a split signal",
+                f"{split.gain_db:+.2f} dB, {split.phase_rad:+.3f} ± {split.phase_std_rad:.3f} rad, path "
+                f"{split.path_m:+.3f} m (receiver: relative to its sidelink); over the band {split.band_db:.2f} dB, "
+                f"{split.band_rad:.3f} rad rms",
                 f"{SPLIT_DB:g} dB, {SPLIT_RAD:g} rad",
-                "split_disagrees",
+                "splitter_channels_differ",
             )
 
     @property
     def report(self) -> dict[str, Any]:
-        """Everything measured, as a JSON document."""
+        """All measurements as a JSON document."""
         return {
             "flight": self.flight,
             "transmitter": self.transmitter,
@@ -321,17 +324,17 @@ class Bench:
 
 
 _DOUBTS = frozenset({
-    "link_weak", "link_incoherent", "contact_loose", "delay_jumps", "wrong_code", "code_unconfirmed",
+    "link_weak", "link_incoherent", "contact_intermittent", "delay_jumps", "wrong_code", "code_unconfirmed",
     "spectrum_inverted", "saturated_radar", "saturated_sidelink", "sidelink_lost", "interference",
 })  # fmt: skip
-"""Flags of a node whose measured path goes into no config."""
+"""Flags that exclude the measured path of a node from the config."""
 
 
 def _link_report(node: BenchNode, interval_s: float) -> dict[str, Any]:
     link = node.link
     if link is None:
         return {}
-    drift, moved = link.phase_drift_rad, link.delay_drift_ps
+    phase_drift, delay_drift = link.phase_drift_rad, link.delay_drift_ps
     return {
         "coherence": link.coherence,
         "coherence_limit": round(link.coherence_limit, 9),
@@ -339,11 +342,13 @@ def _link_report(node: BenchNode, interval_s: float) -> dict[str, Any]:
         "coherence_before": node.coherence_before,
         "snr_db": round(decibels(link.snr), 2),
         "phase_excess_rad": round(link.phase_excess_rad, 5),
-        "phase_drift_rad": [round(value, 5) for value in drift],
-        "delay_drift_ps": [round(value, 3) for value in moved],
+        "phase_drift_rad": [round(value, 5) for value in phase_drift],
+        "delay_drift_ps": [round(value, 3) for value in delay_drift],
         "path_m": round(link.path_m, 5),
         "path_std_m": round(link.path_std_m, 6),
-        "arrivals": [{"later_m": round(one.later_m, 3), "level_db": round(one.level_db, 1)} for one in link.arrivals],
+        "arrivals": [
+            {"later_m": round(arrival.later_m, 3), "level_db": round(arrival.level_db, 1)} for arrival in link.arrivals
+        ],
         "allan_deviation": [[time_s, float(f"{value:.4g}")] for time_s, value in link.deviation(interval_s)],
     }
 
@@ -354,21 +359,21 @@ def measure_bench(campaign: Campaign, flight: str) -> Bench:
     Raises
     ------
     CampaignError
-        If what was recorded are no samples, or a recording does not open.
+        If the waveform is not recorded as samples, or a recording cannot be opened.
     """
     waveform = campaign.settings.waveform
     if not isinstance(waveform, SampledWaveform):
         raise CampaignError(
             f"waveform.kind {waveform.kind}",
             where=CONFIG,
-            expected="a waveform recorded as samples: clocks and channels are measured on them",
-            remedy="Take flights of kind bench out of flights.tsv.",
+            expected="a waveform recorded as samples, from which clocks and channels are measured",
+            remedy="Remove flights of kind bench from flights.tsv.",
         )
     flown, sent = campaign.flight(flight), transmitted(campaign, waveform)
     names = [name for name in flown.participants if name in flown.nodes]
-    nodes = tuple(_node(campaign, flight, name, sent, own=name == flown.transmitter) for name in names)
+    nodes = tuple(_node(campaign, flight, name, sent, is_transmitter=name == flown.transmitter) for name in names)
     due = max((node.triggers.due for node in nodes), default=0)
-    # pulses that other nodes recorded before a node began or after it stopped
+    # pulses recorded by other nodes before a node started or after it stopped
     counts = [replace(node.triggers, beyond=due - node.triggers.due) for node in nodes]
     nodes = tuple(
         replace(node, triggers=triggers, flags=Flags.merged(node.flags, triggers.flags))
@@ -376,17 +381,17 @@ def measure_bench(campaign: Campaign, flight: str) -> Bench:
     )
     stated, offsets, flags = campaign.settings.bench, {}, []
     for node in nodes:
-        own = node.name == flown.transmitter
+        is_transmitter = node.name == flown.transmitter
         expected_m = stated.radar_m
-        if not own and expected_m is not None:
+        if not is_transmitter and expected_m is not None:
             expected_m = None if stated.sidelink_m is None else expected_m - stated.sidelink_m
         if node.link is None:
             continue
-        if not own:
+        if not is_transmitter:
             flags.append(reversed_flags(node.link, expected_m))
         if expected_m is not None:
             paths = campaign.settings.nodes[node.name].path_offset_m
-            offset_m = paths.radar if own else paths.radar - paths.sidelink
+            offset_m = paths.radar if is_transmitter else paths.radar - paths.sidelink
             link = node.link
             offsets[node.name] = BenchPathOffset(link.path_m - expected_m, link.path_std_m, offset_m, link.cell_m)
             flags.append(offsets[node.name].flags(link.name))
@@ -403,7 +408,7 @@ def measure_bench(campaign: Campaign, flight: str) -> Bench:
     )  # fmt: skip
 
 
-def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, own: bool) -> BenchNode:
+def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, is_transmitter: bool) -> BenchNode:
     recording = checked_recording(campaign, flight, name)
     raw = captures_of(recording, campaign, node=name)
     where = f"raw/{flight}/{name}"
@@ -413,47 +418,48 @@ def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, own:
     counted = triggers(time_s, prf_hz=sent.waveform.prf_hz)
     present = [channel for channel in _CHANNELS if channel in recording.channels]
     every = np.arange(len(time_s))
-    read = captured.reader(present if own else list(_CHANNELS), every)
+    read = captured.reader(present if is_transmitter else list(_CHANNELS), every)
     channels, saturation = _channels(read, present, captured, len(every))
     flags = [channel.flags for channel in channels] + [saturation.flags]
     pair = f"{campaign.flight(flight).transmitter}-{name}"
-    if _is_inverted(read, sent, "radar" if own else "sidelink", len(every)):
+    if _is_inverted(read, sent, "radar" if is_transmitter else "sidelink", len(every)):
         read = _conjugated(read)
         line = (
-            f"{name}: the code is in the conjugates of its samples: toggle nodes.{name}.iq, or waveform.iq of all nodes"
+            f"{name}: the code matches the complex conjugate of the samples; toggle nodes.{name}.iq, or waveform.iq "
+            "for all nodes"
         )
         flags.append({"spectrum_inverted": line})
     before, clock, contact, state = None, None, None, None
     measured: Transfer | None = None
-    if own:
+    if is_transmitter:
         measured = transfer_by_code(read, sent.inverse, captured.numerology, time_s=time_s)
     else:
         contact = measure_contact(f"{name} sidelink", _by_code(read, sent, "sidelink"), len(every))
         flags.append(contact.flags if contact else {})
-        clock, found = _clock(read, sent, name, len(every))
-        flags.append(found)
-        alone = measure_link(pair, _by_code(read, sent, "radar"), time_s, captured.numerology, divided=False)
-        before = alone.coherence if alone else None
+        clock, flags_of_clock = _clock(read, sent, name, len(every))
+        flags.append(flags_of_clock)
+        uncorrected = measure_link(pair, _by_code(read, sent, "radar"), time_s, captured.numerology, divided=False)
+        before = uncorrected.coherence if uncorrected else None
         try:
             measured = transfer_by_sidelink(
                 read, sent.inverse, captured.numerology, symbol_samples=sent.waveform.capture_samples,
                 sidelink_m=np.zeros(len(every)), method=campaign.settings.processing.sidelink,
                 accuracy_db=strictest_accuracy_db(campaign.settings.processing.accuracy_db), where=where,
             )  # fmt: skip
-        except CampaignError as nothing:
-            flags.append({"sidelink_lost": f"{name}: {nothing.found}"})
+        except CampaignError as error:
+            flags.append({"sidelink_lost": f"{name}: {error.found}"})
         else:
             state = measured.report["sidelink"]
     link = None
     if measured is not None:
-        # nothing moves: what echo processing says of geometry and of a phase that moves is measured better here
+        # the radar is stationary: flags of echo processing on geometry and on phase stability do not apply here
         flags.append({key: line for key, line in measured.flags.items() if key not in _OF_FLIGHTS})
         kept = np.flatnonzero(measured.kept)
         if len(kept) > 1:
             rows = measured.form
             link = measure_link(
-                pair, lambda some: rows(kept[some]), time_s[kept], captured.numerology, divided=not own,
-                prefix_cells=captured.numerology.delay_cells if own else None,
+                pair, lambda pulses: rows(kept[pulses]), time_s[kept], captured.numerology, divided=not is_transmitter,
+                prefix_cells=captured.numerology.delay_cells if is_transmitter else None,
             )  # fmt: skip
             flags.append(link.flags if link else {"link_weak": f"{pair}: no path above the noise"})
     return BenchNode(
@@ -468,13 +474,13 @@ _OF_FLIGHTS = frozenset({"association_suspect", "phase_unstable"})
 def _channels(
     read: Read, present: list[str], captured: Captured, count: int
 ) -> tuple[tuple[MeasuredChannel, ...], Saturation]:
-    """Return the state of each channel and how much of it is saturated, by some thousand captures."""
-    some = np.unique(np.linspace(0, count - 1, min(count, _EVERY_CAPTURE)).astype(np.int64))
+    """Return the state and saturation of each channel, from at most `_EVERY_CAPTURE` captures."""
+    captures = np.unique(np.linspace(0, count - 1, min(count, _EVERY_CAPTURE)).astype(np.int64))
     saturation = Saturation()
 
     def blocks(channel: str) -> Iterator[Samples]:
-        for one in blocks_of(some):
-            iq = read(one)[channel]
+        for block in blocks_of(captures):
+            iq = read(block)[channel]
             saturation.count({channel: iq})
             yield iq
 
@@ -482,24 +488,24 @@ def _channels(
 
 
 def _by_code(read: Read, sent: Transmitted, channel: str) -> Any:
-    """Return a function that forms the transfer functions of a channel by the code alone."""
+    """Return a function that computes the transfer functions of a channel from the code, without a sidelink."""
 
-    def form(some: Pulses) -> Complexes:
-        return np.asarray(demodulate(as_complex(read(some)[channel]), sent.numerology) * sent.inverse)
+    def form(pulses: Pulses) -> Complexes:
+        return np.asarray(demodulate(as_complex(read(pulses)[channel]), sent.numerology) * sent.inverse)
 
     return form
 
 
 def _conjugated(read: Read) -> Read:
-    return lambda some: {name: conjugates(iq) for name, iq in read(some).items()}
+    return lambda pulses: {name: conjugates(iq) for name, iq in read(pulses).items()}
 
 
 def _is_inverted(read: Read, sent: Transmitted, channel: str, count: int) -> bool:
-    """Test whether the code locks in the conjugates of a channel's samples, and not in the samples."""
-    some = np.concatenate(spread(count, groups=4, each=16))
+    """Return True if the code locks to the complex conjugate of a channel's samples, but not to the samples."""
+    pulses = np.concatenate(spread(count, groups=4, each=16))
 
-    def locks(one: Read) -> bool:
-        contact = measure_contact(channel, lambda rows: _by_code(one, sent, channel)(some[rows]), len(some))
+    def locks(reader: Read) -> bool:
+        contact = measure_contact(channel, lambda rows: _by_code(reader, sent, channel)(pulses[rows]), len(pulses))
         return contact is not None and 2 * contact.dropouts < contact.pulses
 
     return not locks(read) and locks(_conjugated(read))
@@ -510,7 +516,7 @@ def _clock(read: Read, sent: Transmitted, name: str, count: int) -> tuple[ClockO
     length = sent.waveform.capture_samples
     try:
         clock = clock_of(
-            (as_complex(read(some)["sidelink"][:, :length]) for some in groups), sent.numerology, pulses=count
+            (as_complex(read(group)["sidelink"][:, :length]) for group in groups), sent.numerology, pulses=count
         )
     except ValueError as error:
         return None, {"clock_unmeasured": f"{name}: {error}"}
@@ -518,6 +524,6 @@ def _clock(read: Read, sent: Transmitted, name: str, count: int) -> tuple[ClockO
 
 
 def series(link: MeasuredLink) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return (pulse,) time, s, phase, rad, delay, ps, and amplitude, dB of the median, as drawn."""
+    """Return the plotted series: (pulse,) time, s, phase, rad, delay, ps, and amplitude, dB re median."""
     size = np.abs(link.terms)
     return link.time_s, link.phase_rad, link.delay_ps, 20 * np.log10(size / np.median(size))

@@ -1,4 +1,4 @@
-"""Rule `bench`: a radar that stands still, measured: bench.json, bench.html and bench.png; and `apertura bench`."""
+"""Rule `bench` and `apertura bench`: measure a stationary radar; bench.json, bench.html and bench.png."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -24,11 +24,11 @@ from apertura.workflow.stale import stale_results
 
 REPORT, PAGE, PICTURE = "bench.json", "bench.html", "bench.png"
 _COLOURS = (BLUE, ORANGE, GREEN, RED, SKY)
-_HEAD = ("of", "quantity", "measured", "limit", "verdict")
+_HEAD = ("node or pair", "quantity", "measured", "limit", "verdict")
 
 
 def bench(campaign: Campaign, flight: str) -> Sequence[Path]:
-    """Measure a flight of kind bench; write its report, page and picture, and return their paths."""
+    """Measure a flight of kind bench; write its report, page and plot, and return their paths."""
     lineage = result_of(campaign, "bench", flight).begin(campaign.root)
     measured = measure_bench(campaign, flight)
     report, text, picture = written = [campaign.result(flight, name) for name in (REPORT, PAGE, PICTURE)]
@@ -42,7 +42,7 @@ def bench(campaign: Campaign, flight: str) -> Sequence[Path]:
 
 
 def print_bench(campaign: Campaign, *, write: bool = False) -> int:
-    """Measure the flights of kind bench that are not measured yet, print their verdicts; return how many lines flag.
+    """Measure new or out-of-date flights of kind bench and print all verdicts; return the number of lines with flags.
 
     Parameters
     ----------
@@ -61,8 +61,8 @@ def print_bench(campaign: Campaign, *, write: bool = False) -> int:
         raise CampaignError(
             f"{number_of(len(campaign.flights), 'flight')}, none of kind bench",
             where=campaign.root / FLIGHTS,
-            expected="a line of a recording that stood still: flight, bench, transmitter, nodes",
-            remedy="Add it; no flight log is needed.",
+            expected="a line for a recording of a stationary radar: flight, bench, transmitter, nodes",
+            remedy="Add the line; no flight log is required.",
         )
     stale, flagged = set(stale_results(campaign)), 0
     for flight in flights:
@@ -91,7 +91,7 @@ def _print(flight: str, report: Mapping[str, Any]) -> None:
         table.add_row(*row)
     console.print(table)
     for name, line in report["flags"].items():
-        console.print(f"{name}: {FLAGS[name].means}\n    {line}\n    look at: {FLAGS[name].look}", markup=False)
+        console.print(f"{name}: {FLAGS[name].meaning}\n    {line}\n    advice: {FLAGS[name].advice}", markup=False)
 
 
 def _rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, str, str]]:
@@ -105,34 +105,34 @@ def _blocks(title: str, report: Mapping[str, Any], picture: bytes) -> Iterator[B
     yield Heading(1, title)
     flags = report["flags"]
     yield Paragraph(
-        "Nothing moved: whatever changes from pulse to pulse is the radar's own. "
+        "The set-up is stationary: changes from pulse to pulse are caused by the radar. "
         + (
-            f"{len(flags)} thing{'s' * (len(flags) > 1)} to look at, below."
+            f"{number_of(len(flags), 'flag')} raised, see below."
             if flags
-            else "Every line is within its limit."
+            else "All measurements are within their limits."
         )
     )
     if flags:
-        rows = [(name, line, FLAGS[name].means, FLAGS[name].look) for name, line in flags.items()]
-        yield Table("What to look at.", ("flag", "measured", "what it means", "look at"), rows)
+        rows = [(name, line, FLAGS[name].meaning, FLAGS[name].advice) for name, line in flags.items()]
+        yield Table("Flags raised.", ("flag", "measurement", "meaning", "advice"), rows)
     yield Picture(
         picture,
-        "Phase, delay and amplitude of the strongest path of each pair from pulse to pulse, against their mean; mean "
-        "range profile; Allan deviation of the delay by its phase, dashed what white noise of that SNR alone gives.",
+        "Phase, delay and amplitude of the strongest path of each pair from pulse to pulse, relative to their mean; "
+        "mean range profile; Allan deviation of the delay from its phase, dashed: white noise at the measured SNR.",
     )
-    yield Table("What was measured.", _HEAD, _rows(report))
+    yield Table("Measurements.", _HEAD, _rows(report))
 
 
 def draw_bench(path: Path, measured: Bench, *, title: str, tags: Mapping[str, str]) -> None:
-    """Draw the links of a bench: phase, delay and amplitude over time, mean profile, Allan deviation of the delay."""
+    """Plot the links of a bench: phase, delay and amplitude over time, mean profile, Allan deviation of the delay."""
     links = [node.link for node in measured.nodes if node.link is not None]
     with sheet(path, 8.4, title=title, tags=tags) as figure:
         *over_time, profile, allan = figure.subplots(5, 1)
         for link, colour in zip(links, _COLOURS * len(links), strict=False):
             time_s, *values = series(link)
-            some = thinned(len(time_s))
+            drawn = thinned(len(time_s))
             for axes, value in zip(over_time, values, strict=True):
-                axes.plot(time_s[some], value[some], ".", ms=2, color=colour, label=link.name)
+                axes.plot(time_s[drawn], value[drawn], ".", ms=2, color=colour, label=link.name)
             path_m, level_db = link.profile
             profile.plot(path_m, level_db, lw=0.8, color=colour)
             deviation = np.array(link.deviation(measured.interval_s))
@@ -145,7 +145,7 @@ def draw_bench(path: Path, measured: Bench, *, title: str, tags: Mapping[str, st
             axes.set(ylabel=label)
             axes.tick_params(labelbottom=axes is over_time[-1])
         over_time[-1].set(xlabel="time, s")
-        profile.set(xlabel="total path, m; of a receiver beyond its sidelink", ylabel="mean profile, dB")
+        profile.set(xlabel="total path, m (receivers: relative to the sidelink)", ylabel="mean profile, dB")
         if links:
             paths_m, margin_m = [0.0, *(link.path_m for link in links)], 40 * links[0].cell_m
             profile.set(xlim=(min(paths_m) - margin_m, max(paths_m) + margin_m), ylim=(-80, 3))
@@ -161,50 +161,53 @@ def draw_bench(path: Path, measured: Bench, *, title: str, tags: Mapping[str, st
 
 
 def _offer(campaign: Campaign, flight: str, offsets: Mapping[str, Any], *, write: bool) -> None:
-    """Print what the config would say of the measured paths, or write it; nothing of links that carry a flag."""
+    """Print the config keys for the measured paths, or write them; links with excluding flags are skipped."""
     if not offsets:
-        print(f"{CONFIG}: bench.radar_m and bench.sidelink_m are not stated: no path beyond the set-up")
+        print(f"{CONFIG}: bench.radar_m and bench.sidelink_m are not configured: path offsets cannot be computed")
         return
-    for node, one in offsets.items():
-        if one["doubts"]:
-            print(f"nodes.{node}.path_offset_m: not of a link with {', '.join(one['doubts'])}")
+    for node, offset in offsets.items():
+        if offset["doubts"]:
+            print(f"nodes.{node}.path_offset_m: not determined, because the link has {', '.join(offset['doubts'])}")
     differing = {
-        node: one
-        for node, one in offsets.items()
-        if not one["doubts"] and abs(one["offset_m"] - one["stated_m"]) > SIGMAS * one["std_m"]
+        node: offset
+        for node, offset in offsets.items()
+        if not offset["doubts"] and abs(offset["offset_m"] - offset["stated_m"]) > SIGMAS * offset["std_m"]
     }
     if write:
         write_offsets(campaign, flight, differing)
     elif differing:
-        print(f"paths for {CONFIG}, or `apertura bench --write`:")
+        print(f"measured paths for {CONFIG} (`apertura bench --write` writes them):")
         transmitter = campaign.flight(flight).transmitter
-        for node, one in differing.items():
-            radar_m = _radar_m(campaign, node, one["offset_m"], own=node == transmitter)
-            print(f"  nodes.{node}.path_offset_m.radar: {radar_m}  # ± {one['std_m']:.4f}")
+        for node, offset in differing.items():
+            radar_m = _radar_m(campaign, node, offset["offset_m"], is_transmitter=node == transmitter)
+            print(f"  nodes.{node}.path_offset_m.radar: {radar_m}  # ± {offset['std_m']:.4f}")
 
 
-def _radar_m(campaign: Campaign, node: str, offset_m: float, *, own: bool) -> float:
-    """Return the offset of a radar channel: of a receiver only its difference to the sidelink's is measured."""
-    return round(offset_m if own else offset_m + campaign.settings.nodes[node].path_offset_m.sidelink, 4)
+def _radar_m(campaign: Campaign, node: str, offset_m: float, *, is_transmitter: bool) -> float:
+    """Return the path offset of a radar channel; for a receiver, the measured offset is relative to its sidelink."""
+    return round(offset_m if is_transmitter else offset_m + campaign.settings.nodes[node].path_offset_m.sidelink, 4)
 
 
 def write_offsets(campaign: Campaign, flight: str, offsets: Mapping[str, Any]) -> None:
-    """Write measured paths into config/config.yaml; all else stays letter by letter."""
+    """Write measured paths into config/config.yaml; the rest of the file is unchanged."""
     path, transmitter = campaign.root / CONFIG, campaign.flight(flight).transmitter
     text = path.read_text(encoding="utf-8")
-    found = {node: _radar_m(campaign, node, one["offset_m"], own=node == transmitter) for node, one in offsets.items()}
-    for node, value in found.items():
+    values = {
+        node: _radar_m(campaign, node, offset["offset_m"], is_transmitter=node == transmitter)
+        for node, offset in offsets.items()
+    }
+    for node, value in values.items():
         text = with_value(text, ("nodes", node, "path_offset_m", "radar"), value)
         print(f"{CONFIG}: nodes.{node}.path_offset_m.radar: {value}")
-    if found:
+    if values:
         validated(yaml.safe_load(text), where=path)
         write_text(path, text)
     else:
-        print(f"{CONFIG}: nothing to write: it says what was measured")
+        print(f"{CONFIG}: unchanged: no measured path to write")
 
 
 def with_value(text: str, keys: tuple[str, ...], value: float) -> str:
-    r"""Return a YAML document with the value of a key below others put in, comments and all else as they were.
+    r"""Set the value of a nested key in a YAML document; comments and all other text are unchanged.
 
     Examples
     --------
@@ -218,16 +221,16 @@ def with_value(text: str, keys: tuple[str, ...], value: float) -> str:
     node: Any = yaml.compose(text)
     rest = list(keys)
     while rest and isinstance(node, yaml.MappingNode):
-        below = next((own for name, own in node.value if name.value == rest[0]), None)
-        if below is None:
+        child = next((entry for name, entry in node.value if name.value == rest[0]), None)
+        if child is None:
             break
-        node, rest = below, rest[1:]
+        node, rest = child, rest[1:]
     if not rest:
         return text[: node.start_mark.index] + repr(value) + text[node.end_mark.index :]
-    put = repr(value)
+    inserted = repr(value)
     for key in reversed(rest[1:]):
-        put = f"{{{key}: {put}}}"
+        inserted = f"{{{key}: {inserted}}}"
     at = node.start_mark.index
     if node.flow_style:
-        return f"{text[: at + 1]}{rest[0]}: {put}{', ' if node.value else ''}{text[at + 1 :]}"
-    return f"{text[:at]}{rest[0]}: {put}\n{' ' * node.start_mark.column}{text[at:]}"
+        return f"{text[: at + 1]}{rest[0]}: {inserted}{', ' if node.value else ''}{text[at + 1 :]}"
+    return f"{text[:at]}{rest[0]}: {inserted}\n{' ' * node.start_mark.column}{text[at:]}"

@@ -1,1 +1,1 @@
-"""Speed against accuracy, on the user's own campaign."""
+"""Charts of speed against accuracy for the user's own campaign."""

@@ -1,4 +1,4 @@
-"""The points of the speed-accuracy chart, one a setting: the Pareto front, as PNG and as one HTML file."""
+"""Speed-accuracy chart with a point for each setting and the Pareto front, as PNG and as HTML file."""
 
 import html
 import json
@@ -21,9 +21,9 @@ _MARKERS = "osD^vP"
 
 @dataclass(frozen=True)
 class Point:
-    """One setting: seconds are for the whole image on one thread, from what its part took.
+    """Time and error of a setting; the time is for the whole image on one thread, extrapolated from the measured part.
 
-    `error_db` is an upper bound at 95 % confidence; None of the double sum, which errors are measured against.
+    `error_db` is an upper bound with 95 % confidence; None for the exact sum, the reference of all errors.
     """
 
     engine: str
@@ -39,7 +39,7 @@ class Point:
 
 
 def with_front(points: Sequence[Point]) -> list[Point]:
-    """Return points, fastest first, marked where nothing faster is as exact: the Pareto front."""
+    """Mark the points of the Pareto front in a list sorted by time: no faster point is as accurate."""
     best, marked = float("inf"), []
     for point in points:
         error_db = -np.inf if point.error_db is None else point.error_db
@@ -48,11 +48,11 @@ def with_front(points: Sequence[Point]) -> list[Point]:
     return marked
 
 
-_BESIDE = 3.0  # times the slowest point: a double sum up to there is drawn where it lies
+_BESIDE = 3.0  # times the slowest other point: the exact sum is drawn on the axis up to this time
 
 
 def draw_points(points: Sequence[Point], path: Path, *, title: str, accuracy_db: float) -> None:
-    """Draw error against seconds of points, fastest first, and the accuracy that the campaign asks for, as PNG."""
+    """Plot error against time of points sorted by time, with the requested accuracy, as PNG."""
     figure = Figure(figsize=(10, 6.5), layout="constrained")
     axes = figure.subplots()
     for engine, colour, marker in zip(ENGINES, cycle(_COLOURS), cycle(_MARKERS), strict=False):
@@ -65,19 +65,19 @@ def draw_points(points: Sequence[Point], path: Path, *, title: str, accuracy_db:
     for point in points:
         if point.error_db is None:
             chosen = "planner's choice: " if point.planned else ""
-            label = f"{chosen}the double sum, reference of the errors: {point.seconds:.3g} s"
+            label = f"{chosen}exact sum, reference of the errors: {point.seconds:.3g} s"
             if point.seconds <= _BESIDE * slowest_s:
                 axes.axvline(point.seconds, color="0.4", linestyle=":", label=label)
-            else:  # beyond the axis: a line there would squeeze the points
+            else:  # not on the axis, which it would stretch
                 axes.plot([], [], color="0.4", linestyle=":", label=f"{label}, beyond the axis")
         elif point.planned:
-            thin = f", {point.presum}:1 pulses" if point.presum > 1 else ""
-            label = f"planner's choice: {point.setting}{thin}"
+            presum = f", presum {point.presum}:1" if point.presum > 1 else ""
+            label = f"planner's choice: {point.setting}{presum}"
             axes.plot(point.seconds, point.error_db, "*", color="#d55e00", markersize=17, label=label)
-    axes.axhline(accuracy_db, color="#009e73", linestyle="--", label=f"asked: {accuracy_db:g} dB")
+    axes.axhline(accuracy_db, color="#009e73", linestyle="--", label=f"requested: {accuracy_db:g} dB")
     axes.set_xscale("log")
-    axes.set_xlabel("Seconds of tables and sums for the whole image, one thread")
-    axes.set_ylabel("Error against the double sum: upper bound at 95 %, dB")
+    axes.set_xlabel("Time of tables and sums for the whole image, one thread, s")
+    axes.set_ylabel("Error relative to the exact sum, upper bound with 95 % confidence, dB")
     axes.set_title(title, fontsize=11)
     axes.grid(which="both", alpha=0.25)
     figure.legend(loc="outside lower center", ncols=2, fontsize=9)
@@ -101,19 +101,19 @@ td:first-child,th:first-child{text-align:left} tr.planned{background:#fbe5d6} tr
 th{cursor:pointer}
 </style>
 <h1 style="font-size:18px">@TITLE@</h1>
-<p>Each point is an engine with one setting: seconds of its tables and sums for the whole image on one
-thread, and the error against the double sum: an upper bound at 95 % confidence. The line is the Pareto front, the star
-the planner's choice, the dashes what is asked, the dots what the double sum takes.</p>
-<div id="filters"></div><svg id="chart" viewBox="0 0 960 560" role="img" aria-label="error against seconds"></svg>
-<p id="tip">Point at a mark to read it.</p><table id="rows"></table>
+<p>Each point is an engine with one setting: time of its tables and sums for the whole image on one thread, and error
+relative to the exact sum, an upper bound with 95 % confidence. Solid line: Pareto front. Star: planner's choice. Dashed
+line: requested accuracy. Dotted line: time of the exact sum.</p>
+<div id="filters"></div><svg id="chart" viewBox="0 0 960 560" role="img" aria-label="error against time"></svg>
+<p id="tip">Move the pointer to a mark for its values.</p><table id="rows"></table>
 <script>
-const points = @POINTS@, asked = @ASKED@;
+const points = @POINTS@, requested = @REQUESTED@;
 const palette = ["#0072b2","#e69f00","#000","#cc79a7","#56b4e9","#009e73"], shown = {};
 const colours = Object.fromEntries(@ENGINES@.map((name,i)=>[name,palette[i%palette.length]]));
 const box = {left:70,right:930,top:20,bottom:510}, svg = document.getElementById("chart");
 const lo = v => Math.floor(Math.log10(Math.min(...v))), hi = v => Math.ceil(Math.log10(Math.max(...v)));
 const x0 = lo(points.map(p=>p.seconds)), x1 = Math.max(x0+1,hi(points.map(p=>p.seconds)));
-const all = points.map(p=>p.error_db).filter(d=>d!==null).concat(asked);
+const all = points.map(p=>p.error_db).filter(d=>d!==null).concat(requested);
 const y0 = Math.floor(Math.min(...all)/20)*20, y1 = Math.ceil(Math.max(...all)/20)*20;
 const X = s => box.left+(Math.log10(s)-x0)/(x1-x0)*(box.right-box.left);
 const Y = d => box.top+(y1-d)/(y1-y0)*(box.bottom-box.top);
@@ -123,12 +123,12 @@ const make = (name,attributes,text) => {
   if (text!==undefined) node.textContent = text;
   svg.appendChild(node); return node;
 };
-const thin = p => p.presum>1 ? `, ${p.presum}:1 pulses` : "";
-const words = p => `${p.setting}${thin(p)}: ${p.seconds.toPrecision(3)} s `
-  +`(predicted ${p.predicted_seconds.toPrecision(3)}), ${p.error_db===null?"the measure of errors"
+const presum = p => p.presum>1 ? `, presum ${p.presum}:1` : "";
+const describe = p => `${p.setting}${presum(p)}: ${p.seconds.toPrecision(3)} s `
+  +`(predicted ${p.predicted_seconds.toPrecision(3)}), ${p.error_db===null?"reference of the errors"
   :`${p.error_db.toFixed(1)} dB (predicted ${p.predicted_error_db.toFixed(1)})`}, `
   +`${p.pixel_pulses_per_s.toExponential(2)} pixel·pulses/s`
-  +(p.planned?" — the planner's choice":"")+(p.on_front?" — on the front":"");
+  +(p.planned?" — planner's choice":"")+(p.on_front?" — Pareto-optimal":"");
 function draw() {
   svg.replaceChildren();
   for (let e=x0;e<=x1;e++) {
@@ -139,22 +139,22 @@ function draw() {
     make("line",{x1:box.left,x2:box.right,y1:Y(d),y2:Y(d),stroke:"#ddd"});
     make("text",{x:box.left-8,y:Y(d)+4,"text-anchor":"end"},`${d} dB`);
   }
-  make("line",{x1:box.left,x2:box.right,y1:Y(asked),y2:Y(asked),stroke:"#009e73","stroke-dasharray":"6 4"});
-  make("text",{x:box.right-4,y:Y(asked)-5,"text-anchor":"end"},`asked: ${asked} dB`);
+  make("line",{x1:box.left,x2:box.right,y1:Y(requested),y2:Y(requested),stroke:"#009e73","stroke-dasharray":"6 4"});
+  make("text",{x:box.right-4,y:Y(requested)-5,"text-anchor":"end"},`requested: ${requested} dB`);
   make("text",{x:(box.left+box.right)/2,y:box.bottom+40,"text-anchor":"middle"},
-    "seconds of tables and sums for the whole image, one thread");
-  const seen = points.filter(p=>shown[p.engine]); let best = Infinity, path = "";
-  for (const p of seen) if (p.error_db!==null && p.error_db<best) {
+    "time of tables and sums for the whole image, one thread, s");
+  const selected = points.filter(p=>shown[p.engine]); let best = Infinity, path = "";
+  for (const p of selected) if (p.error_db!==null && p.error_db<best) {
     path += path ? `H${X(p.seconds)}V${Y(p.error_db)}` : `M${X(p.seconds)},${Y(p.error_db)}`; best = p.error_db;
   }
   if (path) make("path",{d:path,fill:"none",stroke:"#777"});
-  for (const p of seen) {
+  for (const p of selected) {
     const mark = p.error_db===null
       ? make("line",{x1:X(p.seconds),x2:X(p.seconds),y1:box.top,y2:box.bottom,stroke:"#777","stroke-dasharray":"2 4"})
       : p.planned
       ? make("text",{x:X(p.seconds),y:Y(p.error_db)+10,"text-anchor":"middle",style:"font-size:30px;fill:#d55e00"},"★")
       : make("circle",{cx:X(p.seconds),cy:Y(p.error_db),r:5,fill:colours[p.engine],"fill-opacity":.65});
-    mark.addEventListener("pointerenter",()=>{document.getElementById("tip").textContent = words(p);});
+    mark.addEventListener("pointerenter",()=>{document.getElementById("tip").textContent = describe(p);});
   }
 }
 const columns = ["setting","presum","seconds","predicted_seconds","error_db","predicted_error_db",
@@ -186,14 +186,14 @@ draw(); table();
 
 
 def write_page(points: Sequence[Mapping[str, Any]], path: Path, *, title: str, accuracy_db: float) -> None:
-    """Write the chart of points, fastest first, each the fields of `apertura.tools.chart.pareto.Point`, as HTML."""
+    """Write the chart as HTML; points are sorted by time, with the fields of `apertura.tools.chart.pareto.Point`."""
     data = json.dumps(list(points), ensure_ascii=False, allow_nan=False).replace("</", "<\\/")
-    page = _PAGE.replace("@TITLE@", html.escape(title)).replace("@ASKED@", f"{accuracy_db:g}")
+    page = _PAGE.replace("@TITLE@", html.escape(title)).replace("@REQUESTED@", f"{accuracy_db:g}")
     write_text(path, page.replace("@ENGINES@", json.dumps(list(ENGINES))).replace("@POINTS@", data))
 
 
 def save_png(figure: Figure, path: Path) -> None:
-    """Write a PNG that is the same for the same figure."""
+    """Write a figure as reproducible PNG."""
     FigureCanvasAgg(figure)
     with replacement(path) as temporary:
         figure.savefig(temporary, format="png", dpi=110, metadata={"Software": None})

@@ -1,4 +1,4 @@
-"""Speed against accuracy on the user's own campaign: every engine and setting timed and measured."""
+"""Speed against accuracy on the user's own campaign: measured time and error of every engine and setting."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -31,30 +31,32 @@ from apertura.workflow.rules import STUDY
 
 PULSES, SIDE_PX = 1024, 256
 LEAST_ROWS = 32
-"""Rows of the window that every setting forms: the pixels whose exact values are known lie in them."""
+"""Number of window rows that every setting forms; they contain all pixels with exact values."""
 
 _TOLERANCES_RAD = (1.5e-3, 1.5e-4)
 _SLOW_SECONDS = 0.3
-"""A setting predicted to take longer than this on the window is timed on fewer of its rows."""
+"""Settings with a longer predicted time for the window are timed on fewer of its rows, seconds."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """The part of a campaign that is measured: a block of pulses over a window of the image.
+    """Measured part of a campaign: a block of pulses and a window of the image.
 
     Attributes
     ----------
     history, profiles, beams
-        Of the block; None where the antennas have no beams.
+        Phase history, range profiles and beams of the block; `beams` is None for antennas without beams.
     pixels
-        (y, x, 3) float64, the window.
+        (y, x, 3) float64, positions of the window's pixels.
     picked, density
-        (pixel, 2) int64, rows (the first `LEAST_ROWS` at most) and columns in the window whose exact values are known;
-        (pixel,) float64, how densely they are drawn there.
+        (pixel, 2) int64, rows (below `LEAST_ROWS`) and columns in the window of the pixels with exact values;
+        (pixel,) float64, sampling density at these pixels.
     exact
-        (pixel,) complex128.
+        (pixel,) complex128, exact values.
+    total_pixels
+        Number of pixels of the whole image.
     reference_seconds
-        What the exact values took.
+        Time for computing the exact values, seconds.
     """
 
     history: PhaseHistory
@@ -74,13 +76,14 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     Parameters
     ----------
     campaign, flight, pair
-        Whose finished echo and profile stages are used.
+        Campaign, flight and pair with finished echo and profile stages.
     seconds
-        When to stop measuring: the planner's choice and the reference come first, then settings by predicted cost.
+        Time limit of the measurement: the planner's choice and the reference are measured first, then settings in the
+        order of their predicted cost.
 
     Notes
     -----
-    Engines are charted: placing pixels and storing tiles, which all share, is in no seconds.
+    The times are those of the engines; computing pixel positions and storing tiles, common to all, are not included.
     """
     lineage = result_of(campaign, "speed_accuracy").begin(campaign.root)
     logged, track = open_pair(campaign, flight, pair), open_refined(campaign, flight)
@@ -90,14 +93,14 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     middle = len(profiles) // 2
     block = slice(max(0, middle - PULSES // 2), middle + PULSES // 2)
     if opened.history is None:
-        raise ValueError("the echo stage is not there")
+        raise ValueError("no echo stage")
     history, beams = opened.history[block], opened.beams and opened.beams[block]
     accuracy_db = float(accuracy_of(campaign, opened, scene).value)
     opened = replace(opened, aperture=history.aperture, history=history, beams=beams)
     job = job_of(campaign, opened, scene)
     plan, search = plan_job(campaign, job, accuracy_db=accuracy_db), SettingSearch(job)
     part = _part(history, profiles[block], scene, plan, total_pixels=job.pixels, beams=beams)
-    settings = [  # cheapest first: of every engine but the reference, which is timed once
+    settings = [  # sorted by predicted cost, without the reference, which is timed once
         setting
         for setting in search.settings(len(job.aperture))
         if not _is_reference(setting)
@@ -107,8 +110,8 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
         replace(point, predicted_seconds=point.predicted_seconds - search.tile_seconds)
         for point in measure(part, plan, settings, seconds=seconds)
     ]
-    some = "" if len(history) == len(opened.time_s) else f"the middle {len(history)} of "
-    size = f"{scene.grid.shape[0]} × {scene.grid.shape[1]} pixels, {some}{len(opened.time_s)} pulses"
+    middle_part = "" if len(history) == len(opened.time_s) else f"the middle {len(history)} of "
+    size = f"{scene.grid.shape[0]} × {scene.grid.shape[1]} pixels, {middle_part}{len(opened.time_s)} pulses"
     title = f"{campaign.settings.campaign}, {flight}/{pair}: {size}"
     paths = [campaign.result(STUDY) / f"speed_accuracy.{suffix}" for suffix in ("csv", "png", "html")]
     write_table(paths[0], points, digits=6)
@@ -127,7 +130,7 @@ def _part(
     total_pixels: int,
     beams: Beams | None,
 ) -> Part:
-    """Return the part; its pixels are drawn as for a certificate, by the brightness of the image as planned."""
+    """Return the measured part; its pixels are sampled as for a certificate, by the brightness of the planned image."""
     window = []
     for size in scene.grid.shape:
         first = max(0, size - SIDE_PX) // 2 // 16 * 16
@@ -143,9 +146,9 @@ def _part(
     bright = brightness.draw(image, whole, BRIGHT_PIXELS, generator)
     picked = np.concatenate([random_pixels(whole, RANDOM_PIXELS, generator), bright])
     density = brightness.density(picked, image[tuple(picked.T)], whole, random=RANDOM_PIXELS)
-    begin = perf_counter()
+    start_s = perf_counter()
     exact = reference.form(history, rows[tuple(picked.T)], beams=beams)
-    return Part(history, profiles, pixels, picked, density, exact, total_pixels, perf_counter() - begin, beams)
+    return Part(history, profiles, pixels, picked, density, exact, total_pixels, perf_counter() - start_s, beams)
 
 
 def _is_reference(setting: Setting) -> bool:
@@ -153,16 +156,16 @@ def _is_reference(setting: Setting) -> bool:
 
 
 def measure(part: Part, plan: Plan, settings: Sequence[Setting], *, seconds: float) -> list[Point]:
-    """Measure time and error of the plan, the reference and as many settings as time allows, fastest first."""
-    begin = perf_counter()
+    """Measure the plan, the reference and further settings within a time limit; return the points sorted by time."""
+    start_s = perf_counter()
     exact = plan.fallbacks[-1] if plan.fallbacks else plan.setting
-    taken_s = part.reference_seconds * part.total_pixels / len(part.picked)
-    points = [replace(_point(part, exact, taken_s, None, None), planned=_is_reference(plan.setting))]
+    exact_s = part.reference_seconds * part.total_pixels / len(part.picked)
+    points = [replace(_point(part, exact, exact_s, None, None), planned=_is_reference(plan.setting))]
     if not _is_reference(plan.setting):
         points.append(_measured(part, plan.setting, plan))
     unplanned = [s for s in settings if plan.presum is not None or s.line != plan.setting.line]
     for setting in unplanned:
-        if perf_counter() - begin > seconds:
+        if perf_counter() - start_s > seconds:
             break
         points.append(_measured(part, setting, None))
     return with_front(sorted(points, key=lambda point: point.seconds))
@@ -177,8 +180,8 @@ def _measured(part: Part, setting: Setting, plan: Plan | None) -> Point:
         return engine.prepare(part.profiles if plan is None else plan.inputs(part.profiles), **setting.options)
 
     tables_s, prepared = _shortest(prepare, repeats=2)
-    quick = _SLOW_SECONDS / max(setting.form_seconds, 1e-9) * part.total_pixels / part.pixels.shape[1]
-    pixels = part.pixels[: max(LEAST_ROWS, round(quick))]
+    n_rows = _SLOW_SECONDS / max(setting.form_seconds, 1e-9) * part.total_pixels / part.pixels.shape[1]
+    pixels = part.pixels[: max(LEAST_ROWS, round(n_rows))]
     form_s, image = _shortest(
         lambda: engine.form(prepared, pixels, beams=part.beams, **setting.form_options), repeats=3
     )
@@ -187,14 +190,14 @@ def _measured(part: Part, setting: Setting, plan: Plan | None) -> Point:
     return _point(part, setting, tables_s + form_s * part.total_pixels / pixels[..., 0].size, error.bound_db, plan)
 
 
-def _point(part: Part, setting: Setting, taken: float, error_db: float | None, plan: Plan | None) -> Point:
-    """Return time and error of a setting; `plan` where it is the planner's choice."""
+def _point(part: Part, setting: Setting, seconds: float, error_db: float | None, plan: Plan | None) -> Point:
+    """Return the point of a setting; `plan` is given for the planner's choice only."""
     return Point(
         engine=setting.engine,
         setting=setting.line,
         presum=1 if plan is None or plan.presum is None else plan.presum.factor,
-        seconds=taken,
-        pixel_pulses_per_s=part.total_pixels * len(part.profiles) / taken,
+        seconds=seconds,
+        pixel_pulses_per_s=part.total_pixels * len(part.profiles) / seconds,
         error_db=error_db,
         predicted_seconds=setting.seconds,
         predicted_error_db=setting.error_db if plan is None else plan.predicted_error_db,
@@ -206,7 +209,7 @@ def _point(part: Part, setting: Setting, taken: float, error_db: float | None, p
 def _shortest(work: Any, *, repeats: int) -> tuple[float, Any]:
     times = []
     for _ in range(repeats):
-        begin = perf_counter()
+        start_s = perf_counter()
         result = work()
-        times.append(perf_counter() - begin)
+        times.append(perf_counter() - start_s)
     return min(times), result

@@ -1,4 +1,4 @@
-"""Error against seconds of the whole chain from raw samples to GeoTIFFs, for settings that trade one for the other."""
+"""Error against processing time of the whole chain from raw samples to GeoTIFFs, for different settings."""
 
 import contextlib
 import io
@@ -32,32 +32,34 @@ from apertura.workflow.rules import STUDY
 _FLOOR_DB = -110.0
 _LONGEST_DB = 20.0
 _MARKS = {
-    "o": "numerical error, certified; seconds from least to most",
-    "s": "expected by the budget: power lost from a peak",
-    "^": "measured at bright points: the same, ± σ",
+    "o": "certified numerical error; bar: range of times",
+    "s": "power spread from peaks, expected by the error budget",
+    "^": "power spread from peaks, measured at bright points, ± σ",
 }
 
 
 @dataclass(frozen=True)
 class Whole:
-    """Time and error of one setting from raw samples to GeoTIFFs, of the pair with the larger error.
+    """Time and error of one setting from raw samples to GeoTIFFs, for the pair with the larger error.
 
     Attributes
     ----------
     seconds, least_seconds, most_seconds
-        Of the processor over the repeats, which other work on the machine stretches little.
+        Mean, minimum and maximum processor time of the repeats, which is less sensitive to other load than wall time.
     wall_seconds
-        By the clock on the wall, mean.
+        Mean wall time.
+    repeats
+        Number of repeats.
     load
-        Mean load of the machine, processes that want to run.
+        Mean load average of the machine.
     expected_loss_db
-        By the lines of the budget that are expected, arithmetic included, 0 or less.
+        Sum of the expected losses of the error budget including the numerical error, 0 or less.
     measured_loss_db, measured_std_db
-        At bright points; NaN where none is bright enough.
+        Peak loss at bright points and its standard deviation; NaN if no point is bright enough.
     numerical_error_db
-        As certified.
+        Certified numerical error.
     flags
-        Of the pairs, with blanks between.
+        Flags of the pairs, separated by blanks.
     """
 
     setting: str
@@ -75,7 +77,7 @@ class Whole:
 
 
 def spread_db(loss_db: float) -> float:
-    """Return the share of a peak's power that a loss has spread around it, dB.
+    """Convert a peak loss into the share of the peak's power that is spread around it, dB.
 
     Examples
     --------
@@ -86,15 +88,15 @@ def spread_db(loss_db: float) -> float:
 
 
 def draw_whole(rows: Sequence[Whole], path: Path, *, title: str, refused: Collection[str]) -> None:
-    """Draw each setting's errors one above the other at its seconds, as PNG; settings that were refused are named."""
+    """Plot the errors of each setting against its time as PNG; refused settings are listed."""
     figure = Figure(figsize=(13, 7), layout="constrained")
-    axes, beside = figure.subplots(1, 2, width_ratios=(3.2, 1))
+    axes, legend_axes = figure.subplots(1, 2, width_ratios=(3.2, 1))
     ordered = sorted(rows, key=lambda row: row.seconds)
     for number, row in enumerate(ordered):
         _draw_row(axes, row, f"C{number % 10}", str(number + 1))
     for marker, label in _MARKS.items():
         axes.plot([], [], marker, color="0.3", label=label)
-    axes.set_xlabel("Processor seconds from raw samples to GeoTIFFs")
+    axes.set_xlabel("Processor time from raw samples to GeoTIFFs, s")
     axes.set_ylabel("Error, dB")
     axes.grid(alpha=0.25)
     axes.margins(y=0.1)
@@ -103,24 +105,25 @@ def draw_whole(rows: Sequence[Whole], path: Path, *, title: str, refused: Collec
     lines = [f"{number}  {row.setting}: {row.wall_seconds:.1f} s" for number, row in enumerate(ordered, 1)]
     lines += [f"–  {name}: refused" for name in refused]
     names = sorted({flag for row in rows for flag in row.flags.split()})
-    beside.text(0, 1, "\n".join(["wall clock", *lines, "", "flags", *(names or ["none"])]), va="top", fontsize=9)
-    beside.axis("off")
+    text = "\n".join(["wall time", *lines, "", "flags", *(names or ["none"])])
+    legend_axes.text(0, 1, text, va="top", fontsize=9)
+    legend_axes.axis("off")
     save_png(figure, path)
 
 
 def _draw_row(axes: Axes, row: Whole, colour: str, number: str) -> None:
-    """Draw one setting: seconds with their spread, and each kind of error."""
-    lost = [row.measured_loss_db + sign * row.measured_std_db for sign in (0, 1, -1)]
+    """Draw one setting: range of its times, and each kind of error."""
+    losses_db = [row.measured_loss_db + sign * row.measured_std_db for sign in (0, 1, -1)]
     heights = dict(zip(_MARKS, map(float, (row.numerical_error_db, spread_db(row.expected_loss_db))), strict=False))
     axes.hlines(row.numerical_error_db, row.least_seconds, row.most_seconds, color=colour)
     if np.isfinite(row.measured_loss_db):
-        heights["^"], low, high = map(spread_db, lost)
+        heights["^"], low, high = map(spread_db, losses_db)
         axes.vlines(row.seconds, max(low, heights["^"] - _LONGEST_DB), high, color=colour)
     for marker, height in heights.items():
         axes.plot(row.seconds, height, marker, color=colour)
     axes.vlines(row.seconds, min(heights.values()), max(heights.values()), color=colour, linewidth=0.5, alpha=0.5)
-    place = (row.seconds, row.numerical_error_db)
-    axes.annotate(number, place, xytext=(0, -16), textcoords="offset points", ha="center", color=colour)
+    position = (row.seconds, row.numerical_error_db)
+    axes.annotate(number, position, xytext=(0, -16), textcoords="offset points", ha="center", color=colour)
 
 
 _SETTINGS: Mapping[str, dict[str, Any]] = {
@@ -136,12 +139,12 @@ _SETTINGS: Mapping[str, dict[str, Any]] = {
     "sidelink gated": {"sidelink": "gated"},
     "sidelink two_parameter": {"sidelink": "two_parameter"},
 }
-"""Name → keys of `processing` that are changed, one at a time."""
+"""Name of a setting → changed keys of `processing`."""
 
 
 @dataclass(frozen=True)
 class _Run:
-    """One run from raw samples to GeoTIFFs."""
+    """Times, load and image reports of a run from raw samples to GeoTIFFs."""
 
     seconds: float
     wall_seconds: float
@@ -150,15 +153,15 @@ class _Run:
 
 
 def whole_chart(campaign: Campaign, *, repeats: int = 3) -> Sequence[Path]:
-    """Write results/study/whole.csv and .png: total error against seconds from raw samples to GeoTIFFs.
+    """Write results/study/whole.csv and .png: error against processing time from raw samples to GeoTIFFs.
 
     Parameters
     ----------
     campaign
-        Whose recordings are carried through every step again, into a folder that is removed afterwards.
+        Campaign whose recordings are processed again, in a folder that is removed afterwards.
     repeats
-        Of every setting, taken in turn, so that what else the machine does touches all alike; one before them, which
-        is not counted, opens libraries and files.
+        Number of runs of every setting. Settings alternate, so that other load of the machine affects all of them
+        equally; an additional first run, which is not counted, loads libraries and files.
     """
     lineage = result_of(campaign, "whole").begin(campaign.root)
     work = with_inputs(campaign, campaign.result(STUDY) / "whole", link=False)
@@ -167,15 +170,15 @@ def whole_chart(campaign: Campaign, *, repeats: int = 3) -> Sequence[Path]:
     }
     runs: dict[str, list[_Run]] = {name: [] for name in choices}
     refused: list[str] = []
-    _carried(choices["as configured"])
+    _processed(choices["as configured"])
     for _ in range(repeats):
         for name in [name for name in choices if name not in refused]:
             try:
-                runs[name].append(_carried(choices[name]))
+                runs[name].append(_processed(choices[name]))
             except CampaignError:
                 refused.append(name)
     remove(work)
-    rows = [_whole(name, some) for name, some in runs.items() if name not in refused]
+    rows = [_whole(name, repeated) for name, repeated in runs.items() if name not in refused]
     paths = [campaign.result(STUDY) / f"whole.{suffix}" for suffix in ("csv", "png")]
     write_table(paths[0], rows, digits=6)
     load = f"load {min(row.load for row in rows):.1f} to {max(row.load for row in rows):.1f} on {os.cpu_count()} cores"
@@ -185,7 +188,7 @@ def whole_chart(campaign: Campaign, *, repeats: int = 3) -> Sequence[Path]:
         paths[1],
         title=(
             f"{campaign.settings.campaign}, {flight.name}, {', '.join(flight.pairs)}: from raw samples to GeoTIFFs\n"
-            f"{_processor()}, {load}; mean, least and most of {repeats} runs, one thread"
+            f"{_processor()}, {load}; mean, minimum and maximum of {repeats} runs, one thread"
         ),
         refused=refused,
     )
@@ -194,25 +197,25 @@ def whole_chart(campaign: Campaign, *, repeats: int = 3) -> Sequence[Path]:
 
 
 def _applies(campaign: Campaign, name: str) -> bool:
-    """Test whether a setting can take effect: terrain where there is a DEM, a sidelink where there is one."""
+    """Return True if a setting has an effect: terrain settings require a DEM, sidelink settings a bistatic pair."""
     if "terrain" in _SETTINGS[name]:
         return campaign.settings.scene.dem is not None
-    receivers = not all(map(is_monostatic, campaign.image_flights[0].pairs))
-    return "sidelink" not in _SETTINGS[name] or (receivers and isinstance(campaign.settings.waveform, SampledWaveform))
+    bistatic = not all(map(is_monostatic, campaign.image_flights[0].pairs))
+    return "sidelink" not in _SETTINGS[name] or (bistatic and isinstance(campaign.settings.waveform, SampledWaveform))
 
 
 def _chosen(campaign: Campaign, work: Path, changes: dict[str, Any]) -> Campaign:
-    """Return the campaign with changed settings, in another folder."""
+    """Return the campaign with changed settings and another root folder."""
     processing = type(campaign.settings.processing)(**{**campaign.settings.processing.model_dump(), **changes})
     return replace(
         campaign, root=ConfinedPath.at(work), settings=campaign.settings.model_copy(update={"processing": processing})
     )
 
 
-def _carried(campaign: Campaign) -> _Run:
-    """Carry a campaign through every step, in the order of the workflow's rules."""
+def _processed(campaign: Campaign) -> _Run:
+    """Run all processing steps of a campaign in the order of the workflow's rules."""
     campaign.results.remove()
-    flight, begin = campaign.image_flights[0], (process_time(), perf_counter())
+    flight, start_s = campaign.image_flights[0], (process_time(), perf_counter())
     with contextlib.redirect_stdout(io.StringIO()):
         for other in campaign.flights:
             if other.kind == "calibration":
@@ -231,9 +234,9 @@ def _carried(campaign: Campaign) -> _Run:
         cube.cube(replace(campaign, flights=(flight,)))
         for pair in flight.pairs:
             export.export(campaign, flight.name, pair)
-    taken = process_time() - begin[0], perf_counter() - begin[1]
+    elapsed_s = process_time() - start_s[0], perf_counter() - start_s[1]
     files = [campaign.results / flight.name / pair / "image.json" for pair in flight.pairs]
-    return _Run(*taken, os.getloadavg()[0], [json.loads(file.read_text(encoding="utf-8")) for file in files])
+    return _Run(*elapsed_s, os.getloadavg()[0], [json.loads(file.read_text(encoding="utf-8")) for file in files])
 
 
 def _echoes(campaign: Campaign, flight: Flight) -> None:
@@ -245,10 +248,10 @@ def _echoes(campaign: Campaign, flight: Flight) -> None:
 
 
 def _whole(name: str, runs: list[_Run]) -> Whole:
-    """Return one setting's point: of the pair that is worse; errors are the same in every run."""
+    """Return the row of a setting, with the errors of the worse pair; errors are identical in all runs."""
     reports, seconds = runs[0].reports, [run.seconds for run in runs]
-    focus = [report["focus"] for report in reports]
-    worst: dict[str, Any] = min((one for one in focus if "loss_db" in one), key=lambda one: one["loss_db"], default={})
+    measured = [report["focus"] for report in reports if "loss_db" in report["focus"]]
+    worst: dict[str, Any] = min(measured, key=lambda focus: focus["loss_db"], default={})
     return Whole(
         name,
         float(np.mean(seconds)),
@@ -266,7 +269,7 @@ def _whole(name: str, runs: list[_Run]) -> Whole:
 
 
 def _processor() -> str:
-    """Return the name of this machine's processor."""
+    """Return the processor name of this machine."""
     with contextlib.suppress(OSError, StopIteration):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))

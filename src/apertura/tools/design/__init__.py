@@ -1,8 +1,8 @@
-"""Before a flight: what it will give, by the functions that the pipeline describes images with after it.
+"""Prediction of image quality before a flight, with the functions that describe images after processing.
 
-`design` returns layers of every image of a plan, what recording and processing take, and whether requirements are met;
-`judgement` names the first cause and the change that helps most, `search` moves tracks within bounds. Nothing here has
-a formula of its own that an image's description has.
+`design` returns layers of every image of a plan, the cost of recording and processing, and a verdict on each
+requirement; `requirements` finds the main cause of a shortfall and the most helpful change, and searches for tracks
+within bounds. Quantities that the pipeline reports of images are computed by the pipeline's own functions.
 """
 
 from collections.abc import Mapping
@@ -31,28 +31,28 @@ def design(
         A YAML file, its document, or a `FlightPlan`: the keys of config/config.yaml, and flights with tracks; see
         docs/howto/design.md.
     root
-        Folder in which files that the plan names lie; by default that of the YAML file, else the current folder.
+        Folder of the files that the plan names; default: folder of the YAML file, else the current folder.
     threads
-        Tiles computed at once.
+        Number of tiles computed in parallel.
 
     Returns
     -------
     xarray.Dataset
-        Layers of `UNITS` over (image, y, x), float32, on the later campaign's grid: NaN where a layer says nothing of
-        an image; `coherence` and `height_ambiguity` over (interferogram, y, x). Attributes: `judgement` of each
-        requirement, `recording`, `budget` and `flags` of each image.
+        Layers of `UNITS` over (image, y, x), float32, on the grid of the later campaign: NaN for a layer that does not
+        apply to an image; `coherence` and `height_ambiguity` over (interferogram, y, x). Attributes: `judgement` of
+        each requirement, `recording`, `budget` and `flags` of each image.
 
     Raises
     ------
     CampaignError
-        If a key is unknown, a track leads through the ground or beyond the DEM, nodes collide, or the pulses are too
-        few for the scene.
+        If a key is unknown, a track passes below the terrain or beyond the DEM, nodes collide, or the pulse rate is
+        too low for the scene.
 
     Examples
     --------
     >>> import apertura as ap
     >>> node = {"attitude": "log"}
-    >>> found = ap.design({
+    >>> design = ap.design({
     ...     "campaign": "meadow",
     ...     "waveform": {"kind": "ofdm", "subcarriers": 512, "subcarrier_spacing_hz": 4e5, "symbol_s": 2.5e-6,
     ...                  "cyclic_prefix_s": 1e-6, "carrier_hz": 1.3e9, "sample_rate_hz": 2.56e8, "prf_hz": 100.0},
@@ -61,20 +61,21 @@ def design(
     ...     "flights": {"f01": {"transmitter": "uav1", "receivers": ["uav1"], "tracks": {"uav1": {
     ...         "kind": "line", "start_m": [-20, 0], "end_m": [20, 0], "height_m": 30.0, "speed_m_s": 5.0}}}},
     ...     "require": {"resolution_m": 2.0, "coverage": 0.95}})
-    >>> found.sizes["image"], [line["met"] for line in found.attrs["judgement"]]
+    >>> design.sizes["image"], [line["met"] for line in design.attrs["judgement"]]
     (1, [True, True])
     """
     return dataset_of(designed(*as_plan(plan, root), threads=threads))
 
 
 def as_plan(plan: FlightPlan | Mapping[str, Any] | str | Path, root: Path | None) -> tuple[FlightPlan, Path]:
-    """Return a plan, read if it is a file, and the folder that its files lie in."""
+    """Return a plan, read if it is a file, and the folder of the files that it names."""
     if isinstance(plan, str | Path):
         return read_flight_plan(Path(plan)), root or Path(plan).absolute().parent
     if not isinstance(plan, FlightPlan):
         if not isinstance(plan, Mapping):
             expected = "a flight plan: a YAML file, its keys as a mapping, or a FlightPlan"
-            raise CampaignError(quoted(plan), "design: plan", expected, "Begin with that of docs/howto/design.md.")
+            remedy = "Start from the plan in docs/howto/design.md."
+            raise CampaignError(quoted(plan), "design: plan", expected, remedy)
         plan = validated(FlightPlan, dict(plan), where="plan", expected="keys of a flight plan, docs/howto/design.md")
     return plan, root or Path.cwd()
 
@@ -88,8 +89,8 @@ def dataset_of(design: Design) -> xr.Dataset:
     def stacked(layers: list[Mapping[str, Any]], name: str) -> np.ndarray:
         dtype = np.uint8 if name == "mask" else np.float32
         values = np.empty((len(layers), *shape), dtype)
-        for at, one in enumerate(layers):
-            values[at] = one.get(name, np.nan)
+        for index, layers_of_image in enumerate(layers):
+            values[index] = layers_of_image.get(name, np.nan)
         return values
 
     each = [image.layers for image in design.images.values()]

@@ -1,4 +1,4 @@
-"""A flight plan with the images it will give, what recording and processing take, and a rehearsal of the flight."""
+"""Predicted images of a flight plan, cost of recording and processing, and rehearsal of the flight by simulation."""
 
 import math
 import shutil
@@ -39,7 +39,7 @@ from apertura.workflow.lineage import places
 from apertura.workflow.resources import Resources
 from apertura.workflow.rules import RULES
 
-_SAMPLE_BYTES = 4  # I and Q of 16 bits
+_SAMPLE_BYTES = 4  # I and Q, 16 bits each
 _REAL_BYTES = 2
 
 
@@ -50,19 +50,19 @@ class ResourceEstimate:
     Attributes
     ----------
     flight_s
-        Flight → time in the air, turns included, seconds; with take-off, transit and landing where the plan has a home.
+        Flight → flight time including turns, seconds; with take-off, transit and landing if the plan has a home.
     transfer_s
-        Flight → the part of it before the first pulse and after the last: 0 where no home is known.
+        Flight → time before the first and after the last pulse, seconds; 0 without a home.
     pulses
-        Flight → pulses sent in that time.
+        Flight → number of transmitted pulses.
     node_bytes_s
-        Flight → node → bytes per second of flight.
+        Flight → node → recorded bytes per second.
     recorded_bytes
-        Of all nodes and flights.
+        Recorded bytes of all nodes and flights.
     processing_s
-        Of the whole workflow on the machine that its costs are from, seconds.
+        Time of the complete workflow on the machine on which its costs were measured, seconds.
     memory_bytes
-        Of its largest job.
+        Memory of the largest job.
     """
 
     flight_s: Mapping[str, float]
@@ -89,7 +89,7 @@ class ResourceEstimate:
             pulses[flight.name], rates[flight.name] = count, {}
             for node in flight.participants:
                 if isinstance(waveform, SampledWaveform):
-                    channels = 1 if node == flight.transmitter else 2  # the sidelink beside the radar
+                    channels = 1 if node == flight.transmitter else 2  # radar and sidelink
                     capture = waveform.capture_samples * channels * _SAMPLE_BYTES
                 elif isinstance(waveform, FmcwWaveform):
                     samples = sweep_of(waveform.model_dump()).sweep_samples
@@ -128,12 +128,12 @@ class Design:
         The plan.
     images
         flight/pair or flight/sum → image.
-    interferograms
-        Key of interferometry.pairs → its layers.
     refinements
         Flight → refinement of its tracks.
+    interferograms
+        Key of interferometry.pairs → layers of the interferogram.
     recording
-        What recording and processing take.
+        Cost of recording and processing.
     """
 
     opened: OpenPlan
@@ -144,12 +144,12 @@ class Design:
 
     @property
     def judged(self) -> list[PlannedImage]:
-        """The images that requirements are of: the sum of each flight, or its one pair."""
-        found = []
+        """Images to which the requirements apply: the sum of each flight, or its only pair."""
+        images = []
         for flight in self.opened.campaign.flights:
             name = f"{flight.name}/sum"
-            found.append(self.images.get(name) or self.images[f"{flight.name}/{flight.pairs[0]}"])
-        return found
+            images.append(self.images.get(name) or self.images[f"{flight.name}/{flight.pairs[0]}"])
+        return images
 
 
 def designed(plan: FlightPlan, root: Path, *, threads: int = 1, coarse: int | None = None) -> Design:
@@ -158,22 +158,23 @@ def designed(plan: FlightPlan, root: Path, *, threads: int = 1, coarse: int | No
     Parameters
     ----------
     plan
-        As read.
+        The flight plan.
     root
-        Folder in which files that it names lie.
+        Folder of the files that the plan names.
     threads
-        Tiles computed at once.
+        Number of tiles computed in parallel.
     coarse
-        Pixels along the longer side of a coarser grid, integrated as the fine one; None: the grid itself.
+        Number of pixels along the longer side of a coarser grid, with the integration of the fine grid; None: the grid
+        of the plan.
 
     Raises
     ------
     CampaignError
-        As `open_plan`, and where pulses are too few for the scene.
+        As `open_plan`, and if the pulse rate is too low for the scene.
     """
     opened = open_plan(plan, root)
     with errors_of_the_plan():
-        for pair in opened.pairs:  # on the grid itself: corners of a coarser one spread less
+        for pair in opened.pairs:  # on the full grid: the corner points of a coarse grid have a smaller Doppler spread
             _check_sampled(opened, pair)
         return _computed(opened, threads=threads, coarse=coarse)
 
@@ -186,7 +187,7 @@ def _computed(opened: OpenPlan, *, threads: int, coarse: int | None) -> Design:
     for flight in opened.campaign.flights:
         pairs = [pair for pair in opened.pairs if pair.flight == flight.name]
         refinements[flight.name] = _refinement(opened, pairs)
-        own = [
+        of_pairs = [
             planned_image(
                 opened.campaign,
                 pair,
@@ -198,21 +199,21 @@ def _computed(opened: OpenPlan, *, threads: int, coarse: int | None) -> Design:
             )
             for pair in pairs
         ]
-        images |= {image.name: image for image in own}
-        if len(own) > 1:
-            total = summed_image(flight.name, own)
+        images |= {image.name: image for image in of_pairs}
+        if len(of_pairs) > 1:
+            total = summed_image(flight.name, of_pairs)
             images[total.name] = total
     by_name = {f"{pair.flight}/{pair.name}": pair for pair in opened.pairs}
     interferograms = {
-        name: coherence_layers(opened.scene, (by_name[one], by_name[other]), (images[one], images[other]))
-        for name, (one, other) in opened.campaign.settings.interferometry.pairs.items()
+        name: coherence_layers(opened.scene, (by_name[first], by_name[second]), (images[first], images[second]))
+        for name, (first, second) in opened.campaign.settings.interferometry.pairs.items()
     }
     return Design(opened, images, refinements, interferograms, recording)
 
 
 def _refinement(opened: OpenPlan, pairs: Sequence[OpenPair]) -> PlannedRefinement:
-    """Decide on refinement of the tracks of a flight, with its expected remainder."""
-    errors = errors_of([replace(pair, positions=tuple(one.assumed for one in pair.positions)) for pair in pairs])
+    """Decide on the refinement of a flight's tracks, and predict the loss by residual position errors."""
+    errors = errors_of([replace(pair, positions=tuple(node.assumed for node in pair.positions)) for pair in pairs])
     remainder_db, obstacles = expected_remainder(
         errors.values(),
         wavelength_m=pairs[0].wave_speed_m_s / centre_frequency(pairs[0].frequency_hz),
@@ -223,7 +224,7 @@ def _refinement(opened: OpenPlan, pairs: Sequence[OpenPair]) -> PlannedRefinemen
 
 
 def _check_sampled(opened: OpenPlan, pair: OpenPair) -> None:
-    """Raise CampaignError where pulses are so few that ghosts and folded echoes show."""
+    """Raise CampaignError if the pulse rate is so low that the image has Doppler ambiguities."""
     job, _, _ = planned_job(opened.campaign, pair, opened.scene)
     if sparse := undersampling(job):
         prf_hz = float(getattr(opened.plan.waveform, "prf_hz", None) or 0.0)
@@ -232,8 +233,8 @@ def _check_sampled(opened: OpenPlan, pair: OpenPair) -> None:
         raise CampaignError(
             f"{pair.flight}/{pair.name}: {sparse}",
             "the plan: waveform.prf_hz",
-            f"{math.ceil(doppler_hz)} Hz or more, the spread of Doppler over the scene, instead of {prf_hz:g} Hz",
-            "Raise it, fly slower, state the antennas' beams, or make the scene smaller.",
+            f"at least {math.ceil(doppler_hz)} Hz, the Doppler spread over the scene, instead of {prf_hz:g} Hz",
+            "Increase it, fly slower, configure the antenna beams, or make the scene smaller.",
         )
 
 
@@ -243,30 +244,33 @@ _BITS = 14
 def rehearse(
     opened: OpenPlan, targets: Sequence[Target], directory: Path, *, seed: int = 1, erring: bool = False
 ) -> Path:
-    """Simulate a plan into a campaign folder with the config that the plan becomes; return the folder.
+    """Simulate the flight of a plan into a campaign folder with the config of the later campaign; return the folder.
 
     Parameters
     ----------
     opened
-        Of an OFDM radar, on Earth.
+        Plan of an OFDM radar in a georeferenced frame.
     targets
-        What stands there, metres from the scene's middle; amplitudes are roots of cross-sections in m².
+        Point targets, metres from the scene centre; amplitudes are square roots of cross-sections in m².
     directory
-        New or empty.
+        New or empty folder.
     seed
-        Of noise and errors.
+        Seed of noise and errors.
     erring
-        Whether logs err by nodes.<n>.position_std_m.
+        True to add errors of nodes.<n>.position_std_m to the logs.
 
     Raises
     ------
     CampaignError
-        If the plan is of another waveform or in a local frame, or the folder holds something.
+        If the plan has another waveform or a local frame, or the folder is not empty.
     """
     plan, scene = opened.plan, opened.scene
     if not isinstance(plan.waveform, OfdmWaveform) or scene.grid.crs == LOCAL:
         raise CampaignError(
-            f"{plan.waveform.kind} in {scene.grid.crs}", "the plan", "an OFDM radar on Earth", "Rehearse another plan."
+            f"waveform {plan.waveform.kind} in scene.crs {scene.grid.crs}",
+            "the plan",
+            "an OFDM radar in a georeferenced CRS",
+            "Rehearse another plan.",
         )
     latitude, longitude, height = map(float, geodetic_from_ecef(scene.middle_m))
     origin = Origin(latitude, longitude, height)
@@ -278,12 +282,12 @@ def rehearse(
         tracks = {}
         for node in flight.participants:
             course = opened.courses[flight.name][node]
-            place = origin.enu(frame_from_map(scene.grid.crs, *course.place_m.T))
-            tracks[node] = Waypoints(tuple(course.time_s.tolist()), tuple(map(tuple, place.tolist())))
+            position = origin.enu(frame_from_map(scene.grid.crs, *course.place_m.T))
+            tracks[node] = Waypoints(tuple(course.time_s.tolist()), tuple(map(tuple, position.tolist())))
         course = opened.courses[flight.name][flight.transmitter]
         pulses = int(course.imaged_s[-1][1] * plan.waveform.prf_hz + 1e-9) + 1
-        several = dict.fromkeys(flight.pairs, course.imaged_s) if len(course.imaged_s) > 1 else {}
-        flights.append(SimulatedFlight(flight.name, flight.transmitter, tracks, pulses, segments=several))
+        segments = dict.fromkeys(flight.pairs, course.imaged_s) if len(course.imaged_s) > 1 else {}
+        flights.append(SimulatedFlight(flight.name, flight.transmitter, tracks, pulses, segments=segments))
     specification = CampaignSpecification(
         plan.campaign,
         origin,
@@ -294,9 +298,8 @@ def rehearse(
         ImageGrid(scene.grid.crs, bounds_m=scene.grid.bounds_m, spacing_m=scene.grid.spacing_m),
     )
     write_campaign(directory, specification, np.random.default_rng(seed))
-    write_config(
-        directory, plan.document, [(one.name, one.kind, one.transmitter, one.nodes) for one in plan.image_flights]
-    )
+    rows = [(flight.name, flight.kind, flight.transmitter, flight.nodes) for flight in plan.image_flights]
+    write_config(directory, plan.document, rows)
     for name, file in opened.campaign.height_files().items():
         named = getattr(plan.scene, name)
         (directory / named).parent.mkdir(parents=True, exist_ok=True)
@@ -305,7 +308,7 @@ def rehearse(
 
 
 def _simulated(node: Node, *, erring: bool) -> SimulatedNode:
-    """Return a node as the simulation has it."""
+    """Return the simulated node of a planned node."""
     receiver, antennas = node.receiver, node.antennas
     radio = None
     if receiver is not None:
@@ -320,12 +323,12 @@ def _simulated(node: Node, *, erring: bool) -> SimulatedNode:
     points: tuple[RadarPoint, ...] = ("radar_tx", "radar_rx")
     beams = {point: getattr(antennas, point) for point in points}
     sigma = float(np.mean(node.position_std_m)) if node.position_std_m else 0.0
-    wrong = Localization(sigma, node.position_correlation_s) if erring and sigma else None
+    localization = Localization(sigma, node.position_correlation_s) if erring and sigma else None
     arms = node.lever_arms_m
     return SimulatedNode(
         {"radar_tx": arms.radar_tx, "radar_rx": arms.radar_rx, "sidelink": arms.sidelink},
         attitude=node.attitude,
-        impairments=Impairments(localization=wrong, adc=Adc(bits=_BITS)),
+        impairments=Impairments(localization=localization, adc=Adc(bits=_BITS)),
         radio=radio,
         antennas={
             point: GaussianBeam(beam.boresight_deg, beam.beamwidth_deg)

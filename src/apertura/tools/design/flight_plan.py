@@ -1,4 +1,4 @@
-"""A flight plan: a campaign before it is flown, in the keys of its config, with tracks that are meant to be flown."""
+"""Flight plan: config keys of a future campaign, planned tracks, expected targets and requirements."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -22,72 +22,74 @@ _MOST_LEGS = 500
 class _Track(Section):
     """Settings shared by tracks that do not follow another node."""
 
-    speed_m_s: Positive = Field(description="over the ground, m/s")
-    height_m: float = Field(description="above what `above` says, m")
+    speed_m_s: Positive = Field(description="ground speed, m/s")
+    height_m: float = Field(description="height above the reference `above`, m")
     above: Above = Field(
         "ground",
-        description="what height_m counts from: ground, the scene's mean; terrain, the ground below each point; "
-        "ellipsoid",
+        description="reference of height_m: ground, mean terrain height of the scene; terrain, terrain below each "
+        "point; ellipsoid",
     )
 
 
 class _Leg(_Track):
-    """Straight track from one place to another."""
+    """Straight track between two points."""
 
-    start_m: Place = Field(description="where the first leg begins: easting, northing in scene.crs, m")
-    end_m: Place = Field(description="where it ends, m")
+    start_m: Place = Field(description="start of the first leg: easting, northing in scene.crs, m")
+    end_m: Place = Field(description="end of the first leg, m")
 
     @model_validator(mode="after")
     def _goes_somewhere(self) -> Self:
         if self.start_m == self.end_m:
-            raise ValueError("start_m and end_m are one place: a hover makes no image")
+            raise ValueError("start_m and end_m are identical: a hover gives no image")
         return self
 
 
 class LineTrack(_Leg):
-    """Straight from one place to another."""
+    """Straight line."""
 
     kind: Literal["line"]
 
 
 class RacetrackTrack(_Leg):
-    """There and back on parallel legs; turns between them are flown and not imaged."""
+    """Parallel legs in alternating directions; turns between them are flown and not imaged."""
 
     kind: Literal["racetrack"]
-    legs: int = Field(2, ge=1, le=_MOST_LEGS, description="number of legs, every other one flown back")
-    spacing_m: float = Field(0.0, description="of a leg to the right of the one before, seen along the first, m")
-    climb_m: float = Field(0.0, description="of a leg above the one before, m")
+    legs: int = Field(2, ge=1, le=_MOST_LEGS, description="number of legs, alternating in direction")
+    spacing_m: float = Field(
+        0.0, description="offset of each leg to the right of the previous one, as seen along the first, m"
+    )
+    climb_m: float = Field(0.0, description="height of each leg above the previous one, m")
 
 
 class CircleTrack(_Track):
-    """Around a place."""
+    """Arc around a point."""
 
     kind: Literal["circle"]
     centre_m: Place = Field(description="easting, northing in scene.crs, m")
     radius_m: Positive = Field(description="m")
-    start_deg: float = Field(0.0, description="where it begins, clockwise from north seen from the centre, deg")
-    turn_deg: float = Field(360.0, description="how far it goes round, clockwise; negative: anticlockwise, deg")
+    start_deg: float = Field(0.0, description="azimuth of the start, clockwise from north as seen from the centre, deg")
+    turn_deg: float = Field(360.0, description="angle of the arc, clockwise; negative: anticlockwise, deg")
 
 
 class MissionTrack(Section):
-    """A mission as a ground station has it."""
+    """Mission file of a ground station."""
 
     kind: Literal["mission"]
-    file: str = Field(description="beside the plan: .plan, .waypoints, .kml or .csv")
-    speed_m_s: Positive | None = Field(None, description="over the ground, m/s; null: as the mission says")
+    file: str = Field(description="path relative to the plan: .plan, .waypoints, .kml or .csv")
+    speed_m_s: Positive | None = Field(None, description="ground speed, m/s; null: speed of the mission")
     image: tuple[int, int] | None = Field(
-        None, description="first and last waypoint between which pulses make the image, from 1; null: all"
+        None, description="first and last waypoint of the imaged part, counted from 1; null: all"
     )
 
 
 class BesideTrack(Section):
-    """Track beside another node, by its course."""
+    """Track at constant offsets from another node, relative to its course."""
 
     kind: Literal["beside"]
     of: Name = Field(description="node that it follows")
-    ahead_m: float = Field(0.0, description="of that node, along its course, m")
-    right_m: float = Field(0.0, description="of that node, m")
-    up_m: float = Field(0.0, description="above that node, m")
+    ahead_m: float = Field(0.0, description="offset ahead of that node, along its course, m")
+    right_m: float = Field(0.0, description="offset to the right of that node, m")
+    up_m: float = Field(0.0, description="offset above that node, m")
 
 
 PlannedTrack = Annotated[
@@ -96,16 +98,17 @@ PlannedTrack = Annotated[
 
 
 class FormationSettings(Section):
-    """Positions of nodes without a track of their own: behind, beside or above the leader, equally separated."""
+    """Positions of nodes without a track of their own: equally spaced behind, to the right of or above the leader."""
 
     shape: Literal["column", "row", "vee", "stack"] = Field(
-        description="column: one behind the other; row: to the right; vee: behind, right and left in turn; stack: above"
+        description="column: in line behind the leader; row: to the right; vee: behind, alternately right and left; "
+        "stack: above"
     )
     leader: Name = Field(description="node with a track of its own")
-    spacing_m: Positive = Field(description="between neighbours, m; of a vee in both axes")
+    spacing_m: Positive = Field(description="distance between neighbours, m; for a vee in both axes")
 
     def offsets(self, followers: int) -> list[tuple[float, float, float]]:
-        """Return ahead, right and up of the leader for each follower, metres.
+        """Return the offsets (ahead, right, up) of each follower from the leader, metres.
 
         Examples
         --------
@@ -120,86 +123,96 @@ class FormationSettings(Section):
 
 
 class WobbleSettings(Section):
-    """Smooth random motion about what is meant to be flown, as wind and a position controller leave it."""
+    """Smooth random deviation from the planned track, such as the residual of a position controller in wind."""
 
     sigma_m: tuple[float, float, float] = Field(
         (0.03, 0.05, 0.04), description="standard deviation east, north and up, m"
     )
-    attitude_sigma_deg: tuple[float, float, float] = Field((2.0, 2.0, 3.0), description="of roll, pitch and yaw, deg")
-    smoothing_s: Positive = Field(1.0, description="standard deviation of the Gaussian that smooths it, s")
+    attitude_sigma_deg: tuple[float, float, float] = Field(
+        (2.0, 2.0, 3.0), description="standard deviation of roll, pitch and yaw, deg"
+    )
+    smoothing_s: Positive = Field(1.0, description="standard deviation of the smoothing Gaussian, s")
 
 
 class PlannedFlight(Section):
-    """One line of flights.tsv, and what is to be flown."""
+    """A row of flights.tsv, with planned tracks."""
 
     transmitter: Name = Field(description="node that transmits")
-    receivers: tuple[Name, ...] = Field(min_length=1, description="nodes that receive: a pair each")
+    receivers: tuple[Name, ...] = Field(min_length=1, description="nodes that receive, one pair each")
     tracks: dict[Name, PlannedTrack] = Field(
         min_length=1, description="node → line, racetrack, circle, mission, beside"
     )
     formation: FormationSettings | None = Field(
-        None, description="where nodes without a track fly; null: every node has one"
+        None, description="formation of nodes without a track; null: every node has a track"
     )
-    separation_m: float = Field(2.0, ge=0, description="least distance between any two nodes, m")
+    separation_m: float = Field(2.0, ge=0, description="minimum distance between any two nodes, m")
     climb_m_s: Positive = Field(
-        2.0, description="vertical speed of take-off and landing, m/s; counts in flight_s of a mission with a home"
+        2.0, description="vertical speed of take-off and landing, m/s; included in flight_s of a mission with a home"
     )
-    wobble: WobbleSettings | None = Field(None, description="by wind; null: none")
-    log_rate_hz: Positive = Field(10.0, description="epochs of the flight logs per second, Hz")
+    wobble: WobbleSettings | None = Field(None, description="deviation from the planned track by wind; null: none")
+    log_rate_hz: Positive = Field(10.0, description="epoch rate of the flight logs, Hz")
     solution: Literal["fix", "float", "single"] = Field(
-        "fix", description="of the receivers: what positions err by where nodes.<n>.position_std_m is null"
+        "fix",
+        description="GNSS solution of the receivers, which gives the position accuracy if nodes.<n>.position_std_m "
+        "is null",
     )
 
     @property
     def participants(self) -> tuple[str, ...]:
-        """Nodes that fly."""
+        """Nodes of the flight."""
         return tuple(dict.fromkeys((self.transmitter, *self.receivers)))
 
 
 class ExpectedScene(Section):
-    """Reference targets that the predicted SNR is for."""
+    """Reference targets of the predicted SNR."""
 
-    sigma0_db: float | None = Field(-15.0, description="backscattering coefficient of the ground, dB; null: not asked")
-    rcs_dbsm: float | None = Field(0.0, description="radar cross-section of a point, dB of 1 m²; null: not asked")
+    sigma0_db: float | None = Field(
+        -15.0, description="backscattering coefficient of the terrain, dB; null: not computed"
+    )
+    rcs_dbsm: float | None = Field(
+        0.0, description="radar cross-section of a point target, dB re 1 m²; null: not computed"
+    )
 
 
 class Requirements(Section):
-    """Requirements, to be met by 95 % of the visible scene; null: no requirement."""
+    """Requirements for 95 % of the visible scene; null: no requirement."""
 
-    resolution_m: Positive | None = Field(None, description="−3 dB width of a point in its coarsest direction, m")
-    nesz_db: float | None = Field(None, description="σ⁰ that equals the noise, at most, dB")
-    snr_db: float | None = Field(None, description="of ground of expect.sigma0_db, at least, dB")
-    point_snr_db: float | None = Field(None, description="of a point of expect.rcs_dbsm, at least, dB")
+    resolution_m: Positive | None = Field(
+        None, description="maximum −3 dB width of a point in its coarsest direction, m"
+    )
+    nesz_db: float | None = Field(None, description="maximum noise-equivalent σ⁰, dB")
+    snr_db: float | None = Field(None, description="minimum SNR of terrain with expect.sigma0_db, dB")
+    point_snr_db: float | None = Field(None, description="minimum SNR of a point with expect.rcs_dbsm, dB")
     coverage: Annotated[float, Field(gt=0, le=1)] | None = Field(
-        None, description="share of the scene that is seen, without shadow and layover, before the prefix ends"
+        None, description="minimum visible share of the scene: no shadow or layover, within the recordable path"
     )
     loss_db: Annotated[float, Field(ge=0)] | None = Field(
-        None, description="of a point's peak by all expected errors, at most, dB"
+        None, description="maximum peak loss of a point by all expected errors, dB"
     )
     ambiguity: Positive | None = Field(
-        None, description="echo of the rest of the scene that folds onto a place, as share of its own, at most"
+        None, description="maximum power of ambiguous echoes of the scene, relative to the echo of the pixel"
     )
     coherence: Annotated[float, Field(gt=0, lt=1)] | None = Field(
-        None, description="of the images that interferometry.pairs names, at least"
+        None, description="minimum coherence of the image pairs in interferometry.pairs"
     )
-    flight_s: Positive | None = Field(None, description="time in the air of one flight, at most, s")
-    recorded_gb: Positive | None = Field(None, description="samples of all nodes and flights, at most, GB")
+    flight_s: Positive | None = Field(None, description="maximum flight time of a flight, s")
+    recorded_gb: Positive | None = Field(None, description="maximum recorded data of all nodes and flights, GB")
 
 
 Range = tuple[float, float]
 
 
 class Moved(Section):
-    """Common displacement of the tracks as drawn; `--optimise` writes its result here."""
+    """Common displacement of the planned tracks; result of `--optimise`."""
 
-    height_m: float = Field(0.0, description="up, m")
-    offset_m: float = Field(0.0, description="away from the middle of the scene, m")
-    spacing: float = Field(1.0, gt=0, description="factor of separations between nodes")
-    heading_deg: float = Field(0.0, description="turned about the middle of the scene, clockwise, deg")
+    height_m: float = Field(0.0, description="upward displacement, m")
+    offset_m: float = Field(0.0, description="displacement away from the scene centre, m")
+    spacing: float = Field(1.0, gt=0, description="factor of the separations between nodes")
+    heading_deg: float = Field(0.0, description="rotation about the scene centre, clockwise, deg")
 
 
 class Bounds(Section):
-    """Within what `--optimise` moves tracks: lowest and highest value of each key of `moved`."""
+    """Bounds of the search by `--optimise`: minimum and maximum of each key of `moved`."""
 
     height_m: Range = Field((-20.0, 40.0), description="m")
     offset_m: Range = Field((-20.0, 40.0), description="m")
@@ -211,34 +224,34 @@ class Bounds(Section):
         for name in type(self).model_fields:
             low, high = getattr(self, name)
             if low >= high:
-                raise ValueError(f"{name}=[{low:g}, {high:g}]: the lowest value first")
+                raise ValueError(f"{name}=[{low:g}, {high:g}]: the minimum must come first")
         if self.spacing[0] <= 0:
-            raise ValueError(f"spacing={list(self.spacing)}: a factor above 0")
+            raise ValueError(f"spacing={list(self.spacing)}: factors must be positive")
         return self
 
 
 class FlightPlan(Settings):
-    """PLAN.yaml: the keys of config/config.yaml, and what is to be flown, seen and required."""
+    """PLAN.yaml: the keys of config/config.yaml, planned flights, expected targets and requirements."""
 
-    flights: dict[Name, PlannedFlight] = Field(min_length=1, description="flights that become images")
-    expect: ExpectedScene = Field(default_factory=ExpectedScene, description="what is to be seen")
-    require: Requirements = Field(default_factory=Requirements, description="what the flight must give")
-    moved: Moved = Field(default_factory=Moved, description="tracks moved from where they are drawn")
-    bounds: Bounds = Field(default_factory=Bounds, description="of what --optimise tries")
+    flights: dict[Name, PlannedFlight] = Field(min_length=1, description="flights to be imaged")
+    expect: ExpectedScene = Field(default_factory=ExpectedScene, description="reference targets of the predicted SNR")
+    require: Requirements = Field(default_factory=Requirements, description="requirements of the images and the flight")
+    moved: Moved = Field(default_factory=Moved, description="displacement of the planned tracks")
+    bounds: Bounds = Field(default_factory=Bounds, description="bounds of the search by --optimise")
 
     @property
     def settings(self) -> Settings:
-        """The config of the later campaign."""
+        """Config of the later campaign."""
         return Settings.model_validate({name: getattr(self, name) for name in Settings.model_fields})
 
     @property
     def document(self) -> dict[str, Any]:
-        """Config of the later campaign as plain values, without what is at its default."""
+        """Config of the later campaign as plain values, without defaults."""
         return self.settings.model_dump(mode="json", exclude_unset=True)
 
     @property
     def image_flights(self) -> tuple[Flight, ...]:
-        """Lines of flights.tsv."""
+        """Rows of flights.tsv."""
         return tuple(
             Flight(name, "image", flight.transmitter, flight.receivers) for name, flight in self.flights.items()
         )
@@ -248,9 +261,9 @@ class FlightPlan(Settings):
         for name, flight in self.flights.items():
             unknown = [node for node in (*flight.participants, *flight.tracks) if node not in self.nodes]
             if unknown:
-                raise ValueError(f"flights.{name}: node {unknown[0]!r} is not in nodes: {', '.join(self.nodes)}")
+                raise ValueError(f"flights.{name}: node {unknown[0]!r} is not one of nodes: {', '.join(self.nodes)}")
             if len(set(flight.receivers)) < len(flight.receivers):
-                raise ValueError(f"flights.{name}: receivers {', '.join(flight.receivers)}: each once")
+                raise ValueError(f"flights.{name}: receivers {', '.join(flight.receivers)} contain a duplicate")
             without = [node for node in flight.participants if node not in flight.tracks]
             if without and flight.formation is None:
                 raise ValueError(f"flights.{name}: {without[0]} has no track, and there is no formation")
@@ -260,7 +273,7 @@ class FlightPlan(Settings):
             for flight in self.flights.values()
             for track in flight.tracks.values()
         ):
-            raise ValueError("scene.crs is auto, but places of tracks are in it: give the CRS")
+            raise ValueError("scene.crs is auto, but track coordinates require a CRS: set scene.crs")
         return self
 
     @staticmethod
@@ -270,24 +283,24 @@ class FlightPlan(Settings):
             followed["formation.leader"] = flight.formation.leader
         for node, leader in followed.items():
             if leader not in flight.tracks or leader in followed:
-                raise ValueError(f"flights.{name}: {node} follows {leader}, which needs a track of its own")
+                raise ValueError(f"flights.{name}: {node} follows {leader}, which requires a track of its own")
 
 
 def read_flight_plan(path: Path) -> FlightPlan:
-    """Return the flight plan in a YAML file.
+    """Read a flight plan from a YAML file.
 
     Raises
     ------
     CampaignError
-        If it is not there, is no YAML, or with every key that is wrong and the nearest valid one.
+        If the file is missing or not YAML, or has invalid keys, which are listed with the nearest valid ones.
     """
-    remedy = "docs/howto/design.md shows one."
+    remedy = "docs/howto/design.md contains an example."
     if path.suffix.lower() in {".plan", ".waypoints", ".kml"}:
         raise CampaignError(
             "a mission, not a flight plan",
             where=path,
-            expected="a plan in YAML, which also states radar, nodes and scene",
-            remedy=f"Name the mission in its tracks, {{kind: mission, file: {path.name}}}: {remedy}",
+            expected="a plan in YAML, which also contains radar, nodes and scene",
+            remedy=f"Write a plan with the track {{kind: mission, file: {path.name}}}; {remedy}",
         )
     document = read_yaml(path, expected="a flight plan in YAML", remedy=remedy)
     return documents.validated(FlightPlan, document, where=path, expected="keys of a flight plan, docs/howto/design.md")

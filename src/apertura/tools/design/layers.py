@@ -1,4 +1,4 @@
-"""Predicted images of a flight plan, pixel by pixel: by the functions that describe images after a flight."""
+"""Predicted images of a flight plan, pixel by pixel, computed with the functions that describe images of a flight."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -31,10 +31,10 @@ from apertura.stages.radiometry import CalibratedPair, calibrated_pair
 from apertura.stages.scene import OpenScene
 
 LOSS_NODES = 3
-"""Points along a side of the scene at which the error budget is made; bilinear between: it varies with range alone."""
+"""Error budgets along each side of the scene, interpolated bilinearly: the effects vary with range only."""
 
 AMBIGUITY_NODES = 9
-"""The same of echoes that fold, and of paths against the end of the recording."""
+"""Points along each side of the scene at which ambiguous echoes and path margins are computed."""
 
 Layer = NDArray[Any]
 
@@ -42,33 +42,33 @@ UNITS: Mapping[str, tuple[str, str]] = {
     "resolution": ("m", "−3 dB width of a point in its coarsest direction"),
     "resolution_fine": ("m", "−3 dB width of a point in its finest direction"),
     "orientation": ("deg", "azimuth of the finest direction, clockwise from grid north"),
-    "looks": ("pulses", "effective number of pulses that make the pixel"),
-    "incidence": ("deg", "incidence at closest approach, from the terrain's normal"),
+    "looks": ("pulses", "effective number of integrated pulses"),
+    "incidence": ("deg", "incidence angle at closest approach, from the terrain normal"),
     "bistatic_angle": ("deg", "angle between transmitter and receiver at closest approach"),
     "mask": ("class", "0 visible, 1 shadow, 2 layover, 3 both, 255 outside"),
     "nesz": ("dB", "noise-equivalent sigma0"),
-    "snr": ("dB", "ground of expect.sigma0_db over noise"),
-    "point_snr": ("dB", "point of expect.rcs_dbsm over noise"),
-    "ambiguity": ("1", "share of the scene's echo that folds onto the place"),
-    "path_margin": ("m", "total path left before the prefix or the recording ends"),
-    "loss": ("dB", "expected loss of a point's peak by all causes of the error budget, with the tracks as logged"),
-    "loss_refined": ("dB", "the same after step refine; NaN where a measured limit of the refinement is exceeded"),
-    "coherence": ("1", "of still ground between two images: common spectrum and noise"),
-    "height_ambiguity": ("m", "height that turns the phase between two images once"),
+    "snr": ("dB", "SNR of terrain with expect.sigma0_db"),
+    "point_snr": ("dB", "SNR of a point with expect.rcs_dbsm"),
+    "ambiguity": ("1", "power of ambiguous echoes of the scene, relative to the echo of the pixel"),
+    "path_margin": ("m", "margin of the total path to the end of the prefix or of the recording"),
+    "loss": ("dB", "expected peak loss of a point by all causes of the error budget, with the tracks as logged"),
+    "loss_refined": ("dB", "the same after step refine; NaN if a measured limit of the refinement is exceeded"),
+    "coherence": ("1", "coherence of stationary terrain between two images: common spectrum and noise"),
+    "height_ambiguity": ("m", "height of ambiguity of two images"),
 }
 """Layer → unit and meaning."""
 
 
 @dataclass(frozen=True)
 class PlannedRefinement:
-    """Refinement of a flight's tracks, before the flight.
+    """Predicted refinement of a flight's tracks.
 
     Attributes
     ----------
     decision
-        On or off by the plan's `processing.autofocus`, and why.
+        On or off according to the plan's `processing.autofocus`, with the reason.
     remainder_db
-        Loss by position errors that it is expected to leave, 0 or less; NaN where an obstacle prevents it.
+        Expected loss by residual position errors, 0 or less; NaN if an obstacle prevents the refinement.
     obstacles
         Measured limits that the flight exceeds.
     """
@@ -79,13 +79,13 @@ class PlannedRefinement:
 
     @property
     def applied(self) -> bool:
-        """True if images are judged with refined tracks: requested by the plan, and within the measured limits."""
+        """True if requirements apply to refined tracks: requested by the plan, and within the measured limits."""
         return self.decision.value == "on" and not self.obstacles
 
 
 @dataclass(frozen=True, eq=False)
 class PlannedImage:
-    """An image of a plan: of a pair, or the sum of a flight's pairs.
+    """Predicted image of a pair, or of the sum of a flight's pairs.
 
     Attributes
     ----------
@@ -94,15 +94,15 @@ class PlannedImage:
     layers
         Name → (row, column) values.
     resolution
-        From which widths follow.
+        Resolution model of the image.
     budget
-        Lines of the error budget in the middle of the scene; none of a sum.
+        Lines of the error budget at the scene centre; empty for a sum.
     flags
-        Limits crossed → what was found.
+        Flag → measurement.
     looks
-        Of a pair: for interferograms; None of a sum.
+        Integrated pulses of a pair, for interferograms; None for a sum.
     doppler_hz
-        Spread of Doppler over the scene, as sampled by the pulses, Hz; NaN of a sum.
+        Doppler spread over the scene, as sampled by the pulses, Hz; NaN for a sum.
     """
 
     name: str
@@ -129,19 +129,20 @@ def planned_image(
     Parameters
     ----------
     campaign, pair, scene
-        Settings, the pair as it will fly, or as its logs say that it flew; grid and ground.
+        Settings; the planned pair, or the pair according to its logs; grid and terrain.
     sigma0_db, rcs_dbsm
-        Of the ground and of a point, to be seen above the noise; None: not computed.
+        Backscattering coefficient of the terrain and cross-section of a point for the predicted SNR; None: not
+        computed.
     refinement
-        Of the flight's tracks before the flight; None: the pair is as it will be imaged.
+        Predicted refinement of the flight's tracks; None for tracks that are imaged unchanged.
     threads
-        Tiles computed at once.
+        Number of tiles computed in parallel.
     """
     grid = scene.grid
     job, integration, beams = planned_job(campaign, pair, scene)
     flags = Flags.merged(check_geometry(job), decide_antennas(job.beams, job.illumination)[1], integration.flags)
     calibrated = calibrated_pair(campaign, pair, scene, weights=(beams, integration.count), threads=threads)
-    noise = float("nan")  # of a pulse by the receiver's noise figure, where it is stated
+    noise = float("nan")  # noise of a pulse, if the receiver's noise figure is configured
     if calibrated is not None and calibrated.thermal_noise is not None and calibrated.noise_figure_db is not None:
         noise = calibrated.thermal_noise * 10 ** (calibrated.noise_figure_db / 10)
     looks = Looks.of(grid, scene.terrain, pair.aperture, beams, threads=threads)
@@ -156,18 +157,18 @@ def planned_image(
         layers["snr"] = (sigma0_db - layers["nesz"]).astype(np.float32)
     if rcs_dbsm is not None:
         layers["point_snr"] = _point_snr(calibrated, noise, rcs_dbsm, grid.shape)
-    seen = _seen_from(pair, beams, scene.middle_m)
-    refined = seen
-    if refinement is not None:  # the loss that it leaves, and the shifts of the logs, which no refinement observes
-        logged = summed(line.effect for line in budget_of(campaign, seen, scene) if line.cause == "positions")
-        refined = replace(seen, left=replace(logged, loss_db=refinement.remainder_db, loss_std_db=0.0))
+    contributing = _contributing(pair, beams, scene.middle_m)
+    refined = contributing
+    if refinement is not None:  # the residual loss, with the displacements of the logs, which are not observable
+        logged = summed(line.effect for line in budget_of(campaign, contributing, scene) if line.cause == "positions")
+        refined = replace(contributing, left=replace(logged, loss_db=refinement.remainder_db, loss_std_db=0.0))
     layers |= _coarse_layers(campaign, pair, scene, beams, None if refinement is None else refined.left)
     outside = layers["mask"] == OUTSIDE
     layers["mask"] = np.where((layers["path_margin"] < 0) | outside, OUTSIDE, layers["mask"]).astype(np.uint8)
     spread, _ = pair.aperture.phase_rates(job.points_m, wavelength_m=pair.wave_speed_m_s / job.band_hz[1])
     rate_hz = 1 / float(np.median(np.diff(pair.time_s)))
     applied = refinement is not None and refinement.applied
-    budget = tuple(budget_of(campaign, refined if applied else seen, scene))
+    budget = tuple(budget_of(campaign, refined if applied else contributing, scene))
     return PlannedImage(f"{pair.flight}/{pair.name}", layers, resolution, budget, flags, looks, spread * rate_hz)
 
 
@@ -177,9 +178,9 @@ def summed_image(flight: str, images: list[PlannedImage]) -> PlannedImage:
     Parameters
     ----------
     flight
-        Its name.
+        Name of the flight.
     images
-        Of its pairs.
+        Images of its pairs.
 
     Notes
     -----
@@ -188,16 +189,16 @@ def summed_image(flight: str, images: list[PlannedImage]) -> PlannedImage:
     resolution = Resolution.summed([image.resolution for image in images])
     shape = images[0].layers["looks"].shape
     masks = np.stack([image.layers["mask"] for image in images])
-    seen = masks != OUTSIDE
+    inside = masks != OUTSIDE
     layers: dict[str, Layer] = resolution_layers(resolution, shape)
     layers["looks"] = np.stack([image.layers["looks"] for image in images]).sum(axis=0)
     layers["mask"] = np.where((masks == 0).any(axis=0), 0, masks.min(axis=0)).astype(np.uint8)
     with np.errstate(divide="ignore", invalid="ignore"):
-        count = np.maximum(seen.sum(axis=0), 1)
+        count = np.maximum(inside.sum(axis=0), 1)
         for name, coherent, sign in (("nesz", False, 1), ("snr", False, -1), ("point_snr", True, -1)):
             if name in images[0].layers:
                 values = np.stack([image.layers[name] for image in images])
-                inverse = np.where(seen, np.exp(sign * np.float32(np.log(10) / 10) * values), np.float32(0))
+                inverse = np.where(inside, np.exp(sign * np.float32(np.log(10) / 10) * values), np.float32(0))
                 mean = inverse.sum(axis=0) / count
                 mean = np.where(mean > 0, mean / (count if coherent else 1), np.nan)
                 layers[name] = (sign * 10 * np.log10(mean)).astype(np.float32)
@@ -215,7 +216,7 @@ def summed_image(flight: str, images: list[PlannedImage]) -> PlannedImage:
 def coherence_layers(
     scene: OpenScene, pairs: tuple[OpenPair, OpenPair], images: tuple[PlannedImage, PlannedImage]
 ) -> dict[str, Layer]:
-    """Return coherence of still ground, and the height that turns the phase once, of two images of one band.
+    """Return coherence of stationary terrain and height of ambiguity of two images in the same band.
 
     Notes
     -----
@@ -223,12 +224,12 @@ def coherence_layers(
     """
     first, second = (image.looks for image in images)
     if first is None or second is None:
-        raise TypeError("interferograms are of pairs")
+        raise TypeError("interferograms require images of pairs, not sums")
     if first.lattice.shape != second.lattice.shape:
         rows, columns = np.meshgrid(*first.lattice.nodes, indexing="ij")
         nearest = [
-            np.abs(at[:, None] - of).argmin(axis=0)
-            for at, of in zip(second.lattice.nodes, (rows[:, 0], columns[0]), strict=True)
+            np.abs(nodes[:, None] - targets).argmin(axis=0)
+            for nodes, targets in zip(second.lattice.nodes, (rows[:, 0], columns[0]), strict=True)
         ]
         second = replace(second, pulses=second.pulses[np.ix_(*nearest)], lattice=first.lattice)
     band = float(pairs[0].frequency_hz[0]), float(pairs[0].frequency_hz[-1])
@@ -241,15 +242,15 @@ def coherence_layers(
 
 
 def resolution_layers(resolution: Resolution, shape: tuple[int, int]) -> dict[str, Layer]:
-    """Return widths of a point along both axes of its response, and the azimuth of the finer one."""
+    """Return the widths along both principal axes of the point response, and the azimuth of the finer axis."""
     tiles = [(slice(row, min(row + BLOCK_PX, shape[0])), slice(0, shape[1])) for row in range(0, shape[0], BLOCK_PX)]
-    parts = [resolution.axes(tile) for tile in tiles]
-    fine, coarse, azimuth = (np.concatenate(one).astype(np.float32) for one in zip(*parts, strict=True))
+    blocks = [resolution.axes(tile) for tile in tiles]
+    fine, coarse, azimuth = (np.concatenate(layer).astype(np.float32) for layer in zip(*blocks, strict=True))
     return {"resolution": coarse, "resolution_fine": fine, "orientation": azimuth}
 
 
 def planned_job(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> tuple[Job, Integration, Beams | None]:
-    """Return the job that limits of imaging are checked on, the planner's without its signal; and its weights."""
+    """Return the planner's job without its signal, for checks of imaging limits, with integration and weights."""
     integration = integration_of(campaign, pair, scene)
     beams = Beams.within(integration.sector, pair.beams)
     grid, frequency_hz = scene.grid, pair.frequency_hz
@@ -284,47 +285,48 @@ def _point_snr(calibrated: CalibratedPair | None, noise: float, rcs_dbsm: float,
 def _coarse_layers(
     campaign: Campaign, pair: OpenPair, scene: OpenScene, beams: Beams | None, left: Effect | None
 ) -> dict[str, Layer]:
-    """Return losses by expected errors, echoes that fold, and path left before the recording ends; bilinear."""
+    """Return layers of expected loss, ambiguous echoes and path margin, interpolated bilinearly."""
     wavelength_m = pair.wave_speed_m_s / float(pair.frequency_hz[-1])
 
-    def loss_db(points: Floats, after: Effect | None = None) -> Floats:
-        seen = [replace(_seen_from(pair, beams, point), left=after or pair.left) for point in points]
-        found = [
-            expected(budget_of(campaign, one, scene, place_m=point)) for one, point in zip(seen, points, strict=True)
+    def loss_db(points: Floats, residual: Effect | None = None) -> Floats:
+        pairs = [replace(_contributing(pair, beams, point), left=residual or pair.left) for point in points]
+        effects = [
+            expected(budget_of(campaign, contributing, scene, place_m=point))
+            for contributing, point in zip(pairs, points, strict=True)
         ]
-        return -np.array([effect.loss_db for effect in found])
+        return -np.array([effect.loss_db for effect in effects])
 
-    def folded(points: Floats) -> Floats:
+    def ambiguity(points: Floats) -> Floats:
         return pair.aperture.ambiguities(points, wavelength_m=wavelength_m)
 
-    def left_m(points: Floats) -> Floats:
+    def margin_m(points: Floats) -> Floats:
         return np.asarray(pair.path_limit_m - pair.aperture[pair.aperture.sample(MOST_PULSES)].path(points).min(axis=0))
 
     counts: dict[str, tuple[int, Callable[[Floats], Floats]]] = {
         "loss": (LOSS_NODES, loss_db),
-        "loss_refined": (LOSS_NODES, partial(loss_db, after=left)),
-        "ambiguity": (AMBIGUITY_NODES, folded),
-        "path_margin": (AMBIGUITY_NODES, left_m),
+        "loss_refined": (LOSS_NODES, partial(loss_db, residual=left)),
+        "ambiguity": (AMBIGUITY_NODES, ambiguity),
+        "path_margin": (AMBIGUITY_NODES, margin_m),
     }
     return {name: _interpolated(scene, count, values) for name, (count, values) in counts.items()}
 
 
 def _interpolated(scene: OpenScene, count: int, values: Callable[[Floats], Floats]) -> Layer:
-    """Return values computed at count × count points of the ground, bilinear at all pixels."""
+    """Compute values at count × count points of the terrain and interpolate them bilinearly to all pixels."""
     rows, columns = (np.linspace(0, size - 1, count) for size in scene.grid.shape)
     row, column = np.meshgrid(rows, columns, indexing="ij")
     points = scene.terrain.positions_at(scene.grid, np.round(row), np.round(column)).reshape(-1, 3)
-    found = np.asarray(values(points)).reshape(1, count, count)
+    computed = np.asarray(values(points)).reshape(1, count, count)
     at = [np.arange(size) * (count - 1) / max(size - 1, 1) for size in scene.grid.shape]
-    values_px: Layer = bilinear(found, at[0][:, None], at[1][None])[0].astype(np.float32)
+    values_px: Layer = bilinear(computed, at[0][:, None], at[1][None])[0].astype(np.float32)
     return values_px
 
 
-def _seen_from(pair: OpenPair, beams: Beams | None, place_m: Floats) -> OpenPair:
-    """Return a pair with those pulses alone that make the image of a place: half or more of the strongest."""
+def _contributing(pair: OpenPair, beams: Beams | None, point_m: Floats) -> OpenPair:
+    """Return a pair reduced to the pulses with at least half of the maximum weight at a point."""
     if beams is None:
         return pair
-    weight = np.abs(point_weights(pair.aperture, beams, place_m[None])[0][:, 0])
+    weight = np.abs(point_weights(pair.aperture, beams, point_m[None])[0][:, 0])
     pulses = np.flatnonzero(weight >= weight.max() / 2)
     if weight.max() == 0 or len(pulses) < 3:
         return pair

@@ -1,4 +1,4 @@
-"""A flight plan, opened: where nodes will be at each pulse, the pairs they make, the grid and the ground."""
+"""Opened flight plan: antenna positions at each pulse, pairs, grid and terrain."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -52,18 +52,18 @@ from apertura.tools.design.flight_plan import (
 )
 
 LEAD_S = 2.0
-"""Seconds that a track goes on before and after what is imaged, so that positions are splines at every pulse."""
+"""Extension of a track before and after its imaged part, seconds, so that the spline covers every pulse."""
 
-_START = np.datetime64("2025-01-01T12:00:00", "ns")  # of every plan: nothing depends on the day
-_CORNER_S = 0.5  # standard deviation by which corners of a mission are rounded: multirotors do not turn on the spot
-_TURN_S = 4.0  # of flight, length of the handles of a turn between two legs
+_START = np.datetime64("2025-01-01T12:00:00", "ns")  # start time of every plan; results do not depend on it
+_CORNER_S = 0.5  # standard deviation of the smoothing of mission corners: multirotors do not turn instantaneously
+_TURN_S = 4.0  # length of the Bézier handles of a turn between two legs, seconds of flight
 _TURN_POINTS = 33
-_ARC_S = 0.05  # between points of a circle
+_ARC_S = 0.05  # interval between points of a circle
 _MOST_EPOCHS = 2_000_000
 _MOST_PULSES = 5_000_000
-_IMAGED_POINTS = 65  # of each leg, where tracks are moved as a whole
-_RADIAL = 0.25  # of their mean distance from the scene's middle: tracks whose mean is nearer go round it
-_SEED = 31  # of the wobble drawn: the same plan gives the same figures
+_IMAGED_POINTS = 65  # points of each leg when tracks are displaced together
+_RADIAL = 0.25  # tracks whose mean lies within this share of their mean distance from the scene centre surround it
+_SEED = 31  # seed of the random deviation from the track: the same plan gives the same results
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +73,13 @@ class Course:
     Attributes
     ----------
     time_s
-        (epoch,) float64, seconds from the first pulse, beyond both ends by `LEAD_S`.
+        (epoch,) float64, seconds from the first pulse, extended at both ends by `LEAD_S`.
     place_m
         (epoch, 3) float64: easting, northing, height above the ellipsoid (z in a local frame), metres.
     imaged_s
-        Begin and end of what makes the image.
+        Start and end of each imaged part, seconds.
     home_m
-        (3,) float64, as `place_m`: take-off and landing point of a mission; None where the plan has none.
+        (3,) float64, as `place_m`: take-off and landing point of a mission; None if the plan has none.
     transit_m_s
         Horizontal speed between home and the track.
     """
@@ -91,7 +91,7 @@ class Course:
     transit_m_s: float = math.inf
 
     def imaged_legs_m(self) -> list[Floats]:
-        """Return places evenly spread over each leg that makes the image, (point, 3) float64 metres."""
+        """Return evenly spread positions on each imaged leg, (point, 3) float64 metres."""
         times = [np.linspace(*span, _IMAGED_POINTS) for span in self.imaged_s]
         return [np.stack([np.interp(time_s, self.time_s, axis) for axis in self.place_m.T], -1) for time_s in times]
 
@@ -102,35 +102,35 @@ class Course:
 
     @property
     def length_s(self) -> float:
-        """Duration from the first pulse to the end of the flight."""
+        """Duration from the first pulse to the end of the flight, seconds."""
         return float(self.time_s[-1]) - LEAD_S
 
     def transfer_s(self, climb_m_s: float) -> float:
-        """Return the time of take-off, transit from and to home, and landing, seconds; 0 where no home is known."""
+        """Return the duration of take-off, transit from and to home, and landing, seconds; 0 without a home."""
         if self.home_m is None:
             return 0.0
-        ends = [[np.interp(at, self.time_s, axis) for axis in self.place_m.T] for at in (0.0, self.length_s)]
-        away_m = np.array(ends) - self.home_m
-        horizontal_s = np.linalg.norm(away_m[:, :2], axis=1).sum() / self.transit_m_s
-        return float(horizontal_s + np.abs(away_m[:, 2]).sum() / climb_m_s)
+        ends = [[np.interp(end_s, self.time_s, axis) for axis in self.place_m.T] for end_s in (0.0, self.length_s)]
+        from_home_m = np.array(ends) - self.home_m
+        horizontal_s = np.linalg.norm(from_home_m[:, :2], axis=1).sum() / self.transit_m_s
+        return float(horizontal_s + np.abs(from_home_m[:, 2]).sum() / climb_m_s)
 
 
 @dataclass(frozen=True, eq=False)
 class OpenPlan:
-    """A flight plan with what the pipeline takes of a campaign before anything is recorded.
+    """Flight plan with the pipeline's inputs that are available before a recording.
 
     Attributes
     ----------
     plan
-        As read.
+        The flight plan.
     campaign
         Settings and flights; its root is the plan's folder.
     scene
-        Grid and ground.
+        Grid and terrain.
     pairs
-        Of all flights.
+        Pairs of all flights.
     courses
-        Flight → node → what it is meant to fly.
+        Flight → node → planned course.
     """
 
     plan: FlightPlan
@@ -140,7 +140,7 @@ class OpenPlan:
     courses: Mapping[str, Mapping[str, Course]]
 
     def coarse(self, count: int) -> "OpenPlan":
-        """Return the same on a grid of few pixels, `count` along the longer side, integrated as on the fine one."""
+        """Return the plan on a grid of `count` pixels along the longer side, with the integration of the fine grid."""
         processing = self.campaign.settings.processing
         if processing.integration == "auto":
             first = {pair.flight: pair for pair in reversed(self.pairs)}
@@ -157,19 +157,19 @@ class OpenPlan:
 
 
 def open_plan(plan: FlightPlan, root: Path) -> OpenPlan:
-    """Return an open flight plan.
+    """Open a flight plan.
 
     Parameters
     ----------
     plan
-        As read.
+        The flight plan.
     root
-        Its folder, in which files that it names lie.
+        Folder of the files that the plan names.
 
     Raises
     ------
     CampaignError
-        If a track leads into the ground or beyond the DEM, nodes come too close, or there is nothing to be imaged.
+        If a track passes below the terrain or beyond the DEM, nodes come too close to each other, or no pulse is sent.
     """
     with errors_of_the_plan():
         return _opened(plan, Campaign(ConfinedPath.at(root), plan.settings, plan.image_flights, planned=True))
@@ -177,7 +177,7 @@ def open_plan(plan: FlightPlan, root: Path) -> OpenPlan:
 
 @contextmanager
 def errors_of_the_plan() -> Iterator[None]:
-    """Raise what a check of campaigns finds as an error of the plan, whose keys are those of the config."""
+    """Convert errors of campaign checks into errors of the plan, which has the keys of the config."""
     try:
         yield
     except CampaignError as error:
@@ -226,16 +226,16 @@ def _opened(plan: FlightPlan, campaign: Campaign) -> OpenPlan:
 
 
 def _radar(campaign: Campaign) -> tuple[NDArray[np.float64], float, float]:
-    """Return the frequencies of the band, the longest delay recorded whole, and pulses per second."""
+    """Return the frequencies of the band, the longest delay of completely recorded echoes, and the pulse rate."""
     waveform = campaign.settings.waveform
     if isinstance(waveform, SampledWaveform):
         frequency_hz = transmitted(campaign, waveform).numerology.frequency_hz
-        if np.ptp(frequency_hz) > frequency_hz.mean():  # wider than the widest UWB radars by 3 dB
+        if np.ptp(frequency_hz) > frequency_hz.mean():  # twice the fractional bandwidth of the widest UWB radars
             raise CampaignError(
-                f"carrier_hz {waveform.carrier_hz:g}, below the {np.ptp(frequency_hz):.4g} Hz that the band is wide",
+                f"carrier_hz {waveform.carrier_hz:g} with a bandwidth of {np.ptp(frequency_hz):.4g} Hz",
                 "the plan: waveform",
-                "a band narrower than its middle frequency; frequencies in Hz",
-                "State carrier_hz in Hz, 1.3e+9 for 1.3 GHz.",
+                "a bandwidth below the centre frequency; frequencies in Hz",
+                "Give carrier_hz in Hz, for example 1.3e+9 for 1.3 GHz.",
             )
         return frequency_hz, waveform.longest_delay_s, waveform.prf_hz
     if isinstance(waveform, FmcwWaveform) and waveform.prf_hz is not None:
@@ -245,7 +245,7 @@ def _radar(campaign: Campaign) -> tuple[NDArray[np.float64], float, float]:
         f"a waveform of kind {waveform.kind}" + (" without prf_hz" if isinstance(waveform, FmcwWaveform) else ""),
         "the plan: waveform",
         "ofdm, samples, or fmcw with its prf_hz",
-        "State what will be transmitted.",
+        "Configure the transmitted waveform.",
     )
 
 
@@ -259,8 +259,8 @@ def _heights(ground: ConfiguredGround, grid: SceneGrid) -> Floats:
         raise CampaignError(
             f"no height at {voids} of {heights.size} pixels of the scene",
             ground.dem.path,
-            "a DEM without voids there",
-            "Fill them, or make scene.bounds_m smaller.",
+            "a DEM without voids in the scene",
+            "Fill the voids, or make scene.bounds_m smaller.",
         )
     return heights
 
@@ -272,18 +272,18 @@ def _crs(plan: FlightPlan, campaign: Campaign) -> str:
         track for flight in plan.flights.values() for track in flight.tracks.values() if isinstance(track, MissionTrack)
     )
     latitude, longitude, height = read_mission(campaign.file(track.file, "flights")).place.T
-    return utm_crs(ecef_from_geodetic(latitude, longitude, height).mean(axis=0))  # longitudes have no mean at 180°
+    return utm_crs(ecef_from_geodetic(latitude, longitude, height).mean(axis=0))  # in ECEF: longitudes jump at 180°
 
 
 # ---- Courses of nodes -----------------------------------------------------------------------------------------------
 
 
 def _courses(plan: FlightPlan, campaign: Campaign, name: str, ground: ConfiguredGround) -> dict[str, Course]:
-    """Return the planned course of each node of a flight, as drawn."""
+    """Return the planned course of each node of a flight, without the displacement `moved`."""
     flight = plan.flights[name]
     if plan.scene.bounds_m == "auto":
         level_m = ground.flat_m
-    else:  # height of the scene's mean ground
+    else:  # mean terrain height of the scene
         xmin, ymin, xmax, ymax = plan.scene.bounds_m
         side_m = min(xmax - xmin, ymax - ymin) / 33
         grid = SceneGrid.from_bounds(ground.crs, plan.scene.bounds_m, spacing_m=side_m)
@@ -302,37 +302,40 @@ def _courses(plan: FlightPlan, campaign: Campaign, name: str, ground: Configured
         elif isinstance(track, MissionTrack):
             courses[node] = _mission(track, campaign, flight, ground, where)
         else:
-            time_s, place, imaged = _drawn(track)
-            course = _sampled(time_s, place, imaged, flight.log_rate_hz, where)
-            base = level_m if track.above == "ground" else 0.0
-            below = _ground_below(ground, course.place_m[:, :2], course.time_s) if track.above == "terrain" else base
-            courses[node] = replace(course, place_m=course.place_m + np.multiply.outer(below, [0.0, 0.0, 1.0]))
+            time_s, position, imaged = _vertices(track)
+            course = _sampled(time_s, position, imaged, flight.log_rate_hz, where)
+            constant = level_m if track.above == "ground" else 0.0
+            base = (
+                _terrain_below(ground, course.place_m[:, :2], course.time_s) if track.above == "terrain" else constant
+            )
+            courses[node] = replace(course, place_m=course.place_m + np.multiply.outer(base, [0.0, 0.0, 1.0]))
     return courses
 
 
-def _ground_below(ground: ConfiguredGround, place_m: Floats, time_s: Floats) -> Floats:
-    """Return the height of the ground below places, once a second and linear between."""
+def _terrain_below(ground: ConfiguredGround, place_m: Floats, time_s: Floats) -> Floats:
+    """Return the terrain height below positions, sampled once a second and interpolated linearly."""
     if ground.dem is None:
         return np.full(len(place_m), ground.height_at(*map(float, place_m[0])))
-    at = np.unique(np.append(np.arange(0, len(place_m), max(1, round(1 / np.diff(time_s).mean()))), len(place_m) - 1))
-    heights = [ground.height_at(*map(float, place_m[one])) for one in at]
-    return np.interp(time_s, time_s[at], heights)
+    every = max(1, round(1 / np.diff(time_s).mean()))
+    sampled = np.unique(np.append(np.arange(0, len(place_m), every), len(place_m) - 1))
+    heights = [ground.height_at(*map(float, place_m[index])) for index in sampled]
+    return np.interp(time_s, time_s[sampled], heights)
 
 
-_Drawn = tuple[Floats, Floats, tuple[tuple[float, float], ...]]
+_Vertices = tuple[Floats, Floats, tuple[tuple[float, float], ...]]
 
 
-def _drawn(track: LineTrack | RacetrackTrack | CircleTrack) -> _Drawn:
-    """Return times and places of a track, and when it makes the image; heights as stated."""
+def _vertices(track: LineTrack | RacetrackTrack | CircleTrack) -> _Vertices:
+    """Return times and positions of a track's vertices, and its imaged parts; heights relative to `above`."""
     if isinstance(track, CircleTrack):
         length_s = float(np.radians(abs(track.turn_deg))) * track.radius_m / track.speed_m_s
         time_s = np.linspace(-LEAD_S, length_s + LEAD_S, 2 + int((length_s + 2 * LEAD_S) / _ARC_S))
         turn_sign = np.sign(track.turn_deg) or 1.0
         azimuth = np.radians(track.start_deg) + turn_sign * time_s * track.speed_m_s / track.radius_m
-        around = np.array([*track.centre_m, track.height_m])
-        out = np.stack([np.sin(azimuth), np.cos(azimuth), np.zeros(len(time_s))], -1)
-        return time_s, around + track.radius_m * out, ((0.0, length_s),)
-    first, last = (np.array([*one, track.height_m]) for one in (track.start_m, track.end_m))
+        centre = np.array([*track.centre_m, track.height_m])
+        radial = np.stack([np.sin(azimuth), np.cos(azimuth), np.zeros(len(time_s))], -1)
+        return time_s, centre + track.radius_m * radial, ((0.0, length_s),)
+    first, last = (np.array([*end, track.height_m]) for end in (track.start_m, track.end_m))
     if isinstance(track, LineTrack):
         return *_timed([first, last], track.speed_m_s), ((0.0, float(np.linalg.norm(last - first)) / track.speed_m_s),)
     along = (last - first) / np.linalg.norm(last - first)
@@ -343,16 +346,16 @@ def _drawn(track: LineTrack | RacetrackTrack | CircleTrack) -> _Drawn:
         turn = _turn(vertices[-1], begin + leg * step, along if leg % 2 else -along, track.speed_m_s)
         vertices += [*turn, end + leg * step]
         ends += [len(vertices) - 2, len(vertices) - 1]
-    time_s, place = _timed(vertices, track.speed_m_s)
+    time_s, position = _timed(vertices, track.speed_m_s)
     return (
         time_s,
-        place,
+        position,
         tuple((float(time_s[a]), float(time_s[b])) for a, b in zip(ends[::2], ends[1::2], strict=True)),
     )
 
 
 def _turn(begin: Floats, end: Floats, along: Floats, speed_m_s: float) -> list[Floats]:
-    """Return points of a turn that leaves along a direction and comes back against it: a cubic by Bézier."""
+    """Return points of a turn that starts in a direction and ends in the opposite one: a cubic Bézier curve."""
     handle = along * max(_TURN_S * speed_m_s, float(np.linalg.norm(end - begin)))
     share = np.linspace(0, 1, _TURN_POINTS)[1:, None]
     corners = begin, begin + handle, end + handle, end
@@ -368,42 +371,45 @@ def _timed(vertices: list[Floats], speed_m_s: float) -> tuple[Floats, Floats]:
 def _sampled(
     time_s: Floats, place_m: Floats, imaged_s: tuple[tuple[float, float], ...], rate_hz: float, where: str
 ) -> Course:
-    """Return a course at the epochs of a log, straight on beyond both ends."""
+    """Return a course at the epochs of a log, extrapolated linearly at both ends."""
     length_s = float(imaged_s[-1][1] if time_s[0] < 0 else time_s[-1])
     if (length_s + 2 * LEAD_S) * rate_hz > _MOST_EPOCHS:
-        raise CampaignError(f"{length_s:.4g} s of flight", where, "hours, not days", "Fly faster, or less far.")
+        longest_s = _MOST_EPOCHS / rate_hz - 2 * LEAD_S
+        expected = f"at most {longest_s:.4g} s at {rate_hz:g} Hz (log_rate_hz)"
+        raise CampaignError(f"{length_s:.4g} s of flight", where, expected, "Increase the speed, or shorten the track.")
     epochs = np.arange(int((length_s + 2 * LEAD_S) * rate_hz) + 2) / rate_hz - LEAD_S
     if time_s[0] >= 0:
         ends = [
-            place_m[at] + 2 * LEAD_S * (place_m[at] - place_m[to]) / abs(time_s[at] - time_s[to])
-            for at, to in ((0, 1), (-1, -2))
+            place_m[end] + 2 * LEAD_S * (place_m[end] - place_m[inner]) / abs(time_s[end] - time_s[inner])
+            for end, inner in ((0, 1), (-1, -2))
         ]
         time_s = np.concatenate([[time_s[0] - 2 * LEAD_S], time_s, [time_s[-1] + 2 * LEAD_S]])
         place_m = np.concatenate([[ends[0]], place_m, [ends[1]]])
-    place = np.stack([np.interp(epochs, time_s, axis) for axis in place_m.T], -1)
-    return Course(epochs, place, imaged_s)
+    return Course(epochs, np.stack([np.interp(epochs, time_s, axis) for axis in place_m.T], -1), imaged_s)
 
 
 def _mission(
     track: MissionTrack, campaign: Campaign, flight: PlannedFlight, ground: ConfiguredGround, where: str
 ) -> Course:
-    """Return the course of a mission: straight from waypoint to waypoint, with rounded corners."""
+    """Return the course of a mission: straight lines between waypoints, with rounded corners."""
     from scipy.ndimage import gaussian_filter1d
 
     path = campaign.file(track.file, where)
     mission = read_mission(path)
     if ground.crs == LOCAL:
-        raise CampaignError("a mission in a local frame", where, "scene.crs on Earth", "Give an EPSG code, or auto.")
+        remedy = "Set scene.crs to an EPSG code, or to auto."
+        raise CampaignError("a mission in a local frame", where, "a georeferenced scene.crs", remedy)
     speed = mission.speed_m_s if track.speed_m_s is None else np.full(len(mission.place), track.speed_m_s)
     if not (speed[1:] > 0).all():
-        raise CampaignError("no speed", path, f"one in the mission, or {where}.speed_m_s", "State it.")
+        remedy = f"Set {where}.speed_m_s."
+        raise CampaignError("no speed", path, f"a speed in the mission, or {where}.speed_m_s", remedy)
     latitude, longitude, height = mission.place.T
     flat = map_from_frame(ground.crs, ecef_from_geodetic(latitude, longitude, np.zeros(len(height))))[:, :2]
     home = mission.home_deg or (float(latitude[0]), float(longitude[0]))
     base: Floats
-    at = map_from_frame(ground.crs, ecef_from_geodetic(*(np.array(one) for one in (*home, 0.0))))
+    home_m = map_from_frame(ground.crs, ecef_from_geodetic(*(np.array(coordinate) for coordinate in (*home, 0.0))))
     if mission.reference == "home":
-        base = np.full(len(flat), ground.height_at(float(at[0]), float(at[1])))
+        base = np.full(len(flat), ground.height_at(float(home_m[0]), float(home_m[1])))
     elif mission.reference == "ground":
         base = np.array([ground.height_at(float(x), float(y)) for x, y in flat])
     elif mission.reference == "sea":
@@ -411,38 +417,39 @@ def _mission(
         base = undulation(grid, longitude, latitude)
     else:
         base = np.zeros(len(flat))
-    place = np.column_stack([flat, height + base])
-    steps = np.linalg.norm(np.diff(place, axis=0), axis=1)
+    waypoints = np.column_stack([flat, height + base])
+    steps = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
     is_distinct = np.concatenate([[True], steps > 1e-3])
-    place, steps, speed = place[is_distinct], steps[is_distinct[1:]], speed[is_distinct]
-    if len(place) < 2:
-        raise CampaignError("waypoints at one place", path, "a mission that goes somewhere", "Export it again.")
+    waypoints, steps, speed = waypoints[is_distinct], steps[is_distinct[1:]], speed[is_distinct]
+    if len(waypoints) < 2:
+        found, remedy = "all waypoints at the same point", "Export the mission again."
+        raise CampaignError(found, path, "a mission with at least two different waypoints", remedy)
     time_s = np.concatenate([[0.0], np.cumsum(steps / speed[1:])])
-    first, last = track.image or (1, len(place))
-    if not 1 <= first < last <= len(place):
-        raise CampaignError(f"image: [{first}, {last}]", where, f"waypoints 1 to {len(place)}", "Correct it.")
+    first, last = track.image or (1, len(waypoints))
+    if not 1 <= first < last <= len(waypoints):
+        raise CampaignError(f"image: [{first}, {last}]", where, f"waypoints 1 to {len(waypoints)}", "Correct it.")
     imaged = ((float(time_s[first - 1]), float(time_s[last - 1])),)
-    course = _sampled(time_s, place, imaged, flight.log_rate_hz, where)
+    course = _sampled(time_s, waypoints, imaged, flight.log_rate_hz, where)
     if mission.reference == "home" and mission.home_deg is not None:
-        landed_m = np.array([at[0], at[1], base[0]])
+        landed_m = np.array([home_m[0], home_m[1], base[0]])
         course = replace(course, home_m=landed_m, transit_m_s=float(np.median(speed[1:])))
-    if len(place) == 2:
+    if len(waypoints) == 2:
         return course
-    rounded = gaussian_filter1d(course.place_m - place[0], _CORNER_S * flight.log_rate_hz, axis=0, mode="nearest")
-    return replace(course, place_m=rounded + place[0])
+    rounded = gaussian_filter1d(course.place_m - waypoints[0], _CORNER_S * flight.log_rate_hz, axis=0, mode="nearest")
+    return replace(course, place_m=rounded + waypoints[0])
 
 
 def _follower(leader: Course, track: BesideTrack, spacing: float) -> Course:
     velocity = np.gradient(leader.place_m, leader.time_s, axis=0)[:, :2]
     ahead = velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-9)
     right = np.stack([ahead[:, 1], -ahead[:, 0]], -1)
-    moved = spacing * (ahead * track.ahead_m + right * track.right_m)
-    up = np.full((len(moved), 1), spacing * track.up_m)
-    return replace(leader, place_m=leader.place_m + np.hstack([moved, up]))
+    horizontal = spacing * (ahead * track.ahead_m + right * track.right_m)
+    up = np.full((len(horizontal), 1), spacing * track.up_m)
+    return replace(leader, place_m=leader.place_m + np.hstack([horizontal, up]))
 
 
 def _displaced(courses: dict[str, dict[str, Course]], plan: FlightPlan) -> dict[str, dict[str, Course]]:
-    """Return courses moved together by what the plan says: turned, pushed away from the scene's middle, lifted."""
+    """Return courses with the common displacement of the plan: rotated, displaced from the scene centre, and raised."""
     moved = plan.moved
     if moved.model_copy(update={"spacing": 1.0}) == Moved():
         return courses
@@ -453,20 +460,21 @@ def _displaced(courses: dict[str, dict[str, Course]], plan: FlightPlan) -> dict[
         xmin, ymin, xmax, ymax = plan.scene.bounds_m
         middle = np.array([xmin + xmax, ymin + ymax]) / 2
     cosine, sine = np.cos(np.radians(moved.heading_deg)), np.sin(np.radians(moved.heading_deg))
-    turn = np.array([[cosine, -sine], [sine, cosine]])  # of row vectors, clockwise
+    rotation = np.array([[cosine, -sine], [sine, cosine]])  # of row vectors, clockwise
     result = {}
     for name, nodes in courses.items():
         away = np.concatenate([leg for course in nodes.values() for leg in course.imaged_legs_m()])[:, :2] - middle
         mean, far_m = away.mean(axis=0), float(np.linalg.norm(away, axis=1).mean())
-        round_it = float(np.linalg.norm(mean)) < _RADIAL * far_m
-        push = np.zeros(2) if round_it else moved.offset_m * mean / np.linalg.norm(mean)
-        wider = max(1 + moved.offset_m / far_m, 0.1) if round_it else 1.0
+        # tracks that surround the scene are scaled about its centre, others are translated
+        surrounds = float(np.linalg.norm(mean)) < _RADIAL * far_m
+        shift = np.zeros(2) if surrounds else moved.offset_m * mean / np.linalg.norm(mean)
+        scale = max(1 + moved.offset_m / far_m, 0.1) if surrounds else 1.0
         result[name] = {
             node: replace(
                 course,
                 place_m=np.column_stack(
                     [
-                        middle + ((course.place_m[:, :2] - middle) * wider + push) @ turn,
+                        middle + ((course.place_m[:, :2] - middle) * scale + shift) @ rotation,
                         course.place_m[:, 2] + moved.height_m,
                     ]
                 ),
@@ -477,29 +485,29 @@ def _displaced(courses: dict[str, dict[str, Course]], plan: FlightPlan) -> dict[
 
 
 def _check_separation(name: str, flight: PlannedFlight, courses: Mapping[str, Course]) -> None:
-    """Raise CampaignError where two nodes come closer to each other than they may."""
-    for one, other in combinations(courses, 2):
-        length = min(len(courses[one].time_s), len(courses[other].time_s))
-        separation_m = np.linalg.norm(courses[one].place_m[:length] - courses[other].place_m[:length], axis=1)
-        at = int(separation_m.argmin())
-        if separation_m[at] < flight.separation_m:
-            at_s = courses[one].time_s[at]
+    """Raise CampaignError if the separation of two nodes falls below the minimum."""
+    for first, second in combinations(courses, 2):
+        length = min(len(courses[first].time_s), len(courses[second].time_s))
+        separation_m = np.linalg.norm(courses[first].place_m[:length] - courses[second].place_m[:length], axis=1)
+        nearest = int(separation_m.argmin())
+        if separation_m[nearest] < flight.separation_m:
+            nearest_s = courses[first].time_s[nearest]
             raise CampaignError(
-                f"{one} and {other} come within {separation_m[at]:.2f} m at {at_s:.1f} s: they collide",
+                f"separation of {first} and {second} falls to {separation_m[nearest]:.2f} m at {nearest_s:.1f} s",
                 f"flights.{name}",
-                f"{flight.separation_m:g} m between any two nodes, separation_m",
-                "Fly them farther apart, or allow less by separation_m.",
+                f"at least {flight.separation_m:g} m between any two nodes (separation_m)",
+                "Increase their separation, or reduce separation_m.",
             )
 
 
-# ---- Pulses and logs of what is planned -----------------------------------------------------------------------------
+# ---- Pulses and logs of a plan --------------------------------------------------------------------------------------
 
 
 _Frame = tuple[str, float]  # CRS of the map, and the shortest wavelength, m
 
 
 def _pulses(course: Course, prf_hz: float, *, where: str) -> NDArray[np.datetime64]:
-    """Return the times of the pulses that make the image."""
+    """Return the times of the imaged pulses."""
     parts = [begin + np.arange(int((end - begin) * prf_hz + 1e-9) + 1) / prf_hz for begin, end in course.imaged_s]
     time_s = np.concatenate(parts)
     if not 2 <= len(time_s) <= _MOST_PULSES:
@@ -509,16 +517,16 @@ def _pulses(course: Course, prf_hz: float, *, where: str) -> NDArray[np.datetime
 
 
 def _log(campaign: Campaign, at: tuple[str, str], flight: PlannedFlight, course: Course, frame: _Frame) -> NodeLog:
-    """Simulate the log of a node: its course and the wobble about it; `at` is flight and node."""
+    """Simulate the log of a node: its course with the wobble; `at` contains flight and node."""
     (name, node), (crs, wave_m) = at, frame
     local = crs == LOCAL
     place, attitude = course.place_m, np.zeros_like(course.place_m)
     if flight.wobble is not None:
-        drawn = Wobble(**flight.wobble.model_dump())
-        still = Straight((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-        seed = np.random.default_rng([_SEED, *f"{name}/{node}".encode()])
-        shaken = drawn.around(still, course.length_s, seed)
-        place, attitude = place + shaken.position(course.time_s), shaken.attitude(course.time_s)
+        wobble = Wobble(**flight.wobble.model_dump())
+        stationary = Straight((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        generator = np.random.default_rng([_SEED, *f"{name}/{node}".encode()])
+        deviation = wobble.around(stationary, course.length_s, generator)
+        place, attitude = place + deviation.position(course.time_s), deviation.attitude(course.time_s)
     position = frame_from_map(crs, *place.T)
     intended = frame_from_map(crs, *course.place_m.T)
     axes = np.broadcast_to(LOCAL_NED, (len(place), 3, 3)) if local else ned_axes(intended)

@@ -1,4 +1,4 @@
-"""A design as files: layers as GeoTIFFs on the later campaign's grid, tracks and footprints, the campaign's config."""
+"""Output files of a design: layers as GeoTIFFs on the later campaign's grid, tracks and footprints, campaign config."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -28,8 +28,8 @@ from apertura.tools.design.layers import UNITS
 from apertura.tools.design.requirements import Tried, report_of, tried_report
 
 _BANDS = {"incidence": INCIDENCE, "bistatic_angle": BISTATIC_ANGLE, "mask": MASK, "looks": LOOKS}
-_DOTS = 480  # of the longer side of the scene, in footprints
-_VERTICES = 400  # of a track
+_DOTS = 480  # maximum number of pixels of the longer side of the scene for footprints
+_VERTICES = 400  # approximate number of vertices of a track
 
 
 def write_design(design: Design, folder: Path, tried: Sequence[Tried] = ()) -> list[Path]:
@@ -38,19 +38,19 @@ def write_design(design: Design, folder: Path, tried: Sequence[Tried] = ()) -> l
     Parameters
     ----------
     design
-        As computed on the grid itself.
+        A design on the full grid.
     folder
-        Made where it is not there; files of the same names are replaced.
+        Output folder, created if necessary; files of the same names are replaced.
     tried
-        Plans that a search tried: those that no other beats are in design.json.
+        Plans tried by a search; the Pareto-optimal ones are written to design.json.
     """
     folder, grid, written = made_folder(folder), design.opened.scene.grid, list[Path]()
-    place = {"transform": Affine(*grid.transform), "crs": grid.crs_wkt}
+    georeference = {"transform": Affine(*grid.transform), "crs": grid.crs_wkt}
     tags = tags_of(design)
     images = {name: image.layers for name, image in design.images.items()}
     for name, layers in {
         **images,
-        **{f"interferometry/{one}": own for one, own in design.interferograms.items()},
+        **{f"interferometry/{name}": layers for name, layers in design.interferograms.items()},
     }.items():
         for layer, values in layers.items():
             path = folder / name / f"{layer}.tif"
@@ -58,7 +58,7 @@ def write_design(design: Design, folder: Path, tried: Sequence[Tried] = ()) -> l
             unit, meaning = UNITS[layer]
             band = _BANDS.get(layer) or Band("float32", np.nan, unit, meaning, "AVERAGE")
             title = f"{design.opened.campaign.settings.campaign} · {name} · {layer}, planned"
-            write_cog(path, values.astype(band.dtype), band, **place, tags=tags, title=title)
+            write_cog(path, values.astype(band.dtype), band, **georeference, tags=tags, title=title)
             style = path.with_suffix(".qml")
             (write_mask_style if layer == "mask" else write_layer_style)(style)
             written += [path, style]
@@ -67,37 +67,39 @@ def write_design(design: Design, folder: Path, tried: Sequence[Tried] = ()) -> l
 
 
 PICTURE_TAGS = {"APERTURA_VERSION": __version__, "APERTURA_PLANNED": "true"}
-"""Provenance tags of pictures of a design; rasters name their plan, too."""
+"""Provenance tags of plots of a design; rasters also contain their plan."""
 
 
 def tags_of(design: Design) -> dict[str, str]:
-    """Return the provenance tags of rasters of a design."""
+    """Return the provenance tags of a design's rasters."""
     plan = design.opened.plan.model_dump(mode="json", exclude_unset=True)
     return PICTURE_TAGS | {"APERTURA_PLAN": canonical_json(plan)}
 
 
 def _write_tracks(design: Design, folder: Path) -> list[Path]:
-    """Write coverage.png, tracks.geojson and, of a scene on Earth, tracks.kml."""
+    """Write coverage.png, tracks.geojson and, for a georeferenced scene, tracks.kml."""
     scene, covered = design.opened.scene, list(_covered(design))
     transform = transform_of(scene.grid, covered[0].looks)
     title = f"{design.opened.campaign.settings.campaign} · planned"
     picture, features = folder / "coverage.png", folder / "tracks.geojson"
     name, local = crs_name(scene.grid), scene.grid.crs == LOCAL
     write_coverage(picture, covered, transform, crs_name=name, title=title, tags=PICTURE_TAGS, local=local)
-    on_earth = place_of(scene)
-    found = feature_collection(covered, transform, on_earth, height_m=scene.level.height_m)
-    write_text(features, canonical_json(found) + "\n")
-    if on_earth is None:
+    to_geographic = place_of(scene)
+    collection = feature_collection(covered, transform, to_geographic, height_m=scene.level.height_m)
+    write_text(features, canonical_json(collection) + "\n")
+    if to_geographic is None:
         return [picture, features]
 
     lines = {
-        f"{flight} {node}": np.asarray(on_earth(course.place_m[:: max(1, len(course.place_m) // _VERTICES)]))
+        f"{flight} {node}": np.asarray(to_geographic(course.place_m[:: max(1, len(course.place_m) // _VERTICES)]))
         for flight, nodes in design.opened.courses.items()
         for node, course in nodes.items()
     }
     areas = {
-        f"{one.flight} {one.pair}": placed_footprint(one.looks, transform, on_earth, height_m=scene.level.height_m)
-        for one in covered
+        f"{pair.flight} {pair.pair}": placed_footprint(
+            pair.looks, transform, to_geographic, height_m=scene.level.height_m
+        )
+        for pair in covered
     }
     write_kml(folder / "tracks.kml", title, lines, areas)
     return [picture, features, folder / "tracks.kml"]
@@ -118,12 +120,12 @@ def _covered(design: Design) -> Iterator[Covered]:
 
 
 def write_campaign_config(plan: FlightPlan, directory: Path) -> Sequence[Path]:
-    """Write the config of the campaign that a plan becomes, ready for its recordings.
+    """Write the config and the raw folders of the later campaign.
 
     Raises
     ------
     CampaignError
-        If a config is there already; nothing is changed then.
+        If a config exists already; nothing is changed then.
     """
     directory = made_folder(directory)
     paths = [directory / "config" / "config.yaml", directory / FLIGHTS]
@@ -133,18 +135,18 @@ def write_campaign_config(plan: FlightPlan, directory: Path) -> Sequence[Path]:
     (directory / "config").mkdir(parents=True, exist_ok=True)
     for flight in plan.image_flights:
         (directory / "raw" / flight.name).mkdir(parents=True, exist_ok=True)
-    flights = [(one.name, one.kind, one.transmitter, one.nodes) for one in plan.image_flights]
+    flights = [(flight.name, flight.kind, flight.transmitter, flight.nodes) for flight in plan.image_flights]
     write_config(directory, plan.document, flights)
     return paths
 
 
 def plan_text(plan: FlightPlan) -> str:
-    """Return a plan as YAML, without what is at its default; `read_flight_plan` reads it back."""
+    """Return a plan as YAML without defaults, which `read_flight_plan` can read."""
     return yaml.safe_dump(plan.model_dump(mode="json", exclude_unset=True), sort_keys=False, width=110)
 
 
 def copy_named(plan: FlightPlan, root: Path, folder: Path) -> None:
-    """Copy the files that a plan names, missions and heights, to the same places of another folder: it runs there."""
+    """Copy the missions and DEMs named in a plan to another folder, so that the plan can be used there."""
 
     def named(value: Any) -> Iterator[str]:
         if isinstance(value, str):

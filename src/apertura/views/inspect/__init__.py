@@ -1,1 +1,1 @@
-"""`apertura inspect`: what a file or folder is, what it holds, and what is missing to make an image of it."""
+"""`apertura inspect`: kind and contents of a file or folder, and the data missing to form an image from it."""

@@ -1,4 +1,4 @@
-"""Reports of one file: a flight log, a recording, phase history, a DEM, an array; with the settings of its campaign."""
+"""Reports of single files: flight log, recording, phase history, DEM or array, read with the campaign's settings."""
 
 import json
 import re
@@ -27,12 +27,12 @@ from apertura.check.facts import (
 )
 from apertura.check.times import TimeFacts, inside, own_clock, utc
 from apertura.common.documents import validated
-from apertura.common.errors import CampaignError, shown
+from apertura.common.errors import CampaignError, number_of, shown
 from apertura.core.scene.dem import open_dem
 from apertura.formats.names import PHASE_HISTORIES, log_format, log_suffixes
 from apertura.formats.npy import read_npy
 from apertura.formats.reading import open_recording, read_phase_history, read_track
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions, QualityNumbers, TimeSystem
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions, QualityNumbers, TimeSystem
 from apertura.views.inspect.report import Report
 
 if TYPE_CHECKING:
@@ -42,10 +42,10 @@ if TYPE_CHECKING:
 
 
 NODE = "<node>"
-"""Stands for a name that is not known."""
+"""Placeholder for an unknown node name."""
 
 _KEY = re.compile(r"\bnodes\.\S+?\.log\.(\w+)")
-_OPTIONS = {one.name for one in fields(LogOptions)}
+_OPTIONS = {option.name for option in fields(LogOptions)}
 _TABLES = {"columns", "scales"}
 _TYPED = {
     "columns": "columns.NAME='COLUMN OF THE LOG'",
@@ -65,23 +65,23 @@ class Surroundings:
     Attributes
     ----------
     node
-        Whose file it is, by its name.
+        Node name, taken from the file name.
     options
-        Of its log.
+        Options for reading the node's flight log.
     waveform
-        Section of the config of the campaign that it lies in; empty outside.
+        Section `waveform` of the campaign's config; empty outside a campaign.
     problem
-        Why that config cannot be read.
+        Error in reading that config; None if it was read.
     typed
-        Keys of its log that were typed with --set.
+        Options of the log given with --set.
     logged
-        Whether a flight log of the node lies beside.
+        True if the folder contains a flight log of the node.
     aligned
-        Whether its campaign says how clocks stand to logs.
+        True if the campaign contains clock offsets between recordings and logs.
     """
 
     node: str
-    options: LogOptions = AS_IT_SAYS
+    options: LogOptions = DEFAULT_OPTIONS
     waveform: Mapping[str, Any] = field(default_factory=dict)
     problem: CampaignError | None = None
     typed: Mapping[str, Any] = field(default_factory=dict)
@@ -90,20 +90,20 @@ class Surroundings:
 
 
 def surroundings(path: Path, settings: Sequence[str]) -> Surroundings:
-    """Return the settings for reading a file: as typed, else by the config of its campaign.
+    """Return the settings for reading a file: options given with --set override the config of its campaign.
 
     Parameters
     ----------
     path
-        The file, absolute.
+        Absolute path of the file.
     settings
-        KEY=VALUE, keys of `LogOptions`; a column is columns.NAME, its factor scales.NAME, a base three numbers with
-        commas.
+        KEY=VALUE, keys of `LogOptions`; a column is columns.NAME, its factor scales.NAME, a base three numbers
+        separated by commas.
 
     Raises
     ------
     CampaignError
-        If a setting is none.
+        If a setting is invalid.
     """
     name = path.name.partition(".track.")[0] if ".track." in path.name else path.name.partition(".")[0]
     typed = _parsed(settings)
@@ -145,39 +145,39 @@ def _parsed(settings: Sequence[str]) -> dict[str, Any]:
 
 
 def retries(problem: CampaignError) -> list[str]:
-    """Return the options to type for a log that was refused for want of a key.
+    """Suggest --set options for a log that was refused because a key is not configured.
 
     Examples
     --------
     >>> retries(CampaignError("times of day only", "a.nmea", "key nodes.u.log.start_utc in config.yaml", "Add it."))
-    ['set nodes.<node>.log.start_utc in the config; to try a value now: --set start_utc=YYYY-MM-DDTHH:MM:SS']
+    ['set nodes.<node>.log.start_utc in the config; to try a value: --set start_utc=YYYY-MM-DDTHH:MM:SS']
     """
     sentence = f"{problem.found} {problem.expected} {problem.remedy}"
     keys = [key for key in dict.fromkeys(_KEY.findall(sentence)) if key in _OPTIONS]
     return [
-        f"set nodes.{NODE}.log.{key} in the config; to try a value now: --set {_TYPED.get(key, f'{key}=VALUE')}"
+        f"set nodes.{NODE}.log.{key} in the config; to try a value: --set {_TYPED.get(key, f'{key}=VALUE')}"
         for key in keys
     ]
 
 
 ARRAY, DEM = (".npy",), (".tif", ".tiff")
-"""Suffixes."""
+"""File name suffixes."""
 
 FIRST = 128
-"""Captures whose samples are read."""
+"""Number of leading captures whose samples are read."""
 
 LISTED = 10
-"""Gaps that are listed one by one, the longest."""
+"""Number of gaps that are listed individually, longest first."""
 
 PHASE_HISTORY = "phase_history"
-"""waveform.kind of samples that say themselves what was transmitted."""
+"""`waveform.kind` of formats that describe the transmitted waveform themselves."""
 
 _MOST_SAMPLES = 1 << 21
 _MOST_NUMBERS = 1 << 28
 
 
 def time_rows(times: TimeFacts) -> dict[str, Any]:
-    """Return facts of a report: span, rate and gaps."""
+    """Return the report rows of time tags: span, rate and gaps."""
     utc_known = times.clock == "UTC"
     rows: dict[str, Any] = {"clock": "UTC" if utc_known else "its own"}
     if utc_known:
@@ -193,17 +193,17 @@ def time_rows(times: TimeFacts) -> dict[str, Any]:
     return rows
 
 
-def log_report(path: Path, beside: Surroundings) -> Report:
+def log_report(path: Path, context: Surroundings) -> Report:
     """Return the report of a flight log.
 
     Raises
     ------
     CampaignError
-        If it is none, or leaves open what `LogOptions` must say.
+        If the file is not a flight log, or lacks information that `LogOptions` must supply.
     """
-    track = read_track(path, node=beside.node, options=beside.options)
+    track = read_track(path, node=context.node, options=context.options)
     facts = log_facts(track)
-    lacks = _missing_of_log(path, facts, beside)
+    lacks = _missing_of_log(path, facts, context)
     from apertura.stages.node_log import yaw_fault_of
     from apertura.views.inspect.pictures import draw_log
 
@@ -212,7 +212,7 @@ def log_report(path: Path, beside: Surroundings) -> Report:
     return Report(
         path,
         "flight log",
-        log_format(path, beside.options),
+        log_format(path, context.options),
         _log_rows(facts, track),
         tuple(lacks),
         picture=lambda: draw_log(track, path.name),
@@ -242,40 +242,44 @@ def _log_rows(log: LogFacts, track: "xr.Dataset") -> dict[str, Any]:
     return rows
 
 
-def _missing_of_log(path: Path, log: LogFacts, beside: Surroundings) -> list[str]:
+def _missing_of_log(path: Path, log: LogFacts, context: Surroundings) -> list[str]:
     lacks, suffixes = [], log_suffixes()
-    if beside.node == NODE:
+    if context.node == NODE:
         suffix = path.suffix[1:].lower()
-        lacks.append(f"its name: copy it to raw/<flight>/{NODE}.track.{suffix if suffix in suffixes else suffixes[0]}")
-    lacks += [f"what --set gives here: put nodes.{NODE}.log.{key} into config/config.yaml" for key in beside.typed]
+        extension = suffix if suffix in suffixes else suffixes[0]
+        lacks.append(f"name of the node: copy the log to raw/<flight>/{NODE}.track.{extension}")
+    lacks += [
+        f"config of the option given with --set: add nodes.{NODE}.log.{key} to config/config.yaml"
+        for key in context.typed
+    ]
     if not log.has_attitude:
         lacks.append(f"attitude: set nodes.{NODE}.attitude to course, or lever arms to zero and antennas to null")
     if log.times.gap_at.size:
-        lacks.append(f"epochs where it has gaps ({log.times.gap_at.size}): pulses there may be left out")
+        lacks.append(f"epochs in {number_of(log.times.gap_at.size, 'gap')}: pulses in gaps may be excluded")
     kinds = log.fixes or {}
     if kinds and not {"fix", "float"} & kinds.keys():
-        lacks.append("a solution with carrier phase (RTK or PPK): positions err by many wavelengths")
+        lacks.append("a carrier-phase solution (RTK or PPK): position errors are many wavelengths")
     elif kinds.get("float") or any(name not in {"fix", "float", "not stated"} for name in kinds):
-        lacks.append(f"a fixed solution throughout: pulses at other epochs are left out, see nodes.{NODE}.worst_fix")
+        lacks.append(f"a fixed solution throughout: pulses at other epochs are excluded, see nodes.{NODE}.worst_fix")
     if log.fixes is None and log.stated_std_m is None:
-        lacks.append(f"how far it errs: the log does not say; state nodes.{NODE}.position_std_m")
+        lacks.append(f"position accuracy: not contained in the log; set nodes.{NODE}.position_std_m")
     return lacks
 
 
-def recording_report(files: Sequence[Path], beside: Surroundings) -> Report:
+def recording_report(files: Sequence[Path], context: Surroundings) -> Report:
     """Return the report of a recording.
 
     Parameters
     ----------
     files
         In the order of a row of `apertura.formats.names.RECORDERS`.
-    beside
-        Where they lie.
+    context
+        Settings for reading them.
 
     Raises
     ------
     CampaignError
-        If they are none.
+        If the files are not a recording.
     """
     recording = open_recording(files)
     facts, samples = recording_facts(recording), first_samples(recording)
@@ -284,20 +288,20 @@ def recording_report(files: Sequence[Path], beside: Surroundings) -> Report:
     rms = np.sqrt(np.mean(np.abs(samples.astype(np.complex128)) ** 2, axis=(0, 1)))
     rows = _recording_rows(recording, facts) | {
         "first_captures": {
-            name: {"rms": float(one), "largest": float(peak)}
-            for name, one, peak in zip(recording.channels, rms, peaks, strict=True)
+            name: {"rms": float(level), "largest": float(peak)}
+            for name, level, peak in zip(recording.channels, rms, peaks, strict=True)
         }
     }
     from apertura.views.inspect.pictures import draw_recording
 
     node = files[0].name.removesuffix(files[0].suffix)
     logs = sorted(log for log in files[0].parent.glob("*.track.*") if log.name.startswith(f"{node}.track."))
-    lacks = _missing_of_recording(recording, facts, beside)
+    lacks = _missing_of_recording(recording, facts, context)
     if logs:
-        covered, left_out = _against_log(recording, node, logs[0], beside)
+        covered, left_out = _against_log(recording, node, logs[0], context)
         rows, lacks = rows | covered, lacks + left_out
     else:
-        lacks.append(f"where it was: no flight log {node}.track.<{'|'.join(log_suffixes())}> lies beside")
+        lacks.append(f"antenna positions: the folder has no flight log {node}.track.<{'|'.join(log_suffixes())}>")
     return Report(
         files[0],
         "recording",
@@ -325,7 +329,7 @@ def _recording_rows(recording: "Recording", facts: RecordingFacts) -> dict[str, 
 
 
 def first_samples(recording: "Recording") -> NDArray[np.complex64]:
-    """Return (capture, sample, channel) complex64: the first captures; of one that runs through its first samples."""
+    """Return the first captures (samples of a continuous recording), complex64 (capture, sample, channel)."""
     captures = recording.captures
     each = min(captures.length, _MOST_SAMPLES)
     count = max(1, min(FIRST, len(captures.start), _MOST_SAMPLES // max(each, 1)))
@@ -333,31 +337,37 @@ def first_samples(recording: "Recording") -> NDArray[np.complex64]:
     return np.asarray(iq[..., 0] + 1j * iq[..., 1], np.complex64)
 
 
-def _missing_of_recording(recording: "Recording", facts: RecordingFacts, beside: Surroundings) -> list[str]:
+def _missing_of_recording(recording: "Recording", facts: RecordingFacts, context: Surroundings) -> list[str]:
     lacks = []
-    if not beside.waveform:
+    if not context.waveform:
         prf_hz = facts.times and facts.times.rate_hz
         stated = {"sample_rate_hz": facts.sample_rate_hz, "carrier_hz": facts.carrier_hz, "prf_hz": prf_hz}
-        known = ", ".join(f"{key}: {value:.9g}" for key, value in stated.items() if value)
-        lacks.append(f"what was transmitted: section waveform of config/config.yaml, with {known} as recorded here")
-        lacks.append(f"its place: raw/<flight>/{NODE}{'|'.join(file.suffix for file in recording.files)} of a campaign")
+        settings = ", ".join(f"{key}: {value:.9g}" for key, value in stated.items() if value)
+        suffixes = "|".join(file.suffix for file in recording.files)
+        lacks.append(
+            f"transmitted waveform: section waveform of config/config.yaml, with {settings} as in the recording"
+        )
+        lacks.append(f"a campaign: copy the recording to raw/<flight>/{NODE}{suffixes} of a campaign folder")
     if not facts.carrier_hz:
-        lacks.append("the carrier: the recording does not say; the one of the config will be taken")
+        lacks.append("the carrier frequency: not in the recording; the configured value is used")
     if facts.captures == 1 and not facts.runs_through:
-        lacks.append("pulses: it is one capture; write one per trigger, or apertura:framing where the recorder ran on")
+        lacks.append(
+            "pulses: the recording is a single capture; write one capture per trigger, or apertura:framing if the "
+            "recording is continuous"
+        )
     if own_clock(recording.captures.time):
-        lacks.append("the time: the recorder has a clock of its own; `apertura align` finds how it stands to the log's")
+        lacks.append("UTC times: the recorder has a free-running clock; `apertura align` estimates its offset to UTC")
     return lacks
 
 
 def _against_log(
-    recording: "Recording", node: str, log: Path, beside: Surroundings
+    recording: "Recording", node: str, log: Path, context: Surroundings
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return facts of how much of a recording its log covers, and what it leaves out."""
-    if not log.is_file():  # a named pipe or a device would be waited for
-        return {}, [f"a readable flight log: {log.name} is no plain file"]
+    """Return the share of a recording that its flight log covers, and a message on captures outside the log."""
+    if not log.is_file():  # reading a named pipe or a device would block
+        return {}, [f"a readable flight log: {log.name} is not a regular file"]
     try:
-        logged = read_track(log, node=node, options=beside.options).time.values
+        logged = read_track(log, node=node, options=context.options).time.values
     except CampaignError as problem:
         return {}, [f"a readable flight log: {problem}"]
     covered = float(np.mean(inside(recording.captures.time, (logged[0], logged[-1]))))
@@ -365,56 +375,56 @@ def _against_log(
     if covered == 1.0:
         return rows, []
     first, last = utc(logged[0]), utc(logged[-1])
-    clocks = "; `apertura align` finds a clock that is off" if covered == 0 else ""
-    return rows, [f"positions for {1 - covered:.1%} of the captures: {log.name} lasts from {first} to {last}{clocks}"]
+    clocks = "; `apertura align` estimates a clock offset" if covered == 0 else ""
+    return rows, [f"positions for {1 - covered:.1%} of the captures: {log.name} covers {first} to {last}{clocks}"]
 
 
-def history_report(here: Path, files: Sequence[Path], kind: str, beside: Surroundings) -> Report:
+def history_report(path: Path, files: Sequence[Path], kind: str, context: Surroundings) -> Report:
     """Return the report of phase history.
 
     Parameters
     ----------
-    here
-        The file or folder.
+    path
+        Path of the file or folder.
     files
-        It and the one beside that belongs to it, or all of the folder.
+        The file and its companion file, or all files of the folder.
     kind
         A key of `apertura.formats.names.PHASE_HISTORIES`.
-    beside
-        Where they lie.
+    context
+        Settings for reading them.
 
     Raises
     ------
     CampaignError
-        If there are none, they are not of that kind, or only the config of a campaign says what was transmitted, and
-        there is none.
+        If there are no files, they are not of that format, or the format requires the waveform from the config of a
+        campaign and there is none.
     """
     if not files:
-        raise CampaignError(f"no {kind} group, the folder is empty", here, "phase history", "Copy the folder again.")
-    described = beside.waveform if beside.waveform.get("format") == kind else {}
+        raise CampaignError(f"no {kind} group, the folder is empty", path, "phase history", "Copy the folder again.")
+    described = context.waveform if context.waveform.get("format") == kind else {}
     if PHASE_HISTORIES[kind].waveform != PHASE_HISTORY and not described:
         raise CampaignError(
-            "samples that do not say what was transmitted",
-            here,
-            f"raw/<flight>/{here.name} of a campaign whose config says waveform.format: {kind}",
-            "`apertura init` makes a campaign folder; copy it there.",
+            "samples without a description of the transmitted waveform",
+            path,
+            f"raw/<flight>/{path.name} of a campaign whose config sets waveform.format: {kind}",
+            "Create a campaign folder with `apertura init` and copy the samples there.",
         )
-    echo = _read_history(files, kind, beside.node, described)
+    echo = _read_history(files, kind, context.node, described)
     facts = history_facts(echo)
     from apertura.views.inspect.pictures import draw_history
 
     return Report(
-        here,
+        path,
         "phase history",
         kind,
         _history_rows(facts),
-        tuple(_missing_of_history(facts, kind, beside)),
-        picture=lambda: draw_history(echo, here.name),
+        tuple(_missing_of_history(facts, kind, context)),
+        picture=lambda: draw_history(echo, path.name),
     )
 
 
 def _read_history(files: Sequence[Path], kind: str, node: str, described: Mapping[str, Any]) -> "xr.Dataset":
-    """Return the `echo` stage as of one antenna, else as of two, where the format says how it was taken."""
+    """Return the `echo` stage, read as monostatic or, where the format declares two antennas, as bistatic."""
     try:
         return read_phase_history(kind, files, pair=f"{node}-{node}", described=described)
     except CampaignError as problem:
@@ -436,24 +446,25 @@ def _history_rows(facts: HistoryFacts) -> dict[str, Any]:
     return rows | ({"remarks": list(facts.remarks)} if facts.remarks else {})
 
 
-def _missing_of_history(facts: HistoryFacts, kind: str, beside: Surroundings) -> list[str]:
+def _missing_of_history(facts: HistoryFacts, kind: str, context: Surroundings) -> list[str]:
     lacks = []
-    if facts.frame is None and not beside.logged:
-        lacks.append(f"where it was: a flight log {NODE}.track.<{'|'.join(log_suffixes())}> beside, for each antenna")
-    if facts.frame is None and not beside.aligned and facts.times.clock != "UTC":
-        lacks.append("the time: the recorder has a clock of its own; `apertura align` sets it against the log's")
-    if not beside.waveform:
-        lacks.append(f"its place: a campaign folder whose config says waveform.format: {kind}")
+    if facts.frame is None and not context.logged:
+        suffixes = "|".join(log_suffixes())
+        lacks.append(f"antenna positions: a flight log {NODE}.track.<{suffixes}> in the same folder for each antenna")
+    if facts.frame is None and not context.aligned and facts.times.clock != "UTC":
+        lacks.append("UTC times: the recorder has a free-running clock; `apertura align` estimates its offset to UTC")
+    if not context.waveform:
+        lacks.append(f"a campaign: a campaign folder whose config sets waveform.format: {kind}")
     return lacks
 
 
 def dem_report(path: Path) -> Report:
-    """Return the report of a raster of heights, or of a product of apertura.
+    """Return the report of an elevation raster or of a product of apertura.
 
     Raises
     ------
     CampaignError
-        If it is no GeoTIFF.
+        If the file is not a GeoTIFF.
     """
     facts = dem_facts(path)
     left, bottom, right, top = facts.bounds
@@ -472,18 +483,18 @@ def dem_report(path: Path) -> Report:
         return Report(path, "product of apertura", "", rows)
     heights = facts.heights
     if heights is not None:
-        known = heights[np.isfinite(heights)]
-        ends = [float(known.min()), float(known.max())] if known.size else None
+        finite = heights[np.isfinite(heights)]
+        ends = [float(finite.min()), float(finite.max())] if finite.size else None
         if facts.values_unit.lower() in METRES:
             rows["height_m"] = ends
         else:
             rows["height"] = None if ends is None else f"{ends[0]:.2f} to {ends[1]:.2f} {shown(facts.values_unit, 40)}"
-        rows["posts_without_height_share"] = 1 - known.size / max(heights.size, 1)
+        rows["posts_without_height_share"] = 1 - finite.size / max(heights.size, 1)
     try:
         open_dem(path, "a scene on Earth")
         lacks: tuple[str, ...] = ()
     except CampaignError as problem:
-        lacks = (f"{problem.found}; expected {problem.expected}: set scene.dem_datum if that is what it lacks",)
+        lacks = (f"{problem.found}; expected {problem.expected}: set scene.dem_datum if the datum is missing",)
     from apertura.views.inspect.pictures import draw_heights
 
     picture = (
@@ -495,7 +506,7 @@ def dem_report(path: Path) -> Report:
 
 
 def _product_rows(facts: DemFacts) -> dict[str, Any]:
-    """Return the report of a product of apertura, by its tags."""
+    """Return the report rows of a product of apertura, from its GeoTIFF tags."""
     tags = facts.tags
     rows = {
         "title": tags.get("TIFFTAG_IMAGEDESCRIPTION", ""),
@@ -510,7 +521,7 @@ def _product_rows(facts: DemFacts) -> dict[str, Any]:
 
 
 def _tag(tags: Mapping[str, str], name: str, kind: type) -> Any:
-    """Return the JSON value of a tag, or an empty value where it is not of that kind."""
+    """Return the JSON value of a tag, or an empty value if it is not of that type."""
     try:
         value = json.loads(tags.get(name, "null"))
     except ValueError:
@@ -519,12 +530,12 @@ def _tag(tags: Mapping[str, str], name: str, kind: type) -> Any:
 
 
 def array_report(path: Path) -> Report:
-    """Return the report of a .npy file; code symbols are an array of complex numbers.
+    """Return the report of a .npy file; a complex vector is reported as code symbols.
 
     Raises
     ------
     CampaignError
-        If it is none, or holds no numbers.
+        If the file is not a .npy file, or contains no numbers.
     """
     expected = f"a .npy file of at most {_MOST_NUMBERS} numbers"
     array = read_npy(path, kinds="biufc", most=_MOST_NUMBERS, expected=expected, remedy="Save it again.")

@@ -1,4 +1,4 @@
-"""`apertura inspect`: what a path is, by the first reader of the tables that its name fits and that reads it."""
+"""`apertura inspect`: identify a path with the first reader that matches its name and reads it without error."""
 
 import json
 import logging
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_FILES = 100
-"""Most files of a folder that are inspected."""
+"""Maximum number of files of a folder that are inspected."""
 
 _HEAD_BYTES = 16
 
@@ -42,14 +42,14 @@ def inspect_path(
     plot: Path | None = None,
     as_json: bool = False,
 ) -> int:
-    """Print what a file or folder is; return 0, or 2 where no reader reads it.
+    """Print the report of a file or folder; return 0, or 2 if no reader reads it.
 
     Parameters
     ----------
     path
-        Absolute.
+        Absolute path.
     name
-        What people call it; None: its path.
+        Name to print; None prints the path.
     settings
         KEY=VALUE, keys of `apertura.formats.tracks.log_options.LogOptions`.
     plot
@@ -60,18 +60,18 @@ def inspect_path(
     Raises
     ------
     CampaignError
-        If the path is not there, a setting is none, or the preview would not be a .png file of its own.
+        If the path does not exist, a setting is invalid, or `plot` is not a .png file or exists and is not an image.
     """
     is_own_png = plot is None or (plot.suffix.lower() == ".png" and plot != path)
     if plot is not None and is_own_png and plot.exists():
         with plot.open("rb") as stream:
             is_own_png = stream.read(8) == b"\x89PNG\r\n\x1a\n"
     if plot is not None and not is_own_png:
-        found = "a file that is no picture" if plot.exists() else "another suffix than .png"
+        found = "an existing file that is not a PNG image" if plot.exists() else "a suffix other than .png"
         raise CampaignError(found, f"--plot {plot}", "the name of a new .png file", "Choose another name.")
     logging.getLogger("apertura.common.errors").addHandler(
         logging.NullHandler()
-    )  # remarks of readers are in the report
+    )  # the report contains the readers' remarks, which would otherwise be printed as warnings
     report = look(path, settings)
     drawn = None if plot is None or report.picture is None else _drawn(report.picture(), plot)
     if as_json:
@@ -84,7 +84,7 @@ def inspect_path(
 
 
 def _drawn(figure: "Figure", plot: Path) -> Path:
-    """Write a picture; return its path."""
+    """Write a plot as PNG; return its path."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     from apertura.common.atomic import replacement
@@ -101,24 +101,24 @@ def look(path: Path, settings: Sequence[str] = ()) -> Report:
     Parameters
     ----------
     path
-        Absolute.
+        Absolute path.
     settings
-        KEY=VALUE: what a flight log cannot say of itself.
+        KEY=VALUE: options that a flight log does not contain.
 
     Raises
     ------
     CampaignError
-        If it is not there, or a setting is none; whatever else is wrong with a file is in the report.
+        If the path does not exist or a setting is invalid; errors in a file's contents are part of the report.
     """
     try:
         mode = path.stat().st_mode
     except OSError as error:
-        found = shown(error.strerror or "not there")
+        found = shown(error.strerror or "not found")
         raise CampaignError(found, path, "a file or folder", "Correct the path.") from None
     if stat.S_ISDIR(mode):
         return _folder(path, settings)
     if not stat.S_ISREG(mode):
-        raise CampaignError("neither a file nor a folder", path, "a file or folder", "Copy its content to a file.")
+        raise CampaignError("not a regular file or folder", path, "a file or folder", "Copy its content to a file.")
     return _file(path, surroundings(path, settings))
 
 
@@ -127,82 +127,85 @@ def _folder(path: Path, settings: Sequence[str]) -> Report:
         return _file(path, surroundings(path, settings))
     if (path / "config").is_dir() or (path / "raw").is_dir():
         return campaign_report(path)
-    names = sorted(one for one in path.iterdir() if one.is_file() and not one.name.startswith("."))
+    files = sorted(entry for entry in path.iterdir() if entry.is_file() and not entry.name.startswith("."))
     parts: dict[Path, Report] = {}
-    for name in names[:MOST_FILES]:
-        part = _file(name, surroundings(name, settings))
-        parts.setdefault(part.path, part)  # the files of a recording are one part
-    more = (f"{len(names) - MOST_FILES} more files: name one",) if len(names) > MOST_FILES else ()
+    for file in files[:MOST_FILES]:
+        part = _file(file, surroundings(file, settings))
+        parts.setdefault(part.path, part)  # all files of a recording give the same report
+    more: tuple[str, ...] = ()
+    if len(files) > MOST_FILES:
+        more = (f"{len(files) - MOST_FILES} more files were not inspected: inspect them individually",)
     columns = ("first_utc", "duration_s", "rate_hz", "gaps")
-    return Report(path, "folder", "", {"files": len(names)}, more, parts=tuple(parts.values()), columns=columns)
+    return Report(path, "folder", "", {"files": len(files)}, more, parts=tuple(parts.values()), columns=columns)
 
 
-def _file(path: Path, beside: Surroundings) -> Report:
-    """Return the report of the first reader that reads a file; else of the first that its name fits."""
+def _file(path: Path, context: Surroundings) -> Report:
+    """Return the report of the first reader that reads a file, else the error of the first that matches its name."""
     refused: list[Report] = []
-    for kind, name, read in _readers(path, beside):
+    for kind, name, read in _readers(path, context):
         try:
-            return _with_config(read(), beside)
-        except Exception as error:  # whatever a file makes a reader raise is reported of the file
+            return _with_config(read(), context)
+        except Exception as error:  # any exception of a reader is reported as a problem of the file
             refused.append(Report(path, kind, name, _size(path), problem=_as_problem(error, path)))
     if not refused:
         return _unknown(path)
     first = refused[0]
-    others = [f"nor is it read as {other.title}: {other.problem.found}" for other in refused[1:] if other.problem]
-    helps = retries(first.problem) if first.problem else []
-    return _with_config(replace(first, missing=(*helps, *others)), beside)
+    others = [f"also refused as {other.title}: {other.problem.found}" for other in refused[1:] if other.problem]
+    advice = retries(first.problem) if first.problem else []
+    return _with_config(replace(first, missing=(*advice, *others)), context)
 
 
-def _with_config(report: Report, beside: Surroundings) -> Report:
-    if beside.problem is None:
+def _with_config(report: Report, context: Surroundings) -> Report:
+    if context.problem is None:
         return report
-    return replace(report, missing=(*report.missing, f"a config that can be read: {beside.problem}"))
+    return replace(report, missing=(*report.missing, f"a valid config: {context.problem}"))
 
 
 def _as_problem(error: Exception, path: Path) -> CampaignError:
     if isinstance(error, CampaignError):
         return error
-    known = explained(error)
-    found = known or f"its reader failed: {type(error).__name__}: {error}"
-    return CampaignError(found, path, "a file that is whole", "Is it damaged? If not, this is a defect of apertura.")
+    explanation = explained(error)
+    found = explanation or f"reader failed: {type(error).__name__}: {error}"
+    remedy = "Check whether the file is damaged; if not, report an internal error of apertura."
+    return CampaignError(found, path, "an undamaged file", remedy)
 
 
-def _readers(path: Path, beside: Surroundings) -> Iterator[tuple[str, str, Reader]]:
-    """Yield kind, format and reader for every row of the tables that a name fits; of a format stated that alone."""
-    stated = "" if "format" in beside.typed or ".track." in path.name else str(beside.waveform.get("format", ""))
+def _readers(path: Path, context: Surroundings) -> Iterator[tuple[str, str, Reader]]:
+    """Yield kind, format and reader for every table row that matches the name; for a configured format only that."""
+    stated = "" if "format" in context.typed or ".track." in path.name else str(context.waveform.get("format", ""))
     if stated in PHASE_HISTORIES and path.name.endswith(PHASE_HISTORIES[stated].suffix):
-        yield "phase history", stated, partial(_history, path, stated, beside)
-        return  # the campaign reads it as that, whichever other reader knows the file
+        yield "phase history", stated, partial(_history, path, stated, context)
+        return  # the campaign reads the file in the configured format, even if other readers match
     from apertura.views.inspect.files import ARRAY, DEM, array_report, dem_report, log_report
 
-    if "format" not in beside.typed:
+    if "format" not in context.typed:
         for row in RECORDERS:
             suffix = next((suffix for suffix in row if path.name.endswith(suffix)), None)
             if suffix is not None:
-                yield "recording", row[0].lstrip("."), partial(_recording, path, suffix, beside)
+                yield "recording", row[0].lstrip("."), partial(_recording, path, suffix, context)
         for name, history in PHASE_HISTORIES.items():
             if path.name.endswith(history.suffix):
-                yield "phase history", name, partial(_history, path, name, beside)
-    if path.is_file() and (".track." in path.name or beside.options.format is None or "format" in beside.typed):
-        with suppress(CampaignError):  # none that is known
-            yield "flight log", log_format(path, beside.options), partial(log_report, path, beside)
+                yield "phase history", name, partial(_history, path, name, context)
+    if path.is_file() and (".track." in path.name or context.options.format is None or "format" in context.typed):
+        with suppress(CampaignError):  # not a known log format
+            yield "flight log", log_format(path, context.options), partial(log_report, path, context)
     if path.suffix.lower() in DEM:
         yield "elevation model", "", partial(dem_report, path)
     if path.suffix in ARRAY:
         yield "array", "", partial(array_report, path)
 
 
-def _recording(path: Path, suffix: str, beside: Surroundings) -> Report:
+def _recording(path: Path, suffix: str, context: Surroundings) -> Report:
     from apertura.views.inspect.files import recording_report
 
-    return recording_report(recording_files(path.parent, path.name.removesuffix(suffix)), beside)
+    return recording_report(recording_files(path.parent, path.name.removesuffix(suffix)), context)
 
 
-def _history(path: Path, name: str, beside: Surroundings) -> Report:
+def _history(path: Path, name: str, context: Surroundings) -> Report:
     from apertura.views.inspect.files import history_report
 
     files = PHASE_HISTORIES[name].files_of(path)
-    return history_report(path if path.is_dir() else files[0], files, name, beside)
+    return history_report(path if path.is_dir() else files[0], files, name, context)
 
 
 def _size(path: Path) -> dict[str, int]:
@@ -220,15 +223,15 @@ def _unknown(path: Path) -> Report:
     if path.suffix == ARCHIVE:
         return Report(path, "unknown", "", {**_size(path), "begins_with": quoted(head)}, problem=archived(path))
     problem = CampaignError(
-        f"no format that is known by a name in {quoted(path.suffix)}",
+        f"no known format has the suffix {quoted(path.suffix)}",
         path,
         f"a recording ({', '.join(recorders)}), phase history ({', '.join(histories)}), a flight log "
         f"({', '.join(logs)}), an elevation model (.tif) or a campaign folder",
-        "Give it the suffix of its format, or convert it.",
+        "Rename the file to the suffix of its format, or convert it.",
     )
     facts = {**_size(path), "begins_with": quoted(head)}
-    helps = (f"if it is a flight log, name its format: --set format=<{'|'.join(TRACKS)}>",)
-    return Report(path, "unknown", "", facts, helps, problem)
+    advice = (f"if the file is a flight log, give its format: --set format=<{'|'.join(TRACKS)}>",)
+    return Report(path, "unknown", "", facts, advice, problem)
 
 
 _LINES = ("recorded", "logged")
@@ -246,7 +249,7 @@ _NEVER = np.array([], "datetime64[ns]")
 
 
 def campaign_report(root: Path) -> Report:
-    """Return the report of a campaign folder; what is wrong with it is what is missing."""
+    """Return the report of a campaign folder; the problems that `apertura check` finds are listed as missing."""
     campaign, problems = load(root)
     if campaign is None:
         lines = tuple(as_line(problem).replace(f"{root}/", "") for problem in problems)
@@ -283,7 +286,7 @@ def campaign_report(root: Path) -> Report:
 
 
 def _node_report(examined: Examination, key: Key) -> tuple[Report, dict[str, Span], list[CampaignError]]:
-    """Return recording and log of one node in one flight, their spans, and errors in reading them."""
+    """Return the report of a node's recording and log in one flight, their spans, and errors in reading them."""
     flight, node = key
     rows: dict[str, Any] = {}
     spans: dict[str, Span] = {}
@@ -313,18 +316,18 @@ def _node_report(examined: Examination, key: Key) -> tuple[Report, dict[str, Spa
 
 
 def _recorded(examined: Examination, key: Key) -> tuple[dict[str, Any], Times, Span | None]:
-    """Return facts of what a node recorded, and by the log's clock the times of its pulses, the first and the last."""
+    """Return facts of a node's recording, its pulse times in the clock of the log, and their span."""
     if examined.waveform is None:
         return _history_line(examined.campaign, key)
     if key not in examined.recorded:
         return {}, _NEVER, None
-    facts = examined.recorded[key]  # times are corrected by the node's clock
+    facts = examined.recorded[key]  # times include the node's clock correction
     rows = {} if facts.times is None else {"captures": facts.captures, **_rate_rows(facts.times)}
     return rows, examined.recordings[key].captures.time, facts.span
 
 
 def _history_line(campaign: Campaign, key: Key) -> tuple[dict[str, Any], Times, Span | None]:
-    """Return the same of phase history, which receiving nodes have; no times where pulses are merely counted."""
+    """Return the same for phase history of a receiving node; no times if the format only numbers the pulses."""
     flight, node = campaign.flight(key[0]), key[1]
     pair = next((pair for pair in flight.pairs if pair.endswith(f"-{node}")), None)
     if pair is None:
@@ -344,7 +347,7 @@ def _rate_rows(times: TimeFacts) -> dict[str, Any]:
 
 
 def _span_row(span: Span) -> dict[str, str]:
-    """Return two times, ISO 8601, with every digit that they have."""
+    """Return first and last time in ISO 8601 with all digits."""
     return {
         name: f"{time.astype('datetime64[ns]')}Z" for name, time in zip(("first_utc", "last_utc"), span, strict=True)
     }

@@ -31,7 +31,7 @@ _COLOURS = {
     "single": "tab:red",
     "ppp": "tab:blue",
 }
-_ROWS = 256  # pulses and captures that are drawn
+_ROWS = 256  # maximum number of pulses or captures drawn
 _COLUMNS = 1024
 _FLOOR_DB = -60.0
 
@@ -39,36 +39,36 @@ Floats = NDArray[np.floating[Any]]
 
 
 def draw_log(track: "xr.Dataset", name: str) -> Figure:
-    """Return a track in plan, its height and its intervals over time; colours are kinds of fix, red lines gaps."""
+    """Plot a track in plan view, its height and its epoch intervals over time; colours give the fix, red lines gaps."""
     figure = _figure(name, (11, 6))
     grid = figure.add_gridspec(2, 2)
     plan, height = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
     steps = figure.add_subplot(grid[1, 1], sharex=height)
     position, times, frame = track.position.values, track.time.values, track.attrs["frame"]
-    place, at_s = east_north_up(position, frame, np.median(position, axis=0)), seconds_since(times, times[0])
-    for label, own in _by_fix(track).items():
-        words, colour = f"{label}, {number_of(int(own.sum()), 'epoch')}", _COLOURS[label]
-        plan.plot(place[own, 0], place[own, 1], ".", color=colour, label=words, markersize=2.5)
-        height.plot(at_s[own], place[own, 2], ".", color=colour, markersize=2.5)
+    local_m, time_s = east_north_up(position, frame, np.median(position, axis=0)), seconds_since(times, times[0])
+    for fix, epochs in _by_fix(track).items():
+        label, colour = f"{fix}, {number_of(int(epochs.sum()), 'epoch')}", _COLOURS[fix]
+        plan.plot(local_m[epochs, 0], local_m[epochs, 1], ".", color=colour, label=label, markersize=2.5)
+        height.plot(time_s[epochs], local_m[epochs, 2], ".", color=colour, markersize=2.5)
     for number, epoch in enumerate(gaps(times, LONG_GAP)):
         ends = slice(epoch - 1, epoch + 1)
-        plan.plot(*place[ends, :2].T, "r--", linewidth=1, label="gap" if number == 0 else None)
-        height.axvspan(*at_s[ends], color="red", alpha=0.2)
-    plan.plot(*place[0, :2], "k^", label="first epoch")
+        plan.plot(*local_m[ends, :2].T, "r--", linewidth=1, label="gap" if number == 0 else None)
+        height.axvspan(*time_s[ends], color="red", alpha=0.2)
+    plan.plot(*local_m[0, :2], "k^", label="first epoch")
     earth = frame == "ecef"
     _named(plan, "east of the median, m" if earth else "x, m", "north of the median, m" if earth else "y, m")
     plan.set_aspect("equal", adjustable="datalim")
     plan.legend(loc="best", fontsize="small")
     _named(height, "", "height above the ellipsoid, m" if earth else "z, m")
-    _intervals(steps, at_s[1:], times)
-    _named(steps, f"seconds since {utc(times[0])}", "since the epoch before, s")
+    _intervals(steps, time_s[1:], times)
+    _named(steps, f"seconds since {utc(times[0])}", "interval to the previous epoch, s")
     return figure
 
 
 def east_north_up(position_m: NDArray[np.float64], frame: str, middle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (n, 3) positions as metres to east and north of a place on Earth, and height above the ellipsoid.
+    """Convert (n, 3) positions to metres east and north of a reference point and height above the ellipsoid.
 
-    In a frame without a place on Earth they are its axes as they stand.
+    Positions in a local frame are returned unchanged.
 
     Examples
     --------
@@ -82,7 +82,7 @@ def east_north_up(position_m: NDArray[np.float64], frame: str, middle: NDArray[n
 
 
 def _intervals(axes: "Axes", across: NDArray[Any], times: NDArray[np.datetime64]) -> None:
-    """Draw the times between neighbours, seconds: from zero, or by decades where they differ by more than that."""
+    """Plot intervals between consecutive times, s; logarithmic if they differ by more than a factor of 10."""
     steps = np.diff(times) / np.timedelta64(1, "s")
     axes.plot(across, steps, "k.", markersize=2.5)
     if steps.max() > 10 * steps.min():
@@ -92,15 +92,15 @@ def _intervals(axes: "Axes", across: NDArray[Any], times: NDArray[np.datetime64]
 
 
 def _by_fix(track: "xr.Dataset") -> dict[str, NDArray[np.bool_]]:
-    """Return kind of solution → (epoch,) bool."""
+    """Return a mapping of kind of fix → (epoch,) bool."""
     kinds = track.fix.values if "fix" in track else np.zeros(track.sizes["epoch"], np.int8)
-    known = {"fix" if kind == 1 else name: kinds == kind for name, kind in FIXES.items()}
-    known["not stated"] = ~np.isin(kinds, list(FIXES.values()))
-    return {name: own for name, own in known.items() if own.any()}
+    masks = {"fix" if kind == 1 else name: kinds == kind for name, kind in FIXES.items()}
+    masks["not stated"] = ~np.isin(kinds, list(FIXES.values()))
+    return {name: mask for name, mask in masks.items() if mask.any()}
 
 
 def draw_recording(recording: "Recording", samples: NDArray[np.complex64], name: str) -> Figure:
-    """Return the times between captures, and the amplitude of the first captures in each channel."""
+    """Plot the intervals between captures and the amplitude of the first captures in each channel."""
     several = len(recording.captures.time) > 1
     count = len(recording.channels) + several
     figure = _figure(name, (11, 0.5 + 2.7 * count))
@@ -108,30 +108,30 @@ def draw_recording(recording: "Recording", samples: NDArray[np.complex64], name:
     if several:
         _captures(axes.pop(0), recording.captures.time)
     length_us = samples.shape[1] / recording.sample_rate_hz * 1e6
-    for channel, own, values in zip(recording.channels, axes, np.moveaxis(samples, 2, 0), strict=True):
-        level_db, label = _decibels(values), f"dB under the largest, {shown(channel)}"
+    for channel, panel, values in zip(recording.channels, axes, np.moveaxis(samples, 2, 0), strict=True):
+        level_db, label = _decibels(values), f"dB relative to the maximum, {shown(channel)}"
         if several:
-            _image(own, level_db, (0.0, length_us), label)
-            _named(own, "time in the capture, µs", "capture")
+            _image(panel, level_db, (0.0, length_us), label)
+            _named(panel, "time in the capture, µs", "capture")
         else:
-            own.plot(np.linspace(0, length_us, level_db.shape[1], endpoint=False), level_db[0], "k", linewidth=0.6)
-            _named(own, f"time since {utc(recording.captures.time[0])}, µs", label)
+            panel.plot(np.linspace(0, length_us, level_db.shape[1], endpoint=False), level_db[0], "k", linewidth=0.6)
+            _named(panel, f"time since {utc(recording.captures.time[0])}, µs", label)
     return figure
 
 
 def _captures(axes: "Axes", times: NDArray[np.datetime64]) -> None:
-    """Draw the times between captures; red where some are missing."""
+    """Plot the intervals between captures; red lines mark missing captures."""
     _intervals(axes, np.arange(1, len(times)), times)
     for capture in gaps(times, LOST_CAPTURE)[:_ROWS]:
         axes.axvline(capture, color="red", linewidth=0.6)
     typical_s = interval_s(times)
     axes.axhline(typical_s, color="tab:blue", linewidth=0.8, label=f"typical: {typical_s:.6g} s")
     axes.legend(loc="lower right", fontsize="small")
-    _named(axes, f"capture; the first at {utc(times[0])}; red: some are missing before", "since the one before, s")
+    _named(axes, f"capture, first at {utc(times[0])}; red: preceded by a gap", "interval to the previous capture, s")
 
 
 def draw_history(echo: "xr.Dataset", name: str) -> Figure:
-    """Return range profiles of pulses spread over the flight, and where the antennas were in plan."""
+    """Plot range profiles of pulses spread over the flight, and the antenna positions in plan view."""
     placed = "tx_position" in echo
     figure = _figure(name, (11, 5))
     grid = figure.add_gridspec(1, 1 + placed, width_ratios=(1.6, 1)[: 1 + placed])
@@ -142,50 +142,51 @@ def draw_history(echo: "xr.Dataset", name: str) -> Figure:
     profile = np.fft.fftshift(np.fft.ifft(transfer * window, axis=1), axes=1)
     reach_m = SPEED_OF_LIGHT_M_S * (frequency.size - 1) / max(float(np.ptp(frequency)), 1.0) / 2
     count = echo.sizes["pulse"]
-    _image(profiles, _decibels(profile), (-reach_m, reach_m), "dB under the largest", rows=count)
-    _named(profiles, "path beyond the reference, m", f"pulse, {len(pulses)} of {count} are drawn")
+    _image(profiles, _decibels(profile), (-reach_m, reach_m), "dB relative to the maximum", rows=count)
+    _named(profiles, "path relative to the reference, m", f"pulse ({len(pulses)} of {count} drawn)")
     if placed:
         plan = figure.add_subplot(grid[1])
         frame, middle = echo.attrs["frame"], np.median(echo.tx_position.values, axis=0)
         for leg, style, size in (("tx", "k.", 5), ("rx", "r.", 2)):
-            place = east_north_up(echo[f"{leg}_position"].values, frame, middle)
-            plan.plot(place[:, 0], place[:, 1], style, markersize=size, label=leg)
-        _named(plan, *(("east of the middle, m", "north of the middle, m") if frame == "ecef" else ("x, m", "y, m")))
+            local_m = east_north_up(echo[f"{leg}_position"].values, frame, middle)
+            plan.plot(local_m[:, 0], local_m[:, 1], style, markersize=size, label=leg)
+        _named(plan, *(("east of the median, m", "north of the median, m") if frame == "ecef" else ("x, m", "y, m")))
         plan.set_aspect("equal", adjustable="datalim")
         plan.legend(loc="best", fontsize="small")
     return figure
 
 
 def draw_heights(heights: NDArray[np.float32], extent: tuple[float, ...], name: str, *, unit: str) -> Figure:
-    """Return heights (in `unit`) of a raster as a map; `extent` is left, bottom, right, top in its CRS."""
+    """Plot a raster of heights (in `unit`) as a map; `extent` is left, bottom, right, top in its CRS."""
     figure = _figure(name, (7, 6))
     axes = figure.subplots()
     left, bottom, right, top = extent
     drawn = axes.imshow(
         heights, extent=(left, right, bottom, top), cmap="terrain", aspect="auto", interpolation="nearest"
     )
-    figure.colorbar(drawn, ax=axes, label=f"height, as the raster counts it, {unit}")
-    _named(axes, "x of its CRS", "y of its CRS")
+    figure.colorbar(drawn, ax=axes, label=f"height in the datum of the raster, {unit}")
+    _named(axes, "x in the CRS of the raster", "y in the CRS of the raster")
     return figure
 
 
 def draw_campaign(spans: Mapping[tuple[str, str], Mapping[str, Span]], name: str) -> Figure:
-    """Return when each node of each flight recorded and logged, in seconds from the first of the flight."""
+    """Plot the time spans of recording and log of each node, in seconds from the first time of each flight."""
     flights = list(dict.fromkeys(flight for flight, _ in spans)) or [""]
     figure = _figure(name, (10, 1.5 + 1.2 * len(spans)))
     for axes, flight in zip(np.ravel(figure.subplots(len(flights), 1)), flights, strict=True):
-        own = {node: known for (of, node), known in spans.items() if of == flight}
-        begun = min(
-            (first for known in own.values() for first, _ in known.values()), default=np.datetime64("NaT", "ns")
+        nodes = {node: node_spans for (span_flight, node), node_spans in spans.items() if span_flight == flight}
+        start = min(
+            (first for node_spans in nodes.values() for first, _ in node_spans.values()),
+            default=np.datetime64("NaT", "ns"),
         )
-        for row, known in enumerate(own.values()):
-            for kind, (first, last) in known.items():
-                start_s, length_s = (float(step / np.timedelta64(1, "s")) for step in (first - begun, last - first))
+        for row, node_spans in enumerate(nodes.values()):
+            for kind, (first, last) in node_spans.items():
+                start_s, length_s = (float(step / np.timedelta64(1, "s")) for step in (first - start, last - first))
                 colour, lift = ("tab:blue", 0.05) if kind == "recorded" else ("tab:green", -0.35)
                 axes.barh(row + lift, length_s, left=start_s, height=0.3, align="edge", color=colour)
-        axes.set_yticks(range(len(own)), [shown(node) for node in own])
-        begins = "" if np.isnat(begun) else f", seconds since {utc(begun)}"
-        _named(axes, f"{shown(flight)}{begins}; blue: recorded, green: logged", "")
+        axes.set_yticks(range(len(nodes)), [shown(node) for node in nodes])
+        since = "" if np.isnat(start) else f", seconds since {utc(start)}"
+        _named(axes, f"{shown(flight)}{since}; blue: recorded, green: logged", "")
     return figure
 
 
@@ -206,7 +207,7 @@ def _named(axes: "Axes", across: str, up: str) -> None:
 
 
 def _decibels(values: NDArray[np.complexfloating]) -> Floats:
-    """Return amplitudes in dB under the largest; of more columns than a picture has the largest of each few."""
+    """Return amplitudes in dB relative to the maximum, reduced to at most `_COLUMNS` columns by block maxima."""
     amplitude = np.abs(values)
     fold = -(-amplitude.shape[1] // _COLUMNS)
     padded = np.pad(amplitude, ((0, 0), (0, -amplitude.shape[1] % fold)))
@@ -216,7 +217,7 @@ def _decibels(values: NDArray[np.complexfloating]) -> Floats:
 
 
 def _image(axes: "Axes", level_db: Floats, across: tuple[float, float], label: str, *, rows: int | None = None) -> None:
-    """Draw levels; of more rows than are drawn the axis counts all."""
+    """Draw levels as an image; `rows` scales the vertical axis if only some rows are drawn."""
     extent = (*across, rows or len(level_db), 0)
     drawn = axes.imshow(level_db, extent=extent, aspect="auto", cmap="viridis", vmin=_FLOOR_DB, vmax=0)
     axes.figure.colorbar(drawn, ax=axes, label=label)

@@ -1,4 +1,4 @@
-"""The report of a file or folder: facts by name, printed for people and for machines."""
+"""Report of a file or folder: named facts, printed as text or JSON."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _UNITS = {"hz": "Hz", "m": "m", "m_s": "m/s", "s": "s", "deg": "deg", "db": "dB", "utc": "UTC", "share": "share"}
-"""Ending of the name of a fact → unit."""
+"""Suffix of a fact's name → unit."""
 
 _PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""))
 _LONGEST = 600
@@ -29,21 +29,21 @@ class Report:
         flight log, recording, phase history, elevation model, product of apertura, array, campaign folder, folder or
         unknown.
     format
-        A key of the table of its readers; empty where there is one alone.
+        Format name; empty for a kind with a single format.
     facts
-        Name, which ends in its unit → what JSON knows; a list of two numbers is a range.
+        Name, which ends in its unit → JSON value; a list of two numbers is a range.
     missing
-        What is missing for an image, a sentence each.
+        Data missing for an image, a phrase each.
     problem
-        Why it was refused.
+        Reason for refusing the file; None if it was read.
     parts
-        What a folder holds.
+        Reports of the contents of a folder.
     columns
-        Facts of the parts that a table of them shows.
+        Facts of the parts that are table columns.
     lines_of_parts
-        Facts of the parts that are too long for a table, a line each.
+        Facts of the parts that are too long for a table, printed a line each.
     picture
-        Draws a preview.
+        Function that draws a preview.
     """
 
     path: Path
@@ -59,11 +59,11 @@ class Report:
 
     @property
     def title(self) -> str:
-        """Kind and format, in words."""
+        """Kind and format as text."""
         return f"{self.kind} ({self.format})" if self.format else self.kind
 
     def as_json(self) -> dict[str, Any]:
-        """Return its contents as JSON values.
+        """Return the report as JSON values.
 
         Examples
         --------
@@ -82,13 +82,13 @@ class Report:
         }
 
     def lines(self) -> Iterator[tuple[str, str]]:
-        """Yield name and value of each fact as people read them, with units and without control characters."""
+        """Yield name and value of each fact as text, with units and without control characters."""
         for name, value in self.facts.items():
             yield worded(name, value)
 
 
 def worded(name: str, value: object) -> tuple[str, str]:
-    """Return a fact in words: its name without the unit, its value with it.
+    """Format a fact as text: name without unit, value with unit.
 
     Examples
     --------
@@ -129,7 +129,7 @@ def _number(value: float, unit: str) -> str:
 
 
 def print_report(report: Report, name: Path | None = None) -> None:
-    """Print a report for people; `name` is the path as they typed it."""
+    """Print a report as text; `name` is the path as the user typed it."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -151,20 +151,20 @@ def print_report(report: Report, name: Path | None = None) -> None:
         sentence = f"{problem.found}; expected {problem.expected}. {problem.remedy}"
         console.print(Text.assemble(("refused: ", "red"), sentence))
     if report.missing:
-        console.print(Text("missing for an image:" if not report.problem else "what helps:", style="yellow"))
+        console.print(Text("missing for an image:" if not report.problem else "remedies:", style="yellow"))
     for sentence in report.missing:
         console.print(Text(f"  - {shown(sentence, _LONGEST)}"))
 
 
 def _table(report: Report) -> Any:
-    """Return a row for each part: what it is, and those facts of it that the columns name."""
+    """Return a table with a row for each part: name, kind and the facts named by the columns."""
     from rich import box
     from rich.table import Table
     from rich.text import Text
 
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for heading in ("", "is", *(worded(name, None)[0] for name in report.columns)):
-        table.add_column(heading, overflow="fold")  # a narrow terminal wraps, and cuts nothing
+    for heading in ("", "kind", *(worded(name, None)[0] for name in report.columns)):
+        table.add_column(heading, overflow="fold")  # wrap instead of truncating in a narrow terminal
     for part in report.parts:
         cells = [worded(name, part.facts[name])[1] if name in part.facts else "" for name in report.columns]
         title = f"{part.title}, refused: {part.problem.found}" if part.problem else part.title

@@ -1,10 +1,10 @@
-"""Pictures and words of a report on a campaign, from arrays and numbers."""
+"""Figures, tables and text of the report on a campaign."""
 
 PICTURES = ("geometry", "pulses", "phase", "cuts", "range_profiles", "budget")
-"""Pictures of a pair, in reading order."""
+"""Figures of a pair, in reading order."""
 
 PAGE = "report.html"
-"""The report of a flight, and of all of them."""
+"""File name of the report of a flight, and of the report of all flights."""
 
 SUM_PICTURES = ("panels", "sum_cuts")
-"""Pictures of the sums of a flight: beside its pairs, and cuts through the brightest target."""
+"""Figures of the sums of a flight: the sums next to the pairs, and cuts through the brightest target."""

@@ -25,14 +25,14 @@ _COLOURS = (ORANGE, BLUE, GREEN)
 def sidelink_error_rad(
     phase_rad: NDArray[np.float64], length_m: NDArray[np.float64], *, wavenumber_rad_m: float
 ) -> NDArray[np.float64]:
-    """Return the phase that clocks and triggers add to each pulse, from its sidelink.
+    """Estimate the phase error of clocks and triggers in each pulse from its sidelink.
 
     Parameters
     ----------
     phase_rad
-        (pulse,) float64, of the sidelink at mid-band, radians.
+        (pulse,) float64, sidelink phase at mid-band, radians.
     length_m
-        (pulse,) float64, of the sidelink by the logs, metres.
+        (pulse,) float64, sidelink length from the logs, metres.
     wavenumber_rad_m
         2π f_mid/c, radians per metre.
 
@@ -54,12 +54,12 @@ def sidelink_error_rad(
 
 
 def steadiness(phasors: NDArray[np.complex128]) -> tuple[float, float]:
-    """Return the phase scatter of a target, rms radians about its mean, and |Σz|/Σ|z|; NaN without an echo.
+    """Return a target's phase scatter, rms radians about its mean, and coherence |Σz|/Σ|z|; NaN without an echo.
 
     Parameters
     ----------
     phasors
-        (pulse,) complex, what each pulse adds at the target.
+        (pulse,) complex, contribution of each pulse at the target.
 
     Examples
     --------
@@ -70,8 +70,8 @@ def steadiness(phasors: NDArray[np.complex128]) -> tuple[float, float]:
     if not size.sum() > 0:
         return float("nan"), float("nan")
     mean = phasors.sum()
-    off = np.angle(phasors * np.conj(mean)) if abs(mean) > 0 else np.angle(phasors)
-    return float(np.sqrt((size * off**2).sum() / size.sum())), float(abs(mean) / size.sum())
+    deviation = np.angle(phasors * np.conj(mean)) if abs(mean) > 0 else np.angle(phasors)
+    return float(np.sqrt((size * deviation**2).sum() / size.sum())), float(abs(mean) / size.sum())
 
 
 def draw_phase(
@@ -83,33 +83,33 @@ def draw_phase(
     tags: Mapping[str, str],
     counted: bool = False,
 ) -> None:
-    """Draw the phase of a target in each pulse, one drawing below the other for each stage of correction, as a PNG.
+    """Plot the phase of a target in each pulse, one panel for each stage of correction, as a PNG.
 
     Parameters
     ----------
     path
-        ``….png``; complete or absent.
+        ``….png``; replaced atomically.
     time_s
         (pulse,) float64, seconds from the first pulse.
     phasors
-        What was corrected so far → (pulse,) complex, what each pulse adds at the target.
+        Stage of correction → (pulse,) complex, contribution of each pulse at the target.
     title
         Flight and pair.
     tags
-        Provenance; lies in the file.
+        Provenance, stored in the file.
     counted
-        Whether `time_s` counts pulses, since the recording has no times.
+        True if `time_s` counts pulses, because the recording has no times.
     """
-    some = thinned(len(time_s))
+    drawn_pulses = thinned(len(time_s))
     with sheet(path, 0.6 + 1.55 * len(phasors), title=title, tags=tags) as figure:
         drawn = column_of(figure, len(phasors))
         for axes, colour, (name, values) in zip(drawn, _COLOURS, phasors.items(), strict=False):
-            rms, together = steadiness(values)
-            phase = np.angle(values[some] * np.conj(values.sum() or 1))
-            axes.plot(time_s[some], phase, ".", color=colour, markersize=2)
+            rms, coherence = steadiness(values)
+            phase = np.angle(values[drawn_pulses] * np.conj(values.sum() or 1))
+            axes.plot(time_s[drawn_pulses], phase, ".", color=colour, markersize=2)
             axes.axhline(0, color=GREY, linewidth=0.6)
             axes.set(
-                title=f"{name}: {rms:.2f} rad rms, {100 * together:.0f} % add up",
+                title=f"{name}: {rms:.2f} rad rms, coherence {100 * coherence:.0f} %",
                 ylabel="phase, rad",
                 ylim=(-1.05 * np.pi, 1.05 * np.pi),
                 yticks=[-np.pi, 0, np.pi],
@@ -119,23 +119,23 @@ def draw_phase(
         drawn[-1].set_xlabel(over(counted=counted))
 
 
-_DEEPEST_DB = -40.0
+_LOWEST_DB = -40.0
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnCut:
-    """A line through a peak and what was measured along it.
+    """A cut through a peak, with its width and sidelobe ratios.
 
     Attributes
     ----------
     name
-        Of its direction.
+        Name of its direction.
     along_m
         (sample,) float64, metres from the peak.
     power
         (sample,) float64, linear, the peak in the middle.
     width_m, pslr_db, islr_db
-        −3 dB width, peak and integrated sidelobe ratio; NaN where the line does not hold them.
+        −3 dB width, peak and integrated sidelobe ratio; NaN if the cut is too short to measure them.
     """
 
     name: str
@@ -152,7 +152,7 @@ class DrawnCut:
 
 
 def drawn_cuts(raster: BlockRaster, brightest: Mapping[str, Any], grid: SceneGrid) -> list[DrawnCut]:
-    """Return the cuts through the brightest target of a pair or a sum, `brightest` of its image.json."""
+    """Return the cuts through the brightest target of a pair or a sum, given as `brightest` of its image.json."""
     east, north = brightest["cross_range_direction"]
     row, column = grid.pixel_of(brightest["x_m"], brightest["y_m"])
     peak, cuts = find_peak(raster, round(float(row)), round(float(column))), []
@@ -164,18 +164,18 @@ def drawn_cuts(raster: BlockRaster, brightest: Mapping[str, Any], grid: SceneGri
 
 
 def draw_cuts(path: Path, cuts: Sequence[DrawnCut], *, title: str, tags: Mapping[str, str]) -> None:
-    """Draw cuts side by side on one scale of dB, as a PNG.
+    """Plot cuts side by side on a common dB scale, as a PNG.
 
     Parameters
     ----------
     path
-        ``….png``; complete or absent.
+        ``….png``; replaced atomically.
     cuts
-        At least one.
+        One or more cuts.
     title
         Flight and pair.
     tags
-        Provenance; lies in the file.
+        Provenance, stored in the file.
     """
     with sheet(path, 2.9, title=title, tags=tags) as figure:
         grid = GridSpec(1, len(cuts), figure=figure)
@@ -192,9 +192,9 @@ def _draw_cut(axes: Axes, cut: DrawnCut, colour: str) -> None:
     width = f"−3 dB: {100 * cut.width_m:.1f} cm" if np.isfinite(cut.width_m) else "−3 dB: beyond the cut"
     axes.set(
         title=f"{cut.name} — {width}",
-        xlabel="from the peak, m",
+        xlabel="distance from the peak, m",
         ylabel="power re peak, dB",
-        ylim=(_DEEPEST_DB, 3),
+        ylim=(_LOWEST_DB, 3),
         xlim=(cut.along_m[0], cut.along_m[-1]),
     )
     ratios = [
@@ -216,10 +216,10 @@ def _crossings(cut: DrawnCut) -> tuple[float, float]:
 
 
 _LEAST = {"loss_db": 1e-4, "shift_m": 1e-4, "phase_rad": 1e-4}
-_LABELS = {"loss_db": "peak lost, dB", "shift_m": "targets shifted, m", "phase_rad": "phase of the image, rad"}
+_LABELS = {"loss_db": "peak loss, dB", "shift_m": "displacement, m", "phase_rad": "image phase, rad"}
 _STYLES: Mapping[bool, Any] = {
-    True: {"color": BLUE, "label": "counted: stated, measured or assumed"},
-    False: {"facecolor": "white", "edgecolor": GREY, "hatch": "/////", "label": "not stated: of the size in the table"},
+    True: {"color": BLUE, "label": "in the sum: size stated, measured or assumed"},
+    False: {"facecolor": "white", "edgecolor": GREY, "hatch": "/////", "label": "not in the sum: size not stated"},
 }
 
 
@@ -230,9 +230,9 @@ class Measured:
     Attributes
     ----------
     loss_db, std_db
-        Lost of their peak, negative, and its standard deviation; None where no point is bright enough.
+        Their peak loss, negative, and its standard deviation; None if no point is bright enough.
     expected_db
-        What the budget expects to be lost; None where nothing is stated.
+        Peak loss expected by the error budget; None if the size of no cause is known.
     """
 
     loss_db: float | None = None
@@ -243,27 +243,28 @@ class Measured:
 def draw_budget(
     path: Path, lines: Sequence[Mapping[str, Any]], measured: Measured, *, title: str, tags: Mapping[str, str]
 ) -> None:
-    """Draw what each cause is expected to cost as a PNG; what is not stated is hatched and does not count.
+    """Plot the expected effect of each cause as a PNG; causes without a known size are hatched and not summed.
 
     Parameters
     ----------
     path
-        ``….png``; complete or absent.
+        ``….png``; replaced atomically.
     lines
-        Of the budget in image.json: cause, stated, loss_db, shift_m, phase_rad, None where a cause does not do that.
+        Lines of the budget in image.json: cause, stated, loss_db, shift_m, phase_rad; None for an effect that a cause
+        does not have.
     measured
-        At the bright points of the image.
+        Measured focus at the bright points of the image.
     title
         Flight and pair.
     tags
-        Provenance; lies in the file.
+        Provenance, stored in the file.
     """
     with sheet(path, 1.5 + 0.21 * max(4, len(lines)), title=title, tags=tags) as figure:
         grid = GridSpec(1, 3, figure=figure, width_ratios=(1.4, 1, 1))
-        for place, measure in enumerate(_LABELS):
-            axes = figure.add_subplot(grid[place])
+        for panel, measure in enumerate(_LABELS):
+            axes = figure.add_subplot(grid[panel])
             _draw_causes(axes, lines, measure)
-            axes.tick_params(labelleft=place == 0)
+            axes.tick_params(labelleft=panel == 0)
             if measure == "loss_db":
                 if measured.expected_db is not None:
                     expected = max(abs(measured.expected_db), _LEAST["loss_db"])
@@ -278,28 +279,28 @@ def draw_budget(
                             color=RED,
                             alpha=0.15,
                         )
-        lines_of, _ = figure.axes[0].get_legend_handles_labels()
-        bars = [Patch(**style) for style in _STYLES.values()]  # also of a kind that this image has none of
-        handles = [*(one for one in lines_of if not isinstance(one, Container)), *bars]
+        plotted, _ = figure.axes[0].get_legend_handles_labels()
+        bars = [Patch(**style) for style in _STYLES.values()]  # both styles, even if this image has only one of them
+        handles = [*(handle for handle in plotted if not isinstance(handle, Container)), *bars]
         figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
 
 
-_SHORT = 0.1  # below which a number is written as a power of ten: three labels find room below an axis
+_SHORT = 0.1  # smaller numbers are written as powers of ten, so that three labels fit below an axis
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def _draw_causes(axes: Axes, lines: Sequence[Mapping[str, Any]], measure: str) -> None:
-    least, places = _LEAST[measure], np.arange(len(lines))
+    least, rows = _LEAST[measure], np.arange(len(lines))
     sizes = [abs(line[measure]) if line[measure] is not None else 0.0 for line in lines]
     highest = max([10 * least, *sizes])
     for stated, style in _STYLES.items():
-        some = [place for place, line in enumerate(lines) if is_counted(line) == stated and sizes[place] > least]
-        axes.barh(some, [sizes[place] for place in some], height=0.62, **style)
-    for place, (size, line) in enumerate(zip(sizes, lines, strict=True)):
+        styled = [row for row, line in enumerate(lines) if is_counted(line) == stated and sizes[row] > least]
+        axes.barh(styled, [sizes[row] for row in styled], height=0.62, **style)
+    for row, (size, line) in enumerate(zip(sizes, lines, strict=True)):
         if size <= least:
-            words = "does not apply" if line[measure] is None else f"below {least:g}"
-            axes.text(1.2 * least, place, words, va="center", fontsize=6, color=GREY)
-    axes.set_yticks(places, _names(lines))
+            label = "does not apply" if line[measure] is None else f"below {least:g}"
+            axes.text(1.2 * least, row, label, va="center", fontsize=6, color=GREY)
+    axes.set_yticks(rows, _names(lines))
     axes.set(xscale="log", xlim=(least, 2 * highest), ylim=(len(lines) - 0.4, -0.6), xlabel=_LABELS[measure])
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _position: _power_of_ten(value)))
     axes.xaxis.set_minor_formatter(NullFormatter())
@@ -308,7 +309,7 @@ def _draw_causes(axes: Axes, lines: Sequence[Mapping[str, Any]], measure: str) -
 
 
 def _names(lines: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the cause of each line, with a distinction of those that occur twice.
+    """Return the cause of each line, qualified if a cause occurs twice.
 
     Examples
     --------
@@ -316,12 +317,15 @@ def _names(lines: Sequence[Mapping[str, Any]]) -> list[str]:
     ['positions, stated', 'positions, not stated']
     """
     causes = [str(line["cause"]) for line in lines]
-    known = ["stated" if is_stated(line) else "not stated" for line in lines]
-    return [f"{cause}, {how}" if causes.count(cause) > 1 else cause for cause, how in zip(causes, known, strict=True)]
+    origins = ["stated" if is_stated(line) else "not stated" for line in lines]
+    return [
+        f"{cause}, {origin}" if causes.count(cause) > 1 else cause
+        for cause, origin in zip(causes, origins, strict=True)
+    ]
 
 
 def _power_of_ten(value: float) -> str:
-    """Return the label of a decade.
+    """Format the tick label of a decade.
 
     Examples
     --------

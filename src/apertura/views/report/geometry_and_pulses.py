@@ -23,33 +23,33 @@ _STYLES: Mapping[str, Any] = {
     "receiver": {"color": ORANGE, "linestyle": "--", "linewidth": 1.6},
 }
 _MARGIN, _BELOW = 0.18, 0.1
-"""Left free in plan around tracks and scene, and how much of it below them for scale and north, of their side."""
+"""Margin of the plan around tracks and scene, and its share below them for scale bar and arrow; 1 is their side."""
 
 
 @dataclass(frozen=True, eq=False)
 class FlownGeometry:
-    """Geometry of a pair, to be drawn.
+    """Geometry of a pair for the geometry figure.
 
     Attributes
     ----------
     time_s
-        (pulse,) float64, of some pulses, seconds from the first.
+        (pulse,) float64, times of the drawn pulses, seconds from the first.
     tracks_m
         Antenna (transmitter, receiver) → (pulse, 3) float64, easting, northing and height on the map, metres.
     bounds_m
         West, south, east, north of the scene.
     ground_m
-        Height of the ground in its middle, as the tracks' heights count.
+        Terrain height at the scene centre, in the height reference of the tracks.
     target_m
         (3,) float64, the brightest target on the map, metres.
     footprint
-        Rings (vertex, 2) of map metres about what the pulses make.
+        Rings (vertex, 2) in map metres around the imaged area.
     crs_name
-        Of the map.
+        Name of the map's CRS.
     local
-        Whether it has no place on Earth.
+        True if the frame is local, without georeference.
     counted
-        Whether `time_s` counts pulses, since the recording has no times.
+        True if `time_s` counts pulses, because the recording has no times.
     """
 
     time_s: NDArray[np.float64]
@@ -64,13 +64,13 @@ class FlownGeometry:
 
     @property
     def middle_m(self) -> NDArray[np.float64]:
-        """Middle of the scene on its ground, (3,) float64 metres of the map."""
+        """Scene centre on the terrain, (3,) float64, map metres."""
         west, south, east, north = self.bounds_m
         return np.array([(west + east) / 2, (south + north) / 2, self.ground_m])
 
     @property
     def towards(self) -> NDArray[np.float64]:
-        """Direction over ground from the middle of the tracks to the target, (2,) float64 of length one."""
+        """Horizontal unit vector from the mean track position to the target, (2,) float64."""
         tracks = np.concatenate([track[:, :2] for track in self.tracks_m.values()])
         vector = self.target_m[:2] - tracks.mean(axis=0)
         length = float(np.hypot(*vector))
@@ -78,18 +78,18 @@ class FlownGeometry:
 
 
 def draw_geometry(path: Path, flown: FlownGeometry, *, title: str, tags: Mapping[str, str]) -> None:
-    """Draw a pair's geometry as a PNG: plan, view from the side, heights over time.
+    """Plot a pair's geometry as a PNG: plan view, side view, heights over time.
 
     Parameters
     ----------
     path
-        ``….png``; complete or absent.
+        ``….png``; replaced atomically.
     flown
         Tracks and scene.
     title
         Flight and pair.
     tags
-        Provenance; lies in the file.
+        Provenance, stored in the file.
     """
     with sheet(path, 5.6, title=title, tags=tags) as figure:
         grid = GridSpec(2, 2, figure=figure, height_ratios=(2.2, 1))
@@ -99,7 +99,7 @@ def draw_geometry(path: Path, flown: FlownGeometry, *, title: str, tags: Mapping
         for name, track in flown.tracks_m.items():
             axes.plot(flown.time_s, track[:, 2] - flown.ground_m, label=name, **_STYLES[name])
         axes.set(
-            title=f"height above the scene, whose ground lies at {number(round(flown.ground_m, 2))} m",
+            title=f"height above the scene centre (terrain height {number(round(flown.ground_m, 2))} m)",
             xlabel=over(counted=flown.counted),
             ylabel="height, m",
         )
@@ -111,16 +111,16 @@ def draw_geometry(path: Path, flown: FlownGeometry, *, title: str, tags: Mapping
 def _draw_plan(axes: Axes, flown: FlownGeometry) -> None:
     west, south, east, north = flown.bounds_m
     corners = np.array([[west, south], [east, north]])
-    places = np.concatenate([corners, *(track[:, :2] for track in flown.tracks_m.values())])
-    low, high = places.min(axis=0), places.max(axis=0)
+    points = np.concatenate([corners, *(track[:, :2] for track in flown.tracks_m.values())])
+    low, high = points.min(axis=0), points.max(axis=0)
     side = float((high - low).max())
     half, (x, y) = (0.5 + _MARGIN) * side, (low + high) / 2
     y -= _BELOW * side
     axes.set(xlim=(x - half, x + half), ylim=(y - half, y + half), aspect="equal", title="plan")
     scene = Rectangle((west, south), east - west, north - south, facecolor="0.93", edgecolor=GREY, label="scene")
     axes.add_patch(scene)
-    for place, ring in enumerate(flown.footprint):
-        axes.plot(*ring.T, color=GREEN, linewidth=1.0, linestyle=":", label="" if place else "footprint")
+    for index, ring in enumerate(flown.footprint):
+        axes.plot(*ring.T, color=GREEN, linewidth=1.0, linestyle=":", label="" if index else "footprint")
     for name, track in flown.tracks_m.items():
         axes.plot(*track[:, :2].T, label=name, **_STYLES[name])
         axes.plot(*track[0, :2], "o", color=_STYLES[name]["color"], markersize=4)
@@ -136,7 +136,7 @@ def _draw_plan(axes: Axes, flown: FlownGeometry) -> None:
 
 
 def _draw_scale_and_north(axes: Axes, *, north: bool) -> None:
-    """Draw a bar of a round length and, where there is one, an arrow to grid north, inside the lower corners."""
+    """Draw a scale bar of a round length and, with `north`, an arrow to grid north in the lower corners."""
     low, high = axes.get_xlim()
     metres = round_length((high - low) / 4)
     part = metres / (high - low)
@@ -150,7 +150,7 @@ def _draw_scale_and_north(axes: Axes, *, north: bool) -> None:
 
 
 def _draw_side(axes: Axes, flown: FlownGeometry) -> None:
-    """Draw the view along the flight: heights over the distance towards the target, in true proportions."""
+    """Draw the side view: heights over the horizontal distance towards the target, with equal scales."""
     origin = flown.target_m[:2]
     ends = np.array([[x, y] for x in flown.bounds_m[::2] for y in flown.bounds_m[1::2]])
     reach = (ends - origin) @ flown.towards
@@ -161,7 +161,7 @@ def _draw_side(axes: Axes, flown: FlownGeometry) -> None:
         sight = float(np.median(away)), float(np.median(height))
         axes.plot([sight[0], 0], [sight[1], flown.target_m[2] - flown.ground_m], color=_STYLES[name]["color"], lw=0.6)
     axes.plot(0, flown.target_m[2] - flown.ground_m, "*", color=RED, markersize=9, label="brightest target")
-    axes.set(title="from the side", xlabel="distance towards the target, m", ylabel="height above the scene, m")
+    axes.set(title="side view", xlabel="distance towards the target, m", ylabel="height above the scene, m")
     axes.set_aspect("equal", adjustable="datalim")
     axes.xaxis.set_major_locator(MaxNLocator(5))
 
@@ -171,24 +171,24 @@ _BINS = 60
 
 @dataclass(frozen=True, eq=False)
 class PulseRecord:
-    """Pulses of a pair and their sidelink, to be drawn.
+    """Pulses of a pair and their sidelink measurements for the pulse figure.
 
     Attributes
     ----------
     sent_s
-        (sent,) float64, when each was sent, seconds from the first.
+        (sent,) float64, transmission times, seconds from the first.
     kept
-        (sent,) bool, whether it makes the image.
+        (sent,) bool, True for pulses used in the image.
     reasons
-        Why others do not → how many, as image.json counts them.
+        Reason for excluding pulses → their number, as in image.json.
     time_s
-        (pulse,) float64, of those kept.
+        (pulse,) float64, times of the used pulses.
     snr_db
-        (pulse,) float64, of the sidelink per subcarrier; None without one.
+        (pulse,) float64, sidelink SNR per subcarrier; None without a sidelink.
     delay_m
-        (pulse,) float64, by how much the sidelink came later than its length says, metres; None without one.
+        (pulse,) float64, sidelink delay less its length from the logs, metres; None without a sidelink.
     counted
-        Whether times count pulses, since the recording has none.
+        True if times count pulses, because the recording has no times.
     """
 
     sent_s: Floats
@@ -201,24 +201,24 @@ class PulseRecord:
 
 
 def draw_pulses(path: Path, record: PulseRecord, *, title: str, tags: Mapping[str, str]) -> None:
-    """Draw pulses kept and left out, and SNR and delay of the sidelink where there is one, as a PNG.
+    """Plot numbers of used and excluded pulses, and SNR and delay of a sidelink if there is one, as a PNG.
 
     Parameters
     ----------
     path
-        ``….png``; complete or absent.
+        ``….png``; replaced atomically.
     record
-        What is known of the pulses.
+        Pulses and sidelink measurements.
     title
         Flight and pair.
     tags
-        Provenance; lies in the file.
+        Provenance, stored in the file.
     """
     series = [
         (values, label, heading)
         for values, label, heading in (
-            (record.snr_db, "SNR, dB", "sidelink, SNR per subcarrier"),
-            (record.delay_m, "delay − length, m", "sidelink, delay beyond its length"),
+            (record.snr_db, "SNR, dB", "sidelink SNR per subcarrier"),
+            (record.delay_m, "delay − length, m", "sidelink delay relative to its length"),
         )
         if values is not None and np.isfinite(values).any()
     ]
@@ -226,9 +226,9 @@ def draw_pulses(path: Path, record: PulseRecord, *, title: str, tags: Mapping[st
         first, *others = column_of(figure, 1 + len(series))
         _draw_counts(first, record)
         for axes, (values, label, heading) in zip(others, series, strict=True):
-            some = thinned(len(values))
+            drawn = thinned(len(values))
             median = float(np.nanmedian(values))
-            axes.plot(record.time_s[some], values[some], ".", color=BLUE, markersize=2, rasterized=True)
+            axes.plot(record.time_s[drawn], values[drawn], ".", color=BLUE, markersize=2, rasterized=True)
             axes.axhline(median, color=GREY, linewidth=0.8, linestyle="--")
             spread = 1.4826 * float(np.nanmedian(np.abs(values - median)))
             unlocked = int(np.isnan(values).sum())
@@ -242,12 +242,13 @@ def draw_pulses(path: Path, record: PulseRecord, *, title: str, tags: Mapping[st
 def _draw_counts(axes: Axes, record: PulseRecord) -> None:
     last = float(record.sent_s.max()) if record.sent_s.size else 0.0
     interval = float(np.median(np.diff(record.sent_s))) if last else 1.0
-    width = interval * _of_bin(round(last / interval) + 1)  # of whole intervals, else columns seem to lack pulses
+    # bins of an integer number of pulse intervals: other widths would alternate in the number of pulses
+    width = interval * _pulses_per_bin(round(last / interval) + 1)
     edges = np.arange(-interval / 2, last + width, width)
-    kept, left = (np.histogram(record.sent_s[some], edges)[0] for some in (record.kept, ~record.kept))
-    axes.stairs(kept, edges, fill=True, color=BLUE, label=f"kept: {int(record.kept.sum())}")
+    kept, excluded = (np.histogram(record.sent_s[selected], edges)[0] for selected in (record.kept, ~record.kept))
+    axes.stairs(kept, edges, fill=True, color=BLUE, label=f"used: {int(record.kept.sum())}")
     axes.stairs(
-        kept + left,
+        kept + excluded,
         edges,
         baseline=kept,
         fill=True,
@@ -255,55 +256,55 @@ def _draw_counts(axes: Axes, record: PulseRecord) -> None:
         edgecolor="white",
         hatch="////",
         linewidth=0,
-        label=f"left out: {int((~record.kept).sum())}{_why(record.reasons)}",
+        label=f"excluded: {int((~record.kept).sum())}{_reasons_text(record.reasons)}",
     )
-    label = f"of {width:.0f} pulses" if record.counted else f"pulses in {width:.2g} s"
-    axes.set(title="pulses", ylabel=label, ylim=(0, 1.45 * max(1, (kept + left).max())))
+    label = f"pulses per {width:.0f} transmitted" if record.counted else f"pulses in {width:.2g} s"
+    axes.set(title="pulses", ylabel=label, ylim=(0, 1.45 * max(1, (kept + excluded).max())))
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.legend(loc="upper right", ncols=2)
 
 
-def _of_bin(slots: int) -> int:
-    """Return the pulses per column, with which the last column is as full as possible.
+def _pulses_per_bin(slots: int) -> int:
+    """Return the number of pulses per histogram bin for which the last bin is as full as possible.
 
     Examples
     --------
-    >>> _of_bin(40), _of_bin(302)  # 302 = 37·8 + 6
+    >>> _pulses_per_bin(40), _pulses_per_bin(302)  # 302 = 37·8 + 6
     (1, 8)
     """
     least = max(1, -(-slots // _BINS))
     return max(range(least, 2 * least + 1), key=lambda count: ((slots - 1) % count + 1) / count)
 
 
-def _why(reasons: Mapping[str, int]) -> str:
-    """Return the reasons in a few words.
+def _reasons_text(reasons: Mapping[str, int]) -> str:
+    """Format the number of excluded pulses for each reason, in brackets.
 
     Examples
     --------
-    >>> _why({"unpaired": 9, "sidelink_lost": 2}), _why({})
+    >>> _reasons_text({"unpaired": 9, "sidelink_lost": 2}), _reasons_text({})
     (' (9 unpaired, 2 sidelink lost)', '')
     """
-    counts = ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in reasons.items())
+    counts = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in reasons.items())
     return f" ({counts})" if counts else ""
 
 
 TIMES, PATHS = 560, 700
-"""Cells of the picture at most, over time and over path."""
+"""Maximum number of bins of the waterfall in time and in path."""
 
 _RANGE_DB = 50.0
 
 
 class Waterfall:
-    """Mean power of range profiles in cells of time and path; profiles are added some at a time.
+    """Mean power of range profiles in bins of time and path, accumulated block by block.
 
     Parameters
     ----------
     start_m
         (pulse,) float64, total path of sample 0, metres.
     step_m
-        Between samples.
+        Path interval between samples, metres.
     samples
-        Of a profile.
+        Number of samples of a profile.
 
     Examples
     --------
@@ -324,13 +325,13 @@ class Waterfall:
         self.span_m = first, first + shape[0] * self._together * step_m
 
     def add(self, first: int, profiles: NDArray[np.complex64]) -> None:
-        """Add profiles, (pulse, sample) complex64, of the pulses from `first` on."""
+        """Add profiles, (pulse, sample) complex64, of consecutive pulses starting at index `first`."""
         power = np.abs(profiles.astype(np.complex128)) ** 2
         size = self._sum.shape[0]
         for row, line in enumerate(power):
             at = self._offset[first + row] + np.arange(line.size)
             lower = np.floor(at + 1e-9).astype(np.int64)
-            upper = np.clip(at - lower, 0, 1)  # its share of the next cell: profiles begin between cells
+            upper = np.clip(at - lower, 0, 1)  # linear share of the next cell: start paths lie between cells
             for cells, share in ((lower, 1 - upper), (lower + 1, upper)):
                 into = np.minimum(cells // self._together, size - 1)
                 column = (first + row) // self._pulses
@@ -339,11 +340,11 @@ class Waterfall:
 
     @property
     def mean(self) -> NDArray[np.float64]:
-        """(path, time) float64 mean power, NaN where no profile reaches."""
+        """(path, time) float64 mean power, NaN in bins without a sample."""
         return np.where(self._count > 0, self._sum / np.maximum(self._count, 1), np.nan)
 
     def times(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the edges of the cells of time, from those of all pulses, (cell + 1,) float64 seconds."""
+        """Return the edges of the time bins, (bin + 1,) float64 seconds, from the times of all pulses."""
         starts = time_s[:: self._pulses]
         last = time_s[-1] + (time_s[-1] - time_s[0]) / max(1, len(time_s) - 1)
         return np.append(starts, last if last > starts[-1] else starts[-1] + 1.0)
@@ -359,22 +360,22 @@ def draw_waterfall(
     tags: Mapping[str, str],
     counted: bool = False,
 ) -> None:
-    """Draw a waterfall with the total path to the brightest target, as a PNG.
+    """Plot a waterfall of range profiles and the total path to the brightest target, as a PNG.
 
     Parameters
     ----------
     path
-        ``….png``; complete or absent.
+        ``….png``; replaced atomically.
     waterfall
-        To which every profile was added.
+        Waterfall that contains all profiles.
     time_s, target_path_m
-        (pulse,) float64, seconds from the first pulse, and metres.
+        (pulse,) float64, seconds from the first pulse, and path in metres.
     title
         Flight and pair.
     tags
-        Provenance; lies in the file.
+        Provenance, stored in the file.
     counted
-        Whether `time_s` counts pulses, since the recording has no times.
+        True if `time_s` counts pulses, because the recording has no times.
     """
     mean = waterfall.mean
     top = float(np.nanmax(mean)) if np.isfinite(mean).any() else 1.0
@@ -386,10 +387,10 @@ def draw_waterfall(
         drawn = axes.pcolormesh(
             waterfall.times(time_s), edges, cells, cmap="viridis", vmin=-_RANGE_DB, vmax=0, rasterized=True
         )
-        some = np.linspace(0, len(time_s) - 1, min(len(time_s), 60)).round().astype(int)
-        axes.plot(time_s[some], target_path_m[some], ":", color="white", linewidth=0.9)
+        drawn_pulses = np.linspace(0, len(time_s) - 1, min(len(time_s), 60)).round().astype(int)
+        axes.plot(time_s[drawn_pulses], target_path_m[drawn_pulses], ":", color="white", linewidth=0.9)
         title = "range profiles; dotted: path to the brightest target"
         axes.set(title=title, xlabel=over(counted=counted), ylabel="total path, m")
         axes.yaxis.set_major_locator(MaxNLocator(7))
         axes.grid(visible=False)
-        figure.colorbar(drawn, ax=axes, extend="min", pad=0.02).set_label("power re strongest cell, dB")
+        figure.colorbar(drawn, ax=axes, extend="min", pad=0.02).set_label("power re maximum, dB")

@@ -57,7 +57,7 @@ td.number { white-space: nowrap; }
 </body>
 </html>
 """
-_NUMBERS = re.compile(r"[-−+±\d.,e\s/%]+")  # a cell of numbers alone, which breaks between lines only where stated
+_NUMBERS = re.compile(r"[-−+±\d.,e\s/%]+")  # a purely numeric cell: line breaks only at explicit newlines
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Heading:
 
 @dataclass(frozen=True)
 class Paragraph:
-    """Sentences."""
+    """A paragraph of text."""
 
     text: str
 
@@ -86,7 +86,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A whole PNG file with a caption below it."""
+    """Contents of a PNG file with a caption below it."""
 
     png: bytes
     caption: str
@@ -96,18 +96,18 @@ Block = Heading | Paragraph | Table | Picture
 
 
 def page(title: str, blocks: Iterable[Block]) -> str:
-    """Render blocks as one HTML document, its tables and figures numbered.
+    """Render blocks as one HTML document with numbered tables and figures.
 
     Parameters
     ----------
     title
-        Of the document.
+        Title of the document.
     blocks
-        One below the other.
+        Blocks from top to bottom.
 
     Notes
     -----
-    All text is escaped, and a policy in the page forbids scripts and requests.
+    All text is escaped, and a content security policy in the page forbids scripts and requests.
 
     Examples
     --------
@@ -125,12 +125,12 @@ def page(title: str, blocks: Iterable[Block]) -> str:
 
 
 def rst_text(text: str) -> str:
-    r"""Return text as reStructuredText shows it, letter by letter, on one line.
+    r"""Escape text so that reStructuredText renders it literally, on one line.
 
     Parameters
     ----------
     text
-        Any text, also an untrusted one.
+        Any text, including untrusted text.
 
     Examples
     --------
@@ -144,7 +144,7 @@ def rst_text(text: str) -> str:
 
 
 def rst_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    r"""Return a table of text as the directive ``list-table``.
+    r"""Render a table of text as the directive ``list-table``.
 
     Examples
     --------
@@ -159,6 +159,6 @@ def rst_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """
     lines = [".. list-table::", "   :header-rows: 1", ""]
     for row in (head, *rows):
-        for place, cell in enumerate(row):
-            lines.append(f"   {'*' if place == 0 else ' '} - {rst_text(cell)}".rstrip())
+        for column, cell in enumerate(row):
+            lines.append(f"   {'*' if column == 0 else ' '} - {rst_text(cell)}".rstrip())
     return "\n".join(lines)

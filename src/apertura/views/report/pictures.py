@@ -1,4 +1,4 @@
-"""Rules `pictures` and `pictures_fused`: what the report shows of a pair and of the sums of a flight."""
+"""Rules `pictures` and `pictures_fused`: figures of a pair and of the sums of a flight for the report."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -60,7 +60,7 @@ from apertura.workflow.lineage import result_of
 
 
 def pictures(campaign: Campaign, flight: str, pair: str) -> Sequence[Path]:
-    """Write the pictures of one pair; return their paths."""
+    """Write the figures of one pair; return their paths."""
     lineage = result_of(campaign, "pictures", flight, pair).begin(campaign.root)
     shown = Shown(campaign, flight, pair)
     written = [campaign.result(flight, pair, "pictures", f"{name}.png") for name in PICTURES]
@@ -82,12 +82,12 @@ def pictures(campaign: Campaign, flight: str, pair: str) -> Sequence[Path]:
 
 @dataclass(frozen=True)
 class Shown:
-    """A pair as its pictures are drawn from it.
+    """Data of a pair for its figures, opened on first use.
 
     Attributes
     ----------
     campaign, flight, pair
-        Which.
+        Campaign, name of the flight and name of the pair.
     """
 
     campaign: Campaign
@@ -114,17 +114,17 @@ class Shown:
 
     @cached_property
     def scene(self) -> OpenScene:
-        """Grid and ground."""
+        """Grid and terrain."""
         return open_scene(self.campaign)
 
     @cached_property
     def time_s(self) -> Floats:
-        """(pulse,) seconds from the first pulse that makes the image."""
+        """(pulse,) times of the imaged pulses, seconds from the first."""
         return seconds_since(self.echo.time.values, self.echo.time.values[0])
 
     @cached_property
     def counted(self) -> bool:
-        """True if these count pulses, since the recording has no times."""
+        """True if `time_s` counts pulses, because the recording has no times."""
         return counted(self.echo.time.values)
 
     @cached_property
@@ -136,8 +136,8 @@ class Shown:
 
     @cached_property
     def _target_m(self) -> Floats:
-        """(1, 3) the brightest target in the frame of the antennas."""
-        row, column = (np.array([at]) for at in self._target)
+        """(1, 3) position of the brightest target in the frame of the antennas."""
+        row, column = (np.array([coordinate]) for coordinate in self._target)
         return np.asarray(self.scene.terrain.positions_at(self.scene.grid, row, column)).reshape(1, 3)
 
     @cached_property
@@ -148,16 +148,16 @@ class Shown:
     def geometry(self) -> FlownGeometry:
         """Return tracks, scene and footprint on the map."""
         grid, aperture = self.scene.grid, aperture_of(self.echo)
-        some = thinned(len(aperture), 400)
-        legs = dict(zip(("transmitter", "receiver"), aperture[some].legs, strict=True))
+        drawn = thinned(len(aperture), 400)
+        legs = dict(zip(("transmitter", "receiver"), aperture[drawn].legs, strict=True))
         if is_monostatic(self.pair):
-            del legs["receiver"]  # the same node: one track
+            del legs["receiver"]  # same node, same track
         step, _, west, _, _, north = grid.transform
         looks = few_looks(self.campaign, self.flight, self.pair)
         down, right = (size * step / dots for size, dots in zip(grid.shape, looks.shape, strict=True))
         rings = footprint(looks, Affine(right, 0, west, 0, -down, north))
         return FlownGeometry(
-            self.time_s[some],
+            self.time_s[drawn],
             {name: map_from_frame(grid.crs, leg) for name, leg in legs.items()},
             grid.bounds_m,
             float(np.array(map_from_frame(grid.crs, self.scene.middle_m))[2]),
@@ -188,7 +188,7 @@ class Shown:
         )
 
     def _sent(self) -> NDArray[np.datetime64]:
-        """Return when the transmitter says that it sent each pulse; of phase history only what it holds is known."""
+        """Return transmission times in the transmitter's clock; for phase history, those of the contained pulses."""
         if not isinstance(self.campaign.settings.waveform, SampledWaveform):
             return np.asarray(self.echo.time.values)
         node = self.pair.split("-")[0]
@@ -196,7 +196,7 @@ class Shown:
         return np.asarray(self.campaign.clock(self.flight, node).utc(raw.time.values)).astype("datetime64[ns]")
 
     def phasors(self) -> dict[str, NDArray[np.complex128]]:
-        """Return the contribution of each pulse at the brightest target: without and with sidelink, refined."""
+        """Return the contribution of each pulse at the brightest target, at each stage of correction."""
         logged, echo = profiles_of(self.profile, lazy=True), self.echo
         every = np.arange(len(logged) + 1)
         phasors = block_contributions(logged, self._target_m, edges=every)[0].astype(np.complex128)
@@ -205,28 +205,29 @@ class Shown:
             wavenumber_rad_m = 2 * np.pi * float(echo.frequency.values.mean()) / logged.wave_speed_m_s
             length_m = np.linalg.norm(echo.sidelink_vector.values, axis=1)
             error = sidelink_error_rad(echo.sidelink_phase.values, length_m, wavenumber_rad_m=wavenumber_rad_m)
-            stages["before: without the sidelink"] = np.nan_to_num(phasors * np.exp(1j * error))
-            stages["corrected by the sidelink"] = phasors
+            stages["without sidelink correction"] = np.nan_to_num(phasors * np.exp(1j * error))
+            stages["corrected with the sidelink"] = phasors
         else:
-            stages["as recorded, on the tracks of the logs"] = phasors
+            stages["as recorded, tracks from the logs"] = phasors
         refined = open_refined(self.campaign, self.flight)
         if refined.correction is not None:
-            moved = refined.profiles(open_pair(self.campaign, self.flight, self.pair, echo=echo), logged)
-            stages["tracks refined"] = block_contributions(moved, self._target_m, edges=every)[0].astype(np.complex128)
+            corrected = refined.profiles(open_pair(self.campaign, self.flight, self.pair, echo=echo), logged)
+            contributions = block_contributions(corrected, self._target_m, edges=every)[0]
+            stages["refined tracks"] = contributions.astype(np.complex128)
         return stages
 
     def cuts(self) -> list[DrawnCut]:
-        """Return the cuts whose widths image.json states."""
+        """Return the cuts through the brightest target, whose widths are in image.json."""
         return drawn_cuts(self.image.image, self.image.attrs["quality"]["brightest"], self.scene.grid)
 
     def waterfall(self) -> Waterfall:
-        """Return the mean power of the range profiles, read some at a time."""
+        """Return the mean power of the range profiles, read block by block."""
         profile = self.profile
         waterfall = Waterfall(profile.start.values, profile.attrs["step_m"], profile.sizes["range"])
         with progress("pulses", profile.sizes["pulse"]) as done:
-            for part in blocks_of_rows(profile, "profile"):
-                waterfall.add(part.start, profile.profile[part].values)
-                done(part.stop - part.start)
+            for block in blocks_of_rows(profile, "profile"):
+                waterfall.add(block.start, profile.profile[block].values)
+                done(block.stop - block.start)
         return waterfall
 
 
@@ -244,24 +245,24 @@ def draw_panels(
     tags: Mapping[str, str],
     local: bool = False,
 ) -> None:
-    """Draw images of one scene as a PNG, each in dB below its own peak, all over the same range of dB.
+    """Plot images of one scene as a PNG, each in dB relative to its own peak, with a common dB range.
 
     Parameters
     ----------
     path
-        ``….png``; complete or absent.
+        ``….png``; replaced atomically.
     powers
-        What a panel is called → (row, column) float64 mean power, north-up, NaN where nothing was formed.
+        Title of a panel → (row, column) float64 mean power, north-up, NaN where no image was formed.
     size_m
-        Of the scene, east and north, metres.
+        Size of the scene, east and north, metres.
     target_m
         Brightest target, metres east and north of the lower left corner.
     title
-        Of the flight.
+        Title with the flight.
     tags
-        Provenance; lies in the file.
+        Provenance, stored in the file.
     local
-        Whether the scene has no place on Earth: its axes are x and y.
+        True if the scene is in a local frame: its axes are x and y.
     """
     across, up = ("x", "y") if local else ("east", "north")
     rows = -(-len(powers) // _COLUMNS)
@@ -269,15 +270,15 @@ def draw_panels(
     with sheet(path, 0.5 + rows * (high + 0.45), title=title, tags=tags) as figure:
         grid = GridSpec(rows, _COLUMNS, figure=figure)
         drawn = []
-        for place, (name, power) in enumerate(powers.items()):
-            axes = figure.add_subplot(grid[place // _COLUMNS, place % _COLUMNS])
+        for panel, (name, power) in enumerate(powers.items()):
+            axes = figure.add_subplot(grid[panel // _COLUMNS, panel % _COLUMNS])
             drawn.append((axes, _draw(axes, power, size_m)))
-            axes.set_title(f"({'abcdefgh'[place % 8]}) {name}")
+            axes.set_title(f"({'abcdefgh'[panel % 8]}) {name}")
             axes.plot(*target_m, "o", markersize=10, markerfacecolor="none", markeredgecolor=SKY, markeredgewidth=1.2)
-            if place % _COLUMNS == 0:
-                axes.set_ylabel(f"{up} of the corner, m")
-            if place >= len(powers) - _COLUMNS:
-                axes.set_xlabel(f"{across} of the corner, m")
+            if panel % _COLUMNS == 0:
+                axes.set_ylabel(f"{up} from the lower left corner, m")
+            if panel >= len(powers) - _COLUMNS:
+                axes.set_xlabel(f"{across} from the lower left corner, m")
         _draw_scale(drawn[0][0], size_m, north=not local)
         bar = figure.colorbar(drawn[0][1], ax=[axes for axes, _ in drawn], extend="both", shrink=0.8, pad=0.02)
         bar.set_label("power re peak of the panel, dB")
@@ -311,12 +312,12 @@ def _draw_scale(axes: Axes, size_m: tuple[float, float], *, north: bool) -> None
     axes.text(0.94, 0.2, "N", transform=axes.transAxes, color="white", ha="center", weight="bold")
 
 
-_DOTS = 480  # of the longer side of a panel
-_MOST_PANELS = 2  # pairs beside their sums
+_DOTS = 480  # longer side of a panel, pixels
+_MOST_PANELS = 2  # number of pairs drawn next to the sums
 
 
 def pictures_fused(campaign: Campaign, flight: str) -> Sequence[Path]:
-    """Write the sums of a flight beside its pairs, and cuts through the brightest target; return their paths."""
+    """Write figures of a flight's sums and pairs, and of cuts through the brightest target; return their paths."""
     lineage = result_of(campaign, "pictures_fused", flight).begin(campaign.root)
     written = [campaign.result(flight, FUSED, f"{name}.png") for name in SUM_PICTURES]
     panels, cuts = written
@@ -330,7 +331,7 @@ def pictures_fused(campaign: Campaign, flight: str) -> Sequence[Path]:
         files[f"{kind} sum"] = campaign.result(flight, FUSED, product(kind, "write_power").file)
     powers = {}
     for name, file in files.items():
-        with opened_raster(file, expected="what step export writes", remedy="Run the workflow again.") as raster:
+        with opened_raster(file, expected="a product of step export", remedy="Run the workflow again.") as raster:
             powers[name] = averaged(raster, _DOTS).astype("f8")
     cube = open_stage(campaign.stage("cube"), "cube")
     tags = tags_of(Provenance.of(lineage.modules, [*images, cube]), lineage)

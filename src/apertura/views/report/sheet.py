@@ -1,4 +1,4 @@
-"""A sheet of drawings as wide as the text of an A4 page: its letters and colours, the same to the byte every time."""
+"""Figures at the text width of an A4 page: style, colours, axis labels and reproducible PNG output."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from apertura.common.atomic import replacement
 
 WIDTH = 6.7
-"""Inches: A4 between margins of 2 cm."""
+"""Figure width in inches: A4 less margins of 2 cm."""
 
 DPI = 220
 MOST_DOTS = 4000
-"""Points of a series that are drawn; more would cover each other."""
+"""Maximum number of points drawn of a series; more would overlap."""
 
 BLUE, ORANGE, GREEN, RED, SKY, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#666666"
-"""Told apart also by who does not see red and green (Okabe and Ito)."""
+"""Colours that are distinguishable with colour vision deficiency (Okabe and Ito)."""
 
 _STYLE: Any = {
     "font.size": 8,
@@ -41,30 +41,30 @@ _STYLE: Any = {
 
 
 def over(*, counted: bool, first: str = "first pulse") -> str:
-    """Return the label of an axis along a flight: seconds, or pulses where a recording has no times.
+    """Return the label of an axis along a flight: seconds, or pulses if the recording has no times.
 
     Examples
     --------
     >>> over(counted=False), over(counted=True)
-    ('time from the first pulse, s', 'pulses from the first pulse; no times were recorded')
+    ('time from the first pulse, s', 'pulses from the first pulse (no times recorded)')
     """
-    return f"pulses from the {first}; no times were recorded" if counted else f"time from the {first}, s"
+    return f"pulses from the {first} (no times recorded)" if counted else f"time from the {first}, s"
 
 
 @contextmanager
 def sheet(path: Path, height: float, *, title: str, tags: Mapping[str, str]) -> Iterator[Figure]:
-    """Yield an empty figure that becomes a PNG when the body ends.
+    """Yield an empty figure that is saved as PNG when the context exits.
 
     Parameters
     ----------
     path
-        ``….png``; complete or absent.
+        ``….png``; replaced atomically.
     height
-        Inches.
+        Height in inches.
     title
-        What it is called; lies in the file.
+        Title, stored in the file.
     tags
-        Provenance, name → text; lies in the file.
+        Provenance, name → text, stored in the file.
 
     Examples
     --------
@@ -84,7 +84,7 @@ def sheet(path: Path, height: float, *, title: str, tags: Mapping[str, str]) -> 
 
 
 def column_of(figure: Figure, rows: int) -> list[Axes]:
-    """Return drawings one below the other that share their horizontal axis; only the lowest is labelled there."""
+    """Add vertically stacked axes with a shared horizontal axis; only the lowest has tick labels there."""
     grid = GridSpec(rows, 1, figure=figure)
     first = figure.add_subplot(grid[0])
     drawn = [first, *(figure.add_subplot(grid[row], sharex=first) for row in range(1, rows))]
@@ -94,7 +94,7 @@ def column_of(figure: Figure, rows: int) -> list[Axes]:
 
 
 def thinned(count: int, most: int = MOST_DOTS) -> NDArray[np.int64]:
-    """Return the indices of a series to draw, (point,) int64, evenly spread.
+    """Return evenly spread indices for drawing a series, (point,) int64.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Rule `page`: what the report says of a flight, as the results section of a paper would: one file that prints."""
+"""Rule `page`: printable HTML report of a flight, organised as the results section of a paper."""
 
 import shutil
 from collections.abc import Iterator, Mapping
@@ -35,7 +35,7 @@ from apertura.views.report.page import page as page_of
 from apertura.workflow.lineage import result_of
 
 SETTING_COLUMNS = ("key", "value")
-"""Headings of the table of settings."""
+"""Headings of the settings table."""
 
 
 def page(campaign: Campaign, flight: str) -> list[Path]:
@@ -56,7 +56,7 @@ def _blocks(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, 
         SETTING_COLUMNS,
         setting_rows(campaign),
     )
-    yield Table("Image quality.", VERDICTS, [verdict_row(*one) for one in reports.items()])
+    yield Table("Image quality.", VERDICTS, [verdict_row(name, report) for name, report in reports.items()])
     if FUSED in reports:
         yield Heading(2, "Pairs and their sums")
         yield Paragraph(" ".join(sentences("Sum of the pairs", reports[FUSED])))
@@ -66,7 +66,7 @@ def _blocks(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, 
     raised = flag_rows(reports)
     yield Heading(2, "Flags")
     if raised:
-        yield Table("Flags raised, their meaning, and what to do.", FLAGGED, raised)
+        yield Table("Flags raised, with meaning and advice.", FLAGGED, raised)
     else:
         yield Paragraph("No flags raised.")
 
@@ -79,7 +79,7 @@ def _pair_blocks(campaign: Campaign, flight: str, pair: str, report: Mapping[str
     yield Paragraph(" ".join(sentences(f"Image {pair}", report)))
     yield from _pictures(folder, shown)
     yield Table(
-        "Error budget; in brackets the effect of an assumed size where none is configured.",
+        "Error budget; values in brackets: not in the sum, because the size of the error is not stated.",
         BUDGET,
         budget_rows(report["budget"]),
     )
@@ -87,44 +87,47 @@ def _pair_blocks(campaign: Campaign, flight: str, pair: str, report: Mapping[str
 
 
 def _pictures(folder: Path, shown: Mapping[str, str]) -> Iterator[Block]:
-    """Yield the pictures of a folder, file → the result that lists it, with what the workflow's report says of them."""
-    for name, of in shown.items():
-        check_listed(folder / name, folder / f"{of}.manifest.json")
+    """Yield figures of a folder, given as file → result that lists it, with their captions of the workflow's report."""
+    for name, result in shown.items():
+        check_listed(folder / name, folder / f"{result}.manifest.json")
         caption = (shipped() / "workflow" / "report" / f"{Path(name).stem}.rst").read_text(encoding="utf-8")
         yield Picture((folder / name).read_bytes(), " ".join(caption.split()))
 
 
 def flight_rows(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
-    """Return date, place, band and geometry of a flight, the latter of its first pair."""
+    """Return table rows with date, location, band and geometry of a flight; the geometry is that of the first pair."""
     pairs = campaign.flight(flight).pairs
     views = [reports[pair]["view"] for pair in pairs if "view" in reports[pair]]
     scene = settled_scene(campaign)
-    rows = [] if scene.grid.crs == LOCAL else [("middle of the scene", _place_text(geodetic_from_ecef(scene.middle_m)))]
+    rows = []
+    if scene.grid.crs != LOCAL:
+        rows.append(("scene centre", _position_text(geodetic_from_ecef(scene.middle_m))))
     if not views:
         return rows
-    first, last = min(one["first_utc"] for one in views), max(one["last_utc"] for one in views)
-    own, wave_m = views[0], SPEED_OF_LIGHT_M_S / views[0]["centre_hz"]
-    speed = own.get("speed_m_s")
+    first, last = min(view["first_utc"] for view in views), max(view["last_utc"] for view in views)
+    view, wave_m = views[0], SPEED_OF_LIGHT_M_S / views[0]["centre_hz"]
+    band = f"{frequency_text(view['centre_hz'])} ± {frequency_text(view['band_hz'] / 2)}"
+    speed = view.get("speed_m_s")
     return [
         ("recorded, UTC", f"{first[:19].replace('T', ' ')} to {last[:19].replace('T', ' ')}"),
         *rows,
-        ("band", f"{frequency_text(own['centre_hz'])} ± {frequency_text(own['band_hz'] / 2)}, {100 * wave_m:.3g} cm"),
-        ("speed", "not known" if speed is None else f"{speed:.3g} m/s"),
-        ("height above the scene", f"{own['height_m']:.3g} m"),
-        ("range, incidence at the middle", f"{own['range_m']:.4g} m, {own['incidence_deg']:.3g}°"),
-        ("side", own["side"] + ("" if own["side_observable"] or own["side"] == "both" else ", assumed")),
+        ("band", f"{band}, wavelength {100 * wave_m:.3g} cm"),
+        ("speed", "unknown" if speed is None else f"{speed:.3g} m/s"),
+        ("height above the scene", f"{view['height_m']:.3g} m"),
+        ("range and incidence angle at the scene centre", f"{view['range_m']:.4g} m, {view['incidence_deg']:.3g}°"),
+        ("look side", view["side"] + ("" if view["side_observable"] or view["side"] == "both" else ", assumed")),
     ]
 
 
-def _place_text(place: Any) -> str:
-    latitude, longitude, _ = map(float, place)
+def _position_text(position: Any) -> str:
+    latitude, longitude, _ = map(float, position)
     return (
         f"{abs(latitude):.5f}° {'N' if latitude >= 0 else 'S'}, {abs(longitude):.5f}° {'E' if longitude >= 0 else 'W'}"
     )
 
 
 def setting_rows(campaign: Campaign) -> list[tuple[str, str]]:
-    """Return the settings of a campaign, key of the config → value; grid as settled, with reasons."""
+    """Return table rows with the settings of a campaign, config key and value, and its output grid with reasons."""
     scene, values = settled_scene(campaign), campaign.values
     west, south, east, north = scene.grid.bounds_m
     rows, columns = scene.grid.shape
@@ -134,14 +137,14 @@ def setting_rows(campaign: Campaign) -> list[tuple[str, str]]:
         ("scene: CRS", scene.grid.crs + _why(scene, "crs")),
         ("scene: west, south, east, north, m", bounds + _why(scene, "bounds_m")),
         ("scene: size", size),
-        ("scene: pixels", f"{setting_text(scene.grid.spacing_m)} m" + _why(scene, "spacing_m")),
-        ("scene: ground", values["scene"]["dem"] or f"level, {setting_text(scene.level.height_m)} m"),
+        ("scene: pixel spacing", f"{setting_text(scene.grid.spacing_m)} m" + _why(scene, "spacing_m")),
+        ("scene: terrain", values["scene"]["dem"] or f"flat, {setting_text(scene.level.height_m)} m"),
     ]
     return [*_set_rows("waveform", values["waveform"]), *grid, *_set_rows("processing", values["processing"])]
 
 
 def _set_rows(section: str, values: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the settings of a section that are not chosen automatically, and matter to its format."""
+    """Return the settings of a section that are not chosen automatically and apply to its format."""
     unset: tuple[object, ...] = ("auto", None, "", (), [], {})
     without = {"trigger"} if str(values.get("format")).startswith("beat_") and values["format"] != "beat_wav" else set()
     return [
@@ -154,19 +157,20 @@ def _set_rows(section: str, values: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def frequency_text(hz: float) -> str:
-    """Return a frequency in the unit that keeps it short.
+    """Format a frequency in GHz, MHz, kHz or Hz.
 
     Examples
     --------
     >>> frequency_text(1_204_800_000), frequency_text(4e5), frequency_text(20)
     ('1.2048 GHz', '400 kHz', '20 Hz')
     """
-    size, unit = next((one for one in ((1e9, "GHz"), (1e6, "MHz"), (1e3, "kHz")) if abs(hz) >= one[0]), (1.0, "Hz"))
-    return f"{hz / size:.9g} {unit}"
+    units = ((1e9, "GHz"), (1e6, "MHz"), (1e3, "kHz"))
+    scale, unit = next((entry for entry in units if abs(hz) >= entry[0]), (1.0, "Hz"))
+    return f"{hz / scale:.9g} {unit}"
 
 
 def setting_text(value: object) -> str:
-    """Return a setting as people write it.
+    """Format a configured value as text.
 
     Examples
     --------
@@ -180,7 +184,7 @@ def setting_text(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.12g}"
     if isinstance(value, Mapping):
-        return ", ".join(f"{name}: {setting_text(one)}" for name, one in value.items())
+        return ", ".join(f"{name}: {setting_text(entry)}" for name, entry in value.items())
     return str(value)
 
 
@@ -189,22 +193,24 @@ def _why(scene: OpenScene, name: str) -> str:
 
 
 def landing(campaign: Campaign) -> dict[str, Any]:
-    """Return the opening of the workflow's report, as reStructuredText with tables as its only markup."""
-    flights = {one.name: one.pairs for one in campaign.image_flights}
+    """Return the parts of the first page of the workflow's report as reStructuredText, with tables as only markup."""
+    flights = {flight.name: flight.pairs for flight in campaign.image_flights}
     reports = {
-        f"{one} {name}": read_report(campaign, one, name) for one, names in campaign.images.items() for name in names
+        f"{flight} {name}": read_report(campaign, flight, name)
+        for flight, names in campaign.images.items()
+        for name in names
     }
     first, pairs = next(iter(flights.items()))
     decided, raised = {pair: reports[f"{first} {pair}"] for pair in pairs}, flag_rows(reports)
     return {
         "title": rst_text(campaign.settings.campaign),
-        "flights": rst_text(", ".join(f"{one} ({', '.join(names)})" for one, names in flights.items())),
-        "asked": rst_table(SETTING_COLUMNS, setting_rows(campaign)),
-        "verdicts": rst_table(VERDICTS, [verdict_row(*one) for one in reports.items()]),
+        "flights": rst_text(", ".join(f"{flight} ({', '.join(names)})" for flight, names in flights.items())),
+        "configuration": rst_table(SETTING_COLUMNS, setting_rows(campaign)),
+        "verdicts": rst_table(VERDICTS, [verdict_row(name, report) for name, report in reports.items()]),
         "sentences": [
-            rst_text(" ".join(sentences(f"Sum of the pairs of {one}", reports[f"{one} {FUSED}"])))
-            for one in flights
-            if f"{one} {FUSED}" in reports
+            rst_text(" ".join(sentences(f"Sum of the pairs of {flight}", reports[f"{flight} {FUSED}"])))
+            for flight in flights
+            if f"{flight} {FUSED}" in reports
         ],
         "first": rst_text(first),
         "decisions": rst_table(("pairs", *DECISIONS), shared_rows(decided)),
@@ -214,13 +220,13 @@ def landing(campaign: Campaign) -> dict[str, Any]:
 
 @contextmanager
 def open_report(campaign: Campaign) -> Iterator[tuple[Path, Path]]:
-    """Yield the paths of snakemake's report and its style; it is recorded when the body ends.
+    """Yield the paths of Snakemake's report and its style sheet; record the report when the context exits.
 
-    Its sources are hashed when it is written: snakemake settles the times of files before.
+    The sources are hashed on exit, because Snakemake updates file times before it writes the report.
     """
     path = campaign.result(PAGE)
     with TemporaryDirectory() as folder, replacement(path) as temporary:
-        page = Path(folder) / path.name  # of another process
+        page = Path(folder) / path.name  # written by the Snakemake process
         yield page, shipped() / "workflow" / "report" / "report.css"
         shutil.copyfile(page, temporary)
         lineage = result_of(campaign, "report").begin(campaign.root)

@@ -1,1 +1,1 @@
-"""Products compared with what they claim to be made from: their chain to the raw samples, made again, with others."""
+"""Verification of products: provenance chain to the raw samples, comparison of two products, reproduction."""

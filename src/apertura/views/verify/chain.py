@@ -1,4 +1,4 @@
-"""`apertura verify`: from a product back to the raw samples, each link compared with its recorded hashes."""
+"""`apertura verify`: compare each link of the provenance chain from a product to the raw samples with its hashes."""
 
 import json
 import re
@@ -39,37 +39,38 @@ _DIGITS = 12
 _NAMED = 3
 _VERSIONS_NAMED = 4
 HASH = re.compile("[0-9a-f]{64}")
+_NO_FILE = "is not a regular file"
 _FILES = {"missing": "missing", "altered": "changed", "added": "is new"}
-"""State of a file of a stage → words."""
+"""State of a file of a stage → text."""
 
 
 @dataclass
 class ChainLink:
-    """One link of a chain.
+    """One link of a provenance chain.
 
     Attributes
     ----------
     name
-        A file or stage relative to the campaign folder; or code, settings or tags, and of which.
+        A file or stage relative to the campaign folder; or "code of", "settings of" or "tags of" a file.
     state
-        Against what was recorded.
+        Result of the comparison with the recorded hash.
     why
-        What differs, and which file records what it should be.
+        The differences, each with the file that contains the recorded hash.
     """
 
     name: str
     state: State = "same"
-    why: list[str] = field(default_factory=list)
+    reason: list[str] = field(default_factory=list)
 
-    def add(self, state: State, why: str) -> None:
-        """Note what is wrong with it; a second note adds to the first."""
+    def add(self, state: State, reason: str) -> None:
+        """Add a difference to the link; state "missing" takes precedence over "changed"."""
         self.state = "missing" if "missing" in (state, self.state) else state
-        if why not in self.why:
-            self.why.append(why)
+        if reason not in self.reason:
+            self.reason.append(reason)
 
 
 class Links:
-    """Links by name, each file read once.
+    """Links by name; each file is read once.
 
     Parameters
     ----------
@@ -83,7 +84,7 @@ class Links:
     ...     links = Links(Path(folder))
     ...     links.compare({"raw/codes.npy": "4c"}, "results/f01/a-a/echo.manifest.json")
     >>> [(link.name, link.state, link.why) for link in links]
-    [('raw/codes.npy', 'missing', ['recorded by results/f01/a-a/echo.manifest.json'])]
+    [('raw/codes.npy', 'missing', ['recorded in results/f01/a-a/echo.manifest.json'])]
     """
 
     def __init__(self, root: Path) -> None:
@@ -96,11 +97,11 @@ class Links:
         yield from self._links.values()
 
     def of(self, name: str) -> ChainLink:
-        """Return the link of that name."""
+        """Return the link of a given name, created if necessary."""
         return self._links.setdefault(name, ChainLink(name))
 
     def sha256(self, name: str) -> str:
-        """Return the sha256 of a file, relative to the campaign folder; empty: not there; words: why it is not read."""
+        """Return the sha256 of a file below the campaign folder, empty if missing, or the reason for not reading it."""
         if name not in self._digests:
             try:
                 self._digests[name] = sha256_present(ConfinedPath.at(self.root).named(name, where=self.root))
@@ -109,27 +110,29 @@ class Links:
         return self._digests[name]
 
     def exists(self, name: str) -> bool:
-        """Test whether a file is there and was read."""
+        """Return True if a file exists and was read."""
         return HASH.fullmatch(self.sha256(name)) is not None
 
     def compare(self, recorded: Mapping[str, str], by: str) -> None:
-        """Compare files, relative to the campaign folder, with the hashes that `by` has recorded."""
+        """Compare files, relative to the campaign folder, with the hashes recorded in `by`."""
         for name in recorded:
             self.of(name)
         self.add(compare(recorded, self.sha256), by)
 
     def add(self, differences: Iterable[Difference], by: str) -> None:
-        """Note at the links of files and sources what differs from the record `by`."""
-        for one in differences:
-            if one.state == "missing":
-                self.of(one.name).add("missing", f"recorded by {by}")
-            elif HASH.fullmatch(one.present):
-                self.of(one.name).add("changed", f"{shortened(one.present)}, was {shortened(one.recorded)} for {by}")
+        """Add differences from the record `by` to the links of the files and sources."""
+        for difference in differences:
+            link = self.of(difference.name)
+            if difference.state == "missing":
+                link.add("missing", f"recorded in {by}")
+            elif HASH.fullmatch(difference.present):
+                present, recorded = shortened(difference.present), shortened(difference.recorded)
+                link.add("changed", f"sha256 {present}, recorded as {recorded} in {by}")
             else:
-                self.of(one.name).add("changed", one.present)
+                link.add("changed", difference.present)
 
     def compare_stage(self, name: str, recorded: Mapping[str, str], by: str) -> None:
-        """Compare all files of a stage's folder, chunks among them, with their hashes; as `compare`."""
+        """Compare all files of a stage's folder, including chunks, with their hashes; as `compare`."""
         link = self.of(name)
         try:
             folder = ConfinedPath.at(self.root).named(name, where=by)
@@ -137,33 +140,33 @@ class Links:
             link.add("changed", error.found)
             return
         if not folder.is_dir():
-            link.add("missing", f"recorded by {by}")
+            link.add("missing", f"recorded in {by}")
             return
-        there = {
+        present_files = {
             path.relative_to(folder).as_posix(): path
             for path in folder.rglob("*")
             if not path.is_dir(follow_symlinks=False)
         }
 
         def present(file: str) -> str:
-            path = there.get(file)
+            path = present_files.get(file)
             if path is None:
                 return ""
-            return "is no file" if path.is_symlink() or not path.is_file() else sha256_file(path)
+            return _NO_FILE if path.is_symlink() or not path.is_file() else sha256_file(path)
 
-        wrong = [
-            (one.name, one.present if one.present == "is no file" else _FILES[one.state])
-            for one in compare(recorded, present, added=there)
+        differing = [
+            (file.name, file.present if file.present == _NO_FILE else _FILES[file.state])
+            for file in compare(recorded, present, added=present_files)
         ]
-        if wrong:
-            named = ", ".join(f"{file} {what}" for file, what in wrong[:_NAMED])
-            more = f" and {len(wrong) - _NAMED} more" if len(wrong) > _NAMED else ""
-            gone = all(what == "missing" for _, what in wrong)
-            link.add("missing" if gone else "changed", f"{named}{more}, by {by}")
+        if differing:
+            listed = ", ".join(f"{file} {state}" for file, state in differing[:_NAMED])
+            more = f" and {len(differing) - _NAMED} more" if len(differing) > _NAMED else ""
+            all_missing = all(state == "missing" for _, state in differing)
+            link.add("missing" if all_missing else "changed", f"{listed}{more}, compared with {by}")
 
 
 def shortened(digest: str | None) -> str:
-    """Return the first digits of a hash, for people.
+    """Return the first digits of a hash for messages.
 
     Examples
     --------
@@ -174,7 +177,7 @@ def shortened(digest: str | None) -> str:
 
 
 class Chain:
-    """The links below some results.
+    """Provenance chain of one or several results.
 
     Parameters
     ----------
@@ -184,9 +187,9 @@ class Chain:
     Attributes
     ----------
     links
-        In the order in which they were compared.
+        Links in the order in which they were compared.
     notes
-        Which versions differ from those installed, a line each.
+        Software versions that differ from those installed, a line each.
     """
 
     def __init__(self, root: Path) -> None:
@@ -197,24 +200,24 @@ class Chain:
         self._leaves: set[str] = set()
         self._waiting: list[str] = []
         self._rows: dict[str, Result] = {}
-        self._asked: list[str] = []
+        self._expected: list[str] = []
         try:
             campaign = Campaign.load(root)
             for _, result in results_of(campaign):
                 self._rows[result.manifest] = result
-            self._asked = [manifest for manifest in self._rows if not on_demand(campaign, manifest)]
-            self._promised = True
-        except CampaignError as error:  # what its manifests say can be compared all the same
-            self._promised = False
+            self._expected = [manifest for manifest in self._rows if not on_demand(campaign, manifest)]
+            self._has_config = True
+        except CampaignError as error:  # the hashes in the manifests can still be compared
+            self._has_config = False
             state: State = "changed" if (root / CONFIG).is_file() else "missing"
             self.links.of("campaign").add(state, str(error).replace(f"{root}/", ""))
 
     def promised(self) -> list[str]:
-        """Return the manifests that a finished campaign has by its config."""
-        return self._asked
+        """Return the manifests of a finished campaign according to its config."""
+        return self._expected
 
     def walk(self, manifests: Iterable[str] = ()) -> None:
-        """Compare some results, and all that they and the tags compared before were made from."""
+        """Compare results with their manifests, and recursively all sources of them and of the tags compared before."""
         for manifest in manifests:
             link = self.links.of(manifest)
             if self.links.exists(manifest):
@@ -222,7 +225,7 @@ class Chain:
             elif found := self.links.sha256(manifest):
                 link.add("changed", found)
             else:
-                link.add("missing", "not there")
+                link.add("missing", "no such file")
         walked = set[str]()
         while self._waiting:
             manifest = self._waiting.pop(0)
@@ -230,19 +233,19 @@ class Chain:
                 walked.add(manifest)
                 self._result(manifest)
         if all(link.state == "same" for link in self.links if link.name.endswith(SUFFIX)):
-            for name, inputs in self._inputs.items():  # the whole chain is known: no input can be outside of it
+            for name, inputs in self._inputs.items():  # only a complete chain contains all inputs
                 for role in [role for role, digest in inputs.items() if digest not in self._leaves]:
-                    self.links.of(name).add("changed", f"APERTURA_INPUTS: {role} with that hash is not in its chain")
+                    self.links.of(name).add("changed", f"APERTURA_INPUTS: the hash of {role} is not in the chain")
 
     def tagged(self, path: Path, name: str, sources: Mapping[str, str] | None = None) -> bool:
-        """Compare the tags of a file; return whether it has any.
+        """Compare the tags of a file; return False if it has none.
 
         Parameters
         ----------
         path, name
-            Where it lies, and what it is called.
+            Path of the file, and its name in messages.
         sources
-            What its manifest says it was made from; None: no manifest lists it, so that its tags alone begin the chain.
+            Sources in the manifest that lists the file; None if no manifest does, and the chain starts at its tags.
         """
         link = f"tags of {name}"
         try:
@@ -263,20 +266,22 @@ class Chain:
             return True
         for source in sorted({*stated, *sources}):
             if stated.get(source) != sources.get(source):
-                now, was = (shortened(one.get(source)) for one in (stated, sources))
-                self.links.of(link).add("changed", f"APERTURA_SOURCES: {source} is {now}, in its manifest {was}")
+                in_tag, in_manifest = (shortened(hashes_of.get(source)) for hashes_of in (stated, sources))
+                self.links.of(link).add(
+                    "changed", f"APERTURA_SOURCES: {source} is {in_tag}, in the manifest {in_manifest}"
+                )
         return True
 
     def _follow(self, sources: Mapping[str, str]) -> None:
-        """Go on to what a result was made from: manifests of other results, or files that nothing here has made."""
-        for name, was in sources.items():
+        """Queue the manifests among a result's sources, and note the hashes of sources that are inputs."""
+        for name, digest in sources.items():
             if not name.startswith("results/"):
-                self._leaves.add(was)
+                self._leaves.add(digest)
             elif name.endswith(SUFFIX) and self.links.exists(name):
                 self._waiting.append(name)
 
     def _result(self, manifest: str) -> None:
-        """Compare a result with its manifest, and its manifest with what it was made from."""
+        """Compare the files of a result, its sources, code and settings with its manifest."""
         link, path = self.links.of(manifest), self.root / manifest
         try:
             recorded = read_manifest(path)
@@ -284,69 +289,69 @@ class Chain:
             link.add("changed", error.found)
             return
         if path.read_text(encoding="utf-8") != json.dumps(recorded, indent=1, sort_keys=True) + "\n":
-            link.add("changed", "not as the workflow writes it")
+            link.add("changed", "not in the form that the workflow writes")
         self._files(manifest, recorded["files"], recorded.get("sources", {}))
         if not states_origin(recorded):
-            link.add("changed", "does not say what it was made from, as versions before 0.1.0 did not")
+            link.add("changed", "contains no sources, code or settings, as manifests of versions before 0.1.0")
             return
         self._origin(manifest, recorded)
         self._follow(recorded["sources"])
 
     def _files(self, manifest: str, files: Mapping[str, str], sources: Mapping[str, str]) -> None:
-        """Compare the files of a result: a stage is one link, with all of its chunks."""
+        """Compare the files of a result; a stage with all of its chunks is one link."""
         folder, stages = manifest.rpartition("/")[0], dict[str, dict[str, str]]()
-        for file, was in files.items():
-            stage, of_stage, rest = file.partition(".zarr/")
+        for file, digest in files.items():
+            stage, in_stage, rest = file.partition(".zarr/")
             name = f"{folder}/{file}"
-            if of_stage:
-                stages.setdefault(f"{folder}/{stage}.zarr", {})[rest] = was
+            if in_stage:
+                stages.setdefault(f"{folder}/{stage}.zarr", {})[rest] = digest
                 continue
-            self.links.compare({name: was}, manifest)
+            self.links.compare({name: digest}, manifest)
             if name.endswith(TAGGED) and self.links.exists(name):
                 self.tagged(self.root / name, name, sources)
         for name, chunks in stages.items():
             self.links.compare_stage(name, chunks, manifest)
 
     def _origin(self, manifest: str, recorded: Mapping[str, Any]) -> None:
-        """Compare sources, code and settings of a result with those of now."""
+        """Compare recorded sources, code and settings of a result with the present ones."""
         result, link = self._rows.get(manifest), self.links.of(manifest)
-        if result is None:  # where the config cannot be read, the formats and so the code that it asks for are unknown
-            if self._promised:
-                link.add("changed", "the config promises no such result")
+        if result is None:  # without a config the formats, and so the code of a result, are unknown
+            if self._has_config:
+                link.add("changed", "not a result of the campaign as configured")
             self.links.compare(recorded["sources"], manifest)
             return
         parts = {part: self.links.of(f"{part} of {manifest}") for part in ("code", "settings")}
         for name in recorded["sources"]:
             self.links.of(name)
-        for one in compare_origin(recorded, result, self.links.sha256):
-            if one.part == "code":
-                was, now = shortened(one.recorded), shortened(one.present)
-                parts["code"].add("changed", f"{now} is installed, {was} made it")
-            elif one.part == "settings":
-                parts["settings"].add("changed", f"{CONFIG} or a table beside it says otherwise now")
-            elif one.state == "added":
-                link.add("changed", f"{one.name} is new to it")
+        for difference in compare_origin(recorded, result, self.links.sha256):
+            if difference.part == "code":
+                made_by, installed = shortened(difference.recorded), shortened(difference.present)
+                parts["code"].add("changed", f"made by code {made_by}, installed is {installed}")
+            elif difference.part == "settings":
+                parts["settings"].add("changed", f"{CONFIG} or a table in its folder was changed since")
+            elif difference.state == "added":
+                link.add("changed", f"has the additional source {difference.name}")
             else:
-                self.links.add([one], manifest)
+                self.links.add([difference], manifest)
 
     def _runspec(self, link: ChainLink, stated: Mapping[str, Any], sources: Mapping[str, str]) -> None:
-        """Compare the settings in tags with those of the images they come from."""
+        """Compare the settings in the tags with those of the source images."""
         for source in sources:
             folder, _, stage = source.rpartition("/")
             if stage == "image.manifest.json":
                 spec = _spec(ConfinedPath.at(self.root).named(f"{folder}/image.zarr/zarr.json", where=link.name))
-                image = folder.removeprefix("results/")  # of several, each has its own under its name
+                image = folder.removeprefix("results/")  # with several images, settings are stored by image name
                 candidates = stated, stated.get(image), stated.get(image.rpartition("/")[2])
-                # a calibrated layer states settings of its own beside those of the image
+                # a calibrated layer has settings of its own in addition to those of the image
                 is_stated = isinstance(spec, Mapping) and any(
-                    isinstance(one, Mapping) and {**one, **spec} == one for one in candidates
+                    isinstance(settings, Mapping) and {**settings, **spec} == settings for settings in candidates
                 )
                 if spec is not None and not is_stated:
                     link.add("changed", f"APERTURA_RUNSPEC: {folder}/image.zarr was made with other settings")
 
 
 def _spec(path: Path) -> Any:
-    """Return the settings in the metadata of a stage; None where it has none: it has a link of its own."""
+    """Return the settings in the metadata of a stage; None if unreadable, which the link of the stage reports."""
     try:
         return json.loads(json.loads(path.read_text(encoding="utf-8"))["attributes"]["runspec"])
     except (OSError, ValueError, TypeError, LookupError, RecursionError):
@@ -354,72 +359,77 @@ def _spec(path: Path) -> Any:
 
 
 def other_versions(tags: Mapping[str, str], made_with: Mapping[str, Any], name: str) -> Iterator[str]:
-    """Yield the software of a file that is not installed here, a line each.
+    """Yield a line for each difference between the software versions in a file's tags and those installed.
 
-    Another version is no change of a product, and may be the reason of one.
+    A different version is not a change of the product, but may explain one.
 
     Parameters
     ----------
     tags
-        Of the file.
+        Tags of the file.
     made_with
         Its tag ``APERTURA_SOFTWARE``.
     name
-        What the file is called.
+        Name of the file in messages.
 
     Examples
     --------
     >>> list(other_versions({"APERTURA_VERSION": "0.0.9"}, {}, "db.tif"))
-    ['made by apertura 0.0.9, such as db.tif; 0.1.0 is installed: its code is another']
+    ['apertura 0.0.9 made products such as db.tif, 0.1.0 is installed: the code differs']
     """
     version = tags.get("APERTURA_VERSION", "before 0.1.0")
     if version != __version__:
-        yield f"made by apertura {version}, such as {name}; {__version__} is installed: its code is another"
-    now = software() if made_with else {}
-    others = sorted(one for one in {*made_with, *now} - {"apertura"} if made_with.get(one) != now.get(one))
-    if others:
-        named = ", ".join(
-            f"{one} {made_with.get(one, 'none')}, here {now.get(one, 'none')}" for one in others[:_VERSIONS_NAMED]
+        yield f"apertura {version} made products such as {name}, {__version__} is installed: the code differs"
+    installed = software() if made_with else {}
+    packages = sorted(
+        package
+        for package in {*made_with, *installed} - {"apertura"}
+        if made_with.get(package) != installed.get(package)
+    )
+    if packages:
+        listed = ", ".join(
+            f"{package} {made_with.get(package, 'absent')} (installed: {installed.get(package, 'absent')})"
+            for package in packages[:_VERSIONS_NAMED]
         )
-        more = f" and {len(others) - _VERSIONS_NAMED} more" if len(others) > _VERSIONS_NAMED else ""
-        yield f"made with {named}{more}: bytes may differ where it is made again"
+        more = f" and {len(packages) - _VERSIONS_NAMED} more" if len(packages) > _VERSIONS_NAMED else ""
+        yield f"made with {listed}{more}: bytes may differ when products are recomputed"
     if tags.get("APERTURA_LOCK_SHA256", lock_sha256()) != lock_sha256():
-        yield "made under another requirements/all.txt"
+        yield "made with a different requirements/all.txt"
 
 
 def verify(path: Path, campaign: Path | None = None) -> Chain:
-    """Compare a product, or all of a campaign, with what it says it was made from, down to the raw samples.
+    """Compare a product, or all results of a campaign, and all their sources with the recorded hashes.
 
     Parameters
     ----------
     path
-        Absolute: a file, a stage or a manifest below results/, or a campaign folder.
+        Absolute path of a file, a stage or a manifest below results/, or of a campaign folder.
     campaign
-        Where a file that lies elsewhere was made.
+        Campaign folder of a file that is stored elsewhere.
 
     Returns
     -------
     Chain
-        Its links; every byte was read, and nothing written.
+        The compared links; every byte was read, and nothing written.
 
     Raises
     ------
     CampaignError
-        If it is no product, or its campaign is not known.
+        If the path is not a product, or its campaign is unknown.
     """
     product = find_product(path, campaign)
     chain = Chain(product.root)
     if product.file is None:
-        there = [found.relative_to(product.root).as_posix() for found in manifests(product.root / "results")]
-        chain.walk(dict.fromkeys([*chain.promised(), *there]))
+        present = [manifest.relative_to(product.root).as_posix() for manifest in manifests(product.root / "results")]
+        chain.walk(dict.fromkeys([*chain.promised(), *present]))
         return chain
-    _begin(chain, product, product.file)
+    _start(chain, product, product.file)
     chain.walk([product.manifest] if product.manifest else [])
     return chain
 
 
-def _begin(chain: Chain, product: Product, file: Path) -> None:
-    """Begin a chain at a file: with its manifest where that lists it, else with its tags."""
+def _start(chain: Chain, product: Product, file: Path) -> None:
+    """Start a chain at a file: at the manifest that lists it, else at its tags."""
     below = file.is_relative_to(product.root)
     name = file.relative_to(product.root).as_posix() if below else file.name
     if product.manifest:
@@ -427,26 +437,26 @@ def _begin(chain: Chain, product: Product, file: Path) -> None:
             chain.links.of(f"{name}, a copy of a file of {product.manifest}")
         return
     if not chain.tagged(file, name):
-        expected = "a file of a result, or one that carries tags"
-        raise CampaignError("no manifest lists it", file, expected, "Name a file that the workflow wrote.")
-    found = "no manifest lists it" if below else "no file of that campaign has its bytes"
-    chain.links.of(name).add("changed", f"{found}; its tags say what it was made from")
+        expected = "a file that a manifest lists, or a file with tags of apertura"
+        raise CampaignError("not listed in any manifest", file, expected, "Name a file that the workflow wrote.")
+    found = "not listed in any manifest" if below else "not identical to any file of that campaign"
+    chain.links.of(name).add("changed", f"{found}; sources taken from its tags")
 
 
 def print_verified(path: Path, campaign: Path | None = None, *, quiet: bool = False) -> int:
-    """Print a line for each link, what is wrong first; return 0, or 1 where a link is not the same.
+    """Print a line for each link, differences first; return 0, or 1 if a link is changed or missing.
 
     Parameters
     ----------
     path, campaign
         As `verify`.
     quiet
-        Only what is not the same.
+        Print only changed and missing links.
 
     Raises
     ------
     CampaignError
-        As `verify`; what the tags of a file say is printed before.
+        As `verify`; the tags of the file are printed before.
     """
     try:
         chain = verify(path, campaign)
@@ -456,8 +466,8 @@ def print_verified(path: Path, campaign: Path | None = None, *, quiet: bool = Fa
     links = sorted(chain.links, key=lambda link: _ORDER.index(link.state))
     for link in links:
         if link.state != "same" or not quiet:
-            why = f": {'; '.join(link.why)}" if link.why else ""
-            print(f"{link.state:<8} {shown(link.name + why, _LONGEST)}")
+            reason = f": {'; '.join(link.reason)}" if link.reason else ""
+            print(f"{link.state:<8} {shown(link.name + reason, _LONGEST)}")
     for note in chain.notes:
         print(shown(note, _LONGEST))
     counts = [(state, sum(link.state == state for link in links)) for state in reversed(_ORDER)]
@@ -467,7 +477,7 @@ def print_verified(path: Path, campaign: Path | None = None, *, quiet: bool = Fa
 
 
 def _print_tags(path: Path) -> None:
-    """Print the tags of a file whose chain cannot be walked."""
+    """Print the tags of a file whose chain cannot be followed."""
     if not path.is_file():
         return
     tags = read_tags(path)
@@ -483,14 +493,14 @@ _MOST = 20
 
 
 def changed_files(root: Path, *, inputs: bool = True) -> dict[str, str]:
-    """Return file → 'changed' or 'missing', of those whose bytes are not what the crate says; every byte is read.
+    """Return file → 'changed' or 'missing' for files that differ from the hashes in the RO-Crate.
 
     Parameters
     ----------
     root
-        The crate's folder, a campaign's results.
+        Folder of the crate, the results of a campaign.
     inputs
-        Recordings and config, too, which lie in the folder above.
+        Include recordings and config, which are in the parent folder.
 
     Raises
     ------
@@ -504,27 +514,27 @@ def changed_files(root: Path, *, inputs: bool = True) -> dict[str, str]:
         try:
             return sha256_file(path) if path.is_file() else ""
         except OSError as error:
-            expected, remedy = "a file that can be read", "Let it be read, or copy it again."
+            expected, remedy = "a readable file", "Grant read permission, or copy it again."
             raise CampaignError(f"not readable ({error.strerror})", path, expected, remedy) from error
 
     differences = compare({name: file.sha256 for name, file in files.items()}, present)
-    return {one.name: "missing" if one.state == "missing" else "changed" for one in differences}
+    return {file.name: "missing" if file.state == "missing" else "changed" for file in differences}
 
 
 def print_checked(folder: Path, *, quiet: bool = False) -> int:
-    """Print which files are not what the crate says, and what is wrong with the catalog; return the exit code.
+    """Print files that differ from the RO-Crate and errors of the STAC catalog; return the exit code.
 
     Parameters
     ----------
     folder
-        A campaign, or its results alone: recordings are compared where the campaign lies above them.
+        A campaign folder, or its results; recordings are compared if the results are inside a campaign folder.
     quiet
-        Only what is not the same.
+        Print differences only.
 
     Returns
     -------
     int
-        0: all as it was made; 1: not.
+        0 without differences, else 1.
 
     Raises
     ------
@@ -534,8 +544,8 @@ def print_checked(folder: Path, *, quiet: bool = False) -> int:
     root = folder if (folder / CRATE).is_file() else folder / "results"
     if folder.is_file():
         raise CampaignError("a file", folder, "a campaign folder, or its results", "Name the folder.")
-    above = (root.parent / "config").is_dir()
-    lines = [f"{name}: {state}" for name, state in changed_files(root, inputs=above).items()]
+    in_campaign = (root.parent / "config").is_dir()
+    lines = [f"{name}: {state}" for name, state in changed_files(root, inputs=in_campaign).items()]
     if (root / "stac" / CATALOG).is_file():
         lines += [f"stac/{problem}" for problem in stac_problems(root / "stac")]
     for line in lines[:_MOST]:
@@ -543,6 +553,6 @@ def print_checked(folder: Path, *, quiet: bool = False) -> int:
     if len(lines) > _MOST:
         print(f"and {len(lines) - _MOST} more")
     if not lines and not quiet:
-        beside = "recordings and config, too" if above else "recordings and config are not here to be compared"
-        print(f"every file as the crate says ({beside}), the catalog valid")
+        inputs = "included" if in_campaign else "not available for comparison"
+        print(f"all files match the hashes in the crate (recordings and config {inputs}); the catalog is valid")
     return 1 if lines else 0

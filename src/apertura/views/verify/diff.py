@@ -1,4 +1,4 @@
-"""`apertura diff` and `apertura reproduce`: two products compared, and a campaign made again to compare with."""
+"""`apertura diff` and `apertura reproduce`: compare two products, or a product with its recomputation."""
 
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -31,22 +31,22 @@ _READ_BYTES = 1 << 20
 
 @dataclass
 class Tally:
-    """Sums over the values of two arrays, block by block: how far they differ, how alike, where only one has a value.
+    """Difference statistics of two arrays, accumulated block by block.
 
     Attributes
     ----------
     compared
-        Values that both hold.
+        Number of values that are finite in both arrays.
     only
-        Values that one holds and the other does not (NaN, infinite), of the first and of the second.
+        Number of values that are finite in the first array only, and in the second only.
     differing
-        Values that are not the same, those that one lacks among them.
+        Number of values that differ, including those finite in one array only.
     largest, square
         Largest magnitude of the difference, and sum of its squares.
     peak
-        Largest magnitude in either.
+        Largest magnitude in either array.
     phased
-        Whether values are complex.
+        True if values are complex.
 
     Examples
     --------
@@ -67,14 +67,14 @@ class Tally:
 
     @classmethod
     def of(cls, blocks: Iterable[tuple[Pixels, Pixels]]) -> "Tally":
-        """Return the sums over pairs of blocks of one shape, real or complex."""
+        """Return the statistics of pairs of blocks of equal shape, real or complex."""
         tally = cls()
         for first, second in blocks:
             tally.add(np.asarray(first), np.asarray(second))
         return tally
 
     def add(self, first: Pixels, second: Pixels) -> None:
-        """Add a block of each."""
+        """Add a block of each array."""
         valid = np.isfinite(first), np.isfinite(second)
         lacking = int((valid[0] & ~valid[1]).sum()), int((valid[1] & ~valid[0]).sum())
         self.only = self.only[0] + lacking[0], self.only[1] + lacking[1]
@@ -89,33 +89,33 @@ class Tally:
         self.largest = max(self.largest, float(difference.max()))
         self.square += float((difference**2).sum())
         self.peak = max(self.peak, float(np.abs(a).max()), float(np.abs(b).max()))
-        if self._sums is None:  # of real values the mean is taken off: sums about one of them keep their digits
+        if self._sums is None:  # sums about one of the real values: no loss of digits when the mean is subtracted
             self._sums, self._about = np.zeros(5, complex), 0.0 if self.phased else float(a[0])
         a, b = a - self._about, b - self._about
         self._sums += [a.sum(), b.sum(), np.vdot(a, a), np.vdot(b, b), np.vdot(b, a)]
 
     @property
     def rms(self) -> float:
-        """Root of the mean square of the difference; 0 where nothing could be compared."""
+        """RMS of the difference; 0 if no value is finite in both arrays."""
         return float(np.sqrt(self.square / self.compared)) if self.compared else 0.0
 
     @property
     def alike(self) -> float:
-        """Coherence |Σ a b*| / √(Σ|a|² Σ|b|²) of complex values, correlation of real ones; NaN where all are equal."""
+        """Coherence |Σ a b*| / √(Σ|a|² Σ|b|²) of complex values, correlation of real values; NaN if undefined."""
         if self._sums is None:
             return float("nan")
-        of_a, of_b, aa, bb, ab = self._sums
+        sum_a, sum_b, aa, bb, ab = self._sums
         if not self.phased:
             aa, bb, ab = (
-                both - left * right / self.compared
-                for both, left, right in ((aa, of_a, of_a), (bb, of_b, of_b), (ab, of_a, of_b))
+                product - left * right / self.compared
+                for product, left, right in ((aa, sum_a, sum_a), (bb, sum_b, sum_b), (ab, sum_a, sum_b))
             )
         scale = np.sqrt(max(aa.real, 0.0) * max(bb.real, 0.0))
         return float((abs(ab) if self.phased else ab.real) / scale) if scale > 0 else float("nan")
 
 
 def rows_of(shape: tuple[int, ...], itemsize: int, *, block_bytes: int = 1 << 24) -> Iterator[slice]:
-    """Yield rows of an array, as many at a time as fit into some bytes, one at least.
+    """Yield slices of rows of an array, each of at most `block_bytes` or one row.
 
     Examples
     --------
@@ -128,45 +128,45 @@ def rows_of(shape: tuple[int, ...], itemsize: int, *, block_bytes: int = 1 << 24
 
 
 def differences(first: Path, second: Path) -> dict[str, list[str]]:
-    """Return section → what differs between two products, a line each; sections that both have and agree are empty.
+    """Return section → differences between two products, a line each; empty for sections that agree.
 
     Parameters
     ----------
     first, second
-        Rasters, pictures, stages or other files, of one kind; of one campaign or of two.
+        Rasters, PNG images, stages or other files, both of the same kind; of one campaign or of two.
 
     Raises
     ------
     CampaignError
-        If one is not there or not readable, or they are of two kinds.
+        If one is missing or not readable, or they are of different kinds.
     """
     first, second = as_product(first), as_product(second)
     for path in (first, second):
         if not path.exists():
             raise CampaignError("no such file or folder", path, EXPECTED, "Correct the path.")
     if first.is_dir() != second.is_dir() or first.suffix != second.suffix:
-        raise CampaignError(f"of another kind than {first.name}", second, "two products of one kind", REMEDY)
+        raise CampaignError(f"of a different kind than {first.name}", second, "two products of the same kind", REMEDY)
     sections = sections_of(first), sections_of(second)
-    found: dict[str, list[str]] = {}
+    lines: dict[str, list[str]] = {}
     for section in (name for name in SECTIONS if name in sections[0]):
-        one, other = (entries.get(section, {}) for entries in sections)
-        if bool(one) != bool(other):
-            found[section] = [f"{len(one)} entries → absent" if one else f"absent → {len(other)} entries"]
+        left, right = (entries.get(section, {}) for entries in sections)
+        if bool(left) != bool(right):
+            lines[section] = [f"{len(left)} entries → absent" if left else f"absent → {len(right)} entries"]
             continue
-        keys = [key for key in sorted({*one, *other}) if one.get(key) != other.get(key)]
-        found[section] = [f"{key}: {_cut(one.get(key))} → {_cut(other.get(key))}" for key in keys]
+        keys = [key for key in sorted({*left, *right}) if left.get(key) != right.get(key)]
+        lines[section] = [f"{key}: {_cut(left.get(key))} → {_cut(right.get(key))}" for key in keys]
     if first.is_dir():
-        return found | {"values": list(_stages(first, second))}
+        return lines | {"values": list(_stages(first, second))}
     if first.suffix == ".tif":
-        found["pixels"] = list(_rasters(first, second))
+        lines["pixels"] = list(_rasters(first, second))
     elif first.suffix == ".png":
-        pictures = [np.asarray(picture(path)).astype(np.float32) for path in (first, second)]
-        tally = Tally.of([(pictures[0], pictures[1])]) if pictures[0].shape == pictures[1].shape else None
-        found["pixels"] = list(difference_lines(tally, unit="of 255")) if tally else []  # sizes are in geometry
-    if not any(found.values()):
-        at = first_difference(first, second)
-        found["bytes"] = [] if at is None else [f"first differ at byte {at}"]
-    return found
+        images = [np.asarray(picture(path)).astype(np.float32) for path in (first, second)]
+        tally = Tally.of([(images[0], images[1])]) if images[0].shape == images[1].shape else None
+        lines["pixels"] = list(difference_lines(tally, unit="of 255")) if tally else []  # sizes are in geometry
+    if not any(lines.values()):
+        offset = first_difference(first, second)
+        lines["bytes"] = [] if offset is None else [f"first difference at byte {offset}"]
+    return lines
 
 
 def _cut(text: str | None) -> str:
@@ -176,137 +176,143 @@ def _cut(text: str | None) -> str:
 
 
 def first_difference(first: Path, second: Path) -> int | None:
-    """Return the first byte in which two files differ, from 0; None if they are the same.
+    """Return the offset of the first byte in which two files differ; None if they are identical.
 
     Examples
     --------
     >>> first_difference(Path(__file__), Path(__file__)) is None
     True
     """
-    at = 0
-    with first.open("rb") as one, second.open("rb") as other:
+    offset = 0
+    with first.open("rb") as left_stream, second.open("rb") as right_stream:
         while True:
-            left, right = one.read(_READ_BYTES), other.read(_READ_BYTES)
+            left, right = left_stream.read(_READ_BYTES), right_stream.read(_READ_BYTES)
             if left != right:
                 pairs = zip(left, right, strict=False)
-                return at + next((i for i, (a, b) in enumerate(pairs) if a != b), min(len(left), len(right)))
+                return offset + next((i for i, (a, b) in enumerate(pairs) if a != b), min(len(left), len(right)))
             if not left:
                 return None
-            at += len(left)
+            offset += len(left)
 
 
-def _rasters(first: Path, second: Path) -> Iterator[str]:
-    """Yield the differences of the pixels of two rasters, where their grids coincide."""
+def _rasters(*paths: Path) -> Iterator[str]:
+    """Yield the differences between the pixels of two rasters in the overlap of their grids."""
     with ExitStack() as stack:
-        one, other = (
-            stack.enter_context(opened_raster(path, expected=EXPECTED, remedy=REMEDY)) for path in (first, second)
-        )
-        shift = _shift(one, other)
+        first, second = (stack.enter_context(opened_raster(path, expected=EXPECTED, remedy=REMEDY)) for path in paths)
+        shift = _shift(first, second)
         if shift is None:
-            yield "not compared: the grids do not lie on each other, in CRS, spacing or by whole pixels"
+            yield "not compared: CRS or pixel spacing differ, or the offset is not an integer number of pixels"
             return
         down, right = shift
-        rows = range(max(0, down), min(one.height, other.height + down))
-        columns = range(max(0, right), min(one.width, other.width + right))
+        rows = range(max(0, down), min(first.height, second.height + down))
+        columns = range(max(0, right), min(first.width, second.width + right))
         if not rows or not columns:
             yield "not compared: the grids do not overlap"
             return
-        if (len(rows), len(columns)) != one.shape or one.shape != other.shape:
-            yield f"compared where both are: {len(columns)} × {len(rows)} of them"
-        tally = Tally.of(_blocks(one, other, (rows[0], columns[0]), shift, (len(rows), len(columns))))
-        yield from difference_lines(tally, unit=one.units[0] or "1", power="power" in (one.descriptions[0] or ""))
+        if (len(rows), len(columns)) != first.shape or first.shape != second.shape:
+            yield f"compared in the overlap: {len(columns)} × {len(rows)} pixels"
+        tally = Tally.of(_blocks(first, second, (rows[0], columns[0]), shift, (len(rows), len(columns))))
+        yield from difference_lines(tally, unit=first.units[0] or "1", power="power" in (first.descriptions[0] or ""))
 
 
-def _shift(one: Any, other: Any) -> tuple[int, int] | None:
-    """Return row and column of the first raster where the second begins; None unless both are whole and grids agree."""
-    here, there = one.transform, other.transform
-    if one.crs != other.crs or not np.allclose(here[:2] + here[3:5], there[:2] + there[3:5], rtol=1e-9, atol=0):
+def _shift(first: Any, second: Any) -> tuple[int, int] | None:
+    """Return row and column of the second raster's origin in the first; None if the grids do not coincide."""
+    a, b = first.transform, second.transform
+    if first.crs != second.crs or not np.allclose(a[:2] + a[3:5], b[:2] + b[3:5], rtol=1e-9, atol=0):
         return None
-    if here.b or here.d or not here.a or not here.e:
+    if a.b or a.d or not a.a or not a.e:
         return None
-    right, down = (there.c - here.c) / here.a, (there.f - here.f) / here.e
+    right, down = (b.c - a.c) / a.a, (b.f - a.f) / a.e
     if not max(abs(right - round(right)), abs(down - round(down))) < 1e-3:
         return None
     return round(down), round(right)
 
 
 def _blocks(
-    one: Any, other: Any, begin: tuple[int, int], shift: tuple[int, int], shape: tuple[int, int]
+    first: Any, second: Any, begin: tuple[int, int], shift: tuple[int, int], shape: tuple[int, int]
 ) -> Iterator[tuple[Pixels, Pixels]]:
-    """Yield the overlap of two rasters, block by block."""
+    """Yield the overlap of two rasters in blocks."""
     from rasterio.windows import Window
 
     for rows, columns in blocks_of(shape):
         top, left = rows.start + begin[0], columns.start + begin[1]
         size = columns.stop - columns.start, rows.stop - rows.start
-        window, moved = Window(left, top, *size), Window(left - shift[1], top - shift[0], *size)
-        yield one.read(1, window=window), other.read(1, window=moved)
+        window, shifted = Window(left, top, *size), Window(left - shift[1], top - shift[0], *size)
+        yield first.read(1, window=window), second.read(1, window=shifted)
 
 
-def _stages(first: Path, second: Path) -> Iterator[str]:
-    """Yield the differences of the arrays of two stages, each with its name."""
-    one, other = (open_stage(folder, folder.stem) for folder in (first, second))
-    for name in one.variables:
-        if name not in other.variables or one[name].shape != other[name].shape or one[name].dtype.kind not in "fciubM":
-            continue  # geometry says so
-        tally = Tally.of(_rows(one[name], other[name]))
-        yield from (f"{name}: {line}" for line in difference_lines(tally, unit=str(one[name].attrs.get("units", "1"))))
+def _stages(*folders: Path) -> Iterator[str]:
+    """Yield the differences between the arrays of two stages, prefixed with the array name."""
+    first, second = (open_stage(folder, folder.stem) for folder in folders)
+    for name in first.variables:
+        if (
+            name not in second.variables
+            or first[name].shape != second[name].shape
+            or first[name].dtype.kind not in "fciubM"
+        ):
+            continue  # reported in section geometry
+        tally = Tally.of(_rows(first[name], second[name]))
+        yield from (
+            f"{name}: {line}" for line in difference_lines(tally, unit=str(first[name].attrs.get("units", "1")))
+        )
 
 
-def _rows(one: Any, other: Any) -> Iterator[tuple[Pixels, Pixels]]:
-    if not one.ndim:
-        yield tuple(np.atleast_1d(_numbers(array.values)) for array in (one, other))  # type: ignore[misc]
+def _rows(first: Any, second: Any) -> Iterator[tuple[Pixels, Pixels]]:
+    if not first.ndim:
+        yield tuple(np.atleast_1d(_numbers(array.values)) for array in (first, second))  # type: ignore[misc]
         return
-    for rows in rows_of(one.shape, one.dtype.itemsize):
-        yield _numbers(one[rows].values), _numbers(other[rows].values)
+    for rows in rows_of(first.shape, first.dtype.itemsize):
+        yield _numbers(first[rows].values), _numbers(second[rows].values)
 
 
 def _numbers(values: Pixels) -> Pixels:
-    """Return times as seconds."""
+    """Return values as numbers, times in seconds."""
     return values.astype("M8[ns]").astype(np.int64) / 1e9 if values.dtype.kind == "M" else values
 
 
 def difference_lines(tally: Tally, *, unit: str = "1", power: bool = False) -> Iterator[str]:
-    """Yield the differences of two arrays, in words; nothing where they are the same.
+    """Describe the differences between two arrays in up to two lines; no line if they are identical.
 
     Parameters
     ----------
     tally
-        Of both.
+        Difference statistics of both arrays.
     unit
-        Of their values; differences of those without one are in dB of the peak.
+        Unit of their values; without a unit, differences are in dB relative to the peak.
     power
-        Whether they are powers, and not amplitudes.
+        True if values are powers, False for amplitudes.
 
     Examples
     --------
     >>> list(difference_lines(Tally.of([(np.array([1.0, 2.0]), np.array([1.0, 2.002]))])))
-    ['1 of 2 differ, by -60.0 dB of the peak at most, -63.0 dB rms; correlation 1.000000']
+    ['1 of 2 values differ: maximum -60.0 dB re peak, rms -63.0 dB re peak; correlation 1.000000']
     """
     if not tally.differing:
         return
     if tally.compared and tally.largest:
-        values, of = np.array([tally.largest, tally.rms]), ""
+        statistics = np.array([tally.largest, tally.rms])
         if unit == "1":
-            values, unit, of = (10 if power else 20) * np.log10(values / tally.peak), "dB", " of the peak"
-        largest, rms = (f"{value:.1f} dB" if of else f"{value:.3g} {unit}" for value in values)
-        kind = "coherence" if tally.phased else "correlation"
+            levels_db = (10 if power else 20) * np.log10(statistics / tally.peak)
+            largest, rms = (f"{level:.1f} dB re peak" for level in levels_db)
+        else:
+            largest, rms = (f"{value:.3g} {unit}" for value in statistics)
+        measure = "coherence" if tally.phased else "correlation"
         count = tally.compared + sum(tally.only)
-        yield f"{tally.differing} of {count} differ, by {largest}{of} at most, {rms} rms; {kind} {tally.alike:.6f}"
+        yield f"{tally.differing} of {count} values differ: maximum {largest}, rms {rms}; {measure} {tally.alike:.6f}"
     if any(tally.only):
-        yield f"{tally.only[0]} values are in the first alone, {tally.only[1]} in the second alone"
+        yield f"{tally.only[0]} values are finite in the first only, {tally.only[1]} in the second only"
 
 
 def print_differences(first: Path, second: Path, *, whole: bool = False) -> int:
-    """Print what differs between two products, a line each; return 0 if nothing does, else 1; as `differences`."""
-    found = differences(first, second)
-    for section, lines in found.items():
+    """Print the differences between two products, a line each; return 0 without differences, else 1."""
+    sections = differences(first, second)
+    for section, lines in sections.items():
         most = len(lines) if whole else _LINES
         for line in lines[:most] or ["same"]:
             print(shown(f"{section:<9}{line}", 400))
         if len(lines) > most:
-            print(f"{section:<9}and {len(lines) - most} more: --all")
-    return 1 if any(found.values()) else 0
+            print(f"{section:<9}and {len(lines) - most} more (--all prints them)")
+    return 1 if any(sections.values()) else 0
 
 
 _MOST_LINES = 8
@@ -314,63 +320,65 @@ _LONGEST = 400
 
 
 def print_reproduced(path: Path, *, cores: int, keep: Path | None = None) -> int:
-    """Make a product again and say whether it is the same; the campaign itself is only read.
+    """Recompute a product in another folder and print differences; the campaign itself is only read.
 
     Parameters
     ----------
     path
-        Absolute: a file, a stage or a manifest below results/, or a campaign folder.
+        Absolute path of a file, a stage or a manifest below results/, or of a campaign folder.
     cores
-        To use.
+        Number of cores to use.
     keep
-        A new folder to make it in, which stays.
+        A new folder for the recomputed results, which is kept; None uses a temporary folder.
 
     Returns
     -------
     int
-        0 if every byte is the same, 1 if not; otherwise what the workflow has ended with.
+        0 if every byte is identical, 1 if not; the exit status of the workflow if it fails.
 
     Raises
     ------
     CampaignError
-        If it is no product of the campaign as its config stands, or a run holds the campaign.
+        If the path is not a product of the campaign as configured, or a run of the campaign is in progress.
     """
     product = find_product(path)
     campaign, whole = Campaign.load(product.root), product.file is None
     running = holder(product.root)
     if running is not None:
-        raise CampaignError(f"a run holds it: {running}", product.root, "a campaign at rest", "Wait until it ends.")
+        found, remedy = f"a run is in progress: {running}", "Wait until it ends."
+        raise CampaignError(found, product.root, "a campaign without a run in progress", remedy)
     known = [result.manifest for _, result in results_of(campaign)]
     if not whole and product.manifest not in known:
         expected = f"one of the {len(known)} results of its campaign"
-        raise CampaignError("no result that the config promises", path, expected, "`apertura list` names them.")
-    wanted = [one for one in known if (product.root / one).is_file()] if whole else [product.manifest]
-    if not wanted:
-        raise CampaignError("no results", product.root, "a campaign that was run", "Run it: `apertura run`.")
-    requested = [one for one in wanted if on_demand(campaign, one)]
+        remedy = "Choose one of the output of `apertura list`."
+        raise CampaignError("not a result of the campaign as configured", path, expected, remedy)
+    requested = [manifest for manifest in known if (product.root / manifest).is_file()] if whole else [product.manifest]
+    if not requested:
+        raise CampaignError("no results", product.root, "a processed campaign", "Run the workflow: `apertura run`.")
+    on_request = [manifest for manifest in requested if on_demand(campaign, manifest)]
     with _scratch(campaign, keep) as again:
-        status = run_workflow(again, cores, *(["all", *requested] if whole else wanted))
+        status = run_workflow(again, cores, *(["all", *on_request] if whole else requested))
         if status:
             return status
-        lines = _outcome(product.root, again, wanted, known)
+        lines = _outcome(product.root, again, requested, known)
     for line in lines:
         print(shown(line, _LONGEST))
     if keep is not None:
-        print(shown(f"made again in {keep}", _LONGEST))
+        print(shown(f"recomputed in {keep}", _LONGEST))
     return 0 if lines[0].startswith("same") else 1
 
 
-def _outcome(root: Path, again: Path, wanted: Sequence[str], known: Sequence[str]) -> list[str]:
-    """Return the differences of the requested results and the first known result that differs; or their agreement."""
-    lines = [line for manifest in wanted for line in compared(root, again, manifest)]
+def _outcome(root: Path, again: Path, requested: Sequence[str], known: Sequence[str]) -> list[str]:
+    """Return lines with the differences of the requested results and the first differing result, or their agreement."""
+    lines = [line for manifest in requested for line in compared(root, again, manifest)]
     if not lines:
-        count, more = sum(len(_files(root, one)) for one in wanted), len(wanted) - 1
+        count, more = sum(len(_files(root, manifest)) for manifest in requested), len(requested) - 1
         others = f" and {more} more results" if more else ""
-        return [f"same     {number_of(count, 'file')}, byte for byte, of {wanted[0]}{others}"]
-    begins = next((one for one in known if _differs(root, again, one)), None)
-    if begins is None:
-        return [*lines, "its manifest is the same: a file was changed after it was made, see `apertura verify`"]
-    return [*lines, f"the first result of the chain that differs is {begins}"]
+        return [f"same     {number_of(count, 'file')}, byte for byte, of {requested[0]}{others}"]
+    first = next((manifest for manifest in known if _differs(root, again, manifest)), None)
+    if first is None:
+        return [*lines, "the manifests agree: a file was changed after it was made, see `apertura verify`"]
+    return [*lines, f"the first result of the chain that differs is {first}"]
 
 
 @contextmanager
@@ -382,46 +390,48 @@ def _scratch(campaign: Campaign, keep: Path | None) -> Iterator[Path]:
             yield with_inputs(campaign, Path(folder, root.name), link=True)
         return
     if keep.is_relative_to(root) or keep.is_symlink() or (keep.exists() and not keep.is_dir()):
-        raise CampaignError("cannot be made again there", keep, "a new folder outside the campaign", "Name another.")
+        found = "inside the campaign, a symbolic link or not a folder"
+        raise CampaignError(found, keep, "a new folder outside the campaign", "Name another folder.")
     if keep.is_dir() and any(keep.iterdir()):
-        raise CampaignError("not empty", keep, "a new folder", "Name another; nothing was changed.")
+        raise CampaignError("not empty", keep, "a new folder", "Name another folder; nothing was changed.")
     yield with_inputs(campaign, keep, link=False)
 
 
 def compared(root: Path, again: Path, manifest: str) -> list[str]:
-    """Return the differences between a result and the same result made again, a line each.
+    """Return the differences between a result and its recomputation, a line each.
 
     Parameters
     ----------
     root, again
-        Campaign folders.
+        Campaign folders of the result and of its recomputation.
     manifest
-        Of the result, relative to both.
+        Manifest of the result, relative to both.
 
     Raises
     ------
     CampaignError
-        If a manifest is damaged, or names a file outside.
+        If a manifest is damaged, or names a file outside of its campaign.
     """
     lines = []
-    there = _files(root, manifest), _files(again, manifest)
-    for name in [*sorted({*there[0], *there[1]}), manifest]:
+    listed = _files(root, manifest), _files(again, manifest)
+    for name in [*sorted({*listed[0], *listed[1]}), manifest]:
         folder = "" if name == manifest else f"{manifest.rpartition('/')[0]}/"
         pair = [ConfinedPath.at(where).named(f"{folder}{name}", where=manifest) for where in (root, again)]
         if not all(path.is_file() for path in pair):
-            lines.append(f"missing  {folder}{name}: {'there' if pair[0].is_file() else 'made again'} alone")
-        elif (at := first_difference(*pair)) is not None:
-            lines.append(f"changed  {folder}{name}: first differs at byte {at}")
+            origin = "campaign" if pair[0].is_file() else "recomputed results"
+            lines.append(f"missing  {folder}{name}: only in the {origin}")
+        elif (offset := first_difference(*pair)) is not None:
+            lines.append(f"changed  {folder}{name}: first difference at byte {offset}")
             lines += _differences(*pair) if len(lines) == 1 else []
     return lines
 
 
 def _differences(path: Path, again: Path) -> Iterator[str]:
-    """Yield the output of `apertura diff` for the first file that differs, old against new."""
+    """Yield the output of `apertura diff` for a file and its recomputation."""
     stage = next((folder for folder in path.parents if folder.suffix == ".zarr"), None)
     if stage is not None:
         path, again = stage, again.parents[len(path.relative_to(stage).parts) - 1]
-    with suppress(CampaignError):  # a stage that is damaged is not opened
+    with suppress(CampaignError):  # a damaged stage cannot be opened
         differing = [(section, line) for section, lines in differences(path, again).items() for line in lines]
         yield from (f"         {section:<9}{line}" for section, line in differing[:_MOST_LINES])
         if len(differing) > _MOST_LINES:
@@ -435,5 +445,5 @@ def _files(root: Path, manifest: str) -> Mapping[str, str]:
 
 
 def _differs(root: Path, again: Path, manifest: str) -> bool:
-    there = root / manifest, again / manifest
-    return all(path.is_file() for path in there) and first_difference(*there) is not None
+    pair = root / manifest, again / manifest
+    return all(path.is_file() for path in pair) and first_difference(*pair) is not None

@@ -1,4 +1,4 @@
-"""Product of a path and its contents: tags of a GeoTIFF or PNG, a stage, a report."""
+"""Identify the product at a path and read its contents: tags of a GeoTIFF or PNG, a stage, a report."""
 
 import json
 import warnings
@@ -24,16 +24,16 @@ _EXPECTED = "a file or stage that the workflow wrote, a manifest, or a campaign 
 
 @dataclass(frozen=True)
 class Product:
-    """The product that a path means.
+    """Product identified by a path.
 
     Attributes
     ----------
     root
         The campaign folder.
     manifest
-        Of the result it belongs to, relative to `root`; empty: no manifest lists it.
+        Manifest of its result, relative to `root`; empty if no manifest lists it.
     file
-        The file, stage or manifest itself, wherever it lies; None: the whole campaign.
+        Path of the file, stage or manifest, also outside `root`; None for the whole campaign.
     """
 
     root: ConfinedPath
@@ -42,19 +42,19 @@ class Product:
 
 
 def find_product(path: Path, campaign: Path | None = None) -> Product:
-    """Return the product that a path means.
+    """Return the product at a path.
 
     Parameters
     ----------
     path
-        Absolute: a file, a stage or a manifest below results/, or a campaign folder.
+        Absolute path of a file, a stage or a manifest below results/, or of a campaign folder.
     campaign
-        Where a file that lies elsewhere was made.
+        Campaign folder of a file that is stored elsewhere.
 
     Raises
     ------
     CampaignError
-        If it is not there, or belongs to no campaign.
+        If the path does not exist, or does not belong to a campaign.
     """
     if path.is_dir() and ((path / CONFIG).is_file() or (path / "results").is_dir()):
         return Product(ConfinedPath.at(path))
@@ -63,37 +63,38 @@ def find_product(path: Path, campaign: Path | None = None) -> Product:
     if campaign is not None and not path.is_relative_to(campaign / "results") and path.is_file():
         listed = _listing(campaign / "results", path, sha256=sha256_file(path))
         return Product(ConfinedPath.at(campaign), listed, path)
-    found = "" if results is None else _manifest(results, path)
-    product = Product(ConfinedPath.at(path.parent if results is None else results.parent), found, path)
-    known = (product.root / product.manifest).is_file()
-    if not path.exists() and not known:
+    manifest = "" if results is None else _manifest(results, path)
+    product = Product(ConfinedPath.at(path.parent if results is None else results.parent), manifest, path)
+    is_listed = (product.root / product.manifest).is_file()
+    if not path.exists() and not is_listed:
         remedy = "Correct the path." if results is None else "Correct the path, or run the workflow (`apertura run`)."
         raise CampaignError("no such file or folder", path, _EXPECTED, remedy)
-    if not known and not (product.root / CONFIG).is_file():
-        remedy = "Name the folder of its campaign with --campaign."
-        raise CampaignError("lies in no campaign: its chain cannot be walked", path, "a file below results/", remedy)
+    if not is_listed and not (product.root / CONFIG).is_file():
+        remedy = "Give its campaign folder with --campaign."
+        found = "outside a campaign folder, so that its chain cannot be followed"
+        raise CampaignError(found, path, "a file below results/", remedy)
     if path.is_dir() and not product.manifest:
-        raise CampaignError("a folder that is no result", path, _EXPECTED, "Name one of its files.")
+        raise CampaignError("a folder that is not a result", path, _EXPECTED, "Name one of its files.")
     return product
 
 
 def as_product(path: Path) -> Path:
-    """Return a path that a user typed, confined to the campaign in whose results it lies, if any."""
+    """Return a path typed by a user, confined to the campaign that contains it in its results, if any."""
     root = next((folder.parent for folder in path.parents if folder.name == "results"), None)
     return path if root is None else ConfinedPath.at(root) / path.relative_to(root)
 
 
 def _manifest(results: Path, path: Path) -> str:
-    """Return the manifest of the result that a path below a folder of results belongs to; empty if none lists it."""
+    """Return the manifest of the result of a path below a results folder; empty if no manifest lists it."""
     stage = next((folder for folder in (path, *path.parents) if folder.suffix == ".zarr"), None)
     manifest = path if path.name.endswith(SUFFIX) else None if stage is None else manifest_of(stage)
     return _listing(results, path) if manifest is None else manifest.relative_to(results.parent).as_posix()
 
 
 def _listing(results: Path, path: Path, *, sha256: str = "") -> str:
-    """Return the manifest that lists a file, relative to the campaign; empty if none does.
+    """Return the manifest that lists a file, relative to the campaign; empty if there is none.
 
-    A file elsewhere is recognised by its hash, unless it was edited.
+    With `sha256`, the file is identified by its hash and not by its path.
     """
     for manifest in manifests(results):
         with suppress(CampaignError):  # a damaged manifest lists nothing
@@ -105,33 +106,33 @@ def _listing(results: Path, path: Path, *, sha256: str = "") -> str:
 
 
 def manifests(results: Path) -> Iterator[ConfinedPath]:
-    """Yield every manifest below a folder of results, in order of their names; links are not followed."""
+    """Yield every manifest below a results folder, sorted by name; symbolic links are not followed."""
     for folder, _, files in ConfinedPath.at(results).walk():
         if not any(".zarr" in part for part in folder.relative_to(results).parts):
             yield from (folder / name for name in files if name.endswith(SUFFIX))
 
 
 TAGGED = (".tif", ".png")
-"""Suffixes of files that carry tags."""
+"""Suffixes of files with tags of apertura."""
 
-_TAGGED_AS = "a GeoTIFF or PNG as the workflow writes it"
+_TAGGED_AS = "an undamaged GeoTIFF or PNG of the workflow"
 _COPY_AGAIN = "Copy it again from its campaign, or run the workflow again."
 
 _OURS = "APERTURA_"
 
 
 def read_tags(path: Path) -> dict[str, str]:
-    """Return the tags of apertura that a file carries; none where it is of another kind.
+    """Return the tags of apertura in a file; an empty mapping for other file types.
 
     Parameters
     ----------
     path
-        The file; nothing beside it is read.
+        The file; sidecar files are not read.
 
     Raises
     ------
     CampaignError
-        If it is named as a GeoTIFF or PNG and is none.
+        If the file has the suffix of a GeoTIFF or PNG and is not readable as such.
     """
     if path.suffix == ".tif":
         with opened_raster(path, expected=_TAGGED_AS, remedy=_COPY_AGAIN) as raster:
@@ -140,7 +141,7 @@ def read_tags(path: Path) -> dict[str, str]:
 
 
 def ours(tags: Mapping[Any, Any]) -> dict[str, str]:
-    """Return the tags that apertura has written.
+    """Select the tags written by apertura.
 
     Examples
     --------
@@ -151,14 +152,14 @@ def ours(tags: Mapping[Any, Any]) -> dict[str, str]:
 
 
 def picture(path: Path) -> Any:
-    """Return a PNG with its pixels, a `PIL.Image.Image`; raises as `read_tags`."""
+    """Read a PNG with its pixels as `PIL.Image.Image`; raises as `read_tags`."""
     from PIL import Image
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # a picture of more pixels than any of ours, before it is unpacked
+            warnings.simplefilter("error")  # refuses decompression bombs before decoding
             with path.open("rb") as stream, Image.open(stream, formats=["PNG"]) as opened:
-                opened.load()  # texts may follow the pixels
+                opened.load()  # text chunks may follow the pixels
                 return opened
     except MemoryError:
         raise
@@ -168,66 +169,66 @@ def picture(path: Path) -> Any:
 
 
 def document(tags: Mapping[str, str], name: str, where: Path) -> dict[str, Any]:
-    """Return the object in a tag's JSON; empty where there is no such tag.
+    """Parse the JSON object in a tag; empty if the tag is missing.
 
     Parameters
     ----------
     tags
-        Of the file.
+        Tags of the file.
     name
-        The tag, without ``APERTURA_``.
+        Name of the tag without ``APERTURA_``.
     where
-        The file, for the message.
+        Path of the file for error messages.
 
     Raises
     ------
     CampaignError
-        If the text is no JSON object.
+        If the text is not a JSON object.
 
     Examples
     --------
     >>> document({"APERTURA_SOURCES": '{"results/scene.manifest.json":"4c"}'}, "SOURCES", Path("db.tif"))
     {'results/scene.manifest.json': '4c'}
     """
-    with undamaged(where, expected=f"tag {_OURS}{name} as the workflow writes it", remedy=_COPY_AGAIN):
-        found = json.loads(tags.get(f"{_OURS}{name}", "{}"))
-        if not isinstance(found, dict):
-            raise TypeError(f"tag {_OURS}{name} is no object of JSON")
-        return found
+    with undamaged(where, expected=f"an undamaged tag {_OURS}{name}", remedy=_COPY_AGAIN):
+        value = json.loads(tags.get(f"{_OURS}{name}", "{}"))
+        if not isinstance(value, dict):
+            raise TypeError(f"tag {_OURS}{name} is not a JSON object")
+        return value
 
 
 def hashes(tags: Mapping[str, str], name: str, where: Path) -> dict[str, str]:
     """Return the hashes in a tag, name → hex; as `document`."""
-    found = document(tags, name, where)
+    digests = document(tags, name, where)
     with undamaged(where, expected="a hash for each name", remedy=_COPY_AGAIN):
-        if not all(isinstance(text, str) for text in found.values()):
-            raise TypeError(f"tag {_OURS}{name} holds a hash that is no text")
-    return found
+        if not all(isinstance(text, str) for text in digests.values()):
+            raise TypeError(f"tag {_OURS}{name} contains a hash that is not text")
+    return digests
 
 
 SECTIONS = ("geometry", "settings", "inputs", "stages", "code", "software", "flags", "report")
-"""Compared sections, in this order."""
+"""Sections in the order of comparison."""
 
-EXPECTED = "a raster, a picture, a stage or a JSON file that the workflow wrote"
-REMEDY = "Name one file of a result, and the file to hold it against."
+EXPECTED = "a raster, a PNG image, a stage or a JSON file that the workflow wrote"
+REMEDY = "Name a file of a result, and the file to compare it with."
 
-_KEPT_APART = ("RUNSPEC", "INPUTS", "SOURCES", "CODE_SHA256", "SOFTWARE", "FLAGS", "VERSION", "LOCK_SHA256")
+_IN_OTHER_SECTIONS = ("RUNSPEC", "INPUTS", "SOURCES", "CODE_SHA256", "SOFTWARE", "FLAGS", "VERSION", "LOCK_SHA256")
 
 Sections = dict[str, dict[str, str]]
 
 
 def sections_of(path: Path) -> Sections:
-    """Return section → key → value as text, of a product.
+    """Return the sections of a product, section → key → value as text.
 
     Parameters
     ----------
     path
-        A .tif, .png, .json or .geojson file, or the folder of a stage. Others have no sections.
+        A .tif, .png, .json or .geojson file, or the folder of a stage. Other files have no sections.
 
     Raises
     ------
     CampaignError
-        If it is not readable, or is a folder of another kind.
+        If the path is not readable, or is a folder other than a stage.
     """
     if path.is_dir():
         return _stage_sections(path)
@@ -249,7 +250,7 @@ def sections_of(path: Path) -> Sections:
 
 
 def _tag_sections(path: Path) -> Sections:
-    """Return the sections of a file by its tags."""
+    """Return the sections that are stored in the tags of a file."""
     tags = read_tags(path)
     others = {name.removeprefix("APERTURA_"): text for name, text in tags.items()}
     return {
@@ -260,7 +261,7 @@ def _tag_sections(path: Path) -> Sections:
         "software": flat(document(tags, "SOFTWARE", path))
         | {name: others[key] for key, name in (("VERSION", "apertura"), ("LOCK_SHA256", "lock")) if key in others},
         "flags": flat(document(tags, "FLAGS", path)),
-        "report": flat({key.lower(): _value(text) for key, text in others.items() if key not in _KEPT_APART}),
+        "report": flat({key.lower(): _value(text) for key, text in others.items() if key not in _IN_OTHER_SECTIONS}),
     }
 
 
@@ -273,14 +274,14 @@ def _value(text: str) -> Any:
 
 
 def _stage_sections(folder: Path) -> Sections:
-    """Return the sections of a finished stage by its attributes; its arrays are compared elsewhere."""
+    """Return the sections of a finished stage from its attributes, without its arrays."""
     if folder.suffix != ".zarr" or folder.stem not in STAGES:
-        raise CampaignError("a folder that is no stage", folder, EXPECTED, REMEDY)
+        raise CampaignError("a folder that is not a stage", folder, EXPECTED, REMEDY)
     stage = open_stage(folder, folder.stem)
     with undamaged(folder, expected="attributes of a stage", remedy="Delete its manifest and run the workflow again."):
         attributes = dict(stage.attrs)
         return {
-            "geometry": {str(name): f"{one.dtype} {dict(one.sizes)}" for name, one in stage.variables.items()},
+            "geometry": {str(name): f"{array.dtype} {dict(array.sizes)}" for name, array in stage.variables.items()},
             "settings": flat(json.loads(attributes.pop("runspec", "{}"))),
             "inputs": flat(attributes.pop("inputs", {})),
             "stages": read_manifest(manifest_of(folder)).get("sources", {}),
@@ -293,20 +294,22 @@ def _stage_sections(folder: Path) -> Sections:
 
 
 def flat(value: Mapping[str, Any]) -> dict[str, str]:
-    """Return key.key… → text of each value that is no mapping and no list.
+    """Flatten nested mappings and lists to key.key… → text of the value.
 
     Examples
     --------
     >>> flat({"waveform": {"carrier_hz": 1.2e9}, "nodes": ["uav1"], "flags": {}})
     {'waveform.carrier_hz': '1200000000.0', 'nodes.0': 'uav1', 'flags': '{}'}
     """
-    found: dict[str, str] = {}
-    waiting: list[tuple[str, Any]] = [("", value)]  # an untrusted document may be deeper than Python's recursion
-    while waiting:
-        key, one = waiting.pop()
-        inner = one.items() if isinstance(one, Mapping) else enumerate(one) if isinstance(one, list) else ()
-        if inner and one:
-            waiting += [(f"{key}.{name}" if key else str(name), below) for name, below in reversed(list(inner))]
+    texts: dict[str, str] = {}
+    stack: list[tuple[str, Any]] = [("", value)]  # no recursion: an untrusted document may exceed Python's limit
+    while stack:
+        key, node = stack.pop()
+        children = node.items() if isinstance(node, Mapping) else enumerate(node) if isinstance(node, list) else ()
+        if children and node:
+            stack += [(f"{key}.{name}" if key else str(name), child) for name, child in reversed(list(children))]
         elif key:
-            found[key] = one if isinstance(one, str) else str(one) if hasattr(one, "dtype") else canonical_json(one)
-    return found
+            texts[key] = (
+                node if isinstance(node, str) else str(node) if hasattr(node, "dtype") else canonical_json(node)
+            )
+    return texts

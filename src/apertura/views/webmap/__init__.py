@@ -1,1 +1,1 @@
-"""A campaign in a browser: one page with its images, served on this machine alone."""
+"""Map of a campaign in a browser: a page with its images, served on this machine only."""

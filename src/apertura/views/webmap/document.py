@@ -1,4 +1,4 @@
-"""Rule `map`: what the page shows, as plain values: images, their layers and stretches, places, links to the files."""
+"""Rule `map`: contents of the map page as JSON: images, layers and their display ranges, points, links to the files."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,13 +25,13 @@ from apertura.views.quality import ImageValues, explained_flags, read_report
 from apertura.workflow.lineage import result_of
 
 FORMAT = 1
-"""Format of `map.json`; the page refuses another."""
+"""Format version of `map.json`; the page refuses other versions."""
 
 KINDS = ("image", "classes", "measure")
-"""Style of a layer: grey between two dB that the reader chooses, named colours, a ramp of colours."""
+"""Style of a layer: greyscale between two adjustable dB values, a colour for each class, a colour ramp."""
 
-CLASSES = {0: "seen", 1: "shadow", 2: "layover", 3: "shadow and layover"}
-"""Value of the mask → what it means."""
+CLASSES = {0: "visible", 1: "shadow", 2: "layover", 3: "shadow and layover"}
+"""Value of the mask → class name."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +41,13 @@ class Layer:
     Attributes
     ----------
     file, sha256
-        Its name, and the hash of the file that is meant and of no other.
+        File name, and the hash that the served file must have.
     kind
         One of `KINDS`.
     title, unit
-        What its values are.
+        Quantity and unit of its values.
     low, high
-        Values at the ends of the colours, in `unit`.
+        Values at the ends of the colour scale, in `unit`.
     """
 
     file: str
@@ -66,13 +66,13 @@ class Place:
     Attributes
     ----------
     name
-        What it is called.
+        Name of the point.
     source
-        Where it is known from: 'truth', 'stated' or 'found' (in an image).
+        Origin: 'truth' (simulation), 'stated' (config) or 'found' (image).
     x_m, y_m
         Easting and northing, metres in the campaign's CRS.
     image
-        ``flight/pair`` that it was found in; None if in none.
+        ``flight/pair`` of the image in which it was found; None for other sources.
     """
 
     name: str
@@ -99,7 +99,7 @@ def image_entry(flight: str, image: str, report: Mapping[str, Any], layers: Iter
         "flight": flight,
         "image": image,
         "verdict": values.verdict,
-        "why": values.why,
+        "reason": values.reason,
         "error_db": values.error_db,
         "flags": explained_flags(values.flags),
         "layers": [
@@ -109,11 +109,11 @@ def image_entry(flight: str, image: str, report: Mapping[str, Any], layers: Iter
 
 
 def found_places(flight: str, image: str, report: Mapping[str, Any]) -> list[Place]:
-    """Return the brightest pixel of an image and the bright points that its focus was judged by.
+    """Return the brightest pixel of an image and the bright points used for its focus verdict.
 
     Examples
     --------
-    >>> found_places("f01", "a-a", {"brightest": {"x_m": 3.0, "y_m": 4.0}, "focus": {"verdict": "cannot tell"}})
+    >>> found_places("f01", "a-a", {"brightest": {"x_m": 3.0, "y_m": 4.0}, "focus": {"verdict": "inconclusive"}})
     [Place(name='brightest', source='found', x_m=3.0, y_m=4.0, image='f01/a-a')]
     """
     where = f"{flight}/{image}"
@@ -130,7 +130,7 @@ def found_places(flight: str, image: str, report: Mapping[str, Any]) -> list[Pla
 
 
 def url_of(file: str, sha256: str) -> str:
-    """Return the address of a file of the results as seen from ``map/``, with the hash that `MapServer` compares.
+    """Return the URL of a results file relative to ``map/``, with the hash that `MapServer` compares.
 
     Examples
     --------
@@ -141,12 +141,12 @@ def url_of(file: str, sha256: str) -> str:
 
 
 def requested_file(target: str) -> tuple[str, str | None]:
-    """Return the file that a request names and the hash it expects, if any; '' is no name of a file.
+    """Return file name and expected hash (None if absent) of a request; the name is '' for an invalid request.
 
     Parameters
     ----------
     target
-        As it stands in the request, percent-encoded.
+        Target of the request, percent-encoded.
 
     Examples
     --------
@@ -164,12 +164,12 @@ def requested_file(target: str) -> tuple[str, str | None]:
 
 
 def named_files(document: Mapping[str, Any]) -> dict[str, str]:
-    """Return file of the results → sha256, of those that a `map.json` names; none where no page reads its format.
+    """Return the result files named in a `map.json`, file → sha256; empty for a format that the page refuses.
 
     Parameters
     ----------
     document
-        Of `map_document`.
+        A document of `map_document`.
 
     Examples
     --------
@@ -200,29 +200,29 @@ def map_document(
     Parameters
     ----------
     campaign
-        Its name.
+        Name of the campaign.
     grid
         ``bounds_m`` (west, south, east, north), ``spacing_m``, ``shape`` (rows, columns).
     crs
-        ``name``; ``local``; ``code`` and ``proj4`` (None where there is none); ``control``: (n, 4) easting and northing
-        (m) with longitude and latitude (deg, WGS 84) by PROJ, which the page holds its own arithmetic against.
+        ``name``; ``local``; ``code`` and ``proj4`` (None if not available); ``control``: (n, 4) easting and northing
+        (m) with longitude and latitude (deg, WGS 84) by PROJ, which the page uses to check its own projection.
     images
-        Of `image_entry`.
+        Entries of `image_entry`.
     places
         The target list.
     coverage_url
-        Of the GeoJSON with tracks and footprints; None where it has no place on Earth.
+        URL of the GeoJSON with tracks and footprints; None for a local frame.
     notes
-        What the reader should know of the map.
+        Remarks on the map for the reader.
     again_s
-        Seconds after which the page reads it again: images of a flight that goes on; None: it is as it will be.
+        Interval in seconds at which the page reloads the document during a flight; None if it does not change.
     """
     return {
         "format": FORMAT,
         "campaign": campaign,
         "grid": dict(grid),
         "crs": dict(crs),
-        "classes": {str(value): words for value, words in CLASSES.items()},
+        "classes": {str(value): name for value, name in CLASSES.items()},
         "images": [dict(image) for image in images],
         "places": [asdict(place) for place in places],
         "coverage_url": coverage_url,
@@ -231,7 +231,7 @@ def map_document(
     }
 
 
-_FEW = 512  # places along a raster's longer side that its range of values is taken from
+_RANGE_SAMPLES = 512  # samples along a raster's longer side from which its value range is taken
 _MOST_TARGETS = 1000
 
 
@@ -242,8 +242,9 @@ def webmap(campaign: Campaign) -> list[Path]:
     images, places = [], [*stated_places(campaign)]
     notes: list[str] = []
     places += true_places(campaign, scene.grid.crs, notes)
-    # Sums, the last of a flight, are what a map opens on.
-    for flight, image in ((name, one) for name, (*pairs, last) in campaign.images.items() for one in (last, *pairs)):
+    # The last image of a flight is its sum; first in the document, it is the one that the map opens with.
+    names = [(flight, image) for flight, (*pairs, last) in campaign.images.items() for image in (last, *pairs)]
+    for flight, image in names:
         report = read_report(campaign, flight, image)
         with undamaged(campaign.result(flight, image, "image.json"), expected="a report", remedy="Run export again."):
             images.append(image_entry(flight, image, report, _layers(campaign, flight, image, report)))
@@ -267,7 +268,7 @@ def webmap(campaign: Campaign) -> list[Path]:
 
 
 def _layers(campaign: Campaign, flight: str, image: str, report: Mapping[str, Any]) -> list[Layer]:
-    """Return the layers of an image to show: real rasters, the linear ones only without an equivalent in dB."""
+    """Return the layers of an image for display: real-valued rasters, linear ones only if there is no dB version."""
     of_pairs = [("export", "pair"), ("layers", "layers"), ("layers", "radiometry")]
     kinds = [("export", "fused")] if image == FUSED else of_pairs
     return [
@@ -288,7 +289,7 @@ def _layer(manifest: Path, row: Export, report: Mapping[str, Any]) -> Layer | No
 
     sha256 = check_listed(path, manifest, present=present)
     remedy = remake_from(manifest)
-    with opened_raster(path, expected="what the workflow wrote", remedy=remedy) as raster:
+    with opened_raster(path, expected="a raster that the workflow wrote", remedy=remedy) as raster:
         title, unit = str(raster.descriptions[0] or row.file), str(raster.units[0] or "")
         if np.dtype(raster.dtypes[0]).kind == "c" or (unit == "1" and row.source in _SHOWN_IN_DB):
             return None
@@ -298,53 +299,53 @@ def _layer(manifest: Path, row: Export, report: Mapping[str, Any]) -> Layer | No
             peak_db = 20 * math.log10(max(float(report["brightest"]["amplitude"]), 1e-30))
             low, high = peak_db + float(report["noise_floor_db"]), peak_db
             return Layer(row.file, sha256, "image", title, unit, *(round(end, 2) + 0.0 for end in (low, high)))
-        fewer = max(1.0, max(raster.shape) / _FEW)
-        values = raster.read(1, out_shape=tuple(max(1, round(size / fewer)) for size in raster.shape), masked=True)
+        factor = max(1.0, max(raster.shape) / _RANGE_SAMPLES)
+        values = raster.read(1, out_shape=tuple(max(1, round(size / factor)) for size in raster.shape), masked=True)
     valid = np.ma.masked_invalid(values).compressed()
     low, high = (float(valid.min()), float(valid.max())) if valid.size else (0.0, 1.0)
     return Layer(row.file, sha256, "measure", title, unit, _rounded(low), _rounded(high))
 
 
 _SHOWN_IN_DB = frozenset({"image", "coherent", "noncoherent", "magnitude"})
-"""Sources of products whose power has a file in dB."""
+"""Sources of products whose power is also exported in dB."""
 
 
 def _rounded(value: float) -> float:
-    return float(f"{value:.4g}") + 0.0  # no -0
+    return float(f"{value:.4g}") + 0.0  # avoids -0
 
 
 def crs_of(grid: SceneGrid) -> dict[str, Any]:
-    """Return the CRS of a grid as the page needs it, with places by which it proves its own arithmetic."""
+    """Return the CRS of a grid for the page, with control points for checking its projection."""
     from pyproj import CRS
 
-    known = CRS.from_user_input(grid.crs_wkt)
+    crs = CRS.from_user_input(grid.crs_wkt)
     if grid.crs == LOCAL:
-        return {"name": known.name, "code": None, "local": True, "proj4": None, "control": []}
+        return {"name": crs.name, "code": None, "local": True, "proj4": None, "control": []}
     west, south, east, north = grid.bounds_m
     x, y = np.array([(x, y) for x in (west, (west + east) / 2, east) for y in (south, (south + north) / 2, north)]).T
     latitude, longitude, _ = geodetic_from_ecef(frame_from_map(grid.crs, x, y, np.zeros(len(x)))).T
     control = np.stack([x, y, longitude, latitude], axis=-1).round(10).tolist()
-    return {"name": known.name, "code": grid.crs, "local": False, "proj4": _proj4(known), "control": control}
+    return {"name": crs.name, "code": grid.crs, "local": False, "proj4": _proj4(crs), "control": control}
 
 
 def _proj4(crs: Any) -> str | None:
     import warnings
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # what the short form loses, the control places show
+        warnings.simplefilter("ignore", UserWarning)  # the control points detect losses of the PROJ.4 string
         return str(crs.to_proj4()) or None
 
 
 def stated_places(campaign: Campaign) -> list[Place]:
-    """Return the places that the config knows."""
+    """Return the reference points and the calibration reflector of the config."""
     scene, calibration = campaign.settings.scene, campaign.settings.calibration
-    known = [(point.name, point.position_m) for point in scene.reference_points]
-    known += [("reflector", calibration.reflector_m)] if calibration is not None else []
-    return [Place(name, "stated", float(x), float(y)) for name, (x, y, _) in known]
+    points = [(point.name, point.position_m) for point in scene.reference_points]
+    points += [("reflector", calibration.reflector_m)] if calibration is not None else []
+    return [Place(name, "stated", float(x), float(y)) for name, (x, y, _) in points]
 
 
 def true_places(campaign: Campaign, crs: str, notes: list[str]) -> list[Place]:
-    """Return the targets of a simulation, numbered as `apertura score` does; what cannot be read becomes a note."""
+    """Return the targets of a simulation, numbered as by `apertura score`; an unreadable truth.json becomes a note."""
     path = campaign.root.named("truth.json", where=campaign.root)
     if not path.is_file():
         return []
@@ -353,10 +354,10 @@ def true_places(campaign: Campaign, crs: str, notes: list[str]) -> list[Place]:
         with undamaged(path, expected="the truth of a simulation", remedy="Delete it."):
             targets = [(float(target["x"]), float(target["y"])) for target in document["targets"]]
             if document.get("crs", crs) != crs:
-                raise ValueError("its places are in another CRS than the images")
+                raise ValueError("targets and images are in different CRSs")
     except CampaignError as error:
-        notes.append(f"No targets are listed: {error}".replace(f"{campaign.root}/", ""))
+        notes.append(f"No simulated targets are listed: {error}".replace(f"{campaign.root}/", ""))
         return []
     if len(targets) > _MOST_TARGETS:
-        notes.append(f"Of {len(targets)} targets the first {_MOST_TARGETS} are listed.")
+        notes.append(f"Only the first {_MOST_TARGETS} of {len(targets)} targets are listed.")
     return [Place(f"target {number}", "truth", x, y) for number, (x, y) in enumerate(targets[:_MOST_TARGETS])]

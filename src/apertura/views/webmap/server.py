@@ -1,9 +1,9 @@
-"""The map of one campaign on this machine alone: the page, and products listed with their hashes; read only.
+"""Read-only HTTP server for the map of one campaign on this machine: the page, and products verified by their hashes.
 
-No policy of content keeps a page from leading its own window elsewhere. So the map is a frame of another origin: where
-a frame may be led to is for the window around it to say, and a sandboxed frame leads no window and opens none. Browsers
-that know connection allowlists (Chromium 152) hold to them for everything, name look-ups, early connections and WebRTC
-too, which no other header of all these reaches.
+A content security policy does not prevent a page from navigating its own window to another site. The map is therefore
+a frame of another origin: the policy of the outer window limits the navigation of the frame, and a sandboxed frame
+can neither navigate nor open a window. Browsers that support connection allowlists (Chromium 152) apply them to all
+connections, including name look-ups, early connections and WebRTC, which the other headers do not cover.
 """
 
 import os
@@ -28,31 +28,31 @@ from apertura.common.documents import read_json, undamaged
 from apertura.common.errors import CampaignError
 from apertura.common.processes import Interrupted
 from apertura.common.provenance import sha256_file
-from apertura.formats.export import LOOK, MAP, product_files
+from apertura.formats.export import MAP, PREVIEW, product_files
 from apertura.views.webmap.document import named_files, requested_file
 
 LOOPBACK = "127.0.0.1"
-"""The only address that is listened on, and the name under which the map and its data are answered."""
+"""The only address on which the server listens, and host name of the map and its data."""
 
 WINDOW = "localhost"
-"""The name under which the window around the map is answered: to a browser, another origin."""
+"""Host name of the window around the map: for a browser, a different origin."""
 
 _RANGE = re.compile(r"bytes=(?:(\d{1,18})-(\d{1,18})?|-(\d{1,18}))", re.ASCII)
 
 
 class UnsatisfiableRangeError(ValueError):
-    """The requested range has no byte of the file."""
+    """Requested range without any byte of the file."""
 
 
 def own_host(hosts: list[str], port: int) -> str | None:
-    """Return the host name of this server in a request; None for another that leads here (DNS rebinding).
+    """Return the host name of this server in a request; None for any other name (DNS rebinding).
 
     Parameters
     ----------
     hosts
-        Every ``Host`` of the request.
+        All ``Host`` headers of the request.
     port
-        Of the server.
+        Port of the server.
 
     Examples
     --------
@@ -64,21 +64,21 @@ def own_host(hosts: list[str], port: int) -> str | None:
 
 
 def requested_range(header: str | None, size: int) -> tuple[int, int] | None:
-    """Return the first requested byte and the one after the last; None for the whole file.
+    """Return the requested range as offsets of the first byte and past the last; None for the whole file.
 
-    A header that is none, or asks for several ranges, asks for the whole file (RFC 9110, 14.2).
+    An invalid header, or one with several ranges, is ignored: the whole file is sent (RFC 9110, 14.2).
 
     Parameters
     ----------
     header
-        ``Range`` of the request.
+        ``Range`` header of the request.
     size
-        Bytes of the file.
+        File size in bytes.
 
     Raises
     ------
     UnsatisfiableRangeError
-        If the range begins beyond the file.
+        If the range starts beyond the end of the file.
 
     Examples
     --------
@@ -87,20 +87,20 @@ def requested_range(header: str | None, size: int) -> tuple[int, int] | None:
     >>> requested_range("bytes=-5", 95), requested_range(None, 9)
     ((90, 95), None)
     """
-    found = _RANGE.fullmatch(header.strip()) if header else None
-    if found is None:
+    match = _RANGE.fullmatch(header.strip()) if header else None
+    if match is None:
         return None
-    first, last, suffix = (None if digits is None else int(digits) for digits in found.groups())
+    first, last, suffix = (None if digits is None else int(digits) for digits in match.groups())
     if first is None:
         first, last = size - min(size, suffix or 0), size - 1
     elif last is not None and last < first:
         return None
     if first >= size:
-        raise UnsatisfiableRangeError(f"bytes from {first} of {size}")
+        raise UnsatisfiableRangeError(f"range starts at byte {first} of a file of {size} bytes")
     return first, min(size, size if last is None else last + 1)
 
 
-_OF_ALL = {
+_COMMON_HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
@@ -110,12 +110,12 @@ _OF_ALL = {
 
 
 def headers_of(port: int) -> Mapping[str, Mapping[str, str]]:
-    """Return name of the server → what every answer under that name carries.
+    """Return host name → headers of all responses under that name.
 
     Parameters
     ----------
     port
-        Of the server.
+        Port of the server.
 
     Examples
     --------
@@ -123,29 +123,31 @@ def headers_of(port: int) -> Mapping[str, Mapping[str, str]]:
     '(response-origin "http://127.0.0.1:8000")'
     """
     page, window = (f"http://{name}:{port}" for name in (LOOPBACK, WINDOW))
-    of_window = (
+    window_policy = (
         f"default-src 'none'; script-src 'self'; style-src 'self'; frame-src {page}; "
         "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
     )
-    of_page = (
+    page_policy = (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
         f"worker-src blob:; base-uri 'none'; form-action 'none'; frame-ancestors {window}; "
         "sandbox allow-scripts allow-same-origin allow-downloads"
     )
     return {
-        WINDOW: _OF_ALL | {"Content-Security-Policy": of_window, "Connection-Allowlist": f'(response-origin "{page}")'},
-        LOOPBACK: _OF_ALL | {"Content-Security-Policy": of_page, "Connection-Allowlist": "(response-origin)"},
+        WINDOW: _COMMON_HEADERS
+        | {"Content-Security-Policy": window_policy, "Connection-Allowlist": f'(response-origin "{page}")'},
+        LOOPBACK: _COMMON_HEADERS
+        | {"Content-Security-Policy": page_policy, "Connection-Allowlist": "(response-origin)"},
     }
 
 
 SHELL = ("shell.html", "shell.js", "shell.css")
-"""The window, of which the map is a frame; what is opened first."""
+"""Files of the window that contains the map as a frame; the start page is first."""
 
 FILES = ("index.html", "app.js", "app.css")
-"""The map; what is opened first."""
+"""Files of the map; its page is first."""
 
 BUILT = Path(__file__).parent / "page"
-"""Output folder of `webmap/build.mjs`: no part of the sources, but of the package that is installed."""
+"""Output folder of `webmap/build.mjs`: part of the installed package, not of the sources."""
 
 
 def page_files(built: Path = BUILT) -> Mapping[str, bytes]:
@@ -154,7 +156,7 @@ def page_files(built: Path = BUILT) -> Mapping[str, bytes]:
     Parameters
     ----------
     built
-        Where the bundle is.
+        Folder of the bundle.
 
     Raises
     ------
@@ -163,16 +165,16 @@ def page_files(built: Path = BUILT) -> Mapping[str, bytes]:
     """
     if not is_built(built):
         raise CampaignError(
-            "this installation has no map page: pip install does not build it",
+            "this installation has no map page, because pip install does not build it",
             "apertura map",
-            f"the page that make webmap builds with Node.js 20 or newer, in {built}",
-            "In apertura's sources, run make setup; or make webmap, then pip install . again.",
+            f"the output of make webmap (Node.js 20 or newer) in {built}",
+            "Run make setup in the sources of apertura, or make webmap and then pip install . again.",
         )
     return {name: (built / name).read_bytes() for name in (*SHELL, *FILES)}
 
 
 def is_built(built: Path = BUILT) -> bool:
-    """Test whether the bundle is built."""
+    """Return True if the bundle is complete."""
     return all((built / name).is_file() for name in (*SHELL, *FILES))
 
 
@@ -184,32 +186,32 @@ _TYPES = {
     ".geojson": "application/geo+json",
     ".tif": "image/tiff",
 }
-_AT_ONCE = 1 << 16
-_WAIT_S = 0.2  # between looks for the first picture
+_BLOCK_BYTES = 1 << 16
+_WAIT_S = 0.2  # interval between checks for the first image
 _IDLE_S = 60.0
 
 
 class MapServer(ThreadingHTTPServer):
-    """A server of a page and of some files of a folder.
+    """HTTP server for a page and for listed files of a folder.
 
     Parameters
     ----------
     folder
-        The results.
+        The results folder.
     files
-        Gives the names below it that are served, with slashes, and the hash that each has to have; no other file is.
-        Asked for every request; CampaignError where they are not known.
+        Function that returns the served files, name below the folder (with slashes) → required hash; no other file is
+        served. Called for every request; raises CampaignError if the list cannot be read.
     page
-        Of `apertura.views.webmap.server.page_files`.
+        Files of `apertura.views.webmap.server.page_files`.
     sha256_of
-        Gives the hash of a file as it is now.
+        Function that returns the present hash of a file.
     port
-        To listen on; 0 for a free one.
+        Port to listen on; 0 for any free port.
 
     Raises
     ------
     CampaignError
-        If the port is taken or not allowed.
+        If the port is in use or not permitted.
 
     Examples
     --------
@@ -238,21 +240,24 @@ class MapServer(ThreadingHTTPServer):
             super().__init__((LOOPBACK, port), _Handler)
         except OSError as error:
             raise CampaignError(
-                f"port {port}: {error.strerror}", "apertura map", "a free port", "Choose another --port, or none."
+                f"port {port}: {error.strerror}",
+                "apertura map",
+                "a free port",
+                "Choose another --port, or omit the option.",
             ) from error
         self.url = f"http://{WINDOW}:{self.server_port}/"
         self.headers = headers_of(self.server_port)
 
     def show(self, *, in_browser: bool = False) -> None:
-        """Print the address, open it if that is wanted, and serve until a signal ends it."""
+        """Print the URL, open it in a browser if requested, and serve until interrupted."""
         with self, suppress(Interrupted):
-            print(f"{self.url}\nCtrl-C ends it.", flush=True)
+            print(f"{self.url}\nPress Ctrl-C to stop the server.", flush=True)
             if in_browser:
                 webbrowser.open(self.url)
             self.serve_forever()
 
     def handle_error(self, request: object, client_address: object) -> None:  # noqa: ARG002
-        """Print the error of a request in one line, unless its reader has just gone."""
+        """Print the error of a request in one line, unless the client closed the connection."""
         error = sys.exception()
         if not isinstance(error, ConnectionError | TimeoutError):
             print(f"error: a request failed: {error}", file=sys.stderr)
@@ -274,28 +279,28 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer()
 
     def __getattr__(self, name: str) -> Callable[[], None]:
-        """Return the handler of every other method."""
+        """Return the refusing handler for all other methods."""
         if name.startswith("do_"):
             return self._refuse
         raise AttributeError(name)
 
     def _refuse(self) -> None:
-        self.close_connection = True  # what the request carries is not read
-        self._say(HTTPStatus.METHOD_NOT_ALLOWED, "the map is only read", Allow="GET, HEAD")
+        self.close_connection = True  # the body of the request is not read
+        self._respond(HTTPStatus.METHOD_NOT_ALLOWED, "the map is read-only", Allow="GET, HEAD")
 
     def _answer(self) -> None:
         host = own_host(self.headers.get_all("Host", []), self.server.server_port)
         if host is None:
-            self._say(HTTPStatus.FORBIDDEN, "this server has another name")
+            self._respond(HTTPStatus.FORBIDDEN, "this server has a different host name")
             return
         self.host = host
         if self.headers.get("Content-Length", "0").strip() != "0" or "Transfer-Encoding" in self.headers:
-            self.close_connection = True  # a body is not read, and must not be taken for the next request
-            self._say(HTTPStatus.BAD_REQUEST, "a request without a body")
+            self.close_connection = True  # an unread body must not be parsed as the next request
+            self._respond(HTTPStatus.BAD_REQUEST, "requests must not have a body")
             return
-        opened = self.path in {"/", "/map/"} or self.headers.get("Sec-Fetch-Dest") == "document"
-        if opened and host == LOOPBACK:  # by a reader, and not as the frame
-            self._say(HTTPStatus.FOUND, "the map", Location=self.server.url)
+        is_top_level = self.path in {"/", "/map/"} or self.headers.get("Sec-Fetch-Dest") == "document"
+        if is_top_level and host == LOOPBACK:  # opened directly instead of in the frame
+            self._respond(HTTPStatus.FOUND, "the map", Location=self.server.url)
             return
         name, expected = (SHELL[0], None) if self.path == "/" else requested_file(self.path)
         if name in self.server.pages[host]:
@@ -303,32 +308,32 @@ class _Handler(BaseHTTPRequestHandler):
         elif host == LOOPBACK:
             self._answer_file(name, expected)
         else:
-            self._say(HTTPStatus.NOT_FOUND, "only the window around the map")
+            self._respond(HTTPStatus.NOT_FOUND, "only the window around the map is served under this name")
 
     def _answer_file(self, name: str, expected: str | None) -> None:
         try:
             sha256 = self.server.files().get(name)
         except CampaignError as error:
-            self._say(HTTPStatus.CONFLICT, str(error))
+            self._respond(HTTPStatus.CONFLICT, str(error))
             return
         file = None if sha256 is None else self._opened(name)
         if file is None:
-            self._say(HTTPStatus.NOT_FOUND, "no product of this campaign")
+            self._respond(HTTPStatus.NOT_FOUND, "not a product of this campaign")
             return
         with file:
-            if expected not in {None, sha256} or not self._is(file, name, sha256):
-                self._say(HTTPStatus.CONFLICT, "changed since the map was made: run the workflow again")
+            if expected not in {None, sha256} or not self._has_hash(file, name, sha256):
+                self._respond(HTTPStatus.CONFLICT, "changed since the map was made: run the workflow again")
                 return
             self._send(file, name)
 
     def _opened(self, name: str) -> IO[bytes] | None:
-        """Return a file of the list; None if it is not there, or is reached through a link, or is no file."""
+        """Open a listed file; None if it is missing, behind a symbolic link, or not a regular file."""
         with suppress(OSError, CampaignError):
             return self.server.folder.named(name, where="request").open("rb")
         return None
 
-    def _is(self, file: IO[bytes], name: str, sha256: str | None) -> bool:
-        """Test whether an open file has the hash; it is computed by path, since products are replaced as a whole."""
+    def _has_hash(self, file: IO[bytes], name: str, sha256: str | None) -> bool:
+        """Return True if an open file has the hash, which is computed by path: products are replaced atomically."""
         with suppress(OSError, CampaignError):
             same = self.server.sha256_of(name) == sha256
             return same and os.path.samestat(os.fstat(file.fileno()), (self.server.folder / name).stat())
@@ -339,7 +344,8 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             part = requested_range(self.headers.get("Range"), size)
         except UnsatisfiableRangeError:
-            self._say(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, "beyond the file", Content_Range=f"bytes */{size}")
+            status = HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE
+            self._respond(status, "range beyond the end of the file", Content_Range=f"bytes */{size}")
             return
         first, end = part or (0, size)
         self.send_response(HTTPStatus.PARTIAL_CONTENT if part else HTTPStatus.OK)
@@ -352,15 +358,15 @@ class _Handler(BaseHTTPRequestHandler):
         if self.command == "HEAD":
             return
         file.seek(first)
-        left = end - first
-        while left and (block := file.read(min(left, _AT_ONCE))):
+        remaining = end - first
+        while remaining and (block := file.read(min(remaining, _BLOCK_BYTES))):
             self.wfile.write(block)
-            left -= len(block)
-        if left:  # cut short meanwhile: the reader must not take what comes next for the rest
+            remaining -= len(block)
+        if remaining:  # truncated meanwhile: the client must not parse the next response as the rest of the file
             self.close_connection = True
 
-    def _say(self, status: HTTPStatus, words: str, **headers: str) -> None:
-        body = f"{words}\n".encode()
+    def _respond(self, status: HTTPStatus, message: str, **headers: str) -> None:
+        body = f"{message}\n".encode()
         self.send_response(status)
         for name, value in headers.items():
             self.send_header(name.replace("_", "-"), value)
@@ -380,55 +386,56 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def served_look(campaign: Campaign, *, port: int = 0) -> MapServer:
-    """Return a server of what `apertura look` shows, once it does; parameters and errors as `served`."""
-    folder = campaign.result(LOOK)
+    """Return a server for the images of `apertura preview`, after waiting for the first; otherwise as `served`."""
+    folder = campaign.result(PREVIEW)
     path = folder / MAP
     if not path.is_file():
-        print("waiting for the first picture of `apertura look`, in another terminal; Ctrl-C ends", flush=True)
+        print("waiting for the first image of `apertura preview` in another terminal; press Ctrl-C to stop", flush=True)
     while not path.is_file():
         time.sleep(_WAIT_S)
 
     def files() -> Mapping[str, str]:
-        document = read_json(path, expected="what apertura look writes", remedy="Run `apertura look CAMPAIGN` again.")
-        with undamaged(path, expected="what apertura look writes", remedy="Run `apertura look CAMPAIGN` again."):
+        expected, remedy = "a document of `apertura preview`", "Run `apertura preview CAMPAIGN` again."
+        document = read_json(path, expected=expected, remedy=remedy)
+        with undamaged(path, expected=expected, remedy=remedy):
             return {**named_files(document), MAP: sha256_file(path)}
 
     return _serving(campaign, folder, files, port)
 
 
 def served(campaign: Campaign, *, port: int = 0) -> MapServer:
-    """Return a server of the campaign's map, of the products that it names and of nothing else.
+    """Return a server for the campaign's map and the products listed in it.
 
     Parameters
     ----------
     campaign
-        With results.
+        A campaign with results.
     port
-        To listen on; 0 for a free one.
+        Port to listen on; 0 for any free port.
 
     Raises
     ------
     CampaignError
-        If there is no map, it is not as it was written, or the port is taken.
+        If there is no map, it was modified, or the port is in use.
     """
     return _serving(campaign, campaign.results, _listing(campaign), port)
 
 
 def _serving(campaign: Campaign, folder: Path, files: Callable[[], Mapping[str, str]], port: int) -> MapServer:
-    """Return a server of a folder of the campaign; raise CampaignError if its files are not known."""
+    """Return a server for a folder of the campaign; raise CampaignError if the list of files cannot be read."""
     files()
-    place = campaign.relative(folder)
+    prefix = campaign.relative(folder)
 
     def sha256_of(name: str) -> str:
-        return digest_of(campaign.root, f"{place}/{name}")
+        return digest_of(campaign.root, f"{prefix}/{name}")
 
     return MapServer(folder, files, page=page_files(), sha256_of=sha256_of, port=port)
 
 
 def _listing(campaign: Campaign) -> Callable[[], Mapping[str, str]]:
-    """Return a function to the served files of the results → sha256: `map.json` by its manifest, and its layers.
+    """Return a function that lists the served results, file → sha256: `map.json` and the layers named in it.
 
-    Both are read again when the manifest is another: the workflow ran meanwhile.
+    Both are read again when the manifest of `map.json` changes, which means that the workflow ran.
     """
     products = frozenset(product_files(campaign.images, campaign.coefficients))
 

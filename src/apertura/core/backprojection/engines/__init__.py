@@ -1,4 +1,4 @@
-"""Backprojection engines: one file and one row each; every one is tested against `reference`."""
+"""Backprojection engines: one module and one entry of `ENGINES` each, all tested against `reference`."""
 
 from collections.abc import Mapping
 from importlib import import_module
@@ -15,10 +15,11 @@ ENGINES: dict[str, str] = {
     "cuda": "apertura.core.backprojection.engines.cuda",
     "reference": "apertura.core.backprojection.engines.reference",
 }
-"""Name → module that is an `Engine`; a module is imported when its engine is loaded."""
+"""Name → module that implements `Engine`, imported when the engine is loaded."""
 
 PATCH_PX = 16
-"""Tiles begin at multiples of this: an engine may work in patches of it and give the same bits in every tiling."""
+"""Tiles start at multiples of this, so that an engine working in patches of this size gives the same bits in every
+tiling."""
 
 
 def load_engine(name: str) -> "Engine":
@@ -27,7 +28,7 @@ def load_engine(name: str) -> "Engine":
     Parameters
     ----------
     name
-        A key of `ENGINES`.
+        Key of `ENGINES`.
 
     Examples
     --------
@@ -38,16 +39,16 @@ def load_engine(name: str) -> "Engine":
 
 
 def pieces(name: str, shape: tuple[int, ...], form_options: Mapping[str, Any]) -> "list[Window]":
-    """Return windows of a tile for which an engine gives the same bits when they are formed alone.
+    """Return windows of a tile that an engine can form independently with the same bits.
 
     Parameters
     ----------
     name
-        A key of `ENGINES`.
+        Key of `ENGINES`.
     shape
-        Of the tile, pixels.
+        Shape of the tile, pixels.
     form_options
-        Of the engine's `form`.
+        Options of the engine's `form`.
 
     Examples
     --------
@@ -62,12 +63,12 @@ def pieces(name: str, shape: tuple[int, ...], form_options: Mapping[str, Any]) -
 
 
 def instruction_set(name: str) -> str:
-    """Return the instructions that an engine's sums run with on this machine; 'unknown' where it states none.
+    """Return the instruction set of an engine's sums on this machine; 'unknown' if the engine does not report it.
 
     Parameters
     ----------
     name
-        A key of `ENGINES`.
+        Key of `ENGINES`.
 
     Examples
     --------

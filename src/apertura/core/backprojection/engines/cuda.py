@@ -1,10 +1,10 @@
-"""Backprojection on an NVIDIA GPU: range tables, a block of threads per patch of pixels; the extra ``cuda``.
+"""Backprojection on an NVIDIA GPU with range tables and one thread block per patch of pixels; needs extra ``cuda``.
 
-`prepare` keeps profiles and filters; the first tile expands them on the device to tables, cells of polynomials with the
-carrier folded in (docs/theory/engine.md, "Cells"). `form` then starts a block of threads for each patch of 16 × 16
-pixels: paths by a series about the patch's middle ("A GPU", eq. 8), exact in float64 where it errs too much, weighted
-by beams and sector. Kernels are in `cuda_kernels`, compiled when they are first used; `candidates` predicts error and
-cost.
+`prepare` keeps profiles and filters; the first tile expands them on the device to tables, cells of polynomials that
+include the carrier (docs/theory/engine.md, "Cells"). `form` starts a thread block for each patch of 16 × 16 pixels.
+Paths are computed by a series about the patch's middle ("A GPU", eq. 8), or exactly in float64 if the error of the
+series is too large, and weighted by beams and sector. The kernels in `cuda_kernels` are compiled at their first use;
+`candidates` predicts error and cost.
 """
 
 import ctypes
@@ -30,18 +30,18 @@ from apertura.core.backprojection.engines.engine import (
 from apertura.core.backprojection.engines.range_interpolation import PHASE_POLYNOMIALS, TableDesign, design_table
 from apertura.core.backprojection.inputs import Profiles
 
-# ---- The device, and arrays on it
+# ---- Device and arrays on the device
 #
-# numba.cuda is imported when a device is used. One call is on the device at a time: threads that form tiles wait for
-# its lock without the GIL.
+# numba.cuda is imported when a device is used. The device executes one call at a time: threads that form tiles wait
+# for its lock without the GIL.
 
 _LOCK = Lock()
-_THREADS, _CHUNK_THREADS = 128, 32  # of blocks that fill tables, and that compare pulses of chunks
+_THREADS, _CHUNK_THREADS = 128, 32  # threads per block of the kernels that fill tables, and that compare pulses
 
 
 @cache
 def available() -> bool:
-    """Return whether a device can be used, or numba's simulator is enabled; never raises.
+    """Return True if a device can be used or numba's simulator is enabled; never raises.
 
     Examples
     --------
@@ -50,7 +50,7 @@ def available() -> bool:
     """
     try:
         if not simulated():
-            ctypes.CDLL("libcuda.so.1")  # the driver's own library: without it the import below would be for nothing
+            ctypes.CDLL("libcuda.so.1")  # the driver's library: fails early, before the slow import below
         from numba import cuda
 
         return bool(cuda.is_available())
@@ -59,7 +59,7 @@ def available() -> bool:
 
 
 def instruction_set() -> str:
-    """Return which device forms images here, and by which package.
+    """Return the device on this machine and the package that uses it.
 
     Examples
     --------
@@ -71,18 +71,18 @@ def instruction_set() -> str:
     from numba import cuda
 
     try:
-        by = f"numba-cuda {version('numba-cuda')}"
-    except PackageNotFoundError:  # numba's own numba.cuda
-        by = f"numba {version('numba')}"
+        package = f"numba-cuda {version('numba-cuda')}"
+    except PackageNotFoundError:  # numba.cuda of package numba
+        package = f"numba {version('numba')}"
     if simulated():
-        return f"cuda: simulator of {by}"
+        return f"cuda: simulator of {package}"
     device = cuda.get_current_device()
     name = device.name.decode() if isinstance(device.name, bytes) else device.name
-    return f"cuda: {name}, compute capability {'.'.join(map(str, device.compute_capability))}, {by}"
+    return f"cuda: {name}, compute capability {'.'.join(map(str, device.compute_capability))}, {package}"
 
 
 class Resident:
-    """Arrays on the device, shared by all slices of one engine's tables from the first tile on; not pickled."""
+    """Arrays on the device, created by the first tile and shared by all slices of the tables; not pickled."""
 
     def __init__(self) -> None:
         self.arrays: tuple[Any, ...] | None = None
@@ -100,20 +100,20 @@ def sum_on_device(
     *,
     rejecting: bool = True,
 ) -> NDArray[np.complex64]:
-    """Return what `apertura.core.backprojection.engines.cuda.form` returns, of one or more pixels.
+    """Return the result of `apertura.core.backprojection.engines.cuda.form` for one or more pixels.
 
     Parameters
     ----------
     tables, pixels, beams, tolerance_rad, counts
-        As of `form`.
+        As for `form`.
     rejecting
-        False: every pulse is weighed at every pixel, also where its weight is one or zero all over a patch. The same
-        bits, for tests.
+        If False, the weight of every pulse is evaluated at every pixel, even if it is one or zero over a whole patch;
+        the result has the same bits. For tests.
 
     Raises
     ------
     CampaignError
-        If no device can be used, or it fails.
+        If no device can be used, or the device fails.
     """
     sector = beams and beams.sector
     weights = _weights(beams or Beams())
@@ -122,21 +122,21 @@ def sum_on_device(
 
         if tables.resident.arrays is None:
             tables.resident.arrays = _tables_on_device(cuda, tables)
-        places, start_m, cells = (array[tables.pulses] for array in tables.resident.arrays)
-        # Numbers of the kernel: scales, phase polynomial, sector.
+        phase_centres, start_m, cells = (array[tables.pulses] for array in tables.resident.arrays)
+        # Parameters of the kernel: scales, phase polynomial, sector.
         scales = (1 / tables.cell_m, tables.wavenumber_rad_m, tolerance_rad, cells.shape[2])
         bounds = (sector.centre, sector.inner, sector.outer) if sector else (0.0, 0.0, 0.0)
         phase = tables.design.phase_coefficients.copy()
         if not PHASE_POLYNOMIALS[tables.design.phase_polynomial][2]:
-            phase[-1] = 0  # no half turns are removed
+            phase[-1] = 0  # no reduction by multiples of π
         numbers = np.array([*scales, *phase, *bounds], np.float64)
-        # Weights, and how far axes and antennas spread within each chunk of 64 pulses, by which chunks are rejected.
+        # Weights, and the spread of axes and antennas within each chunk of 64 pulses, for the rejection of chunks.
         on_device = [cuda.to_device(array) for array in weights]
         spread = cuda.to_device(np.full((-(-len(start_m) // CHUNK) + 1, 2, 3), np.inf))
         if beams and rejecting:
             blocks = -(-len(spread) // _CHUNK_THREADS)
-            kernels.spread_of_chunks[blocks, _CHUNK_THREADS](places, *on_device[:2], spread)
-        # One block of threads per patch.
+            kernels.spread_of_chunks[blocks, _CHUNK_THREADS](phase_centres, *on_device[:2], spread)
+        # One thread block per patch.
         rows, columns = pixels.shape[:2]
         image, tally = (
             cuda.device_array((rows, columns), np.complex64),
@@ -146,7 +146,7 @@ def sum_on_device(
         form = kernels.form_weighed if beams else kernels.form
         form[patches, (SIDE, kernels.ROWS)](
             cuda.to_device(pixels),
-            (places, start_m, cells),
+            (phase_centres, start_m, cells),
             cuda.to_device(numbers),
             (*on_device, spread),
             (image, tally),
@@ -157,10 +157,10 @@ def sum_on_device(
 
 
 def _weights(beams: Beams) -> tuple[NDArray[Any], ...]:
-    """Return beams and sector as arrays of the kernels; empty where there are none.
+    """Return beams and sector as arrays of the kernels; empty arrays without beams or sector.
 
-    (pulse, 2, 3) float64, axes of the sector for transmitter and receiver; (pulse, 2, 3, 3) float64, those of their
-    beams; (2, 2, 3) float32, first angle, samples per radian and place of the last sample of both cuts, or -1 without a
+    (pulse, 2, 3) float64, axes of the sector for transmitter and receiver; (pulse, 2, 3, 3) float64, axes of their
+    beams; (2, 2, 3) float32, first angle, samples per radian and index of the last sample of both cuts, or -1 without a
     beam; (2, 2, sample) float32, gains; (end, 2, 2, 3) float64, phase centres and axes of the sector's ends.
     """
     sector, legs = beams.sector, [(n, beam) for n, beam in enumerate((beams.transmit, beams.receive)) if beam]
@@ -173,13 +173,13 @@ def _weights(beams: Beams) -> tuple[NDArray[Any], ...]:
         for cut, (angle, gain) in enumerate(patterns):
             cuts[leg, cut] = angle[0], (angle.size - 1) / (angle[-1] - angle[0]), angle.size - 1
             gains[leg, cut, : gain.size] = gain
-    flown, ends = np.zeros((0, 2, 3)), np.zeros((0, 2, 2, 3))
+    sector_axes, ends = np.zeros((0, 2, 3)), np.zeros((0, 2, 2, 3))
     if sector:
-        flown = np.stack([sector.tx_axis, sector.rx_axis], axis=1)
+        sector_axes = np.stack([sector.tx_axis, sector.rx_axis], axis=1)
     if sector and sector.ends:
-        aperture, there = sector.ends
-        ends = np.stack([np.stack(aperture.legs, 1), np.stack([there.tx_axis, there.rx_axis], 1)], axis=1)
-    return flown, axes, cuts, gains, ends
+        aperture, end_sector = sector.ends
+        ends = np.stack([np.stack(aperture.legs, 1), np.stack([end_sector.tx_axis, end_sector.rx_axis], 1)], axis=1)
+    return sector_axes, axes, cuts, gains, ends
 
 
 def _tables_on_device(cuda: Any, tables: "ResidentTables") -> tuple[Any, ...]:
@@ -190,16 +190,18 @@ def _tables_on_device(cuda: Any, tables: "ResidentTables") -> tuple[Any, ...]:
     pulses, length = tables.samples.shape
     used = (length - 1) * design.up // design.down + 1
     carrier = np.exp(1j * np.remainder(k * tables.cell_m * np.arange(used), 2 * np.pi)).astype(np.complex64)
-    turn = np.exp(1j * np.remainder(k * tables.start_m, 2 * np.pi)).astype(np.complex64)
+    carrier_at_start = np.exp(1j * np.remainder(k * tables.start_m, 2 * np.pi)).astype(np.complex64)
     cells = cuda.device_array((pulses, 6, used), np.float32)
-    samples, taps, lead, carrier, turn = map(cuda.to_device, (tables.samples, design.taps, design.lead, carrier, turn))
-    expand[-(-pulses * used // _THREADS), _THREADS](samples, taps, lead, design.down, carrier, turn, cells)
+    samples, taps, lead, carrier, carrier_at_start = map(
+        cuda.to_device, (tables.samples, design.taps, design.lead, carrier, carrier_at_start)
+    )
+    expand[-(-pulses * used // _THREADS), _THREADS](samples, taps, lead, design.down, carrier, carrier_at_start, cells)
     return cuda.to_device(tables.places_m), cuda.to_device(tables.start_m), cells
 
 
 @contextmanager
 def _device() -> Iterator[Any]:
-    """Yield numba.cuda under the device's lock; its failures become one message."""
+    """Yield numba.cuda under the device's lock; report failures of the device as a CampaignError."""
     if not available():
         raise _unusable("no device can be used")
     from numba import cuda
@@ -216,17 +218,17 @@ def _unusable(found: str) -> CampaignError:
     return CampaignError(
         f"engine cuda: {found}",
         where="processing.engine",
-        expected="an NVIDIA GPU with its driver and memory for a block of pulses (docs/howto/gpu.md)",
-        remedy="Choose engine native or numba, or free the device.",
+        expected="an NVIDIA GPU with its driver and sufficient memory for a pulse block (docs/howto/gpu.md)",
+        remedy="Select engine native or numba, or free memory of the device.",
     )
 
 
-# ---- The engine
+# ---- Engine
 
 __all__ = ["NEEDS", "READS", "TIMED", "VARIANTS", "available", "candidates", "form", "instruction_set", "prepare"]
 
 READS: Literal["profiles"] = "profiles"
-TIMED = False  # the seconds below are published ones of others, auto compares measured ones
+TIMED = False  # the cost is based on published rates of other software, but the planner compares measured costs
 VARIANTS = ("by series", "by exact paths", "without an echo", "without an echo of 64")
 NEEDS = "an NVIDIA GPU with its driver, and apertura[cuda] (docs/howto/gpu.md)"
 
@@ -238,13 +240,13 @@ class Options(EngineOptions):
         None, description="table cells per resolution cell c/B of total path"
     )
     tolerance_rad: Annotated[float, Field(gt=0, le=0.1)] | None = Field(
-        None, description="largest phase error that the path series may make, rad"
+        None, description="largest tolerated phase error of the path series, rad"
     )
 
 
 @dataclass(frozen=True, eq=False)
 class ResidentTables:
-    """Profiles, and their tables on the device: polynomials per cell, carrier folded in.
+    """Profiles, and their tables on the device: polynomials per cell that include the carrier.
 
     Attributes
     ----------
@@ -253,7 +255,7 @@ class ResidentTables:
     places_m
         (pulse, 2, 3) float64, phase centres of transmitter and receiver in the frame of the pixels.
     start_m
-        (pulse,) float64, total path of sample 0 and of the middle of cell 0, metres.
+        (pulse,) float64, total path of sample 0 and at the middle of cell 0, metres.
     cell_m
         Total path across one cell, metres.
     wavenumber_rad_m
@@ -261,9 +263,9 @@ class ResidentTables:
     design
         Filters from samples to cells.
     error_db
-        Predicted RMS error on random pixels of a profile with a flat spectrum.
+        Predicted RMS error at random pixels for a profile with a flat spectrum, dB.
     pulses
-        Pulses of these tables.
+        Slice of the pulses of these tables.
     resident
         Arrays on the device.
     """
@@ -279,14 +281,14 @@ class ResidentTables:
     resident: Resident
 
     def __getitem__(self, pulses: slice) -> "ResidentTables":
-        """Return the tables of some pulses; they are on the device once."""
+        """Return the tables of a slice of pulses, which share the arrays on the device."""
         first, last, _ = pulses.indices(self.pulses.stop - self.pulses.start)
         start = self.pulses.start
         return replace(self, pulses=slice(start + first, start + max(first, last)))
 
 
 def prepare(profiles: Profiles, *, oversampling: int = 6) -> ResidentTables:
-    """Return the inputs of tables; the tables are made on the device with the first tile.
+    """Return the inputs of tables; the first tile creates the tables on the device.
 
     Parameters
     ----------
@@ -297,24 +299,24 @@ def prepare(profiles: Profiles, *, oversampling: int = 6) -> ResidentTables:
 
     Returns
     -------
-    Tables
-        On the device pulses × cells × 24 bytes.
+    ResidentTables
+        Tables of pulses × cells × 24 bytes on the device.
 
     Raises
     ------
     ValueError
-        If the profiles are oversampled less than 1.5 times or have no pulse, or a position or start is not finite.
+        If the oversampling of the profiles is below 1.5, there is no pulse, or a position or start is not finite.
 
     Notes
     -----
     Source: docs/theory/engine.md, "Cells" and "A GPU".
     """
-    samples, start_m, places = profiles.for_tables()
+    samples, start_m, phase_centres = profiles.for_tables()
     wavenumber = profiles.wavenumber_rad_m
     design = design_table(profiles.oversampling, wavenumber * profiles.step_m, oversampling=oversampling, degree=DEGREE)
     return ResidentTables(
         samples=samples,
-        places_m=np.ascontiguousarray(np.stack(places, axis=1)),
+        places_m=np.ascontiguousarray(np.stack(phase_centres, axis=1)),
         start_m=start_m,
         cell_m=profiles.step_m * design.down / design.up,
         wavenumber_rad_m=wavenumber,
@@ -333,23 +335,24 @@ def form(
     tolerance_rad: float = 1.5e-3,
     counts: NDArray[np.int64] | None = None,
 ) -> NDArray[np.complex64]:
-    """Sum the tables over the pixels of one tile.
+    """Sum the tables at the pixels of one tile.
 
     Parameters
     ----------
     tables
-        From `prepare`.
+        Tables from `prepare`.
     pixels
-        (y, x, 3) float64, metres, in the frame of the phase centres: any surface. A tile of a larger grid that begins
-        at multiples of 16 pixels gets the same bits as in the larger grid.
+        (y, x, 3) float64, metres, in the frame of the phase centres, on any surface. A tile of a larger grid that
+        starts at multiples of 16 pixels gets the same bits as in the larger grid.
     beams
-        Weight of each pulse at each pixel; none by default. Pulses whose beam or sector misses a patch cost little.
+        Weight of each pulse at each pixel; none by default. Pulses whose beam or sector does not illuminate a patch
+        cost little.
     tolerance_rad
-        Largest phase error that the path series may make anywhere in a patch of 16 × 16 pixels; patches and pulses that
-        would exceed it take exact paths, pixel by pixel in float64.
+        Largest phase error of the path series anywhere in a patch of 16 × 16 pixels; paths of patches and pulses that
+        exceed it are exact, computed pixel by pixel in float64.
     counts
-        (4,) int64 to which the number of pixels × pulses is added that were summed by series, by exact paths, had no
-        echo, or no echo together with 63 others: those cost next to nothing.
+        (4,) int64 array to which the pixels × pulses are added that are summed by series, summed by exact paths, have
+        no echo, or have no echo in a whole chunk of 64 pulses, which costs very little.
 
     Returns
     -------
@@ -360,9 +363,9 @@ def form(
     Raises
     ------
     ValueError
-        If `pixels` has another shape, or a beam or the sector is of other pulses.
+        If the shape of `pixels` is not (y, x, 3), or a beam or the sector has another number of pulses.
     CampaignError
-        If no device can be used, or it fails.
+        If no device can be used, or the device fails.
 
     Notes
     -----

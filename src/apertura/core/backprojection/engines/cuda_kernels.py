@@ -1,4 +1,4 @@
-"""Kernels of the GPU: tables of profiles, and their weighted sums over patches; imported only where that is done."""
+"""GPU kernels: tables of profiles, and their weighted sums over patches; imported only if a device is used."""
 
 import math
 import warnings
@@ -22,7 +22,7 @@ from apertura.core.backprojection.engines.cuda_prediction import (
 
 @cuda.jit
 def expand(samples, taps, lead, down, carrier, turn, cells):  # type: ignore[no-untyped-def]  # noqa: PLR0917
-    """Fill cells (pulse, 6, cell) from samples (pulse, range): one thread a cell, (2)."""
+    """Fill cells (pulse, 6, cell) from samples (pulse, range) by eq. 2, one thread per cell."""
     used, length, up = cells.shape[2], samples.shape[1], len(lead)
     number = cuda.grid(1)
     if number >= len(samples) * used:
@@ -48,95 +48,97 @@ def expand(samples, taps, lead, down, carrier, turn, cells):  # type: ignore[no-
 # ---- Sums of tables over patches on a GPU
 #
 # numba compiles these functions for the device, or its simulator runs them as Python (NUMBA_ENABLE_CUDASIM=1).
-# Literals are float64 to numba: float32 constants have names, since one literal would slow every pixel down.
-# Equations are those of docs/theory/engine.md, "A GPU"; of weights those of "Antennas" there and of integration.md.
+# numba treats literals as float64: float32 constants have names, as a single literal would slow down every pixel.
+# Equations are those of docs/theory/engine.md, "A GPU"; for weights, of "Antennas" there and of integration.md.
 
-warnings.filterwarnings("ignore", "Grid size .* low occupancy")  # expected of the certificate's patches
+warnings.filterwarnings("ignore", "Grid size .* low occupancy")  # expected for the patches of the certificate
 
 ROWS = 4
-"""Rows of threads of a patch: each thread sums every fourth pixel of a column, and reads their common values once."""
+"""Rows of threads of a patch: each thread sums every fourth pixel of a column, and reads common values once."""
 
 _PIXELS, _EACH, _LANES = SIDE * SIDE, SIDE // ROWS, SIDE * ROWS
-_SERIES, _EXACT, _SKIPPED, _UNSEEN = range(4)  # as VARIANTS of the engine; _UNSEEN: a whole chunk
+_SERIES, _EXACT, _SKIPPED, _UNSEEN = range(4)  # VARIANTS of the engine; _UNSEEN: a whole chunk without an echo
 _NO_CELL = 2**32 - 1
-_ROUNDER = np.float32(1.5 * 2**23)  # adding and subtracting it rounds
-_ONE, _NONE, _TWO, _THREE = np.float32(1), np.float32(0), np.float32(2), np.float32(3)
-_B1, _B2, _B3, _B4 = np.float32(-1 / 4), np.float32(1 / 8), np.float32(-5 / 64), np.float32(7 / 128)  # of (8)
-_LEG, _MIDDLE, _WORDS = 5, 10, 11  # of a pulse in shared memory: five numbers of each leg, and the origin's place
-_PER_CELL, _WAVENUMBER, _TOLERANCE, _CELLS, _TURN = range(5)  # places in `numbers`
-_CENTRE, _INNER, _OUTER = 13, 14, 15  # those of a sector
-_X, _Y, _Z, _REACH, _PATCH_CENTRE, _MOVED = range(6)  # places in `patch`: origin, reach, sector's centre and its reach
-_WAY, _ORIGIN, _ZONE = range(3)  # places in `steps`: path variant, cell of the origin, zone of the sector
+_ROUNDER = np.float32(1.5 * 2**23)  # adding and subtracting it rounds to an integer
+_ONE, _ZERO, _TWO, _THREE = np.float32(1), np.float32(0), np.float32(2), np.float32(3)
+_B1, _B2, _B3, _B4 = np.float32(-1 / 4), np.float32(1 / 8), np.float32(-5 / 64), np.float32(7 / 128)  # of eq. 8
+_LEG, _MIDDLE, _WORDS = 5, 10, 11  # layout of a pulse in shared memory: five words per leg, position of the origin
+_CELLS_PER_M, _WAVENUMBER, _TOLERANCE, _CELLS, _PHASE = range(5)  # indices in `numbers`
+_CENTRE, _INNER, _OUTER = 13, 14, 15  # indices of the sector's parameters in `numbers`
+_X, _Y, _Z, _REACH, _PATCH_CENTRE, _CENTRE_REACH = range(
+    6
+)  # indices in `patch`: origin, reach, sector centre, its reach
+_VARIANT, _ORIGIN, _ZONE = range(3)  # indices in `steps`: path variant, cell of the origin, zone of the sector
 
 
 def _over_an_image(weighed):  # type: ignore[no-untyped-def]
-    """Return the kernel that sums the cells over an image (y, x): a block of threads a patch, a thread four pixels.
+    """Return the kernel that sums the cells over an image (y, x), one thread block per patch, four pixels per thread.
 
-    Its arguments: pixels; phase centres, starts and cells; numbers; axes of the sector and of beams, cuts, gains, ends
-    of the sector, spread of chunks; image and counts. `weighed` is known when it is compiled: a sum without weights
-    takes no registers for them.
+    Arguments of the kernel: pixels; phase centres, starts and cells; numbers; axes of the sector and of beams, cuts,
+    gains, ends of the sector, spread of chunks; image and counts. `weighed` is a compile-time constant: a sum without
+    weights uses no registers for them.
     """
     width, own = (_WEIGHED_WORDS, _PIXELS) if weighed else (_WORDS, 1)
 
     @cuda.jit
     def kernel(pixels, tables, numbers, weights, results):  # type: ignore[no-untyped-def]
-        place = cuda.shared.array((3, _PIXELS), np.float64)
+        positions = cuda.shared.array((3, _PIXELS), np.float64)
         patch = cuda.shared.array(6, np.float64)
         words = cuda.shared.array((CHUNK, width), np.float32)
         steps = cuda.shared.array((CHUNK, 3), np.int32)
         centres = cuda.shared.array(own, np.float64)
         reached = cuda.shared.array(_LANES, np.int32)
-        near = cuda.local.array((_EACH, 5), np.float32)  # x, y, z from the origin, squared; centre from the patch's
+        near = cuda.local.array((_EACH, 5), np.float32)  # x, y, z from the origin, squared; sector centre offset
         total = cuda.local.array((_EACH, 2), np.float64)
         tally = cuda.local.array(4, np.int64)
         lane = cuda.threadIdx.y * SIDE + cuda.threadIdx.x
-        # The patch: positions, origin, offsets; with weights, where the sectors of its pixels are centred.
-        _place(pixels, lane, place)
+        # The patch: positions, origin, offsets; with weights, the sector centres of its pixels.
+        _load_positions(pixels, lane, positions)
         cuda.syncthreads()
-        _fit(lane, place, patch)
-        _offsets(lane, place, patch, near, total)
+        _fit(lane, positions, patch)
+        _offsets(lane, positions, patch, near, total)
         if weighed:
-            _centres(lane, place, weights, numbers, (patch, centres, near))
+            _centres(lane, positions, weights, numbers, (patch, centres, near))
         for variant in range(4):
             tally[variant] = 0
         turn, pulses = _carrier(numbers), len(tables[1])
         for first in range(0, pulses, CHUNK):
             count = min(CHUNK, pulses - first)
-            # Pulses whose weights are zero all over the patch: whole chunks of them cost next to nothing.
+            # Skip whole chunks of pulses whose weights are zero over the patch.
             if weighed and not _is_reached(first // CHUNK, lane, patch, numbers, (tables, weights, reached, words)):
                 tally[_UNSEEN] += count if lane == 0 else 0
                 continue
-            # A thread a pulse: how the patch sees it.
+            # One thread per pulse: series of the paths, and weights.
             if lane < count:
                 _view(first + lane, patch, numbers, tables, (words[lane], steps[lane]))
                 if weighed:
                     _weigh(first + lane, patch, numbers, (tables, weights), (words[lane], steps[lane]))
-                tally[steps[lane, _WAY]] += 1
+                tally[steps[lane, _VARIANT]] += 1
             cuda.syncthreads()
-            # A thread four pixels: the sum over these pulses.
+            # Four pixels per thread: the sum over these pulses.
             _chunk(
                 (first, count),
-                (lane, place, near, total),
+                (lane, positions, near, total),
                 (words, steps, patch),
                 (tables, turn, numbers),
                 (weights, weighed),
             )
             cuda.syncthreads()
-        _write(lane, place, total, tally, results)
+        _write(lane, positions, total, tally, results)
 
     return kernel
 
 
 @cuda.jit(device=True)
-def _write(lane, place, total, tally, results):  # type: ignore[no-untyped-def]
-    """Put the sums of a thread into the image; pixels × pulses of its pulses to the counts of their variants."""
+def _write(lane, positions, total, tally, results):  # type: ignore[no-untyped-def]
+    """Write the sums of a thread to the image; add pixels × pulses of its pulses to the counts of their variants."""
     image, counts = results
     above, left = cuda.blockIdx.y * SIDE, cuda.blockIdx.x * SIDE
     for n in range(_EACH):
         row, column = above + cuda.threadIdx.y + n * ROWS, left + cuda.threadIdx.x
         if row < image.shape[0] and column < image.shape[1]:
-            nowhere = math.isnan(place[0, lane + n * ROWS * SIDE])
-            image[row, column] = complex(math.nan, math.nan) if nowhere else complex(total[n, 0], total[n, 1])
+            unknown = math.isnan(positions[0, lane + n * ROWS * SIDE])
+            image[row, column] = complex(math.nan, math.nan) if unknown else complex(total[n, 0], total[n, 1])
     pixels = min(SIDE, image.shape[0] - above) * min(SIDE, image.shape[1] - left)
     for variant in range(4):
         if tally[variant]:
@@ -145,16 +147,16 @@ def _write(lane, place, total, tally, results):  # type: ignore[no-untyped-def]
 
 @cuda.jit(device=True)
 def _carrier(numbers):  # type: ignore[no-untyped-def]
-    """Return float32 arguments of `_carrier_at`: four coefficients of cosine, four of sine, half turns a cell."""
-    a, b, c, d = numbers[_TURN], numbers[_TURN + 1], numbers[_TURN + 2], numbers[_TURN + 3]
-    e, f, g, h = numbers[_TURN + 4], numbers[_TURN + 5], numbers[_TURN + 6], numbers[_TURN + 7]
+    """Return float32 arguments of `_carrier_at`: four cosine and four sine coefficients, half cycles per table cell."""
+    a, b, c, d = numbers[_PHASE], numbers[_PHASE + 1], numbers[_PHASE + 2], numbers[_PHASE + 3]
+    e, f, g, h = numbers[_PHASE + 4], numbers[_PHASE + 5], numbers[_PHASE + 6], numbers[_PHASE + 7]
     cosine = (np.float32(a), np.float32(b), np.float32(c), np.float32(d))
-    return cosine + (np.float32(e), np.float32(f), np.float32(g), np.float32(h), np.float32(numbers[_TURN + 8]))
+    return cosine + (np.float32(e), np.float32(f), np.float32(g), np.float32(h), np.float32(numbers[_PHASE + 8]))
 
 
 @cuda.jit(device=True)
-def _place(pixels, lane, place):  # type: ignore[no-untyped-def]
-    """Put the positions of a patch into shared memory; x is NaN where a pixel has none or lies beyond the image."""
+def _load_positions(pixels, lane, positions):  # type: ignore[no-untyped-def]
+    """Write the positions of a patch to shared memory; x is NaN if a pixel has no position or is outside the image."""
     for n in range(_EACH):
         row, column = cuda.blockIdx.y * SIDE + cuda.threadIdx.y + n * ROWS, cuda.blockIdx.x * SIDE + cuda.threadIdx.x
         inside = row < pixels.shape[0] and column < pixels.shape[1]
@@ -162,53 +164,53 @@ def _place(pixels, lane, place):  # type: ignore[no-untyped-def]
         for axis in range(3):
             value = pixels[row, column, axis] if inside else math.nan
             known = known and math.isfinite(value)
-            place[axis, lane + n * ROWS * SIDE] = value
+            positions[axis, lane + n * ROWS * SIDE] = value
         if not known:
-            place[0, lane + n * ROWS * SIDE] = math.nan
+            positions[0, lane + n * ROWS * SIDE] = math.nan
 
 
 @cuda.jit(device=True)
-def _fit(lane, place, patch):  # type: ignore[no-untyped-def]
-    """Put the middle of a patch's box, and how far its pixels lie from it, into shared memory."""
+def _fit(lane, positions, patch):  # type: ignore[no-untyped-def]
+    """Write the middle of a patch's bounding box and the largest distance of its pixels to shared memory."""
     if lane < 3:
         low, high = math.inf, -math.inf
         for other in range(_PIXELS):
-            if not math.isnan(place[0, other]):
-                low, high = min(low, place[lane, other]), max(high, place[lane, other])
+            if not math.isnan(positions[0, other]):
+                low, high = min(low, positions[lane, other]), max(high, positions[lane, other])
         patch[lane] = (low + high) / 2
     cuda.syncthreads()
     if lane == 0:
         reach = 0.0
         for other in range(_PIXELS):
-            if not math.isnan(place[0, other]):
-                x, y, z = place[0, other] - patch[0], place[1, other] - patch[1], place[2, other] - patch[2]
+            if not math.isnan(positions[0, other]):
+                x, y, z = positions[0, other] - patch[0], positions[1, other] - patch[1], positions[2, other] - patch[2]
                 reach = max(reach, x * x + y * y + z * z)
         patch[_REACH] = math.sqrt(reach)
     cuda.syncthreads()
 
 
 @cuda.jit(device=True)
-def _offsets(lane, place, patch, near, total):  # type: ignore[no-untyped-def]
-    """Fill the offsets of a thread's pixels; a pixel without a position is summed at the origin, and not written."""
+def _offsets(lane, positions, patch, near, total):  # type: ignore[no-untyped-def]
+    """Fill the offsets of a thread's pixels; a pixel without a position is summed at the origin but not written."""
     for n in range(_EACH):
         at = lane + n * ROWS * SIDE
-        squared = _NONE
+        squared = _ZERO
         for axis in range(3):
-            offset = _NONE if math.isnan(place[0, at]) else np.float32(place[axis, at] - patch[axis])
+            offset = _ZERO if math.isnan(positions[0, at]) else np.float32(positions[axis, at] - patch[axis])
             near[n, axis] = offset
             squared += offset * offset
         near[n, 3] = squared
-        near[n, 4] = _NONE
+        near[n, 4] = _ZERO
         total[n, 0] = 0.0
         total[n, 1] = 0.0
 
 
 @cuda.jit(device=True)
 def _view(p, patch, numbers, tables, shared):  # type: ignore[no-untyped-def]
-    """Put into shared memory the series of one pulse's paths over a patch, (8), and the path variant of its pixels."""
+    """Write the series of a pulse's paths over a patch, eq. 8, and the path variant of its pixels to shared memory."""
     antennas, start_m = tables[0][p], tables[1][p]
     words, step = shared
-    reach, per_cell = patch[_REACH], numbers[_PER_CELL]
+    reach, per_cell = patch[_REACH], numbers[_CELLS_PER_M]
     path, error = 0.0, 2 * FLOAT32_ERROR * reach
     for leg in range(2):
         x, y, z = patch[0] - antennas[leg, 0], patch[1] - antennas[leg, 1], patch[2] - antennas[leg, 2]
@@ -228,36 +230,36 @@ def _view(p, patch, numbers, tables, shared):  # type: ignore[no-untyped-def]
             error = math.inf
     middle, spread = (path - start_m) * per_cell, 2 * reach * per_cell
     if not (middle + spread > -1 and middle - spread < numbers[_CELLS]):
-        step[_WAY] = _SKIPPED
+        step[_VARIANT] = _SKIPPED
     elif numbers[_WAVENUMBER] * error <= numbers[_TOLERANCE] and spread < MOST_CELLS:
         nearest = math.floor(middle + 0.5)
-        step[_WAY] = _SERIES
+        step[_VARIANT] = _SERIES
         step[_ORIGIN] = int(nearest)
         words[_MIDDLE] = middle - nearest
     else:
-        step[_WAY] = _EXACT
+        step[_VARIANT] = _EXACT
 
 
 @cuda.jit(device=True)
-def _chunk(chunk, mine, shared, given, weighing):  # type: ignore[no-untyped-def]
-    """Add some pulses to a thread's pixels; they are summed in float32 first."""
+def _chunk(chunk, mine, shared, inputs, weighing):  # type: ignore[no-untyped-def]
+    """Add a chunk of pulses to a thread's pixels; the chunk is summed in float32 first."""
     first, count = chunk
-    lane, place, near, total = mine
+    lane, positions, near, total = mine
     words, steps, patch = shared
-    (antennas, start_m, cells), turn, numbers = given
+    (antennas, start_m, cells), turn, numbers = inputs
     weights, weighed = weighing
-    # Sums of this chunk in float32; rows of cells are read once for all pixels of the thread.
+    # Sums of this chunk in float32; rows of cells are read once for all pixels of a thread.
     part = cuda.local.array((_EACH, 2), np.float32)
     for n in range(_EACH):
-        part[n, 0], part[n, 1] = _NONE, _NONE
+        part[n, 0], part[n, 1] = _ZERO, _ZERO
     weight = _ONE
     for number in range(count):
-        c, p = np.uint64(number), np.uint64(first + number)  # signed ones would be taken as counted from the end
-        if steps[c, _WAY] == _SKIPPED:
+        c, p = np.uint64(number), np.uint64(first + number)  # unsigned, as signed indices may count from the end
+        if steps[c, _VARIANT] == _SKIPPED:
             continue
         rows = (cells[p, 0], cells[p, 1], cells[p, 2], cells[p, 3], cells[p, 4], cells[p, 5])
-        if steps[c, _WAY] == _SERIES:
-            w = words[c]  # (8), the pulse's series about the patch
+        if steps[c, _VARIANT] == _SERIES:
+            w = words[c]  # eq. 8, the pulse's series about the patch
             word = (w[0], w[1], w[2], w[3], w[4], w[5], w[6], w[7], w[8], w[9], w[10])
             for n in range(_EACH):
                 at, u, legs = _by_series(word, steps[c, _ORIGIN], near[n, 0], near[n, 1], (near[n, 2], near[n, 3]))
@@ -267,10 +269,10 @@ def _chunk(chunk, mine, shared, given, weighing):  # type: ignore[no-untyped-def
         else:
             for n in range(_EACH):
                 pixel = lane + n * ROWS * SIDE
-                at, u = _exact(antennas[p], start_m[p], numbers, place, pixel)
+                at, u = _exact(antennas[p], start_m[p], numbers, positions, pixel)
                 if weighed:
                     centre = patch[_PATCH_CENTRE] + near[n, 4]
-                    weight = _exact_weight(p, steps[c, _ZONE], (place, pixel), centre, (antennas, weights, numbers))
+                    weight = _exact_weight(p, steps[c, _ZONE], (positions, pixel), centre, (antennas, weights, numbers))
                 _add(rows, at, u, turn, (weight, part[n]))
     for n in range(_EACH):
         total[n, 0] += part[n, 0]
@@ -279,7 +281,7 @@ def _chunk(chunk, mine, shared, given, weighing):  # type: ignore[no-untyped-def
 
 @cuda.jit(device=True)
 def _by_series(word, middle, x, y, rest):  # type: ignore[no-untyped-def]
-    """Return cell and place in it of a pixel's path, (8), and s of both legs."""
+    """Return cell and position in the cell of a pixel's path by eq. 8, and s of both legs."""
     z, squared = rest
     s = word[3] * squared + word[0] * x + word[1] * y + word[2] * z
     t = word[8] * squared + word[5] * x + word[6] * y + word[7] * z
@@ -295,24 +297,28 @@ def _root(s):  # type: ignore[no-untyped-def]
 
 
 @cuda.jit(device=True)
-def _exact(antennas, start_m, numbers, place, at):  # type: ignore[no-untyped-def]
-    """Return cell and place in it of a pixel's path in float64; no cell where the table does not reach it."""
+def _exact(antennas, start_m, numbers, positions, at):  # type: ignore[no-untyped-def]
+    """Return cell and position in the cell of a pixel's path in float64; `_NO_CELL` if it lies outside the table."""
     path = 0.0
     for leg in range(2):
-        x, y, z = place[0, at] - antennas[leg, 0], place[1, at] - antennas[leg, 1], place[2, at] - antennas[leg, 2]
+        x, y, z = (
+            positions[0, at] - antennas[leg, 0],
+            positions[1, at] - antennas[leg, 1],
+            positions[2, at] - antennas[leg, 2],
+        )
         path += math.sqrt(x * x + y * y + z * z)
-    middle = (path - start_m) * numbers[_PER_CELL]
+    middle = (path - start_m) * numbers[_CELLS_PER_M]
     if not -0.5 <= middle < numbers[_CELLS] - 0.5:
-        return np.uint32(_NO_CELL), _NONE
+        return np.uint32(_NO_CELL), _ZERO
     nearest = math.floor(middle + 0.5)
     return np.uint32(nearest), np.float32(middle - nearest)
 
 
 @cuda.jit(device=True)
 def _add(rows, i, u, turn, sums):  # type: ignore[no-untyped-def]
-    """Add the weighted polynomial of a cell at place u, times the carrier there, (2); nothing without such a cell."""
+    """Add the weighted polynomial of a cell at position u, times the carrier, eq. 2; nothing outside the table."""
     weight, part = sums
-    if i >= np.uint32(len(rows[0])) or weight == _NONE:
+    if i >= np.uint32(len(rows[0])) or weight == _ZERO:
         return
     re = weight * (rows[0][i] + u * (rows[2][i] + u * rows[4][i]))
     im = weight * (rows[1][i] + u * (rows[3][i] + u * rows[5][i]))
@@ -323,13 +329,13 @@ def _add(rows, i, u, turn, sums):  # type: ignore[no-untyped-def]
 
 @cuda.jit(device=True)
 def _carrier_at(turn, u):  # type: ignore[no-untyped-def]
-    """Return cosine and sine of the carrier at place u of a cell; where it turns often, half turns are removed."""
+    """Return cosine and sine of the carrier at position u of a cell, reduced by multiples of π if required."""
     sign = _ONE
-    if turn[8] != _NONE:
+    if turn[8] != _ZERO:
         scaled = u * turn[8]
-        turns = (scaled + _ROUNDER) - _ROUNDER
-        u = scaled - turns
-        if np.int32(turns) & 1:
+        half_cycles = (scaled + _ROUNDER) - _ROUNDER
+        u = scaled - half_cycles
+        if np.int32(half_cycles) & 1:
             sign = -_ONE
     v = u * u
     cosine = turn[0] + v * (turn[1] + v * (turn[2] + v * turn[3]))
@@ -337,29 +343,32 @@ def _carrier_at(turn, u):  # type: ignore[no-untyped-def]
     return sign * cosine, sign * u * sine
 
 
-# ---- Weights of pulses: beams of antennas, and the sector integrated
+# ---- Weights of pulses: antenna beams and the integrated sector
 #
-# What a pulse weighs at a patch is looked at once for the patch, and written beside the series of its paths; pixels of
-# the patch take weights from there, at offsets from the origin.
+# The weights of a pulse are prepared once for a patch and written after the series of its paths; weights of the pixels
+# are computed from them and the offsets from the origin.
 
 _INSIDE, _EDGE, _OUTSIDE = range(3)
-"""Zones of a sector over a patch: its weight is one, differs, or is zero; it is zero, too, where a beam does not go."""
+"""Zones of a patch by its weight: one inside the sector, variable at its edge, zero outside the sector or a beam."""
 
-_ENDS, _SPREAD = 4, 5  # places in `weights`
-_FIRST, _PER_RAD, _LAST = range(3)  # of a cut: first angle, samples per radian, and place of the last one; -1: no beam
-_STRAYED, _TURNED, _VEERED = range(3)  # by how much pulses of a chunk differ from its middle: place, beam, sector
-_SECTOR, _PLACE, _BEAM, _BEAM_WORDS = 11, 19, 20, 12  # of a pulse in shared memory, behind the series of its paths
-_WEIGHED_WORDS = 45  # an odd number: threads that write them do not wait for each other
-_QUARTER = np.float32(math.pi / 2)
-_HALF_TURN = np.float32(math.pi)
-_MARGIN = 1e-5  # rad, and of s: more than float32 errs by, so that a weight called zero or one is that at each pixel
+_ENDS, _SPREAD = 4, 5  # indices in `weights`
+_FIRST, _PER_RAD, _LAST = range(3)  # of a cut: first angle, samples per radian, index of the last sample (-1: no beam)
+_ANTENNA_SPREAD, _BEAM_SPREAD, _SECTOR_SPREAD = range(
+    3
+)  # largest differences of a chunk's pulses from its middle pulse
+_SECTOR, _S, _BEAM, _BEAM_WORDS = 11, 19, 20, 12  # layout of a pulse in shared memory, after the series of its paths
+_WEIGHED_WORDS = 45  # odd, to avoid bank conflicts of threads that write them
+_HALF_PI = np.float32(math.pi / 2)
+_PI = np.float32(math.pi)
+_MARGIN = 1e-5  # rad, and of s: larger than the float32 error, so that a weight of zero or one holds at each pixel
 
 
 @cuda.jit
 def spread_of_chunks(antennas, sector_axes, beam_axes, spread):  # type: ignore[no-untyped-def]
-    """Fill how far the pulses of each chunk differ from its middle one, (chunk, 2, 3): one thread a chunk.
+    """Fill the spread of each chunk, (chunk, 2, 3), one thread per chunk.
 
-    Metres, change of beam axes and of a sector's axis, of each leg. The last row is that of a pulse alone: zeros.
+    For each leg: the largest differences of the chunk's pulses from its middle pulse in position (metres), beam axes
+    and sector axis. The last row is that of a single pulse: zeros.
     """
     chunk = cuda.grid(1)
     if chunk >= len(spread):
@@ -367,46 +376,47 @@ def spread_of_chunks(antennas, sector_axes, beam_axes, spread):  # type: ignore[
     pulses = len(antennas)
     first, middle = chunk * CHUNK, min(chunk * CHUNK + CHUNK // 2, pulses - 1)
     for leg in range(2):
-        strayed, turned, veered = 0.0, 0.0, 0.0
+        most_antenna, most_beam, most_sector = 0.0, 0.0, 0.0
         for p in range(first, min(first + CHUNK, pulses)):
-            metres, beam, sector = 0.0, 0.0, 0.0
+            antenna, beam, sector = 0.0, 0.0, 0.0
             for n in range(3):
-                metres += (antennas[p, leg, n] - antennas[middle, leg, n]) ** 2
+                antenna += (antennas[p, leg, n] - antennas[middle, leg, n]) ** 2
                 if len(sector_axes):
                     sector += (sector_axes[p, leg, n] - sector_axes[middle, leg, n]) ** 2
                 if len(beam_axes):
                     for axis in range(3):
                         beam += (beam_axes[p, leg, axis, n] - beam_axes[middle, leg, axis, n]) ** 2
-            strayed, turned, veered = max(strayed, metres), max(turned, beam), max(veered, sector)
-        spread[chunk, leg, _STRAYED] = math.sqrt(strayed)
-        spread[chunk, leg, _TURNED] = math.sqrt(turned / 2)  # the largest change of a direction by a rotation
-        spread[chunk, leg, _VEERED] = math.sqrt(veered)
+            most_antenna, most_beam = max(most_antenna, antenna), max(most_beam, beam)
+            most_sector = max(most_sector, sector)
+        spread[chunk, leg, _ANTENNA_SPREAD] = math.sqrt(most_antenna)
+        spread[chunk, leg, _BEAM_SPREAD] = math.sqrt(most_beam / 2)  # the largest change of a direction by a rotation
+        spread[chunk, leg, _SECTOR_SPREAD] = math.sqrt(most_sector)
 
 
 @cuda.jit(device=True)
-def _centres(lane, place, weights, numbers, mine):  # type: ignore[no-untyped-def]
-    """Find the sector's centre of each pixel, integration.md (4), the middle of the patch's, and the rest to it."""
+def _centres(lane, positions, weights, numbers, mine):  # type: ignore[no-untyped-def]
+    """Compute the sector centres of pixels (integration.md, eq. 4), their middle value, and offsets from it."""
     ends, (patch, centres, near) = weights[_ENDS], mine
     for n in range(_EACH):
         at = lane + n * ROWS * SIDE
-        centres[at] = _centre(place[0, at], place[1, at], place[2, at], ends, numbers)
+        centres[at] = _centre(positions[0, at], positions[1, at], positions[2, at], ends, numbers)
     cuda.syncthreads()
     if lane == 0:
         low, high = math.inf, -math.inf
         for other in range(_PIXELS):
-            if not math.isnan(place[0, other]):
+            if not math.isnan(positions[0, other]):
                 low, high = min(low, centres[other]), max(high, centres[other])
-        patch[_PATCH_CENTRE], patch[_MOVED] = (low + high) / 2, (high - low) / 2
+        patch[_PATCH_CENTRE], patch[_CENTRE_REACH] = (low + high) / 2, (high - low) / 2
     cuda.syncthreads()
     for n in range(_EACH):
         at = lane + n * ROWS * SIDE
-        if not math.isnan(place[0, at]):
+        if not math.isnan(positions[0, at]):
             near[n, 4] = centres[at] - patch[_PATCH_CENTRE]
 
 
 @cuda.jit(device=True)
 def _centre(x, y, z, ends, numbers):  # type: ignore[no-untyped-def]
-    """Return where the sector of a pixel is centred: the stated centre, or the nearest whose sector was flown."""
+    """Return the sector centre of a pixel: the configured centre, or the nearest one with a fully flown sector."""
     if not len(ends):
         return numbers[_CENTRE]
     low, high = math.inf, -math.inf
@@ -423,12 +433,12 @@ def _centre(x, y, z, ends, numbers):  # type: ignore[no-untyped-def]
 
 
 @cuda.jit(device=True)
-def _is_reached(chunk, lane, patch, numbers, given):  # type: ignore[no-untyped-def]
-    """Return whether any pulse of a chunk may have a weight in a patch; as many chunks as threads are asked at once."""
-    tables, weights, reached, words = given
+def _is_reached(chunk, lane, patch, numbers, inputs):  # type: ignore[no-untyped-def]
+    """Return True if any pulse of a chunk may have a weight in a patch; one chunk per thread is evaluated at once."""
+    tables, weights, reached, words = inputs
     if chunk % _LANES == 0:
         spread, mine = weights[_SPREAD], chunk + lane
-        cuda.syncthreads()  # what is written below, no thread reads any more
+        cuda.syncthreads()  # until no thread reads the values that are overwritten below
         reached[lane] = 0
         if mine < len(spread) - 1:
             middle = min(mine * CHUNK + CHUNK // 2, len(tables[1]) - 1)
@@ -438,69 +448,69 @@ def _is_reached(chunk, lane, patch, numbers, given):  # type: ignore[no-untyped-
 
 
 @cuda.jit(device=True)
-def _weigh(p, patch, numbers, given, shared):  # type: ignore[no-untyped-def]
-    """Put into shared memory what weights one pulse has over a patch, and its zone; without a weight it is skipped."""
-    (tables, weights), (word, step) = given, shared
-    if step[_WAY] != _SKIPPED:
+def _weigh(p, patch, numbers, inputs, shared):  # type: ignore[no-untyped-def]
+    """Write the weights of a pulse over a patch and its zone to shared memory; skip the pulse if they are zero."""
+    (tables, weights), (word, step) = inputs, shared
+    if step[_VARIANT] != _SKIPPED:
         spread = weights[_SPREAD]
         step[_ZONE] = _zone(p, spread[len(spread) - 1], patch, numbers, (tables[0], weights, word))
         if step[_ZONE] == _OUTSIDE:
-            step[_WAY] = _SKIPPED
+            step[_VARIANT] = _SKIPPED
 
 
 @cuda.jit(device=True)
 def _zone(p, spread, patch, numbers, pulse):  # type: ignore[no-untyped-def]
-    """Return the zone of a patch by a pulse, and by others that differ from it by no more than `spread`.
+    """Return the zone of a patch for a pulse, and for all pulses that differ from it by no more than `spread`.
 
-    Puts into `word` what the weights of the patch's pixels are computed from: of each leg the sector's axis over range
-    and s at the origin, (1) of integration.md; s of both less the centre; of each beam, the way from antenna to origin
-    along its axes, and the axes.
+    Write the values from which the weights of pixels are computed to `word`: for each leg, the sector's axis over range
+    and s at the origin (integration.md, eq. 1); s of both legs minus the centre; for each beam, the vector from antenna
+    to origin along its axes, and the axes.
     """
     antennas, (sector_axes, beam_axes, cuts, _, _, _), word = pulse
-    place, slack = -patch[_PATCH_CENTRE], patch[_MOVED] + _MARGIN
+    s, slack = -patch[_PATCH_CENTRE], patch[_CENTRE_REACH] + _MARGIN
     for leg in range(2):
         x, y, z = patch[_X] - antennas[p, leg, 0], patch[_Y] - antennas[p, leg, 1], patch[_Z] - antennas[p, leg, 2]
-        distance, reach = math.sqrt(x * x + y * y + z * z), patch[_REACH] + spread[leg, _STRAYED]
+        distance, reach = math.sqrt(x * x + y * y + z * z), patch[_REACH] + spread[leg, _ANTENNA_SPREAD]
         if len(sector_axes):
             axis, at = sector_axes[p, leg], _SECTOR + 4 * leg
             a, b, c = axis[0] / distance, axis[1] / distance, axis[2] / distance
             along = a * x + b * y + c * z
             word[at], word[at + 1], word[at + 2], word[at + 3] = a, b, c, along
-            # A direction turns by asin(reach / distance) at most, which is no more than π/2 times that.
-            turn = math.pi / 2 * reach / distance if reach < distance else 2.0
-            place += along
-            slack += turn * distance * math.sqrt(a * a + b * b + c * c) + spread[leg, _VEERED]
-        if len(beam_axes) and cuts[leg, 0, _LAST] > _NONE:
+            # A direction changes by at most asin(reach / distance) ≤ π/2 · reach / distance.
+            change = math.pi / 2 * reach / distance if reach < distance else 2.0
+            s += along
+            slack += change * distance * math.sqrt(a * a + b * b + c * c) + spread[leg, _SECTOR_SPREAD]
+        if len(beam_axes) and cuts[leg, 0, _LAST] > _ZERO:
             at = _BEAM + leg * _BEAM_WORDS
             for n in range(3):
                 axis = beam_axes[p, leg, n]
                 word[at + n] = axis[0] * x + axis[1] * y + axis[2] * z
                 first = at + 3 + 3 * n
                 word[first], word[first + 1], word[first + 2] = axis[0], axis[1], axis[2]
-            # Axes that turn move a place along them by that times its distance.
-            moved = reach + spread[leg, _TURNED] * (distance + reach)
-            if _misses(word[at], word[at + 1], word[at + 2], np.float32(moved), cuts[leg]):
+            # A rotation of the axes displaces a point along them by the angle times its distance.
+            beam_reach = reach + spread[leg, _BEAM_SPREAD] * (distance + reach)
+            if _misses(word[at], word[at + 1], word[at + 2], np.float32(beam_reach), cuts[leg]):
                 return _OUTSIDE
     if not len(sector_axes):
         return _INSIDE
-    word[_PLACE] = place
-    if abs(place) + slack <= numbers[_INNER]:
+    word[_S] = s
+    if abs(s) + slack <= numbers[_INNER]:
         return _INSIDE
-    return _OUTSIDE if abs(place) - slack >= numbers[_OUTER] else _EDGE
+    return _OUTSIDE if abs(s) - slack >= numbers[_OUTER] else _EDGE
 
 
 @cuda.jit(device=True)
 def _misses(ahead, right, above, reach, cuts):  # type: ignore[no-untyped-def]
-    """Return whether a ball about a place along an antenna's axes lies outside of one of its cuts."""
+    """Return True if a ball about a point, given along an antenna's axes, lies outside one of its cuts."""
     margin, level = np.float32(_MARGIN), np.float32(math.sqrt(ahead * ahead + right * right))
     if reach < np.float32(math.sqrt(level * level + above * above)):
         elevation = np.float32(math.atan2(above, level))
-        near = _QUARTER * reach / np.float32(math.sqrt(level * level + above * above)) + margin
+        near = _HALF_PI * reach / np.float32(math.sqrt(level * level + above * above)) + margin
         if elevation + near < cuts[1, _FIRST] or elevation - near > _last_angle(cuts[1]):
             return True
     if reach < level:
-        azimuth, near = np.float32(math.atan2(right, ahead)), _QUARTER * reach / level + margin
-        if abs(azimuth) + near < _HALF_TURN:  # not across the cut at half a turn
+        azimuth, near = np.float32(math.atan2(right, ahead)), _HALF_PI * reach / level + margin
+        if abs(azimuth) + near < _PI:  # not across the branch cut at π
             return azimuth + near < cuts[0, _FIRST] or azimuth - near > _last_angle(cuts[0])
     return False
 
@@ -511,19 +521,19 @@ def _last_angle(cut):  # type: ignore[no-untyped-def]
 
 
 @cuda.jit(device=True)
-def _weight(w, zone, near, legs, given):  # type: ignore[no-untyped-def]
-    """Return the weight of a pulse at a pixel by its offset from the origin, in float32; s of (8) is that of `legs`."""
-    (_, _, cuts, gains, _, _), numbers = given
+def _weight(w, zone, near, legs, inputs):  # type: ignore[no-untyped-def]
+    """Return the weight of a pulse at a pixel from its offset to the origin, in float32; `legs` are s of eq. 8."""
+    (_, _, cuts, gains, _, _), numbers = inputs
     x, y, z, weight = near[0], near[1], near[2], _ONE
     if zone == _EDGE:
-        # s of (1) changes by little over a patch, and that change is what float32 errs by.
-        place = w[_PLACE] - near[4]
-        place += _change(w[_SECTOR] * x + w[_SECTOR + 1] * y + w[_SECTOR + 2] * z, w[_SECTOR + 3], legs[0])
-        place += _change(w[_SECTOR + 4] * x + w[_SECTOR + 5] * y + w[_SECTOR + 6] * z, w[_SECTOR + 7], legs[1])
+        # s of eq. 1 changes little over a patch: only this change has float32 errors.
+        s = w[_S] - near[4]
+        s += _change(w[_SECTOR] * x + w[_SECTOR + 1] * y + w[_SECTOR + 2] * z, w[_SECTOR + 3], legs[0])
+        s += _change(w[_SECTOR + 4] * x + w[_SECTOR + 5] * y + w[_SECTOR + 6] * z, w[_SECTOR + 7], legs[1])
         outer, inner = np.float32(numbers[_OUTER]), np.float32(numbers[_INNER])
-        weight = _smooth((outer - abs(place)) / (outer - inner))
+        weight = _smooth((outer - abs(s)) / (outer - inner))
     for leg in range(2):
-        if cuts[leg, 0, _LAST] > _NONE:
+        if cuts[leg, 0, _LAST] > _ZERO:
             b = _BEAM + leg * _BEAM_WORDS
             ahead = w[b] + (w[b + 3] * x + w[b + 4] * y + w[b + 5] * z)
             right = w[b + 1] + (w[b + 6] * x + w[b + 7] * y + w[b + 8] * z)
@@ -534,21 +544,21 @@ def _weight(w, zone, near, legs, given):  # type: ignore[no-untyped-def]
 
 @cuda.jit(device=True)
 def _change(along, s, relative):  # type: ignore[no-untyped-def]
-    """Return by how much s of one leg differs from that at the origin, (8a)."""
+    """Return the difference of s of one leg from its value at the origin, eq. 8a."""
     longer = relative * _root(relative) / _TWO
     return (along - s * longer) / (_ONE + longer)
 
 
 @cuda.jit(device=True)
 def _smooth(depth):  # type: ignore[no-untyped-def]
-    """Return (3) of integration.md."""
-    held = min(max(depth, _NONE), _ONE)
-    return held * held * (_THREE - _TWO * held)
+    """Return the smooth step of integration.md, eq. 3."""
+    clipped = min(max(depth, _ZERO), _ONE)
+    return clipped * clipped * (_THREE - _TWO * clipped)
 
 
 @cuda.jit(device=True)
 def _gain(ahead, right, above, cuts, gains):  # type: ignore[no-untyped-def]
-    """Return the gain of an antenna in a direction along its axes, (6)."""
+    """Return the gain of an antenna in a direction given along its axes, eq. 6."""
     azimuth = np.float32(math.atan2(right, ahead))
     elevation = np.float32(math.atan2(above, np.float32(math.sqrt(ahead * ahead + right * right))))
     return _look_up(azimuth, cuts[0], gains[0]) * _look_up(elevation, cuts[1], gains[1])
@@ -557,30 +567,30 @@ def _gain(ahead, right, above, cuts, gains):  # type: ignore[no-untyped-def]
 @cuda.jit(device=True)
 def _look_up(radians, cut, gains):  # type: ignore[no-untyped-def]
     """Return the gain at an angle of a cut, linear between samples and zero beyond them."""
-    place = (radians - cut[_FIRST]) * cut[_PER_RAD]
-    if not _NONE <= place <= cut[_LAST]:
-        return _NONE
-    at = np.uint32(min(place, cut[_LAST] - _ONE))
-    low, high = gains[at], gains[at + np.uint32(1)]
-    return low + (place - np.float32(at)) * (high - low)
+    position = (radians - cut[_FIRST]) * cut[_PER_RAD]
+    if not _ZERO <= position <= cut[_LAST]:
+        return _ZERO
+    index = np.uint32(min(position, cut[_LAST] - _ONE))
+    low, high = gains[index], gains[index + np.uint32(1)]
+    return low + (position - np.float32(index)) * (high - low)
 
 
 @cuda.jit(device=True)
-def _exact_weight(p, zone, pixel, centre, given):  # type: ignore[no-untyped-def]
-    """Return the weight of a pulse at a pixel by its place, in float64."""
-    antennas, (sector_axes, beam_axes, cuts, gains, _, _), numbers = given
-    place, at = pixel
+def _exact_weight(p, zone, pixel, centre, inputs):  # type: ignore[no-untyped-def]
+    """Return the weight of a pulse at a pixel from its position, in float64."""
+    antennas, (sector_axes, beam_axes, cuts, gains, _, _), numbers = inputs
+    positions, at = pixel
     s, weight = -centre, _ONE
     for leg in range(2):
         x, y, z = (
-            place[0, at] - antennas[p, leg, 0],
-            place[1, at] - antennas[p, leg, 1],
-            place[2, at] - antennas[p, leg, 2],
+            positions[0, at] - antennas[p, leg, 0],
+            positions[1, at] - antennas[p, leg, 1],
+            positions[2, at] - antennas[p, leg, 2],
         )
         if zone == _EDGE:
             axis = sector_axes[p, leg]
             s += (x * axis[0] + y * axis[1] + z * axis[2]) / math.sqrt(x * x + y * y + z * z)
-        if cuts[leg, 0, _LAST] > _NONE:
+        if cuts[leg, 0, _LAST] > _ZERO:
             axes = beam_axes[p, leg]
             ahead = np.float32(axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z)
             right = np.float32(axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z)

@@ -1,4 +1,4 @@
-"""Error and cost of settings of the GPU's kernel, with the sizes and bounds that the kernel is compiled with."""
+"""Predicted error and cost of settings of the GPU kernel, and the sizes and bounds compiled into the kernel."""
 
 import os
 from collections.abc import Iterator, Mapping
@@ -17,7 +17,7 @@ from apertura.core.backprojection.engines.range_interpolation import design_tabl
 from apertura.core.backprojection.job import Job
 
 SIDE = KERNEL.patch_side
-"""Pixels along a patch, which one block of threads sums; tiles begin at multiples of it."""
+"""Pixels along a patch, which one thread block sums; tiles start at multiples of it."""
 
 
 TAPS = KERNEL.taps
@@ -25,39 +25,39 @@ TAPS = KERNEL.taps
 
 
 DEGREE = 2
-"""Degree of the polynomials in a cell: linear ones save two look-ups of six, and need tables 1.7 times as fine."""
+"""Degree of the polynomials in a cell; linear ones save two of six look-ups but need 1.7 times as many cells."""
 
 
 CHUNK = 64
-"""Pulses of a patch that are summed in float32; these sums add up in float64."""
+"""Pulses summed in float32; these partial sums are added in float64."""
 
 
 LAST_ORDER, LAST_TERM = 6, 21 / 1024
-"""The first order of √(1 + s) that (8) neglects, and its coefficient: at most that over 1 − |s| is neglected."""
+"""First order of √(1 + s) neglected in eq. 8, and its coefficient; all neglected terms: at most that over 1 − |s|."""
 
 
 FARTHEST = 0.5
-"""Largest |s| at which the series is used: beyond, its error bound is of no use."""
+"""Largest |s| at which the series is used; beyond it the error bound is too loose."""
 
 
 FLOAT32_ERROR, FLOAT32_RMS = 2.5e-7, 3.2e-8
-"""Error of (8) by float32, relative to D: at worst, and RMS over 20 000 random pixels at each of five ranges."""
+"""Float32 error of eq. 8 relative to D: bound, and RMS over 20 000 random pixels at each of five ranges."""
 
 
 MOST_CELLS = 2.0**20
-"""Cells across a patch beyond which float32 cannot separate neighbours."""
+"""Cells across a patch above which float32 cannot resolve neighbouring cells."""
 
 
 ANGLE_ERROR, ANGLE_RMS = 1e-6, 2e-7
-"""Error of a pixel's angle in a cut by float32, rad: at worst, and RMS."""
+"""Float32 error of a pixel's angle in a cut, rad: bound, and RMS."""
 
 
 PLACE_ERROR, PLACE_RMS = 3e-7, 3.2e-8
-"""Error of s of docs/theory/integration.md, (1), by float32, relative to D/R: at worst, and RMS."""
+"""Float32 error of s of docs/theory/integration.md, eq. 1, relative to D/R: bound, and RMS."""
 
 
 def simulated() -> bool:
-    """Return whether numba's simulator replaces the device: for tests, thousands of times slower.
+    """Return True if numba's simulator replaces the device, as in tests; it is thousands of times slower.
 
     Examples
     --------
@@ -67,33 +67,33 @@ def simulated() -> bool:
     return os.environ.get("NUMBA_ENABLE_CUDASIM", "0") not in ("", "0")
 
 
-_WORST_TO_RMS = 0.105  # of a sixth power over a square patch along its diagonal, √(2/13 − 2/14)
+_WORST_TO_RMS = 0.105  # RMS over maximum of a sixth power along the diagonal of a square patch, √(2/13 − 2/14)
 
 
-_FLOAT32_RAD = 2e-6  # tables and their look-ups, as native
+_FLOAT32_RAD = 2e-6  # rounding error of tables and look-ups, as in native
 
 
 _NO_ERROR = 1e-20  # added before a logarithm
 
 
-# Seconds, not measured: a tenth of the rate that torchbp publishes for a card of 2022 (docs/theory/engine.md, "A GPU"),
-# float64 at 1/64 of float32's rate as on gaming cards, 10 GB/s there and back, and the wait for a first kernel.
+# Seconds, not measured: a tenth of the rate published by torchbp for a card of 2022 (docs/theory/engine.md, "A GPU"),
+# float64 at 1/64 of the rate of float32 as on consumer cards, transfers at 10 GB/s, and the start of the first kernel.
 _PIXEL_S, _EXACT_S = 5e-11, 5e-9  # per pixel and pulse: by the series, by exact paths
 
 
 _CELL_S, _SAMPLE_S = 2e-11, 8e-10  # per pulse and coefficient of a cell; per pulse and sample
 
 
-_PLACE_S = 3.2e-9  # per pixel: position there, sum back
+_PLACE_S = 3.2e-9  # per pixel: transfer of position and sum
 
 
-_SECTOR_S, _BEAM_S = 3e-11, 1e-10  # on top, at the edge of a sector and for each beam: operations over a pixel's
+_SECTOR_S, _BEAM_S = 3e-11, 1e-10  # additional, at the edge of a sector and for each beam, from operation counts
 
 
 _START_S = 3.0
 
 
-_SIMULATED_S = 1e-4  # per pixel and pulse, half as much for a weight, in Python: this one is measured
+_SIMULATED_S = 1e-4  # per pixel and pulse in the simulator, and half of it per weight (measured)
 
 
 def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterator[Setting]:
@@ -111,7 +111,7 @@ def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterat
 
 
 def series(view: View, *, wavenumber_rad_m: float, tolerance_rad: float) -> tuple[float, float]:
-    """Return the share of pulses × patches with exact paths, and the phase error of all paths.
+    """Return the share of patches × pulses with exact paths, and the phase error of all paths.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def series(view: View, *, wavenumber_rad_m: float, tolerance_rad: float) -> tupl
     wavenumber_rad_m
         2πf_mid/c.
     tolerance_rad
-        Largest phase error that the path series may make.
+        Largest tolerated phase error of the path series.
 
     Returns
     -------
@@ -141,24 +141,25 @@ def series(view: View, *, wavenumber_rad_m: float, tolerance_rad: float) -> tupl
     within = np.minimum(most, FARTHEST)
     neglected = (LAST_TERM * view.range_m * within**LAST_ORDER / (1 - within)).sum(axis=0)
     worst = wavenumber_rad_m * (neglected + 2 * FLOAT32_ERROR * reach)
-    taken = (worst <= tolerance_rad) & (most.max(axis=0) < FARTHEST)
+    uses_series = (worst <= tolerance_rad) & (most.max(axis=0) < FARTHEST)
     error = wavenumber_rad_m * np.hypot(_WORST_TO_RMS * neglected, np.sqrt(2) * FLOAT32_RMS * reach)
-    return float(1 - taken.mean()), float(np.sqrt((np.where(taken, error, 0.0) ** 2).mean()))
+    return float(1 - uses_series.mean()), float(np.sqrt((np.where(uses_series, error, 0.0) ** 2).mean()))
 
 
 def weights_error(job: Job, view: View) -> float:
-    """Return the RMS error of weights by float32, relative to a weight of one.
+    """Return the RMS float32 error of weights, relative to a weight of one.
 
     Parameters
     ----------
     job
-        With its beams and sector.
+        Job with beams and sector.
     view
         Imaging geometry of the scene.
 
     Notes
     -----
-    Source: docs/theory/engine.md, "A GPU": angles times the steepest slopes of the cuts; s over the sector's edge.
+    Source: docs/theory/engine.md, "A GPU": angle errors times the steepest slopes of the cuts; error of s over the
+    width of the sector's edge.
     """
     if job.beams is None:
         return 0.0
@@ -166,13 +167,13 @@ def weights_error(job: Job, view: View) -> float:
     squared = (ANGLE_RMS * np.linalg.norm(slopes)) ** 2
     if job.sector is not None:
         reach = np.sqrt(2) * (SIDE - 1) / 2 * view.spacing_m
-        place = PLACE_RMS * (reach / view.range_m.min() + 2 * job.sector.half)
-        squared += view.weights.edge * (1.5 * place / (job.sector.outer - job.sector.inner)) ** 2
+        error = PLACE_RMS * (reach / view.range_m.min() + 2 * job.sector.half)
+        squared += view.weights.edge * (1.5 * error / (job.sector.outer - job.sector.inner)) ** 2
     return float(np.sqrt(squared))
 
 
 def _pixel_seconds(view: View, exact: float) -> float:
-    """Return the seconds per pixel and pulse that is summed."""
+    """Return the predicted seconds per pixel and summed pulse."""
     weights = view.weights
     if simulated():
         return (1 - weights.dark) * (1 + (weights.antennas + weights.edge) / 2) * _SIMULATED_S
@@ -188,7 +189,7 @@ def _setting(job: Job, view: View, weights: float, pulses: int, oversampling: in
     exact, path_rad = series(view, wavenumber_rad_m=k, tolerance_rad=tolerance_rad)
     paths_db = 20 * np.log10(path_rad + _FLOAT32_RAD)
     weights_db = 20 * np.log10(weights + _NO_ERROR)
-    weighed = f", weights by {weights_db:.1f} dB" if job.weights else ""
+    weighted = f", weights {weights_db:.1f} dB" if job.weights else ""
     up, down = ratio(signal.oversampling, oversampling)
     coefficients = pulses * ((signal.samples - 1) * up // down + 1) * (DEGREE + 1)
     return Setting(
@@ -200,8 +201,8 @@ def _setting(job: Job, view: View, weights: float, pulses: int, oversampling: in
         table_seconds=_START_S + _CELL_S * coefficients + _SAMPLE_S * pulses * signal.samples,
         table_bytes=8 * coefficients,
         reasons={
-            "oversampling": f"table errs by {table_db:.1f} dB, paths by {paths_db:.1f} dB{weighed}; "
+            "oversampling": f"predicted errors: table {table_db:.1f} dB, paths {paths_db:.1f} dB{weighted}; "
             "seconds are not measured",
-            "tolerance_rad": f"of pixel·pulses {100 * exact:.0f} % take exact paths in float64",
+            "tolerance_rad": f"exact float64 paths for {100 * exact:.0f} % of pixels × pulses",
         },
     )

@@ -1,4 +1,4 @@
-"""Interface of an engine, and a setting of one with its predicted error and cost."""
+"""Engine interface, and engine settings with predicted error and cost."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -12,36 +12,36 @@ from apertura.common.units import decibels
 from apertura.core.backprojection.job import Job
 
 BEAM_S = 1.2e-7
-"""Seconds that `Beams.weight` takes for a pixel, a pulse and an antenna or the sector."""
+"""Seconds of `Beams.weight` per pixel, pulse, and antenna or sector."""
 
 
 class EngineOptions(BaseModel):
-    """Options of an engine in ``processing.engine_options.<engine>``; None leaves one to the planner."""
+    """Options of an engine in ``processing.engine_options.<engine>``; the planner selects options that are None."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 @dataclass(frozen=True)
 class Setting:
-    """An engine with its options, predicted error and cost.
+    """Engine with options, predicted error and predicted cost.
 
     Attributes
     ----------
     engine
-        A key of `ENGINES`.
+        Key of `ENGINES`.
     options, form_options
-        Keywords of its `prepare` and of its `form`.
+        Keyword arguments of `prepare` and of `form`.
     error_db
-        Predicted RMS error on random pixels.
+        Predicted RMS error at random pixels, dB.
     form_seconds, table_seconds
-        Predicted for all pixels, and for the tables that all tiles share: of one core of a server of 2023 with AVX-512.
-        Other machines take longer, in about the same ratios: a choice depends on the job alone.
+        Predicted time for all pixels, and for the tables common to all tiles, on one core of a 2023 server with
+        AVX-512. Times of other machines have approximately the same ratios, so that a choice depends on the job alone.
     table_bytes
-        What `prepare` returns for all pulses.
+        Size of the tables of all pulses.
     reasons
-        Option → reason of its value, in one line.
+        Option → reason of its value, one line.
     pulse_blocks
-        Into how many blocks pulses are split, so that the tables of one fit into memory; their images add up.
+        Number of pulse blocks, so that the tables of one block fit into memory; the images of blocks add up.
     """
 
     engine: str
@@ -56,7 +56,7 @@ class Setting:
 
     @property
     def seconds(self) -> float:
-        """Tables and pixels."""
+        """Predicted time for tables and pixels."""
         return self.table_seconds + self.form_seconds
 
     @property
@@ -66,7 +66,7 @@ class Setting:
 
     @property
     def line(self) -> str:
-        """The engine and its options in a few words.
+        """Engine and options, one phrase.
 
         Examples
         --------
@@ -77,37 +77,37 @@ class Setting:
 
 
 class Engine(Protocol):
-    """A module that forms images.
+    """Interface of an engine module, which forms images.
 
     Attributes
     ----------
     Options
-        Options of the config; its fields are options of `prepare` or `form`.
+        Options in the config; its fields are options of `prepare` or `form`.
     READS
-        Its input: a `PhaseHistory` or `Profiles`.
+        Input type: phase history or profiles.
     available
-        Whether it can run here.
+        Returns True if the engine can run on this machine.
     NEEDS
-        Requirements, in a few words; an engine that runs everywhere leaves it out.
+        Requirements, one phrase; omitted by an engine that runs everywhere.
     TIMED
-        False where its seconds were not measured: it is taken on request only, never by the planner alone.
+        False if the cost of the engine has not been measured: the planner never selects it, it runs on request only.
     candidates
         (job, pulses=, requested=) → settings with predicted error and cost; `pulses` may be fewer than the job's,
-        `requested` are options fixed by the config.
+        `requested` contains options fixed by the config.
     prepare
-        (inputs, **options) → tables that all tiles share; ``[pulses]`` of it, a slice from a multiple of 64 on, is that
-        of some pulses.
+        (inputs, **options) → tables common to all tiles; indexing them by a slice of pulses, which starts at a multiple
+        of 64, gives the tables of these pulses.
     instruction_set
-        Which instructions its sums run with here; an engine may leave it out.
+        Returns the instruction set of the sums on this machine; optional.
     pieces
-        (shape of a block of pixels, form_options) → windows of it that get the same bits when formed alone; an engine
-        whose pixels are formed in patches of `PATCH_PX` leaves it out.
+        (shape of a block of pixels, form_options) → windows that can be formed independently with the same bits;
+        omitted by an engine that forms pixels in patches of `PATCH_PX`.
     VARIANTS
-        Names of the variants of its sum; `form` adds the pixels × pulses that took each to an int64 array `counts`. An
-        engine with one variant leaves it out.
+        Names of the variants of the sum; `form` adds the pixels × pulses of each variant to an int64 array `counts`.
+        Omitted by an engine with one variant.
     form
         (prepared, pixels (y, x, 3) float64, beams=None, **form_options) → (y, x) complex, the sum over the pulses;
-        releases the GIL, starts no threads.
+        releases the GIL and starts no threads.
     """
 
     Options: type[EngineOptions]
@@ -121,7 +121,7 @@ class Engine(Protocol):
 
 
 def checked_pixels(pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the places of pixels as contiguous float64, checked for an engine's `form`.
+    """Return pixel positions as contiguous float64, validated for an engine's `form`.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def checked_pixels(pixels: NDArray[np.float64]) -> NDArray[np.float64]:
     Raises
     ------
     ValueError
-        If they have another shape.
+        If the shape is not (y, x, 3).
 
     Examples
     --------
@@ -144,7 +144,7 @@ def checked_pixels(pixels: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def compiled_for() -> str:
-    """Return the processor that numba compiles for here, as LLVM calls it."""
+    """Return LLVM's name of the processor for which numba compiles on this machine."""
     from llvmlite.binding import get_host_cpu_name
     from numba.core import config
 
@@ -152,7 +152,7 @@ def compiled_for() -> str:
 
 
 def power_sum_db(*parts_db: float) -> float:
-    """Return the sum of independent errors, dB.
+    """Return the power sum of independent errors, dB.
 
     Examples
     --------
@@ -163,5 +163,5 @@ def power_sum_db(*parts_db: float) -> float:
 
 
 def option_values(requested: Mapping[str, Any], name: str, offered: Iterable[Any]) -> tuple[Any, ...]:
-    """Return the values of an option to consider: the one requested, or all that the engine offers."""
+    """Return the candidate values of an option: the requested value, or all values offered by the engine."""
     return (requested[name],) if requested.get(name) is not None else tuple(offered)

@@ -1,4 +1,4 @@
-"""Binding of the compiled library: structures, sizes and error bounds, instruction sets."""
+"""ctypes binding of the compiled library: structures, sizes and error bounds, instruction sets."""
 
 import ctypes
 import os
@@ -18,49 +18,50 @@ from apertura.core.geometry.sector import Sector
 
 # ---- Sizes and error bounds of the compiled kernel
 #
-# A plan is made with them where the engine is not compiled, too; a test compares them with those of the library.
+# The planner uses them also if the engine is not compiled; a test compares them with those of the library.
 
 
 @dataclass(frozen=True)
 class KernelConstants:
     """Sizes and error bounds of the kernel.
 
-    D is the largest distance of a block from its patch's origin, δ of a pixel from its block's centre, R the range;
-    errors are of one leg's path, in the unit of D, δ and R.
+    D is the largest distance of a block from its patch's origin, δ that of a pixel from its block's centre, R the
+    range; errors refer to the path of one leg, in the unit of D, δ and R.
 
     Attributes
     ----------
     patch_side, block_side
-        Pixels along a patch, whose paths are series about its origin, and along a block, of one polynomial.
+        Pixels along a patch, whose paths are series about its origin, and along a block with one polynomial.
     batch
-        Pulses whose paths are computed together: phase centres are padded to a multiple of it.
+        Pulses whose paths are computed together; phase centres are padded to a multiple of it.
     taps
         Taps of a table's filters.
     window
-        Table cells that one look-up can reach; tables have as many empty cells at both ends.
+        Table cells within reach of one look-up; tables have the same number of empty cells at both ends.
     echo_taps, echo_degree
-        Samples that make an echo at a single place, and the degree of the polynomials that weigh them
-        (docs/theory/autofocus.md, "What pulses add").
+        Samples used for an echo at a single point, and degree of their weight polynomials (docs/theory/autofocus.md,
+        "What pulses add").
     term_taps
-        Samples that make one in float64, for certificates.
+        Samples used for an echo in float64, for certificates.
     window_margin
-        Cells: a path lies up to ½ beyond the cell it is rounded to, the rest is what float32 may err.
+        Cells: a path lies up to ½ cell beyond the cell to which it is rounded; the rest covers float32 rounding.
     fifth_order
-        Of D⁵/R⁴. Order n of |w + d| is at most max |P_{n-2} − P_n| / (2n − 1) · dⁿ/Rⁿ⁻¹, 0.083 for n = 5, with room for
-        higher orders.
+        Factor of D⁵/R⁴. Order n of |w + d| is at most max |P_{n-2} − P_n| / (2n − 1) · dⁿ/Rⁿ⁻¹, 0.083 for n = 5, plus a
+        margin for higher orders.
     third_order
-        Of δ³/R²: 1/(3√3).
+        Factor of δ³/R²: 1/(3√3).
     shared_curvature_error
-        Of Dδ²/R², where all blocks of a patch share one curvature: three terms of 1/(3√3).
+        Factor of Dδ²/R² if all blocks of a patch share one curvature: three terms of 1/(3√3).
     own_curvature_error
-        Of D²δ²/R³, where each has its own: six terms of 1/8, of which all but a tenth is in the block's curvature.
+        Factor of D²δ²/R³ if each block has its own curvature: six terms of 1/8, which it includes except for a tenth.
     curvature_span
-        Second-order terms move a pixel of a block by at most 1.5² their coefficients; twice that bounds all blocks.
+        Second-order terms displace a pixel of a block by at most 1.5² their coefficients; twice that bounds all blocks.
     weight_change, weight_curvature
-        Of the beam's peak: how much antenna weights may differ between the nodes of a patch, first and second
-        difference, to be taken as a polynomial.
+        Largest first and second differences of antenna weights between the nodes of a patch, relative to the beam's
+        peak, for which the weights are a polynomial.
     sector_bend
-        Of the width of a sector's edge: how much a pixel's place in it may bend inside a block to be taken as linear.
+        Largest curvature of a pixel's position in a sector's edge within a block, relative to the width of the edge,
+        for which the position is linear.
 
     Notes
     -----
@@ -96,23 +97,23 @@ class TreeConstants:
     Attributes
     ----------
     nodes, side, levels
-        Nodes and pixels along an axis of a tile, and levels of a tree, at most.
+        Largest number of nodes and of pixels along an axis of a tile, and of levels of a tree.
     slots
-        Numbers of nodes, and above them the sides of tiles in pixels, to which nodes are interpolated.
+        Number of slots for node counts and, above them, for sides of tiles in pixels, to which nodes are interpolated.
     leaf
         Pulses of a leaf, all summed by one variant.
     virtual, virtual_margin
-        Virtual pulses that replace those of a leaf, at most, and how many there are beyond the degree of their curve.
+        Largest number of virtual pulses of a leaf, and their number beyond the degree of their curve.
     terms
-        Polynomials of the track over a leaf: one more than the highest degree of a curve.
+        Number of polynomials of the track over a leaf: one more than the highest degree of a curve.
     degree
-        Of a tile's surface that is no plane.
+        Degree of a nonplanar surface of a tile.
     delays
         Taps of the filter that aligns a pulse to a tile.
     weights
-        Coefficients of the antennas' gain over a tile.
+        Coefficients of the antenna gain over a tile.
     weighted_rad
-        Added to the band at a tile's nodes by smooth weights, rad per half tile.
+        Band added at a tile's nodes by smooth weights, rad per half tile.
     """
 
     nodes: int = 128
@@ -133,7 +134,7 @@ TREE = TreeConstants()
 
 
 BY_TREE, DIRECTLY, NO_ECHO = range(3)
-"""Variant by which a group of pulses is summed over a tile: native/tree_job.hpp, TreeVariant."""
+"""Variants of the sum of a group of pulses over a tile: native/tree_job.hpp, TreeVariant."""
 
 
 # ---- Structures of the compiled library
@@ -246,20 +247,20 @@ class TreeJob(ctypes.Structure):
 
 
 STRUCTS = (BeamJob, SectorJob, ApertureJob, TableJob, EchoJob, TermsJob, TreeTile, TreeJob)
-"""All of them."""
+"""All structures."""
 
 
 # ---- Loading the compiled library
 #
-# Bound with ctypes: the GIL is released during a call, and one wheel serves every Python version. The library says
-# the layout of its structs; a library whose layout differs from the mirrors here is refused when it is loaded.
+# Bound with ctypes: the GIL is released during a call, and one wheel supports every Python version. The library
+# reports the layout of its structs; a library with a layout different from this module is rejected on loading.
 
 INSTRUCTION_SETS = ("avx512", "avx2", "portable")
 
 NAMED_BY = "APERTURA_KERNEL"
-"""Environment variable: another library than the one installed."""
+"""Environment variable: path of a library that replaces the installed one."""
 
-# Resolved once: calls may be short.
+# Resolved once, as calls may be short.
 _BUILT = Path(str(files("apertura.core.backprojection.engines") / "_backprojection.so"))
 
 
@@ -275,43 +276,43 @@ def layout() -> dict[str, str]:
     for struct in STRUCTS:
         for name, *_ in struct._fields_:
             field = getattr(struct, name)
-            lines[f"{struct.__name__}.{name}"] = _place(field.offset, field.size)
-        lines[struct.__name__] = _place(0, ctypes.sizeof(struct))
+            lines[f"{struct.__name__}.{name}"] = _extent(field.offset, field.size)
+        lines[struct.__name__] = _extent(0, ctypes.sizeof(struct))
     return lines
 
 
-def _place(offset: int, size: int) -> str:
+def _extent(offset: int, size: int) -> str:
     return f"byte {offset}, {size} bytes"
 
 
 def check_layout(theirs: dict[str, str], path: Path) -> None:
-    """Refuse a library whose structs are not those of this module.
+    """Reject a library whose structs differ from those of this module.
 
     Parameters
     ----------
     theirs
-        As `layout`, from the library.
+        Layout reported by the library, in the form of `layout`.
     path
-        Of the library.
+        Path of the library.
 
     Raises
     ------
     CampaignError
-        Naming the first field that differs, as it is there and here.
+        For the first field that differs, with both layouts.
     """
     ours = layout()
     for name in [*ours, *(theirs.keys() - ours.keys())]:
         if ours.get(name) != theirs.get(name):
             raise CampaignError(
-                f"{name} at {theirs.get(name, 'no place')}",
+                f"{name}: {theirs.get(name, 'no such field')}",
                 where=str(path),
-                expected=f"{name} at {ours.get(name, 'no place')}, as in apertura's native_binding.py",
-                remedy="Reinstall apertura, so that the library and Python are of one version; unset APERTURA_KERNEL.",
+                expected=f"{name}: {ours.get(name, 'no such field')}, as in apertura's native_binding.py",
+                remedy="Reinstall apertura to get the library of the same version, and unset APERTURA_KERNEL.",
             )
 
 
 def available() -> bool:
-    """Return whether the kernel was compiled when the package was installed.
+    """Return True if the kernel was compiled at the installation of the package.
 
     Examples
     --------
@@ -322,14 +323,14 @@ def available() -> bool:
 
 
 def instruction_set() -> str:
-    """Return the instruction set in use: the best of this machine, or what APERTURA_ISA names.
+    """Return the instruction set in use: the best of this machine, or the one requested by APERTURA_ISA.
 
     Raises
     ------
     RuntimeError
         If the kernel was not compiled.
     CampaignError
-        If APERTURA_ISA is unknown, or one that this machine lacks.
+        If APERTURA_ISA is unknown or not supported by this machine.
 
     Examples
     --------
@@ -338,46 +339,48 @@ def instruction_set() -> str:
     """
     requested = os.environ.get("APERTURA_ISA", "")
     if requested and requested not in INSTRUCTION_SETS:
-        raise _unfit(requested, f"one of {', '.join(INSTRUCTION_SETS)}, or unset")
+        raise _unsupported(requested, f"one of {', '.join(INSTRUCTION_SETS)}, or unset")
     chosen = library().apertura_isa(requested.encode())
     if chosen is None:
-        raise _unfit(requested, "instructions that this machine has")
+        raise _unsupported(requested, "an instruction set that this machine supports")
     return str(chosen.decode())
 
 
 def supports(isa: str) -> bool:
-    """Return whether the kernel was compiled and this machine has the instruction set of that name."""
+    """Return True if the kernel was compiled and this machine supports the named instruction set."""
     return available() and library().apertura_isa(isa.encode()) is not None
 
 
-def _unfit(requested: str, expected: str) -> CampaignError:
+def _unsupported(requested: str, expected: str) -> CampaignError:
     return CampaignError(
         f"{requested!r}", where="environment variable APERTURA_ISA", expected=expected, remedy="Unset it."
     )
 
 
 def call(function: str, job: ctypes.Structure) -> None:
-    """Run `function` of the library on `job`; the GIL is released meanwhile.
+    """Run `function` of the library on `job` with the GIL released.
 
     Raises
     ------
     MemoryError
-        If the library found no memory for its scratch.
+        If the library cannot allocate its work memory.
+    RuntimeError
+        If the function fails for another reason.
     """
     status = getattr(library(), function)(instruction_set().encode(), ctypes.byref(job))
     if status == 1:
-        raise MemoryError(f"{function}: no memory for scratch")
+        raise MemoryError(f"{function}: work memory cannot be allocated")
     if status:
         raise RuntimeError(f"{function}: failed with status {status}")
 
 
 def library_path() -> Path:
-    """Return where the library lies once it is compiled; APERTURA_KERNEL names another, such as one with sanitizers.
+    """Return the path of the compiled library: the installed one, or APERTURA_KERNEL, for instance with sanitizers.
 
     Raises
     ------
     CampaignError
-        If APERTURA_KERNEL names no file, or a relative path: every process has a working folder of its own.
+        If APERTURA_KERNEL is not an existing file, or a relative path, as working directories differ between processes.
     """
     named = os.environ.get(NAMED_BY)
     if not named:
@@ -389,7 +392,7 @@ def library_path() -> Path:
 
 def _no_kernel(named: str, found: str) -> CampaignError:
     where = f"environment variable {NAMED_BY}"
-    expected = "the whole path of a library built from native/ of this version"
+    expected = "the absolute path of a library built from native/ of this version"
     return CampaignError(f"{quoted(named)}: {found}", where=where, expected=expected, remedy="Unset it.")
 
 
@@ -407,7 +410,7 @@ def library() -> ctypes.CDLL:
 
 
 def kernel_constants() -> dict[str, float]:
-    """Return the constants that the library was compiled with, by name (native/bounds.hpp, native/tree_job.hpp).
+    """Return the constants of the compiled library by name (native/bounds.hpp, native/tree_job.hpp).
 
     Examples
     --------
@@ -421,7 +424,7 @@ def kernel_constants() -> dict[str, float]:
 def _load(path: Path) -> ctypes.CDLL:
     if not path.is_file():
         raise RuntimeError(
-            "the compiled kernel is missing: install a C++ compiler and reinstall apertura, or use numba"
+            "the compiled kernel is missing: install a C++ compiler and reinstall apertura, or use engine numba"
         )
     try:
         loaded = ctypes.CDLL(str(path))
@@ -432,7 +435,7 @@ def _load(path: Path) -> ctypes.CDLL:
     for function in (loaded.apertura_isa, loaded.apertura_layout, loaded.apertura_constants):
         function.restype = ctypes.c_char_p
     loaded.apertura_isa.argtypes = [ctypes.c_char_p]
-    check_layout({name: _place(int(at), int(size)) for name, at, size in _lines(loaded.apertura_layout)}, path)
+    check_layout({name: _extent(int(at), int(size)) for name, at, size in _lines(loaded.apertura_layout)}, path)
     return loaded
 
 
@@ -443,23 +446,23 @@ def _lines(function: Callable[[], bytes]) -> list[list[str]]:
 # ---- Beams and sectors as structures
 
 KeptArrays = list[NDArray[np.generic]]
-"""Arrays that a struct points into, kept alive as long as the struct is used."""
+"""Arrays referenced by a struct, kept alive while the struct is used."""
 
 
 def weights_of(beams: Beams | None, pulses: int, padded: int) -> tuple[Any, Any, KeptArrays]:
-    """Return the pointers `beam` and `sector` of a job, and the arrays that they point into.
+    """Return the pointers `beam` and `sector` of a job, and the arrays that they reference.
 
     Parameters
     ----------
     beams
-        Over as many pulses.
+        Beams of the same number of pulses.
     pulses, padded
-        Of the tables, without and with those that fill a batch.
+        Number of pulses of the tables, without and with padding to a batch.
 
     Raises
     ------
     ValueError
-        If a beam or the sector is of other pulses.
+        If a beam or the sector has another number of pulses.
     """
     beams = beams or Beams()
     beams.check_pulses(pulses)
@@ -476,7 +479,7 @@ def weights_of(beams: Beams | None, pulses: int, padded: int) -> tuple[Any, Any,
 
 
 def _beam(beam: Beam, padded: int) -> tuple[BeamJob, KeptArrays]:
-    axes = np.ascontiguousarray(np.moveaxis(_filled(beam.axes, padded), 0, -1), np.float64)
+    axes = np.ascontiguousarray(np.moveaxis(_padded(beam.axes, padded), 0, -1), np.float64)
     angles = (beam.azimuth_rad, beam.elevation_rad)
     gains = [np.ascontiguousarray(gain, np.float32) for gain in (beam.azimuth_gain, beam.elevation_gain)]
     job = BeamJob(
@@ -490,15 +493,15 @@ def _beam(beam: Beam, padded: int) -> tuple[BeamJob, KeptArrays]:
     return job, [axes, *gains]
 
 
-def _filled(axes: NDArray[np.float64], padded: int) -> NDArray[np.float64]:
-    """Return the axes of pulses, the last one repeated."""
+def _padded(axes: NDArray[np.float64], padded: int) -> NDArray[np.float64]:
+    """Return the axes padded to `padded` pulses by repeating the last."""
     return np.concatenate([axes, np.repeat(axes[-1:], padded - len(axes), axis=0)]) if padded > len(axes) else axes
 
 
 def _sector(sector: Sector, padded: int) -> tuple[SectorJob, KeptArrays]:
-    axes = [np.ascontiguousarray(_filled(axis, padded).T, np.float64) for axis in (sector.tx_axis, sector.rx_axis)]
+    axes = [np.ascontiguousarray(_padded(axis, padded).T, np.float64) for axis in (sector.tx_axis, sector.rx_axis)]
     at = [] if sector.ends is None else [*sector.ends[0].legs, sector.ends[1].tx_axis, sector.ends[1].rx_axis]
     kept: KeptArrays = [*axes, *(np.ascontiguousarray(array, np.float64) for array in at)]
-    pair, pointers = ctypes.c_void_p * 2, [one.ctypes.data for one in kept]
+    pair, pointers = ctypes.c_void_p * 2, [array.ctypes.data for array in kept]
     fields = pair(*pointers[:2]), sector.centre, sector.inner, sector.outer, pair(*pointers[2:4]), pair(*pointers[4:])
     return SectorJob(*fields, len(at[0]) if at else 0), kept

@@ -1,4 +1,4 @@
-"""Backprojection by interpolation in an oversampled range table, compiled by numba."""
+"""Backprojection by cubic interpolation in oversampled range tables, compiled by numba."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -27,15 +27,15 @@ from apertura.core.windowed_sinc import kaiser_sinc
 instruction_set = compiled_for
 READS: Literal["profiles"] = "profiles"
 STANDS_IN_FOR = "native"
-"""Taken by itself only where that cannot run."""
+"""Engine that this one replaces in the planner's selection if that engine cannot run."""
 OVERSAMPLINGS = (2, 4, 6, 8, 12, 16, 24, 32)
 
-_SAMPLE_S = 3.1e-8  # per pulse and fine sample
-_PIXEL_S = 3.2e-8  # per pixel and pulse
-_REFINED_DB = -98.0  # the sinc filter of the table
+_SAMPLE_S = 3.1e-8  # seconds per pulse and table sample
+_PIXEL_S = 3.2e-8  # seconds per pixel and pulse
+_REFINED_DB = -98.0  # error of the sinc filter of the table
 _HALF_TAPS = 10
-_PIXELS_AT_ONCE = 1024  # whose weights are in memory at once
-_KAISER_BETA = 10.0  # -100 dB, with half the band free for the transition
+_PIXELS_AT_ONCE = 1024  # pixels whose weights are in memory
+_KAISER_BETA = 10.0  # -100 dB, with half the band as transition
 
 
 class Options(EngineOptions):
@@ -47,12 +47,12 @@ class Options(EngineOptions):
 
 
 def available() -> bool:
-    """Return True: numba is installed with the package."""
+    """Return True, as numba is installed with the package."""
     return True
 
 
 def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterator[Setting]:
-    """Yield a setting per oversampling, as `apertura.core.backprojection.engines.engine.Engine` describes.
+    """Yield a setting for each oversampling, as `apertura.core.backprojection.engines.engine.Engine` describes.
 
     Notes
     -----
@@ -66,7 +66,9 @@ def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterat
         factor = max(1, round(oversampling / signal.oversampling))
         samples = pulses * signal.samples * factor
         cubic_db = cubic_error_db(signal.oversampling * factor, signal.window)
-        reason = f"cubic interpolation of a {signal.oversampling * factor:.3g}× table errs by {cubic_db:.1f} dB"
+        reason = (
+            f"predicted error of cubic interpolation in a {signal.oversampling * factor:.3g}× table {cubic_db:.1f} dB"
+        )
         yield Setting(
             "numba",
             {"oversampling": oversampling},
@@ -80,7 +82,7 @@ def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterat
 
 
 def cubic_error_db(oversampling: float, window: NDArray[np.float64]) -> float:
-    """Return the RMS error of four-point Lagrange interpolation of echoes that a window (subcarrier,) weighs, dB.
+    """Return the RMS error of four-point Lagrange interpolation of echoes with a window (subcarrier,), dB.
 
     Examples
     --------
@@ -101,7 +103,7 @@ def cubic_error_db(oversampling: float, window: NDArray[np.float64]) -> float:
 
 @dataclass(frozen=True)
 class OversampledTables:
-    """Range profiles, finely sampled.
+    """Oversampled range profiles.
 
     Attributes
     ----------
@@ -124,19 +126,20 @@ class OversampledTables:
     aperture: Aperture
 
     def __getitem__(self, pulses: slice) -> "OversampledTables":
-        """Return the tables of some pulses, as views."""
+        """Return the tables of a slice of pulses, as views."""
         return replace(self, samples=self.samples[pulses], start_m=self.start_m[pulses], aperture=self.aperture[pulses])
 
 
 def prepare(profiles: Profiles, *, oversampling: int = 8) -> OversampledTables:
-    """Return tables of `oversampling` samples per resolution cell.
+    """Return tables with `oversampling` samples per resolution cell.
 
     Parameters
     ----------
     profiles
-        At least twice oversampled, so that half the band is left for the transition of the filter.
+        Profiles, at least twice oversampled to leave half the band for the transition of the filter.
     oversampling
-        Samples per cell c/B; cubic interpolation of 8 errs by about -80 dB (docs/theory/planner.md, "Error").
+        Samples per range cell c/B; the error of cubic interpolation of 8 samples is about -80 dB
+        (docs/theory/planner.md, "Error").
     """
     factor = max(1, round(oversampling / profiles.oversampling))
     fine = refine(profiles.samples, factor)
@@ -150,19 +153,19 @@ def prepare(profiles: Profiles, *, oversampling: int = 8) -> OversampledTables:
 
 
 def refine(samples: NDArray[np.complex64], factor: int) -> NDArray[np.complex64]:
-    """Return samples interpolated to `factor` times their rate by a windowed sinc; the first ones coincide.
+    """Interpolate samples to `factor` times their rate by a windowed sinc; the first samples coincide.
 
     Parameters
     ----------
     samples
         (pulse, range) complex64, at least twice oversampled.
     factor
-        New samples per old one.
+        New samples per original sample.
 
     Returns
     -------
     ndarray
-        (pulse, range·factor) complex64; within ten samples of an end the missing neighbours count as zero.
+        (pulse, range·factor) complex64; within ten samples of an end, missing neighbours are zero.
 
     Examples
     --------
@@ -183,21 +186,21 @@ def refine(samples: NDArray[np.complex64], factor: int) -> NDArray[np.complex64]
 def form(
     tables: OversampledTables, pixels: NDArray[np.float64], *, beams: Beams | None = None
 ) -> NDArray[np.complex64]:
-    """Return Σ p(R)·exp(+j2πf_mid·R/c) over the pulses at each pixel, R the total path.
+    """Return Σ p(R)·exp(+j2πf_mid·R/c) over the pulses at each pixel, with R the total path.
 
     Parameters
     ----------
     tables
-        From `prepare`.
+        Tables from `prepare`.
     pixels
         (y, x, 3) float64, metres, in the frame of the phase centres.
     beams
-        Weight of each pulse at each pixel by its antennas; none by default.
+        Antenna weight of each pulse at each pixel; none by default.
 
     Returns
     -------
     ndarray
-        (y, x) complex64. A path outside the table adds nothing.
+        (y, x) complex64. A path outside the table adds zero.
 
     Notes
     -----
@@ -231,11 +234,11 @@ def _accumulate(samples, start, step, wavenumber, tx, rx, pixels, weights, image
             path = np.sqrt((x - tx[p, 0]) ** 2 + (y - tx[p, 1]) ** 2 + (z - tx[p, 2]) ** 2) + np.sqrt(
                 (x - rx[p, 0]) ** 2 + (y - rx[p, 1]) ** 2 + (z - rx[p, 2]) ** 2
             )
-            place = (path - start[p]) / step
-            k = int(np.floor(place))
+            position = (path - start[p]) / step
+            k = int(np.floor(position))
             if k < 1 or k > length - 3:
                 continue
-            u = place - k
+            u = position - k
             value = (
                 samples[p, k - 1] * (-u * (u - 1) * (u - 2) / 6)
                 + samples[p, k] * ((u + 1) * (u - 1) * (u - 2) / 2)

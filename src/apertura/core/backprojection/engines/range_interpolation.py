@@ -1,7 +1,7 @@
 """Range tables of the compiled engine: polynomials of the profile inside each cell, and their error.
 
-A cell has the coefficients of the least-squares polynomial of the profile over itself, multiplied by the carrier at its
-middle; the rest of the carrier inside the cell is a short polynomial too (docs/theory/engine.md).
+A cell contains the coefficients of the least-squares polynomial of the profile over the cell, multiplied by the carrier
+at its middle; the carrier relative to the middle is a short polynomial as well (docs/theory/engine.md).
 """
 
 from dataclasses import dataclass, replace
@@ -14,21 +14,21 @@ from apertura.common.units import decibels
 from apertura.core.backprojection.engines.native_binding import KERNEL
 
 TAPS = KERNEL.taps
-MARGIN = KERNEL.window  # empty cells at both ends, so that a look-up window may extend beyond
-# Sine terms, cosine terms, half turns removed first: the polynomials of native/phase.hpp, cheapest first.
+MARGIN = KERNEL.window  # empty cells at both ends for look-up windows that extend beyond the profile
+# Sine terms, cosine terms, reduction by multiples of π: the polynomials of native/phase.hpp, cheapest first.
 PHASE_POLYNOMIALS = ((2, 3, False), (3, 4, False), (4, 4, False), (3, 4, True))
 
 BAND = np.cos(np.pi * (np.arange(160) + 0.5) / 160)
-"""Places over the band at which errors are evaluated, its edges at ±1: Chebyshev nodes, dense at the edges."""
+"""Frequencies at which errors are evaluated, with the band edges at ±1: Chebyshev nodes, dense at the edges."""
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
-_WITHIN = _NODES / 2  # places inside a cell, in cells
+_WITHIN = _NODES / 2  # positions inside a cell, in cells
 _WITHIN_WEIGHTS = _WEIGHTS / 2
 
 
 @dataclass(frozen=True)
 class Tables:
-    """Profiles as polynomials per cell, carrier folded in; shared by all tiles.
+    """Range profiles as polynomials per cell that include the carrier; common to all tiles.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Tables:
     transmitter_m, receiver_m
         (3, padded) float64, phase centres in the frame of the pixels; pulses padded to a multiple of 8.
     first_path_m
-        (padded,) float64, total path of the middle of cell 0, metres.
+        (padded,) float64, total path at the middle of cell 0, metres.
     cell_m
         Total path across one cell, metres.
     carrier_rad_per_cell
@@ -46,9 +46,9 @@ class Tables:
     phase_polynomial, phase_coefficients
         Index into `PHASE_POLYNOMIALS` and its (9,) float32 coefficients.
     degree
-        Of the polynomials, 1 or 2.
+        Degree of the polynomials, 1 or 2.
     error_db
-        Predicted RMS error on random pixels of a profile with a flat spectrum.
+        Predicted RMS error at random pixels for a profile with a flat spectrum, dB.
     """
 
     cells: NDArray[np.float32]
@@ -63,7 +63,7 @@ class Tables:
     error_db: float
 
     def __getitem__(self, pulses: slice) -> "Tables":
-        """Return the tables of pulses from a multiple of a batch on."""
+        """Return the tables of a slice of pulses that starts at a multiple of a batch."""
         first, last, _ = pulses.indices(len(self.cells))
         padded = slice(first, first - (first - last) // KERNEL.batch * KERNEL.batch)
         return replace(
@@ -82,15 +82,15 @@ class TableDesign:
     Attributes
     ----------
     up, down
-        `up` cells cover `down` samples.
+        Number of cells that cover `down` samples, and number of these samples.
     taps
-        (up, degree + 1, tap) float32, filters giving each coefficient at each position of the cell.
+        (up, degree + 1, tap) float32, filters for each coefficient of each of the `up` cells.
     lead
         (up,) int32, sample of the first tap relative to the first of the `down` samples.
     phase_polynomial, phase_coefficients
         As in `Tables`.
     squared_error
-        (160,) float64, mean squared error of a frequency at each place of `BAND`, over the places in a cell.
+        (160,) float64, mean squared error over a cell at each frequency of `BAND`.
     """
 
     up: int
@@ -102,19 +102,19 @@ class TableDesign:
     squared_error: NDArray[np.float64]
 
     def error_db(self, window: NDArray[np.float64]) -> float:
-        """Return the predicted RMS error on random pixels of echoes that a window weighs, as `band_error_db`."""
+        """Return the predicted RMS error at random pixels for echoes with a window, as `band_error_db`."""
         return band_error_db(self.squared_error, window)
 
 
 def band_error_db(squared_error: NDArray[np.float64], window: NDArray[np.float64]) -> float:
-    """Return the RMS error of a white echo under a window over its subcarriers, relative to the echo under the window.
+    """Return the RMS error of a windowed white echo, relative to the echo, dB.
 
     Parameters
     ----------
     squared_error
-        (160,) float64, of a frequency at each place of `BAND`.
+        (160,) float64, squared error at each frequency of `BAND`.
     window
-        (subcarrier,) float64, weights from the lowest to the highest; their scale does not count.
+        (subcarrier,) float64, weights from the lowest to the highest subcarrier, with any scale.
 
     Returns
     -------
@@ -133,12 +133,12 @@ def band_error_db(squared_error: NDArray[np.float64], window: NDArray[np.float64
     """
     count = len(window)
     power = np.interp(BAND, (np.arange(count) - count // 2) * 2 / count, window**2)
-    power *= np.sqrt(1 - BAND**2)  # Chebyshev nodes → even over the band
+    power *= np.sqrt(1 - BAND**2)  # weights for integration over the band at Chebyshev nodes
     return decibels(float((squared_error * power).sum() / power.sum()))
 
 
 def ratio(profile_oversampling: float, oversampling: float) -> tuple[int, int]:
-    """Return (cells, samples) that cover the same path, with at least `oversampling` cells per Nyquist cell.
+    """Return the numbers of cells and samples of the same path, with at least `oversampling` cells per Nyquist cell.
 
     Examples
     --------
@@ -162,16 +162,16 @@ def design_table(
     carrier_rad_per_sample
         Phase of the carrier over one sample of total path, rad.
     oversampling
-        Cells per Nyquist cell of the table.
+        Cells of the table per Nyquist cell.
     degree
-        Of the polynomials, 1 or 2.
+        Degree of the polynomials, 1 or 2.
     taps
-        Of the filters.
+        Taps of the filters.
 
     Notes
     -----
-    Source: docs/theory/engine.md, "Cells". The filters are least-squares optimal over the band that the
-    profiles occupy, so oversampled profiles need few taps.
+    Source: docs/theory/engine.md, "Cells". The filters are least-squares optimal over the band of the profiles, so that
+    oversampled profiles require few taps.
 
     Examples
     --------
@@ -179,23 +179,23 @@ def design_table(
     >>> design.up, design.down, design.error_db(np.ones(1)) < -74
     (3, 1, True)
     """
-    # Positions of the `up` cells within `down` samples, and the band that profiles occupy.
+    # Positions of the `up` cells within `down` samples, and the band of the profiles.
     up, down = ratio(profile_oversampling, oversampling)
     starts = np.arange(up) * down / up
     first_sample = np.floor(starts)
     omega = np.pi / profile_oversampling * BAND
-    # Coefficients that each frequency has in each cell, and the taps that give them, by least squares.
+    # Coefficients of each frequency in each cell, and least-squares filter taps for them.
     ideal = np.exp(1j * omega * (starts - first_sample)[:, None])[:, None] * _coefficients(omega * down / up, degree)
     before = taps // 2 - 1
     basis = np.exp(1j * omega[:, None] * (np.arange(taps) - before))
     target = ideal.reshape(-1, omega.size).T
     filters = np.linalg.lstsq(_stacked(basis), _stacked(target), rcond=1e-9)[0].T.reshape(up, degree + 1, taps)
     # Their error, with the carrier inside a cell as a short polynomial.
-    given = np.einsum("pkt,wt->pkw", filters, basis)
+    coefficients = np.einsum("pkt,wt->pkw", filters, basis)
     carrier_rad_per_cell = carrier_rad_per_sample * down / up
     polynomial, phase = _phase(carrier_rad_per_cell)
     error = _squared_error(
-        given,
+        coefficients,
         omega,
         starts - first_sample,
         samples_per_cell=down / up,
@@ -222,7 +222,7 @@ def _coefficients(omega: NDArray[np.float64], degree: int) -> NDArray[np.complex
 
 
 def _phase(carrier_rad_per_cell: float) -> tuple[int, NDArray[np.float32]]:
-    """Return the cheapest phase polynomial that models the carrier inside a cell, and its coefficients."""
+    """Return the index of the cheapest accurate phase polynomial of the carrier inside a cell, and its coefficients."""
     u = 0.5 * np.cos(np.pi * (np.arange(200) + 0.5) / 200)
     for sines, cosines, reduced in PHASE_POLYNOMIALS:
         scale = np.pi if reduced else carrier_rad_per_cell
@@ -238,7 +238,7 @@ def _phase(carrier_rad_per_cell: float) -> tuple[int, NDArray[np.float32]]:
 
 
 def _squared_error(
-    given: NDArray[np.complex128],
+    coefficients: NDArray[np.complex128],
     omega: NDArray[np.float64],
     starts: NDArray[np.float64],
     *,
@@ -247,16 +247,16 @@ def _squared_error(
     polynomial: int,
     phase: NDArray[np.float32],
 ) -> NDArray[np.float64]:
-    """Return the mean squared error at each frequency, over place in the cell and position of the cell."""
-    powers = _WITHIN ** np.arange(given.shape[1])[:, None]
-    value = np.einsum("pkw,ku->pwu", given, powers)
+    """Return the mean squared error at each frequency, over positions inside a cell and over the `up` cells."""
+    powers = _WITHIN ** np.arange(coefficients.shape[1])[:, None]
+    value = np.einsum("pkw,ku->pwu", coefficients, powers)
     sines, cosines, reduced = PHASE_POLYNOMIALS[polynomial]
-    turns = _WITHIN * phase[8] if reduced else np.zeros_like(_WITHIN)
-    u = turns - np.rint(turns) if reduced else _WITHIN
-    sign = np.where(np.rint(turns) % 2 == 0, 1, -1)
+    half_cycles = _WITHIN * phase[8] if reduced else np.zeros_like(_WITHIN)
+    u = half_cycles - np.rint(half_cycles) if reduced else _WITHIN
+    sign = np.where(np.rint(half_cycles) % 2 == 0, 1, -1)
     cosine = u[:, None] ** (2 * np.arange(cosines)) @ phase[:cosines]
     sine = u[:, None] ** (2 * np.arange(sines) + 1) @ phase[4 : 4 + sines]
     carrier = sign * (cosine + 1j * sine)
-    place = starts[:, None, None] + samples_per_cell * _WITHIN
-    truth = np.exp(1j * omega[:, None] * place) * np.exp(1j * carrier_rad_per_cell * _WITHIN)
+    position = starts[:, None, None] + samples_per_cell * _WITHIN
+    truth = np.exp(1j * omega[:, None] * position) * np.exp(1j * carrier_rad_per_cell * _WITHIN)
     return np.asarray((np.abs(value * carrier - truth) ** 2 @ _WITHIN_WEIGHTS).mean(axis=0))

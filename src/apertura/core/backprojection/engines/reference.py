@@ -1,4 +1,4 @@
-"""The double sum over pulses and subcarriers in float64: slow, the reference of every other engine."""
+"""Backprojection by the double sum over pulses and subcarriers in float64, the slow reference of all other engines."""
 
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -16,27 +16,27 @@ instruction_set = compiled_for
 READS: Literal["phase_history"] = "phase_history"
 
 _PULSES_AT_ONCE = 16
-_SUBCARRIER_S = 5.3e-10  # per pixel, pulse and subcarrier
-_ERROR_DB = -140.0  # images are complex64
+_SUBCARRIER_S = 5.3e-10  # seconds per pixel, pulse and subcarrier
+_ERROR_DB = -140.0  # rounding of complex64 images
 
 
 class Options(EngineOptions):
-    """The double sum has no options."""
+    """Options of the engine: none."""
 
 
 def available() -> bool:
-    """Return True: it runs everywhere."""
+    """Return True, as the engine runs everywhere."""
     return True
 
 
 def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> list[Setting]:  # noqa: ARG001
-    """Return its one setting, as `apertura.core.backprojection.engines.engine.Engine` describes."""
+    """Return the single setting, as `apertura.core.backprojection.engines.engine.Engine` describes."""
     each = job.subcarriers * _SUBCARRIER_S + job.weights * BEAM_S
     return [Setting("reference", {}, {}, _ERROR_DB, job.pixels * pulses * job.share * each)]
 
 
 def prepare(history: PhaseHistory) -> PhaseHistory:
-    """Return the phase history as it is: the double sum needs no table."""
+    """Return the phase history unchanged, as the double sum needs no table."""
     return history
 
 
@@ -46,11 +46,11 @@ def form(history: PhaseHistory, pixels: NDArray[np.float64], *, beams: Beams | N
     Parameters
     ----------
     history
-        Calibrated transfer functions, subcarriers equally spaced.
+        Calibrated transfer functions with equally spaced subcarriers.
     pixels
         (..., 3) float64, metres, in the frame of the phase centres.
     beams
-        Weight of each pulse at each pixel by its antennas; none by default.
+        Antenna weight of each pulse at each pixel; none by default.
 
     Returns
     -------
@@ -80,12 +80,12 @@ def form(history: PhaseHistory, pixels: NDArray[np.float64], *, beams: Beams | N
 
 
 def terms(history: PhaseHistory, pixels: NDArray[np.float64], beams: Beams | None = None) -> NDArray[np.complex128]:
-    """Return the contribution of each pulse at each pixel: the sum over subcarriers alone.
+    """Return the contribution of each pulse at each pixel, the sum over subcarriers.
 
     Parameters
     ----------
     history, beams
-        As `form`.
+        As for `form`.
     pixels
         (pixel, 3) float64, metres.
 
@@ -96,8 +96,8 @@ def terms(history: PhaseHistory, pixels: NDArray[np.float64], beams: Beams | Non
 
     Notes
     -----
-    The sum is a polynomial in exp(j2πΔfτ), evaluated by Horner's rule: one rounding per term, 1e-12 for
-    thousands of them, and no table or interpolation.
+    The sum is a polynomial in exp(j2πΔfτ), evaluated by Horner's rule without table or interpolation; the rounding
+    error of thousands of terms is 1e-12.
     """
     frequency = history.frequency_hz
     step = float(frequency[-1] - frequency[0]) / (len(frequency) - 1)
@@ -112,7 +112,7 @@ def terms(history: PhaseHistory, pixels: NDArray[np.float64], beams: Beams | Non
 
 @numba.njit(cache=True, nogil=True)
 def polynomial(coefficients, argument):  # type: ignore[no-untyped-def]
-    """Return Σ_n coefficients[p, n]·argument[p, i]**n, (pulse, pixel): Horner, all pixels of a pulse side by side."""
+    """Return Σ_n coefficients[p, n]·argument[p, i]**n, (pulse, pixel), by Horner's rule vectorised over pixels."""
     pulses, count = argument.shape
     real, imag = np.zeros((pulses, count)), np.zeros((pulses, count))
     for p in range(pulses):

@@ -1,22 +1,24 @@
-"""Backprojection by subaperture trees on Cartesian tiles: of lower order of cost for large images.
+"""Backprojection by subaperture trees on Cartesian tiles, with a lower order of complexity for large images.
 
-Over a tile of up to 256 × 256 pixels the sum of a few neighbouring pulses is band-limited, once the phase φ of a
-reference pulse is removed (docs/theory/tree.md, eq. 3 and 4). It is therefore computed at few nodes, and interpolated:
+Over a tile of up to 256 × 256 pixels, the sum of neighbouring pulses is band-limited after removal of the phase φ of a
+reference pulse (docs/theory/tree.md, eq. 3 and 4). It is therefore computed at a small number of nodes and
+interpolated:
 
-1. **Surface** (`tree_geometry`). The places of a tile's pixels become Legendre polynomials, plane or of degree 6.
+1. **Surface** (`tree_geometry`). The pixel positions of a tile are approximated by Legendre polynomials, plane or of
+   degree 6.
 2. **Plan** (native/tree_plan.hpp). Every subaperture of each level gets the fewest nodes that support its band (4b),
-   every leaf of 64 pulses the fewest virtual pulses that replace its own (8). Levels end where 128 nodes are too few.
+   and every leaf of 64 pulses the fewest virtual pulses (8). Levels stop where 128 nodes are insufficient.
 3. **Leaves** (native/tree_leaf.hpp). The pulses of a leaf are aligned to the tile's centre (7), presummed to virtual
    pulses (8), expanded to cells and summed at the nodes of the leaf, with the weights of antennas and sector (13).
 4. **Merges** (native/tree_merge.hpp). Subapertures of 64, 256 and `chunk` pulses are merged by two small matrix
-   products each, φ of the child removed and that of the parent restored (5); the last merge goes to the pixels.
-5. **Height layers** (`tree_geometry`). Where pixels lie off the surface (9) the tile is formed on several layers
-   parallel to it and interpolated between them (11).
+   products each, with φ of the child removed and that of the parent restored (5); the last merge evaluates the pixels.
+5. **Height layers** (`tree_geometry`). If pixels lie off the surface (9), the tile is formed on several parallel layers
+   and interpolated between them (11).
 
-What a tree cannot sum goes to the quarters of its tile, then through the direct kernel (engine `native`): ends of
-profiles inside the tile, weights that are not smooth, more than 128 nodes, tiles below 32 × 32 pixels. Tiles depend on
-nothing but their own pixels. `tree_inputs` has what all tiles share and the jobs for the library, `tree_prediction` the
-error (10) and the cost of a setting.
+Parts that a tree cannot sum are summed on the quarters of the tile, then by the direct kernel (engine `native`): ends
+of profiles inside the tile, weights that are not smooth, more than 128 nodes, tiles below 32 × 32 pixels. A tile
+depends only on its own pixels. `tree_inputs` prepares the inputs common to all tiles and the jobs of the library,
+`tree_prediction` predicts the error (10) and cost of a setting.
 """
 
 from collections.abc import Iterator, Mapping
@@ -72,14 +74,14 @@ class Options(EngineOptions):
         None, description="tolerated error of one interpolation between nodes, dB"
     )
     presum_db: Annotated[int, Field(ge=-100, le=-38)] | None = Field(
-        None, description="tolerated error by deviations of the track from the curve of virtual pulses, dB"
+        None, description="tolerated error from deviations of the track from the curve of the virtual pulses, dB"
     )
     side_px: Annotated[int, Field(ge=16, le=TREE.side)] | None = Field(
-        None, description="largest side of a tree's tile, pixels"
+        None, description="largest side of a tile of a tree, pixels"
     )
     chunk: Literal[256, 512, 1024, 2048] | None = Field(None, description="pulses of the largest subaperture")
     height_layers: Annotated[int, Field(ge=0, le=MOST_LAYERS)] | None = Field(
-        None, description="most height layers between which a tile of rough ground is interpolated"
+        None, description="largest number of height layers between which a tile of rough terrain is interpolated"
     )
 
 
@@ -95,29 +97,29 @@ def form(
     height_layers: int = 0,
     counts: NDArray[np.int64] | None = None,
 ) -> NDArray[np.complex64]:
-    """Sum the pulses over a block of pixels.
+    """Sum the pulses at a block of pixels.
 
     Parameters
     ----------
     trees
-        From `prepare`.
+        Trees from `prepare`.
     pixels
-        (y, x, 3) float64, metres, in the frame of the phase centres: any surface.
+        (y, x, 3) float64, metres, in the frame of the phase centres, on any surface.
     beams
         Weight of each pulse at each pixel; none by default.
     nodes_db
         Tolerated error of one interpolation between nodes, dB.
     presum_db
-        Tolerated error by deviations of the track from the curve of the virtual pulses, dB RMS.
+        Tolerated error from deviations of the track from the curve of the virtual pulses, dB RMS.
     side_px
-        Largest side of the tiles that the block is cut into; the bits of each do not depend on the others.
+        Largest side of the tiles into which the block is divided; the bits of a tile do not depend on the others.
     chunk
         Pulses of the largest subaperture.
     height_layers
-        Most height layers between which a tile of rough ground is interpolated; where more are needed it is summed
-        directly.
+        Largest number of height layers between which a tile of rough terrain is interpolated; tiles that require more
+        are summed directly.
     counts
-        (3,) int64 to which the number of pixels × pulses is added that were summed by tree, directly, or had no echo.
+        (3,) int64 array to which the pixels × pulses summed by tree, summed directly, and without an echo are added.
 
     Returns
     -------
@@ -128,18 +130,19 @@ def form(
     Raises
     ------
     ValueError
-        If `pixels` has another shape, beams are of other pulses, or an option is none of `Options`.
+        If the shape of `pixels` is not (y, x, 3), beams have another number of pulses, or an option is not in the range
+        of `Options`.
     MemoryError
-        If the library found no memory.
+        If the library cannot allocate memory.
 
     Notes
     -----
     Source: docs/theory/tree.md.
     """
-    given = {"nodes_db": nodes_db, "presum_db": presum_db, "side_px": side_px, "chunk": chunk}
-    Options.model_validate(given | {"height_layers": height_layers})
+    options = {"nodes_db": nodes_db, "presum_db": presum_db, "side_px": side_px, "chunk": chunk}
+    Options.model_validate(options | {"height_layers": height_layers})
     if beams is not None and any(b is not None and len(b.axes) != len(trees) for b in (beams.transmit, beams.receive)):
-        raise ValueError(f"beams must be of {len(trees)} pulses")
+        raise ValueError(f"beams must have {len(trees)} pulses")
     pixels = checked_pixels(pixels)
     image = np.zeros(pixels.shape[:2], np.complex64)
     block = partial(_Block, trees, nodes_db, presum_db, chunk)
@@ -149,26 +152,26 @@ def form(
     flat.sum(beams, [tile for tile in tiles if tile not in rough])
     total = flat.counts
     for tile, layers in rough.items():
-        places = layers.pixels
-        on_layers = block(places, np.zeros(places.shape[:2], np.complex64))
+        layer_pixels = layers.pixels
+        on_layers = block(layer_pixels, np.zeros(layer_pixels.shape[:2], np.complex64))
         on_layers.sum(beams, on_layers.tiles(layers.windows))
         image[tile.window] = layers.read(on_layers.image, trees.middle, trees.wavenumber_rad_m)
         of_tile = on_layers.counts // len(layers.heights_m)
         total += of_tile
-        total[0] += image[tile.window].size * len(trees) - of_tile.sum()  # what the division dropped
+        total[0] += image[tile.window].size * len(trees) - of_tile.sum()  # remainder of the division
     if counts is not None:
         counts += total
     return image
 
 
 def pieces(shape: tuple[int, ...], form_options: Mapping[str, Any]) -> Iterator[Window]:
-    """Yield the windows of a block of pixels that get the same bits when they are formed alone: its tiles."""
+    """Yield the tiles of a block of pixels, windows that can be formed independently with the same bits."""
     return windows(shape, form_options["side_px"])
 
 
 @dataclass(eq=False)
 class _Block:
-    """A block of pixels and all pulses: its image, tolerated errors, and pixels × pulses of each variant."""
+    """Sum of all pulses at a block of pixels: image, tolerated errors, and pixels × pulses of each variant."""
 
     trees: Trees
     nodes_db: int
@@ -179,18 +182,20 @@ class _Block:
     counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(VARIANTS), np.int64))
     _quarters: dict[JobTile, list[JobTile]] = field(default_factory=dict)
 
-    def tiles(self, parts: list[Window]) -> list[JobTile]:
-        """Return tiles of the block; small and rough ones are not summed by tree."""
+    def tiles(self, tile_windows: list[Window]) -> list[JobTile]:
+        """Return the tiles of windows of the block; small and rough tiles are not summed by tree."""
         limit = 2 * 10 ** (self.nodes_db / 10)
         return [
             JobTile(
-                part, surface, self.pixels[part].size >= 3 * LEAST_PIXELS and self.trees.roughness(surface) <= limit
+                window,
+                surface,
+                self.pixels[window].size >= 3 * LEAST_PIXELS and self.trees.roughness(surface) <= limit,
             )
-            for part, surface in zip(parts, surfaces_of(self.pixels, parts), strict=True)
+            for window, surface in zip(tile_windows, surfaces_of(self.pixels, tile_windows), strict=True)
         ]
 
     def height_layers(self, tile: JobTile, most: int) -> HeightLayers | None:
-        """Return the layers between which a rough tile is interpolated; None where too many are needed."""
+        """Return the height layers for a rough tile; None if more than `most` are required."""
         trees, limit = self.trees, 10 ** (self.nodes_db / 20)
         pixels = self.pixels[tile.window]
         if not most or not np.isfinite(tile.surface.rough_m) or pixels.size < 3 * LEAST_PIXELS:
@@ -203,24 +208,24 @@ class _Block:
         return HeightLayers.of(relief, band, self.nodes_db) if layers_for(band, self.nodes_db) <= most else None
 
     def sum(self, beams: Beams | None, tiles: list[JobTile]) -> None:
-        """Add all pulses to tiles."""
+        """Add all pulses to the image at the given tiles."""
         for pulses in self.trees.chunks(self.chunk):
-            some = self.trees[pulses]
-            every = np.ones(-(-len(some) // LEAF), bool)
+            trees = self.trees[pulses]
+            all_groups = np.ones(-(-len(trees) // LEAF), bool)
             if tiles:
-                self.add(some, beams and beams[pulses], [(tile, every) for tile in tiles])
+                self.add(trees, beams and beams[pulses], [(tile, all_groups) for tile in tiles])
 
     def add(self, trees: Trees, beams: Beams | None, tasks: list[Task]) -> None:
-        """Add groups of some pulses to tiles; those that a tree cannot sum go to quarters of the tile, or directly."""
+        """Add groups of pulses to tiles; groups unfit for a tree are summed on quarters of the tile, or directly."""
         chunk = Chunk(
             trees, beams, self.nodes_db, self.presum_db, subaperture_sizes(self.chunk), self.pixels, self.image
         )
         pulses_of = np.minimum(LEAF, len(trees) - LEAF * np.arange(-(-len(trees) // LEAF)))
-        left: list[Task] = []
+        remaining: list[Task] = []
         for (tile, selected), variants in zip(tasks, chunk.add(tasks), strict=True):
             direct = selected & (variants == DIRECTLY)
             smaller = self._quartered(tile) if direct.any() else []
-            left += [(quarter, direct) for quarter in smaller]
+            remaining += [(quarter, direct) for quarter in smaller]
             done = selected & ~direct if smaller else selected
             self.counts += self.image[tile.window].size * np.bincount(variants[done], pulses_of[done], 3).astype(
                 np.int64
@@ -232,11 +237,11 @@ class _Block:
                     beams=beams and beams[run],
                     tolerance_rad=self.trees.direct_setting(self.nodes_db).tolerance_rad,
                 )
-        if left:
-            self.add(trees, beams, left)
+        if remaining:
+            self.add(trees, beams, remaining)
 
     def _quartered(self, tile: JobTile) -> list[JobTile]:
-        """Return the quarters of a tile, over which geometry is smoother; none of a tile too small."""
+        """Return the quarters of a tile, over which the geometry is smoother; empty for a small tile."""
         rows, columns = tile.window
         if min(rows.stop - rows.start, columns.stop - columns.start) < 2 * LEAST_QUARTER_PX:
             return []
@@ -250,7 +255,7 @@ class _Block:
 
 
 def _runs(groups: NDArray[np.bool_], pulses: int) -> Iterator[slice]:
-    """Yield runs of pulses in these groups."""
+    """Yield contiguous slices of pulses in the selected groups."""
     edges = [0, *(np.flatnonzero(np.diff(groups)) + 1).tolist(), len(groups)]
     for first, last in pairwise(edges):
         if groups[first]:

@@ -21,17 +21,17 @@ from apertura.core.geometry.aperture import Aperture
 #
 # docs/theory/tree.md, "Nodes".
 
-_NOISE_DB = -20.0  # white noise in the design of weights, relative to the error they are designed for
+_NOISE_DB = -20.0  # white noise in the design of weights, relative to the tolerated error
 
 
 @lru_cache(maxsize=4096)
 def nodes(count: int, error_db: int) -> NDArray[np.float64]:
-    """Return the places of so many nodes, (count,) float64, in -1…1: Chebyshev's, mapped to be nearly even.
+    """Return node positions, (count,) float64, in -1…1: Chebyshev nodes, mapped to be nearly equidistant.
 
     Parameters
     ----------
     count
-        At least 1.
+        Number of nodes, at least 1.
     error_db
         Tolerated error of one interpolation.
 
@@ -52,21 +52,21 @@ def nodes(count: int, error_db: int) -> NDArray[np.float64]:
 
 
 def weights(count: int, places: NDArray[np.float64], error_db: int, band_rad: float) -> NDArray[np.float64]:
-    """Return the weights of nodes at some places: least squares over a flat band.
+    """Return least-squares interpolation weights of nodes at target positions for a flat band.
 
     Parameters
     ----------
     count, error_db
-        Of the nodes.
+        Number of nodes, and tolerated error.
     places
-        (place,) float64, in -1…1.
+        (target,) float64, positions in -1…1.
     band_rad
         Highest wavenumber, rad per half tile.
 
     Returns
     -------
     ndarray
-        (place, count) float64.
+        (target, count) float64.
 
     Notes
     -----
@@ -79,14 +79,16 @@ def weights(count: int, places: NDArray[np.float64], error_db: int, band_rad: fl
     >>> bool(np.abs(wave - np.exp(5j * at)).max() < 1e-3)
     True
     """
-    here = nodes(count, error_db)
-    covariance = _sinc(band_rad, here, here) + 10 ** ((error_db + _NOISE_DB) / 10) * np.eye(count)
-    return np.asarray(np.linalg.solve(covariance, _sinc(band_rad, here, places)).T)
+    positions = nodes(count, error_db)
+    covariance = _sinc(band_rad, positions, positions) + 10 ** ((error_db + _NOISE_DB) / 10) * np.eye(count)
+    return np.asarray(np.linalg.solve(covariance, _sinc(band_rad, positions, places)).T)
 
 
 @lru_cache
 def supports(error_db: int) -> NDArray[np.float64]:
-    """Return the widest band that up to so many nodes support, (TREE.nodes + 1,) rad per half tile: tree_supports.csv.
+    """Return the widest band supported by each number of nodes, (TREE.nodes + 1,) rad per half tile.
+
+    The values are read from tree_supports.csv.
 
     Examples
     --------
@@ -110,21 +112,21 @@ def supports(error_db: int) -> NDArray[np.float64]:
 def matrices(
     count: int, target: int, error_db: int, *, pixels: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the weights of nodes at other nodes or at pixels, in the layout of the compiled tree.
+    """Return interpolation weights from nodes to other nodes or to pixels, in the layout of the compiled tree.
 
     Parameters
     ----------
     count, error_db
-        Of the nodes.
+        Number of nodes, and tolerated error.
     target
-        How many nodes or pixels there are to be interpolated to.
+        Number of target nodes or pixels.
     pixels
-        Whether they are pixels, evenly apart, the outermost at -1 and 1.
+        True if the targets are equidistant pixels, with the outermost at -1 and 1.
 
     Returns
     -------
     spread
-        (count, 2·padded) float32: each weight twice, for real and imaginary part; zero beyond the target.
+        (count, 2·padded) float32, each weight repeated for real and imaginary part; zero beyond the target.
     mix
         (target, count) float32.
     """
@@ -137,7 +139,7 @@ def matrices(
 
 
 def pixel_places(count: int) -> NDArray[np.float64]:
-    """Return where so many pixels lie along a tile, (count,) float64.
+    """Return pixel positions along a tile in -1…1, (count,) float64.
 
     Examples
     --------
@@ -152,7 +154,7 @@ def _sinc(band_rad: float, a: NDArray[np.float64], b: NDArray[np.float64]) -> ND
 
 
 def nodes_for(band_rad: NDArray[np.float64], error_db: int) -> NDArray[np.int64]:
-    """Return the least numbers of nodes that support bands; more than `TREE.nodes` where none does.
+    """Return the least numbers of nodes that support bands; `TREE.nodes` + 1 if no allowed number does.
 
     Examples
     --------
@@ -164,8 +166,8 @@ def nodes_for(band_rad: NDArray[np.float64], error_db: int) -> NDArray[np.int64]
 
 # ---- Tiles, and the smooth surface through their pixels
 
-_PLANE_M = 2e-5  # RMS distance of pixels from a plane that counts as one
-_THIN = 20  # pixels along a side that a surface is fitted to, at most
+_PLANE_M = 2e-5  # largest RMS distance of pixels from a plane for a plane surface
+_THIN = 20  # largest number of pixels along a side in the fit of a surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,14 +177,14 @@ class Surface:
     Attributes
     ----------
     coefficients
-        (degree + 1, degree + 1, 3) float64, metres: of Legendre polynomials along rows and columns, of -1…1 from the
-        first pixel to the last.
+        (degree + 1, degree + 1, 3) float64, coefficients of Legendre polynomials along rows and columns, in -1…1 from
+        the first pixel to the last, metres.
     centre_m
-        (3,) float64, the place at 0, 0.
+        (3,) float64, position at (0, 0).
     up
-        (3,) float64, unit vector across the surface there.
+        (3,) float64, unit vector normal to the surface.
     rough_m
-        RMS distance of the pixels from it; infinite if a pixel has no finite position.
+        RMS distance of the pixels from the surface; infinite if a pixel has no finite position.
     """
 
     coefficients: NDArray[np.float64]
@@ -192,16 +194,16 @@ class Surface:
 
 
 def windows(shape: tuple[int, ...], side_px: int) -> Iterator[Window]:
-    """Yield windows of at most `side_px` pixels a side that divide a block of pixels as evenly as possible.
+    """Yield windows with sides of at most `side_px` pixels that divide a block of pixels as evenly as possible.
 
     Examples
     --------
     >>> list(windows((100, 150), 128))
     [(slice(0, 100, None), slice(0, 75, None)), (slice(0, 100, None), slice(75, 150, None))]
     """
-    parts = [-(-size // side_px) for size in shape]
+    counts = [-(-size // side_px) for size in shape]
     rows, columns = (
-        [round(n * size / count) for n in range(count + 1)] for size, count in zip(shape, parts, strict=True)
+        [round(n * size / count) for n in range(count + 1)] for size, count in zip(shape, counts, strict=True)
     )
     for top, bottom in pairwise(rows):
         for left, right in pairwise(columns):
@@ -209,14 +211,14 @@ def windows(shape: tuple[int, ...], side_px: int) -> Iterator[Window]:
 
 
 def surfaces_of(pixels: NDArray[np.float64], parts: list[Window]) -> list[Surface]:
-    """Return the surfaces through the pixels of tiles: planes where these are close enough.
+    """Fit surfaces to the pixels of tiles: planes if these are accurate enough.
 
     Parameters
     ----------
     pixels
         (y, x, 3) float64, metres, contiguous.
     parts
-        The tiles.
+        Windows of the tiles.
 
     Notes
     -----
@@ -229,26 +231,26 @@ def surfaces_of(pixels: NDArray[np.float64], parts: list[Window]) -> list[Surfac
     True
     """
     surfaces = [Surface(np.zeros((1, 1, 3)), np.zeros(3), np.zeros(3), np.inf)] * len(parts)
-    left = list(range(len(parts)))
+    remaining = list(range(len(parts)))
     for degree in (1, TREE.degree):
-        fitted = [_fit(pixels[parts[number]], degree) for number in left]
-        rests = _residuals(pixels, [parts[number] for number in left], fitted)
-        for number, coefficients, rest in zip(left, fitted, rests, strict=True):
-            if np.isfinite(rest):
+        fitted = [_fit(pixels[parts[number]], degree) for number in remaining]
+        residuals = _residuals(pixels, [parts[number] for number in remaining], fitted)
+        for number, coefficients, residual in zip(remaining, fitted, residuals, strict=True):
+            if np.isfinite(residual):
                 at_0 = np.polynomial.legendre.legvander(np.zeros(1), degree)[0]
                 centre = np.einsum("a,abk,b->k", at_0, coefficients, at_0)
-                surfaces[number] = Surface(coefficients, centre, _across(coefficients), float(np.sqrt(rest)))
-        left = [number for number in left if _PLANE_M < surfaces[number].rough_m < np.inf]
-        if not left:
+                surfaces[number] = Surface(coefficients, centre, _normal(coefficients), float(np.sqrt(residual)))
+        remaining = [number for number in remaining if _PLANE_M < surfaces[number].rough_m < np.inf]
+        if not remaining:
             break
     return surfaces
 
 
 def _fit(pixels: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
-    """Return the coefficients of the surface through some pixels of a tile."""
+    """Return the coefficients of the surface fitted to pixels of a tile."""
     middle = pixels[pixels.shape[0] // 2, pixels.shape[1] // 2]
     (rows, fit_rows), (columns, fit_columns) = (_fitting(size, degree) for size in pixels.shape[:2])
-    offsets = pixels[np.ix_(rows, columns)] - middle  # places may be those of the Earth's centre
+    offsets = pixels[np.ix_(rows, columns)] - middle  # for accuracy, as positions may be geocentric
     coefficients = np.tensordot(fit_rows, fit_columns @ offsets, 1)
     coefficients[0, 0] += middle
     return np.ascontiguousarray(coefficients)
@@ -257,7 +259,7 @@ def _fit(pixels: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
 def _residuals(
     pixels: NDArray[np.float64], parts: list[Window], surfaces: list[NDArray[np.float64]]
 ) -> NDArray[np.float64]:
-    """Return the mean squared distance of the pixels of tiles from surfaces; NaN where one has no place."""
+    """Return the mean squared distance of the pixels of tiles from surfaces; NaN if a pixel has no position."""
     tiles = (TreeTile * len(parts))()
     for tile, (rows, columns), surface in zip(tiles, parts, surfaces, strict=True):
         tile.surface, tile.degree = surface.ctypes.data, len(surface) - 1
@@ -269,34 +271,34 @@ def _residuals(
 
 @lru_cache(maxsize=64)
 def _fitting(size: int, degree: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return pixels along a side that a surface is fitted to, and the matrix that fits it."""
-    place = np.linspace(-1, 1, size) if size > 1 else np.zeros(1)
-    some: NDArray[np.int64] = np.unique(
+    """Return the pixels along a side used in the fit of a surface, and the matrix of the fit."""
+    position = np.linspace(-1, 1, size) if size > 1 else np.zeros(1)
+    indices: NDArray[np.int64] = np.unique(
         np.round(np.linspace(0, size - 1, min(size, 4 if degree == 1 else _THIN))).astype(np.int64)
     )
-    return some, np.asarray(np.linalg.pinv(np.polynomial.legendre.legvander(place[some], degree)))
+    return indices, np.asarray(np.linalg.pinv(np.polynomial.legendre.legvander(position[indices], degree)))
 
 
-def _across(coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the unit vector across a surface: that of its linear part."""
-    across = np.cross(coefficients[0, 1], coefficients[1, 0])
-    length = np.linalg.norm(across)
-    return np.asarray(across / length if length else np.array([0.0, 0.0, 1.0]))
+def _normal(coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the unit normal of a surface, from its linear coefficients."""
+    normal = np.cross(coefficients[0, 1], coefficients[1, 0])
+    length = np.linalg.norm(normal)
+    return np.asarray(normal / length if length else np.array([0.0, 0.0, 1.0]))
 
 
 # ---- Leaves and larger subapertures
 
 LEAF = TREE.leaf
-"""Pulses of a leaf, which virtual pulses may replace, and which are summed at its nodes."""
+"""Pulses of a leaf, which are presummed to virtual pulses if possible, and summed at its nodes."""
 
 DEGREES = (5, 9, 14, 20)
-"""Degrees of the curves through a leaf's track that virtual pulses may lie on."""
+"""Candidate degrees of the curve through a leaf's track on which virtual pulses lie."""
 
 _SECOND = 256  # pulses of a subaperture of leaves
 
 
 def subaperture_sizes(chunk: int) -> tuple[int, ...]:
-    """Return the pulses of the subapertures of each level, the largest last.
+    """Return the number of pulses of the subapertures of each level, the largest last.
 
     Examples
     --------
@@ -307,7 +309,7 @@ def subaperture_sizes(chunk: int) -> tuple[int, ...]:
 
 
 def leaves_of(places_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (leaf, pulse, 3) places; the last place is repeated to fill its leaf."""
+    """Return (leaf, pulse, 3) positions; the last position is repeated to fill its leaf."""
     count = -(-len(places_m) // LEAF)
     filling = np.repeat(places_m[-1:], count * LEAF - len(places_m), axis=0)
     return np.concatenate([places_m, filling]).reshape(count, LEAF, 3)
@@ -315,29 +317,29 @@ def leaves_of(places_m: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def parabola_deviation(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return (leaf,) largest distance of pulses from the parabola through the first, middle and last one, metres."""
-    x, three = np.linspace(-1, 1, LEAF), [0, (LEAF - 1) // 2, LEAF - 1]
-    to_all = np.vander(x, 3) @ np.linalg.inv(np.vander(x[three], 3))
-    rest = leaves_m - to_all @ leaves_m[:, three]
-    return np.asarray(np.linalg.norm(rest, axis=-1).max(axis=1))
+    x, nodes_of_parabola = np.linspace(-1, 1, LEAF), [0, (LEAF - 1) // 2, LEAF - 1]
+    to_all = np.vander(x, 3) @ np.linalg.inv(np.vander(x[nodes_of_parabola], 3))
+    residual = leaves_m - to_all @ leaves_m[:, nodes_of_parabola]
+    return np.asarray(np.linalg.norm(residual, axis=-1).max(axis=1))
 
 
 def tracks(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (leaf, term, 3) float64: the track over each leaf as orthonormal polynomials of the pulses' numbers."""
+    """Return (leaf, term, 3) float64, coefficients of each leaf's track in orthonormal polynomials of pulse numbers."""
     return np.asarray(_polynomials()[0].T @ leaves_m)
 
 
 def leaf_roughness(one_m: NDArray[np.float64], other_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the deviation of legs from curves of growing degree through them, along the worst direction.
+    """Return the deviation of tracks from fitted curves of increasing degree, along the worst direction.
 
     Parameters
     ----------
     one_m, other_m
-        (leaf, pulse, 3) float64: phase centres of the two antennas, which may share a platform.
+        (leaf, pulse, 3) float64, phase centres of the two antennas, which may be on one platform.
 
     Returns
     -------
     ndarray
-        (leaf, curve) float64, metres RMS, of both legs together.
+        (leaf, curve) float64, deviation of both legs together, metres RMS.
 
     Examples
     --------
@@ -351,18 +353,18 @@ def leaf_roughness(one_m: NDArray[np.float64], other_m: NDArray[np.float64]) -> 
 
 
 def _widest(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (leaf, curve) the largest variance along any direction of deviations from curves of growing degree."""
+    """Return (leaf, curve) largest variance along any direction of deviations from curves of increasing degree."""
     shifted, widest = leaves_m - leaves_m[:, :1], np.empty((len(leaves_m), len(DEGREES)))
     terms = tracks(shifted)
     for number, degree in enumerate(DEGREES):
-        rest = shifted - _polynomials()[0][:, : degree + 1] @ terms[:, : degree + 1]
-        widest[:, number] = np.linalg.eigvalsh(rest.swapaxes(1, 2) @ rest / LEAF)[:, -1]
+        residual = shifted - _polynomials()[0][:, : degree + 1] @ terms[:, : degree + 1]
+        widest[:, number] = np.linalg.eigvalsh(residual.swapaxes(1, 2) @ residual / LEAF)[:, -1]
     return np.maximum(widest, 0)
 
 
 @cache
 def curve(count: int, nodes_db: int) -> NDArray[np.float64]:
-    """Return the polynomials of `tracks` at so many virtual pulses of a leaf, (virtual pulse, term) float64.
+    """Return the polynomials of `tracks` at the virtual pulses of a leaf, (virtual pulse, term) float64.
 
     Examples
     --------
@@ -377,19 +379,19 @@ def curve(count: int, nodes_db: int) -> NDArray[np.float64]:
 
 @cache
 def _polynomials() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (pulse, term) orthonormal polynomials, and their coefficients in Legendre's."""
+    """Return (pulse, term) orthonormal polynomials, and their coefficients in Legendre polynomials."""
     basis, triangle = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, LEAF), TREE.terms - 1))
     return basis, np.linalg.inv(triangle)
 
 
-# ---- Rough ground: a tile formed on several height layers, interpolated between them
+# ---- Rough terrain: a tile formed on several height layers, with interpolation between them
 #
 # docs/theory/tree.md, "Height layers".
 
-MOST_LAYERS = 32  # of a tile: more cost more than the direct sum
+MOST_LAYERS = 32  # largest number of layers of a tile; more cost more than the direct sum
 
-_TABLE = 8192  # heights between the layers with tabulated weights
-_SAMPLED = 64  # pulses that are evaluated
+_TABLE = 8192  # heights with tabulated weights
+_SAMPLED = 64  # pulses sampled for the band
 
 
 @dataclass(frozen=True, eq=False)
@@ -399,13 +401,13 @@ class SurfaceResidual:
     Attributes
     ----------
     pixels
-        (y, x, 3) float64, their places, metres.
+        (y, x, 3) float64, pixel positions, metres.
     up
-        (3,) unit vector across the surface.
+        (3,) unit vector of the largest deviations.
     off_m
         (y, x) float64, deviation along `up`, metres.
     aside_m
-        RMS deviation across `up`, metres.
+        RMS deviation perpendicular to `up`, metres.
     """
 
     pixels: NDArray[np.float64]
@@ -415,7 +417,7 @@ class SurfaceResidual:
 
     @classmethod
     def of(cls, surface: Surface, pixels: NDArray[np.float64]) -> "SurfaceResidual":
-        """Return the deviation of pixels with positions.
+        """Return the deviation of pixels with finite positions.
 
         Examples
         --------
@@ -428,19 +430,19 @@ class SurfaceResidual:
         """
         degree = len(surface.coefficients) - 1
         along, across = (np.polynomial.legendre.legvander(pixel_places(size), degree) for size in pixels.shape[1::-1])
-        rest = pixels - np.tensordot(across, along @ surface.coefficients, 1)
-        flat = rest.reshape(-1, 3)
+        residual = pixels - np.tensordot(across, along @ surface.coefficients, 1)
+        flat = residual.reshape(-1, 3)
         power, axes = np.linalg.eigh(flat.T @ flat / len(flat))
-        return cls(pixels, axes[:, -1], rest @ axes[:, -1], float(np.sqrt(max(0.0, power[:2].sum()))))
+        return cls(pixels, axes[:, -1], residual @ axes[:, -1], float(np.sqrt(max(0.0, power[:2].sum()))))
 
     @property
     def span_m(self) -> tuple[float, float]:
-        """Middle and half span of the heights, metres."""
+        """Middle and half span of the deviations, metres."""
         low, high = float(self.off_m.min()), float(self.off_m.max())
         return (low + high) / 2, (high - low) / 2
 
     def band_rad(self, aperture: Aperture, *, wavenumber_rad_m: float, band_rad_m: float) -> float:
-        """Return the half width of the band along `up`, rad per half of the heights, against the middle pulse.
+        """Return the half width of the band along `up` relative to the middle pulse, rad per half span of heights.
 
         Notes
         -----
@@ -454,16 +456,16 @@ class SurfaceResidual:
 
 @dataclass(frozen=True, eq=False)
 class HeightLayers:
-    """Height layers between which a tile of rough ground is interpolated.
+    """Height layers between which a tile of rough terrain is interpolated.
 
     Attributes
     ----------
     relief
-        Of the tile.
+        Deviation of the tile's pixels from its surface.
     heights_m
-        (layer,) float64, above the surface.
+        (layer,) float64, heights above the surface.
     error_db
-        Tolerated error of the interpolation between them.
+        Tolerated error of the interpolation between layers.
     """
 
     relief: SurfaceResidual
@@ -472,16 +474,16 @@ class HeightLayers:
 
     @classmethod
     def of(cls, relief: SurfaceResidual, band_rad: float, error_db: int) -> "HeightLayers":
-        """Return the fewest layers that support a band, at the nodes (6) of the tile's heights."""
+        """Return the fewest layers that support a band, at the nodes (eq. 6) of the tile's heights."""
         middle, half = relief.span_m
         return cls(relief, middle + half * nodes(layers_for(band_rad, error_db), error_db), error_db)
 
     @property
     def pixels(self) -> NDArray[np.float64]:
-        """Places of the pixels on each layer, (layers · y, x, 3) float64, metres."""
+        """Pixel positions on each layer, (layers · y, x, 3) float64, metres."""
         relief = self.relief
-        moved = (self.heights_m[:, None, None] - relief.off_m)[..., None] * relief.up
-        return np.ascontiguousarray((relief.pixels + moved).reshape(-1, *relief.pixels.shape[1:]))
+        displacement = (self.heights_m[:, None, None] - relief.off_m)[..., None] * relief.up
+        return np.ascontiguousarray((relief.pixels + displacement).reshape(-1, *relief.pixels.shape[1:]))
 
     @property
     def windows(self) -> list[Window]:
@@ -490,26 +492,26 @@ class HeightLayers:
         return [(slice(n * rows, (n + 1) * rows), slice(0, columns)) for n in range(len(self.heights_m))]
 
     def read(self, images: NDArray[np.complex64], pulse: Aperture, wavenumber_rad_m: float) -> NDArray[np.complex64]:
-        """Return the image at the pixels, (y, x) complex64, from that on `pixels`; `pulse` is s of (11).
+        """Interpolate the image at the pixels, (y, x) complex64, from that on the layers; `pulse` is s of eq. 11.
 
         Notes
         -----
         Source: docs/theory/tree.md, eq. 11.
         """
         relief, (middle, half) = self.relief, self.relief.span_m
-        # A_m(h): weights of the layers, linear in a table over the heights.
-        place = (np.clip((relief.off_m - middle) / (half or 1.0), -1, 1) + 1) * (_TABLE / 2)
-        number = np.minimum(place.astype(np.int64), _TABLE - 1)
-        part = (place - number).astype(np.float32)
+        # A_m(h): weights of the layers, interpolated linearly in a table over heights.
+        position = (np.clip((relief.off_m - middle) / (half or 1.0), -1, 1) + 1) * (_TABLE / 2)
+        number = np.minimum(position.astype(np.int64), _TABLE - 1)
+        part = (position - number).astype(np.float32)
         table = _layer_weights(len(self.heights_m), self.error_db)
-        # |w|² and 2w·up of each leg, w from the antenna to the pixel.
+        # |w|² and 2w·up of each leg, with w from the antenna to the pixel.
         legs = []
         for leg in pulse.legs:
             away = relief.pixels - leg[0]
             legs.append((np.einsum("yxk,yxk->yx", away, away), 2 * (away @ relief.up)))
         image = np.zeros(relief.off_m.shape, np.complex64)
         for layer, (height, window) in enumerate(zip(self.heights_m, self.windows, strict=True)):
-            # R_s(x + h_m up) - R_s(x + h up) by (2), d = (h_m - h) up.
+            # R_s(x + h_m up) - R_s(x + h up) by eq. 2, with d = (h_m - h) up.
             rise = height - relief.off_m
             extra_path_m = np.zeros_like(rise)
             for square, slope in legs:
@@ -528,6 +530,6 @@ def layers_for(band_rad: float, error_db: int) -> int:
 
 @lru_cache(maxsize=64)
 def _layer_weights(count: int, error_db: int) -> NDArray[np.float32]:
-    """Return the weights of layers at evenly spaced heights, (layer, height) float32."""
-    at = np.linspace(-1, 1, _TABLE + 1)
-    return np.ascontiguousarray(weights(count, at, error_db, float(supports(error_db)[count])).T, np.float32)
+    """Return the weights of layers at equidistant heights, (layer, height) float32."""
+    heights = np.linspace(-1, 1, _TABLE + 1)
+    return np.ascontiguousarray(weights(count, heights, error_db, float(supports(error_db)[count])).T, np.float32)

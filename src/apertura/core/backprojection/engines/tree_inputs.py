@@ -1,4 +1,4 @@
-"""Inputs of trees: filters and tracks of all tiles, tables of the direct kernel, and jobs of chunks of pulses."""
+"""Inputs of trees: filters and tracks common to all tiles, tables of the direct kernel, and jobs of pulse chunks."""
 
 import ctypes
 from collections.abc import Iterator
@@ -42,11 +42,11 @@ from apertura.core.backprojection.engines.tree_geometry import (
 from apertura.core.backprojection.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
 
-# ---- The direct kernel beside trees
+# ---- Direct kernel used together with trees
 
 
 class DirectSetting(NamedTuple):
-    """Setting of the direct kernel beside trees."""
+    """Setting of the direct kernel used together with trees."""
 
     oversampling: int
     tolerance_rad: float
@@ -57,7 +57,7 @@ _TOLERANCES_RAD = {-74: 1.5e-3, -80: 7e-4, -86: 3e-4, -92: 1.5e-4, -98: 1e-4}
 
 @lru_cache
 def direct_setting(nodes_db: int, profile_oversampling: float, carrier_rad_per_sample: float) -> DirectSetting:
-    """Return the setting of the direct kernel beside trees of such nodes: its error is below theirs.
+    """Return a setting of the direct kernel whose error is below that of trees with the error `nodes_db`.
 
     Examples
     --------
@@ -65,7 +65,7 @@ def direct_setting(nodes_db: int, profile_oversampling: float, carrier_rad_per_s
     [4, 5, 12]
     """
     least: tuple[float, int] = (np.inf, 0)
-    for oversampling in range(4, 33):  # more cells need not err less: the polynomial of the phase changes
+    for oversampling in range(4, 33):  # the error is not monotonic, as the phase polynomial changes
         design = design_table(profile_oversampling, carrier_rad_per_sample, oversampling=float(oversampling), degree=2)
         least = min(least, (design.error_db(np.ones(64)), oversampling))
         if least[0] <= nodes_db + 5:
@@ -74,7 +74,7 @@ def direct_setting(nodes_db: int, profile_oversampling: float, carrier_rad_per_s
 
 
 class DirectTables:
-    """Tables of the direct kernel, made when a tile first asks for them and shared by all."""
+    """Tables of the direct kernel, computed on the first request of a tile and shared by all tiles."""
 
     def __init__(self, profiles: Profiles):
         self._profiles, self._lock, self._tables = profiles, Lock(), dict[int, Tables]()
@@ -86,42 +86,42 @@ class DirectTables:
             return self._tables[oversampling]
 
 
-# ---- Inputs that all tiles share
+# ---- Inputs common to all tiles
 
 CELLS_AT_ONCE = 4
-"""Cells per sample are a multiple of it: the lanes of an AVX-512 vector."""
+"""Divisor of the number of cells per sample, from the lanes of an AVX-512 vector."""
 
 LEAST_PIXELS = 32**2
-"""Pixels of a tile at least: the overhead of a tree is larger than the direct sum of fewer."""
+"""Least number of pixels of a tile; for fewer the overhead of a tree exceeds the cost of the direct sum."""
 
 LEAST_QUARTER_PX = 64
-"""Pixels, side of the quarter of a tile at least: smaller ones are cheaper by the direct sum."""
+"""Least side of the quarter of a tile, pixels; the direct sum of smaller quarters is cheaper."""
 
-_SAMPLED = 64  # pulses at which roughness is evaluated
+_SAMPLED = 64  # pulses sampled for the roughness
 _DELAY_DEGREE = 9
 
 
 @dataclass(frozen=True, eq=False)
 class Trees:
-    """Pulses as inputs of trees.
+    """Pulses prepared for trees.
 
     Attributes
     ----------
     profiles
-        The pulses, contiguous.
+        Contiguous profiles of the pulses.
     design
         Filters of the cells.
     deviation_m
-        (leaf,) float32, deviation of the pulses of a leaf from the parabola through its first, middle and last one,
-        metres.
+        (leaf,) float32, largest deviation of the pulses of a leaf from the parabola through its first, middle and last
+        one, metres.
     rough_m
-        (leaf, 4) float32, deviation from curves of growing degree, metres RMS.
+        (leaf, 4) float32, deviation from curves of increasing degree, metres RMS.
     tracks_m
-        (leaf, antenna, term, 3) float64, phase centres over each leaf as polynomials.
+        (leaf, antenna, term, 3) float64, polynomial coefficients of the phase centres over each leaf.
     first
-        Number of the first pulse among those prepared.
+        Number of the first pulse among all prepared pulses.
     tables
-        Of the direct kernel, for all pulses prepared.
+        Tables of the direct kernel for all prepared pulses.
     """
 
     profiles: Profiles
@@ -137,16 +137,16 @@ class Trees:
         return len(self.profiles)
 
     def __getitem__(self, pulses: slice) -> "Trees":
-        """Return the trees of pulses from a multiple of a leaf on.
+        """Return the trees of a slice of pulses that starts at a multiple of a leaf.
 
         Raises
         ------
         ValueError
-            If they begin elsewhere, or are not in a row.
+            If the slice starts elsewhere, or its step is not 1.
         """
         first, last, step = pulses.indices(len(self))
         if step != 1 or first % LEAF:
-            raise ValueError(f"{pulses}: pulses of a tree are taken from a multiple of {LEAF} on, and in a row")
+            raise ValueError(f"{pulses}: the pulses of a tree must start at a multiple of {LEAF} and be consecutive")
         leaves = slice(first // LEAF, -(-last // LEAF))
         return replace(
             self,
@@ -170,18 +170,18 @@ class Trees:
         return self.tables[self.direct_setting(nodes_db).oversampling][self.first : self.first + len(self)]
 
     def direct_setting(self, nodes_db: int) -> DirectSetting:
-        """Return the direct kernel's setting beside trees of such nodes."""
+        """Return the setting of the direct kernel for trees with the error `nodes_db`."""
         return direct_setting(nodes_db, self.profiles.oversampling, self.wavenumber_rad_m * self.profiles.step_m)
 
     def roughness(self, surface: Surface) -> float:
-        """Return the error by pixels off the surface of a tile, as the function of that name."""
+        """Return the error by pixels off the surface of a tile, computed by the function `roughness`."""
         aperture = self.profiles.aperture
-        some = aperture[aperture.sample(_SAMPLED)]
-        return roughness(some, surface, wavenumber_rad_m=self.wavenumber_rad_m, band_rad_m=self.band_rad_m)
+        sampled = aperture[aperture.sample(_SAMPLED)]
+        return roughness(sampled, surface, wavenumber_rad_m=self.wavenumber_rad_m, band_rad_m=self.band_rad_m)
 
     @property
     def middle(self) -> Aperture:
-        """The middle pulse."""
+        """Aperture of the middle pulse."""
         return self.profiles.aperture[len(self) // 2 : len(self) // 2 + 1]
 
     @property
@@ -201,9 +201,9 @@ def roughness(aperture: Aperture, surface: Surface, *, wavenumber_rad_m: float, 
     Parameters
     ----------
     aperture
-        Some of the pulses, evenly spread.
+        Evenly spaced sample of the pulses.
     surface
-        Of the tile.
+        Surface of the tile.
     wavenumber_rad_m, band_rad_m
         2πf_mid/c and πB/c.
 
@@ -214,13 +214,13 @@ def roughness(aperture: Aperture, surface: Surface, *, wavenumber_rad_m: float, 
     if not np.isfinite(surface.rough_m):
         return np.inf
     rate = aperture.path_gradient(surface.centre_m[None])[:, 0] @ surface.up
-    against = rate[len(rate) // 2]  # the middle pulse of the flight, not of each chunk
-    of_phase, of_delay = wavenumber_rad_m**2 * ((rate - against) ** 2).mean(), band_rad_m**2 / 3 * (rate**2).mean()
+    reference = rate[len(rate) // 2]  # the middle pulse of the flight, not of each chunk
+    of_phase, of_delay = wavenumber_rad_m**2 * ((rate - reference) ** 2).mean(), band_rad_m**2 / 3 * (rate**2).mean()
     return float(surface.rough_m**2 * (of_phase + of_delay))
 
 
 def cells_per_sample(profile_oversampling: float, oversampling: float) -> int:
-    """Return how many cells a sample is expanded to, for at least so many per resolution cell.
+    """Return the number of cells per sample for at least `oversampling` cells per resolution cell.
 
     Examples
     --------
@@ -231,7 +231,7 @@ def cells_per_sample(profile_oversampling: float, oversampling: float) -> int:
 
 
 def cells(profile_oversampling: float, carrier_rad_per_sample: float, oversampling: float, taps: int) -> TableDesign:
-    """Return the filters that expand profiles to cells: straight lines in each, of so many taps."""
+    """Return the filters with `taps` taps that expand profiles to cells of linear polynomials."""
     count = cells_per_sample(profile_oversampling, oversampling)
     return design_table(
         profile_oversampling, carrier_rad_per_sample, oversampling=count * profile_oversampling, degree=1, taps=taps
@@ -240,13 +240,13 @@ def cells(profile_oversampling: float, carrier_rad_per_sample: float, oversampli
 
 @lru_cache
 def delay_filter(profile_oversampling: float) -> NDArray[np.float32]:
-    """Return the filter that gives a profile between two samples, as polynomials of the place between them.
+    """Return the fractional-delay filter of a profile, as polynomials of the position between two samples.
 
     Returns
     -------
     ndarray
-        (degree + 1, tap) float32, constant term first; of 0…1 from the sample before to the one after. The first tap
-        is that of the sample `tap / 2 - 1` before.
+        (degree + 1, tap) float32, constant term first; the variable is 0…1 from the previous to the next sample. The
+        first tap belongs to the sample `tap / 2 - 1` before the previous one.
 
     Notes
     -----
@@ -263,38 +263,38 @@ def delay_filter(profile_oversampling: float) -> NDArray[np.float32]:
     basis = np.exp(1j * omega[:, None] * (np.arange(TREE.delays) - TREE.delays // 2 + 1))
     u = 0.5 - 0.5 * np.cos(np.pi * (np.arange(24) + 0.5) / 24)
     ideal = np.exp(1j * omega[:, None] * u)
-    left, right = (np.concatenate([part.real, part.imag]) for part in (basis, ideal))
-    taps = np.linalg.lstsq(left, right, rcond=1e-9)[0].T
+    matrix, target = (np.concatenate([part.real, part.imag]) for part in (basis, ideal))
+    taps = np.linalg.lstsq(matrix, target, rcond=1e-9)[0].T
     return np.ascontiguousarray(np.linalg.lstsq(np.vander(u, _DELAY_DEGREE + 1, increasing=True), taps)[0], np.float32)
 
 
 def prepare(profiles: Profiles, *, oversampling: int = 24, taps: int = 8) -> Trees:
-    """Return the inputs that trees of all tiles share; pulses are expanded to cells later, tile by tile.
+    """Return the inputs common to the trees of all tiles; pulses are expanded to cells later, tile by tile.
 
     Parameters
     ----------
     profiles
         Band-limited profiles.
     oversampling
-        Table cells per Nyquist cell c/B of total path, at least.
+        Least number of table cells per Nyquist cell c/B of total path.
     taps
-        Of the filters that make cells, 8 or 16.
+        Taps of the filters from samples to cells, 8 or 16.
 
     Raises
     ------
     ValueError
-        If the profiles are oversampled less than 1.5 times or have no pulse, or a position or start is not finite.
+        If the oversampling of the profiles is below 1.5, there is no pulse, or a position or start is not finite.
 
     Notes
     -----
     Source: docs/theory/tree.md, "Leaves"; the cells are those of docs/theory/engine.md, "Cells".
     """
-    samples, start_m, places = profiles.for_tables()
+    samples, start_m, phase_centres = profiles.for_tables()
     contiguous = replace(profiles, samples=samples, start_m=start_m)
-    legs = [leaves_of(leg) for leg in places]
+    legs = [leaves_of(leg) for leg in phase_centres]
     deviation, rough = parabola_deviation(legs[0]) + parabola_deviation(legs[1]), leaf_roughness(*legs)
-    turn = profiles.wavenumber_rad_m * profiles.step_m
-    design = cells(profiles.oversampling, turn, float(oversampling), taps)
+    carrier_rad_per_sample = profiles.wavenumber_rad_m * profiles.step_m
+    design = cells(profiles.oversampling, carrier_rad_per_sample, float(oversampling), taps)
     polynomials = np.stack([tracks(leg) for leg in legs], axis=1)
     return Trees(
         contiguous,
@@ -311,18 +311,18 @@ def prepare(profiles: Profiles, *, oversampling: int = 24, taps: int = 8) -> Tre
 
 
 class Weighed(NamedTuple):
-    """Groups of 64 pulses over a tile, classified by the weights of antennas and sector.
+    """Classification of groups of 64 pulses over a tile by the weights of antennas and sector.
 
     Attributes
     ----------
     variant
-        (group,) uint8.
+        (group,) uint8, variant of the sum.
     edge
-        (group,) bool: the sector ends within the tile.
+        (group,) bool, True if the sector ends within the tile.
     slope
-        (group, 3) float32: change of the depth in that edge along ξ, along η and over the pulses, per half of them.
+        (group, 3) float32, change of the depth in that edge along ξ, along η and over the pulses, per half extent.
     each
-        (group,) bool: weights jump from pulse to pulse, so that virtual pulses cannot replace them.
+        (group,) bool, True if weights jump from pulse to pulse, which prevents presumming.
     """
 
     variant: NDArray[np.uint8]
@@ -372,12 +372,12 @@ def weighed(beams: Beams, aperture: Aperture, surface: Surface, nodes_db: float)
     return Weighed(variant, edge.astype(bool), slope, each.astype(bool))
 
 
-# ---- Trees of one chunk of pulses over the tiles of a block
+# ---- Trees of a pulse chunk over the tiles of a block
 
 
 @dataclass(frozen=True, eq=False)
 class JobTile:
-    """A part of a block: its window, the surface of its pixels, and whether that is smooth enough for a tree."""
+    """Tile of a block: window, surface of the pixels, and `by_tree`, True if the surface permits a tree."""
 
     window: Window
     surface: Surface
@@ -385,19 +385,19 @@ class JobTile:
 
 
 Task = tuple[JobTile, NDArray[np.bool_]]
-"""A tile, and the groups of 64 pulses to add to it, (group,) bool."""
+"""Tile, and mask of the groups of 64 pulses to add to it, (group,) bool."""
 
 
 @dataclass(eq=False)
 class Chunk:
-    """Some pulses over a block of pixels.
+    """Sum of a pulse chunk over a block of pixels.
 
     Attributes
     ----------
     trees, beams
-        Of the pulses.
+        Trees and beams of the pulses.
     nodes_db, presum_db
-        Tolerated error of one interpolation, dB, and of pulses of a leaf off a smooth track.
+        Tolerated errors of one interpolation, and from deviations of a leaf's track from its curve, dB.
     sizes
         Pulses of the subapertures of each level.
     pixels, image
@@ -411,12 +411,12 @@ class Chunk:
     sizes: tuple[int, ...]
     pixels: NDArray[np.float64]
     image: NDArray[np.complex64]
-    _kept: list[NDArray[np.generic]] = field(default_factory=list)  # arrays that the structs point into
-    _counts: list[NDArray[np.uint8]] = field(default_factory=list)  # numbers of nodes of each tile
-    _n_virtual: list[NDArray[np.uint8]] = field(default_factory=list)  # numbers of virtual pulses of each leaf
+    _kept: list[NDArray[np.generic]] = field(default_factory=list)  # arrays referenced by the structs
+    _counts: list[NDArray[np.uint8]] = field(default_factory=list)  # node counts of each tile
+    _n_virtual: list[NDArray[np.uint8]] = field(default_factory=list)  # virtual pulses of each leaf
 
     def add(self, tasks: list[Task]) -> list[NDArray[np.uint8]]:
-        """Add by tree the groups of 64 pulses given for each tile; return the variant of each group."""
+        """Sum the given groups of 64 pulses of each tile by tree; return the variant of each group."""
         variants = [
             np.where(selected, BY_TREE if tile.by_tree else DIRECTLY, NO_ECHO).astype(np.uint8)
             for tile, selected in tasks
@@ -505,18 +505,18 @@ class Chunk:
         return job
 
     def _fill(self, job: TreeJob, tiles: "ctypes.Array[TreeTile]") -> None:
-        """Add to a planned job the nodes and the matrices A of (5), (6) and (8) for its numbers of nodes.
+        """Add to a planned job the nodes and the matrices A of eq. 5, 6 and 8 for its node counts.
 
-        They lie in tables by number of nodes; sides of tiles in pixels, the last target of a merge, have slots above.
+        The tables are indexed by node count; sides of tiles in pixels, the last target of a merge, have higher slots.
         """
-        # Which A are needed: of a child's number of nodes, at the slot of its parent's nodes or of the pixels.
+        # Required A: from a child's node count to the slot of its parent's node count or of the pixels.
         slots: dict[int, int] = {}  # pixels along a side → slot
-        merges: set[tuple[int, int]] = set()  # number of nodes, slot
+        merges: set[tuple[int, int]] = set()  # node count, slot
         ends = np.cumsum([-(-len(self.trees) // size) for size in self.sizes])
         for tile, counts in zip(tiles, self._counts, strict=True):
             sides = tile.columns, tile.rows
             tile.column_slot, tile.row_slot = (slots.setdefault(n, TREE.nodes + 1 + len(slots)) for n in sides)
-            levels = np.split(counts.reshape(-1, 2), ends[:-1])[: tile.top + 1]  # of each level, (subaperture, 2)
+            levels = np.split(counts.reshape(-1, 2), ends[:-1])[: tile.top + 1]  # (subaperture, 2) of each level
             for (children, parents), (size, wider) in zip(pairwise(levels), pairwise(self.sizes), strict=False):
                 parent_of = parents[np.arange(len(children)) // (wider // size)]
                 merges.update(zip(children.ravel().tolist(), parent_of.ravel().tolist(), strict=True))
@@ -524,22 +524,22 @@ class Chunk:
                 for axis, slot in enumerate((tile.column_slot, tile.row_slot)):
                     merges.update((count, slot) for count in set(top[:, axis].tolist()))
         side_of = {slot: side for side, slot in slots.items()}
-        # (5): both layouts of each A, and the places of nodes and pixels for the phases u, v and m of (3).
-        places = np.zeros(TREE.slots, np.uintp)
+        # Eq. 5: both layouts of each A, and the positions of nodes and pixels for the phases u, v and m of eq. 3.
+        positions = np.zeros(TREE.slots, np.uintp)
         spread, mix = (np.zeros((TREE.nodes + 1, TREE.slots), np.uintp) for _ in range(2))
         for count, slot in merges:
             by_node, by_target = matrices(count, side_of.get(slot, slot), self.nodes_db, pixels=slot in side_of)
             spread[count, slot], mix[count, slot] = self._pointer_to(by_node), self._pointer_to(by_target)
         for slot in {slot for merge in merges for slot in merge}:
-            at = pixel_places(side_of[slot]) if slot in side_of else nodes(slot, self.nodes_db)
-            places[slot] = self._pointer_to(np.ascontiguousarray(at))
-        # (8): weights A_pv of a leaf's pulses in virtual ones, and the polynomials of the track at these.
+            targets = pixel_places(side_of[slot]) if slot in side_of else nodes(slot, self.nodes_db)
+            positions[slot] = self._pointer_to(np.ascontiguousarray(targets))
+        # Eq. 8: weights A_pv of a leaf's pulses in virtual pulses, and the polynomials of the track at these.
         presum, curves = (np.zeros(TREE.virtual + 1, np.uintp) for _ in range(2))
         for count in {int(n) for counts in self._n_virtual for n in counts if n > 1}:
             presum[count] = self._pointer_to(
                 np.ascontiguousarray(matrices(count, LEAF, self.nodes_db, pixels=True)[1].T)
             )
-            places[count] = self._pointer_to(np.ascontiguousarray(nodes(count, self.nodes_db)))
+            positions[count] = self._pointer_to(np.ascontiguousarray(nodes(count, self.nodes_db)))
             curves[count] = self._pointer_to(curve(count, self.nodes_db))
-        job.places, job.spread, job.mix = map(self._pointer_to, (places, spread, mix))
+        job.places, job.spread, job.mix = map(self._pointer_to, (positions, spread, mix))
         job.presum, job.curve = map(self._pointer_to, (presum, curves))

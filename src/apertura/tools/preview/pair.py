@@ -1,4 +1,4 @@
-"""A pair while it flies: which pulses have come, and the images that they are added to."""
+"""Incremental image formation of a pair: association of new pulses, and images that accumulate them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -41,32 +41,32 @@ from apertura.stages.positions import inside_segments, place, scene_air
 from apertura.stages.scene import ConfiguredGround
 from apertura.stages.transfer import PairEcho
 from apertura.stages.transmitted import Transmitted
-from apertura.tools.look.node import NodeSoFar
+from apertura.tools.preview.node import NodeSoFar
 
 Axes = dict[str, NDArray[np.float64]]
-"""Body axes of the antennas with beams, as of `apertura.stages.pair.beams_of`."""
+"""Body axes of the antennas with beams, as required by `apertura.stages.pair.beams_of`."""
 
 
-_CERTIFIED = 16  # pixels that are also summed exactly
-_TOGETHER = 16  # pulses that are bounded in range by one of them
-_CELLS = 8  # of resolution that the shorter side of a scene must have before its image is judged
-_JUDGED = 1024  # pulses kept for the judgement, evenly spread
+_CERTIFIED = 16  # number of pixels that are also summed exactly
+_TOGETHER = 16  # number of neighbouring pulses whose range bounds are computed from one of them
+_CELLS = 8  # number of resolution cells in the shorter side of a scene that an assessment requires
+_JUDGED = 1024  # number of evenly spread pulses kept for the assessment
 
 
 @dataclass(frozen=True, eq=False)
 class PulseBlock:
-    """Some pulses of a pair: transfer functions, body axes and times.
+    """A block of pulses of a pair: transfer functions, body axes and times.
 
     Attributes
     ----------
     history
         Their phase history.
     axes
-        As of `apertura.stages.pair.beams_of`.
+        Body axes, as required by `apertura.stages.pair.beams_of`.
     time
         (pulse,) datetime64[ns], UTC.
     weight
-        Pulses that each stands for: those left out beside it, and itself.
+        Decimation factor: number of recorded pulses that each pulse represents.
     """
 
     history: PhaseHistory
@@ -77,7 +77,7 @@ class PulseBlock:
 
 @dataclass(frozen=True, eq=False)
 class Compressed:
-    """Pulses of a block that may add to an image, with axes, times and weight as of the block, and how many it had."""
+    """Range-compressed pulses of a block that contribute to an image, with axes, times and pulse count of the block."""
 
     profiles: Profiles
     axes: Axes
@@ -86,46 +86,47 @@ class Compressed:
     weight: int = 1
 
     def every(self, step: int) -> "Compressed":
-        """Return every `step`-th pulse, apart from the others' memory."""
-        some = self.profiles[::step]
-        axes = {name: one[::step] for name, one in self.axes.items()}
-        own = replace(some, samples=np.array(some.samples))
-        return replace(self, profiles=own, axes=axes, time=self.time[::step])
+        """Return a copy with every `step`-th pulse, so that the memory of the others can be freed."""
+        selected = self.profiles[::step]
+        axes = {name: values[::step] for name, values in self.axes.items()}
+        profiles = replace(selected, samples=np.array(selected.samples))
+        return replace(self, profiles=profiles, axes=axes, time=self.time[::step])
 
     @classmethod
-    def joined(cls, several: Sequence["Compressed"]) -> "Compressed":
-        """Return several blocks as one; shorter profiles end in zeros."""
-        parts = [one.profiles for one in several]
-        longest = max(one.samples.shape[1] for one in parts)
-        samples = [np.pad(one.samples, ((0, 0), (0, longest - one.samples.shape[1]))) for one in parts]
-        whole = replace(
+    def joined(cls, blocks: Sequence["Compressed"]) -> "Compressed":
+        """Concatenate blocks; shorter profiles are padded with zeros."""
+        parts = [block.profiles for block in blocks]
+        longest = max(part.samples.shape[1] for part in parts)
+        samples = [np.pad(part.samples, ((0, 0), (0, longest - part.samples.shape[1]))) for part in parts]
+        profiles = replace(
             parts[0],
             samples=np.concatenate(samples),
-            start_m=np.concatenate([one.start_m for one in parts]),
-            aperture=Aperture(*(np.concatenate([one.aperture.legs[leg] for one in parts]) for leg in (0, 1))),
+            start_m=np.concatenate([part.start_m for part in parts]),
+            aperture=Aperture(*(np.concatenate([part.aperture.legs[leg] for part in parts]) for leg in (0, 1))),
         )
-        axes = {name: np.concatenate([one.axes[name] for one in several]) for name in several[0].axes}
-        return cls(whole, axes, np.concatenate([one.time for one in several]), sum(one.pulses for one in several))
+        axes = {name: np.concatenate([block.axes[name] for block in blocks]) for name in blocks[0].axes}
+        times = np.concatenate([block.time for block in blocks])
+        return cls(profiles, axes, times, sum(block.pulses for block in blocks))
 
 
 class ImageSoFar:
-    """The sum of the pulses so far over a grid: eq. 8 of docs/theory/engine.md, block by block.
+    """Backprojection of the pulses so far on a grid: eq. 8 of docs/theory/engine.md, accumulated block by block.
 
     Parameters
     ----------
     campaign, pair
-        Settings, and which pair.
+        Campaign, and name of the pair.
     grid, terrain
-        Its pixels, and the ground under them.
+        Pixels, and their heights.
     share
-        Of the band and of the resolution along the flight: 2 takes the middle half of the subcarriers and half the
-        angle, whose cells twice as wide need every second pixel.
+        Divisor of bandwidth and of the integration angle: 2 uses the middle half of the subcarriers and half the angle,
+        whose resolution cells are twice as wide and need every second pixel only.
     accuracy_db
         Requested numerical error.
     threads
-        Tiles formed at once.
+        Number of tiles formed in parallel.
     plans
-        Share → how it is formed: what one pair has planned serves the others, as long as the error measured allows.
+        Share → plan of the image formation, shared by all pairs; replanned if the measured error exceeds the request.
     """
 
     def __init__(
@@ -151,40 +152,41 @@ class ImageSoFar:
         self._summed, self._every, self._kept = 0, 1, list[Compressed]()
 
     def compressed(self, block: PulseBlock) -> "Compressed":
-        """Return the range profiles of a block, over this image's share of the band, of pulses that may add to it."""
+        """Return range profiles of a block's contributing pulses, with this image's share of the bandwidth."""
         history, count = block.history, len(block.history.frequency_hz)
-        self._speed_m_s = self._speed_m_s or history.wave_speed_m_s  # of all blocks: air changes it by less than 1e-8
+        # the same speed for all blocks: the refractivity changes it by less than 1e-8
+        self._speed_m_s = self._speed_m_s or history.wave_speed_m_s
         kept = -(-count // self.share)
-        part = slice((count - kept) // 2, (count - kept) // 2 + kept)
+        band = slice((count - kept) // 2, (count - kept) // 2 + kept)
         weight = window_weights(self._campaign.settings.processing.window, kept)
-        some = replace(
-            history, transfer=history.transfer[:, part], frequency_hz=history.frequency_hz[part], weight=weight
+        banded = replace(
+            history, transfer=history.transfer[:, band], frequency_hz=history.frequency_hz[band], weight=weight
         ).at_speed(self._speed_m_s)
         window = RangeWindow.of(
-            some.aperture,
+            banded.aperture,
             self.grid,
             self._terrain,
-            some.frequency_hz,
-            beams=self._beams(some.aperture, block.axes, centre_frequency(some.frequency_hz)),
+            banded.frequency_hz,
+            beams=self._beams(banded.aperture, block.axes, centre_frequency(banded.frequency_hz)),
             wave_speed_m_s=self._speed_m_s,
             together=_TOGETHER,
         )
-        here = window.contributing
-        some = replace(
-            some,
-            transfer=some.transfer[here],
-            reference_delay_s=some.reference_delay_s[here],
-            aperture=some.aperture[here],
+        contributing = window.contributing
+        banded = replace(
+            banded,
+            transfer=banded.transfer[contributing],
+            reference_delay_s=banded.reference_delay_s[contributing],
+            aperture=banded.aperture[contributing],
         )
-        window = replace(window, start_m=window.start_m[here], farthest_m=window.farthest_m[here])
-        profiles = range_compress(some, self.grid, self._terrain, window=window)
-        axes = {name: one[here] for name, one in block.axes.items()}
-        return Compressed(profiles, axes, block.time[here], len(block.time), block.weight)
+        window = replace(window, start_m=window.start_m[contributing], farthest_m=window.farthest_m[contributing])
+        profiles = range_compress(banded, self.grid, self._terrain, window=window)
+        axes = {name: values[contributing] for name, values in block.axes.items()}
+        return Compressed(profiles, axes, block.time[contributing], len(block.time), block.weight)
 
     def add(self, block: "Compressed") -> None:
         """Add a block of `compressed` pulses.
 
-        The setting is planned for the first, and again where the measured error is above the requested one.
+        Settings are planned for the first block, and again if the measured error exceeds the requested one.
         """
         self.pulses += block.pulses
         profiles = block.profiles
@@ -203,16 +205,16 @@ class ImageSoFar:
             weighing=Weighing(beams, None, count=1),
         )
         self.sums += block.weight * image.compute(scheduler="threads", num_workers=self._threads)
-        places = plan.terrain.positions_at(self.grid, *self._pixels.T)
-        self._exact += block.weight * band_limited_image(profiles, places, beams=beams)
+        positions = plan.terrain.positions_at(self.grid, *self._pixels.T)
+        self._exact += block.weight * band_limited_image(profiles, positions, beams=beams)
         self._summed += block.weight * len(profiles)
         power = np.full(_CERTIFIED, float(np.mean(np.abs(self.sums) ** 2)))
         computed = self.sums[tuple(self._pixels.T)]
         self.error_db = error_bound(computed, self._exact, np.ones(_CERTIFIED), power=power).bound_db
         self._kept.append(block.every(max(1, self._every // block.weight)))
-        if sum(len(one.profiles) for one in self._kept) > _JUDGED:
+        if sum(len(kept.profiles) for kept in self._kept) > _JUDGED:
             self._every *= 2
-            self._kept = [one.every(2) for one in self._kept]
+            self._kept = [kept.every(2) for kept in self._kept]
 
     @property
     def _plan(self) -> Plan | None:
@@ -227,14 +229,14 @@ class ImageSoFar:
         )
 
     def _beams(self, aperture: Aperture, axes: Axes, centre_hz: float) -> Beams | None:
-        """Return the weights of pulses: antennas, and a sector that no later pulse changes; None: all count alike."""
+        """Return pulse weights of antennas and integration sector, independent of later pulses; None: equal weights."""
         requested = self._campaign.settings.processing.integrated
         antennas = beams_of(self._campaign, self._pair, axes)
         if requested == "all" or len(aperture) < 2:
             return antennas
         half = sector_half(requested, self._speed_m_s / centre_hz, self.grid.spacing_m)
-        half /= 1 if requested == "auto" else self.share  # what pixels carry follows from their spacing
-        if half * (1 - TAPER) >= 1:  # all directions
+        half /= 1 if requested == "auto" else self.share  # with auto, it already follows from the pixel spacing
+        if half * (1 - TAPER) >= 1:  # the sector contains all directions
             return antennas
         middle_m = self._terrain.positions_at(self.grid, *((size - 1) / 2 for size in self.grid.shape))
         range_m = float(np.linalg.norm(aperture.middle_m - middle_m, axis=-1).min())
@@ -242,78 +244,85 @@ class ImageSoFar:
 
     @property
     def image(self) -> NDArray[np.complex64]:
-        """(y, x) complex64, the mean over the pulses so far that may add to it."""
+        """(y, x) complex64, the mean over the contributing pulses so far."""
         return np.asarray(self.sums / np.float32(max(1, self._summed)), np.complex64)
 
     @property
     def setting(self) -> str:
-        """Engine and options."""
+        """Engine and options as text."""
         return self._plan.setting.line if self._plan else ""
 
     @property
     def peak(self) -> dict[str, float]:
-        """Place of the brightest pixel, metres of the scene's CRS, and dB above the median pixel."""
+        """Position of the brightest pixel, metres in the scene's CRS, and its level above the median pixel, dB."""
         power = np.abs(self.sums) ** 2
         row, column = np.unravel_index(int(power.argmax()), power.shape)
         x_m, y_m = map(float, self.grid.map_at(row, column))
-        lit = power[power > 0]
-        above_db = 10 * float(np.log10(power.max() / np.median(lit))) if lit.size else 0.0
+        illuminated = power[power > 0]
+        above_db = 10 * float(np.log10(power.max() / np.median(illuminated))) if illuminated.size else 0.0
         return {"x_m": round(x_m, 3), "y_m": round(y_m, 3), "above_median_db": round(above_db, 1)}
 
     def judged(self) -> dict[str, Any]:
-        """Return verdict, why, loss_db where it was measured, and flags, by the pulses kept."""
-        pulses = sum(len(one.profiles) for one in self._kept)
+        """Return focus verdict, reason, peak loss if measured, and flags, from the kept pulses."""
+        pulses = sum(len(kept.profiles) for kept in self._kept)
         if self._plan is None or pulses < LEAST_PULSES or not self.sums.any():
-            return {"verdict": "cannot tell", "why": f"{pulses} pulses so far", "flags": {}}
+            return {"verdict": "inconclusive", "reason": f"{pulses} pulses so far", "flags": {}}
         joined = Compressed.joined(self._kept)
-        profiles, at = joined.profiles, joined.time
+        profiles, times = joined.profiles, joined.time
         beams = self._beams(profiles.aperture, joined.axes, profiles.centre_frequency_hz)
-        plan = replace(self._plan, beams=beams, integration=None, flags={})  # they are of the block it was planned for
+        plan = replace(self._plan, beams=beams, integration=None, flags={})  # those of the plan are of its first block
         side = self._campaign.settings.processing.tile_px
         formation = Formation(None, profiles, self.grid, plan, side)
         cell_m = resolution_cell_m(formation)
         if not cell_m * _CELLS < min(self.grid.shape) * self.grid.spacing_m:
-            return {"verdict": "cannot tell", "why": f"no aperture yet: cells of {cell_m:.2g} m", "flags": {}}
+            reason = f"aperture too short: resolution cells of {cell_m:.2g} m"
+            return {"verdict": "inconclusive", "reason": reason, "flags": {}}
         stated = [self._campaign.settings.nodes[node].position_std_m for node in self._pair.split("-")]
-        std_m = None if None in stated else max(float(np.max(cast("Any", one))) for one in stated)
-        seconds = seconds_since(at, at[0])
+        std_m = None if None in stated else max(float(np.max(cast("Any", axes))) for axes in stated)
+        seconds = seconds_since(times, times[0])
         error_db = float(self.error_db) if np.isfinite(self.error_db) else None
         lines = budget_by_hand(formation, error_db=error_db, position_std_m=std_m, time_s=seconds)
         judged = judgement(formation, self.image, lines)
         loss = {"loss_db": judged.focus["loss_db"]} if "loss_db" in judged.focus else {}
-        return {"verdict": judged.verdict, "why": judged.why, **loss, "flags": dict(judged.flags)}
+        return {"verdict": judged.verdict, "reason": judged.reason, **loss, "flags": dict(judged.flags)}
 
 
 AT_ONCE = 2048
-"""Pulses of a block at most: each costs a tenth of a second, however few they are."""
+"""Maximum number of pulses of a block; a block takes at least a tenth of a second, whatever its size."""
 
-_LEAST = 32  # pulses of a block while more will come: the state of a sidelink is measured on each
-_OVERLAP = 256  # pulses that are paired again, so that tags of the next follow from theirs
-_QUEUE_BYTES = 512_000_000  # of profiles that wait for the fine image
+_LEAST = 32  # minimum block size in pulses before the recordings end: each block measures the state of a sidelink
+_OVERLAP = 256  # number of pulses that are associated again, for continuity of the time tags
+_QUEUE_BYTES = 512_000_000  # maximum memory of profiles queued for the fine image
 
 
 @dataclass(eq=False)
 class PairSoFar:
-    """A pair while it flies: pulses are paired and held back until both logs know where they were sent and received.
+    """A pair during the flight: pulses are associated, and used when both logs cover their times.
 
     Attributes
     ----------
     campaign, flight, name
-        Which.
+        Campaign, name of the flight and name of the pair.
     scene
-        First block → grid, and its ground.
+        Function of the first block that returns the grid and its terrain.
     echo
-        Of a recorder that stores transfer functions; tx, rx and sent are then None.
+        Echo of a recorder that stores transfer functions; tx, rx and sent are then None.
     tx, rx, sent
-        Its nodes, and what was transmitted.
+        Nodes, and transmitted waveform.
     threads
-        Tiles formed at once.
+        Number of tiles formed in parallel.
     plans
-        As of `ImageSoFar`.
+        As in `ImageSoFar`.
     images
-        Coarse, then fine; the fine one's pulses wait in a queue.
+        Coarse and fine image; blocks for the fine image are queued.
+    taken
+        Number of transmitter captures processed so far.
     dropped
-        Pulses read that have no position or no sidelink, or are left out as every other.
+        Number of processed pulses without a position or sidelink, or excluded by decimation.
+    until
+        Time of the last processed pulse.
+    why_dropped
+        Reason for the last dropped block; empty: none.
     """
 
     campaign: Campaign
@@ -330,32 +339,32 @@ class PairSoFar:
     taken: int = 0
     dropped: int = 0
     until: np.datetime64 | None = None
-    why_dropped: str = ""
+    drop_reason: str = ""
     _shift_ns: int = 0
     _blocks: int = 0
     _raised: dict[str, tuple[int, str]] = field(default_factory=dict)  # blocks that raised a flag, and its last line
     _queue: list[Compressed] = field(default_factory=list)
     _fine: bool = True
 
-    def anew(self) -> "PairSoFar":
-        """Return the pair before its first pulse."""
-        given = ("campaign", "flight", "name", "scene", "echo", "tx", "rx", "sent", "threads", "plans")
-        return PairSoFar(*(getattr(self, name) for name in given))
+    def reset(self) -> "PairSoFar":
+        """Return the pair in its state before the first pulse."""
+        parameters = ("campaign", "flight", "name", "scene", "echo", "tx", "rx", "sent", "threads", "plans")
+        return PairSoFar(*(getattr(self, name) for name in parameters))
 
     def ready(self, *, ended: bool) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return captures of transmitter and receiver that belong together and were not taken yet.
+        """Return indices of associated transmitter and receiver captures that are ready and not processed yet.
 
-        Those are held back that a log does not reach yet, or whose partner may still come.
+        Captures beyond the end of a log, or whose counterpart may still be recorded, are not ready.
         """
         nothing = np.zeros(0, np.int64)
         if self.tx is None or self.rx is None or self.sent is None:
-            here = np.arange(self.taken, len(self.time))
-            return here, here
+            index = np.arange(self.taken, len(self.time))
+            return index, index
         until = min(node.known_until(ended=ended) for node in (self.tx, self.rx))
         last = int(np.searchsorted(self.tx.time, until, "right"))
         if self.tx is self.rx:
-            here = np.arange(self.taken, last)
-            return here, here
+            index = np.arange(self.taken, last)
+            return index, index
         tags = [nanoseconds(node.time) for node in (self.tx, self.rx)]
         if last <= self.taken or not tags[1].size:
             return nothing, nothing
@@ -365,81 +374,78 @@ class PairSoFar:
             last = min(last, int(np.searchsorted(tags[0], tags[1][-1] - interval_ns)))
         if last <= self.taken:
             return nothing, nothing
-        begun = max(0, self.taken - _OVERLAP)
-        ends = np.searchsorted(tags[1], [tags[0][begun] - interval_ns, tags[0][last - 1] + interval_ns])
-        some = slice(begun, last), slice(*map(int, ends))
-        if some[1].start == some[1].stop:
+        first = max(0, self.taken - _OVERLAP)
+        ends = np.searchsorted(tags[1], [tags[0][first] - interval_ns, tags[0][last - 1] + interval_ns])
+        tx_part, rx_part = slice(first, last), slice(*map(int, ends))
+        if rx_part.start == rx_part.stop:
             return nothing, nothing
-        found = associate(
-            tags[0][some[0]],
-            tags[1][some[1]],
+        association = associate(
+            tags[0][tx_part],
+            tags[1][rx_part],
             repetition_interval_s=interval_ns * 1e-9,
-            tx_frame=self.tx.frame[some[0]],
-            rx_frame=self.rx.frame[some[1]],
+            tx_frame=self.tx.frame[tx_part],
+            rx_frame=self.rx.frame[rx_part],
             where=f"flight {self.flight}, pair {self.name}",
         )
-        tx_index, rx_index = found.tx_index + some[0].start, found.rx_index + some[1].start
+        tx_index, rx_index = association.tx_index + tx_part.start, association.rx_index + rx_part.start
         self._shift_ns += round(float(np.median(tags[1][rx_index] - tags[0][tx_index])))
-        new = ~found.outlier & (tx_index >= self.taken)
+        new = ~association.outlier & (tx_index >= self.taken)
         return tx_index[new], rx_index[new]
 
     def add_next(self, *, ended: bool, every: int = 1) -> bool:
-        """Read a block of the pulses that have come and add it to the coarse image; return whether there was one.
-
-        Of every `every` pulses one is taken.
-        """
+        """Read the next block of pulses and add every `every`-th pulse to the coarse image; False if none is ready."""
         try:
             tx_index, rx_index = self.ready(ended=ended)
-        except CampaignError as error:  # tags that do not pair yet
+        except CampaignError as error:  # the time tags cannot be associated yet
             if ended:
-                self.why_dropped = str(error)
+                self.drop_reason = str(error)
             return False
         if len(tx_index) < (1 if ended else _LEAST * every):
             return False
-        some = slice(0, AT_ONCE * every)
-        tx_index, rx_index = tx_index[some], rx_index[some]
-        read = self.taken
+        block = slice(0, AT_ONCE * every)
+        tx_index, rx_index = tx_index[block], rx_index[block]
+        previously = self.taken
         self.taken = int(tx_index[-1]) + 1
         kept = tx_index % every == 0
         added = self._add(tx_index[kept], rx_index[kept], every) if kept.any() else 0
-        self.dropped += self.taken - read - added
+        self.dropped += self.taken - previously - added
         self.until = self.time[self.taken - 1]
         return True
 
     def _add(self, tx_index: NDArray[np.int64], rx_index: NDArray[np.int64], every: int) -> int:
-        """Add the pulses of some captures; return how many have a position and a transfer function."""
+        """Add the pulses of the given captures; return the number with a position and a transfer function."""
         try:
             block = self._block(tx_index, rx_index)
-        except (CampaignError, OSError) as error:  # also a file that has just been removed
-            self.why_dropped = str(error)
+        except (CampaignError, OSError) as error:  # for example a file that was removed meanwhile
+            self.drop_reason = str(error)
             return 0
         if block is None:
             return 0
         block = replace(block, weight=every)
         if not self.images:
-            self.images = self._begin(block)
+            self.images = self._new_images(block)
         coarse, fine = self.images
         coarse.add(coarse.compressed(block))
         if self._fine:
             self._queue.append(fine.compressed(block))
-            self._fine = sum(one.profiles.samples.nbytes for one in self._queue) <= _QUEUE_BYTES
-            self._queue = self._queue if self._fine else []  # it would never be as far as the coarse one
+            self._fine = sum(queued.profiles.samples.nbytes for queued in self._queue) <= _QUEUE_BYTES
+            self._queue = self._queue if self._fine else []  # the fine image cannot keep up with the coarse one
         return len(block.time)
 
     def _block(self, tx_index: NDArray[np.int64], rx_index: NDArray[np.int64]) -> PulseBlock | None:
-        """Return the echo of some captures, as step `echo` forms it of all; None where no pulse is left."""
+        """Return the echo of the given captures, computed as in step `echo`; None if no pulse is usable."""
         campaign, processing = self.campaign, self.campaign.settings.processing
         if self.tx is None or self.rx is None or self.sent is None:
             return self._read(cast("PairEcho", self.echo), tx_index)
         try:
             inside = inside_segments(campaign, self.flight, self.name, self.tx.time[tx_index])
-        except CampaignError:  # none is
+        except CampaignError:  # all pulses are outside the segments
             return None
         tx = self.tx.acquisition(tx_index[inside])
         rx = tx if self.rx is self.tx else self.rx.acquisition(rx_index[inside])
         hovers = bool(campaign.segments_of(self.flight, self.name))
         if not place(tx, rx, tx.raw.time.values, hovers=hovers).good.any():
-            self.why_dropped = "hover: platform stationary"
+            self.drop_reason = "hover: platform stationary"
             return None
         air = scene_air(campaign, tx.track.position.values)
         offset = calibrated(campaign, self.flight, self.name)
@@ -454,77 +460,77 @@ class PairSoFar:
         history = phase_history_of(formed, self.campaign.settings.processing.window)
         return PulseBlock(history, body_axes(formed), formed.time.values)
 
-    def _begin(self, block: PulseBlock) -> list[ImageSoFar]:
-        """Return the images, coarse and fine."""
+    def _new_images(self, block: PulseBlock) -> list[ImageSoFar]:
+        """Return an empty coarse and an empty fine image."""
         campaign, (grid, ground) = self.campaign, self.scene(block)
         requested = campaign.settings.processing.accuracy_db
         accuracy_db = MOST_ACCURACY_DB if requested == "auto" else float(requested)
         images = []
         for share in (2, 1):
-            own = grid.coarse(max(grid.shape) // share)
-            terrain = UncheckedDem(ground.dem, own) if ground.dem else ground.level(own)
-            how: dict[str, Any] = {
+            image_grid = grid.coarse(max(grid.shape) // share)
+            terrain = UncheckedDem(ground.dem, image_grid) if ground.dem else ground.level(image_grid)
+            options: dict[str, Any] = {
                 "share": share,
                 "accuracy_db": accuracy_db / share,
                 "threads": self.threads,
                 "plans": self.plans,
             }
-            images.append(ImageSoFar(campaign, self.name, own, terrain, **how))
+            images.append(ImageSoFar(campaign, self.name, image_grid, terrain, **options))
         return images
 
     def refine_next(self) -> bool:
-        """Add the next block of the queue to the fine image; return whether there was one."""
+        """Add the next queued block to the fine image; return False if the queue is empty."""
         if not self._queue:
             return False
         self.images[1].add(self._queue.pop(0))
         return True
 
     def judged(self) -> dict[str, Any]:
-        """Return the judgement of the fine image, or of the coarse one where that has more than twice its pulses.
+        """Return the assessment of the fine image, or of the coarse one if that has more than twice as many pulses.
 
-        The coarse one may only say that it is focused: in its range cells, twice as deep, points spoil each other while
-        they are being passed.
+        Only the verdict "focused" of a coarse image is reported: its range cells are twice as deep, so that points in
+        the same cell disturb each other's measurement during the pass.
         """
         coarse, fine = self.images
-        by = fine if 2 * fine.pulses >= coarse.pulses else coarse
-        judged = by.judged() | {"judged_by": f"{by.pulses} pulses, {'fine' if by is fine else 'coarse'}"}
-        if by is coarse and judged["flags"]:
-            judged |= {"verdict": "cannot tell", "why": f"the coarse image alone: {judged['why']}", "flags": {}}
+        image = fine if 2 * fine.pulses >= coarse.pulses else coarse
+        judged = image.judged() | {"judged_by": f"{image.pulses} pulses, {'fine' if image is fine else 'coarse'}"}
+        if image is coarse and judged["flags"]:
+            judged |= {"verdict": "inconclusive", "reason": f"coarse image only: {judged['reason']}", "flags": {}}
         return judged
 
     @property
     def time(self) -> Times:
-        """(pulse,) datetime64[ns], UTC: when the pulses so far were sent."""
+        """(pulse,) datetime64[ns], UTC: transmission times of the pulses so far."""
         if self.tx is None:
             return cast("Times", cast("PairEcho", self.echo).dataset.time.values)
         return self.tx.time
 
     @property
     def delay_s(self) -> float | None:
-        """Seconds by which the last pulse added is behind the last one recorded; None before both."""
+        """Delay of the last added pulse behind the last recorded one, seconds; None before the first block."""
         if self.until is None or not len(self.time):
             return None
         return round(float((self.time[-1] - self.until) / np.timedelta64(1, "s")), 2)
 
     @property
     def counts(self) -> dict[str, int]:
-        """Pulses recorded, added to what is shown, and left out."""
+        """Numbers of pulses recorded, added to the shown image, and excluded."""
         return {"recorded": len(self.time), "added": self.shown.pulses if self.shown else 0, "left_out": self.dropped}
 
     @property
     def flags(self) -> dict[str, str]:
-        """Flags that most blocks raised, with the last line: the statistics of a single block may be chance."""
+        """Flags raised by most blocks, with the last measurement; a single block is not statistically significant."""
         return {name: line for name, (times, line) in self._raised.items() if 2 * times > self._blocks}
 
     @property
     def waits(self) -> str:
-        """Missing parts for more pulses; empty: none."""
+        """Reason for missing pulses; empty: none."""
         nodes = [node.waits for node in (self.tx, self.rx) if node is not None]
-        return next((why for why in (*nodes, self.why_dropped) if why), "")
+        return next((reason for reason in (*nodes, self.drop_reason) if reason), "")
 
     @property
     def shown(self) -> ImageSoFar | None:
-        """The fine image where it has all pulses that the coarse one has; else that one."""
+        """The fine image if it has all pulses of the coarse image, else the coarse image."""
         if not self.images:
             return None
         coarse, fine = self.images

@@ -1,4 +1,4 @@
-"""Recording and log of a node while they grow: complete captures and lines, read once."""
+"""Incremental reading of a node's growing recording and log: complete captures and lines only."""
 
 import time
 import zlib
@@ -21,37 +21,37 @@ from apertura.stages.ingest import captures_of
 from apertura.stages.node_log import shortest_wave
 from apertura.stages.transmitted import Transmitted
 
-_ABOUT_S = 60.0  # of the log about the pulses of a block: farther epochs do not move a spline
-_KNOWN_BYTES = 4096  # at either end of the samples that were read, by which they are known again
-_EPOCHS = 4  # that a log must be ahead of a pulse: those to come would move it by 0.27⁴ of its error at the end
+_MARGIN_S = 60.0  # log margin before and after the pulses of a block: farther epochs do not affect the spline
+_KNOWN_BYTES = 4096  # compared at either end of the samples that were read, to detect a restarted recording
+_EPOCHS = 4  # lead of the log over a pulse: later epochs change the spline there by 0.27⁴ of its error at the end
 
 
 class NotFollowedError(CampaignError):
-    """A recording that cannot be read while it is written."""
+    """A recording that cannot be read while it is being written."""
 
 
 class NodeSoFar:
-    """Recording and log of a node so far; complete captures and lines alone.
+    """Recording and log of a node so far, complete captures and lines only.
 
-    What was read is dropped where the files no longer begin with it: a recorder that is started again under the same
-    name. A change in the middle of the samples is not seen; the run reads all of them.
+    Data read before are dropped if the files no longer begin with them, which means that the recorder was restarted
+    under the same name. A change in the middle of the samples is not detected; the workflow reads all samples.
 
     Parameters
     ----------
     campaign, flight, node
-        Which.
+        Campaign, name of the flight and name of the node.
     sent
-        What was transmitted.
+        The transmitted waveform.
     follow
-        Whether its files still grow: a kind that cannot be read meanwhile is refused.
+        True if the files still grow: formats that cannot be read meanwhile are refused.
     """
 
     def __init__(self, campaign: Campaign, flight: str, node: str, sent: Transmitted, *, follow: bool) -> None:
         self.name, self.waits = node, ""
         self.grown_at: float | None = None
-        """When something was last found to have come, by the clock `time.monotonic`."""
-        self.begun_anew = ""
-        """Why all that was read has been dropped, until someone has taken note and emptied it."""
+        """Time of the last growth, in the clock `time.monotonic`."""
+        self.restart = ""
+        """Message on a restarted recording or log, until the caller clears it."""
         self._campaign, self._flight, self._sent, self._follow = campaign, flight, sent, follow
         self._forget()
 
@@ -61,19 +61,19 @@ class NodeSoFar:
         self.track: xr.Dataset | None = None
         self.ended = False
         self._recording: Recording | None = None
-        self._found: xr.Dataset | None = None  # captures found in samples that never stopped
+        self._found: xr.Dataset | None = None  # captures found in a continuous recording
         self._growing: Any = None
-        self._known = 0, b"", b""  # of the samples
-        self._log_size, self._log_bytes, self._log_crc = -1, 0, 0  # of the file, of its whole lines
+        self._known = 0, b"", b""  # size, first and last bytes of the samples read
+        self._log_size, self._log_bytes, self._log_crc = -1, 0, 0  # file size; size and CRC of its complete lines
 
-    def _begin_anew(self, path: Path, found: str) -> None:
-        """Drop what was read: a file no longer begins with it."""
+    def _restart(self, path: Path, change: str) -> None:
+        """Drop the data read, because a file no longer begins with them."""
         self._forget()
         file = path.relative_to(self._campaign.root)
-        self.begun_anew = f"{file}: {found}: what was shown of {self._flight} {self.name} is dropped, and begun anew"
+        self.restart = f"{file}: {change}: images of {self._flight} {self.name} are restarted from the new files"
 
     def read(self) -> bool:
-        """Read what has come since; return whether anything has."""
+        """Read new data of recording and log; return True if there were any."""
         before = len(self.time), self._log_size
         self.waits = ""
         for read in (self._read_recording, self._read_log):
@@ -84,7 +84,7 @@ class NodeSoFar:
             except (CampaignError, OSError) as error:
                 if not self._follow:
                     raise
-                self.waits = str(error)  # a file that is not there yet, or not now, or has only begun
+                self.waits = str(error)  # a file that is missing, not readable at present, or incomplete
         grown = (len(self.time), self._log_size) != before
         self.grown_at = time.monotonic() if grown else self.grown_at
         return grown
@@ -98,23 +98,23 @@ class NodeSoFar:
             self._growing = GROWING[row](*files)
         growing = self._growing.read()
         if self._growing.runs_through and not self._follow:
-            whole = open_recording(files)
-            self._recording, self._found = whole, captures_of(whole, self._campaign, node=self.name)
+            complete = open_recording(files)
+            self._recording, self._found = complete, captures_of(complete, self._campaign, node=self.name)
             recorded, self.frame = self._found.time.values, self._found.frame.values
         elif self._growing.runs_through:
             raise NotFollowedError(
-                "apertura:framing: its recorder never stops",
+                "apertura:framing: a continuous recording, whose pulses are found only in the complete samples",
                 files[0],
-                "one capture segment per trigger, in a recording that is followed",
-                "Its pulses are found in all of its samples: look at it without --follow, or when it has ended.",
+                "one capture segment per trigger for --follow",
+                "Use apertura preview without --follow, or after the end of the recording.",
             )
         else:
             recording = growing if growing or self._follow else open_recording(files)
             if changed := self._changed(recording, files[-1]):
-                self._begin_anew(files[-1], changed)
+                self._restart(files[-1], changed)
                 return
             if recording is None or (self._recording and len(recording.captures.start) < len(self.time)):
-                return  # it has only begun, or its metadata are being written anew
+                return  # no complete capture yet, or the metadata are being rewritten
             self._known = _ends(files[-1], files[-1].stat().st_size)
             self._recording = recording
             recorded, self.frame = recording.captures.time, recording.captures.frame
@@ -122,17 +122,17 @@ class NodeSoFar:
         self.ended = self._growing.ended
 
     def _changed(self, recording: Recording | None, path: Path) -> str:
-        """Return the parts of captures and samples that differ from the earlier reading; empty: none."""
+        """Describe the change of captures or samples since the last reading; empty without a change."""
         if self._recording is None or not path.is_file():
             return ""
-        known = self._recording.captures.time
-        now = known[:0] if recording is None else recording.captures.time
-        both = min(len(now), len(known))
-        if not np.array_equal(now[:both], known[:both]):
-            return "holds captures of other times than before"
+        earlier = self._recording.captures.time
+        present = earlier[:0] if recording is None else recording.captures.time
+        common = min(len(present), len(earlier))
+        if not np.array_equal(present[:common], earlier[:common]):
+            return "the capture times changed"
         if (size := path.stat().st_size) < self._known[0]:
-            return f"holds {size} bytes where there were {self._known[0]}"
-        return "" if _ends(path, self._known[0]) == self._known else "does not hold the samples that were read"
+            return f"the file size decreased from {self._known[0]} to {size} bytes"
+        return "" if _ends(path, self._known[0]) == self._known else "samples that were already read changed"
 
     def _read_log(self) -> None:
         path = self._campaign.track_file(self._flight, self.name)
@@ -145,27 +145,27 @@ class NodeSoFar:
             if self._follow:
                 by_lines = ", ".join(name for name, row in TRACKS.items() if row.by_lines)
                 raise NotFollowedError(
-                    f"a log of format {kind}, which cannot be read while it is written",
+                    f"a log of format {kind}, which cannot be read while it is being written",
                     path,
-                    f"a log of lines of text ({by_lines}), where it is followed",
-                    "Look without --follow when it has ended, or let the log be streamed as text.",
+                    f"a line-oriented text format ({by_lines}) for --follow",
+                    "Use apertura preview without --follow after the end of the log, or record the log as text.",
                 )
             self.track = read_track(path, node=self.name, options=options)
         else:
             lines = path.read_bytes()
             lines = lines[: lines.rfind(b"\n") + 1]
             if self._log_bytes > 0 and zlib.crc32(lines[: self._log_bytes]) != self._log_crc:
-                self._begin_anew(path, "does not begin with the lines that were read")
+                self._restart(path, "log lines that were already read changed")
                 return
             with TemporaryDirectory() as folder:
-                whole = Path(folder) / path.name
-                whole.write_bytes(lines)
-                self.track = read_track(whole, node=self.name, options=options)
+                complete_lines = Path(folder) / path.name
+                complete_lines.write_bytes(lines)
+                self.track = read_track(complete_lines, node=self.name, options=options)
             self._log_bytes, self._log_crc = len(lines), zlib.crc32(lines)
         self._log_size = size
 
     def known_until(self, *, ended: bool) -> np.datetime64:
-        """Return up to when positions are known: by some epochs less than the log, unless that has ended."""
+        """Return the time until which positions are available: `_EPOCHS` before the end of a log that still grows."""
         if self.track is None:
             return np.datetime64(0, "ns")
         epochs = self.track.time.values
@@ -178,37 +178,39 @@ class NodeSoFar:
 
     @property
     def complete(self) -> bool:
-        """True if the recording says that it has ended, and the log reaches as far."""
+        """True if the recording is declared complete and the log covers it."""
         return bool(self.ended and len(self.time) and self.known_until(ended=True) >= self.time[-1])
 
     @property
-    def lacks(self) -> str:
-        """Missing parts for `complete`, in words."""
+    def missing(self) -> str:
+        """Description of the data missing for `complete`."""
         if not self.ended:
-            return f"the metadata of {self.name} do not state the hash of its samples, or not all of these are there"
+            return f"the metadata of {self.name} do not contain the hash of the samples, or samples are missing"
         return "" if self.complete else f"the log of {self.name} ends before its last capture"
 
     def acquisition(self, captures: NDArray[np.int64]) -> Acquisition:
-        """Return some captures with the log about them; frames count them, as they are paired already."""
+        """Return selected captures with the log around their times; frame numbers count them, as they are paired."""
         if self._recording is None or self.track is None:
-            raise TypeError("nothing is recorded or logged yet")
+            raise TypeError("no recording or log has been read yet")
         if self._found is not None:
             raw = self._found.isel(pulse=captures)
         else:
-            own = self._recording.captures
-            some = Captures(own.start[captures], own.length, own.time[captures], own.frame[captures])
-            raw = self._recording.cut(some, node=self.name)
+            recorded = self._recording.captures
+            selected = Captures(
+                recorded.start[captures], recorded.length, recorded.time[captures], recorded.frame[captures]
+            )
+            raw = self._recording.cut(selected, node=self.name)
         raw = raw.assign(time=("pulse", self.time[captures]), frame=("pulse", np.arange(len(captures))))
-        about = np.timedelta64(round(_ABOUT_S * 1e9), "ns")
+        margin = np.timedelta64(round(_MARGIN_S * 1e9), "ns")
         epochs = self.track.time.values
-        near = (epochs >= raw.time.values[0] - about) & (epochs <= raw.time.values[-1] + about)
+        near = (epochs >= raw.time.values[0] - margin) & (epochs <= raw.time.values[-1] + margin)
         log = str(self._campaign.track_file(self._flight, self.name))
         if not near.any():
             raise CampaignError(
-                f"no epoch within {_ABOUT_S:g} s of captures from {raw.time.values[0]} on",
+                f"no epoch within {_MARGIN_S:g} s of the captures that start at {raw.time.values[0]}",
                 log,
-                "the log of the same flight, and clocks that agree",
-                "Give the log of this flight, or the clock's offset in config/clocks.tsv.",
+                "a log of the same flight, and clocks that agree",
+                "Provide the log of this flight, or enter the clock offset in config/clocks.tsv.",
             )
         files = Path("raw") / self._flight / self.name
         order = self._campaign.settings.iq_of(self.name)
@@ -219,7 +221,7 @@ class NodeSoFar:
 
 
 def _ends(path: Path, size: int) -> tuple[int, bytes, bytes]:
-    """Return a number of bytes of a file, and those at the begin and the end of that many."""
+    """Return `size` together with the first and last bytes of that leading part of a file."""
     with path.open("rb") as stream:
         head = stream.read(min(size, _KNOWN_BYTES))
         stream.seek(max(0, size - _KNOWN_BYTES))

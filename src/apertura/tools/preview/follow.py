@@ -1,4 +1,4 @@
-"""A campaign shown while it flies: pictures, verdicts, a page and a map in results/look, until its recordings end."""
+"""`apertura preview`: quicklooks, verdicts, a page and a map in results/preview, updated until the recordings end."""
 
 import json
 import signal
@@ -29,7 +29,7 @@ from apertura.common.provenance import sha256_file
 from apertura.core.geometry.geodesy import LOCAL
 from apertura.core.planning.plan import Plan
 from apertura.core.scene.grid import SceneGrid
-from apertura.formats.export import LOOK, MAP
+from apertura.formats.export import MAP, PREVIEW
 from apertura.formats.export.cog import power, write_cog
 from apertura.formats.export.db import DB, decibels
 from apertura.formats.export.quicklook import write_quicklook
@@ -37,38 +37,38 @@ from apertura.stages.pair import open_pair
 from apertura.stages.scene import ConfiguredGround, Flown, settled
 from apertura.stages.transfer import PairEcho, recorded_echo
 from apertura.stages.transmitted import transmitted
-from apertura.tools.look.node import NodeSoFar
-from apertura.tools.look.pair import PairSoFar, PulseBlock
+from apertura.tools.preview.node import NodeSoFar
+from apertura.tools.preview.pair import PairSoFar, PulseBlock
 from apertura.views.quality import explained_flags
 from apertura.views.webmap.document import Layer, Place, crs_of, map_document, stated_places, true_places, url_of
 
-_POLLS = 2  # looks at the files for each picture
-_BEHIND = 3  # times the seconds between pictures: a delay above it takes every other pulse
-_AT_EASE = 0.3  # busy share of the time below which all of them are taken again
+_POLLS = 2  # polls of the files for each update of the images
+_BEHIND = 3  # a delay of more update intervals than this doubles the decimation of pulses
+_AT_EASE = 0.3  # busy share of the time below which the decimation is halved
 _MOST_DECIMATED = 64
 
 
-class Look:
-    """A campaign while it flies.
+class Preview:
+    """Live view of a campaign.
 
     Parameters
     ----------
     campaign
-        Its folder, whose recordings may still grow.
+        A campaign whose recordings may still grow.
     follow
-        Whether they do: what is there is else taken once.
+        True to read the recordings while they grow, False to read them once.
     every_s
-        Seconds between pictures.
+        Interval between updates of the images, seconds.
     end_after_s
-        Seconds without growth after which recordings have ended; they also have where they state the hash of their
-        samples and these are there.
+        Time without growth after which the recordings count as finished, seconds; they are also finished when their
+        metadata contain the hash of their samples and all samples are present.
     threads
-        Tiles formed at once.
+        Number of tiles formed in parallel.
 
     Raises
     ------
     CampaignError
-        If nothing becomes an image, or what is recorded cannot be followed.
+        If the campaign has no images, or a recording cannot be read while it grows.
     """
 
     def __init__(
@@ -77,11 +77,11 @@ class Look:
         campaign.check_images()
         self.campaign, self.follow, self.every_s, self.end_after_s = campaign, follow, every_s, end_after_s
         self.finish = threading.Event()
-        """Set: the recordings have ended."""
+        """Event that is set when the recordings have ended."""
         self.decimated, self.busy_s = 1, 0.0
-        self._map = LiveMap(campaign, LOOK, every_s=every_s)
-        self._delay_s = np.inf  # of the picture before
-        self._reported = set[str]()  # errors of files, printed once each
+        self._map = LiveMap(campaign, PREVIEW, every_s=every_s)
+        self._delay_s = np.inf  # at the previous update
+        self._reported = set[str]()  # file errors that were printed already
         waveform = campaign.settings.waveform
         self.nodes: dict[tuple[str, str], NodeSoFar] = {}
         self.pairs: list[PairSoFar] = []
@@ -89,10 +89,10 @@ class Look:
         if not isinstance(waveform, SampledWaveform):
             if follow:
                 raise CampaignError(
-                    f"waveform.kind {waveform.kind}, whose files state how much they hold before they hold it",
+                    f"waveform.kind {waveform.kind}, whose files cannot be read before they are complete",
                     campaign.root / CONFIG,
                     "ofdm or samples, recorded as SigMF, for --follow",
-                    "Look without --follow at what has been written whole.",
+                    "Use apertura preview without --follow when the files are complete.",
                 )
             for flight in campaign.image_flights:
                 for pair in flight.pairs:
@@ -112,46 +112,47 @@ class Look:
                 )
 
     def _scene(self, block: PulseBlock) -> tuple[SceneGrid, ConfiguredGround]:
-        """Return the grid of all pairs and its ground; what is `auto` is settled by all that has come, once.
+        """Return the common grid of all pairs and its terrain; automatic settings are determined once.
 
-        Of a flight that is followed, whose bounds are stated, by its first block.
+        They follow from all data read so far, or with `follow`, which requires configured bounds, from the first block.
         """
         if self._settled is None:
             campaign, history = self.campaign, block.history
-            here = Flown(history.aperture, history.frequency_hz, np.inf)
-            self._settled = settled(campaign, cache(lambda: here if self.follow else self._flown()))[:2]
+            of_block = Flown(history.aperture, history.frequency_hz, np.inf)
+            self._settled = settled(campaign, cache(lambda: of_block if self.follow else self._flown()))[:2]
         return self._settled
 
     def _flown(self) -> Flown:
-        """Return the joint geometry of all pairs of the first flight, by its logs."""
+        """Return the joint geometry of all pairs of the first flight from its logs."""
         pairs = [pair for pair in self.pairs if pair.flight == self.pairs[0].flight]
-        tags = [None if pair.tx is None else pair.tx.time for pair in pairs]
+        times = [None if pair.tx is None else pair.tx.time for pair in pairs]
         opened = (
-            open_pair(self.campaign, one.flight, one.name, recorded=at) for one, at in zip(pairs, tags, strict=True)
+            open_pair(self.campaign, pair.flight, pair.name, recorded=time)
+            for pair, time in zip(pairs, times, strict=True)
         )
         return Flown.together([pair.flown for pair in opened])
 
     def _read(self) -> bool:
-        """Read what has come; begin anew the pairs of nodes whose files did. Return whether anything has come."""
+        """Read new data and reset the pairs of restarted recordings; return True if there were new data."""
         grown = [node.read() for node in self.nodes.values()]
         for node in self.nodes.values():
-            # While nothing was read, the lines of the pairs say what they wait for.
+            # before the first data, the status lines of the pairs report the reason for waiting
             if node.waits and self.follow and node.has_read and node.waits not in self._reported:
                 self._reported.add(node.waits)
-                print(f"{datetime.now(UTC):%H:%M:%S}  {node.name} is not read at present: {node.waits}", flush=True)
-            if not node.begun_anew:
+                print(f"{datetime.now(UTC):%H:%M:%S}  {node.name} is not readable at present: {node.waits}", flush=True)
+            if not node.restart:
                 continue
-            print(f"{datetime.now(UTC):%H:%M:%S}  {node.begun_anew}", flush=True)
-            node.begun_anew = ""
+            print(f"{datetime.now(UTC):%H:%M:%S}  {node.restart}", flush=True)
+            node.restart = ""
             for number, pair in enumerate(self.pairs):
                 if node in (pair.tx, pair.rx):
                     self._map.drop(pair)
                     self._picture(pair).unlink(missing_ok=True)
-                    self.pairs[number] = pair.anew()
+                    self.pairs[number] = pair.reset()
         return any(grown)
 
     def run(self) -> None:
-        """Read, add and show until the recordings end, and then what the fine images still lack."""
+        """Read data and update the images until the recordings end, then complete the fine images."""
         poll_s, shown_at, ended = self.every_s / _POLLS, time.monotonic(), False
         self._map.begin()
         while not ended:
@@ -162,14 +163,14 @@ class Look:
             complete = not grown and all(node.complete for node in self.nodes.values())
             ended = not self.follow or self.finish.is_set() or idle or complete
             if self.follow and idle and not (complete or self.finish.is_set()):
-                lacks = "; ".join(node.lacks for node in self.nodes.values() if node.lacks)
-                print(f"ended: nothing has come for {self.end_after_s:g} s (--end-after); {lacks}", flush=True)
+                missing = "; ".join(node.missing for node in self.nodes.values() if node.missing)
+                print(f"finished: no new data for {self.end_after_s:g} s (--end-after); {missing}", flush=True)
             self._add(ended=ended, until=shown_at + self.every_s)
             self.busy_s += time.monotonic() - polled
-            while not ended and time.monotonic() < polled + poll_s and any(one.refine_next() for one in self.pairs):
+            while not ended and time.monotonic() < polled + poll_s and any(pair.refine_next() for pair in self.pairs):
                 pass
             if ended or time.monotonic() >= shown_at + self.every_s:
-                while ended and any(one.refine_next() for one in self.pairs):
+                while ended and any(pair.refine_next() for pair in self.pairs):
                     pass
                 self.show(ended=ended, elapsed_s=time.monotonic() - shown_at)
                 shown_at = time.monotonic()
@@ -177,21 +178,21 @@ class Look:
                 self.finish.wait(max(0.0, polled + poll_s - time.monotonic()))
 
     def _add(self, *, ended: bool, until: float) -> None:
-        """Add what has come, pair by pair in turn, until it is time to show it."""
+        """Add new pulses to the images, one block for each pair in turn, until the next update is due."""
         more = True
         while more and (ended or time.monotonic() < until):
-            added = [one.add_next(ended=ended, every=self.decimated) for one in self.pairs]
+            added = [pair.add_next(ended=ended, every=self.decimated) for pair in self.pairs]
             more = any(added)
 
     def show(self, *, ended: bool, elapsed_s: float) -> None:
-        """Write pictures, status and page, and say each in a line; take fewer pulses where it has fallen behind."""
+        """Write quicklooks, status and page, print a line for each pair, and adapt the decimation to the delay."""
         began = time.monotonic()
         pairs = {}
         for pair in self.pairs:
             report = self.show_pair(pair)
             pairs[f"{pair.flight}/{pair.name}"] = report
             print(f"{datetime.now(UTC):%H:%M:%S}  {_line(pair, report, self.decimated)}", flush=True)
-        delays = [one["delay_s"] for one in pairs.values() if one["delay_s"] is not None]
+        delays = [report["delay_s"] for report in pairs.values() if report["delay_s"] is not None]
         status = {
             "campaign": self.campaign.settings.campaign,
             "shown": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
@@ -199,22 +200,22 @@ class Look:
             "one_pulse_in": self.decimated,
             "pairs": pairs,
         }
-        folder = self.campaign.result(LOOK)
+        folder = self.campaign.result(PREVIEW)
         write_json(folder / "status.json", status)
         self._map.write(ended=ended)
         write_text(folder / "index.html", _page(status, refresh_s=0 if ended else max(1, round(self.every_s))))
         self.busy_s += time.monotonic() - began
         busy = self.busy_s / max(elapsed_s, 1e-3)
         self.busy_s = 0.0
-        delay_s, before_s = max(delays, default=0.0), self._delay_s
-        self._delay_s = delay_s if delays else before_s
-        if not ended and delay_s > max(before_s, _BEHIND * self.every_s):  # and it does not catch up
+        delay_s, previous_s = max(delays, default=0.0), self._delay_s
+        self._delay_s = delay_s if delays else previous_s
+        if not ended and delay_s > max(previous_s, _BEHIND * self.every_s):  # large and increasing
             self.decimated = min(_MOST_DECIMATED, 2 * self.decimated)
         elif busy < _AT_EASE and self.decimated > 1:
             self.decimated //= 2
 
     def show_pair(self, pair: PairSoFar) -> dict[str, Any]:
-        """Write the picture of a pair; return what is known of it, for the status."""
+        """Write the quicklook of a pair; return its status report."""
         shown = pair.shown
         report: dict[str, Any] = {"pulses": pair.counts, "waits": pair.waits, "delay_s": None, "image": None}
         if shown is None or not shown.sums.any():
@@ -231,21 +232,21 @@ class Look:
         self._map.add(pair, report)
         if pair.tx is not None:
             pair.tx.read()
-            if pair.tx.begun_anew:
-                return {"pulses": pair.anew().counts, "waits": "", "delay_s": None, "image": None}
-        report |= {"delay_s": pair.delay_s, "pulses": pair.counts}  # when the picture is there
+            if pair.tx.restart:
+                return {"pulses": pair.reset().counts, "waits": "", "delay_s": None, "image": None}
+        report |= {"delay_s": pair.delay_s, "pulses": pair.counts}  # after writing the quicklook
         report["image"] = f"{pair.flight}/{pair.name}.png"
         return report
 
     def _picture(self, pair: PairSoFar) -> Path:
-        return self.campaign.result(LOOK, pair.flight, f"{pair.name}.png")
+        return self.campaign.result(PREVIEW, pair.flight, f"{pair.name}.png")
 
     def _draw(self, path: Path, pair: PairSoFar, report: Mapping[str, Any]) -> None:
         shown = pair.shown
         if shown is None:
-            raise TypeError("a pair without an image is not drawn")
+            raise TypeError("the pair has no image yet")
         image, grid = shown.image, shown.grid
-        image[image == 0] = np.complex64(complex(np.nan, np.nan))  # no pulse has seen it yet
+        image[image == 0] = np.complex64(complex(np.nan, np.nan))  # not illuminated so far
         focus = {"verdict": report["verdict"], **({"loss_db": report["loss_db"]} if "loss_db" in report else {})}
         tags = {
             "APERTURA_VERSION": __version__,
@@ -265,24 +266,24 @@ class Look:
 
 
 def check_bounds(campaign: Campaign, *, follow: bool) -> None:
-    """Raise CampaignError where the scene of a campaign that is followed follows from the whole flight."""
+    """Raise CampaignError if `follow` is set and the scene bounds would be determined from the whole flight."""
     if follow and campaign.settings.scene.bounds_m == "auto":
         raise CampaignError(
-            "auto, which is settled by a whole flight",
+            "auto, which requires the complete flight",
             where=f"{campaign.root / CONFIG}: scene.bounds_m",
-            expected="the bounds to look at, for --follow",
-            remedy="State scene.bounds_m.",
+            expected="configured bounds for --follow",
+            remedy="Set scene.bounds_m.",
         )
 
 
 @contextmanager
-def finished_by_interrupt(look: Look) -> Iterator[None]:
-    """Let Ctrl-C end the recordings once; a second one ends the command, as ever."""
+def finished_by_interrupt(preview: Preview) -> Iterator[None]:
+    """Handle the first Ctrl-C as the end of the recordings; a second one stops the command."""
 
     def finish(_: int, __: FrameType | None) -> None:
         signal.signal(signal.SIGINT, before)
-        print("finishing with what has come; Ctrl-C again to stop", flush=True)
-        look.finish.set()
+        print("finishing with the data read so far; press Ctrl-C again to stop", flush=True)
+        preview.finish.set()
 
     before = signal.signal(signal.SIGINT, finish)
     try:
@@ -291,18 +292,18 @@ def finished_by_interrupt(look: Look) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def look_at(campaign: Campaign, *, follow: bool, every_s: float, end_after_s: float, threads: int) -> None:
-    """Show a campaign as far as it has come, until its recordings end."""
-    look = Look(campaign, follow=follow, every_s=every_s, end_after_s=end_after_s, threads=threads)
-    print(f"shown in {as_typed(campaign.result(LOOK, 'index.html'))}", flush=True)
+def run_preview(campaign: Campaign, *, follow: bool, every_s: float, end_after_s: float, threads: int) -> None:
+    """Show images of a campaign's pulses so far, with `follow` until its recordings end."""
+    preview = Preview(campaign, follow=follow, every_s=every_s, end_after_s=end_after_s, threads=threads)
+    print(f"shown in {as_typed(campaign.result(PREVIEW, 'index.html'))}", flush=True)
     if not follow:
-        look.run()
+        preview.run()
         return
-    with finished_by_interrupt(look):
-        look.run()
+    with finished_by_interrupt(preview):
+        preview.run()
 
 
-# ---- In words -------------------------------------------------------------------------------------------------------
+# ---- Text -----------------------------------------------------------------------------------------------------------
 
 
 def _decimation_text(every: int) -> str:
@@ -314,26 +315,26 @@ def _delay_text(delay_s: float | None) -> str:
 
 
 def _resolution_text(report: Mapping[str, Any]) -> str:
-    of = "coarse: half the band, every 2nd pixel" if report["share"] == 2 else "fine"
-    return f"{of} ({report['spacing_m']:g} m)"
+    level = "coarse: half the bandwidth, every 2nd pixel" if report["share"] == 2 else "fine"
+    return f"{level} ({report['spacing_m']:g} m)"
 
 
 def _subtitle(pair: PairSoFar, report: Mapping[str, Any], every: int) -> str:
     until = "" if pair.until is None else f"{str(pair.until)[11:21]}Z"
-    words = (
-        f"{report['pulses']['added']} pulses to {until}",
+    parts = (
+        f"{report['pulses']['added']} pulses until {until}",
         _delay_text(report["delay_s"]),
         _decimation_text(every),
         _resolution_text(report),
     )
-    return " · ".join(word for word in words if word)
+    return " · ".join(part for part in parts if part)
 
 
 def _line(pair: PairSoFar, report: Mapping[str, Any], every: int) -> str:
     name, counts = f"{pair.flight} {pair.name}", report["pulses"]
     if report["image"] is None:
         return f"{name}: no image yet, {counts['recorded']} pulses recorded{report['waits'] and '; '}{report['waits']}"
-    words = (
+    parts = (
         f"{counts['added']} of {counts['recorded']} pulses",
         _delay_text(report["delay_s"]),
         _decimation_text(every),
@@ -342,7 +343,7 @@ def _line(pair: PairSoFar, report: Mapping[str, Any], every: int) -> str:
         f"peak at {report['peak']['x_m']:.2f}, {report['peak']['y_m']:.2f}",
         ", ".join(flag for flag in report["flags"] if flag != report["verdict"]),
     )
-    return f"{name}: {'; '.join(word for word in words if word)}"
+    return f"{name}: {'; '.join(part for part in parts if part)}"
 
 
 _PAGE = """<!doctype html><html lang="en"><head><meta charset="utf-8">
@@ -351,7 +352,7 @@ _PAGE = """<!doctype html><html lang="en"><head><meta charset="utf-8">
 body{font-family:sans-serif;margin:1em}section{display:inline-block;vertical-align:top;max-width:48em}
 img{max-width:100%}th{text-align:left;vertical-align:top;padding-right:1em;font-weight:normal;color:#555}
 </style></head><body><h1>{{ status.campaign }}, so far</h1>
-<p>{{ status.state }}, shown {{ status.shown }}, 1 pulse in {{ status.one_pulse_in }} taken</p>
+<p>{{ status.state }}, updated {{ status.shown }}, 1 pulse in {{ status.one_pulse_in }} used</p>
 {% for name, pair in status.pairs.items() -%}
 <section><h2>{{ name }}</h2>
 {%- if pair.image %}<img src="{{ pair.image }}" alt="">{% else %}<p>no image yet</p>{% endif %}<table>
@@ -366,7 +367,7 @@ img{max-width:100%}th{text-align:left;vertical-align:top;padding-right:1em;font-
 
 
 def _page(status: Mapping[str, Any], *, refresh_s: int) -> str:
-    """Render a page of pictures and text that needs no network, and reloads itself while the campaign flies."""
+    """Render a page of quicklooks and text without external resources, which reloads itself during the flight."""
     from jinja2 import Environment
 
     page = Environment(autoescape=True, keep_trailing_newline=True).from_string(_PAGE)
@@ -374,7 +375,7 @@ def _page(status: Mapping[str, Any], *, refresh_s: int) -> str:
 
 
 _KEPT = 2
-"""Pictures of a pair, in turn: a page that has just read the document still finds the one before the last."""
+"""Number of images kept for a pair: a page that has just read the document still finds the previous image."""
 
 
 class LiveMap:
@@ -383,11 +384,11 @@ class LiveMap:
     Parameters
     ----------
     campaign
-        Whose look it is.
+        The campaign.
     folder
-        Of the look, relative to the results.
+        Folder of the live view, relative to the results.
     every_s
-        Seconds after which a page asks again.
+        Interval at which a page reloads the document, seconds.
     """
 
     def __init__(self, campaign: Campaign, folder: str, *, every_s: float) -> None:
@@ -411,7 +412,7 @@ class LiveMap:
         }
 
     def begin(self) -> None:
-        """Remove the document of an earlier look: who asks for the map now waits for the first picture of this one."""
+        """Remove the document of an earlier live view, so that the map server waits for the first image of this one."""
         (self._folder / MAP).unlink(missing_ok=True)
 
     def add(self, pair: PairSoFar, report: Mapping[str, Any]) -> None:
@@ -420,36 +421,36 @@ class LiveMap:
         if shown is None:
             return
         self._grid = grid
-        where = f"{pair.flight}/{pair.name}"
+        name = f"{pair.flight}/{pair.name}"
         image = on_grid(shown.image, shown.share, grid.shape)
-        path = self._folder / where / f"db.{self._shown[where] % _KEPT}.tif"
-        self._shown[where] += 1
+        path = self._folder / name / f"db.{self._shown[name] % _KEPT}.tif"
+        self._shown[name] += 1
         path.parent.mkdir(parents=True, exist_ok=True)
         write_cog(path, image, DB, value=lambda block: decibels(power(block)), tags={}, **placed_on(grid))
         level = decibels(power(image[image != 0]))
         high = round(float(np.nanmax(level, initial=-300.0)), 1)
         low = min(round(float(np.nanmedian(level)), 1), high - 1.0) if np.isfinite(level).any() else high - 60.0
         layer = Layer("db.tif", sha256_file(path), "image", "image so far", "dB", low, high)
-        self._entries[where] = {
+        self._entries[name] = {
             "flight": pair.flight,
             "image": pair.name,
             "verdict": report["verdict"],
-            "why": report["why"],
+            "reason": report["reason"],
             "error_db": report["error_db"],
             "flags": explained_flags(report["flags"]),
-            "layers": [{**asdict(layer), "url": url_of(f"{where}/{path.name}", layer.sha256)}],
+            "layers": [{**asdict(layer), "url": url_of(f"{name}/{path.name}", layer.sha256)}],
         }
         peak = report["peak"]
-        self._places[where] = Place("brightest", "found", float(peak["x_m"]), float(peak["y_m"]), where)
+        self._places[name] = Place("brightest", "found", float(peak["x_m"]), float(peak["y_m"]), name)
 
     def drop(self, pair: PairSoFar) -> None:
-        """Leave a pair out until it is added again: its image was of what is no longer there."""
-        where = f"{pair.flight}/{pair.name}"
-        self._entries.pop(where, None)
-        self._places.pop(where, None)
+        """Remove a pair whose recording was restarted, until it is added again."""
+        name = f"{pair.flight}/{pair.name}"
+        self._entries.pop(name, None)
+        self._places.pop(name, None)
 
     def write(self, *, ended: bool) -> None:
-        """Write the document of what was added; nothing before there is an image."""
+        """Write the document of the added images; no document before the first image."""
         if self._grid is None:
             return
         document = map_document(
@@ -465,12 +466,12 @@ class LiveMap:
 
 
 def placed_on(grid: SceneGrid) -> dict[str, Any]:
-    """Return transform and crs of a grid, as exports take them."""
+    """Return transform and CRS of a grid as arguments of the export functions."""
     return {"transform": Affine(*grid.transform), "crs": grid.crs_wkt if grid.crs == LOCAL else grid.crs}
 
 
 def on_grid(image: NDArray[np.complex64], side: int, shape: tuple[int, ...]) -> NDArray[np.complex64]:
-    """Return an image of pixels `side` times as wide on the grid that they are blocks of; 0 beyond the last block.
+    """Resample an image by repeating each pixel `side` × `side` times on a grid of `shape`; 0 beyond the last pixel.
 
     Examples
     --------

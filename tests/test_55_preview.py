@@ -1,4 +1,4 @@
-"""`apertura look`: images of the pulses so far, of files cut wherever a write may end; nothing is written elsewhere."""
+"""Preview of a flight (`apertura preview`): images of the pulses so far, from files cut wherever a write may end."""
 
 import hashlib
 import json
@@ -28,24 +28,24 @@ from apertura.stages import echo
 from apertura.stages.scene import settled_scene
 from apertura.stages.transfer import PairEcho
 from apertura.stages.transmitted import transmitted
-from apertura.tools.look import pair as look_pair
-from apertura.tools.look.follow import Look
-from apertura.tools.look.node import NodeSoFar
+from apertura.tools.preview import pair as preview_pair
+from apertura.tools.preview.follow import Preview
+from apertura.tools.preview.node import NodeSoFar
 from apertura.views.webmap.server import served_look
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
-import look as replayed  # the writers of benchmarks/look.py, which end files wherever a write may
+import preview as replayed  # the writers of benchmarks/preview.py, which end files wherever a write may
 
 APERTURA = Path(sys.executable).parent / "apertura"
 
 
 def files_of(root):
-    """Return the files of the results but those of the look → sha256."""
+    """Return the files of the results but those of the preview → sha256."""
     found = (path for path in (root / "results").rglob("*") if path.is_file())
     return {
         path.relative_to(root).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in found
-        if path.relative_to(root).parts[1] != "look"
+        if path.relative_to(root).parts[1] != "preview"
     }
 
 
@@ -56,14 +56,14 @@ def node_of(root, node, *, follow=True):
 
 def in_blocks(root, pulses, monkeypatch):
     """Return the pairs of a campaign whose pulses were added so many at a time."""
-    monkeypatch.setattr(look_pair, "AT_ONCE", pulses)
-    look = Look(Campaign.load(root), follow=False)
-    for node in look.nodes.values():
+    monkeypatch.setattr(preview_pair, "AT_ONCE", pulses)
+    preview = Preview(Campaign.load(root), follow=False)
+    for node in preview.nodes.values():
         node.read()
-    for pair in look.pairs:
+    for pair in preview.pairs:
         while pair.add_next(ended=True) or pair.refine_next():
             pass
-    return look.pairs
+    return preview.pairs
 
 
 def apart_db(image, exact):
@@ -176,10 +176,10 @@ def test_pulses_are_held_back_that_a_log_does_not_reach(tiny):
     (log,) = (tiny / "raw/f01").glob("uav2.track.*")
     lines = log.read_text().splitlines(keepends=True)
     log.write_text("".join(lines[: len(lines) // 2]))
-    look = Look(Campaign.load(tiny), follow=True)
-    for one in look.nodes.values():
+    preview = Preview(Campaign.load(tiny), follow=True)
+    for one in preview.nodes.values():
         one.read()
-    mono, other = look.pairs
+    mono, other = preview.pairs
     reach = other.rx.known_until(ended=False)
     tx_index, rx_index = other.ready(ended=False)
     assert 0 < len(tx_index) < len(mono.ready(ended=False)[0])
@@ -223,69 +223,69 @@ def other_log(root):
 @pytest.mark.quick("other_flight", "other_log")
 @pytest.mark.parametrize("change", [other_flight, shorter, other_samples, other_last_samples, other_log])
 def test_a_recorder_that_is_started_again_under_the_same_name_is_shown_anew(tiny, change, capsys):
-    look = Look(Campaign.load(tiny), follow=True)
-    look._read()
-    for pair in look.pairs:
+    preview = Preview(Campaign.load(tiny), follow=True)
+    preview._read()
+    for pair in preview.pairs:
         while pair.add_next(ended=False):
             pass
-    look.show(ended=False, elapsed_s=1.0)
-    before = look.pairs[0].counts
+    preview.show(ended=False, elapsed_s=1.0)
+    before = preview.pairs[0].counts
     assert before["added"] > 0
     change(tiny)
-    look._read()
-    assert "is dropped, and begun anew" in capsys.readouterr().out
-    assert [pair.counts["added"] for pair in look.pairs] == [0, 0]  # both are sent by uav1
-    assert look._map._entries == {}
-    assert not list((tiny / "results/look").rglob("*.png"))
-    look._read()
-    for pair in look.pairs:
+    preview._read()
+    assert "are restarted from the new files" in capsys.readouterr().out
+    assert [pair.counts["added"] for pair in preview.pairs] == [0, 0]  # both are sent by uav1
+    assert preview._map._entries == {}
+    assert not list((tiny / "results/preview").rglob("*.png"))
+    preview._read()
+    for pair in preview.pairs:
         while pair.add_next(ended=True):
             pass
         assert pair.counts["added"] <= pair.counts["recorded"]
-    assert "anew" not in capsys.readouterr().out
-    assert (look.pairs[0].counts["recorded"] < before["recorded"]) == (change in (other_flight, shorter))
+    assert "restarted" not in capsys.readouterr().out
+    assert (preview.pairs[0].counts["recorded"] < before["recorded"]) == (change in (other_flight, shorter))
 
 
 def test_a_recorder_started_again_while_a_picture_is_drawn_leaves_none_of_the_flight_before(tiny, monkeypatch):
-    look = Look(Campaign.load(tiny), follow=True)
-    look._read()
-    look.pairs[0].add_next(ended=True)
-    monkeypatch.setattr(look, "_draw", lambda *_: other_flight(tiny))
-    told = look.show_pair(look.pairs[0])
+    preview = Preview(Campaign.load(tiny), follow=True)
+    preview._read()
+    preview.pairs[0].add_next(ended=True)
+    monkeypatch.setattr(preview, "_draw", lambda *_: other_flight(tiny))
+    told = preview.show_pair(preview.pairs[0])
     assert (told["image"], told["pulses"]["added"]) == (None, 0)
-    look._read()
-    assert look.pairs[0].shown is None
+    preview._read()
+    assert preview.pairs[0].shown is None
 
 
 def test_a_file_that_is_away_for_a_moment_ends_no_look(tiny):
     """As a recorder leaves it that removes and creates its files: between two reads, and before a block is read."""
     data = tiny / "raw/f01/uav2.sigmf-data"
-    look, content = Look(Campaign.load(tiny), follow=True), data.read_bytes()
-    look._read()
+    preview, content = Preview(Campaign.load(tiny), follow=True), data.read_bytes()
+    preview._read()
     data.unlink()
-    assert not look.pairs[1].add_next(ended=True) or look.pairs[1].counts["added"] == 0
-    assert "no such file" in look.pairs[1].why_dropped.lower()
-    look._read()
+    assert not preview.pairs[1].add_next(ended=True) or preview.pairs[1].counts["added"] == 0
+    assert "no such file" in preview.pairs[1].drop_reason.lower()
+    preview._read()
     data.write_bytes(content[: len(content) // 2])
-    look._read()
-    assert look.pairs[1].taken == 0
-    look._read()
-    while look.pairs[1].add_next(ended=True):
+    preview._read()
+    assert preview.pairs[1].taken == 0
+    preview._read()
+    while preview.pairs[1].add_next(ended=True):
         pass
-    assert 0 < look.pairs[1].counts["added"] <= look.pairs[1].counts["recorded"]
+    assert 0 < preview.pairs[1].counts["added"] <= preview.pairs[1].counts["recorded"]
 
 
 def test_a_log_that_becomes_a_named_pipe_is_reported_once(tiny, capsys):
-    look = Look(Campaign.load(tiny), follow=True)
-    look._read()
+    preview = Preview(Campaign.load(tiny), follow=True)
+    preview._read()
     capsys.readouterr()
     log = tiny / "raw/f01/uav1.track.csv"
     log.unlink()
     os.mkfifo(log)
-    look._read()
-    look._read()
+    preview._read()
+    preview._read()
     (line,) = capsys.readouterr().out.splitlines()
-    assert "uav1 is not read at present: " in line
+    assert "uav1 is not readable at present: " in line
     assert "uav1.track.csv: a named pipe" in line
 
 
@@ -298,7 +298,7 @@ def test_metadata_that_are_half_written_anew_are_no_new_flight(tiny):
     for share in (0.5, 1.0):
         meta.write_text(text[: int(share * len(text))])
         node.read()
-        assert (node.begun_anew, len(node.time)) == ("", count)
+        assert (node.restart, len(node.time)) == ("", count)
 
 
 def test_a_recording_that_rests_is_ended_and_what_it_lacks_is_said(tiny, capsys):
@@ -306,58 +306,58 @@ def test_a_recording_that_rests_is_ended_and_what_it_lacks_is_said(tiny, capsys)
     meta.write_text(meta.read_text().rstrip().rstrip("}"))
     (log,) = (tiny / "raw/f01").glob("uav2.track.*")
     log.write_bytes(log.read_bytes()[: log.stat().st_size // 2])
-    Look(Campaign.load(tiny), follow=True, every_s=1.0, end_after_s=1.0).run()
+    Preview(Campaign.load(tiny), follow=True, every_s=1.0, end_after_s=1.0).run()
     told = next(line for line in capsys.readouterr().out.splitlines() if "--end-after" in line)
-    assert "nothing has come for 1 s" in told
-    assert "the metadata of uav1 do not state" in told
+    assert "no new data for 1 s" in told
+    assert "the metadata of uav1 do not contain" in told
     assert "the log of uav2 ends before its last capture" in told
 
 
 @pytest.mark.slow
 def test_the_last_picture_is_the_fine_one(tiny):
-    look = Look(Campaign.load(tiny), follow=True, every_s=1.0, end_after_s=1.0)
-    look.run()
-    told = json.loads((tiny / "results/look/status.json").read_text())["pairs"]
+    preview = Preview(Campaign.load(tiny), follow=True, every_s=1.0, end_after_s=1.0)
+    preview.run()
+    told = json.loads((tiny / "results/preview/status.json").read_text())["pairs"]
     assert [one["share"] for one in told.values()] == [1, 1]
 
 
 def test_files_that_are_not_there_yet_are_waited_for(tiny):
     for path in (tiny / "raw/f01").iterdir():
         path.unlink()
-    earlier = tiny / "results/look/map/map.json"
+    earlier = tiny / "results/preview/map/map.json"
     earlier.parent.mkdir(parents=True)
     earlier.write_text("{}")
-    look = Look(Campaign.load(tiny), follow=True, every_s=1.0)
-    threading.Timer(2.0, look.finish.set).start()
-    look.run()
-    told = json.loads((tiny / "results/look/status.json").read_text())["pairs"]["f01/uav1-uav1"]
+    preview = Preview(Campaign.load(tiny), follow=True, every_s=1.0)
+    threading.Timer(2.0, preview.finish.set).start()
+    preview.run()
+    told = json.loads((tiny / "results/preview/status.json").read_text())["pairs"]["f01/uav1-uav1"]
     assert "no such file" in told["waits"] or "track" in told["waits"]
     assert told["image"] is None
     assert not earlier.exists()
 
 
 def test_an_image_of_hardly_any_aperture_is_shown_but_not_judged(tiny, monkeypatch):
-    monkeypatch.setattr(look_pair, "AT_ONCE", 16)
-    monkeypatch.setattr(look_pair, "LEAST_PULSES", 8)
-    look = Look(Campaign.load(tiny), follow=False)
-    for node in look.nodes.values():
+    monkeypatch.setattr(preview_pair, "AT_ONCE", 16)
+    monkeypatch.setattr(preview_pair, "LEAST_PULSES", 8)
+    preview = Preview(Campaign.load(tiny), follow=False)
+    for node in preview.nodes.values():
         node.read()
-    assert look.pairs[0].add_next(ended=True)
-    told = look.pairs[0].shown.judged()
-    assert told["verdict"] == "cannot tell"
-    assert told["why"].startswith("no aperture yet")
+    assert preview.pairs[0].add_next(ended=True)
+    told = preview.pairs[0].shown.judged()
+    assert told["verdict"] == "inconclusive"
+    assert told["reason"].startswith("aperture too short")
 
 
 def test_what_the_first_pulses_could_not_tell_later_ones_do(tmp_path, monkeypatch):
     plan = replace(preset("demo", pulses=100), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
-    look = Look(Campaign.load(ap.simulate(tmp_path / "campaign", plan, seed=7)), follow=False)
-    look.nodes["f01", "uav1"].read()
-    monkeypatch.setattr(look_pair, "AT_ONCE", 2)  # which span no aperture: what is planned for them says so
-    assert look.pairs[0].add_next(ended=True)
-    monkeypatch.setattr(look_pair, "AT_ONCE", 2048)
-    while look.pairs[0].add_next(ended=True) or look.pairs[0].refine_next():
+    preview = Preview(Campaign.load(ap.simulate(tmp_path / "campaign", plan, seed=7)), follow=False)
+    preview.nodes["f01", "uav1"].read()
+    monkeypatch.setattr(preview_pair, "AT_ONCE", 2)  # which span no aperture: what is planned for them says so
+    assert preview.pairs[0].add_next(ended=True)
+    monkeypatch.setattr(preview_pair, "AT_ONCE", 2048)
+    while preview.pairs[0].add_next(ended=True) or preview.pairs[0].refine_next():
         pass
-    told = look.pairs[0].judged()
+    told = preview.pairs[0].judged()
     assert told["verdict"] == "focused", told
     assert told["judged_by"].endswith("fine")
 
@@ -370,9 +370,9 @@ def test_a_scene_left_to_auto_is_that_of_the_run(tiny, tmp_path):
     for pair in other.flight("f01").pairs:
         echo.echo(other, "f01", pair)
     settle_ground(other)
-    look = Look(Campaign.load(tiny), follow=False)
-    look.run()
-    grids = {pair.images[1].grid for pair in look.pairs}
+    preview = Preview(Campaign.load(tiny), follow=False)
+    preview.run()
+    grids = {pair.images[1].grid for pair in preview.pairs}
     assert grids == {settled_scene(other).grid}
 
 
@@ -391,21 +391,21 @@ def test_a_recording_has_ended_only_where_its_log_has(tiny):
 
 @pytest.mark.slow
 def test_a_pair_that_falls_behind_takes_every_other_pulse_and_says_so(tiny):
-    look = Look(Campaign.load(tiny), follow=False)
-    look.decimated = 2
-    look.run()
-    told = json.loads((tiny / "results/look/status.json").read_text())
+    preview = Preview(Campaign.load(tiny), follow=False)
+    preview.decimated = 2
+    preview.run()
+    told = json.loads((tiny / "results/preview/status.json").read_text())
     assert told["one_pulse_in"] == 2
     counts = told["pairs"]["f01/uav1-uav1"]["pulses"]
     assert counts["added"] + counts["left_out"] == counts["recorded"]
     assert counts["added"] == counts["recorded"] // 2
-    assert "1 pulse in 2 taken" in (tiny / "results/look/index.html").read_text()
+    assert "1 pulse in 2 used" in (tiny / "results/preview/index.html").read_text()
 
 
 def test_pulses_stand_for_those_left_out_beside_them(finished_tiny, tmp_path, monkeypatch):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
-    (whole, _), look = in_blocks(root, 20, monkeypatch), Look(Campaign.load(root), follow=False)
-    node, pair = look.nodes["f01", "uav1"], look.pairs[0]
+    (whole, _), preview = in_blocks(root, 20, monkeypatch), Preview(Campaign.load(root), follow=False)
+    node, pair = preview.nodes["f01", "uav1"], preview.pairs[0]
     node.read()
     assert pair.add_next(ended=True, every=1)
     assert pair.add_next(ended=True, every=2)
@@ -416,43 +416,43 @@ def test_pulses_stand_for_those_left_out_beside_them(finished_tiny, tmp_path, mo
 
 
 def test_a_delay_doubles_the_decimation_and_ease_halves_it(tiny, monkeypatch):
-    look = Look(Campaign.load(tiny), follow=True, every_s=1.0)
+    preview = Preview(Campaign.load(tiny), follow=True, every_s=1.0)
     delay = [20.0]
     monkeypatch.setattr(
-        look, "show_pair", lambda _: {"delay_s": delay[0], "image": None, "pulses": {"recorded": 0}, "waits": ""}
+        preview, "show_pair", lambda _: {"delay_s": delay[0], "image": None, "pulses": {"recorded": 0}, "waits": ""}
     )
     told = []
     for delay[0] in (20.0, 21.0, 20.5, 22.0, 0.5, 0.5):
-        look.busy_s = 900.0 * (delay[0] > 1)
-        look.show(ended=False, elapsed_s=1e3)
-        told.append(look.decimated)
+        preview.busy_s = 900.0 * (delay[0] > 1)
+        preview.show(ended=False, elapsed_s=1e3)
+        told.append(preview.decimated)
     assert told == [1, 2, 2, 4, 2, 1]  # not at first, when it still plans, nor while it catches up
 
 
 @pytest.mark.slow
 def test_a_map_of_a_look_serves_the_last_pictures_and_nothing_else(tiny, capsys):
     """It waits for the first; two of a pair stay, the image is on the scene's grid whatever it was formed on."""
-    look, waiting = Look(Campaign.load(tiny), follow=True, every_s=2.0, end_after_s=1e6), threading.Event()
+    preview, waiting = Preview(Campaign.load(tiny), follow=True, every_s=2.0, end_after_s=1e6), threading.Event()
 
     def serve():
-        with served_look(look.campaign):
+        with served_look(preview.campaign):
             waiting.set()
 
     serving = threading.Thread(target=serve)
     serving.start()
     assert not waiting.wait(0.5)
-    assert "waiting for the first picture" in capsys.readouterr().out
-    for node in look.nodes.values():
+    assert "waiting for the first image" in capsys.readouterr().out
+    for node in preview.nodes.values():
         node.read()
-    assert all(pair.add_next(ended=True) for pair in look.pairs)
+    assert all(pair.add_next(ended=True) for pair in preview.pairs)
     for number in range(4):
-        look.show(ended=number == 3, elapsed_s=1.0)
+        preview.show(ended=number == 3, elapsed_s=1.0)
     assert waiting.wait(5.0)
     serving.join()
-    folder = tiny / "results/look"
+    folder = tiny / "results/preview"
     document = json.loads((folder / "map/map.json").read_text())
     assert document["again_s"] is None
-    with served_look(look.campaign) as server:
+    with served_look(preview.campaign) as server:
         listed = server.files()
         assert sorted(listed) == ["f01/uav1-uav1/db.1.tif", "f01/uav1-uav2/db.1.tif", "map/map.json"]
         assert all(server.sha256_of(name) == sha256 for name, sha256 in listed.items())
@@ -468,23 +468,23 @@ def test_a_map_of_a_look_serves_the_last_pictures_and_nothing_else(tiny, capsys)
 def test_a_look_writes_beside_the_results_and_nowhere_else(finished_tiny, tmp_path):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     before = files_of(root)
-    Look(Campaign.load(root), follow=False).run()
+    Preview(Campaign.load(root), follow=False).run()
     assert files_of(root) == before
-    shown = {path.relative_to(root / "results/look").as_posix() for path in (root / "results/look").rglob("*.*")}
+    shown = {path.relative_to(root / "results/preview").as_posix() for path in (root / "results/preview").rglob("*.*")}
     pictures = {f"f01/uav1-uav{node}{end}" for node in (1, 2) for end in (".png", "/db.0.tif")}
     assert shown == {"index.html", "status.json", "map/map.json"} | pictures
-    told = json.loads((root / "results/look/status.json").read_text())["pairs"]["f01/uav1-uav1"]
-    assert told["verdict"] in {"focused", "cannot tell"}
+    told = json.loads((root / "results/preview/status.json").read_text())["pairs"]["f01/uav1-uav1"]
+    assert told["verdict"] in {"focused", "inconclusive"}
     assert told["share"] == 1
 
 
 @pytest.mark.slow
 def test_what_a_look_wrote_goes_with_what_a_run_wrote(tiny):
     campaign = Campaign.load(tiny)
-    Look(campaign, follow=False).run()
-    (tiny / "results/look/notes.txt").write_text("mine")
+    Preview(campaign, follow=False).run()
+    (tiny / "results/preview/notes.txt").write_text("mine")
     clean(campaign, unfinished_only=False, agreed=True)
-    assert [path.name for path in (tiny / "results/look").rglob("*")] == ["notes.txt"]
+    assert [path.name for path in (tiny / "results/preview").rglob("*")] == ["notes.txt"]
 
 
 @pytest.mark.parametrize(
@@ -497,27 +497,27 @@ def test_what_a_look_wrote_goes_with_what_a_run_wrote(tiny):
 def test_what_cannot_be_followed_is_refused_in_one_message(tiny, spoil, named):
     spoil(tiny)
     with pytest.raises(CampaignError, match=named):
-        Look(Campaign.load(tiny), follow=True, every_s=1.0).run()
+        Preview(Campaign.load(tiny), follow=True, every_s=1.0).run()
 
 
 @pytest.mark.slow
 def test_a_picture_that_takes_longer_than_files_may_rest_does_not_end_them(tiny, tmp_path, monkeypatch):
     root = tmp_path / "replayed"
     replayed.begin(tiny, root)
-    look = Look(Campaign.load(root), follow=True, every_s=1.0, end_after_s=2.0)
+    preview = Preview(Campaign.load(root), follow=True, every_s=1.0, end_after_s=2.0)
 
     def slowly(_):
         time.sleep(2.5)
-        for node in look.nodes.values():
+        for node in preview.nodes.values():
             node.read()
         return {"delay_s": None, "image": None, "pulses": {"recorded": 0}, "waits": ""}
 
-    monkeypatch.setattr(look, "show_pair", slowly)
+    monkeypatch.setattr(preview, "show_pair", slowly)
     writing = threading.Thread(target=replayed.replay, args=(tiny, root, 0.2))
     writing.start()
-    look.run()
+    preview.run()
     writing.join()
-    assert all(node.complete for node in look.nodes.values())
+    assert all(node.complete for node in preview.nodes.values())
 
 
 @pytest.mark.slow
@@ -525,7 +525,7 @@ def test_a_picture_that_takes_longer_than_files_may_rest_does_not_end_them(tiny,
 def test_a_replay_that_was_looked_at_ends_as_an_ordinary_run(tiny, tmp_path, ends):
     root = tmp_path / "replayed"
     replayed.begin(tiny, root)
-    words = [APERTURA, "look", root, "--follow", "--every", "1", "--end-after", "600", "--cores", "2"]
+    words = [APERTURA, "preview", root, "--follow", "--every", "1", "--end-after", "600", "--cores", "2"]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(
         words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
