@@ -218,7 +218,7 @@ def air_decision(pair: OpenPair) -> Decision:
 
 
 def background_decision(pair: OpenPair) -> Decision:
-    """Return the decision on the background: from stage `profile`, or what decides it once there is one."""
+    """Return the decision on background removal: that of stage `profile`, or the setting before this stage exists."""
     report = pair.report.get("background")
     if report is None:
         return Decision("background", "auto", "decided when range profiles are formed")
