@@ -16,7 +16,7 @@ from apertura.core.quality.agreement import OUT_OF_PHASE_RAD, Agreement
 
 @dataclass(frozen=True)
 class InPhase:
-    """Share of the power of its images that a coherent sum retains at bright points.
+    """Share of the power of the images at bright points that is preserved in their coherent sum.
 
     Attributes
     ----------

@@ -26,7 +26,7 @@ base."""
 _GROUPS = 512
 """Number of groups of pulses whose means are used for estimates: a burst of interference corrupts few of them."""
 
-_SAMPLED_GROUPS, _SAMPLED_EACH = 64, 8  # number of pulses used by the test
+_SAMPLED_GROUPS, _SAMPLED_EACH = 64, 8  # groups of pulses used by the test, and pulses per group
 # Doppler frequencies compared with zero Doppler, in units of 1/duration: higher than those of a slow drift of coupling
 _DOPPLER_CELLS = 3, 12
 _FALSE_ALARM = 1e-6

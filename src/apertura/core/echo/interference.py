@@ -18,8 +18,8 @@ from apertura.common.flags import Flags
 from apertura.common.units import decibels
 from apertura.core.echo.captures import Pulses, spread
 
-_GROUPS, _EACH = 64, 8  # number of pulses used by the test
-_NEIGHBOURS = 32  # number of parts of the band in each of which the median of the noise is computed
+_GROUPS, _EACH = 64, 8  # groups of pulses used by the test, and pulses per group
+_NEIGHBOURS = 32  # inverse share of the band in half the window of the noise median
 _FEWEST_NEIGHBOURS = 8
 
 EXCESS_DB = 6.0

@@ -111,7 +111,7 @@ def _strongest(profile: NDArray[np.complex64], run: int, inside: int, beyond: sl
     false_alarm = FALSE_ALARM / (inside * len(power))  # per cell
     sigmas = (blocks * scatter**2 - 1) / np.sqrt((2 + 6 / blocks) / floor.shape[1])
     # The floor of a wrong code is the same in all pulses: unlike noise, it is exponentially distributed over the cells
-    # for # any number of added pulses.
+    # for any number of added pulses.
     is_noise = sigmas.max() < _NOISE_SIGMAS
     needed = (
         scipy.special.gammainccinv(blocks, false_alarm) / blocks

@@ -51,7 +51,7 @@ TOLERATED_LOSS_DB = 0.2
 """Peak loss from position errors that is tolerated without autofocus, dB.
 
 The best RTK accuracy, half a centimetre in each log, causes a loss of 0.3 dB at L-band. A smaller loss is not visible
-in an image, and does not justify a job that reads all pairs of a flight together.
+in an image, and does not justify a step that reads all pairs of a flight together.
 """
 
 

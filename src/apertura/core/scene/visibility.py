@@ -85,8 +85,8 @@ def _blocked(antenna, row, column, highest, top, ground):  # type: ignore[no-unt
         if terrain > line + TOLERANCE_M:
             return True
         # `least` is a lower bound of the rest of a rising line, which is not blocked if it is above all terrain of the
-        # scene. Above all terrain of this block (and one pixel around it) the search skips to the last step inside the
-        # block.
+        # scene. If the line is above all terrain of this block and one pixel around it, the search skips to the last
+        # step inside the block.
         leap, least = 1, line - bend * steps
         if up > 0 and least > top:
             return False
