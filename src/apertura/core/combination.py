@@ -115,8 +115,8 @@ def clutter_reduction_db(single_db: Sequence[float], coherent_db: float) -> floa
 
 
 MOST_SETS_OF = 12
-"""Largest number of pairs of which all 4096 subsets are tried; of a larger number, those that agree with most others
-are used."""
+"""Largest number of pairs of which all 4096 subsets are tried; with more pairs, those that agree with most others are
+used."""
 
 _SURE = 3.09
 """Quantile of a normal variable, standard deviations, exceeded with probability 1/1000: above it a set is

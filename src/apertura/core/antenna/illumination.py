@@ -59,7 +59,7 @@ def illuminate(beams: Beams, aperture: Aperture, point_m: NDArray[np.float64]) -
     beams
         Beams of all pulses.
     aperture
-        Aperture of all pulses; of a larger number than 1024, an evenly spaced sample is evaluated.
+        Aperture of all pulses; for more than 1024 pulses, an evenly spaced sample is evaluated.
     point_m
         (point, 3) float64, metres.
     """

@@ -58,8 +58,8 @@ def band_limited_terms(
 
     Notes
     -----
-    Source: docs/theory.md, eq. 6. The error is -148 dB for a tone at the band edge. Computed in float64 by code that is
-    independent of all engines; with numpy if the compiled library is not available.
+    Source: docs/theory.md, eq. 6. The error is -148 dB for a tone at the band edge. The computation is in float64 and
+    independent of all engines; it uses numpy if the compiled library is not available.
     """
     terms = (_compiled_terms if available() else _terms)(profiles, np.ascontiguousarray(pixels, np.float64))
     if beams is not None:
@@ -336,7 +336,7 @@ def block_contributions(
     Notes
     -----
     Source: docs/theory/autofocus.md, eq. 4 and 5. The error is below -65 dB over the whole band of twice oversampled
-    profiles. Paths and carrier phase are computed in float64. Computed with numpy if the compiled library is not
+    profiles. Paths and carrier phase are computed in float64. The computation uses numpy if the compiled library is not
     available.
 
     Examples
@@ -464,7 +464,7 @@ def path_gradient(
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 6 to 8. numpy replaces the compiled library if that is not available.
+    Source: docs/theory/autofocus.md, eq. 6 to 8. The computation uses numpy if the compiled library is not available.
     """
     if places_m.shape != (*slope.shape, 3) or slope.ndim != 1:
         raise ValueError(f"{places_m.shape=}, {slope.shape=}: must be (point, 3) and (point,)")

@@ -263,7 +263,7 @@ class Profiles:
 
         Notes
         -----
-        Source: docs/theory/autofocus.md, eq. 3: an echo at path R is shifted to R + ∆ and gets the phase of R + ∆.
+        Source: docs/theory/autofocus.md, eq. 3: an echo at path R is shifted to R + ∆ and has the phase of R + ∆.
         """
         rotated = (
             PhaseRotated(self.samples, np.exp(-1j * self.wavenumber_rad_m * extra_path_m))

@@ -100,14 +100,14 @@ class Job:
     tile_px, threads
         Side of a tile, pixels; number of tiles formed at once.
     terrain
-        Terrain of the scene and its cheaper models.
+        Terrain of the scene and its simplified models.
     path_limit_m
         Longest total path inside the cyclic prefix.
     memory_bytes
         Memory limit of the imaging step.
     beams, illumination
         Weights from antenna beams and the integrated sector, and illumination by the beams, over all pulses; None
-        without.
+        without beams and sector.
     integration
         Integrated part of the flight; None for the whole flight.
     recorded
@@ -167,7 +167,7 @@ class Job:
 
     @property
     def share(self) -> float:
-        """Summed share of pixels × pulses."""
+        """Share of pixel-pulse combinations that is summed."""
         return 1.0 if self.integration is None else self.integration.share
 
     @property

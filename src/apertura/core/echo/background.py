@@ -96,8 +96,8 @@ def background_excess_db(read: Read, count: int, subcarriers: int) -> float:
 
     Notes
     -----
-    Source: docs/theory/background.md, eq. 2. Echoes of the scene cross zero Doppler no slower than the cells beside it,
-    and noise is white: neither raises the ratio.
+    Source: docs/theory/background.md, eq. 2. Echoes of the scene pass zero Doppler at least as fast as the neighbouring
+    cells, and noise is white: neither increases the ratio.
 
     Examples
     --------

@@ -167,9 +167,9 @@ def compress(
 
     Notes
     -----
-    Source: docs/theory.md, eq. 4. Referring the profile to the band centre halves the bandwidth that interpolation
-    must handle; backprojection applies the factor exp(+j2πf_mid·ρ/v). If the swath is only a part of the unambiguous
-    range, the subcarriers are first decimated to it (docs/theory.md, eq. 4a), at the accuracy of complex64.
+    Source: docs/theory.md, eq. 4. With the profile referenced to the band centre, the bandwidth for interpolation is
+    halved; backprojection applies the factor exp(+j2πf_mid·ρ/v). If the swath is only a part of the unambiguous range,
+    the subcarriers are first decimated to it (docs/theory.md, eq. 4a), at the accuracy of complex64.
 
     Examples
     --------

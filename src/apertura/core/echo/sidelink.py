@@ -50,8 +50,8 @@ def divide(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = Non
 
     Notes
     -----
-    Source: docs/theory/echo_methods.md, "Corrections". The only method that is exact for any transmit ripple and for
-    a wrong code.
+    Source: docs/theory/echo_methods.md, "Corrections". This is the only method that is exact for any transmit ripple
+    and for a wrong code.
 
     Examples
     --------

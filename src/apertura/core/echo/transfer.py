@@ -1,8 +1,8 @@
 """Transfer functions from the captures of a pair: with the code alone, or corrected by the sidelink.
 
 Captures are read in two passes: the first measures clock and sidelink, a few numbers per pulse; the second computes
-transfer functions from the captures and these numbers, block by block and on demand. Memory holds one block of
-captures, for any length of the flight.
+transfer functions from the captures and these numbers, block by block and on demand. Only one block of captures is in
+memory at a time, for any length of the flight.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -234,7 +234,7 @@ def transfer_by_sidelink(
     Notes
     -----
     Source: docs/theory/echo_methods.md. The clock is measured on up to 4096 captures, in 16 groups spread over the
-    flight, the state of the sidelink on all captures.
+    flight; the state of the sidelink is measured on all captures.
     """
     # First pass: measure the clock on a sample of captures, the state of the sidelink on all.
     demodulator = Demodulator(inverse, numerology, symbol_samples)

@@ -116,7 +116,7 @@ class Detection:
     sample
         Its first sample, counted from the start of the recording.
     score
-        Squared normalised correlation, 0…1: share of the energy that the preamble explains.
+        Squared normalised correlation, 0…1: share of the energy that is due to the preamble.
     snr_db
         SNR per sample, derived from the score.
     """

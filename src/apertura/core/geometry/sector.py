@@ -181,7 +181,7 @@ class Sector:
         return edge((self.outer - np.abs(self.place(aperture, points_m))) / (self.outer - self.inner))
 
     def over(self, aperture: Aperture) -> Weigh:
-        """Return a function of a slice of pulses and points that gives their weights."""
+        """Return a function that computes the weights of a slice of pulses at points."""
         return lambda pulses, points_m: self[pulses].weight(aperture[pulses], points_m)
 
     def slack(

@@ -89,7 +89,7 @@ class Removal:
 
     @property
     def flags(self) -> Flags:
-        """`background` if arcs remain in the image, `background_loss` if targets lose by the removal."""
+        """Flags: `background` if arcs remain in the image, `background_loss` if targets lose power by the removal."""
         flags, removed = Flags(), self.background is not None
         if not removed and self.gain_db >= FLAGGED_GAIN_DB:
             flags["background"] = f"{self.gain_db:.1f} dB; {self.reason}"

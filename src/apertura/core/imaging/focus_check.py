@@ -513,8 +513,8 @@ def focus_flags(report: dict[str, Any], expected: Effect) -> Flags:
 
     Notes
     -----
-    Source: docs/theory/focus.md, "Focus of a point". Both losses have a standard deviation: that of the measured loss
-    is estimated from its points, that of the expected loss is its variation between flights.
+    Source: docs/theory/focus.md, "Focus of a point". The standard deviation of the measured loss is estimated from its
+    points; that of the expected loss describes its variation between flights.
     """
     flags = Flags({"echo_outside_scene": report["elsewhere"]} if "elsewhere" in report else {})
     budget = f"{abs(expected.loss_db):.1f} ± {expected.loss_std_db:.1f} dB expected from the error budget"

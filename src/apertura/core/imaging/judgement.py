@@ -99,7 +99,7 @@ def judge(
         For a lazy selection or function of it, the whole image is assessed.
     position_std_m
         Standard deviation of the phase centres in each axis, metres, from which the expected loss is computed
-        (default: not stated, no loss expected).
+        (default: not stated; no loss is expected).
     time_s
         (pulse,) float64, transmit times of the pulses, seconds; position errors have a correlation time of one second.
 

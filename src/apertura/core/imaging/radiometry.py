@@ -196,7 +196,7 @@ class Calibration:
     aperture, beams
         All pulses, and their weights in image formation: antennas and sector.
     count
-        M, by which the image's sum was divided.
+        M, divisor of the image's sum.
     constant
         K of eq. 2, configured or measured.
     cell_m2

@@ -100,7 +100,7 @@ def carriers_of(formation: Formation) -> NDArray[np.float64]:
 
 
 def ground_axes(formation: Formation, row: float, column: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return a point on the terrain, (3,) metres, and unit vectors along the grid's east and north there, (2, 3)."""
+    """Return a point on the terrain, (3,) metres, and unit vectors along the grid's east and north at it, (2, 3)."""
     point, east, north = formation.positions_at([row, row, row - 0.5], [column, column + 0.5, column])
     axes = np.stack([east - point, north - point])
     return point, axes / np.linalg.norm(axes, axis=1, keepdims=True)

@@ -99,7 +99,7 @@ class SettingSearch:
         return {option: value for option, value in self.options.get(engine, {}).items() if value is not None}
 
     def fallbacks(self, chosen: Setting) -> tuple[Setting, ...]:
-        """Return the cheapest setting for each gain of 6 dB, regardless of the request, ending with the exact sum."""
+        """Return the cheapest setting per 6 dB of accuracy, regardless of the request; the last is the exact sum."""
         if chosen.engine == "reference":
             return ()
         is_restricted = self.engine is not None or any(self._requested(engine) for engine in self.options)
@@ -139,8 +139,8 @@ class SettingSearch:
     def _engines(self) -> list[str]:
         """Return the available engines that match the request.
 
-        Engines without a measured cost are included only if requested. A substitute engine that is compiled at run
-        time, for ten seconds, is excluded if the engine that it substitutes was built.
+        Engines without a measured cost are included only if requested. A substitute engine, whose compilation at run
+        time takes ten seconds, is excluded if the engine for which it is the substitute was built.
         """
         reads = {"profiles", "phase_history"} if self.job.recorded else {"profiles"}
         runnable = [name for name in ENGINES if load_engine(name).available() and load_engine(name).READS in reads]

@@ -12,7 +12,7 @@ from apertura.core.quality.measures import BlockRaster
 from apertura.core.quality.point_targets import PATCH_PX, find_peak
 
 SPECKLE = 0.06
-"""Power around a bright point relative to its own, above which it may be speckle: 0.07 for the brightest of 10⁶ pixels.
+"""Power around a bright point relative to the point, above which it may be speckle: 0.07 for the brightest of 10⁶.
 """
 
 # ---- Point response at other points

@@ -161,7 +161,7 @@ def position_lines(paths: PointPaths, nodes: Sequence[NodePositions], *, sidelin
     Parameters
     ----------
     paths
-        Paths to a point in the middle of the scene.
+        Paths to a point at the scene centre.
     nodes
         One node that transmits and receives, or a transmitter and a receiver with independent errors.
     sidelink
@@ -246,7 +246,7 @@ def attitude_lines(paths: PointPaths, nodes: Sequence[NodeAttitude | None], *, s
     Parameters
     ----------
     paths
-        Paths to a point in the middle of the scene.
+        Paths to a point at the scene centre.
     nodes
         One node that transmits and receives, or a transmitter and a receiver, at the pulses of `paths`; None for a node
         without lever arms.
@@ -306,7 +306,7 @@ def antenna_line(paths: PointPaths, phase_rad: NDArray[np.float64], weight: NDAr
     Parameters
     ----------
     paths
-        Paths to a point in the middle of the scene.
+        Paths to a point at the scene centre.
     phase_rad, weight
         (pulse,) float64: sum of the phases, and product of the fields, of both antennas towards the point; pulses with
         a field below `LEAST_FIELD` of the strongest are excluded.
@@ -344,7 +344,7 @@ def offset_line(
     Parameters
     ----------
     paths
-        Paths to a point in the middle of the scene.
+        Paths to a point at the scene centre.
     cause
         Name of the error source.
     slope
@@ -374,7 +374,7 @@ def height_line(paths: PointPaths, std_m: float | None, *, expected_db: float = 
     Parameters
     ----------
     paths
-        Paths to a point in the middle of the scene.
+        Paths to a point at the scene centre.
     std_m
         Configured standard deviation of the heights, metres; None: not configured.
     expected_db

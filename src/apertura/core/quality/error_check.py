@@ -212,7 +212,7 @@ def _level(block: NDArray[np.complexfloating]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """Exact values at the pixels drawn by `random_pixels`, independent of the values of the image.
+    """Exact values at the pixels drawn by `random_pixels`, which do not depend on the values of the image.
 
     Attributes
     ----------
@@ -252,7 +252,7 @@ class Certificate:
     ) -> ErrorBound:
         """Estimate the error of the whole image from its random pixels and `bright` pixels drawn by `brightness`.
 
-        `bright` are (pixel, 2) int64 rows and columns, `exact` (pixel,) complex128 the exact sum there.
+        `bright`: (pixel, 2) int64, rows and columns. `exact`: (pixel,) complex128, the exact sum at these pixels.
         """
         pixels = np.concatenate([self.pixels, bright])
         values = values_at(image, pixels)

@@ -149,7 +149,7 @@ class Dem(Terrain):
         return np.asarray(a * x + b * y + c - 0.5), np.asarray(d * x + e * y + f - 0.5)
 
     def _shift(self, crs: str, xy_m: Floats) -> Floats:
-        """Return the offset from heights of the DEM to those of a grid in `crs`, above WGS 84, metres."""
+        """Return the offset that converts heights of the DEM to heights of a grid in `crs`, above WGS 84, metres."""
         if crs == LOCAL:
             return np.zeros(xy_m.shape[:-1])
         longitude, latitude = _transformer(crs, CRS(self.geodetic).to_2d()).transform(xy_m[..., 0], xy_m[..., 1])

@@ -100,7 +100,8 @@ def _blocked(antenna, row, column, highest, top, ground):  # type: ignore[no-unt
 def mark_shadow(mask, first, legs, highest, ground):  # type: ignore[no-untyped-def]
     """Set `SHADOW` in `mask`, (row, column) uint8 with first pixel `first`, where most pulses are blocked.
 
-    A pulse is blocked if its line of sight to the transmitter or to the receiver is blocked.
+    A pulse is blocked if its line of sight to the transmitter or to the receiver is blocked. A pixel is in shadow if
+    more than half of the pulses are blocked.
     """
     pulses, top = legs.shape[0], highest.max()
     for i in range(mask.shape[0]):
@@ -158,7 +159,7 @@ def _in_layover(direction, legs, pixel, extreme, ground):  # type: ignore[no-unt
 
 @numba.njit(cache=True, nogil=True)
 def _path_gradient(legs, pixel, height_m, spacing):  # type: ignore[no-untyped-def]
-    """Return the horizontal gradient of the total path along rows and columns; its direction is the line of sight."""
+    """Return the horizontal gradient of the total path by row and column, which gives the horizontal line of sight."""
     down, right = 0.0, 0.0
     for leg in range(2):
         south, east = (pixel[0] - legs[leg, 0]) * spacing, (pixel[1] - legs[leg, 1]) * spacing

@@ -1,8 +1,8 @@
 """Backprojection on an NVIDIA GPU with range tables and one thread block per patch of pixels; needs extra ``cuda``.
 
 `prepare` stores profiles and filters. With the first tile they are expanded on the device to tables: cells of
-polynomials that include the carrier (docs/theory/engine.md, "Cells"). `form` starts a thread block for each patch of 16
-× 16 pixels. Paths are computed by a series about the patch's middle ("A GPU", eq. 8), or exactly in float64 if the
+polynomials that include the carrier (docs/theory/engine.md, "Cells"). `form` starts a thread block for each patch of
+16 × 16 pixels. Paths are computed by a series about the patch's middle ("A GPU", eq. 8), or exactly in float64 if the
 error of the series is too large, and weighted by beams and sector. The kernels in `cuda_kernels` are compiled at their
 first use; `candidates` predicts error and cost.
 """
@@ -345,7 +345,7 @@ def form(
         Tables from `prepare`.
     pixels
         (y, x, 3) float64, metres, in the frame of the phase centres, on any surface. A tile of a larger grid that
-        starts at multiples of 16 pixels gets the same bits as in the larger grid.
+        starts at multiples of 16 pixels has the same bits as in the larger grid.
     beams
         Weight of each pulse at each pixel; none by default. Pulses whose beam or sector does not illuminate a patch
         cost little.

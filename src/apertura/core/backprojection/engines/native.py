@@ -3,9 +3,9 @@
 1. `prepare` converts range profiles to tables (native/expand.hpp): each cell contains the least-squares polynomial of
    the profile, times the carrier (docs/theory/engine.md, "Cells"; `range_interpolation` designs the filters).
 2. `form` sums the tables over patches of 16 × 16 pixels (native/patch.cpp, batch.hpp). Paths are polynomials in blocks
-   of 4 × 4 pixels with one curvature for the patch or one for each block, or exact in float64: the cheapest within
-   `tolerance_rad` ("Paths"). Beam weights are polynomials over the patch if they are smooth (eq. 7), sector weights
-   polynomials at the edge of the sector (docs/theory/integration.md, eq. 3).
+   of 4 × 4 pixels with one curvature for the patch or one for each block, or are computed exactly in float64, whichever
+   has the lowest cost within `tolerance_rad` ("Paths"). Beam weights are polynomials over the patch if they are smooth
+   (eq. 7), sector weights polynomials at the edge of the sector (docs/theory/integration.md, eq. 3).
 3. `candidates` predicts the share of each path variant, error and cost (docs/theory/planner.md).
 
 `prepare` and `form` release the GIL and start no threads. `available` returns False if no compiler was present at
@@ -141,7 +141,7 @@ def form(
         Tables from `prepare`.
     pixels
         (y, x, 3) float64, metres, in the frame of the phase centres (ECEF or local), on any surface. A tile of a
-        larger grid that starts at multiples of 16 pixels gets the same bits as in the larger grid.
+        larger grid that starts at multiples of 16 pixels has the same bits as in the larger grid.
     beams
         Weight of each pulse at each pixel; none by default. Pulses whose beam or sector does not illuminate a patch
         cost little.

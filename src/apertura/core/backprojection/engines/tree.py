@@ -5,10 +5,10 @@ reference pulse (docs/theory/tree.md, eq. 3 and 4). It is therefore computed at 
 interpolated:
 
 1. **Surface** (`tree_geometry`). The pixel positions of a tile are approximated by a plane or by Legendre polynomials
-of degree 6.
+   of degree 6.
 2. **Plan** (native/tree_plan.hpp). Every subaperture of each level is assigned the smallest number of nodes that
-supports its band (4b), and every leaf of 64 pulses the smallest number of virtual pulses (8). The highest level is that
-at which 128 nodes are sufficient.
+   supports its band (4b), and every leaf of 64 pulses the smallest number of virtual pulses (8). The highest level is
+   the last at which 128 nodes are sufficient.
 3. **Leaves** (native/tree_leaf.hpp). The pulses of a leaf are aligned to the tile's centre (7), presummed to virtual
    pulses (8), expanded to cells and summed at the nodes of the leaf, with the weights of antennas and sector (13).
 4. **Merges** (native/tree_merge.hpp). Subapertures of 64, 256 and `chunk` pulses are merged by two small matrix
