@@ -125,7 +125,7 @@ def recording_files(folder: Path, node: str) -> tuple[Path, ...]:
 
 
 def log_format(path: Path, options: LogOptions = DEFAULT_OPTIONS) -> str:
-    """Determine the format of a log, a key of `TRACKS`: as configured, otherwise by suffix and heading.
+    """Determine the format of a log, a key of `TRACKS`: as configured, otherwise by suffix and first bytes.
 
     Raises
     ------
