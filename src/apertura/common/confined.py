@@ -71,7 +71,7 @@ class ConfinedPath(PosixPath):
         Parameters
         ----------
         folder
-            The root folder; its path may contain links or be one.
+            The root folder; its path may be or contain a link.
         elsewhere
             Name of a subfolder → folder outside the root that replaces the subfolder, accessed under the same rules.
         """
@@ -417,9 +417,9 @@ class ConfinedPath(PosixPath):
         yield from (self / name for name, _ in self._entries())
 
     def walk(self, *_: Any, **__: Any) -> Iterator[tuple["ConfinedPath", list[str], list[str]]]:
-        """Yield this folder and all folders below it, with sorted names of subfolders and other entries, without links.
+        """Yield this folder and all folders below it, with sorted names of subfolders and other entries.
 
-        Nothing is yielded for a missing folder.
+        Links are not followed. Nothing is yielded for a missing folder.
         """
         entries = self._entries()
         if not entries and not self.is_dir():

@@ -50,10 +50,7 @@ def leave_status(status: int) -> None:
     """Report the exit status of a step to its run, if any."""
     if STATUS_FILE in os.environ and status:
         file = ConfinedPath.referenced(os.environ[STATUS_FILE])
-        with (
-            suppress(OSError, CampaignError),
-            file.open("a", encoding="utf-8") as stream,
-        ):  # no such file on another node
+        with suppress(OSError, CampaignError), file.open("a", encoding="utf-8") as stream:  # absent on another node
             stream.write(f"{status}\n")
 
 
@@ -91,7 +88,7 @@ def ended_by_signals() -> Iterator[None]:
 #
 # Python and libraries load modules and settings from the working folder (``yaml.py``, numba's ``.numba_config.yaml``
 # with its cache of pickled code, ``matplotlibrc``). Users run commands in campaign folders, and Snakemake starts every
-# step in one.
+# step in such a folder.
 
 SAFE_PATH = "PYTHONSAFEPATH"
 """Environment variable that prevents Python, including ``python -m snakemake``, from importing from the working
@@ -338,7 +335,7 @@ def holder(root: Path) -> str | None:
 
 
 def _take(lock: IO[str]) -> None:
-    """Acquire the lock; retry while `holder` holds it for an instant."""
+    """Acquire the lock; retry, because `holder` acquires it for an instant."""
     for attempt in range(_TRIES):
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

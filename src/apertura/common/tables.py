@@ -1,7 +1,7 @@
 """CSV tables of the studies: one dataclass instance per row, one file per table; a file that exists is complete.
 
-The csv module is used instead of pandas: importing pandas takes a second of a job that takes a few, and pandas converts
-text columns that look like numbers.
+The csv module is used instead of pandas: importing pandas takes one second, a large part of a job of a few seconds, and
+pandas converts text columns that resemble numbers.
 """
 
 import csv

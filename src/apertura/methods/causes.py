@@ -119,7 +119,7 @@ HEIGHT = Quantity(
     ("above", "below"),
     (50.0, 47.0, 20.0, 10.0, 5.0, 4.0, 3.0, 2.5, 2.0, 1.5, 1.0, 0.5),
     std=3.0,
-    # an error of 10 m or more may come from geoid heights taken for ellipsoidal heights, or the reverse
+    # an error of 10 m or more may be due to geoid heights that are interpreted as ellipsoidal, or the reverse
     question=lambda height_m: ": another vertical datum?" if abs(height_m) >= 10.0 else "",
 )
 PREFIX = Quantity(
@@ -182,7 +182,7 @@ class Cause:
 
 
 def late_logs(nodes: Sequence[str], flown: Mapping[str, tuple[Floats, Floats]]) -> Cause:
-    """Return the cause that the logs of the given nodes have one common time delay.
+    """Return the cause of a time delay that is common to the logs of the given nodes.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ def late_logs(nodes: Sequence[str], flown: Mapping[str, tuple[Floats, Floats]]) 
 
 
 def other_arm(node: str, time_s: Floats, body_axes: Floats) -> Cause:
-    """Return the cause that the lever arms of a node, or its attitude, have a constant error.
+    """Return the cause of a constant error of the lever arms or of the attitude of a node.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ def other_arm(node: str, time_s: Floats, body_axes: Floats) -> Cause:
 
 
 def other_height(nodes: Sequence[str], time_s: Floats, up: Floats) -> Cause:
-    """Return the cause that the terrain lies higher than configured, as if all nodes flew lower.
+    """Return the cause of a terrain height above the configured one, equivalent to lower heights of all nodes.
 
     `up` is the (3,) unit vector in the frame.
     """

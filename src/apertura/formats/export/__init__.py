@@ -70,7 +70,7 @@ class Export:
         Function that writes the file, ``write(path, raster, transform=…, crs=…, tags=…, title=…)``; see
         `apertura.formats.export.cog.write_slc`.
     pictured
-        True if the workflow report shows the file.
+        True if the workflow report contains the file as a picture.
     opened
         Hint for opening the file, shown in the summary; empty: the summary does not list the file.
     mosaicked
@@ -323,8 +323,8 @@ def write_exports(
     folder
         Output folder.
     rasters, titles
-        Source → (y, x) raster on the campaign's grid, and its title; of ``radiometry`` and ``multilook`` only the
-        requested ones.
+        Source → (y, x) raster on the campaign's grid, and its title; of kinds ``radiometry`` and ``multilook``, only
+        the requested sources.
     tags
         Tags of every file, name → text.
     radiometry

@@ -336,7 +336,7 @@ def _draw_overview(
 
 
 def _draw_direction(layout: MapLayout, leg_m: NDArray[np.float64], colour: Any) -> None:
-    """Draw an arrow in the direction of flight at the middle of a leg."""
+    """Draw an arrow in the direction of flight at the centre of a track segment."""
     middle = max(1, len(leg_m) // 2)
     if len(leg_m) > 1 and (leg_m[middle, :2] != leg_m[middle - 1, :2]).any():
         arrow = {"arrowstyle": "-|>", "color": colour, "mutation_scale": 12}

@@ -80,7 +80,7 @@ class MapLayout:
         return cls(figure, axes, bounds, scale, local=local)
 
     def beside(self, bounds: tuple[float, float, float, float] | None = None) -> "MapLayout":
-        """Add the next map to the right of this one: with the same bounds, or with `bounds` at the largest scale."""
+        """Add a map to the right of this map, with the same bounds or with `bounds` at the largest scale."""
         width, height = self.figure.get_size_inches()
         room = max((self.bounds[2] - self.bounds[0]) * self.inch_per_m, LEAST_WIDTH), height - TOP - BOTTOM
         left = self.left + room[0] + RIGHT + LEFT
@@ -204,7 +204,7 @@ def flag_words(flags: Sequence[str], most: int) -> str:
 
 
 def round_origin(low_m: float, high_m: float) -> float:
-    """Return a round offset of coordinates at or below `low_m`; 0 if the coordinates are short without one.
+    """Return a round offset of coordinates at or below `low_m`; 0 if the coordinates have few digits without an offset.
 
     Examples
     --------

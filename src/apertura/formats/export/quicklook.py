@@ -223,5 +223,5 @@ def below_peak(mean: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     if not brightest.size:
         return decibel, 0.0
     decibel -= brightest[-1]
-    fourth = float(brightest[0] - brightest[-1])  # a target covers several dots, an outlier may be a single one
+    fourth = float(brightest[0] - brightest[-1])  # a target covers several dots, an outlier may cover a single dot
     return decibel, 0.0 if fourth > -20 else 5.0 * ceil(fourth / 5)

@@ -78,7 +78,7 @@ def read_cphd(paths: Sequence[Path], *, pair: str, described: Mapping[str, Any])
 
 
 def of_channel(path: Path, fields: dict[str, NDArray[Any]], requested: str | None) -> dict[str, NDArray[Any]]:
-    """Select the fields of the requested channel, or of the only one."""
+    """Select the fields of the requested channel, or of the only channel."""
     names = list(map(str, fields["channels"]))
     if names.count(requested or "") != 1 and (requested is not None or len(names) != 1):
         raise CampaignError(

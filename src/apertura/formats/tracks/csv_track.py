@@ -353,7 +353,7 @@ def _error(found: str, log: _Log, remedy: str) -> CampaignError:
 
 
 def _missing_column(name: str, table: pd.DataFrame, log: _Log) -> CampaignError:
-    """Return the error for a log without a column: its columns, and the setting that maps one of them."""
+    """Return the error for a missing column, with the columns of the log and the setting that maps one of them."""
     key = f"nodes.{log.node}.log.columns"
     remedy = (
         f"If the column has another name, set {key}: {{{name}: NAME}}; to try a name, use --set columns.{name}=NAME."

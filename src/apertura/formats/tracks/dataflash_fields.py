@@ -54,7 +54,7 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
         name = str(path)
         if is_binary:
             spans, ended = _foreign(data)
-            if spans:  # the parser stops at an unknown type, and reads files only, no bytes
+            if spans:  # the parser stops at an unknown type, and reads only from files
                 file = stack.enter_context(tempfile.NamedTemporaryFile())
                 file.write(without(data[:ended], spans))
                 file.flush()

@@ -26,7 +26,7 @@ _POSITIONS = {
     "ecef": ("x-ecef(m)", "y-ecef(m)", "z-ecef(m)"),
     "baseline": ("e-baseline(m)", "n-baseline(m)", "u-baseline(m)"),
 }
-"""Position format → its columns; an angle in degrees, minutes and seconds takes three cells."""
+"""Position format → its columns; an angle in degrees, minutes and seconds occupies three cells."""
 
 _STD = ("sdn(m)", "sde(m)", "sdu(m)")
 _STD_ECEF = ("sdx(m)", "sdy(m)", "sdz(m)", "sdxy(m)", "sdyz(m)", "sdzx(m)")

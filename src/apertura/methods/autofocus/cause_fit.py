@@ -56,7 +56,7 @@ class CausePrior(Prior):
         return {node: np.tensordot(unknowns, shape, axes=(-1, 0)) for node, shape in self.shapes_m.items()}
 
     def adjoint(self, gradient: Mapping[str, Floats]) -> Floats:
-        """Return (..., size) derivatives by the unknowns from derivatives by the corrections of each node."""
+        """Convert derivatives with respect to the corrections of each node to (..., size), the unknowns."""
         return np.asarray(
             sum(np.tensordot(gradient[node], shape, axes=((-2, -1), (1, 2))) for node, shape in self.shapes_m.items())
         )

@@ -263,7 +263,7 @@ class SpeckleAgreement:
     weight: float = WEIGHT
 
     def __call__(self, tracks: Tracks) -> tuple[float, dict[str, Floats]]:
-        """Return the value and its derivatives by the corrections, node → (knot, 3)."""
+        """Return the value and its derivatives with respect to the corrections, node → (knot, 3)."""
         moved, coherences = self._evaluate(tracks)
         total = sum(tile.cells * coherence for tile, (coherence, _) in zip(self.tiles, coherences, strict=True))
         rotation = np.exp(-1j * np.angle(total))

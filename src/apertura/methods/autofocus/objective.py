@@ -201,7 +201,7 @@ class Contribution:
     blocks
         Illuminating blocks of the pair.
     slopes
-        Node → (block, 3) float64, gradient of the path to the patch by the node's position (eq. 2).
+        Node → (block, 3) float64, gradient of the path to the patch with respect to the node's position (eq. 2).
     wavenumber
         2πf_mid/c, rad/m.
     band
@@ -299,7 +299,7 @@ class Sharpness:
     used: NDArray[np.bool_]
 
     def __call__(self, tracks: Tracks) -> tuple[float, dict[str, Floats]]:
-        """Return the value and its derivatives by the corrections, node → (knot, 3)."""
+        """Return the value and its derivatives with respect to the corrections, node → (knot, 3)."""
         total = 0.0
         gradient = {node: np.zeros_like(track) for node, track in tracks.items()}
         for blocks, patches, statistics in zip(self.pairs, self.cached, self.statistics, strict=True):
@@ -325,7 +325,7 @@ def phases(patch: Contribution, moved: Tracks) -> Floats:
 
 
 def _patch(patch: Contribution, cached: PatchImage, moved: Tracks) -> tuple[float, Floats]:
-    """Return the objective of a patch and its derivative by the phase of each block."""
+    """Return the objective of a patch and its derivative with respect to the phase of each block."""
     rotation = np.exp(1j * phases(patch, moved)).astype(np.complex64)
     image = patch.values @ rotation  # I = B e^{jθ}
     power = (image.real**2 + image.imag**2).astype(np.float64)

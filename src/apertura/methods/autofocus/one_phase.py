@@ -180,7 +180,7 @@ def minimum_entropy(patches: Patches) -> Floats:
 
 
 def entropy(lines: NDArray[np.complex128], phase: Floats) -> tuple[float, Floats]:
-    """Return the entropy of image lines and its derivative by the phase of each block.
+    """Return the entropy of image lines and its derivative with respect to the phase of each block.
 
     Parameters
     ----------

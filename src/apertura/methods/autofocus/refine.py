@@ -284,7 +284,7 @@ LEAST_FURTHER_DB = 0.05
 """Least contrast gain of held-out patches over the previous round for another round, dB."""
 
 _BETWEEN_KNOTS_RAD2 = 0.05
-"""Phase variance due to errors between knots; it costs 0.2 dB."""
+"""Phase variance due to errors between knots, which causes a loss of 0.2 dB."""
 
 _MOST_KNOTS_PER_CORRELATION_TIME = (
     32  # sufficient for 4 cm at L-band; the error budget contains the residual of larger errors
@@ -311,7 +311,7 @@ def refine(
     errors
         Node → error statistics of its log.
     reference_points
-        Points of known position, which fix the position of the image.
+        Points of known position, which determine the position of the image.
     causes
         Possible errors of configured constants, tried if errors of the logs alone do not explain the images.
 

@@ -55,7 +55,7 @@ class Gauge:
     smooth: "SmoothMotions"
 
     def project_out(self, unknowns: Floats) -> Floats:
-        """Return unknowns, or a gradient, without their component along the modes."""
+        """Return unknowns, or a gradient, without the component along the modes."""
         return np.asarray(unknowns - self.modes.T @ (self.modes @ unknowns))
 
     @property

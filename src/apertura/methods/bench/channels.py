@@ -16,7 +16,7 @@ from apertura.core.echo.demodulate import Numerology
 # ---- Limits ---------------------------------------------------------------------------------------------------------
 
 SIGMAS = 5.0
-"""Standard deviations of a significant measurement: less than one false flag in 10⁴ bench reports of a dozen lines."""
+"""Standard deviations above which a measurement is significant: less than one false flag in 10⁴ reports of 12 lines."""
 
 MISSED_SHARE = 0.01
 """Largest share of missed pulses among the pulses that a node should have recorded."""
@@ -182,7 +182,7 @@ def measure_channel(name: str, blocks: Iterable[Samples], numerology: Numerology
     # N random products is about √N, and three times this value is significant.
     floor = 3 / (2 * np.sqrt(numerology.numbers.size)) if mirrored.mean() > 0.5 else 0.0
     power = max(power, 1e-30)
-    # Eq. 1a: constant bits between changing bits; constant bits below the lowest changing one are padding.
+    # Eq. 1a: constant bits between changing bits; constant bits below the lowest changing bit are padding.
     changing = ones & zeros
     stuck = tuple(
         bit for bit in range(changing.bit_length()) if changing & ((1 << bit) - 1) != 0 and not changing >> bit & 1

@@ -29,7 +29,7 @@ WEAK_DB = 10.0
 """Least SNR of a compressed pulse, dB; below it Γ is less than 0.91 and phases scatter by 0.22 rad."""
 
 PHASE_RAD = 0.05
-"""Largest phase scatter beyond noise, rms, and largest phase drift over the recording; each costs an image 0.01 dB."""
+"""Largest phase scatter beyond noise, rms, and largest phase drift over the recording; each causes 0.01 dB of loss."""
 
 AMPLITUDE_DB = 0.5
 """Largest amplitude scatter beyond noise, dB rms; tight connectors cause some hundredths of a dB."""
@@ -44,7 +44,7 @@ TONE_DB = 13.0
 """Largest pulse-to-pulse change of a subcarrier relative to the median, dB; with 20 pulses, noise reaches 5 dB."""
 
 UNLOCKED_PPM = 0.3
-"""Largest offset between locked oscillators; disciplined ones (GNSS, 10 MHz cable) stay below 0.1 ppm."""
+"""Largest offset between locked oscillators; the offset of disciplined ones (GNSS, 10 MHz cable) is below 0.1 ppm."""
 
 DRIFT_PPM = 0.02
 """Largest clock drift over the recording; a carrier of 1.2 GHz then drifts by 24 Hz."""

@@ -199,7 +199,7 @@ def _looks(one: NDArray[np.complex128], other: NDArray[np.complex128], window: i
 
 def _correlation(image: NDArray[np.complex128], window: int) -> NDArray[np.complex128]:
     """Return the autocorrelation at lags below `window` along both axes, 1 at lag 0."""
-    # Zero-padded, else the correlation would be circular.
+    # Zero-padded, because the correlation is circular otherwise.
     padded = [scipy.fft.next_fast_len(size + window - 1) for size in image.shape]
     lags = np.arange(1 - window, window)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -82,7 +82,7 @@ MOST_RESIDUES = 1e-3
 """Largest number of residues per loop of four pixels."""
 
 MOST_FOLDED = 0.01
-"""Largest share of points imaged by several pixels, relative to the unwrapped pixels."""
+"""Largest number of points imaged at several pixels, relative to the number of unwrapped pixels."""
 
 
 def interferogram_flags(measured: InterferogramCounts) -> Flags:
@@ -246,8 +246,8 @@ def form_interferogram(
         replace(
             point,
             measured_rad=float(phase[point.row, point.column]) - centre,
-            # decorrelation about a point is spread over all looks of the window, of which the point occupies one; the
-            # point response lies in the middle of the window and is not truncated
+            # decorrelation about a point is spread over all looks of the window, one of which contains the point; the
+            # point response lies at the centre of the window and is not truncated
             std_rad=float(phase_std(unbiased(magnitude[point.row, point.column], looks), looks)) / MARGIN,
         )
         for point in ground.known

@@ -243,8 +243,8 @@ MARGIN = 1.4
 """Factor on the Cramér-Rao bound of the phase; the phase scatter of simulated terrain stays below it."""
 
 
-_STEPS = 30  # iterations of the fixed-point search for the pixel that images a point
-_MOST_COVERED = 1.5  # largest number of pixels that image a point; 2 indicates layover
+_STEPS = 30  # iterations of the fixed-point search for the pixel at which a point is imaged
+_MOST_COVERED = 1.5  # largest number of pixels at which a point is imaged; 2 indicates layover
 _TOLERANCE_PX = 0.05  # tolerance of the fixed-point search
 
 
@@ -308,11 +308,11 @@ class PlacedHeights:
     Attributes
     ----------
     height
-        (y, x) float64, terrain height at the centre of each pixel, metres; NaN if no pixel or several pixels image it.
+        (y, x) float64, terrain height at the centre of each pixel, metres; NaN unless imaged at exactly one pixel.
     std
         (y, x) float64, standard deviation due to the scatter of phase and level, metres.
     folded
-        Number of points imaged by more than one pixel at these heights, due to layover or unwrapping errors.
+        Number of points that these heights image at more than one pixel, due to layover or unwrapping errors.
     """
 
     height: Floats
@@ -328,7 +328,7 @@ def place_heights(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Flo
     ground_m
         (y, x) float64, heights assumed in image formation.
     rise_m, std_m
-        (y, x) float64, height of the terrain imaged by a pixel above the assumed height, NaN if unknown; and its
+        (y, x) float64, height of the terrain imaged at a pixel above the assumed height, NaN if unknown; and its
         standard deviation.
     shift_px
         (y, x, 2) float64, rows and columns from a pixel to the terrain imaged there, per metre of rise.
@@ -350,7 +350,7 @@ def place_heights(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Flo
     if not known.any():
         return PlacedHeights(np.full(rise_m.shape, np.nan), np.full(rise_m.shape, np.nan), 0)
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
-    # Pixel that images each point, eq. 16, by fixed-point iteration; an unknown rise is replaced by the nearest known.
+    # Pixel at which each point is imaged, eq. 16, by fixed-point iteration; unknown rises are set to the nearest known.
     shift = np.moveaxis(shift_px, -1, 0) * rise_m[tuple(nearest)]
     position = np.stack(np.meshgrid(*map(np.arange, rise_m.shape), indexing="ij")).astype(np.float64)
     imaged_at, error_px = position, np.full(rise_m.shape, np.inf)
@@ -359,7 +359,7 @@ def place_heights(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Flo
         error_px, imaged_at = np.abs(target - imaged_at).max(axis=0), target
         if not (error_px > _TOLERANCE_PX).any():
             break
-    # Points imaged by several pixels, and points without convergence, have no height.
+    # Points imaged at several pixels, and points without convergence, have no height.
     folds = _covered(position + shift, np.abs(_stretch(shift)) * known) > _MOST_COVERED
     converged = (error_px <= _TOLERANCE_PX) & ~folds
     height, std = (map_coordinates(values, imaged_at, order=1, cval=np.nan) for values in (ground_m + rise_m, std_m))
@@ -368,7 +368,7 @@ def place_heights(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Flo
 
 
 def _covered(positions: Floats, area: Floats) -> Floats:
-    """Return the number of pixels that image each point: mean over 3 × 3 pixels of the areas mapped to the point."""
+    """Return the number of pixels at which a point is imaged: mean over 3 × 3 pixels of the areas mapped to it."""
     from scipy.ndimage import uniform_filter
 
     inside = np.logical_and.reduce(
@@ -380,7 +380,7 @@ def _covered(positions: Floats, area: Floats) -> Floats:
 
 
 def _stretch(shift: Floats) -> Floats:
-    """Return the terrain area imaged by a pixel, in pixels; negative in layover."""
+    """Return the terrain area imaged at a pixel, in pixels; negative in layover."""
     size = shift.shape[1:]
     rows, columns = (
         [np.gradient(component, axis=axis) if size[axis] > 1 else np.zeros(size) for axis in (0, 1)]

@@ -10,7 +10,7 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.quality.path_errors import autocorrelation
 
 Legs = tuple[Floats, Floats]
-"""Phase centres of transmitter and receiver of the pulses that image each point, (point, pulse, 3) metres each."""
+"""Phase centres of transmitter and receiver for the pulses that illuminate a point, (point, pulse, 3) metres each."""
 
 PROBE = 0.02
 """Height step of the finite difference relative to the range: large against rounding, small against the range."""
@@ -20,7 +20,7 @@ _STEPS = 4  # Gauss-Newton steps; the first is accurate to first order in PROBE,
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """Sensitivity of the phase between two images to the terrain height above the assumed one.
+    """Sensitivity of the phase between two images to the terrain height above the assumed height.
 
     Attributes
     ----------
