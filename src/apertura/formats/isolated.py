@@ -24,7 +24,7 @@ from apertura.common.errors import shown
 from apertura.common.lazy import module_of, name_of
 
 SPARE_BYTES = 1 << 30
-"""Fixed part of a reader's limit of address space, bytes; `BYTES_PER_BYTE` × size of its largest file is added."""
+"""Fixed part of a reader's limit of address space, bytes; `BYTES_PER_BYTE` times the largest file size is added."""
 
 BYTES_PER_BYTE = 16
 """Limit of address space per byte of the largest file."""

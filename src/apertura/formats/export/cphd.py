@@ -315,7 +315,7 @@ def _layout(pulses: NDArray[Any]) -> dict[str, Any]:
 
 
 def _dwell(collection: CphdCollection) -> dict[str, Any]:
-    """Return centre time and dwell time of the scene; all pulses are assumed to illuminate all of it."""
+    """Return centre time and dwell time of the scene; all pulses are assumed to illuminate the whole scene."""
     exposed_s = collection.exposed_s
     return {
         "NumCODTimes": 1,

@@ -25,7 +25,7 @@ class Radiometry:
     one_is
         Reference to which the value 1, or 0 dB, corresponds.
     divided_by
-        Pair → largest amplitude of its image, by which it was divided before summation.
+        Pair → largest amplitude of its image, by which the image was divided before summation.
     phases_removed_rad
         Pair → constant phase removed before summation; without pairs that are excluded from the coherent sum.
     peak_db, noise_floor_re_peak_db

@@ -21,7 +21,7 @@ SETTLING = 63
 """Half length of the filter in samples; at both ends of a capture, this number of samples is invalid."""
 
 EDGE = 0.025
-"""Minimum distance of a band from the ends of its Nyquist zone, relative to the sample rate; image rejection 80 dB."""
+"""Minimum distance of a band from the ends of its Nyquist zone over the sample rate, for 80 dB of image rejection."""
 
 _KAISER = 8.0
 
@@ -238,7 +238,7 @@ class SampleLayout:
 # file crashes the process instead of raising an error.
 
 Spans = Sequence[tuple[int, int]]
-"""First sample, and sample after the last, of each span."""
+"""First sample of each span, and sample after its last."""
 
 
 def _are_samples(numbers: NDArray[np.floating[Any]]) -> bool:

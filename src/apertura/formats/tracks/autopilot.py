@@ -1,4 +1,4 @@
-"""Logs of autopilots: epochs of a GNSS receiver in UTC, attitude by the autopilot's clock, Doppler velocities."""
+"""Logs of autopilots: GNSS epochs in UTC, attitude with times of the autopilot's clock, Doppler velocities."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from apertura.formats.times import utc_times
 from apertura.formats.tracks.log_options import LogOptions
 from apertura.formats.tracks.track import make_track
 
-# ---- Autopilot's clock relative to UTC: a line through the times of its receiver ------------------------------------
+# ---- Autopilot's clock relative to UTC: line fitted to the times of the receiver ------------------------------------
 
 
 _AGREES_S = 0.25  # latency of receiver messages: about 0.1 s, occasionally some tens of milliseconds more
@@ -168,7 +168,7 @@ def contradicted(time_utc: NDArray[np.datetime64], geodetic: Floats, velocity: F
     return np.asarray(np.concatenate([[True], too_large]) & np.concatenate([too_large, [True]]))
 
 
-# ---- Track of an autopilot's log: epochs of the receiver in UTC, attitude by the autopilot's clock ------------------
+# ---- Track of an autopilot's log: epochs of the receiver in UTC, interpolated attitude ------------------------------
 
 _WORST_STD_M = 1e4
 _UNIT = 1e-2
@@ -290,7 +290,7 @@ def autopilot_track(
 
 
 def _counted(boot_s: Floats, options: LogOptions, node: str, where: Path) -> NDArray[np.datetime64]:
-    """Convert times of the autopilot's clock to UTC by the configured time zero."""
+    """Convert times of the autopilot's clock to UTC with the configured time zero."""
     key = f"nodes.{node}.log.start_utc"
     try:
         start = utc_times([options.start_utc or ""])[0]

@@ -13,7 +13,7 @@ _CHAIN = 3
 """Consecutive valid messages required to resume reading; a random header is plausible with probability 1/256."""
 
 Span = tuple[int, int]
-"""Offset of the first byte, and of the byte after the last."""
+"""Offset of the first byte, and offset of the byte after the last."""
 
 
 def foreign_bytes(

@@ -98,7 +98,7 @@ def _foreign(data: bytes) -> tuple[list[Span], int]:
 
 
 def _wrong_lines(data: bytes) -> tuple[list[Span], int]:
-    """Find the lines of a text log, numbered from 1, of unknown type or with too few columns; also count all lines."""
+    """Find the lines of a text log, numbered from 1, with unknown type or too few columns, and count all lines."""
     columns, wrong = {"FMT": 5}, list[Span]()
     lines = data[data.find(b"FMT,") :].splitlines()
     for number, line in enumerate(lines, 1 + data[: data.find(b"FMT,")].count(b"\n")):

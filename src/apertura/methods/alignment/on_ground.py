@@ -37,7 +37,7 @@ class SceneSharpness:
     Attributes
     ----------
     profiles
-        Range profiles of the recorder, (pulse, range), over its whole range; their aperture is a placeholder.
+        Range profiles of the recorder over the whole range, (pulse, range), with a placeholder as aperture.
     time_s
         (pulse,) float64, seconds of the recorder's clock.
     log

@@ -254,7 +254,7 @@ def estimate_drift(alignment: Alignment, echo: Recorded, log: Logged, point_m: F
 
     Notes
     -----
-    Source: docs/theory/tracks.md, "Clock of the recorder". The drift is fitted about the middle of the recording,
+    Source: docs/theory/tracks.md, "Clock of the recorder". The drift is fitted about the mid-time of the recording,
     where it is independent of the offset; the returned drift counts from the first pulse, as in config/clocks.tsv. A
     drift that changes no path by an eighth of a wavelength over half of the recording is not estimated.
     """

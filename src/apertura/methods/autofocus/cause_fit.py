@@ -52,11 +52,11 @@ class CausePrior(Prior):
         return len(next(iter(self.shapes_m.values())))
 
     def tracks(self, unknowns: Floats) -> dict[str, Floats]:
-        """Return node → (..., knot, 3) float64 corrections, metres, of (..., size) unknowns."""
+        """Return node → (..., knot, 3) float64 corrections, metres, for (..., size) unknowns."""
         return {node: np.tensordot(unknowns, shape, axes=(-1, 0)) for node, shape in self.shapes_m.items()}
 
     def adjoint(self, gradient: Mapping[str, Floats]) -> Floats:
-        """Convert derivatives with respect to the corrections of each node to (..., size), the unknowns."""
+        """Return (..., size) derivatives with respect to unknowns, from those with respect to nodes' corrections."""
         return np.asarray(
             sum(np.tensordot(gradient[node], shape, axes=((-2, -1), (1, 2))) for node, shape in self.shapes_m.items())
         )
@@ -127,7 +127,7 @@ class CauseFit:
         return replace(self, values=self.values + residual.values, correction=correction, gain_db=gain_db)
 
     def with_rest(self, rest: Refinement, evidence: float) -> Refinement:
-        """Return the refinement by this cause, followed by the refinement of the corrected logs if it is accepted.
+        """Return the refinement by this cause, followed by the refinement of the corrected logs if that is accepted.
 
         Parameters
         ----------
@@ -171,7 +171,7 @@ def explained(
     Notes
     -----
     Source: docs/theory/autofocus.md, eq. 16b. A cause has at most three unknowns and is fitted to all bright points of
-    all pairs; the gain of random tracks with as many unknowns is measured, not derived.
+    all pairs; the gain of random tracks with the same number of unknowns is measured, not derived.
     """
     fits = [CauseFit.of(problem, cause, axes) for cause in causes]
     lowest = min((fit.objective for fit in fits), default=np.inf)

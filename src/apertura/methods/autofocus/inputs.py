@@ -172,7 +172,7 @@ class NodePrior:
         return 3 * (self.knots + self.smooth - 1 + int(self.slow.shape[1]))
 
     def tracks(self, unknowns: Floats) -> Floats:
-        """Return (..., knot, 3) float64 corrections, metres in the frame, of (..., size) unknowns."""
+        """Return (..., knot, 3) float64 corrections, metres in the frame, for (..., size) unknowns."""
         white = unknowns.reshape(*unknowns.shape[:-1], -1, 3)
         noise, slow = white[..., : self.knots + self.smooth - 1, :], white[..., self.knots + self.smooth - 1 :, :]
         total = np.cumsum(np.concatenate([np.zeros_like(noise[..., :1, :]), noise], axis=-2), axis=-2)
@@ -180,7 +180,7 @@ class NodePrior:
         return np.asarray((smoothed * self.std_m + self.slow @ slow) @ self.axes)
 
     def adjoint(self, gradient: Floats) -> Floats:
-        """Convert (..., knot, 3) derivatives with respect to the corrections to (..., size), the unknowns."""
+        """Return (..., size) derivatives with respect to unknowns, from those by corrections, (..., knot, 3)."""
         along_axes = gradient @ self.axes.T
         scaled = along_axes * self.std_m / np.sqrt(self.smooth)
         nothing = np.zeros((*scaled.shape[:-2], self.smooth, 3))
@@ -208,11 +208,11 @@ class Prior:
         return sum(node.size for node in self.nodes.values())
 
     def tracks(self, unknowns: Floats) -> dict[str, Floats]:
-        """Return node → (..., knot, 3) float64 corrections, metres, of (..., size) unknowns."""
+        """Return node → (..., knot, 3) float64 corrections, metres, for (..., size) unknowns."""
         return {name: node.tracks(unknowns[..., part]) for (name, node), part in self._parts()}
 
     def adjoint(self, gradient: Mapping[str, Floats]) -> Floats:
-        """Convert derivatives with respect to the corrections of each node to (..., size), the unknowns."""
+        """Return (..., size) derivatives with respect to unknowns, from those with respect to nodes' corrections."""
         return np.concatenate([node.adjoint(gradient[name]) for name, node in self.nodes.items()], axis=-1)
 
     def _parts(self) -> list[tuple[tuple[str, NodePrior], slice]]:

@@ -261,7 +261,7 @@ def _distance_sigma(residuals: Floats) -> float:
 
 
 PATH_STD_M = 0.1
-"""Prior standard deviation of path offsets between pairs that are not caused by the tracks, metres. Errors of path
+"""Prior standard deviation of path offsets between pairs due to causes other than the tracks, metres. Errors of path
 offsets by fractions of a wavelength must not bend tracks; the constraints between pairs in range are hardly weaker."""
 
 PATH_SIGMAS = 3.0

@@ -59,7 +59,7 @@ class Triggers:
 
     @property
     def flags(self) -> dict[str, str]:
-        """Flag → measured values, of exceeded limits."""
+        """Flag → measured values for exceeded limits."""
         flags, due, lost = {}, self.due + self.beyond, self.missed + self.beyond
         if lost > MISSED_SHARE * due:
             ends = f", {self.beyond} of them before its first capture or after its last" if self.beyond else ""
@@ -124,7 +124,7 @@ class MeasuredChannel:
 
     @property
     def flags(self) -> dict[str, str]:
-        """Flag → measured values, of exceeded limits."""
+        """Flag → measured values for exceeded limits."""
         flags = {}
         if self.integers and self.counts < FEWEST_COUNTS:
             flags["channel_weak"] = f"channel {self.name}: level {self.counts:.1f} counts rms"

@@ -313,7 +313,7 @@ class MeasuredLink:
 
     @property
     def flags(self) -> dict[str, str]:
-        """Flag → measured values, of exceeded limits."""
+        """Flag → measured values for exceeded limits."""
         flags, snr_db = {}, decibels(self.snr)
         if snr_db < WEAK_DB:
             flags["link_weak"] = f"{self.name}: SNR {snr_db:.1f} dB in a compressed pulse"
