@@ -2,7 +2,7 @@
 
 H_n = Σ_j a_j·exp(-j2πf_n ρ_j/c) at equally spaced f_n is a Fourier sum at non-uniform delays, evaluated as a
 non-uniform FFT. Each echo, with the carrier phase at band centre, is spread over `_TAPS` samples of a range profile
-with an oversampling of 2, and the spectrum is divided by that of the spreading function. Relative error 3e-6.
+with an oversampling of 2, and the spectrum is divided by that of the spreading function. The relative error is 3e-6.
 """
 
 import numba

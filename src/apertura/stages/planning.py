@@ -45,7 +45,7 @@ from apertura.stages.scene import OpenScene
 
 _MS, _CM, _PPM = 1e-3, 1e-2, 1e-6
 _OBSERVABLE_CELLS = 0.01
-"""Smallest observable displacement in range cells, of a point of 20 dB SNR (docs/theory/focus.md, eq. 6)."""
+"""Smallest observable displacement of a point with 20 dB SNR, range cells (docs/theory/focus.md, eq. 6)."""
 
 
 def budget_of(

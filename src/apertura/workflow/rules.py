@@ -86,7 +86,7 @@ class Cost:
 
     @property
     def of_rasters(self) -> bool:
-        """True if a job mainly reads and writes rasters; run times of such jobs deviate alike from expected ones."""
+        """True if a job mainly reads and writes rasters; such jobs exceed their cost by similar factors."""
         return bool(self.mpx_s) and not self.mb_s and not self.mb_mpx_s
 
 

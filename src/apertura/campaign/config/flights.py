@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 FLIGHTS = Path("config/flights.tsv")
 _COLUMNS = ["flight", "kind", "transmitter", "nodes"]
 KINDS = ("bench", "calibration", "image")
-"""Kinds of flights: stationary radar; flight past a reflector, whose calibration other flights use; images."""
+"""Kinds of flights: stationary radar; calibration flight past a reflector; imaging flight."""
 _NAME: TypeAdapter[str] = TypeAdapter(Name)
 
 FUSED = "fused"
@@ -68,7 +68,7 @@ class Flight:
 
     @property
     def images(self) -> tuple[str, ...]:
-        """Names of its images: its pairs, and their sums if there are several pairs.
+        """Names of the images of the flight: its pairs, and 'fused' if there are several pairs.
 
         Examples
         --------

@@ -37,7 +37,7 @@ def writing(folder: Path) -> Iterator[ConfinedPath]:
 
     A kernel lock, which is released when its process ends, excludes a second writer: a new step waits for one that is
     still running after its snakemake was killed. A finished folder with unchanged files becomes work in progress
-    again, so that nothing is computed twice.
+    again, so that its chunks are not recomputed.
 
     Yields
     ------

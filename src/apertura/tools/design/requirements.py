@@ -32,7 +32,7 @@ _LAYERS = {
     "loss_db": ("loss", "most"),
     "ambiguity": ("ambiguity", "most"),
 }
-"""Requirement → layer, and "most" for an upper limit of it or "least" for a lower one."""
+"""Requirement → layer, and "most" for an upper or "least" for a lower limit of its values."""
 
 LEAST_GAIN_DB = 0.05
 """Minimum gain of a listed change, unless the complete shortfall is smaller: smaller gains are printed as zero."""
@@ -396,7 +396,7 @@ def _with_halved_position_errors(plan: FlightPlan) -> FlightPlan:
 
 @dataclass(frozen=True)
 class Tried:
-    """A plan that a search tried.
+    """Plan evaluated by a search.
 
     Attributes
     ----------

@@ -89,7 +89,7 @@ class Tally:
         self.largest = max(self.largest, float(difference.max()))
         self.square += float((difference**2).sum())
         self.peak = max(self.peak, float(np.abs(a).max()), float(np.abs(b).max()))
-        if self._sums is None:  # sums about one of the real values: no loss of digits when the mean is subtracted
+        if self._sums is None:  # sums relative to a real value, so that subtraction of the mean loses no digits
             self._sums, self._about = np.zeros(5, complex), 0.0 if self.phased else float(a[0])
         a, b = a - self._about, b - self._about
         self._sums += [a.sum(), b.sum(), np.vdot(a, a), np.vdot(b, b), np.vdot(b, a)]
