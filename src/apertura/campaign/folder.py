@@ -261,7 +261,7 @@ class Campaign(RawFolder):
         return (*written, *averaged, *noise, "multilook_coherent", "multilook_noncoherent")
 
     def check_radio(self) -> None:
-        """Check that the radio of the pairs is configured completely or not at all; measured constants replace it."""
+        """Check that the radio of the pairs is configured completely or not at all, unless constants are measured."""
         if self.settings.processing.radiometric_calibration:
             return
         sampled = isinstance(self.settings.waveform, SampledWaveform)

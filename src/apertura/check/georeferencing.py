@@ -39,7 +39,7 @@ _NOWHERE = (np.nan, np.nan)
 
 
 def check_scene_crs(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a problem if the CRS is not in metres, has another frame than positions, or is unsuitable for the area."""
+    """Yield a problem if the CRS is not in metres, does not fit the positions' frame, or is unsuitable for the area."""
     crs = examined.campaign.settings.scene.crs
     if examined.other_frame:
         local = crs == LOCAL
@@ -276,7 +276,7 @@ def _place(crs: str, x: float, y: float) -> Place:
 
 
 def _distance_m(*places: Place) -> float:
-    """Return the straight distance of two locations; inf if one of them is not on Earth."""
+    """Return the straight-line distance between two locations; inf if one of them is not on Earth."""
     if not all(abs(latitude) <= 90 and abs(longitude) <= 180 for latitude, longitude in places):
         return np.inf
     first, second = (ecef_from_geodetic(*(np.array(value) for value in (*place, 0.0))) for place in places)

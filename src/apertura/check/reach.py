@@ -177,7 +177,7 @@ def _length(metres: float) -> str:
 
 
 def check_aperture(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a problem for pairs of image flights within range of the scene whose logs contain no motion."""
+    """Yield a problem for each pair within range of the scene if the logs contain no motion of its nodes."""
     waveform, transmitted = examined.waveform, examined.transmitted
     if waveform is None or transmitted is None:
         return

@@ -258,7 +258,7 @@ def _words(root: Path, cores: int, arguments: Sequence[str]) -> list[str]:
 
 
 def _ended_by(status: int) -> str:
-    """Return the signal that terminated a process, from its or a shell's exit status; empty: exit, or interrupt."""
+    """Return the signal that terminated a process, from its or a shell's exit status; empty after exit or SIGINT."""
     number = -status if status < 0 else status - SIGNALLED
     return signal.Signals(number).name if status != INTERRUPTED and number in set(signal.Signals) else ""
 

@@ -86,7 +86,7 @@ def _add(ranges, points, paths, per_m, tables, spreading):  # type: ignore[no-un
             phase = (phase - np.floor(phase)) * fine
             nearest = int(phase)
             small = -2 * np.pi * (phase - nearest) / fine
-            # the phasor of the remainder, less than 1.6 mrad, to the third order
+            # phasor of the remaining phase, below 1.6 mrad, to the third order
             echo = phasors[nearest] * complex(1 - small * small / 2, small - small**3 / 6)
             echo *= amplitude[scatterer] / (tx_range * rx_range) if spreading else amplitude[scatterer]
             position = path * samples_per_m

@@ -193,7 +193,7 @@ def _focused_power(
 ) -> float:
     """Return the joint peak power if every pair were focused at one point and in phase.
 
-    A focused pair contributes its own peak, another pair the strongest echo of its pulses.
+    A focused pair contributes its own peak; any other pair contributes the strongest echo of its pulses.
     """
     amplitudes = np.array(
         [
@@ -288,7 +288,7 @@ def subset_geometry(nodes: Mapping[str, Acquisition], pair: str, echo: xr.Datase
 def with_logs(
     nodes: Mapping[str, Acquisition], geometries: Sequence[PairGeometry], late_s: Mapping[str, float] | None = None
 ) -> list[PairGeometry]:
-    """Return the echoes with antenna positions and sidelink lengths from other logs, or from logs that are late.
+    """Return the echoes with antenna positions and sidelink lengths from other logs, or from delayed logs.
 
     Raises
     ------

@@ -246,7 +246,7 @@ def expected_track(
 ) -> tuple[list[OpenPair], tuple[Decision, ...]]:
     """Return the pairs of a flight with refined tracks if they exist, and the decisions on the refinement.
 
-    Before step `refine`, the pairs are those of the logs, whatever the decision.
+    Before step `refine`, the pairs are those of the logs, regardless of the decision.
     """
     if campaign.is_current(campaign.stage("refined_track", pairs[0].flight)):
         track = open_refined(campaign, pairs[0].flight)

@@ -27,7 +27,7 @@ KINDS = ("bench", "calibration", "image")
 _NAME: TypeAdapter[str] = TypeAdapter(Name)
 
 FUSED = "fused"
-"""Name of the sums of a flight's pairs, as image and folder name."""
+"""Name of the sums of a flight's pairs, used as image name and as folder name."""
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,7 @@ def read_segments(path: Path, *, flights: Sequence[Flight]) -> Iterator[Segment]
 
 
 def _utc(text: str) -> datetime | None:
-    """Parse a time as UTC, which is also assumed without a time zone; None if it is not valid."""
+    """Parse a time as UTC, also if it has no time zone; return None if it is not valid."""
     try:
         time = datetime.fromisoformat(text)
         time = time.astimezone(UTC).replace(tzinfo=None) if time.tzinfo else time

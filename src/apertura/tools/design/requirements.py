@@ -22,7 +22,10 @@ SHARE = 95.0
 """Percentage of the visible pixels that must meet a requirement, since edges of a scene are worse than its centre."""
 
 COARSE_PX = 64
-"""Pixels along the longer side of the grid on which changes are compared; the outermost centres lie 1 % inside."""
+"""Number of pixels along the longer side of the grid on which changes are compared.
+
+The centres of the outermost pixels are 1 % of the side from the edges.
+"""
 
 _LAYERS = {
     "resolution_m": ("resolution", "most"),

@@ -162,7 +162,7 @@ def differences(first: Path, second: Path) -> dict[str, list[str]]:
     elif first.suffix == ".png":
         images = [np.asarray(picture(path)).astype(np.float32) for path in (first, second)]
         tally = Tally.of([(images[0], images[1])]) if images[0].shape == images[1].shape else None
-        lines["pixels"] = list(difference_lines(tally, unit="of 255")) if tally else []  # sizes are in geometry
+        lines["pixels"] = list(difference_lines(tally, unit="of 255")) if tally else []  # sizes: see geometry
     if not any(lines.values()):
         offset = first_difference(first, second)
         lines["bytes"] = [] if offset is None else [f"first difference at byte {offset}"]
