@@ -265,7 +265,7 @@ def recorded_echo(campaign: Campaign, flight: str, pair: str) -> xr.Dataset:
     Raises
     ------
     CampaignError
-        If positions are neither stored with the samples nor in a flight log, or in both; or if their frame is not that
+        If positions are stored neither with the samples nor in a flight log, or in both; or if their frame is not that
         of the scene.
     """
     tx, rx = pair.split("-")

@@ -270,7 +270,7 @@ class ImageSoFar:
         joined = Compressed.joined(self._kept)
         profiles, times = joined.profiles, joined.time
         beams = self._beams(profiles.aperture, joined.axes, profiles.centre_frequency_hz)
-        plan = replace(self._plan, beams=beams, integration=None, flags={})  # the plan has those of its first block
+        plan = replace(self._plan, beams=beams, integration=None, flags={})  # the plan's refer to its first block
         side = self._campaign.settings.processing.tile_px
         formation = Formation(None, profiles, self.grid, plan, side)
         cell_m = resolution_cell_m(formation)
