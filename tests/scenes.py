@@ -1,4 +1,4 @@
-"""Small radar scenes as arrays: straight flights over flat ground, turned frames, antenna beams."""
+"""Small radar scenes as arrays: straight flights over flat ground, rotated frames, antenna beams."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ WAVELENGTH = C / 1.2e9
 
 
 def without_library(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make this process one of an installation without a compiler."""
+    """Simulate an installation without a compiler."""
     monkeypatch.setattr(native_binding, "library_path", lambda: Path("nowhere/_backprojection.so"))
 
 
@@ -35,7 +35,7 @@ def without_library(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def ground_points(size_m: float = 10.0, *, north_m: float = 20.0, count: int = 5) -> NDArray[np.float64]:
-    """(count, count, 3) places on flat ground north of the track, rows going south."""
+    """(count, count, 3) points on flat ground north of the track, rows from north to south."""
     east, north = np.meshgrid(np.linspace(-size_m / 2, size_m / 2, count), north_m + np.linspace(size_m, 0, count))
     return np.stack([east, north, 0 * east], -1)
 
@@ -43,7 +43,7 @@ def ground_points(size_m: float = 10.0, *, north_m: float = 20.0, count: int = 5
 def straight_track(
     pulses: int = 300, *, length_m: float = 6.0, height_m: float = 10.0, wobble_m: float = 0.0
 ) -> NDArray[np.float64]:
-    """(pulse, 3) eastward at north 0; the wobble is an amplitude, up and down."""
+    """(pulse, 3) eastward track at north 0; `wobble_m` is the amplitude of a vertical oscillation."""
     along = np.linspace(-length_m / 2, length_m / 2, pulses)
     return np.stack([along, 0 * along, height_m + wobble_m * np.sin(2 * np.pi * along / length_m * 3)], -1)
 
@@ -53,7 +53,7 @@ def monostatic(track_m: NDArray[np.float64]) -> Aperture:
 
 
 def planning_job(**changes: Any) -> Job:
-    """What the planner is told of that flight, 400 MHz at 1.2 GHz."""
+    """Return the planner's job for that flight, 400 MHz at 1.2 GHz."""
     signal = Signal(1.2e9, 2.0, C / 800e6, 120)
     plain = Job(
         monostatic(straight_track()), ground_points(), (200, 200), 0.05, 1.2e9, 400e6, 512, signal, frame="local"
@@ -62,12 +62,12 @@ def planning_job(**changes: Any) -> Job:
 
 
 def plan(accuracy_db: float = -60.0, *, overrides: Mapping[str, Any] | None = None, **changes: Any) -> Plan:
-    """What the planner makes of that flight."""
+    """Return the plan of that flight."""
     return make_plan(planning_job(**changes), accuracy_db=accuracy_db, overrides=overrides)
 
 
 def ground_of(heights: NDArray[np.float64], level_m: float = 0.0) -> GroundModels:
-    """A ground of one height per pixel of 5 cm."""
+    """Return terrain with one height per pixel of 5 cm."""
     grid = SceneGrid("local", 0.0, 10.0, 0.05, heights.shape)
     return GroundModels.of(GridHeights(grid, heights), FlatGround(level_m), grid)
 
@@ -87,7 +87,7 @@ def point_history(pulses: int = 96) -> PhaseHistory:
 
 
 def strip_history(aperture: Aperture, targets_m: NDArray[np.float64], subcarriers: int = 64) -> PhaseHistory:
-    """Echoes of targets (target, 3) of any flight, 96 MHz about 1.25 GHz."""
+    """Echoes of targets (target, 3) recorded on any flight, 96 MHz about 1.25 GHz."""
     frequency = 1.2e9 + 1.5e6 * np.arange(subcarriers)
     echo = transfer(Scatterers(targets_m, np.ones(len(targets_m))), aperture, frequency, spreading=False)
     weight = np.full(subcarriers, 1 / subcarriers)
@@ -105,13 +105,13 @@ GUARD = 12
 
 
 def ecef(local: NDArray[np.float64]) -> NDArray[np.float64]:
-    """From local east, north, up to ECEF: nothing may depend on axes being aligned."""
+    """Convert local east, north, up to ECEF: rotated axes reveal any dependence on their alignment."""
     return local @ AXES.T + PLACE
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What was flown, and the calibrated spectra it gave; positions in ECEF."""
+    """A flight and the calibrated spectra of its echoes; positions in ECEF."""
 
     transfer: NDArray[np.complex64]
     tx: NDArray[np.float64]
@@ -179,12 +179,12 @@ def pixel_grid(
 
 
 def scatter(pixels: NDArray[np.float64], count: int = 25) -> NDArray[np.float64]:
-    """Random ones of the pixels, for targets to stand on."""
+    """Return randomly chosen pixels as target positions."""
     return pixels.reshape(-1, 3)[np.random.default_rng(2).integers(0, pixels[..., 0].size, count)]
 
 
 def error_db(scene: Scene, pixels: NDArray[np.float64], image: NDArray[np.complex64], count: int = 150) -> float:
-    """RMS error of random pixels, no gain taken out."""
+    """Return the RMS error of random pixels, without removing a gain."""
     pick = np.random.default_rng(3).integers(0, image.size, count)
     truth = scene.exact(ecef(pixels).reshape(-1, 3)[pick])
     return decibels(image.ravel()[pick] - truth, truth)
@@ -204,7 +204,7 @@ def side_beam(
     pulses: int = 300,
     cutoff_db: float = -20.0,
 ) -> Beam:
-    """A beam to the left of a body that flies east: northward."""
+    """Beam to the left of a body that flies east: northward."""
     body = np.broadcast_to(np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), (pulses, 3, 3))
     cuts = (
         gaussian_cut(w, cutoff_db=cutoff_db, limit_rad=x) for w, x in zip(width_deg, (np.pi, np.pi / 2), strict=True)
@@ -215,7 +215,7 @@ def side_beam(
 def swaying_beam(
     antenna: NDArray[np.float64], at: tuple[float, float, float], width_deg: float = 40.0, *, sway_deg: float = 15.0
 ) -> Beam:
-    """A Gaussian beam (width at half power, cut where it has fallen to nothing) kept on one local place, swaying."""
+    """Gaussian beam (half-power width, cut off at negligible gain) pointed at one local point, with a sway."""
     boresight = ecef(np.array(at)) - antenna
     boresight /= np.linalg.norm(boresight, axis=-1, keepdims=True)
     sideways = np.cross(AXES[:, 2], boresight)
@@ -232,6 +232,6 @@ def swaying_beam(
 
 
 def hard_beam(soft: Beam, half_deg: float) -> Beam:
-    """The same axes with a gain of one out to `half_deg`."""
+    """Return a beam with the same axes and unit gain out to `half_deg`."""
     angle = np.radians([-half_deg, 0, half_deg])
     return Beam(soft.axes, angle, np.ones(3), angle, np.ones(3))
