@@ -137,7 +137,7 @@ def test_truncated_dem_is_one_message(tmp_path, share):
 @pytest.mark.parametrize(
     ("place", "expected"),
     [
-        ((500000, 5400100, 0, 2), "no geodetic CRS"),  # GDAL drops such a transform
+        ((500000, 5400100, 0, 2), "no geodetic CRS"),  # GDAL reads such a file without a CRS
         ((500000, 5400100, 1e-300, 1e-300), "a degenerate transform [1e-300, "),
         ((500000, 5400100, float("nan"), 2), "a degenerate transform [nan, "),
     ],
