@@ -206,7 +206,7 @@ def test_a_header_that_states_two_time_systems_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("spelling", ["-1.#IND", "1.#QNAN", "1.#INF", "-nan(ind)", "nan(snan)", "-nan", "1.#J", "inf"])
-def test_a_standard_deviation_that_c_prints_as_no_number_is_unknown(tmp_path, spelling):
+def test_standard_deviation_printed_as_nan_is_unknown(tmp_path, spelling):
     columns = np.hstack([PLACES, np.full((40, 3), 0.01)])
     text = logs.solution(TIMES, columns, f"{LLH} sdn(m) sde(m) sdu(m)").replace(" 0.010000000", f" {spelling}", 1)
     track = read(tmp_path, text)
@@ -216,7 +216,7 @@ def test_a_standard_deviation_that_c_prints_as_no_number_is_unknown(tmp_path, sp
 
 
 @pytest.mark.parametrize("system", ["UTC", "JST"])
-def test_epochs_within_a_leap_second_are_left_out_and_counted(tmp_path, system):
+def test_epochs_within_a_leap_second_are_dropped(tmp_path, system):
     text = logs.solution(TIMES, PLACES, LLH)
     for second in ("00", "01"):  # the whole flight, less its last epochs, in the year of a leap second
         text = text.replace(f"2025/05/15 00:00:{second}", f"2016/12/31 23:59:6{second[1]}")

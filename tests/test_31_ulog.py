@@ -56,7 +56,7 @@ def apart_m(track, time_s=None):
 @pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize("old", [True, False])
 @pytest.mark.parametrize("topic", [GPS, SENSOR])
-def test_a_track_is_what_the_receiver_said(tmp_path, topic, old):
+def test_track_has_the_values_of_the_receiver(tmp_path, topic, old):
     track = read(tmp_path, (topic, 0, ulog_receiver(old=old)), (ATTITUDE, 0, ulog_attitude()), (FUSED, 0, ulog_fused()))
     time, geodetic, _ = flight()
     np.testing.assert_array_equal(track.time.values, utc_of(time))
@@ -69,7 +69,7 @@ def test_a_track_is_what_the_receiver_said(tmp_path, topic, old):
 
 
 @pytest.mark.usefixtures("reader")
-def test_attitude_is_taken_where_the_autopilot_was_when_the_epoch_was_true(tmp_path):
+def test_attitude_is_read_at_the_time_of_validity(tmp_path):
     """Its clock hears of an epoch 110 ms late; without that, yaw would be 1.0° off in this turn."""
     track = read(tmp_path, (GPS, 0, ulog_receiver()), (ATTITUDE, 0, ulog_attitude()))
     expected = np.stack([np.full(60, 10.0), np.full(60, 3.0), flight()[2]], -1)
@@ -155,7 +155,7 @@ SYNC = struct.pack("<HB", 8, ord("S")) + bytes([0x2F, 0x73, 0x13, 0x20, 0x25, 0x
     ],
     ids=["200 bytes", "before a sync", "within a message", "zeros", "ones", "a size beyond the file"],
 )
-def test_epochs_behind_foreign_bytes_are_read_and_the_bytes_are_counted(tmp_path, foreign, inside):
+def test_epochs_after_foreign_bytes_are_read_and_bytes_counted(tmp_path, foreign, inside):
     data = ulog((GPS, 0, ulog_receiver(epochs=98)))
     size = len(_last_message(data))
     at = len(data) - 58 * size + inside  # behind epoch 40
@@ -183,7 +183,7 @@ def _last_message(data):
 
 @pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize("tail", [b"", bytes(700), b"\xff" * 64, "cut"], ids=["none", "zeros", "ones", "cut"])
-def test_the_end_of_a_log_is_no_damage(tmp_path, tail):
+def test_truncated_or_padded_end_is_no_damage(tmp_path, tail):
     data = ulog((GPS, 0, ulog_receiver()), (ATTITUDE, 0, ulog_attitude()))
     path = tmp_path / "a.track.ulg"
     path.write_bytes(data[:-9] if tail == "cut" else data + tail)
@@ -205,7 +205,7 @@ def test_dropouts_of_the_logger_are_reported(tmp_path):
 
 @pytest.mark.parametrize("old", [True, False])
 @pytest.mark.usefixtures("reader")
-def test_heights_above_sea_level_are_refused_or_made_ellipsoidal(tmp_path, old):
+def test_heights_above_sea_level_need_an_offset(tmp_path, old):
     name = "alt" if old else "altitude_msl_m"
     copied = {f"{name}_ellipsoid" if old else "altitude_ellipsoid_m": ulog_receiver(old=old)[name][1]}
     for change in (copied, dict.fromkeys(copied), {key: np.zeros(60, int) for key in copied}):
@@ -222,7 +222,7 @@ def test_a_height_that_the_log_tells_is_not_overruled(tmp_path):
 
 
 @pytest.mark.usefixtures("reader")
-def test_kinds_of_solution_are_kept_and_epochs_without_any_are_counted(tmp_path):
+def test_solution_types_are_kept_and_epochs_without_fix_counted(tmp_path):
     kinds = np.resize([6, 5, 4, 3, 2, 1, 0, 8], 60)
     track = read(tmp_path, (GPS, 0, ulog_receiver(fix_type=kinds)))
     assert track.attrs["dropped"] == {"no fix": int((~np.isin(kinds, [3, 4, 5, 6])).sum())}
@@ -289,7 +289,7 @@ def test_a_receiver_that_learns_of_a_leap_second_on_the_way_is_refused(tmp_path)
 @pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize("epoch", [0, 3, 30, 58, 59])
 @pytest.mark.parametrize(("field", "step"), [("lat", 90), ("lon", -150), ("alt_ellipsoid", 1000)])
-def test_an_epoch_that_is_not_where_the_velocities_lead_is_left_out(tmp_path, epoch, field, step):
+def test_position_that_contradicts_the_velocity_is_dropped(tmp_path, epoch, field, step):
     """A metre off, as by a flipped bit. At a log's ends nothing else tells; the last falls with its neighbour."""
     moved = ulog_receiver()[field][1] + step * (np.arange(60) == epoch)
     track = read(tmp_path, (GPS, 0, ulog_receiver(**{field: moved})))
@@ -325,7 +325,7 @@ def test_a_step_between_solutions_is_no_epoch_out_of_place(tmp_path):
         (ulog((GPS, 0, ulog_receiver(epochs=1))), "1 epochs"),
     ],
 )
-def test_what_is_no_log_of_a_flight_is_refused(tmp_path, data, found):
+def test_invalid_log_is_rejected(tmp_path, data, found):
     path = tmp_path / "a.track.ulg"
     path.write_bytes(data)
     assert found in complaint(lambda: read_track(path, node="a"))
@@ -376,7 +376,7 @@ def place(tmp_path_factory):
 
 @DAMAGED
 @given(st.integers(0, len(MESSAGES) - 1))
-def test_a_log_cut_anywhere_is_shorter_or_refused(place, size):
+def test_truncated_log_is_shorter_or_rejected(place, size):
     track = read_damaged(place, MESSAGES[:size])
     if track is not None:
         assert apart_m(track).max() < 0.02
@@ -386,7 +386,7 @@ def test_a_log_cut_anywhere_is_shorter_or_refused(place, size):
 @pytest.mark.slow
 @DAMAGED
 @given(st.lists(st.tuples(st.integers(0, len(MESSAGES) - 1), st.integers(0, 7)), min_size=1, max_size=4))
-def test_no_flipped_bit_moves_a_position_silently(place, flips):
+def test_flipped_bit_displaces_no_position_silently(place, flips):
     data = bytearray(MESSAGES)
     for at, bit in flips:
         data[at] ^= 1 << bit
@@ -398,7 +398,7 @@ def test_no_flipped_bit_moves_a_position_silently(place, flips):
 @pytest.mark.slow
 @DAMAGED
 @given(st.randoms(use_true_random=False), st.integers(1, 20))
-def test_messages_in_another_order_are_refused_or_the_same(place, random, swaps):
+def test_reordered_messages_are_rejected_or_harmless(place, random, swaps):
     header, *messages = split(MESSAGES)
     for _ in range(swaps):
         first, second = random.randrange(len(messages)), random.randrange(len(messages))
