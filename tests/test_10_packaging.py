@@ -37,9 +37,8 @@ def test_classifiers_match_the_required_python_versions():
     assert versions == sorted(versions, key=lambda version: int(version[2:]))
     assert project()["requires-python"] == f">={versions[0]}"
     assert "3.13" in versions
-    assert not any(
-        name.startswith("License ::") for name in project()["classifiers"]
-    )  # PEP 639: the license expression replaces the classifier
+    # PEP 639: the license expression replaces the classifier
+    assert not any(name.startswith("License ::") for name in project()["classifiers"])
     assert (ROOT / "src/apertura/py.typed").is_file()
 
 

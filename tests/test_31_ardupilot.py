@@ -327,7 +327,6 @@ def assert_no_position_is_silently_wrong(track):
     time_s = (track.time.values - track.time.values[0]) / SECOND
     checked = check_track(time_s, track.position.values, poor_fix=np.zeros(time_s.size, bool), tolerated_m=0.01)
     inside = np.minimum(np.arange(time_s.size), np.arange(time_s.size)[::-1]) >= 6
-    wrong = position_error_m(track) > np.where(
-        inside, 0.15, 0.6
-    )  # near the ends only the receiver's velocity reveals an error
+    # near the ends only the receiver's velocity reveals an error
+    wrong = position_error_m(track) > np.where(inside, 0.15, 0.6)
     assert not (wrong & checked.kept).any(), (track.time.values[wrong], position_error_m(track)[wrong])

@@ -98,9 +98,8 @@ def expected_transfer(echo):
     delay = [
         sum(np.linalg.norm(leg - SRP - target, axis=1) for leg in (tx, rx)) / SPEED_OF_LIGHT_M_S for target in TARGETS
     ]
-    delay_difference_s = np.stack(delay) - echo.reference_delay.values
-    cycles = delay_difference_s[:, :, None] * echo.frequency.values
-    return (AMPLITUDES[:, None, None] * np.exp(-2j * np.pi * cycles)).sum(axis=0)
+    excess_s = np.stack(delay) - echo.reference_delay.values
+    return (AMPLITUDES[:, None, None] * np.exp(-2j * np.pi * excess_s[:, :, None] * echo.frequency.values)).sum(axis=0)
 
 
 @pytest.mark.parametrize("version", ["1.0.1", "1.1.0"])

@@ -136,9 +136,8 @@ def test_sweep_starts_between_sound_samples_are_found(tmp_path):
     assert stage.attrs["dropped"] == {}
     starts_utc = BEGAN + np.round((STARTS_S + 0.00001) * 1e9).astype("timedelta64[ns]")
     middle = np.timedelta64(round(COFFEE.middle_s * 1e9), "ns")
-    within = np.timedelta64(
-        round(0.51e9 / COFFEE.sample_rate_hz), "ns"
-    )  # resolution of a sync edge without intermediate samples
+    # resolution of a sync edge without intermediate samples
+    within = np.timedelta64(round(0.51e9 / COFFEE.sample_rate_hz), "ns")
     assert np.abs(stage.time.values - middle - starts_utc).max() <= within
 
 

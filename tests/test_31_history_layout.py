@@ -68,10 +68,11 @@ def read(kind, *paths):
 def test_arrays_are_read_back_unchanged(tmp_path, kind):
     fields = arrays()
     echo = check(read(kind, write(tmp_path / f"b{SUFFIX[kind]}", fields)), "echo")
+    # default until a campaign configures its atmosphere
     of_vacuum = {
         "reference": "delay",
         "wave_speed_m_s": SPEED_OF_LIGHT_M_S,
-    }  # default until a campaign configures its atmosphere
+    }
     assert echo.attrs == {"frame": "ecef", "pair": "a-b", "flags": {}, **of_vacuum}
     np.testing.assert_array_equal(echo.time.values, fields.pop("time").astype("datetime64[ns]"))
     np.testing.assert_allclose(echo.frequency.values, fields.pop("frequency"), rtol=1e-15)
