@@ -17,16 +17,16 @@ N_M = 47.5
 def flight(epochs=60, rate_hz=10.0):
     """Return time (s), geodetic (epoch, 3) and yaw (deg) of a climbing circle: radius 50 m, 8 m/s, climb 0.5 m/s."""
     time = np.arange(epochs) / rate_hz
-    turned = time * 8 / 50
-    latitude = 48.42 + 50 * np.sin(turned) / 111_200
-    longitude = 9.955 - 50 * np.cos(turned) / 73_900
-    return time, np.stack([latitude, longitude, 600 + 0.5 * time], -1), np.degrees(turned)
+    angle_rad = time * 8 / 50
+    latitude = 48.42 + 50 * np.sin(angle_rad) / 111_200
+    longitude = 9.955 - 50 * np.cos(angle_rad) / 73_900
+    return time, np.stack([latitude, longitude, 600 + 0.5 * time], -1), np.degrees(angle_rad)
 
 
 def velocity(epochs=60):
     """Return velocity to north, east and down (epoch, 3), m/s."""
-    turned = flight(epochs)[0] * 8 / 50
-    return np.stack([8 * np.cos(turned), 8 * np.sin(turned), np.full(epochs, -0.5)], -1)
+    angle_rad = flight(epochs)[0] * 8 / 50
+    return np.stack([8 * np.cos(angle_rad), 8 * np.sin(angle_rad), np.full(epochs, -0.5)], -1)
 
 
 def utc_of(time_s):
@@ -152,9 +152,9 @@ def dataflash_rows(*, epochs=60, receivers=(0,), parameters=None, without_ael=Fa
             rows.append((at["TimeUS"], "GPS", {**at, **of, "Lat": latitude, "Lng": longitude, "Alt": height - N_M}))
             known = -(2**31) / 100 if without_ael else height
             rows.append((at["TimeUS"], "GPA", {**at, "HAcc": 0.02, "VAcc": 0.03, "VV": 1, "AEl": known}))
-    for late in np.arange(-0.5, epochs / 10 + 0.5, 0.05):
-        turn = {"Roll": 10.0, "Pitch": 3.0, "Yaw": np.degrees(late * 8 / 50) % 360}
-        rows.append((int(boot_us(late, 0.0)), "ATT", {"TimeUS": int(boot_us(late, 0.0)), **turn}))
+    for time_s in np.arange(-0.5, epochs / 10 + 0.5, 0.05):
+        angles_deg = {"Roll": 10.0, "Pitch": 3.0, "Yaw": np.degrees(time_s * 8 / 50) % 360}
+        rows.append((int(boot_us(time_s, 0.0)), "ATT", {"TimeUS": int(boot_us(time_s, 0.0)), **angles_deg}))
     return [(name, values) for _, name, values in sorted(rows, key=lambda row: row[0])]
 
 

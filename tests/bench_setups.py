@@ -65,9 +65,9 @@ def cabled(
             lever_arms_m={"radar_tx": (0, 0, 0)},
         ),
     }
-    apart = {TRANSMITTER: -SIDELINK_M / 2, RECEIVER: SIDELINK_M / 2}
-    away = float(np.sqrt((RADAR_M / 2) ** 2 - (SIDELINK_M / 2) ** 2))
-    tracks = {name: Straight((x, -away, 0.75), (0.0, 0.0, 0.0)) for name, x in apart.items()}
+    east_m = {TRANSMITTER: -SIDELINK_M / 2, RECEIVER: SIDELINK_M / 2}
+    south_m = float(np.sqrt((RADAR_M / 2) ** 2 - (SIDELINK_M / 2) ** 2))
+    tracks = {name: Straight((x, -south_m, 0.75), (0.0, 0.0, 0.0)) for name, x in east_m.items()}
     flight = SimulatedFlight(FLIGHT, TRANSMITTER, tracks, pulses, kind="bench")
     grid = ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1)
     target = (PointTarget((0.0, 0.0, 0.75)),)
@@ -156,8 +156,8 @@ def _stopped(captures: list, iq: NDArray[np.int16]) -> tuple[list, NDArray[np.in
 
 def _tone(x: Samples) -> Samples:
     """Add a tone at a fifth of the band, 10 dB below the signal, with a random phase in each capture."""
-    turns = 2 * np.pi * (80e6 * np.arange(x.shape[1]) / _RATE_HZ + np.random.default_rng(2).random((len(x), 1)))
-    return x + 0.3 * np.sqrt((np.abs(x) ** 2).mean()) * np.exp(1j * turns)
+    phase_rad = 2 * np.pi * (80e6 * np.arange(x.shape[1]) / _RATE_HZ + np.random.default_rng(2).random((len(x), 1)))
+    return x + 0.3 * np.sqrt((np.abs(x) ** 2).mean()) * np.exp(1j * phase_rad)
 
 
 def _stuck(x: Samples) -> Samples:

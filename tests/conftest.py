@@ -37,9 +37,9 @@ def pytest_collection_modifyitems(config, items):
             met.update(matching)
             if not matching:
                 item.add_marker(pytest.mark.slow)
-    gone = [f"{function}[{row}]" for function, row in named.keys() - met]
-    if gone and not any("::" in arg for arg in config.args):
-        raise pytest.UsageError(f"marked quick, and no test: {', '.join(sorted(gone))}")
+    unmatched = [f"{function}[{row}]" for function, row in named.keys() - met]
+    if unmatched and not any("::" in arg for arg in config.args):
+        raise pytest.UsageError(f"marked quick, and no test: {', '.join(sorted(unmatched))}")
 
 
 def pytest_collection_finish():
@@ -136,9 +136,9 @@ def pytest_generate_tests(metafunc):
     if "isa" in metafunc.fixturenames:
         from apertura.core.backprojection.engines import native, native_binding
 
-        taken = next(filter(native_binding.supports, native.INSTRUCTION_SETS), None)
-        others = [pytest.param(isa, marks=pytest.mark.slow) for isa in native.INSTRUCTION_SETS if isa != taken]
-        metafunc.parametrize("isa", [taken, *others] if taken else others, indirect=True)
+        selected = next(filter(native_binding.supports, native.INSTRUCTION_SETS), None)
+        others = [pytest.param(isa, marks=pytest.mark.slow) for isa in native.INSTRUCTION_SETS if isa != selected]
+        metafunc.parametrize("isa", [selected, *others] if selected else others, indirect=True)
 
 
 @pytest.fixture

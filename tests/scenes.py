@@ -132,8 +132,8 @@ class Scene:
         start = paths.min(1) - GUARD * step_m
         length = int(np.ceil((paths.max(1) - start).max() / step_m)) + GUARD
         at = start[:, None] + step_m * np.arange(length)
-        turns = np.exp(2j * np.pi * at[..., None] / C * OFFSET_HZ)
-        samples = np.einsum("pln,pn->pl", turns, self.transfer).astype(np.complex64)
+        phasors = np.exp(2j * np.pi * at[..., None] / C * OFFSET_HZ)
+        samples = np.einsum("pln,pn->pl", phasors, self.transfer).astype(np.complex64)
         return Profiles(samples, start, step_m, self.carrier_hz, 2.0, Aperture(self.tx, self.rx))
 
     def exact(self, places: NDArray[np.float64]) -> NDArray[np.complex128]:
@@ -173,8 +173,11 @@ def pixel_grid(
     across, along = np.meshgrid(
         spacing_m * (np.arange(columns) - columns / 2), spacing_m * (np.arange(rows) - rows / 2)
     )
-    turn = np.radians(turned_deg)
-    x, y = across * np.cos(turn) - along * np.sin(turn), across * np.sin(turn) + along * np.cos(turn)
+    rotation_rad = np.radians(turned_deg)
+    x, y = (
+        across * np.cos(rotation_rad) - along * np.sin(rotation_rad),
+        across * np.sin(rotation_rad) + along * np.cos(rotation_rad),
+    )
     return np.stack([x + range_m, y, 0 * x], -1)
 
 
@@ -222,13 +225,13 @@ def swaying_beam(
     sideways /= np.linalg.norm(sideways, axis=-1, keepdims=True)
     axes = np.stack([boresight, sideways, np.cross(boresight, sideways)], 1)
     sway = np.radians(sway_deg) * np.sin(np.arange(len(antenna)))
-    turn = np.zeros((len(antenna), 3, 3))
-    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(sway)
-    turn[:, 0, 1], turn[:, 1, 0], turn[:, 2, 2] = np.sin(sway), -np.sin(sway), 1
+    rotation = np.zeros((len(antenna), 3, 3))
+    rotation[:, 0, 0] = rotation[:, 1, 1] = np.cos(sway)
+    rotation[:, 0, 1], rotation[:, 1, 0], rotation[:, 2, 2] = np.sin(sway), -np.sin(sway), 1
     edge = np.radians(2.2 * width_deg)
     angle = np.linspace(-edge, edge, 701)
     gain = np.exp(-2 * np.log(2) * (angle / np.radians(width_deg)) ** 2)
-    return Beam(turn @ axes, angle, gain, angle[150:-150], gain[150:-150])
+    return Beam(rotation @ axes, angle, gain, angle[150:-150], gain[150:-150])
 
 
 def hard_beam(soft: Beam, half_deg: float) -> Beam:

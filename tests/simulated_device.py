@@ -230,8 +230,8 @@ def test_sector_finer_than_float32_is_weighted_exactly():
     scene = fly(scatter(pixels), range_m=20e3, pulses=8)
     places, profiles = ecef(pixels), scene.profiles(ecef(pixels))
     sector = Sector.of(profiles.aperture, chord_m=2e3, centre=0.0, half=2e-4)
-    there = float(sector.place(profiles.aperture, places[8, 8][None])[2, 0])
-    beams = Beams(sector=replace(sector, centre=there + sector.half))
+    at_patch = float(sector.place(profiles.aperture, places[8, 8][None])[2, 0])
+    beams = Beams(sector=replace(sector, centre=at_patch + sector.half))
     weight = beams.weight(profiles.aperture, places.reshape(-1, 3))
     assert np.all((weight[2] > 0.05) & (weight[2] < 0.95))
     assert np.all(np.delete(weight, 2, axis=0) == 0)
@@ -244,8 +244,10 @@ def test_pattern_phase_is_not_compensated(plain, tables):
     scene, pixels, _ = plain
     places = ecef(pixels)[:, :16]
     soft = swaying_beam(scene.tx, (12, 0, 0))
-    turned = replace(soft, azimuth_phase_rad=np.linspace(0, 3, 701), elevation_phase_rad=np.linspace(1, 0, 401))
-    with_phase, without = (cuda.form(tables, places, beams=Beams(beam)) for beam in (turned, soft))
+    with_pattern_phase = replace(
+        soft, azimuth_phase_rad=np.linspace(0, 3, 701), elevation_phase_rad=np.linspace(1, 0, 401)
+    )
+    with_phase, without = (cuda.form(tables, places, beams=Beams(beam)) for beam in (with_pattern_phase, soft))
     np.testing.assert_array_equal(with_phase.view(np.uint32), without.view(np.uint32))
 
 
@@ -271,8 +273,12 @@ def long():
 def steady(scene, turn_deg, width_deg=8.0):
     """Return a beam that follows the scene at an offset angle."""
     beam = swaying_beam(scene.tx, (12, 0, 0), width_deg, sway_deg=0)
-    turn, zero = np.radians(turn_deg), np.zeros(len(scene.tx))
-    rows = [[np.cos(turn), np.sin(turn), zero], [-np.sin(turn), np.cos(turn), zero], [zero, zero, zero + 1]]
+    offset_rad, zero = np.radians(turn_deg), np.zeros(len(scene.tx))
+    rows = [
+        [np.cos(offset_rad), np.sin(offset_rad), zero],
+        [-np.sin(offset_rad), np.cos(offset_rad), zero],
+        [zero, zero, zero + 1],
+    ]
     return Beams(replace(beam, axes=np.moveaxis(np.array(rows), -1, 0) @ beam.axes))
 
 
@@ -287,11 +293,11 @@ def veering(sector, flown, place):
 
 def ending_near(sector, scene, place):
     """Return the same sector, centred by a pulse so near that its s changes more over a patch than that of others."""
-    away = ecef(np.array([12.0, 0.0, 2.0]))[None]
+    near_position = ecef(np.array([12.0, 0.0, 2.0]))[None]
     along = (ecef(np.array([0.7, 0.7, 0.0])) - ecef(np.zeros(3)))[None] / 2
     end = Sector(along, along, 0.0, sector.half)
-    at = float(end.place(Aperture(away, away), place[None])[0, 0])
-    return Beams(sector=replace(sector, centre=at, ends=(Aperture(away, away), end)))
+    at = float(end.place(Aperture(near_position, near_position), place[None])[0, 0])
+    return Beams(sector=replace(sector, centre=at, ends=(Aperture(near_position, near_position), end)))
 
 
 @pytest.mark.parametrize(
@@ -339,11 +345,11 @@ def test_more_chunks_than_threads_are_checked_in_groups(long):
 
     scene, places, tables = long
     cuda.form(tables, places)
-    often, pulses = cuda.Resident(), 33 * 128
-    often.arrays = tuple(
+    repeated, pulses = cuda.Resident(), 33 * 128
+    repeated.arrays = tuple(
         numba_cuda.to_device(np.concatenate([array.copy_to_host()[:128]] * 33)) for array in tables.resident.arrays
     )
-    many, turn = replace(tables, pulses=slice(0, pulses), resident=often), np.full(pulses, 100.0)
+    many, turn = replace(tables, pulses=slice(0, pulses), resident=repeated), np.full(pulses, 100.0)
     turn[-20:-10] = 0.0
     beams, counts = steady(replace(scene, tx=np.tile(scene.tx[:128], (33, 1))), turn), np.zeros(4, np.int64)
     image = cuda.form(many, places, beams=beams, counts=counts)

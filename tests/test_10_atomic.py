@@ -44,7 +44,7 @@ MANY = """
 import sys
 from pathlib import Path
 from apertura.common.atomic import write_text
-for turn in range(40):
+for _ in range(40):
     write_text(Path(sys.argv[1]), sys.argv[2] * 20000)
 """
 

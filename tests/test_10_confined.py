@@ -214,12 +214,12 @@ def test_derived_paths_are_confined(root, tmp_path):
 
 
 def test_with_elsewhere_redirects_a_subfolder(root, outside):
-    moved = root.with_elsewhere({"raw": outside})
-    assert (moved / "raw" / "a.json").read_text() == "kept"
-    assert str((moved / "raw" / "a.json").location) == str(outside / "a.json")
+    redirected = root.with_elsewhere({"raw": outside})
+    assert (redirected / "raw" / "a.json").read_text() == "kept"
+    assert str((redirected / "raw" / "a.json").location) == str(outside / "a.json")
     (outside / "deep" / "link").symlink_to(outside / "a.json")
     with pytest.raises(CampaignError, match="a symbolic link"):
-        (moved / "raw" / "deep" / "link").read_text()
+        (redirected / "raw" / "deep" / "link").read_text()
 
 
 # ---- No other code path --------------------------------------------------------------------------------------------

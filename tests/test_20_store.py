@@ -145,9 +145,9 @@ def test_equal_stages_have_equal_manifests(tmp_path):
 
 
 def test_contract_error_lists_every_fault():
-    wrong = track().drop_vars("time").assign(position=(("axis", "epoch"), np.zeros((3, 2), np.float32)))
+    invalid = track().drop_vars("time").assign(position=(("axis", "epoch"), np.zeros((3, 2), np.float32)))
     with pytest.raises(ContractError, match=r"no variable 'time'.*position has dims.*position is float32"):
-        check(wrong, "track")
+        check(invalid, "track")
 
 
 def test_every_variable_of_a_stage_has_a_meaning():

@@ -76,8 +76,8 @@ def test_refractivity_std_covers_10_k_20_hpa_and_any_humidity():
     air = Atmosphere.standard(300.0)
     celsius, hpa, humidity = standard_weather(300.0)
     for change in ((10, 0, 0), (-10, 0, 0), (0, 20, 0), (0, -20, 0)):
-        off = refractivity(celsius + change[0], hpa + change[1], humidity) - air.refractivity_n
-        assert abs(off) < air.std_n
+        error_n = refractivity(celsius + change[0], hpa + change[1], humidity) - air.refractivity_n
+        assert abs(error_n) < air.std_n
     for extreme in (0.0, 100.0):
         assert abs(refractivity(celsius, hpa, extreme) - air.refractivity_n) < 2 * air.std_n
     measured = Atmosphere.of_weather(celsius, hpa, humidity, ground_m=300.0)
@@ -119,16 +119,16 @@ def peak_m(image):
 def test_target_is_at_its_position_only_at_the_speed_in_air():
     aperture, fine = flight(), ap.SceneGrid("local", 0.25, 0.25, 0.02, (100, 100))
     for speed, off_m in ((SPEED_OF_LIGHT_M_S / AIR, 0.0), (SPEED_OF_LIGHT_M_S, 282e-6 * 600 / 0.8)):
-        given = history(aperture, AIR, wave_speed_m_s=speed)
-        x, y = peak_m(ap.backproject(given, fine, terrain=0.0, certified_pixels=8).compute())
+        recorded = history(aperture, AIR, wave_speed_m_s=speed)
+        x, y = peak_m(ap.backproject(recorded, fine, terrain=0.0, certified_pixels=8).compute())
         assert (x, y) == pytest.approx((1.25, -0.75 + off_m), abs=0.05 * off_m + 0.021)
 
 
 @pytest.mark.slow
 def test_atmosphere_keyword_sets_the_wave_speed():
     """Accepted values: N at the terrain, an Atmosphere, the standard atmosphere, vacuum."""
-    aperture, given = flight(), history(flight(), AIR)
-    profiles = range_compress(given, GRID, FlatGround(0.0))
+    aperture, recorded_history = flight(), history(flight(), AIR)
+    profiles = range_compress(recorded_history, GRID, FlatGround(0.0))
     height_m = float(aperture.tx_m[:, 2].mean())
     stated = Atmosphere.stated(300.0, ground_m=0.0)
     expected = {wave_speed(float(stated.mean_n(height_m, 0.0))): (300.0, stated), SPEED_OF_LIGHT_M_S: ("vacuum",)}
@@ -136,16 +136,18 @@ def test_atmosphere_keyword_sets_the_wave_speed():
     quick = {"terrain": 0.0, "certified_pixels": 0}
     for speed, same in expected.items():
         for air in same:
-            assert ap.backproject(given, GRID, atmosphere=air, **quick).wave_speed_m_s == pytest.approx(speed, abs=10)
-    by_speed = ap.backproject(given.at_speed(wave_speed(float(stated.mean_n(height_m, 0.0)))), GRID, **quick)
-    for recorded in (given, profiles):
+            assert ap.backproject(recorded_history, GRID, atmosphere=air, **quick).wave_speed_m_s == pytest.approx(
+                speed, abs=10
+            )
+    by_speed = ap.backproject(recorded_history.at_speed(wave_speed(float(stated.mean_n(height_m, 0.0)))), GRID, **quick)
+    for recorded in (recorded_history, profiles):
         image = ap.backproject(recorded, GRID, atmosphere=stated, **quick)
         assert np.abs(image.values - by_speed.values).max() < 2e-3 * np.abs(by_speed.values).max()
-    assert np.abs(ap.backproject(given, GRID, **quick).values - by_speed.values).max() > 0.1
+    assert np.abs(ap.backproject(recorded_history, GRID, **quick).values - by_speed.values).max() > 0.1
     with pytest.raises(
         CampaignError, match="expected auto, vacuum, an Atmosphere, or the refractivity at the terrain in N units"
     ):
-        ap.backproject(given, GRID, atmosphere="dry")
+        ap.backproject(recorded_history, GRID, atmosphere="dry")
 
 
 @pytest.mark.quick("numba", "reference")
@@ -173,23 +175,23 @@ def test_image_in_air_equals_image_of_scaled_geometry_in_vacuum(engine):
 
 def test_profiles_keep_the_wave_speed_and_it_is_at_most_c():
     aperture = flight()
-    given = history(aperture, AIR, wave_speed_m_s=SPEED_OF_LIGHT_M_S / AIR)
-    profiles = range_compress(given, GRID, FlatGround(0.0))
-    assert profiles.wave_speed_m_s == given.wave_speed_m_s
+    recorded = history(aperture, AIR, wave_speed_m_s=SPEED_OF_LIGHT_M_S / AIR)
+    profiles = range_compress(recorded, GRID, FlatGround(0.0))
+    assert profiles.wave_speed_m_s == recorded.wave_speed_m_s
     assert profiles.bandwidth_hz == pytest.approx(256e6)
     assert profiles.wavelength_m * profiles.wavenumber_rad_m == pytest.approx(2 * np.pi)
     window = RangeWindow.of(aperture, GRID, FlatGround(0.0), FREQUENCY, wave_speed_m_s=SPEED_OF_LIGHT_M_S)
     with pytest.raises(ValueError, match="that of the history"):
-        range_compress(given, GRID, FlatGround(0.0), window=window)
+        range_compress(recorded, GRID, FlatGround(0.0), window=window)
     for speed in (SPEED_OF_LIGHT_M_S * 1.0001, 1.0):
         with pytest.raises(ValueError, match="wave_speed_m_s"):
-            replace(given, wave_speed_m_s=speed)
+            replace(recorded, wave_speed_m_s=speed)
 
 
 def test_extra_path_delays_echoes_at_the_speed_in_air():
     aperture, extra_path_m = flight(), np.full(96, 1.7)
-    given = history(aperture, AIR, wave_speed_m_s=SPEED_OF_LIGHT_M_S / AIR)
-    longer_s = given.moved(aperture, extra_path_m).reference_delay_s - given.reference_delay_s
+    recorded = history(aperture, AIR, wave_speed_m_s=SPEED_OF_LIGHT_M_S / AIR)
+    longer_s = recorded.moved(aperture, extra_path_m).reference_delay_s - recorded.reference_delay_s
     np.testing.assert_allclose(longer_s, 1.7 * AIR / SPEED_OF_LIGHT_M_S, rtol=1e-12)
 
 

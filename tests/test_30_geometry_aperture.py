@@ -44,8 +44,10 @@ def test_path_obeys_the_triangle_inequality(legs, points):
 @given(legs=LEGS, points=POINTS, shift=arrays(np.float64, 3, elements=COORDINATES), seed=st.integers(0, 2**32 - 1))
 def test_paths_are_invariant_to_rigid_motion(legs, points, shift, seed):
     rotation = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))[0]
-    moved = [part @ rotation.T + shift for part in (*legs, points)]
-    np.testing.assert_allclose(Aperture(*moved[:2]).path(moved[2]), Aperture(*legs).path(points), atol=NANOMETRES)
+    transformed = [part @ rotation.T + shift for part in (*legs, points)]
+    np.testing.assert_allclose(
+        Aperture(*transformed[:2]).path(transformed[2]), Aperture(*legs).path(points), atol=NANOMETRES
+    )
 
 
 def test_path_of_points_on_the_baseline_is_its_length():

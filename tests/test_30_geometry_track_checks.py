@@ -190,10 +190,10 @@ RADIUS_M = 6_371_000 * np.pi / 180
 @pytest.mark.parametrize("speed", [0.1, 1.0])
 def test_rounded_positions_are_found_with_their_error(grain_deg, expected_m, kind, speed):
     time_s, place = logged(kind, epochs=600, noise_m=0.003, seed=2)
-    turned = speed * place @ np.array([[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1]])  # aligned with no axis of the grid
-    latitude, longitude = 48 + turned[:, 0] / RADIUS_M, 9 + turned[:, 1] / RADIUS_M / np.cos(np.radians(48))
+    rotated = speed * place @ np.array([[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1]])  # aligned with no axis of the grid
+    latitude, longitude = 48 + rotated[:, 0] / RADIUS_M, 9 + rotated[:, 1] / RADIUS_M / np.cos(np.radians(48))
     rounded = [np.round(angle / grain_deg) * grain_deg for angle in (latitude, longitude)]
-    ecef = ecef_from_geodetic(*rounded, 600 + turned[:, 2])
+    ecef = ecef_from_geodetic(*rounded, 600 + rotated[:, 2])
     error_m = rounded_position_m(time_s, ecef, least_m=X_BAND_M)
     few = grain_deg == 1e-4 and speed * np.ptp(place[:, :2], axis=0).min() < 100  # too few values for a grid
     assert few or error_m == pytest.approx(expected_m, rel=0.01)
@@ -304,8 +304,8 @@ def test_anticlockwise_yaw_is_detected_on_a_round_course():
     """From north or from east; a single corner is ambiguous, as the node may turn towards the scene."""
     degrees = attitude(ROUND, "ahead", np.random.default_rng(1))
     for zero in (0.0, 90.0):
-        turned = np.radians(degrees * [1, 1, -1] + [0, 0, zero])
-        assert check_yaw(ROUND, turned, np.eye(3)).convention == "anticlockwise"
+        anticlockwise = np.radians(degrees * [1, 1, -1] + [0, 0, zero])
+        assert check_yaw(ROUND, anticlockwise, np.eye(3)).convention == "anticlockwise"
     corner = FLOWN["corner"]
     other = np.radians(attitude(corner, "ahead", np.random.default_rng(1)) * [1, 1, -1])
     assert check_yaw(corner, other, np.eye(3)) is None

@@ -76,8 +76,8 @@ def test_attitude_is_read_at_the_time_of_validity(tmp_path):
     """GPS1_DELAY_MS is the delay of the receiver; 0 means the driver's default, 120 ms in this log."""
     configured = read(tmp_path, dataflash_rows(parameters={"GPS1_DELAY_MS": 220.0}))
     default = read(tmp_path, dataflash_rows(parameters={"GPS1_DELAY_MS": 0.0}))
-    turned = np.degrees(default.attitude.values[:, 2] - configured.attitude.values[:, 2])
-    np.testing.assert_allclose(turned, 0.1 * np.degrees(8 / 50), atol=2e-3)
+    difference_deg = np.degrees(default.attitude.values[:, 2] - configured.attitude.values[:, 2])
+    np.testing.assert_allclose(difference_deg, 0.1 * np.degrees(8 / 50), atol=2e-3)
 
 
 @pytest.mark.usefixtures("reader")

@@ -210,8 +210,8 @@ def test_invalid_parameter_is_named(tmp_path, changes, expected):
 
 def test_times_that_contradict_positions_are_flagged(tmp_path):
     right, signal = collected()
-    away = right["RcvPos"][4] - SRP
-    pvp, _ = changed(RcvPos=(4, SRP + away * (1 + 50.0 / np.linalg.norm(away))))
+    receiver_from_srp = right["RcvPos"][4] - SRP
+    pvp, _ = changed(RcvPos=(4, SRP + receiver_from_srp * (1 + 50.0 / np.linalg.norm(receiver_from_srp))))
     flag = read(write(tmp_path / "rx.cphd", pvp, signal)).attrs["flags"]["reference_point"]
     assert flag == (
         "RcvTime - TxTime of pulse 4 differs by 1.67e-07 s from the delay of its reference point, 50 m of path "

@@ -121,11 +121,11 @@ def test_base_of_baselines_comes_from_header_or_config(tmp_path):
     np.testing.assert_allclose(read(tmp_path, text, base=BASE).position.values, expected, atol=1e-6)
     elsewhere = (BASE[0] + 1e-6, *BASE[1:])
     assert "ref pos" in complaint(lambda: read(tmp_path, text, base=elsewhere))
-    turned = text.replace(" 48.399000000 9.951000000", " 48 23 56.40000 9 57 03.60000")
-    assert turned != text
-    np.testing.assert_allclose(read(tmp_path, turned).position.values, expected, atol=1e-3)
-    wild = text.replace(" 48.399000000 9.951", " 98.399000000 9.951")
-    assert "ref pos '98.399" in complaint(lambda: read(tmp_path, wild))
+    sexagesimal_base = text.replace(" 48.399000000 9.951000000", " 48 23 56.40000 9 57 03.60000")
+    assert sexagesimal_base != text
+    np.testing.assert_allclose(read(tmp_path, sexagesimal_base).position.values, expected, atol=1e-3)
+    invalid_base = text.replace(" 48.399000000 9.951", " 98.399000000 9.951")
+    assert "ref pos '98.399" in complaint(lambda: read(tmp_path, invalid_base))
 
 
 def test_height_offset_applies_to_geoid_heights_only(tmp_path):

@@ -51,9 +51,9 @@ def test_reported_std_matches_the_errors_of_many_flights(snr_db, clutter, wobble
         )
     ]
     errors = np.array([flight.offset_m - 1.374 for flight in flights])
-    stated = np.sqrt(np.mean([flight.std_m**2 for flight in flights]))
+    reported_m = np.sqrt(np.mean([flight.std_m**2 for flight in flights]))
     # clutter has errors of both signs: the reported deviation is too large
-    assert stated / 4 < np.sqrt(np.mean(errors**2)) < stated * 2
+    assert reported_m / 4 < np.sqrt(np.mean(errors**2)) < reported_m * 2
 
 
 def test_clutter_of_equal_power_does_not_bias_the_offset():

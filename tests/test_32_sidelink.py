@@ -217,12 +217,12 @@ def test_sidelink_without_lock_is_rejected():
 def test_wrong_code_is_flagged_and_division_still_works():
     rng = np.random.default_rng(15)
     radar, sidelink = SCENE.record(rng, 15)
-    wrong = np.exp(2j * np.pi * rng.random(512)).astype(np.complex64)
-    state = measure(sidelink * wrong)
+    wrong_code = np.exp(2j * np.pi * rng.random(512)).astype(np.complex64)
+    state = measure(sidelink * wrong_code)
     assert "wrong_code" in state.flags
     assert state.snr_db == pytest.approx(15, abs=1)
     assert choose(state)[0] == "divide"
-    assert abs(SCENE.loss_db(divide(radar * wrong, sidelink * wrong))) < 0.3
+    assert abs(SCENE.loss_db(divide(radar * wrong_code, sidelink * wrong_code))) < 0.3
     assert "wrong_code" not in measure(sidelink).flags
     for method, needs_code in (("divide", False), ("wiener", False), ("gated", True), ("two_parameter", True)):
         assert ("sidelink_code" in edges(method, state)) == needs_code

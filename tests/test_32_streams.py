@@ -83,8 +83,8 @@ def test_sidelink_state_does_not_depend_on_block_size():
 def test_wrong_code_is_detected_across_blocks():
     """Neighbouring pulses agree, also across the boundary between blocks."""
     rng = np.random.default_rng(4)
-    wrong = np.exp(2j * np.pi * rng.random(128))
-    sidelink = (20 * wrong + rng.normal(size=(9, 128)) + 1j * rng.normal(size=(9, 128))).astype(np.complex64)
+    wrong_code = np.exp(2j * np.pi * rng.random(128))
+    sidelink = (20 * wrong_code + rng.normal(size=(9, 128)) + 1j * rng.normal(size=(9, 128))).astype(np.complex64)
     state = measure_blocks(lambda: (sidelink[pulses] for pulses in blocks_of(np.arange(9), 1)))
     assert "wrong_code" in state.flags
     assert state.locked.all()

@@ -77,18 +77,18 @@ def of_sums(looks):
     return total**2 / squares
 
 
-@pytest.mark.parametrize("turn", [0.019, 0.021])
+@pytest.mark.parametrize("step", [0.019, 0.021])
 @pytest.mark.parametrize("growth", [1.0, 0.55, 1.9])
-def test_looks_are_bilinear_only_where_both_sums_change_alike(turn, growth):
+def test_looks_are_bilinear_only_where_both_sums_change_alike(step, growth):
     """The largest tolerated change gives a non-zero error of at most 0.08 %; above it the sums are interpolated."""
     looks = Looks.of(GRID, GROUND, FLOWN, None)
     row, column = np.ogrid[: looks.lattice.shape[0], : looks.lattice.shape[1]]
     total = 1e3 * growth ** (row % 2) * np.ones(column.shape)
-    squares = total * (1 + turn * (column % 2))
+    squares = total * (1 + step * (column % 2))
     changed = replace(looks, total=total.astype(np.float32), squares=squares.astype(np.float32))
     found, exact = assembled(changed, changed.effective), of_sums(changed)
     error = np.abs(found / exact - 1).max()
-    if turn > 0.02:
+    if step > 0.02:
         assert error < 1e-6
     else:
         assert 1e-5 < error < 8e-4
