@@ -161,7 +161,7 @@ def dataflash_rows(*, epochs=60, receivers=(0,), parameters=None, without_ael=Fa
 def _formats(forms):
     own = {"FMT": (128, 89, _FMT), **{name: (130 + n, 0, form) for n, (name, form) in enumerate(forms.items())}}
     for name, (number, _, (form, columns)) in own.items():
-        size = struct.calcsize("<" + "".join(_STRUCTS.get(one, one) for one in form)) + 3
+        size = struct.calcsize("<" + "".join(_STRUCTS.get(letter, letter) for letter in form)) + 3
         yield {"Type": number, "Length": size, "Name": name, "Format": form, "Columns": columns}
 
 
@@ -187,7 +187,7 @@ def dataflash_text(rows, forms=None):
     """Return messages as the text log that ground stations convert a binary log to."""
     forms = {**_FORMS, **(forms or {})}
     digits = {"L": 7, "e": 2, "E": 2, "c": 2, "C": 2, "f": 6}
-    lines = [", ".join(["FMT", *(str(value) for value in one.values())]) for one in _formats(forms)]
+    lines = [", ".join(["FMT", *(str(value) for value in row.values())]) for row in _formats(forms)]
     for name, values in rows:
         form, columns = forms[name]
         cells = [

@@ -255,7 +255,7 @@ def test_weighted_tiles_and_unit_weights_are_bitwise_equal(plain, tables):
     scene, pixels, _ = plain
     places = ecef(pixels)
     beams = weights_of(scene, places, "all")
-    whole, part = (cuda.form(tables, some, beams=beams) for some in (places, places[:, 16:]))
+    whole, part = (cuda.form(tables, points, beams=beams) for points in (places, places[:, 16:]))
     np.testing.assert_array_equal(part.view(np.uint32), whole[:, 16:].view(np.uint32))
     everywhere = Sector.of(Aperture(scene.tx, scene.rx), chord_m=1.2, centre=0.0, half=3.0)
     inside, plainly = (cuda.form(tables, places[:, 16:], beams=beams) for beams in (Beams(sector=everywhere), None))
@@ -335,7 +335,7 @@ def test_excluded_pulses_change_no_bit(long, kind):
     unseen = 12 * np.array([64, 64, 2])[~chunks].sum()
     assert counts[0, 3] == unseen  # a whole chunk costs one check
     assert 12 * weight.sum() <= counts[0, 0] <= 12 * (weight.sum() + 4)
-    parts = [cuda.form(tables[some], places, beams=beams[some]) for some in (slice(0, 64), slice(64, 130))]
+    parts = [cuda.form(tables[chunk], places, beams=beams[chunk]) for chunk in (slice(0, 64), slice(64, 130))]
     assert decibels(sum(parts) - image, image) <= -110
 
 
@@ -355,8 +355,8 @@ def test_more_chunks_than_threads_are_checked_in_groups(long):
     image = cuda.form(many, places, beams=beams, counts=counts)
     assert counts.tolist() == [12 * 10, 0, 12 * 54, 12 * (pulses - 64)]
     last = slice(pulses - 64, pulses)
-    some = cuda.form(many[last], places, beams=beams[last])
-    np.testing.assert_array_equal(image.view(np.uint32), some.view(np.uint32))
+    last_chunk = cuda.form(many[last], places, beams=beams[last])
+    np.testing.assert_array_equal(image.view(np.uint32), last_chunk.view(np.uint32))
     assert np.all(image != 0)
 
 

@@ -54,7 +54,7 @@ def exists(name, document):
 
 
 def missing(lacking_in, documents=DOCUMENTS):
-    """Return the missing references of each document that has some."""
+    """Return the missing references of documents that have any."""
     assert len(documents) > 20
     lacking = {document.relative_to(ROOT).as_posix(): sorted(lacking_in(document)) for document in documents}
     return {document: names for document, names in lacking.items() if names}

@@ -43,7 +43,7 @@ def changes(copied, file, *modules):
         ("core/combination.py", "cube", True),
         ("core/combination.py", "image", False),
         ("core/echo/sidelink.py", "echo", True),
-        ("core/echo/sidelink.py", "image", True),  # the check of its samples forms some again
+        ("core/echo/sidelink.py", "image", True),  # the check of its samples recomputes a few
         ("core/echo/calibration.py", "image", False),
         ("formats/export/__init__.py", "export", True),
         ("formats/export/cog.py", "export", True),

@@ -149,6 +149,6 @@ def test_certified_error_is_met_for_any_illuminated_part(seed, widths):
     image = engine.form(
         engine.prepare(inputs, **planned.setting.options), places, beams=beams, **planned.setting.form_options
     )
-    some = tuple(np.random.default_rng(1).integers(0, drawn.grid.shape, (200, 2)).T)
-    exact = reference.form(drawn.history, places[some], beams=beams)
-    assert numerical_error_db(image[some].astype(np.complex64), exact) <= drawn.accuracy_db
+    sample = tuple(np.random.default_rng(1).integers(0, drawn.grid.shape, (200, 2)).T)
+    exact = reference.form(drawn.history, places[sample], beams=beams)
+    assert numerical_error_db(image[sample].astype(np.complex64), exact) <= drawn.accuracy_db
