@@ -8,7 +8,7 @@ from apertura.common.leap_seconds import GPS_EPOCH, gps_from_utc
 
 START = np.datetime64("2025-05-14T09:30:00", "ns")
 LAG_S, BOOT_S = 0.11, 300.0
-"""Delay after which the autopilot receives an epoch, s; clock of the autopilot at `START`, s."""
+"""Latency of epochs at the autopilot, s; clock of the autopilot at `START`, s."""
 
 N_M = 47.5
 """Geoid height above the ellipsoid, m."""
@@ -184,7 +184,7 @@ def dataflash(rows, forms=None):
 
 
 def dataflash_text(rows, forms=None):
-    """Return messages as the text log that ground stations convert a binary log to."""
+    """Return messages as the text log into which ground stations convert a binary log."""
     forms = {**_FORMS, **(forms or {})}
     digits = {"L": 7, "e": 2, "E": 2, "c": 2, "C": 2, "f": 6}
     lines = [", ".join(["FMT", *(str(value) for value in row.values())]) for row in _formats(forms)]

@@ -147,7 +147,7 @@ def _captures(
 
 def _lost(captures: list, iq: NDArray[np.int16]) -> tuple[list, NDArray[np.int16]]:
     kept = np.flatnonzero(np.random.default_rng(5).random(len(captures)) > 0.1)
-    return [captures[capture] for capture in kept], iq[kept]
+    return [captures[index] for index in kept], iq[kept]
 
 
 def _stopped(captures: list, iq: NDArray[np.int16]) -> tuple[list, NDArray[np.int16]]:

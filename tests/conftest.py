@@ -43,7 +43,7 @@ def pytest_collection_modifyitems(config, items):
 
 
 def pytest_collection_finish():
-    """Exclude imported objects from garbage collection: they stay until the end."""
+    """Exclude imported objects from garbage collection, since they stay alive until the end."""
     gc.freeze()
 
 
@@ -66,7 +66,7 @@ def made_once(tmp_path_factory, worker_id):
 
 @pytest.fixture(scope="session")
 def shared():
-    """../shared/data, where it exists."""
+    """Folder of real recordings, ../shared/data."""
     from folders import SHARED
 
     if not SHARED.is_dir():

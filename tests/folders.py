@@ -219,7 +219,7 @@ def small_simulation(
     pulses: int = 6,
     **flight: Any,
 ) -> CampaignSpecification:
-    """Two nodes at a low sampling rate; 2 ms pulse interval, so that a continuous recording stays small."""
+    """Return a specification of two nodes: low sampling rate and 2 ms pulse interval keep recordings small."""
     waveform = WaveformSpecification(64, 1.2e9 + 4567e3, 250e3, 5e-6, 2e-6, 32e6, 500.0)
     tracks = {"a": Straight((-2.0, -11.0, 5.0), (5.0, 0.0, 0.0)), "b": Straight((2.7, -11.0, 5.0), (5.0, 0.0, 0.0))}
     targets = (PointTarget((0.0, 0.0, 0.0)), PointTarget((1.0, 2.0, 0.5), 0.5))

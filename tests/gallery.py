@@ -35,7 +35,7 @@ PICTURES = ROOT / "docs/assets/gallery"
 WORK = ROOT / "build/gallery"
 AIM_BYTES, MOST_BYTES = 40_000, 60_000
 WIDTHS, COLOURS = (660, 600, 560), (256, 64, 32, 20)
-"""Widths in pixels and palette sizes, tried in order until a picture meets the aim; full colour first if it fits."""
+"""Widths in pixels and palette sizes, tried in order after full colour until a picture is small enough."""
 
 WITHOUT = {
     "antenna_coupling": "the example of the UAV flight shows it",
@@ -264,7 +264,7 @@ def gis(_: Path) -> Made:
 
 
 def formed(engine: str) -> None:
-    """Write an image of the posts of the first page by an engine, in a process in which numba may simulate a device."""
+    """Save an image of the example scene formed by an engine; numba may simulate a device in this process."""
     from website.picture import example_history
 
     np.save(f"{engine}.npy", ap.backproject(example_history()[::5], GRID_OF_POSTS, engine=engine).values)

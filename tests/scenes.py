@@ -35,7 +35,7 @@ def without_library(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def ground_points(size_m: float = 10.0, *, north_m: float = 20.0, count: int = 5) -> NDArray[np.float64]:
-    """(count, count, 3) points on flat ground north of the track, rows from north to south."""
+    """Return (count, count, 3) points on flat ground north of the track, rows from north to south."""
     east, north = np.meshgrid(np.linspace(-size_m / 2, size_m / 2, count), north_m + np.linspace(size_m, 0, count))
     return np.stack([east, north, 0 * east], -1)
 
@@ -43,7 +43,7 @@ def ground_points(size_m: float = 10.0, *, north_m: float = 20.0, count: int = 5
 def straight_track(
     pulses: int = 300, *, length_m: float = 6.0, height_m: float = 10.0, wobble_m: float = 0.0
 ) -> NDArray[np.float64]:
-    """(pulse, 3) eastward track at north 0; `wobble_m` is the amplitude of a vertical oscillation."""
+    """Return a (pulse, 3) eastward track at north 0; `wobble_m` is the amplitude of a vertical oscillation."""
     along = np.linspace(-length_m / 2, length_m / 2, pulses)
     return np.stack([along, 0 * along, height_m + wobble_m * np.sin(2 * np.pi * along / length_m * 3)], -1)
 
@@ -77,7 +77,7 @@ TARGET_GRID = SceneGrid("local", -4.0, 4.0, 0.05, (160, 160))
 
 
 def point_history(pulses: int = 96) -> PhaseHistory:
-    """Echoes of `TARGET` from a straight track 20 m south of the middle of `TARGET_GRID`."""
+    """Return echoes of `TARGET` from a straight track 20 m south of the middle of `TARGET_GRID`."""
     frequency = 1.2e9 + 2e6 * np.arange(200)
     along = np.linspace(-4, 4, pulses)
     track = np.stack([along, np.full(pulses, -20.0), np.full(pulses, 10.0)], -1)
@@ -87,7 +87,7 @@ def point_history(pulses: int = 96) -> PhaseHistory:
 
 
 def strip_history(aperture: Aperture, targets_m: NDArray[np.float64], subcarriers: int = 64) -> PhaseHistory:
-    """Echoes of targets (target, 3) recorded on any flight, 96 MHz about 1.25 GHz."""
+    """Return echoes of targets (target, 3) recorded on any flight, 96 MHz about 1.25 GHz."""
     frequency = 1.2e9 + 1.5e6 * np.arange(subcarriers)
     echo = transfer(Scatterers(targets_m, np.ones(len(targets_m))), aperture, frequency, spreading=False)
     weight = np.full(subcarriers, 1 / subcarriers)
@@ -96,7 +96,7 @@ def strip_history(aperture: Aperture, targets_m: NDArray[np.float64], subcarrier
 
 UTM_GRID = SceneGrid("EPSG:32632", 500020.0, 5400060.0, 0.5, (70, 90))
 
-# A bent bistatic flight somewhere on Earth, axes aligned with nothing
+# A curved bistatic flight in ECEF, with arbitrarily rotated axes
 
 AXES, PLACE = np.linalg.qr(np.random.default_rng(4).standard_normal((3, 3)))[0], np.array([4.1e6, 0.9e6, 4.8e6])
 SUBCARRIERS, BANDWIDTH_HZ = 128, 409.6e6
@@ -150,7 +150,7 @@ def fly(
     carrier_hz: float = 1.2e9,
     range_m: float = 12.0,
 ) -> Scene:
-    """Echoes of targets (local metres, around x = range_m) seen from height range_m, aperture equal to the range."""
+    """Return echoes of targets (local metres, around x = range_m) from height range_m, aperture equal to the range."""
     along = np.linspace(-0.5, 0.5, pulses)[:, None] * range_m
     bend = np.sin(np.linspace(0, 7, pulses))[:, None]
     tx = ecef(np.hstack([0.03 * bend, along, range_m + 0.05 * bend]))
@@ -161,7 +161,7 @@ def fly(
 def observed(
     targets: NDArray[np.float64], tx: NDArray[np.float64], rx: NDArray[np.float64], carrier_hz: float
 ) -> Scene:
-    """Echoes of targets (local metres) of unit modulus from antennas in ECEF."""
+    """Return echoes of targets (local metres) of unit modulus from antennas in ECEF."""
     points = Scatterers(ecef(targets), np.exp(2j * np.pi * np.arange(len(targets)) * 0.618))
     return Scene(transfer(points, Aperture(tx, rx), carrier_hz + OFFSET_HZ, spreading=False), tx, rx, carrier_hz)
 
@@ -169,7 +169,7 @@ def observed(
 def pixel_grid(
     rows: int, columns: int, *, spacing_m: float = 0.05, turned_deg: float = 0.0, range_m: float = 12.0
 ) -> NDArray[np.float64]:
-    """(y, x, 3) local pixels around (range_m, 0)."""
+    """Return (y, x, 3) local pixels around (range_m, 0)."""
     across, along = np.meshgrid(
         spacing_m * (np.arange(columns) - columns / 2), spacing_m * (np.arange(rows) - rows / 2)
     )
@@ -207,7 +207,7 @@ def side_beam(
     pulses: int = 300,
     cutoff_db: float = -20.0,
 ) -> Beam:
-    """Beam to the left of a body that flies east: northward."""
+    """Return a beam to the left of a body that flies east: northward."""
     body = np.broadcast_to(np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), (pulses, 3, 3))
     cuts = (
         gaussian_cut(w, cutoff_db=cutoff_db, limit_rad=x) for w, x in zip(width_deg, (np.pi, np.pi / 2), strict=True)
@@ -218,7 +218,7 @@ def side_beam(
 def swaying_beam(
     antenna: NDArray[np.float64], at: tuple[float, float, float], width_deg: float = 40.0, *, sway_deg: float = 15.0
 ) -> Beam:
-    """Gaussian beam (half-power width, cut off at negligible gain) pointed at one local point, with a sway."""
+    """Return a Gaussian beam (half-power width, cut off at negligible gain) pointed at one local point, with a sway."""
     boresight = ecef(np.array(at)) - antenna
     boresight /= np.linalg.norm(boresight, axis=-1, keepdims=True)
     sideways = np.cross(AXES[:, 2], boresight)

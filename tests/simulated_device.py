@@ -49,7 +49,7 @@ def plain():
 
 @pytest.fixture(scope="module")
 def tables(plain):
-    """Tables on the device once for all tests: in the simulator they take longer than an image."""
+    """Tables on the device, shared by all tests: in the simulator they take longer than an image."""
     return cuda.prepare(plain[2])
 
 
@@ -312,7 +312,7 @@ def ending_near(sector, scene, place):
     ],
 )
 def test_excluded_pulses_change_no_bit(long, kind):
-    """Whole chunks, or single pulses; also where the middle of a chunk is excluded and its ends are not."""
+    """Whole chunks and single pulses are excluded, also chunks whose middle is excluded and whose ends are not."""
     scene, places, tables = long
     flown = Aperture(scene.tx, scene.rx)
     sector = Sector.of(flown, chord_m=1.2, centre=0.0, half=0.03)
@@ -362,7 +362,7 @@ def test_more_chunks_than_threads_are_checked_in_groups(long):
 
 @compiled
 def test_unilluminated_pixels_match_the_compiled_engine(plain, tables):
-    """Zero, which the steps write as no data."""
+    """Their value is zero, which the steps write as no data."""
     scene, pixels, profiles = plain
     places, flown = ecef(pixels), Aperture(scene.tx, scene.rx)
     beams = Beams(None, hard_beam(swaying_beam(scene.rx, (11.8, 0, 0), sway_deg=1), 0.8))
@@ -375,7 +375,7 @@ def test_unilluminated_pixels_match_the_compiled_engine(plain, tables):
     np.testing.assert_array_equal(image != 0, compiled_image != 0)
     np.testing.assert_array_equal(image != 0, lit)
     truth = reference.form(scene.history(), places, beams=beams)
-    assert decibels(image - truth, truth) <= -70  # to the very edge
+    assert decibels(image - truth, truth) <= -70  # up to the edge of the beam
 
 
 def test_pixel_without_position_affects_no_weight(plain, tables):

@@ -13,7 +13,7 @@ from snakemake_interface_logger_plugins.registry import LoggerPluginRegistry
 
 
 class LogHandler(LogHandlerBase):
-    """Prints jobs, and error messages unchanged."""
+    """Logger plugin that prints jobs, and error messages unchanged."""
 
     writes_to_stream = True
     writes_to_file = False

@@ -145,7 +145,7 @@ def test_config_keys_in_documents_exist():
     keys = {key for part in parts for key in part.get("properties", {})} | {"native", "numba", "cuda", "reference"}
 
     def lacking(document):
-        config, *_ = text_of(document).split("\n## image.json")  # its keys are those of results
+        config, *_ = text_of(document).split("\n## image.json")  # without image.json, whose keys are those of results
         named = {word for key in _KEY.findall(config) for word in key.split(".")}
         return {word for word in named if not word.startswith("<")} - keys
 

@@ -1,4 +1,4 @@
-"""Progress of a step: written to a file during the work, rarely, and without effect on the step if it fails."""
+"""Progress of a step: written to a file at most once a second; a failed write does not stop the step."""
 
 import json
 

@@ -22,7 +22,7 @@ X_BAND_M = 0.0316 / 16
 
 
 def flight(kind, time_s, generator):
-    """Positions of a flight, (epoch, 3) metres."""
+    """Return positions of a flight, (epoch, 3) metres."""
     if kind == "hover":
         return 0.03 * np.stack([np.sin(0.5 * time_s + phase) for phase in range(3)], -1)
     if kind == "straight":
@@ -182,7 +182,7 @@ RADIUS_M = 6_371_000 * np.pi / 180
     [
         (1e-4 / 60, 0.0644),  # four decimals of an arc minute: 0.185 m and 0.124 m, over √12
         (1e-5 / 60, 0.00535),  # 1.9 cm of latitude; 1.2 cm of longitude are fine enough
-        (1e-4, 3.87),  # six digits of a spreadsheet
+        (1e-4, 3.87),  # six significant digits, as in a spreadsheet
         (1e-9, 0.0),
     ],
 )
@@ -240,7 +240,7 @@ WIND_M_S, AIR_M_S = np.array([2.0, -1.0]), 7.0
 
 
 def attitude(place_m, policy, generator):
-    """Return roll, pitch and yaw (deg) of a multirotor that tilts into its flight; positions are north, east, down."""
+    """Return roll, pitch and yaw (deg) of a multirotor tilted along its flight; positions are north, east, down."""
     velocity = np.gradient(place_m[:, :2], 0.1, axis=0)
     course = np.degrees(np.unwrap(np.arctan2(velocity[:, 1], velocity[:, 0])))
     across = (velocity[:, 0] * WIND_M_S[1] - velocity[:, 1] * WIND_M_S[0]) / np.hypot(*velocity.T)

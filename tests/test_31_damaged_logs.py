@@ -26,7 +26,7 @@ LOGS = {
 }
 HEADING = {"csv": 1, "rtklib": 2, "nmea": 0, "airdata": 1, "optitrack": 7}
 SHIFT = {"airdata": np.timedelta64(150, "ms")}
-"""Tolerated change of the fraction of a second, which is estimated from all epochs."""
+"""Tolerated time offset, since the fraction of a second is estimated from all epochs."""
 
 PROPERTY = tried(60)
 
@@ -42,7 +42,7 @@ def read(folder, kind, data):
 
 
 def changed_epochs(track, whole, kind):
-    """Return the number of epochs that equal none of the undamaged log, in position and time."""
+    """Return the number of epochs that differ from all epochs of the undamaged log in position or time."""
     if track is None:
         return 0
     nearest = np.abs(track.position.values[:, None] - whole.position.values).max(axis=2).argmin(axis=1)

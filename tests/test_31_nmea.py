@@ -146,7 +146,7 @@ def test_sentence_with_wrong_or_missing_checksum_is_dropped(tmp_path):
 
 @pytest.mark.parametrize("end", ["\r\n", "\n", " \r\n"])
 def test_log_without_checksums_is_read_with_a_remark(tmp_path, end):
-    """A truncated sentence is still dropped, at the end of the log even if only its last digits are missing."""
+    """A truncated sentence is still dropped, even if only the last digits at the end of the log are missing."""
     lines = [line.partition("*")[0] for line in logs.nmea(TIMES, PLACES).splitlines()]
     at = next(place for place, line in enumerate(lines) if "GGA,235957.30" in line)
     lines[at] = lines[at][:40]

@@ -119,7 +119,7 @@ def test_incomplete_pose_and_non_unit_quaternion_are_rejected(tmp_path):
 
 
 def test_real_rail_pass_is_read(shared):
-    """10928 frames at 360 Hz by its heading, five without the radar; the rail is 3.42 m long, straight and level."""
+    """10928 frames at 360 Hz in the heading, five without the radar; the rail is 3.42 m long, straight and level."""
     path = shared / "bwsi_rail_passA" / "Rail SAR 2.csv"
     track = read(path)
     assert track.sizes["epoch"] + track.dropped["body not tracked"] == 10928

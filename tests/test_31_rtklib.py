@@ -137,7 +137,7 @@ def test_height_offset_applies_to_geoid_heights_only(tmp_path):
 
 
 def restarted(first, second, **written):
-    """Return a log of two parts, 20 epochs and a header each; keys of both are systems, kinds or datums."""
+    """Return a log of two parts of 20 epochs, each with a header; the dicts may set system and kind."""
     parts = []
     for part, keys in ((slice(0, 20), first), (slice(20, 40), second)):
         system = keys.get("system", "UTC")

@@ -207,7 +207,7 @@ def test_mixing_of_a_continuous_recording_does_not_depend_on_reads(tmp_path):
 @pytest.mark.parametrize(("kind", "right"), [("<f4", "f32_le"), (">f4", "f32_be"), ("<f8", "f64_le")])
 @pytest.mark.parametrize("unit", [1.0, 1e-6])
 def test_floats_declared_as_integers_are_rejected(campaign, taken_for, kind, right, unit):
-    """Captures contain as many samples as the file does with the declared datatype."""
+    """The sample indices of the captures are adapted to the declared datatype."""
     numbers = (counts_of(campaign, "a") * unit).astype(kind)
     per_sample = np.dtype(kind).itemsize * 8 // int("".join(filter(str.isdigit, taken_for)))
 

@@ -296,7 +296,7 @@ def test_leap_second_learnt_during_the_log_is_rejected(tmp_path):
 @pytest.mark.parametrize("epoch", [0, 3, 30, 58, 59])
 @pytest.mark.parametrize(("field", "step"), [("lat", 90), ("lon", -150), ("alt_ellipsoid", 1000)])
 def test_position_that_contradicts_the_velocity_is_dropped(tmp_path, epoch, field, step):
-    """Error of about 1 m, as from a flipped bit. At the ends only velocity reveals it; epoch 58 takes 59 with it."""
+    """Error of about 1 m, as from a flipped bit; at the ends only velocity reveals it. With epoch 58, 59 is dropped."""
     displaced = ulog_receiver()[field][1] + step * (np.arange(60) == epoch)
     track = read(tmp_path, (GPS, 0, ulog_receiver(**{field: displaced})))
     assert track.attrs["dropped"] == {"position contradicts the receiver's velocity": 1 + (epoch == 58)}

@@ -54,7 +54,7 @@ def test_drift_beyond_a_repetition_interval_is_followed(drift_ppm):
         tx_missed=0.05,
     )
     pairs = associate(tx, rx, repetition_interval_s=0.01)
-    assert abs(drift_ppm) * 1e-6 * 400 > 0.01  # the drift does exceed an interval
+    assert abs(drift_ppm) * 1e-6 * 400 > 0.01  # the drift exceeds an interval
     assert share_right(pairs, numbers) == 1.0
     assert pairs.drift_ppm == pytest.approx(drift_ppm, abs=2)
 

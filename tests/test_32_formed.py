@@ -118,7 +118,7 @@ def test_pulses_are_returned_in_the_requested_order(drifting, tmp_path):
     whole = transfer.values
     pulses = np.array([7, 3, 3, 40])
     for key in (pulses, slice(None, None, 9), slice(60, 10, -7), 5, (pulses, slice(2, 9)), (slice(3), 4)):
-        # of 100: rounding of the DFT
+        # rounding of the DFT at amplitudes of 100
         np.testing.assert_allclose(transfer[key].values, whole[key], rtol=2e-6, atol=1e-4)
     assert transfer[:0].values.shape == (0, whole.shape[1])
 

@@ -10,7 +10,7 @@ PULSES, CELLS, PREFIX = 200, 256, 80
 
 
 def echoes(rng, targets=5, *, image_snr_db=60.0, step_m=0.025, phase_rad=0.0):
-    """Return transfer functions (pulse, subcarrier) of a flight past targets with an SNR of mean power in the image."""
+    """Return (pulse, subcarrier) transfer functions of a flight past targets; image SNR of a target of mean power."""
     frequency = 1.2e9 + 409.6e6 * np.arange(CELLS) / CELLS
     along = (np.arange(PULSES) - PULSES / 2) * step_m
     track = np.stack([along, 0 * along, 0 * along + 5], -1)

@@ -56,7 +56,7 @@ def test_steep_planes_are_in_shadow_or_layover(slope_deg, expected):
 
 
 def test_shadow_on_random_hills_matches_dense_sampling():
-    """The search that skips whole blocks against dense sampling of bilinear terrain."""
+    """The search that skips whole blocks agrees with dense sampling of bilinear terrain."""
     from scipy.ndimage import gaussian_filter, map_coordinates
 
     generator = np.random.default_rng(1)
