@@ -127,8 +127,8 @@ def test_chart_distinguishes_the_verdicts(monkeypatch, tmp_path):
     monkeypatch.setattr(sweep, "save_png", lambda figure, _: figures.append(figure))
     charts.draw_losses("losses", rows, tmp_path / "losses.png")
     five, dense = figures[0].axes
-    places = [marks(five, said).tolist() for said in (*VERDICTS, "refused estimate")]
-    assert places == [[[1.0, 0.2]], [[2.0, 0.2]], [[3.0, 6.0]], [[5.0, 10.0]], [[3.0, 0.2]]]
+    marked = [marks(five, label).tolist() for label in (*VERDICTS, "refused estimate")]
+    assert marked == [[[1.0, 0.2]], [[2.0, 0.2]], [[3.0, 6.0]], [[5.0, 10.0]], [[3.0, 0.2]]]
     assert marks(dense, TOO_FEW)[:, 0].tolist() == [1.0, 2.0, 3.0, 5.0]
     assert "2 of 4 accepted, 0 of them worse" in five.get_title()
     assert "0 of 4 accepted" in dense.get_title()

@@ -97,8 +97,8 @@ def test_printed_values_are_quoted_digit_by_digit():
     assert printed["clock error of each node at the SFO limit, ±"] == (
         "100",
         "97.64",
-        EXPLAINED,
-    )  # two clocks in opposite directions, and rounded
+        EXPLAINED,  # two clocks with opposite offsets, rounded
+    )
     assert printed["CFO of a clock error of 10 ppb"] == ("41", "12", EXPLAINED)
     assert printed["SFO of a clock error of 10 ppb"] == ("12", "40.96", EXPLAINED)
     assert not any("8.3" in row.paper for row in rows.values())
@@ -159,11 +159,11 @@ def test_timing_error_shifts_a_profile_and_carrier_phase_does_not():
     assert {claim.verdict for claim in (shift, phase, small, magnitude)} == {AGREES}
 
 
-def test_errors_along_the_sidelink_cancel_only_where_both_nodes_share_them():
-    both = position_claims(draws=1)[-1]
-    assert (both.about, both.verdict) == (PAPER, AGREES)
-    alone_cm = 1 - 2.35 / np.hypot(2.35, np.hypot(15, 10))  # the sidelink grows by 1 cm, the echo's path by less
-    assert f"of a single node, which the paper does not discuss, leaves {alone_cm:.2f} cm" in both.note
+def test_errors_along_the_sidelink_cancel_only_if_common_to_both_nodes():
+    claim = position_claims(draws=1)[-1]
+    assert (claim.about, claim.verdict) == (PAPER, AGREES)
+    alone_cm = 1 - 2.35 / np.hypot(2.35, np.hypot(15, 10))  # the sidelink grows by 1 cm, the echo path by less
+    assert f"of a single node, which the paper does not discuss, leaves {alone_cm:.2f} cm" in claim.note
 
 
 def test_worst_bistatic_path_error_is_root_2_times_the_monostatic_one():
@@ -199,8 +199,8 @@ def test_swarm_receivers_sum_in_phase_with_gain_10_lg_n():
 
 
 def test_trigger_finds_every_pulse_at_its_position():
-    found, error = trigger_claims(pulses=4)
-    assert (found.computed, found.verdict, error.verdict) == ("1", AGREES, AGREES)
+    detected, error = trigger_claims(pulses=4)
+    assert (detected.computed, detected.verdict, error.verdict) == ("1", AGREES, AGREES)
 
 
 @pytest.mark.parametrize(
@@ -339,11 +339,11 @@ def test_loss_row_is_marked_destroyed_only_if_both_values_are(monkeypatch):
     assert other.note.startswith("differs")
 
 
-def test_a_row_says_whose_value_it_is_compared_with_and_hides_no_difference():
-    ours = require("x", 0.02, "dB", limit="below 0.01 dB", met=False, note="n")
-    assert ours == Claim("x", "", "", "0.02", "dB", OWN, DISAGREES, "required: below 0.01 dB; n")
-    said = require("x", 0.02, "dB", limit="below 0.01 dB", met=False, words="none", note="n")
-    assert (said.about, said.note) == (PAPER, "the paper: none; interpreted as: below 0.01 dB; n")
+def test_claim_states_its_reference_and_every_difference():
+    own = require("x", 0.02, "dB", limit="below 0.01 dB", met=False, note="n")
+    assert own == Claim("x", "", "", "0.02", "dB", OWN, DISAGREES, "required: below 0.01 dB; n")
+    from_paper = require("x", 0.02, "dB", limit="below 0.01 dB", met=False, words="none", note="n")
+    assert (from_paper.about, from_paper.note) == (PAPER, "the paper: none; interpreted as: below 0.01 dB; n")
     both = compare("x", 1.0, "1", paper="2.0", independent_model=1.0, within=0.1)
     assert (both.paper, both.independent_model, both.about, both.verdict) == ("2.0", "1", PAPER, DISAGREES)
     assert both.note == "differs by -50.0 %"
