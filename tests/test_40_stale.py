@@ -287,7 +287,7 @@ def test_results_moved_into_another_folder_are_not_stale(finished, tmp_path):
 # ---- Recordings that lie elsewhere, and what was kept of them -------------------------------------------------------
 
 SAMPLES = ["raw/f01/uav1.sigmf-data", "raw/f01/uav2.sigmf-data"]
-TOLD = "expected the recording of node uav2 in flight f01, to make results/f01/uav1-uav2/image.manifest.json again"
+TOLD = "expected the recording of node uav2 in flight f01, to recompute results/f01/uav1-uav2/image.manifest.json"
 
 
 def archive(root):
@@ -371,5 +371,5 @@ def test_a_plan_follows_the_config_and_not_results_that_are_out_of_date(tiny, ca
     assert planned_spacing_m(edited) == 0.2
     print_plan(edited)
     printed = capsys.readouterr().out
-    assert "1 result out of date (results/scene.manifest.json): planned from the config" in printed
+    assert "1 result out of date (results/scene.manifest.json): plan from the config" in printed
     assert "pixels of 0.2 m" in " ".join(printed.split())

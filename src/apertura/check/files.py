@@ -42,9 +42,9 @@ def check_flights(examined: "Examination") -> Iterator[CampaignError]:
 def check_files(examined: "Examination") -> Iterator[CampaignError]:
     """Yield a problem for each file that is missing, empty, dated in the future or not readable."""
     campaign = examined.campaign
-    wanted = _wanted(examined)
+    required_by = _wanted(examined)
     for flight in campaign.flights:
-        yield from _recorded(campaign, flight, wanted)
+        yield from _recorded(campaign, flight, required_by)
     lookups: list[Callable[[], dict[str, ConfinedPath]]] = [
         lambda: {f"scene.{role}": path for role, path in campaign.height_files().items()}
     ]
@@ -78,14 +78,14 @@ def _wanted(examined: Examination) -> Callable[[str], str | None]:
         except CampaignError:  # reported by other checks
             return None
 
-    def wanted(name: str) -> str | None:
+    def required_by(name: str) -> str | None:
         known = files()
         return known[0].get(name, "") if known and name in known[1] else None
 
-    return wanted
+    return required_by
 
 
-def _recorded(campaign: Campaign, flight: Flight, wanted: Callable[[str], str | None]) -> Iterator[CampaignError]:
+def _recorded(campaign: Campaign, flight: Flight, required_by: Callable[[str], str | None]) -> Iterator[CampaignError]:
     """Yield problems of the files of a flight: samples and logs, or phase history."""
     if not isinstance(campaign.settings.waveform, SampledWaveform):
         for node in flight.nodes:
@@ -105,7 +105,7 @@ def _recorded(campaign: Campaign, flight: Flight, wanted: Callable[[str], str | 
             except CampaignError as problem:  # a link
                 yield problem
                 continue
-            if exists or (result := wanted(campaign.relative(path))) is None:
+            if exists or (result := required_by(campaign.relative(path))) is None:
                 yield from _readable(path, expected, remedy)
             elif result:
                 yield from _readable(path, f"{expected}, to recompute {result}", f"{remedy} {_KEPT}")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from apertura.campaign.config import SEGMENTS, Node, PhaseHistoryWaveform
 from apertura.campaign.folder import Campaign
 from apertura.common.arrays import Times
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, number_of
 from apertura.common.flags import Flags
 from apertura.core.geometry.atmosphere import Atmosphere, FlightAir, SceneAir
 from apertura.core.geometry.geodesy import LOCAL, frame_from_map, map_from_frame
@@ -205,7 +205,7 @@ def _flags(node: NodeLog, at: Times, excluded: dict[str, NDArray[np.bool_]]) -> 
         if faults:
             time_s, size_m = faults[0]
             size = f"{size_m:.3f} m " if size_m else ""
-            worst = f"; {len(faults)} in the log, largest {size}at {node.log_time(time_s)}"
+            worst = f"; {number_of(len(faults), 'fault')}, the worst {size}at {node.log_time(time_s)}"
         longest = _longest_hole(node, checked, name) if count else ""
         reason = fault.format(poorest_fix=node.settings.poorest_fix)
         lines[name] = f"{node.name}: {count} of {len(at)} pulses excluded: {reason}{longest}{worst}"

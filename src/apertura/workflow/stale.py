@@ -83,14 +83,14 @@ def wanted_files(campaign: Campaign, stale: Collection[str]) -> dict[str, str]:
 
     `stale`: manifests of `stale_results`.
     """
-    wanted = dict[str, str]()
+    missing = dict[str, str]()
     for name, where, result in places_of(campaign):
         is_current = (campaign.root / result.manifest).is_file() and result.manifest not in stale
         if not is_current and not on_demand(campaign, result.manifest):
             for source in files_read(campaign, name, *where):
                 if source.startswith(_RAW) and not (campaign.root / source).is_file():
-                    wanted.setdefault(source, result.manifest)
-    return wanted
+                    missing.setdefault(source, result.manifest)
+    return missing
 
 
 def absent_lines(campaign: Campaign) -> Iterator[str]:

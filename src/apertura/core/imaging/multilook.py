@@ -308,8 +308,8 @@ class Multilook:
         >>> multilook.shape, round(multilook.looks), multilook.mean((slice(0, 2), slice(5, 8))).shape
         ((128, 128), 16, (2, 3))
         """
-        wanted = min(max(_MEASURED_PX, _MEASURED_WINDOWS * WINDOW * side), _LARGEST_PX)
-        rows, columns = (min(wanted, size) // side * side or min(wanted, size) for size in pixels)
+        size_px = min(max(_MEASURED_PX, _MEASURED_WINDOWS * WINDOW * side), _LARGEST_PX)
+        rows, columns = (min(size_px, size) // side * side or min(size_px, size) for size in pixels)
         count = max(1, min(_MEASURED_BLOCKS, min(_MOST_PX, 2 * pixels[0] * pixels[1]) // (rows * columns)))
         corners = np.random.default_rng(0).uniform(size=(count, 2)) * (pixels[0] - rows, pixels[1] - columns)
         starts = sorted({(int(row) // side * side, int(column) // side * side) for row, column in corners})

@@ -240,12 +240,12 @@ def apply_drift(time_s: Floats, drift_ppm: float) -> Floats:
     return np.asarray(middle_s + (time_s - middle_s) * (1 + drift_ppm * 1e-6))
 
 
-def estimate_drift(found: Alignment, echo: Recorded, log: Logged, point_m: Floats) -> Alignment:
+def estimate_drift(alignment: Alignment, echo: Recorded, log: Logged, point_m: Floats) -> Alignment:
     """Add the drift that maximises the coherent sum at a known point to an alignment, if the recording resolves it.
 
     Parameters
     ----------
-    found
+    alignment
         Alignment without drift.
     echo, log
         Echoes on the recorder's clock; antenna positions on the log's clock.
@@ -266,7 +266,7 @@ def estimate_drift(found: Alignment, echo: Recorded, log: Logged, point_m: Float
     step_ppm = 1e6 * offset_step_s(echo, log) / max(half_s, 1e-12)
     if step_ppm > MOST_PPM:
         line = f"not observable: a drift below {step_ppm:.0f} ppm changes no path by 1/{_STEPS_PER_WAVE} wavelength"
-        return replace(found, report={**found.report, "drift": line})
+        return replace(alignment, report={**alignment.report, "drift": line})
 
     def power(ppm: float, offset_s: float, path_m: float) -> float:
         times_s = apply_drift(time_s, ppm)
@@ -274,9 +274,9 @@ def estimate_drift(found: Alignment, echo: Recorded, log: Logged, point_m: Float
 
     # Drift alone on a grid, then jointly with the offset and, unless it is fixed, the path by the simplex method.
     drifts_ppm = np.arange(-MOST_PPM, MOST_PPM + step_ppm, step_ppm)
-    start = found.offset_s, found.path_m
+    start = alignment.offset_s, alignment.path_m
     best_ppm = float(drifts_ppm[int(np.argmax([power(ppm, *start) for ppm in drifts_ppm]))])
-    steps = np.array([found.offset_width_s / 2, max(found.path_width_m, 0.0) / 2, step_ppm])
+    steps = np.array([alignment.offset_width_s / 2, max(alignment.path_width_m, 0.0) / 2, step_ppm])
     free = np.flatnonzero(steps)
 
     def displaced(by: Floats) -> tuple[float, float, float]:
@@ -294,5 +294,5 @@ def estimate_drift(found: Alignment, echo: Recorded, log: Logged, point_m: Float
     offset_s, path_m, ppm = displaced(result.x)
     gain_db = decibels(-result.fun / max(power(0.0, *start), 1e-300))
     first_s = float(apply_drift(time_s, ppm)[0] - time_s[0])
-    report = {**found.report, "drift": f"peak {gain_db:.2f} dB higher than without drift"}
-    return replace(found, offset_s=offset_s + first_s, path_m=path_m, drift_ppm=ppm, report=report)
+    report = {**alignment.report, "drift": f"peak {gain_db:.2f} dB higher than without drift"}
+    return replace(alignment, offset_s=offset_s + first_s, path_m=path_m, drift_ppm=ppm, report=report)

@@ -79,8 +79,8 @@ def tiles(
     >>> silent = np.zeros((200, 100), np.complex64)
     >>> profiles = Profiles(silent, np.full(200, 20.0), 0.366, 1.4e9, 2.0, Aperture(track, track))
     >>> grid = SceneGrid("local", -9.0, 24.0, 0.5, (36, 36))
-    >>> found = tiles([PairRecord("a-a", profiles, time_s)], grid, FlatGround(0.0), correlation_s=1.0)
-    >>> len(found), found[0].sides_m.round(1).tolist()
+    >>> scene_tiles = tiles([PairRecord("a-a", profiles, time_s)], grid, FlatGround(0.0), correlation_s=1.0)
+    >>> len(scene_tiles), scene_tiles[0].sides_m.round(1).tolist()
     (9, [[0.0, -6.0, 0.0], [6.0, 0.0, 0.0]])
     """
     middle = terrain.positions_at(grid, (grid.shape[0] - 1) / 2, (grid.shape[1] - 1) / 2)
@@ -463,10 +463,9 @@ def _solved(ground: SpeckleTiles, prior: Prior, used: Bools) -> Floats:
         agreements = ground.agreements(prior.tracks(unknowns), used)
 
         def value(tracks: Tracks, every: Sequence[SpeckleAgreement] = agreements) -> tuple[float, dict[str, Floats]]:
-            found = [one(tracks) for one in every]
-            return sum(one for one, _ in found), {
-                node: np.sum([by[node] for _, by in found], axis=0) for node in tracks
-            }
+            evaluated = [agreement(tracks) for agreement in every]
+            gradient = {node: np.sum([by_node[node] for _, by_node in evaluated], axis=0) for node in tracks}
+            return sum(of_pairs for of_pairs, _ in evaluated), gradient
 
         unknowns = minimise(value, prior, Gauge.none(prior.size), unknowns, iterations=_ITERATIONS)
     return unknowns

@@ -28,7 +28,7 @@ _SHIFTS = 0.5  # variation of the path gradient, relative to the largest, of dir
 
 
 def refine_one_phase(
-    records: Sequence[PairRecord], found: Candidates, errors: Mapping[str, TrackErrors], *, method: str
+    records: Sequence[PairRecord], candidates: Candidates, errors: Mapping[str, TrackErrors], *, method: str
 ) -> Refinement:
     """Estimate path offsets of the pairs by one-phase autofocus, accepted by the contrast gain of held-out patches.
 
@@ -36,7 +36,7 @@ def refine_one_phase(
     ----------
     records
         Records of all pairs.
-    found
+    candidates
         Candidate points of the scene.
     errors
         Node → error statistics of its log.
@@ -49,9 +49,9 @@ def refine_one_phase(
     fitted to those of the other patches that share no range with it. Of these offsets and those fitted to all patches,
     the sharpest are returned. Tracks are not corrected: the position errors of a node remain those of its log.
     """
-    if not found.patches:
-        return found.rejected(errors)
-    fits = [_Pair.of(record, found.patches, errors).fitted(method) for record in records]
+    if not candidates.patches:
+        return candidates.rejected(errors)
+    fits = [_Pair.of(record, candidates.patches, errors).fitted(method) for record in records]
     gain_db = np.concatenate([fit.gain_db for fit in fits])
     gain = mean_gain(gain_db[None])
     reason = (
@@ -63,13 +63,13 @@ def refine_one_phase(
         {node: np.zeros((len(knots_s), 3)) for node in errors},
         {fit.pair: np.interp(knots_s, fit.time_s, fit.extra_path_m) for fit in fits},
     )
-    std_m = {node: np.tile(error.along(found.axes), (len(knots_s), 1)) for node, error in errors.items()}
+    std_m = {node: np.tile(error.along(candidates.axes), (len(knots_s), 1)) for node, error in errors.items()}
     report = {
         "method": method,
-        "patches": len(found.patches),
+        "patches": len(candidates.patches),
         "gain_held_out_db": round(gain.mean_db, 3),
         "gain_std_db": round(gain.std_db, 3),
-        **_residuals(fits, [_log_effect(record, found, errors) for record in records]),
+        **_residuals(fits, [_log_effect(record, candidates, errors) for record in records]),
     }
     promising = not gain.certain and abs(gain.mean_db) > LEAST_GAIN_DB  # else no improvement over the logs
     return Refinement(
@@ -195,14 +195,14 @@ def _contributions(
     return cached
 
 
-def _log_effect(record: PairRecord, found: Candidates, errors: Mapping[str, TrackErrors]) -> Effect:
+def _log_effect(record: PairRecord, candidates: Candidates, errors: Mapping[str, TrackErrors]) -> Effect:
     """Return the effect of the logs' errors on the image of a pair."""
     profiles = record.profiles
     paths = PointPaths.of(
         profiles.aperture,
         record.time_s,
-        point_m=np.mean([patch.place_m for patch in found.patches], axis=0),
-        axes=found.axes,
+        point_m=np.mean([patch.place_m for patch in candidates.patches], axis=0),
+        axes=candidates.axes,
         wavelength_m=profiles.wavelength_m,
     )
     nodes = [NodePositions(errors[node].std_m, errors[node].correlation_s) for node in dict.fromkeys(record.nodes)]

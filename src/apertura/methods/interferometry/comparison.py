@@ -47,7 +47,7 @@ class InterferogramCounts:
         Median share of the spectrum that both images sample.
     ambiguity_m
         Median height of ambiguity, metres.
-    told
+    unwrapped
         Number of pixels with unwrapped phase; `apart`: in components without a reference level.
     residues, loops, jumps, by
         As in `apertura.methods.interferometry.heights.Unwrapped`.
@@ -64,7 +64,7 @@ class InterferogramCounts:
     chance: float
     overlap: float
     ambiguity_m: float
-    told: int = 0
+    unwrapped: int = 0
     apart: int = 0
     residues: int = 0
     loops: int = 0
@@ -108,8 +108,8 @@ def interferogram_flags(measured: InterferogramCounts) -> Flags:
     ambiguous = []
     if counts.apart:
         ambiguous.append(
-            f"{counts.apart} of {counts.told} unwrapped pixels lie in other components, with unknown multiples of 2π: "
-            "excluded"
+            f"{counts.apart} of {counts.unwrapped} unwrapped pixels lie in other components, "
+            "with unknown multiples of 2π: excluded"
         )
     if counts.jumps and not counts.by:
         ambiguous.append(
@@ -121,16 +121,16 @@ def interferogram_flags(measured: InterferogramCounts) -> Flags:
     inconsistent = []
     if counts.residues > MOST_RESIDUES * counts.loops:
         inconsistent.append(f"{counts.residues} phase residues in {counts.loops} loops of four pixels")
-    if counts.folded > MOST_FOLDED * counts.told:
+    if counts.folded > MOST_FOLDED * counts.unwrapped:
         inconsistent.append(f"{number_of(counts.folded, 'point')} imaged by several pixels, excluded")
     if inconsistent:
         flags["unwrapping_inconsistent"] = (
             f"{'; '.join(inconsistent)}: heights may have errors of multiples of {counts.ambiguity_m:.3g} m"
         )
-    if counts.told and not counts.points:
+    if counts.unwrapped and not counts.points:
         flags["height_relative"] = (
-            "no point of known height is visible: the median phase is assigned to the terrain height, and its error is "
-            "a height error that varies with the height of ambiguity"
+            "no point of known height is visible: heights are relative to the terrain model; their offset varies "
+            "with the height of ambiguity"
         )
     return flags
 
@@ -319,7 +319,7 @@ def _unwrapping(
     unwrapped, kept = int(np.isfinite(phase.phase).sum()), int(np.isfinite(height_phase).sum())
     return replace(
         counted,
-        told=unwrapped,
+        unwrapped=unwrapped,
         apart=unwrapped - kept,
         residues=phase.residues,
         loops=phase.loops,

@@ -84,7 +84,7 @@ class Verdict:
     def report(self) -> dict[str, Any]:
         """JSON values of the verdict."""
         found = float(f"{self.found:.4g}") if np.isfinite(self.found) else None
-        values = {"requirement": self.requirement, "asked": self.required, "found": found, "met": self.met}
+        values = {"requirement": self.requirement, "required": self.required, "found": found, "met": self.met}
         return values | {"image": self.image, "cause": self.cause}
 
 

@@ -205,7 +205,7 @@ def landing(campaign: Campaign) -> dict[str, Any]:
     return {
         "title": rst_text(campaign.settings.campaign),
         "flights": rst_text(", ".join(f"{flight} ({', '.join(names)})" for flight, names in flights.items())),
-        "asked": rst_table(SETTING_COLUMNS, setting_rows(campaign)),
+        "configuration": rst_table(SETTING_COLUMNS, setting_rows(campaign)),
         "verdicts": rst_table(VERDICTS, [verdict_row(name, report) for name, report in reports.items()]),
         "sentences": [
             rst_text(" ".join(sentences(f"Sum of the pairs of {flight}", reports[f"{flight} {FUSED}"])))

@@ -352,15 +352,15 @@ def print_reproduced(path: Path, *, cores: int, keep: Path | None = None) -> int
         expected = f"one of the {len(known)} results of its campaign"
         remedy = "Choose one of the output of `apertura list`."
         raise CampaignError("not a result of the campaign as configured", path, expected, remedy)
-    wanted = [manifest for manifest in known if (product.root / manifest).is_file()] if whole else [product.manifest]
-    if not wanted:
+    requested = [manifest for manifest in known if (product.root / manifest).is_file()] if whole else [product.manifest]
+    if not requested:
         raise CampaignError("no results", product.root, "a processed campaign", "Run the workflow: `apertura run`.")
-    on_request = [manifest for manifest in wanted if on_demand(campaign, manifest)]
+    on_request = [manifest for manifest in requested if on_demand(campaign, manifest)]
     with _scratch(campaign, keep) as again:
-        status = run_workflow(again, cores, *(["all", *on_request] if whole else wanted))
+        status = run_workflow(again, cores, *(["all", *on_request] if whole else requested))
         if status:
             return status
-        lines = _outcome(product.root, again, wanted, known)
+        lines = _outcome(product.root, again, requested, known)
     for line in lines:
         print(shown(line, _LONGEST))
     if keep is not None:
@@ -368,13 +368,13 @@ def print_reproduced(path: Path, *, cores: int, keep: Path | None = None) -> int
     return 0 if lines[0].startswith("same") else 1
 
 
-def _outcome(root: Path, again: Path, wanted: Sequence[str], known: Sequence[str]) -> list[str]:
+def _outcome(root: Path, again: Path, requested: Sequence[str], known: Sequence[str]) -> list[str]:
     """Return lines with the differences of the requested results and the first differing result, or their agreement."""
-    lines = [line for manifest in wanted for line in compared(root, again, manifest)]
+    lines = [line for manifest in requested for line in compared(root, again, manifest)]
     if not lines:
-        count, more = sum(len(_files(root, manifest)) for manifest in wanted), len(wanted) - 1
+        count, more = sum(len(_files(root, manifest)) for manifest in requested), len(requested) - 1
         others = f" and {more} more results" if more else ""
-        return [f"same     {number_of(count, 'file')}, byte for byte, of {wanted[0]}{others}"]
+        return [f"same     {number_of(count, 'file')}, byte for byte, of {requested[0]}{others}"]
     first = next((manifest for manifest in known if _differs(root, again, manifest)), None)
     if first is None:
         return [*lines, "the manifests agree: a file was changed after it was made, see `apertura verify`"]

@@ -241,12 +241,12 @@ def _view(p, patch, numbers, tables, shared):  # type: ignore[no-untyped-def]
 
 
 @cuda.jit(device=True)
-def _chunk(chunk, mine, shared, given, weighing):  # type: ignore[no-untyped-def]
+def _chunk(chunk, mine, shared, inputs, weighing):  # type: ignore[no-untyped-def]
     """Add a chunk of pulses to a thread's pixels; the chunk is summed in float32 first."""
     first, count = chunk
     lane, positions, near, total = mine
     words, steps, patch = shared
-    (antennas, start_m, cells), turn, numbers = given
+    (antennas, start_m, cells), turn, numbers = inputs
     weights, weighed = weighing
     # Sums of this chunk in float32; rows of cells are read once for all pixels of a thread.
     part = cuda.local.array((_EACH, 2), np.float32)
@@ -433,9 +433,9 @@ def _centre(x, y, z, ends, numbers):  # type: ignore[no-untyped-def]
 
 
 @cuda.jit(device=True)
-def _is_reached(chunk, lane, patch, numbers, given):  # type: ignore[no-untyped-def]
+def _is_reached(chunk, lane, patch, numbers, inputs):  # type: ignore[no-untyped-def]
     """Return True if any pulse of a chunk may have a weight in a patch; one chunk per thread is evaluated at once."""
-    tables, weights, reached, words = given
+    tables, weights, reached, words = inputs
     if chunk % _LANES == 0:
         spread, mine = weights[_SPREAD], chunk + lane
         cuda.syncthreads()  # until no thread reads the values that are overwritten below
@@ -448,9 +448,9 @@ def _is_reached(chunk, lane, patch, numbers, given):  # type: ignore[no-untyped-
 
 
 @cuda.jit(device=True)
-def _weigh(p, patch, numbers, given, shared):  # type: ignore[no-untyped-def]
+def _weigh(p, patch, numbers, inputs, shared):  # type: ignore[no-untyped-def]
     """Write the weights of a pulse over a patch and its zone to shared memory; skip the pulse if they are zero."""
-    (tables, weights), (word, step) = given, shared
+    (tables, weights), (word, step) = inputs, shared
     if step[_VARIANT] != _SKIPPED:
         spread = weights[_SPREAD]
         step[_ZONE] = _zone(p, spread[len(spread) - 1], patch, numbers, (tables[0], weights, word))
@@ -521,9 +521,9 @@ def _last_angle(cut):  # type: ignore[no-untyped-def]
 
 
 @cuda.jit(device=True)
-def _weight(w, zone, near, legs, given):  # type: ignore[no-untyped-def]
+def _weight(w, zone, near, legs, inputs):  # type: ignore[no-untyped-def]
     """Return the weight of a pulse at a pixel from its offset to the origin, in float32; `legs` are s of eq. 8."""
-    (_, _, cuts, gains, _, _), numbers = given
+    (_, _, cuts, gains, _, _), numbers = inputs
     x, y, z, weight = near[0], near[1], near[2], _ONE
     if zone == _EDGE:
         # s of eq. 1 changes little over a patch: only this change has float32 errors.
@@ -576,9 +576,9 @@ def _look_up(radians, cut, gains):  # type: ignore[no-untyped-def]
 
 
 @cuda.jit(device=True)
-def _exact_weight(p, zone, pixel, centre, given):  # type: ignore[no-untyped-def]
+def _exact_weight(p, zone, pixel, centre, inputs):  # type: ignore[no-untyped-def]
     """Return the weight of a pulse at a pixel from its position, in float64."""
-    antennas, (sector_axes, beam_axes, cuts, gains, _, _), numbers = given
+    antennas, (sector_axes, beam_axes, cuts, gains, _, _), numbers = inputs
     positions, at = pixel
     s, weight = -centre, _ONE
     for leg in range(2):
