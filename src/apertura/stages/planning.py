@@ -212,7 +212,7 @@ def air_decision(pair: OpenPair) -> Decision:
     reason = (
         f"{air['source']}; mean along the paths from {air['antennas_m']:.0f} m height; displacement of the image "
         f"relative to {reference} {100 * displaced_m:.2g} cm in slant range, {displaced_m / cell_m:.2g} cells"
-        f"{observable}; residual of one value for all pulses {100 * residual_m:.1g} cm of path"
+        f"{observable}; path error of a single value for all pulses {100 * residual_m:.1g} cm"
     )
     return Decision("atmosphere", f"N = {air['refractivity_n']:.1f}", reason)
 
