@@ -31,7 +31,7 @@ FLAGGED_LOSS_DB = 1.0
 """dB that a target loses by the removal, above which `background_loss` is raised."""
 
 FLAGGED_GAIN_DB = 3.0
-"""dB that a removal left undone would gain, above which `background` is raised."""
+"""dB of gain that the decision leaves unused, above which `background` is raised."""
 
 SIMPLER_DB = 2.0
 """dB of net gain that a method must add over a simpler one: longer windows come first, all delays before some."""
@@ -64,6 +64,8 @@ class Removal:
         Change of the peak of the target that loses most by it, dB, 0 or less.
     middle_loss_db
         The same of a target in the middle of the scene.
+    left_db
+        Gain of the best method, whatever targets lose, relative to that of the method applied, dB.
     """
 
     background: Background | None
@@ -72,11 +74,16 @@ class Removal:
     gain_db: float
     loss_db: float
     middle_loss_db: float
+    left_db: float = 0.0
 
     @property
     def net_db(self) -> float:
         """Gain less the largest loss, dB (eq. 6)."""
         return self.gain_db + self.loss_db
+
+    def undone(self, reason: str, most_db: float) -> "Removal":
+        """Return the decision against the removal, which leaves the gain of the best method unused."""
+        return replace(self, background=None, value="none", reason=reason, left_db=most_db)
 
     @property
     def report(self) -> dict[str, Any]:
@@ -87,10 +94,10 @@ class Removal:
     @property
     def flags(self) -> Flags:
         """`background` if arcs remain in the image, `background_loss` if targets lose by the removal."""
-        flags, removed = Flags(), self.background is not None
-        if not removed and self.gain_db >= FLAGGED_GAIN_DB:
-            flags["background"] = f"{self.gain_db:.1f} dB; {self.reason}"
-        if removed and self.loss_db <= -FLAGGED_LOSS_DB:
+        flags = Flags()
+        if self.left_db >= FLAGGED_GAIN_DB:
+            flags["background"] = f"{self.left_db:.1f} dB; {self.reason}"
+        if self.background is not None and self.loss_db <= -FLAGGED_LOSS_DB:
             flags["background_loss"] = f"at most {-self.loss_db:.1f} dB; removed: {self.value}"
         return flags
 
@@ -214,11 +221,12 @@ def decide_removal(
         best = other if other.net_db > best.net_db + SIMPLER_DB else best
     if method != "auto":
         return replace(best, reason=f"configured; {best.reason}")
+    most_db = max(one.gain_db for one in tried)
     if best.loss_db < -MOST_LOSS_DB:
-        return replace(best, background=None, value="none", reason=f"auto: too high a loss by {best.reason}")
+        return best.undone(f"auto: too high a loss by {best.reason}", most_db)
     if best.net_db < LEAST_NET_DB:
-        return replace(best, background=None, value="none", reason=f"auto: no net gain by {best.reason}")
-    return replace(best, reason=f"auto: {best.reason}")
+        return best.undone(f"auto: no net gain by {best.reason}", most_db)
+    return replace(best, reason=f"auto: {best.reason}", left_db=most_db - best.gain_db)
 
 
 def steadiest(scene: BackgroundScene, *, without: NDArray[np.bool_] | None = None) -> Floats:

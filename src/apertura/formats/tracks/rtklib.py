@@ -233,7 +233,7 @@ def _check_stated(header: _Header, options: LogOptions, *, node: str, where: Pat
     if header.geodetic_height == "geodetic" and options.height_offset_m is None:
         raise unstated(
             "height_offset_m",
-            "heights are geodetic (above a geoid)",
+            "heights are above a geoid (geodetic in RTKLIB)",
             node=node,
             where=where,
             remedy=", or export ellipsoidal heights",

@@ -130,8 +130,8 @@ def interferogram_flags(measured: InterferogramCounts) -> Flags:
         )
     if counts.unwrapped and not counts.points:
         flags["height_relative"] = (
-            "no point of known height is visible: the median phase is assigned to the terrain height, and its error is "
-            "a height error that varies with the height of ambiguity"
+            "no point of known height is visible: heights are relative to the terrain model; their offset varies "
+            "with the height of ambiguity"
         )
     return flags
 
