@@ -330,7 +330,7 @@ def _flags(state: SidelinkState) -> dict[str, str]:
     flags = {}
     unlocked = int((~state.locked).sum())
     if unlocked:
-        flags["sidelink_lost"] = f"{unlocked} of {state.locked.size} pulses excluded: their sidelink does not lock"
+        flags["sidelink_lost"] = f"{unlocked} of {state.locked.size} pulses excluded: no sidelink detected"
     if state.echo_cells and state.echo_db > SECOND_ARRIVAL_DB:
         flags["second_arrival"] = (
             f"a second arrival of {state.echo_db:.1f} dB relative to the direct path, {state.echo_cells:+d} cells from "

@@ -75,11 +75,16 @@ class Removal:
     gain_db: float
     loss_db: float
     middle_loss_db: float
+    left_db: float = 0.0
 
     @property
     def net_db(self) -> float:
         """Gain less the largest loss, dB (eq. 6)."""
         return self.gain_db + self.loss_db
+
+    def undone(self, reason: str, most_db: float) -> "Removal":
+        """Return the decision against the removal, which leaves the gain of the best method unused."""
+        return replace(self, background=None, value="none", reason=reason, left_db=most_db)
 
     @property
     def report(self) -> dict[str, Any]:
@@ -218,11 +223,12 @@ def decide_removal(
         best = other if other.net_db > best.net_db + SIMPLER_DB else best
     if method != "auto":
         return replace(best, reason=f"configured; {best.reason}")
+    most_db = max(one.gain_db for one in tried)
     if best.loss_db < -MOST_LOSS_DB:
-        return replace(best, background=None, value="none", reason=f"auto: too high a loss by {best.reason}")
+        return best.undone(f"auto: too high a loss by {best.reason}", most_db)
     if best.net_db < LEAST_NET_DB:
-        return replace(best, background=None, value="none", reason=f"auto: no net gain by {best.reason}")
-    return replace(best, reason=f"auto: {best.reason}")
+        return best.undone(f"auto: no net gain by {best.reason}", most_db)
+    return replace(best, reason=f"auto: {best.reason}", left_db=most_db - best.gain_db)
 
 
 def steadiest(scene: BackgroundScene, *, without: NDArray[np.bool_] | None = None) -> Floats:

@@ -354,7 +354,7 @@ def focus_with_flags(
 
     Examples
     --------
-    >>> focus_with_flags({"verdict": "focused", "why": "peak loss 0.02 dB"}, ["wrong_code"])["verdict"]
+    >>> focus_with_flags({"verdict": "focused", "reason": "peak loss 0.02 dB"}, ["wrong_code"])["verdict"]
     'inconclusive'
     """
     against = sorted(GEOMETRY_CONTRADICTED.intersection(flags))

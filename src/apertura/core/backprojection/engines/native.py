@@ -518,8 +518,7 @@ def _reasons(
 ) -> dict[str, str]:
     shared, wide, exact = (100 * share for share in shares)
     paths = (
-        f"shares of pixels × pulses: shared curvature {shared:.0f} %, wide windows {wide:.0f} %, exact paths "
-        f"{exact:.0f} %"
+        f"pixel-pulse pairs with shared curvature {shared:.0f} %, wide windows {wide:.0f} %, exact paths {exact:.0f} %"
     )
     beams = "" if beams_db is None else f", antenna weights {beams_db:.1f} dB"
     return {
