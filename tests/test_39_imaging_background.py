@@ -168,6 +168,12 @@ def test_coupling_is_removed_at_all_delays_except_a_circled_target():
     assert median_db(disturbed, removal.background) < median_db(disturbed) - 10
 
 
+def test_coupling_left_at_the_delay_of_a_circled_target_is_flagged():
+    removal = coupled(recorded(circle(), CENTRE), 60).decided()
+    assert removal.background is not None
+    assert "background" in removal.flags
+
+
 def test_configured_method_removes_a_circled_target_with_a_flag():
     recording = recorded(circle(), CENTRE)
     removal = recording.decided("median")

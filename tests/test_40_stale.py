@@ -287,7 +287,7 @@ def test_results_moved_into_another_folder_are_not_stale(finished, tmp_path):
 # ---- Recordings that lie elsewhere, and what was kept of them -------------------------------------------------------
 
 SAMPLES = ["raw/f01/uav1.sigmf-data", "raw/f01/uav2.sigmf-data"]
-TOLD = "expected the recording of node uav2 in flight f01, to make results/f01/uav1-uav2/image.manifest.json again"
+TOLD = "expected the recording of node uav2 in flight f01, to recompute results/f01/uav1-uav2/image.manifest.json"
 
 
 def archive(root):

@@ -10,7 +10,7 @@ from folders import STAND_ON_ALL, copy_writable, edit_config, image_of, ingest_a
 from judging.bases import curved
 from spoiling.logs import read_log, write_log
 from spoiling.of_logs import late, noisy
-from track_noise import saying
+from track_noise import declare_std
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage, save_stage
@@ -275,7 +275,7 @@ def spoil_logs(root, std_m, said_m):
     """Add noise that lasts a second to both logs, and say how large it is."""
     for path in sorted((root / "raw" / "f01").glob("*.track.*")):
         log = noisy(std_m, seed=3)(read_log(path))
-        write_log(path, log if log.attitude_deg is not None else saying(said_m)(log))
+        write_log(path, log if log.attitude_deg is not None else declare_std(said_m)(log))
     edit_config(root, lambda document: [node.update(position_std_m=said_m) for node in document["nodes"].values()])
 
 

@@ -280,7 +280,7 @@ def test_a_single_wrong_tag_is_left_out(tmp_path):
     edit_meta(campaign.root, "b", late)
     attrs = echo_of(campaign).attrs
     assert attrs["pulses"] == {"used": 39, "dropped": 1, "reasons": {"time_tag_outlier": 1}}
-    assert attrs["flags"]["time_tag_outlier"].startswith("1 of 40 pulses left out")
+    assert attrs["flags"]["time_tag_outlier"].startswith("1 of 40 pulses excluded")
 
 
 @pytest.mark.parametrize(("arm_m", "flagged"), [(0.3, True), (0.0, False)])

@@ -257,7 +257,7 @@ def test_what_beams_forbid_is_refused_when_asked_for_and_not_chosen_otherwise(be
     message = complaint(lambda: expected_plan(stated(beamed, BEAM, presum=4), "f01", "uav1-uav1"))
     assert "config/config.yaml: processing.presum" in message
     reasons = expected_plan(stated(beamed, BEAM), "f01", "uav1-uav1").reasons
-    assert "weigh every pulse" in reasons["presum"]
+    assert "the weights of the antennas differ" in reasons["presum"]
     assert reasons["antenna"].startswith("transmit, receive: each point of the scene is illuminated by ")
     assert " of 80 pulses (median " in reasons["antenna"]
     assert "antenna" not in expected_plan(stated(beamed, None), "f01", "uav1-uav1").reasons

@@ -168,7 +168,7 @@ def check_raw_root(examined: "Examination") -> Iterator[CampaignError]:
 
 
 def check_links(examined: "Examination") -> Iterator[CampaignError]:
-    """Yield a problem for each symbolic link in, or in place of, the folders results and .snakemake."""
+    """Yield a problem for each symbolic link that replaces, or lies in, the folders results and .snakemake."""
     root = examined.campaign.root
     for top in (root / "results", root / ".snakemake"):
         below = () if top.is_symlink() else (folder / name for folder, _, names in top.walk() for name in names)
@@ -221,7 +221,7 @@ def _is_damaged(path: ConfinedPath) -> bool:
 _BASE_BYTES = 120_000_000  # the interpreter and its libraries
 _CAPTURE_BYTES = 1100  # memory per capture for its metadata while they are read; samples are read in blocks
 _RAW_BYTES = 10  # per capture in the stage raw, compressed
-_ECHO_SHARE = 0.95  # of 8 bytes per pulse and subcarrier, uncompressed; a share of the pulses may be excluded
+_ECHO_SHARE = 0.95  # least fraction of the pulses that is not excluded; 8 bytes per pulse and subcarrier
 PIXEL_BYTES = 36  # per pixel and pair: image, its share of the cube, three rasters, compressed; 76 uncompressed
 MEMINFO = Path("/proc/meminfo")
 

@@ -139,7 +139,7 @@ def place(tx: NodeLog, rx: NodeLog, at: Times, *, hovers: bool = False) -> Pulse
 
 
 def _log_report(node: NodeLog) -> dict[str, Any]:
-    """Return smoothing residual, source and remarks of a log, as far as there are any."""
+    """Return smoothing residual, source and remarks of a log; values that do not exist are omitted."""
     values = {"smoothing_residual_m": node.smoothing_residual_m} | {
         name: node.track.attrs.get(name) for name in ("source", "remarks")
     }

@@ -143,7 +143,7 @@ class PairEcho:
 
     @property
     def stage(self) -> xr.Dataset:
-        """Stage `echo`, whose `transfer` is read or formed on access, without removed background and interference."""
+        """Stage `echo`, whose `transfer` is formed or read on access, after removal of background and interference."""
         if "transfer" in self.dataset and self.removed is None and self.gain is None:
             return self.dataset
         return self.dataset.assign(transfer=xr.Variable(_HISTORY, indexing.LazilyIndexedArray(_Transfer(self))))
@@ -188,7 +188,7 @@ class PairEcho:
         return np.asarray(self.extra_s + self.dataset.reference_delay.values)
 
     def read(self, pulses: Pulses) -> Complexes:
-        """Return the transfer functions of ascending pulse indices, without removed background and interference."""
+        """Return the transfer functions of ascending pulse indices after removal of background and interference."""
         transfer = self.dataset.transfer[pulses].values if "transfer" in self.dataset else self.form(pulses)
         if self.gain is not None:
             transfer = transfer * self.gain
@@ -265,7 +265,7 @@ def recorded_echo(campaign: Campaign, flight: str, pair: str) -> xr.Dataset:
     Raises
     ------
     CampaignError
-        If positions are neither stored with the samples nor in a flight log, or in both; or if their frame is not that
+        If positions are stored neither with the samples nor in a flight log, or in both; or if their frame is not that
         of the scene.
     """
     tx, rx = pair.split("-")

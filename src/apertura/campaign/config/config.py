@@ -23,7 +23,7 @@ CONFIG = Path("config/config.yaml")
 
 
 class Metadata(Section):
-    """Metadata of the campaign that its files do not contain."""
+    """Metadata of the campaign that recordings and logs do not contain."""
 
     author: Title | None = Field(None, description="author of the recordings; null: not stated")
     licence: Licence | None = Field(

@@ -354,7 +354,7 @@ class Scene(Section):
 
     @property
     def height_is_default(self) -> bool:
-        """True if the height of flat terrain is 0 m, as in the template, which is unlikely."""
+        """True if the height of flat terrain is the 0 m of the template, which is an unlikely height."""
         return self.dem is None and self.height_m == 0
 
     @model_validator(mode="after")

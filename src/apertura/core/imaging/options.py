@@ -24,7 +24,7 @@ class IntegrationResolution(BaseModel):
 
 
 PLANNED = ("engine", "engine_options", "presum", "pulse_blocks", "terrain")
-"""Options decided by the planner where they are 'auto'."""
+"""Options for which 'auto' leaves the decision to the planner."""
 
 
 def _options_of_each_engine(schema: dict[str, Any]) -> None:

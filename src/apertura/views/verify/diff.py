@@ -89,7 +89,7 @@ class Tally:
         self.largest = max(self.largest, float(difference.max()))
         self.square += float((difference**2).sum())
         self.peak = max(self.peak, float(np.abs(a).max()), float(np.abs(b).max()))
-        if self._sums is None:  # sums about one of the real values: no loss of digits when the mean is subtracted
+        if self._sums is None:  # sums relative to a real value, so that subtraction of the mean loses no digits
             self._sums, self._about = np.zeros(5, complex), 0.0 if self.phased else float(a[0])
         a, b = a - self._about, b - self._about
         self._sums += [a.sum(), b.sum(), np.vdot(a, a), np.vdot(b, b), np.vdot(b, a)]
@@ -162,7 +162,7 @@ def differences(first: Path, second: Path) -> dict[str, list[str]]:
     elif first.suffix == ".png":
         images = [np.asarray(picture(path)).astype(np.float32) for path in (first, second)]
         tally = Tally.of([(images[0], images[1])]) if images[0].shape == images[1].shape else None
-        lines["pixels"] = list(difference_lines(tally, unit="of 255")) if tally else []  # sizes are in geometry
+        lines["pixels"] = list(difference_lines(tally, unit="of 255")) if tally else []  # sizes: see geometry
     if not any(lines.values()):
         offset = first_difference(first, second)
         lines["bytes"] = [] if offset is None else [f"first difference at byte {offset}"]
