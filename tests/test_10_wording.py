@@ -32,5 +32,5 @@ def test_standard_wording_is_not_reported(code):
 
 
 def test_code_blocks_of_documents_are_not_checked():
-    text = "Nobody.\n\n    nobody\n\n```\nnobody\n```\n"
+    text = "Nobody, `nobody`.\n\n    nobody\n\n```\nnobody\n```\n"
     assert [line for line, _ in faults_of_document(text)] == [1]
