@@ -98,6 +98,7 @@ crate-check: $(SETUP)
 lint: $(SETUP)
 	$(BIN)/ruff check src research tests benchmarks website
 	$(BIN)/ruff format --check src research tests benchmarks website
+	$(BIN)/python -m website.wording
 	$(BIN)/mypy --cache-dir=/dev/null  # what a cache remembers, a fresh clone does not: an error hid behind one
 	$(BIN)/snakefmt --check Snakefile workflow research/study.smk
 	$(BIN)/clang-format --dry-run -Werror native/*.?pp

@@ -1,9 +1,9 @@
-"""Campaigns flown in air, focused with it and without: where targets are found, at 30 m, 300 m and 3 km.
+"""Geolocation of targets with and without atmospheric correction, for flights at heights of 30 m, 300 m and 3 km.
 
-Each leg of each path is simulated by the air at the heights of its own ends (`apertura.simulation.scatterers.TrueAir`);
-by
-`--weather` it is 10 °C warmer, 20 hPa denser and wetter than the standard atmosphere. The pipeline knows but one N
-for each pair. Run: `.venv/bin/python benchmarks/atmosphere.py [--weather] [HEIGHT …]`; a table on the screen.
+Each one-way path is simulated with the refractivity at the heights of its ends
+(`apertura.simulation.scatterers.TrueAir`); with `--weather`, the atmosphere is 10 °C warmer, 20 hPa denser and wetter
+than the standard atmosphere. The pipeline uses one refractivity N per pair.
+Run: `.venv/bin/python benchmarks/atmosphere.py [--weather] [HEIGHT …]`; prints a table.
 """
 
 import argparse
@@ -37,13 +37,14 @@ from apertura.simulation.impairments import Impairments
 from apertura.stages.scene import settled_scene
 
 BAND_HZ, CARRIER_HZ = 200e6, 1.3e9
-"""Range cells of 75 cm, waves of 21 cm."""
+"""Bandwidth and lowest frequency: range cells of 75 cm, mean wavelength 21 cm."""
 
-_NEAR_M = 2.4  # of its place a target is looked for; others are farther
+_NEAR_M = 2.4
+"""Half width of the area in which a target is searched; other targets are farther away."""
 
 
 def flown(height_m: float, *, weather: bool = False) -> CampaignSpecification:
-    """Return a flight of four pairs past targets at a slant range of 1.4 heights, of an aperture of a third of it."""
+    """Specify a flight of four pairs past targets at a slant range of 1.4 heights; the aperture is a third of it."""
     base, ground_m, side_m = preset("demo"), height_m, 12.0
     range_m = float(np.hypot(height_m, ground_m))
     prefix_s = 1e-6 * np.ceil(2e6 * range_m / 299_792_458 + 0.3)
@@ -52,8 +53,8 @@ def flown(height_m: float, *, weather: bool = False) -> CampaignSpecification:
     speed = long_m * 20.0 / pulses
     ahead = 0.02 * range_m + 3.0
     tracks = {
-        name: Straight((-long_m / 2 + further, -ground_m, height_m), (speed, 0.0, 0.0))
-        for name, further in (("uav1", 0.0), ("uav2", ahead), ("uav3", -ahead), ("uav4", 2 * ahead))
+        name: Straight((-long_m / 2 + ahead_m, -ground_m, height_m), (speed, 0.0, 0.0))
+        for name, ahead_m in (("uav1", 0.0), ("uav2", ahead), ("uav3", -ahead), ("uav4", 2 * ahead))
     }
     perfect = {name: SimulatedNode(impairments=Impairments(radar_snr_db=25.0, doppler=False)) for name in tracks}
     origin = base.origin
@@ -73,7 +74,7 @@ def flown(height_m: float, *, weather: bool = False) -> CampaignSpecification:
 
 
 def formed(root: Path, air: object) -> dict[str, Any]:
-    """Return how far north and east of their places targets are found (m) by a scene.atmosphere, and reports."""
+    """Process a campaign with a value of scene.atmosphere; return target displacements (north, east) and reports."""
     config = root / "config/config.yaml"
     document = yaml.safe_load(config.read_text(encoding="utf-8"))
     document["scene"]["atmosphere"] = air
@@ -102,10 +103,10 @@ def _off(image: NDArray[np.complex64], grid: SceneGrid, target: dict[str, float]
 
 
 def expected_m(height_m: float, refractivity_n: float) -> float:
-    """Return by how much farther a point is focused by an image that takes air for vacuum, metres over ground.
+    """Return the displacement of a point in an image that neglects the atmosphere, metres in ground range.
 
-    The peak of the sum of all pulses and frequencies along the ground: (n - 1)·R²/r_g, less what the phases over the
-    aperture hold it back by, which fit no shift (docs/theory/atmosphere.md, eq. 5).
+    Position of the peak of the sum over all pulses and frequencies in ground range: (n - 1)·R²/r_g, reduced by the
+    phases over the aperture that no displacement reproduces (docs/theory/atmosphere.md, eq. 5).
     """
     range_m = float(np.hypot(height_m, height_m))
     along = np.linspace(-range_m / 6, range_m / 6, 240)[:, None]
@@ -127,10 +128,13 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("heights", nargs="*", type=float, default=[30.0, 300.0, 3000.0])
-    parser.add_argument("--weather", action="store_true", help="air that is not the standard atmosphere")
+    parser.add_argument("--weather", action="store_true", help="weather that differs from the standard atmosphere")
     options = parser.parse_args()
     cell_m = 299_792_458 / BAND_HZ / 2
-    print("height  atmosphere  image  N  found off north, east; from expected at most, of a cell; expected; budget")
+    print(
+        "height  atmosphere  image  N  mean displacement north, east; largest deviation from expected, in range cells; "
+        "expected; budget"
+    )
     for height_m in options.heights:
         with TemporaryDirectory() as folder:
             root, known_n = simulate(Path(folder) / "campaign", flown(height_m, weather=options.weather), seed=1), 0.0

@@ -1,4 +1,4 @@
-"""Random small campaigns as arrays: what a planner must cope with, from 30 m to 10 km and 0.4 to 10 GHz."""
+"""Random small campaigns as arrays, test cases of the planner: ranges 30 m to 10 km, carriers 0.4 to 10 GHz."""
 
 from dataclasses import dataclass, replace
 
@@ -23,7 +23,7 @@ FLAT = FlatGround(0.0)
 
 @dataclass(frozen=True)
 class Drawn:
-    """A campaign: what was recorded, where it is imaged, how exact that has to be."""
+    """Random campaign: its echo, its grid and the requested accuracy."""
 
     name: str
     history: PhaseHistory
@@ -34,7 +34,7 @@ class Drawn:
 
 
 def draw(generator: np.random.Generator, *, pixels: int = 80, pulses: int = 160) -> Drawn:
-    """Return one campaign; everything about it is drawn."""
+    """Draw all parameters of a campaign and simulate it."""
 
     def between(low: float, high: float) -> float:
         return float(np.exp(generator.uniform(np.log(low), np.log(high))))
@@ -74,15 +74,15 @@ def _fly(
     along = step_m * (np.arange(pulses) - pulses / 2 + generator.uniform(-0.2, 0.2) * pulses)
 
     def wobble() -> NDArray[np.float64]:
-        turns = generator.uniform(0.5, 3, (3, 3)) * np.linspace(0, 2 * np.pi, pulses)[:, None, None]
+        phase_rad = generator.uniform(0.5, 3, (3, 3)) * np.linspace(0, 2 * np.pi, pulses)[:, None, None]
         size = generator.uniform(0, 0.2) * wavelength_m
-        return size * np.sin(turns + generator.uniform(0, 6, (3, 3))).sum(-1)
+        return size * np.sin(phase_rad + generator.uniform(0, 6, (3, 3))).sum(-1)
 
     tx = start + along[:, None] * ahead + wobble()
     if generator.random() < 0.4:
         return tx, tx
-    apart = generator.uniform(-0.3, 0.3, 3) * range_m * [1, 1, 0.2]
-    return tx, start + apart + 0.9 * along[:, None] * ahead + wobble()
+    separation = generator.uniform(-0.3, 0.3, 3) * range_m * [1, 1, 0.2]
+    return tx, start + separation + 0.9 * along[:, None] * ahead + wobble()
 
 
 def _record(
@@ -112,6 +112,6 @@ def _record(
 
 
 def compressed(history: PhaseHistory, grid: SceneGrid, window: str) -> Profiles:
-    """Return the range profiles of an echo under a window, as the profile step makes them."""
+    """Range-compress an echo with a window, as in the profile step."""
     weighted = replace(history, weight=window_weights(window, len(history.frequency_hz)))
     return range_compress(weighted, grid, FLAT)

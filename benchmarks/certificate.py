@@ -1,8 +1,8 @@
-"""The certificate against all pixels: 200 campaigns and settings, each recomputed by the double sum everywhere.
+"""Comparison of certified error bounds with the true errors of 200 images, recomputed by the double sum at all pixels.
 
-Counts how often the error over all pixels stays below the bound, and how far below; once as an image is certified
-when it is finished, once as from Python, where no pixel but the drawn ones is known. How far from it the predicted
-error lies is the planner's.
+Counts how often the error over all pixels stays below the bound, and the margin of the bound: for the certificate of
+finished images, and for the bound from Python, which uses only the sampled pixels. The difference of the predicted
+error characterises the planner.
 """
 
 import argparse
@@ -25,8 +25,8 @@ TILE_PX = 32
 
 
 @dataclass(frozen=True)
-class Judged:
-    """One image: its error over all pixels, the one predicted, the bounds and the estimate of its certificates, dB."""
+class ImageErrors:
+    """Errors of one image, dB: true error over all pixels, prediction, bounds and estimate of its certificates."""
 
     name: str
     error_db: float
@@ -36,8 +36,8 @@ class Judged:
     drawn_alone_db: float
 
 
-def judged(seeds: range, *, pixels: int, pulses: int, engine: str | None = None) -> Iterator[Judged]:
-    """Yield two images of every campaign: as planned, and by a setting of any accuracy, of one engine or any."""
+def evaluated(seeds: range, *, pixels: int, pulses: int, engine: str | None = None) -> Iterator[ImageErrors]:
+    """Evaluate two images of every campaign: the planned one, and one with a random setting of one or any engine."""
     for seed in seeds:
         generator = np.random.default_rng(seed)
         drawn = draw(generator, pixels=pixels, pulses=pulses)
@@ -46,23 +46,23 @@ def judged(seeds: range, *, pixels: int, pulses: int, engine: str | None = None)
         others = [one for one in SettingSearch(drawn.job, engine).settings(pulses) if one.engine != "reference"]
         other = others[generator.integers(len(others))]
         for one in (plan, replace(plan, setting=other, presum=None)):
-            yield _judge(drawn, one, exact, seed)
+            yield _image_errors(drawn, one, exact, seed)
 
 
-def _judge(drawn: Drawn, plan: Plan, exact: NDArray[np.complex128], seed: int) -> Judged:
+def _image_errors(drawn: Drawn, plan: Plan, exact: NDArray[np.complex128], seed: int) -> ImageErrors:
     formation = Formation(drawn.history, drawn.profiles, drawn.grid, plan, TILE_PX)
     image = _image(drawn, plan.setting, plan)
-    stated = certified(formation, image, accuracy_db=np.inf, threads=1)
-    some = np.random.default_rng(seed).integers(0, image.shape, (64, 2))
-    values, power = formation.values(some)
-    alone = error_bound(values, exact[tuple(some.T)], np.ones(64), power=power)
-    return Judged(
+    certificate = certified(formation, image, accuracy_db=np.inf, threads=1)
+    sampled = np.random.default_rng(seed).integers(0, image.shape, (64, 2))
+    values, power = formation.values(sampled)
+    bound = error_bound(values, exact[tuple(sampled.T)], np.ones(64), power=power)
+    return ImageErrors(
         f"{drawn.name}, {plan.setting.line}",
         true_error_db(image, exact),
         plan.setting.error_db,
-        stated["numerical_error_db"],
-        stated["numerical_error_estimate_db"],
-        max(alone.bound_db, plan.setting.error_db),
+        certificate["numerical_error_db"],
+        certificate["numerical_error_estimate_db"],
+        max(bound.bound_db, plan.setting.error_db),
     )
 
 
@@ -87,11 +87,11 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="seed of the first campaign")
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument("--pulses", type=int, default=80)
-    parser.add_argument("--engine", help="of the second image of each; any")
-    asked = parser.parse_args()
-    seeds = range(asked.first, asked.first + asked.campaigns)
+    parser.add_argument("--engine", help="engine of the second image (default: any)")
+    options = parser.parse_args()
+    seeds = range(options.first, options.first + options.campaigns)
     images = []
-    for one in judged(seeds, pixels=asked.size, pulses=asked.pulses, engine=asked.engine):
+    for one in evaluated(seeds, pixels=options.size, pulses=options.pulses, engine=options.engine):
         images.append(one)
         missed = "" if one.bound_db >= one.error_db else "  below the error"
         print(f"{one.name:<100}{one.error_db:>8.1f} dB, bound {one.bound_db:>7.1f} dB{missed}", flush=True)
@@ -99,7 +99,7 @@ def main() -> None:
     for name in ("predicted_db", "estimate_db"):
         less = np.array([getattr(one, name) for one in images]) - error
         low, high = np.percentile(less, [2.5, 97.5])
-        print(f"{name} less error: {low:+.1f} to {high:+.1f} dB in 95 % of {len(images)}, {less.min():+.1f} least")
+        print(f"{name} less error: {low:+.1f} to {high:+.1f} dB in 95 % of {len(images)}, minimum {less.min():+.1f} dB")
     for name in ("bound_db", "drawn_alone_db"):
         above = np.array([getattr(one, name) for one in images]) - error
         print(

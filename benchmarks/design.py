@@ -1,9 +1,9 @@
-"""Predicted by `apertura design`, and measured after the same plan was sampled and processed: twelve plans.
+"""Image quality predicted by `apertura design`, compared with simulated and processed campaigns of twelve plans.
 
-`python benchmarks/design.py WORKFOLDER [--only NAME …] [--draws 8]`. Five points of 1 m² stand in the scene;
-each plan is simulated to raw samples and goes through the steps. Noise is the mean power of an image without targets.
-Of plans that state position_std_m, logs err by as much, and the loss is the mean over draws and points; of one that
-names an interferogram, the scene is clutter.
+`python benchmarks/design.py WORKFOLDER [--only NAME …] [--draws 8]`. The scene contains five points of 1 m²; each plan
+is simulated as raw samples and processed by all steps. Noise is the mean power of an image without targets. If a plan
+configures position_std_m, its logs have errors of this standard deviation, and the loss is the mean over draws and
+points; if it configures an interferogram, the scene is clutter.
 """
 
 import argparse
@@ -51,10 +51,10 @@ def node(**more):
 
 
 def line(length=16.0, away=30.0, height=30.0, speed=1.0, heading=0.0, **more):
-    """Fly east, the scene's middle on the left, `away` metres north of the track; turned about it by `heading`."""
-    turn = np.radians(heading)
+    """Return a track to the east with the scene's middle `away` metres north of it, rotated about it by `heading`."""
+    angle = np.radians(heading)
     ends = np.array([[-length / 2, -away], [length / 2, -away]])
-    ends = ends @ np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) + [EAST, NORTH]
+    ends = ends @ np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) + [EAST, NORTH]
     start, end = ends.round(3).tolist()
     return {"kind": "line", "start_m": start, "end_m": end, "height_m": height, "speed_m_s": speed} | more
 
@@ -86,7 +86,7 @@ def beamed(document, azimuth, elevation, widths):
 
 
 def hill(folder: Path) -> Path:
-    """Write a DEM of a gentle hill of 6 m, where the points stand, and a mound beside it that throws a shadow."""
+    """Write a DEM of a smooth hill of 6 m below the points, and a mound next to it that casts a shadow."""
     path = folder / "dem.tif"
     x, y = np.meshgrid(np.arange(-60.5, 60.5, 1.0), np.arange(60.5, -60.5, -1.0))
     heights = 500.0 + 6.0 * np.exp(-(x**2 + (y - 2.0) ** 2) / (2 * 15.0**2))
@@ -98,11 +98,11 @@ def hill(folder: Path) -> Path:
     return path
 
 
-def two_flights(apart):
-    one = {"transmitter": "uav1", "receivers": ["uav1"]}
+def two_flights(baseline_m):
+    nodes = {"transmitter": "uav1", "receivers": ["uav1"]}
     flights = {
-        "f01": {**one, "tracks": {"uav1": line()}},
-        "f02": {**one, "tracks": {"uav1": line(height=30.0 + apart)}},
+        "f01": {**nodes, "tracks": {"uav1": line()}},
+        "f02": {**nodes, "tracks": {"uav1": line(height=30.0 + baseline_m)}},
     }
     return plan({}, flights=flights) | {"interferometry": {"pairs": {"two": ["f01/uav1-uav1", "f02/uav1-uav1"]}}}
 
@@ -142,18 +142,18 @@ LAYERS = ("resolution_fine", "resolution", "nesz", "point_snr")
 
 
 def points(opened, half):
-    """Return easting, northing and height of five places on the ground, none in the sidelobes of another."""
-    found = []
+    """Return easting, northing and height of five points on the terrain, none in the sidelobes of another."""
+    positions = []
     for east, north in ((0.0, 0.0), (0.6, 0.35), (-0.35, 0.6), (-0.6, -0.35), (0.35, -0.6)):
         pixel = opened.grid.pixel_of(EAST + east * half, NORTH + north * half)
         row, column = (round(float(one)) for one in pixel)
         x, y = opened.grid.map_at(row, column)
-        found.append((float(x), float(y), float(opened.terrain.heights_at(opened.grid, row, column))))
-    return found
+        positions.append((float(x), float(y), float(opened.terrain.heights_at(opened.grid, row, column))))
+    return positions
 
 
 def standing(opened, half):
-    """Return the same as targets of 1 m², east, north and up of the scene's middle."""
+    """Return these points as targets of 1 m², in east, north and up from the scene's middle."""
     latitude, longitude, height = map(float, geodetic_from_ecef(opened.middle_m))
     origin = Origin(latitude, longitude, height)
     placed = [origin.enu(frame_from_map(CRS, *place)) for place in points(opened, half)]
@@ -173,10 +173,10 @@ def processed(root: Path) -> Campaign:
 
 
 def measured(alone: list[Campaign], empty: Campaign, flight: str, pair: str, design):
-    """Return predicted and measured at the points: widths along both axes, NESZ, SNR; and coverage.
+    """Return predicted and measured values at the points: widths along both axes, NESZ and SNR; and the coverage.
 
-    Each point stands alone in its image: the sidelobe of another bends its width by up to 8 % on a hill. Noise is the
-    mean power of the same image without anything in its scene.
+    Each image contains a single point: on a hill, sidelobes of another point change its width by up to 8 %. Noise is
+    the mean power of the same image of an empty scene.
     """
     campaign = alone[0]
     opened, planned = open_scene(campaign), design.images[f"{flight}/{pair}"]
@@ -190,21 +190,24 @@ def measured(alone: list[Campaign], empty: Campaign, flight: str, pair: str, des
     with np.errstate(invalid="ignore"):
         nesz = 10 * np.log10(noise * calibration.pixel_noise(whole) / calibration.power(whole, "sigma0", normal))
     with rasterio.open(str(campaign.result(flight, pair, "mask.tif"))) as raster:
-        seen = raster.read(1) == 0
+        is_imaged = raster.read(1) == 0
     rows, half = [], grid.shape[0] * grid.spacing_m / 2
     for target, pixels in zip(points(opened, half), images, strict=True):
         row, column = (round(float(one)) for one in grid.pixel_of(*target[:2]))
-        if not seen[row, column]:
+        if not is_imaged[row, column]:
             continue
         peak = find_peak(pixels, row, column)
         azimuth = np.radians(planned.layers["orientation"][row, column])
-        ways = (np.sin(azimuth), np.cos(azimuth)), (np.cos(azimuth), -np.sin(azimuth))
-        cuts = [cut_through(pixels, peak, direction=way, spacing_m=grid.spacing_m, reach_m=half / 2) for way in ways]
+        directions = (np.sin(azimuth), np.cos(azimuth)), (np.cos(azimuth), -np.sin(azimuth))
+        cuts = [
+            cut_through(pixels, peak, direction=direction, spacing_m=grid.spacing_m, reach_m=half / 2)
+            for direction in directions
+        ]
         place = opened.terrain.positions_at(grid, np.array([row]), np.array([column]))
         snr_db = 10 * np.log10(abs(peak.value) ** 2 / (noise * calibration.at(place)[1][0]))
         predicted = [planned.layers[name][row, column] for name in LAYERS]
         rows.append((predicted, [cuts[0].width_m, cuts[1].width_m, nesz[row, column], snr_db]))
-    cover = 100 * np.array([(planned.layers["mask"] == 0).mean(), seen.mean()])
+    cover = 100 * np.array([(planned.layers["mask"] == 0).mean(), is_imaged.mean()])
     return np.array(rows), cover
 
 
@@ -217,7 +220,7 @@ def peaks_db(campaign: Campaign, flight: str, pair: str):
 
 
 def compare(name: str, folder: Path, draws: int):
-    """Yield rows: pair, quantity, predicted, measured, apart."""
+    """Compare the predictions of a plan with its campaign; yield pair, quantity, predicted, measured, difference."""
     bounds = PLANS[name]["scene"]["bounds_m"]
     half = (bounds[2] - bounds[0]) / 2
     shutil.rmtree(folder, ignore_errors=True)
@@ -233,8 +236,8 @@ def compare(name: str, folder: Path, draws: int):
             with rasterio.open(str(campaign.result("interferometry", two, "coherence.tif"))) as raster:
                 values = raster.read(1)
             inner = tuple(slice(size // 5, -size // 5) for size in values.shape)
-            both = float(np.median(own["coherence"][inner])), float(np.nanmedian(values[inner]))
-            yield two, "coherence", *both, f"{both[1] - both[0]:+.3f}"
+            coherences = float(np.median(own["coherence"][inner])), float(np.nanmedian(values[inner]))
+            yield two, "coherence", *coherences, f"{coherences[1] - coherences[0]:+.3f}"
         return
     targets = standing(design.opened.scene, half)
     alone = [processed(rehearse(design.opened, [one], folder / str(at))) for at, one in enumerate(targets)]
@@ -243,24 +246,24 @@ def compare(name: str, folder: Path, draws: int):
     pairs = [(flight.name, pair) for flight in campaign.image_flights for pair in flight.pairs]
     for flight, pair in pairs:
         rows, cover = measured(alone, empty, flight, pair, design)
-        for at, what in enumerate(("finer width, m", "coarser width, m", "NESZ, dB", "SNR, dB")):
-            predicted, found = rows[:, 0, at], rows[:, 1, at]
-            off = found - predicted if at > 1 else 100 * (found / predicted - 1)
-            worst = off[np.nanargmax(np.abs(off))]
+        for at, quantity in enumerate(("finer width, m", "coarser width, m", "NESZ, dB", "SNR, dB")):
+            predicted, measured_values = rows[:, 0, at], rows[:, 1, at]
+            difference = measured_values - predicted if at > 1 else 100 * (measured_values / predicted - 1)
+            worst = difference[np.nanargmax(np.abs(difference))]
             unit = "dB" if at > 1 else "%"
-            line = f"{np.nanmean(off):+.2f} {unit}, worst {worst:+.2f}"
-            yield pair, what, np.median(predicted), np.nanmedian(found), line
+            line = f"{np.nanmean(difference):+.2f} {unit}, worst {worst:+.2f}"
+            yield pair, quantity, np.median(predicted), np.nanmedian(measured_values), line
         yield pair, "coverage, %", *cover, f"{cover[1] - cover[0]:+.2f} %"
     if planned.nodes["uav1"].position_std_m:
-        lost = {pair: [] for _, pair in pairs}
+        losses_db = {pair: [] for _, pair in pairs}
         for seed in range(draws):
             wrong = processed(rehearse(design.opened, targets, folder / "draw", seed=seed + 2, erring=True))
             for flight, pair in pairs:
-                lost[pair].append((peaks_db(campaign, flight, pair) - peaks_db(wrong, flight, pair)).mean())
+                losses_db[pair].append((peaks_db(campaign, flight, pair) - peaks_db(wrong, flight, pair)).mean())
             shutil.rmtree(folder / "draw")
         for flight, pair in pairs:
             predicted = float(np.median(design.images[f"{flight}/{pair}"].layers["loss"]))
-            mean, std = float(np.mean(lost[pair])), float(np.std(lost[pair])) / draws**0.5
+            mean, std = float(np.mean(losses_db[pair])), float(np.std(losses_db[pair])) / draws**0.5
             line = f"{100 * (mean / predicted - 1):+.0f} %, ± {100 * std / predicted:.0f} %"
             yield pair, "loss, dB", predicted, mean, line
 
@@ -270,16 +273,16 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--only", nargs="*", choices=list(PLANS), default=list(PLANS))
     parser.add_argument("--draws", type=int, default=8)
-    asked = parser.parse_args()
+    options = parser.parse_args()
     console = Console(width=150)
-    for name in asked.only:
-        table = Table(title=name, title_justify="left")
-        for heading in ("pair", "quantity", "predicted", "measured", "apart"):
+    for name in options.only:
+        table, folder = Table(title=name, title_justify="left"), options.folder / name.replace(" ", "_")
+        for heading in ("pair", "quantity", "predicted", "measured", "difference"):
             table.add_column(heading)
-        for pair, what, predicted, found, apart in compare(name, asked.folder / name.replace(" ", "_"), asked.draws):
-            table.add_row(pair, what, f"{predicted:.4g}", f"{found:.4g}", apart)
+        for pair, quantity, predicted, measured_value, difference in compare(name, folder, options.draws):
+            table.add_row(pair, quantity, f"{predicted:.4g}", f"{measured_value:.4g}", difference)
         console.print(table)
-        shutil.rmtree(asked.folder / name.replace(" ", "_"))
+        shutil.rmtree(folder)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Random geometries of the envelope: range 30 m to 10 km, aperture up to the range, 0.4 to 10 GHz."""
+"""Random geometries: range 30 m to 10 km, aperture up to the range, carrier 0.4 to 10 GHz."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -11,12 +11,12 @@ from apertura.core.geometry.aperture import Aperture
 
 TRACKS = ("straight", "wobbling", "circular")
 JITTERS_M = (0.0, 0.0, 1e-4, 1e-3, 1e-2)
-BETWEEN_DEG = (0.0, 112.0, None, 112.0)  # nodes seen from the scene; None: 5 to 80
+BETWEEN_DEG = (0.0, 112.0, None, 112.0)  # bistatic angle in azimuth; None: drawn from 5 to 80
 GROUNDS = ("flat", "tilted", "rolling")
 
 
 class Flight(NamedTuple):
-    """What a track is drawn for."""
+    """Parameters of a random track."""
 
     range_m: float
     aperture_m: float
@@ -28,7 +28,7 @@ class Flight(NamedTuple):
 
 @dataclass(frozen=True)
 class Geometry:
-    """One draw; lengths in metres."""
+    """Random geometry; lengths in metres."""
 
     seed: int
     range_m: float
@@ -48,12 +48,12 @@ class Geometry:
 
     @property
     def step_m(self) -> float:
-        """Total path between samples of a profile, two in a resolution cell."""
+        """Total path between samples of a profile, half a resolution cell."""
         return C / self.bandwidth_hz / 2
 
 
 def draw(seed: int) -> Geometry:
-    """Return a random geometry; kinds of tracks, nodes and ground take turns."""
+    """Draw a random geometry; kinds of tracks, nodes and terrain alternate with the seed."""
     generator = np.random.default_rng([15, seed])
 
     def evenly_in_log(low: float, high: float) -> float:
@@ -79,18 +79,18 @@ def draw(seed: int) -> Geometry:
 def _pixels(
     generator: np.random.Generator, shape: tuple[int, int], spacing_m: float, ground: str
 ) -> NDArray[np.float64]:
-    """Return (y, x, 3) pixels about the origin, turned anyhow."""
+    """Return pixels about the origin with a random orientation, (y, x, 3)."""
     y, x = np.meshgrid(*(spacing_m * (np.arange(size) - (size - 1) / 2) for size in shape), indexing="ij")
-    turn, (east, north) = generator.uniform(0, 2 * np.pi), generator.uniform(-0.25, 0.25, 2)
+    angle, (east, north) = generator.uniform(0, 2 * np.pi), generator.uniform(-0.25, 0.25, 2)
     extent, phases = spacing_m * max(shape), generator.uniform(0, 2 * np.pi, 2)
     rolls = np.sin(2 * np.pi * x / extent + phases[0]) + np.sin(1.4 * np.pi * y / extent + phases[1])
     rolls *= extent * 10 ** generator.uniform(-3, -1.7)
     height = {"flat": 0 * x, "tilted": east * x + north * y, "rolling": rolls}[ground]
-    return np.stack([x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn), height], -1)
+    return np.stack([x * np.cos(angle) - y * np.sin(angle), x * np.sin(angle) + y * np.cos(angle), height], -1)
 
 
 def _aperture(generator: np.random.Generator, flight: Flight) -> Aperture:
-    """Return both nodes' phase centres, `between_deg` apart in azimuth as the scene sees them."""
+    """Return both nodes' phase centres, separated by `between_deg` in azimuth as seen from the scene."""
     middle, legs = generator.uniform(0, 2 * np.pi), []
     for side in (-0.5, 0.5) if flight.between_deg else (0,):
         azimuth = middle + side * np.radians(flight.between_deg)
@@ -113,8 +113,8 @@ def _aperture(generator: np.random.Generator, flight: Flight) -> Aperture:
 
 
 def _wobble(generator: np.random.Generator, pulses: int, size_m: float) -> NDArray[np.float64]:
-    """Return (pulse, 3): some cycles over the track, less of the faster ones."""
+    """Draw track deviations, (pulse, 3): 1 to 16 cycles over the track, with amplitudes decreasing with frequency."""
     cycles = np.arange(1, 17)
     terms = generator.standard_normal((2, len(cycles), 3)) / cycles[:, None]
-    turn = 2 * np.pi * np.linspace(0, 1, pulses)[:, None] * cycles
-    return np.asarray(size_m * (np.cos(turn) @ terms[0] + np.sin(turn) @ terms[1]))
+    phase_rad = 2 * np.pi * np.linspace(0, 1, pulses)[:, None] * cycles
+    return np.asarray(size_m * (np.cos(phase_rad) @ terms[0] + np.sin(phase_rad) @ terms[1]))

@@ -1,10 +1,9 @@
-"""Times every engine on one job in one interleaved run: `make bench`, or `python benchmarks/engines.py`.
+"""Run times of all engines on one job, measured in alternating rounds: `make bench`, or `python benchmarks/engines.py`.
 
-Seconds are the median over rounds of the process's CPU time, since other work on the machine stretches the wall
-clock; rounds visit all contestants in turn, so that a slow minute hits each of them. Two threads count the CPU time of
-the busier one, which is the wall clock of an idle machine. Tables are a row of their own; fastsar compresses within
-its call, so its own compression is timed too and taken off. Prints a table and puts its rows into
-benchmarks/latest.json.
+Times are medians over rounds of the process's CPU time, because other load extends the wall-clock time; each round runs
+all contestants, so that a slow period affects all of them. For two threads, the CPU time of the busier thread counts,
+which equals the wall-clock time of an idle machine. Tables are a separate row; fastsar compresses within its call, so
+that its compression is timed separately and subtracted. Prints a table and updates its rows in benchmarks/latest.json.
 """
 
 import os
@@ -31,33 +30,33 @@ from apertura.core.echo.compression import compress, window_weights
 
 @dataclass
 class Contestant:
-    """One row: what to run, what it makes, and how long it took."""
+    """One row: the call, its result and its run times."""
 
     name: str
     geometry: str
     run: Callable[[], Any]
     job: Job | None = None
     clock: Callable[[], float] = time.process_time
-    every: int = 1  # rounds between runs, for slow ones
+    every: int = 1  # rounds per run; more than 1 for slow contestants
     isa: str = ""
-    less: "Contestant | None" = None  # its time is taken off
-    exact: np.ndarray | None = None  # what it should have made, where that is no image
+    less: "Contestant | None" = None  # contestant whose time is subtracted
+    exact: np.ndarray | None = None  # exact result, for results other than images
     seconds: list[float] = field(default_factory=list)
     image: Any = None
 
     def go(self) -> None:
-        """Run once and note the time."""
+        """Run once and record the time."""
         os.environ["APERTURA_ISA"] = self.isa
         begin = self.clock()
         self.image = self.run()
         self.seconds.append(self.clock() - begin)
 
     def median(self) -> float:
-        """Return median seconds, less those of what does not count."""
+        """Return the median time in seconds, less that of `less`."""
         return statistics.median(self.seconds) - (self.less.median() if self.less else 0.0)
 
     def error_db(self) -> float | None:
-        """Return the RMS error of what was made: on random pixels of an image, or of all there is."""
+        """Return the RMS error of the result: at random pixels of an image, or of the whole array."""
         if self.exact is not None:
             return float(20 * np.log10(np.linalg.norm(self.image - self.exact) / np.linalg.norm(self.exact)))
         return None if self.job is None else error_db(self.job, self.image)
@@ -67,14 +66,18 @@ def native_contestants(jobs: dict[str, Job]) -> list[Contestant]:
     """Return the compiled engine in each instruction set and geometry."""
     flat = jobs["bistatic"]
     contestants = [
-        Contestant(f"native {isa}", "bistatic", former(flat), flat, isa=isa, every=1 + (isa == "portable"))
+        Contestant(f"native {isa}", "bistatic", formation_call(flat), flat, isa=isa, every=1 + (isa == "portable"))
         for isa in filter(native_binding.supports, native.INSTRUCTION_SETS)
     ]
     fast, linear = contestants[0].isa, {"oversampling": 10, "degree": 1}
     contestants += [
-        Contestant(f"native {fast}", name, former(job), job, isa=fast) for name, job in jobs.items() if job is not flat
+        Contestant(f"native {fast}", name, formation_call(job), job, isa=fast)
+        for name, job in jobs.items()
+        if job is not flat
     ]
-    contestants.append(Contestant(f"native {fast}, lines 10x", "bistatic", former(flat, **linear), flat, isa=fast))
+    contestants.append(
+        Contestant(f"native {fast}, lines 10x", "bistatic", formation_call(flat, **linear), flat, isa=fast)
+    )
     contestants.append(compression_contestant(flat))
     contestants.append(Contestant("tables", "bistatic", lambda: native.prepare(flat.profiles), isa=fast))
     pair = TwoThreads(flat)
@@ -83,7 +86,7 @@ def native_contestants(jobs: dict[str, Job]) -> list[Contestant]:
 
 
 def compression_contestant(job: Job) -> Contestant:
-    """Return range compression of the job's transfer functions to the swath of its profiles."""
+    """Return the range compression of the job's transfer functions to the swath of its profiles."""
     profiles, number = job.profiles, np.arange(SUBCARRIERS) - SUBCARRIERS // 2
     frequency, count = CENTRE_HZ + SPACING_HZ * (number + 0.5), profiles.samples.shape[1]
     path = profiles.start_m[:, None] + profiles.step_m * np.arange(count)
@@ -96,14 +99,14 @@ def compression_contestant(job: Job) -> Contestant:
     )
 
 
-def former(job: Job, **options: int) -> Callable[[], Any]:
-    """Return a call that forms the whole image, tables made beforehand."""
+def formation_call(job: Job, **options: int) -> Callable[[], Any]:
+    """Return a call that forms the whole image from precomputed tables."""
     tables = native.prepare(job.profiles, **options)
     return lambda: native.form(tables, job.pixels)
 
 
 class TwoThreads:
-    """Halves of the image in two threads at once; its clock is the CPU time of the busier one."""
+    """Formation of both image halves in two threads; its clock is the CPU time of the busier thread."""
 
     def __init__(self, job: Job) -> None:
         self.tables, self.tiles = native.prepare(job.profiles), np.array_split(job.pixels, 2)
@@ -124,13 +127,13 @@ class TwoThreads:
 
 
 def numba_contestant(job: Job) -> Contestant:
-    """Return the interpolating engine."""
+    """Return the numba engine, which interpolates profiles."""
     tables = numba.prepare(job.profiles)
     return Contestant("numba", "bistatic", lambda: numba.form(tables, job.pixels), job, every=4)
 
 
 def fastsar_contestants(job: Job, mono: Job) -> list[Contestant]:
-    """Return fastsar's bistatic former of points and its exact monostatic former."""
+    """Return fastsar's bistatic backprojection of points and its exact monostatic former."""
     import fastsar
     from fastsar import bp
 
@@ -156,14 +159,14 @@ def fastsar_contestants(job: Job, mono: Job) -> list[Contestant]:
 
 
 def centred(job: Job) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return antennas from the scene's middle, their mean distance to it, and the middle."""
+    """Return antenna positions relative to the scene's middle, their mean distance from it, and the middle."""
     middle = job.pixels.mean((0, 1))
     tx, rx = (leg - middle for leg in job.profiles.aperture.legs)
     return tx, rx, (np.linalg.norm(tx, axis=1) + np.linalg.norm(rx, axis=1)) / 2, middle
 
 
 def compression(bp: Any, history: np.ndarray, upsample: int) -> Callable[[], None]:
-    """Return a call of fastsar's own range compression, in its own chunks."""
+    """Return a call of fastsar's range compression with its chunk size."""
     length = upsample * history.shape[1]
 
     def run() -> None:
@@ -174,7 +177,7 @@ def compression(bp: Any, history: np.ndarray, upsample: int) -> Callable[[], Non
 
 
 def rows(contestants: list[Contestant]) -> list[dict[str, object]]:
-    """Return what was measured, one dict per contestant."""
+    """Return the results, one dict per contestant."""
     best = contestants[0].median()
     table = []
     for one in contestants:
@@ -196,28 +199,27 @@ def rows(contestants: list[Contestant]) -> list[dict[str, object]]:
 
 
 def main() -> None:
-    """Run all contestants in turn, print and save."""
+    """Run all contestants alternately, print and save the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=20)
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--pulses", type=int, default=1024)
-    asked = parser.parse_args()
-    flat = build(asked.size, asked.pulses)
-    mono = build(asked.size, asked.pulses, bistatic=False)
+    options = parser.parse_args()
+    flat = build(options.size, options.pulses)
+    mono = build(options.size, options.pulses, bistatic=False)
     jobs = {"bistatic": flat, "monostatic": mono, "bistatic, turned 30°": turned(flat, 30)}
     for name, surface in (("bistatic, DEM", "natural"), ("bistatic, harsh DEM", "harsh")):
-        jobs[name] = build(asked.size, asked.pulses, surface=surface)
+        jobs[name] = build(options.size, options.pulses, surface=surface)
     contestants = native_contestants(jobs)
     contestants.append(numba_contestant(flat))
     if importlib.util.find_spec("fastsar"):
         contestants += fastsar_contestants(flat, mono)
-    for turn in range(asked.rounds):
+    for round_number in range(options.rounds):
         for one in contestants:
-            if turn % one.every == 0:
+            if round_number % one.every == 0:
                 one.go()
-    table = rows(
-        [replace(one, seconds=one.seconds[min(1, len(one.seconds) - 1) :]) for one in contestants]
-    )  # first: warm-up
+    # The first run of each contestant is a warm-up.
+    table = rows([replace(one, seconds=one.seconds[min(1, len(one.seconds) - 1) :]) for one in contestants])
     for row in table:
         rate, error = row["pixel_pulses_per_s_per_core"], row["error_db"]
         line = (

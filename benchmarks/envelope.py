@@ -1,7 +1,8 @@
 """Error of the compiled engine from 30 m to 10 km: `python benchmarks/envelope.py` writes benchmarks/envelope.csv.
 
-Aperture equal to the range, bistatic, 409.6 MHz; spacing from an eighth of a wavelength to 1 m, carrier 0.4 to 10 GHz.
-A grid of 40 × 40 pixels (whole and cut patches) about a place at the range; the double sum is the truth.
+Bistatic, 409.6 MHz bandwidth, aperture equal to the range; spacing from an eighth of a wavelength to 1 m, carrier 0.4
+to 10 GHz. The grid has 40 × 40 pixels (complete and partial patches) about a point at the range; the reference is the
+double sum.
 """
 
 import csv
@@ -22,7 +23,7 @@ STEP_M = C / 409.6e6 / 2
 
 
 def patch(range_m: float, carrier_hz: float, spacing_m: float, *, pulses: int = 48, size: int = 40) -> Job:
-    """Return echoes of twenty points among `size` × `size` pixels, seen from 30° above."""
+    """Return a job with the echoes of twenty points among `size` × `size` pixels, at an elevation angle of 30°."""
     generator = np.random.default_rng(1)
     along = np.linspace(-0.5, 0.5, pulses)[:, None] * range_m
     wobble = 0.01 * range_m**0.5 * np.cumsum(generator.standard_normal((2, pulses, 3)), 1) / pulses**0.5
@@ -50,7 +51,7 @@ def patch(range_m: float, carrier_hz: float, spacing_m: float, *, pulses: int = 
 
 
 def measure(job: Job, **options: float) -> tuple[float, float, list[float]]:
-    """Return the RMS error of all pixels and the tables' own, dB, and the shares of the ways that pulses took."""
+    """Return the RMS error over all pixels and that of the tables, dB, and the shares of the path variants."""
     tables, counts = native.prepare(job.profiles), np.zeros(4, np.int64)
     image = native.form(tables, job.pixels, counts=counts, **options).ravel()
     truth = exact(job, job.pixels.reshape(-1, 3), carrier_hz=job.profiles.centre_frequency_hz)
@@ -59,18 +60,20 @@ def measure(job: Job, **options: float) -> tuple[float, float, list[float]]:
 
 
 def main() -> None:
-    """Measure the whole table, save it and print its worst rows."""
+    """Measure all settings, save the table and print its worst rows."""
     rows = []
     for carrier_hz in CARRIERS_HZ:
         for range_m in RANGES_M:
             for spacing_m in sorted({C / carrier_hz / 8, C / carrier_hz / 2, 0.1, 0.3, 1.0}):
-                error_db, tables_db, ways = measure(patch(range_m, carrier_hz, spacing_m))
-                rows.append([carrier_hz, range_m, round(spacing_m, 5), round(error_db, 1), round(tables_db, 1), *ways])
+                error_db, tables_db, shares = measure(patch(range_m, carrier_hz, spacing_m))
+                rows.append(
+                    [carrier_hz, range_m, round(spacing_m, 5), round(error_db, 1), round(tables_db, 1), *shares]
+                )
     with Path(__file__).with_name("envelope.csv").open("w", newline="") as stream:
         table = csv.writer(stream, lineterminator="\n")
         table.writerow(COLUMNS)
         table.writerows(rows)
-    print(f"{len(rows)} settings, {sum(row[3] <= -60 for row in rows)} at -60 dB or less; the worst:")
+    print(f"{len(rows)} settings, {sum(row[3] <= -60 for row in rows)} with an error of -60 dB or less; the worst:")
     for row in sorted(rows, key=lambda row: -row[3])[:12]:
         print(*row)
 

@@ -1,7 +1,7 @@
-"""Right campaigns of every kind, and each flag that is raised on them: true, or a false alarm.
+"""False-alarm rates of flags on random error-free campaigns.
 
-`python benchmarks/false_alarms.py WORKFOLDER [--count 100] [--seed 0] [--only 17,18] [--out table.csv]`. A campaign
-follows from seed and number; what is imperfect in it on purpose stands beside it, and a flag that says so is true.
+`python benchmarks/false_alarms.py WORKFOLDER [--count 100] [--seed 0] [--only 17,18] [--out table.csv]`. A campaign is
+determined by seed and number; its intentional flaws are listed with it, and a flag that reports one of them is true.
 """
 
 import argparse
@@ -24,20 +24,20 @@ Row = dict[str, Any]
 
 
 def main() -> None:
-    """Make the campaigns, run each, print and save what was said of it."""
+    """Simulate and process the campaigns, print and save their flags."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path, help="where campaigns are simulated, one after the other")
+    parser.add_argument("folder", type=Path, help="work folder for the simulated campaigns")
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="numbers of campaigns, comma separated; their folders are kept")
-    parser.add_argument("--out", type=Path, help="CSV to write")
-    asked = parser.parse_args()
-    chosen = [int(number) for number in asked.only.split(",") if number]
+    parser.add_argument("--out", type=Path, help="output CSV")
+    options = parser.parse_args()
+    chosen = [int(number) for number in options.only.split(",") if number]
     rows: list[Row] = []
-    for number in chosen or range(asked.count):
-        rows += _judged(asked.folder, number, asked.seed, keep=bool(chosen))
-        if asked.out:
-            _save(asked.out, rows)
+    for number in chosen or range(options.count):
+        rows += _judged(options.folder, number, options.seed, keep=bool(chosen))
+        if options.out:
+            _save(options.out, rows)
     print(_rates(rows))
 
 
@@ -49,8 +49,8 @@ def _judged(folder: Path, number: int, seed: int, *, keep: bool) -> list[Row]:
     rows = list(_rows(number, drawn, outcome, root))
     print(number, drawn.parameters, f"{outcome.seconds:.1f} s", flush=True)
     for row in rows:
-        said = f"Γ {row['coherence']}  {row['shift_cells']} cells off  {row['verdict']}{row['error']}"
-        print(f"    {row['image']:10} {said}")
+        quality = f"Γ {row['coherence']}  displacement {row['shift_cells']} cells  {row['verdict']}{row['error']}"
+        print(f"    {row['image']:10} {quality}")
         for flag, text in json.loads(row["texts"]).items():
             word = f"true: {drawn.true_flags[flag]}" if flag in drawn.true_flags else "FALSE"
             print(f"        {flag} ({word}): {text}", flush=True)
@@ -60,21 +60,19 @@ def _judged(folder: Path, number: int, seed: int, *, keep: bool) -> list[Row]:
 
 
 def _rows(number: int, drawn: Drawn, outcome: Outcome, root: Path) -> Iterator[Row]:
-    known = {"number": number, **drawn.parameters, "imperfect": json.dumps(drawn.true_flags)}
-    said: Row = {"image": "-", "error": outcome.error, "coherence": "", "shift_cells": "", "flags": "", "false": ""}
-    said |= {"verdict": "", "texts": "{}", "seconds": round(outcome.seconds, 1)}
+    inputs = {"number": number, **drawn.parameters, "imperfect": json.dumps(drawn.true_flags)}
+    results: Row = {"image": "-", "error": outcome.error, "coherence": "", "shift_cells": "", "flags": "", "false": ""}
+    results |= {"verdict": "", "texts": "{}", "seconds": round(outcome.seconds, 1)}
     if outcome.error:
-        yield known | said
-    untold = any(verdict_of(report) == "inconclusive" for report in outcome.reports.values())
-    true_flags = {
-        *drawn.true_flags,
-        *(["phase_unobservable"] if untold else []),
-    }  # of an image without a point: so it is
+        yield inputs | results
+    # The flag phase_unobservable is true for an image without a point.
+    has_no_points = any(verdict_of(report) == "inconclusive" for report in outcome.reports.values())
+    true_flags = {*drawn.true_flags, *(["phase_unobservable"] if has_no_points else [])}
     for image, report in outcome.reports.items():
         flags = report["flags"]
         yield (
-            known
-            | said
+            inputs
+            | results
             | {
                 "image": image,
                 "coherence": round(report["brightest"].get("coherence_factor", float("nan")), 4),
@@ -88,7 +86,7 @@ def _rows(number: int, drawn: Drawn, outcome: Outcome, root: Path) -> Iterator[R
 
 
 def _shift_cells(outcome: Outcome, image: str, root: Path, cell_m: float) -> float | str:
-    """Return how far the brightest target is from where it was put, in cells; empty where there is none."""
+    """Return the displacement of the brightest target from its true position, in cells; empty without targets."""
     places = true_places(root)
     if not len(places):
         return ""
@@ -104,12 +102,12 @@ def _save(path: Path, rows: list[Row]) -> None:
 
 
 def _rates(rows: list[Row]) -> str:
-    """Return how many campaigns raise each flag, and which of them without reason."""
+    """Summarise the number of campaigns that raise each flag, and the false alarms."""
     campaigns = len({row["number"] for row in rows})
     raised, untrue = (
         {(row["number"], flag) for row in rows for flag in row[key].split(",") if flag} for key in ("flags", "false")
     )
-    lines = [f"{campaigns} campaigns; {len({number for number, _ in untrue})} with a flag that is not true"]
+    lines = [f"{campaigns} campaigns; {len({number for number, _ in untrue})} with a false alarm"]
     for flag, count in Counter(flag for _, flag in raised).most_common():
         wrong = sorted(number for number, name in untrue if name == flag)
         lines.append(f"{count:4} {flag}, false in {len(wrong)}: {wrong}")

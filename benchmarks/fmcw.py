@@ -1,7 +1,7 @@
-"""One scene, one flight and one band by FMCW and by OFDM: places, widths and sidelobes of the same three targets.
+"""Comparison of FMCW and OFDM on one flight: position errors, widths and sidelobes of the same three targets.
 
-python benchmarks/fmcw.py: the table of docs/theory/fmcw.md. 400 MHz from 2.2 GHz, 200 pulses along 10 m, 20 m away and
-10 m above; FMCW 20 µs sampled at 25 MHz, OFDM 1000 subcarriers of 400 kHz; no noise.
+`python benchmarks/fmcw.py` prints the table of docs/theory/fmcw.md. Band of 400 MHz from 2.2 GHz, 200 pulses along
+10 m, at 20 m distance and 10 m height; FMCW 20 µs sampled at 25 MHz, OFDM 1000 subcarriers of 400 kHz; no noise.
 """
 
 import json
@@ -37,32 +37,32 @@ BAND = 2.2e9, 400e6
 
 
 def fmcw(root: Path, iq: str) -> np.ndarray:
-    """Write the campaign of a sweep; return where targets are, easting and northing."""
+    """Write the FMCW campaign; return easting and northing of the targets."""
     sweep = FrequencySweep(*BAND, 20e-6, 25e6, iq)
     nodes = {"uav1": (0.0, -20.0, 10.0)}
-    asked = {"speed_m_s": SPEED_M_S, "half_width_m": HALF_M, "spacing_m": SPACING_M}
-    flight = FmcwFlight(sweep, PRF_HZ, PULSES, nodes, TARGETS, **asked)
+    options = {"speed_m_s": SPEED_M_S, "half_width_m": HALF_M, "spacing_m": SPACING_M}
+    flight = FmcwFlight(sweep, PRF_HZ, PULSES, nodes, TARGETS, **options)
     write_fmcw_campaign(root, flight, waveform={})
     return np.add(flight.origin[:2], np.array(TARGETS)[:, :2])
 
 
 def ofdm(root: Path, _: str) -> np.ndarray:
-    """Write the campaign of a symbol; return where targets are, easting and northing."""
+    """Write the OFDM campaign; return easting and northing of the targets."""
     waveform = WaveformSpecification(1000, BAND[0], 400e3, 2.5e-6, 0.5e-6, 512e6, PRF_HZ)
     start = -SPEED_M_S * (PULSES - 1) / PRF_HZ / 2
     flight = SimulatedFlight("f01", "uav1", {"uav1": Straight((start, -20.0, 10.0), (SPEED_M_S, 0, 0))}, PULSES)
     grid = ImageGrid("EPSG:32632", half_width_m=HALF_M, spacing_m=SPACING_M)
     points = tuple(PointTarget(target) for target in TARGETS)
-    made = CampaignSpecification(
+    specification = CampaignSpecification(
         "ofdm", Origin(48.4, 9.95, 500.0), waveform, points, {"uav1": SimulatedNode()}, (flight,), grid
     )
-    simulate(root, made)
+    simulate(root, specification)
     truth = json.loads((root / "truth.json").read_text())["targets"]
     return np.array([[target["x"], target["y"]] for target in truth])
 
 
 def formed(root: Path, window: str) -> tuple[Campaign, float]:
-    """Return the campaign with its image, and the processor's seconds for the echo."""
+    """Process a campaign up to its image; return it, and the CPU seconds of the echo step."""
     path = root / "config/config.yaml"
     document = yaml.safe_load(path.read_text())
     document["processing"] = {"autofocus": False, "window": window}
@@ -70,9 +70,9 @@ def formed(root: Path, window: str) -> tuple[Campaign, float]:
     campaign = Campaign.load(root)
     if campaign.settings.waveform.kind == "ofdm":
         ingest.ingest(campaign, "f01", "uav1")
-    begun = time.process_time()
+    start_s = time.process_time()
     echo.echo(campaign, "f01", "uav1-uav1")
-    seconds = time.process_time() - begun
+    seconds = time.process_time() - start_s
     scene.scene(campaign)
     profile.profile(campaign, "f01", "uav1-uav1")
     refine.refine(campaign, "f01")
@@ -81,7 +81,7 @@ def formed(root: Path, window: str) -> tuple[Campaign, float]:
 
 
 def measured(campaign: Campaign, truth: np.ndarray) -> list[float]:
-    """Return the largest error of place (cm), and of the middle target widths (cm) and PSLR (dB) along and across."""
+    """Return the largest position error (cm), and widths (cm) and PSLR (dB) of the middle target along and across."""
     grid = open_scene(campaign).grid
     pixels = open_stage(campaign.stage("image", "f01", "uav1-uav1"), "image").image.values
     errors, cuts = [], []
@@ -97,7 +97,7 @@ def measured(campaign: Campaign, truth: np.ndarray) -> list[float]:
 
 
 if __name__ == "__main__":
-    print("waveform | window | place, cm | width along, across, cm | sidelobes along, across, dB | echo, CPU s")
+    print("waveform | window | position error, cm | width along, across, cm | PSLR along, across, dB | echo, CPU s")
     for name, write, iq in (("FMCW, real", fmcw, "real"), ("FMCW, complex", fmcw, "complex"), ("OFDM", ofdm, "")):
         for window in ("hann", "none"):
             with tempfile.TemporaryDirectory() as folder:

@@ -1,10 +1,10 @@
-"""Error of the tree in random geometries: `python benchmarks/geometries.py` writes benchmarks/geometries.csv.
+"""Error of engine tree in random geometries: `python benchmarks/geometries.py` writes benchmarks/geometries.csv.
 
-Range 30 m to 10 km, aperture up to the range, spacing from an eighth of a wavelength to 1 m, 0.4 to 10 GHz; straight,
-wobbling and circular tracks with and without jitter, one node or two, flat, tilted and rolling ground. Each is planned
-for -60 dB with every engine free, then formed by the tree as the planner sets it for that with nodes of -74 dB, in
-smaller tiles where that goes directly. Echoes are noise and
-scatterers of a flat band; the truth is their sum in float64 over pulses and frequencies at random pixels.
+Range 30 m to 10 km, aperture up to the range, spacing from an eighth of a wavelength to 1 m, carrier 0.4 to 10 GHz;
+straight, wobbling and circular tracks with and without jitter, one or two nodes, flat, tilted and rolling terrain. Each
+geometry is planned for -60 dB with a free choice of the engine, then formed by the tree with the planner's settings for
+that accuracy and nodes of -74 dB, in smaller tiles if the first ones are summed directly. Echoes are noise and
+scatterers of a flat band; the reference is their sum in float64 over pulses and frequencies at random pixels.
 """
 
 import argparse
@@ -31,7 +31,7 @@ LINES, GUARD, SCATTERERS, CHECKED = 128, 32, 200, 400
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one geometry."""
+    """Results of one geometry."""
 
     planned: str
     nodes_db: int
@@ -45,51 +45,52 @@ class Outcome:
 
     @property
     def failure(self) -> str:
-        """What is wrong, in a few words; nothing if nothing is."""
-        missed = ["certified worse than asked"] if self.bound_db > AIM_DB else []
-        worse = ["worse than predicted"] if self.measured_db > self.predicted_db + 3 else []
-        return ", ".join(missed + worse)
+        """Short description of a failure; empty without one."""
+        uncertified = ["certified error exceeds the requested one"] if self.bound_db > AIM_DB else []
+        unpredicted = ["error exceeds the prediction"] if self.measured_db > self.predicted_db + 3 else []
+        return ", ".join(uncertified + unpredicted)
 
 
 def frequencies(geometry: Geometry) -> NDArray[np.float64]:
-    """Return the lines of the band, those of the centre frequency between the middle two."""
+    """Return the frequencies of the lines; the centre frequency is halfway between the middle two."""
     return geometry.carrier_hz + geometry.bandwidth_hz / LINES * (np.arange(LINES) - (LINES - 1) / 2)
 
 
 def echo(geometry: Geometry, generator: np.random.Generator) -> NDArray[np.complex128]:
-    """Return (pulse, line) noise, and a tenth of its power from scatterers among the pixels."""
+    """Simulate echoes, (pulse, line): noise, and scatterers among the pixels with a tenth of its power."""
     shape = geometry.pulses, LINES
     lines = np.sqrt(0.5) * (generator.standard_normal(shape) + 1j * generator.standard_normal(shape))
     flat = geometry.pixels.reshape(-1, 3)
     paths = geometry.aperture.path(flat[generator.integers(0, len(flat), SCATTERERS)])
     first, *_, last = -2j * np.pi * frequencies(geometry) / C
     for path in paths.T:
-        turn, step = np.exp(first * path), np.exp((last - first) / (LINES - 1) * path)
-        lines += np.sqrt(0.1 / SCATTERERS) * turn[:, None] * step[:, None] ** np.arange(LINES)
+        phasor, step = np.exp(first * path), np.exp((last - first) / (LINES - 1) * path)
+        lines += np.sqrt(0.1 / SCATTERERS) * phasor[:, None] * step[:, None] ** np.arange(LINES)
     return np.asarray(lines)
 
 
 def profiles_of(geometry: Geometry, lines: NDArray[np.complex128]) -> Profiles:
-    """Return exact samples of the band-limited echo over all pixels and a guard; lines repeat beyond their period."""
-    step_m, some = geometry.step_m, geometry.pixels[:: max(1, geometry.rows // 32), :: max(1, geometry.columns // 32)]
+    """Return exact samples of the band-limited echo over all pixels and a guard, periodic in the range of the lines."""
+    step_m = geometry.step_m
+    coarse = geometry.pixels[:: max(1, geometry.rows // 32), :: max(1, geometry.columns // 32)]
     edges = (geometry.pixels[edge].reshape(-1, 3) for edge in (0, -1, np.s_[:, 0], np.s_[:, -1]))
-    paths = geometry.aperture.path(np.concatenate([some.reshape(-1, 3), *edges]))
+    paths = geometry.aperture.path(np.concatenate([coarse.reshape(-1, 3), *edges]))
     start = paths.min(1) - GUARD * step_m
     length = int(np.ceil((paths.max(1) - start).max() / step_m)) + GUARD
-    turned = lines * np.exp(2j * np.pi * start[:, None] / C * (frequencies(geometry) - geometry.carrier_hz))
-    period, at = np.fft.ifft(turned, 2 * LINES, axis=1) * 2 * LINES, np.arange(length)
+    delayed = lines * np.exp(2j * np.pi * start[:, None] / C * (frequencies(geometry) - geometry.carrier_hz))
+    period, at = np.fft.ifft(delayed, 2 * LINES, axis=1) * 2 * LINES, np.arange(length)
     samples = period[:, at % (2 * LINES)] * np.exp(-1j * np.pi * (LINES - 1) / (2 * LINES) * at)
     return Profiles(samples.astype(np.complex64), start, step_m, geometry.carrier_hz, 2.0, geometry.aperture)
 
 
 def exact(geometry: Geometry, lines: NDArray[np.complex128], places: NDArray[np.float64]) -> NDArray[np.complex128]:
-    """Return the double sum at (place, 3), float64."""
+    """Compute the double sum at points (point, 3) in float64."""
     frequency, image = frequencies(geometry), np.zeros(len(places), np.complex128)
     for first in range(0, geometry.pulses, 50):
-        some = slice(first, first + 50)
-        delay = 2 * np.pi / C * geometry.aperture[some].path(places)
+        pulses = slice(first, first + 50)
+        delay = 2 * np.pi / C * geometry.aperture[pulses].path(places)
         step, value = np.exp(1j * delay * (frequency[1] - frequency[0])), np.zeros(delay.shape, complex)
-        for line in lines[some].T[::-1]:
+        for line in lines[pulses].T[::-1]:
             value *= step
             value += line[:, None]
         image += (value * np.exp(1j * delay * frequency[0])).sum(0)
@@ -97,7 +98,7 @@ def exact(geometry: Geometry, lines: NDArray[np.complex128], places: NDArray[np.
 
 
 def job_of(geometry: Geometry, profiles: Profiles) -> Job:
-    """Return what the planner is told."""
+    """Return the planner's input."""
     shape = geometry.rows, geometry.columns
     at = np.ix_(*(np.linspace(0, size - 1, 5).astype(int) for size in shape))
     windows = [
@@ -113,7 +114,7 @@ def job_of(geometry: Geometry, profiles: Profiles) -> Job:
 
 
 def _setting(job: Job, options: Mapping[str, int]) -> Setting:
-    """Return what the planner makes of the tree with some options given."""
+    """Return the planner's setting of the tree with some options fixed."""
     overrides = {"engine": "tree", "presum": 1, "engine_options": {"tree": options}}
     return make_plan(job, accuracy_db=AIM_DB, overrides=overrides).setting
 
@@ -121,14 +122,14 @@ def _setting(job: Job, options: Mapping[str, int]) -> Setting:
 def _formed(
     geometry: Geometry, profiles: Profiles, setting: Setting
 ) -> tuple[NDArray[np.complex64], NDArray[np.float64]]:
-    """Return the image, flat, and the shares of pixels × pulses that went by tree, directly and not at all."""
+    """Return the flattened image, and the shares of pixels × pulses summed by tree, directly, or without echo."""
     counts, trees = np.zeros(3, np.int64), tree.prepare(profiles, **setting.options)
     image = tree.form(trees, geometry.pixels, counts=counts, **setting.form_options)
     return image.ravel(), counts / counts.sum()
 
 
 def measure(geometry: Geometry, **options: int) -> Outcome:
-    """Plan and form one geometry, with options of the tree where they are given, and hold it against the exact sum."""
+    """Plan and form one geometry, with any given options of the tree, and compare it with the exact sum."""
     generator = np.random.default_rng([16, geometry.seed])
     lines = echo(geometry, generator)
     profiles = profiles_of(geometry, lines)
@@ -136,22 +137,22 @@ def measure(geometry: Geometry, **options: int) -> Outcome:
     planned = make_plan(job, accuracy_db=AIM_DB).engine
     setting = _setting(job, options)
     image, shares = _formed(geometry, profiles, setting)
-    if not shares[0]:  # what small tiles hold is formed by tree all the same
+    if not shares[0]:  # smaller tiles allow the sum by tree
         setting = _setting(job, {"side_px": 64, "chunk": 256} | options)
         image, shares = _formed(geometry, profiles, setting)
     checked = generator.choice(image.size, CHECKED, replace=False)
     truth = exact(geometry, lines, geometry.pixels.reshape(-1, 3)[checked])
     power = float((np.abs(image.astype(np.complex128)) ** 2).sum())
     bound = error_bound(image[checked], truth, np.full(CHECKED, CHECKED / image.size), power=power)
-    wrong = np.abs(image[checked] - truth) ** 2
+    squared_error = np.abs(image[checked] - truth) ** 2
     return Outcome(
         planned, *(setting.form_options[name] for name in ("nodes_db", "side_px", "chunk")), *shares[:2].tolist(),
-        setting.error_db, float(10 * np.log10(wrong.sum() / (np.abs(truth) ** 2).sum())), bound.bound_db,
+        setting.error_db, float(10 * np.log10(squared_error.sum() / (np.abs(truth) ** 2).sum())), bound.bound_db,
     )  # fmt: skip
 
 
 def row_of(geometry: Geometry, outcome: Outcome) -> dict[str, str]:
-    """Return what the table says of one geometry."""
+    """Return the table row of one geometry."""
     names = [f.name for f in fields(geometry) if f.repr] + [f.name for f in fields(outcome)]
     values = [getattr(geometry, f.name) for f in fields(geometry) if f.repr] + list(astuple(outcome))
     row = {n: f"{v:.4g}" if isinstance(v, float) else str(v) for n, v in zip(names, values, strict=True)}
@@ -159,12 +160,14 @@ def row_of(geometry: Geometry, outcome: Outcome) -> dict[str, str]:
 
 
 def main() -> None:
-    """Measure all, save the table and say which failed."""
+    """Measure all geometries, save the table and list the failures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", nargs=2, type=int, default=(0, 60), metavar=("FIRST", "END"))
-    parser.add_argument("--nodes_db", type=int, default=-74, help="of the tree; -74 is the least that -60 takes")
+    parser.add_argument(
+        "--nodes_db", type=int, default=-74, help="option of the tree; the planner uses at most -74 for -60 dB"
+    )
     for name in ("side_px", "chunk"):
-        parser.add_argument(f"--{name}", type=int, help="of the tree; by default the planner's")
+        parser.add_argument(f"--{name}", type=int, help="option of the tree (default: chosen by the planner)")
     parser.add_argument("--table", type=Path, default=Path(__file__).with_suffix(".csv"))
     arguments = parser.parse_args()
     options = {name: value for name in ("nodes_db", "side_px", "chunk") if (value := getattr(arguments, name))}

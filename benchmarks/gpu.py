@@ -1,9 +1,9 @@
-"""The engine `cuda` where there is a device: `python benchmarks/gpu.py [--size 4096] [--pulses 4096] [--rounds 5]`.
+"""Rate and error of engine cuda: `python benchmarks/gpu.py [--size 4096] [--pulses 4096] [--rounds 5]`.
 
-Wall clock, host to host: pixels go there, the image comes back; medians of rounds that visit all rows in turn, without
-the first, in which kernels are compiled. Rates are of pixels × pulses that have a weight, errors those of random pixels
-against the exact image of job.py. Beside the rates stand what others publish of theirs, on their devices and jobs.
-Without a device it says so and ends with 1.
+Wall-clock times include the transfer of pixels to the device and of the image to the host; they are medians over rounds
+that run all rows alternately, without the first round, which compiles kernels. Rates count pixels × pulses with a
+non-zero weight; errors are measured at random pixels against the exact image of job.py. For comparison, published rates
+of other programs, on their devices and jobs, are printed. Without a device, the exit status is 1.
 """
 
 import argparse
@@ -29,12 +29,12 @@ PUBLISHED = (
     ),
     (68e9, "fastsar, L4, exact, cubic, -67 dB; docs/performance.md of github.com/saulpingerman/FastSAR"),
 )
-"""Pixel·pulses per second as published, and where."""
+"""Published rates, pixels × pulses per second, and their sources."""
 
 
 @dataclass
 class Row:
-    """What to run, on which job, and how long it took."""
+    """One row: the job, the call and its run times."""
 
     name: str
     job: Job
@@ -44,19 +44,19 @@ class Row:
     image: Any = None
 
     def go(self) -> None:
-        """Run once and note the time."""
+        """Run once and record the time."""
         begin = time.perf_counter()
         self.image = self.run()
         self.seconds.append(time.perf_counter() - begin)
 
     @property
     def kept(self) -> list[float]:
-        """Seconds without those of the first round, where there are others."""
+        """Times in seconds without the first round, unless it is the only one."""
         return self.seconds[min(1, len(self.seconds) - 1) :]
 
 
 def weights(job: Job) -> dict[str, Beams]:
-    """Return a sector of a tenth of the flight, beams of 40° by 60° that look at the scene's middle, and both."""
+    """Return a sector of a tenth of the flight, beams of 40° by 60° directed at the scene's middle, and both."""
     flown = job.profiles.aperture
     sector, middle = Sector.of(flown, chord_m=1.5, centre=0.0, half=0.08), job.pixels.reshape(-1, 3).mean(axis=0)
     cuts = gaussian_cut(40.0, cutoff_db=-20, limit_rad=np.pi), gaussian_cut(60.0, cutoff_db=-20, limit_rad=np.pi / 2)
@@ -70,11 +70,11 @@ def weights(job: Job) -> dict[str, Beams]:
 
 
 def rows(size: int, pulses: int) -> list[Row]:
-    """Return what is timed: geometries and surfaces by the series, exact paths alone, weights, and tables alone."""
+    """Return the timed rows: geometries and surfaces by the series, exact paths only, weights, and tables only."""
     flat = build(size, pulses)
     mono, rough = build(size, pulses, bistatic=False), build(size, pulses, surface="natural")
     weighed = [(f"bistatic, {name}", flat, {"beams": beams}) for name, beams in weights(flat).items()]
-    found = []
+    timed = []
     for name, job, options in (
         ("bistatic", flat, {}),
         ("monostatic", mono, {}),
@@ -83,43 +83,43 @@ def rows(size: int, pulses: int) -> list[Row]:
         *weighed,
     ):
         run = partial(cuda.form, cuda.prepare(job.profiles), job.pixels, **options)
-        found.append(Row(name, job, run, options.get("beams")))
+        timed.append(Row(name, job, run, options.get("beams")))
     patch = flat.pixels[:16, :16]
-    found.append(Row("tables and a patch", flat, lambda: cuda.form(cuda.prepare(flat.profiles), patch)))
-    return found
+    timed.append(Row("tables and a patch", flat, lambda: cuda.form(cuda.prepare(flat.profiles), patch)))
+    return timed
 
 
 def share(row: Row) -> float:
-    """Return the share of pixels × pulses that have a weight: the rate is that of these."""
+    """Return the share of pixels × pulses with a non-zero weight, to which the rate refers."""
     if row.beams is None:
         return 1.0
-    some = row.job.pixels[:: max(1, row.job.pixels.shape[0] // 9), :: max(1, row.job.pixels.shape[1] // 9)]
-    return float((row.beams.weight(row.job.profiles.aperture, some.reshape(-1, 3)) != 0).mean())
+    coarse = row.job.pixels[:: max(1, row.job.pixels.shape[0] // 9), :: max(1, row.job.pixels.shape[1] // 9)]
+    return float((row.beams.weight(row.job.profiles.aperture, coarse.reshape(-1, 3)) != 0).mean())
 
 
 def main() -> int:
-    """Time and print; return 1 where there is no device."""
+    """Measure and print the rows; return 1 without a device."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     for name, default in (("size", 4096), ("pulses", 4096), ("rounds", 5)):
         parser.add_argument(f"--{name}", type=int, default=default)
-    asked = parser.parse_args()
+    options = parser.parse_args()
     if not cuda.available():
-        print("no device: not measured (docs/howto/gpu.md)")
+        print("no CUDA device found: nothing measured (docs/howto/gpu.md)")
         return 1
-    print(f"{cuda.instruction_set()}; {asked.size}² pixels, {asked.pulses} pulses, {asked.rounds} rounds")
-    timed = rows(asked.size, asked.pulses)
-    for _ in range(asked.rounds):
+    print(f"{cuda.instruction_set()}; {options.size}² pixels, {options.pulses} pulses, {options.rounds} rounds")
+    timed = rows(options.size, options.pulses)
+    for _ in range(options.rounds):
         for row in timed:
             row.go()
     for row in timed:
         seconds, spread = statistics.median(row.kept), max(row.kept) / min(row.kept)
         line = f"{row.name:<26}{seconds:>9.3f} s  first {row.seconds[0]:.2f} s  spread {spread:.2f}"
         if row.image.shape == row.job.pixels.shape[:2]:
-            taken = share(row)
-            rate = taken * np.prod(row.image.shape) * asked.pulses / seconds
+            weighted_share = share(row)
+            rate = weighted_share * np.prod(row.image.shape) * options.pulses / seconds
             ratios = ", ".join(f"{rate / theirs:.2f} of {who.split(',')[0]}" for theirs, who in PUBLISHED)
             error = error_db(row.job, row.image, beams=row.beams)
-            line += f"{rate:>11.3g} pixel·pulses/s of {100 * taken:.0f} %{error:>7.1f} dB  {ratios}"
+            line += f"{rate:>11.3g} pixel·pulses/s of {100 * weighted_share:.0f} %{error:>7.1f} dB  {ratios}"
         print(line)
     for rate, who in PUBLISHED:
         print(f"published: {rate:.3g}/s, {who}")

@@ -1,14 +1,14 @@
-"""How seconds grow with the image: every engine and fastsar on scenes of 512² to 8192², interleaved.
+"""Growth of run times with the image size: all engines and fastsar on scenes of 512² to 8192², run alternately.
 
-    python benchmarks/growth.py --quick          # 12 minutes, most cases, one round of what is slow
+    python benchmarks/growth.py --quick          # 12 minutes, most cases, one round of slow contestants
     python benchmarks/growth.py                  # all cases
-    python benchmarks/growth.py --cases low      # whose name holds a word: "4096² × 8192, low, flat"
-    python benchmarks/growth.py --draw           # the chart and the table again, of the rows that are there
+    python benchmarks/growth.py --cases low      # cases whose name contains a word: "4096² × 8192, low, flat"
+    python benchmarks/growth.py --draw           # redraw chart and table from the saved rows
 
-Seconds are CPU seconds of one thread, medians over rounds that visit all contestants in turn, least and most beside
-them. Where an engine's cost grows with its pixels some tiles stand for all (`share`). Prints a table, puts its rows
-into benchmarks/latest.json and draws docs/assets/growth.png. fastsar takes part where it is installed
-(`pip install fastsar`); an engine that is missing is named with its reason.
+Times are CPU seconds of one thread: medians over rounds that run all contestants alternately, with minimum and maximum.
+If the cost of an engine grows with its pixels, a part of the tiles represents the image (`share`). Prints a table,
+updates its rows in benchmarks/latest.json and draws docs/assets/growth.png. fastsar is compared if it is installed
+(`pip install fastsar`); skipped contestants are listed with the reason.
 """
 
 import os
@@ -25,7 +25,7 @@ from statistics import median
 from typing import NamedTuple
 
 from growing.chart import draw
-from growing.contestants import Contestant, House, SkippedError
+from growing.contestants import Contestant, EngineInput, SkippedError
 from growing.rivals import Fastsar
 from growing.scene import Geometry, Scene, Surface, build
 from growing.table import exponents, markdown
@@ -36,13 +36,13 @@ from apertura.core.backprojection.engines import instruction_set
 CHART = Path(__file__).parents[1] / "docs" / "assets" / "growth.png"
 AIMS_DB = (-40.0, -60.0, -80.0)
 SLOW = 0.05
-"""Who forms less of an image than this has one round where it is quick."""
+"""Share of the image below which a contestant runs one round in quick mode."""
 
 _KEY = ("group", "name", "aim_db", "geometry", "surface", "size", "pulses")
 
 
 class Case(NamedTuple):
-    """A scene, and whether a quick run has it."""
+    """Parameters of a scene; `quick` is True if a quick run includes it."""
 
     size: int
     pulses: int
@@ -56,7 +56,7 @@ class Case(NamedTuple):
 
 
 class Effort(NamedTuple):
-    """Rounds at most; seconds of one run, roughly; whether native stands at one accuracy alone."""
+    """Maximum number of rounds, approximate time limit of one run, and quick mode (native at one accuracy only)."""
 
     rounds: int
     limit_s: float
@@ -83,27 +83,31 @@ CASES = (
 
 
 def main() -> None:
-    """Measure, print, save and draw."""
+    """Measure the cases, print, save and draw the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="fewer cases, rounds and tiles; native at -60 dB alone")
-    parser.add_argument("--cases", nargs="*", default=[], help="words, one of which a case's name holds")
+    parser.add_argument("--quick", action="store_true", help="fewer cases, rounds and tiles; native at -60 dB only")
+    parser.add_argument("--cases", nargs="*", default=[], help="select cases whose name contains one of these words")
     parser.add_argument("--only", nargs="*", default=[], help="names of contestants")
-    parser.add_argument("--rounds", type=int, help="at most; 5, or 3 where quick")
-    parser.add_argument("--limit", type=float, help="seconds of one run of a contestant, roughly; 40, or 6 where quick")
-    parser.add_argument("--draw", action="store_true", help="measure nothing")
-    parser.add_argument("--unsaved", action="store_true", help="print alone")
-    asked = parser.parse_args()
-    rounds, limit_s = asked.rounds or (3 if asked.quick else 5), asked.limit or (6.0 if asked.quick else 40.0)
-    cases = [case for case in CASES if case.quick or not asked.quick]
-    cases = [case for case in cases if not asked.cases or any(word in case.name for word in asked.cases)]
+    parser.add_argument("--rounds", type=int, help="maximum number of rounds (default: 5; 3 with --quick)")
+    parser.add_argument(
+        "--limit", type=float, help="approximate seconds of one run of a contestant (default: 40; 6 with --quick)"
+    )
+    parser.add_argument("--draw", action="store_true", help="redraw the saved rows without measuring")
+    parser.add_argument("--unsaved", action="store_true", help="print the results without saving them")
+    options = parser.parse_args()
+    rounds = options.rounds or (3 if options.quick else 5)
+    limit_s = options.limit or (6.0 if options.quick else 40.0)
+    cases = [case for case in CASES if case.quick or not options.quick]
+    cases = [case for case in cases if not options.cases or any(word in case.name for word in options.cases)]
     rows: list[Row] = []
-    for geometry in () if asked.draw else sorted({case.geometry for case in cases}):
-        measured(Case(256, 64, geometry), Effort(1, limit_s, quick=False), asked.only)  # what is compiled once
-    for case in () if asked.draw else cases:
-        rows += measured(case, Effort(rounds, limit_s, asked.quick), asked.only)
-    if not asked.unsaved:
-        made = {tuple(row[key] for key in _KEY) for row in rows}
-        kept = replace_rows(rows, lambda row: tuple(row.get(key) for key in _KEY) in made) if rows else read_rows()
+    for geometry in () if options.draw else sorted({case.geometry for case in cases}):
+        # A small scene compiles the kernels before the measurement.
+        measured(Case(256, 64, geometry), Effort(1, limit_s, quick=False), options.only)
+    for case in () if options.draw else cases:
+        rows += measured(case, Effort(rounds, limit_s, options.quick), options.only)
+    if not options.unsaved:
+        new = {tuple(row[key] for key in _KEY) for row in rows}
+        kept = replace_rows(rows, lambda row: tuple(row.get(key) for key in _KEY) in new) if rows else read_rows()
         rows = [row for row in kept if row.get("group") == "growth"]
         CHART.parent.mkdir(exist_ok=True)
         draw(rows, CHART)
@@ -111,66 +115,68 @@ def main() -> None:
 
 
 def measured(case: Case, effort: Effort, only: list[str]) -> list[Row]:
-    """Return the rows of one scene; contestants take turns until each has had its rounds or its time."""
+    """Measure one scene; contestants run alternately until each reaches its number of rounds or its time limit."""
     begin = time.perf_counter()
     scene = build(case.size, case.pulses, case.geometry, case.surface)
-    house = House(scene)
+    engine_input = EngineInput(scene)
     print(f"{scene.name}: {len(scene.history.frequency_hz)} subcarriers", flush=True)
-    contestants = [one for one in _contestants(house, effort) if not only or one.name in only]
+    contestants = [one for one in _contestants(engine_input, effort) if not only or one.name in only]
     loads = [os.getloadavg()[0]]
-    for turn in range(effort.rounds):
-        house.compress()
+    for number in range(effort.rounds):
+        engine_input.compress()
         for one in contestants:
-            once = effort.quick and one.share < SLOW  # of what goes pixel by pixel
-            if turn == 0 or (not once and one.spent * (turn + 1) / turn < 3 * effort.limit_s):
+            once = effort.quick and one.share < SLOW  # contestants that work pixel by pixel
+            if number == 0 or (not once and one.spent * (number + 1) / number < 3 * effort.limit_s):
                 one.go()
         loads.append(os.getloadavg()[0])
     print(f"  {time.perf_counter() - begin:.0f} s, load {min(loads):.1f} to {max(loads):.1f}", flush=True)
-    compression_s = median(house.compressions)
+    compression_s = median(engine_input.compressions)
     measures = {"machine": machine(), "load": round(max(loads), 1), "compression_s": float(f"{compression_s:.3g}")}
     return [one.row(compression_s) | measures for one in contestants]
 
 
 def machine() -> str:
-    """Return the processor, as Linux calls it, and what our sums run with."""
+    """Return the processor's model name and the instruction set of engine native."""
     lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown")
     return f"{model}, {instruction_set('native')}"
 
 
-def _contestants(house: House, effort: Effort) -> Iterator[Contestant]:
-    """Yield those who can take part; say why the others do not."""
+def _contestants(engine_input: EngineInput, effort: Effort) -> Iterator[Contestant]:
+    """Yield the available contestants; print the reasons of the skipped ones."""
     limit_s = effort.limit_s
     entries: list[tuple[str, Callable[[], Contestant]]] = [
-        (f"{engine} {aim_db:.0f} dB", partial(house.planned, engine, aim_db, limit_s))
+        (f"{engine} {aim_db:.0f} dB", partial(engine_input.planned, engine, aim_db, limit_s))
         for engine in ("native", "tree")
         for aim_db in (AIMS_DB if engine == "tree" or not effort.quick else (-60.0,))
     ]
-    entries.append(("numba", partial(house.planned, "numba", -60.0, limit_s / 2, fields=True)))
+    entries.append(("numba", partial(engine_input.planned, "numba", -60.0, limit_s / 2, fields=True)))
     if importlib.util.find_spec("fastsar"):
-        rival = Fastsar(house.scene)
-        entries += [(name, partial(rival.factorized, name, **options)) for name, options in _factorized(house.scene)]
+        rival = Fastsar(engine_input.scene)
+        entries += [
+            (name, partial(rival.factorized, name, **options)) for name, options in _factorized(engine_input.scene)
+        ]
         entries += [
             ("fastsar exact", partial(rival.exact, limit_s)),
             ("fastsar points", partial(rival.points, limit_s / 2)),
         ]
     else:
         print("  fastsar is not installed")
-    without: dict[str, list[str]] = {}
+    skipped: dict[str, list[str]] = {}
     for name, enter in entries:
         try:
             yield enter()
-        except SkippedError as reason:
-            without.setdefault(str(reason), []).append(name)
-    for why_not, names in without.items():
-        print(f"  without {', '.join(names)}: {why_not}")
+        except SkippedError as error:
+            skipped.setdefault(str(error), []).append(name)
+    for reason, names in skipped.items():
+        print(f"  {', '.join(names)} skipped: {reason}")
 
 
 def _factorized(scene: Scene) -> Iterator[tuple[str, dict[str, int]]]:
-    """Yield fastsar's factorized former as it comes, and as exact as it gets.
+    """Yield fastsar's factorized former with default settings, and with the most accurate settings.
 
-    Its image is the more exact the smaller its last patches are: of 16 pixels at least, so pixels are made finer; with
-    one level more where three leave too much to the last.
+    Its error decreases with the size of its last patches, which have at least 16 pixels: finer pixels reduce them, and
+    large images use one more level than the default of three.
     """
     deep = {"levels": 4} if scene.size >= 2048 else {}
     yield "fastsar FFBP", {}

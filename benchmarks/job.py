@@ -1,8 +1,8 @@
-"""The benchmark's job: a low, wobbling bistatic flight over a field of point scatterers, with its exact image.
+"""Job of the engine benchmarks: a low, wobbling bistatic flight over point scatterers, with its exact image.
 
-512 × 512 pixels of 5 cm seen from 10 m height at 5 to 30 m ground range, 1024 pulses over 30 m, 409.6 MHz at
-1.2 GHz: the geometry of the source paper, and the hardest for series about a patch: aperture, range and scene
-are of one size.
+512 × 512 pixels of 5 cm, imaged from 10 m height at 5 to 30 m ground range, 1024 pulses over 30 m, 409.6 MHz at
+1.2 GHz. This is the geometry of the source paper, and the most demanding one for series about a patch, because
+aperture, range and scene have the same size.
 """
 
 from dataclasses import dataclass, replace
@@ -26,7 +26,7 @@ Surface = Literal["flat", "harsh", "natural"]
 
 @dataclass(frozen=True)
 class Job:
-    """Profiles, pixels (y, x, 3), scatterers (place, amplitude)."""
+    """Profiles, pixels (y, x, 3), and positions and amplitudes of scatterers."""
 
     profiles: Profiles
     pixels: NDArray[np.float64]
@@ -52,17 +52,17 @@ def flight(generator: np.random.Generator, pulses: int, *, bistatic: bool) -> tu
 def grid(
     size: int, spacing_m: float = 0.05, *, turned_deg: float = 0.0, surface: Surface = "flat"
 ) -> NDArray[np.float64]:
-    """Return (y, x, 3) pixels on a surface."""
+    """Return pixels on a surface, (y, x, 3)."""
     step = spacing_m * (np.arange(size) - (size - 1) / 2)
     across, along = np.meshgrid(step, step)
-    turn = np.radians(turned_deg)
+    angle = np.radians(turned_deg)
     middle = 5 + spacing_m * size / 2
-    x, y = middle + across * np.cos(turn) - along * np.sin(turn), across * np.sin(turn) + along * np.cos(turn)
+    x, y = middle + across * np.cos(angle) - along * np.sin(angle), across * np.sin(angle) + along * np.cos(angle)
     return np.stack([x, y, height(x, y, surface)], -1)
 
 
 def height(x: NDArray, y: NDArray, surface: Surface) -> NDArray[np.float64]:
-    """Return heights: relief of 10 cm and 1 cm RMS from pixel to pixel, or 1 m and 1 cm RMS over a quarter metre."""
+    """Return heights: relief of 10 cm with 1 cm RMS noise per pixel, or relief of 1 m with 1 cm RMS over 25 cm."""
     rough = np.random.default_rng(5).standard_normal(x.shape)
     if surface == "harsh":
         return 0.1 * (np.sin(x / 3) + np.cos(y / 4)) + 0.01 * rough
@@ -73,21 +73,21 @@ def height(x: NDArray, y: NDArray, surface: Surface) -> NDArray[np.float64]:
 
 
 def total_path(tx: NDArray, rx: NDArray, place: NDArray) -> NDArray[np.float64]:
-    """Return (pulse, place) total path, metres."""
+    """Return total paths to points, (pulse, point) metres."""
     legs = [np.linalg.norm(place[None] - antenna[:, None], axis=-1) for antenna in (tx, rx)]
     return legs[0] + legs[1]
 
 
 def response(path_m: NDArray) -> NDArray[np.float64]:
     """Return Σ_n exp(j2π(f_n - f_mid)·path/c) / N in closed form."""
-    turn = np.pi * SPACING_HZ * path_m / C
-    small = np.abs(turn) < 1e-12
-    safe = np.where(small, 1.0, turn)
+    half_phase = np.pi * SPACING_HZ * path_m / C
+    small = np.abs(half_phase) < 1e-12
+    safe = np.where(small, 1.0, half_phase)
     return np.where(small, 1.0, np.sin(SUBCARRIERS * safe) / (SUBCARRIERS * np.sin(safe)))
 
 
 def echoes(tx: NDArray, rx: NDArray, scatterers: NDArray, amplitude: NDArray, at: NDArray) -> NDArray[np.complex64]:
-    """Return the scatterers' band-limited echoes at the paths `at`, (pulse, sample)."""
+    """Return the band-limited echoes of scatterers at the paths `at`, (pulse, sample)."""
     samples, wavenumber = np.zeros(at.shape, np.complex128), 2 * np.pi * CENTRE_HZ / C
     for place, gain in zip(scatterers, amplitude, strict=True):
         path = total_path(tx, rx, place[None])
@@ -104,7 +104,7 @@ def build(size: int = 512, pulses: int = 1024, *, bistatic: bool = True, surface
     scatterers = flat[generator.integers(0, len(flat), 100)] + generator.uniform(-0.025, 0.025, (100, 3)) * [1, 1, 0]
     amplitude = generator.standard_normal(100) + 1j * generator.standard_normal(100)
     step = C / (SUBCARRIERS * SPACING_HZ) / 2
-    edge = grid(64, 0.05 * size * 1.45 / 64)  # a turned grid fits in too
+    edge = grid(64, 0.05 * size * 1.45 / 64)  # also covers rotated grids
     paths = total_path(tx, rx, np.concatenate([edge, pixels[::8, ::8]], axis=None).reshape(-1, 3))
     start = paths.min(1) - GUARD * step
     length = int(np.ceil((paths.max(1) - start).max() / step)) + GUARD
@@ -115,12 +115,12 @@ def build(size: int = 512, pulses: int = 1024, *, bistatic: bool = True, surface
 
 
 def turned(job: Job, degrees: float) -> Job:
-    """Return the job on a grid turned about its middle."""
+    """Return the job on a grid rotated about its middle."""
     return replace(job, pixels=grid(len(job.pixels), turned_deg=degrees))
 
 
 def spectra(job: Job, reference_path_m: NDArray) -> NDArray[np.complex64]:
-    """Return (pulse, subcarrier) Σ a·exp(-j2πf(path - reference)/c), as other codes read it."""
+    """Return phase histories Σ a·exp(-j2πf(path - reference)/c), (pulse, subcarrier), the input of other programs."""
     frequency_hz = CENTRE_HZ + SPACING_HZ * (np.arange(SUBCARRIERS) - (SUBCARRIERS - 1) / 2)
     points = Scatterers(job.scatterers, job.amplitude)
     return transfer(points, job.profiles.aperture, frequency_hz, longer_m=-reference_path_m, spreading=False)
@@ -129,18 +129,18 @@ def spectra(job: Job, reference_path_m: NDArray) -> NDArray[np.complex64]:
 def exact(
     job: Job, places: NDArray[np.float64], *, carrier_hz: float = CENTRE_HZ, beams: Beams | None = None
 ) -> NDArray[np.complex128]:
-    """Return the image at (place, 3), float64: the double sum, over subcarriers in closed form."""
+    """Compute the double sum at points (point, 3) in float64, with subcarriers summed in closed form."""
     wavenumber, weight = 2 * np.pi * carrier_hz / C, (beams or Beams()).weight(job.profiles.aperture, places)
-    here = total_path(*job.profiles.aperture.legs, places)
+    path = total_path(*job.profiles.aperture.legs, places)
     image = np.zeros(len(places), np.complex128)
     for place, gain in zip(job.scatterers, job.amplitude, strict=True):
-        apart = here - total_path(*job.profiles.aperture.legs, place[None])
-        image += gain * (np.exp(1j * wavenumber * apart) * response(apart) * weight).sum(0)
+        difference = path - total_path(*job.profiles.aperture.legs, place[None])
+        image += gain * (np.exp(1j * wavenumber * difference) * response(difference) * weight).sum(0)
     return image
 
 
 def error_db(job: Job, image: NDArray[np.complex64], count: int = 300, *, beams: Beams | None = None) -> float:
-    """Return the RMS error on random pixels after one complex gain, dB."""
+    """Return the RMS error at random pixels after one complex gain, dB."""
     index = np.random.default_rng(7).integers(0, job.pixels.shape[0], (2, count))
     truth, value = (
         exact(job, job.pixels[index[0], index[1]], beams=beams),

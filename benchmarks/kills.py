@@ -2,11 +2,12 @@
 
     python benchmarks/kills.py [CAMPAIGN] [KILLS] [SEED]
 
-Without a folder, or with '-', the campaign is a small simulated one: 48 x 48 pixels in nine tiles of two pairs. A run
-gets SIGKILL after a random share of the time that an undisturbed run takes, with all that it has started or, three
-times of ten, alone: then its steps live on beside the next run's. What resumes it is killed too, until KILLS (16) are
-spent. Whenever a run gets through, its results are compared byte for byte with the undisturbed ones, logs, timings and
-hidden files left out, and the next begins from nothing. Ends with an error where they differ.
+Without a folder, or with '-', the campaign is a small simulated one: 48 x 48 pixels in nine tiles, two pairs. A run
+receives SIGKILL after a random share of the duration of an undisturbed run, together with all processes that it has
+started or, in three of ten cases, without them: its steps then continue in parallel with those of the next run. Resumed
+runs are killed, too, until the number of KILLS (16) is reached. When a run finishes, its results are compared byte for
+byte with the undisturbed ones, without logs, timings and hidden files, and the next run starts from the beginning.
+Exits with an error if results differ.
 """
 
 import contextlib
@@ -27,7 +28,7 @@ APERTURA = Path(sys.executable).parent / "apertura"
 
 
 def small(folder):
-    """Simulate the campaign that is killed by default."""
+    """Simulate the default campaign."""
     from apertura.simulation import ImageGrid, preset, simulate
 
     plan = replace(preset("demo", pulses=24), scene=ImageGrid("EPSG:32632", half_width_m=1.2, spacing_m=0.05))
@@ -49,19 +50,19 @@ def finish(process, root):
 
 
 def products(root):
-    """Return path → bytes of all results but logs, timings, and hidden files and folders."""
-    results, found = root / "results", {}
+    """Read all results as path → bytes, without logs, timings, and hidden files and folders."""
+    results, contents = root / "results", {}
     for path in results.rglob("*"):
         name = path.relative_to(results)
         hidden = any(part.startswith(".") for part in name.parts)
         if path.is_file() and not hidden and name.parts[0] not in {"logs", "benchmarks"}:
-            found[name] = path.read_bytes()
-    return found
+            contents[name] = path.read_bytes()
+    return contents
 
 
 def compare(root, expected):
-    made = products(root)
-    differ = sorted(str(path) for path in made.keys() | expected.keys() if made.get(path) != expected.get(path))
+    actual = products(root)
+    differ = sorted(str(path) for path in actual.keys() | expected.keys() if actual.get(path) != expected.get(path))
     if differ:
         sys.exit(f"{len(differ)} of {len(expected)} files differ: {', '.join(differ[:5])}")
 
@@ -72,7 +73,7 @@ def copy(campaign, root):
 
 
 def killed(process, wait_s, root, *, alone):
-    """Kill a run after some time, `alone` or with all that it has started; return whether it still ran."""
+    """Kill a run after `wait_s`, `alone` or with all its child processes; return True if it was still running."""
     try:
         process.wait(wait_s)
         return False
@@ -87,19 +88,19 @@ def killed(process, wait_s, root, *, alone):
 
 
 def steps_of(root):
-    """Return the processes that work in a campaign folder."""
-    found = []
+    """Return the numbers of the processes that work in a campaign folder."""
+    numbers = []
     for path in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
             state = (path / "stat").read_text().rpartition(")")[2].split()[0]
             if state != "Z" and (path / "cwd").readlink() == root.resolve():
-                found.append(int(path.name))
-    return found
+                numbers.append(int(path.name))
+    return numbers
 
 
 def main():
     campaign, kills, seed = [*sys.argv[1:], *("-", "16", "1")[len(sys.argv) - 1 :]]
-    moment, spent, through, began = random.Random(int(seed)), 0, 0, time.perf_counter()
+    generator, spent, finished, start_s = random.Random(int(seed)), 0, 0, time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         campaign = small(Path(folder)) if campaign == "-" else Path(campaign)
         root = copy(campaign, Path(folder) / "campaign")
@@ -113,23 +114,23 @@ def main():
             copy(campaign, root)
             while killed(
                 process := start(root),
-                wait_s := moment.uniform(0.1, 0.6) * whole_s,
+                wait_s := generator.uniform(0.1, 0.6) * whole_s,
                 root,
-                alone=(alone := moment.random() < 0.3),
+                alone=(alone := generator.random() < 0.3),
             ):
                 spent += 1
-                what = "apertura run alone" if alone else "the run with all its steps"
-                print(f"kill {spent} after {wait_s:.1f} s, {what}: {len(products(root))} files", flush=True)
+                target = "apertura run without its steps" if alone else "apertura run with all its steps"
+                print(f"kill {spent} after {wait_s:.1f} s, {target}: {len(products(root))} files", flush=True)
                 if spent == int(kills):
                     process = start(root)
                     break
             finish(process, root)
             compare(root, expected)
-            through += 1
-            print("resumed to identical bytes", flush=True)
+            finished += 1
+            print("resumed: results are identical", flush=True)
             shutil.rmtree(root)
-    seconds = time.perf_counter() - began
-    print(f"{spent} kills of {through} runs, identical bytes after all; {seconds / max(1, spent):.1f} s a kill")
+    seconds = time.perf_counter() - start_s
+    print(f"{spent} kills of {finished} runs, all results identical; {seconds / max(1, spent):.1f} s per kill")
 
 
 if __name__ == "__main__":

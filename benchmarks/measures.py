@@ -1,7 +1,7 @@
-"""What an image's own measures cost: `python benchmarks/measures.py [--size 2048] [--pulses 4096] [--repeats 3]`.
+"""Run time of the image quality checks: `python benchmarks/measures.py [--size 2048] [--pulses 4096] [--repeats 3]`.
 
-Five targets and noise are imaged as the workflow plans them, tile by tile into zarr; beside that time stand those of
-the certificate, the brightest target, the focus and the agreement with another image. Repeated, one after the other.
+Five targets and noise are imaged tile by tile into zarr, as planned by the workflow; this time is compared with those
+of the certificate, the brightest target, the focus check and the agreement with another image. All are repeated.
 """
 
 import os
@@ -42,7 +42,7 @@ BANDWIDTH_HZ, CENTRE_HZ, SPACING_M, TILE = 409.6e6, 1.2e9, 0.1, 256
 
 
 def formation(size: int, pulses: int, subcarriers: int) -> Formation:
-    """Return what forms the image: a straight flight beside the grid, 25 dB of SNR per pulse and subcarrier."""
+    """Return the formation of an image: a straight flight next to the grid, 25 dB SNR per pulse and subcarrier."""
     generator, half = np.random.default_rng(1), size * SPACING_M / 2
     along = np.linspace(-half / 4, half / 4, pulses)
     track = np.stack([along, np.full(pulses, -half - 60.0), np.full(pulses, 60.0)], -1)
@@ -64,7 +64,7 @@ def formation(size: int, pulses: int, subcarriers: int) -> Formation:
 
 
 def timed(work: Callable[[], Any]) -> tuple[float, Any]:
-    """Return CPU seconds and the result."""
+    """Run a function; return its CPU seconds and its result."""
     begin = time.process_time()
     with contextlib.redirect_stdout(io.StringIO()):
         result = work()
@@ -72,26 +72,26 @@ def timed(work: Callable[[], Any]) -> tuple[float, Any]:
 
 
 def main() -> None:
-    """Time and print."""
+    """Measure and print the run times."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     for name, default in (("size", 2048), ("pulses", 4096), ("subcarriers", 1024), ("repeats", 3)):
         parser.add_argument(f"--{name}", type=int, default=default)
-    asked = parser.parse_args()
-    formed, rows = formation(asked.size, asked.pulses, asked.subcarriers), []
-    for _ in range(asked.repeats):
+    options = parser.parse_args()
+    formed, rows = formation(options.size, options.pulses, options.subcarriers), []
+    for _ in range(options.repeats):
         with tempfile.TemporaryDirectory() as folder:
             target = zarr.create_array(folder, shape=formed.grid.shape, chunks=(TILE, TILE), dtype="complex64")
             rows.append(_round(formed, target))
     seconds = np.array(rows)
     table = Table(title=f"{formed.plan.setting.line}, load {os.getloadavg()[0]:.1f}")
-    for heading in ("work", "CPU seconds", "spread", "of imaging"):
+    for heading in ("check", "CPU seconds", "spread", "share of imaging"):
         table.add_column(heading)
     names = ("image", "certificate", "brightest target", "focus", "agreement")
     for name, column in zip(names, seconds.T, strict=True):
         share = column.mean() / seconds[:, 0].mean()
         table.add_row(name, f"{column.mean():.2f}", f"{np.ptp(column):.2f}", f"{100 * share:.0f} %")
-    new = seconds[:, 3:].sum(axis=1).mean() / seconds[:, 0].mean()
-    Console().print(table, f"focus and agreement: {100 * new:.0f} % of imaging")
+    checks_share = seconds[:, 3:].sum(axis=1).mean() / seconds[:, 0].mean()
+    Console().print(table, f"focus and agreement: {100 * checks_share:.0f} % of imaging")
 
 
 def _round(formed: Formation, target: Any) -> list[float]:

@@ -1,9 +1,9 @@
-"""Mistakes made in right campaigns: which images become wrong, and which of those without a word.
+"""Effect of mistakes in error-free campaigns: wrong images, and wrong images without a flag.
 
 `python benchmarks/mistakes.py WORKFOLDER [--base sample|curved|all] [--only name,name] [--out table.csv]`. An image is
-wrong when a target is more than 0.15 m from where the right campaign shows it, or more than 1 dB weaker; silent when
-it is wrong and neither an error nor a flag says so that the right campaign has not. What only moves points by less than
-two deviations of their place, as `expected_shift_m` in image.json has it, is counted apart.
+wrong if a target is displaced by more than 0.15 m relative to the error-free campaign, or is weaker by more than 1 dB;
+it is unflagged if it raises neither an error nor a flag that the error-free campaign does not raise. Displacements of
+less than two standard deviations of the geolocation, `expected_shift_m` in image.json, are counted separately.
 """
 
 import argparse
@@ -25,16 +25,28 @@ from spoiling.table import MISTAKES
 _RIGHT = "right"
 
 _NAMES = {"arm": "lever arm", "tracks": "tracks swapped", "prefix": "range", "attitude": "offset"}
-"""Cause of a mistake → kind of the hypothesis that names it, where the words differ."""
+"""Cause of a mistake → kind of its hypothesis, if the names differ."""
 
 _OFFSETS = {"offset", "range", "prefix", "arm", "attitude", "time"}
-"""Causes that may add a constant to the paths of a pair, so that a hypothesis of kind `offset` names them rightly: a
-time does along a straight track, a wrong attitude or arm while the attitude stays."""
+"""Causes that may add a constant to the paths of a pair, so that the hypothesis `offset` is correct: a time error on a
+straight track, or an error of attitude or lever arm at constant attitude."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """What a mistake did to one image, and what was said of it; losses in dB, shifts in metres, worst and median."""
+    """Effect of a mistake on one image, and its report; losses in dB and displacements in metres, worst and median.
+
+    Attributes
+    ----------
+    wrong, silent
+        True if the image is wrong; and if it has no flag in addition to those of the error-free campaign.
+    control
+        True for a change without effect on the image.
+    alike
+        True if the mistake displaces the whole scene.
+    within
+        True if the displacement is within the geolocation uncertainty.
+    """
 
     base: str
     mistake: str
@@ -59,73 +71,73 @@ class Row:
 
 @dataclass(frozen=True)
 class Right:
-    """Image of the right campaign → its targets, and its flags."""
+    """Targets and flags by image of the error-free campaign."""
 
     peaks: dict[str, Peaks]
     flags: dict[str, set[str]]
 
 
 def main() -> None:
-    """Make the mistakes asked for, one after the other; print and save what came of them."""
+    """Introduce the requested mistakes one by one; print and save their effects."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path, help="where campaigns are copied to and spoilt")
+    parser.add_argument("folder", type=Path, help="work folder for copied and modified campaigns")
     parser.add_argument("--base", choices=(*BASES, "all"), default="all")
     parser.add_argument("--only", help="names of mistakes, comma separated", default="")
-    parser.add_argument("--out", type=Path, help="CSV to write")
-    asked = parser.parse_args()
-    names = [name for name in asked.only.split(",") if name] or list(MISTAKES)
+    parser.add_argument("--out", type=Path, help="output CSV")
+    options = parser.parse_args()
+    names = [name for name in options.only.split(",") if name] or list(MISTAKES)
     console = Console(width=200)
     rows: list[Row] = []
-    for base in BASES if asked.base == "all" else (asked.base,):
-        for row in _rows(asked.folder, base, names):
+    for base in BASES if options.base == "all" else (options.base,):
+        for row in _rows(options.folder, base, names):
             rows.append(row)
-            if asked.out:
-                _save(asked.out, rows)
-            console.print(f"{row.base:7}{row.mistake:30}{row.pair:10}{_said(row)}", highlight=False, no_wrap=True)
+            if options.out:
+                _save(options.out, rows)
+            console.print(f"{row.base:7}{row.mistake:30}{row.pair:10}{_line(row)}", highlight=False, no_wrap=True)
     console.print(_table(rows))
     print(_totals(rows))
 
 
 def _rows(folder: Path, base: str, names: list[str]) -> Iterator[Row]:
-    right, spoilt = folder / f"{base}-right", folder / f"{base}-spoilt"
+    right, modified = folder / f"{base}-right", folder / f"{base}-modified"
     if not right.exists():
         BASES[base](right)
     outcome, places = run_campaign(right), true_places(right)
     if outcome.grid is None:
-        raise SystemExit(f"{base} itself fails: {outcome.error}")
+        raise SystemExit(f"the error-free campaign {base} fails: {outcome.error}")
     before = Right(
         {pair: find_targets(image, outcome.grid, places) for pair, image in outcome.images.items()},
         {pair: set(report["flags"]) for pair, report in outcome.reports.items()},
     )
     yield from _judged(base, _RIGHT, outcome, before, right)
     for name in names:
-        copy_writable(right, spoilt)
-        MISTAKES[name].spoil(Folder(spoilt))
-        yield from _judged(base, name, run_campaign(spoilt), before, spoilt)
+        copy_writable(right, modified)
+        MISTAKES[name].apply(Folder(modified))
+        yield from _judged(base, name, run_campaign(modified), before, modified)
 
 
 def _judged(base: str, name: str, outcome: Outcome, right: Right, root: Path) -> Iterator[Row]:
-    """Yield a row per image, or one for a campaign that ended in an error."""
-    known = MISTAKES.get(name)
-    kind = (
-        {"control": known.control, "alike": base in known.alike, "cause": known.cause} if known else {"control": True}
-    )
-    place_m = max(
+    """Yield a row per image, or one row for a campaign that stopped with an error."""
+    mistake = MISTAKES.get(name)
+    kind = {"control": True}
+    if mistake:
+        kind = {"control": mistake.control, "alike": base in mistake.alike, "cause": mistake.cause}
+    expected_shift_m = max(
         (report.get("focus", {}).get("expected_shift_m", 0.0) for report in outcome.reports.values()), default=0
     )
     if outcome.error:
         yield Row(base, name, "-", error=outcome.error, seconds=round(outcome.seconds, 2), **kind)
     for pair, report in outcome.reports.items():
-        done = harm(find_targets(outcome.images[pair], outcome.grid, true_places(root)), right.peaks[pair])
+        effect = harm(find_targets(outcome.images[pair], outcome.grid, true_places(root)), right.peaks[pair])
         yield Row(
             base,
             name,
             pair,
-            *(round(value, 3) for value in astuple(done)),
+            *(round(value, 3) for value in astuple(effect)),
             coherence=round(report["brightest"].get("coherence_factor", math.nan), 4),
-            wrong=done.wrong,
-            silent=done.wrong and not set(report["flags"]) - right.flags[pair],
-            within=done.loss_db <= 1.0 and done.shift_m <= 2 * place_m,
+            wrong=effect.wrong,
+            silent=effect.wrong and not set(report["flags"]) - right.flags[pair],
+            within=effect.loss_db <= 1.0 and effect.shift_m <= 2 * expected_shift_m,
             flags=",".join(report["flags"]),
             verdict=verdict_of(report),
             hypothesis=hypothesis_of(report),
@@ -141,24 +153,25 @@ def _save(path: Path, rows: list[Row]) -> None:
         table.writerows(astuple(row) for row in rows)
 
 
-def _said(row: Row) -> str:
+def _line(row: Row) -> str:
     if row.error:
         return f"error: {row.error}"
-    word = ("within" if row.within else "SILENT") if row.silent else "wrong" if row.wrong else ""
-    found = f"{row.loss_db:+7.2f} dB {row.shift_m:6.3f} m  Γ {row.coherence:6.4f}  {word:7}{row.flags or 'no flag'}"
-    return "  ".join([found, *filter(None, (row.verdict, row.hypothesis))])
+    rating = ("within" if row.within else "UNFLAGGED") if row.silent else "wrong" if row.wrong else ""
+    line = f"{row.loss_db:+7.2f} dB {row.shift_m:6.3f} m  Γ {row.coherence:6.4f}  {rating:10}{row.flags or 'no flag'}"
+    return "  ".join([line, *filter(None, (row.verdict, row.hypothesis))])
 
 
 def _table(rows: list[Row]) -> Table:
-    """Return the images that are wrong, and the right ones that are flagged."""
-    table = Table(title="wrong images, and right ones with a flag", title_justify="left")
-    for heading in ("base", "mistake", "image", "loss dB", "shift m", "Γ", "silent", "flags", "verdict", "hypothesis"):
+    """Return a table of the wrong images, and of the controls with a flag."""
+    table = Table(title="Wrong images, and controls with a flag", title_justify="left")
+    numeric = ("loss, dB", "displacement, m", "Γ")
+    for heading in ("base", "mistake", "image", *numeric, "unflagged", "flags", "verdict", "hypothesis"):
         table.add_column(heading)
     for row in rows:
         if row.wrong or (row.flags and row.control):
             numbers = (f"{row.loss_db:+.1f}", f"{row.shift_m:.2f}", f"{row.coherence:.3f}")
-            said = ("silent" if row.silent else "", row.flags, row.verdict, row.hypothesis)
-            table.add_row(row.base, row.mistake, row.pair, *numbers, *said)
+            texts = ("unflagged" if row.silent else "", row.flags, row.verdict, row.hypothesis)
+            table.add_row(row.base, row.mistake, row.pair, *numbers, *texts)
     return table
 
 
@@ -170,24 +183,24 @@ def _named_rightly(row: Row) -> bool:
 
 
 def _totals(rows: list[Row]) -> str:
-    """Return how many mistakes there are of each kind, and the names of those that matter."""
+    """Return the number of mistakes in each category, with their names."""
     kinds = {
-        "tried": list(rows),
-        "ended in an error": [row for row in rows if row.error],
-        "wrong in some image": [row for row in rows if row.wrong],
-        "SILENT in some image": [row for row in rows if row.silent and not (row.alike or row.within)],
-        "silent, all moved alike": [row for row in rows if row.silent and row.alike and not row.within],
-        "silent, within what is said of places": [row for row in rows if row.silent and row.within],
+        "mistakes": list(rows),
+        "stopped with an error": [row for row in rows if row.error],
+        "with a wrong image": [row for row in rows if row.wrong],
+        "with an UNFLAGGED wrong image": [row for row in rows if row.silent and not (row.alike or row.within)],
+        "unflagged, whole scene displaced": [row for row in rows if row.silent and row.alike and not row.within],
+        "unflagged, within the geolocation uncertainty": [row for row in rows if row.silent and row.within],
         "controls with a flag or an error": [row for row in rows if row.control and (row.flags or row.error)],
-        "controls that are wrong": [row for row in rows if row.control and row.wrong],
+        "controls with a wrong image": [row for row in rows if row.control and row.wrong],
     }
     named = {(row.base, row.mistake): row for row in rows if row.hypothesis}
-    kinds["hypotheses that name the cause"] = [row for row in named.values() if _named_rightly(row)]
-    kinds["hypotheses that do not"] = [row for row in named.values() if not _named_rightly(row)]
+    kinds["hypotheses with the correct cause"] = [row for row in named.values() if _named_rightly(row)]
+    kinds["hypotheses with a wrong cause"] = [row for row in named.values() if not _named_rightly(row)]
     lines = []
-    for kind, some in kinds.items():
-        names = list(dict.fromkeys(f"{row.base}/{row.mistake}" for row in some))
-        lines.append(f"{len(names):4} {kind}" + ("" if kind == "tried" else f": {', '.join(names)}"))
+    for kind, members in kinds.items():
+        names = list(dict.fromkeys(f"{row.base}/{row.mistake}" for row in members))
+        lines.append(f"{len(names):4} {kind}" + ("" if kind == "mistakes" else f": {', '.join(names)}"))
     return "\n".join(lines)
 
 

@@ -1,7 +1,7 @@
-"""One phase per pulse on near and far scenes: loss, shift and cost of each method and of tracks, beside the rule.
+"""Comparison of autofocus with one phase per pulse and track refinement on near and far scenes: loss and cost.
 
-`python -m benchmarks.one_phase [--cases forty/straight,far/mono,bi/2/10/0-2]`: as of `benchmarks.refinement`. Run with
-OPENBLAS_NUM_THREADS=1: seconds are then those of one core.
+`python -m benchmarks.one_phase [--cases forty/straight,far/mono,bi/2/10/0-2]`: cases as in `benchmarks.refinement`. The
+planner's choice of the method is listed with the results. Run with OPENBLAS_NUM_THREADS=1 to measure times of one core.
 """
 
 import argparse
@@ -31,14 +31,14 @@ MIDDLE_M = np.array([0.0, 15.0, 0.0])
 CORNERS_M = np.array([(east, north, 0.0) for east in AREA_M[::2] for north in AREA_M[1::2]])
 HEADINGS = (
     *("scene", "flight", "pair", "σ, cm", "SNR, dB", "rule", "method"),
-    *("before", "after", "worst", "off", "held out", "accepted", "images"),
+    *("before", "after", "worst", "displacement", "held-out gain", "accepted", "cost, images"),
 )
 CASES = ("forty/straight,far/mono,bi/2/10/0-4",)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of probes: (pair, probe) dB lost; median distance of their peaks from where true tracks show them, cm."""
+    """Peak levels of the probes, (pair, probe) dB, and median displacement of their peaks, relative to true tracks."""
 
     before_db: NDArray[np.float64]
     after_db: NDArray[np.float64]
@@ -53,17 +53,17 @@ def main() -> None:
     """Run the cases and print a row for each scene, flight, pair, σ, SNR and method."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", nargs="+", default=CASES)
-    asked = [key for cases in parser.parse_args().cases for key in keys(cases)]
+    requested = [key for cases in parser.parse_args().cases for key in keys(cases)]
     table = Table()
     for heading in HEADINGS:
         table.add_column(heading, justify="right")
     rows: dict[tuple[str, ...], list[Outcome]] = {}
-    for key in asked:
+    for key in requested:
         one, rule = _case(key)
         for method, outcome in _outcomes(one):
             rows.setdefault((*key[:5], f"{rule.method} {rule.loss_db:.2f}", method), []).append(outcome)
-    for told, drawn in rows.items():
-        table.add_row(*told, *_cells(drawn))
+    for labels, drawn in rows.items():
+        table.add_row(*labels, *_cells(drawn))
     Console(width=170).print(table)
 
 
@@ -82,29 +82,25 @@ def _outcomes(one: AutofocusCase) -> Iterator[tuple[str, Outcome]]:
     image_s = image_seconds(one.records[0])
     true, before = (peaks(one.probes, tracks, PROBES_M, one.reach_m) for tracks in (one.truth, UNCORRECTED))
     for method in (*METHODS, "tracks"):
-        begun = process_time()
-        found = _refined(one, method)
-        seconds = process_time() - begun
-        yield (
-            method,
-            _outcome(
-                found, true, before, peaks(one.probes, found.correction, PROBES_M, one.reach_m), seconds / image_s
-            ),
-        )
+        start_s = process_time()
+        result = _refined(one, method)
+        seconds = process_time() - start_s
+        after = peaks(one.probes, result.correction, PROBES_M, one.reach_m)
+        yield method, _outcome(result, true, before, after, seconds / image_s)
 
 
 def _refined(one: AutofocusCase, method: str) -> Refinement:
-    """Return what a method makes of a case, from its search for points on."""
+    """Refine a case by one method, including its search for bright points."""
     if method == "tracks":
         return refine(one.records, GRID, FlatGround(0.0), one.errors)
-    found = Candidates.of(one.records, GRID, FlatGround(0.0), one.errors)
-    return refine_one_phase(one.records, found, one.errors, method=method)
+    candidates = Candidates.of(one.records, GRID, FlatGround(0.0), one.errors)
+    return refine_one_phase(one.records, candidates, one.errors, method=method)
 
 
-def _outcome(found: Refinement, true: PointPeaks, before: PointPeaks, after: PointPeaks, images: float) -> Outcome:
+def _outcome(result: Refinement, true: PointPeaks, before: PointPeaks, after: PointPeaks, images: float) -> Outcome:
     before_db, after_db = (20 * np.log10(each.height / true.height) for each in (before, after))
-    gain_db = float(found.report.get("gain_held_out_db", np.nan))
-    return Outcome(before_db, after_db, _off_cm(true, before), _off_cm(true, after), gain_db, found.accepted, images)
+    gain_db = float(result.report.get("gain_held_out_db", np.nan))
+    return Outcome(before_db, after_db, _off_cm(true, before), _off_cm(true, after), gain_db, result.accepted, images)
 
 
 def _off_cm(true: PointPeaks, now: PointPeaks) -> float:

@@ -1,10 +1,10 @@
-"""Peak memory and seconds of the steps that write products, on a synthetic campaign of any size.
+"""Peak memory and run time of the steps that write products, on a synthetic campaign of any size.
 
-    python -m benchmarks.products export --side 16384          one pair's files
+    python -m benchmarks.products export --side 16384          files of one pair
     python -m benchmarks.products cube --side 8192 --pairs 3   the cube, then the files of the sums
 
-A tiny simulated campaign is run to its images; then its grid is enlarged and its images are replaced by speckle, a
-fifth of whose tiles no pulse sees. Each step runs in a process of its own.
+A small simulated campaign is processed up to its images; then its grid is enlarged and its images are replaced by
+speckle, with a fifth of the tiles not illuminated by any pulse. Each step runs in a separate process.
 """
 
 import argparse
@@ -31,7 +31,7 @@ LIT = 0.8
 
 
 def prepare(root: Path, side: int, receivers: int) -> Campaign:
-    """Write the campaign: speckle of side × side pixels for each pair."""
+    """Write the campaign, with speckle of side × side pixels for each pair."""
     plan = replace(preset("demo", pulses=60), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
     start = plan.flights[0].tracks["uav2"].start_m
     third = replace(plan.flights[0].tracks["uav2"], start_m=(start[0] - 3.0, start[1] - 3.6, start[2]))
@@ -59,7 +59,7 @@ def prepare(root: Path, side: int, receivers: int) -> Campaign:
 
 
 def enlarge(campaign: Campaign, flight: str, pair: str, seed: int) -> None:
-    """Replace an image by speckle on the enlarged grid."""
+    """Replace the image of a pair by speckle on the enlarged grid."""
     folder, grid = campaign.stage("image", flight, pair), settled_scene(campaign).grid
     small = open_stage(folder, "image")
     missing = np.broadcast_to(np.complex64(complex(np.nan, np.nan)), grid.shape)
@@ -77,41 +77,41 @@ def enlarge(campaign: Campaign, flight: str, pair: str, seed: int) -> None:
 
 
 def measured(root: Path, *step: str) -> None:
-    """Run a step in a process of its own and print what it took."""
-    started = time.perf_counter()
+    """Run a step in a separate process and print its wall-clock time."""
+    start_s = time.perf_counter()
     subprocess.run([sys.executable, "-m", __spec__.name, "--measure", str(root), *step], check=True)
-    print(f"{' '.join(step)}: {time.perf_counter() - started:.1f} s of wall clock", flush=True)
+    print(f"{' '.join(step)}: {time.perf_counter() - start_s:.1f} s wall-clock time", flush=True)
 
 
 def run_step(root: str, *step: str) -> None:
-    """Run a step here; print its peak memory and seconds of the processor."""
+    """Run a step in this process; print its peak memory and CPU seconds."""
     from apertura.cli import app
 
     app([*step, "--campaign", root], standalone_mode=False)
     used = resource.getrusage(resource.RUSAGE_SELF)
     seconds = used.ru_utime + used.ru_stime
-    print(f"{' '.join(step)}: peak {used.ru_maxrss / 2**20:.2f} GiB, {seconds:.1f} s of the processor", flush=True)
+    print(f"{' '.join(step)}: peak {used.ru_maxrss / 2**20:.2f} GiB, {seconds:.1f} CPU s", flush=True)
 
 
 def main() -> None:
-    """Prepare a campaign and measure the steps asked for."""
+    """Prepare a campaign and measure the requested steps."""
     if sys.argv[1:2] == ["--measure"]:
         run_step(*sys.argv[2:])
         return
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=["export", "cube"])
+    parser.add_argument("step", choices=["export", "cube"])
     parser.add_argument("--side", type=int, default=16384)
     parser.add_argument("--pairs", type=int, default=2)
     parser.add_argument("--folder", type=Path, default=Path("/tmp/apertura-products"))
-    asked = parser.parse_args()
-    shutil.rmtree(asked.folder, ignore_errors=True)
-    campaign = prepare(asked.folder, asked.side, 1 if asked.what == "export" else asked.pairs)
+    options = parser.parse_args()
+    shutil.rmtree(options.folder, ignore_errors=True)
+    campaign = prepare(options.folder, options.side, 1 if options.step == "export" else options.pairs)
     (flight,) = campaign.image_flights
-    if asked.what == "export":
-        measured(asked.folder, "export", flight.name, flight.pairs[0])
+    if options.step == "export":
+        measured(options.folder, "export", flight.name, flight.pairs[0])
         return
-    measured(asked.folder, "cube")
-    measured(asked.folder, "export", flight.name, "fused")
+    measured(options.folder, "cube")
+    measured(options.folder, "export", flight.name, "fused")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""What a campaign of many flights costs before its first step, and when nothing is left to do.
+"""Overhead of the workflow for campaigns of 10 to 1000 flights, before the first step and with complete results.
 
     python benchmarks/scale.py [FOLDER] [FLIGHTS ...]
 
-For 10, 100 and 1000 FLIGHTS, a campaign folder each in FOLDER (a temporary one without): two nodes that record 24
-pulses, the same ones in every flight (hard links). Each line is a command on that folder, with its wall and CPU
-seconds and the largest resident memory of one of its processes. First nothing is there; then all results are:
-placeholders with manifests that say truly what they were made from.
+For each number of FLIGHTS (default: 10, 100, 1000), FOLDER (default: temporary) receives a campaign folder: two nodes
+with 24 pulses, the same ones in every flight (hard links). Each line is a command on that folder, with its wall-clock
+and CPU seconds and the peak resident memory of its largest process. The commands run first without results, then with
+all results, as placeholders with valid manifests.
 """
 
 import os
@@ -23,7 +23,7 @@ BATCH = 10
 
 
 def campaign_of(root, flights):
-    """Simulate one flight and give it so many names."""
+    """Simulate one flight and link it under the names of all flights."""
     from apertura.simulation import ImageGrid, preset, simulate
 
     if (root / "config").is_dir():
@@ -42,7 +42,7 @@ def campaign_of(root, flights):
 
 
 def finish(root):
-    """Put a file in the place of every result, with the manifest that its step would write."""
+    """Write a placeholder for every result, with the manifest that its step writes."""
     from apertura.campaign.digests import Sources
     from apertura.campaign.folder import Campaign
     from apertura.campaign.store import record_files
@@ -51,41 +51,42 @@ def finish(root):
     from apertura.formats.export import exports_in
     from apertura.workflow.lineage import results_of
 
-    beside = {
+    companions = {
         "scene": ["scene.json"],
         "assessment": ["assessment.json"],
         "calibration": ["calibration.json"],
         **{kind: [one.file for one in exports_in(kind)] for kind in ("fused", "layers")},
         "export": [one.file for one in exports_in("pair")],
     }
-    beside["export"], beside["fused"] = [*beside["export"], "image.json"], [*beside["fused"], "image.json"]
+    for name in ("export", "fused"):
+        companions[name].append("image.json")
     campaign, code = Campaign.load(root), cache(code_sha256)
 
-    class Made:
+    class PlaceholderRecord:
         def __init__(self, result):
-            sources, ran = Sources.of(root, result.sources).digests, code(*result.modules)
-            self.record = lambda: {"sources": sources, "settings": result.settings_sha256, "code": ran}
+            sources, code_digest = Sources.of(root, result.sources).digests, code(*result.modules)
+            self.record = lambda: {"sources": sources, "settings": result.settings_sha256, "code": code_digest}
 
     for name, result in results_of(campaign):
         if "study" in result.manifest:
             continue
         manifest = root / result.manifest
         manifest.parent.mkdir(parents=True, exist_ok=True)
-        files = [manifest.parent / file for file in beside.get(name, [])]
+        files = [manifest.parent / file for file in companions.get(name, [])]
         for file in files:
-            write_json(file, {"stands for": file.name})
-        record_files(manifest, files, Made(result))
+            write_json(file, {"placeholder of": file.name})
+        record_files(manifest, files, PlaceholderRecord(result))
 
 
 def measured(name, *command, cwd):
-    """Run a command, print what it took, and return what it said."""
-    began = time.perf_counter()
-    with tempfile.TemporaryFile("w+") as said:
-        process = subprocess.Popen(list(map(str, command)), cwd=cwd, stdout=said, stderr=subprocess.STDOUT)
+    """Run a command, print its time and memory, and return its output."""
+    start_s = time.perf_counter()
+    with tempfile.TemporaryFile("w+") as output:
+        process = subprocess.Popen(list(map(str, command)), cwd=cwd, stdout=output, stderr=subprocess.STDOUT)
         _, status, usage = os.wait4(process.pid, 0)
-        wall = time.perf_counter() - began
-        said.seek(0)
-        text = said.read()
+        wall = time.perf_counter() - start_s
+        output.seek(0)
+        text = output.read()
     cpu = usage.ru_utime + usage.ru_stime
     print(f"{name:<44}{wall:>9.1f}{cpu:>9.1f}{usage.ru_maxrss / 1024:>9.0f}", flush=True)
     if status:
@@ -98,14 +99,14 @@ def measure(root, flights):
     snakemake = (BIN / "snakemake", "--directory", root, "--cores", "2", "-n", "--quiet", "rules")
     home = Path(__file__).parents[1]
     print(f"\n{flights} flights{'wall s':>37}{'CPU s':>9}{'MiB':>9}")
-    measured("apertura check, nothing made", apertura, "check", root, cwd=home)
+    measured("apertura check, no results", apertura, "check", root, cwd=home)
     measured("snakemake -n", *snakemake, cwd=home)
     batch = f"all=1/{BATCH}"
     measured(f"snakemake -n --batch {batch}", *snakemake, "--batch", batch, cwd=home)
-    measured("apertura run -n, nothing made", apertura, "run", root, "-n", "-q", cwd=home)
+    measured("apertura run -n, no results", apertura, "run", root, "-n", "-q", cwd=home)
     measured("(placeholders for all results)", sys.executable, __file__, "--finish", root, cwd=home)
-    measured("apertura check, all made", apertura, "check", root, cwd=home)
-    measured("apertura run -n, all made", apertura, "run", root, "-n", "-q", cwd=home)
+    measured("apertura check, all results", apertura, "check", root, cwd=home)
+    measured("apertura run -n, all results", apertura, "run", root, "-n", "-q", cwd=home)
 
 
 def main():

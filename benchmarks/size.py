@@ -1,8 +1,8 @@
-"""Forms 8192 × 8192 UTM pixels from 4096 pulses, tile by tile into zarr: `python benchmarks/size.py`.
+"""Rate and peak memory of a large image: 8192 × 8192 UTM pixels from 4096 pulses: `python benchmarks/size.py`.
 
-Peak memory is that of the process; the rate is compared with the kernel's own on tiles spread over the same image, on
-as many threads, timed after each block of pulses. Samples are random: neither time nor memory depends on them. Prints
-both and writes benchmarks/size.json.
+The image is formed tile by tile into zarr. Peak memory is that of the process; the rate is compared with that of the
+kernel on tiles spread over the same image, on the same number of threads, for each block of pulses. Samples are random,
+because time and memory do not depend on them. Prints the results and writes benchmarks/size.json.
 """
 
 import os
@@ -35,7 +35,7 @@ BANDWIDTH_HZ, CENTRE_HZ, SPACING_M, TILE = 409.6e6, 1.2e9, 0.1, 512
 
 
 def profiles(grid: SceneGrid, pulses: int, height_m: float = 400.0) -> Profiles:
-    """Return random samples over the swath of a straight flight beside the grid, aperture equal to its side."""
+    """Return random samples over the swath of a straight flight next to the grid, with an aperture of its side."""
     generator = np.random.default_rng(1)
     west, south, east, north = grid.bounds_m
     along = np.linspace(south, north, pulses)
@@ -54,7 +54,7 @@ def profiles(grid: SceneGrid, pulses: int, height_m: float = 400.0) -> Profiles:
 
 
 def kernel_seconds(tables: Tables, grid: SceneGrid, threads: int) -> float:
-    """Return seconds of the whole image by the kernel alone, from tiles on its diagonal."""
+    """Return the kernel's time in seconds for the whole image, extrapolated from tiles on its diagonal."""
     corners = np.linspace(0, grid.shape[0] - TILE, 2 * threads).astype(int) // PATCH_PX * PATCH_PX
     tiles = [grid[c : c + TILE, c : c + TILE].positions(0.0) for c in corners]
     begin = time.perf_counter()
@@ -64,8 +64,8 @@ def kernel_seconds(tables: Tables, grid: SceneGrid, threads: int) -> float:
 
 
 def image_seconds(profiles: Profiles, grid: SceneGrid, *, blocks: int, threads: int) -> tuple[float, float]:
-    """Return seconds of forming into zarr, tables, places and all, and of the kernel alone, block after block."""
-    alone = sum(
+    """Return the seconds to form the image into zarr, including tables and positions, and those of the kernel."""
+    kernel_s = sum(
         kernel_seconds(native.prepare(profiles[part]), grid, threads) for part in profiles.aperture.blocks(blocks)
     )
     with tempfile.TemporaryDirectory() as folder:
@@ -74,28 +74,29 @@ def image_seconds(profiles: Profiles, grid: SceneGrid, *, blocks: int, threads: 
         setting = Setting("native", {}, {}, -60.0, 1.0, pulse_blocks=blocks)
         image = image_array(profiles, setting, grid, FlatGround(0.0), side_px=TILE)
         compute_tiles(image, list(grid.tiles(TILE)), array, threads=threads)
-        return time.perf_counter() - begin, alone
+        return time.perf_counter() - begin, kernel_s
 
 
 def main() -> None:
-    """Run once, print and save."""
+    """Form the image once, print and save the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", type=int, default=8192)
     parser.add_argument("--pulses", type=int, default=4096)
-    parser.add_argument("--blocks", type=int, default=2, help="of pulses, whose tables are held one after the other")
+    parser.add_argument("--blocks", type=int, default=2, help="pulse blocks; the tables of one block are in memory")
     parser.add_argument("--threads", type=int, default=2)
-    asked = parser.parse_args()
-    grid = SceneGrid("EPSG:32632", 5e5, 5.3e6, SPACING_M, (asked.size, asked.size))
-    history = profiles(grid, asked.pulses)
-    spent, alone = image_seconds(history, grid, blocks=asked.blocks, threads=asked.threads)
+    options = parser.parse_args()
+    grid = SceneGrid("EPSG:32632", 5e5, 5.3e6, SPACING_M, (options.size, options.size))
+    history = profiles(grid, options.pulses)
+    spent_s, kernel_s = image_seconds(history, grid, blocks=options.blocks, threads=options.threads)
+    rate = options.size**2 * options.pulses / spent_s / options.threads
     measured = {
-        "pixels": asked.size**2,
-        "pulses": asked.pulses,
-        "threads": asked.threads,
-        "seconds": round(spent, 1),
-        "kernel_seconds": round(alone, 1),
-        "ratio_to_kernel": round(spent / alone, 3),
-        "pixel_pulses_per_s_per_core": float(f"{asked.size**2 * asked.pulses / spent / asked.threads:.3g}"),
+        "pixels": options.size**2,
+        "pulses": options.pulses,
+        "threads": options.threads,
+        "seconds": round(spent_s, 1),
+        "kernel_seconds": round(kernel_s, 1),
+        "ratio_to_kernel": round(spent_s / kernel_s, 3),
+        "pixel_pulses_per_s_per_core": float(f"{rate:.3g}"),
         "peak_memory_gib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2),
     }
     print(json.dumps(measured, indent=1))

@@ -1,10 +1,10 @@
-"""CPU seconds before anything is computed: importing, `--help`, the demo's pipeline, and each of its steps alone.
+"""Start-up cost in CPU seconds: import, `--help`, the demo's pipeline, and each of its steps.
 
     python benchmarks/startup.py [CAMPAIGN]
 
-CAMPAIGN, made by `apertura simulate`, is copied; without it the demo is simulated. Steps are the commands that
-snakemake prints, run once more on the finished campaign: each figure is start, imports, opening and the demo's small
-computation. User and system time of the command and its children, the least of three.
+CAMPAIGN, a folder simulated by `apertura simulate`, is copied; without it, the demo is simulated. The steps are the
+commands printed by snakemake, repeated on the finished campaign: each time includes start, imports, opening of files
+and the demo's small computation. Times are user and system time of a command and its children, the minimum of three.
 """
 
 import re
@@ -21,16 +21,16 @@ REPEATS = 3
 
 
 def cpu_s(*command, cwd=None, repeats=REPEATS):
-    """Return the least CPU and wall seconds of a command, and what it printed last."""
+    """Run a command repeatedly; return its minimum CPU and wall-clock seconds, and its last output."""
     figures = []
     for _ in range(repeats):
-        before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-        done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
-        after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter() - began
-        if done.returncode:
-            sys.exit(f"{' '.join(map(str, command))}\n{done.stdout}{done.stderr}")
+        before, start_s = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        process = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+        after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter() - start_s
+        if process.returncode:
+            sys.exit(f"{' '.join(map(str, command))}\n{process.stdout}{process.stderr}")
         figures.append((after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime, wall))
-    return (*map(min, zip(*figures, strict=True)), done.stdout + done.stderr)
+    return (*map(min, zip(*figures, strict=True)), process.stdout + process.stderr)
 
 
 def show(name, cpu, wall):
@@ -50,14 +50,14 @@ def main():
             cpu_s(apertura, "simulate", str(demo), repeats=1)
         cpu, wall, printed = cpu_s(apertura, "run", str(demo), "--cores", "2", repeats=1)
         show("apertura run demo --cores 2", cpu, wall)
-        show("the same, nothing to do", *cpu_s(apertura, "run", str(demo), "--cores", "2", repeats=1)[:2])
+        show("apertura run demo, results up to date", *cpu_s(apertura, "run", str(demo), "--cores", "2", repeats=1)[:2])
         steps = re.findall(r"^\s*(?:Shell command: )?apertura (step .*?) > ", printed, re.MULTILINE)
         total = 0.0
         for step in sorted(set(steps), key=steps.index):
             cpu, wall, _ = cpu_s(apertura, *step.split(), cwd=demo)
             show(f"apertura {step}", cpu, wall)
             total += cpu
-        show(f"{len(set(steps))} steps together", total, 0.0)
+        show(f"sum of {len(set(steps))} steps", total, 0.0)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,13 @@
-"""A strip flown past: what a pixel costs as the flight grows, and what a long flight takes of memory.
+"""Stripmap imaging: cost per pixel against the length of the flight, and memory of a long flight.
 
     python benchmarks/stripmap.py
     python benchmarks/stripmap.py --pulses 300000 --pixels 4096
 
-The first images a strip of one width from flights of 0.25 to 2 km, a pulse every 2 cm, and a small scene from the
-longest; CPU seconds of planning and of tiles, and the error against the double sum over pulses and subcarriers at
-random pixels, all with the same integration. The second writes echo and profiles of a flight to disk, and images,
-certifies and measures it as the step does, in a process of its own whose peak memory it prints.
+The first command images a strip of constant width from flights of 0.25 to 2 km with a pulse every 2 cm, and a small
+scene from the longest flight; it prints CPU seconds of planning and of tiles, and the error relative to the double sum
+over pulses and subcarriers at random pixels, all with the same integration. The second command writes echo and profiles
+of a flight to disk, then images, certifies and measures it like the step, in a separate process, and prints its peak
+memory.
 """
 
 import argparse
@@ -50,7 +51,7 @@ AT_ONCE = 4096
 
 
 class Flight:
-    """Point targets every 25 metres along a straight flight, and the echo of each pulse, made as it is asked for."""
+    """Point targets every 25 m along a straight flight, with echoes simulated on access."""
 
     def __init__(self, pulses: int, step_m: float, width_m: float, subcarriers: int, band_hz: float):
         along = (np.arange(pulses) - pulses / 2) * step_m
@@ -65,20 +66,20 @@ class Flight:
         return self.shape[0]
 
     def __getitem__(self, pulses: slice) -> NDArray[np.complex64]:
-        some = self.aperture[pulses]
-        east, reach = some.tx_m[:, 0], 200.0
+        aperture = self.aperture[pulses]
+        east, reach = aperture.tx_m[:, 0], 200.0
         near_m = self.targets_m[np.abs(self.targets_m[:, 0] - east.mean()) < reach]
-        return transfer(Scatterers(near_m, np.ones(len(near_m))), some, self.frequency_hz, spreading=False)
+        return transfer(Scatterers(near_m, np.ones(len(near_m))), aperture, self.frequency_hz, spreading=False)
 
     @property
     def history(self) -> PhaseHistory:
-        """All of it, read as it is asked for."""
+        """Phase history of the whole flight, simulated on access."""
         weight = np.hanning(self.shape[1]) / np.hanning(self.shape[1]).sum()
         return PhaseHistory(self, self.frequency_hz, weight, np.zeros(len(self)), self.aperture)  # type: ignore[arg-type]
 
 
 def compress_into(history: PhaseHistory, window: RangeWindow, grid: SceneGrid, into: Any) -> None:
-    """Compress a flight block by block into an array."""
+    """Range-compress a flight block by block into an array."""
     for first in range(0, len(history), AT_ONCE):
         block = slice(first, min(first + AT_ONCE, len(history)))
         part = RangeWindow(
@@ -99,9 +100,9 @@ def _profiles(samples: Any, start_m: Any, step_m: float, unambiguous: int, histo
 
 
 def formed(flight: Flight, grid: SceneGrid, *, integration: Any = "auto") -> dict[str, Any]:
-    """Return what an image costs, and how exact it is."""
+    """Form an image; return its cost and its error."""
     history, ground = flight.history, GroundModels.of(FLAT, None, grid)
-    began = time.process_time()
+    start_s = time.process_time()
     job = imaging_job(flight.aperture, flight.frequency_hz, history.weight, grid, ground, integration=integration)
     plan = make_plan(job, accuracy_db=-60.0)
     window = RangeWindow.of(
@@ -113,12 +114,12 @@ def formed(flight: Flight, grid: SceneGrid, *, integration: Any = "auto") -> dic
     profiles = _profiles(samples, window.start_m, window.step_m, window.unambiguous, history)
     formation = Formation(history, profiles, grid, plan, 256)
     image = np.zeros(grid.shape, np.complex64)
-    ready = time.process_time()
+    tiles_start_s = time.process_time()
     with contextlib.redirect_stdout(io.StringIO()):
         compute_tiles(formation.image, formation.windows, image, threads=1)
-    done = time.process_time()
+    tiles_s = time.process_time() - tiles_start_s
     with contextlib.redirect_stdout(io.StringIO()):
-        said = certified(formation, image, accuracy_db=-60.0, threads=1)
+        certificate = certified(formation, image, accuracy_db=-60.0, threads=1)
     summed = job.pixels * len(flight) * job.share
     return {
         "length_km": round(float(np.ptp(flight.aperture.tx_m[:, 0])) / 1000, 2),
@@ -127,18 +128,18 @@ def formed(flight: Flight, grid: SceneGrid, *, integration: Any = "auto") -> dic
         "pixels": job.pixels,
         "samples": window.samples,
         "idle_pulses": int((~window.contributing).sum()),
-        "plan_s": round(planned - began, 2),
-        "tiles_s": round(done - ready, 2),
-        "us_per_pixel": round(1e6 * (done - ready) / job.pixels, 3),
-        "ns_per_pixel_pulse": round(1e9 * (done - ready) / summed, 3),
-        "error_db": said["numerical_error_estimate_db"],
-        "recomputed": len(said["recomputed"]),
+        "plan_s": round(planned - start_s, 2),
+        "tiles_s": round(tiles_s, 2),
+        "us_per_pixel": round(1e6 * tiles_s / job.pixels, 3),
+        "ns_per_pixel_pulse": round(1e9 * tiles_s / summed, 3),
+        "error_db": certificate["numerical_error_estimate_db"],
+        "recomputed": len(certificate["recomputed"]),
         "flags": ",".join(plan.flags),
     }
 
 
 def lengths() -> None:
-    """Print a row per length of a flight past a strip, then one of the longest past a small scene."""
+    """Print a row per length of a flight past a strip, then a row of the longest flight past a small scene."""
     warm = Flight(3000, SPEED_M, WIDTH_M, SUBCARRIERS, BAND_HZ)
     formed(warm, SceneGrid("local", -8.0, NEAR_M + WIDTH_M, SPACING_M, (160, 64)))
     for flown_m, length in ((250, 250.0), (500, 500.0), (1000, 1000.0), (2000, 2000.0), (2000, 64.0)):
@@ -149,11 +150,11 @@ def lengths() -> None:
 
 
 def long_flight(pulses: int, pixels: int, folder: Path) -> None:
-    """Write echo and profiles of a flight along the middle of a square scene, two swaths of antennas wide."""
+    """Write echo and profiles of a flight along the middle of a square scene, with antenna beams limiting the swath."""
     grid, flight, beams = _long(pulses, pixels)
     history = flight.history
-    known = flight.aperture, flight.frequency_hz, history.weight
-    job = imaging_job(*known, grid, GroundModels.of(FLAT, None, grid), beams=beams)
+    inputs = flight.aperture, flight.frequency_hz, history.weight
+    job = imaging_job(*inputs, grid, GroundModels.of(FLAT, None, grid), beams=beams)
     window = RangeWindow.of(
         flight.aperture, grid, FLAT, flight.frequency_hz, beams=job.beams, wave_speed_m_s=history.wave_speed_m_s
     )
@@ -171,14 +172,14 @@ def long_flight(pulses: int, pixels: int, folder: Path) -> None:
     echo = xr.open_zarr(folder / "flight.zarr", consolidated=False, chunks=None)
     compress_into(replace(history, transfer=Rows(echo.transfer)), window, grid, profile)  # type: ignore[arg-type]
     np.savez(folder / "window.npz", start=window.start_m, step=window.step_m, over=window.unambiguous)
-    print(f"{window.samples} samples, {int((~window.contributing).sum())} pulses add to nothing")
+    print(f"{window.samples} samples, {int((~window.contributing).sum())} pulses do not contribute to the image")
 
 
 def _long(pulses: int, pixels: int) -> tuple[SceneGrid, Flight, Beams]:
     side_m = 0.5 * pixels
     flight = Flight(pulses, 1.1 * side_m / pulses, 200.0, 512, 100e6)
     grid = SceneGrid("local", -side_m / 2, side_m / 2, 0.5, (pixels, pixels))
-    down = np.radians(20.0)  # to the north and down, 15° above and below
+    down = np.radians(20.0)  # depression angle of the boresight, to the north
     ahead, up = [0.0, np.cos(down), -np.sin(down)], [0.0, np.sin(down), np.cos(down)]
     axes = np.broadcast_to(np.array([ahead, [1.0, 0.0, 0.0], up]), (pulses, 3, 3))
     wide, narrow = (gaussian_cut(width, cutoff_db=-10.0, limit_rad=1.5) for width in (60.0, 12.0))
@@ -187,10 +188,10 @@ def _long(pulses: int, pixels: int) -> tuple[SceneGrid, Flight, Beams]:
 
 
 def imaged(pulses: int, pixels: int, folder: Path) -> None:
-    """Image, certify and measure the flight that `long_flight` wrote, as the step does."""
+    """Image, certify and measure the flight written by `long_flight`, like the step."""
     import zarr
 
-    began, wall = time.process_time(), time.perf_counter()
+    start_s, wall_start_s = time.process_time(), time.perf_counter()
     grid, flight, beams = _long(pulses, pixels)
     stage = xr.open_zarr(folder / "flight.zarr", consolidated=False, chunks=None)
     window = np.load(folder / "window.npz")
@@ -206,34 +207,34 @@ def imaged(pulses: int, pixels: int, folder: Path) -> None:
     target = zarr.open_array(folder / "image.zarr", mode="w", shape=grid.shape, chunks=(256, 256), dtype="complex64")
     compute_tiles(formation.image, formation.windows, target, threads=2)
     print(_peak("tiles"), f"{time.process_time() - planned:.1f} CPU s")
-    said = certified(formation, target, accuracy_db=-60.0, threads=2)
-    print(_peak("certificate"), said["numerical_error_db"])
+    certificate = certified(formation, target, accuracy_db=-60.0, threads=2)
+    print(_peak("certificate"), certificate["numerical_error_db"])
     measures(formation, target), focus_report(formation, target)
     tiles = f"{len(formation.windows)} of {len(formation.tiles)} tiles"
     report = plan.integration.report if plan.integration else {}
     print(plan.setting.line, plan.setting.pulse_blocks, "blocks;", tiles, report, dict(plan.flags))
     print(f"planned {plan.memory_bytes / 2**30:.2f} GiB, {plan.predicted_seconds:.0f} s")
-    print(_peak("focus"), f"{time.process_time() - began:.1f} CPU s, {time.perf_counter() - wall:.1f} s")
+    print(_peak("focus"), f"{time.process_time() - start_s:.1f} CPU s, {time.perf_counter() - wall_start_s:.1f} s")
 
 
-def _peak(what: str) -> str:
-    return f"{what}: peak {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB"
+def _peak(stage: str) -> str:
+    return f"{stage}: peak {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB"
 
 
 def main() -> None:
-    """Measure."""
-    asked = argparse.ArgumentParser(description=__doc__)
-    asked.add_argument("--pulses", type=int, default=0)
-    asked.add_argument("--pixels", type=int, default=4096)
-    asked.add_argument("--folder", type=Path)
-    given = asked.parse_args()
-    if not given.pulses:
+    """Run the requested measurement."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pulses", type=int, default=0)
+    parser.add_argument("--pixels", type=int, default=4096)
+    parser.add_argument("--folder", type=Path)
+    options = parser.parse_args()
+    if not options.pulses:
         lengths()
-    elif given.folder:
-        imaged(given.pulses, given.pixels, given.folder)
+    elif options.folder:
+        imaged(options.pulses, options.pixels, options.folder)
     else:
         with tempfile.TemporaryDirectory() as folder:
-            long_flight(given.pulses, given.pixels, Path(folder))
+            long_flight(options.pulses, options.pixels, Path(folder))
             subprocess.run([sys.executable, __file__, *sys.argv[1:], "--folder", folder], check=True)
 
 

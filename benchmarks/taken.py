@@ -1,8 +1,8 @@
-"""Whether the planner's choice between the direct kernel and the tree pays: `python benchmarks/taken.py`.
+"""Quality of the planner's choice between engine native and engine tree: `python benchmarks/taken.py`.
 
-Images of 256² to 1024² pixels, 256 to 8192 pulses, smooth tracks and tracks with white noise, for -40, -60, -80 dB:
-the cheapest setting of either engine, the least of three CPU seconds of one thread, tables and sums, taking turns. The
-error is that of the tree's image against a finer one of the direct kernel, over all pixels.
+Images of 256² to 1024² pixels, 256 to 8192 pulses, smooth tracks and tracks with white noise, for -40, -60 and -80 dB:
+the cheapest setting of each engine, with the minimum of three CPU times of one thread for tables and sums, measured
+alternately. The error is that of the tree's image relative to a more accurate image of engine native, over all pixels.
 """
 
 import os
@@ -29,11 +29,11 @@ from apertura.core.planning.planner import MARGIN_DB
 
 AIMS_DB = (-40.0, -60.0, -80.0)
 SLOWER = 1.05
-"""Times as long as the direct kernel that a tree may take where it is chosen."""
+"""Tolerated ratio of the times of tree and native if the tree is chosen."""
 
 
 class Case(NamedTuple):
-    """An image, and white noise on its tracks."""
+    """Parameters of an image, with white noise on its tracks."""
 
     size: int
     pulses: int
@@ -49,46 +49,49 @@ CASES = (
 
 
 def main() -> None:
-    """Measure and print; say how many chosen trees were slower."""
+    """Measure and print the cases, and the number of chosen trees that are slower than native."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sizes", nargs="*", type=int, help="of images; all by default")
-    asked = parser.parse_args()
-    print("pixels × pulses, noise on tracks | aim dB | chosen | tree s | native s | ratio | tree's error, predicted dB")
+    parser.add_argument("--sizes", nargs="*", type=int, help="sizes of images (default: all)")
+    options = parser.parse_args()
+    print("pixels × pulses, track noise | accuracy dB | chosen | tree s | native s | ratio | tree error, predicted dB")
     ratios: list[float] = []
     for case in CASES:
-        if not asked.sizes or case.size in asked.sizes:
+        if not options.sizes or case.size in options.sizes:
             ratios += measured(case)
     slow = sum(ratio > SLOWER for ratio in ratios)
-    print(f"load {os.getloadavg()[0]:.1f}; the tree was chosen {len(ratios)} times, {slow} times more than 5 % slower")
+    print(
+        f"load {os.getloadavg()[0]:.1f}; the tree was chosen {len(ratios)} times, in {slow} cases more than 5 % slower "
+        "than native"
+    )
 
 
 def measured(case: Case) -> Iterator[float]:
-    """Print the rows of a case; yield how many times as long as native the tree took where it is chosen."""
-    job = _shaken(build(case.size, case.pulses, bistatic=case.bistatic), case)
+    """Print the rows of a case; yield the ratio of the times of tree and native where the tree is chosen."""
+    job = _with_track_noise(build(case.size, case.pulses, bistatic=case.bistatic), case)
     planned = _planned(job)
     exact = native.form(native.prepare(job.profiles, oversampling=16), job.pixels, tolerance_rad=5e-5)
     for aim_db in AIMS_DB:
-        both = [_cheapest(engine, planned, case.pulses, aim_db - MARGIN_DB) for engine in (tree, native)]
+        settings = [_cheapest(engine, planned, case.pulses, aim_db - MARGIN_DB) for engine in (tree, native)]
         seconds, image = [np.inf, np.inf], exact
         for _ in range(3):
-            for number, (engine, setting) in enumerate(zip((tree, native), both, strict=True)):
+            for number, (engine, setting) in enumerate(zip((tree, native), settings, strict=True)):
                 begin = time.process_time()
                 formed = engine.form(
                     engine.prepare(job.profiles, **setting.options), job.pixels, **setting.form_options
                 )
                 seconds[number] = min(seconds[number], time.process_time() - begin)
                 image = formed if engine is tree else image
-        chosen = min(both, key=lambda setting: setting.seconds + setting.table_seconds).engine
-        wrong_db = 10 * np.log10((np.abs(image - exact) ** 2).sum() / (np.abs(exact) ** 2).sum())
+        chosen = min(settings, key=lambda setting: setting.seconds + setting.table_seconds).engine
+        error_db = 10 * np.log10((np.abs(image - exact) ** 2).sum() / (np.abs(exact) ** 2).sum())
         name = f"{case.size}² × {case.pulses}{'' if case.bistatic else ' mono'}, {1e3 * case.jitter_m:.1f} mm"
         times = f"{seconds[0]:.3f} | {seconds[1]:.3f} | {seconds[1] / seconds[0]:.2f}"
-        print(f"{name} | {aim_db:.0f} | {chosen} | {times} | {wrong_db:.1f}, {both[0].error_db:.1f}", flush=True)
+        print(f"{name} | {aim_db:.0f} | {chosen} | {times} | {error_db:.1f}, {settings[0].error_db:.1f}", flush=True)
         if chosen == "tree":
             yield seconds[0] / seconds[1]
 
 
-def _shaken(job: Job, case: Case) -> Job:
-    """Return the job with noise on its tracks, and its echoes as they were: seconds and errors are of arithmetic."""
+def _with_track_noise(job: Job, case: Case) -> Job:
+    """Return the job with noise on its tracks and unchanged echoes; only times and numerical errors are measured."""
     generator = np.random.default_rng(3)
     legs = (leg + case.jitter_m * generator.standard_normal(leg.shape) for leg in job.profiles.aperture.legs)
     tx, rx = legs if case.bistatic else (next(legs),) * 2
@@ -96,21 +99,21 @@ def _shaken(job: Job, case: Case) -> Job:
 
 
 def _planned(job: Job) -> PlannedJob:
-    """Return what engines are told of a job."""
+    """Return the engines' planning input for a job."""
     profiles, pixels = job.profiles, job.pixels
-    some, size = np.linspace(0, len(pixels) - 1, 9).astype(int), len(pixels)
+    sampled, size = np.linspace(0, len(pixels) - 1, 9).astype(int), len(pixels)
     corners = {(top, left) for top in (0, max(0, size - 256)) for left in (0, max(0, size - 256))}
     patches: list[NDArray[np.float64]] = [pixels[top : top + 256, left : left + 256] for top, left in sorted(corners)]
     spacing_m = float(np.linalg.norm(pixels[0, 1] - pixels[0, 0]))
     signal = Signal(profiles.centre_frequency_hz, profiles.oversampling, profiles.step_m, profiles.samples.shape[1])
     return PlannedJob(
-        profiles.aperture, pixels[np.ix_(some, some)], pixels.shape[:2], spacing_m, profiles.centre_frequency_hz,
+        profiles.aperture, pixels[np.ix_(sampled, sampled)], pixels.shape[:2], spacing_m, profiles.centre_frequency_hz,
         C / (profiles.step_m * profiles.oversampling), 4096, signal, frame="local", patches_m=tuple(patches),
     )  # fmt: skip
 
 
 def _cheapest(engine: object, job: PlannedJob, pulses: int, target_db: float) -> Setting:
-    """Return the cheapest setting that errs less than a target."""
+    """Return the cheapest setting with an error below a target."""
     settings: list[Setting] = list(engine.candidates(job, pulses=pulses, requested={}))  # type: ignore[attr-defined]
     exact = [setting for setting in settings if setting.error_db <= target_db]
     return min(exact, key=lambda setting: setting.seconds + setting.table_seconds)

@@ -1,7 +1,7 @@
-"""Track noise: loss of peak predicted by the budget, measured against truth, told by the image itself, and the verdict.
+"""Peak loss by track noise: predicted by the budget, measured against truth, and estimated from the image.
 
 `python benchmarks/track_noise.py WORKFOLDER [--base sample|curved] [--draws 20]`. White noise after a moving average of
-one second, σ per axis, is added to both logs, and σ is stated in the config.
+one second, σ per axis, is added to both logs, and σ is configured as the position accuracy.
 """
 
 import argparse
@@ -31,63 +31,63 @@ SIZES_CM = (0.0, 0.5, 1.0, 2.0, 4.0)
 
 @dataclass(frozen=True)
 class Draw:
-    """One image: losses in dB, negative; the verdict on its focus."""
+    """Losses of one image in dB, negative, and the verdict on its focus."""
 
     pair: str
     predicted_db: float
     true_db: float
-    told_db: float
+    estimated_db: float
     verdict: str
 
 
 def main() -> None:
-    """Draw, image, and print a row for each size and pair."""
+    """Image random draws, and print a row for each σ and pair."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--base", choices=sorted(BASES), default="sample")
     parser.add_argument("--draws", type=int, default=20)
-    asked = parser.parse_args()
-    right = BASES[asked.base](asked.folder / f"{asked.base}-right")
-    peaks = {pair: found for pair, _, _, found in _imaged(right)}
-    table = Table(title=f"{asked.base}: mean of {asked.draws} draws")
-    for heading in ("σ", "pair", "predicted", "measured", "spread", "told by the image", "defocused"):
+    options = parser.parse_args()
+    right = BASES[options.base](options.folder / f"{options.base}-right")
+    peaks = {pair: pair_peaks for pair, _, _, pair_peaks in _imaged(right)}
+    table = Table(title=f"{options.base}: mean of {options.draws} draws")
+    for heading in ("σ", "pair", "predicted", "measured", "spread", "estimated from the image", "defocused"):
         table.add_column(heading, justify="right")
     for size_cm in SIZES_CM:
-        draws = [one for seed in range(asked.draws) for one in _drawn(asked.folder, right, size_cm, seed, peaks)]
+        draws = [one for seed in range(options.draws) for one in _drawn(options.folder, right, size_cm, seed, peaks)]
         for pair in peaks:
             table.add_row(f"{size_cm:g} cm", pair, *_row([one for one in draws if one.pair == pair]))
     Console(width=140).print(table)
 
 
 def _row(draws: list[Draw]) -> list[str]:
-    true, told = np.array([one.true_db for one in draws]), np.array([one.told_db for one in draws])
+    true, estimated = np.array([one.true_db for one in draws]), np.array([one.estimated_db for one in draws])
     predicted = float(np.mean([one.predicted_db for one in draws]))
     defocused = sum(one.verdict == "defocused" for one in draws)
-    values = (predicted, true.mean(), true.std(), np.nanmean(told))
+    values = (predicted, true.mean(), true.std(), np.nanmean(estimated))
     return [*(f"{value:.2f} dB" for value in values), f"{defocused} of {len(draws)}"]
 
 
 def _drawn(folder: Path, right: Path, size_cm: float, seed: int, peaks: dict[str, Peaks]) -> list[Draw]:
-    spoilt = copy_writable(right, folder / "spoilt")
+    modified = copy_writable(right, folder / "modified")
     if size_cm:
-        logs(noisy(size_cm / 100, seed=seed), TX, RX)(Folder(spoilt))
-    logs(saying(max(size_cm, 1e-2) / 100), RX)(Folder(spoilt))
-    Folder(spoilt).edit_config(
+        logs(noisy(size_cm / 100, seed=seed), TX, RX)(Folder(modified))
+    logs(declare_std(max(size_cm, 1e-2) / 100), RX)(Folder(modified))
+    Folder(modified).edit_config(
         lambda document: [
             document.setdefault("processing", {}).update(autofocus="off"),
             *(node.update(position_std_m=max(size_cm, 1e-3) / 100) for node in document["nodes"].values()),
         ]
     )
-    found = []
-    for pair, quality, predicted_db, now in _imaged(spoilt):
-        loss_db = float(np.nanmean(now.level_db - peaks[pair].level_db))
+    draws = []
+    for pair, quality, predicted_db, pair_peaks in _imaged(modified):
+        loss_db = float(np.nanmean(pair_peaks.level_db - peaks[pair].level_db))
         focus = quality["focus"]
-        found.append(Draw(pair, predicted_db, loss_db, focus.get("loss_db", np.nan), focus["verdict"]))
-    return found
+        draws.append(Draw(pair, predicted_db, loss_db, focus.get("loss_db", np.nan), focus["verdict"]))
+    return draws
 
 
-def saying(sigma_m: float) -> Callable[[Log], Log]:
-    """Return what makes an RTKLIB log state a standard deviation."""
+def declare_std(sigma_m: float) -> Callable[[Log], Log]:
+    """Return a change that sets the standard deviations in an RTKLIB log."""
 
     def change(log: Log) -> Log:
         rows = [line.split() for line in log.quality]
@@ -98,9 +98,9 @@ def saying(sigma_m: float) -> Callable[[Log], Log]:
 
 
 def _imaged(root: Path) -> list[tuple[str, dict, float, Peaks]]:
-    """Carry a campaign to its images; return of each pair what it says, its predicted loss, and its targets."""
+    """Process a campaign up to its images; return the quality report, predicted loss and target peaks of each pair."""
     campaign, places = Campaign.load(root), true_places(root)
-    flight, found = campaign.image_flights[0], []
+    flight, images = campaign.image_flights[0], []
     with contextlib.redirect_stdout(io.StringIO()):
         for node in flight.nodes:
             ingest.ingest(campaign, flight.name, node)
@@ -116,10 +116,9 @@ def _imaged(root: Path) -> list[tuple[str, dict, float, Peaks]]:
         stage = open_stage(campaign.stage("image", flight.name, pair), "image")
         quality = stage.attrs["quality"]
         predicted_db = next(line["loss_db"] for line in quality["budget"] if line["cause"] == "positions")
-        found.append(
-            (pair, quality, predicted_db, find_targets(stage.image.values, settled_scene(campaign).grid, places))
-        )
-    return found
+        peaks = find_targets(stage.image.values, settled_scene(campaign).grid, places)
+        images.append((pair, quality, predicted_db, peaks))
+    return images
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""GB of recording searched for preambles per minute, and the detection probability beside theory.
+"""Throughput and detection probability of the preamble search in continuous recordings.
 
-python benchmarks/trigger.py
+`python benchmarks/trigger.py` prints GB per minute on one core, and the detection probability against the SNR.
 """
 
 import time
@@ -22,13 +22,13 @@ def search(blocks: list[np.ndarray], false_alarms_per_s: float = 1e-2) -> int:
 
 def throughput_gb_min(samples: int = 2**25) -> float:
     noise = np.random.default_rng(1).integers(-500, 500, (2**21, 2), dtype=np.int16)
-    started = time.perf_counter()
+    start_s = time.perf_counter()
     search([noise] * (samples // len(noise)))
-    return samples * 4 / 1e9 / (time.perf_counter() - started) * 60
+    return samples * 4 / 1e9 / (time.perf_counter() - start_s) * 60
 
 
 def detection_probability(snr_db: float, trials: int = 200) -> float:
-    """Of preambles in noise, `snr_db` per sample, at fractional starts."""
+    """Return the detection probability of preambles in noise, `snr_db` per sample, with fractional starts."""
     rng = np.random.default_rng(2)
     spacing, length = 40_000, len(FRAMING.template())
     hits = 0
@@ -49,7 +49,7 @@ def detection_probability(snr_db: float, trials: int = 200) -> float:
 if __name__ == "__main__":
     print(f"{throughput_gb_min():.1f} GB/min, one core")
     for snr_db in (-25, -23, -22, -21, -20, -19, -18):
-        # a symbol of N of f_s/Δf bins has N/(f_s/Δf) less SNR per sample than per subcarrier
+        # A symbol with N of the f_s/Δf bins has a lower SNR per sample than per subcarrier, by N/(f_s/Δf).
         per_subcarrier_db = snr_db + 10 * np.log10(10240 / 4096)
         print(
             f"{snr_db} dB per sample ({per_subcarrier_db:.1f} dB per subcarrier): {detection_probability(snr_db):.3f}"

@@ -1,7 +1,8 @@
-"""One scene by an OFDM symbol, a chirp, a maximum-length sequence and a Golay code: what is left of each.
+"""Comparison of an OFDM symbol, a chirp, a maximum-length sequence and a Golay code on one scene.
 
-python benchmarks/waveforms.py: the table of docs/theory/waveforms.md. Pulses of 1 µs with 409.6 MHz about 1.4048 GHz,
-two nodes, three targets, no noise but that of 14 bits; noise is measured on a scene of its own, 10 dB per bin.
+`python benchmarks/waveforms.py` prints the table of docs/theory/waveforms.md. Pulses of 1 µs with 409.6 MHz about
+1.4048 GHz, two nodes, three targets, with the quantisation noise of 14 bits only; the noise loss is measured on a
+separate scene with an SNR of 10 dB per bin.
 """
 
 import json
@@ -39,7 +40,7 @@ PULSES = 200
 
 
 def run(waveform, targets, snr_db: float | None) -> tuple[Campaign, float]:
-    """Return a simulated campaign carried to its images, and the seconds that echo took, of the processor."""
+    """Simulate a campaign and process it up to its images; return it, and the CPU seconds of the echo step."""
     root = Path(tempfile.mkdtemp()) / "campaign"
     own = Impairments(radar_snr_db=snr_db)
     quiet = {"uav1": own, "uav2": own}
@@ -47,10 +48,10 @@ def run(waveform, targets, snr_db: float | None) -> tuple[Campaign, float]:
     campaign = Campaign.load(root)
     for node in ("uav1", "uav2"):
         ingest.ingest(campaign, "f01", node)
-    begun = time.process_time()
+    start_s = time.process_time()
     for pair in PAIRS:
         echo.echo(campaign, "f01", pair)
-    seconds = time.process_time() - begun
+    seconds = time.process_time() - start_s
     scene.scene(campaign)
     for pair in PAIRS:
         profile.profile(campaign, "f01", pair)
@@ -61,7 +62,7 @@ def run(waveform, targets, snr_db: float | None) -> tuple[Campaign, float]:
 
 
 def places(campaign: Campaign, pair: str) -> tuple[float, float, float]:
-    """Return the largest error of place (cm) and the widths (cm) across and along range, means over targets."""
+    """Return the largest position error (cm), and the mean widths of the targets to the east and north (cm)."""
     truth = json.loads((campaign.root / "truth.json").read_text())["targets"]
     grid = open_scene(campaign).grid
     pixels = open_stage(campaign.stage("image", "f01", pair), "image").image.values
@@ -78,17 +79,17 @@ def places(campaign: Campaign, pair: str) -> tuple[float, float, float]:
 
 
 def aligned(stage: xr.Dataset, campaign: Campaign) -> np.ndarray:
-    """Return transfer functions less the path to the first target, (pulse, subcarrier)."""
+    """Return transfer functions with the path to the first target removed, (pulse, subcarrier)."""
     truth = json.loads((campaign.root / "truth.json").read_text())
     first = truth["targets"][0]
     place = frame_from_map(truth["crs"], np.array(first["x"]), np.array(first["y"]), np.array(first["height_m"]))
     path = sum(np.linalg.norm(stage[leg].values - place, axis=1) for leg in ("tx_position", "rx_position"))
-    turn = np.exp(2j * np.pi * np.outer(path / SPEED_OF_LIGHT_M_S, stage.frequency.values))
-    return stage.transfer.values * turn
+    phasors = np.exp(2j * np.pi * np.outer(path / SPEED_OF_LIGHT_M_S, stage.frequency.values))
+    return stage.transfer.values * phasors
 
 
 def sidelobes_db(campaign: Campaign, pair: str) -> float:
-    """Return the highest sidelobe at any delay of one target's range profile, Hann, beyond its main lobe."""
+    """Return the highest sidelobe of one target's range profile with a Hann window, at all delays."""
     stage = open_stage(campaign.stage("echo", "f01", pair), "echo")
     mean = aligned(stage, campaign).mean(0)
     count = len(mean)
@@ -98,7 +99,7 @@ def sidelobes_db(campaign: Campaign, pair: str) -> float:
 
 
 def noise_loss_db(campaign: Campaign, pair: str, snr_db: float) -> float:
-    """Return what of N·SNR is missing in the range profile of one target, no window."""
+    """Return the loss of the SNR in the range profile of one target relative to N·SNR, without window."""
     stage = open_stage(campaign.stage("echo", "f01", pair), "echo")
     own = aligned(stage, campaign)
     profile_ = np.fft.ifft(own, axis=1)
@@ -108,7 +109,8 @@ def noise_loss_db(campaign: Campaign, pair: str, snr_db: float) -> float:
 
 if __name__ == "__main__":
     print(
-        "waveform | pair | place, cm | widths east, north, cm | sidelobes, dB | noise loss (stated), dB | echo, CPU s"
+        "waveform | pair | position error, cm | widths east, north, cm | sidelobes, dB | noise loss (reported), dB | "
+        "echo, CPU s"
     )
     for name, waveform in WAVEFORMS.items():
         whole, seconds = run(waveform, TARGETS, None)

@@ -1,4 +1,4 @@
-// The entry points that Python binds, and the choice of the instruction set.
+// Entry points for the Python binding, and selection of the instruction set.
 #include <algorithm>
 #include <cmath>
 #include <cstring>
@@ -32,7 +32,7 @@ APERTURA_DECLARE(avx512)
 
 namespace {
 
-// The kernel compiled for one instruction set.
+// Kernel functions compiled for one instruction set.
 struct Isa {
   const char* name;
   bool runs;
@@ -74,8 +74,8 @@ const Isa* find(const char* name) {
   return nullptr;
 }
 
-constexpr int64_t kPulses = 64;   // in one pass: with kRegion, what the second-level cache holds
-constexpr int64_t kRegion = 256;  // pixels on a side of what is finished before going on
+constexpr int64_t kPulses = 64;   // per pass; together with kRegion, sized for the second-level cache
+constexpr int64_t kRegion = 256;  // pixels along a side of a region; regions are formed one after the other
 constexpr int64_t kSum = 2 * kPixels;
 
 // Writes the sums of one patch to its pixels.
@@ -92,12 +92,12 @@ void write(const ApertureJob& job, const Patch& patch, const Real* total) {
   }
 }
 
-// Forms the patches of one region, blocks of pulses in the outer loop. The order of summation of a patch does not
-// depend on the region or the tile.
+// Forms the patches of one region, with the loop over blocks of pulses outside. The order of summation in a patch does
+// not depend on the region or the tile.
 template <class Real>
 void form_region(const ApertureJob& job, const Isa& isa, int64_t top, int64_t left, std::vector<Patch>& patches,
                  std::vector<Real>& totals) {
-  // A quarter of the tolerance, seen by both legs.
+  // Deviation of a pixel that changes the total path by at most a quarter of the tolerance.
   const double deviation_cells = 0.125 * job.tolerance_rad / job.radians_per_cell;
   int64_t count = 0;
   for (int64_t row = top; row < top + kRegion && row < job.rows; row += kPatchSide)
@@ -124,7 +124,7 @@ void form_tile(const ApertureJob& job, const Isa& isa) {
     for (int64_t left = 0; left < job.columns; left += kRegion) form_region(job, isa, top, left, patches, totals);
 }
 
-// Runs `work` with the instruction set of that name. Returns what the entry points return.
+// Runs `work` with the named instruction set. Returns the status of the entry points.
 template <class Work>
 int run(const char* name, const Work& work) {
   const Isa* isa = find(name);
@@ -141,13 +141,13 @@ int run(const char* name, const Work& work) {
 
 extern "C" {
 
-// The instruction set that `name` ("" for the best) selects here, or null if this machine has none of that name.
+// Name of the instruction set that `name` selects ("": the best one), or null if this machine does not support it.
 __attribute__((visibility("default"))) const char* apertura_isa(const char* name) {
   const Isa* isa = find(name);
   return isa ? isa->name : nullptr;
 }
 
-// 0, or 1 if memory ran out, or 2 if this machine lacks the instruction set.
+// Status: 0: success; 1: out of memory; 2: instruction set not supported by this machine.
 __attribute__((visibility("default"))) int apertura_expand(const char* name, const TableJob* job) {
   return run(name, [job](const Isa& isa) {
     std::vector<float> scratch(apertura::scratch_length(*job));

@@ -1,4 +1,4 @@
-// Eight pulses over one patch: which path variant each pulse takes, and the pixel loop of the fast variants.
+// Eight pulses over one patch: choice of the path variant of each pulse, and the pixel loop of the fast variants.
 // Equation numbers in brackets are those of docs/theory/engine.md.
 #pragma once
 #include "lanes.hpp"
@@ -7,25 +7,25 @@
 
 namespace {
 
-// How the path of a patch's pixels is taken for one pulse, cheapest first. Curvature is the second-order part of the
+// Variant of the path computation for one pulse over a patch, cheapest first. Curvature is the second-order part of the
 // path inside a block, (5a). Windows are the 16 cells of the table that a look-up can reach: narrow ones serve a group
 // of four blocks with 16 lanes, one block (8 cells) with 8 lanes, and are not used with 4; wide ones serve one block.
 enum Variant {
-  kSharedCurvature,  // narrow window, all blocks curve as the origin does
-  kLinearHeights,    // the same, where heights inside a block need no second-order term
+  kSharedCurvature,  // narrow window, all blocks have the curvature of the origin
+  kLinearHeights,    // the same, for heights inside a block that need no second-order term
   kWideWindow,       // shared curvature, wide windows
   kOwnCurvature,     // wide windows, each block has its own curvature
-  kWeighted,         // the same, weighted by the antennas' beams: holds for all pulses that may go fast
-  kAtEdge,           // the same as kOwnCurvature, weighted by the edge of a sector
-  kWeightedAtEdge,   // weighted by both
+  kWeighted,         // kOwnCurvature, weighted by the antennas' beams: with beams, the fast variant except at an edge
+  kAtEdge,           // kOwnCurvature, weighted by the edge of a sector
+  kWeightedAtEdge,   // kOwnCurvature, weighted by both
   kExactPath,        // each pixel in float64 (exact.hpp)
   kSkipped,          // no echo, or no beam, reaches the patch
   kVariants
 };
 constexpr bool kGrouped = kLanes == 16;  // narrow windows serve groups of four blocks
 
-// What the pixel loop reads: pulses sorted by variant, and the path's polynomial (5b) of each pulse and block. What
-// flat ground needs lies together.
+// Input of the pixel loop: pulses sorted by variant, and the path's polynomial (5b) of each pulse and block. Fields
+// used for flat terrain are adjacent.
 struct Batch {
   alignas(64) float path[kBatch][kBlocks];  // at the block's centre, in cells from the window's first cell
   alignas(64) float x[kBatch][kBlocks], y[kBatch][kBlocks];  // its derivatives
@@ -47,14 +47,14 @@ struct Batch {
   float depth_h[kBatch], depth_xx[kBatch], depth_xy[kBatch], depth_yy[kBatch];  // second order at the origin
 };
 
-// x' and y': pixels of a block from its centre.
+// x' and y': offsets of a block's pixels from its centre.
 alignas(64) constexpr float kLaneX[16] = {-1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f,
                                           -1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f};
 alignas(64) constexpr float kLaneY[16] = {-1.5f, -1.5f, -1.5f, -1.5f, -.5f, -.5f, -.5f, -.5f,
                                           .5f,   .5f,   .5f,   .5f,   1.5f, 1.5f, 1.5f, 1.5f};
 
-// Expands the paths of one pulse about the patch's blocks and sets their look-up windows. Returns the variant it takes:
-// every index stays inside its window and every window inside the table, or the pulse takes exact paths.
+// Expands the paths of one pulse about the patch's blocks and sets their look-up windows. Returns the variant of the
+// pulse: a fast one only if every index is inside its window and every window inside the table, otherwise exact paths.
 template <bool kTerrain, bool kCurvature>
 inline Variant expand_paths(const ApertureJob& job, const Patch& patch, const OriginPaths& origin, int64_t pulse,
                             int64_t q, Batch& batch) {
@@ -64,18 +64,17 @@ inline Variant expand_paths(const ApertureJob& job, const Patch& patch, const Or
   Lanes path[kParts], low[kParts], lowest[kParts], high[kParts];
   for (int64_t part = 0; part < kParts; part++) {
     const int64_t b = part * kLanes;
-    // (3) to (5): path and derivatives at the block centres, both legs added.
+    // (3) to (5): path and derivatives at the block centres, sum over both antennas.
     BlockPaths s;
     add_block_leg<kTerrain, kCurvature>(patch, origin.leg[0], q, b, s);
     add_block_leg<kTerrain, kCurvature>(patch, origin.leg[1], q, b, s);
     path[part] = s.path + origin.fraction[q];
-    // How far a pixel's path lies from its block's at most: 1.5 pixels along both axes, the heights, the curvature.
+    // Largest difference between a pixel's path and its block's: 1.5 pixels along both axes, heights and curvature.
     Lanes span = 1.5f * (magnitude(s.x) + magnitude(s.y)) + origin.curvature_bound[q];
     if constexpr (kTerrain) span += patch.rise_max * magnitude(s.h);
     high[part] = path[part] + span;
     low[part] = floor(path[part] - span);
-    // A window begins at the block's lowest cell, or at the lowest of its group; it must lie in the table and reach far
-    // enough.
+    // A window starts at the lowest cell of its block or group; it must be inside the table and cover all paths.
     lowest[part] = kGrouped ? least_of_four(low[part]) : low[part];
     inside &= at_most(splat(first), low[part]) & at_most(low[part], splat(last)) &
               at_most(high[part] - low[part], splat(kWindow - apertura::kWindowMargin));
@@ -87,7 +86,7 @@ inline Variant expand_paths(const ApertureJob& job, const Patch& patch, const Or
       store(batch.xh[q] + b, s.xh), store(batch.yh[q] + b, s.yh), store(batch.hh[q] + b, s.hh);
   }
   if (!all(inside)) {
-    // A patch that lies before or behind all of the profile gets nothing of this pulse.
+    // A patch entirely before or behind the profile has no echo in this pulse.
     LaneMask before = kAllLanes, behind = kAllLanes;
     for (int64_t part = 0; part < kParts; part++) {
       before &= at_most(high[part], splat(first - 1));
@@ -95,7 +94,7 @@ inline Variant expand_paths(const ApertureJob& job, const Patch& patch, const Or
     }
     return all(before) || all(behind) ? kSkipped : kExactPath;
   }
-  // Paths count from the first cell of the window, so that a rounded path is an index into it.
+  // Paths are counted from the first cell of the window, so that a rounded path is an index into it.
   const bool narrow_windows = !kCurvature && kLanes != 4 && all(narrow);
   for (int64_t part = 0; part < kParts; part++) {
     const Lanes begin = narrow_windows ? lowest[part] : low[part];
@@ -104,7 +103,7 @@ inline Variant expand_paths(const ApertureJob& job, const Patch& patch, const Or
   }
   batch.row[q] = job.cells + (pulse + q) * 2 * (job.degree + 1) * job.width + int64_t(origin.whole[q]);
   if constexpr (kCurvature) return kOwnCurvature;
-  // Shared curvature depends on the pixel's place in its block alone: once per pulse, for all blocks.
+  // Shared curvature depends only on the pixel's position in its block: computed once per pulse for all blocks.
   for (int64_t lane = 0; lane < 16; lane += kLanes) {
     const Lanes x = load(kLaneX + lane), y = load(kLaneY + lane);
     store(batch.shared_curvature[q] + lane, x * (x * origin.xx[q] + y * origin.xy[q]) + y * y * origin.yy[q]);
@@ -115,13 +114,13 @@ inline Variant expand_paths(const ApertureJob& job, const Patch& patch, const Or
   return kTerrain && origin.linear_heights[q] ? kLinearHeights : kSharedCurvature;
 }
 
-// Sorts eight pulses by the variant they take.
+// Sorts eight pulses by their path variant.
 template <bool kTerrain>
 inline void sort_pulses(const ApertureJob& job, const Patch& patch, int64_t pulse, int64_t pulses, Batch& batch) {
   OriginPaths origin;
   find_origin_paths<kTerrain>(job, patch, pulse, origin);
   constexpr Variant kMost = kTerrain ? kLinearHeights : kSharedCurvature;
-  int64_t most = 0;  // in a register: nearly all pulses take this variant
+  int64_t most = 0;  // counted in a register: nearly all pulses have this variant
   for (int64_t variant = 0; variant < kVariants; variant++) batch.count[variant] = 0;
   for (int64_t q = 0; q < pulses; q++) {
     Variant variant = kExactPath;
@@ -137,7 +136,7 @@ inline void sort_pulses(const ApertureJob& job, const Patch& patch, int64_t puls
   batch.count[kMost] = most;
 }
 
-// (5b): path of a block's pixels, in cells from the first cell of its window.
+// Path of a block's pixels by (5b), in cells from the first cell of its window.
 template <bool kTerrain, Variant kVariant>
 inline Lanes pixel_paths(const Patch& patch, const Batch& batch, int64_t q, int64_t b, int64_t part) {
   const Lanes x = load(kLaneX + part), y = load(kLaneY + part);
@@ -159,25 +158,25 @@ inline Lanes pixel_paths(const Patch& patch, const Batch& batch, int64_t q, int6
   return t;
 }
 
-// The first group of blocks from `group` on that holds pixels, or kBlocks.
+// First group of blocks from `group` on that contains pixels, or kBlocks.
 template <int64_t kBundle>
 inline int64_t next_present(const Patch& patch, int64_t group) {
   while (group < kBlocks && !patch.present[group]) group += kBundle;
   return group;
 }
 
-// The pixel loop: for the blocks of each window, all pulses of one variant. `sum` is re then im, block by block.
+// Pixel loop: adds all pulses of one variant to the blocks of each window. `sum` contains re, then im, block by block.
 template <class Phase, int64_t kDegree, bool kTerrain, Variant kVariant>
 inline void add_pulses(const ApertureJob& job, const Patch& patch, const Batch& batch, float* sum) {
   constexpr bool kWide = kVariant != kSharedCurvature && kVariant != kLinearHeights;
   constexpr int64_t kParts = 16 / kLanes, kBundle = kGrouped && !kWide ? 4 : 1, kVectors = kBundle * kParts;
-  constexpr bool kAhead = kGrouped && !kWide;  // 32 registers also hold the pixels' places for the next pulse
+  constexpr bool kAhead = kGrouped && !kWide;  // 32 registers also suffice for the pixels' paths of the next pulse
   const int64_t count = batch.count[kVariant], width = job.width, *order = batch.order[kVariant];
   if (count == 0) return;
   const Phase phase(job.phase_coefficients);
-  // Path t of each pixel by (5b); its cell i = round(t) lies in the low bits of t + 1.5 2^23, and u = t - i is the
-  // place in the cell. They are found before they are needed, so that no vector waits for its own: with registers for
-  // it a pulse ahead, else all of a pulse before its first look-up.
+  // Path t of each pixel by (5b); its cell i = round(t) is in the low bits of t + 1.5 2^23, and u = t - i is the
+  // position in the cell. They are computed early to hide latency: with enough registers one pulse ahead, otherwise for
+  // all vectors of a pulse before its first look-up.
   Lanes place[kVectors];
   IntLanes index[kVectors];
   const auto find_place = [&](int64_t q, int64_t group, int64_t v) {
@@ -200,7 +199,7 @@ inline void add_pulses(const ApertureJob& job, const Patch& patch, const Batch& 
       const WindowCells<kWide> re0(window), im0(window + width), re1(window + 2 * width), im1(window + 3 * width);
       const WindowCells<kWide> re2(kDegree == 2 ? window + 4 * width : window);
       const WindowCells<kWide> im2(kDegree == 2 ? window + 5 * width : window);
-      // After the last pulse comes the first, in the next group.
+      // The pulse after the last one is the first one of the next group.
       const bool last = n + 1 == count;
       const int64_t next = order[last ? 0 : n + 1], next_group = last && after < kBlocks ? after : group;
 #pragma GCC unroll 4
@@ -210,7 +209,7 @@ inline void add_pulses(const ApertureJob& job, const Patch& patch, const Batch& 
         const Lanes u = place[v];
         const IntLanes cell = index[v];
         if constexpr (kAhead) find_place(next, next_group, v);
-        // (2): the echo at the pixel's path, a_0 + a_1 u + a_2 u^2, with the carrier of the cell's middle folded in.
+        // (2): the echo at the pixel's path, a_0 + a_1 u + a_2 u^2, including the carrier at the middle of the cell.
         Lanes vr = re1[cell], vi = im1[cell], cosine, sine;
         if constexpr (kDegree == 2) vr += u * re2[cell], vi += u * im2[cell];
         vr = re0[cell] + u * vr, vi = im0[cell] + u * vi;
@@ -233,7 +232,7 @@ inline void add_pulses(const ApertureJob& job, const Patch& patch, const Batch& 
           if constexpr (kTerrain) weight += load(patch.rise + b * 16 + part) * batch.weight_h[q];
           vr *= weight, vi *= weight;
         }
-        // What is left of the carrier inside the cell, exp(j omega u), and the sum over pulses, (1).
+        // The residual carrier inside the cell, exp(j omega u), and the sum over pulses, (1).
         phase(u, cosine, sine);
         re[v] += vr * cosine, im[v] += vr * sine;
         re[v] -= vi * sine, im[v] += vi * cosine;

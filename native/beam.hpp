@@ -1,5 +1,6 @@
-// Weight of antennas whose beams turn with the pulses: at eleven nodes of a patch, then as polynomials of its blocks;
-// pixel by pixel where that would not do. docs/theory/engine.md, "Antennas", says how well; equation numbers are its.
+// Weight of antennas whose beams rotate from pulse to pulse: gains at eleven nodes of a patch, interpolated by
+// polynomials per block, or pixel by pixel if these are not accurate. Errors and equation numbers:
+// docs/theory/engine.md, "Antennas".
 #pragma once
 #include "batch.hpp"
 #include "pattern.hpp"
@@ -8,20 +9,20 @@
 namespace {
 
 constexpr int64_t kPlaneNodes = 9;  // 3 x 3 over the plane of a patch, row by row
-constexpr int64_t kNodes = 11;      // with heights, its middle lowered and raised as well
+constexpr int64_t kNodes = 11;      // with heights: additionally the lowered and the raised middle
 
-// How a pulse's weight over a patch is taken: pixel by pixel, as polynomials of its blocks, or not at all.
+// Computation of a pulse's weight over a patch: pixel by pixel, by polynomials of its blocks, or zero.
 enum Weighing { kPixelwise, kSmooth, kDark };
 
-// Gains at the nodes of a patch and what they tell of it, eight pulses at once.
+// Gains at the nodes of a patch and classification of the patch, for eight pulses.
 struct NodeGains {
   alignas(64) float gain[kNodes][kBatch];             // of all antennas so far
-  alignas(64) float low[2][kBatch], high[2][kBatch];  // smallest and largest place in this one's azimuth, elevation cut
-  alignas(64) float ahead[kBatch];                    // how far at most the patch lies before this antenna
-  alignas(64) int32_t dark[kBatch], smooth[kBatch];   // no gain anywhere in the patch; inside both cuts everywhere
+  alignas(64) float low[2][kBatch], high[2][kBatch];  // smallest, largest position in this antenna's two cuts
+  alignas(64) float ahead[kBatch];                    // largest distance of the patch in front of this antenna
+  alignas(64) int32_t dark[kBatch], smooth[kBatch];   // true: no gain in the patch; true: all of it inside both cuts
 };
 
-// From antennas to a patch along their axes, in cells: its origin, and the steps from node to node.
+// Vectors from antennas to a patch along the antenna axes, in cells: to its origin, and from node to node.
 struct BeamFrame {
   alignas(64) float origin[3][kBatch], step_x[3][kBatch], step_y[3][kBatch], up[3][kBatch];
 };
@@ -43,8 +44,8 @@ inline void turn_to_axes(const BeamJob& beam, const double* antenna, const Apert
   }
 }
 
-// Marks pulses whose patch lies outside the narrowest cone about the boresight that holds the pattern, before any angle
-// is taken.
+// Marks pulses whose patch is outside the narrowest cone about the boresight that contains the pattern, without
+// computing angles.
 inline void mark_outside_cone(const BeamJob& beam, const BeamFrame& to, int32_t* dark) {
   float edge[2];
   for (int64_t cut = 0; cut < 2; cut++) {
@@ -56,16 +57,16 @@ inline void mark_outside_cone(const BeamJob& beam, const BeamFrame& to, int32_t*
     return __builtin_sqrtf(v[0][q] * v[0][q] + v[1][q] * v[1][q] + v[2][q] * v[2][q]);
   };
   for (int64_t q = 0; q < kBatch; q++) {
-    // The patch lies in a ball of radius `reach`; its most favourable point has boresight + reach along the boresight.
+    // The patch is inside a ball of radius `reach`; its most favourable point is `reach` farther along the boresight.
     const float far = length(to.origin, q), reach = length(to.step_x, q) + length(to.step_y, q) + length(to.up, q);
     dark[q] |= to.origin[0][q] + reach < widest * (widest < 0 ? far + reach : far - reach) - 1e-3f * far;
   }
 }
 
-// Multiplies (6) of one antenna into the gains at the nodes, and notes which part of its cuts they span.
+// Multiplies (6) of one antenna into the gains at the nodes, and records the range of its cuts that they span.
 inline void sample_nodes(const BeamJob& beam, const Patch& patch, const BeamFrame& to, NodeGains& out) {
   for (int64_t node = 0; node < (patch.terrain ? kNodes : kPlaneNodes); node++) {
-    // Node (x, y) of the plane in half widths of the patch, or the middle lowered (h = -1) and raised (1).
+    // Node (x, y) of the plane in half widths of the patch, or the lowered (h = -1) or raised (1) middle.
     const bool plane = node < kPlaneNodes;
     const float x = plane ? float(node % 3 - 1) : 0, y = plane ? float(node / 3 - 1) : 0;
     const float h = plane ? 0 : float(2 * (node - kPlaneNodes) - 1);
@@ -88,32 +89,32 @@ inline void sample_nodes(const BeamJob& beam, const Patch& patch, const BeamFram
   }
 }
 
-// Whether all of a patch lies inside or outside the pattern.
+// Marks patches that are entirely inside or outside the pattern.
 inline void compare_with_cuts(const BeamJob& beam, const BeamFrame& to, NodeGains& out) {
   const bool forward = beam.first_rad[0] >= -1.5708 && last_rad(beam, 0) <= 1.5708;
   for (int64_t q = 0; q < kBatch; q++) out.dark[q] |= forward && out.ahead[q] + magnitude(to.up[0][q]) < -1e-3f;
   for (int64_t cut = 0; cut < 2; cut++) {
     const float last = float(beam.count[cut] - 1), radian = float(beam.samples_per_rad[cut]);
     for (int64_t q = 0; q < kBatch; q++) {
-      // Between nodes an angle exceeds theirs by less than half of what they span.
+      // Angles between nodes exceed those at nodes by less than half of their span.
       const float low = out.low[cut][q], high = out.high[cut][q], beyond = 1e-3f + 0.5f * (high - low);
-      const bool near = high - low <= radian;  // not around the pole or the cut at half a turn
+      const bool near = high - low <= radian;  // does not enclose the pole or the cut at ±pi
       out.dark[q] |= near && (high + beyond < 0 || low - beyond > last);
       out.smooth[q] &= near && low - beyond >= 0 && high + beyond <= last;
     }
   }
 }
 
-// The biquadratic through the gains `g` of one pulse at the nodes: (7), value and slope in each block. Returns whether
-// it holds. d_x, d_y are first differences per half width of the patch, d_xx, d_yy halves of second differences, d_xy
-// and d_xyy those along columns of d_x.
+// Biquadratic through the gains `g` of one pulse at the nodes, (7): value and slopes in each block. Returns true if it
+// is accurate. d_x and d_y are first differences per half width of the patch, d_xx and d_yy halves of second
+// differences, d_xy and d_xyy those of d_x along columns.
 inline bool fit_weights(const Patch& patch, const float* g, float peak, int64_t q, Batch& batch) {
   float middle[3], d_x[3], d_xx[3], change = 0, curvature = 0;
   const auto compare = [&](float a, float b, float c) {
     const float first = magnitude(c - a), second = magnitude(a - 2 * b + c);
     change = first <= change ? change : first, curvature = second <= curvature ? curvature : second;
   };
-  // Along each row of nodes: value in its middle, slope and curvature.
+  // Along each row of nodes: middle value, slope and curvature.
   for (int64_t i = 0; i < 3; i++) {
     compare(g[3 * i], g[3 * i + 1], g[3 * i + 2]), compare(g[i], g[3 + i], g[6 + i]);
     middle[i] = g[3 * i + 1], d_x[i] = 0.5f * (g[3 * i + 2] - g[3 * i]);
@@ -125,12 +126,12 @@ inline bool fit_weights(const Patch& patch, const float* g, float peak, int64_t 
   const float slope_h = patch.terrain ? 0.5f * (g[10] - g[9]) / patch.height_max : 0;
   batch.weight_h[q] = slope_h;
   for (int64_t b = 0; b < kBlocks; b += kLanes) {
-    // The rows' parabolas at the column of each block: three values, three slopes along x.
+    // Parabolas of the three rows at the column of each block: values and slopes along x.
     const Lanes x = load(patch.along_x + b) * per_x, y = load(patch.along_y + b) * per_y;
     Lanes value[3], slope[3];
     for (int64_t i = 0; i < 3; i++)
       value[i] = middle[i] + x * (d_x[i] + x * d_xx[i]), slope[i] = d_x[i] + 2 * x * d_xx[i];
-    // Then the parabola through the three along y.
+    // Parabola through the three values along y.
     const Lanes d_y = 0.5f * (value[2] - value[0]), d_yy = 0.5f * (value[0] + value[2]) - value[1];
     const Lanes d_xy = 0.5f * (slope[2] - slope[0]), d_xyy = 0.5f * (slope[0] + slope[2]) - slope[1];
     store(batch.weight[q] + b, value[1] + y * (d_y + y * d_yy) + slope_h * load(patch.height + b));
@@ -140,7 +141,7 @@ inline bool fit_weights(const Patch& patch, const float* g, float peak, int64_t 
   return true;
 }
 
-// Weights of eight pulses over the blocks of a patch, and how each is taken.
+// Weights of eight pulses over the blocks of a patch, and the computation of each.
 inline void weigh_patch(const ApertureJob& job, const Patch& patch, int64_t pulse, Batch& batch, Weighing* weighing) {
   NodeGains nodes;
   BeamFrame to[2];
@@ -170,7 +171,7 @@ inline void weigh_patch(const ApertureJob& job, const Patch& patch, int64_t puls
   }
 }
 
-// (6) of one pulse at each pixel of a patch, and the sector's weight.
+// Product of (6) and the sector's weight for one pulse at each pixel of a patch.
 inline void weigh_pixels(const ApertureJob& job, const Patch& patch, const Positions& at, int64_t pulse,
                          float* weight) {
   const int64_t n = job.padded;
@@ -191,7 +192,7 @@ inline void weigh_pixels(const ApertureJob& job, const Patch& patch, const Posit
   }
 }
 
-// Sorts eight pulses by the variant they take; `places` in a sector, or null.
+// Sorts eight pulses by their variant; `places`: their positions in a sector, or null.
 template <bool kTerrain>
 inline void sort_weighted(const ApertureJob& job, const Patch& patch, int64_t pulse, int64_t pulses,
                           const SectorPlaces* places, Batch& batch) {

@@ -1,4 +1,4 @@
-// Where the sector of a place is centred: on what was flown past it. docs/theory/integration.md, (4).
+// Centre of the sector of a point, limited to the range of s that the flight covers. docs/theory/integration.md, (4).
 #pragma once
 #include <cmath>
 
@@ -6,8 +6,8 @@
 
 namespace {
 
-// Least and largest s of (1) at a point, the pulses that have them, and by how much s differs at most within some
-// metres of it.
+// Smallest and largest s of (1) at a point, the ends with these values, and the largest change of s within `reach`
+// metres of the point.
 struct Flown {
   double first, last, slack;
   int64_t first_end, last_end;
@@ -35,7 +35,7 @@ inline Flown flown_past(const SectorJob& sector, const double* at, double reach)
   return out;
 }
 
-// (4); no number where a place is none.
+// Centre by (4); NaN for a point with non-finite coordinates.
 inline double centre_of(const SectorJob& sector, const Flown& own) {
   const double middle = 0.5 * (own.first + own.last);
   const double lowest = std::fmin(own.first + sector.outer, middle),

@@ -1,4 +1,4 @@
-// What this build assumes, in words that Python can compare with its own: struct layouts and constants.
+// Struct layouts and constants of this build as text, for comparison with those of the Python binding.
 #include <cstddef>
 #include <cstdio>
 #include <string>
@@ -217,7 +217,7 @@ __attribute__((visibility("default"))) const char* apertura_layout() {
   return lines.c_str();
 }
 
-// One line for each constant of bounds.hpp and tree_job.hpp that Python has, too: "name value".
+// One line for each constant of bounds.hpp and tree_job.hpp that Python also defines: "name value".
 __attribute__((visibility("default"))) const char* apertura_constants() {
   static const std::string lines = [] {
     std::string text;

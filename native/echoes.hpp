@@ -1,5 +1,5 @@
-// What pulses add at single places, and how that changes with the path: no tables, no series. For places that are few,
-// such as those around bright points. docs/theory/autofocus.md, "What pulses add", has the equations.
+// Contributions of pulses at single points, and their derivatives with the path, without tables or series; for small
+// numbers of points such as the surroundings of bright points. Equations: docs/theory/autofocus.md, "What pulses add".
 #pragma once
 #include "bounds.hpp"
 #include "job.hpp"
@@ -9,7 +9,7 @@ namespace {
 using apertura::kEchoDegree;
 using apertura::kEchoTaps;
 
-constexpr int64_t kRun = 64;                   // pulses whose paths to a place are taken together
+constexpr int64_t kRun = 64;                   // pulses whose paths to a point are computed together
 constexpr double kWhole = 6755399441055744.0;  // 1.5 * 2^52: adding it rounds to the nearest integer
 typedef float Taps __attribute__((vector_size(4 * kEchoTaps), may_alias));
 typedef float UnalignedTaps __attribute__((vector_size(4 * kEchoTaps), aligned(4), may_alias));
@@ -21,20 +21,20 @@ inline float total(Taps value) {
   return (a + c) + (b + d);
 }
 
-// Where a place lies in the samples of up to kRun pulses.
+// Position of a point in the samples of up to kRun pulses.
 struct Looks {
-  alignas(64) float u[kRun];                   // from the middle between the two nearest samples, in samples
+  alignas(64) float u[kRun];                   // offset from the middle between the two nearest samples, in samples
   alignas(64) float cosine[kRun], sine[kRun];  // of the carrier's phase, times the pulse's weight
-  alignas(64) int32_t first[kRun];             // first sample that takes part
+  alignas(64) int32_t first[kRun];             // first sample of the interpolation
 };
 
-// Distance of a place from an antenna at pulse q.
+// Distance of a point from an antenna at pulse q.
 inline double leg(const double* antenna, int64_t pulses, int64_t q, const double* place) {
   const double x = place[0] - antenna[q], y = place[1] - antenna[pulses + q], z = place[2] - antenna[2 * pulses + q];
   return __builtin_sqrt(x * x + y * y + z * z);
 }
 
-// The sine of pi t and the cosine for |t| <= 1/2, by Taylor to below the rounding of float.
+// Sine and cosine of pi t for |t| <= 1/2, by Taylor series with errors below the rounding of float.
 inline void half_turns(float t, float& cosine, float& sine) {
   const float x = 3.14159265358979f * t, z = x * x;
   sine = x * (1 + z * (-1.f / 6 + z * (1.f / 120 + z * (-1.f / 5040 + z * (1.f / 362880 + z * (-1.f / 39916800))))));
@@ -43,11 +43,11 @@ inline void half_turns(float t, float& cosine, float& sine) {
                z * (1.f / 24 + z * (-1.f / 720 + z * (1.f / 40320 + z * (-1.f / 3628800 + z * (1.f / 479001600))))));
 }
 
-// Looks at one place from pulses begin .. begin + count.
+// Computes the positions of one point in the samples of pulses begin .. begin + count.
 inline void look(const EchoJob& job, int64_t pixel, int64_t begin, int64_t count, Looks& looks) {
   const double* place = job.pixels + 3 * pixel;
   const float* weight = job.weight + pixel * job.weight_step + begin;
-  // Held inside the samples; what lies beyond them is held where only zeros are.
+  // Positions are clamped to the samples; those beyond are clamped to where the samples are zero.
   const double low = kEchoTaps / 2 - 0.5, high = double(job.length) - kEchoTaps / 2 - 0.5;
   const double *tx = job.transmitter + begin, *rx = job.receiver + begin, *start = job.start + begin;
   for (int64_t i = 0; i < count; i++) {
@@ -58,7 +58,7 @@ inline void look(const EchoJob& job, int64_t pixel, int64_t begin, int64_t count
     const double whole = (at - 0.5 + kWhole) - kWhole;
     looks.first[i] = int32_t(whole) - int32_t(kEchoTaps / 2 - 1);
     looks.u[i] = float(at - 0.5 - whole);
-    // Whole turns go in float64; of the rest, by the double angle.
+    // Integer cycles are removed in float64; the phase of the rest follows from the half angle.
     const double turns = path * job.turns_per_metre;
     float cosine, sine;
     half_turns(float(turns - ((turns + kWhole) - kWhole)), cosine, sine);
@@ -67,7 +67,7 @@ inline void look(const EchoJob& job, int64_t pixel, int64_t begin, int64_t count
   }
 }
 
-// Weights of the samples about a place between two of them: each a polynomial of where it is.
+// Interpolation weights of the samples about a position: each is a polynomial of the position.
 struct Weights {
   Taps coefficient[kEchoDegree + 1];
   explicit Weights(const float* taps) {
@@ -78,7 +78,7 @@ struct Weights {
     for (int64_t n = kEchoDegree - 1; n >= 0; n--) value = value * u + coefficient[n];
     return value;
   }
-  // Their derivative, per sample.
+  // Derivatives of the weights, per sample.
   Taps slope(float u) const {
     Taps value = float(kEchoDegree) * coefficient[kEchoDegree];
     for (int64_t n = kEchoDegree - 1; n >= 1; n--) value = value * u + float(n) * coefficient[n];
@@ -86,7 +86,7 @@ struct Weights {
   }
 };
 
-// Adds some pulses of a run to the sum of a block: s(R) exp(j k R), re and im.
+// Adds pulses begin .. end of a run to the sum of a block: s(R) exp(j k R), re and im.
 inline void add_looks(const EchoJob& job, const Weights& weights, const Looks& looks, int64_t run, int64_t begin,
                       int64_t end, float* sum) {
   Taps re{}, im{};
@@ -117,7 +117,7 @@ inline void contribute(const EchoJob& job) {
   }
 }
 
-// (7): what the objective gains at one pixel per metre that the path of each pulse of a run grows.
+// (7): derivative of the objective at one pixel with respect to the path of each pulse of a run, per metre.
 inline void path_slopes(const EchoJob& job, const Weights& weights, const Looks& looks, int64_t pixel, int64_t run,
                         int64_t count, float* slope) {
   const float re = job.objective[2 * pixel], im = job.objective[2 * pixel + 1];
@@ -132,7 +132,7 @@ inline void path_slopes(const EchoJob& job, const Weights& weights, const Looks&
   }
 }
 
-// (8): a phase centre that moves changes the path by the unit vector from the pixel to it.
+// (8): the gradient of the path with respect to a phase centre is the unit vector from the pixel to it.
 inline void add_directions(const double* antenna, int64_t pulses, int64_t count, const double* place,
                            const float* slope, double (*sum)[kRun]) {
   for (int64_t i = 0; i < count; i++) {
@@ -155,7 +155,7 @@ inline void differentiate(const EchoJob& job) {
       path_slopes(job, weights, looks, pixel, run, count, slope);
       add_directions(job.transmitter + run, job.pulses, count, place, slope, sum);
       add_directions(job.receiver + run, job.pulses, count, place, slope, sum + 3);
-      // Echoes that lie further are looked for as if the path were shorter.
+      // An additional path of the echoes has the opposite sign: their positions are computed with a shorter path.
       for (int64_t i = 0; i < count; i++) sum[6][i] -= slope[i];
     }
     for (int64_t axis = 0; axis < 7; axis++)

@@ -1,10 +1,10 @@
-// The slow variant that always holds: the path of each pixel in float64, the table cell by cell.
+// Slow variant that is always valid: the path of each pixel in float64, and scalar look-ups in the table.
 #pragma once
 #include "batch.hpp"
 
 namespace {
 
-// Positions of a patch's pixels, block by block; lanes without a pixel repeat the first.
+// Positions of a patch's pixels, block by block; lanes without a pixel repeat the first pixel.
 struct Positions {
   alignas(64) double x[kPixels], y[kPixels], z[kPixels];
 };
@@ -19,7 +19,7 @@ inline void gather(const ApertureJob& job, const Patch& patch, Positions& out) {
   }
 }
 
-// R of (1) at each pixel, in cells of the pulse's table.
+// Path R of (1) to each pixel, in cells of the pulse's table.
 inline void exact_paths(const ApertureJob& job, const Positions& at, int64_t pulse, double* path) {
   const double *tx = job.transmitter + pulse, *rx = job.receiver + pulse;
   const int64_t n = job.padded;
@@ -31,7 +31,7 @@ inline void exact_paths(const ApertureJob& job, const Positions& at, int64_t pul
   }
 }
 
-// Adds one pulse to all pixels. `weight`: of each pixel, or null for one.
+// Adds one pulse to all pixels. `weight`: weight of each pixel, or null for weight 1.
 template <class Phase, int64_t kDegree>
 inline void add_exact(const ApertureJob& job, const Patch& patch, const Positions& at, int64_t pulse,
                       const float* weight, float* sum) {
@@ -41,7 +41,7 @@ inline void add_exact(const ApertureJob& job, const Patch& patch, const Position
   exact_paths(job, at, pulse, path);
   for (int64_t b = 0; b < kBlocks; b++)
     for (int64_t slot = b * 16; patch.present[b] && slot < b * 16 + 16; slot += kLanes) {
-      // The cell nearest to each pixel's path, lane by lane; zeros beyond the table.
+      // Cell nearest to each pixel's path, lane by lane; zeros beyond the table.
       alignas(64) float coefficient[2 * (kDegree + 1)][kLanes], place[kLanes];
       for (int64_t lane = 0; lane < kLanes; lane++) {
         const double middle = __builtin_floor(path[slot + lane] + 0.5);

@@ -1,5 +1,5 @@
-// Range profiles to tables: one short filter per polynomial coefficient and position of the cell between samples
-// (docs/theory/engine.md, "Cells").
+// Expansion of range profiles into tables: one short filter per polynomial coefficient and position of the cell between
+// samples (docs/theory/engine.md, "Cells").
 #pragma once
 #include "job.hpp"
 #include "lanes.hpp"
@@ -8,7 +8,7 @@ namespace {
 
 using apertura::kTaps;
 
-// Splits a pulse into `down` interleaved streams of re and im, zeros before and after: stream s holds samples
+// Splits a pulse into `down` interleaved streams of re and im with zeros before and after: stream s contains samples
 // s, s + down, … of the padded pulse, whose first kTaps samples are zero.
 inline void split(const TableJob& job, int64_t pulse, int64_t length, float* streams) {
   const float* samples = job.samples + pulse * job.length * 2;
@@ -20,7 +20,8 @@ inline void split(const TableJob& job, int64_t pulse, int64_t length, float* str
   }
 }
 
-// One position of the cell: all coefficients a_m of (2), carrier folded in; result (2 (degree + 1), steps).
+// Computes all coefficients a_m of (2), including the carrier, for one position of the cell between samples; result
+// (2 (degree + 1), steps).
 template <int64_t kCoefficients>
 inline void filter(const TableJob& job, int64_t pulse, int64_t position, int64_t length, const float* streams,
                    float* result) {
@@ -39,7 +40,7 @@ inline void filter(const TableJob& job, int64_t pulse, int64_t position, int64_t
         im[k] += taps[k * kTaps + tap] * y;
       }
     }
-    // exp(j k R_i) of the cell's middle: that of the first cell of this pulse, turned by that of the cell's number.
+    // exp(j k R_i) at the middle of the cell: the carrier of the pulse's first cell times that of the cell number.
     const Lanes base_re = load(carrier + m), base_im = load(carrier + job.steps + m);
     const Lanes c = base_re * turn_re - base_im * turn_im, s = base_re * turn_im + base_im * turn_re;
     for (int64_t k = 0; k < kCoefficients; k++) {

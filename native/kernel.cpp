@@ -1,4 +1,4 @@
-// Compiled once per instruction set; APERTURA_ISA names the copy.
+// Kernel functions for one instruction set, APERTURA_ISA; compiled once for each.
 #include "beam.hpp"
 #include "echoes.hpp"
 #include "expand.hpp"
@@ -9,7 +9,7 @@
 
 namespace {
 
-// Sorts eight pulses by variant and sums those that go fast.
+// Sorts eight pulses by path variant and adds those with fast variants.
 template <class Phase, int64_t kDegree, bool kTerrain>
 void add_fast(const ApertureJob& job, const Patch& patch, int64_t pulse, int64_t pulses, const SectorPlaces* places,
               bool weighted, Batch& batch, float* sum) {

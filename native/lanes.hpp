@@ -1,6 +1,6 @@
-// Vectors of float as wide as the instruction set has, and the one operation C++ cannot say: a table
-// look-up in a register. Everything is in an unnamed namespace: this header is compiled once per
-// instruction set, and the linker must never merge those copies.
+// Vectors of float with the width of the instruction set, and operations without a C++ equivalent such as a table
+// look-up in a register. Everything is in an unnamed namespace: this header is compiled once per instruction set, and
+// the linker must never merge the copies.
 #pragma once
 #include <cstdint>
 #if defined(__AVX2__)
@@ -25,7 +25,7 @@ typedef float Lanes __attribute__((vector_size(4 * kLanes), may_alias));
 typedef int32_t IntLanes __attribute__((vector_size(4 * kLanes), may_alias));
 typedef float UnalignedLanes __attribute__((vector_size(4 * kLanes), aligned(4), may_alias));
 
-constexpr float kNarrow = kLanes == 8 ? kWindow / 2 : kWindow;  // cells a single register permute can reach
+constexpr float kNarrow = kLanes == 8 ? kWindow / 2 : kWindow;  // cells within reach of a single register permute
 constexpr float kRounder = 12582912.0f;                         // 1.5 * 2^23: adding it rounds to the nearest integer
 
 inline Lanes load(const float* from) { return *reinterpret_cast<const UnalignedLanes*>(from); }
@@ -53,7 +53,7 @@ inline Lanes floor(Lanes value) {
 #endif
 }
 
-// Each lane held between 0 and 1.
+// Clamps each lane to 0 … 1.
 inline Lanes within_unit(Lanes value) {
 #if defined(__AVX512F__)
   return (Lanes)_mm512_min_ps(_mm512_max_ps((__m512)value, _mm512_setzero_ps()), _mm512_set1_ps(1));
@@ -65,7 +65,7 @@ inline Lanes within_unit(Lanes value) {
 #endif
 }
 
-// One truth per lane, from comparisons that a NaN never passes.
+// One boolean per lane; comparisons with NaN are false.
 #if defined(__AVX512F__)
 typedef __mmask16 LaneMask;
 constexpr LaneMask kAllLanes = 0xffff;
@@ -82,7 +82,7 @@ inline bool all(LaneMask mask) { return mask[0] & mask[1] & mask[2] & mask[3]; }
 #endif
 #endif
 
-// Smallest of each four neighbouring lanes, in all four.
+// Minimum of each group of four neighbouring lanes, in all four.
 inline Lanes least_of_four(Lanes value) {
 #if defined(__AVX512F__)
   const __m512 swapped = _mm512_min_ps((__m512)value, _mm512_permute_ps((__m512)value, 0xb1));
@@ -97,8 +97,8 @@ inline Lanes least_of_four(Lanes value) {
 #endif
 }
 
-// One coefficient of the cells of a look-up window, held in registers: 16 cells, or only 8 where that is what one
-// register holds and !kWide. Only the low bits of an index count, so no lane can read beside it.
+// One coefficient of the cells of a look-up window, in registers: 16 cells, or 8 if a register has 8 lanes and !kWide.
+// Only the low bits of an index are used, so that no lane reads outside the window.
 template <bool kWide>
 struct WindowCells {
 #if defined(__AVX512F__)
@@ -124,11 +124,11 @@ struct WindowCells {
 #endif
 };
 
-inline Lanes larger(Lanes a, Lanes b) { return a > b ? a : b; }   // b where a is no number
+inline Lanes larger(Lanes a, Lanes b) { return a > b ? a : b; }   // b if a is NaN
 inline Lanes smaller(Lanes a, Lanes b) { return a < b ? a : b; }  // the same
 inline Lanes nearest(Lanes value) { return (value + kRounder) - kRounder; }
 
-// 1 / value, to a few units of the last place.
+// 1 / value, with an error of a few units in the last place.
 inline Lanes reciprocal(Lanes value) {
 #if defined(__AVX512F__)
   const Lanes y = (Lanes)_mm512_rcp14_ps((__m512)value);
@@ -142,7 +142,7 @@ inline Lanes reciprocal(Lanes value) {
 #endif
 }
 
-// Square root, to a few units of the last place.
+// Square root, with an error of a few units in the last place.
 inline Lanes root(Lanes value) {
 #if defined(__AVX512F__)
   const Lanes y = (Lanes)_mm512_rsqrt14_ps((__m512)value);
@@ -158,7 +158,7 @@ inline Lanes root(Lanes value) {
 #endif
 }
 
-// Two floats, in all pairs of lanes.
+// Two floats, repeated in all pairs of lanes.
 inline Lanes splat_pair(const float* from) {
   double both;
   __builtin_memcpy(&both, from, sizeof both);
@@ -171,7 +171,7 @@ inline Lanes splat_pair(const float* from) {
 #endif
 }
 
-// The two floats of each pair exchanged.
+// Exchanges the two floats of each pair of lanes.
 inline Lanes swap_pairs(Lanes a) {
 #if defined(__AVX512F__)
   return (Lanes)_mm512_permute_ps((__m512)a, 0xb1);
@@ -182,7 +182,7 @@ inline Lanes swap_pairs(Lanes a) {
 #endif
 }
 
-// a0 b0 a1 b1 …: 2 kLanes floats.
+// Stores a0 b0 a1 b1 …: 2 kLanes floats.
 inline void store_pairs(float* to, Lanes a, Lanes b) {
 #if defined(__AVX512F__)
   const __m512i low = _mm512_setr_epi32(0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
@@ -198,7 +198,7 @@ inline void store_pairs(float* to, Lanes a, Lanes b) {
 #endif
 }
 
-// Four floats from each of kLanes places: `fields[n]` holds the n-th of all of them.
+// Loads four floats from each of kLanes addresses: `fields[n]` contains the n-th float of all of them.
 inline void load_records(const float* base, const int32_t* at, Lanes fields[4]) {
 #if defined(__AVX512F__)
   __m512 q[4];

@@ -11,7 +11,7 @@ namespace {
 
 double dot(const double* a, const double* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
-// Least-squares plane through the pixels; offsets from it are left in `rest`, in cells.
+// Least-squares plane through the pixels; `rest` receives the residuals in cells.
 void fit_plane(const ApertureJob& job, Patch& patch, double rest[kPixels][3]) {
   const double* corner = job.pixels + 3 * (patch.row * job.columns + patch.column);
   const double mid_y = 0.5 * (patch.rows - 1), mid_x = 0.5 * (patch.columns - 1);
@@ -41,8 +41,8 @@ void fit_plane(const ApertureJob& job, Patch& patch, double rest[kPixels][3]) {
             mean[axis] + (j - mid_x) * patch.step_x[axis] + (i - mid_y) * patch.step_y[axis];
 }
 
-// The direction in which the pixels leave the plane (the vertical, for terrain): the largest eigenvector of their
-// second moments, by four power iterations. Fills up, terrain, irregular and `height`.
+// Direction of the residuals from the plane (the vertical, for terrain): the dominant eigenvector of their second
+// moments, by four power iterations. Sets `up`, `terrain`, `irregular` and `height`.
 void fit_height(Patch& patch, double deviation_cells, const double rest[kPixels][3], double height[kPixels]) {
   double moment[3][3] = {}, largest = 0;
   for (int64_t i = 0; i < patch.rows; i++)
@@ -69,7 +69,7 @@ void fit_height(Patch& patch, double deviation_cells, const double rest[kPixels]
   }
   const double length = std::sqrt(dot(up, up));
   for (int64_t axis = 0; axis < 3; axis++) patch.up[axis] = up[axis] / length;
-  double aside = 0;  // largest squared distance of a pixel from its height above the plane
+  double aside = 0;  // largest squared residual perpendicular to `up`
   for (int64_t i = 0; i < patch.rows; i++)
     for (int64_t j = 0; j < patch.columns; j++) {
       const double* r = rest[i * kPatchSide + j];
@@ -80,7 +80,7 @@ void fit_height(Patch& patch, double deviation_cells, const double rest[kPixels]
   patch.irregular = !(aside <= deviation_cells * deviation_cells);
 }
 
-// Centre and mean height of a block, and how far its pixels lie from them.
+// Centre and mean height of a block, and the largest distances of its pixels from them.
 void describe_block(Patch& patch, int64_t block, const double height[kPixels]) {
   double sum = 0;
   int64_t count = 0;
@@ -107,7 +107,7 @@ void describe_block(Patch& patch, int64_t block, const double height[kPixels]) {
   }
 }
 
-// How the centres of a sector lie over a patch: integration.md, (4). A block that is not whole is taken as level.
+// Centres of the sector over a patch, integration.md (4). Blocks with missing pixels are assumed to have no slopes.
 void describe_centres(const ApertureJob& job, Patch& patch) {
   const SectorJob& sector = *job.sector;
   const Flown about = flown_past(sector, patch.origin, (patch.block_reach + patch.pixel_reach) / job.cells_per_metre);
@@ -168,7 +168,7 @@ void fit(const ApertureJob& job, int64_t row, int64_t column, double deviation_c
     patch.present[block] = block_row(block) < patch.rows && block_column(block) < patch.columns;
     if (patch.present[block]) describe_block(patch, block, height);
   }
-  // The corner of a block, and a pixel's height as if it lay crosswise to it or along it.
+  // Distance of a block's corner pixel from its centre, plus the largest height, which may add in any direction.
   for (int64_t side = -1; side <= 1; side += 2) {
     double corner[3];
     for (int64_t axis = 0; axis < 3; axis++) corner[axis] = 1.5 * (patch.step_x[axis] + side * patch.step_y[axis]);
@@ -181,7 +181,7 @@ void fit(const ApertureJob& job, int64_t row, int64_t column, double deviation_c
   patch.shared = kSharedCurvatureError * reach * inner * inner;
   patch.own = kOwnCurvatureError * reach * reach * inner * inner;
   if (job.sector && job.sector->ends) describe_centres(job, patch);
-  // A block without pixels stands where one with pixels is, so that it never decides about its group.
+  // A block without pixels receives the geometry of one with pixels, so that it does not affect its group's windows.
   for (int64_t block = 0; block < kBlocks; block++)
     if (!patch.present[block]) {
       const int64_t like = patch.present[block / 4 * 4] ? block / 4 * 4 : 0;

@@ -1,4 +1,4 @@
-// A patch: up to 16 x 16 pixels, described by a plane and a height above it along one fitted direction.
+// Patch of up to 16 x 16 pixels, described by a plane and heights above it along one fitted direction.
 #pragma once
 #include "job.hpp"
 
@@ -6,49 +6,49 @@
 // copies.
 namespace apertura {
 
-constexpr int64_t kBlocks = 16;  // of 4 x 4 pixels in a patch
+constexpr int64_t kBlocks = 16;  // blocks of 4 x 4 pixels in a patch
 constexpr int64_t kPixels = kPatchSide * kPatchSide;
 
-// First row and column of a block in its patch: four blocks are a group of 8 x 8 pixels, four groups a patch.
+// First row and column of a block in its patch: four blocks form a group of 8 x 8 pixels, four groups a patch.
 static constexpr int64_t block_row(int64_t block) { return block / 8 * 8 + block / 2 % 2 * kBlockSide; }
 static constexpr int64_t block_column(int64_t block) { return block / 4 % 2 * 8 + block % 2 * kBlockSide; }
 
-// Row and column in its patch of a pixel that is stored block by block.
+// Row and column of a pixel in its patch; pixels are stored block by block.
 static constexpr int64_t pixel_row(int64_t slot) { return block_row(slot / 16) + slot % 16 / kBlockSide; }
 static constexpr int64_t pixel_column(int64_t slot) { return block_column(slot / 16) + slot % kBlockSide; }
 
-// Half of what `count` pixels span, in pixels.
+// Half the span of `count` pixels, in pixels.
 static constexpr float half_span(int64_t count) { return count > 1 ? 0.5f * float(count - 1) : 0.5f; }
 
-// Lengths in cells but for `origin`. Pixel (i, j) lies at origin + j step_x + i step_y + height up, i and j counted
-// from the patch's middle; pixels are stored block by block, and row by row in a block.
+// Lengths are in cells, except `origin` in metres. Pixel (i, j) is at origin + j step_x + i step_y + height up, with i
+// and j counted from the patch's middle; pixels are stored block by block, and row by row in a block.
 struct alignas(64) Patch {
   float along_x[kBlocks], along_y[kBlocks], height[kBlocks];   // centre of each block: pixels, pixels, cells
   float square[kBlocks];                                       // |d|^2: squared distance of that centre from the origin
   float dot_x[kBlocks], dot_y[kBlocks], dot_h[kBlocks];        // d . step_x, d . step_y and d . up
-  float rise[kPixels];                                         // h': height of each pixel above its block's
-  float moved[kPixels];                                        // of a sector: centre of each pixel less that of the job
+  float rise[kPixels];                                         // h': height of each pixel above its block
+  float moved[kPixels];                                        // sector centre of each pixel less that of the job
   float moved_b[kBlocks], moved_x[kBlocks], moved_y[kBlocks];  // the same at each block's centre, and its slopes
-  float moved_mean, moved_reach, moved_bend;  // over the patch; largest deviation from it, and from a block's slopes
+  float moved_mean, moved_reach, moved_bend;  // mean over the patch; largest deviations from it and from block slopes
   double origin[3], step_x[3], step_y[3], up[3];
   float xx, xy, yy, xh, yh;         // products of step_x, step_y and up
   float block_reach, pixel_reach;   // D and delta: largest |d|, largest distance of a pixel from its block's centre
-  float fifth, third, shared, own;  // errors of a leg's series (engine.md, "Neglected per leg"), without powers of 1/R
+  float fifth, third, shared, own;  // errors of a one-way path's series (engine.md, "Paths"), without powers of 1/R
   float rise_max, height_max;       // largest |rise|, and largest height above or below the plane
   int64_t row, column;              // of the first pixel
-  int64_t rows, columns;            // pixels present
-  bool present[kBlocks];            // which blocks hold any
-  bool terrain;                     // heights matter
-  bool irregular;                   // no plane with heights describes it: exact paths only
+  int64_t rows, columns;            // number of pixels
+  bool present[kBlocks];            // blocks that contain pixels
+  bool terrain;                     // heights exceed the tolerance
+  bool irregular;                   // not described by a plane with heights: exact paths only
 };
 
-// Whether a pixel that is stored block by block is one of the patch.
+// Returns true if a slot of the block-by-block storage is a pixel of the patch.
 static inline bool holds(const Patch& patch, int64_t slot) {
   return pixel_row(slot) < patch.rows && pixel_column(slot) < patch.columns;
 }
 
-// Describes the patch whose first pixel is at `row`, `column`; `deviation_cells` is the largest distance of a pixel
-// from that description that still counts as described.
+// Fits the description of the patch whose first pixel is at `row`, `column`; `deviation_cells` is the tolerated
+// distance of a pixel from this description.
 void fit(const ApertureJob& job, int64_t row, int64_t column, double deviation_cells, Patch& patch);
 
 }  // namespace apertura

@@ -1,4 +1,4 @@
-// Gain of an antenna in a direction: the product of two sampled cuts, linear between samples and zero beyond them.
+// Gain of an antenna in a direction: product of two sampled cuts, linear between samples and zero beyond them.
 // docs/theory/engine.md, "Antennas" (6).
 #pragma once
 #include "job.hpp"
@@ -6,7 +6,7 @@
 
 namespace {
 
-// atan2 to 1e-7 rad, without a branch: an odd polynomial of the smaller ratio, then the octants.
+// atan2 with an error of 1e-7 rad, without branches: odd polynomial of the smaller ratio, then octants.
 inline float angle(float y, float x) {
   const float a = magnitude(x), b = magnitude(y);
   const float z = (a < b ? a : b) / ((a < b ? b : a) + 1e-30f), s = z * z;
@@ -17,7 +17,7 @@ inline float angle(float y, float x) {
   return y < 0 ? -turn : turn;
 }
 
-// Place in the azimuth (0) or elevation (1) cut of a pattern, in samples from its first.
+// Position in the azimuth (0) or elevation (1) cut of a pattern, in samples from the first one.
 inline float place_of(const BeamJob& beam, int64_t cut, float radians) {
   return (radians - float(beam.first_rad[cut])) * float(beam.samples_per_rad[cut]);
 }
@@ -32,12 +32,12 @@ inline double last_rad(const BeamJob& beam, int64_t cut) {
   return beam.first_rad[cut] + double(beam.count[cut] - 1) / beam.samples_per_rad[cut];
 }
 
-// Gain at a place of a cut, linear between samples and zero beyond.
+// Gain at a position of a cut, linear between samples and zero beyond.
 inline float look_up(const BeamJob& beam, int64_t cut, float place) {
   const int64_t last = beam.count[cut] - 1;
   const bool inside = place >= 0 && place <= float(last);
   const float held = inside ? place : 0;
-  const int32_t at = int32_t(held) < int32_t(last) ? int32_t(held) : int32_t(last) - 1;  // AVX2 converts no 64 bits
+  const int32_t at = int32_t(held) < int32_t(last) ? int32_t(held) : int32_t(last) - 1;  // AVX2 lacks 64 bits
   const float *gain = beam.gain[cut] + at, part = held - float(at);
   return inside ? gain[0] + part * (gain[1] - gain[0]) : 0;
 }

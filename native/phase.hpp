@@ -1,11 +1,11 @@
-// The carrier's phase inside one cell, exp(j omega u) of (2), as an even and an odd polynomial in u. native_tables.py
-// fits the coefficients and picks the cheapest polynomial that holds.
+// Carrier phase inside one cell, exp(j omega u) of (2), as an even and an odd polynomial in u. native_tables.py fits
+// the coefficients and selects the cheapest polynomial with a sufficient accuracy.
 #pragma once
 #include "lanes.hpp"
 
 namespace {
 
-// Terms of sine and cosine; kReduced first takes half turns off, for carriers that turn often in a cell.
+// kSine and kCosine: numbers of terms; kReduced: half cycles are removed first, for carriers with several per cell.
 template <int64_t kSine, int64_t kCosine, bool kReduced>
 struct PhasePolynomial {
   Lanes c0, c1, c2, c3, s0, s1, s2, s3, half_turns;

@@ -1,15 +1,15 @@
-// The sector that pixels are integrated over: which pulses count for all of a patch, for none of it, or at its smooth
-// edge, where a pulse weighs each pixel by its own place. Equation numbers are those of docs/theory/integration.md.
+// Integration sector: pulses that contribute to all of a patch, to none of it, or at the smooth edge of the sector,
+// where the weight depends on the pixel. Equation numbers are those of docs/theory/integration.md.
 #pragma once
 #include "exact.hpp"
 
 namespace {
 
-// What a sector makes of a pulse over a patch. At an edge that bends, or with both edges in reach, pixels are weighed
+// Position of a patch relative to a pulse's sector. At a curved edge, or with both edges in reach, pixels are weighted
 // one by one.
 enum Zone { kInside, kEdge, kEdgePixelwise, kOutside };
 
-// From both antennas to a patch's origin along the axes of a sector, for eight pulses.
+// Components of the vectors from both antennas to a patch's origin along the sector's axes, for eight pulses.
 struct SectorPlaces {
   alignas(64) float along[2][kBatch];    // w . a, in cells
   alignas(64) float inverse[2][kBatch];  // 1 / R, per cell
@@ -17,7 +17,7 @@ struct SectorPlaces {
   Zone zone[kBatch];
 };
 
-// Places of eight pulses, and what follows from how far they may differ within the patch.
+// Values of s for eight pulses at a patch's origin, and the zones that follow from their largest change in the patch.
 inline void place_in_sector(const ApertureJob& job, const Patch& patch, int64_t pulse, SectorPlaces& out) {
   const SectorJob& sector = *job.sector;
   const int64_t n = job.padded;
@@ -38,7 +38,8 @@ inline void place_in_sector(const ApertureJob& job, const Patch& patch, int64_t 
       const double along = (wx * ax + wy * ay + wz * az) * scale;
       const float inverse = float(1 / distance), length = __builtin_sqrtf(float(ax * ax + ay * ay + az * az));
       out.along[leg][q] = float(along), out.inverse[leg][q] = inverse, out.place[q] += float(along / distance);
-      // A direction turns by asin(reach / R) at most; beyond the origin's second order a block bends by 3 D d^2 / R^3.
+      // A direction changes by at most asin(reach / R); the second-order expansion at the origin has an error of
+      // 3 D d^2 / R^3 inside a block.
       slack[q] += length * (reach * inverse < 1 ? 1.5708f * reach * inverse : 2);
       bend[q] += length * 3 * reach * inside_block * inverse * inverse * inverse;
     }
@@ -53,7 +54,7 @@ inline void place_in_sector(const ApertureJob& job, const Patch& patch, int64_t 
   }
 }
 
-// Depth inside the sector, in widths of its edge, at the centre of each block and its slopes: (5).
+// Depth inside the sector in widths of its edge, (5): value at the centre of each block, and slopes.
 inline void fit_depth(const ApertureJob& job, const Patch& patch, const OriginPaths& origin, const SectorPlaces& places,
                       int64_t pulse, int64_t q, Batch& batch) {
   const SectorJob& sector = *job.sector;
@@ -75,7 +76,7 @@ inline void fit_depth(const ApertureJob& job, const Patch& patch, const OriginPa
     const float along = places.along[leg][q], inverse = places.inverse[leg][q], range = 1 / inverse;
     const float up = patch.terrain ? w.h[q] : 0;
     for (int64_t b = 0; b < kBlocks; b++) {
-      // d is the block's offset from the origin, v = w + d: s = v . a / |v|, with |v| from |w|, w . d and |d|.
+      // With d the block's offset from the origin and v = w + d: s = v . a / |v|, with |v| from |w|, w . d and |d|.
       const float x = patch.along_x[b], y = patch.along_y[b], h = patch.height[b];
       const float more = (2 * range * (w.x[q] * x + w.y[q] * y + up * h) + patch.square[b]) * inverse * inverse;
       const float per_range = inverse / __builtin_sqrtf(1 + more);
@@ -100,7 +101,7 @@ inline void fit_depth(const ApertureJob& job, const Patch& patch, const OriginPa
   batch.depth_yy[q] = side * s_yy * per_width;
 }
 
-// (3): the weight of one pulse at each pixel of a patch, times what `weight` holds.
+// Multiplies `weight` by (3), the sector's weight of one pulse at each pixel of a patch.
 inline void weigh_by_sector(const ApertureJob& job, const Patch& patch, const Positions& at, int64_t pulse,
                             float* weight) {
   const SectorJob& sector = *job.sector;
@@ -119,7 +120,7 @@ inline void weigh_by_sector(const ApertureJob& job, const Patch& patch, const Po
   }
 }
 
-// Sorts eight pulses by the variant they take, where not all of them are inside.
+// Sorts eight pulses by their variant if not all of them are inside the sector.
 template <bool kTerrain>
 inline void sort_at_edge(const ApertureJob& job, const Patch& patch, int64_t pulse, int64_t pulses,
                          const SectorPlaces& places, Batch& batch) {

@@ -1,5 +1,5 @@
-// What each pulse adds at each place, in float64, by a long windowed sinc: for certificates, which the engines are
-// measured by. docs/theory.md (6). numpy does the same where this is not compiled.
+// Contribution of each pulse at each point in float64, by a long windowed sinc: the reference for certificates of the
+// engines, docs/theory.md (6). Without a compiled library, numpy computes the same.
 #pragma once
 #include "bounds.hpp"
 #include "job.hpp"
@@ -8,11 +8,11 @@ namespace {
 
 using apertura::kTermTaps;
 
-constexpr int64_t kGroup = 8;  // re and im of four samples
+constexpr int64_t kGroup = 8;  // floats: re and im of four samples
 typedef double Doubles __attribute__((vector_size(8 * kGroup), aligned(8), may_alias));
 typedef float Floats __attribute__((vector_size(4 * kGroup), aligned(4), may_alias));
 
-// The profile between its samples: `weights` of two neighbouring fractions, linear between them.
+// Interpolates the profile between its samples, with weights linear between two neighbouring rows of `weights`.
 inline void interpolate(const float* samples, const double* weights, double fraction, double& re, double& im) {
   static_assert(2 * kTermTaps % kGroup == 0, "whole groups");
   Doubles sum{};
@@ -37,7 +37,7 @@ inline void add_terms(const TermsJob& job) {
       const double* place = job.pixels + 3 * n;
       const double path = distance(job.transmitter + 3 * pulse, place) + distance(job.receiver + 3 * pulse, place);
       const double at = (path - job.start[pulse]) / job.step;
-      // Samples beyond count as zero; a place that is not finite is not a number.
+      // Samples beyond the profile are zero; the result for a non-finite point is NaN.
       if (!(at > -kTermTaps && at < double(job.length + kTermTaps))) {
         term[0] = term[1] = at == at ? 0 : at;
         continue;

@@ -1,4 +1,4 @@
-// Subaperture trees on tiles of pixels, compiled once per instruction set; APERTURA_ISA names the copy.
+// Subaperture trees on tiles of pixels for one instruction set, APERTURA_ISA; compiled once for each.
 #include "tree_plan.hpp"
 #include "tree_rows.hpp"
 
@@ -13,7 +13,7 @@ struct Work {
   MergeScratch merge;
 };
 
-// Brings a leaf's sums up the tree, as far as its subapertures are complete; at the top of the tile to its pixels.
+// Merges a leaf's sums into the higher levels whose subapertures are complete; at the top level, forms the pixels.
 void climb(const TreeJob& job, TileState& state, int64_t begin, int64_t end, bool summed, Work& work) {
   const TreeTile& tile = state.tile;
   const float* pairs = work.leaf.pairs.data();
@@ -39,7 +39,7 @@ void climb(const TreeJob& job, TileState& state, int64_t begin, int64_t end, boo
   }
 }
 
-// Sums one leaf of every tile at its nodes: by virtual pulses where the plan has them, else pulse by pulse.
+// Sums one leaf of every tile at its nodes: by virtual pulses if the plan provides them, otherwise pulse by pulse.
 template <class Phase>
 void sum_leaves(const TreeJob& job, std::vector<std::unique_ptr<TileState>>& states, int64_t begin, int64_t end,
                 Work& work) {
@@ -82,23 +82,23 @@ void form(const TreeJob& job) {
 
 }  // namespace
 
-// Fills `top`, `variant`, `nodes`, `n_virtual_pulses`, `first_path`, `samples` and the weights of the tiles.
+// Sets `top`, `variant`, `nodes`, `n_virtual_pulses`, `first_path`, `samples` and the weights of the tiles.
 extern "C" void APERTURA_JOIN(apertura_plan_tree_, APERTURA_ISA)(TreeJob* job) {
   for (int64_t n = 0; n < job->count; n++) plan_tile(*job, job->tiles[n]);
 }
 
-// Fills `variant`, `edge`, `slope`, `weight` of the tiles by their weights alone; `n_virtual_pulses` is 1 where these
-// jump from pulse to pulse.
+// Sets `variant`, `edge`, `slope` and `weight` of the tiles from antennas and sector only; `n_virtual_pulses` is 1 for
+// leaves whose weights jump from pulse to pulse.
 extern "C" void APERTURA_JOIN(apertura_weigh_tree_, APERTURA_ISA)(TreeJob* job) {
   for (int64_t n = 0; n < job->count; n++) weigh_leaves(*job, job->tiles[n], lattice_of(*job, job->tiles[n]));
 }
 
-// Fills `rest` of the tiles.
+// Sets `rest` of the tiles.
 extern "C" void APERTURA_JOIN(apertura_rest_tree_, APERTURA_ISA)(TreeJob* job) {
   for (int64_t n = 0; n < job->count; n++) job->tiles[n].rest = rest_of(*job, job->tiles[n]);
 }
 
-// Adds the pulses that go by tree to the image.
+// Adds the pulses that are summed by tree to the image.
 extern "C" void APERTURA_JOIN(apertura_form_tree_, APERTURA_ISA)(TreeJob* job) {
   switch (job->phase_polynomial) {
     case 0: return form<Phase0>(*job);

@@ -1,6 +1,6 @@
-// What Python hands over for a subaperture tree: one chunk of pulses on some tiles of pixels. Mirrored, field by field,
-// in `core/backprojection/engines/native_binding.py`; contract.cpp lists the layout. docs/theory/tree.md derives what
-// is computed.
+// Structs passed from Python for a subaperture tree: one chunk of pulses on several tiles of pixels. Mirrored field by
+// field in `core/backprojection/engines/native_binding.py`; contract.cpp lists the layout. docs/theory/tree.md derives
+// the algorithm.
 #pragma once
 #include <cstdint>
 
@@ -8,48 +8,49 @@
 
 namespace apertura {
 
-constexpr int64_t kTreeNodes = 128;        // along one axis of a tile, at most
-constexpr int64_t kTreeSide = 256;         // pixels along a tile, at most
-constexpr int64_t kTreeLevels = 4;         // at most
-constexpr int64_t kTreeGroup = 64;         // pulses of a leaf, all summed by one variant
+constexpr int64_t kTreeNodes = 128;        // maximum nodes along one axis of a tile
+constexpr int64_t kTreeSide = 256;         // maximum pixels along a tile
+constexpr int64_t kTreeLevels = 4;         // maximum levels
+constexpr int64_t kTreeGroup = 64;         // pulses of a leaf, which all have one variant
 constexpr int64_t kTreeDelays = 12;        // taps of the filter that aligns a pulse to a tile
-constexpr int64_t kTreeMostVirtual = 28;   // virtual (presummed) pulses that replace those of a leaf, at most
-constexpr int64_t kTreeCurves = 4;         // degrees of the curve through a leaf's track that are tried
-constexpr int64_t kTreeTerms = 21;         // of the track over a leaf, one more than the degree of the last of them
-constexpr int64_t kTreeVirtualMargin = 4;  // virtual pulses of a curve beyond its degree
-constexpr int64_t kTreeSlots = 136;    // 0 … kTreeNodes: that many nodes; above: pixels of one of the sides of tiles
-constexpr int64_t kTreeDegree = 6;     // of a tile's surface, at most
-constexpr int64_t kTreeWeights = 16;   // of the antennas' polynomial over a tile: ξ^a η^b at 4 b + a, a and b up to 3
-constexpr int64_t kTreeMargin = 2;     // samples around those that a tile's paths reach
-constexpr double kTreeWeighted = 1.5;  // rad that smooth weights add to the band at a tile's nodes
+constexpr int64_t kTreeMostVirtual = 28;   // maximum virtual (presummed) pulses that replace those of a leaf
+constexpr int64_t kTreeCurves = 4;         // number of tried degrees of the curve through a leaf's track
+constexpr int64_t kTreeTerms = 21;         // polynomial terms of the track over a leaf: the largest degree plus one
+constexpr int64_t kTreeVirtualMargin = 4;  // virtual pulses of a curve in addition to its degree
+constexpr int64_t kTreeSlots = 136;        // 0 … kTreeNodes: number of nodes; above: pixels along one of the tile sides
+constexpr int64_t kTreeDegree = 6;         // maximum degree of a tile's surface
+constexpr int64_t kTreeWeights = 16;   // terms of the antennas' polynomial over a tile: ξ^a η^b at 4 b + a, a, b ≤ 3
+constexpr int64_t kTreeMargin = 2;     // samples around the range of a tile's paths
+constexpr double kTreeWeighted = 1.5;  // rad by which smooth weights increase the band at a tile's nodes
 
-// Variant by which a group of pulses is summed over a tile; kNoEcho: no profile, weight or sector reaches the tile.
+// Summation of a group of pulses over a tile: by tree, directly, or (kNoEcho) not at all, because profile, antennas or
+// sector do not reach the tile.
 enum TreeVariant : uint8_t { kByTree, kDirectly, kNoEcho };
 
 }  // namespace apertura
 
 struct TreeTile {
-  const double* surface;  // (degree + 1 along η, degree + 1 along ξ, 3): Legendre coefficients of the pixels' places
-  const double* pixels;   // its first one; rows are TreeJob.stride pixels apart
-  float* image;           // the same, (re, im)
+  const double* surface;  // (degree + 1 along η, degree + 1 along ξ, 3): Legendre coefficients of the pixel positions
+  const double* pixels;   // position of the first pixel; rows have a stride of TreeJob.stride pixels
+  float* image;           // first pixel of the image, (re, im), with the same stride
   float* weight;          // (pulse, kTreeWeights): gain of both antennas over the tile, set by the plan; null: no beams
-  uint8_t* variant;       // (group): TreeVariant; those not kByTree on entry are left
-  uint8_t* nodes;         // (subaperture of each level in turn, 2): nodes along ξ and η
+  uint8_t* variant;       // (group): TreeVariant; groups that are not kByTree on entry are unchanged
+  uint8_t* nodes;         // (subaperture, 2), level after level: nodes along ξ and η
   // (leaf): virtual pulses that replace those of a leaf; 0: each pulse is summed itself. Between apertura_weigh_tree
-  // and the plan 1 marks weights that jump from pulse to pulse, which no virtual pulse can have; zero on entry.
+  // and the plan, 1 marks weights that jump from pulse to pulse, which exclude virtual pulses; zero on entry.
   uint8_t* n_virtual_pulses;
-  uint8_t* edge;  // (leaf): 1 where the sector ends within the tile; zero on entry
-  float* slope;   // (leaf, 3): there, how much depth changes along ξ, η and the leaf's pulses, per half of them
-  float* band;  // (subaperture of each level in turn, 2): (4b) along ξ and η, rad per half tile; by apertura_view_tree
-  float* turn;  // (leaf, 2): of the carrier in half a leaf, rad, and (8b) in rad per metre; by apertura_view_tree
+  uint8_t* edge;  // (leaf): 1 if the edge of the sector crosses the tile; zero on entry
+  float* slope;   // (leaf, 3): for these leaves, change of depth along ξ, η and the pulses, per half of each
+  float* band;    // (subaperture, 2), level after level: (4b) along ξ and η, rad per half tile; by apertura_view_tree
+  float* turn;    // (leaf, 2): carrier phase over half a leaf, rad, and (8b) in rad per metre; by apertura_view_tree
   double centre[3];
   double rest;        // mean square of the pixels' distances from the surface; set by apertura_rest_tree
-  double first_path;  // of the first sample, more than that of the centre; set by the plan
+  double first_path;  // path of the first sample less that of the centre; set by the plan
   double span,
       slope_rms;  // total path across the tile, and RMS of its slope, metres per half tile; by apertura_view_tree
   int64_t degree, rows, columns, row_slot, column_slot;
-  int64_t samples;  // of each pulse over the tile; set by the plan
-  int64_t top;      // level at which pixels are formed; -1: no tree holds this tile
+  int64_t samples;  // samples per pulse over the tile; set by the plan
+  int64_t top;      // level at which pixels are formed; -1: the tile is not formed by tree
 };
 
 struct TreeJob {
@@ -57,14 +58,14 @@ struct TreeJob {
   const double* start;              // (pulse): total path of sample 0
   const double* transmitter;        // (pulse, 3)
   const double* receiver;           // (pulse, 3)
-  const float* max_track_residual;  // (leaf): of its pulses, metres from the parabola through three of them
-  const float* rms_track_residual;  // (leaf, kTreeCurves): metres from curves of growing degree
-  const double* track;  // (leaf, antenna, kTreeTerms, 3): its phase centres as polynomials, orthonormal over the leaf
-  const float* taps;    // (taps_count, up, 2, 2): of level and slope, each twice (for re, im)
+  const float* max_track_residual;  // (leaf): largest distance of pulses from the parabola through three of them, m
+  const float* rms_track_residual;  // (leaf, kTreeCurves): RMS distance from curves of increasing degree, metres
+  const double* track;  // (leaf, antenna, kTreeTerms, 3): phase centres as polynomials, orthonormal over the leaf
+  const float* taps;    // (taps_count, up, 2, 2): filters of level and slope, each twice (for re, im)
   const float* delay;   // (delay_terms, kTreeDelays): polynomials of the fraction of a sample
   const float* const* presum;   // (kTreeMostVirtual + 1): weights (virtual pulse, pulse of a leaf)
   const double* const* curve;   // (kTreeMostVirtual + 1): polynomials of `track` at (virtual pulse, kTreeTerms)
-  const double* supports;       // (kTreeNodes + 1): band that so many nodes hold, rad per half tile
+  const double* supports;       // (kTreeNodes + 1): band supported by a number of nodes, rad per half tile
   const double* const* places;  // (kTreeSlots): nodes or pixels along an axis, -1 … 1
   const float* const* spread;   // (kTreeNodes + 1, kTreeSlots): (node, 2 padded): weights, each twice
   const float* const* mix;      // (kTreeNodes + 1, kTreeSlots): (target, node): the same weights
@@ -75,8 +76,8 @@ struct TreeJob {
   int64_t curve_degrees[apertura::kTreeCurves];
   double step, wavenumber, band;  // metres; 2 pi f / c; half the band in the same unit
   double presum_error;            // tolerated (8b), rad RMS
-  double node_error;              // that one interpolation between nodes may make, RMS, relative
-  const BeamJob* beam[2];         // as of ApertureJob, their axes `pulses` apart
+  double node_error;              // tolerated relative RMS error of one interpolation between nodes
+  const BeamJob* beam[2];         // as in ApertureJob, with axes of stride `pulses`
   const SectorJob* sector;
   float phase_coefficients[9];
 };
@@ -87,14 +88,14 @@ static inline int64_t subapertures(const TreeJob& job, int64_t level) {
   return (job.pulses + job.sizes[level] - 1) / job.sizes[level];
 }
 
-// Where the node counts of a level begin in TreeTile.nodes.
+// Index of the first node count of a level in TreeTile.nodes.
 static inline int64_t first_of_level(const TreeJob& job, int64_t level) {
   int64_t at = 0;
   for (int64_t below = 0; below < level; below++) at += 2 * subapertures(job, below);
   return at;
 }
 
-// The middle pulse of a subaperture, c of (3).
+// Middle pulse of a subaperture, c of (3).
 static inline int64_t middle_of(const TreeJob& job, int64_t begin, int64_t size) {
   const int64_t end = begin + size < job.pulses ? begin + size : job.pulses;
   return (begin + end - 1) / 2;

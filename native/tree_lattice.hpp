@@ -1,5 +1,4 @@
-// Geometry of a tile from one pulse, at a lattice of its places: paths and their slopes. docs/theory/tree.md,
-// "Support".
+// Geometry of one pulse over a tile, on a lattice of points: paths and their slopes. docs/theory/tree.md, "Support".
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -8,21 +7,21 @@
 
 namespace {
 
-constexpr int64_t kLattice = 64;  // places of the lattice, at most: 8 x 8, corners included
-constexpr int64_t kFew = 4;       // along an axis, of a tile whose band changes little in between; otherwise
+constexpr int64_t kLattice = 64;  // maximum points of the lattice: 8 x 8, including corners
+constexpr int64_t kFew = 4;       // points along an axis if the band changes little between them; otherwise kMany
 constexpr int64_t kMany = 8;
-constexpr double kNearby = 0.5;  // of the nearest antenna's distance that a plane tile's half diagonal may be for few
+constexpr double kNearby = 0.5;  // largest ratio of a plane tile's half diagonal and the nearest range for kFew
 constexpr int64_t kAxes = 2 * kMany;
 
-// Places of a tile and how they move with xi and eta: over the tile, and along its two axes (`side` on each; the rest
-// repeats them). Plain arrays, which the compiler makes vectors of.
+// Points of a tile and their derivatives along xi and eta: over the tile, and along its two axes (`side` points on
+// each, repeated in the remaining lanes). Plain arrays, which the compiler vectorises.
 struct Lattice {
   alignas(64) float at[4][kLattice], by_xi[3][kLattice], by_eta[3][kLattice];
   alignas(64) float axis_at[4][kAxes], by_axis[3][kAxes];
-  int64_t side, count;  // places along an axis, and of the tile
+  int64_t side, count;  // points along an axis, and in the tile
   double radius;        // of the tile
-  double bend;    // square of half the distance between neighbours: how far the path may dip between them, times 1/R
-  double relief;  // deviation of the surface from straight lines between them, metres of path
+  double bend;          // square of half the point spacing; times 1/R, it bounds the dip of the path between points
+  double relief;        // deviation of the surface from straight lines between points, metres of path
 };
 
 template <int64_t kPlaces>
@@ -42,7 +41,7 @@ inline void put_slope(const TreeTile& tile, const double* along_xi, const double
   for (int64_t axis = 0; axis < 3; axis++) by[axis][n] = float(slope[axis] + tile.centre[axis]);
 }
 
-// The largest change of slope along xi or eta from place to place, of values at `side` x `side` places.
+// Largest negative second difference along xi or eta of values at `side` x `side` points.
 inline float bent(const float* value, int64_t side, int64_t step) {
   float most = 0;
   for (int64_t n = 0; n < side * side; n++) {
@@ -53,8 +52,7 @@ inline float bent(const float* value, int64_t side, int64_t step) {
   return most;
 }
 
-// Deviation of the surface from straight lines between places, both legs of a path: an eighth of its second
-// differences.
+// Deviation of the surface from straight lines between points, for both antennas: an eighth of its second differences.
 inline double relief_of(const Lattice& lattice) {
   double square = 0;
   for (const auto& axis : {lattice.at[0], lattice.at[1], lattice.at[2]}) {
@@ -68,7 +66,7 @@ inline double relief_of(const Lattice& lattice) {
   return std::sqrt(2 * square);
 }
 
-// Distance of the nearest of a few antennas from a tile's centre.
+// Distance of a tile's centre from the nearest antenna at the first, middle and last pulse.
 inline double nearest_of(const TreeJob& job, const TreeTile& tile) {
   double nearest = 1e300;
   for (const int64_t pulse : {int64_t(0), job.pulses / 2, job.pulses - 1}) {
@@ -89,7 +87,7 @@ inline Lattice lattice_of_side(const TreeTile& tile, int64_t side) {
     put_place(tile, value[x], value[y], lattice.at, n);
     put_slope(tile, slope[x], value[y], lattice.by_xi, n), put_slope(tile, value[x], slope[y], lattice.by_eta, n);
   }
-  for (int64_t n = 0; n < kAxes; n++) {  // lanes 0 ... side - 1 lie along xi, the next along eta
+  for (int64_t n = 0; n < kAxes; n++) {  // lanes 0 ... side - 1 are along xi, the next `side` lanes along eta
     const int64_t x = n % side;
     const bool xi = n / side % 2 == 0;
     put_place(tile, xi ? value[x] : value[side], xi ? value[side] : value[x], lattice.axis_at, n);
@@ -105,8 +103,8 @@ inline Lattice lattice_of_side(const TreeTile& tile, int64_t side) {
   return lattice;
 }
 
-// 4 x 4 places suffice where the band changes slowly, so that second differences bound it between them; 8 x 8 are taken
-// where the surface bends, and near an antenna, where the band may peak within the tile.
+// 4 x 4 points suffice if the band changes slowly, so that second differences bound it between them; 8 x 8 are used for
+// curved surfaces, and near an antenna, where the band may have a peak within the tile.
 inline Lattice lattice_of(const TreeJob& job, const TreeTile& tile) {
   const Lattice lattice = lattice_of_side(tile, kFew);
   return tile.degree > 1 || lattice.radius > kNearby * nearest_of(job, tile) ? lattice_of_side(tile, kMany) : lattice;
@@ -139,10 +137,10 @@ inline Slopes slopes_at(const Legs& legs, const Lattice& lattice) {
   return out;
 }
 
-// Paths of one pulse to the places of a tile, more than to its centre.
+// Paths of one pulse to the points of a tile, less the path to its centre.
 struct Reach {
   alignas(64) float extra_path[kLattice];
-  double low, high;  // of any place, on top of the centre's
+  double low, high;  // bounds over the tile, relative to the centre
 };
 
 inline Reach reach_of(const Legs& legs, const Lattice& lattice) {
@@ -153,9 +151,9 @@ inline Reach reach_of(const Legs& legs, const Lattice& lattice) {
   float least = 0, most = 0;
   for (int64_t n = 0; n < lattice.count; n++) {
     const float r = out.extra_path[n];
-    least = r >= least ? least : r, most = r <= most ? most : r;  // no number stays
+    least = r >= least ? least : r, most = r <= most ? most : r;  // keeps a NaN
   }
-  // Paths are convex over a plane: none is longer than at a corner, and none much shorter than at the nearest place.
+  // Paths are convex over a plane: the longest is at a corner, and none is much shorter than at the nearest point.
   const double dip = 0.5 * lattice.bend * (1 / legs.ranges[0] + 1 / legs.ranges[1]);
   out.low = least - dip - lattice.relief - 1e-3, out.high = most + lattice.relief + 1e-3;
   return out;

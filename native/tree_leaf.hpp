@@ -1,5 +1,5 @@
-// The leaves of a tree: pulses presummed to fewer virtual pulses for one tile, and summed at its nodes.
-// docs/theory/tree.md, "Leaves"; equation numbers in brackets are its.
+// Leaves of a tree: pulses presummed to fewer virtual pulses for one tile, and summed at its nodes. Numbers in brackets
+// are equations of docs/theory/tree.md, "Leaves".
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -15,18 +15,18 @@ using apertura::kTreeDelays;
 using apertura::kTreeTerms;
 
 constexpr int64_t kRecord = 4;                // floats of a cell: level and slope, re and im each
-constexpr int64_t kCells = kLanes / kRecord;  // that a vector holds
+constexpr int64_t kCells = kLanes / kRecord;  // cells per vector
 
-// What leaves are computed in. Lines are rows of pairs: samples of the pulses over one tile, aligned to its centre.
+// Scratch memory of leaves. Lines are rows of pairs: samples of the pulses over one tile, aligned to its centre.
 struct LeafScratch {
   Floats taken, lines, virtual_lines, cells, pairs, gain, along_xi[2], along_eta[2];
 };
 
-// Cells of a pulse about a tile: that at the path of its centre, how far the path lies beyond it, and where they end.
+// Cells of a pulse over a tile: the cell at the path of its centre, the offset of the path from it, and their limits.
 struct Cells {
   const float* middle;
   float offset, low, high;
-  // `cells` holds `width` of them, the first of number `first`; `place` is that of the centre, in cells from number 0.
+  // `cells` contains `width` cells from number `first` on; `place` is the path of the centre, in cells from number 0.
   Cells(const float* cells, int64_t first, int64_t width, double place) {
     const double whole = std::floor(place);
     const int64_t number = int64_t(whole) - first;
@@ -35,7 +35,7 @@ struct Cells {
   }
 };
 
-// exp(j k r) at so many cells from number `first` on, number 0 at r = `from`, as factors for pairs.
+// Computes exp(j k r) at `width` cells from number `first` on, with number 0 at r = `from`, as factors for pairs.
 inline void put_carrier(const TreeJob& job, double from, int64_t first, int64_t width, Floats& cosines, Floats& sines) {
   cosines.resize(size_t(kRecord * width)), sines.resize(size_t(kRecord * width));
   for (int64_t cell = 0; cell < width; cell++) {
@@ -46,24 +46,24 @@ inline void put_carrier(const TreeJob& job, double from, int64_t first, int64_t 
   }
 }
 
-// Pairs in a line: the samples of a tile, and those around them that filters of cells see.
+// Pairs per line: the samples of a tile, and those around them within the filters of cells.
 inline int64_t line_length(const TreeJob& job, const TreeTile& tile) {
   return padded(tile.samples + job.taps_count, 8);
 }
 
-// (7): one pulse at the samples of a tile, whatever the fraction of a sample it starts at; exp(j k |w|) put on.
+// (7): resamples one pulse, with any fractional start, at the samples of a tile, and applies exp(j k |w|).
 inline void align(const TreeJob& job, const TreeTile& tile, int64_t pulse, float* taken, float* line) {
   const Legs legs = legs_of(job, tile.centre, pulse);
   const int64_t length = line_length(job, tile), count = length + kTreeDelays;
   const double at = (legs.range + tile.first_path - job.start[pulse]) / job.step + double(job.lead),
                whole = std::floor(at);
-  // Samples from `whole - kTreeDelays / 2 + 1` on, zeros beyond the profile.
+  // Samples from `whole - kTreeDelays / 2 + 1` on, with zeros beyond the profile.
   const int64_t before = int64_t(whole) - kTreeDelays / 2 + 1;
   const int64_t low = std::min(count, std::max<int64_t>(0, -before));
   const int64_t high = std::max(low, std::min(count, job.length - before));
   std::fill(taken, taken + 2 * low, 0.0f), std::fill(taken + 2 * high, taken + 2 * count, 0.0f);
   std::memcpy(taken + 2 * low, job.samples + 2 * (pulse * job.length + before + low), size_t(8 * (high - low)));
-  // The filter of this fraction: polynomials of it.
+  // Filter taps, which are polynomials of the fraction.
   alignas(64) float filter[kTreeDelays] = {};
   const float u = float(at - whole);
   for (int64_t term = job.delay_terms - 1; term >= 0; term--)
@@ -81,11 +81,11 @@ inline void align(const TreeJob& job, const TreeTile& tile, int64_t pulse, float
   }
 }
 
-// `samples` samples of a line to cells: level and slope of the profile in each, by the filters of its place between
-// samples, times a carrier.
+// Expands `samples` samples of a line into cells: level and slope of the profile in each cell, by the filters of its
+// position between samples, times a carrier.
 inline void expand(const TreeJob& job, const float* line, int64_t samples, const float* cosines, const float* sines,
                    float* cells) {
-  const int64_t along = job.up / kCells;  // vectors that the cells of one sample fill
+  const int64_t along = job.up / kCells;  // vectors per sample
   for (int64_t sample = 0; sample < samples; sample++)
     for (int64_t v = 0; v < along; v++) {
       const float *from = line + 2 * sample, *tap = job.taps + v * kLanes;
@@ -99,7 +99,7 @@ inline void expand(const TreeJob& job, const float* line, int64_t samples, const
     }
 }
 
-// Adds what one pulse has at the nodes of a leaf: (2) of engine.md at the path of each, times a gain.
+// Adds one pulse at the nodes of a leaf: (2) of engine.md at the path of each node, times a gain.
 template <class Phase, bool kMono>
 inline void add_pulse(const TreeJob& job, const LeafNodes& leaf, const Legs& legs, const float* gain,
                       const Cells& cells, float* re, float* im) {
@@ -111,12 +111,12 @@ inline void add_pulse(const TreeJob& job, const LeafNodes& leaf, const Legs& leg
   for (int64_t n = 0; n < count; n += kLanes) {
     const Lanes extra_path =
         path<kMono>(legs, load(x + n), load(x + count + n), load(x + 2 * count + n), load(x + 3 * count + n));
-    // Held inside the row, whatever the path: no look-up leaves it.
+    // Clamped to the row, so that no look-up is outside it.
     const Lanes t = smaller(larger(extra_path * scale + cells.offset, low), high), rounded = t + kRounder;
     const Lanes u = t - (rounded - kRounder);
     alignas(64) int32_t at[kLanes];
     *reinterpret_cast<IntLanes*>(at) = ((IntLanes)rounded - (IntLanes)splat(kRounder)) * int32_t(kRecord);
-    asm volatile("" : "+m"(at));  // through memory: taking lanes out one by one would keep the shuffle port
+    asm volatile("" : "+m"(at));  // through memory, because extracting single lanes occupies the shuffle port
     Lanes fields[4], cosine, sine;
     load_records(cells.middle, at, fields);
     Lanes vr = fields[0] + u * fields[2], vi = fields[1] + u * fields[3];
@@ -127,7 +127,7 @@ inline void add_pulse(const TreeJob& job, const LeafNodes& leaf, const Legs& leg
   }
 }
 
-// exp(-j k R) along an axis, as planes.
+// Computes exp(-j k R) along an axis, as planes of re and im.
 inline void axis_planes(const TreeJob& job, const Points& line, const Legs& legs, Floats* out) {
   out[0].resize(size_t(line.count)), out[1].resize(size_t(line.count));
   for (int64_t n = 0; n < line.count; n += kLanes) {
@@ -137,7 +137,7 @@ inline void axis_planes(const TreeJob& job, const Points& line, const Legs& legs
   }
 }
 
-// Sums of a leaf, its reference taken off, as pairs: rows of eta, `stride` pairs apart.
+// Removes the reference from the sums of a leaf, and stores them as pairs: rows along eta with a stride of `stride`.
 inline void take_reference_off(const TreeJob& job, TileState& state, const LeafNodes& leaf, int64_t middle,
                                int64_t stride, LeafScratch& work) {
   const Legs legs = legs_of(job, state.tile.centre, middle);
@@ -146,7 +146,7 @@ inline void take_reference_off(const TreeJob& job, TileState& state, const LeafN
   work.pairs.resize(size_t(2 * (stride * leaf.rows + 2 * kLanes)));
   for (int64_t row = 0; row < leaf.rows; row++) {
     const float yr = work.along_eta[0][row], yi = work.along_eta[1][row];
-    for (int64_t n = 0; n < leaf.columns; n += kLanes) {  // beyond the row's end: overwritten by the next
+    for (int64_t n = 0; n < leaf.columns; n += kLanes) {  // lanes beyond the row's end are overwritten by the next row
       const int64_t at = row * leaf.columns + n;
       const Lanes xr = load(&work.along_xi[0][n]), xi = load(&work.along_xi[1][n]);
       const Lanes ar = xr * yr - xi * yi, ai = xr * yi + xi * yr;
@@ -157,7 +157,7 @@ inline void take_reference_off(const TreeJob& job, TileState& state, const LeafN
   }
 }
 
-// Where pulse number `place` of a leaf, which need not be whole, would lie: cubic between its neighbours.
+// Cubic interpolation between the pulses of a leaf at a fractional pulse number `place`.
 struct Between {
   int64_t first;
   float share[4];
@@ -172,16 +172,17 @@ struct Between {
   }
 };
 
-// A virtual pulse of a leaf: its phase centres on a smooth curve through those of the leaf, and its weights.
+// Virtual pulse of a leaf: phase centres on a smooth curve through those of the leaf, and weights.
 struct VirtualPulse {
   Look look;
   float weight[kTreeWeights];
 };
 
-// Number n of `count`. Of all curves that so many support, the one of highest degree follows the track most closely.
+// Virtual pulse n of `count`, on the curve of the highest degree that `count` virtual pulses support, which follows the
+// track most closely.
 inline VirtualPulse virtual_pulse(const TreeJob& job, const TreeTile& tile, int64_t begin, int64_t count, int64_t n) {
   VirtualPulse out{};
-  // b_v of (8) at v: phase centres from the polynomials of the leaf's track.
+  // Phase centres of b_v of (8) from the polynomials of the leaf's track.
   const double *curve = job.curve[count] + n * kTreeTerms,
                *track = job.track + begin / apertura::kTreeGroup * 6 * kTreeTerms;
   const int64_t terms = std::min(kTreeTerms, count - apertura::kTreeVirtualMargin + 1);
@@ -192,7 +193,7 @@ inline VirtualPulse virtual_pulse(const TreeJob& job, const TreeTile& tile, int6
   out.look.legs = legs_between(tile.centre, antenna[0], antenna[1]);
   const bool edge = tile.edge[begin / apertura::kTreeGroup];
   if (!tile.weight && !edge) return out;
-  // Axes of the sector and polynomials of the antennas' gain, interpolated between the pulses beside v.
+  // Axes of the sector and polynomials of the antennas' gain, interpolated between the pulses next to v.
   const Between between(0.5 * double(apertura::kTreeGroup - 1) * (1 + job.places[count][n]));
   double axis[2][3] = {};
   for (int64_t leg = 0; edge && leg < 2; leg++)
@@ -207,7 +208,7 @@ inline VirtualPulse virtual_pulse(const TreeJob& job, const TreeTile& tile, int6
   return out;
 }
 
-// (8): the lines b_v of the virtual pulses of a leaf, from the aligned lines a_p of its own.
+// (8): the lines b_v of the virtual pulses of a leaf, from the aligned lines a_p of its pulses.
 inline const float* virtual_lines(const TreeJob& job, const TreeTile& tile, int64_t begin, int64_t count,
                                   LeafScratch& work) {
   const int64_t wide = 2 * line_length(job, tile), pulses = apertura::kTreeGroup;

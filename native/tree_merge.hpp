@@ -1,12 +1,12 @@
-// Merging subapertures, and the last step to the pixels: two small matrix products each. docs/theory/tree.md, "Merge".
+// Merging of subapertures, and formation of the pixels: two small matrix products each. docs/theory/tree.md, "Merge".
 #pragma once
 #include "tree_tile.hpp"
 
 namespace {
 
-constexpr int64_t kPairs = kLanes / 2;           // complex numbers in a vector
-constexpr int64_t kWide = kLanes == 16 ? 4 : 2;  // vectors that a block of a product spans: what the registers hold
-constexpr int64_t kTall = 4;                     // and rows
+constexpr int64_t kPairs = kLanes / 2;           // complex numbers per vector
+constexpr int64_t kWide = kLanes == 16 ? 4 : 2;  // vectors per row of a product block, limited by the registers
+constexpr int64_t kTall = 4;                     // rows of a product block
 
 inline int64_t pair_stride(int64_t count) { return padded(count, 8); }
 
@@ -15,7 +15,7 @@ struct MergeScratch {
   Turns along_xi, along_eta;
 };
 
-// (5) along xi: `rows` rows of pairs times weights that stand twice, then turned column by column.
+// (5) along xi: kRows rows of pairs times duplicated weights, then multiplied by the phase factor of each column.
 template <int64_t kRows, int64_t kVectors>
 inline void mix_xi(const float* pairs, int64_t stride, const float* weight, int64_t wide, int64_t terms,
                    const Turns& turns, int64_t column, float* out) {
@@ -34,7 +34,7 @@ inline void mix_xi(const float* pairs, int64_t stride, const float* weight, int6
   }
 }
 
-// (5) along eta: weights times rows of pairs, turned row by row, and added.
+// (5) along eta: weights times rows of pairs, multiplied by the phase factor of each row, and added.
 template <int64_t kRows, int64_t kVectors>
 inline void mix_eta(const float* weight, int64_t terms, const float* pairs, int64_t wide, const Turns& turns,
                     int64_t row, int64_t column, float* out) {
@@ -56,7 +56,7 @@ inline void mix_eta(const float* weight, int64_t terms, const float* pairs, int6
   }
 }
 
-// (8): weights times lines.
+// (8): product of weights and lines.
 template <int64_t kRows, int64_t kVectors>
 inline void mix_lines(const float* weight, int64_t terms, const float* lines, int64_t wide, int64_t row, int64_t column,
                       float* out) {
@@ -78,7 +78,7 @@ struct Size {
   static constexpr int64_t value = kCount;
 };
 
-// Calls `body` with row after row, in numbers known when compiled.
+// Calls `body` for all rows, in groups whose size is a compile-time constant.
 template <class Body>
 inline void in_rows(int64_t rows, const Body& body) {
   int64_t r = 0;
@@ -88,7 +88,7 @@ inline void in_rows(int64_t rows, const Body& body) {
   if (rows - r == 1) body(Size<1>(), r);
 }
 
-// The same with columns, `wide` floats of them in vectors.
+// Calls `body` for `wide` floats of columns, in groups of vectors whose size is a compile-time constant.
 template <class Body>
 inline void in_columns(int64_t wide, const Body& body) {
   for (int64_t column = 0; column < wide;) {
@@ -110,13 +110,13 @@ inline void in_columns(int64_t wide, const Body& body) {
   }
 }
 
-// Nodes of a subaperture: how many along each axis, and its values as rows of pairs.
+// Nodes of a subaperture: numbers along each axis, and values as rows of pairs.
 struct Nodes {
   int64_t columns, rows;
   const float* pairs;
 };
 
-// The product along xi for all rows of nodes, columns of one strip.
+// Product along xi for all rows of nodes and the columns of one strip.
 template <int64_t kVectors>
 inline void mix_strip(const TreeJob& job, const Nodes& from, int64_t slot, int64_t wide, int64_t column,
                       MergeScratch& work) {
@@ -128,7 +128,7 @@ inline void mix_strip(const TreeJob& job, const Nodes& from, int64_t slot, int64
   });
 }
 
-// (5): adds a subaperture to the one above it.
+// (5): adds a subaperture to its parent.
 inline void merge(const TreeJob& job, TileState& state, const Nodes& from, int64_t child, int64_t parent,
                   int64_t columns, int64_t rows, float* sum, MergeScratch& work) {
   const Legs legs = legs_of(job, state.tile.centre, child), above = legs_of(job, state.tile.centre, parent);
@@ -147,9 +147,9 @@ inline void merge(const TreeJob& job, TileState& state, const Nodes& from, int64
   });
 }
 
-constexpr int64_t kStrip = 16;  // rows of pixels that are finished before going on
+constexpr int64_t kStrip = 16;  // rows of pixels per strip; strips are formed one after the other
 
-// The mixed part m of (3) at the pixels of a row, put back: adds what is in `pairs` to the image.
+// Restores the mixed part m of (3) at the pixels of a row, and adds `pairs` to the image.
 inline void add_row(const TreeJob& job, const TileState& state, const Legs& shared, const float* along_xi,
                     float along_eta, int64_t row, const float* pairs) {
   const TreeTile& tile = state.tile;
@@ -175,7 +175,7 @@ inline void add_row(const TreeJob& job, const TileState& state, const Legs& shar
   for (int64_t n = 0; n < 2 * columns; n++) image[n] += value[n];
 }
 
-// The last step: nodes to pixels.
+// Last step: interpolation from nodes to pixels.
 inline void form_pixels(const TreeJob& job, TileState& state, const Nodes& from, int64_t child, MergeScratch& work) {
   const TreeTile& tile = state.tile;
   const Points &x = line_of(job, state, tile.column_slot, true), &y = line_of(job, state, tile.row_slot, false);

@@ -1,5 +1,5 @@
-// Paths to the nodes and pixels of a tile, from its centre, and the phases that a tree takes off and puts back.
-// docs/theory/tree.md, "References"; equation numbers in brackets are its.
+// Paths to the nodes and pixels of a tile relative to its centre, and the reference phases that a tree removes and
+// restores. Numbers in brackets are equations of docs/theory/tree.md, "References".
 #pragma once
 #include <vector>
 
@@ -12,10 +12,10 @@ using apertura::padded;
 
 typedef std::vector<float> Floats;
 
-// One pulse over one tile: 2 w, |w|^2 and |w| of both legs, w from the antenna to the tile's centre.
+// One pulse over one tile: 2 w, |w|^2 and |w| of both antennas, with w from the antenna to the tile's centre.
 struct Legs {
   float transmitter[3], receiver[3], squares[2], ranges[2];
-  double range;  // |w| of both legs
+  double range;  // sum of |w| of both antennas
 };
 
 inline Legs legs_between(const double* centre, const double* transmitter, const double* receiver) {
@@ -35,9 +35,9 @@ inline Legs legs_of(const TreeJob& job, const double* centre, int64_t pulse) {
   return legs_between(centre, job.transmitter + 3 * pulse, job.receiver + 3 * pulse);
 }
 
-// Offsets of places from a tile's centre, and their squared distances, metres: x, y, z, square, `count` of each.
+// Offsets of points from a tile's centre, and their squared distances, metres: x, y, z, square, `count` of each.
 struct Points {
-  int64_t count = 0;  // a multiple of kLanes and of 8; the last place fills it up
+  int64_t count = 0;  // a multiple of kLanes and of 8, padded with the last point
   Floats at;
   const float* x(int64_t n) const { return at.data() + n; }
   void resize(int64_t places) { count = padded(places, kLanes < 8 ? 8 : kLanes), at.assign(size_t(4 * count), 0.0f); }
@@ -55,14 +55,14 @@ struct Points {
   }
 };
 
-// (2): |w + d| - |w| = q / (|w + d| + |w|), q = 2 w d + d^2: nothing cancels.
+// (2): |w + d| - |w| = q / (|w + d| + |w|), q = 2 w d + d^2, without cancellation.
 inline Lanes extra_path(Lanes q, float square, float range) { return q * reciprocal(root(q + square) + range); }
 
 inline Lanes leg_path(const float* w, float square, float range, Lanes x, Lanes y, Lanes z, Lanes d2) {
   return extra_path(x * w[0] + (y * w[1] + (z * w[2] + d2)), square, range);
 }
 
-// How much longer the path over a place is than that over the centre, metres.
+// Path to a point less that to the centre, metres.
 template <bool kMono = false>
 inline Lanes path(const Legs& legs, Lanes x, Lanes y, Lanes z, Lanes d2) {
   const Lanes out = leg_path(legs.transmitter, legs.squares[0], legs.ranges[0], x, y, z, d2);
@@ -74,7 +74,7 @@ inline Lanes path(const Legs& legs, const Points& at, int64_t n) {
   return path(legs, load(x), load(x + at.count), load(x + 2 * at.count), load(x + 3 * at.count));
 }
 
-// Cosine and sine of so many turns: of half the angle by Taylor, then doubled.
+// Cosine and sine of an angle in cycles: Taylor series of half the angle, then doubled.
 inline void turn(Lanes turns, Lanes& cosine, Lanes& sine) {
   const Lanes x = (turns - nearest(turns)) * 3.14159265f, z = x * x;
   const Lanes s = x * (1 + z * (-1.6666667e-1f +
@@ -93,7 +93,7 @@ struct Turns {
 };
 inline Lanes turned(Lanes pairs, Lanes cosines, Lanes sines) { return pairs * cosines + swap_pairs(pairs) * sines; }
 
-// (3) along one axis: exp(j k (R_child - R_parent)) at the points of a line; without a parent exp(j k R_child).
+// (3) along one axis: exp(j k (R_child - R_parent)) at the points of a line; without a parent, exp(j k R_child).
 inline void axis_turns(const TreeJob& job, const Points& line, const Legs& child, const Legs* parent, Turns& out) {
   const float turns_per_metre = float(job.wavenumber / 6.283185307179586);
   out.resize(line.count);

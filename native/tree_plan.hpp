@@ -1,5 +1,5 @@
-// The plan of a tile's tree: nodes of each subaperture, virtual pulses of each leaf, and pulses that the tree cannot
-// sum. docs/theory/tree.md, "Support" and "Leaves"; equation numbers in brackets are its.
+// Plan of a tile's tree: nodes of each subaperture, virtual pulses of each leaf, and pulses that the tree cannot sum.
+// Numbers in brackets are equations of docs/theory/tree.md, "Support" and "Leaves".
 #pragma once
 #include "tree_weight.hpp"
 
@@ -10,30 +10,30 @@ using apertura::kTreeNodes;
 using apertura::kTreeVirtualMargin;
 using apertura::kTreeWeighted;
 
-constexpr float kAiry = 3;  // units of (4b) beyond which nothing is left
+constexpr float kAiry = 3;  // units of (4b) beyond which the spectrum is negligible
 
 // Paths of a leaf's pulses over the tile.
 struct LeafPaths {
-  Reach reach[3];                      // of its first, middle and last pulse
-  double low, high;                    // of all of them
-  bool inside = true, outside = true;  // of the profiles, whatever the pulse
+  Reach reach[3];                      // of the first, middle and last pulse
+  double low, high;                    // over all pulses
+  bool inside = true, outside = true;  // all pulses are inside, or outside, of their profiles
 };
 
-// Every eighth pulse is evaluated; those between may reach beyond these by half the difference of neighbours.
+// Every eighth pulse is evaluated; pulses between them may exceed their range by half the difference of neighbours.
 inline LeafPaths paths_of_leaf(const TreeJob& job, const TreeTile& tile, const Lattice& lattice, int64_t begin,
                                int64_t end) {
   LeafPaths paths;
-  const double margin = double(apertura::kTreeMargin + (job.taps_count + apertura::kTreeDelays) / 2);  // of filters
+  const double margin = double(apertura::kTreeMargin + (job.taps_count + apertura::kTreeDelays) / 2);  // filters
   const double length = double(job.length - 1);
   const int64_t three[3] = {begin, (begin + end - 1) / 2, end - 1};
   double slack = 0;
   Reach last;
-  int64_t checked = begin;  // pulses below it are known to lie inside or outside of their profile
+  int64_t checked = begin;  // first pulse that has not been compared with its profile
   for (int64_t n = begin; n < end; n += n + 8 < end || n == end - 1 ? 8 : end - 1 - n) {
     const Reach reach = reach_of(legs_of(job, tile.centre, n), lattice);
     if (n == begin) last = reach, paths.low = reach.low, paths.high = reach.high;
     const double apart = 0.5 * std::max(std::fabs(reach.low - last.low), std::fabs(reach.high - last.high));
-    for (; checked <= n; checked++) {  // each profile has a start of its own
+    for (; checked <= n; checked++) {  // each profile has its own start
       const double centre = legs_of(job, tile.centre, checked).range - job.start[checked];
       const double low = (centre + std::min(reach.low, last.low) - apart) / job.step;
       const double high = (centre + std::max(reach.high, last.high) + apart) / job.step;
@@ -48,20 +48,20 @@ inline LeafPaths paths_of_leaf(const TreeJob& job, const TreeTile& tile, const L
   return paths;
 }
 
-// The least number of nodes that holds a band, rad per half tile; more than kTreeNodes where none does.
+// Smallest number of nodes that supports a band in rad per half tile; kTreeNodes + 1 if none does.
 inline int64_t nodes_for(const TreeJob& job, double band) {
   if (!(band <= job.supports[kTreeNodes])) return kTreeNodes + 1;
   return std::max<int64_t>(2, std::lower_bound(job.supports, job.supports + kTreeNodes + 1, band) - job.supports);
 }
 
-// (8b) per metre of track residual: what the place in a tile's corner sees of it, over sqrt 3 for the RMS over the
-// tile.
+// (8b) per metre of track residual: phase in the corner of a tile, divided by sqrt 3 for the RMS over the tile.
 inline double residual_turn(const TreeJob& job, const TreeTile& tile, const Lattice& lattice, int64_t pulse) {
   const Legs legs = legs_of(job, tile.centre, pulse);
   return 0.577 * (job.wavenumber + job.band) * lattice.radius / std::min(legs.ranges[0], legs.ranges[1]);
 }
 
-// Band of (8) along a leaf, rad per half leaf: of any place against the centre, from first, middle and last pulse.
+// Band of (8) along a leaf, rad per half leaf: largest over all points relative to the centre, from the first, middle
+// and last pulse.
 inline double carrier_turn(const TreeJob& job, const Lattice& lattice, const Reach* reach) {
   double most = 0;
   for (int64_t n = 0; n < lattice.count; n++) {
@@ -71,18 +71,18 @@ inline double carrier_turn(const TreeJob& job, const Lattice& lattice, const Rea
   return (job.wavenumber + job.band) * most;
 }
 
-// Number of virtual pulses that replace those of a leaf; 0: none do.
+// Number of virtual pulses that replace those of a leaf; 0: no replacement.
 inline uint8_t virtual_pulses_for(const TreeJob& job, const TreeTile& tile, const Lattice& lattice,
                                   const LeafPaths& paths, int64_t leaf) {
   const int64_t begin = leaf * kTreeGroup;
   if (tile.n_virtual_pulses[leaf] || begin + kTreeGroup > job.pulses) return 0;  // weights jump, or the leaf is short
-  // (8b): the curve of lowest degree that the track follows closely enough.
+  // (8b): the curve of lowest degree with a tolerated residual of the track.
   const double per_metre = residual_turn(job, tile, lattice, begin + kTreeGroup / 2);
   const float* residual = job.rms_track_residual + leaf * kTreeCurves;
   int64_t curve = 0;
   while (curve < kTreeCurves && !(residual[curve] * per_metre <= job.presum_error)) curve++;
   if (curve == kTreeCurves) return 0;
-  // (8): the band of the carrier, of pulses off the parabola through three, of antennas (1.5 rad) and of an edge (13).
+  // (8): bands of the carrier, of track residuals from the parabola, of antennas (1.5 rad) and of an edge (13).
   const Legs legs = legs_of(job, tile.centre, begin + kTreeGroup / 2);
   const double turns = (1 / legs.ranges[0] + 1 / legs.ranges[1]) * (job.wavenumber + job.band) * lattice.radius;
   double band = carrier_turn(job, lattice, paths.reach) + job.max_track_residual[leaf] * turns;
@@ -92,7 +92,7 @@ inline uint8_t virtual_pulses_for(const TreeJob& job, const TreeTile& tile, cons
   return count <= apertura::kTreeMostVirtual ? uint8_t(count) : 0;
 }
 
-// Variant of each leaf, its virtual pulses, and the samples of all leaves by tree.
+// Sets the variant of each leaf, its virtual pulses, and the sample range of all leaves summed by tree.
 inline void plan_leaves(const TreeJob& job, TreeTile& tile, const Lattice& lattice) {
   double low = 0, high = 0;
   weigh_leaves(job, tile, lattice);
@@ -109,7 +109,7 @@ inline void plan_leaves(const TreeJob& job, TreeTile& tile, const Lattice& latti
   tile.samples = int64_t(std::ceil((high - tile.first_path) / job.step)) + apertura::kTreeMargin + 1;
 }
 
-// Slopes of the reference of a subaperture over the tile: those along the axes, and the mixed part.
+// Slopes of a subaperture's reference over the tile: slopes along the axes, and the mixed part.
 struct Reference {
   alignas(64) float xi[kLattice], eta[kLattice];
   Reference(const Slopes& middle, const Slopes& mixed, const Lattice& lattice) {
@@ -120,7 +120,8 @@ struct Reference {
   }
 };
 
-// The parabola through a value and those beside it: by how much it peaks above, and how sharply; 0 if not among them.
+// Parabola through a value and its two neighbours: height of its peak above the value, and its curvature; 0 if the peak
+// is not between the neighbours.
 struct Peak {
   float above = 0, bend = 0;
   Peak(const float* value, int64_t step) {
@@ -130,7 +131,7 @@ struct Peak {
   }
 };
 
-// (4): the band left on a tile by pulses against the reference of their subaperture.
+// (4): residual band of pulses on a tile, relative to the reference of their subaperture.
 struct Band {
   float xi[kLattice] = {}, eta[kLattice] = {};
   void include(const TreeJob& job, const Slopes& pulse, const Reference& reference, const Lattice& lattice) {
@@ -138,11 +139,11 @@ struct Band {
     for (int64_t n = 0; n < lattice.count; n++) {
       const float cx = k * magnitude(pulse.xi[n] - reference.xi[n]) + b * magnitude(pulse.xi[n]);
       const float cy = k * magnitude(pulse.eta[n] - reference.eta[n]) + b * magnitude(pulse.eta[n]);
-      xi[n] = cx <= xi[n] ? xi[n] : cx, eta[n] = cy <= eta[n] ? eta[n] : cy;  // no number stays
+      xi[n] = cx <= xi[n] ? xi[n] : cx, eta[n] = cy <= eta[n] ? eta[n] : cy;  // keeps a NaN
     }
   }
-  // Of any place, `step` the axis along which it is interpolated: where it peaks between places, by parabolas, and what
-  // a phase whose slope peaks has beyond that slope (4b).
+  // Largest band over the tile for interpolation along the axis of `step`: includes peaks between points, by parabolas,
+  // and the extension (4b) of the spectrum beyond the largest slope.
   static float most(const float* values, const Lattice& lattice, int64_t step) {
     const int64_t side = lattice.side, across = step == 1 ? side : 1;
     const float bend = float((side - 1) * (side - 1)) / 8;
@@ -160,8 +161,8 @@ struct Band {
   }
 };
 
-// Slopes of the first, middle and last pulse of each leaf, and what a pulse off the parabola through them may add to
-// the band.
+// Slopes of the first, middle and last pulse of each leaf, and the additional band of track residuals from the parabola
+// through them.
 struct Leaves {
   std::vector<Slopes> slopes;
   std::vector<float> residual_xi, residual_eta;
@@ -194,7 +195,7 @@ inline Leaves leaves_of(const TreeJob& job, const TreeTile& tile, const Lattice&
   return leaves;
 }
 
-// Slopes of m of (3): those of the chunk's middle pulse, less what they are on the axes.
+// Slopes of m of (3): those of the chunk's middle pulse less their values on the axes.
 inline Slopes mixed_slopes(const TreeJob& job, const TreeTile& tile, const Lattice& lattice) {
   Slopes mixed = slopes_at(shared_legs(job, tile), lattice);
   for (int64_t n = 0; n < lattice.count; n++)
@@ -202,7 +203,7 @@ inline Slopes mixed_slopes(const TreeJob& job, const TreeTile& tile, const Latti
   return mixed;
 }
 
-// (4) over a subaperture, from its leaves by tree.
+// (4) for a subaperture, from its leaves that are summed by tree.
 inline Band band_of(const TreeJob& job, const TreeTile& tile, const Lattice& lattice, const Leaves& leaves,
                     const Slopes& mixed, int64_t begin, int64_t size) {
   const int64_t middle = apertura::middle_of(job, begin, size), end = std::min(begin + size, job.pulses);
@@ -214,14 +215,14 @@ inline Band band_of(const TreeJob& job, const TreeTile& tile, const Lattice& lat
   return band;
 }
 
-// Whether any of some pulses goes by the tree of a tile.
+// Returns true if any of the pulses begin … end is summed by tree.
 inline bool any_taken(const TreeJob& job, const TreeTile& tile, int64_t begin, int64_t end) {
   for (int64_t p = begin; p < end && p < job.pulses; p += apertura::kTreeGroup)
     if (tile.variant[p / apertura::kTreeGroup] == apertura::kByTree) return true;
   return false;
 }
 
-// Node counts of one level. Returns whether kTreeNodes suffice for all subapertures with a leaf by tree.
+// Sets the node counts of one level. Returns true if kTreeNodes suffice for all subapertures with a leaf by tree.
 inline bool plan_level(const TreeJob& job, TreeTile& tile, const Lattice& lattice, const Leaves& leaves,
                        const Slopes& mixed, int64_t level) {
   const int64_t size = job.sizes[level], leaf = job.sizes[0];
@@ -242,13 +243,13 @@ inline bool plan_level(const TreeJob& job, TreeTile& tile, const Lattice& lattic
       edge = true;
       slope_xi = std::max(slope_xi, tile.slope[3 * n]), slope_eta = std::max(slope_eta, tile.slope[3 * n + 1]);
     }
-    // (4b), pulses off the parabola, antennas (1.5 rad), and the edge of a sector (13).
+    // Sum of (4b), track residuals, antennas (1.5 rad) and the edge of a sector (13).
     double wide_xi = Band::most(band.xi, lattice, 1) + residual_xi + (tile.weight ? kTreeWeighted : 0);
     double wide_eta = Band::most(band.eta, lattice, lattice.side) + residual_eta + (tile.weight ? kTreeWeighted : 0);
     if (edge) wide_xi += widened(job, slope_xi, wide_xi), wide_eta += widened(job, slope_eta, wide_eta);
     const int64_t xi = nodes_for(job, wide_xi), eta = nodes_for(job, wide_eta);
     if (level == 0 && edge && (xi > kTreeNodes || eta > kTreeNodes)) {
-      tile.variant[begin / kTreeGroup] = kDirectly;  // this leaf alone: too steep an edge
+      tile.variant[begin / kTreeGroup] = kDirectly;  // only this leaf: the edge is too steep
       continue;
     }
     holds &= xi <= kTreeNodes && eta <= kTreeNodes;

@@ -1,22 +1,21 @@
-// Pulses that no virtual pulse replaces: expanded to cells once for all tiles that sum them so. docs/theory/tree.md,
-// "Leaves".
+// Pulses that are not replaced by virtual pulses: expanded to cells once for all tiles. docs/theory/tree.md, "Leaves".
 #pragma once
 #include "tree_leaf.hpp"
 
 namespace {
 
-constexpr int64_t kRows = 16;  // pulses expanded at once: what the second-level cache holds beside a tile
+constexpr int64_t kRows = 16;  // pulses expanded at once, so that the second-level cache holds them and a tile
 
-// Some pulses as cells: cell 0 of a row lies at sample `first` of its pulse.
+// Pulses expanded to cells: cell 0 of a row is at sample `first` of its pulse.
 struct Rows {
   int64_t first[kRows], samples = 0;
   Floats held, cells, gain, cosines, sines;
-  int64_t low = 0, high = 0;  // samples of a profile that the carrier is there for: no cell depends on other tiles
+  int64_t low = 0, high = 0;  // sample range of the carrier; it is counted from sample 0, so that tiles do not matter
 };
 
-// Provides the carrier, exp(j k r) from sample 0 of a profile on, at the samples of all rows.
+// Computes the carrier exp(j k r), with r from sample 0 of a profile, at the samples of all rows.
 inline void carry(const TreeJob& job, int64_t count, Rows& rows) {
-  constexpr int64_t kMore = 64;  // samples, so that the next pulses find theirs
+  constexpr int64_t kMore = 64;  // additional samples for the following pulses
   const int64_t low = *std::min_element(rows.first, rows.first + count);
   const int64_t high = *std::max_element(rows.first, rows.first + count) + rows.samples;
   if (rows.low <= low && high <= rows.high) return;
@@ -24,7 +23,7 @@ inline void carry(const TreeJob& job, int64_t count, Rows& rows) {
   put_carrier(job, 0, rows.low * job.up, (rows.high - rows.low) * job.up, rows.cosines, rows.sines);
 }
 
-// Which samples of each pulse the tiles need.
+// Determines the sample range of each pulse that the tiles need.
 inline void take_samples(const TreeJob& job, const std::vector<TileState*>& tiles, int64_t begin, int64_t count,
                          Rows& rows) {
   rows.samples = 0;
@@ -57,7 +56,7 @@ inline void expand_row(const TreeJob& job, int64_t pulse, int64_t row, Rows& row
          &rows.cells[kRecord * row * rows.samples * job.up]);
 }
 
-// Adds pulses begin … end to the leaves of some tiles, one by one.
+// Adds pulses begin … end one by one to the leaves of the given tiles.
 template <class Phase>
 inline void sum_each(const TreeJob& job, const std::vector<TileState*>& tiles, int64_t begin, int64_t end, Rows& rows) {
   for (int64_t first = begin; first < end; first += kRows) {

@@ -1,4 +1,4 @@
-// What a tree keeps of a tile: its surface at nodes and pixels. docs/theory/tree.md, "Surface" and "References".
+// State of a tile in a tree: its surface at nodes and pixels. docs/theory/tree.md, "Surface" and "References".
 #pragma once
 #include <memory>
 #include <vector>
@@ -20,27 +20,27 @@ inline void legendre(double x, int64_t degree, double* value, double* slope = nu
   for (int64_t n = 2; n <= degree; n++) slope[n] = slope[n - 2] + (2 * n - 1) * value[n - 1];
 }
 
-// The nodes of a leaf: places, and what turns its sums by the mixed part m of (3).
+// Nodes of a leaf: positions, and phase factors of the mixed part m of (3).
 struct LeafNodes {
   int64_t columns, rows, count;
   Points at;
   Floats cosine, sine;  // of -k m
-  Floats xi, eta;       // places in the tile, for weights of antennas
-  Floats centre;        // of the sector; empty where that is the same everywhere
+  Floats xi, eta;       // positions in the tile, for antenna weights
+  Floats centre;        // centre of the sector; empty if it is constant
 };
 
 struct TileState {
   const TreeTile& tile;
   std::unique_ptr<Points> lines[2][kTreeSlots];  // along xi through eta = 0, and along eta through xi = 0
   std::vector<std::unique_ptr<LeafNodes>> leaves;
-  std::vector<Floats> sums;  // of the subaperture being added up at each level
-  Floats cosines, sines;     // the carrier at its cells
-  Floats re, im;             // sums at the nodes of the leaf in work
+  std::vector<Floats> sums;  // of the current subaperture at each level
+  Floats cosines, sines;     // carrier at the cells of the tile
+  Floats re, im;             // sums at the nodes of the current leaf
   const LeafNodes* leaf = nullptr;
   explicit TileState(const TreeTile& tile) : tile(tile), sums(apertura::kTreeLevels) {}
 };
 
-// Offset from the centre of (xi, eta), given the polynomials there.
+// Offset of the point (xi, eta) from the centre, from the polynomials' values at xi and eta.
 inline void offset_at(const TreeTile& tile, const double* along_xi, const double* along_eta, double* offset) {
   const int64_t m = tile.degree + 1;
   for (int64_t axis = 0; axis < 3; axis++) offset[axis] = -tile.centre[axis];
@@ -50,7 +50,7 @@ inline void offset_at(const TreeTile& tile, const double* along_xi, const double
         offset[axis] += along_eta[a] * along_xi[e] * tile.surface[(a * m + e) * 3 + axis];
 }
 
-// Mean square of the distances of all pixels from the surface; no number if a pixel has no place.
+// Mean square of the distances of all pixels from the surface; NaN if a pixel has non-finite coordinates.
 inline double rest_of(const TreeJob& job, const TreeTile& tile) {
   const int64_t m = tile.degree + 1;
   std::vector<double> basis(size_t(m * tile.columns));
@@ -84,7 +84,7 @@ inline int64_t points_of(const TileState& state, int64_t slot) {
   return slot == state.tile.column_slot ? state.tile.columns : state.tile.rows;
 }
 
-// The axis of a tile at the nodes or pixels of a slot.
+// Points of a tile's axis at the nodes or pixels of a slot.
 inline const Points& line_of(const TreeJob& job, TileState& state, int64_t slot, bool along_xi) {
   std::unique_ptr<Points>& line = state.lines[along_xi ? 0 : 1][slot];
   if (line) return *line;
@@ -102,7 +102,7 @@ inline const Points& line_of(const TreeJob& job, TileState& state, int64_t slot,
   return *line;
 }
 
-// The pulse whose m of (3) all subapertures of a chunk share.
+// Pulse whose mixed part m of (3) is common to all subapertures of a chunk.
 inline Legs shared_legs(const TreeJob& job, const TreeTile& tile) { return legs_of(job, tile.centre, job.pulses / 2); }
 
 inline void put_mixed_turns(const TreeJob& job, TileState& state, LeafNodes& leaf) {

@@ -1,5 +1,5 @@
-// The geometry of tiles that predictions rest on, compiled once per instruction set; APERTURA_ISA names the copy. Apart
-// from tree.cpp, where more callers of a function would change what is inlined, and with it the rounding of images.
+// Geometry of tiles for predictions, for one instruction set, APERTURA_ISA; compiled once for each. Separate from
+// tree.cpp, because additional callers there change the inlining of functions and thereby the rounding of images.
 #include "tree_plan.hpp"
 
 #define APERTURA_JOIN2(a, b) a##b
@@ -7,8 +7,8 @@
 
 namespace {
 
-// The geometry that the plan counts nodes and virtual pulses by, for predictions: bands (4b) of all subapertures, turns
-// (8) and (8b) of all leaves, the span of paths and the RMS of their slopes over the tile.
+// Geometry that determines the plan's numbers of nodes and virtual pulses: bands (4b) of all subapertures, bands (8)
+// and residuals (8b) of all leaves, and the span and RMS slope of paths over the tile.
 inline void view_tile(const TreeJob& job, TreeTile& tile) {
   const Lattice lattice = lattice_of(job, tile);
   const Leaves leaves = leaves_of(job, tile, lattice);
@@ -37,7 +37,7 @@ inline void view_tile(const TreeJob& job, TreeTile& tile) {
 
 }  // namespace
 
-// Fills `band`, `turn`, `span` and `slope_rms` of the tiles.
+// Sets `band`, `turn`, `span` and `slope_rms` of the tiles.
 extern "C" void APERTURA_JOIN(apertura_view_tree_, APERTURA_ISA)(TreeJob* job) {
   for (int64_t n = 0; n < job->count; n++) view_tile(*job, job->tiles[n]);
 }

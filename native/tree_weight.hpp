@@ -1,5 +1,5 @@
-// Weights of antennas and of the sector over a tile: leaves with weight 1 or 0 all over the tile, and the weights of
-// the others at their nodes. docs/theory/tree.md, "Weights"; equation numbers in brackets are its.
+// Weights of antennas and of the sector over a tile: classification of leaves with constant weight 1 or 0, and weights
+// of the other leaves at their nodes. Numbers in brackets are equations of docs/theory/tree.md, "Weights".
 #pragma once
 #include "centre.hpp"
 #include "pattern.hpp"
@@ -13,14 +13,14 @@ using apertura::kTreeGroup;
 using apertura::kTreeWeights;
 
 constexpr double kKink = 0.28647889757;  // 9 / (10 pi) of (13)
-constexpr int64_t kTerms = 4;            // of a polynomial of weights, along xi and along eta
-constexpr int64_t kBetween = 5;          // places along an axis at which it is checked
-constexpr int64_t kChecked = 8;          // one of so many pulses
-constexpr int64_t kCurve = 6;            // terms of weights over the pulses of a leaf
-constexpr double kLargest = 3;           // of an error, in its RMS
-constexpr double kPlaceError = 2e-6;     // of s, by float32
+constexpr int64_t kTerms = 4;            // terms of a polynomial of weights along xi and along eta
+constexpr int64_t kBetween = 5;          // points along an axis at which the polynomial is checked
+constexpr int64_t kChecked = 8;          // every kChecked-th pulse is checked
+constexpr int64_t kCurve = 6;            // polynomial terms of weights over the pulses of a leaf
+constexpr double kLargest = 3;           // ratio of the largest error and the RMS error
+constexpr double kPlaceError = 2e-6;     // error of s by float32
 
-// One pulse, or a virtual pulse, towards a tile: paths, and its axes of the sector.
+// Geometry of a pulse or virtual pulse over a tile: paths, and axes of the sector.
 struct Look {
   Legs legs;
   float axis[2][3] = {}, along[2] = {};  // a, and a . w in metres
@@ -48,7 +48,7 @@ inline Look look_of(const TreeJob& job, const double* centre, int64_t pulse) {
   return look;
 }
 
-// s of (1) of integration.md at offsets d from the centre of a tile, |d|^2 beside them.
+// s of (1) of integration.md at offsets d = (x, y, z) from the centre of a tile, with d2 = |d|^2.
 inline Lanes place_at(const Look& look, Lanes x, Lanes y, Lanes z, Lanes d2) {
   Lanes s{};
   for (int64_t leg = 0; leg < 2; leg++) {
@@ -61,16 +61,16 @@ inline Lanes place_at(const Look& look, Lanes x, Lanes y, Lanes z, Lanes d2) {
 
 // ---- The sector over a tile
 
-// Centres c of the sector at the places of a tile's lattice, (4) of integration.md; whether they are one smooth
-// function over the tile; and by how much c may differ from these between them.
+// Centres c of the sector at the points of a tile's lattice, (4) of integration.md; `smooth`: c is one smooth function
+// over the tile; `slack`: largest deviation of c between the points.
 struct Centres {
   alignas(64) float at[kLattice];
   bool smooth = true;
   double slack = 0;
 };
 
-// (12): largest deviation of s between places from its values at these: half the square of their half distance times
-// its second derivative, 2 / sqrt 3 |a| / R^2 at most.
+// (12): largest deviation of s between points from its values at the points: half the square of half their spacing
+// times the second derivative, which is at most 2 / sqrt 3 |a| / R^2.
 inline double dip_of(const Lattice& lattice, double axis, double range) {
   const double nearest = range - lattice.radius;
   return nearest > 0 ? axis * (0.58 * lattice.bend / nearest + lattice.relief) / nearest : 2;
@@ -80,8 +80,8 @@ inline double length_of(const double* v, int64_t step) {
   return std::sqrt(v[0] * v[0] + v[step] * v[step] + v[2 * step] * v[2 * step]);
 }
 
-// The terms of (4) of integration.md that give c: the sector's own centre s_0, the limit s_1 + S' or s_2 - S' of what
-// was flown past, or their middle m; undecided where two of them are closer than s may vary between places.
+// Term of (4) of integration.md that determines c: the sector's centre s_0, the limit s_1 + S' or s_2 - S' of the flown
+// range, or their middle m; undecided if two terms differ by less than the variation of s between points.
 enum CentreTerm { kUndecided, kOwn, kFirstFlown, kLastFlown, kMiddle };
 
 inline CentreTerm centre_term(const SectorJob& sector, const Flown& flown, double margin) {
@@ -99,8 +99,8 @@ inline Centres centres_of(const TreeJob& job, const TreeTile& tile, const Lattic
   const SectorJob& sector = *job.sector;
   std::fill(out.at, out.at + kLattice, float(sector.centre));
   if (!sector.ends) return out;
-  // (12) for the ends of what was flown, from which s_1 and s_2 follow: how far s may leave its values at neighbouring
-  // places between these, and by how much it differs from one to the next.
+  // (12) for the ends of the flight, which determine s_1 and s_2: largest deviation of s between neighbouring points,
+  // and its largest difference between them.
   double step = 0;
   for (int64_t end = 0; end < sector.ends; end++) {
     double dip = 0, slope = 0;
@@ -113,7 +113,7 @@ inline Centres centres_of(const TreeJob& job, const TreeTile& tile, const Lattic
     }
     out.slack = std::max(out.slack, dip), step = std::max(step, slope);
   }
-  // c is smooth where one term of (4), of the same two ends, gives it at all places.
+  // c is smooth if the same term of (4), with the same two ends, determines it at all points.
   CentreTerm term_of_tile = kUndecided;
   int64_t ends_of_tile = 0;
   for (int64_t n = 0; n < lattice.count; n++) {
@@ -126,11 +126,11 @@ inline Centres centres_of(const TreeJob& job, const TreeTile& tile, const Lattic
     if (n == 0) term_of_tile = term, ends_of_tile = ends;
     out.smooth &= term != kUndecided && term == term_of_tile && ends == ends_of_tile;
   }
-  if (!out.smooth) out.slack = step;  // c may follow any term between places
+  if (!out.smooth) out.slack = step;  // any term may determine c between points
   return out;
 }
 
-// Largest deviation of the axes of a leaf's pulses from the parabola through three of them, both legs together.
+// Largest deviation of the axes of a leaf's pulses from the parabola through three of them, sum of both antennas.
 inline double turning_of(const TreeJob& job, int64_t begin, int64_t end) {
   const int64_t last = end - 1, middle = (begin + last) / 2, n = job.pulses;
   if (last == begin) return 0;
@@ -152,15 +152,15 @@ inline double turning_of(const TreeJob& job, int64_t begin, int64_t end) {
   return most;
 }
 
-// Classifies a leaf as inside the sector all over a tile, outside of it, or at its edge; there `slope` is the change of
-// the depth (3) of integration.md along the axes of the tile and over the leaf, per half of them.
+// Classifies a leaf as inside the sector over the whole tile, outside, or at its edge; at an edge, `slope` is the
+// change of the depth (3) of integration.md along the axes of the tile and over the leaf, per half of each.
 inline void weigh_by_sector(const TreeJob& job, TreeTile& tile, const Lattice& lattice, const Centres& centres,
                             int64_t leaf) {
   const SectorJob& sector = *job.sector;
   const int64_t begin = leaf * kTreeGroup, end = std::min(begin + kTreeGroup, job.pulses);
   const int64_t three[3] = {begin, (begin + end - 1) / 2, end - 1};
   alignas(64) float place[3][kLattice];
-  // s - c at the lattice for three pulses, and the slack (12) of places and pulses between these.
+  // s - c at the lattice for three pulses, and the slack (12) for points and pulses between them.
   double slack = centres.slack + kPlaceError, low = 1e9, high = -1e9, dips = 0, nearest = 1e300;
   for (int64_t i = 0; i < 3; i++) {
     const Look look = look_of(job, tile.centre, three[i]);
@@ -177,7 +177,7 @@ inline void weigh_by_sector(const TreeJob& job, TreeTile& tile, const Lattice& l
     }
     dips = std::max(dips, dip);
   }
-  // Range of s - c, and its changes from place to place and over the leaf.
+  // Range of s - c, and its changes from point to point and over the leaf.
   double along[3] = {};
   for (int64_t n = 0; n < lattice.count; n++) {
     const int64_t x = n % lattice.side, y = n / lattice.side;
@@ -193,7 +193,7 @@ inline void weigh_by_sector(const TreeJob& job, TreeTile& tile, const Lattice& l
   }
   const double turning = turning_of(job, begin, end);
   slack += dips + turning;
-  // With the slack all of the tile is outside (weight 0), inside (weight 1), or there is an edge.
+  // Including the slack, the whole tile is outside (weight 0) or inside (weight 1), or there is an edge.
   const double width = sector.outer - sector.inner;
   if (low - slack >= sector.outer || high + slack <= -sector.outer)
     tile.variant[leaf] = kNoEcho;
@@ -203,15 +203,15 @@ inline void weigh_by_sector(const TreeJob& job, TreeTile& tile, const Lattice& l
     slope[0] = float(steps * along[0] / width), slope[1] = float(steps * along[1] / width);
     slope[2] = float(along[2] / width);
     tile.edge[leaf] = 1;
-    // The weight changes by 1.5 per width at most, where the edge is steepest: axes that turn so far from a parabola
-    // leave no smooth weights to virtual pulses.
+    // The weight changes by at most 1.5 per width of the edge: axes that deviate too far from a parabola exclude smooth
+    // weights of virtual pulses.
     if (1.5 * turning / width > kLargest * job.node_error) tile.n_virtual_pulses[leaf] = 1;
-    // Centres that change from one term of (4) to another have a kink, which no nodes support.
+    // Centres that change from one term of (4) to another have a kink, which nodes cannot represent.
     if (!centres.smooth || nearest < 2 * lattice.radius) tile.variant[leaf] = kDirectly;
   }
 }
 
-// (13): rad by which an edge whose depth changes by `slope` per half axis widens a band.
+// (13): increase of a band, rad, by an edge whose depth changes by `slope` per half axis.
 inline double widened(const TreeJob& job, double slope, double band) {
   const double content = std::max(band, 1.0) * job.node_error * job.node_error;
   return std::max(apertura::kTreeWeighted, slope * std::sqrt(std::sqrt(kKink / content)));
@@ -219,7 +219,8 @@ inline double widened(const TreeJob& job, double slope, double band) {
 
 // ---- Antennas over a tile: polynomials of each pulse
 
-// Places of a tile, offsets from its centre, and the matrices from gains at kTerms x kTerms of them to a polynomial.
+// Sampling points of a tile as offsets from its centre, and matrices from gains at kTerms x kTerms points to a
+// polynomial.
 struct Sampled {
   double at[kTerms * kTerms][3], between[kBetween * kBetween][3];
   double to_terms[kTerms][kTerms], checked[kBetween][kTerms], curve[kCurve][kTreeGroup];
@@ -229,7 +230,7 @@ struct Sampled {
     put(tile, nodes, kTerms, at);
     const double places[kBetween] = {-1, -0.65, 0, 0.65, 1};
     put(tile, places, kBetween, between);
-    for (int64_t n = 0; n < kTerms; n++) {  // Lagrange polynomials of the nodes, as powers
+    for (int64_t n = 0; n < kTerms; n++) {  // Lagrange polynomials of the nodes in powers
       std::fill(power, power + kTerms, 0.0), power[0] = 1;
       for (int64_t m = 0, degree = 0; m < kTerms; m++) {
         if (m == n) continue;
@@ -243,7 +244,7 @@ struct Sampled {
       for (int64_t k = 0; k < kTerms; k++) checked[n][k] = k ? checked[n][k - 1] * places[n] : 1;
     put_curve();
   }
-  // Polynomials over the pulses of a leaf, orthonormal by Gram and Schmidt.
+  // Polynomials over the pulses of a leaf, orthonormalised by Gram-Schmidt.
   void put_curve() {
     for (int64_t term = 0; term < kCurve; term++) {
       for (int64_t p = 0; p < kTreeGroup; p++)
@@ -264,7 +265,7 @@ struct Sampled {
   }
 };
 
-// Gain of both antennas of one pulse at some places.
+// Gain of both antennas of one pulse at `count` points.
 inline void gains_at(const TreeJob& job, const TreeTile& tile, int64_t pulse, const double (*at)[3], int64_t count,
                      float* out) {
   std::fill(out, out + count, 1.0f);
@@ -290,7 +291,8 @@ inline void gains_at(const TreeJob& job, const TreeTile& tile, int64_t pulse, co
   }
 }
 
-// Whether the ball that holds a tile may touch the cone about the boresight that holds the pattern, and its elevations.
+// Returns true if the ball around a tile may touch the cone about the boresight that contains the pattern, and the
+// elevations of the pattern.
 inline bool may_touch(const TreeJob& job, const TreeTile& tile, double radius, int64_t pulse) {
   for (int64_t leg = 0; leg < 2; leg++) {
     const BeamJob* beam = job.beam[leg];
@@ -316,7 +318,7 @@ inline bool may_touch(const TreeJob& job, const TreeTile& tile, double radius, i
   return true;
 }
 
-// Largest deviation of the weights of a leaf at each place from a polynomial over its pulses.
+// Largest deviation of a leaf's weights from a polynomial over its pulses, over all sampling points.
 inline float jumps_of(const Sampled& sampled, const float (*gain)[kTerms * kTerms]) {
   double most = 0;
   for (int64_t place = 0; place < kTerms * kTerms; place++) {
@@ -332,15 +334,15 @@ inline float jumps_of(const Sampled& sampled, const float (*gain)[kTerms * kTerm
   return float(most);
 }
 
-// Polynomials of the gains of a leaf's pulses; where they err by more than kLargest nodes or a beam ends in the tile
-// the leaf is summed directly.
+// Fits polynomials to the gains of a leaf's pulses; a leaf is summed directly if their error exceeds kLargest times the
+// node error, or if a beam ends in the tile.
 inline void weigh_by_antennas(const TreeJob& job, TreeTile& tile, const Lattice& lattice, const Sampled& sampled,
                               int64_t leaf) {
   const int64_t begin = leaf * kTreeGroup, count = std::min(begin + kTreeGroup, job.pulses) - begin;
   constexpr int64_t kPlaces = kTerms * kTerms;
   float gain[kTreeGroup][kPlaces], most = 0;
   const double far = std::sqrt(*std::max_element(lattice.at[3], lattice.at[3] + lattice.count)) + lattice.relief;
-  // Gains at the kTerms x kTerms places; `whole`: no beam ends between them.
+  // Gains at the kTerms x kTerms points; `whole`: no beam ends between them.
   bool illuminated = false, whole = true;
   for (int64_t p = 0; p < count; p++) {
     gains_at(job, tile, begin + p, sampled.at, kPlaces, gain[p]);
@@ -354,8 +356,8 @@ inline void weigh_by_antennas(const TreeJob& job, TreeTile& tile, const Lattice&
     return;
   }
   const float limit = float(kLargest * job.node_error) * most;
-  const bool each = count < kTreeGroup || jumps_of(sampled, gain) > limit;  // no virtual pulse has such weights
-  // Polynomials of degree 3 along both axes, and their largest error at kBetween x kBetween places.
+  const bool each = count < kTreeGroup || jumps_of(sampled, gain) > limit;  // excludes virtual pulses
+  // Polynomials of degree 3 along both axes, and their largest error at kBetween x kBetween points.
   float worst = 0;
   for (int64_t p = 0; p < count; p++) {
     double half[kTerms][kTerms] = {};
@@ -369,7 +371,7 @@ inline void weigh_by_antennas(const TreeJob& job, TreeTile& tile, const Lattice&
         for (int64_t n = 0; n < kTerms; n++) sum += sampled.to_terms[b][n] * half[n][a];
         terms[kTerms * b + a] = float(sum);
       }
-    if (!each && p % kChecked) continue;  // where weights jump, one may miss between two that do not
+    if (!each && p % kChecked) continue;  // weights that jump are checked for every pulse
     float there[kBetween * kBetween];
     gains_at(job, tile, begin + p, sampled.between, kBetween * kBetween, there);
     for (int64_t n = 0; n < kBetween * kBetween; n++) {
@@ -384,7 +386,7 @@ inline void weigh_by_antennas(const TreeJob& job, TreeTile& tile, const Lattice&
   if (each) tile.n_virtual_pulses[leaf] = 1;
 }
 
-// Classifies by their weights the leaves of a tile that are to be summed by tree.
+// Classifies the leaves of a tile that are to be summed by tree by their weights.
 inline void weigh_leaves(const TreeJob& job, TreeTile& tile, const Lattice& lattice) {
   const bool antennas = job.beam[0] || job.beam[1];
   if (!antennas && !job.sector) return;
@@ -396,16 +398,16 @@ inline void weigh_leaves(const TreeJob& job, TreeTile& tile, const Lattice& latt
   }
 }
 
-// ---- At the nodes of a leaf
+// ---- Weights at the nodes of a leaf
 
-// Gain of both antennas at a vector of nodes, by a polynomial.
+// Gain of both antennas at a vector of nodes, from a polynomial.
 inline Lanes weight_at(const float* w, Lanes xi, Lanes eta) {
   Lanes along[4];
   for (int64_t b = 0; b < 4; b++) along[b] = w[4 * b] + xi * (w[4 * b + 1] + xi * (w[4 * b + 2] + xi * w[4 * b + 3]));
   return along[0] + eta * (along[1] + eta * (along[2] + eta * along[3]));
 }
 
-// Gains of one pulse at the nodes of a leaf; null where all are one.
+// Gains of one pulse at the nodes of a leaf; null if all are 1.
 inline const float* node_gains(const TreeJob& job, const LeafNodes& leaf, const Look& look, bool edge,
                                const float* weight, Floats& out) {
   if (!edge && !weight) return nullptr;

@@ -1,4 +1,5 @@
-# The studies need no campaign: `snakemake --snakefile research/study.smk --cores 2 paper stability`.
+# Workflow of the studies; no campaign folder is needed:
+# `snakemake --snakefile research/study.smk --cores 2 paper stability`.
 from apertura.common.provenance import code_sha256
 from apertura_research.autofocus.outcomes import KINDS
 from apertura_research.commands import (
@@ -12,8 +13,9 @@ from apertura_research.commands import (
 CAMPAIGN = "results/study/paper/campaigns/{experiment}"
 STUDY = {name: study_of(name) for name in STUDIES}
 STEPS = ("ingest f01 uav1", "ingest f01 uav2", "echo f01 uav1-uav1", "echo f01 uav1-uav2")
-STANDS = " && ".join(f"apertura step {step}" for step in STEPS)  # a radar that did not move has no image
-PROCESSED = {"lab": STANDS, "static": STANDS, "uav": "apertura run . --cores 1"}
+# A stationary radar has no image: only the steps up to the echo are run.
+STATIONARY = " && ".join(f"apertura step {step}" for step in STEPS)
+PROCESSED = {"lab": STATIONARY, "static": STATIONARY, "uav": "apertura run . --cores 1"}
 
 
 def parts(study, names):
@@ -68,7 +70,7 @@ rule paper_campaign:
             "apertura.stages.cube",
         ),
     message:
-        "the paper's experiment {wildcards.experiment}, through the ordinary steps"
+        "processing the paper's experiment {wildcards.experiment} with the regular steps"
     shell:
         "(rm -rf {params.folder} && apertura simulate {params.folder} --preset paper-{wildcards.experiment}"
         " && (cd {params.folder} && {params.processed}) && touch {output}) > {log} 2>&1"
@@ -91,7 +93,7 @@ rule paper_part:
     params:
         code=lambda wildcards: code_sha256("apertura_research.paper." + PAPER_PARTS[wildcards.part].split(":")[0]),
     message:
-        "claims of the paper: {wildcards.part}"
+        "computing claims of the paper: {wildcards.part}"
     shell:
         "apertura study paper-part {wildcards.part} > {log} 2>&1"
 
@@ -113,7 +115,7 @@ rule paper_claims:
     params:
         code=code_sha256("apertura_research.paper.claims"),
     message:
-        "putting the claims together"
+        "merging the claims"
     shell:
         "apertura study paper-claims > {log} 2>&1"
 
@@ -155,7 +157,7 @@ rule sweep:
     params:
         code=lambda wildcards: code_sha256(STUDY[wildcards.study].run.__module__),
     message:
-        "{wildcards.study}: sweeping {wildcards.part}"
+        "{wildcards.study}: computing {wildcards.part}"
     shell:
         "apertura study sweep {wildcards.study} {wildcards.part} > {log} 2>&1"
 
@@ -178,7 +180,7 @@ rule chart:
     params:
         code=lambda wildcards: code_sha256(STUDY[wildcards.study].draw.__module__),
     message:
-        "{wildcards.study}: charting {wildcards.chart}"
+        "{wildcards.study}: drawing chart {wildcards.chart}"
     shell:
         "apertura study chart {wildcards.study} {wildcards.chart} > {log} 2>&1"
 
@@ -210,7 +212,7 @@ for study_name, study in STUDY.items():
                 study=study_name,
                 code=code_sha256(study.draw.__module__),
             message:
-                "{params.study}: tables and picture of all parts"
+                "{params.study}: writing summary tables and plot"
             shell:
                 "apertura study summary {params.study} > {log} 2>&1"
 
@@ -230,6 +232,6 @@ rule autofocus_picture:
     params:
         code=code_sha256("apertura_research.autofocus.charts"),
     message:
-        "images of {wildcards.scene} before and after"
+        "drawing images of {wildcards.scene} before and after autofocus"
     shell:
         "apertura study autofocus-picture {wildcards.scene} > {log} 2>&1"

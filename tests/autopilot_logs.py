@@ -1,4 +1,4 @@
-"""Logs as autopilots write them, from the public descriptions of ULog and DataFlash, of a flight that is known."""
+"""Logs in the formats of autopilots, from the public descriptions of ULog and DataFlash, of a known flight."""
 
 import struct
 
@@ -8,29 +8,29 @@ from apertura.common.leap_seconds import GPS_EPOCH, gps_from_utc
 
 START = np.datetime64("2025-05-14T09:30:00", "ns")
 LAG_S, BOOT_S = 0.11, 300.0
-"""By how much the autopilot hears of an epoch late; its clock at `START`."""
+"""Latency of epochs at the autopilot, s; clock of the autopilot at `START`, s."""
 
 N_M = 47.5
-"""The geoid above the ellipsoid."""
+"""Geoid height above the ellipsoid, m."""
 
 
 def flight(epochs=60, rate_hz=10.0):
-    """Return time (s), geodetic (epoch, 3) and yaw (deg) of a circle of 50 m at 8 m/s that climbs by 0.5 m/s."""
+    """Return time (s), geodetic (epoch, 3) and yaw (deg) of a climbing circle: radius 50 m, 8 m/s, climb 0.5 m/s."""
     time = np.arange(epochs) / rate_hz
-    turned = time * 8 / 50
-    latitude = 48.42 + 50 * np.sin(turned) / 111_200
-    longitude = 9.955 - 50 * np.cos(turned) / 73_900
-    return time, np.stack([latitude, longitude, 600 + 0.5 * time], -1), np.degrees(turned)
+    angle_rad = time * 8 / 50
+    latitude = 48.42 + 50 * np.sin(angle_rad) / 111_200
+    longitude = 9.955 - 50 * np.cos(angle_rad) / 73_900
+    return time, np.stack([latitude, longitude, 600 + 0.5 * time], -1), np.degrees(angle_rad)
 
 
 def velocity(epochs=60):
-    """Return (epoch, 3) velocity to north, east and down, m/s."""
-    turned = flight(epochs)[0] * 8 / 50
-    return np.stack([8 * np.cos(turned), 8 * np.sin(turned), np.full(epochs, -0.5)], -1)
+    """Return velocity to north, east and down (epoch, 3), m/s."""
+    angle_rad = flight(epochs)[0] * 8 / 50
+    return np.stack([8 * np.cos(angle_rad), 8 * np.sin(angle_rad), np.full(epochs, -0.5)], -1)
 
 
 def utc_of(time_s):
-    """Return UTC of seconds of the flight."""
+    """Return the UTC of times in seconds of the flight."""
     return START + np.rint(np.asarray(time_s) * 1e9).astype("timedelta64[ns]")
 
 
@@ -45,7 +45,7 @@ def _message(kind, payload):
 
 
 def ulog(*topics, delay_ms=LAG_S * 1e3):
-    """Return a ULog of topics (name, instance, {field: (type, values)}); each begins with its timestamp, µs."""
+    """Return a ULog with topics (name, instance, {field: (type, values)}); each starts with its timestamp, µs."""
     parts = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", round(BOOT_S * 1e6))]
     for name, fields in {name: fields for name, _, fields in topics}.items():
         text = f"{name}:" + "".join(f"{kind} {field};" for field, (kind, _) in fields.items())
@@ -64,12 +64,12 @@ def ulog(*topics, delay_ms=LAG_S * 1e3):
 
 
 def boot_us(time_s, late_s=LAG_S):
-    """Return the autopilot's clock, µs, at which it hears of epochs."""
+    """Return the autopilot clock, µs, at which epochs are received."""
     return np.rint((np.asarray(time_s) + BOOT_S + late_s) * 1e6).astype(np.int64)
 
 
 def ulog_receiver(*, old=True, epochs=60, **changes):
-    """Return fields of a receiver's topic, as PX4 wrote them until 1.13 or does since; a change to None drops one."""
+    """Return fields of a receiver's topic as in PX4 until 1.13, or since; a change to None removes a field."""
     time, geodetic, _ = flight(epochs)
     names = ("lat", "lon", "alt", "alt_ellipsoid")
     scales, kind = (1e-7, 1e-7, 1e-3, 1e-3), "int32_t"
@@ -93,7 +93,7 @@ def ulog_receiver(*, old=True, epochs=60, **changes):
 
 
 def ulog_attitude(epochs=60, rate_hz=40.0):
-    """Return fields of vehicle_attitude of an aircraft that flies along its circle, rolled by 10° and pitched by 3°."""
+    """Return fields of vehicle_attitude of an aircraft along its circle with a roll of 10° and a pitch of 3°."""
     time = np.arange(-0.5, epochs / 10 + 0.5, 1 / rate_hz)
     half = np.radians([np.full(time.size, 10.0), np.full(time.size, 3.0), np.degrees(time * 8 / 50)]) / 2
     (cr, cp, cy), (sr, sp, sy) = np.cos(half), np.sin(half)
@@ -108,7 +108,7 @@ def ulog_attitude(epochs=60, rate_hz=40.0):
 
 
 def ulog_fused(epochs=60, **changes):
-    """Return fields of vehicle_global_position, of the moments between the receiver's epochs."""
+    """Return fields of vehicle_global_position at times between the receiver's epochs."""
     time, geodetic, _ = flight(2 * epochs, 20.0)
     fields = {
         "timestamp": ("uint64_t", boot_us(time, 0.0)),
@@ -137,12 +137,12 @@ _SCALED = {"c": 100, "C": 100, "e": 100, "E": 100, "L": 10_000_000}
 
 
 def dataflash_rows(*, epochs=60, receivers=(0,), parameters=None, without_ael=False, **changes):
-    """Return messages (name, {column: value}) in the order of time; changes are of columns of GPS."""
+    """Return messages (name, {column: value}) in order of time; `changes` replace columns of GPS."""
     time, geodetic, _ = flight(epochs)
     gps = gps_from_utc(utc_of(time)) - GPS_EPOCH
     week, ms = np.divmod(gps // np.timedelta64(1, "ms"), 604_800_000)
-    moved = {"Spd": np.full(epochs, 8.0), "GCrs": np.degrees(time * 8 / 50) % 360, "VZ": np.full(epochs, -0.5)}
-    columns = {"Status": np.full(epochs, 6), "GMS": ms, "GWk": week, **moved, **changes}
+    motion = {"Spd": np.full(epochs, 8.0), "GCrs": np.degrees(time * 8 / 50) % 360, "VZ": np.full(epochs, -0.5)}
+    columns = {"Status": np.full(epochs, 6), "GMS": ms, "GWk": week, **motion, **changes}
     rows = [(0, "PARM", {"Name": name, "Value": value}) for name, value in (parameters or {}).items()]
     for receiver in receivers:
         for n in range(epochs):
@@ -152,16 +152,16 @@ def dataflash_rows(*, epochs=60, receivers=(0,), parameters=None, without_ael=Fa
             rows.append((at["TimeUS"], "GPS", {**at, **of, "Lat": latitude, "Lng": longitude, "Alt": height - N_M}))
             known = -(2**31) / 100 if without_ael else height
             rows.append((at["TimeUS"], "GPA", {**at, "HAcc": 0.02, "VAcc": 0.03, "VV": 1, "AEl": known}))
-    for late in np.arange(-0.5, epochs / 10 + 0.5, 0.05):
-        turn = {"Roll": 10.0, "Pitch": 3.0, "Yaw": np.degrees(late * 8 / 50) % 360}
-        rows.append((int(boot_us(late, 0.0)), "ATT", {"TimeUS": int(boot_us(late, 0.0)), **turn}))
+    for time_s in np.arange(-0.5, epochs / 10 + 0.5, 0.05):
+        angles_deg = {"Roll": 10.0, "Pitch": 3.0, "Yaw": np.degrees(time_s * 8 / 50) % 360}
+        rows.append((int(boot_us(time_s, 0.0)), "ATT", {"TimeUS": int(boot_us(time_s, 0.0)), **angles_deg}))
     return [(name, values) for _, name, values in sorted(rows, key=lambda row: row[0])]
 
 
 def _formats(forms):
     own = {"FMT": (128, 89, _FMT), **{name: (130 + n, 0, form) for n, (name, form) in enumerate(forms.items())}}
     for name, (number, _, (form, columns)) in own.items():
-        size = struct.calcsize("<" + "".join(_STRUCTS.get(one, one) for one in form)) + 3
+        size = struct.calcsize("<" + "".join(_STRUCTS.get(letter, letter) for letter in form)) + 3
         yield {"Type": number, "Length": size, "Name": name, "Format": form, "Columns": columns}
 
 
@@ -169,25 +169,25 @@ def dataflash(rows, forms=None):
     """Return messages as a binary log."""
     forms = {**_FORMS, **(forms or {})}
     described = list(_formats(forms))
-    number = {one["Name"]: one["Type"] for one in described}
+    number = {row["Name"]: row["Type"] for row in described}
     parts = []
-    for name, values in [*(("FMT", one) for one in described), *rows]:
+    for name, values in [*(("FMT", row) for row in described), *rows]:
         form, columns = {**forms, "FMT": _FMT}[name]
         cells = []
         for kind, column in zip(form, columns.split(","), strict=True):
             cell = values.get(column, "" if kind in "nNZ" else 0)
             whole = round(cell * _SCALED[kind]) if kind in _SCALED else cell
             cells.append(whole.encode() if kind in "nNZ" else whole if kind in "fd" else int(whole))
-        packed = struct.pack("<" + "".join(_STRUCTS.get(one, one) for one in form), *cells)
+        packed = struct.pack("<" + "".join(_STRUCTS.get(letter, letter) for letter in form), *cells)
         parts.append(b"\xa3\x95" + bytes([number[name]]) + packed)
     return b"".join(parts)
 
 
 def dataflash_text(rows, forms=None):
-    """Return messages as the text that ground stations make of a binary log."""
+    """Return messages as the text log into which ground stations convert a binary log."""
     forms = {**_FORMS, **(forms or {})}
     digits = {"L": 7, "e": 2, "E": 2, "c": 2, "C": 2, "f": 6}
-    lines = [", ".join(["FMT", *(str(value) for value in one.values())]) for one in _formats(forms)]
+    lines = [", ".join(["FMT", *(str(value) for value in row.values())]) for row in _formats(forms)]
     for name, values in rows:
         form, columns = forms[name]
         cells = [

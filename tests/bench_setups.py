@@ -1,4 +1,4 @@
-"""A cabled tandem that stands still, right and spoilt in ways that benches are, with the flags of each."""
+"""A stationary tandem with cables, correct and with typical faults of a bench set-up, and the flags of each fault."""
 
 import json
 from collections.abc import Callable
@@ -26,7 +26,7 @@ from apertura.simulation.impairments import Clock, Reflection, TimeTag, Timing, 
 FLIGHT, TRANSMITTER, RECEIVER = "b01", "uav1", "uav2"
 PULSES = 120
 RADAR_M, SIDELINK_M = 10.0, 5.0
-"""Echo and back, 5 m away; electrical length of the sidelink's cable."""
+"""Path to the target and back, m, target 5 m away; electrical length of the sidelink cable, m."""
 
 _CARRIER_HZ, _RATE_HZ = 1.2e9, 1.024e9
 _WAVEFORM = WaveformSpecification(512, _CARRIER_HZ, 800e3, 1.5625e-6, 0.390625e-6, _RATE_HZ, 20.0)
@@ -46,7 +46,7 @@ RECEIVED = Impairments(
     radar_snr_db=10.0,
     sidelink_snr_db=30.0,
 )
-"""Of the receiver's channels, per subcarrier: 37 dB of a compressed pulse."""
+"""Impairments of the receiver's channels per subcarrier; 37 dB for a compressed pulse."""
 
 
 def cabled(
@@ -56,7 +56,7 @@ def cabled(
     pulses: int = PULSES,
     radar_m: float = 0.911,
 ) -> CampaignSpecification:
-    """Return a tandem on a bench: one echo of `RADAR_M`, `radar_m` of cable, a sidelink of `SIDELINK_M`."""
+    """Return a tandem on a bench: echo path `RADAR_M`, cable of `radar_m`, sidelink of `SIDELINK_M`."""
     nodes = {
         TRANSMITTER: SimulatedNode(impairments=own),
         RECEIVER: SimulatedNode(
@@ -65,9 +65,9 @@ def cabled(
             lever_arms_m={"radar_tx": (0, 0, 0)},
         ),
     }
-    apart = {TRANSMITTER: -SIDELINK_M / 2, RECEIVER: SIDELINK_M / 2}
-    away = float(np.sqrt((RADAR_M / 2) ** 2 - (SIDELINK_M / 2) ** 2))
-    tracks = {name: Straight((x, -away, 0.75), (0.0, 0.0, 0.0)) for name, x in apart.items()}
+    east_m = {TRANSMITTER: -SIDELINK_M / 2, RECEIVER: SIDELINK_M / 2}
+    south_m = float(np.sqrt((RADAR_M / 2) ** 2 - (SIDELINK_M / 2) ** 2))
+    tracks = {name: Straight((x, -south_m, 0.75), (0.0, 0.0, 0.0)) for name, x in east_m.items()}
     flight = SimulatedFlight(FLIGHT, TRANSMITTER, tracks, pulses, kind="bench")
     grid = ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1)
     target = (PointTarget((0.0, 0.0, 0.75)),)
@@ -81,12 +81,12 @@ _CABLED = cabled()
 
 @dataclass(frozen=True)
 class Setup:
-    """A set-up: how it is simulated, and what is done to its files afterwards.
+    """A set-up: its simulation, and the changes to its files afterwards.
 
     Attributes
     ----------
     flags
-        One of these must be raised; none: no flag at all.
+        At least one of these must be raised; an empty set: no flag at all.
     """
 
     flags: frozenset[str]
@@ -94,7 +94,7 @@ class Setup:
     spoil: Callable[[Path], None] = lambda _: None
 
     def write(self, folder: Path, seed: int) -> Path:
-        """Simulate it into a new folder, without flight logs."""
+        """Simulate the set-up into a new folder, without flight logs."""
         root = write_campaign(folder, self.specification, np.random.default_rng(seed))
         for log in (root / "raw" / FLIGHT).glob("*.track.*"):
             log.unlink()
@@ -104,7 +104,7 @@ class Setup:
 
 
 def samples_of(root: Path, node: str) -> tuple[Path, Path, dict, NDArray[np.int16]]:
-    """Return metadata and samples of a node, and both read: (capture, sample, channel, 2) int16."""
+    """Return both paths, the metadata and the samples (capture, sample, channel, 2) int16 of a node."""
     meta, data = (root / "raw" / FLIGHT / f"{node}.sigmf-{kind}" for kind in ("meta", "data"))
     described = json.loads(meta.read_text(encoding="utf-8"))
     channels = described["global"].get("core:num_channels", 1)
@@ -113,7 +113,7 @@ def samples_of(root: Path, node: str) -> tuple[Path, Path, dict, NDArray[np.int1
 
 
 def write_samples(meta: Path, data: Path, described: dict, iq: NDArray[np.int16]) -> None:
-    """Write them back, with captures where they now lie and without the hash of before."""
+    """Write samples and metadata with updated sample indices of the captures and without a hash."""
     for number, capture in enumerate(described["captures"]):
         capture["core:sample_start"] = number * iq.shape[1]
     described["global"].pop("core:sha512", None)
@@ -122,7 +122,7 @@ def write_samples(meta: Path, data: Path, described: dict, iq: NDArray[np.int16]
 
 
 def channel(node: str, number: int, change: Callable[[Samples], Samples]) -> Callable[[Path], None]:
-    """Return what changes the complex samples, (capture, sample), of one channel of a node."""
+    """Return a function that changes the complex samples (capture, sample) of one channel of a node."""
 
     def spoil(root: Path) -> None:
         meta, data, described, iq = samples_of(root, node)
@@ -147,7 +147,7 @@ def _captures(
 
 def _lost(captures: list, iq: NDArray[np.int16]) -> tuple[list, NDArray[np.int16]]:
     kept = np.flatnonzero(np.random.default_rng(5).random(len(captures)) > 0.1)
-    return [captures[one] for one in kept], iq[kept]
+    return [captures[index] for index in kept], iq[kept]
 
 
 def _stopped(captures: list, iq: NDArray[np.int16]) -> tuple[list, NDArray[np.int16]]:
@@ -155,9 +155,9 @@ def _stopped(captures: list, iq: NDArray[np.int16]) -> tuple[list, NDArray[np.in
 
 
 def _tone(x: Samples) -> Samples:
-    """Add a tone at a fifth of the band, 10 dB below the signal, of another phase in each capture."""
-    turns = 2 * np.pi * (80e6 * np.arange(x.shape[1]) / _RATE_HZ + np.random.default_rng(2).random((len(x), 1)))
-    return x + 0.3 * np.sqrt((np.abs(x) ** 2).mean()) * np.exp(1j * turns)
+    """Add a tone at a fifth of the band, 10 dB below the signal, with a random phase in each capture."""
+    phase_rad = 2 * np.pi * (80e6 * np.arange(x.shape[1]) / _RATE_HZ + np.random.default_rng(2).random((len(x), 1)))
+    return x + 0.3 * np.sqrt((np.abs(x) ** 2).mean()) * np.exp(1j * phase_rad)
 
 
 def _stuck(x: Samples) -> Samples:
@@ -166,7 +166,7 @@ def _stuck(x: Samples) -> Samples:
 
 
 def _false(captures: list, iq: NDArray[np.int16]) -> tuple[list, NDArray[np.int16]]:
-    """Put a capture of noise between two pulses, five times."""
+    """Insert a capture of noise between two pulses, five times."""
     rng, listed, rows = np.random.default_rng(6), [], []
     for number, capture in enumerate(captures):
         listed.append(capture)
@@ -184,7 +184,7 @@ def _swapped(root: Path) -> None:
 
 
 def _leaks(root: Path) -> None:
-    """Add what the sidelink records to the radar channel, 10 dB below."""
+    """Add the sidelink samples to the radar channel, 10 dB below."""
     meta, data, described, iq = samples_of(root, RECEIVER)
     iq[:, :, 0] = (iq[:, :, 0] + 0.3 * iq[:, :, 1]).round()
     write_samples(meta, data, described, iq)
@@ -201,7 +201,7 @@ def _stated(**paths: float) -> Callable[[Path], None]:
 
 
 def _split(root: Path) -> None:
-    """Say that one signal feeds both radar channels, and weaken one by 3 dB."""
+    """Configure one signal for both radar channels, and attenuate one by 3 dB."""
     edit_config(root, lambda config: config["bench"].update(split=True))
     channel(RECEIVER, 0, lambda x: 0.7 * x)(root)
 
@@ -215,13 +215,13 @@ def _along(x: Samples) -> NDArray[np.float64]:
 
 
 def _bad_contact(x: Samples) -> Samples:
-    """Lose a tenth of the captures, nearly, in bursts."""
+    """Attenuate about a tenth of the captures to near zero, in bursts."""
     bad = np.repeat(np.random.default_rng(8).random(-(-len(x) // 4)) < 0.1, 4)[: len(x)]
     return np.where(bad[:, None], 0.02 * x, x)
 
 
 def _moving_clock(x: Samples) -> Samples:
-    """Turn samples within each capture, faster and faster: 2 ppm of the carrier from first to last."""
+    """Rotate samples within each capture at an increasing rate: 2 ppm of the carrier from first to last."""
     time_s = np.arange(x.shape[1]) / _RATE_HZ
     return x * np.exp(-2j * np.pi * 2e-6 * _CARRIER_HZ * (_along(x) - 0.5) * time_s)
 
@@ -299,4 +299,4 @@ SPOILT = {
     "another transmitter": Setup(frozenset({"interference"}), spoil=channel(RECEIVER, 0, _tone)),
     "split unequal": Setup(frozenset({"splitter_channels_differ"}), spoil=_split),
 }
-"""What is wrong → a set-up with it, and which flags name it."""
+"""Fault → a set-up with it, and the flags that report it."""

@@ -1,6 +1,6 @@
-"""Shared campaigns: the real ones beside the repository, and small simulated ones made once a run. What is slow.
+"""Shared campaigns (real ones next to the repository, simulated ones generated once per run) and slow-test markers.
 
-Nothing of apertura is imported before a test needs it: the process that only hands out tests reads this file, too.
+Nothing of apertura is imported before a test needs it: the process that only distributes tests reads this file, too.
 """
 
 import fcntl
@@ -11,20 +11,20 @@ from fnmatch import fnmatchcase
 
 import pytest
 
-# Arrays here are small, and a test has one core: threads of BLAS that wait for work took a third of all time.
+# Arrays in tests are small, and a test has one core: idle BLAS threads took a third of the total time.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-# They run in other environments: of roc-validator, of QGIS.
+# These files run in other environments: that of roc-validator, that of QGIS.
 collect_ignore = ["crate/contexts.py", "crate/profile", "in_qgis.py"]
 
 
 COMPILING = {"apertura.core.imaging.backproject.backproject", "apertura.core.imaging.judgement.judge"}
-"""Doctests that are slow: the compiler of numba starts for them."""
+"""Doctests marked slow, because they start the compiler of numba."""
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
-    """Of tests that are marked ``quick(*ids)``, rows of other ids are slow; an id may hold stars."""
+    """Mark rows of tests marked ``quick(*ids)`` as slow if their id matches none; an id may contain wildcards."""
     named, met = {}, set()
     for item in items:
         if item.name in COMPILING:
@@ -37,19 +37,19 @@ def pytest_collection_modifyitems(config, items):
             met.update(matching)
             if not matching:
                 item.add_marker(pytest.mark.slow)
-    gone = [f"{function}[{row}]" for function, row in named.keys() - met]
-    if gone and not any("::" in arg for arg in config.args):
-        raise pytest.UsageError(f"marked quick, and no test: {', '.join(sorted(gone))}")
+    unmatched = [f"{function}[{row}]" for function, row in named.keys() - met]
+    if unmatched and not any("::" in arg for arg in config.args):
+        raise pytest.UsageError(f"marked quick, and no test: {', '.join(sorted(unmatched))}")
 
 
 def pytest_collection_finish():
-    """What was imported stays: no search for garbage needs to look at it again."""
+    """Exclude imported objects from garbage collection, since they stay alive until the end."""
     gc.freeze()
 
 
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory, worker_id):
-    """A folder that is made by the first worker that asks for it, and read by all."""
+    """Return a function that generates a shared folder in the first worker that requests it."""
 
     def made(name, make):
         base = tmp_path_factory.getbasetemp()
@@ -66,11 +66,11 @@ def made_once(tmp_path_factory, worker_id):
 
 @pytest.fixture(scope="session")
 def shared():
-    """../shared/data, where it exists."""
+    """Folder of real recordings, ../shared/data."""
     from folders import SHARED
 
     if not SHARED.is_dir():
-        pytest.skip("real recordings are not here: no ../shared/data beside the repository")
+        pytest.skip("real recordings not available: no ../shared/data next to the repository")
     return SHARED
 
 
@@ -84,7 +84,7 @@ def _tiny(made_once):
 
 @pytest.fixture
 def tiny(_tiny, tmp_path):
-    """A campaign folder of 40 pulses and 60 × 60 pixels, to be spoilt at will."""
+    """A campaign folder of 40 pulses and 60 × 60 pixels, writable for the test."""
     from folders import copy_writable
 
     return copy_writable(_tiny, tmp_path / "campaign")
@@ -92,7 +92,7 @@ def tiny(_tiny, tmp_path):
 
 @pytest.fixture(scope="session")
 def all_steps(made_once):
-    """A copy of a campaign folder with all its results, by the name of what is made; read only."""
+    """Return a function that runs all steps on a copy of a campaign folder, cached by name; read only."""
     from folders import copy_writable, run_steps
 
     from apertura.campaign.folder import Campaign
@@ -111,7 +111,7 @@ def finished_tiny(_tiny, all_steps):
 
 @pytest.fixture(scope="session")
 def run_by_snakemake(_tiny, made_once):
-    """The tiny campaign as `snakemake` itself runs it, each step a process, images in two jobs each; read only."""
+    """The tiny campaign run by `snakemake` itself, one process per step, each image in two jobs; read only."""
     from folders import copy_writable, finished, snakemake
 
     def run(root):
@@ -123,22 +123,22 @@ def run_by_snakemake(_tiny, made_once):
 
 @pytest.fixture(scope="session")
 def finished_sample(shared, all_steps, tmp_path_factory):
-    """The independently made campaign-sample with all its results; read only."""
+    """The independently generated campaign-sample with all its results; read only."""
     from folders import copy_writable, state
 
     campaign = copy_writable(shared / "campaign-sample", tmp_path_factory.mktemp("sample") / "campaign")
-    state(campaign, "scene", atmosphere={"refractivity_n": 0.0})  # which the model that made it flies in
+    state(campaign, "scene", atmosphere={"refractivity_n": 0.0})  # the model that generated it assumes vacuum
     return all_steps("sample", campaign)
 
 
 def pytest_generate_tests(metafunc):
-    """Tests with `isa` run on every instruction set of the compiled engine; the one that is taken here is quick."""
+    """Run tests with `isa` on every instruction set of the compiled engine; only the one selected here is quick."""
     if "isa" in metafunc.fixturenames:
         from apertura.core.backprojection.engines import native, native_binding
 
-        taken = next(filter(native_binding.supports, native.INSTRUCTION_SETS), None)
-        others = [pytest.param(isa, marks=pytest.mark.slow) for isa in native.INSTRUCTION_SETS if isa != taken]
-        metafunc.parametrize("isa", [taken, *others] if taken else others, indirect=True)
+        selected = next(filter(native_binding.supports, native.INSTRUCTION_SETS), None)
+        others = [pytest.param(isa, marks=pytest.mark.slow) for isa in native.INSTRUCTION_SETS if isa != selected]
+        metafunc.parametrize("isa", [selected, *others] if selected else others, indirect=True)
 
 
 @pytest.fixture
@@ -147,14 +147,14 @@ def isa(request, monkeypatch):
     from apertura.core.backprojection.engines import native_binding
 
     if not native_binding.supports(request.param):
-        pytest.skip(f"this machine has no {request.param}")
+        pytest.skip(f"this machine does not support {request.param}")
     monkeypatch.setenv("APERTURA_ISA", request.param)
     return request.param
 
 
 @pytest.fixture
 def toy(monkeypatch):
-    """The engine of `toy_engine.py`, known by its one row."""
+    """The engine of `toy_engine.py`, registered by one row of the engine table."""
     from apertura.core.backprojection.engines import ENGINES
 
     monkeypatch.setitem(ENGINES, "toy", "toy_engine")
@@ -162,7 +162,7 @@ def toy(monkeypatch):
 
 @pytest.fixture(params=["here", pytest.param("isolated", marks=pytest.mark.slow)])
 def reader(request, monkeypatch):
-    """What reads files that may crash their reader: this process, at once; by `make test-slow` one of its own, too."""
+    """Run readers that may crash in this process (fast); in `make test-slow` also in a process of their own."""
     if request.param == "here":
         from in_this_process import Processes
 

@@ -1,4 +1,4 @@
-"""Campaign folders for tests: copied, edited by hand, carried through every step in this process."""
+"""Campaign folders for tests: copied, edited, and run through every step in the test process."""
 
 import hashlib
 import json
@@ -71,7 +71,7 @@ UPHILL = np.array([ALONG[1], -ALONG[0]]) * 0.8 + ALONG * 0.6  # away from the tr
 
 
 def copy_writable(source: Path, target: Path) -> Path:
-    """Copy a folder to one that may be changed, and return that."""
+    """Copy a folder and make the copy writable; return it."""
     shutil.copytree(str(source), str(target), copy_function=shutil.copyfile)
     for folder in [target, *(path for path in target.rglob("*") if path.is_dir())]:
         folder.chmod(0o755)
@@ -79,32 +79,32 @@ def copy_writable(source: Path, target: Path) -> Path:
 
 
 def require_files(campaign: Campaign) -> None:
-    """Raise the first problem with the files that the config and the flights promise."""
+    """Raise the first problem with the files that config and flights require."""
     for problem in check_files(Examination(campaign)):
         raise problem
 
 
 def expected_plan(campaign: Campaign, flight: str, pair: str) -> Plan:
-    """Plan the image of a pair: from its echo, or from the flight logs before anything ran."""
+    """Plan the image of a pair from its echo, or from the flight logs before the echo step has run."""
     ground = scene.expected_scene(campaign, lambda: first_flight(campaign))
     return plan_pair(campaign, open_pair(campaign, flight, pair), ground)
 
 
 def settle_ground(campaign: Campaign) -> None:
-    """Run the steps between echo and profile."""
+    """Run the steps between the echo and profile steps."""
     scene.scene(campaign)
     if campaign.settings.scene.dem:
         scene.terrain(campaign)
 
 
 def ingest_all(campaign: Campaign) -> None:
-    """Ingest what both nodes of flight f01 recorded."""
+    """Ingest the recordings of both nodes of flight f01."""
     for node in ("uav1", "uav2"):
         ingest.ingest(campaign, "f01", node)
 
 
 def make_images(campaign: Campaign, flight: str) -> None:
-    """Run the steps between the scene's grid and the images of a flight."""
+    """Run the steps between the scene grid and the images of a flight."""
     pairs = campaign.flight(flight).pairs
     for pair in pairs:
         profile.profile(campaign, flight, pair)
@@ -114,11 +114,11 @@ def make_images(campaign: Campaign, flight: str) -> None:
 
 
 STAND_ON_ALL = frozenset({"mosaic", "map", "stac", "ro_crate"})
-"""Results that stand on every image of a campaign."""
+"""Results that depend on every image of a campaign."""
 
 
 def export_flight(campaign: Campaign, flight: str) -> None:
-    """Write what the images of a flight are for others: rasters and tracks."""
+    """Write the exports of a flight: rasters and tracks."""
     for pair in campaign.flight(flight).pairs:
         layers.layers(campaign, flight, pair, threads=2)
         export.export(campaign, flight, pair)
@@ -128,7 +128,7 @@ def export_flight(campaign: Campaign, flight: str) -> None:
 
 
 def run_steps(root: Path, *, exports: bool = True) -> Campaign:
-    """Run every step of a campaign in this process, as the workflow would."""
+    """Run every step of a campaign in this process, in the order of the workflow."""
     campaign = Campaign.load(root)
     for flight in campaign.image_flights:
         if isinstance(campaign.settings.waveform, SampledWaveform):
@@ -155,7 +155,7 @@ def run_steps(root: Path, *, exports: bool = True) -> Campaign:
 
 
 def quality_of(campaign: Campaign, pair: str) -> dict[str, Any]:
-    """Return what the image of a pair of flight f01 says of itself, before its flight is assessed."""
+    """Return the quality measures in the image of a pair of flight f01, before the flight is assessed."""
     quality: dict[str, Any] = open_stage(campaign.stage("image", "f01", pair), "image").attrs["quality"]
     return quality
 
@@ -181,7 +181,7 @@ def state(root: Path, section: str, **keys: object) -> Campaign:
 
 
 def edit_meta(root: Path, node: str, change: Callable[[dict[str, Any]], object]) -> None:
-    """Change what the SigMF file of a node says of its recording."""
+    """Change the SigMF metadata of a node's recording."""
     path = root / "raw" / "f01" / f"{node}.sigmf-meta"
     meta = json.loads(path.read_text())
     change(meta)
@@ -189,7 +189,7 @@ def edit_meta(root: Path, node: str, change: Callable[[dict[str, Any]], object])
 
 
 def edit_data(root: Path, node: str, change: Callable[[np.ndarray], object]) -> None:
-    """Rewrite the samples and their hash: damage that only the content shows."""
+    """Rewrite the samples and their hash, so that only the content reveals the damage."""
     path = root / "raw" / "f01" / f"{node}.sigmf-data"
     samples = np.fromfile(path, "<i2")
     change(samples)
@@ -205,7 +205,7 @@ def edit_track(root: Path, node: str, change: Callable[[list[str]], list[str]]) 
 
 
 def complaint(work: Callable[[], object]) -> str:
-    """Return the message of the `CampaignError` that the work must end with."""
+    """Return the message of the `CampaignError` that a call must raise."""
     with pytest.raises(CampaignError) as caught:
         work()
     return str(caught.value)
@@ -219,7 +219,7 @@ def small_simulation(
     pulses: int = 6,
     **flight: Any,
 ) -> CampaignSpecification:
-    """Two nodes at a low sampling rate; pulses 2 ms apart, so that a continuous recording stays small."""
+    """Return a specification of two nodes: low sampling rate and 2 ms pulse interval keep recordings small."""
     waveform = WaveformSpecification(64, 1.2e9 + 4567e3, 250e3, 5e-6, 2e-6, 32e6, 500.0)
     tracks = {"a": Straight((-2.0, -11.0, 5.0), (5.0, 0.0, 0.0)), "b": Straight((2.7, -11.0, 5.0), (5.0, 0.0, 0.0))}
     targets = (PointTarget((0.0, 0.0, 0.0)), PointTarget((1.0, 2.0, 0.5), 0.5))
@@ -233,14 +233,14 @@ def small_simulation(
 
 
 def recordings_of(specification: CampaignSpecification) -> tuple[dict[str, Observation], DrawnCampaign]:
-    """What each node of the first flight records, and the campaign that was drawn."""
+    """Return the recordings of each node of the first flight, and the drawn campaign."""
     campaign = draw_campaign(specification, np.random.default_rng(1))
     standing = scatterers(specification.origin, specification.targets, np.random.default_rng(0))
     return fly(campaign, specification.flights[0], standing, np.random.default_rng(0)), campaign
 
 
 def contents(root: Path) -> dict[str, bytes]:
-    """Every file below a folder."""
+    """Return the contents of every file below a folder."""
     return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
@@ -253,7 +253,7 @@ def write_plane(
     void: float | None = None,
     keep: Any = slice(None),
 ) -> Path:
-    """A DEM of the plane through the demo's origin, posts every metre, 20 m around; `keep` rows and columns of it."""
+    """Write a DEM of the plane through the demo origin: 1 m posts, 20 m around; `keep` selects rows and columns."""
     east, north, _ = projected_from_ecef("EPSG:32632", DEMO_ORIGIN.ecef(np.zeros(3)))
     west, top = np.floor(east) - 20, np.ceil(north) + 20
     x, y = np.meshgrid(west + 0.5 + np.arange(40), top - 0.5 - np.arange(40))
@@ -271,7 +271,7 @@ def write_plane(
 
 
 def snakemake(campaign: Path, *options: str, **popen: Any) -> subprocess.Popen[str]:
-    """Start Snakemake itself on a campaign, without the driver of `apertura run`."""
+    """Start Snakemake itself on a campaign, without `apertura run`."""
     environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
     command = [sys.executable, "-m", "snakemake", "--directory", str(campaign), "--cores", "2", *options]
     return subprocess.Popen(

@@ -1,6 +1,6 @@
-"""Run by a Python that has QGIS, never imported: say what QGIS makes of rasters, sample and draw them.
+"""Script for a Python with QGIS, never imported: report how QGIS reads rasters, sample and draw them.
 
-What is asked comes as JSON on stdin: {"tell": [raster], "sample": {raster: [[x, y]]}, "draw": {raster: [png, width]}}.
+Requests come as JSON on stdin: {"tell": [raster], "sample": {raster: [[x, y]]}, "draw": {raster: [png, width]}}.
 """
 
 import json
@@ -24,14 +24,14 @@ from qgis.PyQt.QtCore import QSize, Qt
 from qgis.PyQt.QtGui import QColor
 
 
-def told(path: str) -> dict[str, object]:
-    """Return what the layer says; its style is the one that QGIS found by itself."""
+def described(path: str) -> dict[str, object]:
+    """Return the properties of a layer, with the style that QGIS selects automatically."""
     layer = QgsRasterLayer(path, "raster")
     provider, renderer, extent = layer.dataProvider(), layer.renderer(), layer.extent()
     width, height = (
         size / pixels for size, pixels in ((extent.width(), layer.width()), (extent.height(), layer.height()))
     )
-    found: dict[str, object] = {
+    properties: dict[str, object] = {
         "valid": layer.isValid(),
         "crs": layer.crs().authid(),
         "wkt": layer.crs().toWkt(),
@@ -44,29 +44,31 @@ def told(path: str) -> dict[str, object]:
     QgsProject.instance().addMapLayer(layer)
     model = QgsLayerTreeModel(root)  # must outlive its nodes
     nodes = model.layerLegendNodes(root.findLayer(layer.id()))
-    found["legend"] = [node.data(Qt.DisplayRole) for node in nodes if isinstance(node, QgsRasterSymbolLegendNode)]
+    properties["legend"] = [node.data(Qt.DisplayRole) for node in nodes if isinstance(node, QgsRasterSymbolLegendNode)]
     ramps = [node.settings() for node in nodes if isinstance(node, QgsColorRampLegendNode)]
-    found["legend"] += [settings.suffix() for settings in ramps]
+    properties["legend"] += [settings.suffix() for settings in ramps]
     if renderer.type() == "singlebandgray" and renderer.contrastEnhancement():
         stretch: QgsContrastEnhancement = renderer.contrastEnhancement()
-        found["stretch"] = [stretch.minimumValue(), stretch.maximumValue()]
+        properties["stretch"] = [stretch.minimumValue(), stretch.maximumValue()]
     if renderer.type() == "paletted":
-        found["classes"] = {str(int(one.value)): [one.label, one.color.alpha()] for one in renderer.classes()}
+        properties["classes"] = {
+            str(int(entry.value)): [entry.label, entry.color.alpha()] for entry in renderer.classes()
+        }
     if renderer.type() == "singlebandpseudocolor":
-        found["stretch"] = [renderer.classificationMin(), renderer.classificationMax()]
-    return found
+        properties["stretch"] = [renderer.classificationMin(), renderer.classificationMax()]
+    return properties
 
 
 def sampled(path: str, places: list[tuple[float, float]]) -> list[float | None]:
-    """Return the values of the pixels at places (x, y) of the raster's own CRS; None without one."""
+    """Return the values of the pixels at points (x, y) in the raster's own CRS; None without a value."""
     layer = QgsRasterLayer(path, "raster")  # must outlive its provider
     provider = layer.dataProvider()
-    found = [provider.sample(QgsPointXY(x, y), 1) for x, y in places]
-    return [value if known else None for value, known in found]
+    samples = [provider.sample(QgsPointXY(x, y), 1) for x, y in places]
+    return [value if valid else None for value, valid in samples]
 
 
 def draw(path: str, picture: str, width: int) -> list[str]:
-    """Draw a raster as QGIS shows it, on ground of a colour that no style has; return what went wrong."""
+    """Draw a raster in QGIS, on a background of a colour that no style uses; return the errors."""
     layer = QgsRasterLayer(path, "raster")
     QgsProject.instance().addMapLayer(layer)
     settings = QgsMapSettings()
@@ -82,18 +84,18 @@ def draw(path: str, picture: str, width: int) -> list[str]:
     return [error.message for error in job.errors()]
 
 
-asked = json.load(sys.stdin)
+requests = json.load(sys.stdin)
 QgsApplication.setPrefixPath("/usr", True)
 application = QgsApplication([], False)
 application.initQgis()
 sys.stdout.write(
     json.dumps(
         {
-            "told": {path: told(path) for path in asked.get("tell", [])},
-            "sampled": {path: sampled(path, places) for path, places in asked.get("sample", {}).items()},
-            "errors": {path: draw(path, *into) for path, into in asked.get("draw", {}).items()},
+            "told": {path: described(path) for path in requests.get("tell", [])},
+            "sampled": {path: sampled(path, places) for path, places in requests.get("sample", {}).items()},
+            "errors": {path: draw(path, *into) for path, into in requests.get("draw", {}).items()},
         }
     )
 )
 sys.stdout.flush()
-os._exit(0)  # QGIS without a screen may crash when it is taken down
+os._exit(0)  # QGIS without a display may crash during shutdown

@@ -1,4 +1,4 @@
-"""What stands for `subprocess` where a module of apertura runs by ``python -m``: it then runs here, without a start."""
+"""Replacement for `subprocess` in modules that run ``python -m``: the module runs in this process."""
 
 import runpy
 import subprocess
@@ -10,18 +10,18 @@ from unittest.mock import patch
 
 
 class Processes:
-    """`subprocess`, but for the process."""
+    """`subprocess` without the process."""
 
     DEVNULL, TimeoutExpired = subprocess.DEVNULL, subprocess.TimeoutExpired
 
     @staticmethod
     def run(command, **_):
-        """Run ``python … -m module words`` in this process; limits that it sets itself are not set."""
-        words, said, status = command[command.index("-m") + 1 :], StringIO(), 0
-        with patch.object(sys, "argv", words), patch("resource.setrlimit"), redirect_stderr(said):
+        """Run ``python … -m module words`` in this process, without the resource limits that it sets itself."""
+        words, stderr, status = command[command.index("-m") + 1 :], StringIO(), 0
+        with patch.object(sys, "argv", words), patch("resource.setrlimit"), redirect_stderr(stderr):
             try:
                 with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # it is imported already
                     runpy.run_module(words[0], run_name="__main__")
             except SystemExit as end:
                 status = int(end.code or 0)
-        return subprocess.CompletedProcess(command, status, b"", said.getvalue().encode())
+        return subprocess.CompletedProcess(command, status, b"", stderr.getvalue().encode())

@@ -1,4 +1,4 @@
-"""How many examples a property is tried on: 25 by `make test`, all where `EXAMPLES` is `all`, as in the slow suite."""
+"""Number of examples per property: 25 in `make test`, all if `EXAMPLES` is `all`, as in the slow suite."""
 
 import os
 
@@ -8,7 +8,7 @@ QUICK = 25
 
 
 def tried(examples: int, *, derandomize: bool = True) -> settings:
-    """Settings of a property that is tried on so many examples; the same ones in each run, unless told otherwise."""
+    """Return settings with a number of examples; examples are the same in each run by default."""
     if os.environ.get("EXAMPLES") != "all":
         examples = min(examples, QUICK)
     return settings(max_examples=examples, deadline=None, derandomize=derandomize)

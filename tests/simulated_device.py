@@ -1,6 +1,6 @@
 """The GPU engine in numba's simulator against the double sum: run by a test in a process of its own.
 
-The simulator must be asked for before numba is imported, and would be in the way of other tests. By hand:
+The simulator must be requested before numba is imported, and would affect other tests. To run it manually:
 NUMBA_ENABLE_CUDASIM=1 python -m pytest -n0 tests/simulated_device.py
 """
 
@@ -49,12 +49,12 @@ def plain():
 
 @pytest.fixture(scope="module")
 def tables(plain):
-    """On the device once for all tests: the simulator takes longer for them than for an image."""
+    """Tables on the device, shared by all tests: in the simulator they take longer than an image."""
     return cuda.prepare(plain[2])
 
 
 def predicted_db(scene, pixels, profiles, beams=None, **requested):
-    """What the engine's own prediction says of a setting."""
+    """Return the error that the engine predicts for a setting."""
     signal = Signal(scene.carrier_hz, 2.0, profiles.step_m, profiles.samples.shape[1])
     spacing = float(np.linalg.norm((pixels[0, 1] - pixels[0, 0])[:2]))
     job = Job(
@@ -66,30 +66,30 @@ def predicted_db(scene, pixels, profiles, beams=None, **requested):
 
 
 @pytest.mark.parametrize(("bistatic", "rough_m"), [(True, 0.3), (False, 0.0)])
-def test_the_predicted_error_is_kept(bistatic, rough_m):
-    """Any surface: pixels need not lie on a plane, nor near one."""
+def test_error_stays_within_prediction(bistatic, rough_m):
+    """On any surface: pixels need not lie on or near a plane."""
     pixels = pixel_grid(16, 18)
     pixels[..., 2] = rough_m * np.random.default_rng(6).standard_normal((16, 18))
     scene = fly(scatter(pixels), pulses=PULSES, bistatic=bistatic)
     profiles = scene.profiles(ecef(pixels))
     image = cuda.form(cuda.prepare(profiles, oversampling=6), ecef(pixels), tolerance_rad=1.5e-3)
-    said = predicted_db(scene, pixels, profiles, oversampling=6, tolerance_rad=1.5e-3)
-    assert -80 < said < -70
-    assert error_db(scene, pixels, image) <= said + 3
+    predicted_error_db = predicted_db(scene, pixels, profiles, oversampling=6, tolerance_rad=1.5e-3)
+    assert -80 < predicted_error_db < -70
+    assert error_db(scene, pixels, image) <= predicted_error_db + 3
 
 
 @pytest.mark.parametrize(("range_m", "tolerance_rad"), [(4.0, 1.5e-3), (4.0, 1e-9), (0.6, 1.5e-3)])
-def test_near_ranges_and_small_tolerances_take_exact_paths_and_the_same_error(range_m, tolerance_rad):
-    """At 4 m by the series or in float64 alone; at 0.6 m the series would not converge."""
+def test_near_ranges_and_small_tolerances_use_exact_paths(range_m, tolerance_rad):
+    """At 4 m by the series or in float64 alone; at 0.6 m the series does not converge."""
     pixels = pixel_grid(16, 16, range_m=range_m)
     scene = fly(scatter(pixels), range_m=range_m, pulses=6)
     profiles = scene.profiles(ecef(pixels))
     image = cuda.form(cuda.prepare(profiles, oversampling=8), ecef(pixels), tolerance_rad=tolerance_rad)
-    said = predicted_db(scene, pixels, profiles, oversampling=8, tolerance_rad=tolerance_rad)
-    assert error_db(scene, pixels, image) <= said + 3
+    predicted_error_db = predicted_db(scene, pixels, profiles, oversampling=8, tolerance_rad=tolerance_rad)
+    assert error_db(scene, pixels, image) <= predicted_error_db + 3
 
 
-def test_carriers_that_turn_often_within_a_cell_are_held():
+def test_many_carrier_cycles_per_resolution_cell_keep_the_error():
     pixels = pixel_grid(16, 16, spacing_m=C / 10e9 / 4)
     scene = fly(scatter(pixels), carrier_hz=10e9, pulses=8)
     profiles = scene.profiles(ecef(pixels))
@@ -97,8 +97,8 @@ def test_carriers_that_turn_often_within_a_cell_are_held():
     assert error_db(scene, pixels, image) <= predicted_db(scene, pixels, profiles, oversampling=6, tolerance_rad=1.5e-3)
 
 
-def test_tiles_and_threads_give_the_same_bits(plain, tables):
-    """Two threads at one device, each with a tile that begins at a multiple of 16 pixels."""
+def test_tiles_and_threads_are_bitwise_equal(plain, tables):
+    """Two threads on one device, each with a tile that starts at a multiple of 16 pixels."""
     places = ecef(plain[1])
     whole = cuda.form(tables, places)
     with ThreadPoolExecutor(2) as pool:
@@ -106,8 +106,8 @@ def test_tiles_and_threads_give_the_same_bits(plain, tables):
     np.testing.assert_array_equal(np.hstack([left, right]).view(np.uint32), whole.view(np.uint32))
 
 
-def test_slices_and_copies_of_tables_are_those_of_their_pulses(plain, tables):
-    """A slice shares what is on the device; a copy that went to another process makes its own."""
+def test_slices_and_copies_of_tables_sum_their_pulses(plain, tables):
+    """A slice shares the arrays on the device; a copy in another process makes its own."""
     places = ecef(plain[1])[:, :16]
     whole = cuda.form(tables, places)
     parts = [tables[0:10], tables[2:][8:]]
@@ -118,19 +118,19 @@ def test_slices_and_copies_of_tables_are_those_of_their_pulses(plain, tables):
     np.testing.assert_array_equal(cuda.form(copy, places), cuda.form(parts[0], places))
 
 
-def test_more_pulses_than_are_looked_at_together_are_all_summed():
+def test_more_pulses_than_a_chunk_are_all_summed():
     pixels = pixel_grid(4, 4)
     scene = fly(scatter(pixels), pulses=70)
     profiles = scene.profiles(ecef(pixels))
     tables = cuda.prepare(profiles, oversampling=4)
     for tolerance_rad in (1.5e-3, 1e-12):  # by the series, and by exact paths
         image = cuda.form(tables, ecef(pixels), tolerance_rad=tolerance_rad)
-        said = predicted_db(scene, pixels, profiles, oversampling=4, tolerance_rad=tolerance_rad)
-        assert error_db(scene, pixels, image) <= said
+        predicted_error_db = predicted_db(scene, pixels, profiles, oversampling=4, tolerance_rad=tolerance_rad)
+        assert error_db(scene, pixels, image) <= predicted_error_db
 
 
 @pytest.mark.parametrize("nowhere", [np.nan, -np.inf])
-def test_a_pixel_without_a_position_is_nan_and_spoils_no_other(plain, tables, nowhere):
+def test_pixel_without_position_is_nan_and_affects_no_other(plain, tables, nowhere):
     scene, pixels, _ = plain
     pixels = pixels[:, :16]
     places = ecef(pixels)
@@ -141,8 +141,8 @@ def test_a_pixel_without_a_position_is_nan_and_spoils_no_other(plain, tables, no
     assert error_db(scene, pixels, image) <= -70
 
 
-def test_pixels_beyond_the_profiles_are_zero_and_others_unharmed(plain, tables):
-    """Beyond all profiles; and where profiles that are cut short end inside the patch."""
+def test_pixels_beyond_the_profiles_are_zero_and_others_unchanged(plain, tables):
+    """Beyond all profiles; and where truncated profiles end inside the patch."""
     scene, pixels, profiles = plain
     far = ecef(pixels)
     far[:, 16:] += 1000.0
@@ -164,7 +164,7 @@ def test_pixels_beyond_the_profiles_are_zero_and_others_unharmed(plain, tables):
 
 
 def weights_of(scene, places, kind):
-    """A sector, inside of which some pulses are, at whose edge and outside of it others; beams; both; or one beam."""
+    """Return weights: a sector with pulses inside, outside and at its edge; beams; both; or one beam."""
     flown = Aperture(scene.tx, scene.rx)
     sector = Sector.of(flown, chord_m=1.2, centre=0.02, half=0.12)
     ahead = Sector.of(flown, chord_m=1.2, centre=0.6, half=0.15).following(flown, places[::8, ::8].reshape(-1, 3))
@@ -198,7 +198,7 @@ def weights_of(scene, places, kind):
         ("all", True, 0.0, 1e-9),
     ],
 )
-def test_weighed_pulses_are_those_of_the_double_sum(kind, bistatic, rough_m, tolerance_rad):
+def test_weighted_pulses_match_the_double_sum(kind, bistatic, rough_m, tolerance_rad):
     """By series with weights in float32, and by exact paths with weights in float64; on any surface."""
     pixels = pixel_grid(16, 18)
     pixels[..., 2] = rough_m * np.random.default_rng(6).standard_normal((16, 18))
@@ -215,23 +215,23 @@ def test_weighed_pulses_are_those_of_the_double_sum(kind, bistatic, rough_m, tol
     tables = cuda.prepare(profiles, oversampling=6)
     image = cuda.form(tables, places, beams=beams, tolerance_rad=tolerance_rad, counts=counts)
     truth = reference.form(scene.history(), places, beams=beams)
-    said = predicted_db(scene, pixels, profiles, beams, oversampling=6, tolerance_rad=tolerance_rad)
-    assert -80 < said < -70
-    assert decibels(image - truth, truth) <= said + 3
+    predicted_error_db = predicted_db(scene, pixels, profiles, beams, oversampling=6, tolerance_rad=tolerance_rad)
+    assert -80 < predicted_error_db < -70
+    assert decibels(image - truth, truth) <= predicted_error_db + 3
     assert decibels(reference.form(scene.history(), places) - truth, truth) > -20  # the weights matter
     summed = counts[0] if tolerance_rad > 1e-6 else counts[1]
     assert counts.sum() == weight.size
     assert (weight != 0).sum() <= summed == counts[:2].sum()
 
 
-def test_a_sector_finer_than_float32_resolves_is_weighed_as_exactly():
-    """An edge 4e-5 wide, all over a patch at 28 km: s is taken from its change over the patch, not as a whole."""
+def test_sector_finer_than_float32_is_weighted_exactly():
+    """An edge 4e-5 wide across a patch at 28 km: s is computed from its change over the patch, not as a whole."""
     pixels = pixel_grid(16, 16, range_m=20e3)
     scene = fly(scatter(pixels), range_m=20e3, pulses=8)
     places, profiles = ecef(pixels), scene.profiles(ecef(pixels))
     sector = Sector.of(profiles.aperture, chord_m=2e3, centre=0.0, half=2e-4)
-    there = float(sector.place(profiles.aperture, places[8, 8][None])[2, 0])
-    beams = Beams(sector=replace(sector, centre=there + sector.half))
+    at_patch = float(sector.place(profiles.aperture, places[8, 8][None])[2, 0])
+    beams = Beams(sector=replace(sector, centre=at_patch + sector.half))
     weight = beams.weight(profiles.aperture, places.reshape(-1, 3))
     assert np.all((weight[2] > 0.05) & (weight[2] < 0.95))
     assert np.all(np.delete(weight, 2, axis=0) == 0)
@@ -240,20 +240,22 @@ def test_a_sector_finer_than_float32_resolves_is_weighed_as_exactly():
     assert decibels(image - truth, truth) <= -80
 
 
-def test_what_a_pattern_says_of_phase_is_taken_out_by_no_engine(plain, tables):
+def test_pattern_phase_is_not_compensated(plain, tables):
     scene, pixels, _ = plain
     places = ecef(pixels)[:, :16]
     soft = swaying_beam(scene.tx, (12, 0, 0))
-    turned = replace(soft, azimuth_phase_rad=np.linspace(0, 3, 701), elevation_phase_rad=np.linspace(1, 0, 401))
-    with_phase, without = (cuda.form(tables, places, beams=Beams(beam)) for beam in (turned, soft))
+    with_pattern_phase = replace(
+        soft, azimuth_phase_rad=np.linspace(0, 3, 701), elevation_phase_rad=np.linspace(1, 0, 401)
+    )
+    with_phase, without = (cuda.form(tables, places, beams=Beams(beam)) for beam in (with_pattern_phase, soft))
     np.testing.assert_array_equal(with_phase.view(np.uint32), without.view(np.uint32))
 
 
-def test_weighed_tiles_have_the_same_bits_and_so_has_what_is_one_everywhere(plain, tables):
+def test_weighted_tiles_and_unit_weights_are_bitwise_equal(plain, tables):
     scene, pixels, _ = plain
     places = ecef(pixels)
     beams = weights_of(scene, places, "all")
-    whole, part = (cuda.form(tables, some, beams=beams) for some in (places, places[:, 16:]))
+    whole, part = (cuda.form(tables, points, beams=beams) for points in (places, places[:, 16:]))
     np.testing.assert_array_equal(part.view(np.uint32), whole[:, 16:].view(np.uint32))
     everywhere = Sector.of(Aperture(scene.tx, scene.rx), chord_m=1.2, centre=0.0, half=3.0)
     inside, plainly = (cuda.form(tables, places[:, 16:], beams=beams) for beams in (Beams(sector=everywhere), None))
@@ -269,15 +271,19 @@ def long():
 
 
 def steady(scene, turn_deg, width_deg=8.0):
-    """A beam that follows the scene but for an angle."""
+    """Return a beam that follows the scene at an offset angle."""
     beam = swaying_beam(scene.tx, (12, 0, 0), width_deg, sway_deg=0)
-    turn, zero = np.radians(turn_deg), np.zeros(len(scene.tx))
-    rows = [[np.cos(turn), np.sin(turn), zero], [-np.sin(turn), np.cos(turn), zero], [zero, zero, zero + 1]]
+    offset_rad, zero = np.radians(turn_deg), np.zeros(len(scene.tx))
+    rows = [
+        [np.cos(offset_rad), np.sin(offset_rad), zero],
+        [-np.sin(offset_rad), np.cos(offset_rad), zero],
+        [zero, zero, zero + 1],
+    ]
     return Beams(replace(beam, axes=np.moveaxis(np.array(rows), -1, 0) @ beam.axes))
 
 
 def veering(sector, flown, place):
-    """The same sector of a flight that heads for its middle for some pulses at the end of each 64."""
+    """Return the same sector for a flight that heads for its middle for some pulses at the end of each 64."""
     axes = []
     for leg, axis in zip(flown.legs, (sector.tx_axis, sector.rx_axis), strict=True):
         toward = (place - leg) / np.linalg.norm(place - leg, axis=1, keepdims=True)
@@ -286,12 +292,12 @@ def veering(sector, flown, place):
 
 
 def ending_near(sector, scene, place):
-    """The same sector, centred by a pulse so near that its s changes over a patch more than that of others."""
-    away = ecef(np.array([12.0, 0.0, 2.0]))[None]
+    """Return the same sector, centred by a pulse so near that its s changes more over a patch than that of others."""
+    near_position = ecef(np.array([12.0, 0.0, 2.0]))[None]
     along = (ecef(np.array([0.7, 0.7, 0.0])) - ecef(np.zeros(3)))[None] / 2
     end = Sector(along, along, 0.0, sector.half)
-    at = float(end.place(Aperture(away, away), place[None])[0, 0])
-    return Beams(sector=replace(sector, centre=at, ends=(Aperture(away, away), end)))
+    at = float(end.place(Aperture(near_position, near_position), place[None])[0, 0])
+    return Beams(sector=replace(sector, centre=at, ends=(Aperture(near_position, near_position), end)))
 
 
 @pytest.mark.parametrize(
@@ -305,8 +311,8 @@ def ending_near(sector, scene, place):
         "a beam that looks in",
     ],
 )
-def test_pulses_that_are_left_out_change_nothing_to_the_bit(long, kind):
-    """Whole chunks of them, or single ones; also where the middle of a chunk is left out and its ends are not."""
+def test_excluded_pulses_change_no_bit(long, kind):
+    """Whole chunks and single pulses are excluded, also chunks whose middle is excluded and whose ends are not."""
     scene, places, tables = long
     flown = Aperture(scene.tx, scene.rx)
     sector = Sector.of(flown, chord_m=1.2, centre=0.0, half=0.03)
@@ -327,36 +333,36 @@ def test_pulses_that_are_left_out_change_nothing_to_the_bit(long, kind):
     assert counts[1].tolist() == [12 * 130, 0, 0, 0]
     chunks = np.add.reduceat(weight, [0, 64, 128]) > 0
     unseen = 12 * np.array([64, 64, 2])[~chunks].sum()
-    assert counts[0, 3] == unseen  # a whole chunk costs one look
+    assert counts[0, 3] == unseen  # a whole chunk costs one check
     assert 12 * weight.sum() <= counts[0, 0] <= 12 * (weight.sum() + 4)
-    parts = [cuda.form(tables[some], places, beams=beams[some]) for some in (slice(0, 64), slice(64, 130))]
+    parts = [cuda.form(tables[chunk], places, beams=beams[chunk]) for chunk in (slice(0, 64), slice(64, 130))]
     assert decibels(sum(parts) - image, image) <= -110
 
 
-def test_more_chunks_than_threads_are_looked_at_group_by_group(long):
-    """128 pulses flown 33 times over: 66 chunks, and ten pulses of the last one see the scene."""
+def test_more_chunks_than_threads_are_checked_in_groups(long):
+    """128 pulses repeated 33 times: 66 chunks, and ten pulses of the last one illuminate the scene."""
     from numba import cuda as numba_cuda
 
     scene, places, tables = long
     cuda.form(tables, places)
-    often, pulses = cuda.Resident(), 33 * 128
-    often.arrays = tuple(
+    repeated, pulses = cuda.Resident(), 33 * 128
+    repeated.arrays = tuple(
         numba_cuda.to_device(np.concatenate([array.copy_to_host()[:128]] * 33)) for array in tables.resident.arrays
     )
-    many, turn = replace(tables, pulses=slice(0, pulses), resident=often), np.full(pulses, 100.0)
+    many, turn = replace(tables, pulses=slice(0, pulses), resident=repeated), np.full(pulses, 100.0)
     turn[-20:-10] = 0.0
     beams, counts = steady(replace(scene, tx=np.tile(scene.tx[:128], (33, 1))), turn), np.zeros(4, np.int64)
     image = cuda.form(many, places, beams=beams, counts=counts)
     assert counts.tolist() == [12 * 10, 0, 12 * 54, 12 * (pulses - 64)]
     last = slice(pulses - 64, pulses)
-    some = cuda.form(many[last], places, beams=beams[last])
-    np.testing.assert_array_equal(image.view(np.uint32), some.view(np.uint32))
+    last_chunk = cuda.form(many[last], places, beams=beams[last])
+    np.testing.assert_array_equal(image.view(np.uint32), last_chunk.view(np.uint32))
     assert np.all(image != 0)
 
 
 @compiled
-def test_pixels_that_no_pulse_reaches_are_those_of_the_compiled_engine(plain, tables):
-    """Zero, which the steps write as no data."""
+def test_unilluminated_pixels_match_the_compiled_engine(plain, tables):
+    """Their value is zero, which the steps write as no data."""
     scene, pixels, profiles = plain
     places, flown = ecef(pixels), Aperture(scene.tx, scene.rx)
     beams = Beams(None, hard_beam(swaying_beam(scene.rx, (11.8, 0, 0), sway_deg=1), 0.8))
@@ -369,10 +375,10 @@ def test_pixels_that_no_pulse_reaches_are_those_of_the_compiled_engine(plain, ta
     np.testing.assert_array_equal(image != 0, compiled_image != 0)
     np.testing.assert_array_equal(image != 0, lit)
     truth = reference.form(scene.history(), places, beams=beams)
-    assert decibels(image - truth, truth) <= -70  # to the very edge
+    assert decibels(image - truth, truth) <= -70  # up to the edge of the beam
 
 
-def test_a_pixel_without_a_position_spoils_no_weight(plain, tables):
+def test_pixel_without_position_affects_no_weight(plain, tables):
     scene, pixels, _ = plain
     places = ecef(pixels)[:, :16]
     beams = weights_of(scene, places, "all")
@@ -388,7 +394,7 @@ def test_a_pixel_without_a_position_spoils_no_weight(plain, tables):
 
 
 @pytest.mark.parametrize("weights", [{}, {"integration": {"degrees": 20.0}}])
-def test_an_image_by_the_device_is_certified_like_any_other(weights):
+def test_device_image_is_certified(weights):
     frequency = 1.2e9 + 4e6 * np.arange(64)
     along = np.linspace(-4, 4, 12)
     track = np.stack([along, np.full(12, -10.0), np.full(12, 5.0)], -1)
@@ -413,7 +419,7 @@ def test_an_image_by_the_device_is_certified_like_any_other(weights):
     assert np.abs(image).max().item() == pytest.approx(1.0, abs=0.05) or weights
 
 
-def test_the_simulator_is_taken_where_it_is_asked_for_and_nowhere_else():
+def test_simulator_is_used_only_on_request():
     assert cuda.available()
     assert plan(overrides={"engine": "cuda"}).engine == "cuda"
     for accuracy_db in (-30.0, -60.0, -100.0, -125.0):
@@ -421,8 +427,8 @@ def test_the_simulator_is_taken_where_it_is_asked_for_and_nowhere_else():
         assert "cuda" not in {chosen.engine, *(setting.engine for setting in chosen.fallbacks)}
 
 
-def test_what_the_device_refuses_is_one_message(plain, monkeypatch):
-    """A device without room, or one that breaks off: numba.cuda's own error, as drivers raise it."""
+def test_device_error_is_one_message(plain, monkeypatch):
+    """A device without memory, or one that fails: numba.cuda's own error, as raised by drivers."""
     from numba import cuda as numba_cuda
     from numba.cuda.cudadrv.driver import CudaAPIError
 

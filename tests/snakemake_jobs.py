@@ -1,6 +1,6 @@
-"""`python tests/snakemake_jobs.py OPTIONS`: snakemake, which prints every job that it plans as a line of JSON.
+"""`python tests/snakemake_jobs.py OPTIONS`: snakemake, printing every planned job as a line of JSON.
 
-With a message Snakemake prints that instead of a job's inputs and outputs; a logger plugin is told all of them.
+With a message Snakemake prints that instead of a job's inputs and outputs; a logger plugin receives all of them.
 """
 
 import json
@@ -13,7 +13,7 @@ from snakemake_interface_logger_plugins.registry import LoggerPluginRegistry
 
 
 class LogHandler(LogHandlerBase):
-    """Prints jobs, and errors as they are."""
+    """Logger plugin that prints jobs, and error messages unchanged."""
 
     writes_to_stream = True
     writes_to_file = False

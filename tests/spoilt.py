@@ -1,4 +1,4 @@
-"""Finished campaigns spoilt byte by byte, for tests of what notices it."""
+"""Finished campaigns with single damaged bytes, for tests of integrity checks."""
 
 import json
 
@@ -20,12 +20,12 @@ def flip(path, at=None):
 
 
 def wrong(root, product=DB):
-    """Link → state, of those that are not the same."""
+    """Return the state of each link that differs from "same"."""
     return {link.name: link.state for link in verify(root / product).links if link.state != "same"}
 
 
 def edited(path, change):
-    """Write a JSON file as the workflow would, with something changed."""
+    """Change a JSON file and write it in the format of the workflow."""
     document = json.loads(path.read_text())
     change(document)
     path.write_text(json.dumps(document, indent=1, sort_keys=True) + "\n")

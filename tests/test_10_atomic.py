@@ -1,4 +1,4 @@
-"""A file or folder is complete or absent, whoever writes it and whoever is killed."""
+"""Atomic writes: a file or folder is complete or absent, with several writers and with killed ones."""
 
 import errno
 import os
@@ -21,7 +21,7 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_a_second_writer_of_the_same_file_waits(tmp_path):
+def test_second_writer_of_a_file_waits(tmp_path):
     path = tmp_path / "note.txt"
 
     def write_second():
@@ -44,22 +44,22 @@ MANY = """
 import sys
 from pathlib import Path
 from apertura.common.atomic import write_text
-for turn in range(40):
+for _ in range(40):
     write_text(Path(sys.argv[1]), sys.argv[2] * 20000)
 """
 
 
 @pytest.mark.slow
-def test_many_writers_at_once_leave_one_complete_file(tmp_path):
+def test_concurrent_writers_leave_one_complete_file(tmp_path):
     path = tmp_path / "note.txt"
     writers = [subprocess.Popen([sys.executable, "-c", MANY, path, letter]) for letter in "abc"]
-    seen = set()
+    contents = set()
     while any(writer.poll() is None for writer in writers):
         if path.exists():
-            seen.add(path.read_text())
+            contents.add(path.read_text())
         time.sleep(0.001)
     assert [writer.returncode for writer in writers] == [0, 0, 0]
-    assert seen | {path.read_text()} <= {letter * 20000 for letter in "abc"}
+    assert contents | {path.read_text()} <= {letter * 20000 for letter in "abc"}
     assert names(tmp_path) == ["note.txt"]
 
 
@@ -74,7 +74,7 @@ with replacement(Path(sys.argv[1])) as temporary:
 """
 
 
-def test_what_a_killed_writer_left_is_cleared_by_the_next(tmp_path):
+def test_next_writer_clears_leftovers_of_a_killed_writer(tmp_path):
     path = tmp_path / "folder"
     killed = subprocess.run([sys.executable, "-c", KILLED, path], check=False)
     assert killed.returncode == -signal.SIGKILL
@@ -87,7 +87,7 @@ def test_what_a_killed_writer_left_is_cleared_by_the_next(tmp_path):
     assert names(path) == ["all"]
 
 
-def test_an_error_keeps_what_was_there_and_leaves_nothing_else(tmp_path):
+def test_failed_write_keeps_the_previous_file(tmp_path):
     write_text(tmp_path / "note.txt", "before")
 
     def fail():
@@ -103,7 +103,7 @@ def test_an_error_keeps_what_was_there_and_leaves_nothing_else(tmp_path):
     assert (tmp_path / "note.txt").read_text() == "before"
 
 
-def test_a_file_reaches_the_disk_before_it_has_its_name_and_its_name_after(tmp_path, monkeypatch):
+def test_file_is_synced_before_renaming_and_folder_after(tmp_path, monkeypatch):
     path, synchronised = tmp_path / "note.txt", []
 
     def fsync(descriptor):
@@ -115,12 +115,12 @@ def test_a_file_reaches_the_disk_before_it_has_its_name_and_its_name_after(tmp_p
     assert synchronised == [("/.note.txt.wip/random/note.txt", False), ("", True)]
 
 
-def test_numbers_and_arrays_of_numpy_are_json(tmp_path):
+def test_numpy_numbers_and_arrays_are_written_as_json(tmp_path):
     write_json(tmp_path / "x.json", {"b": np.float32(0.5), "a": np.arange(2)})
     assert (tmp_path / "x.json").read_text() == '{\n "a": [\n  0,\n  1\n ],\n "b": 0.5\n}\n'
 
 
-def test_a_file_written_beside_reaches_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+def test_write_beside_syncs_before_renaming(tmp_path, monkeypatch):
     path, synchronised = tmp_path / "c" / "0", []
     monkeypatch.setattr(os, "fsync", lambda _: synchronised.append(path.exists()))
     write_beside(path, b"all of it")
@@ -128,7 +128,7 @@ def test_a_file_written_beside_reaches_the_disk_before_it_has_its_name(tmp_path,
     assert path.read_bytes() == b"all of it"
 
 
-def test_a_write_that_fails_leaves_what_was_there_and_names_its_file(tmp_path, monkeypatch):
+def test_full_disk_keeps_the_file_and_names_it(tmp_path, monkeypatch):
     path = tmp_path / "0"
     write_beside(path, b"before")
 
@@ -144,7 +144,7 @@ def test_a_write_that_fails_leaves_what_was_there_and_names_its_file(tmp_path, m
     assert path.read_bytes() == b"before"
 
 
-def test_removing_a_link_keeps_what_it_points_to(tmp_path):
+def test_removing_a_link_keeps_its_target(tmp_path):
     (tmp_path / "kept").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "kept")
     for name in ("link", "absent"):
@@ -164,14 +164,14 @@ def test_removing_a_link_keeps_what_it_points_to(tmp_path):
         (errno.EMFILE, "ulimit -n"),
     ],
 )
-def test_an_error_of_the_machine_says_what_it_was_where_and_what_to_do(tmp_path, number, remedy):
+def test_system_error_message_has_path_cause_and_remedy(tmp_path, number, remedy):
     message = explained(OSError(number, os.strerror(number), str(tmp_path / "absent" / "x.tif")))
     assert message.startswith(f"{tmp_path}/absent/x.tif: {os.strerror(number)} ({errno.errorcode[number]})")
     assert remedy in message
     assert message.endswith("run again: the run resumes.")
 
 
-def test_memory_that_is_gone_and_a_reader_that_is_gone_are_no_defects():
+def test_out_of_memory_and_broken_pipe_are_explained():
     with pytest.raises(MemoryError) as caught:
         np.empty(1 << 62, np.uint8)
     assert explained(caught.value).startswith("out of memory: Unable to allocate")
@@ -179,5 +179,5 @@ def test_memory_that_is_gone_and_a_reader_that_is_gone_are_no_defects():
 
 
 @pytest.mark.parametrize("defect", [KeyError("x"), FileNotFoundError(errno.ENOENT, "no"), ValueError("No space left")])
-def test_a_defect_is_not_explained_away(defect):
+def test_internal_error_is_not_explained(defect):
     assert explained(defect) is None

@@ -1,4 +1,4 @@
-"""The config's model, its generated files and what it refuses."""
+"""Model of the config, its generated files, and the values that it rejects."""
 
 import json
 import re
@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 CONDA_NAMES = {"dask": "dask-core", "matplotlib": "matplotlib-base", "snakemake": "snakemake-minimal"}
 
 
-def test_the_template_is_a_valid_config_and_comments_every_key():
+def test_template_is_valid_and_comments_every_key():
     lines = config_template().splitlines()
     assert validated(yaml.safe_load(config_template()), where="template").campaign == "my_campaign"
     keys = [number for number, line in enumerate(lines) if re.match(r"\s*[a-z_]+:", line)]
@@ -31,7 +31,7 @@ def test_the_template_is_a_valid_config_and_comments_every_key():
     assert uncommented == []
 
 
-def test_the_template_says_what_range_and_words_the_options_of_engines_take():
+def test_template_lists_ranges_and_choices_of_engine_options():
     template = config_template()
     assert re.search(r"tree\.oversampling: .* \(8 to 64\)\n", template)
     assert re.search(r"native\.tolerance_rad: .* \(above 0 to 0\.1\)\n", template)
@@ -39,21 +39,21 @@ def test_the_template_says_what_range_and_words_the_options_of_engines_take():
 
 
 @pytest.mark.parametrize("kind", WAVEFORMS)
-def test_init_writes_a_valid_config_of_the_kind_asked_and_names_the_others(tmp_path, kind):
+def test_init_writes_a_valid_config_of_the_requested_kind(tmp_path, kind):
     run = CliRunner().invoke(app, ["init", str(tmp_path / "new"), "--kind", kind])
     assert run.exit_code == 0, run.output
     text = (tmp_path / "new/config/config.yaml").read_text(encoding="utf-8")
     assert validated(yaml.safe_load(text), where="config.yaml").waveform.kind == kind
     comment, line = re.search(r"^ *# (.*)\n( *kind: .*)$", text, re.M).groups()
     assert line.strip() == f"kind: {kind}"
-    named = re.sub(r"\(.*?\)", "", comment)  # what each is may use the name of another
+    named = re.sub(r"\(.*?\)", "", comment)  # a description in brackets may use the name of another kind
     assert [other for other in WAVEFORMS if not re.search(rf"\b{other}\b", named)] == []
     assert set(yaml.safe_load(text)["waveform"]) == set(WAVEFORMS[kind].model_fields)
-    asked = next(one for one in get_command(app).commands["init"].params if one.name == "kind")
-    assert set(re.findall(r"\w+", asked.help)) >= set(WAVEFORMS)
+    option = next(parameter for parameter in get_command(app).commands["init"].params if parameter.name == "kind")
+    assert set(re.findall(r"\w+", option.help)) >= set(WAVEFORMS)
 
 
-def test_a_kind_of_waveform_that_there_is_not_is_refused_and_nothing_is_written(tmp_path):
+def test_unknown_waveform_kind_is_rejected_without_writing(tmp_path):
     error = CliRunner().invoke(app, ["init", str(tmp_path / "new"), "--kind", "chirp"]).exception
     assert isinstance(error, CampaignError)
     assert "'chirp'" in str(error)
@@ -61,7 +61,7 @@ def test_a_kind_of_waveform_that_there_is_not_is_refused_and_nothing_is_written(
     assert not (tmp_path / "new").exists()
 
 
-def test_the_schema_accepts_the_template_and_refuses_a_misspelt_key():
+def test_schema_accepts_the_template_and_rejects_a_misspelt_key():
     import jsonschema
 
     document = yaml.safe_load(config_template())
@@ -71,19 +71,19 @@ def test_the_schema_accepts_the_template_and_refuses_a_misspelt_key():
         jsonschema.validate(document, json.loads(config_schema()))
 
 
-def test_environment_yml_asks_for_what_pyproject_asks_and_installs_this_version():
+def test_environment_yml_matches_pyproject():
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    asked = dict(re.match(r"([\w.-]+)(.*)", d).groups() for d in project["dependencies"])
-    asked = {CONDA_NAMES.get(name, name): bound for name, bound in asked.items()} | {
+    required = dict(re.match(r"([\w.-]+)(.*)", d).groups() for d in project["dependencies"])
+    required = {CONDA_NAMES.get(name, name): bound for name, bound in required.items()} | {
         "python": project["requires-python"]
     }
     *conda, pip = yaml.safe_load((ROOT / "environment.yml").read_text())["dependencies"]
-    assert dict(re.match(r"([\w.-]+)(.*)", d).groups() for d in conda) == asked | {"pip": ""}
+    assert dict(re.match(r"([\w.-]+)(.*)", d).groups() for d in conda) == required | {"pip": ""}
     assert pip == {"pip": [f"apertura=={apertura.__version__}"]}
 
 
-def test_every_requirement_is_locked_by_hash_and_no_registry_is_named():
+def test_requirements_are_locked_by_hash_without_a_registry():
     for file in ("all.txt", "uv.txt"):
         text = (ROOT / "requirements" / file).read_text()
         pins = re.findall(r"^[\w.-]+==", text, re.M)
@@ -101,14 +101,14 @@ def test_every_requirement_is_locked_by_hash_and_no_registry_is_named():
         ({"kind": "chirp"}, "ofdm"),
     ],
 )
-def test_a_waveform_that_cannot_be_demodulated_is_refused(change, expected):
+def test_waveform_that_cannot_be_demodulated_is_rejected(change, expected):
     document = yaml.safe_load(config_template())
     document["waveform"] |= change
     with pytest.raises(CampaignError, match=expected):
         validated(document, where="config.yaml")
 
 
-def test_the_order_of_i_and_q_of_a_node_overrides_that_of_the_waveform_of_samples_alone():
+def test_iq_order_of_a_node_overrides_that_of_sampled_waveforms():
     document = yaml.safe_load(config_template()) | {"nodes": {"uav1": {}, "uav2": {"iq": "conjugate"}}}
     document["waveform"]["iq"] = "swapped"
     settings = validated(document, where="config.yaml")
@@ -118,8 +118,8 @@ def test_the_order_of_i_and_q_of_a_node_overrides_that_of_the_waveform_of_sample
         validated(document, where="config.yaml")
 
 
-def test_only_what_matters_to_a_stage_is_its_parameter(finished_tiny):
-    """A step that depended on the complete config would rerun for nothing."""
+def test_stage_depends_only_on_its_own_settings(finished_tiny):
+    """A step that depended on the complete config would rerun without need."""
     everything = {*Settings.model_json_schema()["properties"], *Processing.model_json_schema()["properties"]}
     of = {"scene": ()}
     stages = {
@@ -132,19 +132,19 @@ def test_only_what_matters_to_a_stage_is_its_parameter(finished_tiny):
     assert "window" not in stages["echo"]
 
 
-def test_a_layer_that_sees_no_settings_names_no_config_file():
+def test_layers_without_settings_do_not_name_the_config_file():
     layers = [ROOT / "src/apertura" / layer for layer in ("core", "methods", "formats/export", "formats/catalog")]
     files = [file for layer in layers for file in layer.rglob("*.py")]
     assert len(files) > 80
     assert [file for file in files if "config/config.yaml" in file.read_text(encoding="utf-8")] == []
 
 
-def a_scene(asked):
-    return documents.validated(Scene, asked, where="config", expected="a scene")
+def read_scene(scene):
+    return documents.validated(Scene, scene, where="config", expected="a scene")
 
 
 @pytest.mark.parametrize(
-    ("asked", "taken"),
+    ("configured", "horizontal_crs"),
     [
         ({"crs": "EPSG:32632"}, "EPSG:32632"),
         ({"crs": "IGNF:LAMB93"}, "IGNF:LAMB93"),
@@ -152,12 +152,12 @@ def a_scene(asked):
         ({"crs": "EPSG:32632+EPSG:3855", "dem": "d.tif", "dem_datum": "egm2008"}, "EPSG:32632"),
     ],
 )
-def test_of_a_compound_crs_pixels_lie_in_the_horizontal_part(asked, taken):
-    assert a_scene(asked).crs == taken
+def test_pixels_use_the_horizontal_part_of_a_compound_crs(configured, horizontal_crs):
+    assert read_scene(configured).crs == horizontal_crs
 
 
 @pytest.mark.parametrize(
-    ("asked", "told"),
+    ("configured", "message"),
     [
         ({"crs": "EPSG:32632+5773"}, "has the vertical datum egm96, but height_datum is 'ellipsoid'"),
         (
@@ -175,12 +175,12 @@ def test_of_a_compound_crs_pixels_lie_in_the_horizontal_part(asked, taken):
         ({"crs": "EPSG:32632\n"}, "must be authority and code such as EPSG:32632"),
     ],
 )
-def test_heights_of_a_crs_that_are_not_those_stated_and_texts_of_proj_are_refused(asked, told):
-    with pytest.raises(CampaignError, match=re.escape(told)):
-        a_scene(asked)
+def test_conflicting_vertical_datum_and_proj_strings_are_rejected(configured, message):
+    with pytest.raises(CampaignError, match=re.escape(message)):
+        read_scene(configured)
 
 
-def test_bounds_that_are_no_multiple_of_the_spacing_name_the_nearest_and_no_keys():
+def test_bounds_off_the_spacing_report_the_nearest_grid():
     document = {"campaign": "c", "waveform": {"kind": "phase_history", "format": "cphd"}, "nodes": {"a": {}}}
     document["scene"] = {"crs": "EPSG:32632", "bounds_m": [0.0, 0.0, 10.1, 10.0], "spacing_m": 0.25}
     with pytest.raises(CampaignError) as refused:

@@ -1,4 +1,4 @@
-"""Paths of a campaign folder: what they read, write and delete lies below it, whatever links are there."""
+"""Confinement of a campaign folder: nothing is read, written or deleted outside it, whatever links it contains."""
 
 import ast
 import os
@@ -29,7 +29,7 @@ def root(tmp_path):
 
 @pytest.fixture
 def outside(tmp_path):
-    """A folder of the user beside the campaign."""
+    """A folder of the user next to the campaign."""
     (tmp_path / "outside" / "deep").mkdir(parents=True)
     for name in ("a.json", "deep/b.log"):
         (tmp_path / "outside" / name).write_text("kept")
@@ -37,7 +37,7 @@ def outside(tmp_path):
 
 
 def state_of(folder):
-    """Return everything below a folder that a change would show in."""
+    """Return the state of everything below a folder: mode, times and contents."""
     return {
         path.relative_to(folder).as_posix(): (
             path.lstat()[:4],
@@ -70,7 +70,7 @@ WAYS = {
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("place", ["results/f01/link", "results/link/f01", "results"])
-def test_nothing_is_read_written_or_deleted_through_a_link(root, outside, way, place):
+def test_links_are_not_followed(root, outside, way, place):
     linked = Path(root) / (place.removesuffix("/f01") if place.startswith("results/link") else place)
     if linked.is_dir():
         (linked / "f01").rmdir()
@@ -82,7 +82,7 @@ def test_nothing_is_read_written_or_deleted_through_a_link(root, outside, way, p
     assert state_of(outside) == before
 
 
-def test_of_a_link_that_is_removed_or_replaced_the_target_stays(root, outside):
+def test_removing_or_replacing_a_link_keeps_its_target(root, outside):
     before, link = state_of(outside), root / "results" / "link"
     for change in (link.unlink, lambda: remove(link), lambda: write_text(link, "new")):
         Path(link).unlink(missing_ok=True)
@@ -97,7 +97,7 @@ def test_of_a_link_that_is_removed_or_replaced_the_target_stays(root, outside):
 
 
 @pytest.mark.parametrize("work", [".note.json.wip", ".note.json.wip/.lock"])
-def test_a_work_folder_or_lock_that_is_a_link_is_refused_and_not_cleared(root, outside, work):
+def test_linked_work_folder_or_lock_is_rejected_and_not_cleared(root, outside, work):
     path = Path(root) / "results" / work
     path.parent.mkdir(exist_ok=True)
     path.symlink_to(outside if work.endswith("wip") else outside / "a.json")
@@ -107,7 +107,7 @@ def test_a_work_folder_or_lock_that_is_a_link_is_refused_and_not_cleared(root, o
     assert state_of(outside) == before
 
 
-def test_of_a_work_folder_that_holds_links_the_links_alone_are_cleared(root, outside):
+def test_clearing_a_work_folder_removes_links_but_not_targets(root, outside):
     work = Path(root) / "results" / ".note.json.wip"
     work.mkdir()
     (work / "of a killed writer").symlink_to(outside)
@@ -118,8 +118,8 @@ def test_of_a_work_folder_that_holds_links_the_links_alone_are_cleared(root, out
     assert state_of(outside) == before
 
 
-def test_a_folder_replaced_by_a_link_while_it_is_written_changes_nothing_outside(root, outside):
-    """The body writes by the descriptor of the folder that was made, wherever its name now leads."""
+def test_folder_swapped_for_a_link_during_a_write_is_safe(root, outside):
+    """The write goes to the descriptor of the folder that was created, wherever its name leads meanwhile."""
     folder, before = Path(root) / "results" / "f01", state_of(outside)
 
     def written():
@@ -135,13 +135,13 @@ def test_a_folder_replaced_by_a_link_while_it_is_written_changes_nothing_outside
 
 @pytest.mark.parametrize("kind", ["named pipe", "socket", "device", "folder"])
 @pytest.mark.parametrize("mode", ["rb", "a", "w"])
-def test_what_is_no_plain_file_is_refused_at_once(root, kind, mode):
+def test_special_file_is_rejected_at_once(root, kind, mode):
     path = Path(root) / "results" / "x"
     if kind == "named pipe":
         os.mkfifo(path)
     elif kind == "socket":
-        with socket.socket(socket.AF_UNIX) as made:
-            made.bind(str(path))
+        with socket.socket(socket.AF_UNIX) as listening:
+            listening.bind(str(path))
     elif kind == "device":
         path.symlink_to("/dev/zero")
         kind = "symbolic link"
@@ -161,7 +161,7 @@ def test_what_is_no_plain_file_is_refused_at_once(root, kind, mode):
     assert done
 
 
-def test_a_hard_link_to_a_file_outside_is_read_but_not_written(root, outside):
+def test_hard_link_to_an_outside_file_is_read_but_not_written(root, outside):
     path = Path(root) / "results" / ".run.lock"
     path.hardlink_to(outside / "a.json")
     assert (root / "results" / ".run.lock").read_text() == "kept"
@@ -170,7 +170,7 @@ def test_a_hard_link_to_a_file_outside_is_read_but_not_written(root, outside):
     assert (outside / "a.json").read_text() == "kept"
 
 
-def test_a_sparse_file_of_any_size_is_refused_before_it_is_read(root):
+def test_huge_sparse_file_is_rejected_before_reading(root):
     with (root / "results" / "x").open("wb") as stream:
         stream.truncate(1 << 40)
     with pytest.raises(CampaignError, match=f"1099511627776 bytes; expected a file of at most {LARGEST_READ}"):
@@ -178,12 +178,12 @@ def test_a_sparse_file_of_any_size_is_refused_before_it_is_read(root):
 
 
 @pytest.mark.parametrize("name", ["../outside/a.json", "results/../../outside/a.json", "/etc/hostname"])
-def test_a_path_that_leads_out_of_the_folder_is_refused(root, outside, name):
+def test_path_that_leads_out_of_the_folder_is_rejected(root, outside, name):
     with pytest.raises(CampaignError, match="leads out of the campaign folder"):
         (root / name).read_text()
 
 
-def test_a_library_gets_a_name_that_leads_to_the_file_that_was_checked(root, outside):
+def test_library_opens_the_checked_file(root, outside):
     (root / "results" / "x.npy").write_bytes(b"")
     with pytest.raises(TypeError, match="use on_disk"):
         np.load(root / "results" / "x.npy")
@@ -193,7 +193,7 @@ def test_a_library_gets_a_name_that_leads_to_the_file_that_was_checked(root, out
         assert name.read_bytes() == b""
 
 
-def test_paths_derived_from_a_confined_one_are_confined_and_the_folder_may_be_a_link(root, tmp_path):
+def test_derived_paths_are_confined(root, tmp_path):
     (tmp_path / "link").symlink_to(Path(root))
     linked = ConfinedPath.at(tmp_path / "link")
     path = linked / "results" / "f01"
@@ -209,22 +209,22 @@ def test_paths_derived_from_a_confined_one_are_confined_and_the_folder_may_be_a_
         pickle.loads(pickle.dumps(path)),
         ConfinedPath.referenced(path.reference()),
     ]
-    assert all(one.is_dir() and isinstance(one, ConfinedPath) for one in derived)
+    assert all(path.is_dir() and isinstance(path, ConfinedPath) for path in derived)
     assert not isinstance(path.relative_to(linked), ConfinedPath)
 
 
-def test_a_folder_that_lies_elsewhere_takes_the_place_of_its_name(root, outside):
-    moved = root.with_elsewhere({"raw": outside})
-    assert (moved / "raw" / "a.json").read_text() == "kept"
-    assert str((moved / "raw" / "a.json").location) == str(outside / "a.json")
+def test_with_elsewhere_redirects_a_subfolder(root, outside):
+    redirected = root.with_elsewhere({"raw": outside})
+    assert (redirected / "raw" / "a.json").read_text() == "kept"
+    assert str((redirected / "raw" / "a.json").location) == str(outside / "a.json")
     (outside / "deep" / "link").symlink_to(outside / "a.json")
     with pytest.raises(CampaignError, match="a symbolic link"):
-        (moved / "raw" / "deep" / "link").read_text()
+        (redirected / "raw" / "deep" / "link").read_text()
 
 
-# ---- No other door -------------------------------------------------------------------------------------------------
+# ---- No other code path --------------------------------------------------------------------------------------------
 
-_DOORS = {"common/confined.py", "common/atomic.py"}
+_FILE_MODULES = {"common/confined.py", "common/atomic.py"}
 _CHANGES_BY_NAME = {
     "os": {
         *("open", "mkdir", "makedirs", "remove", "unlink", "rmdir", "removedirs", "rename", "renames", "replace"),
@@ -233,7 +233,7 @@ _CHANGES_BY_NAME = {
     "shutil": {"rmtree", "move", "copy", "copy2", "copyfile", "copytree", "copymode", "copystat"},
 }
 _ELSEWHERE = {
-    ("common/processes.py", "os.open"): "folders that Landlock is told of, opened without following by their names",
+    ("common/processes.py", "os.open"): "folders for Landlock rules, opened without following links",
     ("cli.py", "os.open"): "/dev/null",
     ("views/report/step.py", "shutil.copyfile"): "from a temporary folder into a replacement",
     ("tools/design/expected_images.py", "shutil.copyfile"): "into a campaign folder that was just made",
@@ -241,17 +241,17 @@ _ELSEWHERE = {
 }
 
 
-def test_no_other_code_of_the_product_changes_files_by_their_names():
-    found = set()
+def test_only_listed_code_changes_files_by_name():
+    calls = set()
     for path in SOURCES.rglob("*.py"):
         file = path.relative_to(SOURCES).as_posix()
         for call in (node for node in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(node, ast.Call)):
             of, name = getattr(getattr(call.func, "value", None), "id", ""), getattr(call.func, "attr", "")
             if name in _CHANGES_BY_NAME.get(of, ()):
-                found.add((file, f"{of}.{name}"))
+                calls.add((file, f"{of}.{name}"))
             if getattr(call.func, "id", "") == "open":
-                found.add((file, "open"))
-    assert {one for one in found if one[0] not in _DOORS} == set(_ELSEWHERE)
+                calls.add((file, "open"))
+    assert {call for call in calls if call[0] not in _FILE_MODULES} == set(_ELSEWHERE)
 
 
 _WATCH = """
@@ -294,8 +294,8 @@ finally:
     ],
     ids=lambda words: " ".join(words[:2]),
 )
-def test_a_command_opens_no_file_of_a_campaign_for_writing_by_its_whole_name(finished_tiny, tmp_path, words):
-    """Python reports every file that is opened or deleted to audit hooks, by the name that was given."""
+def test_commands_write_campaign_files_by_descriptor(finished_tiny, tmp_path, words):
+    """Python reports every opened or deleted file to audit hooks, by the name that was passed."""
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     done = subprocess.run(
         [sys.executable, "-c", _WATCH, str(root), *words, str(root)],

@@ -1,4 +1,4 @@
-"""What the documents name is there: files, tests, commands, dotted names and keys of the config."""
+"""References in the documentation exist: files, tests, commands, dotted names and keys of the config."""
 
 import json
 import pkgutil
@@ -33,7 +33,7 @@ _CITED = re.compile(r"(docs/[\w/]+\.md)((?:[,;]? (?:and )?(?:eqs?\. [\w]+|\"[^\"
 _NAME_IN_FILE = re.compile(r"`(\w+)` (?:of `\w+` )?in `([\w/.]+\.(?:py|hpp|cpp|smk))`")
 
 ENTRY_POINTS = {"apertura.exports", "apertura.commands"}
-"""Groups of entry points: names, but not of modules."""
+"""Groups of entry points, which look like names of modules."""
 
 
 @cache
@@ -46,36 +46,36 @@ def anywhere(name):
     return any(any((ROOT / folder).rglob(name)) for folder in SOURCES)
 
 
-def is_there(name, document):
-    """A path counts from the root, src/apertura or the document; a name alone may stand anywhere in the code."""
+def exists(name, document):
+    """A path is relative to the root, src/apertura or the document; a bare name may be anywhere in the code."""
     if any(any(place.glob(name.rstrip("/"))) for place in (*PLACES, document.parent)):
         return True
     return "/" not in name and anywhere(name)
 
 
-def missing(found, documents=DOCUMENTS):
-    """Return document → what of it is not there, of those that lack something; each is asked in one pass."""
+def missing(lacking_in, documents=DOCUMENTS):
+    """Return the missing references of documents that have any."""
     assert len(documents) > 20
-    lacking = {document.relative_to(ROOT).as_posix(): sorted(found(document)) for document in documents}
+    lacking = {document.relative_to(ROOT).as_posix(): sorted(lacking_in(document)) for document in documents}
     return {document: names for document, names in lacking.items() if names}
 
 
-def test_every_file_that_a_document_names_is_there():
+def test_files_named_in_documents_exist():
     def lacking(document):
         text = text_of(document)
         named = {*_FILE.findall(text), *(name for name in _FOLDER.findall(text) if "." not in Path(name).name)}
-        yield from (name for name in named if not is_there(name, document))
+        yield from (name for name in named if not exists(name, document))
         yield from (link for link in _LINK.findall(text) if not (document.parent / link).exists())
 
     assert missing(lacking) == {}
 
 
-def test_every_test_that_a_document_cites_exists():
-    written = set(re.findall(r"^\s*def (test_\w+)", "\n".join(map(text_of, ROOT.glob("tests/*.py"))), re.M))
-    assert missing(lambda document: set(_TEST.findall(text_of(document))) - written) == {}
+def test_tests_cited_in_documents_exist():
+    defined = set(re.findall(r"^\s*def (test_\w+)", "\n".join(map(text_of, ROOT.glob("tests/*.py"))), re.M))
+    assert missing(lambda document: set(_TEST.findall(text_of(document))) - defined) == {}
 
 
-def test_the_table_of_tests_holds_every_section_of_the_theory_and_no_other():
+def test_table_of_tests_has_every_section_of_the_theory():
     for page, sections in TESTS.items():
         text = text_of(ROOT / ("docs/theory.md" if page == "theory" else f"docs/theory/{page}.md"))
         assert re.findall(r"^##? (.+)", text, re.M) == list(sections), page
@@ -85,12 +85,12 @@ def test_the_table_of_tests_holds_every_section_of_the_theory_and_no_other():
     assert {path.stem for path in ROOT.glob("docs/theory/*.md")} == {*TESTS, "tests"} - {"theory"}
 
 
-def test_the_theory_names_no_test_in_its_running_text():
+def test_theory_names_no_test_in_running_text():
     theory = [ROOT / "docs/theory.md", *ROOT.glob("docs/theory/*.md")]
     assert [path.name for path in theory if re.search(r"\btest_\w", text_of(path))] == ["tests.md"]
 
 
-def test_every_identifier_that_theory_and_glossary_quote_stands_in_the_code():
+def test_identifiers_quoted_in_theory_and_glossary_exist():
     files = [
         ROOT / "config/schema.json",
         *(ROOT / "native").glob("*.?pp"),
@@ -102,7 +102,7 @@ def test_every_identifier_that_theory_and_glossary_quote_stands_in_the_code():
     def lacking(document):
         quoted = re.findall(r"`([^`\n]+)`", text_of(document))
         words = [re.findall(r"[A-Za-z]\w*", name) for name in quoted if not re.search(r"[/*{]|\.\w+$", name)]
-        return {word for some in words for word in some if re.search(r"_|[a-z][A-Z]", word)} - code
+        return {word for names in words for word in names if re.search(r"_|[a-z][A-Z]", word)} - code
 
     assert missing(lacking, [*ROOT.glob("docs/theory/*.md"), *ROOT.glob("docs/[glt]*.md")]) == {}
 
@@ -114,14 +114,14 @@ def resolves(name):
         return False
 
 
-def test_every_dotted_name_in_a_document_resolves():
+def test_dotted_names_in_documents_resolve():
     def lacking(document):
         return (name for name in set(_DOTTED.findall(text_of(document))) - ENTRY_POINTS if not resolves(name))
 
     assert missing(lacking) == {}
 
 
-def test_every_command_that_a_document_gives_exists():
+def test_commands_in_documents_exist():
     from typer.main import get_command
 
     from apertura.cli import app
@@ -139,20 +139,20 @@ def test_every_command_that_a_document_gives_exists():
     assert missing(lacking) == {}
 
 
-def test_every_key_of_the_config_that_a_document_names_exists():
+def test_config_keys_in_documents_exist():
     schema = json.loads(text_of(ROOT / "config/schema.json"))
     parts = [schema, *schema["$defs"].values()]
     keys = {key for part in parts for key in part.get("properties", {})} | {"native", "numba", "cuda", "reference"}
 
     def lacking(document):
-        config, *_ = text_of(document).split("\n## image.json")  # whose keys are of results
+        config, *_ = text_of(document).split("\n## image.json")  # without image.json, whose keys are those of results
         named = {word for key in _KEY.findall(config) for word in key.split(".")}
         return {word for word in named if not word.startswith("<")} - keys
 
     assert missing(lacking) == {}
 
 
-def test_a_name_that_a_document_puts_in_a_file_stands_there():
+def test_names_that_documents_locate_in_files_exist():
     def lacking(document):
         for name, file in _NAME_IN_FILE.findall(text_of(document)):
             path = next(place / file for place in PLACES if (place / file).is_file())
@@ -162,17 +162,17 @@ def test_a_name_that_a_document_puts_in_a_file_stands_there():
     assert missing(lacking) == {}
 
 
-def test_every_heading_that_the_code_cites_stands_in_its_document():
+def test_headings_and_equations_cited_in_code_exist():
     cited = 0
     for source in [*CODE, *ROOT.glob("native/*.?pp"), *ROOT.glob("tests/*.py")]:
-        for document, what in _CITED.findall(re.sub(r"\s+(?:// )?", " ", text_of(source))):
+        for document, citation in _CITED.findall(re.sub(r"\s+(?:// )?", " ", text_of(source))):
             text = text_of(ROOT / document)
-            for heading in re.findall(r"\"([^\"]+)\"", what):
+            for heading in re.findall(r"\"([^\"]+)\"", citation):
                 assert re.search(rf"^(#+ (\d\. )?|\*\*){re.escape(heading)}\b", text, re.M), (
                     f"{source}: {document}, {heading}"
                 )
                 cited += 1
-            for number in re.findall(r"eqs?\. (\w+)", what):
+            for number in re.findall(r"eqs?\. (\w+)", citation):
                 assert re.search(rf"\({number}\)|eqs?\. {number}\b|to {number}\)", text), (
                     f"{source}: {document}, eq. {number}"
                 )
@@ -180,7 +180,7 @@ def test_every_heading_that_the_code_cites_stands_in_its_document():
     assert cited > 50
 
 
-def test_the_layers_told_to_contributors_are_those_that_imports_are_checked_against():
+def test_documented_layers_match_the_import_contract():
     contracts = tomllib.loads(text_of(ROOT / "pyproject.toml"))["tool"]["importlinter"]["contracts"]
     checked = [set(re.findall(r"apertura\.([a-z]+)", layer)) for layer in contracts[0]["layers"]]
     table = text_of(ROOT / "CONTRIBUTING.md").partition("| layer of")[2]
@@ -191,23 +191,23 @@ def test_the_layers_told_to_contributors_are_those_that_imports_are_checked_agai
             assert any((ROOT / "src/apertura" / layer / package).is_dir() for layer in names), package
 
 
-def test_the_page_of_the_data_flow_holds_every_stage_with_its_rules_and_module():
+def test_data_flow_page_has_every_stage_with_rule_and_module():
     text, drawn = text_of(ROOT / "docs/dataflow.md"), text_of(ROOT / "docs/assets/dataflow.svg")
     rows = [re.findall(r"`([^`]+)`", row) for row in re.findall(r"^\| (`.*)", text.partition("## Stages")[2], re.M)]
-    told = {row[0]: row[1:] for row in rows}
-    assert told.keys() == RESULTS.keys()
-    for result, words in told.items():
+    documented = {row[0]: row[1:] for row in rows}
+    assert documented.keys() == RESULTS.keys()
+    for result, words in documented.items():
         rule = RESULTS[result]
         assert {rule.name, rule.module.removeprefix("apertura.stages.")} <= set(words), result
     boxes = set(re.findall(r'class="stage"[^>]*>(\w+)<', drawn))
     assert {name for name, rule in RESULTS.items() if not rule.on_demand} - {"bench"} <= boxes <= RESULTS.keys()
 
 
-def test_every_dependency_has_its_reason_among_the_decisions():
+def test_every_dependency_has_a_documented_reason():
     settings = tomllib.loads(text_of(ROOT / "pyproject.toml"))
     project = settings["project"]
     listed = [*project["dependencies"], *settings["dependency-groups"]["dev"]]
-    listed += [one for extra in project["optional-dependencies"].values() for one in extra]
+    listed += [requirement for extra in project["optional-dependencies"].values() for requirement in extra]
     reasons = text_of(ROOT / "docs/decisions.md").partition("## Dependencies")[2]
-    names = {re.match(r"[\w-]+", one)[0] for one in listed}
+    names = {re.match(r"[\w-]+", requirement)[0] for requirement in listed}
     assert {name for name in names if not re.search(rf"(?<![\w-]){name}(?![\w-])", reasons)} == set()

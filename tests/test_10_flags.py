@@ -1,4 +1,4 @@
-"""One table explains every flag: none that is not in it can be raised, and each is raised where it says."""
+"""Table of flags: only flags of the table can be raised, and each is raised where the table states."""
 
 import pickle
 import re
@@ -14,8 +14,8 @@ ROOT = Path(__file__).parents[1]
 SOURCES = {path.relative_to(ROOT / "src/apertura").as_posix(): path for path in ROOT.glob("src/apertura/*/**/*.py")}
 
 
-def test_a_flag_that_is_no_row_of_the_table_cannot_be_raised():
-    """However it is set: no product holds a flag that nobody explains."""
+def test_flag_outside_the_table_cannot_be_raised():
+    """By any method of setting it: every flag in a product has an explanation."""
     flags = Flags(dict.fromkeys(FLAGS, "measured"))
     for raise_it in (
         lambda: Flags({"clipped": "3 %"}),
@@ -34,7 +34,7 @@ def test_every_flag_has_measured_quantity_meaning_and_advice():
             assert not set(text) & set("|`\n")
 
 
-def test_every_flag_is_named_in_the_file_that_is_said_to_raise_it():
+def test_every_flag_is_named_in_the_file_that_raises_it():
     lacking = [
         f"{file} has no {name}"
         for name, flag in FLAGS.items()
@@ -44,7 +44,7 @@ def test_every_flag_is_named_in_the_file_that_is_said_to_raise_it():
     assert lacking == []
 
 
-def test_the_page_from_symptom_to_remedy_names_flags_that_exist_and_those_that_say_an_image_is_wrong():
+def test_symptom_page_names_existing_flags_and_all_of_wrong_images():
     page = (ROOT / "docs/howto/me_or_the_radar.md").read_text(encoding="utf-8")
     rows = [line.split(" | ") for line in page.splitlines() if line.startswith("| ") and "`" in line]
     named = {flag for row in rows for flag in re.findall(r"`(\w+)`", row[1])}
@@ -55,13 +55,13 @@ def test_the_page_from_symptom_to_remedy_names_flags_that_exist_and_those_that_s
     assert {*_LOOKS_WRONG, "attitude_suspect", "outside_swath", "accuracy_not_met", "wrong_code"} <= named
 
 
-def test_pages_that_come_from_the_code_are_as_they_would_be_written_now():
+def test_generated_pages_are_up_to_date():
     other = [name for name, page in PAGES.items() if (ROOT / name).read_text(encoding="utf-8") != page()]
     assert other == [], "run: make pages"
 
 
-def test_two_parts_that_raise_one_flag_both_have_their_say():
-    """The union of dicts keeps the last line and loses the other without a word."""
+def test_texts_of_a_flag_raised_twice_are_merged():
+    """The union of dicts keeps the last text and silently drops the other."""
     merged = Flags.merged(
         {"saturated_radar": "tx: 3 %"}, {"fix_quality_low": "9 pulses"}, {"saturated_radar": "rx: 40 %"}
     )
@@ -72,20 +72,20 @@ def test_two_parts_that_raise_one_flag_both_have_their_say():
     }
 
 
-def test_lines_that_begin_alike_are_both_kept_and_a_line_of_two_clauses_is_kept_once():
-    one, ten = {"fix_quality_low": "3 of 90 pulses of uav1"}, {"fix_quality_low": "3 of 90 pulses of uav10"}
-    assert Flags.merged(one, ten)["fix_quality_low"] == "3 of 90 pulses of uav1; 3 of 90 pulses of uav10"
-    assert Flags.merged(ten, one)["fix_quality_low"] == "3 of 90 pulses of uav10; 3 of 90 pulses of uav1"
+def test_texts_with_common_prefix_are_kept_and_repeats_dropped():
+    first, ten = {"fix_quality_low": "3 of 90 pulses of uav1"}, {"fix_quality_low": "3 of 90 pulses of uav10"}
+    assert Flags.merged(first, ten)["fix_quality_low"] == "3 of 90 pulses of uav1; 3 of 90 pulses of uav10"
+    assert Flags.merged(ten, first)["fix_quality_low"] == "3 of 90 pulses of uav10; 3 of 90 pulses of uav1"
     shared = {"fix_quality_low": "3 of 90 pulses; a float solution"}
     assert Flags.merged(shared, shared, shared) == shared
     longer = {"fix_quality_low": "3 of 90 pulses of uav10; at the end"}
-    assert Flags.merged(Flags.merged(one, ten), longer)["fix_quality_low"] == (
+    assert Flags.merged(Flags.merged(first, ten), longer)["fix_quality_low"] == (
         "3 of 90 pulses of uav1; 3 of 90 pulses of uav10; at the end"
     )
-    assert pickle.loads(pickle.dumps(Flags.merged(one, ten))) == Flags.merged(one, ten)
+    assert pickle.loads(pickle.dumps(Flags.merged(first, ten))) == Flags.merged(first, ten)
 
 
-def test_flags_are_brought_together_in_one_way_alone():
+def test_flags_are_merged_by_one_function_only():
     other = re.compile(r"""\*\*[\w.()]*\bflags\b|\bflags["\]]* \|=? |\| [\w.]*\bflags\b|\bflags["\]]*\.update\(""")
     sources = [path for path in (ROOT / "src/apertura").rglob("*.py") if path.name != "flags.py"]
     assert len(sources) > 100

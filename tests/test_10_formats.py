@@ -1,4 +1,4 @@
-"""docs/formats.md says what the code reads: every key, column, format and kind, and no other."""
+"""docs/formats.md against the code: it lists every key, column, format and kind that is read, and no other."""
 
 import json
 import re
@@ -24,14 +24,14 @@ TEXT = (ROOT / "docs/formats.md").read_text(encoding="utf-8")
 
 
 def table(after):
-    """Return the rows of the first table behind a text, as lists of cells."""
+    """Return the rows of the first table after a text, as lists of cells."""
     part = TEXT[TEXT.index(after) :]
     block = re.search(r"^\|.*\n\|[-|]+\n((?:\|.*\n)+)", part, re.M)[1]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in block.splitlines()]
 
 
 def names(after):
-    """Return what the first column quotes."""
+    """Return the names quoted in the first column."""
     return [name for row in table(after) for name in re.findall(r"`([^`]+)`", row[0])]
 
 
@@ -43,19 +43,19 @@ def required(after):
     ("model", "after"),
     [(Global, "Global object:"), (Capture, "Each of the captures:"), (SigmfCollection, "### Collections")],
 )
-def test_every_key_of_sigmf_that_is_read_is_told_and_no_other(model, after):
+def test_documented_sigmf_keys_match_those_read(model, after):
     read = {field.alias: field.is_required() for field in model.model_fields.values()}
     assert sorted(names(after)) == sorted(read)
-    assert required(after) == {alias for alias, must in read.items() if must}
+    assert required(after) == {alias for alias, is_required in read.items() if is_required}
 
 
-def test_every_key_of_framing_is_told():
+def test_every_framing_key_is_documented():
     assert names("A frame is preamble") == list(SigmfFraming.model_fields)
 
 
-def test_the_datatypes_that_are_told_are_those_that_are_read():
-    told = re.search(r"^Datatypes: .*?\. ", TEXT, re.M | re.S)[0]
-    kinds = set(re.findall(r"`([iuf]\d+)`", told))
+def test_documented_datatypes_match_those_read():
+    documented = re.search(r"^Datatypes: .*?\. ", TEXT, re.M | re.S)[0]
+    kinds = set(re.findall(r"`([iuf]\d+)`", documented))
     read = set()
     for kind in {f"{letter}{bits}" for letter in "iuf" for bits in (8, 16, 32, 64)}:
         for order in ("", "_le", "_be"):
@@ -70,11 +70,11 @@ def test_the_datatypes_that_are_told_are_those_that_are_read():
     assert f"{100 * EDGE:g} % of the rate" in TEXT
 
 
-def test_every_key_of_a_pulse_is_told_and_what_must_be_there():
+def test_pulse_keys_are_documented_with_required_ones():
     shared = {"kind", "carrier_hz", "sample_rate_hz", "prf_hz"}
     own = {name: field.is_required() for name, field in PulseWaveform.model_fields.items() if name not in shared}
     assert names("## Pulse") == list(own)
-    assert required("## Pulse") == {name for name, must in own.items() if must}
+    assert required("## Pulse") == {name for name, is_required in own.items() if is_required}
 
 
 ROWS = {
@@ -90,7 +90,7 @@ READERS = {
 
 
 @pytest.mark.parametrize("name", ROWS)
-def test_a_table_of_the_config_has_the_columns_that_are_told_in_their_order(tmp_path, name):
+def test_config_tables_have_the_documented_columns(tmp_path, name):
     columns = names(f"`{name}`")
     assert set(columns) == set(ROWS[name])
     line = "\t".join(ROWS[name][column] for column in columns)
@@ -108,11 +108,11 @@ PLACES = {
 
 @pytest.mark.parametrize("time", TIMES)
 @pytest.mark.parametrize("place", PLACES)
-def test_a_csv_log_has_the_columns_that_are_told_and_needs_a_time_and_a_position(tmp_path, time, place):
-    told = names("Columns of CSV")
-    assert set(told) >= {*TIMES, *(name for group in PLACES for name in group)}
-    further = [name for name in told if name not in TIMES and not any(name in group for group in PLACES)]
-    cells = TIMES | dict(zip(place, PLACES[place], strict=True)) | dict.fromkeys(further, "1.5") | {"quality": "fix"}
+def test_csv_log_columns_are_documented_and_need_time_and_position(tmp_path, time, place):
+    documented = names("Columns of CSV")
+    assert set(documented) >= {*TIMES, *(name for group in PLACES for name in group)}
+    optional = [name for name in documented if name not in TIMES and not any(name in group for group in PLACES)]
+    cells = TIMES | dict(zip(place, PLACES[place], strict=True)) | dict.fromkeys(optional, "1.5") | {"quality": "fix"}
 
     def read(of):
         lines = [",".join(cells[name].format(epoch) for name in of) for epoch in range(3)]
@@ -121,7 +121,7 @@ def test_a_csv_log_has_the_columns_that_are_told_and_needs_a_time_and_a_position
         return read_track(tmp_path / "a.csv", node="a", options=options)
 
     columns = [time, *place]
-    track = read([*further, *columns])
+    track = read([*optional, *columns])
     assert {"position_std", "fix"} <= set(track)
     assert np.isfinite(track.attitude.values).all()
     read(columns)
@@ -131,18 +131,18 @@ def test_a_csv_log_has_the_columns_that_are_told_and_needs_a_time_and_a_position
 
 
 @pytest.mark.parametrize(("formats", "section"), [(TRACKS, "## Flight logs"), (PHASE_HISTORIES, "## Phase history")])
-def test_every_format_is_told_with_its_suffixes(formats, section):
+def test_every_format_is_documented_with_its_suffixes(formats, section):
     rows = {re.findall(r"`(\w+)`", row[0])[0]: row[1] for row in table(section)}
     assert rows.keys() == formats.keys()
     for name, row in formats.items():
         assert set(re.findall(r"\.\w+", rows[name])) == set(row.suffixes if name in TRACKS else [row.suffix])
 
 
-def test_every_kind_of_solution_is_told_with_its_number():
+def test_every_kind_of_solution_is_documented_with_its_number():
     assert {re.findall(r"`(\w+)`", row[0])[0]: int(row[1]) for row in table("| kind of solution")} == FIXES
 
 
-def test_leap_seconds_and_columns_of_patterns_are_as_told(tmp_path):
+def test_documented_leap_seconds_and_pattern_columns_are_read(tmp_path):
     assert f"({gps_ahead_s(np.datetime64('2017-01-01', 'ns'))} since 2017)" in TEXT
     part = TEXT[TEXT.index("## Beams") :]
     columns = re.search(r"columns `(\w+)`.*?`(angle_deg)`.*?`(gain_db)`", part, re.S).groups()
@@ -152,7 +152,7 @@ def test_leap_seconds_and_columns_of_patterns_are_as_told(tmp_path):
 
 
 def leaves(value, key=""):
-    """Yield the dotted keys of the values of a JSON document, `[]` for each item of a list."""
+    """Yield the dotted keys of the values of a JSON document, with `[]` for the items of a list."""
     if isinstance(value, dict) and value:
         for name, each in value.items():
             yield from leaves(each, f"{key}.{name}" if key else name)
@@ -163,17 +163,18 @@ def leaves(value, key=""):
         yield key
 
 
-def test_every_key_of_an_image_json_is_told_and_no_other(finished_tiny):
+def test_image_json_keys_match_the_documentation(finished_tiny):
     rows = re.findall(r"^\| (`[^|]*) \|", TEXT.partition("\n## image.json")[2], re.M)
-    told = {
+    documented = {
         key: re.compile(re.sub(r"<\w+>", r"[^.]+", re.sub(r"([.\[\]])", r"\\\1", key)) + r"(\.[^.]+)?")  # or a map
         for key in re.findall(r"`([^`]+)`", " ".join(rows))
     }
     files = [finished_tiny.results / f"f01/{image}/image.json" for image in ("uav1-uav1", "uav1-uav2", "fused")]
-    found = {key for path in files for key in leaves(json.loads(path.read_text(encoding="utf-8")))}
-    assert {key for key in found if not any(pattern.fullmatch(key) for pattern in told.values())} == set()
+    present = {key for path in files for key in leaves(json.loads(path.read_text(encoding="utf-8")))}
+    assert {key for key in present if not any(pattern.fullmatch(key) for pattern in documented.values())} == set()
     code = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "src").rglob("*.py"))
-    absent = {key for key, pattern in told.items() if not any(map(pattern.fullmatch, found))}  # of other campaigns
+    # keys that only other campaigns have
+    absent = {key for key, pattern in documented.items() if not any(map(pattern.fullmatch, present))}
     written = {re.sub(r"\.<\w+>$", "", key).split(".")[-1] for key in absent}
     assert {name for name in written if not re.search(rf"\b{re.escape(name)}\b", code)} == set()
-    assert len(absent) < len(told) / 3
+    assert len(absent) < len(documented) / 3

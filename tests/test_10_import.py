@@ -1,4 +1,4 @@
-"""Importing apertura is cheap, and its public names come from where they are defined."""
+"""Importing apertura loads few modules, and its public names are resolved from their defining modules."""
 
 import json
 import re
@@ -26,7 +26,7 @@ def test_importing_apertura_loads_no_library():
     assert loaded_by("import apertura") - loaded_by("pass") - sys.stdlib_module_names == {"apertura"}
 
 
-def test_the_command_line_loads_no_library_of_a_step():
+def test_command_line_loads_no_library_of_a_step():
     assert not HEAVY & loaded_by("import apertura.cli")
     assert "typer" in loaded_by("import apertura.cli")
 
@@ -36,8 +36,8 @@ def test_reading_a_config_loads_no_arrays():
 
 
 @pytest.mark.slow
-def test_a_step_over_level_ground_loads_neither_a_compiler_nor_transforms():
-    """Each costs a tenth of a second of every job."""
+def test_step_over_level_terrain_loads_no_compiler_or_transforms():
+    """Each costs a tenth of a second per job."""
     heavy = {"numba", "scipy.fft", "scipy.ndimage", "scipy.special"}
     loaded_by(f"import sys, apertura.stages.layers\nassert not {heavy} & set(sys.modules)")
 
@@ -50,18 +50,18 @@ def test_every_public_name_is_documented_and_listed():
     assert set(apertura.__all__) <= set(dir(apertura))
 
 
-def test_a_name_that_is_not_public_is_an_attribute_error():
+def test_unknown_public_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="'backprojekt'"):
         _ = apertura.backprojekt
 
 
-def test_the_public_names_are_no_code_of_a_stage():
-    """Stages import the version from there; that must not tie their hash to every module that is public."""
+def test_public_names_do_not_enter_the_code_hash_of_a_stage():
+    """Stages import the version from the package; that must not tie their hash to every public module."""
     assert code_sha256("apertura") == code_sha256()
     assert code_sha256("apertura.common.contracts") != code_sha256()
 
 
-def test_the_version_is_printed_and_is_what_the_build_reads():
+def test_printed_version_matches_the_package():
     source = Path(apertura.__file__).read_text(encoding="utf-8")
     assert re.search(r'^__version__ = "(.+)"$', source, re.MULTILINE)[1] == apertura.__version__
     for words in (["--version"],):

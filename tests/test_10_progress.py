@@ -1,19 +1,19 @@
-"""How far a step is: told in a file while it works, rarely, and never at the step's cost."""
+"""Progress of a step: written to a file at most once a second; a failed write does not stop the step."""
 
 import json
 
 import numpy as np
 import pytest
 
-from apertura.common import progress as told
+from apertura.common import progress as progress_module
 from apertura.common.progress import progress, progress_path, reporting_to
 
 
 @pytest.fixture
 def clock(monkeypatch):
-    """A clock that stands until it is moved on."""
+    """A clock that advances only when the test advances it."""
     now = [0.0]
-    monkeypatch.setattr(told.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(progress_module.time, "monotonic", lambda: now[0])
     return now
 
 
@@ -22,7 +22,7 @@ def counted(path):
     return report["done"], report["total"]
 
 
-def test_a_step_tells_at_most_once_a_second_and_in_the_end(tmp_path, clock):
+def test_progress_is_written_at_most_once_a_second_and_at_the_end(tmp_path, clock):
     path = tmp_path.joinpath(*progress_path(["image", "f01", "uav1-uav2"]))
     with reporting_to(path):
         with progress("tiles", 10) as done:
@@ -38,43 +38,43 @@ def test_a_step_tells_at_most_once_a_second_and_in_the_end(tmp_path, clock):
     assert not path.exists()
 
 
-def test_work_outside_a_step_tells_nothing_and_writes_nothing(tmp_path, monkeypatch):
+def test_work_outside_a_step_writes_no_progress(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with progress("tiles", 2) as done:
         done(2)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_that_takes_no_file_does_not_end_the_step(tmp_path):
+def test_unwritable_progress_folder_does_not_stop_the_step(tmp_path):
     (tmp_path / ".run").write_text("a file where a folder should be")
     with reporting_to(tmp_path.joinpath(*progress_path(["cube"]))), progress("images", 2) as done:
         done(2)
 
 
-def test_a_failing_step_leaves_no_progress_behind(tmp_path):
+def test_failing_step_removes_its_progress(tmp_path):
     path = tmp_path.joinpath(*progress_path(["echo", "f01", "a-a"]))
     with pytest.raises(ZeroDivisionError), reporting_to(path), progress("pulses", 0) as done:
         done(1 // 0)
     assert not path.exists()
 
 
-def test_tiles_under_way_tell_how_many_of_their_parts_are_done(tmp_path, monkeypatch):
-    """A tile of a long flight is done with the last block of pulses: parts are counted, not tiles."""
+def test_progress_of_tiles_counts_their_parts(tmp_path, monkeypatch):
+    """A tile of a long flight is complete with the last block of pulses: parts are counted, not tiles."""
     from dask.array import ones
 
     from apertura.core.backprojection.tiles import compute_tiles
 
     monkeypatch.setattr("apertura.common.progress._BETWEEN_S", 0.0)
-    seen, path, target = [], tmp_path / "image.json", np.zeros((4, 6), complex)
+    reports, path, target = [], tmp_path / "image.json", np.zeros((4, 6), complex)
 
     class Watched:
         def __setitem__(self, window, block):
-            seen.append(json.loads(path.read_text()))
+            reports.append(json.loads(path.read_text()))
             target[window] = block
 
     windows = [(slice(0, 2), slice(0, 2)), (slice(2, 4), slice(2, 4)), (slice(0, 2), slice(4, 6))]
     with reporting_to(path):
         compute_tiles(ones((4, 6), chunks=2), windows, Watched(), threads=1)
-    assert {one["total"] for one in seen} == {6}  # each is formed and written
-    assert 0 < seen[-1]["done"] < 6
+    assert {report["total"] for report in reports} == {6}  # each tile is formed and written
+    assert 0 < reports[-1]["done"] < 6
     assert target.sum() == 12

@@ -1,4 +1,4 @@
-"""The code hash follows imports: it changes with what a stage can run and with nothing else."""
+"""The code hash follows imports: it changes with the code that a stage can run and with nothing else."""
 
 import ast
 import hashlib
@@ -26,7 +26,7 @@ def copied(tmp_path_factory):
 
 
 def changes(copied, file, *modules):
-    """Whether the code hash of modules changes with a file, which stays as it was."""
+    """Return True if the code hash of modules changes with an edit of a file; the edit is undone."""
     path = copied / file
     before, text = code_sha256(*modules, package=copied), path.read_bytes()
     path.write_bytes(text + b"\nEDITED = 1\n")
@@ -43,7 +43,7 @@ def changes(copied, file, *modules):
         ("core/combination.py", "cube", True),
         ("core/combination.py", "image", False),
         ("core/echo/sidelink.py", "echo", True),
-        ("core/echo/sidelink.py", "image", True),  # the check of its samples forms some anew
+        ("core/echo/sidelink.py", "image", True),  # the check of its samples recomputes a few
         ("core/echo/calibration.py", "image", False),
         ("formats/export/__init__.py", "export", True),
         ("formats/export/cog.py", "export", True),
@@ -60,12 +60,12 @@ def changes(copied, file, *modules):
         ("cli.py", "ingest", False),
     ],
 )
-def test_editing_a_module_changes_what_depends_on_it_and_nothing_else(copied, edited, step, reruns):
+def test_editing_a_module_changes_only_hashes_that_depend_on_it(copied, edited, step, reruns):
     assert changes(copied, edited, f"apertura.stages.{step}", *RUN.get(step, ())) is reruns
 
 
 @pytest.mark.parametrize(("step", "reruns"), [("image", True), ("echo", False)])
-def test_compiling_other_sources_changes_what_runs_them(copied, step, reruns):
+def test_compiling_other_sources_changes_the_hash(copied, step, reruns):
     digests = copied / "core/backprojection/engines/_backprojection.sha256"
     digests.write_text("of other sources")
     assert changes(copied, digests, f"apertura.stages.{step}", *RUN.get(step, ())) is reruns
@@ -84,9 +84,9 @@ print(json.dumps([name for name, module in ours.items() if name not in before an
 
 
 @pytest.mark.slow
-def test_every_module_that_an_import_loads_is_in_the_closure():
-    shown = subprocess.run([sys.executable, "-c", LOADED], check=True, capture_output=True, text=True)
-    loaded = set(json.loads(shown.stdout))
+def test_import_closure_has_every_loaded_module():
+    listing = subprocess.run([sys.executable, "-c", LOADED], check=True, capture_output=True, text=True)
+    loaded = set(json.loads(listing.stdout))
     assert {
         "apertura.campaign.store.progress",
         "apertura.core.backprojection.tiles",
@@ -95,7 +95,7 @@ def test_every_module_that_an_import_loads_is_in_the_closure():
     assert loaded <= set(import_closure(["apertura.stages.image"]))
 
 
-def test_a_module_of_another_package_counts_with_what_it_imports_of_apertura(monkeypatch, copied):
+def test_closure_of_a_foreign_module_includes_its_apertura_imports(monkeypatch, copied):
     monkeypatch.syspath_prepend(copied.parent)
     (copied.parent / "toy_format.py").write_text("import json\nfrom apertura.formats.export import cog\n")
     assert "json" not in import_closure(["toy_format"], package=copied)
@@ -104,16 +104,16 @@ def test_a_module_of_another_package_counts_with_what_it_imports_of_apertura(mon
 
 
 def as_run(source):
-    """What the interpreter makes of a source, without docstrings."""
+    """Return the syntax tree of a source without docstrings."""
     tree = ast.parse(source)
     for node in ast.walk(tree):
         for field in ("body", "orelse", "finalbody"):
             if isinstance(statements := getattr(node, field, None), list):
-                setattr(node, field, [one for one in statements if not is_text(one)])
+                setattr(node, field, [statement for statement in statements if not is_docstring(statement)])
     return ast.dump(tree)
 
 
-def is_text(statement):
+def is_docstring(statement):
     value = statement.value if isinstance(statement, ast.Expr) else None
     return isinstance(value, ast.Constant) and isinstance(value.value, str | EllipsisType)
 
@@ -122,18 +122,18 @@ def is_text(statement):
 @pytest.mark.parametrize(
     "layer", sorted(path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name[0] != "_")
 )
-def test_what_is_left_of_every_source_runs_as_before(layer):
+def test_removing_descriptions_keeps_the_code(layer):
     for path in PACKAGE.joinpath(layer).rglob("*.py"):
         source = path.read_text()
         assert as_run(without_description(source)) == as_run(source), path
 
 
-def test_a_text_that_is_a_value_is_code():
-    one, other = (without_description(f'page = (\n    """{text}\n\n# {text}"""\n)\n') for text in "ab")
-    assert one != other
+def test_string_value_is_part_of_the_code():
+    first, second = (without_description(f'page = (\n    """{text}\n\n# {text}"""\n)\n') for text in "ab")
+    assert first != second
 
 
-def test_two_hashes_for_one_role_are_refused():
+def test_two_hashes_for_one_role_are_rejected():
     with pytest.raises(ValueError, match="codes"):
         merged({"codes": "a"}, {"codes": "b"})
 
@@ -142,23 +142,23 @@ def stage(code, **runspec):
     return SimpleNamespace(attrs={"runspec": json.dumps(runspec), "inputs": {code: code}, "code_sha256": code})
 
 
-def test_settings_of_one_line_join_and_those_of_several_lines_stay_apart():
+def test_settings_of_one_lineage_merge_and_of_several_stay_separate():
     first, second = stage("1", node="a", window="hann"), stage("2", node="b")
     line = Provenance.of(["apertura.common.errors"], [first, second], settings={"engine": "native"})
     assert line.runspec == {"node": "b", "window": "hann", "engine": "native"}
-    apart = Provenance.of(["apertura.common.errors"], {"a-a": first, "a-b": second})
-    assert apart.runspec == {"a-a": {"node": "a", "window": "hann"}, "a-b": {"node": "b"}}
-    assert apart.inputs == {"1": "1", "2": "2"}
+    separate = Provenance.of(["apertura.common.errors"], {"a-a": first, "a-b": second})
+    assert separate.runspec == {"a-a": {"node": "a", "window": "hann"}, "a-b": {"node": "b"}}
+    assert separate.inputs == {"1": "1", "2": "2"}
 
 
-def test_the_code_of_a_parent_changes_the_code_of_its_child():
+def test_code_hash_of_a_parent_changes_that_of_its_child():
     hashes = {Provenance.of(["apertura.common.errors"], [stage(code)]).code_sha256 for code in ("1", "2")}
     assert len(hashes) == 2
 
 
 @pytest.mark.parametrize("size", [0, 1, 4 << 20, (4 << 20) + 1, 8 << 20, (13 << 20) + 7])
-def test_both_hashes_of_a_file_are_those_of_its_bytes(tmp_path, size):
-    """Of none, of part of a block and of several: a block is read over only when both hashes have taken it."""
+def test_both_hashes_of_a_file_match_its_bytes(tmp_path, size):
+    """No block, part of a block, several blocks: a buffer is reused only when both hashes have processed it."""
     content = np.random.default_rng(size).bytes(size)
     (tmp_path / "samples").write_bytes(content)
     expected = {name: hashlib.new(name, content).hexdigest() for name in ("sha256", "sha512")}

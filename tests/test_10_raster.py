@@ -1,4 +1,4 @@
-"""A stranger's raster: read as GeoTIFF and nothing else, no file beside it counts, no byte goes over the network."""
+"""Untrusted rasters: read as GeoTIFF only, without sidecar files and without network access."""
 
 import socket
 import struct
@@ -19,7 +19,7 @@ PLACE = (500000, 5400100, 2, 2)
 
 
 def write_dem(path, heights=None, place=PLACE, crs="EPSG:32632", **profile):
-    """Posts every 2 m under `UTM_GRID`, 600 m high and sloping."""
+    """Write a sloping DEM with 2 m posts under `UTM_GRID`, about 600 m high."""
     rows, columns = np.mgrid[:60, :60]
     heights = (600 + 0.1 * rows + 0.2 * columns).astype(np.float32) if heights is None else heights
     shape = {"height": heights.shape[0], "width": heights.shape[1], "count": 1, "dtype": heights.dtype}
@@ -33,7 +33,7 @@ def heights_of(path):
 
 
 def tagged(path, tag, kind, value):
-    """Overwrite the value of a TIFF tag of little-endian bytes."""
+    """Overwrite the value of a TIFF tag in a little-endian file."""
     data = bytearray(path.read_bytes())
     first = struct.unpack_from("<I", data, 4)[0]
     for entry in range(struct.unpack_from("<H", data, first)[0]):
@@ -46,7 +46,7 @@ def tagged(path, tag, kind, value):
 
 @pytest.fixture
 def listener():
-    """A server that counts who connects."""
+    """A server that records connections."""
     calls = []
     server = socket.create_server(("127.0.0.1", 0))
 
@@ -73,7 +73,7 @@ WMS = """<GDAL_WMS><Service name="TMS"><ServerUrl>http://127.0.0.1:{}/${{z}}</Se
 <BandsCount>1</BandsCount></GDAL_WMS>"""
 
 
-def test_a_vrt_or_wms_document_named_tif_is_refused_and_reaches_no_server(tmp_path, listener):
+def test_vrt_or_wms_named_tif_is_rejected_without_network_access(tmp_path, listener):
     port, calls = listener
     path = tmp_path / "dem.tif"
     for text in (VRT.format(f"/vsicurl/http://127.0.0.1:{port}/x.tif"), WMS.format(port), VRT.format("/etc/passwd")):
@@ -88,8 +88,8 @@ def test_a_vrt_or_wms_document_named_tif_is_refused_and_reaches_no_server(tmp_pa
     assert calls == [b"own"]
 
 
-def test_a_server_would_have_been_reached_by_the_vrt_as_gdal_opens_it(tmp_path, listener):
-    """The listener of the test above can hear."""
+def test_gdal_itself_connects_to_the_server_of_the_vrt(tmp_path, listener):
+    """Confirms that the listener of the test above records connections."""
     port, calls = listener
     (tmp_path / "dem.tif").write_text(VRT.format(f"/vsicurl/http://127.0.0.1:{port}/x.tif"))
     with pytest.raises(rasterio.errors.RasterioIOError), rasterio.open(tmp_path / "dem.tif") as raster:
@@ -105,16 +105,16 @@ AUX = """<PAMDataset><SRS>EPSG:32633</SRS><GeoTransform>500010, 2, 0, 5400100, 0
 @pytest.mark.parametrize(
     ("name", "text"), [("dem.tif.aux.xml", AUX), ("dem.tfw", "9\n0\n0\n-9\n0\n0\n"), ("dem.wld", "9\n0\n0\n-9\n0\n0\n")]
 )
-def test_a_file_beside_a_dem_changes_nothing(tmp_path, name, text):
+def test_sidecar_file_of_a_dem_is_ignored(tmp_path, name, text):
     path = write_dem(tmp_path / "dem.tif")
     alone = heights_of(path)
     (tmp_path / name).write_text(text)
     np.testing.assert_array_equal(heights_of(path), alone)
-    with rasterio.open(path) as raster:  # for whom the .aux.xml counts
+    with rasterio.open(path) as raster:  # plain GDAL applies the .aux.xml
         assert name != "dem.tif.aux.xml" or raster.offsets[0] == 100
 
 
-def test_a_mask_or_overview_beside_a_dem_changes_nothing(tmp_path):
+def test_external_mask_or_overview_of_a_dem_is_ignored(tmp_path):
     path = write_dem(tmp_path / "dem.tif")
     alone = heights_of(path)
     with rasterio.Env(GDAL_TIFF_INTERNAL_MASK="NO"), rasterio.open(path, "r+") as raster:
@@ -125,7 +125,7 @@ def test_a_mask_or_overview_beside_a_dem_changes_nothing(tmp_path):
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.7])
-def test_a_truncated_dem_is_one_message(tmp_path, share):
+def test_truncated_dem_is_one_message(tmp_path, share):
     path = write_dem(tmp_path / "dem.tif", compress="deflate", tiled=True, blockxsize=16, blockysize=16)
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
@@ -137,25 +137,25 @@ def test_a_truncated_dem_is_one_message(tmp_path, share):
 @pytest.mark.parametrize(
     ("place", "expected"),
     [
-        ((500000, 5400100, 0, 2), "no geodetic CRS"),  # which is how GDAL reads it
+        ((500000, 5400100, 0, 2), "no geodetic CRS"),  # GDAL reads such a file without a CRS
         ((500000, 5400100, 1e-300, 1e-300), "a degenerate transform [1e-300, "),
         ((500000, 5400100, float("nan"), 2), "a degenerate transform [nan, "),
     ],
 )
-def test_pixels_without_an_area_are_refused(tmp_path, place, expected):
+def test_degenerate_transform_is_rejected(tmp_path, place, expected):
     path = write_dem(tmp_path / "dem.tif", place=place)
     message = complaint(lambda: heights_of(path))
     assert expected in message
 
 
-def test_a_dem_that_claims_a_billion_rows_and_columns_costs_nothing(tmp_path):
+def test_dem_with_a_billion_declared_rows_is_rejected(tmp_path):
     path = write_dem(tmp_path / "dem.tif")
     for tag in (256, 257, 278):  # width, height, rows of a strip
         tagged(path, tag, 4, 10**9)
     assert "dem.tif: " in complaint(lambda: heights_of(path))
 
 
-def test_more_posts_than_memory_should_hold_are_refused_before_they_are_read(tmp_path):
+def test_dem_with_too_many_posts_is_rejected_before_reading(tmp_path):
     """Half a micrometre between posts: 120 m of scene would be 10^16 of them."""
     side = 1 << 20
     path = tmp_path / "dem.tif"
@@ -167,12 +167,12 @@ def test_more_posts_than_memory_should_hold_are_refused_before_they_are_read(tmp
     assert f"at most {MOST_POSTS} posts at once" in message
 
 
-def test_heights_that_are_complex_are_refused(tmp_path):
+def test_complex_heights_are_rejected(tmp_path):
     path = write_dem(tmp_path / "dem.tif", np.ones((60, 60), np.complex64))
     assert "heights of type complex64" in complaint(lambda: heights_of(path))
 
 
-# Grids of undulations
+# Geoid grids
 
 
 def gtx(path, *, rows=9, values=None, header=(47.0, 7.0, 0.5, 0.5)):
@@ -185,7 +185,7 @@ def lifted(path):
     return undulation(geoid_file("egm96", path), np.array([9.0]), np.array([48.5]))
 
 
-def test_a_grid_is_as_large_as_its_header_says(tmp_path):
+def test_grid_size_must_match_its_header(tmp_path):
     path = tmp_path / "egm96.gtx"
     assert 40 < lifted(gtx(path))[0] < 50
     for rows in (8, 10, -9, 0, 2**31 - 1):
@@ -196,7 +196,7 @@ def test_a_grid_is_as_large_as_its_header_says(tmp_path):
     assert "5 bytes" in complaint(lambda: lifted(path))
 
 
-def test_an_undulation_that_no_geoid_has_is_refused(tmp_path):
+def test_implausible_undulation_is_rejected(tmp_path):
     for value in (1e30, -2000.0, np.nan):
         path = gtx(tmp_path / "egm96.gtx", values=np.full(81, value))
         assert "no valid undulation at longitude" in complaint(lambda path=path: lifted(path))
@@ -206,8 +206,8 @@ def test_an_undulation_that_no_geoid_has_is_refused(tmp_path):
     ("place", "shape"),
     [((6.75, 51.25, 0.5, 0.5), (9, 9)), ((-180, 90, 10, 7.5), (24, 36)), ((0, 90, 10, 7.5), (24, 36))],
 )
-def test_a_tif_grid_says_what_proj_makes_of_it(tmp_path, place, shape):
-    """Regional, and all round the Earth, where there is a post beyond the last column."""
+def test_tif_grid_matches_proj(tmp_path, place, shape):
+    """Regional, and global, with a post beyond the last column."""
     values = np.random.default_rng(1).uniform(-50, 50, shape).astype(np.float32)
     path = write_dem(tmp_path / "egm96.tif", values, place, "EPSG:4326", nodata=-999)
     west, south = (-179.9, -80) if shape[1] > 9 else (7.1, 47.1)
@@ -222,15 +222,15 @@ def test_a_tif_grid_says_what_proj_makes_of_it(tmp_path, place, shape):
     assert "no valid undulation at longitude" in complaint(lambda: undulation(path, longitude, latitude))
 
 
-def test_a_tif_of_which_proj_divides_by_zero_is_read_or_refused(tmp_path):
-    """Nothing says how many rows a strip has: the reader of PROJ ends the process."""
+def test_tif_without_rows_per_strip_is_read(tmp_path):
+    """The tag for the rows of a strip is missing: PROJ's own reader divides by zero and ends the process."""
     path = write_dem(tmp_path / "egm96.tif", np.full((9, 9), 45, np.float32), (6.75, 51.25, 0.5, 0.5), "EPSG:4326")
     rows_of_a_strip, unknown = (struct.pack("<HHI", tag, 3, 1) for tag in (278, 30000))
     path.write_bytes(path.read_bytes().replace(rows_of_a_strip, unknown))
     assert lifted(path)[0] == 45
 
 
-def test_a_grid_of_another_suffix_or_format_is_refused(tmp_path):
+def test_grid_of_another_suffix_or_format_is_rejected(tmp_path):
     assert "a file of type '.gsb'" in complaint(lambda: lifted(gtx(tmp_path / "egm96.gsb")))
     (tmp_path / "egm96.tif").write_text(VRT.format("/etc/passwd"))
     assert "not readable as GeoTIFF" in complaint(lambda: lifted(tmp_path / "egm96.tif"))

@@ -1,4 +1,4 @@
-"""The site holds every page of docs/, sets equations and not names, and asks no other host for anything."""
+"""The site contains every page of docs/, typesets equations but not names, and loads nothing from other hosts."""
 
 import subprocess
 import sys
@@ -19,11 +19,11 @@ def leaves(node):
     if isinstance(node, str):
         yield node
     else:
-        for one in node.values() if isinstance(node, dict) else node:
-            yield from leaves(one)
+        for child in node.values() if isinstance(node, dict) else node:
+            yield from leaves(child)
 
 
-def test_every_page_of_docs_stands_in_the_navigation_once():
+def test_every_page_is_in_the_navigation_once():
     nav = list(leaves(yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))["nav"]))
     pages = [path.relative_to(ROOT / "docs").as_posix() for path in ROOT.glob("docs/**/*.md")]
     assert sorted(nav) == sorted([*pages, *OUTSIDE.values()])
@@ -45,7 +45,7 @@ def test_every_page_of_docs_stands_in_the_navigation_once():
         ('<a href="w_n.md">p_i</a> <code>w_n</code>', '<a href="w_n.md">p<sub>i</sub></a> <code>w_n</code>'),
     ],
 )
-def test_indices_and_powers_are_set_and_names_are_not(text, shown):
+def test_indices_and_powers_are_typeset_but_names_are_not(text, shown):
     assert set_equations(text) == shown
 
 
@@ -53,7 +53,7 @@ def block(text):
     return f'<div class="highlight"><pre><span></span><code>{text}\n</code></pre></div>'
 
 
-def test_an_indented_equation_keeps_its_number_at_the_margin_and_a_table_stays_as_it_is():
+def test_indented_equation_is_typeset_and_table_is_unchanged():
     assert set_equations(block("y = x_n        (4a)")) == (
         '<pre class="equation">y = x<sub>n</sub><span class="number">(4a)</span></pre>'
     )
@@ -68,7 +68,7 @@ def write(site, body, css=""):
     return [fault.removeprefix(f"{site}/index.html: ") for fault in faults(site)]
 
 
-def test_dead_links_and_whatever_is_loaded_from_elsewhere_are_told(tmp_path):
+def test_dead_links_and_external_resources_are_reported(tmp_path):
     site = tmp_path / "site"
     assert write(site, '<a href="#here">a</a><a href="https://a.example/">b</a><link href="site.css">') == []
     assert write(site, '<a href="gone.html">a</a>') == ["gone.html: target does not exist"]
@@ -89,13 +89,13 @@ def site(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_the_site_builds_without_a_warning_and_every_link_leads_somewhere(site):
+def test_site_builds_without_warnings_or_dead_links(site):
     assert faults(site) == []
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not CHROMIUM.exists(), reason="no /usr/bin/chromium")
-def test_pages_opened_from_a_disk_are_searched(site):
+def test_search_works_on_pages_opened_from_disk(site):
     with pytest.importorskip("playwright.sync_api").sync_playwright() as tool:
         browser = tool.chromium.launch(executable_path=CHROMIUM, headless=True, args=["--no-sandbox"])
         page = browser.new_page()

@@ -1,4 +1,4 @@
-"""A stage is complete or absent, and says so when it is not what was written."""
+"""Store of stages: a stage is complete or absent, and any difference from what was written is detected."""
 
 import fcntl
 import json
@@ -51,14 +51,14 @@ def track():
     return stamp(dataset, "track", **NOTHING)
 
 
-def test_a_stage_comes_back_as_it_was_saved(tmp_path):
+def test_saved_stage_is_read_back_unchanged(tmp_path):
     save_stage(track(), tmp_path / "track.zarr")
     back = open_stage(tmp_path / "track.zarr", "track")
     xr.testing.assert_identical(back.load(), track())
     assert back.time.dtype == "datetime64[ns]"
 
 
-def test_a_changed_file_is_named_with_the_manifest_to_delete(tmp_path):
+def test_changed_file_is_reported_with_the_manifest_to_delete(tmp_path):
     save_stage(track(), tmp_path / "track.zarr")
     chunk = next(path for path in (tmp_path / "track.zarr" / "position" / "c").rglob("*") if path.is_file())
     chunk.write_bytes(b"x")
@@ -66,8 +66,8 @@ def test_a_changed_file_is_named_with_the_manifest_to_delete(tmp_path):
         open_stage(tmp_path / "track.zarr", "track").load()
 
 
-def test_a_document_that_is_not_as_it_was_written_is_refused(tmp_path):
-    """Also where it is still a document: its hash is what its manifest says, or it is not read."""
+def test_changed_document_is_rejected(tmp_path):
+    """Also if it is still a valid document: it is read only if its hash equals that in its manifest."""
     path = tmp_path / "scene.json"
     save_document(path, {"height_m": 1.0})
     assert open_document(path) == {"height_m": 1.0}
@@ -76,8 +76,8 @@ def test_a_document_that_is_not_as_it_was_written_is_refused(tmp_path):
         open_document(path)
 
 
-def test_a_chunk_in_the_place_of_another_is_refused_when_it_is_read(tmp_path):
-    """It is whole by its own sum; the manifest knows better. What is not read is not looked at."""
+def test_swapped_chunk_is_rejected_when_read(tmp_path):
+    """Its own checksum is valid; only the hash in the manifest differs. Chunks that are not read are not checked."""
     values = np.arange(40.0).reshape(10, 4).astype(np.complex64)
     stage = xr.Dataset({"transfer": (("pulse", "subcarrier"), np.broadcast_to(np.complex64(0), values.shape))})
     for name in ("a", "b"):
@@ -92,7 +92,7 @@ def test_a_chunk_in_the_place_of_another_is_refused_when_it_is_read(tmp_path):
     np.testing.assert_array_equal(zarr.open_array(tmp_path / "b" / "echo.zarr", path="transfer")[:7], values[:7] + 1)
 
 
-def test_an_array_is_the_same_on_the_disk_however_its_blocks_are_cut(tmp_path, monkeypatch):
+def test_stored_array_does_not_depend_on_its_blocks(tmp_path, monkeypatch):
     monkeypatch.setattr(progress, "_CHUNK_BYTES", 3 * 4 * 8)
     monkeypatch.setattr(progress, "_FEWEST_ROWS", 1)
     values = np.random.default_rng(1).normal(size=(11, 4))
@@ -106,7 +106,7 @@ def test_an_array_is_the_same_on_the_disk_however_its_blocks_are_cut(tmp_path, m
     assert len(trees[0]) == 2 + 6  # two rows a chunk
 
 
-def test_rows_of_zeros_take_no_space_and_read_as_zeros(tmp_path):
+def test_rows_of_zeros_take_no_space(tmp_path):
     values = np.zeros((4096, 1024), np.complex64)
     values[1500] = 1
     stage = xr.Dataset({"profile": (("pulse", "range"), np.broadcast_to(np.complex64(0), values.shape))})
@@ -116,20 +116,20 @@ def test_rows_of_zeros_take_no_space_and_read_as_zeros(tmp_path):
 
 
 @pytest.mark.parametrize("rows", [10, 12])
-def test_blocks_that_are_not_the_whole_array_are_no_stage(tmp_path, rows):
+def test_blocks_that_do_not_fill_the_array_are_rejected(tmp_path, rows):
     stage = xr.Dataset({"profile": (("pulse", "range"), np.broadcast_to(0.0, (11, 4)))})
     with pytest.raises(ValueError, match="of profile: must be 11"):
         write_blocks(tmp_path / "x.wip", stage, "profile", [np.zeros((rows, 4))])
 
 
-def test_a_folder_without_a_manifest_is_not_finished(tmp_path):
+def test_folder_without_manifest_is_unfinished(tmp_path):
     save_stage(track(), tmp_path / "track.zarr")
     manifest_of(tmp_path / "track.zarr").unlink()
     with pytest.raises(CampaignError, match="missing or unfinished"):
         open_stage(tmp_path / "track.zarr", "track")
 
 
-def test_a_stage_of_another_version_is_one_message(tmp_path):
+def test_stage_of_another_version_is_one_message(tmp_path):
     save_stage(track().drop_vars("attitude"), tmp_path / "track.zarr")
     with pytest.raises(
         CampaignError, match=r"written by another version of apertura: .*attitude.*Run the workflow again"
@@ -137,23 +137,23 @@ def test_a_stage_of_another_version_is_one_message(tmp_path):
         open_stage(tmp_path / "track.zarr", "track")
 
 
-def test_the_same_stage_gives_the_same_manifest(tmp_path):
+def test_equal_stages_have_equal_manifests(tmp_path):
     for name in ("a", "b"):
         save_stage(track(), tmp_path / name / "track.zarr")
     first, second = ((tmp_path / name / "track.manifest.json").read_bytes() for name in ("a", "b"))
     assert first == second
 
 
-def test_a_broken_contract_lists_everything_that_is_wrong():
-    wrong = track().drop_vars("time").assign(position=(("axis", "epoch"), np.zeros((3, 2), np.float32)))
+def test_contract_error_lists_every_fault():
+    invalid = track().drop_vars("time").assign(position=(("axis", "epoch"), np.zeros((3, 2), np.float32)))
     with pytest.raises(ContractError, match=r"no variable 'time'.*position has dims.*position is float32"):
-        check(wrong, "track")
+        check(invalid, "track")
 
 
-def test_every_stage_says_what_each_variable_means():
-    meanings = {name: [one.meaning for one in stage.variables.values()] for name, stage in STAGES.items()}
+def test_every_variable_of_a_stage_has_a_meaning():
+    meanings = {name: [variable.meaning for variable in stage.variables.values()] for name, stage in STAGES.items()}
     assert min(map(len, meanings.values())) >= 1
-    assert [name for name, told in meanings.items() if not all(one.strip() for one in told)] == []
+    assert [name for name, texts in meanings.items() if not all(text.strip() for text in texts)] == []
 
 
 def empty_image(code="0"):
@@ -167,7 +167,7 @@ def empty_image(code="0"):
 WINDOWS = [(slice(r, r + 32), slice(c, min(c + 32, 48))) for r in (0, 32) for c in (0, 32)]
 
 
-def test_finished_tiles_are_kept_and_other_work_is_thrown_away(tmp_path):
+def test_finished_tiles_are_kept_and_other_work_is_discarded(tmp_path):
     with writing(tmp_path / "image.zarr") as wip:
         assert resume(wip, empty_image(), "image", WINDOWS) == WINDOWS
         zarr.open_array(Path(wip) / "image", mode="r+")[WINDOWS[1]] = 0
@@ -176,7 +176,7 @@ def test_finished_tiles_are_kept_and_other_work_is_thrown_away(tmp_path):
         assert resume(wip, empty_image(code="1"), "image", WINDOWS) == WINDOWS
 
 
-def test_jobs_share_the_work_and_who_finishes_waits_for_them(tmp_path):
+def test_finishing_job_waits_for_jobs_that_share_the_work(tmp_path):
     folder, alone = tmp_path / "image.zarr", threading.Event()
 
     def finish_it():
@@ -194,11 +194,11 @@ def test_jobs_share_the_work_and_who_finishes_waits_for_them(tmp_path):
     assert (first, second) == (WINDOWS, WINDOWS[1:])
 
 
-def test_other_work_that_came_between_is_not_written_into(tmp_path, monkeypatch):
+def test_shared_work_replaced_meanwhile_is_not_written(tmp_path, monkeypatch):
     folder, real = tmp_path / "image.zarr", fcntl.flock
 
     def slow(lock, kind):
-        if kind == fcntl.LOCK_SH:  # the lock is let go for a moment: another step begins other work
+        if kind == fcntl.LOCK_SH:  # the lock is released for a moment: another step starts other work
             resume(folder.with_name("image.zarr.wip"), empty_image(code="1"), "image", WINDOWS)
         real(lock, kind)
 
@@ -214,21 +214,21 @@ def finished_image(folder):
         finish(wip, folder)
 
 
-def test_a_sealed_stage_whose_record_snakemake_removed_is_not_computed_again(tmp_path):
+def test_complete_stage_without_manifest_is_not_recomputed(tmp_path):
     finished_image(tmp_path / "image.zarr")
     manifest_of(tmp_path / "image.zarr").unlink()
     with writing(tmp_path / "image.zarr") as wip:
         assert resume(wip, empty_image(), "image", WINDOWS) == []
 
 
-def test_a_damaged_stage_is_computed_again(tmp_path):
+def test_damaged_stage_is_recomputed(tmp_path):
     finished_image(tmp_path / "image.zarr")
     (tmp_path / "image.zarr" / "image" / "c" / "0" / "0").write_bytes(b"x")
     with writing(tmp_path / "image.zarr") as wip:
         assert resume(wip, empty_image(), "image", WINDOWS) == WINDOWS
 
 
-def test_a_partial_chunk_of_a_killed_writer_does_not_stay(tmp_path):
+def test_partial_chunk_of_a_killed_writer_is_removed(tmp_path):
     with writing(tmp_path / "image.zarr") as wip:
         resume(wip, empty_image(), "image", WINDOWS)
         zarr.open_array(Path(wip) / "image", mode="r+")[:] = 1
@@ -238,8 +238,8 @@ def test_a_partial_chunk_of_a_killed_writer_does_not_stay(tmp_path):
     assert not [name for name in files if name.endswith(".partial")]
 
 
-def test_chunks_that_were_being_rewritten_are_begun_anew_and_so_are_those_of_a_finished_stage(tmp_path):
-    """Tiles formed again for their error: a run that is killed meanwhile must come to the same certificate."""
+def test_chunks_being_rewritten_are_recomputed_after_a_kill(tmp_path):
+    """Tiles are formed again to measure their error: a run killed meanwhile must reach the same certificate."""
     folder = tmp_path / "image.zarr"
     with writing(folder) as wip:
         resume(wip, empty_image(), "image", WINDOWS)
@@ -257,7 +257,7 @@ def test_chunks_that_were_being_rewritten_are_begun_anew_and_so_are_those_of_a_f
         assert resume(wip, empty_image(), "image", WINDOWS) == WINDOWS[2:3]
 
 
-def test_no_name_in_work_of_a_stranger_removes_anything_else(tmp_path):
+def test_names_in_untrusted_work_remove_nothing_else(tmp_path):
     (tmp_path / "kept").write_text("")
     with writing(tmp_path / "image.zarr") as wip:
         resume(wip, empty_image(), "image", WINDOWS)
@@ -270,21 +270,21 @@ def test_no_name_in_work_of_a_stranger_removes_anything_else(tmp_path):
     assert (tmp_path / "kept").exists()
 
 
-def test_a_second_writer_waits_for_the_first(tmp_path):
+def test_second_writer_waits_for_the_first(tmp_path):
     holder = "from apertura.campaign.store import writing\nfrom pathlib import Path\nimport sys, time\n"
     holder += "with writing(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(1.5)\n"
     with subprocess.Popen(
         [sys.executable, "-c", holder, str(tmp_path / "image.zarr")], stdout=subprocess.PIPE, text=True
     ) as process:
         assert process.stdout.readline() == "held\n"
-        began = time.monotonic()
+        start_s = time.monotonic()
         with writing(tmp_path / "image.zarr"):
-            waited = time.monotonic() - began
+            waited = time.monotonic() - start_s
     assert waited > 0.5
 
 
 def half_done(folder):
-    """Work in progress that holds all tiles but the last; what it holds is 1."""
+    """Create work in progress with all tiles but the last, filled with 1."""
     with writing(folder) as wip:
         resume(wip, empty_image(), "image", WINDOWS)
         target = open_array(wip, "image")
@@ -308,7 +308,7 @@ DAMAGE = {
 
 @pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
 @pytest.mark.parametrize("shared", [False, True], ids=["one job", "many jobs"])
-def test_a_damaged_tile_in_work_in_progress_is_formed_again_with_a_notice(tmp_path, caplog, damage, shared):
+def test_damaged_tile_in_progress_is_recomputed_with_a_notice(tmp_path, caplog, damage, shared):
     tile = half_done(tmp_path / "image.zarr") / "image" / "c" / "0" / "1"
     tile.write_bytes(damage(tile.read_bytes()))
     if shared:
@@ -326,7 +326,7 @@ def test_a_damaged_tile_in_work_in_progress_is_formed_again_with_a_notice(tmp_pa
     [b"", b"{", b"\xff\xfe", b"[]", b'{"attributes": 1}', b"[" * 100_000],
     ids=["empty", "cut", "no text", "a list", "other attributes", "very deep"],
 )
-def test_work_in_progress_that_cannot_say_what_it_is_is_begun_anew_with_a_notice(tmp_path, caplog, content):
+def test_unreadable_work_in_progress_is_restarted_with_a_notice(tmp_path, caplog, content):
     wip = half_done(tmp_path / "image.zarr")
     (wip / "zarr.json").write_bytes(content)
     with writing(tmp_path / "image.zarr") as wip:
@@ -334,7 +334,7 @@ def test_work_in_progress_that_cannot_say_what_it_is_is_begun_anew_with_a_notice
     assert "recomputing from the start" in caplog.text
 
 
-def test_damaged_metadata_of_an_array_is_written_again_and_its_tiles_are_kept(tmp_path, caplog):
+def test_damaged_array_metadata_is_rewritten_and_tiles_are_kept(tmp_path, caplog):
     wip = half_done(tmp_path / "image.zarr")
     metadata = wip / "image" / "zarr.json"
     content = metadata.read_bytes()
@@ -348,14 +348,14 @@ def test_damaged_metadata_of_an_array_is_written_again_and_its_tiles_are_kept(tm
     assert "image/zarr.json is damaged" in caplog.text
 
 
-def test_undamaged_work_is_resumed_without_a_word(tmp_path, caplog):
+def test_undamaged_work_is_resumed_without_a_notice(tmp_path, caplog):
     half_done(tmp_path / "image.zarr")
     with writing(tmp_path / "image.zarr") as wip:
         assert resume(wip, empty_image(), "image", WINDOWS) == WINDOWS[3:]
     assert caplog.records == []
 
 
-def test_a_tile_reaches_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+def test_tile_is_synced_before_renaming(tmp_path, monkeypatch):
     with writing(tmp_path / "image.zarr") as wip:
         resume(wip, empty_image(), "image", WINDOWS)
         tile, synchronised = wip / "image" / "c" / "0" / "0", []
@@ -365,7 +365,7 @@ def test_a_tile_reaches_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
         assert tile.is_file()
 
 
-def test_every_chunk_of_every_array_carries_a_sum(tmp_path):
+def test_every_array_has_chunk_checksums(tmp_path):
     save_stage(track(), tmp_path / "track.zarr")
     finished_image(tmp_path / "image.zarr")
     arrays = [json.loads(path.read_text()) for path in tmp_path.glob("*.zarr/*/zarr.json")]
@@ -373,7 +373,7 @@ def test_every_chunk_of_every_array_carries_a_sum(tmp_path):
     assert {array["codecs"][-1]["name"] for array in arrays} == {"crc32c"}
 
 
-def test_a_chunk_damaged_after_its_stage_was_opened_is_one_message_with_the_manifest_to_delete(tmp_path):
+def test_chunk_damaged_after_opening_is_reported_with_the_manifest(tmp_path):
     finished_image(tmp_path / "image.zarr")
     opened = open_stage(tmp_path / "image.zarr", "image")
     chunk = tmp_path / "image.zarr" / "image" / "c" / "1" / "1"
@@ -386,8 +386,8 @@ def test_a_chunk_damaged_after_its_stage_was_opened_is_one_message_with_the_mani
     assert str(caught.value).count(str(tmp_path)) == 2
 
 
-def test_a_chunk_that_is_gone_after_its_stage_was_opened_is_no_empty_one(tmp_path):
-    """zarr fills a chunk that is not there with the fill value, as of pixels that were never formed: NaN."""
+def test_chunk_deleted_after_opening_is_reported(tmp_path):
+    """zarr reads an absent chunk as the fill value, NaN, the value of pixels that were never formed."""
     finished_image(tmp_path / "image.zarr")
     opened = open_stage(tmp_path / "image.zarr", "image")
     (tmp_path / "image.zarr" / "image" / "c" / "1" / "1").unlink()

@@ -1,4 +1,4 @@
-"""Patterns, axes and weights of antennas, and what the planner makes of them."""
+"""Antenna patterns, axes and weights, and their effect on plans."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ from apertura.core.planning.planner import make_plan
 from apertura.core.quality.measures import numerical_error_db
 
 
-def test_the_axes_of_an_antenna_are_those_of_a_body_turned_by_its_boresight():
+def test_antenna_axes_are_the_body_axes_rotated_to_the_boresight():
     for azimuth, elevation in ((0, 0), (90, -30), (-135, 60), (200, -90)):
         body = body_axes(np.radians([[10.0, -20.0, 30.0]]))
         ahead, right, below = np.moveaxis(body @ body_axes(np.radians([0.0, elevation, azimuth])), -1, 0)
@@ -38,7 +38,7 @@ def test_the_axes_of_an_antenna_are_those_of_a_body_turned_by_its_boresight():
         )
 
 
-def test_half_the_power_is_left_at_half_the_width_and_nothing_beyond_the_cutoff():
+def test_gain_is_half_power_at_half_width_and_zero_past_cutoff():
     beam = side_beam((20.0, 50.0), boresight_deg=(0.0, 0.0), pulses=1)
     angle = np.radians([10.0, 25.0])
     places = np.array([[np.cos(angle[0]), -np.sin(angle[0]), 0], [np.cos(angle[1]), 0, np.sin(angle[1])], [1, -0.6, 0]])
@@ -46,20 +46,20 @@ def test_half_the_power_is_left_at_half_the_width_and_nothing_beyond_the_cutoff(
     assert np.degrees(beam.azimuth_rad[-1]) == pytest.approx(20 * np.sqrt(20 / 12.0412), abs=1e-3)
 
 
-def test_a_wide_beam_ends_where_directions_do():
+def test_wide_beam_ends_at_90_degrees():
     angle, gain = gaussian_cut(170.0, cutoff_db=-20.0, limit_rad=np.pi / 2)
     assert angle[-1] == np.pi / 2
     assert gain[-1] > 0.1
 
 
-def test_a_sampled_cut_keeps_its_main_lobe_alone():
+def test_sampled_cut_keeps_only_the_main_lobe():
     angle = np.array([-40.0, -30, -20, 0, 20, 30, 40])
     kept, gain = sampled_cut(angle, np.array([-5.0, -13, -60, 0, -60, -13, -5]), cutoff_db=-20)
     assert np.degrees(kept[-1]) == pytest.approx(20 / 3, abs=0.05)
     assert gain.min() >= 0.1
 
 
-def test_pulses_that_illuminate_a_place_are_counted():
+def test_pulses_that_illuminate_a_point_are_counted():
     tx, places = straight_track(3000), np.array([[0.0, 20, 0], [2.0, 20, 0], [0.0, -20, 0]])
     beams = Beams(side_beam((4.0, 60.0), boresight_deg=(-90.0, -26.6), pulses=3000))
     illumination = illuminate(beams, monostatic(tx), places)
@@ -75,7 +75,7 @@ def jobs(beams, *, shape=(200, 200)):
     return {"beams": beams, "illumination": lit, "shape": shape}
 
 
-def test_pulses_outside_a_beam_cost_less_than_without_beams_and_those_inside_more():
+def test_pulses_cost_less_outside_a_beam_and_more_inside():
     shared = (1.0, 0.0, 0.0)
     lit, half, dark = (pixel_seconds(shared, 2, PatchWeights(1 - share, 0.0, share, 0.0, 2)) for share in (0, 0.5, 1))
     assert half == pytest.approx((lit + dark) / 2)
@@ -84,7 +84,7 @@ def test_pulses_outside_a_beam_cost_less_than_without_beams_and_those_inside_mor
 
 @pytest.mark.slow
 @compiled
-def test_a_plan_counts_what_its_beams_cost():
+def test_plan_includes_the_cost_of_beams():
     native = {"engine": "native"}
     lit = plan(overrides=native, **jobs(None, shape=(2000, 2000))).predicted_seconds
     wide = Beams(side_beam((100.0, 100.0), cutoff_db=-40.0), side_beam((100.0, 100.0), cutoff_db=-40.0))
@@ -93,7 +93,7 @@ def test_a_plan_counts_what_its_beams_cost():
 
 @compiled
 @pytest.mark.parametrize("width_deg", [20.0, 35.0, 60.0])
-def test_how_native_applies_weights_is_predicted(width_deg):
+def test_weighting_method_of_native_is_predicted(width_deg):
     pixels = pixel_grid(48, 64)
     scene = fly(scatter(pixels), pulses=64)
     places = ecef(pixels)
@@ -112,7 +112,7 @@ def test_how_native_applies_weights_is_predicted(width_deg):
 
 @pytest.mark.slow
 @compiled
-def test_an_accuracy_that_smooth_weights_cannot_give_is_left_to_exact_ones():
+def test_high_accuracy_needs_exact_weights():
     beams = Beams(side_beam((8.0, 16.0)), side_beam((8.0, 16.0)))
     assert plan(-60.0, **jobs(beams)).engine == "native"
     fine = plan(-100.0, **jobs(beams))
@@ -121,7 +121,7 @@ def test_an_accuracy_that_smooth_weights_cannot_give_is_left_to_exact_ones():
 
 
 def aimed(position_m, middle_m, width_deg):
-    """A beam on a level body that flies along the track, aimed at the scene's middle from the middle of the track."""
+    """Return the beam of a level body that flies along the track, aimed at the scene centre from mid-track."""
     ahead = (position_m[-1] - position_m[0]) * [1, 1, 0]
     ahead /= np.linalg.norm(ahead)
     body = np.stack([ahead, np.cross(ahead, [0, 0, 1.0]), [0, 0, -1.0]], 1)
@@ -135,7 +135,7 @@ def aimed(position_m, middle_m, width_deg):
 @pytest.mark.quick("2.0-1")
 @pytest.mark.parametrize("seed", [0, 1, 2, 5])
 @pytest.mark.parametrize("widths", [0.5, 2.0, 10.0])
-def test_the_certified_error_is_met_whatever_part_of_a_scene_the_beam_lights(seed, widths):
+def test_certified_error_is_met_for_any_illuminated_part(seed, widths):
     drawn = draw(np.random.default_rng(seed), pixels=64, pulses=90)
     aperture = drawn.job.aperture
     middle = drawn.job.points_m[len(drawn.job.points_m) // 2]
@@ -149,6 +149,6 @@ def test_the_certified_error_is_met_whatever_part_of_a_scene_the_beam_lights(see
     image = engine.form(
         engine.prepare(inputs, **planned.setting.options), places, beams=beams, **planned.setting.form_options
     )
-    some = tuple(np.random.default_rng(1).integers(0, drawn.grid.shape, (200, 2)).T)
-    exact = reference.form(drawn.history, places[some], beams=beams)
-    assert numerical_error_db(image[some].astype(np.complex64), exact) <= drawn.accuracy_db
+    sample = tuple(np.random.default_rng(1).integers(0, drawn.grid.shape, (200, 2)).T)
+    exact = reference.form(drawn.history, places[sample], beams=beams)
+    assert numerical_error_db(image[sample].astype(np.complex64), exact) <= drawn.accuracy_db

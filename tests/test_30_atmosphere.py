@@ -1,4 +1,4 @@
-"""The speed of light in air: refractivity, its mean along paths, and images of waves that are slower than in vacuum."""
+"""Speed of light in the atmosphere: refractivity, its mean along paths, and images at that wave speed."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -25,17 +25,17 @@ ROOT = Path(__file__).parent.parent
 AIR = 1.000282
 
 
-def test_refractivity_is_that_of_the_recommendation():
-    """Dry air and vapour by hand: 77.6·1013.25/288.15; e_s = 17.04 hPa at 15 °C in tables, 3.73e5·e/T² of vapour."""
+def test_refractivity_matches_itu_r_p453():
+    """Reference values: dry 77.6·1013.25/288.15; e_s = 17.04 hPa at 15 °C from tables, 3.73e5·e/T² of vapour."""
     assert refractivity(15.0, 1013.25, 0.0) == pytest.approx(77.6 * 1013.25 / 288.15, rel=1e-12)
     wet = refractivity(15.0, 1013.25, 100.0) - refractivity(15.0, 1013.25, 0.0)
-    assert wet == pytest.approx(3.73e5 * 17.04 / 288.15**2, rel=0.006)  # 0.4 % is the enhancement of moist air
+    assert wet == pytest.approx(3.73e5 * 17.04 / 288.15**2, rel=0.006)  # 0.4 % is the enhancement factor of moist air
     assert refractivity(30.0, 1000.0, 100.0) == pytest.approx(430, abs=3)  # the tropics
     assert standard_weather(5000.0)[:2] == pytest.approx((-17.5, 540.2), abs=0.1)  # ISO 2533
 
 
 @pytest.mark.parametrize("heights", [(600.0, 610.0), (3000.0, 0.0), (-50.0, 9000.0), (500.0, 500.0)])
-def test_the_mean_along_a_path_is_that_of_its_integral(heights):
+def test_mean_refractivity_equals_the_path_integral(heights):
     air = Atmosphere(300.0, 100.0, "a test")
     along = np.linspace(0, 1, 20001)
     profile = 300.0 * np.exp(-(heights[0] + along * (heights[1] - heights[0]) - 100.0) / SCALE_HEIGHT_M)
@@ -44,8 +44,8 @@ def test_the_mean_along_a_path_is_that_of_its_integral(heights):
     assert air.mean_n(*heights[::-1]) == air.mean_n(*heights)
 
 
-def test_bending_is_less_than_a_tenth_of_a_millimetre_below_ten_kilometres():
-    """The quickest path between two points of a layered air against the straight one, by a sine-shaped detour."""
+def test_ray_bending_is_below_0_1_mm_up_to_10_km():
+    """Fastest path between two points of a layered atmosphere against the straight line, for a sine-shaped sag."""
     air, length = Atmosphere(320.0, 0.0, "a test"), 10_000.0
     x = np.linspace(0, length, 4001)
 
@@ -60,7 +60,7 @@ def test_bending_is_less_than_a_tenth_of_a_millimetre_below_ten_kilometres():
     assert times[0] - min(times) < 1e-4
 
 
-def test_a_flight_has_one_refractivity_weighed_by_its_legs():
+def test_refractivity_of_a_flight_is_weighted_by_path_length():
     air = Atmosphere.stated(300.0, ground_m=0.0)
     high, low, far, near = (np.full(5, value) for value in (3000.0, 10.0, 5000.0, 100.0))
     flown = air.over(high, low, (far, near))
@@ -72,27 +72,27 @@ def test_a_flight_has_one_refractivity_weighed_by_its_legs():
     assert flown.report["vacuum_shift_m"] == pytest.approx(flown.refractivity_n * 1e-6 * 5100 / 2, rel=1e-3)
 
 
-def test_what_the_weather_may_be_covers_ten_kelvin_twenty_hectopascals_and_any_humidity():
+def test_refractivity_std_covers_10_k_20_hpa_and_any_humidity():
     air = Atmosphere.standard(300.0)
     celsius, hpa, humidity = standard_weather(300.0)
-    for wrong in ((10, 0, 0), (-10, 0, 0), (0, 20, 0), (0, -20, 0)):
-        off = refractivity(celsius + wrong[0], hpa + wrong[1], humidity) - air.refractivity_n
-        assert abs(off) < air.std_n
+    for change in ((10, 0, 0), (-10, 0, 0), (0, 20, 0), (0, -20, 0)):
+        error_n = refractivity(celsius + change[0], hpa + change[1], humidity) - air.refractivity_n
+        assert abs(error_n) < air.std_n
     for extreme in (0.0, 100.0):
         assert abs(refractivity(celsius, hpa, extreme) - air.refractivity_n) < 2 * air.std_n
     measured = Atmosphere.of_weather(celsius, hpa, humidity, ground_m=300.0)
     assert measured.refractivity_n == air.refractivity_n
     assert 1 < measured.std_n < air.std_n / 3
     assert Atmosphere.stated(0.0, ground_m=0.0).std_n == 0  # simulated in vacuum
-    assert Atmosphere.vacuum().std_n == 300  # in place of air
-    assert wave_speed(0.0) == SPEED_OF_LIGHT_M_S  # to the bit
+    assert Atmosphere.vacuum().std_n == 300  # vacuum assumed for a real atmosphere
+    assert wave_speed(0.0) == SPEED_OF_LIGHT_M_S  # bitwise equal
 
 
-# ---- Images of waves in air -----------------------------------------------------------------------------------------
+# ---- Images at the wave speed in air --------------------------------------------------------------------------------
 
 FREQUENCY = 1.2e9 + 2e6 * np.arange(128)
 GRID = ap.SceneGrid("local", -6.0, 6.0, 0.25, (48, 48))
-TARGET = np.array([[1.25, -0.75, 0.0]])  # a corner of pixels; pixel middles lie half a spacing beside
+TARGET = np.array([[1.25, -0.75, 0.0]])  # a corner of pixels; pixel centres are half a spacing away
 
 
 def flight(range_m=600.0, pulses=96):
@@ -102,7 +102,7 @@ def flight(range_m=600.0, pulses=96):
 
 
 def history(aperture, index, **changes):
-    """Return the echo of TARGET through air, by the delays of both legs, less the delay of the origin."""
+    """Return the echo of TARGET through air, from the delays of both one-way paths, relative to the origin's delay."""
     origin_s, target_s = (index * aperture.path(place) / SPEED_OF_LIGHT_M_S for place in (0 * TARGET, TARGET))
     delay_s = target_s - origin_s
     echo = np.exp(-2j * np.pi * FREQUENCY * delay_s).astype(np.complex64)
@@ -116,19 +116,19 @@ def peak_m(image):
 
 
 @pytest.mark.slow
-def test_a_target_seen_through_air_lies_where_it_stands_by_the_speed_in_air_and_beyond_it_in_vacuum():
+def test_target_is_at_its_position_only_at_the_speed_in_air():
     aperture, fine = flight(), ap.SceneGrid("local", 0.25, 0.25, 0.02, (100, 100))
     for speed, off_m in ((SPEED_OF_LIGHT_M_S / AIR, 0.0), (SPEED_OF_LIGHT_M_S, 282e-6 * 600 / 0.8)):
-        given = history(aperture, AIR, wave_speed_m_s=speed)
-        x, y = peak_m(ap.backproject(given, fine, terrain=0.0, certified_pixels=8).compute())
+        recorded = history(aperture, AIR, wave_speed_m_s=speed)
+        x, y = peak_m(ap.backproject(recorded, fine, terrain=0.0, certified_pixels=8).compute())
         assert (x, y) == pytest.approx((1.25, -0.75 + off_m), abs=0.05 * off_m + 0.021)
 
 
 @pytest.mark.slow
-def test_the_air_of_a_scene_is_a_keyword_from_python_for_transfer_functions_and_profiles():
-    """N at the ground, an Atmosphere, the standard one, vacuum: the speed of waves between ground and antennas."""
-    aperture, given = flight(), history(flight(), AIR)
-    profiles = range_compress(given, GRID, FlatGround(0.0))
+def test_atmosphere_keyword_sets_the_wave_speed():
+    """Accepted values: N at the terrain, an Atmosphere, the standard atmosphere, vacuum."""
+    aperture, recorded_history = flight(), history(flight(), AIR)
+    profiles = range_compress(recorded_history, GRID, FlatGround(0.0))
     height_m = float(aperture.tx_m[:, 2].mean())
     stated = Atmosphere.stated(300.0, ground_m=0.0)
     expected = {wave_speed(float(stated.mean_n(height_m, 0.0))): (300.0, stated), SPEED_OF_LIGHT_M_S: ("vacuum",)}
@@ -136,24 +136,26 @@ def test_the_air_of_a_scene_is_a_keyword_from_python_for_transfer_functions_and_
     quick = {"terrain": 0.0, "certified_pixels": 0}
     for speed, same in expected.items():
         for air in same:
-            assert ap.backproject(given, GRID, atmosphere=air, **quick).wave_speed_m_s == pytest.approx(speed, abs=10)
-    by_speed = ap.backproject(given.at_speed(wave_speed(float(stated.mean_n(height_m, 0.0)))), GRID, **quick)
-    for recorded in (given, profiles):
+            assert ap.backproject(recorded_history, GRID, atmosphere=air, **quick).wave_speed_m_s == pytest.approx(
+                speed, abs=10
+            )
+    by_speed = ap.backproject(recorded_history.at_speed(wave_speed(float(stated.mean_n(height_m, 0.0)))), GRID, **quick)
+    for recorded in (recorded_history, profiles):
         image = ap.backproject(recorded, GRID, atmosphere=stated, **quick)
         assert np.abs(image.values - by_speed.values).max() < 2e-3 * np.abs(by_speed.values).max()
-    assert np.abs(ap.backproject(given, GRID, **quick).values - by_speed.values).max() > 0.1
+    assert np.abs(ap.backproject(recorded_history, GRID, **quick).values - by_speed.values).max() > 0.1
     with pytest.raises(
         CampaignError, match="expected auto, vacuum, an Atmosphere, or the refractivity at the terrain in N units"
     ):
-        ap.backproject(given, GRID, atmosphere="dry")
+        ap.backproject(recorded_history, GRID, atmosphere="dry")
 
 
 @pytest.mark.quick("numba", "reference")
 @pytest.mark.parametrize("engine", [name for name in ENGINES if name not in {"cuda"}])
-def test_an_image_in_air_is_that_of_a_larger_world_in_vacuum(engine):
-    """docs/theory/atmosphere.md, eq. 4, pixel by pixel; every engine against itself, and against the double sum.
+def test_image_in_air_equals_image_of_scaled_geometry_in_vacuum(engine):
+    """docs/theory/atmosphere.md, eq. 4, pixel by pixel, for every engine, and against the double sum.
 
-    Without a certificate, which would replace an engine that errs.
+    Without a certificate, which would replace an engine whose error is too large.
     """
     if not load_engine(engine).available():
         pytest.skip("cannot run here")
@@ -163,37 +165,37 @@ def test_an_image_in_air_is_that_of_a_larger_world_in_vacuum(engine):
     in_air = history(aperture, AIR, wave_speed_m_s=SPEED_OF_LIGHT_M_S / AIR)
     vacuum = replace(in_air, aperture=larger, wave_speed_m_s=SPEED_OF_LIGHT_M_S)
     images = [
-        np.asarray(ap.backproject(given, on, terrain=0.0, engine=engine, integration="all", certified_pixels=0))
-        for given, on in ((in_air, GRID), (vacuum, grid))
+        np.asarray(ap.backproject(recorded, on, terrain=0.0, engine=engine, integration="all", certified_pixels=0))
+        for recorded, on in ((in_air, GRID), (vacuum, grid))
     ]
     exact = np.asarray(ap.backproject(in_air, GRID, terrain=0.0, engine="reference", integration="all"))
     assert np.abs(images[0] - images[1]).max() < 1e-3 * np.abs(exact).max()
     assert np.abs(images[0] - exact).max() < 2e-3 * np.abs(exact).max()
 
 
-def test_profiles_are_of_one_speed_and_no_wave_is_faster_than_light():
+def test_profiles_keep_the_wave_speed_and_it_is_at_most_c():
     aperture = flight()
-    given = history(aperture, AIR, wave_speed_m_s=SPEED_OF_LIGHT_M_S / AIR)
-    profiles = range_compress(given, GRID, FlatGround(0.0))
-    assert profiles.wave_speed_m_s == given.wave_speed_m_s
+    recorded = history(aperture, AIR, wave_speed_m_s=SPEED_OF_LIGHT_M_S / AIR)
+    profiles = range_compress(recorded, GRID, FlatGround(0.0))
+    assert profiles.wave_speed_m_s == recorded.wave_speed_m_s
     assert profiles.bandwidth_hz == pytest.approx(256e6)
     assert profiles.wavelength_m * profiles.wavenumber_rad_m == pytest.approx(2 * np.pi)
     window = RangeWindow.of(aperture, GRID, FlatGround(0.0), FREQUENCY, wave_speed_m_s=SPEED_OF_LIGHT_M_S)
     with pytest.raises(ValueError, match="that of the history"):
-        range_compress(given, GRID, FlatGround(0.0), window=window)
+        range_compress(recorded, GRID, FlatGround(0.0), window=window)
     for speed in (SPEED_OF_LIGHT_M_S * 1.0001, 1.0):
         with pytest.raises(ValueError, match="wave_speed_m_s"):
-            replace(given, wave_speed_m_s=speed)
+            replace(recorded, wave_speed_m_s=speed)
 
 
-def test_echoes_over_longer_paths_are_longer_by_that_in_air():
+def test_extra_path_delays_echoes_at_the_speed_in_air():
     aperture, extra_path_m = flight(), np.full(96, 1.7)
-    given = history(aperture, AIR, wave_speed_m_s=SPEED_OF_LIGHT_M_S / AIR)
-    longer_s = given.moved(aperture, extra_path_m).reference_delay_s - given.reference_delay_s
+    recorded = history(aperture, AIR, wave_speed_m_s=SPEED_OF_LIGHT_M_S / AIR)
+    longer_s = recorded.moved(aperture, extra_path_m).reference_delay_s - recorded.reference_delay_s
     np.testing.assert_allclose(longer_s, 1.7 * AIR / SPEED_OF_LIGHT_M_S, rtol=1e-12)
 
 
-def test_histories_that_a_reader_joins_are_of_vacuum_until_a_campaign_says_otherwise(tmp_path):
+def test_joined_histories_have_the_speed_in_vacuum_by_default(tmp_path):
     place = np.ones((3, 3))
     one = History(
         tmp_path / "a", np.arange(3).astype("datetime64[ns]"), place, place, np.ones((3, 4), np.complex64),
@@ -203,14 +205,14 @@ def test_histories_that_a_reader_joins_are_of_vacuum_until_a_campaign_says_other
     assert (echo.attrs["wave_speed_m_s"], echo.attrs["reference"]) == (SPEED_OF_LIGHT_M_S, "point")
 
 
-# ---- Who takes vacuum -----------------------------------------------------------------------------------------------
+# ---- Uses of the speed in vacuum ------------------------------------------------------------------------------------
 
-_SIZE = "sizes of cells, searches, windows or grids, and limits of checks: 0.03 % of them is nothing"
+_SIZE = "sizes of cells, searches, windows or grids, and limits of checks: 0.03 % is negligible"
 _POWER = "wavelength of the radar equation: 0.003 dB"
-_DRAWN = "what is drawn or listed"
+_DRAWN = "plots and listings"
 _ELECTRICAL = "electrical paths: cables, delays given as c times seconds"
-_DEFAULT = "where arrays state no speed of their own"
-_FORMAT = "delays of a point that a file states as a distance, or delays as they were, for in_air to convert"
+_DEFAULT = "default for arrays without a speed of their own"
+_FORMAT = "delays that a file gives as a distance, or unconverted delays for in_air"
 
 VACUUM = {
     "common/constants.py": "the constant",
@@ -226,7 +228,7 @@ VACUUM = {
     "core/imaging/resolution.py": _SIZE,
     "core/imaging/reflectors.py": "wavelength of a cross-section: 0.003 dB",
     "core/imaging/job.py": f"{_DEFAULT}; {_SIZE}",
-    "core/imaging/judgement.py": "whether a wave speed is that in vacuum, so that the budget states what air would do",
+    "core/imaging/judgement.py": "comparison with the speed in vacuum, so that the budget has the effect of air",
     "core/echo/compression.py": _DEFAULT,
     "core/echo/calibration.py": _ELECTRICAL,
     "core/echo/dechirp.py": _ELECTRICAL,
@@ -244,33 +246,33 @@ VACUUM = {
     "formats/phase_histories/phase_history.py": _FORMAT,
     "formats/phase_histories/fmcw.py": _FORMAT,
     "formats/phase_histories/pulson.py": _FORMAT,
-    "formats/export/cphd.py": "what TDTropoSRP counts from",
+    "formats/export/cphd.py": "reference of TDTropoSRP",
     "simulation/scatterers.py": "delay of an optical path",
-    "simulation/fmcw.py": "flies in vacuum, and its config says so",
-    "simulation/gridding.py": "as simulation/scatterers.py's plain sum, of arrays in vacuum",
+    "simulation/fmcw.py": "simulates vacuum, and writes that to its config",
+    "simulation/gridding.py": "same as the plain sum of simulation/scatterers.py, for arrays in vacuum",
     "simulation/observation.py": _POWER,
-    "simulation/synthesis.py": "excess of reflections beside the sidelink",
+    "simulation/synthesis.py": "excess path of reflections of the sidelink",
     "check/reach.py": _SIZE,
     "workflow/resources.py": _SIZE,
     "check/facts.py": _DRAWN,
     "stages/hypotheses.py": _SIZE,
     "stages/echo.py": _ELECTRICAL,
-    "stages/tags.py": "wavelength written beside the frequency",
+    "stages/tags.py": "wavelength written next to the frequency",
     "stages/transfer.py": _ELECTRICAL,
     "tools/align.py": _ELECTRICAL,
     "stages/node_log.py": _SIZE,
     "stages/radiometry.py": _POWER,
     "tools/design/planned_tracks.py": _ELECTRICAL,
-    "tools/reflectors.py": "phase that an error of a place leaves, to 0.03 %",
+    "tools/reflectors.py": "residual phase of a position error, to 0.03 %",
     "stages/calibration.py": _ELECTRICAL,
     "tools/design/view.py": _DRAWN,
     "views/inspect/pictures.py": _DRAWN,
     "views/report/step.py": _SIZE,
 }
-"""Modules that take the speed of light in vacuum, and why: what turns delay into path takes that of its arrays."""
+"""Modules that use the speed of light in vacuum, with reasons: delays are converted at the speed of their arrays."""
 
 
-def test_who_takes_the_speed_of_light_in_vacuum_is_listed_with_the_reason():
+def test_uses_of_the_speed_of_light_in_vacuum_are_listed():
     source = ROOT / "src/apertura"
     users = {
         path.relative_to(source).as_posix()

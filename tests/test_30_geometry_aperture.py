@@ -1,4 +1,4 @@
-"""The geometry of an aperture: paths, their gradients and rates, the cell it resolves, blocks of its pulses."""
+"""Geometry of an aperture: paths, their gradients and rates, the resolution cell, blocks of pulses."""
 
 import numpy as np
 import pytest
@@ -26,36 +26,36 @@ def at(places):
 
 @tried(100, derandomize=False)
 @given(legs=LEGS, points=POINTS)
-def test_the_path_is_the_same_when_transmitter_and_receiver_change_places(legs, points):
+def test_path_is_symmetric_in_transmitter_and_receiver(legs, points):
     np.testing.assert_array_equal(Aperture(*legs).path(points), Aperture(*reversed(legs)).path(points))
 
 
 @tried(100, derandomize=False)
 @given(legs=LEGS, points=POINTS)
-def test_no_path_is_shorter_than_the_baseline_and_none_changes_faster_than_twice_the_way_to_the_next_point(
-    legs, points
-):
+def test_path_obeys_the_triangle_inequality(legs, points):
     path = Aperture(*legs).path(points)
     baseline = np.linalg.norm(legs[0] - legs[1], axis=1)
     assert (path >= baseline[:, None] - NANOMETRES).all()
-    way = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    assert (np.abs(np.diff(path, axis=1)) <= 2 * way + NANOMETRES).all()
+    distance = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    assert (np.abs(np.diff(path, axis=1)) <= 2 * distance + NANOMETRES).all()
 
 
 @tried(100, derandomize=False)
 @given(legs=LEGS, points=POINTS, shift=arrays(np.float64, 3, elements=COORDINATES), seed=st.integers(0, 2**32 - 1))
-def test_paths_do_not_change_when_everything_is_turned_and_moved(legs, points, shift, seed):
-    turn = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))[0]
-    moved = [part @ turn.T + shift for part in (*legs, points)]
-    np.testing.assert_allclose(Aperture(*moved[:2]).path(moved[2]), Aperture(*legs).path(points), atol=NANOMETRES)
+def test_paths_are_invariant_to_rigid_motion(legs, points, shift, seed):
+    rotation = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))[0]
+    transformed = [part @ rotation.T + shift for part in (*legs, points)]
+    np.testing.assert_allclose(
+        Aperture(*transformed[:2]).path(transformed[2]), Aperture(*legs).path(points), atol=NANOMETRES
+    )
 
 
-def test_a_path_at_one_antenna_is_the_baseline_and_halfway_between_both_too():
+def test_path_of_points_on_the_baseline_is_its_length():
     flown = Aperture(at([[0, 0, 0]]), at([[6, 8, 0]]))
     np.testing.assert_allclose(flown.path(at([[0, 0, 0], [3, 4, 0], [6, 8, 0]])), [[10, 10, 10]])
 
 
-def test_points_keep_their_axes_and_pulses_come_first():
+def test_pulse_axis_precedes_axes_of_points():
     flown = Aperture(straight_track(7), straight_track(7) + [1.0, 0, 0])
     points = ground_points(count=3)
     assert flown.path(points).shape == (7, 3, 3)
@@ -63,7 +63,7 @@ def test_points_keep_their_axes_and_pulses_come_first():
     np.testing.assert_array_equal(flown.path(points)[4, 1, 2], flown[4:5].path(points[1, 2])[0])
 
 
-def test_the_gradient_is_what_finite_differences_of_the_path_give():
+def test_path_gradient_matches_finite_differences():
     flown = Aperture(straight_track(20, wobble_m=0.3), straight_track(20) + [3.0, -2.0, 1.0])
     points, step = ground_points().reshape(-1, 3), 1e-4
     shifted = [flown.path(points + side * step * axis) for axis in np.eye(3) for side in (1, -1)]
@@ -75,7 +75,7 @@ def test_the_gradient_is_what_finite_differences_of_the_path_give():
     assert np.abs(gradient).max() > 0.5
 
 
-def test_phase_centres_of_different_shapes_are_refused():
+def test_phase_centres_of_different_shapes_are_rejected():
     for tx, rx in (
         (np.zeros((4, 3)), np.zeros((5, 3))),
         (np.zeros((4, 2)), np.zeros((4, 2))),
@@ -90,7 +90,7 @@ def test_phase_centres_of_different_shapes_are_refused():
 
 @tried(100, derandomize=False)
 @given(pulses=st.integers(0, 400), count=st.integers(1, 60))
-def test_blocks_hold_each_pulse_once_in_order_and_differ_by_one_pulse_at_most(pulses, count):
+def test_blocks_partition_the_pulses_evenly(pulses, count):
     track = np.zeros((pulses, 3))
     blocks = Aperture(track, track).blocks(count)
     assert len(blocks) == count
@@ -101,7 +101,7 @@ def test_blocks_hold_each_pulse_once_in_order_and_differ_by_one_pulse_at_most(pu
 
 @tried(100, derandomize=False)
 @given(pulses=st.integers(1, 2000), most=st.integers(1, 300))
-def test_a_sample_is_spread_evenly_over_the_aperture(pulses, most):
+def test_sample_is_spread_evenly_over_the_aperture(pulses, most):
     track = straight_track(pulses)
     flown = monostatic(track)
     sample = flown[flown.sample(most)]
@@ -110,7 +110,7 @@ def test_a_sample_is_spread_evenly_over_the_aperture(pulses, most):
     assert len(set(np.diff(np.arange(pulses)[flown.sample(most)]))) <= 1
 
 
-def test_part_of_an_aperture_has_the_paths_of_that_part():
+def test_subaperture_has_the_paths_of_its_pulses():
     flown = Aperture(straight_track(9), straight_track(9) + [1.0, 0, 0])
     points, odd = ground_points(count=2), np.arange(9) % 2 == 1
     for part in (slice(2, 7, 2), odd, np.array([8, 0])):
@@ -121,8 +121,8 @@ def test_part_of_an_aperture_has_the_paths_of_that_part():
 # Phase rates
 
 
-def test_phase_rates_are_those_of_a_passing_antenna():
-    """Rates of places at ±θ from abeam differ by 2·2·sin θ·step/λ cycles per pulse."""
+def test_phase_rates_match_a_passing_antenna():
+    """Rates of points at ±θ from abeam differ by 2·2·sin θ·step/λ cycles per pulse."""
     step, angle = 0.02, np.radians(20)
     antenna = np.array([[-step / 2, 0.0, 0.0], [step / 2, 0.0, 0.0]])
     places = 50 * np.array([[np.sin(a), np.cos(a), 0] for a in (-angle, 0, angle)])
@@ -132,7 +132,7 @@ def test_phase_rates_are_those_of_a_passing_antenna():
 
 
 @pytest.mark.parametrize("fast", [0, 230, 520])
-def test_a_part_of_an_aperture_that_is_flown_faster_decides_the_spread_wherever_it_stands(fast):
+def test_fastest_part_determines_the_rate_spread(fast):
     steps = np.full(600, 0.01)
     steps[fast : fast + 70] = 0.1
     track = np.stack([np.cumsum(steps), np.zeros(600), np.full(600, 10.0)], -1)
@@ -144,8 +144,8 @@ def test_a_part_of_an_aperture_that_is_flown_faster_decides_the_spread_wherever_
 
 
 @pytest.mark.parametrize("jump", [0, 100, 255, 256, 257, 598])
-def test_the_widest_rate_of_a_long_aperture_is_seen_wherever_it_stands(jump):
-    """A jump between two pulses anywhere, also where one block of pulses ends and the next begins."""
+def test_largest_rate_is_found_anywhere_in_a_long_aperture(jump):
+    """A jump between any two pulses, also at the boundary between blocks of pulses."""
     track = straight_track(600)
     track[jump + 1 :, 0] += 1.0
     points = ground_points().reshape(-1, 3)
@@ -159,8 +159,8 @@ def test_the_widest_rate_of_a_long_aperture_is_seen_wherever_it_stands(jump):
 
 
 @pytest.mark.parametrize("apart_m", [0.0, 2.0])
-def test_the_cell_along_a_straight_aperture_is_the_wavelength_over_the_angle_it_spans(apart_m):
-    """δ = λ/(4 sin(θ/2)) with sin(θ/2) = (L/2)/√((L/2)² + R²); antennas one behind the other see about the same."""
+def test_azimuth_resolution_follows_the_integration_angle(apart_m):
+    """δ = λ/(4 sin(θ/2)) with sin(θ/2) = (L/2)/√((L/2)² + R²); antennas in a line have nearly the same angle."""
     length, height, north = 6.0, 10.0, 20.0
     track = straight_track(64, length_m=length, height_m=height)
     ground = ground_points(1e-3, north_m=north)
@@ -170,7 +170,7 @@ def test_the_cell_along_a_straight_aperture_is_the_wavelength_over_the_angle_it_
     assert cell == pytest.approx(WAVELENGTH / (4 * half), rel=1e-3 if apart_m == 0 else 2e-2)
 
 
-def test_the_cell_of_a_standing_antenna_is_that_of_its_bandwidth_on_the_ground():
+def test_resolution_of_a_stationary_antenna_is_its_ground_range_cell():
     """δ = c/(2B)·R/r_g."""
     track = np.tile([0.0, 0.0, 10.0], (64, 1))
     ground = ground_points(1e-3, north_m=20.0)
@@ -178,7 +178,7 @@ def test_the_cell_of_a_standing_antenna_is_that_of_its_bandwidth_on_the_ground()
     assert cell == pytest.approx(C / 800e6 * np.hypot(10, 20) / 20, rel=1e-3)
 
 
-def test_the_finer_of_both_cells_counts_and_twice_the_aperture_resolves_about_twice_as_much():
+def test_doubled_aperture_halves_the_resolution_cell():
     ground = ground_points(1e-3)
     cells = [
         monostatic(straight_track(64, length_m=length)).resolution_cell_m(ground, band_hz=(1.19e9, 1.21e9))
@@ -192,13 +192,13 @@ def test_the_finer_of_both_cells_counts_and_twice_the_aperture_resolves_about_tw
 
 @tried(100, derandomize=False)
 @given(start=arrays(np.float64, 3, elements=COORDINATES), heading=st.floats(0, 6.28), climb=st.floats(-1, 1))
-def test_a_straight_flight_has_no_wobble(start, heading, climb):
+def test_straight_flight_has_no_wobble(start, heading, climb):
     along = np.linspace(0, 30, 50)[:, None] * [np.cos(heading), np.sin(heading), climb]
     assert monostatic(start + along).wobble_m < 1e-9
 
 
 def test_wobble_is_that_of_the_midpoints():
-    """Antennas that move against one another leave their midpoint on its line."""
+    """Antennas that move in opposite directions leave their midpoint on its line."""
     track, sway = straight_track(100), np.zeros((100, 3))
     sway[:, 1] = np.sin(np.arange(100))
     assert Aperture(track + sway, track - sway).wobble_m == pytest.approx(0, abs=1e-12)

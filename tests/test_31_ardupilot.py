@@ -1,4 +1,4 @@
-"""ArduPilot logs: GPS weeks become UTC, heights are ellipsoidal or refused, the receiver is the one asked for."""
+"""ArduPilot logs: GPS weeks are converted to UTC, heights must be ellipsoidal, the receiver is selectable."""
 
 from collections import Counter
 
@@ -29,20 +29,20 @@ def read(tmp_path, rows, *, suffix=".bin", options=DEFAULT_OPTIONS, forms=None):
     return check(read_track(path, node="a", options=options), "track")
 
 
-def apart_m(track):
-    """Return how far epochs are from where the flight was at their times."""
+def position_error_m(track):
+    """Return the distance of each epoch from the true position at its time."""
     exact, geodetic, _ = flight(4000, 400.0)
     seconds = (track.time.values - START) / SECOND
-    where = np.stack([np.interp(seconds, exact, axis) for axis in ecef_from_geodetic(*geodetic.T).T], -1)
-    return np.linalg.norm(track.position.values - where, axis=1)
+    truth = np.stack([np.interp(seconds, exact, axis) for axis in ecef_from_geodetic(*geodetic.T).T], -1)
+    return np.linalg.norm(track.position.values - truth, axis=1)
 
 
 @pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize("suffix", KINDS)
-def test_a_track_is_what_the_receiver_said(tmp_path, suffix):
+def test_track_has_the_values_of_the_receiver(tmp_path, suffix):
     track = read(tmp_path, dataflash_rows(), suffix=suffix)
     time, geodetic, yaw = flight()
-    np.testing.assert_array_equal(track.time.values, utc_of(time))  # 18 s behind the log's own weeks
+    np.testing.assert_array_equal(track.time.values, utc_of(time))  # the log's own weeks are 18 s ahead
     np.testing.assert_allclose(geodetic_from_ecef(track.position.values), geodetic, atol=6e-3)
     np.testing.assert_allclose(geodetic_from_ecef(track.position.values)[:, :2], geodetic[:, :2], atol=6e-8)
     np.testing.assert_allclose(track.position_std.values, np.tile([0.02, 0.02, 0.03], (60, 1)))
@@ -54,8 +54,8 @@ def test_a_track_is_what_the_receiver_said(tmp_path, suffix):
     assert track.attrs["source"] == "GPS 0 of 0"
 
 
-def test_the_log_written_here_is_one_to_the_makers_own_reader(tmp_path):
-    """The epochs are those that pymavlink gives one by one, at the times that it makes of weeks."""
+def test_generated_log_is_readable_by_pymavlink(tmp_path):
+    """The epochs equal those of pymavlink message by message, at the times that it computes from weeks."""
     from pymavlink.DFReader import DFReader_binary
 
     path = tmp_path / "a.track.bin"
@@ -72,34 +72,34 @@ def test_the_log_written_here_is_one_to_the_makers_own_reader(tmp_path):
 
 
 @pytest.mark.usefixtures("reader")
-def test_attitude_is_taken_where_the_autopilot_was_when_the_epoch_was_true(tmp_path):
-    """GPS1_DELAY_MS says by how much it hears of an epoch late; 0 leaves it to the driver, 120 ms here."""
-    said = read(tmp_path, dataflash_rows(parameters={"GPS1_DELAY_MS": 220.0}))
-    own = read(tmp_path, dataflash_rows(parameters={"GPS1_DELAY_MS": 0.0}))
-    turned = np.degrees(own.attitude.values[:, 2] - said.attitude.values[:, 2])
-    np.testing.assert_allclose(turned, 0.1 * np.degrees(8 / 50), atol=2e-3)
+def test_attitude_is_read_at_the_time_of_validity(tmp_path):
+    """GPS1_DELAY_MS is the delay of the receiver; 0 means the driver's default, 120 ms in this log."""
+    configured = read(tmp_path, dataflash_rows(parameters={"GPS1_DELAY_MS": 220.0}))
+    default = read(tmp_path, dataflash_rows(parameters={"GPS1_DELAY_MS": 0.0}))
+    difference_deg = np.degrees(default.attitude.values[:, 2] - configured.attitude.values[:, 2])
+    np.testing.assert_allclose(difference_deg, 0.1 * np.degrees(8 / 50), atol=2e-3)
 
 
 @pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize("suffix", KINDS)
-def test_heights_above_sea_level_are_refused_or_made_ellipsoidal(tmp_path, suffix):
+def test_heights_above_sea_level_need_an_offset(tmp_path, suffix):
     rows = dataflash_rows(without_ael=True)
     message = complaint(lambda: read(tmp_path, rows, suffix=suffix))
     assert "heights are above sea level (GPS.Alt)" in message
     assert "nodes.a.log.height_offset_m" in message
-    assert apart_m(read(tmp_path, rows, suffix=suffix, options=LogOptions(height_offset_m=N_M))).max() < 0.02
+    assert position_error_m(read(tmp_path, rows, suffix=suffix, options=LogOptions(height_offset_m=N_M))).max() < 0.02
 
 
 @pytest.mark.usefixtures("reader")
-def test_ellipsoidal_heights_of_a_driver_that_turns_the_geoid_over_are_not_used(tmp_path):
+def test_ellipsoidal_heights_of_the_novatel_driver_are_not_used(tmp_path):
     rows = dataflash_rows(parameters={"GPS_TYPE": 15})
     assert "NovAtel" in complaint(lambda: read(tmp_path, rows))
-    assert apart_m(read(tmp_path, rows, options=LogOptions(height_offset_m=N_M))).max() < 0.02
+    assert position_error_m(read(tmp_path, rows, options=LogOptions(height_offset_m=N_M))).max() < 0.02
 
 
 @pytest.mark.usefixtures("reader")
-def test_one_of_several_receivers_is_chosen_by_number(tmp_path):
-    """The second is 1e-5 degrees, 1.11 m, to the north."""
+def test_receiver_is_selected_by_number(tmp_path):
+    """The second receiver is 1e-5 degrees, 1.11 m, to the north."""
     rows = dataflash_rows(receivers=(0, 1))
     first = read(tmp_path, rows)
     assert first.attrs["source"] == "GPS 0 of 0, 1"
@@ -120,8 +120,8 @@ def test_several_receivers_are_listed_with_their_solutions(tmp_path, suffix):
         for name, row in dataflash_rows(receivers=(0, 1))
     ]
     track = read(tmp_path, rows, suffix=suffix)
-    found = "the log contains receivers 0 (single 60) and 1 (fix 60); 0 is used: select with nodes.a.log.body"
-    assert track.attrs["remarks"] == [found]
+    remark = "the log contains receivers 0 (single 60) and 1 (fix 60); 0 is used: select with nodes.a.log.body"
+    assert track.attrs["remarks"] == [remark]
     assert "remarks" not in read(tmp_path, rows, suffix=suffix, options=LogOptions(body="1")).attrs
 
 
@@ -135,7 +135,7 @@ RNG = np.random.default_rng(12)
     ids=["200 bytes", "zeros", "a message of no kind", "beginnings of messages"],
 )
 @pytest.mark.parametrize("inside", [0, 20])
-def test_epochs_behind_foreign_bytes_are_read_and_the_bytes_are_counted(tmp_path, foreign, inside):
+def test_epochs_after_foreign_bytes_are_read_and_bytes_counted(tmp_path, foreign, inside):
     data = dataflash(dataflash_rows())
     at = data.index(b"\xa3\x95\x82", len(data) // 2) + inside  # within the first GPS message of the second half
     path = tmp_path / "a.track.bin"
@@ -144,21 +144,21 @@ def test_epochs_behind_foreign_bytes_are_read_and_the_bytes_are_counted(tmp_path
     assert 58 <= track.sizes["epoch"] <= 60
     assert np.isin(track.time.values, utc_of(flight()[0])).all()
     assert track.time.values[-1] == utc_of(flight()[0])[-1]
-    assert apart_m(track).max() < 0.02
-    lost, of = _counts(track)
-    assert of == len(data) + len(foreign)
+    assert position_error_m(track).max() < 0.02
+    lost, total = _counts(track)
+    assert total == len(data) + len(foreign)
     assert len(foreign) <= lost <= len(foreign) + 200
 
 
 def _counts(track):
-    """Return how many bytes of how many are no messages."""
-    lost, of = track.attrs["damage"].split(" bytes")[0].split(" of ")
-    return int(lost), int(of)
+    """Return the number of bytes that are no messages, and the total."""
+    lost, total = track.attrs["damage"].split(" bytes")[0].split(" of ")
+    return int(lost), int(total)
 
 
 @pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize("tail", [b"", bytes(700), b"\xff" * 64, "cut"], ids=["none", "zeros", "ones", "cut"])
-def test_the_end_of_a_log_is_no_damage(tmp_path, tail):
+def test_truncated_or_padded_end_is_no_damage(tmp_path, tail):
     data = dataflash(dataflash_rows())
     path = tmp_path / "a.track.bin"
     path.write_bytes(data[:-9] if tail == "cut" else data + tail)
@@ -168,7 +168,7 @@ def test_the_end_of_a_log_is_no_damage(tmp_path, tail):
 
 
 @pytest.mark.usefixtures("reader")
-def test_lines_of_a_text_log_that_are_no_messages_are_counted(tmp_path):
+def test_invalid_lines_of_a_text_log_are_counted(tmp_path):
     lines = dataflash_text(dataflash_rows()).split(b"\n")
     at = next(place for place, line in enumerate(lines) if line.startswith(b"GPS, ") and place > 200)
     lines[at] = lines[at][:30]
@@ -181,28 +181,28 @@ def test_lines_of_a_text_log_that_are_no_messages_are_counted(tmp_path):
 
 
 @pytest.mark.usefixtures("reader")
-def test_messages_of_a_second_receiver_in_older_logs_are_its_own(tmp_path):
-    own = "TimeUS,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw,U"
-    forms = dict.fromkeys(("GPS", "GPS2"), ("QBIHBcLLeffffB", own))
+def test_gps2_messages_of_older_logs_are_a_second_receiver(tmp_path):
+    columns = "TimeUS,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw,U"
+    forms = dict.fromkeys(("GPS", "GPS2"), ("QBIHBcLLeffffB", columns))
     rows = [(name + "2" * values.get("I", 0), values) for name, values in dataflash_rows(receivers=(0, 1))]
     rows = [(name, values) for name, values in rows if not name.startswith("GPA")]
     tracks = [
         read(tmp_path, rows, forms=forms, options=LogOptions(body=body, height_offset_m=N_M)) for body in ("0", "1")
     ]
     assert tracks[1].attrs["source"] == "GPS 1 of 0, 1"
-    moved = [geodetic_from_ecef(track.position.values)[0, 0] for track in tracks]
-    assert moved[1] - moved[0] == pytest.approx(1e-5, abs=2e-7)
+    latitudes = [geodetic_from_ecef(track.position.values)[0, 0] for track in tracks]
+    assert latitudes[1] - latitudes[0] == pytest.approx(1e-5, abs=2e-7)
 
 
 @pytest.mark.usefixtures("reader")
-def test_kinds_of_solution_are_kept_and_epochs_without_any_are_counted(tmp_path):
+def test_solution_types_are_kept_and_epochs_without_fix_counted(tmp_path):
     track = read(tmp_path, dataflash_rows(Status=np.resize([6, 5, 4, 3, 2, 1], 60)))
     assert track.attrs["dropped"] == {"no fix": 20}
     assert Counter(track.fix.values.tolist()) == {1: 10, 2: 10, 4: 10, 5: 10}
 
 
 @pytest.mark.usefixtures("reader")
-def test_epochs_before_the_receiver_knew_the_week_are_counted(tmp_path):
+def test_epochs_without_gps_week_are_counted(tmp_path):
     weeks = np.where(np.arange(60) < 9, 0, 2366)
     assert read(tmp_path, dataflash_rows(GWk=weeks)).attrs["dropped"] == {"no UTC from the receiver": 9}
     message = complaint(lambda: read(tmp_path, dataflash_rows(GWk=np.zeros(60, int))))
@@ -211,29 +211,29 @@ def test_epochs_before_the_receiver_knew_the_week_are_counted(tmp_path):
 
 
 @pytest.mark.usefixtures("reader")
-def test_a_flight_before_the_last_leap_seconds_is_behind_by_fewer(tmp_path):
-    """Week 1850, in June 2015, was 16 s ahead of UTC; the same milliseconds ten years later are 18 s ahead."""
+def test_earlier_flight_has_fewer_leap_seconds(tmp_path):
+    """In week 1850, June 2015, GPS time was 16 s ahead of UTC; ten years later, 18 s."""
     track = read(tmp_path, dataflash_rows(GWk=np.full(60, 1850)))
     assert (track.time.values[0] - START) / SECOND == (1850 - 2366) * 7 * 86400 + 2
 
 
 @pytest.mark.usefixtures("reader")
-def test_an_epoch_that_is_not_where_the_velocities_lead_is_left_out(tmp_path):
-    moved = [
+def test_position_that_contradicts_the_velocity_is_dropped(tmp_path):
+    rows = [
         (name, {**v, "Lat": v["Lat"] + 1e-5 * (name == "GPS" and n == 59)}) if name == "GPS" else (name, v)
         for n, (name, v) in numbered(dataflash_rows())
     ]
-    track = read(tmp_path, moved)
+    track = read(tmp_path, rows)
     assert track.attrs["dropped"] == {"position contradicts the receiver's velocity": 1}
-    assert apart_m(track).max() < 0.02
+    assert position_error_m(track).max() < 0.02
 
 
 def numbered(rows):
-    """Return messages with how many of the same name came before."""
-    seen = Counter()
+    """Yield messages with the number of earlier messages of the same name."""
+    counts = Counter()
     for name, values in rows:
-        yield seen[name], (name, values)
-        seen[name] += 1
+        yield counts[name], (name, values)
+        counts[name] += 1
 
 
 @pytest.mark.usefixtures("reader")
@@ -256,13 +256,13 @@ def numbered(rows):
         (".log", b"FMT, 1, 2, X, Z, \xff\n" + dataflash_text(dataflash_rows()), "not readable"),
     ],
 )
-def test_what_is_no_log_of_a_flight_is_refused(tmp_path, suffix, data, found):
+def test_invalid_log_is_rejected(tmp_path, suffix, data, found):
     path = tmp_path / f"a.track{suffix}"
     path.write_bytes(data)
     assert found in complaint(lambda: read_track(path, node="a"))
 
 
-# A damaged log: DataFlash holds no checksums
+# Damaged logs: DataFlash has no checksums
 
 LOGS = {suffix: write(dataflash_rows()) for suffix, write in KINDS.items()}
 DAMAGED = tried(120)
@@ -270,7 +270,7 @@ PLACES = st.integers(0, 10**6)
 
 
 def read_damaged(path, data):
-    """Return the track of a damaged log, or None where it is refused, as the reader does in its own process."""
+    """Return the track of a damaged log, or None if it is rejected; in-process version of the isolated reader."""
     path.write_bytes(data)
     try:
         fields = read_fields(path)
@@ -290,7 +290,7 @@ def log(request, tmp_path_factory):
 @pytest.mark.quick(".bin")
 @DAMAGED
 @given(PLACES)
-def test_a_log_cut_anywhere_is_shorter_or_refused(log, place):
+def test_truncated_log_is_shorter_or_rejected(log, place):
     data = LOGS[log.suffix]
     track = read_damaged(log, data[: place % len(data)])
     if track is not None:
@@ -300,7 +300,7 @@ def test_a_log_cut_anywhere_is_shorter_or_refused(log, place):
 @pytest.mark.slow
 @DAMAGED
 @given(st.lists(st.tuples(PLACES, st.integers(0, 7)), min_size=1, max_size=4))
-def test_no_flipped_bit_moves_a_position_silently(log, flips):
+def test_flipped_bit_displaces_no_position_silently(log, flips):
     data = bytearray(LOGS[log.suffix])
     for place, bit in flips:
         data[place % len(data)] ^= 1 << bit
@@ -312,20 +312,21 @@ def test_no_flipped_bit_moves_a_position_silently(log, flips):
 @pytest.mark.slow
 @DAMAGED
 @given(st.randoms(use_true_random=False), st.integers(1, 20))
-def test_messages_in_another_order_are_refused_or_the_same(log, random, swaps):
+def test_reordered_messages_are_rejected_or_harmless(log, random, swaps):
     rows = dataflash_rows()
     for _ in range(swaps):
         first, second = random.randrange(len(rows)), random.randrange(len(rows))
         rows[first], rows[second] = rows[second], rows[first]
     track = read_damaged(log, KINDS[log.suffix](rows))
     if track is not None:
-        assert apart_m(track).max() < 0.02
+        assert position_error_m(track).max() < 0.02
 
 
 def assert_no_position_is_silently_wrong(track):
-    """Every epoch is where the flight then was, or is found by the check that every track goes through."""
+    """Check that every epoch is at the true position or is found by the check applied to every track."""
     time_s = (track.time.values - track.time.values[0]) / SECOND
     checked = check_track(time_s, track.position.values, poor_fix=np.zeros(time_s.size, bool), tolerated_m=0.01)
     inside = np.minimum(np.arange(time_s.size), np.arange(time_s.size)[::-1]) >= 6
-    wrong = apart_m(track) > np.where(inside, 0.15, 0.6)  # near the ends only the receiver's velocity tells
-    assert not (wrong & checked.kept).any(), (track.time.values[wrong], apart_m(track)[wrong])
+    # near the ends only the receiver's velocity reveals an error
+    wrong = position_error_m(track) > np.where(inside, 0.15, 0.6)
+    assert not (wrong & checked.kept).any(), (track.time.values[wrong], position_error_m(track)[wrong])

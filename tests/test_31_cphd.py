@@ -1,4 +1,4 @@
-"""CPHD of other radars: files written here field by field after the standard, not by what `apertura` exports with."""
+"""CPHD of other radars: files written field by field after the standard, independent of apertura's own export."""
 
 import re
 
@@ -29,18 +29,18 @@ WORDS = {"CF8": ">c8", "CI4": ">i2", "CI2": "i1"}
 
 
 def collected(sign=-1, srp=SRP):
-    """Parameters of pulses of a moving bistatic pair, and its signals: SGN·fx·ΔTOA cycles from each target."""
-    moved = np.arange(PULSES)[:, None]
-    pvp = {name: SRP + AWAY[name] + moved * ALONG[name] for name in AWAY}
+    """Return PVP of a moving bistatic pair, and its signals: SGN·fx·ΔTOA cycles from each target."""
+    pulse = np.arange(PULSES)[:, None]
+    pvp = {name: SRP + AWAY[name] + pulse * ALONG[name] for name in AWAY}
     pvp["SRPPos"] = np.broadcast_to(srp, (PULSES, 3))
 
     def delay(place):
         return sum(np.linalg.norm(pvp[name] - place, axis=-1) for name in AWAY) / SPEED_OF_LIGHT_M_S
 
     fx = 9e9 + 1e6 * np.arange(SAMPLES)
-    later = np.stack([delay(SRP + target) - delay(pvp["SRPPos"]) for target in TARGETS])
-    amplitudes = AMPLITUDES if sign < 0 else AMPLITUDES.conj()  # the other sign of time turns all phases
-    signal = (amplitudes[:, None, None] * np.exp(2j * np.pi * sign * later[:, :, None] * fx)).sum(axis=0)
+    delay_s = np.stack([delay(SRP + target) - delay(pvp["SRPPos"]) for target in TARGETS])
+    amplitudes = AMPLITUDES if sign < 0 else AMPLITUDES.conj()  # the other sign of time conjugates all phases
+    signal = (amplitudes[:, None, None] * np.exp(2j * np.pi * sign * delay_s[:, :, None] * fx)).sum(axis=0)
     sent = 0.5 + 0.001 * np.arange(PULSES)
     pvp |= {"TxTime": sent, "RcvTime": sent + delay(pvp["SRPPos"]), "SC0": 9e9, "SCSS": 1e6}
     return {**pvp, "FX1": 9e9, "FX2": 9e9 + 1e6 * (SAMPLES - 1), "TOA1": -3e-7, "TOA2": 3e-7}, signal
@@ -49,7 +49,7 @@ def collected(sign=-1, srp=SRP):
 def write(
     path, pvp, signals, *, kind="CF8", sign=-1, version="1.1.0", domain="FX", collect="BISTATIC", channels=("A",)
 ):
-    """Write what of the standard a reader needs; a parameter may be one number for all pulses."""
+    """Write the parts of the standard that a reader needs; a parameter may be one number for all pulses."""
     names = [name for name in (*FIELDS, "AmpSF", "SIGNAL") if name in pvp]
     table = np.zeros(
         PULSES, [(name, "i8" if name == "SIGNAL" else "f8", (3,) if name.endswith("Pos") else ()) for name in names]
@@ -93,18 +93,18 @@ def read(*paths, pair="tx-rx", **described):
 
 
 def expected_transfer(echo):
-    """Σ a·exp(-j2πf(τ - τ_ref)) of the targets, as the contract of stage echo has it."""
+    """Return Σ a·exp(-j2πf(τ - τ_ref)) over the targets, as defined by the contract of the echo stage."""
     tx, rx = echo.tx_position.values, echo.rx_position.values
     delay = [
         sum(np.linalg.norm(leg - SRP - target, axis=1) for leg in (tx, rx)) / SPEED_OF_LIGHT_M_S for target in TARGETS
     ]
-    beyond = np.stack(delay) - echo.reference_delay.values
-    return (AMPLITUDES[:, None, None] * np.exp(-2j * np.pi * beyond[:, :, None] * echo.frequency.values)).sum(axis=0)
+    excess_s = np.stack(delay) - echo.reference_delay.values
+    return (AMPLITUDES[:, None, None] * np.exp(-2j * np.pi * excess_s[:, :, None] * echo.frequency.values)).sum(axis=0)
 
 
 @pytest.mark.parametrize("version", ["1.0.1", "1.1.0"])
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_samples_of_either_sign_are_referred_to_the_delay_of_the_reference_point(tmp_path, sign, version):
+def test_samples_of_either_sign_refer_to_the_reference_point(tmp_path, sign, version):
     pvp, signal = collected(sign)
     echo = read(write(tmp_path / "rx.cphd", pvp, signal, sign=sign, version=version))
     np.testing.assert_allclose(echo.transfer.values, expected_transfer(echo), atol=1e-5)
@@ -115,14 +115,14 @@ def test_samples_of_either_sign_are_referred_to_the_delay_of_the_reference_point
     assert np.isinf(echo.path_limit.values).all()
 
 
-def test_a_reference_point_that_moves_is_followed(tmp_path):
+def test_moving_reference_point_is_followed(tmp_path):
     wandering = SRP + np.arange(PULSES)[:, None] * np.array([0.4, 0.1, -0.3])
     echo = read(write(tmp_path / "rx.cphd", *collected(srp=wandering)))
     np.testing.assert_allclose(echo.transfer.values, expected_transfer(echo), atol=1e-5)
 
 
 @pytest.mark.parametrize(("kind", "full"), [("CI2", 100), ("CI4", 20000)])
-def test_whole_numbers_are_scaled_pulse_by_pulse(tmp_path, kind, full):
+def test_integer_samples_are_scaled_per_pulse(tmp_path, kind, full):
     pvp, signal = collected()
     scale = (1 + np.arange(PULSES)) / full
     pvp["AmpSF"] = scale
@@ -133,10 +133,10 @@ def test_whole_numbers_are_scaled_pulse_by_pulse(tmp_path, kind, full):
     assert (np.abs(echo.transfer.values - wanted) <= 0.75 * scale[:, None]).all()
 
 
-def test_pulses_without_a_normal_signal_are_left_out_and_counted(tmp_path):
+def test_pulses_without_a_normal_signal_are_dropped_and_counted(tmp_path):
     pvp, signal = collected()
     pvp["SIGNAL"] = np.where(np.arange(PULSES) == 3, 0, np.where(np.arange(PULSES) == 7, 2, 1))
-    pvp["TxPos"][3] = np.nan  # noise was recorded, nothing was sent
+    pvp["TxPos"][3] = np.nan  # noise was recorded without a transmission
     signal[5] = 0
     echo = read(write(tmp_path / "rx.cphd", pvp, signal))
     assert echo.attrs["pulses"] == {
@@ -147,7 +147,7 @@ def test_pulses_without_a_normal_signal_are_left_out_and_counted(tmp_path):
     np.testing.assert_allclose(echo.transfer.values, expected_transfer(echo), atol=1e-5)
 
 
-def test_samples_beyond_the_band_of_a_pulse_are_no_echo(tmp_path):
+def test_samples_outside_the_band_of_a_pulse_are_zero(tmp_path):
     pvp, signal = collected()
     pvp["FX1"], pvp["FX2"] = 9e9 + 3e6, np.where(np.arange(PULSES) == 2, 9e9 + 30e6, 9e9 + 35e6)
     echo = read(write(tmp_path / "rx.cphd", pvp, signal))
@@ -157,7 +157,7 @@ def test_samples_beyond_the_band_of_a_pulse_are_no_echo(tmp_path):
     np.testing.assert_allclose(echo.transfer.values, wanted, atol=1e-5)
 
 
-def test_of_several_channels_the_one_named_is_read(tmp_path):
+def test_configured_channel_is_read(tmp_path):
     pvp, signal = collected()
     path = write(tmp_path / "rx.cphd", pvp, np.stack([signal, 2 * signal]), channels=("HH", "VV"))
     assert "2 channels, 'HH', 'VV'; expected a channel selected by waveform.channel" in complaint(lambda: read(path))
@@ -165,7 +165,7 @@ def test_of_several_channels_the_one_named_is_read(tmp_path):
     np.testing.assert_allclose(read(path, channel="VV").transfer.values, 2 * signal, atol=1e-5)
 
 
-def test_files_follow_each_other_in_the_order_of_their_names(tmp_path):
+def test_files_are_joined_in_order_of_their_names(tmp_path):
     pvp, signal = collected()
     second = write(tmp_path / "rx.b.cphd", {**pvp, "TxTime": pvp["TxTime"] + 1}, 2 * signal)
     first = write(tmp_path / "rx.a.cphd", pvp, signal)
@@ -177,7 +177,7 @@ def test_files_follow_each_other_in_the_order_of_their_names(tmp_path):
 
 
 def changed(**changes):
-    """What a file holds with some parameters replaced, or spoilt at one pulse: (pulse, value)."""
+    """Return PVP and signals with some parameters replaced, or changed at one pulse: (pulse, value)."""
     pvp, signal = collected()
     for name, change in changes.items():
         if isinstance(change, tuple):
@@ -203,25 +203,25 @@ def changed(**changes):
         ({"AmpSF": np.full(PULSES, np.inf)}, "AmpSF is not a number"),
     ],
 )
-def test_a_parameter_that_is_wrong_is_named(tmp_path, changes, expected):
+def test_invalid_parameter_is_named(tmp_path, changes, expected):
     message = complaint(lambda: read(write(tmp_path / "rx.cphd", *changed(**changes))))
     assert message.startswith(f"{tmp_path / 'rx.cphd'}: {expected}")
 
 
-def test_times_that_contradict_the_positions_are_flagged(tmp_path):
+def test_times_that_contradict_positions_are_flagged(tmp_path):
     right, signal = collected()
-    away = right["RcvPos"][4] - SRP
-    pvp, _ = changed(RcvPos=(4, SRP + away * (1 + 50.0 / np.linalg.norm(away))))
+    receiver_from_srp = right["RcvPos"][4] - SRP
+    pvp, _ = changed(RcvPos=(4, SRP + receiver_from_srp * (1 + 50.0 / np.linalg.norm(receiver_from_srp))))
     flag = read(write(tmp_path / "rx.cphd", pvp, signal)).attrs["flags"]["reference_point"]
     assert flag == (
         "RcvTime - TxTime of pulse 4 differs by 1.67e-07 s from the delay of its reference point, 50 m of path "
         "(1 of 12 pulses)"
     )
-    tropo = {"RcvTime": pvp["RcvTime"] + 8e-8}  # 24 m: a path through the whole atmosphere
+    tropo = {"RcvTime": pvp["RcvTime"] + 8e-8}  # 24 m: the tropospheric delay of a path through the whole atmosphere
     assert read(write(tmp_path / "b.cphd", {**right, **tropo}, signal)).attrs["flags"] == {}
 
 
-def test_a_sample_that_is_not_a_number_is_named(tmp_path):
+def test_nan_sample_is_named(tmp_path):
     pvp, signal = collected()
     signal[7, 11] = np.nan
     assert "the signal is not a number at index [7, 11]" in complaint(
@@ -230,23 +230,23 @@ def test_a_sample_that_is_not_a_number_is_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("how", "pair", "expected"),
+    ("options", "pair", "expected"),
     [
         ({"domain": "TOA"}, "tx-rx", "samples in domain TOA, not in the frequency domain"),
         ({"collect": "MONOSTATIC"}, "tx-rx", "CollectType MONOSTATIC for pair tx-rx"),
         ({}, "rx-rx", "CollectType BISTATIC for pair rx-rx"),
     ],
 )
-def test_a_file_of_another_kind_is_refused(tmp_path, how, pair, expected):
-    assert expected in complaint(lambda: read(write(tmp_path / "rx.cphd", *collected(), **how), pair=pair))
+def test_unsupported_file_is_rejected(tmp_path, options, pair, expected):
+    assert expected in complaint(lambda: read(write(tmp_path / "rx.cphd", *collected(), **options), pair=pair))
 
 
-def test_frequencies_that_hardly_differ_are_one_set(tmp_path):
+def test_nearly_equal_frequencies_are_one_set(tmp_path):
     echo = read(write(tmp_path / "rx.cphd", *changed(SC0=(6, 9e9 + 10.0))))  # 3e-6 cycles at the edge of the swath
     assert echo.sizes["pulse"] == PULSES
 
 
-def test_a_file_cut_anywhere_is_refused(tmp_path):
+def test_truncated_file_is_rejected(tmp_path):
     path = write(tmp_path / "rx.cphd", *collected())
     data = path.read_bytes()
     for length in (*range(0, 2000, 200), *np.linspace(2000, len(data) - 1, 12).astype(int)):
@@ -255,16 +255,16 @@ def test_a_file_cut_anywhere_is_refused(tmp_path):
             read(path)
 
 
-def test_a_file_outside_the_campaign_is_not_read_into_it(tmp_path):
-    """An entity of the XML may name any file; what it holds must not come out."""
+def test_external_xml_entity_is_not_read(tmp_path):
+    """An entity of the XML may name any file, whose contents must not be disclosed."""
     secret = tmp_path / "secret"
     secret.write_text("BISTATIC")
     path = write(tmp_path / "rx.cphd", *collected())
     xml = f'<!DOCTYPE CPHD [<!ENTITY x SYSTEM "file://{secret}">]><CPHD xmlns="'
-    grown = path.read_bytes().replace(b'<CPHD xmlns="', xml.encode()).replace(b"BISTATIC<", b"&x;<")
-    size = int(re.search(rb"XML_BLOCK_SIZE := (\d+)", grown).group(1))
-    now = size + len(xml) - len('<CPHD xmlns="') - len("BISTATIC") + len("&x;")
-    path.write_bytes(grown.replace(b"XML_BLOCK_SIZE := %d" % size, b"XML_BLOCK_SIZE := %d" % now))
+    modified = path.read_bytes().replace(b'<CPHD xmlns="', xml.encode()).replace(b"BISTATIC<", b"&x;<")
+    size = int(re.search(rb"XML_BLOCK_SIZE := (\d+)", modified).group(1))
+    new_size = size + len(xml) - len('<CPHD xmlns="') - len("BISTATIC") + len("&x;")
+    path.write_bytes(modified.replace(b"XML_BLOCK_SIZE := %d" % size, b"XML_BLOCK_SIZE := %d" % new_size))
     try:
         fields = read_isolated(cphd_fields.read_fields, [path])[0]
     except ValueError:

@@ -1,4 +1,4 @@
-"""CSV logs under anybody's names, in three frames, with times of every kind."""
+"""CSV logs: mapped column names, three frames, and times of every kind."""
 
 import numpy as np
 import pytest
@@ -38,14 +38,14 @@ def test_heights_of_another_datum_take_an_offset(tmp_path):
 
 
 @pytest.mark.parametrize(("names", "frame"), [("x_m,y_m,z_m", "ecef"), ("east_m,north_m,up_m", "local")])
-def test_positions_in_metres_are_taken_as_they_are(tmp_path, names, frame):
+def test_positions_in_metres_are_read_unchanged(tmp_path, names, frame):
     metres = ECEF if frame == "ecef" else ECEF - ECEF[0]
     track = read(tmp_path, f"time_utc,{names}", TIMES, *metres.T)
     np.testing.assert_array_equal(track.position.values, metres)
     assert track.frame == frame
 
 
-def test_a_whole_frame_is_taken_where_another_lacks_a_column(tmp_path):
+def test_complete_frame_is_used_if_another_lacks_a_column(tmp_path):
     track = read(tmp_path, "time_utc,latitude_deg,longitude_deg,x_m,y_m,z_m", TIMES, *PLACES[:, :2].T, *ECEF.T)
     np.testing.assert_array_equal(track.position.values, ECEF)
 
@@ -58,14 +58,14 @@ def test_a_whole_frame_is_taken_where_another_lacks_a_column(tmp_path):
         ("1980-01-06", {"time_system": "gpst"}),
     ],
 )
-def test_seconds_count_from_where_the_config_says(tmp_path, start, options):
-    """Of the log's beginning, of Unix, of GPS time, which has counted 18 leap seconds."""
+def test_seconds_count_from_the_configured_time_zero(tmp_path, start, options):
+    """From the start of the log, from the Unix epoch, in GPS time with 18 leap seconds."""
     seconds = (TIMES - np.datetime64(start, "ns")) / np.timedelta64(1, "s") + (18 if "time_system" in options else 0)
     track = read(tmp_path, f"time_s,{GEODETIC}", [f"{second:.6f}" for second in seconds], *PLACES.T, **options)
     assert (np.abs(track.time.values - TIMES) <= np.timedelta64(500, "ns")).all()
 
 
-def test_seconds_since_nobody_knows_when_are_refused(tmp_path):
+def test_seconds_without_time_zero_are_rejected(tmp_path):
     message = complaint(lambda: read(tmp_path, f"time_s,{GEODETIC}", range(40), *PLACES.T))
     assert "without a time zero" in message
     assert "nodes.a.log.start_utc" in message
@@ -74,7 +74,7 @@ def test_seconds_since_nobody_knows_when_are_refused(tmp_path):
     )
 
 
-def test_times_without_a_zone_ask_for_their_system(tmp_path):
+def test_times_without_a_zone_need_a_time_system(tmp_path):
     heading = f"time,{GEODETIC}"
     message = complaint(lambda: read(tmp_path, heading, TIMES, *PLACES.T))
     assert "without a time system (UTC or GPST); expected key nodes.a.log.time_system" in message
@@ -86,7 +86,7 @@ def test_times_without_a_zone_ask_for_their_system(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["time_utc", "time"])
-def test_times_that_say_utc_are_not_gps_time(tmp_path, name):
+def test_utc_times_contradict_a_configured_gps_time(tmp_path, name):
     columns = [f"{time}Z" for time in TIMES], *PLACES.T
     message = complaint(lambda: read(tmp_path, f"{name},{GEODETIC}", *columns, time_system="gpst"))
     assert f"times in column {name} are UTC; expected nodes.a.log.time_system of config.yaml" in message
@@ -102,11 +102,11 @@ def test_times_that_say_utc_are_not_gps_time(tmp_path, name):
         (f"t,{GEODETIC}", {"columns": {"time_s": "t"}, "start_utc": "noon"}, "nodes.a.log.start_utc: 'noon'"),
     ],
 )
-def test_a_map_that_does_not_fit_the_log_is_one_message(tmp_path, heading, options, expected):
+def test_column_map_that_does_not_fit_the_log_is_one_message(tmp_path, heading, options, expected):
     assert expected in complaint(lambda: read(tmp_path, heading, range(40), *PLACES.T, **options))
 
 
-def test_a_name_of_ours_that_is_also_mapped_is_not_guessed(tmp_path):
+def test_ambiguous_column_is_rejected(tmp_path):
     heading = f"time_utc,{GEODETIC},alt"
     message = complaint(lambda: read(tmp_path, heading, TIMES, *PLACES.T, PLACES[:, 2], columns={"height_m": "alt"}))
     assert "column height_m in addition to 'alt', which config.yaml maps to height_m" in message
@@ -115,7 +115,7 @@ def test_a_name_of_ours_that_is_also_mapped_is_not_guessed(tmp_path):
     )
 
 
-def test_a_log_of_other_names_shows_them_and_how_they_are_mapped(tmp_path):
+def test_unknown_columns_are_listed_with_the_mapping_key(tmp_path):
     message = complaint(lambda: read(tmp_path, "when,lat,lon,alt", TIMES, *PLACES.T))
     assert "no column latitude_deg among ['when', 'lat', 'lon', 'alt']" in message
     assert "nodes.a.log.columns: {latitude_deg: NAME}; to try a name, use --set columns.latitude_deg=NAME" in message
@@ -126,7 +126,7 @@ def test_a_log_of_other_names_shows_them_and_how_they_are_mapped(tmp_path):
 
 
 @pytest.mark.parametrize("comma", [".", ","])
-def test_cells_between_semicolons_are_named_with_their_line(tmp_path, comma):
+def test_semicolon_separators_are_reported_with_their_line(tmp_path, comma):
     rows = [
         f"{time};{north};{east};{up}".replace(".", comma) for time, (north, east, up) in zip(TIMES, PLACES, strict=True)
     ]
@@ -134,7 +134,7 @@ def test_cells_between_semicolons_are_named_with_their_line(tmp_path, comma):
     assert "cells of line 1 are separated by semicolons, not commas" in message
 
 
-def test_a_line_with_more_cells_than_the_heading_is_named(tmp_path):
+def test_line_with_extra_cells_is_named(tmp_path):
     rows = [f"{time},{north},{east},{up}" for time, (north, east, up) in zip(TIMES, PLACES, strict=True)]
     rows[6] += ",0"
     assert "line 8 has 5 cells, the heading 4" in complaint(lambda: read(tmp_path, f"time_utc,{GEODETIC}", rows))
@@ -148,8 +148,8 @@ def test_a_line_with_more_cells_than_the_heading_is_named(tmp_path):
     )
 
 
-def test_numbers_of_another_unit_take_a_factor(tmp_path):
-    """As ulog2csv writes them: µs, 1e-7 degrees, millimetres."""
+def test_columns_in_other_units_are_scaled(tmp_path):
+    """As written by ulog2csv: µs, 1e-7 degrees, millimetres."""
     elapsed = (TIMES - np.datetime64("1970-01-01", "ns")).astype("timedelta64[us]").astype(int)
     whole = np.rint(PLACES / [1e-7, 1e-7, 1e-3]).astype(int)
     scales = {"time_s": 1e-6, "latitude_deg": 1e-7, "longitude_deg": 1e-7, "height_m": 1e-3}
@@ -161,8 +161,8 @@ def test_numbers_of_another_unit_take_a_factor(tmp_path):
 
 
 @pytest.mark.parametrize("numbers", [[1], [5], [4, 5], [1, 2, 5], [2, 9]])
-def test_numbers_of_kinds_of_solution_ask_for_their_numbering(tmp_path, numbers):
-    """4 is a fixed solution in GGA and DGPS in RTKLIB; 1 is a single one in GGA and fixed in RTKLIB."""
+def test_numeric_solution_types_need_a_numbering(tmp_path, numbers):
+    """4 is a fixed solution in GGA and DGPS in RTKLIB; 1 is a single solution in GGA and fixed in RTKLIB."""
     columns = TIMES, *PLACES.T, np.resize(numbers, 40)
     message = complaint(lambda: read(tmp_path, f"time_utc,{GEODETIC},quality", *columns))
     assert f"solution types {', '.join(map(str, numbers))} in column 'quality'" in message
@@ -172,14 +172,14 @@ def test_numbers_of_kinds_of_solution_ask_for_their_numbering(tmp_path, numbers)
 @pytest.mark.parametrize(
     ("numbering", "kinds"), [("gga", [0, 5, 4, 5, 1, 2, 3]), ("rtklib", [0, 1, 2, 3, 4, 5, 6])], ids=["gga", "rtklib"]
 )
-def test_kinds_of_solution_are_read_by_the_numbering_that_the_config_states(tmp_path, numbering, kinds):
+def test_solution_types_follow_the_configured_numbering(tmp_path, numbering, kinds):
     numbers = ["", 1, 2, 3, 4, 5, 9 if numbering == "gga" else 6]
     columns = TIMES[:7], *PLACES[:7].T, numbers
     track = read(tmp_path, f"time_utc,{GEODETIC},quality", *columns, quality=numbering)
     assert track.fix.values.tolist() == kinds
 
 
-def test_epochs_that_gga_calls_not_measured_are_left_out(tmp_path):
+def test_epochs_without_measurement_by_gga_are_dropped(tmp_path):
     columns = TIMES, *PLACES.T, [4] * 36 + [0, 6, 7, 8]
     track = read(tmp_path, f"time_utc,{GEODETIC},quality", *columns, quality="gga")
     assert track.dropped == {
@@ -205,13 +205,13 @@ def rows_of(times=TIMES, places=PLACES):
     ],
     ids=["joined", "comments", "heading is a comment", "capitals"],
 )
-def test_headings_and_comments_as_programs_write_them(tmp_path, lines):
+def test_headings_and_comments_of_programs_are_read(tmp_path, lines):
     track = read(tmp_path, lines[0], lines[1:])
     np.testing.assert_array_equal(track.time.values, TIMES)
     np.testing.assert_allclose(track.position.values, ECEF, atol=1e-6, rtol=0)
 
 
-def test_a_second_heading_of_other_columns_is_refused(tmp_path):
+def test_second_heading_with_other_columns_is_rejected(tmp_path):
     lines = [*rows_of()[:20], "longitude_deg,latitude_deg,time_utc,height_m", *rows_of()[20:]]
     message = complaint(lambda: read(tmp_path, f"time_utc,{GEODETIC}", lines))
     assert "line 22 is a second, different heading: concatenated files" in message
@@ -225,7 +225,7 @@ def test_a_second_heading_of_other_columns_is_refused(tmp_path):
         ("cp1252", "µ", "byte 0xb5 in line 1 is not UTF-8; save the file as UTF-8"),
     ],
 )
-def test_text_that_is_not_utf_8_is_refused_with_what_to_do(tmp_path, encoding, name, expected):
+def test_text_that_is_not_utf_8_is_rejected_with_a_remedy(tmp_path, encoding, name, expected):
     path = tmp_path / "a.track.csv"
     path.write_bytes("\n".join([f"time_utc,{GEODETIC},{name}", *(f"{row},1" for row in rows_of())]).encode(encoding))
     message = complaint(lambda: read_track(path, node="a"))
@@ -237,18 +237,18 @@ def test_text_that_is_not_utf_8_is_refused_with_what_to_do(tmp_path, encoding, n
     "text", ["14.05.2025 09:29:58", "14-May-2025 09:29:58", "29:58.0", "2025-05-14 25:00:00", "5/14/25"]
 )
 @pytest.mark.parametrize("name", ["time_utc", "time"])
-def test_a_time_that_is_not_in_iso_8601_is_named_with_its_column(tmp_path, name, text):
+def test_time_not_in_iso_8601_is_named_with_its_column(tmp_path, name, text):
     columns = [*TIMES[:20], text, *TIMES[21:]], *PLACES.T
     message = complaint(lambda: read(tmp_path, f"{name},{GEODETIC}", *columns, time_system="utc"))
     assert f"column {name}: '{text}' is not an ISO 8601 time such as 2025-05-14T09:30:00.5Z" in message
 
 
-def test_a_decimal_comma_of_seconds_is_one_of_iso_8601(tmp_path):
+def test_decimal_comma_of_seconds_is_read(tmp_path):
     texts = [f'"{str(time)[:23].replace(".", ",")}Z"' for time in TIMES]
     np.testing.assert_array_equal(read(tmp_path, f"time_utc,{GEODETIC}", texts, *PLACES.T).time.values, TIMES)
 
 
-def test_epochs_within_a_leap_second_are_left_out_and_counted(tmp_path):
+def test_epochs_within_a_leap_second_are_dropped(tmp_path):
     start = np.datetime64("2016-12-31T23:59:57", "ns")
     texts = [str(time) for time in start + np.arange(30) * np.timedelta64(100, "ms")]
     texts += [f"2016-12-31T23:59:60.{tenth}" for tenth in range(10)]
@@ -262,7 +262,7 @@ def test_epochs_within_a_leap_second_are_left_out_and_counted(tmp_path):
 
 
 @pytest.mark.parametrize("spelling", ["1.#INF", "-nan(ind)", "-1.#IND", "1.#J"])
-def test_a_standard_deviation_that_c_prints_as_no_number_is_unknown(tmp_path, spelling):
+def test_standard_deviation_printed_as_nan_is_unknown(tmp_path, spelling):
     columns = TIMES, *PLACES.T, *[[spelling, *[0.01] * 39]] * 3
     track = read(tmp_path, f"time_utc,{GEODETIC},std_north_m,std_east_m,std_up_m", *columns)
     assert np.isnan(track.position_std.values[0]).all()

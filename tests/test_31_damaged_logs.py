@@ -1,4 +1,4 @@
-"""A log that is cut, reordered or has a bit flipped loses epochs or is refused; none of the others moves."""
+"""Damaged logs (cut, reordered, flipped bits): epochs are lost or the log is rejected; no other epoch changes."""
 
 import numpy as np
 import pytest
@@ -26,13 +26,13 @@ LOGS = {
 }
 HEADING = {"csv": 1, "rtklib": 2, "nmea": 0, "airdata": 1, "optitrack": 7}
 SHIFT = {"airdata": np.timedelta64(150, "ms")}
-"""By how much the fraction of a second may be taken otherwise where fewer epochs tell it."""
+"""Tolerated time offset, since the fraction of a second is estimated from all epochs."""
 
 PROPERTY = tried(60)
 
 
 def read(folder, kind, data):
-    """Return the track of a damaged log, or None where it is refused."""
+    """Return the track of a damaged log, or None if it is rejected."""
     name, _, options = LOGS[kind]
     (folder / name).write_bytes(data)
     try:
@@ -41,8 +41,8 @@ def read(folder, kind, data):
         return None
 
 
-def moved(track, whole, kind):
-    """Return how many epochs are none of the whole log's: of its position, at its time."""
+def changed_epochs(track, whole, kind):
+    """Return the number of epochs that differ from all epochs of the undamaged log in position or time."""
     if track is None:
         return 0
     nearest = np.abs(track.position.values[:, None] - whole.position.values).max(axis=2).argmin(axis=1)
@@ -55,13 +55,13 @@ def moved(track, whole, kind):
 @pytest.mark.parametrize("kind", LOGS)
 @PROPERTY
 @given(data=st.data())
-def test_a_log_that_is_cut_off_ends_earlier_or_is_refused(tmp_path_factory, kind, data):
+def test_truncated_log_ends_earlier_or_is_rejected(tmp_path_factory, kind, data):
     folder, text = tmp_path_factory.mktemp("log"), LOGS[kind][1].encode()
     whole = read(folder, kind, text)
-    # half of the places lie within the last lines, where numbers are cut
+    # half of the positions lie within the last lines, where numbers are cut
     place = data.draw(st.one_of(st.integers(0, len(text) - 1), st.integers(len(text) - 300, len(text) - 1)))
     track = read(folder, kind, text[:place])
-    assert moved(track, whole, kind) == 0
+    assert changed_epochs(track, whole, kind) == 0
     assert track is None or track.sizes["epoch"] <= whole.sizes["epoch"]
 
 
@@ -69,52 +69,52 @@ def test_a_log_that_is_cut_off_ends_earlier_or_is_refused(tmp_path_factory, kind
 @pytest.mark.parametrize("kind", LOGS)
 @PROPERTY
 @given(data=st.data())
-def test_a_log_whose_lines_change_places_is_refused_or_the_same(tmp_path_factory, kind, data):
+def test_log_with_swapped_lines_is_rejected_or_unchanged(tmp_path_factory, kind, data):
     folder, text = tmp_path_factory.mktemp("log"), LOGS[kind][1]
     whole = read(folder, kind, text.encode())
     lines = text.split("\n")[:-1]
     first, second = (data.draw(st.integers(HEADING[kind], len(lines) - 1)) for _ in range(2))
     lines[first], lines[second] = lines[second], lines[first]
-    assert moved(read(folder, kind, ("\n".join(lines) + "\n").encode()), whole, kind) == 0
+    assert changed_epochs(read(folder, kind, ("\n".join(lines) + "\n").encode()), whole, kind) == 0
 
 
 @pytest.mark.quick("rtklib")
 @pytest.mark.parametrize("kind", LOGS)
 @PROPERTY
 @given(data=st.data())
-def test_a_log_that_lost_a_piece_is_refused_or_lacks_epochs(tmp_path_factory, kind, data):
-    """Of the line that a piece is missing from the two ends may be one plausible line; no other epoch moves."""
+def test_log_with_a_missing_piece_is_rejected_or_lacks_epochs(tmp_path_factory, kind, data):
+    """The remainders of a cut line may form one plausible line; no other epoch changes."""
     folder, text = tmp_path_factory.mktemp("log"), LOGS[kind][1].encode()
     whole = read(folder, kind, text)
     place = data.draw(st.integers(text.index(b"\n") + 1, len(text) - 1))
     length = data.draw(st.integers(1, 150))
     track = read(folder, kind, text[:place] + text[place + length :])
-    assert moved(track, whole, kind) <= (0 if kind == "nmea" else 1)
+    assert changed_epochs(track, whole, kind) <= (0 if kind == "nmea" else 1)
 
 
 @pytest.mark.quick("rtklib", "optitrack")
 @pytest.mark.parametrize("kind", LOGS)
 @PROPERTY
 @given(data=st.data())
-def test_a_flipped_bit_moves_one_epoch_at_most(tmp_path_factory, kind, data):
-    """Without a checksum a digit that became another is a position; how far it stands out is `check_track`'s."""
+def test_flipped_bit_changes_at_most_one_epoch(tmp_path_factory, kind, data):
+    """Without a checksum a changed digit is a valid position; `check_track` finds those that stand out."""
     folder, text = tmp_path_factory.mktemp("log"), bytearray(LOGS[kind][1].encode())
     whole = read(folder, kind, bytes(text))
     place = data.draw(st.integers(0, len(text) - 1))
     text[place] ^= 1 << data.draw(st.integers(0, 7))
-    assert moved(read(folder, kind, bytes(text)), whole, kind) <= (0 if kind == "nmea" else 1)
+    assert changed_epochs(read(folder, kind, bytes(text)), whole, kind) <= (0 if kind == "nmea" else 1)
 
 
 @pytest.mark.parametrize("kind", LOGS)
-def test_a_line_that_stands_twice_is_refused_or_counted(tmp_path, kind):
+def test_repeated_line_is_rejected_or_dropped(tmp_path, kind):
     lines = LOGS[kind][1].split("\n")
     doubled = "\n".join([*lines[:-2], lines[-2], *lines[-2:]])
     track, whole = (read(tmp_path, kind, text.encode()) for text in (doubled, LOGS[kind][1]))
-    assert track is None or (track.sizes["epoch"] == whole.sizes["epoch"] and moved(track, whole, kind) == 0)
+    assert track is None or (track.sizes["epoch"] == whole.sizes["epoch"] and changed_epochs(track, whole, kind) == 0)
 
 
 @pytest.mark.parametrize("kind", ["csv", "rtklib", "airdata", "optitrack"])
-def test_a_line_that_the_file_ends_in_is_counted_as_no_epoch(tmp_path, kind):
+def test_unterminated_last_line_is_dropped_and_counted(tmp_path, kind):
     text = LOGS[kind][1].rstrip("\r\n")
     track, whole = (read(tmp_path, kind, data.encode()) for data in (text, LOGS[kind][1]))
     assert track.sizes["epoch"] == whole.sizes["epoch"] - 1

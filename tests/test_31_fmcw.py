@@ -1,4 +1,4 @@
-"""Files of beat signals: arrays, MATLAB and sound-card recordings hold the same sweeps, and wrong ones are named."""
+"""Files of FMCW beat signals: arrays, MATLAB and sound-card recordings contain the same sweeps; faults are named."""
 
 import re
 from dataclasses import asdict, replace
@@ -23,8 +23,8 @@ TRIGGER = {"sync_channel": 1, "beat_channel": 2, "edge": "rising", "threshold": 
 
 
 def described(**changes):
-    own = {"kind": "fmcw", "prf_hz": None, "start_utc": "2025-05-14T09:30", "trigger": TRIGGER}
-    return {**asdict(COFFEE), **own, **changes}
+    defaults = {"kind": "fmcw", "prf_hz": None, "start_utc": "2025-05-14T09:30", "trigger": TRIGGER}
+    return {**asdict(COFFEE), **defaults, **changes}
 
 
 def echo(form, *paths, **changes):
@@ -32,13 +32,13 @@ def echo(form, *paths, **changes):
 
 
 def beats(start_s, sweep=COFFEE):
-    """A target that stands still 30 m away, another that comes."""
+    """Return beats of a stationary target 30 m away and of an approaching one."""
     paths = [lambda time: np.full_like(time, 60.0), lambda time: 90.0 - 2 * time]
     return beat_signal(sweep, np.asarray(start_s), paths, [1.0, 0.5])
 
 
 def sound(path, starts, *, count, scale=8000, dtype=np.int16, high_s=20e-3):
-    """Write what a sound card records: a sync channel that is high during sweeps, and the beats."""
+    """Write a sound-card recording: a sync channel that is high during sweeps, and the beats."""
     rate = COFFEE.sample_rate_hz
     samples = np.zeros((count, 2))
     for start in starts:
@@ -52,13 +52,13 @@ def sound(path, starts, *, count, scale=8000, dtype=np.int16, high_s=20e-3):
 
 
 def beats_from(sweep, late_s, start_s):
-    """A sweep whose first sample is taken `late_s` after its beginning."""
+    """Return a sweep whose first sample is recorded `late_s` after its start."""
     elapsed = np.arange(sweep.sweep_samples + 2) / sweep.sample_rate_hz + late_s
     total = np.zeros(len(elapsed))
     for path, amplitude in ((np.full_like(elapsed, 60.0), 1.0), (90.0 - 2 * (start_s + elapsed), 0.5)):
-        own = elapsed - path / 299_792_458.0
-        phase = [sweep.start_hz * at + sweep.slope_hz_s * at**2 / 2 for at in (own, elapsed)]
-        total += np.where(own >= 0, amplitude * np.cos(2 * np.pi * (phase[0] - phase[1])), 0)
+        delayed = elapsed - path / 299_792_458.0
+        phase = [sweep.start_hz * at + sweep.slope_hz_s * at**2 / 2 for at in (delayed, elapsed)]
+        total += np.where(delayed >= 0, amplitude * np.cos(2 * np.pi * (phase[0] - phase[1])), 0)
     return total
 
 
@@ -69,8 +69,8 @@ STARTS_S = 0.05 + 0.040004 * np.arange(8)
 @pytest.mark.parametrize("count", [5, 900, 3000])
 @pytest.mark.parametrize("stated", ["times", "prf", "none"])
 @pytest.mark.parametrize("form", ["beat_npy", "beat_mat"])
-def test_an_array_with_a_sweep_in_each_column_is_refused(tmp_path, form, stated, count):
-    """Of 882 samples: fewer sweeps than samples, as many and more."""
+def test_array_with_a_sweep_per_column_is_rejected(tmp_path, form, stated, count):
+    """Sweeps of 882 samples: fewer sweeps than samples, about as many, and more."""
     beat = np.random.default_rng(1).normal(size=(count, 882)).astype(np.float32)
     time = BEGAN + np.arange(count) * np.timedelta64(40, "ms")
     changes = {"prf_hz": 25.0} if stated != "times" else {}
@@ -93,7 +93,7 @@ def test_an_array_with_a_sweep_in_each_column_is_refused(tmp_path, form, stated,
     assert "Save the transpose" in message
 
 
-def test_arrays_and_matlab_hold_the_same_sweeps(tmp_path):
+def test_arrays_and_matlab_files_give_the_same_sweeps(tmp_path):
     beat = beats(STARTS_S).astype("f4")
     time = BEGAN + np.round(STARTS_S * 1e9).astype("timedelta64[ns]")
     np.save(tmp_path / "a.npy", beat)
@@ -109,7 +109,7 @@ def test_arrays_and_matlab_hold_the_same_sweeps(tmp_path):
     assert array.attrs["dropped"] == {}
 
 
-def test_files_of_one_node_are_joined_each_with_its_times(tmp_path):
+def test_files_of_a_node_are_joined_with_their_times(tmp_path):
     beat = beats(STARTS_S)
     for part, rows in (("p1", slice(0, 5)), ("p2", slice(5, 8))):
         np.save(tmp_path / f"a.{part}.npy", beat[rows])
@@ -118,7 +118,7 @@ def test_files_of_one_node_are_joined_each_with_its_times(tmp_path):
     np.testing.assert_array_equal(both.transfer, transfer_of(beat, COFFEE))
 
 
-def test_without_times_sweeps_come_at_the_rate_stated_from_the_time_stated(tmp_path):
+def test_sweeps_without_times_follow_the_configured_rate_and_start(tmp_path):
     np.save(tmp_path / "a.npy", beats(STARTS_S))
     stage = echo("beat_npy", tmp_path / "a.npy", prf_hz=25.0)
     middle = np.timedelta64(round(COFFEE.middle_s * 1e9), "ns")
@@ -127,20 +127,21 @@ def test_without_times_sweeps_come_at_the_rate_stated_from_the_time_stated(tmp_p
     assert unknown.time.values[0] == np.datetime64("1970-01-01", "ns") + middle
 
 
-def test_a_sound_card_holds_the_sweeps_between_its_samples(tmp_path):
+def test_sweep_starts_between_sound_samples_are_found(tmp_path):
     starts = (STARTS_S + 0.00001) * COFFEE.sample_rate_hz
     assert np.ptp(starts % 1) > 0.1
     path = sound(tmp_path / "a.wav", starts, count=int(starts[-1]) + 1200)
     stage = echo("beat_wav", path)
     assert stage.sizes["pulse"] == len(starts)
     assert stage.attrs["dropped"] == {}
-    begun = BEGAN + np.round((STARTS_S + 0.00001) * 1e9).astype("timedelta64[ns]")
+    starts_utc = BEGAN + np.round((STARTS_S + 0.00001) * 1e9).astype("timedelta64[ns]")
     middle = np.timedelta64(round(COFFEE.middle_s * 1e9), "ns")
-    within = np.timedelta64(round(0.51e9 / COFFEE.sample_rate_hz), "ns")  # such a sync edge says no more
-    assert np.abs(stage.time.values - middle - begun).max() <= within
+    # resolution of a sync edge without intermediate samples
+    within = np.timedelta64(round(0.51e9 / COFFEE.sample_rate_hz), "ns")
+    assert np.abs(stage.time.values - middle - starts_utc).max() <= within
 
 
-def test_of_a_sync_pulse_with_an_edge_that_is_sampled_the_fraction_counts(tmp_path):
+def test_sampled_sync_edge_gives_the_fraction_of_a_sample(tmp_path):
     starts = (STARTS_S + 0.00001) * COFFEE.sample_rate_hz
     path = sound(tmp_path / "a.wav", starts, count=int(starts[-1]) + 1200)
     rate, samples = wavfile.read(path)
@@ -153,11 +154,13 @@ def test_of_a_sync_pulse_with_an_edge_that_is_sampled_the_fraction_counts(tmp_pa
     inside = slice(40, -40)
     error = np.abs(stage.transfer.values - truth)[:, inside].max() / 8000
     assert error < 0.03
-    roughly = transfer_of(np.stack([samples[int(np.ceil(one)) :, 1][: COFFEE.sweep_samples] for one in starts]), COFFEE)
-    assert np.abs(roughly - truth)[:, inside].max() / 8000 > 0.3
+    rounded = transfer_of(
+        np.stack([samples[int(np.ceil(start)) :, 1][: COFFEE.sweep_samples] for start in starts]), COFFEE
+    )
+    assert np.abs(rounded - truth)[:, inside].max() / 8000 > 0.3
 
 
-def test_sweeps_that_are_cut_short_are_left_out_and_counted(tmp_path):
+def test_truncated_sweeps_are_dropped_and_counted(tmp_path):
     starts = STARTS_S * COFFEE.sample_rate_hz
     early = np.insert(starts, 4, starts[3] + 500)  # a trigger within a sweep
     stage = echo("beat_wav", sound(tmp_path / "a.wav", early, count=int(starts[-1]) + 400, high_s=5e-3))
@@ -166,13 +169,13 @@ def test_sweeps_that_are_cut_short_are_left_out_and_counted(tmp_path):
 
 
 @pytest.mark.parametrize("dtype", [np.int16, np.int32, np.float32, np.uint8])
-def test_triggers_of_a_channel_that_swings_about_zero_and_of_any_type_are_found(tmp_path, dtype):
+def test_triggers_of_a_bipolar_channel_of_any_type_are_found(tmp_path, dtype):
     starts = STARTS_S * COFFEE.sample_rate_hz
     path = sound(tmp_path / "a.wav", starts, count=int(starts[-1]) + 1200)
     rate, samples = wavfile.read(path)
     swings = np.where(samples[:, 0] > 0, -0.6, 0.4) * 100 + np.random.default_rng(1).normal(0, 3, len(samples))
-    own = np.stack([samples[:, 1] / 80, swings], 1) + (128 if dtype == np.uint8 else 0)
-    wavfile.write(path, rate, own.astype(dtype))
+    recorded = np.stack([samples[:, 1] / 80, swings], 1) + (128 if dtype == np.uint8 else 0)
+    wavfile.write(path, rate, recorded.astype(dtype))
     trigger = {"sync_channel": 2, "beat_channel": 1, "edge": "falling", "threshold": 0.3}
     stage = echo("beat_wav", path, trigger=trigger)
     assert stage.sizes["pulse"] == len(starts)
@@ -180,14 +183,14 @@ def test_triggers_of_a_channel_that_swings_about_zero_and_of_any_type_are_found(
     assert set(profile[:, 1:].argmax(axis=1) + 1) == {round(60 / 299_792_458 * 330e6)}
 
 
-def test_a_click_beside_the_pulses_is_no_trigger():
+def test_click_between_sync_pulses_is_no_trigger():
     sync = np.tile(np.r_[np.zeros(500), np.ones(500)], 5)
-    sync[1200] = 0.6  # beyond the middle, within the threshold
+    sync[1200] = 0.6  # above the middle, within the threshold
     np.testing.assert_allclose(trigger_starts(sync, threshold=0.3), [499.5, 1499.5, 2499.5, 3499.5, 4499.5])
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"beat": np.ones((8, 700))}, r"float64 of shape \(8, 700\); a sweep has 882 samples"),
         ({"beat": np.ones((8, 882), "c8")}, "complex64 samples, but waveform.iq is real"),
@@ -206,21 +209,21 @@ def test_a_click_beside_the_pulses_is_no_trigger():
         ({"beat": None}, "no variable beat"),
     ],
 )
-def test_what_no_sweeps_can_be_is_refused(tmp_path, change, told):
+def test_invalid_sweeps_are_rejected(tmp_path, change, message):
     fields = {"beat": beats(STARTS_S), "time": 1.7e9 + STARTS_S, **change}
     savemat(tmp_path / "a.mat", {name: values for name, values in fields.items() if values is not None})
-    message = complaint(lambda: echo("beat_mat", tmp_path / "a.mat"))
-    assert re.search(told, message)
-    assert "a.mat" in message
+    error = complaint(lambda: echo("beat_mat", tmp_path / "a.mat"))
+    assert re.search(message, error)
+    assert "a.mat" in error
 
 
-def test_times_alone_are_refused(tmp_path):
+def test_times_without_beat_signals_are_rejected(tmp_path):
     np.save(tmp_path / "a.time.npy", np.arange(8.0))
     assert "times without beat signals" in complaint(lambda: echo("beat_npy", tmp_path / "a.time.npy"))
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"sample_rate_hz": 48_000.0}, "44100 samples/s"),
         ({"trigger": TRIGGER | {"beat_channel": 3}}, "2 channels"),
@@ -228,13 +231,13 @@ def test_times_alone_are_refused(tmp_path):
         ({"start_utc": "soon"}, "waveform.start_utc"),
     ],
 )
-def test_a_sound_file_that_does_not_fit_its_waveform_is_refused(tmp_path, changes, told):
+def test_sound_file_that_does_not_fit_its_waveform_is_rejected(tmp_path, changes, message):
     starts = STARTS_S * COFFEE.sample_rate_hz
     path = sound(tmp_path / "a.wav", starts, count=int(starts[-1]) + 1200)
-    assert told in complaint(lambda: echo("beat_wav", path, **changes))
+    assert message in complaint(lambda: echo("beat_wav", path, **changes))
 
 
-def test_a_sound_file_that_was_cut_off_is_refused(tmp_path):
+def test_truncated_sound_file_is_rejected(tmp_path):
     starts = STARTS_S * COFFEE.sample_rate_hz
     path = sound(tmp_path / "a.wav", starts, count=int(starts[-1]) + 1200)
     path.write_bytes(path.read_bytes()[:-5000])

@@ -1,4 +1,4 @@
-"""Phase history in HDF5 and zarr: what was written comes back, and what is not of the layout is refused."""
+"""Phase history in HDF5 and zarr: arrays are read back unchanged, and deviations from the layout are rejected."""
 
 import json
 import shutil
@@ -24,7 +24,7 @@ FORMATS = pytest.mark.parametrize("kind", SUFFIX)
 
 
 def arrays():
-    """What a radar recorded; single precision is as good."""
+    """Return the arrays of a recording."""
     rng = np.random.default_rng(5)
     samples = rng.standard_normal((PULSES, SUBCARRIERS)) + 1j * rng.standard_normal((PULSES, SUBCARRIERS))
     place = np.array([4177000.0, 855000.0, 4728000.0])
@@ -40,7 +40,7 @@ def arrays():
 
 
 def write(path, fields, *, frame="ecef", units="nanoseconds since 1970-01-01"):
-    """Write a file or a folder by its suffix."""
+    """Write a file or a folder, depending on the suffix."""
     if path.suffix == ".h5":
         with h5py.File(path, "w") as file:
             file.attrs["frame"] = frame
@@ -65,10 +65,14 @@ def read(kind, *paths):
 
 
 @FORMATS
-def test_what_was_written_comes_back(tmp_path, kind):
+def test_arrays_are_read_back_unchanged(tmp_path, kind):
     fields = arrays()
     echo = check(read(kind, write(tmp_path / f"b{SUFFIX[kind]}", fields)), "echo")
-    of_vacuum = {"reference": "delay", "wave_speed_m_s": SPEED_OF_LIGHT_M_S}  # until a campaign states its air
+    # default until a campaign configures its atmosphere
+    of_vacuum = {
+        "reference": "delay",
+        "wave_speed_m_s": SPEED_OF_LIGHT_M_S,
+    }
     assert echo.attrs == {"frame": "ecef", "pair": "a-b", "flags": {}, **of_vacuum}
     np.testing.assert_array_equal(echo.time.values, fields.pop("time").astype("datetime64[ns]"))
     np.testing.assert_allclose(echo.frequency.values, fields.pop("frequency"), rtol=1e-15)
@@ -77,7 +81,7 @@ def test_what_was_written_comes_back(tmp_path, kind):
 
 
 @FORMATS
-def test_positions_may_be_left_to_flight_logs_and_no_limit_is_none(tmp_path, kind):
+def test_positions_and_path_limit_are_optional(tmp_path, kind):
     fields = {
         name: values for name, values in arrays().items() if name not in {"tx_position", "rx_position", "path_limit"}
     }
@@ -100,7 +104,7 @@ def without(name):
 
 @FORMATS
 @pytest.mark.parametrize(
-    ("fields", "how", "expected"),
+    ("fields", "options", "expected"),
     [
         (arrays(), {"frame": "wgs84"}, "frame is 'wgs84', not 'ecef' or 'local'"),
         (arrays(), {"units": "seconds since 1970-01-01"}, "units of time are 'seconds since 1970-01-01'"),
@@ -127,14 +131,14 @@ def without(name):
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_what_is_not_of_the_layout_is_named(tmp_path, kind, fields, how, expected):
-    path = write(tmp_path / f"b{SUFFIX[kind]}", fields, **how)
+def test_deviation_from_the_layout_is_named(tmp_path, kind, fields, options, expected):
+    path = write(tmp_path / f"b{SUFFIX[kind]}", fields, **options)
     message = complaint(lambda: read(kind, path))
     assert message.startswith(f"{path}: ")
     assert expected in message
 
 
-def test_silent_pulses_are_left_out_and_counted(tmp_path):
+def test_silent_pulses_are_dropped_and_counted(tmp_path):
     fields = arrays()
     fields["transfer"][4] = 0
     echo = read("hdf5", write(tmp_path / "b.h5", fields))
@@ -142,7 +146,7 @@ def test_silent_pulses_are_left_out_and_counted(tmp_path):
     assert echo.attrs["pulses"] == {"used": PULSES - 1, "dropped": 1, "reasons": {"all samples zero": 1}}
 
 
-def test_an_array_that_lies_in_another_file_is_not_followed(tmp_path):
+def test_external_hdf5_array_is_rejected(tmp_path):
     inner, other = tmp_path / "b.h5", tmp_path / "secret"
     np.arange(PULSES, dtype=np.float64).tofile(other)
     write(tmp_path / "whole.h5", arrays())
@@ -159,7 +163,7 @@ def test_an_array_that_lies_in_another_file_is_not_followed(tmp_path):
         assert "reference_delay is not an array stored in this file" in complaint(lambda: read("hdf5", inner))
 
 
-def test_a_codec_that_may_run_code_is_not_asked(tmp_path):
+def test_codec_that_may_run_code_is_rejected(tmp_path):
     path = write(tmp_path / "b.zarr", arrays())
     meta = json.loads((path / "time/zarr.json").read_text())
     meta["codecs"].append({"name": "numcodecs.pickle", "configuration": {}})
@@ -170,7 +174,7 @@ def test_a_codec_that_may_run_code_is_not_asked(tmp_path):
     assert "time uses codec 'evil'" in complaint(lambda: read("zarr", path))
 
 
-def test_what_a_link_in_a_zarr_folder_leads_to_is_not_read(tmp_path):
+def test_link_in_a_zarr_folder_is_rejected(tmp_path):
     path = write(tmp_path / "b.zarr", arrays())
     chunk = path / "time/c/0"
     chunk.rename(tmp_path / "elsewhere")
@@ -178,14 +182,14 @@ def test_what_a_link_in_a_zarr_folder_leads_to_is_not_read(tmp_path):
     assert "b.zarr/time/c/0: a symbolic link" in complaint(lambda: read("zarr", path))
 
 
-def test_a_zarr_folder_of_version_2_is_refused(tmp_path):
+def test_zarr_folder_of_version_2_is_rejected(tmp_path):
     group = zarr.open_group(tmp_path / "b.zarr", mode="w", zarr_format=2, attributes={"frame": "ecef"})
     for name, values in arrays().items():
         group.create_array(name, data=values)
     assert "no zarr.json in b.zarr" in complaint(lambda: read("zarr", tmp_path / "b.zarr"))
 
 
-def test_a_chunk_cut_short_is_refused(tmp_path):
+def test_truncated_chunk_is_rejected(tmp_path):
     path = write(tmp_path / "b.zarr", arrays())
     chunk = next(file for file in (path / "transfer/c").rglob("*") if file.is_file())
     chunk.write_bytes(chunk.read_bytes()[:20])
@@ -206,14 +210,14 @@ def campaign(tmp_path):
     return Campaign.load(tmp_path)
 
 
-def test_every_file_of_a_zarr_folder_is_one_of_the_recording(campaign):
+def test_every_file_of_a_zarr_folder_belongs_to_the_recording(campaign):
     require_files(campaign)
     files = campaign.raw_files("f01", "b")
     assert {"history.b.pass.zarr/zarr.json", "history.b.pass.zarr/time/c/0"} <= set(files)
     assert read_phase_history("zarr", campaign.history_files("f01", "b"), pair="a-b").sizes["pulse"] == PULSES
 
 
-def test_a_zarr_folder_that_leads_out_of_the_campaign_is_refused(campaign, tmp_path_factory):
+def test_zarr_folder_that_leads_out_of_the_campaign_is_rejected(campaign, tmp_path_factory):
     elsewhere, inside = tmp_path_factory.mktemp("elsewhere"), campaign.root / "raw/f01/b.pass.zarr"
     shutil.move(str(inside / "time"), str(elsewhere / "time"))
     Path(inside / "time").symlink_to(elsewhere / "time")

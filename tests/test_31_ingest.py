@@ -1,4 +1,4 @@
-"""Bytes of recorders and flight logs come out as the stages promise."""
+"""Ingest of recorders and flight logs: the stages have the arrays that their contracts define."""
 
 import hashlib
 import json
@@ -30,7 +30,7 @@ EPOCHS = st.lists(
     min_size=2,
     max_size=12,
 )
-"""Latitude, longitude (deg), height (m), nanoseconds since the epoch before."""
+"""Latitude, longitude (deg), height (m), nanoseconds since the previous epoch."""
 
 HEADER = (
     "% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix)\n%  {}                  latitude(deg) longitude(deg)  height(m)   Q\n"
@@ -42,7 +42,7 @@ def pos(path, system, *lines):
     return read_track(path, node="a")
 
 
-def test_gpst_is_eighteen_seconds_ahead_of_utc(tmp_path):
+def test_gpst_is_18_seconds_ahead_of_utc(tmp_path):
     lines = [f"2025/05/14 09:30:{second}.500   48.0   9.0   600.0   1" for second in (16, 17)]
     gpst, utc = (pos(tmp_path / f"{system}.pos", system, *lines) for system in ("GPST", "UTC"))
     assert (utc.time.values - gpst.time.values == np.timedelta64(18, "s")).all()
@@ -55,7 +55,7 @@ def test_gps_weeks_and_calendar_dates_are_the_same_times(tmp_path):
     np.testing.assert_array_equal(dates.time.values, weeks.time.values)
 
 
-def test_a_solution_says_of_what_kind_it_is_and_how_good(tmp_path):
+def test_solution_has_its_type_and_standard_deviations(tmp_path):
     columns = "ns   sdn(m)   sde(m)   sdu(m)  sdne(m)"
     lines = [
         f"2025/05/14 09:30:1{n}.0 48.0 9.0 600.0 {q} 18 0.01 0.02 {up} 0.0" for n, q, up in ((6, 1, 0.03), (7, 2, 0.6))
@@ -78,11 +78,11 @@ def csv_log(path, *cells):
     return check(read_track(path, node="a", options=LogOptions(quality="rtklib")), "track")
 
 
-def test_a_csv_log_says_how_good_it_is(tmp_path):
+def test_csv_log_has_solution_types_and_standard_deviations(tmp_path):
     track = csv_log(tmp_path / "a.csv", "fix,0.01,0.02,0.03", "Float,1,1,1", ",,,", "5,2,2,2")
     assert track.fix.values.tolist() == [1, 2, 0, 5]
     np.testing.assert_array_equal(track.position_std.values[[0, 2]], [[0.01, 0.02, 0.03], [np.nan] * 3])
-    numbers = csv_log(tmp_path / "b.csv", "1,1,1,1", ",1,1,1", "2,1,1,1")  # which pandas reads as 1.0, NaN, 2.0
+    numbers = csv_log(tmp_path / "b.csv", "1,1,1,1", ",1,1,1", "2,1,1,1")  # read by pandas as 1.0, NaN, 2.0
     assert numbers.fix.values.tolist() == [1, 0, 2]
     with pytest.raises(
         CampaignError, match=r"quality 'fixed'; expected .*quality \(fix, float, sbas, dgps, single, ppp"
@@ -101,13 +101,13 @@ def test_a_csv_log_says_how_good_it_is(tmp_path):
         (HEADER.format("GPST") + "2017/01/01 00:00:17.5 48.0 9.0 600.0 1\n", "leap second"),
     ],
 )
-def test_a_solution_that_does_not_say_what_it_holds_is_refused(tmp_path, text, expected):
+def test_solution_with_an_incomplete_header_is_rejected(tmp_path, text, expected):
     (tmp_path / "a.pos").write_text(text)
     with pytest.raises(CampaignError, match=expected):
         read_track(tmp_path / "a.pos", node="a")
 
 
-def test_a_csv_log_keeps_position_and_attitude(tmp_path):
+def test_csv_log_keeps_position_and_attitude(tmp_path):
     path = tmp_path / "a.track.csv"
     path.write_text(
         "time_utc,latitude_deg,longitude_deg,height_m,roll_deg,pitch_deg,yaw_deg\n"
@@ -119,7 +119,7 @@ def test_a_csv_log_keeps_position_and_attitude(tmp_path):
     assert track.time.values[1] - track.time.values[0] == np.timedelta64(1500, "ms")
 
 
-def test_a_csv_log_without_a_column_is_refused(tmp_path):
+def test_csv_log_without_a_height_column_is_rejected(tmp_path):
     (tmp_path / "a.csv").write_text("time_utc,latitude_deg,longitude_deg\n2025-05-14T09:30:00Z,48,9\n")
     with pytest.raises(CampaignError, match="no column height_m"):
         read_track(tmp_path / "a.csv", node="a")
@@ -132,7 +132,7 @@ def raw_of(*files):
 
 
 def iq_of(raw):
-    """Return (channel, pulse, sample, 2) as the stage refers to them."""
+    """Return the samples of the stage, (channel, pulse, sample, 2)."""
     file = SampleFile(Path(raw.attrs["samples"]), len(raw.attrs["channels"]))
     return np.moveaxis(file.captures(raw.start.values, raw.attrs["capture_samples"]), 2, 0)
 
@@ -176,12 +176,12 @@ def test_channels_are_interleaved_per_sample_and_captures_become_pulses(tmp_path
     assert raw.attrs["frequency_hz"] == 1e9
 
 
-def test_time_tags_that_run_backwards_are_refused(tmp_path):
+def test_decreasing_time_tags_are_rejected(tmp_path):
     with pytest.raises(CampaignError, match="capture 1 has time tag"):
         recording(tmp_path, np.ones((10, 1, 2)), [capture(0, 5), capture(5, 1)], **{"apertura:channels": ["radar"]})
 
 
-def test_a_real_recording_of_another_maker_is_read(shared):
+def test_real_recording_of_another_recorder_is_read(shared):
     folder = shared / "sigmf_nbiot"
     names = [folder / f"V16-beacon-NB-IoT-uplink.sigmf-{kind}" for kind in ("meta", "data")]
     raw = check(raw_of(*names), "raw")
@@ -190,8 +190,8 @@ def test_a_real_recording_of_another_maker_is_read(shared):
 
 
 @pytest.mark.usefixtures("reader")
-def test_gotcha_delays_are_referred_to_the_scene_centre(shared):
-    """The antenna's distance to the scene centre is r0, so an echo from there has no phase left."""
+def test_gotcha_delays_refer_to_the_scene_centre(shared):
+    """The antenna's distance to the scene centre is r0, so that an echo from there has zero phase."""
     files = sorted((shared / "gotcha_afrl").glob("*.mat"))
     echo = check(read_phase_history("afrl_mat", files, pair="a-a"), "echo")
     assert echo.transfer.shape == (234, 424)
@@ -201,7 +201,7 @@ def test_gotcha_delays_are_referred_to_the_scene_centre(shared):
 
 
 def gotcha(folder, *, version=7, **changes):
-    """Write a file of AFRL's structure, of 8 frequencies and 5 pulses, by MATLAB's version 7 or 7.3."""
+    """Write a file with AFRL's structure, 8 frequencies and 5 pulses, in MATLAB format 7 or 7.3."""
     generator, pulses = np.random.default_rng(6), np.arange(5.0)
     fields = {
         "fp": generator.normal(size=(8, 5)) + 1j * generator.normal(size=(8, 5)),
@@ -234,24 +234,26 @@ def gotcha(folder, *, version=7, **changes):
 
 
 @pytest.mark.usefixtures("reader")
-def test_matlab_files_of_version_7_3_are_those_of_version_7(tmp_path):
-    echoes = [read_phase_history("afrl_mat", [gotcha(tmp_path, version=one)[0]], pair="a-a") for one in (7, 7.3)]
+def test_matlab_7_3_files_equal_those_of_version_7(tmp_path):
+    echoes = [
+        read_phase_history("afrl_mat", [gotcha(tmp_path, version=version)[0]], pair="a-a") for version in (7, 7.3)
+    ]
     for name in ("transfer", "frequency", "reference_delay", "tx_position"):
         np.testing.assert_array_equal(echoes[0][name].values, echoes[1][name].values)
     assert echoes[0].attrs["remarks"] == echoes[1].attrs["remarks"]
 
 
 @pytest.mark.usefixtures("reader")
-def test_corrections_of_passes_are_applied_where_the_config_says_so(tmp_path):
+def test_stored_corrections_are_applied_if_configured(tmp_path):
     path, fields = gotcha(tmp_path)
     raw = read_phase_history("afrl_mat", [path], pair="a-a")
     assert "corrections of r0 (0.20 to 0.24 m) and of phases, which are not applied" in raw.attrs["remarks"][0]
-    moved = read_phase_history("afrl_mat", [path], pair="a-a", described={"corrections": "stored"})
-    assert "remarks" not in moved.attrs
-    turned = raw.transfer.values * np.exp(1j * fields["af"]["ph_correct"])[:, None]
-    np.testing.assert_allclose(moved.transfer.values, turned, rtol=1e-5)
-    further = (moved.reference_delay - raw.reference_delay).values * SPEED_OF_LIGHT_M_S / 2
-    np.testing.assert_allclose(further, fields["af"]["r_correct"], atol=1e-6)
+    corrected = read_phase_history("afrl_mat", [path], pair="a-a", described={"corrections": "stored"})
+    assert "remarks" not in corrected.attrs
+    expected = raw.transfer.values * np.exp(1j * fields["af"]["ph_correct"])[:, None]
+    np.testing.assert_allclose(corrected.transfer.values, expected, rtol=1e-5)
+    range_m = (corrected.reference_delay - raw.reference_delay).values * SPEED_OF_LIGHT_M_S / 2
+    np.testing.assert_allclose(range_m, fields["af"]["r_correct"], atol=1e-6)
     bare, _ = gotcha(tmp_path, af=None)
     assert "remarks" not in read_phase_history("afrl_mat", [bare], pair="a-a").attrs
     with pytest.raises(CampaignError, match=r"no field data\.af\.r_correct.*Set waveform\.corrections to none"):
@@ -259,8 +261,8 @@ def test_corrections_of_passes_are_applied_where_the_config_says_so(tmp_path):
 
 
 @pytest.mark.slow
-def test_corrections_that_gotcha_stores_keep_its_trihedrals_sharp(shared):
-    """By the signs above: the other ones lose 18 dB and more."""
+def test_stored_corrections_of_gotcha_keep_trihedrals_focused(shared):
+    """With the signs above; the opposite signs lose at least 18 dB."""
     files = sorted((shared / "gotcha_afrl").glob("*.mat"))
     east, north = np.meshgrid(np.arange(-16.6, -14.6, 0.1), np.arange(20.0, 23.0, 0.1))
     peaks = []
@@ -276,7 +278,7 @@ def test_corrections_that_gotcha_stores_keep_its_trihedrals_sharp(shared):
 
 
 @pytest.mark.usefixtures("reader")
-def test_frequencies_in_ghz_are_refused(tmp_path):
+def test_frequencies_in_ghz_are_rejected(tmp_path):
     path, _ = gotcha(tmp_path, freq=9.3 + 1e-3 * np.arange(8.0))
     with pytest.raises(CampaignError, match=r"frequencies of 9\.3 to 9\.307, probably not in Hz"):
         read_phase_history("afrl_mat", [path], pair="a-a")
@@ -296,7 +298,7 @@ def test_frequencies_in_ghz_are_refused(tmp_path):
         ("cut,angle_deg,gain_db,phase_deg\nazimuth,-9,-9,0\nazimuth,0,0,2e5\nazimuth,9,-9,0\n", "a phase of 200000°"),
     ],
 )
-def test_a_pattern_that_cannot_be_read_is_named(tmp_path, rows, expected):
+def test_unreadable_antenna_pattern_is_named(tmp_path, rows, expected):
     path = tmp_path / "horn.csv"
     path.write_text(rows)
     with pytest.raises(CampaignError, match=rf"horn.csv: .*{expected}.*expected columns cut"):
@@ -304,7 +306,7 @@ def test_a_pattern_that_cannot_be_read_is_named(tmp_path, rows, expected):
 
 
 def epochs_of(logged, start="2025-05-14T09:30:00", grain_ns=1):
-    """Return geodetic positions as written with nine decimals, and times."""
+    """Return geodetic positions rounded to the nine decimals that are written, and times."""
     values = np.array([epoch[:3] for epoch in logged]).round(9)
     elapsed = np.cumsum([epoch[3] for epoch in logged]) * grain_ns
     return values, np.datetime64(start, "ns") + elapsed.astype("timedelta64[ns]")
@@ -312,7 +314,7 @@ def epochs_of(logged, start="2025-05-14T09:30:00", grain_ns=1):
 
 @QUICK
 @given(logged=EPOCHS)
-def test_any_csv_log_comes_back_as_it_was_written(tmp_path_factory, logged):
+def test_any_csv_log_is_read_back_unchanged(tmp_path_factory, logged):
     geodetic, time = epochs_of(logged)
     path = tmp_path_factory.mktemp("log") / "a.track.csv"
     rows = (f"{t}Z,{lat:.9f},{lon:.9f},{h:.9f}" for t, (lat, lon, h) in zip(time, geodetic, strict=True))
@@ -325,7 +327,7 @@ def test_any_csv_log_comes_back_as_it_was_written(tmp_path_factory, logged):
 
 @QUICK
 @given(logged=EPOCHS, weeks=st.booleans())
-def test_any_rtklib_log_comes_back_as_it_was_written(tmp_path_factory, logged, weeks):
+def test_any_rtklib_log_is_read_back_unchanged(tmp_path_factory, logged, weeks):
     geodetic, time = epochs_of(logged, grain_ns=10**6)
     path = tmp_path_factory.mktemp("log") / "a.track.pos"
 
@@ -345,8 +347,8 @@ def test_any_rtklib_log_comes_back_as_it_was_written(tmp_path_factory, logged, w
 
 @QUICK
 @given(gaps=st.lists(st.integers(0, 3), min_size=1, max_size=9), channels=st.integers(1, 3), data=st.data())
-def test_captures_hold_their_own_samples_whatever_lies_between_them(tmp_path_factory, gaps, channels, data):
-    """Every capture is as long as the median one; samples that a recorder kept beyond it belong to none."""
+def test_captures_have_their_own_samples_despite_gaps(tmp_path_factory, gaps, channels, data):
+    """Every capture has the median length; samples recorded beyond it belong to no capture."""
     length = 6
     gaps = sorted(gaps)[: (len(gaps) + 1) // 2] if np.median(gaps) else gaps
     gaps = [0] * (len(gaps) + 1) + gaps  # most captures follow each other
@@ -365,8 +367,8 @@ def test_captures_hold_their_own_samples_whatever_lies_between_them(tmp_path_fac
             np.testing.assert_array_equal(iq_of(raw)[channel, pulse], samples[start : start + length, channel])
 
 
-def test_a_new_log_format_is_one_function_and_one_row(tmp_path, monkeypatch):
-    """Read through the table, and named in the message about a node without a log."""
+def test_new_log_format_is_one_function_and_one_row(tmp_path, monkeypatch):
+    """The format is read through the table, and named in the message about a node without a log."""
     monkeypatch.setitem(TRACKS, "toy", LogFormat((".toy",), read_toy_track))
     (tmp_path / "a.track.toy").write_text("48 9 600\n48 9 601\n")
     track = read_track(tmp_path / "a.track.toy", node="a")
@@ -381,8 +383,8 @@ def read_toy_track(path, *, node, options):
     return make_track(time, geodetic, node=node, where=path)
 
 
-def test_a_recorder_of_one_file_is_one_function_and_one_row(tmp_path, monkeypatch):
-    """Found in its folder, opened, its hash checked, its captures cut; messages name its one file."""
+def test_new_recorder_is_one_function_and_one_row(tmp_path, monkeypatch):
+    """The file is found, opened, checked against its hash, and cut into captures; messages name it."""
     monkeypatch.setitem(RECORDERS, (".toy",), open_toy_recording)
     path = tmp_path / "raw" / "f01" / "a.toy"
     path.parent.mkdir(parents=True)
@@ -419,19 +421,19 @@ def open_toy_recording(path):
         ({"core:sample_start": -1}, "captures.0.core:sample_start: .*not -1"),
     ],
 )
-def test_metadata_that_are_not_sigmf_are_refused_by_key(tmp_path, change, expected):
+def test_invalid_sigmf_metadata_are_rejected_by_key(tmp_path, change, expected):
     with pytest.raises(CampaignError, match=rf"a\.sigmf-meta: .*{expected}"):
         recording(tmp_path, np.ones((10, 1, 2)), [capture(0, 0) | change], **{"apertura:channels": ["radar"]})
 
 
-def test_metadata_that_are_not_json_are_refused(tmp_path):
+def test_metadata_that_are_not_json_are_rejected(tmp_path):
     (tmp_path / "a.sigmf-meta").write_text('{"global": ')
     (tmp_path / "a.sigmf-data").write_bytes(b"1234")
     with pytest.raises(CampaignError, match="not valid SigMF: invalid JSON: parse error"):
         open_recording((tmp_path / "a.sigmf-meta", tmp_path / "a.sigmf-data"))
 
 
-def test_a_capture_at_another_carrier_is_named(tiny):
+def test_capture_at_another_carrier_is_named(tiny):
     path = tiny / "raw/f01/uav1.sigmf-meta"
     meta = json.loads(path.read_text())
     for capture in meta["captures"][1:]:

@@ -1,4 +1,4 @@
-"""Missions of ground stations: waypoints, what heights count from, speeds; and one message for what is none."""
+"""Missions of ground control stations: waypoints, height references, speeds; one message for an invalid file."""
 
 import json
 
@@ -29,7 +29,7 @@ SURVEY = {
 }
 
 
-def test_a_qgroundcontrol_plan_gives_waypoints_heights_above_home_and_speeds(tmp_path):
+def test_qgroundcontrol_plan_gives_waypoints_and_speeds(tmp_path):
     file = tmp_path / "dike.plan"
     file.write_text(plan(item(22, 48.4, 9.9, 50), item(178, second=3.0), item(16, 48.401, 9.9, 50), SURVEY, item(20)))
     mission = read_mission(file)
@@ -39,7 +39,7 @@ def test_a_qgroundcontrol_plan_gives_waypoints_heights_above_home_and_speeds(tmp
     assert mission.speed_m_s.tolist() == [5, 3, 3, 3]
 
 
-def test_waypoints_of_ardupilot_begin_with_home(tmp_path):
+def test_ardupilot_waypoints_start_with_home(tmp_path):
     rows = ["QGC WPL 110", "0 1 0 16 0 0 0 0 48.4 9.9 480 1", "1 0 3 178 0 4 0 0 0 0 0 1"]
     rows += [f"{number} 0 3 16 0 0 0 0 48.40{number} 9.9 40 1" for number in (2, 3)]
     file = tmp_path / "one.waypoints"
@@ -50,7 +50,7 @@ def test_waypoints_of_ardupilot_begin_with_home(tmp_path):
     assert mission.home_deg == (48.4, 9.9)
 
 
-def test_kml_is_read_as_it_is_written(tmp_path):
+def test_kml_is_read_back_unchanged(tmp_path):
     lines = {"uav<1>": np.array([[9.9, 48.4, 500.0], [9.91, 48.4, 501.0]])}
     write_kml(tmp_path / "one.kml", "a & b", lines, {"seen": [[lines["uav<1>"]]]})
     mission = read_mission(tmp_path / "one.kml")
@@ -58,7 +58,7 @@ def test_kml_is_read_as_it_is_written(tmp_path):
     assert mission.place == pytest.approx(np.array([[48.4, 9.9, 500.0], [48.4, 9.91, 501.0]]))
 
 
-def test_a_table_has_heights_above_the_ground(tmp_path):
+def test_table_has_heights_above_terrain(tmp_path):
     (tmp_path / "one.csv").write_text("latitude_deg,longitude_deg,height_m,speed_m_s\n48.4,9.9,30,2\n48.41,9.9,30,3\n")
     mission = read_mission(tmp_path / "one.csv")
     assert (mission.reference, mission.speed_m_s.tolist()) == ("ground", [2, 3])
@@ -83,7 +83,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_is_no_mission_is_refused_by_one_message(tmp_path, name):
+def test_invalid_mission_is_one_message(tmp_path, name):
     text, words = WRONG[name]
     (tmp_path / name).write_text(text)
     with pytest.raises(CampaignError) as caught:

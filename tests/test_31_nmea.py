@@ -1,4 +1,4 @@
-"""NMEA logs: heights above the ellipsoid, dates over midnight, checksums that keep wrong positions out."""
+"""NMEA logs: heights above the ellipsoid, dates past midnight, checksums against wrong positions."""
 
 import re
 
@@ -24,7 +24,7 @@ def read(tmp_path, text, name="a.track.nmea", **options):
     return check(read_track(path, node="a", options=LogOptions(**options)), "track")
 
 
-def test_height_is_altitude_plus_geoid_separation_and_the_date_goes_on_over_midnight(tmp_path):
+def test_height_adds_geoid_separation_and_date_passes_midnight(tmp_path):
     track = read(tmp_path, logs.nmea(TIMES, PLACES))
     np.testing.assert_array_equal(track.time.values, TIMES)
     np.testing.assert_allclose(track.position.values, ecef_from_geodetic(*PLACES.T), atol=2e-5, rtol=0)
@@ -35,13 +35,13 @@ def test_height_is_altitude_plus_geoid_separation_and_the_date_goes_on_over_midn
 
 
 @pytest.mark.parametrize("south_west", [False, True])
-def test_hemispheres_are_signs(tmp_path, south_west):
+def test_hemispheres_give_the_signs(tmp_path, south_west):
     places = PLACES * ([-1, -1, 1] if south_west else 1)
     track = read(tmp_path, logs.nmea(TIMES, places))
     np.testing.assert_allclose(track.position.values, ecef_from_geodetic(*places.T), atol=2e-5, rtol=0)
 
 
-def test_one_date_in_the_middle_dates_the_whole_log(tmp_path):
+def test_single_date_applies_to_the_whole_log(tmp_path):
     lines = logs.nmea(TIMES, PLACES, every=0).splitlines()
     for date in (logs.zda(TIMES[35]), logs.rmc(TIMES[35])):
         track = read(tmp_path, "\n".join([*lines[:70], date, *lines[70:]]) + "\n")
@@ -49,8 +49,8 @@ def test_one_date_in_the_middle_dates_the_whole_log(tmp_path):
 
 
 @pytest.mark.parametrize("wrong", [1, 3, 10])
-def test_a_date_that_is_late_after_midnight_is_that_of_the_next_day(tmp_path, wrong):
-    """RMC of some receivers has the day before for a moment: epochs from then on would be a day earlier."""
+def test_late_date_change_after_midnight_is_corrected(tmp_path, wrong):
+    """Some receivers briefly send the previous date in RMC after midnight; later epochs would be a day early."""
     lines, late = logs.nmea(TIMES, PLACES, every=1).splitlines(), 0
     for place, line in enumerate(lines):
         if "RMC,000" in line and late < wrong:
@@ -61,19 +61,19 @@ def test_a_date_that_is_late_after_midnight_is_that_of_the_next_day(tmp_path, wr
     assert track.remarks[0].startswith(f"{wrong} dates after midnight are those of the previous day")
 
 
-def test_a_receiver_that_is_not_sure_has_no_date(tmp_path):
+def test_invalid_rmc_gives_no_date(tmp_path):
     text = logs.rmc(TIMES[0] + np.timedelta64(400, "D"), status="V") + "\n" + logs.nmea(TIMES, PLACES, every=0)
     assert "no RMC or ZDA with a date; expected key nodes.a.log.start_utc" in complaint(lambda: read(tmp_path, text))
     track = read(tmp_path, text, start_utc="2025-05-14")
     np.testing.assert_array_equal(track.time.values, TIMES)
 
 
-def test_times_of_nmea_are_utc_whatever_the_config_says(tmp_path):
+def test_configured_time_system_other_than_utc_is_rejected(tmp_path):
     assert "times of NMEA are UTC" in complaint(lambda: read(tmp_path, logs.nmea(TIMES, PLACES), time_system="gpst"))
 
 
 @pytest.mark.parametrize("separation", ["", "0.0"])
-def test_altitudes_without_geoid_separation_ask_for_an_offset(tmp_path, separation):
+def test_altitudes_without_geoid_separation_need_an_offset(tmp_path, separation):
     text = logs.nmea(TIMES, PLACES, separation=separation)
     assert "expected key nodes.a.log.height_offset_m" in complaint(lambda: read(tmp_path, text))
     heights = geodetic_from_ecef(read(tmp_path, text, height_offset_m=48.0).position.values)[:, 2]
@@ -82,7 +82,7 @@ def test_altitudes_without_geoid_separation_ask_for_an_offset(tmp_path, separati
     assert "GGA contains the geoid separation" in complaint(lambda: read(tmp_path, stated, height_offset_m=48.0))
 
 
-def test_epochs_without_separation_among_others_are_left_out(tmp_path):
+def test_epochs_without_geoid_separation_are_dropped(tmp_path):
     lines = [logs.rmc(TIMES[0]), *(logs.gga(*epoch) for epoch in zip(TIMES, PLACES, strict=True))]
     lines[7] = logs.gga(TIMES[6], PLACES[6], separation="")
     track = read(tmp_path, "\n".join(lines) + "\n")
@@ -90,7 +90,7 @@ def test_epochs_without_separation_among_others_are_left_out(tmp_path):
     np.testing.assert_array_equal(track.time.values, np.delete(TIMES, 6))
 
 
-def test_what_kind_a_position_is_and_which_is_none(tmp_path):
+def test_solution_types_are_kept_and_invalid_ones_dropped(tmp_path):
     qualities = [1, 2, 3, 4, 5, 9, 0, 6, 7, 8]
     lines = [logs.rmc(TIMES[0])]
     lines += [logs.gga(*epoch, quality=q) for q, *epoch in zip(qualities, TIMES, PLACES, strict=False)]
@@ -101,7 +101,7 @@ def test_what_kind_a_position_is_and_which_is_none(tmp_path):
     assert track.dropped == {"no fix": 3, "dead reckoning": 1, "manual input": 1, "simulated": 1}
 
 
-def test_of_two_talkers_the_one_of_all_systems_is_taken_and_what_is_said_twice_counts_once(tmp_path):
+def test_gn_talker_is_preferred_and_duplicates_are_dropped(tmp_path):
     lines = [logs.rmc(TIMES[0])]
     for time, place in zip(TIMES, PLACES, strict=True):
         lines += [logs.gga(time, place + [1e-4, 0, 0], talker="GP"), logs.gga(time, place)]
@@ -113,7 +113,7 @@ def test_of_two_talkers_the_one_of_all_systems_is_taken_and_what_is_said_twice_c
 
 
 @pytest.mark.parametrize("prefix", ["2025-05-14 23:59:57.123 ", "[1747267197.5] ", "23:59:57;"])
-def test_stamps_of_a_host_are_cut_off_and_told(tmp_path, caplog, prefix):
+def test_host_time_stamps_are_removed_with_a_remark(tmp_path, caplog, prefix):
     track = read(tmp_path, logs.nmea(TIMES, PLACES, prefix=prefix), name="a.track.txt")
     np.testing.assert_array_equal(track.time.values, TIMES)
     assert "88 lines start with a time stamp of the host" in track.remarks[0]
@@ -121,14 +121,14 @@ def test_stamps_of_a_host_are_cut_off_and_told(tmp_path, caplog, prefix):
     assert "remarks" not in read(tmp_path, logs.nmea(TIMES, PLACES)).attrs
 
 
-def test_binary_messages_between_sentences_are_no_sentences(tmp_path):
+def test_binary_messages_between_sentences_are_skipped(tmp_path):
     data = b"\xb5\x62\x01\x07$\x00\xff".join(line + b"\n" for line in logs.nmea(TIMES, PLACES).encode().splitlines())
     track = read(tmp_path, data)
     np.testing.assert_array_equal(track.time.values, TIMES)
     assert track.dropped == {}
 
 
-def test_a_sentence_whose_checksum_is_wrong_or_missing_is_no_epoch(tmp_path):
+def test_sentence_with_wrong_or_missing_checksum_is_dropped(tmp_path):
     lines = logs.nmea(TIMES, PLACES).splitlines()
     at = [place for place, line in enumerate(lines) if "GGA" in line]
     lines[at[3]] = lines[at[3]].replace("N,00957", "N,00956")
@@ -145,8 +145,8 @@ def test_a_sentence_whose_checksum_is_wrong_or_missing_is_no_epoch(tmp_path):
 
 
 @pytest.mark.parametrize("end", ["\r\n", "\n", " \r\n"])
-def test_a_log_without_any_checksum_is_read_with_a_remark(tmp_path, end):
-    """A sentence that is cut off is still none, at the end of the log even where its last digits alone are lost."""
+def test_log_without_checksums_is_read_with_a_remark(tmp_path, end):
+    """A truncated sentence is still dropped, even if only the last digits at the end of the log are missing."""
     lines = [line.partition("*")[0] for line in logs.nmea(TIMES, PLACES).splitlines()]
     at = next(place for place, line in enumerate(lines) if "GGA,235957.30" in line)
     lines[at] = lines[at][:40]
@@ -161,7 +161,7 @@ def test_a_log_without_any_checksum_is_read_with_a_remark(tmp_path, end):
     np.testing.assert_array_equal(cut.time.values, np.delete(TIMES, [3, 39]))
 
 
-def test_a_sentence_within_a_leap_second_is_no_epoch(tmp_path):
+def test_sentence_within_a_leap_second_is_dropped(tmp_path):
     lines = logs.nmea(TIMES, PLACES).splitlines()
     inserted = logs.sealed(lines[1][1:].partition("*")[0].replace("235957.00", "235960.50"))
     assert read(tmp_path, "\n".join([*lines, inserted]) + "\n").dropped == {"within a leap second": 1}
@@ -178,7 +178,7 @@ def test_a_sentence_within_a_leap_second_is_no_epoch(tmp_path):
         ("48.000", "48_0"),
     ],
 )
-def test_a_sentence_that_no_receiver_sends_is_one_message(tmp_path, old, new):
+def test_invalid_sentence_is_one_message(tmp_path, old, new):
     bodies = [line[1:].partition("*")[0] for line in logs.nmea(TIMES, PLACES).splitlines()]
     at = next(place for place, body in enumerate(bodies) if "GGA,235957.20" in body)
     assert old in bodies[at]
@@ -191,8 +191,8 @@ def test_a_sentence_that_no_receiver_sends_is_one_message(tmp_path, old, new):
 @pytest.mark.slow
 @tried(200)
 @given(data=st.data())
-def test_no_flipped_bit_moves_an_epoch(tmp_path_factory, data):
-    """One bit: a sentence less, or a date less, never another position or time."""
+def test_flipped_bit_changes_no_epoch(tmp_path_factory, data):
+    """One flipped bit removes a sentence or a date; it never changes a position or time."""
     whole = logs.nmea(TIMES, PLACES).encode()
     place, bit = data.draw(st.integers(0, len(whole) - 1)), data.draw(st.integers(0, 7))
     damaged = bytearray(whole)
@@ -205,7 +205,7 @@ def test_no_flipped_bit_moves_an_epoch(tmp_path_factory, data):
     np.testing.assert_array_equal(good.position.values[kept], track.position.values)
 
 
-def test_a_day_of_the_config_that_is_not_the_logs_is_refused(tmp_path):
+def test_configured_day_that_contradicts_the_log_is_rejected(tmp_path):
     text = logs.nmea(TIMES, PLACES)
     for day in ("2025-05-13", "2025-05-15", "1970-01-01"):
         message = complaint(lambda day=day: read(tmp_path, text, start_utc=day))

@@ -1,4 +1,4 @@
-"""Motion captures: one body of a room with y up becomes a track to east, north and up."""
+"""OptiTrack motion captures: a rigid body in a y-up frame becomes a track in east, north and up."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def read(path, **options):
     return check(read_track(path, node="a", options=LogOptions(**{**RADAR, **options})), "track")
 
 
-def test_x_is_east_minus_z_is_north_and_y_is_up(tmp_path):
+def test_axes_are_x_east_minus_z_north_y_up(tmp_path):
     track = read(take(tmp_path))
     along = np.linspace(0, 1, 12)
     expected = np.stack([along - 5, 3 * along, 0 * along + 1.8], -1)
@@ -35,36 +35,36 @@ def test_x_is_east_minus_z_is_north_and_y_is_up(tmp_path):
     np.testing.assert_allclose(elapsed, SECONDS, atol=1e-6)
 
 
-def test_a_turn_about_motives_y_axis_is_a_turn_to_the_left(tmp_path):
-    """Counter-clockwise seen from above: yaw, clockwise from north, goes down."""
+def test_rotation_about_y_is_counter_clockwise(tmp_path):
+    """Counter-clockwise seen from above, so that yaw, clockwise from north, decreases."""
     np.testing.assert_allclose(np.degrees(read(take(tmp_path)).attitude.values[-1]), [0, 0, -57.2958], atol=1e-3)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_attitude_turns_the_bodys_axes_as_the_quaternion_does(tmp_path, seed):
+def test_attitude_rotates_the_body_axes_like_the_quaternion(tmp_path, seed):
     generator = np.random.default_rng(seed)
     bodies = logs.poses()
     drawn = generator.normal(size=(12, 4))
     bodies["Radar"][:, :4] = drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
-    turned = body_axes(read(take(tmp_path, bodies=bodies)).attitude.values) @ [1.0, 0, 0]
+    rotated = body_axes(read(take(tmp_path, bodies=bodies)).attitude.values) @ [1.0, 0, 0]
     x, y, z, w = bodies["Radar"][:, :4].T
     forward = -np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], -1)  # the body's −z
-    np.testing.assert_allclose(turned, np.stack([-forward[:, 2], forward[:, 0], -forward[:, 1]], -1), atol=1e-5)
+    np.testing.assert_allclose(rotated, np.stack([-forward[:, 2], forward[:, 0], -forward[:, 1]], -1), atol=1e-5)
 
 
-def test_millimetres_are_millimetres(tmp_path):
+def test_millimetres_are_converted(tmp_path):
     np.testing.assert_allclose(
         read(take(tmp_path, unit="Millimeters")).position.values, read(take(tmp_path)).position.values / 1000
     )
 
 
-def test_frames_that_do_not_show_the_body_are_counted(tmp_path):
+def test_frames_without_the_body_are_counted(tmp_path):
     track = read(take(tmp_path, lost=[3, 4]))
     assert track.sizes["epoch"] == 10
     assert track.dropped == {"body not tracked": 2}
 
 
-def test_a_body_must_be_chosen_where_there_are_several(tmp_path):
+def test_body_must_be_selected_among_several(tmp_path):
     path = take(tmp_path)
     message = complaint(lambda: read(path, body=None))
     assert "rigid bodies 'Radar', 'Corner Reflector'; expected key nodes.a.log.body" in message
@@ -73,12 +73,12 @@ def test_a_body_must_be_chosen_where_there_are_several(tmp_path):
     assert read(alone, body=None).sizes["epoch"] == 12
 
 
-def test_a_wall_clock_without_zone_is_no_time(tmp_path):
+def test_local_time_without_a_zone_is_rejected(tmp_path):
     message = complaint(lambda: read(take(tmp_path), start_utc=None))
     assert "local time without a zone; expected key nodes.a.log.start_utc" in message
 
 
-def test_a_body_that_stands_still_has_one_position(tmp_path):
+def test_stationary_body_has_one_position(tmp_path):
     track = read(take(tmp_path, lost=[0]), body="Corner Reflector")
     np.testing.assert_allclose(np.median(track.position.values, axis=0), [-1, 1.15, 0.07])
 
@@ -99,7 +99,7 @@ def test_a_body_that_stands_still_has_one_position(tmp_path):
         ("\r\n5,0.0", "\r\n5,inf", "line 13: 'inf"),
     ],
 )
-def test_a_take_that_does_not_say_what_it_holds_is_one_message(tmp_path, old, new, expected):
+def test_invalid_take_is_one_message(tmp_path, old, new, expected):
     path = tmp_path / "a.track.csv"
     text = logs.capture(SECONDS, logs.poses())
     assert old in text
@@ -109,7 +109,7 @@ def test_a_take_that_does_not_say_what_it_holds_is_one_message(tmp_path, old, ne
     assert message.isprintable()
 
 
-def test_half_a_pose_and_a_long_quaternion_are_refused(tmp_path):
+def test_incomplete_pose_and_non_unit_quaternion_are_rejected(tmp_path):
     for column, value, expected in ((6, np.nan, "incomplete pose"), (3, 0.5, "not a unit quaternion")):
         bodies = logs.poses()
         bodies["Radar"][4, column] = value
@@ -118,8 +118,8 @@ def test_half_a_pose_and_a_long_quaternion_are_refused(tmp_path):
         assert expected in complaint(lambda path=path: read(path))
 
 
-def test_a_real_pass_on_a_rail_comes_back_as_it_was_captured(shared):
-    """10928 frames at 360 Hz in its heading, five without the radar; the rail is 3.42 m long, straight and level."""
+def test_real_rail_pass_is_read(shared):
+    """10928 frames at 360 Hz in the heading, five without the radar; the rail is 3.42 m long, straight and level."""
     path = shared / "bwsi_rail_passA" / "Rail SAR 2.csv"
     track = read(path)
     assert track.sizes["epoch"] + track.dropped["body not tracked"] == 10928

@@ -1,4 +1,4 @@
-"""Scans of a PulsON radar: what was put in comes out, and what is damaged is left out or refused."""
+"""Scans of a PulsON radar: recorded echoes are read back, damaged scans are dropped or rejected."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ MESSAGES = -(-TOTAL // 350)
 
 
 def echo_of(path_m):
-    """The real samples of a pulse that fills the band, by its delay."""
+    """Return the real samples of a delayed pulse that fills the band."""
     delay_s = path_m / SPEED_OF_LIGHT_M_S - START_PS * 1e-12
     frequency = np.arange(TOTAL // 2 + 1) * SAMPLE_RATE_HZ / TOTAL
     inside = (frequency >= BAND_HZ[0]) & (frequency <= BAND_HZ[1])
@@ -43,7 +43,7 @@ def written(path, content):
     return read_pulson([path], pair="a-a")
 
 
-def test_the_phase_of_a_scan_is_that_of_its_path(tmp_path):
+def test_phase_of_a_scan_follows_its_path(tmp_path):
     paths_m = np.array([8.0, 8.1, 9.3])
     history = written(tmp_path / "a.out", recorded(paths_m))
     delay_s = paths_m[:, None] / SPEED_OF_LIGHT_M_S - history.reference_delay.values[:, None]
@@ -53,7 +53,7 @@ def test_the_phase_of_a_scan_is_that_of_its_path(tmp_path):
     assert history.attrs["flags"] == {}
 
 
-def test_a_scan_that_is_cut_off_or_lacks_a_message_is_left_out_and_counted(tmp_path):
+def test_incomplete_scan_is_dropped_and_counted(tmp_path):
     whole = recorded(8 + 0.1 * np.arange(6))
     size = MESSAGE.itemsize
     cut = written(tmp_path / "a.out", whole[:-size])
@@ -64,13 +64,13 @@ def test_a_scan_that_is_cut_off_or_lacks_a_message_is_left_out_and_counted(tmp_p
 
 
 @pytest.mark.parametrize("content", [b"", bytes(32), b"a log of something else " * 200, bytes(5000)])
-def test_another_file_is_refused(tmp_path, content):
+def test_other_file_is_rejected(tmp_path, content):
     assert "MRM_SCAN_INFO" in complaint(lambda: written(tmp_path / "a.out", content))
 
 
 @tried(60, derandomize=False)
 @given(at=st.integers(0, 32 + 6 * MESSAGES * MESSAGE.itemsize - 1), bit=st.integers(0, 7), last=st.integers(40, 20_000))
-def test_flipped_bits_and_lost_ends_move_no_scan_in_time(tmp_path_factory, at, bit, last):
+def test_flipped_bits_and_truncation_change_no_scan_time(tmp_path_factory, at, bit, last):
     paths_m = 8 + 0.1 * np.arange(6)
     content = bytearray(recorded(paths_m))
     content[at] ^= 1 << bit
@@ -85,7 +85,7 @@ def test_flipped_bits_and_lost_ends_move_no_scan_in_time(tmp_path_factory, at, b
 
 
 @pytest.mark.parametrize("lost", [1, 7, MESSAGE.itemsize - 5, MESSAGE.itemsize - 1])
-def test_a_scan_that_a_file_ends_in_is_counted_once_wherever_it_ends(tmp_path, lost):
+def test_truncated_last_scan_is_counted_once(tmp_path, lost):
     whole, size = recorded(8 + 0.1 * np.arange(6)), MESSAGE.itemsize
     for messages in range(MESSAGES):
         cut = written(tmp_path / "a.out", whole[: len(whole) - messages * size - lost])

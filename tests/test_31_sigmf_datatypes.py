@@ -1,4 +1,4 @@
-"""Whatever numbers a recorder writes, and however they lie in its files, the echo is that of the same scene."""
+"""SigMF recordings: every datatype and file layout gives the same echo of the same scene."""
 
 import hashlib
 import json
@@ -27,12 +27,12 @@ from apertura.views.inspect.path import look
 
 RATE_HZ, DFT = 64e6, 256
 NODES = {"a": 1, "b": 2}
-"""Node → channels."""
+"""Number of channels of each node."""
 
 
 @pytest.fixture(scope="module")
 def _recorded(tmp_path_factory):
-    """Band of 0 to 16 MHz in 64 MHz, 448 samples per capture, hardly any noise."""
+    """Band of 0 to 16 MHz sampled at 64 MHz, 448 samples per capture, negligible noise."""
     plan = small_simulation(pulses=20)
     nodes = {
         name: replace(node, impairments=replace(node.impairments, radar_snr_db=90.0, sidelink_snr_db=90.0))
@@ -47,26 +47,26 @@ def campaign(_recorded, tmp_path):
     return copy_writable(_recorded, tmp_path / "campaign")
 
 
-def stated(root, node):
+def metadata_of(root, node):
     return json.loads((root / f"raw/f01/{node}.sigmf-meta").read_text())
 
 
 def counts_of(root, node):
-    """Return (capture, sample, channel, 2) as simulated."""
+    """Return the simulated samples, (capture, sample, channel, 2)."""
     counts = np.fromfile(root / f"raw/f01/{node}.sigmf-data", "<i2")
     return counts.reshape(20, -1, NODES[node], 2)
 
 
 def rewrite(root, node, numbers, datatype, **header):
-    """Write other numbers as the samples of a node."""
+    """Write other samples of a node."""
     data = np.ascontiguousarray(numbers).tobytes()
     (root / f"raw/f01/{node}.sigmf-data").write_bytes(data)
-    known = {"core:datatype": datatype, "core:sha512": hashlib.sha512(data).hexdigest(), **header}
-    edit_meta(root, node, lambda meta: meta["global"].update(known))
+    properties = {"core:datatype": datatype, "core:sha512": hashlib.sha512(data).hexdigest(), **header}
+    edit_meta(root, node, lambda meta: meta["global"].update(properties))
 
 
 def transfers(root):
-    """Return pair → transfer functions."""
+    """Return the transfer functions of each pair."""
     opened = Campaign.load(root)
     for node in NODES:
         ingest.ingest(opened, "f01", node)
@@ -78,17 +78,17 @@ def transfers(root):
 
 @pytest.fixture(scope="module")
 def plain(_recorded, tmp_path_factory):
-    """Transfer functions of the recording as it was simulated, ci16_le."""
+    """Transfer functions of the recording as simulated, ci16_le."""
     return transfers(copy_writable(_recorded, tmp_path_factory.mktemp("plain") / "campaign"))
 
 
-def apart_db(ours, theirs):
+def difference_db(ours, theirs):
     return 10 * np.log10(np.mean(np.abs(ours - theirs) ** 2) / np.mean(np.abs(theirs) ** 2) + 1e-20)
 
 
 @pytest.mark.quick("ci16_be")
 @pytest.mark.parametrize("datatype", ["ci16_be", "ci32_le", "ci32_be", "cf32_le", "cf32_be", "cf64_le", "cu16_le"])
-def test_a_datatype_that_holds_every_count_gives_the_same_bits(campaign, plain, datatype):
+def test_lossless_datatype_gives_bitwise_equal_echoes(campaign, plain, datatype):
     stored = SampleLayout(datatype).stored
     for node, channels in NODES.items():
         counts = counts_of(campaign, node)
@@ -103,19 +103,19 @@ def test_a_datatype_that_holds_every_count_gives_the_same_bits(campaign, plain, 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("unit", [2.0**-40, 2.0**15])
-def test_the_unit_of_floats_is_that_of_the_echo_and_changes_nothing_else(campaign, plain, unit):
-    """Volts or counts: by powers of two, to the last bit of what a node hears of itself."""
+def test_unit_of_floats_only_scales_the_echo(campaign, plain, unit):
+    """Volts or counts: scaled by powers of two, bitwise equal for a node's own echoes."""
     for node in NODES:
         rewrite(campaign, node, (counts_of(campaign, node) * unit).astype("<f4"), "cf32_le")
     scaled = transfers(campaign)
     np.testing.assert_array_equal(scaled["a-a"], plain["a-a"] * np.float32(unit))
-    assert apart_db(scaled["a-b"], plain["a-b"] * unit) < -120
+    assert difference_db(scaled["a-b"], plain["a-b"] * unit) < -120
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("datatype", ["ci8", "cu8"])
-def test_eight_bits_add_the_noise_of_their_steps_and_nothing_else(campaign, plain, datatype):
-    """A step of Δ has Δ²/12 in I and in Q, which a DFT of N samples spreads over N subcarriers: Δ²/6N on each."""
+def test_eight_bit_samples_add_only_quantisation_noise(campaign, plain, datatype):
+    """A step Δ gives Δ²/12 in I and in Q, which a DFT of N samples spreads over N subcarriers: Δ²/6N on each."""
     counts = counts_of(campaign, "a")
     step = np.abs(counts).max() / 127
     rounded = np.rint(counts / step) + (128 if datatype == "cu8" else 0)
@@ -126,29 +126,29 @@ def test_eight_bits_add_the_noise_of_their_steps_and_nothing_else(campaign, plai
 
 
 def as_real(counts, if_hz):
-    """Return counts of I and Q as real samples at an intermediate frequency, each capture from phase zero."""
-    turns = if_hz / RATE_HZ * np.arange(counts.shape[1])
-    carrier = np.exp(2j * np.pi * turns)[None, :, None]
+    """Return I and Q as real samples at an intermediate frequency, with phase zero at the start of each capture."""
+    cycles = if_hz / RATE_HZ * np.arange(counts.shape[1])
+    carrier = np.exp(2j * np.pi * cycles)[None, :, None]
     return np.real((counts[..., 0] + 1j * counts[..., 1]) * carrier)
 
 
 @pytest.mark.quick("-24000000.0")
 @pytest.mark.parametrize("if_hz", [8e6, 8e6 + 5 * RATE_HZ, -24e6])
 def test_real_samples_at_an_intermediate_frequency_give_the_same_echo(campaign, plain, if_hz):
-    """In whichever Nyquist zone the band lies, upright or mirrored: to the filter's -80 dB."""
+    """In any Nyquist zone, upright or mirrored, within the filter's -80 dB."""
     for node in NODES:
         real = as_real(counts_of(campaign, node), if_hz)
         rewrite(campaign, node, real.astype("<f4"), "rf32_le", **{"apertura:if_hz": if_hz})
-    assert [str(one) for one in check_recordings(Examination(Campaign.load(campaign)))] == []
+    assert [str(problem) for problem in check_recordings(Examination(Campaign.load(campaign)))] == []
     for pair, transfer in transfers(campaign).items():
-        assert apart_db(transfer, plain[pair]) < -70, pair
+        assert difference_db(transfer, plain[pair]) < -70, pair
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("datatype", ["ri16_le", "ri16_be", "rf16_le"])
-def test_real_counts_add_the_noise_of_their_steps(campaign, plain, datatype):
-    """Rounded to whole counts, Δ²/12 at the real sample: H gives as much to the quadrature, within the band."""
-    real = np.rint(as_real(counts_of(campaign, "a"), 8e6) / 16)  # 11 bits, which float16 holds
+def test_real_samples_add_only_quantisation_noise(campaign, plain, datatype):
+    """Rounding gives Δ²/12 in the real sample; the Hilbert filter gives the same to the quadrature, within the band."""
+    real = np.rint(as_real(counts_of(campaign, "a"), 8e6) / 16)  # 11 bits, exact in float16
     rewrite(campaign, "a", real.astype(SampleLayout(datatype).stored), datatype, **{"apertura:if_hz": 8e6})
     transfer = transfers(campaign)["a-a"]
     noise = np.mean(np.abs(16 * transfer - plain["a-a"]) ** 2)
@@ -156,10 +156,10 @@ def test_real_counts_add_the_noise_of_their_steps(campaign, plain, datatype):
 
 
 @pytest.mark.slow
-def test_the_wrong_sign_of_the_intermediate_frequency_is_another_echo(campaign, plain):
+def test_wrong_sign_of_the_intermediate_frequency_changes_the_echo(campaign, plain):
     real = as_real(counts_of(campaign, "a"), 8e6)
     rewrite(campaign, "a", real.astype("<f4"), "rf32_le", **{"apertura:if_hz": -24e6})
-    assert apart_db(transfers(campaign)["a-a"], plain["a-a"]) > -6
+    assert difference_db(transfers(campaign)["a-a"], plain["a-a"]) > -6
 
 
 @pytest.mark.parametrize(
@@ -172,27 +172,27 @@ def test_the_wrong_sign_of_the_intermediate_frequency_is_another_echo(campaign, 
         ("ci16", None, "core:datatype 'ci16'"),
     ],
 )
-def test_a_datatype_or_mixing_that_cannot_be_is_named(campaign, datatype, if_hz, expected):
+def test_invalid_datatype_or_mixing_is_named(campaign, datatype, if_hz, expected):
     real = as_real(counts_of(campaign, "a"), 8e6).astype("<f4")
     rewrite(campaign, "a", real, datatype, **({} if if_hz is None else {"apertura:if_hz": if_hz}))
     with pytest.raises(CampaignError, match=expected):
         transfers(campaign)
     problems = check_recordings(Examination(Campaign.load(campaign)))
-    assert any(expected[:20].replace("\\", "") in str(one) for one in problems)
+    assert any(expected[:20].replace("\\", "") in str(problem) for problem in problems)
 
 
-def test_the_mirror_image_stays_80_db_below_from_edge_to_edge():
-    """A tone anywhere inside the band comes out as exp(j2πft) and nothing else, whatever its phase."""
+def test_mirror_image_is_80_db_down_across_the_band():
+    """A tone anywhere inside the band comes out as exp(j2πft), for any phase."""
     n = np.arange(600)
     inner = slice(SETTLING, -SETTLING)
-    for turns in np.linspace(EDGE, 0.5 - EDGE, 23):
-        mixed = Mixing(0.25, 1.0, restarts=True).baseband(np.cos(2 * np.pi * turns * n + 1)[None, :, None])
-        tone = np.exp(1j * (2 * np.pi * (turns - 0.25) * n + 1))
-        left = mixed[0, inner, 0].astype(float) @ [1, 1j] - tone[inner]
-        assert np.abs(left).max() < 2e-4  # I is exact, Q errs by twice the image
+    for cycles in np.linspace(EDGE, 0.5 - EDGE, 23):
+        mixed = Mixing(0.25, 1.0, restarts=True).baseband(np.cos(2 * np.pi * cycles * n + 1)[None, :, None])
+        tone = np.exp(1j * (2 * np.pi * (cycles - 0.25) * n + 1))
+        residual = mixed[0, inner, 0].astype(float) @ [1, 1j] - tone[inner]
+        assert np.abs(residual).max() < 2e-4  # I is exact; the error of Q is twice the image
 
 
-def test_a_recording_that_ran_through_is_mixed_the_same_however_it_is_read(tmp_path):
+def test_mixing_of_a_continuous_recording_does_not_depend_on_reads(tmp_path):
     rng = np.random.default_rng(1)
     rng.normal(0, 1000, (5000, 2)).astype(">i2").tofile(tmp_path / "a")
     file = SampleFile(tmp_path / "a", 2, SampleLayout("ri16_be", mixing=Mixing(11.3, 64.0, restarts=False)))
@@ -206,8 +206,8 @@ def test_a_recording_that_ran_through_is_mixed_the_same_however_it_is_read(tmp_p
 @pytest.mark.parametrize("taken_for", ["i16_le", "i16_be", "u16_le", "i32_le", "i8"])
 @pytest.mark.parametrize(("kind", "right"), [("<f4", "f32_le"), (">f4", "f32_be"), ("<f8", "f64_le")])
 @pytest.mark.parametrize("unit", [1.0, 1e-6])
-def test_floats_that_are_taken_for_counts_are_refused(campaign, taken_for, kind, right, unit):
-    """Captures are as many samples as the file holds by the datatype that is stated."""
+def test_floats_declared_as_integers_are_rejected(campaign, taken_for, kind, right, unit):
+    """The sample indices of the captures are adapted to the declared datatype."""
     numbers = (counts_of(campaign, "a") * unit).astype(kind)
     per_sample = np.dtype(kind).itemsize * 8 // int("".join(filter(str.isdigit, taken_for)))
 
@@ -218,22 +218,22 @@ def test_floats_that_are_taken_for_counts_are_refused(campaign, taken_for, kind,
     rewrite(campaign, "a", numbers, f"c{taken_for}")
     edit_meta(campaign, "a", count)
     message = complaint(lambda: open_recording(recording_files(campaign / "raw/f01", "a")))
-    found = f"core:datatype c{taken_for}, but a.sigmf-data contains floating-point numbers; expected c{right}"
-    assert found in message
+    expected = f"core:datatype c{taken_for}, but a.sigmf-data contains floating-point numbers; expected c{right}"
+    assert expected in message
     assert f"Set core:datatype to c{right}" in message
 
 
 @pytest.mark.parametrize("kind", ["noise", "full scale", "sine", "constant", "zeros", "clipped"])
 @pytest.mark.parametrize("bits", [8, 16, 32])
-def test_counts_are_no_floats(tmp_path, kind, bits):
-    generator, top, turns = np.random.default_rng(3), 2 ** (bits - 1) - 1, np.arange(40_000) * 0.01
+def test_integers_are_not_mistaken_for_floats(tmp_path, kind, bits):
+    generator, top, phase_rad = np.random.default_rng(3), 2 ** (bits - 1) - 1, np.arange(40_000) * 0.01
     values = {
-        "noise": generator.normal(0, top / 100, turns.size),
-        "full scale": generator.uniform(-top, top, turns.size),
-        "sine": top * 0.9 * np.sin(turns),
-        "constant": np.full(turns.size, top * 0.49),
-        "zeros": np.zeros(turns.size),
-        "clipped": np.clip(generator.normal(0, top, turns.size), -top, top),
+        "noise": generator.normal(0, top / 100, phase_rad.size),
+        "full scale": generator.uniform(-top, top, phase_rad.size),
+        "sine": top * 0.9 * np.sin(phase_rad),
+        "constant": np.full(phase_rad.size, top * 0.49),
+        "zeros": np.zeros(phase_rad.size),
+        "clipped": np.clip(generator.normal(0, top, phase_rad.size), -top, top),
     }[kind]
     path = tmp_path / "iq"
     path.write_bytes(values.astype(f"<i{bits // 8}").tobytes())
@@ -242,7 +242,7 @@ def test_counts_are_no_floats(tmp_path, kind, bits):
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e30])
-def test_a_float_that_is_no_sample_is_named(campaign, wrong):
+def test_invalid_float_sample_is_named(campaign, wrong):
     numbers = counts_of(campaign, "a").astype("<f4")
     numbers[3, 5, 0, 1] = wrong
     rewrite(campaign, "a", numbers, "cf32_le")
@@ -251,7 +251,7 @@ def test_a_float_that_is_no_sample_is_named(campaign, wrong):
         transfers(campaign)
 
 
-def test_floats_that_a_converter_has_clipped_are_flagged_too():
+def test_clipped_float_samples_are_flagged():
     rng = np.random.default_rng(1)
     waves = rng.normal(0, 0.1, (4, 5000, 2)).astype(np.float32)
     for recorded, clipped in ((waves, False), (waves.clip(-0.25, 0.25), True)):
@@ -263,39 +263,40 @@ def test_floats_that_a_converter_has_clipped_are_flagged_too():
 
 
 def nonconforming(root, node, *, header=24, trailing=10):
-    """Put a header before every capture and a footer behind all, in a file of another name."""
+    """Add a header to every capture and a footer to the file, under another file name."""
     folder = root / "raw/f01"
     counts = counts_of(root, node)
-    captures = [b"\xff" * header + one.tobytes() for one in counts]
+    captures = [b"\xff" * header + samples.tobytes() for samples in counts]
     (folder / f"{node}.sigmf-data").unlink()
     (folder / f"{node} rx0.dat").write_bytes(b"".join(captures) + b"\xee" * trailing)
     digest = hashlib.sha512((folder / f"{node} rx0.dat").read_bytes()).hexdigest()
 
     def describe(meta):
-        known = {"core:dataset": f"{node} rx0.dat", "core:trailing_bytes": trailing, "core:sha512": digest}
-        meta["global"].update(known)
+        properties = {"core:dataset": f"{node} rx0.dat", "core:trailing_bytes": trailing, "core:sha512": digest}
+        meta["global"].update(properties)
         for capture in meta["captures"]:
             capture["core:header_bytes"] = header
 
     edit_meta(root, node, describe)
 
 
-def test_bytes_that_are_no_samples_are_passed_over(campaign, plain):
+def test_header_and_trailing_bytes_are_skipped(campaign, plain):
     recorded = {node: counts_of(campaign, node) for node in NODES}
     for node in NODES:
         nonconforming(campaign, node)
         files = recording_files(campaign / "raw/f01", node)
         opened = open_recording(files)
         np.testing.assert_array_equal(opened.samples.captures(opened.captures.start[3:7], 448), recorded[node][3:7])
-        begin, end = sigmf.fromfile(str(files[0])).get_capture_byte_boundaries(5)  # its own reading adds a header twice
+        # sigmf's own reading adds a header twice
+        begin, end = sigmf.fromfile(str(files[0])).get_capture_byte_boundaries(5)
         assert files[1].read_bytes()[begin:end] == recorded[node][5].tobytes()
-        across = opened.samples.read(440, 460)  # the end of a capture, and the beginning of the next
+        across = opened.samples.read(440, 460)  # the end of a capture and the start of the next
         np.testing.assert_array_equal(across, recorded[node].reshape(-1, NODES[node], 2)[440:460])
     for pair, transfer in transfers(campaign).items():
         np.testing.assert_array_equal(transfer, plain[pair])
 
 
-def test_a_header_that_is_not_where_the_metadata_say_is_a_wrong_size(campaign):
+def test_wrong_header_size_is_a_wrong_file_size(campaign):
     nonconforming(campaign, "a")
     edit_meta(campaign, "a", lambda meta: meta["captures"][4].update({"core:header_bytes": 25}))
     message = complaint(lambda: ingest.ingest(Campaign.load(campaign), "f01", "a"))
@@ -303,14 +304,14 @@ def test_a_header_that_is_not_where_the_metadata_say_is_a_wrong_size(campaign):
 
 
 @pytest.mark.parametrize("name", ["../a.dat", "/etc/passwd", "..", ".hidden", "a\\b"])
-def test_a_dataset_lies_beside_its_metadata(campaign, name):
+def test_dataset_must_be_next_to_its_metadata(campaign, name):
     nonconforming(campaign, "a")
     edit_meta(campaign, "a", lambda meta: meta["global"].update({"core:dataset": name}))
     assert "global.core:dataset" in complaint(lambda: ingest.ingest(Campaign.load(campaign), "f01", "a"))
 
 
 def collection(root, **nodes):
-    """Give the recordings other names, and a collection that knows them."""
+    """Rename the recordings, and write a collection that refers to them."""
     folder = root / "raw/f01"
     streams = []
     for node, name in nodes.items():
@@ -323,13 +324,13 @@ def collection(root, **nodes):
     return body
 
 
-def test_a_collection_says_which_recording_is_a_nodes(campaign, plain):
+def test_collection_assigns_recordings_to_nodes(campaign, plain):
     collection(campaign, a="rx_0", b="rx_1")
     for pair, transfer in transfers(campaign).items():
         np.testing.assert_array_equal(transfer, plain[pair])
 
 
-def test_an_archive_is_to_be_unpacked(campaign):
+def test_archive_is_rejected_with_the_command_to_unpack(campaign):
     folder = campaign / "raw/f01"
     for suffix in ("meta", "data"):
         (folder / f"a.sigmf-{suffix}").unlink()
@@ -341,7 +342,7 @@ def test_an_archive_is_to_be_unpacked(campaign):
     assert any("Unpack it" in problem for problem in problems)
 
 
-def test_metadata_that_a_collection_hashed_otherwise_are_refused(campaign):
+def test_metadata_with_another_hash_in_the_collection_are_rejected(campaign):
     collection(campaign, a="rx_0", b="b")
     edit_meta(campaign, "rx_0", lambda meta: meta["captures"][0].update({"core:frequency": 1e9}))
     message = complaint(lambda: ingest.ingest(Campaign.load(campaign), "f01", "a"))
@@ -360,12 +361,12 @@ def test_metadata_that_a_collection_hashed_otherwise_are_refused(campaign):
         ({"core:streams": [{"name": "../rx_0", "hash": "0" * 128}]}, "collection.core:streams.0.name"),
     ],
 )
-def test_a_collection_that_cannot_be_is_named(campaign, change, expected):
+def test_invalid_collection_is_named(campaign, change, expected):
     body = collection(campaign, a="rx_0", b="rx_1") | change
     (campaign / "raw/f01/flight.sigmf-collection").write_text(json.dumps({"collection": body}))
     assert expected in complaint(lambda: ingest.ingest(Campaign.load(campaign), "f01", "a"))
 
 
 @pytest.mark.parametrize("node", NODES)
-def test_what_we_write_passes_the_validator_of_sigmf(campaign, node):
+def test_written_recordings_pass_the_sigmf_validator(campaign, node):
     sigmf.fromfile(str(campaign / f"raw/f01/{node}")).validate()

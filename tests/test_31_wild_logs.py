@@ -1,4 +1,4 @@
-"""Flight logs that no flight writes: each is one message, printable and short; those of Windows are as good as any."""
+"""Flight logs with implausible values: each is one short, printable message; Windows line ends are accepted."""
 
 import pytest
 from folders import complaint, edit_track
@@ -32,19 +32,19 @@ GOOD = "2025-05-14T09:30:00Z,48,9,600,1"
         ('"2025-05-14T09:30:01Z,48', "a.track.csv: "),
     ],
 )
-def test_a_line_that_no_flight_logs_is_one_message(tmp_path, line, expected):
+def test_implausible_csv_line_is_one_message(tmp_path, line, expected):
     message = complaint(csv_log(tmp_path, GOOD, line))
     assert expected in message
     assert message.isprintable()
     assert len(message) < 800
 
 
-def test_a_column_that_stands_twice_is_named(tmp_path):
+def test_repeated_column_is_named(tmp_path):
     heading = "time_utc,latitude_deg,longitude_deg,height_m,height_m"
     assert "repeated column height_m" in complaint(csv_log(tmp_path, GOOD, GOOD, heading=heading))
 
 
-def test_a_standard_deviation_below_zero_is_refused(tmp_path):
+def test_negative_standard_deviation_is_rejected(tmp_path):
     heading = "time_utc,latitude_deg,longitude_deg,height_m,std_north_m,std_east_m,std_up_m"
     lines = [f"2025-05-14T09:30:0{n}Z,48,9,600,1,{-n},1" for n in range(3)]
     assert "a standard deviation of -1 in epoch 1" in complaint(csv_log(tmp_path, *lines, heading=heading))
@@ -62,7 +62,7 @@ def test_a_standard_deviation_below_zero_is_refused(tmp_path):
         ("2025/05/14 09:30:01 48.0 9.0 \x1b[2J 1", r"\x1b[2J"),
     ],
 )
-def test_a_solution_that_no_receiver_writes_is_one_message(tmp_path, line, expected):
+def test_implausible_solution_is_one_message(tmp_path, line, expected):
     path = tmp_path / "a.track.pos"
     path.write_text(f"% (lat/lon/height=WGS84/ellipsoidal)\n% UTC latitude(deg) longitude(deg) height(m) Q\n{line}\n")
     message = complaint(lambda: read_track(path, node="a"))
@@ -70,7 +70,7 @@ def test_a_solution_that_no_receiver_writes_is_one_message(tmp_path, line, expec
     assert message.isprintable()
 
 
-def test_logs_of_windows_are_read_as_those_of_unix(tiny):
+def test_windows_line_ends_are_read(tiny):
     for node in ("uav1", "uav2"):
         path = next((tiny / "raw" / "f01").glob(f"{node}.track.*"))
         track = read_track(path, node=node)
@@ -78,7 +78,7 @@ def test_logs_of_windows_are_read_as_those_of_unix(tiny):
         assert read_track(path, node=node).identical(track)
 
 
-def test_a_log_that_is_not_utf8_is_refused(tiny):
+def test_log_that_is_not_utf8_is_rejected(tiny):
     edit_track(tiny, "uav1", lambda lines: [*lines[:5], lines[5] + "é"])
     for node in ("uav1", "uav2"):
         path = next((tiny / "raw" / "f01").glob(f"{node}.track.*"))

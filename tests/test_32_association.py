@@ -1,4 +1,4 @@
-"""Pairing pulses of two nodes: what must come out right, and what must be said when it cannot."""
+"""Association of the pulses of two nodes: correct pairs, and flags or errors for ambiguous cases."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ NS = 1_000_000_000
 
 
 def fly(rng, pulses=400, interval_s=0.05, *, offset_s=0.0, jitter_s=0.0, drift_ppm=0.0, missed=0.0, tx_missed=0.0):
-    """Return tags of transmitter and receiver and the true pulse number of each capture."""
+    """Return tags of transmitter and receiver, and the true pulse numbers of both."""
     truth = np.arange(pulses)
     tx = truth[(rng.random(pulses) >= tx_missed)]
     rx = truth[(rng.random(pulses) >= missed)]
@@ -28,7 +28,7 @@ def share_right(pairs, numbers):
 
 @pytest.mark.parametrize("offset_s", [-0.019, -0.004, 0.0, 0.003, 0.019])
 @pytest.mark.parametrize("jitter_s", [0.0, 0.003])
-def test_pulses_missed_on_both_sides_leave_every_pair_right(offset_s, jitter_s):
+def test_missed_pulses_on_both_sides_keep_every_pair_correct(offset_s, jitter_s):
     rng = np.random.default_rng(1)
     (tx, rx), numbers = fly(rng, offset_s=offset_s, jitter_s=jitter_s, missed=0.2, tx_missed=0.1)
     pairs = associate(tx, rx, repetition_interval_s=0.05)
@@ -42,7 +42,7 @@ def test_pulses_missed_on_both_sides_leave_every_pair_right(offset_s, jitter_s):
 
 
 @pytest.mark.parametrize("drift_ppm", [-100.0, 35.0, 100.0])
-def test_tags_that_drift_past_a_whole_interval_are_followed(drift_ppm):
+def test_drift_beyond_a_repetition_interval_is_followed(drift_ppm):
     (tx, rx), numbers = fly(
         np.random.default_rng(2),
         40_000,
@@ -54,12 +54,12 @@ def test_tags_that_drift_past_a_whole_interval_are_followed(drift_ppm):
         tx_missed=0.05,
     )
     pairs = associate(tx, rx, repetition_interval_s=0.01)
-    assert abs(drift_ppm) * 1e-6 * 400 > 0.01  # the tags do pass an interval
+    assert abs(drift_ppm) * 1e-6 * 400 > 0.01  # the drift exceeds an interval
     assert share_right(pairs, numbers) == 1.0
     assert pairs.drift_ppm == pytest.approx(drift_ppm, abs=2)
 
 
-def test_a_long_gap_in_either_recording_is_bridged():
+def test_long_gap_in_either_recording_is_bridged():
     (tx, rx), numbers = fly(np.random.default_rng(3), 1000, offset_s=0.01, jitter_s=0.002)
     keep_tx, keep_rx = np.r_[0:200, 420:1000], np.r_[0:500, 760:1000]
     pairs = associate(tx[keep_tx], rx[keep_rx], repetition_interval_s=0.05)
@@ -67,7 +67,7 @@ def test_a_long_gap_in_either_recording_is_bridged():
     assert pairs.tx_index.size == 200 + 80 + 240
 
 
-def test_a_receiver_that_starts_late_is_paired_from_its_first_pulse():
+def test_late_receiver_is_paired_from_its_first_pulse():
     (tx, rx), _ = fly(np.random.default_rng(4), 300, offset_s=-0.015)
     pairs = associate(tx, rx[250:], repetition_interval_s=0.05)
     assert pairs.tx_index[0] == 250
@@ -75,14 +75,14 @@ def test_a_receiver_that_starts_late_is_paired_from_its_first_pulse():
 
 
 @pytest.mark.parametrize(("offset_s", "flagged"), [(0.0195, False), (0.0205, True), (-0.0195, False), (-0.0205, True)])
-def test_an_offset_near_half_an_interval_is_flagged(offset_s, flagged):
+def test_offset_near_half_an_interval_is_flagged(offset_s, flagged):
     (tx, rx), _ = fly(np.random.default_rng(5), offset_s=offset_s)
     pairs = associate(tx, rx, repetition_interval_s=0.05)
     assert ("association_ambiguous" in pairs.flags) == flagged
 
 
 @pytest.mark.parametrize(("jitter_s", "flagged"), [(0.0008, False), (0.0015, True)])
-def test_tags_too_rough_for_the_interval_are_flagged(jitter_s, flagged):
+def test_jitter_too_large_for_the_interval_is_flagged(jitter_s, flagged):
     (tx, rx), numbers = fly(np.random.default_rng(6), interval_s=0.01, jitter_s=jitter_s, missed=0.05)
     pairs = associate(tx, rx, repetition_interval_s=0.01)
     assert ("time_tag_jitter" in pairs.flags) == flagged
@@ -90,7 +90,7 @@ def test_tags_too_rough_for_the_interval_are_flagged(jitter_s, flagged):
 
 
 @pytest.mark.parametrize(("common", "flagged"), [(200, False), (199, True)])
-def test_recordings_with_little_in_common_are_flagged(common, flagged):
+def test_small_overlap_of_recordings_is_flagged(common, flagged):
     tx = np.arange(400) * (NS // 20)
     rx = tx + (400 - common) * (NS // 20)
     pairs = associate(tx, rx, repetition_interval_s=0.05)
@@ -98,48 +98,48 @@ def test_recordings_with_little_in_common_are_flagged(common, flagged):
     assert ("association_sparse" in pairs.flags) == flagged
 
 
-def test_recordings_of_different_flights_are_refused_with_how_far_apart_they_are():
+def test_recordings_of_different_flights_are_rejected():
     (tx, rx), _ = fly(np.random.default_rng(8), 100)
     with pytest.raises(CampaignError, match=r"starts \+18\.000 s.*half a repetition interval \(0\.025 s\)"):
         associate(tx, rx + 18 * NS, repetition_interval_s=0.05)
 
 
-def test_a_tag_that_steps_back_is_named():
+def test_decreasing_time_tag_is_named():
     tags = np.arange(10) * NS
     with pytest.raises(CampaignError, match="pulse 4 of the receiver"):
         associate(tags, np.array([0, 1, 2, 3, 3, 5]) * NS, repetition_interval_s=1.0)
 
 
 @pytest.mark.parametrize(("offset_s", "flagged"), [(0.019, False), (0.021, True), (-0.019, False), (-0.021, True)])
-def test_tags_further_apart_than_good_ones_are_flagged_with_what_was_flown_meanwhile(offset_s, flagged):
+def test_large_tag_offset_is_flagged_with_the_distance_flown(offset_s, flagged):
     (tx, rx), _ = fly(np.random.default_rng(5), interval_s=0.1, offset_s=offset_s)
     flags = associate(tx, rx, repetition_interval_s=0.1, speed_m_s=12.0).flags
     assert ("time_tag_offset" in flags) == flagged
     assert not flagged or flags["time_tag_offset"].endswith("moved 0.25 m in that time")
 
 
-@pytest.mark.parametrize(("late_s", "left_out"), [(0.004, False), (0.006, True)])
-def test_a_tag_that_leaves_the_line_of_all_is_marked(late_s, left_out):
+@pytest.mark.parametrize(("late_s", "excluded"), [(0.004, False), (0.006, True)])
+def test_outlying_time_tag_is_flagged(late_s, excluded):
     (tx, rx), _ = fly(np.random.default_rng(5), jitter_s=0.0002)
     rx[70] += int(late_s * NS)
     pairs = associate(tx, rx, repetition_interval_s=0.05)
-    assert np.flatnonzero(pairs.outlier).tolist() == [70] * left_out
-    assert ("time_tag_outlier" in pairs.flags) == left_out
+    assert np.flatnonzero(pairs.outlier).tolist() == [70] * excluded
+    assert ("time_tag_outlier" in pairs.flags) == excluded
 
 
-def test_tags_that_all_scatter_have_no_outlier():
+def test_uniform_jitter_has_no_outlier():
     (tx, rx), _ = fly(np.random.default_rng(5), jitter_s=0.005)
     assert not associate(tx, rx, repetition_interval_s=0.05).outlier.any()
 
 
 @pytest.mark.parametrize(("early", "flagged"), [(20, False), (21, True)])
-def test_pulses_before_and_after_the_other_recording_are_remarked_from_five_percent_on(early, flagged):
+def test_unpaired_pulses_are_flagged_above_5_percent(early, flagged):
     (tx, rx), _ = fly(np.random.default_rng(5))
     assert ("pulses_unpaired" in associate(tx, rx[early:], repetition_interval_s=0.05).flags) == flagged
-    assert associate(tx[early:], rx, repetition_interval_s=0.05).flags == {}  # the transmitter's are all paired
+    assert associate(tx[early:], rx, repetition_interval_s=0.05).flags == {}  # all pulses of the transmitter are paired
 
 
-def test_tags_late_by_whole_intervals_show_as_equal_recordings_that_begin_apart():
+def test_offset_of_integer_intervals_is_reported():
     (tx, rx), _ = fly(np.random.default_rng(5), pulses=130, jitter_s=0.001)
     shifted = associate(tx, rx + NS // 2, repetition_interval_s=0.05).flags["pulses_unpaired"]
     assert shifted.startswith("of 130 transmitted pulses, 10 are before and 0 after the receiver's recording: ")
@@ -148,7 +148,7 @@ def test_tags_late_by_whole_intervals_show_as_equal_recordings_that_begin_apart(
 
 
 @pytest.mark.parametrize("offset_s", [0.0, 0.06, 1.3])
-def test_frame_counters_that_wrap_decide_against_any_tag_offset_below_half_a_turn(offset_s):
+def test_wrapping_frame_counters_override_tag_offsets(offset_s):
     (tx, rx), numbers = fly(np.random.default_rng(9), 1500, offset_s=offset_s, jitter_s=0.003, missed=0.2)
     frames = [(n + 40) % 64 for n in numbers]
     pairs = associate(tx, rx, repetition_interval_s=0.05, tx_frame=frames[0], rx_frame=frames[1])
@@ -158,7 +158,7 @@ def test_frame_counters_that_wrap_decide_against_any_tag_offset_below_half_a_tur
     assert ("time_tag_offset" in pairs.flags) == (offset_s > 0.025)
 
 
-def test_a_gap_of_several_turns_of_the_counter_is_bridged():
+def test_gap_of_several_counter_periods_is_bridged():
     (tx, rx), numbers = fly(np.random.default_rng(10), 2000, jitter_s=0.003)
     keep = np.r_[0:100, 1234:2000]
     pairs = associate(
@@ -168,7 +168,7 @@ def test_a_gap_of_several_turns_of_the_counter_is_bridged():
     assert pairs.tx_index.size == keep.size
 
 
-def test_pulses_whose_number_was_not_read_are_paired_by_their_tags():
+def test_pulses_without_a_number_are_paired_by_time_tags():
     rng = np.random.default_rng(11)
     (tx, rx), numbers = fly(rng, 500, offset_s=0.02, jitter_s=0.002, missed=0.1)
     frame = np.where(rng.random(rx.size) < 0.3, -1, numbers[1])
@@ -178,39 +178,39 @@ def test_pulses_whose_number_was_not_read_are_paired_by_their_tags():
     assert share_right(pairs, numbers) == 1.0
 
 
-def test_a_misread_number_is_dropped_and_flagged():
+def test_misread_number_is_dropped_and_flagged():
     (tx, rx), numbers = fly(np.random.default_rng(12), 300)
     frame = numbers[1].copy()
-    frame[150] = 42  # a pulse of seven seconds before
+    frame[150] = 42  # the number of a pulse seven seconds earlier
     frame[42] = -1
     pairs = associate(tx, rx, repetition_interval_s=0.05, tx_frame=numbers[0], rx_frame=frame, frame_modulus=1024)
     assert share_right(pairs, numbers) == 1.0
     assert pairs.flags["frame_counter_conflict"].startswith("1 pulse excluded")
 
 
-def test_without_any_read_number_the_tags_decide():
+def test_without_numbers_time_tags_decide():
     (tx, rx), numbers = fly(np.random.default_rng(13), 50)
     pairs = associate(tx, rx, repetition_interval_s=0.05, tx_frame=numbers[0], rx_frame=np.full(rx.size, -1))
     assert pairs.method == "time tags"
 
 
 def sidelink_of_a_flight(rng, wrong_from, lag, jitter_m=0.03):
-    """A receiver that overtakes the transmitter at 1 m/s, and pairs wrong by `lag` pulses from one pulse on."""
+    """Return paths of a receiver that overtakes at 1 m/s, with a wrong association by `lag` from one pulse on."""
     time = np.arange(400) * 0.05
     distance = np.hypot(4.7, time - 10) + 0.2 * np.sin(time)
-    carried = np.arange(400)
-    carried[wrong_from:] = np.clip(carried[wrong_from:] + lag, 0, 399)
-    return distance + 12.0 + rng.normal(0, jitter_m, 400), distance[carried]
+    associated = np.arange(400)
+    associated[wrong_from:] = np.clip(associated[wrong_from:] + lag, 0, 399)
+    return distance + 12.0 + rng.normal(0, jitter_m, 400), distance[associated]
 
 
 @pytest.mark.parametrize(("lag", "detected"), [(0, False), (1, False), (20, True), (-20, True)])
-def test_pulses_with_somebody_elses_positions_show_in_the_sidelink(lag, detected):
+def test_wrong_association_is_detected_in_the_sidelink(lag, detected):
     measured, predicted = sidelink_of_a_flight(np.random.default_rng(14), 130, lag)
     message = detect_wrong_association(baseline_residual(measured, predicted))
     assert (message is not None) == detected
 
 
-def test_one_wild_sidelink_measurement_is_no_wrong_association():
+def test_outliers_of_the_sidelink_are_no_wrong_association():
     measured, predicted = sidelink_of_a_flight(np.random.default_rng(15), 400, 0)
     measured[[77, 200]] += 9.0
     measured[300:320] = np.nan
@@ -218,8 +218,8 @@ def test_one_wild_sidelink_measurement_is_no_wrong_association():
 
 
 @pytest.mark.slow
-def test_no_right_association_of_500_with_jittery_tags_is_suspected():
-    """Jitter of the trigger from 1 mm to 3 m, Gaussian and uniform, over 30 to 800 pulses: at most one false alarm."""
+def test_correct_associations_with_jitter_raise_no_false_alarm():
+    """Trigger jitter from 1 mm to 3 m, Gaussian and uniform, 30 to 800 pulses: at most one false alarm in 500."""
     alarms = 0
     for seed in range(500):
         rng = np.random.default_rng(seed)
@@ -232,21 +232,21 @@ def test_no_right_association_of_500_with_jittery_tags_is_suspected():
 
 
 @pytest.mark.parametrize(("size_m", "found"), [(0.8, False), (1.25, True)])
-def test_a_slow_movement_is_found_just_above_what_positions_may_explain(size_m, found):
-    """Jitter of 0.15 m hides 16 cm and more from a median of 15 pulses; a longer one sees them."""
+def test_slow_displacement_above_the_limit_is_found(size_m, found):
+    """Jitter of 0.15 m hides at least 16 cm from a median of 15 pulses, but not from a longer one."""
     rng = np.random.default_rng(3)
     time = np.arange(1600) / 20
-    moved = size_m * EXPLAINED_M * np.cos(2 * np.pi * time / 40)
-    residual = baseline_residual(5 + moved + rng.normal(0, 0.005, time.size), np.full(time.size, 5.0))
+    displacement_m = size_m * EXPLAINED_M * np.cos(2 * np.pi * time / 40)
+    residual = baseline_residual(5 + displacement_m + rng.normal(0, 0.005, time.size), np.full(time.size, 5.0))
     assert residual.jitter_m == pytest.approx(0.005, rel=0.1)
     assert (detect_wrong_association(residual) is not None) == found
-    hidden = baseline_residual(5 + 4 * moved + rng.normal(0, 0.15, time.size), np.full(time.size, 5.0))
+    hidden = baseline_residual(5 + 4 * displacement_m + rng.normal(0, 0.15, time.size), np.full(time.size, 5.0))
     assert hidden.excess > 1
     assert hidden.noise_m < 0.03
 
 
-def test_pulses_at_both_ends_are_not_counted_more_than_once():
-    """One wild pulse at the very end of a flight is no movement."""
+def test_pulses_at_the_ends_are_counted_once():
+    """An outlier at the very end of a flight is no displacement."""
     measured = 5 + np.random.default_rng(5).normal(0, 0.02, 60)
     measured[[0, -1]] += 1.0
     assert detect_wrong_association(baseline_residual(measured, np.full(60, 5.0))) is None
@@ -260,8 +260,8 @@ def test_pulses_at_both_ends_are_not_counted_more_than_once():
     lost=st.tuples(st.floats(0, 0.4), st.floats(0, 0.4)),
     drift_ppm=st.floats(-100, 100),
 )
-def test_no_jitter_that_leaves_tags_nearest_their_own_pulse_confuses_the_pairs(seed, offset, reach, lost, drift_ppm):
-    """Two nodes' tags scatter by up to 0.4 of an interval against each other, about an offset of up to 0.4."""
+def test_jitter_below_half_an_interval_keeps_pairs_correct(seed, offset, reach, lost, drift_ppm):
+    """Time tags with a relative jitter of up to 0.4 of an interval, about an offset of up to 0.4."""
     rng, interval_ns = np.random.default_rng(seed), 50_000_000
     numbers = [np.flatnonzero(rng.random(150) >= share) for share in lost]
     tags = [n * interval_ns + (rng.uniform(-reach, reach, n.size) * interval_ns).astype(np.int64) for n in numbers]

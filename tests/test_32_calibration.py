@@ -1,4 +1,4 @@
-"""A reflector at a known place: the path offset it gives, and when it gives none."""
+"""Path offset from a reflector at a known position, and the cases in which none is determined."""
 
 import numpy as np
 import pytest
@@ -19,21 +19,21 @@ def path(tx, rx, place):
 
 
 def fly(rng, *, offset_m=1.374, snr_db=3.0, level=1.0, clutter=0.0, wobble_m=0.0, rival=0.0, rival_m=4.0):
-    """Return transfer functions and the path to the reflector as the logged track has it."""
+    """Return transfer functions and the path to the reflector by the logged track."""
     error = np.convolve(rng.normal(size=(96 + 16)), np.ones(17) / np.sqrt(17), "valid") * wobble_m
     true = path(TX, RX, REFLECTOR) + error + offset_m
     scatterers = rng.uniform([-8, 4, 0], [8, 25, 0], (30, 3))
     transfer = level * np.exp(-2j * np.pi * FREQUENCY * true[:, None] / C)
     transfer = transfer + level * rival * np.exp(-2j * np.pi * FREQUENCY * (true[:, None] + rival_m) / C)
     for place in scatterers if clutter else []:
-        beyond = (path(TX, RX, place) + error + offset_m)[:, None]
-        transfer = transfer + clutter * np.exp(-2j * np.pi * FREQUENCY * beyond / C)
+        clutter_path_m = (path(TX, RX, place) + error + offset_m)[:, None]
+        transfer = transfer + clutter * np.exp(-2j * np.pi * FREQUENCY * clutter_path_m / C)
     noise = (rng.normal(size=transfer.shape) + 1j * rng.normal(size=transfer.shape)) / np.sqrt(2)
     return (transfer + noise * 10 ** (-snr_db / 20)).astype(np.complex64), path(TX, RX, REFLECTOR)
 
 
 @pytest.mark.parametrize("offset_m", [-4.2, 0.0, 1.374, 9.5])
-def test_the_path_offset_of_a_node_is_estimated_to_a_millimetre(offset_m):
+def test_path_offset_of_a_node_is_estimated_to_2_mm(offset_m):
     transfer, predicted = fly(np.random.default_rng(1), offset_m=offset_m, snr_db=20)
     estimate = estimate_path_offset(transfer, FREQUENCY, path_m=predicted)
     assert estimate.offset_m == pytest.approx(offset_m, abs=0.002)
@@ -43,7 +43,7 @@ def test_the_path_offset_of_a_node_is_estimated_to_a_millimetre(offset_m):
 
 @pytest.mark.quick("10-0.0-0.01")
 @pytest.mark.parametrize(("snr_db", "clutter", "wobble_m"), [(-15, 0.0, 0.0), (10, 0.05, 0.0), (10, 0.0, 0.01)])
-def test_the_stated_deviation_is_the_one_over_many_flights(snr_db, clutter, wobble_m):
+def test_reported_std_matches_the_errors_of_many_flights(snr_db, clutter, wobble_m):
     flights = [
         estimate_path_offset(transfer, FREQUENCY, path_m=predicted)
         for transfer, predicted in (
@@ -51,18 +51,19 @@ def test_the_stated_deviation_is_the_one_over_many_flights(snr_db, clutter, wobb
         )
     ]
     errors = np.array([flight.offset_m - 1.374 for flight in flights])
-    stated = np.sqrt(np.mean([flight.std_m**2 for flight in flights]))
-    assert stated / 4 < np.sqrt(np.mean(errors**2)) < stated * 2  # clutter errs to both sides: stated too large
+    reported_m = np.sqrt(np.mean([flight.std_m**2 for flight in flights]))
+    # clutter has errors of both signs: the reported deviation is too large
+    assert reported_m / 4 < np.sqrt(np.mean(errors**2)) < reported_m * 2
 
 
-def test_clutter_as_strong_in_sum_as_the_reflector_does_not_move_it():
+def test_clutter_of_equal_power_does_not_bias_the_offset():
     transfer, predicted = fly(np.random.default_rng(3), clutter=0.1)
     estimate = estimate_path_offset(transfer, FREQUENCY, path_m=predicted)
     assert estimate.offset_m == pytest.approx(1.374, abs=0.03)
 
 
 @pytest.mark.parametrize(("level", "visible"), [(0.0, False), (0.01, False), (0.06, True)])
-def test_a_reflector_that_does_not_stand_out_is_refused(level, visible):
+def test_weak_reflector_is_rejected(level, visible):
     transfer, predicted = fly(np.random.default_rng(4), level=level)
     if visible:
         assert estimate_path_offset(transfer, FREQUENCY, path_m=predicted).offset_m == pytest.approx(1.374, abs=0.1)
@@ -72,19 +73,19 @@ def test_a_reflector_that_does_not_stand_out_is_refused(level, visible):
 
 
 @pytest.mark.slow
-def test_noise_alone_is_rarely_taken_for_a_reflector():
-    seen = 0
+def test_noise_is_rarely_mistaken_for_a_reflector():
+    detections = 0
     for seed in range(100):
         try:
             estimate_path_offset(*fly(np.random.default_rng(seed), level=0.0)[:1], FREQUENCY, path_m=np.full(96, 30.0))
         except CampaignError:
             continue
-        seen += 1
-    assert seen <= 1
+        detections += 1
+    assert detections <= 1
 
 
 @pytest.mark.parametrize(("search_m", "visible"), [(1.2, False), (1.7, True)])
-def test_a_reflector_outside_the_search_is_refused(search_m, visible):
+def test_reflector_outside_the_search_is_rejected(search_m, visible):
     transfer, predicted = fly(np.random.default_rng(5), snr_db=20)
     if visible:
         estimate_path_offset(transfer, FREQUENCY, path_m=predicted, search_m=search_m)
@@ -94,7 +95,7 @@ def test_a_reflector_outside_the_search_is_refused(search_m, visible):
 
 
 @pytest.mark.parametrize(("rival", "flagged"), [(0.45, False), (0.56, True)])
-def test_a_second_reflector_as_strong_is_flagged(rival, flagged):
+def test_second_reflector_of_similar_strength_is_flagged(rival, flagged):
     transfer, predicted = fly(np.random.default_rng(6), snr_db=20, rival=rival)
     estimate = estimate_path_offset(transfer, FREQUENCY, path_m=predicted)
     assert estimate.offset_m == pytest.approx(1.374, abs=0.01)
@@ -102,14 +103,14 @@ def test_a_second_reflector_as_strong_is_flagged(rival, flagged):
 
 
 @pytest.mark.parametrize(("wobble_m", "flagged"), [(0.01, False), (0.2, True)])
-def test_an_offset_known_too_poorly_is_flagged(wobble_m, flagged):
+def test_uncertain_offset_is_flagged(wobble_m, flagged):
     transfer, predicted = fly(np.random.default_rng(7), snr_db=20, wobble_m=wobble_m)
     estimate = estimate_path_offset(transfer, FREQUENCY, path_m=predicted)
     assert (estimate.std_m > NEEDED_STD_M) == flagged
     assert ("calibration_uncertain" in estimate.flags) == flagged
 
 
-def test_a_single_pulse_gives_an_offset_without_a_deviation():
+def test_single_pulse_gives_an_offset_without_std():
     transfer, predicted = fly(np.random.default_rng(8), snr_db=20)
     estimate = estimate_path_offset(transfer[:1], FREQUENCY, path_m=predicted[:1])
     assert estimate.offset_m == pytest.approx(1.374, abs=0.02)
@@ -118,8 +119,8 @@ def test_a_single_pulse_gives_an_offset_without_a_deviation():
 
 
 @pytest.mark.parametrize("offset_m", [0.0, 0.4])
-def test_phases_of_a_static_recording_follow_the_clock_and_nothing_else(offset_m):
-    """200 pulses at rest: random phase per pulse comes back as it was put in, and a corrected one is coherent."""
+def test_phase_of_a_static_recording_equals_the_clock_phase(offset_m):
+    """200 stationary pulses: the random phase of each is recovered, and the corrected pulses are coherent."""
     rng = np.random.default_rng(9)
     phase = rng.uniform(-np.pi, np.pi, 200)
     still = np.exp(-2j * np.pi * FREQUENCY * (31.0 + offset_m) / C)

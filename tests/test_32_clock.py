@@ -1,4 +1,4 @@
-"""A receiver with its own clock: measured on its sidelink, corrected in its samples, left alone where harmless."""
+"""Clock offset of a receiver: measured on its sidelink, corrected in its samples, ignored where harmless."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ ECHOES_S = np.array([0.2e-6, 0.53e-6, 1.4e-6])
 
 
 def record(delays_s, *, cfo_hz=0.0, sfo_hz=0.0, pulses=1, snr_db=None, rng=None, waveform=NUMEROLOGY):
-    """Return (pulse, sample) what a receiver digitises whose oscillator and sampling run fast by so much."""
+    """Return (pulse, sample) captures of a receiver whose oscillator and sampling clock are fast by the offsets."""
     t = np.arange(SYMBOL) / (waveform.sample_rate_hz + sfo_hz) - waveform.prefix_samples / waveform.sample_rate_hz
     tones = np.exp(2j * np.pi * np.outer(t, waveform.numbers * waveform.spacing_hz))
     frequency = waveform.carrier_hz + waveform.numbers * waveform.spacing_hz
@@ -30,13 +30,13 @@ def record(delays_s, *, cfo_hz=0.0, sfo_hz=0.0, pulses=1, snr_db=None, rng=None,
 
 
 def transfer(samples, waveform=NUMEROLOGY):
-    """Return R/S-ready symbols: DFT after the prefix, code removed."""
+    """Return the symbols for R/S: DFT after the prefix, code removed."""
     window = samples[:, waveform.prefix_samples : waveform.prefix_samples + waveform.dft_samples]
     return (np.fft.fft(window, axis=1) / waveform.dft_samples)[:, waveform.numbers] / CODES
 
 
 def floor_db(radar, sidelink):
-    """Return the RMS error of the divided range profile beside what it should be, relative to its peak."""
+    """Return the RMS error of the divided range profile against the ideal one, relative to its peak."""
     ratio = (transfer(radar) / transfer(sidelink))[0]
     frequency = NUMEROLOGY.carrier_hz + NUMBERS * NUMEROLOGY.spacing_hz
     ideal = np.exp(-2j * np.pi * np.outer(ECHOES_S - 0.1e-6, frequency)).sum(0)
@@ -54,7 +54,7 @@ def corrected(offset, *captures):
     return [correct_clock(samples, NUMEROLOGY, cfo_hz=cfo_hz, sfo_ppm=offset.sfo_ppm) for samples in captures]
 
 
-def test_correction_lowers_the_floor_of_an_8_ppm_clock_by_20_db_and_more():
+def test_correction_lowers_the_floor_of_an_8_ppm_clock_by_40_db():
     radar, sidelink = both(cfo_hz=9600.0, sfo_hz=819.2)
     offset = estimate_clock(sidelink, NUMEROLOGY)
     before, after = floor_db(radar, sidelink), floor_db(*corrected(offset, radar, sidelink))
@@ -62,7 +62,7 @@ def test_correction_lowers_the_floor_of_an_8_ppm_clock_by_20_db_and_more():
     assert after < before - 40
 
 
-def test_one_correction_serves_a_sampling_clock_far_from_the_carriers():
+def test_separate_sampling_clock_is_corrected():
     radar, sidelink = both(cfo_hz=-3000.0, sfo_hz=200 * 102.4)
     offset = estimate_clock(np.repeat(sidelink, 4, 0), NUMEROLOGY)
     assert not offset.one_clock
@@ -72,7 +72,7 @@ def test_one_correction_serves_a_sampling_clock_far_from_the_carriers():
 
 
 @pytest.mark.parametrize("ppm", [-35.0, -8.0, 0.0, 1.0, 8.0, 35.0])
-def test_a_clock_is_measured_in_noise_as_well_as_theory_allows(ppm):
+def test_clock_accuracy_in_noise_matches_theory(ppm):
     rng = np.random.default_rng(1)
     captures = record(0.7e-6, cfo_hz=1200 * ppm, sfo_hz=102.4 * ppm, pulses=64, snr_db=0, rng=rng)
     offset = estimate_clock(captures, NUMEROLOGY)
@@ -84,18 +84,18 @@ def test_a_clock_is_measured_in_noise_as_well_as_theory_allows(ppm):
     assert offset.sfo_ppm == pytest.approx(ppm, abs=4 * theory_hz / 1200)
 
 
-def test_a_clock_that_drifts_over_the_flight_is_followed():
+def test_clock_drift_is_followed():
     rng = np.random.default_rng(2)
     drift_hz = np.linspace(-600, 600, 128)
     captures = record(0.7e-6, cfo_hz=5000, pulses=128, snr_db=20, rng=rng)
     captures = captures * np.exp(-2j * np.pi * np.outer(drift_hz, np.arange(SYMBOL) / 102.4e6)).astype(np.complex64)
     offset = estimate_clock(captures, NUMEROLOGY)
     assert offset.cfo_of_pulses_hz(128) == pytest.approx(5000 + drift_hz, abs=40)
-    still = estimate_clock(record(0.7e-6, cfo_hz=5000, pulses=128, snr_db=20, rng=rng), NUMEROLOGY)
-    assert still.cfo_slope_hz == 0
+    constant = estimate_clock(record(0.7e-6, cfo_hz=5000, pulses=128, snr_db=20, rng=rng), NUMEROLOGY)
+    assert constant.cfo_slope_hz == 0
 
 
-def test_blocked_pulses_do_no_harm():
+def test_blocked_pulses_do_not_bias_the_clock():
     rng = np.random.default_rng(3)
     captures = record(0.7e-6, cfo_hz=5000, pulses=128, snr_db=20, rng=rng)
     captures[40:64] = record(0.7e-6, pulses=24, snr_db=20, rng=rng) * 1e-3
@@ -103,12 +103,12 @@ def test_blocked_pulses_do_no_harm():
 
 
 @pytest.mark.parametrize(("cfo_hz", "sfo_hz"), [(10e3, 0.0), (2e3, 0.0), (0.0, 200 * 102.4), (9600.0, 819.2)])
-def test_the_predicted_floor_is_the_one_that_is_measured(cfo_hz, sfo_hz):
+def test_predicted_floor_matches_the_measured_floor(cfo_hz, sfo_hz):
     predicted = interference_floor_db(cfo_hz, sfo_hz / 102.4, NUMEROLOGY)
-    # what an echo shares with the sidelink divides out; the rest grows with the delay between them
-    turn = 2 * np.pi * 100e3 * (ECHOES_S - 0.1e-6)
-    apart = ((np.pi * turn / 2 - turn**2 / 4) / (np.pi**2 / 6)).sum()
-    assert floor_db(*both(cfo_hz=cfo_hz, sfo_hz=sfo_hz)) == pytest.approx(predicted + 10 * np.log10(apart), abs=1)
+    # components common to echo and sidelink cancel in the ratio; the rest grows with the delay between them
+    phase_rad = 2 * np.pi * 100e3 * (ECHOES_S - 0.1e-6)
+    excess = ((np.pi * phase_rad / 2 - phase_rad**2 / 4) / (np.pi**2 / 6)).sum()
+    assert floor_db(*both(cfo_hz=cfo_hz, sfo_hz=sfo_hz)) == pytest.approx(predicted + 10 * np.log10(excess), abs=1)
 
 
 def decision(ppm, *, std_hz=1.0, accuracy_db=-60.0, cfo_hz=None):
@@ -119,15 +119,15 @@ def decision(ppm, *, std_hz=1.0, accuracy_db=-60.0, cfo_hz=None):
 @pytest.mark.parametrize(
     ("ppm", "accuracy_db", "correct"), [(0.3, -60, False), (1.0, -60, True), (1.0, -40, False), (8.0, -40, True)]
 )
-def test_a_clock_is_corrected_only_when_the_asked_accuracy_needs_it(ppm, accuracy_db, correct):
+def test_clock_is_corrected_only_if_the_accuracy_needs_it(ppm, accuracy_db, correct):
     decided = decision(ppm, accuracy_db=accuracy_db)
     assert decided.correct == correct
     assert decided.reason.endswith(": samples corrected" if correct else ": not corrected")
     assert (decided.floor_db > accuracy_db) == correct
 
 
-def test_a_clock_that_noise_only_suggests_is_left_alone():
-    """2400 Hz: left alone below three standard deviations, and both are stated."""
+def test_insignificant_clock_offset_is_not_corrected():
+    """2400 Hz: not corrected below three standard deviations, and both values are reported."""
     assert not decision(2.0, std_hz=820.0).correct
     assert decision(2.0, std_hz=820.0).reason.startswith("clock +2.00 ± 0.68 ppm (CFO")
     assert decision(2.0, std_hz=820.0).reason.endswith("not corrected: below 3 σ")
@@ -138,7 +138,7 @@ def test_a_clock_that_noise_only_suggests_is_left_alone():
 
 
 @pytest.mark.slow
-def test_a_true_clock_under_a_weak_sidelink_is_left_alone_whatever_it_seems_to_be():
+def test_accurate_clock_with_a_weak_sidelink_is_not_corrected():
     for seed in range(20):
         rng = np.random.default_rng(seed)
         offset = estimate_clock(record(0.7e-6, cfo_hz=60.0, sfo_hz=5.0, pulses=48, snr_db=-14, rng=rng), NUMEROLOGY)
@@ -148,25 +148,25 @@ def test_a_true_clock_under_a_weak_sidelink_is_left_alone_whatever_it_seems_to_b
 
 
 @pytest.mark.parametrize(("std_hz", "flagged"), [(250.0, False), (1000.0, True)])
-def test_a_clock_known_too_poorly_is_flagged(std_hz, flagged):
+def test_uncertain_clock_is_flagged(std_hz, flagged):
     assert ("clock_uncertain" in decision(8.0, std_hz=std_hz).flags) == flagged
 
 
 @pytest.mark.parametrize(("share", "flagged"), [(AMBIGUOUS_SHARE - 0.01, False), (AMBIGUOUS_SHARE + 0.01, True)])
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_an_offset_close_to_where_it_wraps_is_flagged(share, flagged, sign):
+def test_offset_near_its_ambiguity_is_flagged(share, flagged, sign):
     assert ("clock_ambiguous" in decision(0.0, cfo_hz=sign * share * 100e3).flags) == flagged
 
 
-def test_a_true_clock_passes_the_correction_unchanged():
+def test_correction_of_zero_changes_nothing():
     radar, sidelink = both()
     offset = estimate_clock(sidelink, NUMEROLOGY)
     assert abs(offset.cfo_hz) < 1
-    again = correct_clock(radar, NUMEROLOGY, cfo_hz=np.zeros(1), sfo_ppm=0.0)
-    assert np.abs(again - radar[:, :1344]).max() < 1e-5 * np.abs(radar).max()
+    corrected_radar = correct_clock(radar, NUMEROLOGY, cfo_hz=np.zeros(1), sfo_ppm=0.0)
+    assert np.abs(corrected_radar - radar[:, :1344]).max() < 1e-5 * np.abs(radar).max()
 
 
-def test_a_band_around_the_carrier_is_measured_and_corrected_as_well():
+def test_band_centred_on_the_carrier_is_corrected():
     centred = Numerology(1.2e9, 102.4e6, NUMBERS - 256, prefix_samples=320, dft_samples=1024)
     capture = record(0.1e-6, cfo_hz=9600.0, sfo_hz=819.2, waveform=centred)
     offset = estimate_clock(capture, centred)
@@ -176,20 +176,20 @@ def test_a_band_around_the_carrier_is_measured_and_corrected_as_well():
     assert np.std(np.abs(symbols)) < 2e-3 * np.mean(np.abs(symbols)) < 0.1 * np.std(np.abs(transfer(capture, centred)))
 
 
-def test_a_clock_whose_scatter_is_unknown_is_not_trusted():
+def test_clock_of_a_single_pulse_is_not_corrected():
     _, sidelink = both(cfo_hz=9600.0, sfo_hz=819.2)
     decided = decide_clock(estimate_clock(sidelink, NUMEROLOGY), NUMEROLOGY, accuracy_db=-60)
     assert not decided.correct
     assert "clock_uncertain" in decided.flags
 
 
-def test_captures_without_a_repetition_are_refused():
+def test_captures_without_a_repetition_are_rejected():
     with pytest.raises(ValueError, match="repeat only 20"):
         estimate_clock(np.ones((3, 1024 + 160 + 20), np.complex64), NUMEROLOGY)
 
 
-def test_captures_that_begin_late_and_end_after_the_symbol_measure_the_same_clock():
-    """A chirp-like code, whose end holds one edge of the band: 8 samples of silence there are no clock offset."""
+def test_late_captures_give_the_same_clock():
+    """A chirp-like code whose end has one edge of the band: 8 samples of silence there are no clock offset."""
     chirp = np.exp(1j * np.pi * NUMBERS**2 / NUMBERS.size)  # Newman's phases
     rng = np.random.default_rng(3)
     captures = np.zeros((400, SYMBOL), np.complex64)

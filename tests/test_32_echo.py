@@ -1,4 +1,4 @@
-"""From captured symbols to range profiles: phases are what delays predict."""
+"""From captured symbols to range profiles: phases match those predicted from delays."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ RATE, SPACING, COUNT, PREFIX = 64e6, 1e6, 32, 16
 
 
 def symbol(delay_s, codes, numbers, carrier=1e9):
-    """A delayed symbol as the receiver samples it, from its definition (theory eq. 1)."""
+    """Return a delayed symbol as sampled by the receiver, from its definition (theory eq. 1)."""
     time = np.arange(PREFIX + 80) / RATE - delay_s
     inside = (time >= 0) & (time < PREFIX / RATE + 1.25 / SPACING)
     waves = np.exp(2j * np.pi * numbers * SPACING * (time[:, None] - PREFIX / RATE))
@@ -34,7 +34,7 @@ def symbol(delay_s, codes, numbers, carrier=1e9):
 
 @pytest.mark.parametrize("carrier_is", ["band_start", "band_centre"])
 @pytest.mark.parametrize("delay_samples", [0.0, 3.3, 15.9])
-def test_an_echo_turns_every_subcarrier_by_its_delay(carrier_is, delay_samples):
+def test_echo_rotates_every_subcarrier_by_its_delay(carrier_is, delay_samples):
     numbers = subcarrier_numbers(COUNT, carrier_is=carrier_is)
     codes = np.exp(2j * np.pi * np.random.default_rng(1).random(COUNT))
     delay = delay_samples / RATE
@@ -44,14 +44,14 @@ def test_an_echo_turns_every_subcarrier_by_its_delay(carrier_is, delay_samples):
     np.testing.assert_allclose(transfer, expected, atol=2e-3)
 
 
-def test_an_echo_beyond_the_prefix_is_no_longer_a_pure_delay():
+def test_echo_beyond_the_prefix_is_no_pure_delay():
     numbers, codes = subcarrier_numbers(COUNT, carrier_is="band_start"), np.ones(COUNT, complex)
     late = symbol(30 / RATE, codes, numbers).astype(np.complex64)
     transfer = demodulate(late, Numerology(1e9, RATE, numbers, PREFIX, 64))[0] / 200
     assert np.abs(np.abs(transfer) - 1).max() > 0.1
 
 
-def test_the_dft_needs_prefix_and_one_period():
+def test_dft_needs_prefix_and_one_period():
     with pytest.raises(ValueError, match="must have at least 80"):
         demodulate(np.ones((1, 79), np.complex64), Numerology(1e9, RATE, np.arange(4), 16, 64))
 
@@ -64,7 +64,7 @@ def echo_of(paths, frequency):
     return sum(np.exp(-2j * np.pi * frequency * path / SPEED_OF_LIGHT_M_S) for path in paths)[None].astype(np.complex64)
 
 
-def test_a_profile_peaks_at_the_path_with_the_phase_of_band_centre():
+def test_profile_peaks_at_the_path_with_the_centre_phase():
     frequency = band()
     step, _ = range_step(frequency, oversampling=2)
     start = 30.0
@@ -77,12 +77,14 @@ def test_a_profile_peaks_at_the_path_with_the_phase_of_band_centre():
         count=100,
     )[0]
     assert np.abs(profile).argmax() == 50
-    turned = profile[50] * np.exp(2j * np.pi * centre_frequency(frequency) * (start + 50 * step) / SPEED_OF_LIGHT_M_S)
-    np.testing.assert_allclose(turned, 1.0, atol=1e-4)
+    compensated = profile[50] * np.exp(
+        2j * np.pi * centre_frequency(frequency) * (start + 50 * step) / SPEED_OF_LIGHT_M_S
+    )
+    np.testing.assert_allclose(compensated, 1.0, atol=1e-4)
 
 
-def test_a_reference_delay_is_put_back():
-    """Samples referred to a delay τ_ref give the same absolute profile as samples that never were."""
+def test_reference_delay_is_restored():
+    """Samples relative to a delay τ_ref give the same absolute profile as samples without a reference."""
     frequency, tau = band(), np.array([137.4 / SPEED_OF_LIGHT_M_S])
     options = {"weight": window_weights("none", 512), "start_m": np.array([140.0]), "count": 64}
     absolute = compress(echo_of([150.0], frequency), frequency, reference_delay_s=np.zeros(1), **options)
@@ -93,8 +95,8 @@ def test_a_reference_delay_is_put_back():
 
 
 @pytest.mark.parametrize("count", [16, 49, 64, 400])
-def test_a_swath_of_the_range_holds_what_the_whole_sum_does_there(count):
-    """Decimation to the swath errs by less than -110 dB of the strongest echo, wherever that is."""
+def test_swath_profile_matches_the_complete_sum(count):
+    """Decimation to the swath has an error below -110 dB of the strongest echo, at any position of it."""
     frequency, generator = band(), np.random.default_rng(3)
     paths = generator.uniform(0, 749, 40)  # everywhere in the unambiguous range
     transfer = np.repeat(echo_of(paths, frequency) + 10 * echo_of([400.0], frequency), 3, axis=0)
@@ -107,7 +109,7 @@ def test_a_swath_of_the_range_holds_what_the_whole_sum_does_there(count):
     assert np.abs(compress(transfer, frequency, **options) - whole).max() < 10 * 10 ** (-110 / 20)
 
 
-def test_the_hann_window_widens_the_cell_and_lowers_the_sidelobes():
+def test_hann_window_lowers_the_sidelobes():
     frequency = band()
     levels = {}
     for window in ("none", "hann"):
@@ -122,15 +124,15 @@ def test_the_hann_window_widens_the_cell_and_lowers_the_sidelobes():
                 oversampling=8,
             )[0]
         )
-        beyond = np.flatnonzero(np.diff(profile) > 0)[0]
-        levels[window] = 20 * np.log10(profile[beyond:300].max() / profile[0])
+        first_null = np.flatnonzero(np.diff(profile) > 0)[0]
+        levels[window] = 20 * np.log10(profile[first_null:300].max() / profile[0])
     assert levels["none"] == pytest.approx(-13.3, abs=0.2)
     assert levels["hann"] == pytest.approx(-31.5, abs=0.3)
 
 
 @pytest.mark.parametrize("count", [3, 64, 1023, 1024])
-def test_the_hann_window_is_the_symmetric_one(count):
-    """A profile of another program, or a closed formula, is compared with this definition and no other."""
+def test_hann_window_is_symmetric(count):
+    """Profiles of other programs and closed formulas are compared with this definition only."""
     expected = hann(count, sym=True)
     np.testing.assert_allclose(window_weights("hann", count), expected / expected.sum(), atol=1e-15)
     periodic = hann(count, sym=False)
@@ -145,7 +147,7 @@ def northward(speed=2.0):
     return ecef_from_geodetic(latitude, np.full(20, 9.0), np.full(20, 600.0))
 
 
-def arm(attitude_deg, lever, attitude_from="log"):
+def lever_arm_offset(attitude_deg, lever, attitude_from="log"):
     attitude = np.tile(np.radians(attitude_deg), (20, 1))
     position = northward()
     placed = phase_centres(
@@ -167,15 +169,15 @@ def arm(attitude_deg, lever, attitude_from="log"):
         ((90, 0, 90), (0, 1, 0), (0, 0, -1)),
     ],
 )
-def test_lever_arms_turn_with_the_body(attitude, lever, north_east_up):
-    np.testing.assert_allclose(arm(attitude, lever), north_east_up, atol=5e-3)
+def test_lever_arms_rotate_with_the_body(attitude, lever, north_east_up):
+    np.testing.assert_allclose(lever_arm_offset(attitude, lever), north_east_up, atol=5e-3)
 
 
-def test_course_stands_for_yaw_when_asked():
-    np.testing.assert_allclose(arm((0, 0, 77), (1, 0, 0), "course"), (1, 0, 0), atol=5e-3)
+def test_course_replaces_yaw_if_configured():
+    np.testing.assert_allclose(lever_arm_offset((0, 0, 77), (1, 0, 0), "course"), (1, 0, 0), atol=5e-3)
 
 
-def test_yaw_is_interpolated_through_north_the_short_way():
+def test_yaw_is_interpolated_across_north():
     attitude = np.zeros((20, 3))
     attitude[:, 2] = np.radians(np.where(np.arange(20) < 10, 359.0, 1.0))
     placed = phase_centres(
@@ -192,7 +194,7 @@ def test_yaw_is_interpolated_through_north_the_short_way():
 
 
 def test_positions_between_epochs_follow_the_curve():
-    """A circle sampled at 10 Hz: a chord would miss it by 1 mm, the spline by less than 0.02 mm."""
+    """A circle sampled at 10 Hz: linear interpolation has an error of 1 mm, the spline of less than 0.02 mm."""
     angle = 0.2 * np.arange(20) * 0.1
     circle = np.stack([10 * np.cos(angle), 10 * np.sin(angle), np.zeros(20)], -1)
     at = EPOCHS[8:12] + np.timedelta64(50, "ms")
@@ -208,7 +210,7 @@ def test_positions_between_epochs_follow_the_curve():
     assert np.abs(np.linalg.norm(placed, axis=1) - 10).max() < 2e-5
 
 
-def test_a_track_must_cover_the_pulses():
+def test_track_must_cover_the_pulses():
     with pytest.raises(CampaignError, match=r"ends 0\.100 s before the last"):
         phase_centres(
             EPOCHS,
@@ -223,8 +225,8 @@ def test_a_track_must_cover_the_pulses():
 
 @tried(50)
 @given(latitude=st.floats(-80, 80), longitude=st.floats(6, 12), height_m=st.floats(-400, 9000))
-def test_every_place_comes_back_from_ecef_to_a_micrometre(latitude, longitude, height_m):
-    """Geodetic and UTM zone 32 both ways; up is where the height grows."""
+def test_ecef_conversion_is_invertible_to_a_micrometre(latitude, longitude, height_m):
+    """Geodetic and UTM zone 32 in both directions; up is the direction of increasing height."""
     place = np.array([latitude, longitude, height_m])
     position = ecef_from_geodetic(*place)
     returned = geodetic_from_ecef(position)
@@ -236,16 +238,16 @@ def test_every_place_comes_back_from_ecef_to_a_micrometre(latitude, longitude, h
 
 
 @pytest.mark.parametrize("overrun", [0.02, 0.1, 0.3])
-def test_an_echo_beyond_the_prefix_loses_its_overrun_and_spreads_as_noise_over_the_period(overrun):
-    """docs/theory/focus.md, eq. 5a, of 512 subcarriers: 20 random codes, one echo of amplitude 1, no window."""
+def test_echo_beyond_the_prefix_loses_power_to_noise(overrun):
+    """docs/theory/focus.md, eq. 5a, for 512 subcarriers: 20 random codes, one echo of amplitude 1, no window."""
     count, length, prefix = 512, 1024, 64
-    known = Numerology(1e9, 1024e6, np.arange(count), prefix_samples=prefix, dft_samples=length)
+    numerology = Numerology(1e9, 1024e6, np.arange(count), prefix_samples=prefix, dft_samples=length)
     codes = np.exp(2j * np.pi * np.random.default_rng(1).random((20, count)))
     period = np.fft.ifft(codes, length, norm="forward")
-    late = 2 * round(overrun * count)  # whole cells
+    late = 2 * round(overrun * count)  # integer resolution cells
     captures = np.zeros((20, prefix + length), np.complex64)
     captures[:, prefix + late :] = np.concatenate([period[:, -prefix:], period], axis=1)[:, : length - late]
-    transfer = demodulate(captures, known) / codes
+    transfer = demodulate(captures, numerology) / codes
     power = np.abs(np.fft.ifft(transfer, axis=1)) ** 2
     cell = round((prefix + late) * count / length)
     assert 10 * np.log10(power[:, cell].mean()) == pytest.approx(20 * np.log10(1 - overrun), abs=0.3)

@@ -1,4 +1,4 @@
-"""Transfer functions formed where they are read: those that a stage keeps, whoever reads them in whatever order."""
+"""Transfer functions formed on reading: equal to those stored in a stage, for any reader and any order."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ PAIRS = "uav1-uav1", "uav1-uav2"
 
 @pytest.fixture(scope="module")
 def drifting(tmp_path_factory):
-    """A flight whose receiver's clock is corrected in its samples."""
+    """A flight with a clock offset of the receiver that is corrected in its samples."""
     plan = replace(preset("demo", pulses=90), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
     changed = {"uav2": replace(plan.nodes["uav2"].impairments, clock=Clock(cfo_hz=12e3, sfo_hz=1e3))}
     root = simulate(tmp_path_factory.mktemp("drifting") / "campaign", plan, impairments=changed, seed=5)
@@ -45,7 +45,7 @@ def formed(root, tmp_path, name, **processing):
 
 @pytest.mark.quick("two_parameter")
 @pytest.mark.parametrize("method", ["divide", "wiener", "gated", "two_parameter"])
-def test_what_is_formed_is_what_a_stage_keeps_to_the_bit(drifting, tmp_path, method):
+def test_formed_and_stored_transfer_functions_are_bitwise_equal(drifting, tmp_path, method):
     campaign = formed(drifting, tmp_path, "a", sidelink=method)
     for pair in PAIRS:
         transfer.transfer(campaign, "f01", pair)
@@ -63,8 +63,8 @@ def kept_of(campaign, pair):
 
 @pytest.mark.quick("divide")
 @pytest.mark.parametrize("method", ["divide", "two_parameter"])
-def test_what_a_stage_says_of_its_pulses_forms_what_was_measured(drifting, tmp_path, method):
-    """Clock, direct path and path taken off go through the stage and back."""
+def test_stored_pulse_parameters_give_the_measured_transfer(drifting, tmp_path, method):
+    """Clock, direct path and removed path are stored in the stage and read back."""
     campaign = formed(drifting, tmp_path, "a", sidelink=method)
     stage, sent = PairEcho.opened(campaign, "f01", "uav1-uav2").stage, transmitted(campaign, campaign.settings.waveform)
     rx, captures = open_acquisition(campaign, "f01", "uav2", sent), stage.capture.values
@@ -78,17 +78,17 @@ def test_what_a_stage_says_of_its_pulses_forms_what_was_measured(drifting, tmp_p
         accuracy_db=-60.0,
         where="here",
     )
-    some = np.arange(64)
-    delay_s = stage.path_removed.values[some] / SPEED_OF_LIGHT_M_S
-    wanted = remove_path(measured.form(some), stage.frequency.values, delay_s=delay_s)
+    pulses = np.arange(64)
+    delay_s = stage.path_removed.values[pulses] / SPEED_OF_LIGHT_M_S
+    wanted = remove_path(measured.form(pulses), stage.frequency.values, delay_s=delay_s)
     assert measured.report["clock"]["corrected"]
-    np.testing.assert_allclose(stage.transfer[some].values, wanted, rtol=1e-5, atol=1e-3)
+    np.testing.assert_allclose(stage.transfer[pulses].values, wanted, rtol=1e-5, atol=1e-3)
 
 
 @pytest.mark.slow
-def test_profiles_and_images_of_what_was_kept_are_those_of_the_recording_to_the_byte(drifting, tmp_path):
-    """With other windows than those of the run before: as whoever images again without the recordings would."""
-    made = []
+def test_images_from_stored_transfer_equal_those_of_recordings(drifting, tmp_path):
+    """With another window than in the first run, as if the recordings had been deleted since."""
+    results = []
     for lost in (False, True):
         campaign = formed(drifting, tmp_path, f"lost {lost}", window="none")
         for pair in PAIRS:
@@ -98,11 +98,11 @@ def test_profiles_and_images_of_what_was_kept_are_those_of_the_recording_to_the_
                 path.unlink()
         settle_ground(campaign)
         make_images(campaign, "f01")
-        made.append({name: data for name, data in contents(campaign.results).items() if not name.startswith(".")})
-    assert made[0] == made[1]
+        results.append({name: data for name, data in contents(campaign.results).items() if not name.startswith(".")})
+    assert results[0] == results[1]
 
 
-def test_what_was_kept_of_another_echo_is_not_read(drifting, tmp_path):
+def test_stored_transfer_of_another_echo_is_not_read(drifting, tmp_path):
     campaign = formed(drifting, tmp_path, "a")
     transfer.transfer(campaign, "f01", "uav1-uav2")
     campaign = state(campaign.root, "processing", sidelink="gated")
@@ -113,18 +113,19 @@ def test_what_was_kept_of_another_echo_is_not_read(drifting, tmp_path):
 
 
 @pytest.mark.slow
-def test_pulses_come_in_the_order_they_are_asked_for(drifting, tmp_path):
+def test_pulses_are_returned_in_the_requested_order(drifting, tmp_path):
     transfer = PairEcho.opened(formed(drifting, tmp_path, "a"), "f01", "uav1-uav2").stage.transfer
     whole = transfer.values
-    some = np.array([7, 3, 3, 40])
-    for key in (some, slice(None, None, 9), slice(60, 10, -7), 5, (some, slice(2, 9)), (slice(3), 4)):
-        np.testing.assert_allclose(transfer[key].values, whole[key], rtol=2e-6, atol=1e-4)  # of 100: a DFT's last bit
+    pulses = np.array([7, 3, 3, 40])
+    for key in (pulses, slice(None, None, 9), slice(60, 10, -7), 5, (pulses, slice(2, 9)), (slice(3), 4)):
+        # rounding of the DFT at amplitudes of 100
+        np.testing.assert_allclose(transfer[key].values, whole[key], rtol=2e-6, atol=1e-4)
     assert transfer[:0].values.shape == (0, whole.shape[1])
 
 
 @pytest.mark.quick("False")
 @pytest.mark.parametrize("lost", [True, False])
-def test_a_recording_that_is_gone_or_another_is_told_where_a_pulse_is_read(drifting, tmp_path, lost):
+def test_missing_or_changed_recording_is_reported_on_reading(drifting, tmp_path, lost):
     campaign = formed(drifting, tmp_path, "a")
     samples = campaign.root / "raw/f01/uav2.sigmf-data"
     stage = PairEcho.opened(campaign, "f01", "uav1-uav2").stage
@@ -133,15 +134,15 @@ def test_a_recording_that_is_gone_or_another_is_told_where_a_pulse_is_read(drift
     else:
         samples.write_bytes(samples.read_bytes()[::-1])
     assert len(stage.time) == stage.sizes["pulse"]
-    told = complaint(lambda: stage.transfer[0].values)
-    assert told.startswith("raw/f01/uav2.sigmf-data") or "uav2.sigmf-data" in told
-    assert ("no such file" in told) is lost
-    assert ("changed since it was ingested" in told) is not lost
+    message = complaint(lambda: stage.transfer[0].values)
+    assert message.startswith("raw/f01/uav2.sigmf-data") or "uav2.sigmf-data" in message
+    assert ("no such file" in message) is lost
+    assert ("changed since it was ingested" in message) is not lost
 
 
 @pytest.mark.parametrize(("wrong_m", "least_db", "most_db"), [(0.0, -300, -120), (0.5, -30, 0)])
-def test_profiles_at_wrong_paths_are_measured_as_wrong(wrong_m, least_db, most_db):
-    """Half a metre is a fifth of a cell of c/B."""
+def test_compression_error_reveals_wrong_paths(wrong_m, least_db, most_db):
+    """Half a metre is a fifth of a resolution cell c/B."""
     rng = np.random.default_rng(2)
     frequency = 1.2e9 + 1e6 * np.arange(128)
     track = np.stack([np.linspace(-1, 1, 64), np.full(64, -20.0), np.full(64, 10.0)], -1)

@@ -14,7 +14,7 @@ TONE = 300
 
 
 def received(*, tone_db=None, noise=1.0, pulses=400, seed=1):
-    """Echoes of three targets from a moving platform, noise, and a tone relative to the power of one echo."""
+    """Return echoes of three targets from a moving platform, noise, and a tone relative to the power of one echo."""
     rng = np.random.default_rng(seed)
     paths_m = TARGETS_M + 0.002 * np.arange(pulses)[:, None] * np.array([1.0, -0.5, 0.2])
     echo = np.exp(-2j * np.pi * np.remainder(paths_m[..., None] / C * FREQUENCY, 1.0)).sum(axis=1)
@@ -36,7 +36,7 @@ def profiles(transfer):
 
 
 def noise_floor_db(transfer):
-    """Mean power of the profiles beyond the targets, dB."""
+    """Return the mean power of the profiles beyond the targets, dB."""
     return 10 * np.log10(np.mean(np.abs(profiles(transfer)[:, 100:]) ** 2))
 
 

@@ -1,4 +1,4 @@
-"""What missing pulses do to an image is predicted before it is formed."""
+"""Effect of missing pulses on an image, predicted before image formation."""
 
 import numpy as np
 import pytest
@@ -9,12 +9,12 @@ SENT = np.arange(600) * 50_000_000
 
 
 def response(kept):
-    """The response along the track of pulses that see a target, normalised by their number, a cell apart and finer."""
+    """Return the azimuth response of the used pulses, normalised by their number, from one cell outwards."""
     return np.abs(np.fft.rfft(kept, 4 * kept.size))[4:] / kept.sum()
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_missing_pulses_raise_the_sidelobes_that_are_predicted(seed):
+def test_missing_pulses_raise_sidelobes_as_predicted(seed):
     generator = np.random.default_rng(seed)
     kept = generator.random(600) > 0.1 * seed
     kept[200 : 200 + 40 * seed] = False
@@ -27,16 +27,16 @@ def test_missing_pulses_raise_the_sidelobes_that_are_predicted(seed):
 
 
 @pytest.mark.parametrize(("missing", "flagged"), [(50, False), (60, True)])
-def test_a_tenth_of_the_aperture_in_a_row_is_flagged(missing, flagged):
-    left = np.delete(SENT, np.arange(200, 200 + missing))
-    assert ("pulses_missing" in missing_flags(left)) is flagged
-    assert missing_flags(SENT[missing:]) == {}  # a shorter aperture misses nothing
+def test_gap_of_a_tenth_of_the_aperture_is_flagged(missing, flagged):
+    remaining = np.delete(SENT, np.arange(200, 200 + missing))
+    assert ("pulses_missing" in missing_flags(remaining)) is flagged
+    assert missing_flags(SENT[missing:]) == {}  # a shorter aperture has no missing pulses
 
 
-def test_a_fifth_of_the_pulses_missed_here_and_there_is_no_flag():
+def test_scattered_loss_of_a_fifth_of_pulses_is_not_flagged():
     assert missing_flags(SENT[np.random.default_rng(1).random(600) > 0.2]) == {}
 
 
-def test_every_second_pulse_of_a_flight_is_not_missing_from_it():
+def test_regular_decimation_has_no_missing_pulses():
     assert missing_flags(SENT[::2]) == {}
     assert "60 of 600" in missing_flags(np.delete(SENT, np.arange(200, 260)))["pulses_missing"]

@@ -1,4 +1,4 @@
-"""A node's own pulses: whether they carry the code that is taken out of them, and whether they keep their phase."""
+"""Checks of a node's own pulses: presence of the configured code, and phase stability."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ PULSES, CELLS, PREFIX = 200, 256, 80
 
 
 def echoes(rng, targets=5, *, image_snr_db=60.0, step_m=0.025, phase_rad=0.0):
-    """(pulse, subcarrier) transfer functions of a flight past targets; SNR of one of their mean power in the image."""
+    """Return (pulse, subcarrier) transfer functions of a flight past targets; image SNR of a target of mean power."""
     frequency = 1.2e9 + 409.6e6 * np.arange(CELLS) / CELLS
     along = (np.arange(PULSES) - PULSES / 2) * step_m
     track = np.stack([along, 0 * along, 0 * along + 5], -1)
@@ -18,7 +18,8 @@ def echoes(rng, targets=5, *, image_snr_db=60.0, step_m=0.025, phase_rad=0.0):
     path = 2 * np.linalg.norm(track[:, None] - places, axis=-1)
     gains = rng.normal(size=targets) + 1j * rng.normal(size=targets)
     sums = sum(
-        gain * np.exp(-2j * np.pi * frequency * one[:, None] / C) for gain, one in zip(gains, path.T, strict=True)
+        gain * np.exp(-2j * np.pi * frequency * target_path[:, None] / C)
+        for gain, target_path in zip(gains, path.T, strict=True)
     )
     sums = sums / np.sqrt(np.mean(np.abs(sums) ** 2)) * np.exp(1j * phase_rad * rng.normal(size=(PULSES, 1)))
     return (sums + noise(rng) * 10 ** (-image_snr_db / 20) * np.sqrt(PULSES * CELLS)).astype(np.complex64)
@@ -34,7 +35,7 @@ def wrong(rng):
 
 @pytest.mark.parametrize("image_snr_db", [30.0, 40.0, 70.0])
 @pytest.mark.parametrize("targets", [1, 5])
-def test_the_right_code_gathers_echoes_inside_the_prefix_that_no_single_pulse_shows(image_snr_db, targets):
+def test_correct_code_is_confirmed(image_snr_db, targets):
     for seed in range(4):
         found = own_code(echoes(np.random.default_rng(seed), targets, image_snr_db=image_snr_db), prefix_cells=PREFIX)
         assert found.carried, found.evidence
@@ -42,7 +43,7 @@ def test_the_right_code_gathers_echoes_inside_the_prefix_that_no_single_pulse_sh
 
 
 @pytest.mark.parametrize("image_snr_db", [15.0, 20.0])
-def test_echoes_too_weak_to_show_before_an_image_is_formed_raise_no_flag(image_snr_db):
+def test_weak_echoes_raise_no_flag(image_snr_db):
     for seed in range(4):
         found = own_code(echoes(np.random.default_rng(seed), image_snr_db=image_snr_db), prefix_cells=PREFIX)
         assert found.carried is not False
@@ -51,7 +52,7 @@ def test_echoes_too_weak_to_show_before_an_image_is_formed_raise_no_flag(image_s
 
 @pytest.mark.quick("20.0", "80.0")
 @pytest.mark.parametrize("image_snr_db", [20.0, 40.0, 50.0, 80.0])
-def test_a_wrong_code_is_never_confirmed_and_flagged_where_echoes_are_strong(image_snr_db):
+def test_wrong_code_is_not_confirmed_and_flagged_if_strong(image_snr_db):
     for seed in range(12):
         rng = np.random.default_rng(seed)
         found = own_code(echoes(rng, 1 + seed % 6, image_snr_db=image_snr_db) * wrong(rng), prefix_cells=PREFIX)
@@ -60,12 +61,12 @@ def test_a_wrong_code_is_never_confirmed_and_flagged_where_echoes_are_strong(ima
             assert "code is wrong" in found.flags["code_unconfirmed"]
 
 
-def test_noise_neither_confirms_a_code_nor_denies_it():
-    found = [own_code(noise(np.random.default_rng(s)).astype(np.complex64), prefix_cells=PREFIX) for s in range(30)]
-    assert {one.carried for one in found} == {None}
+def test_noise_neither_confirms_nor_rejects_a_code():
+    verdicts = [own_code(noise(np.random.default_rng(s)).astype(np.complex64), prefix_cells=PREFIX) for s in range(30)]
+    assert {verdict.carried for verdict in verdicts} == {None}
 
 
-def test_a_prefix_as_long_as_the_period_leaves_nothing_to_compare_with():
+def test_prefix_as_long_as_the_period_gives_no_decision():
     found = own_code(echoes(np.random.default_rng(1)), prefix_cells=CELLS - 30)
     assert found.carried is None
     assert "too few others to measure the floor" in found.evidence
@@ -78,29 +79,29 @@ def stability(transfer, time_s=None):
 @pytest.mark.quick("*-1", "*-5")
 @pytest.mark.parametrize("targets", [1, 5, 60])
 @pytest.mark.parametrize(("phase_rad", "flagged"), [(0.0, False), (0.3, False), (1.0, True), (30.0, True)])
-def test_random_phase_of_own_pulses_is_seen_on_points_and_on_clutter(targets, phase_rad, flagged):
+def test_random_phase_is_detected_on_points_and_clutter(targets, phase_rad, flagged):
     for seed in range(4):
         found = stability(echoes(np.random.default_rng(seed), targets, phase_rad=phase_rad))
         assert ("phase_unstable" in found.flags) is flagged
-        if phase_rad == 0.3:  # σ of a second difference of white phase noise is √6 of its own
+        if phase_rad == 0.3:  # the standard deviation of a second difference of white phase noise is √6 times its own
             assert found.rms_rad == pytest.approx(np.sqrt(6) * 0.3, rel=0.2)
 
 
 @pytest.mark.quick("3-*")
 @pytest.mark.parametrize("step_m", [0.06, 0.15, 0.3])
 @pytest.mark.parametrize("targets", [3, 60])
-def test_a_sparsely_sampled_flight_is_not_taken_for_an_unstable_one(step_m, targets):
+def test_sparse_sampling_is_not_mistaken_for_unstable_phase(step_m, targets):
     for seed in range(4):
         found = stability(echoes(np.random.default_rng(seed), targets, step_m=step_m))
         assert found is None or found.flags == {}
 
 
-def test_noise_alone_decides_nothing():
+def test_noise_gives_no_phase_stability():
     assert stability(noise(np.random.default_rng(1)).astype(np.complex64)) is None
     assert stability(echoes(np.random.default_rng(1), image_snr_db=20.0)) is None
 
 
-def test_missed_pulses_do_not_count_as_jumps_of_phase():
+def test_missed_pulses_are_no_phase_jumps():
     rng = np.random.default_rng(2)
     kept = np.sort(rng.choice(PULSES, 150, replace=False))
     transfer = echoes(rng, 3, step_m=0.1)[kept]

@@ -1,4 +1,4 @@
-"""A pulse sent once: its captures are a linear convolution, which one DFT as long as they are undoes."""
+"""Single-pulse waveforms: captures are linear convolutions, inverted by one DFT of the capture length."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from apertura.stages.transmitted import read_pulse, transmitted
 RATE = 256e6
 SIZES = {"bandwidth_hz": 128e6, "pulse_s": 2e-6, "sample_rate_hz": RATE}
 NAMES = ["chirp", "pn", "golay"]
-HALF_BAND = 0.25  # of the sampled band: what codes of two samples per chip and a chirp over half the rate fill
+HALF_BAND = 0.25  # of the sampled band: occupied by codes of two samples per chip and by a chirp over half the rate
 LENGTH = 900
 
 
@@ -33,15 +33,15 @@ def middle_band(length=LENGTH, share=HALF_BAND):
 
 
 def delayed(pulse, delay_samples, lead=0.0, *, carrier_hz=1.2e9, length=LENGTH):
-    """A capture of one echo, by the definition: the samples as band-limited functions of time, summed."""
+    """Return a capture of one echo by definition: a sum of band-limited interpolation functions."""
     time = np.arange(length)[:, None] - np.arange(len(pulse)) - delay_samples - lead
     return (np.sinc(time) @ pulse) * np.exp(-2j * np.pi * carrier_hz * delay_samples / RATE)
 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("lead", [0, 33.25])
-def test_a_dft_of_the_whole_capture_divided_by_the_pulse_gives_every_echo_its_delay(name, lead):
-    """H_k = Y_k/S_k: amplitude and phase of each path at f = carrier + k·f_s/L, wherever the capture begins."""
+def test_capture_spectrum_over_pulse_spectrum_gives_delays(name, lead):
+    """H_k = Y_k/S_k: amplitude and phase of each path at f = carrier + k·f_s/L, for any start of the capture."""
     pulse = pulse_samples(name, **SIZES)
     numbers = middle_band()
     numerology = numerology_of(numbers, LENGTH - len(pulse) - 34)
@@ -58,7 +58,7 @@ def test_a_dft_of_the_whole_capture_divided_by_the_pulse_gives_every_echo_its_de
     assert np.abs(measured - expected)[strong].max() < 0.02
 
 
-def test_an_echo_that_the_capture_does_not_hold_to_its_end_is_not_exact():
+def test_truncated_echo_is_inexact():
     pulse = pulse_samples("chirp", **SIZES)
     numbers = middle_band()
     spectrum = pulse_spectrum(pulse, lead=0, length=LENGTH)[numbers % LENGTH]
@@ -73,7 +73,7 @@ def test_an_echo_that_the_capture_does_not_hold_to_its_end_is_not_exact():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_simulated_captures_are_the_pulse_delayed(name):
+def test_simulated_captures_are_delayed_pulses(name):
     pulse = pulse_samples(name, **SIZES)
     wave = TransmitPulse.of(
         pulse, carrier_hz=1.2e9, sample_rate_hz=RATE, prf_hz=1e3, lead_s=0.1e-6, listen_s=1e-6, band_hz=(-64e6, 64e6)
@@ -83,20 +83,21 @@ def test_simulated_captures_are_the_pulse_delayed(name):
     channel = Channel(wave, paths, np.ones(len(wave.codes)), np.zeros(1), np.zeros(1))
     expected = sum(
         level * delayed(pulse, delay, 25.6, length=wave.capture_samples)
+        # echoes after the capture or before it are not recorded
         for delay, level in (
             (20.3, 1.0),
             (150.0, 0.3j),
-        )  # what comes after the capture, or ends before it, is not heard
+        )
     )
     assert np.abs(samples(channel, None)[0] - expected).max() < 0.01
     carried = samples(
         Channel(wave, paths.at(slice(None)), np.ones(len(wave.codes)), np.zeros(1), np.zeros(1), sfo_hz=1e-6), None
     )
-    assert np.abs(carried[0] - expected).max() < 0.01  # by the road of a clock that is off
+    assert np.abs(carried[0] - expected).max() < 0.01  # through the simulation path for clock offsets
 
 
 @pytest.mark.parametrize(("name", "widest"), [("chirp", 0.26), ("pn", 0.48), ("golay", 0.48)])
-def test_a_band_that_nobody_states_is_where_the_pulse_is(name, widest):
+def test_default_band_is_that_of_the_pulse(name, widest):
     pulse = pulse_samples(name, **SIZES)
     first, last = occupied_band(np.abs(pulse_spectrum(pulse, lead=0, length=LENGTH)) ** 2)
     assert -widest * LENGTH < first < -0.23 * LENGTH
@@ -106,8 +107,8 @@ def test_a_band_that_nobody_states_is_where_the_pulse_is(name, widest):
 @pytest.mark.quick("inverse-chirp", "matched-golay")
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("requested", ["inverse", "matched"])
-def test_the_filter_loses_what_it_says(name, requested):
-    """Noise through the filter, against N·SNR of the matched one."""
+def test_snr_loss_of_the_filter_is_as_reported(name, requested):
+    """Noise through the filter, against N·SNR of the matched filter."""
     pulse = pulse_samples(name, **SIZES)
     spectrum = pulse_spectrum(pulse, lead=0, length=LENGTH)[middle_band() % LENGTH]
     chosen = pulse_filter(spectrum, requested=requested)
@@ -119,7 +120,7 @@ def test_the_filter_loses_what_it_says(name, requested):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_inverse_leaves_the_sidelobes_of_the_window_and_matched_those_of_the_pulse(name):
+def test_inverse_has_window_and_matched_has_pulse_sidelobes(name):
     numbers = middle_band()
     spectrum = pulse_spectrum(pulse_samples(name, **SIZES), lead=0, length=LENGTH)[numbers % LENGTH]
     window = np.hanning(spectrum.size)
@@ -134,12 +135,12 @@ def test_inverse_leaves_the_sidelobes_of_the_window_and_matched_those_of_the_pul
         assert highest["matched"] > -24
 
 
-def test_auto_takes_matched_for_a_flat_spectrum_inverse_for_an_uneven_one_and_matched_for_one_with_gaps():
+def test_auto_filter_depends_on_the_pulse_spectrum():
     rng = np.random.default_rng(1)
     flat = np.exp(2j * np.pi * rng.random(500))
     uneven = flat * (1 + 0.3 * np.cos(np.arange(500) / 20))
     gaps = flat * np.where(np.arange(500) % 2, 1.0, 1e-3)
-    assert [pulse_filter(one, requested="auto").report["filter"] for one in (flat, uneven, gaps)] == [
+    assert [pulse_filter(spectrum, requested="auto").report["filter"] for spectrum in (flat, uneven, gaps)] == [
         "matched",
         "inverse",
         "matched",
@@ -155,20 +156,20 @@ def test_auto_takes_matched_for_a_flat_spectrum_inverse_for_an_uneven_one_and_ma
 
 
 @pytest.mark.parametrize("cfo_hz", [0.0, 3e4])
-def test_division_needs_no_clock_where_the_pulse_is_sent_once(cfo_hz):
-    """A carrier that is off moves both spectra alike; of their ratio only 2π·CFO·(delay difference) is left."""
+def test_division_needs_no_clock_for_a_single_pulse(cfo_hz):
+    """A carrier offset displaces both spectra alike; their ratio keeps only 2π·CFO·(delay difference)."""
     pulse = pulse_samples("pn", **SIZES)
     numbers = middle_band()
-    turn = np.exp(-2j * np.pi * cfo_hz / RATE * np.arange(LENGTH))
+    rotation = np.exp(-2j * np.pi * cfo_hz / RATE * np.arange(LENGTH))
     delays = {"radar": 120.3, "sidelink": 10.0}
     iq = {}
     for name, delay in delays.items():
-        capture = 2000 * delayed(pulse, delay) * turn
+        capture = 2000 * delayed(pulse, delay) * rotation
         iq[name] = np.stack([capture.real, capture.imag], -1).round().astype(np.int16)[None].repeat(40, 0)
     spectrum = pulse_spectrum(pulse, lead=0, length=LENGTH)[numbers % LENGTH]
     numerology = numerology_of(numbers, LENGTH - len(pulse))
     measured = transfer_by_sidelink(
-        lambda some: {name: one[some] for name, one in iq.items()},
+        lambda pulses: {name: samples[pulses] for name, samples in iq.items()},
         pulse_filter(spectrum, requested="inverse").inverse,
         numerology,
         symbol_samples=LENGTH,
@@ -177,7 +178,7 @@ def test_division_needs_no_clock_where_the_pulse_is_sent_once(cfo_hz):
         accuracy_db=-60.0,
         where="here",
     )
-    formed = np.concatenate([measured.form(some) for some in blocks_of(np.arange(40))])[0]
+    formed = np.concatenate([measured.form(pulses) for pulses in blocks_of(np.arange(40))])[0]
     after_s = (delays["radar"] - delays["sidelink"]) / RATE
     expected = np.exp(-2j * np.pi * (numerology.frequency_hz + cfo_hz) * after_s)
     coherent = np.abs(np.vdot(expected, formed)) / np.sqrt((np.abs(formed) ** 2).sum() * formed.size)
@@ -187,10 +188,10 @@ def test_division_needs_no_clock_where_the_pulse_is_sent_once(cfo_hz):
     assert measured.report["clock"]["reason"].startswith("not measurable: a pulse that is sent once has no repetition")
 
 
-def test_captures_that_begin_in_the_direct_pulse_or_end_in_it_are_counted():
-    held = {"lead_s": 0.2e-6, "pulse_s": 1e-6, "listen_s": 0.5e-6, "cell_s": 2.5e-9}
-    assert truncation_flags(np.array([0.0, -0.2e-6, 0.5e-6, np.nan]), **held) == {}
-    assert "2 of 3 pulses" in truncation_flags(np.array([0.0, -0.25e-6, 0.75e-6]), **held)["pulse_truncated"]
+def test_captures_that_truncate_the_direct_pulse_are_counted():
+    durations = {"lead_s": 0.2e-6, "pulse_s": 1e-6, "listen_s": 0.5e-6, "cell_s": 2.5e-9}
+    assert truncation_flags(np.array([0.0, -0.2e-6, 0.5e-6, np.nan]), **durations) == {}
+    assert "2 of 3 pulses" in truncation_flags(np.array([0.0, -0.25e-6, 0.75e-6]), **durations)["pulse_truncated"]
 
 
 PULSE = {
@@ -209,7 +210,7 @@ def settings(**more):
 
 
 @pytest.mark.parametrize(
-    ("changed", "told"),
+    ("changed", "message"),
     [
         ({"band_hz": [-64e6, 129e6]}, "must be ascending and within"),
         ({"band_hz": [64e6, -64e6]}, "must be ascending"),
@@ -218,13 +219,13 @@ def settings(**more):
         ({"pulse_s": 0.0}, "waveform.pulse_s"),
     ],
 )
-def test_what_a_pulse_cannot_be_is_told(changed, told):
-    with pytest.raises(CampaignError, match=told):
+def test_invalid_pulse_settings_are_rejected(changed, message):
+    with pytest.raises(CampaignError, match=message):
         settings(**changed)
 
 
 @pytest.mark.parametrize(
-    ("stored", "told"),
+    ("stored", "message"),
     [
         (None, "no such file"),
         (np.ones(255, np.complex64), r"complex64 of shape \(255,\)"),
@@ -236,15 +237,15 @@ def test_what_a_pulse_cannot_be_is_told(changed, told):
         (np.zeros((256, 2), np.int16), "all samples are zero"),
     ],
 )
-def test_a_file_that_is_not_the_pulse_is_told(tmp_path, stored, told):
+def test_invalid_pulse_file_is_rejected(tmp_path, stored, message):
     path = tmp_path / "pulse.npy"
     if stored is not None:
         np.save(path, stored)
-    with pytest.raises(CampaignError, match=told):
+    with pytest.raises(CampaignError, match=message):
         read_pulse(path, PulseWaveform(**PULSE))
 
 
-def test_pairs_of_integers_are_the_same_pulse_as_complex_numbers(tmp_path):
+def test_integer_pairs_are_read_as_complex_samples(tmp_path):
     pulse = np.exp(1j * np.arange(256) ** 2 / 100)
     np.save(tmp_path / "one.npy", pulse.astype(np.complex64))
     np.save(tmp_path / "two.npy", np.stack([pulse.real, pulse.imag], -1).__mul__(32000).round().astype(np.int16))
@@ -262,14 +263,14 @@ def campaign_with(root, pulse, **waveform):
     return Campaign.load(root)
 
 
-def test_a_band_without_the_pulse_is_told(tmp_path):
+def test_band_without_the_pulse_is_rejected(tmp_path):
     pulse = np.exp(1j * np.pi * 40e6 / 1e-6 * ((np.arange(256) - 128) / 256e6) ** 2)
     campaign = campaign_with(tmp_path, pulse, band_hz=[90e6, 120e6])
     with pytest.raises(CampaignError, match="of the pulse's energy in"):
         transmitted(campaign, campaign.settings.waveform)
 
 
-def test_what_was_sent_has_the_band_of_the_pulse_and_all_of_the_capture(tmp_path):
+def test_transmitted_pulse_has_its_band_and_capture_length(tmp_path):
     pulse = np.exp(1j * np.pi * 100e6 / 1e-6 * ((np.arange(256) - 128) / 256e6) ** 2)
     campaign = campaign_with(tmp_path, pulse, lead_s=0.25e-6)
     sent = transmitted(campaign, campaign.settings.waveform)

@@ -1,4 +1,4 @@
-"""A flight is read in blocks: what comes out does not depend on them, and memory not on its length."""
+"""Block processing of a flight: results do not depend on the blocks, and memory does not grow with the length."""
 
 import tracemalloc
 
@@ -20,7 +20,7 @@ SYMBOL = 64 + 256 + 40
 
 
 def recorded(pulses, *, first=0, ppm=0.0):
-    """Return channel → captures, (pulse, sample, 2) int16, of a sidelink and one echo."""
+    """Return captures per channel, (pulse, sample, 2) int16, of a sidelink and one echo."""
     time, frequency = np.arange(SYMBOL) / 32e6, 1.2e9 + np.arange(200) * 125e3
     waves = np.exp(2j * np.pi * np.arange(200)[:, None] * 125e3 * (time - 2e-6))
     iq = {"radar": [], "sidelink": []}
@@ -38,7 +38,7 @@ def recorded(pulses, *, first=0, ppm=0.0):
 def formed(iq, **more):
     pulses = len(iq["radar"])
     measured = transfer_by_sidelink(
-        lambda some: {name: samples[some] for name, samples in iq.items()},
+        lambda pulses: {name: samples[pulses] for name, samples in iq.items()},
         1 / CODES,
         NUMEROLOGY,
         symbol_samples=SYMBOL,
@@ -47,19 +47,19 @@ def formed(iq, **more):
         where="here",
         **({"method": "auto"} | more),
     )
-    return measured, np.concatenate([measured.form(some) for some in blocks_of(np.flatnonzero(measured.kept))])
+    return measured, np.concatenate([measured.form(pulses) for pulses in blocks_of(np.flatnonzero(measured.kept))])
 
 
 @pytest.mark.parametrize("method", ["divide", "wiener", "gated", "two_parameter"])
-def test_transfer_functions_do_not_depend_on_the_blocks_they_are_formed_in(method):
+def test_transfer_functions_do_not_depend_on_block_size(method):
     iq = recorded(70)
     measured, whole = formed(iq, method=method)
-    odd = np.concatenate([measured.form(some) for some in blocks_of(np.arange(70), 23)])
+    odd = np.concatenate([measured.form(pulses) for pulses in blocks_of(np.arange(70), 23)])
     np.testing.assert_array_equal(odd, whole)
 
 
-def test_a_secondary_gives_the_echo_of_its_scene_whatever_phase_and_start_its_captures_have():
-    """After division the echo runs 0.45 µs behind the sidelink, and 10 ps more with every pulse."""
+def test_random_phase_and_start_of_captures_are_removed():
+    """After division the echo is 0.45 µs after the sidelink, and 10 ps more with every pulse."""
     _, whole = formed(recorded(40))
     delay_s = 0.45e-6 + 1e-11 * np.arange(40)
     straight = remove_path(whole, NUMEROLOGY.frequency_hz, delay_s=delay_s)
@@ -67,12 +67,12 @@ def test_a_secondary_gives_the_echo_of_its_scene_whatever_phase_and_start_its_ca
     assert together > 0.995
 
 
-def test_the_state_of_a_sidelink_is_the_same_in_any_blocks():
+def test_sidelink_state_does_not_depend_on_block_size():
     rng = np.random.default_rng(3)
     sidelink = (8 + rng.normal(size=(150, 128)) + 1j * rng.normal(size=(150, 128))).astype(np.complex64)
     in_one, in_many = (
         measure(sidelink),
-        measure_blocks(lambda: (sidelink[some] for some in blocks_of(np.arange(150), 31))),
+        measure_blocks(lambda: (sidelink[pulses] for pulses in blocks_of(np.arange(150), 31))),
     )
     np.testing.assert_array_equal(in_many.locked, in_one.locked)
     np.testing.assert_allclose(in_many.delay_cells, in_one.delay_cells, atol=1e-6)
@@ -80,18 +80,18 @@ def test_the_state_of_a_sidelink_is_the_same_in_any_blocks():
         assert getattr(in_many, name) == pytest.approx(getattr(in_one, name), abs=1e-3), name
 
 
-def test_a_code_that_is_not_carried_is_told_across_blocks():
-    """Neighbouring pulses agree, also the last of a block and the first of the next."""
+def test_wrong_code_is_detected_across_blocks():
+    """Neighbouring pulses agree, also across the boundary between blocks."""
     rng = np.random.default_rng(4)
-    wrong = np.exp(2j * np.pi * rng.random(128))
-    sidelink = (20 * wrong + rng.normal(size=(9, 128)) + 1j * rng.normal(size=(9, 128))).astype(np.complex64)
-    state = measure_blocks(lambda: (sidelink[some] for some in blocks_of(np.arange(9), 1)))
+    wrong_code = np.exp(2j * np.pi * rng.random(128))
+    sidelink = (20 * wrong_code + rng.normal(size=(9, 128)) + 1j * rng.normal(size=(9, 128))).astype(np.complex64)
+    state = measure_blocks(lambda: (sidelink[pulses] for pulses in blocks_of(np.arange(9), 1)))
     assert "wrong_code" in state.flags
     assert state.locked.all()
 
 
-def test_the_delay_of_a_direct_path_is_the_most_likely_one():
-    """Its power |Σ S_n exp(j2πn·delay/N)|² does not grow to either side; noise, ripple and an echo are in it."""
+def test_direct_path_delay_maximises_the_likelihood():
+    """The power |Σ S_n exp(j2πn·delay/N)|² decreases on both sides, with noise, ripple and an echo."""
     rng = np.random.default_rng(5)
     number = np.arange(300) - 149.5
     delay = rng.uniform(-140, 140, 50)
@@ -108,13 +108,13 @@ def test_the_delay_of_a_direct_path_is_the_most_likely_one():
         assert (power(found + step) < power(found)).all()
 
 
-def test_a_clock_is_measured_as_well_on_stretches_of_a_long_flight():
-    """8 ppm, on 16 stretches of 8 of 640 pulses: as all of them, and near the truth."""
+def test_clock_is_measured_on_groups_of_a_long_flight():
+    """8 ppm, from 16 groups of 8 of 640 pulses: consistent with the estimate from all, and near the truth."""
     iq = recorded(640, ppm=8.0)["sidelink"]
     samples = transfer.as_complex(iq)
     groups = spread(640, groups=16, each=8)
     assert sum(map(len, groups)) == 128
-    part = clock_of((samples[some] for some in groups), NUMEROLOGY, pulses=640)
+    part = clock_of((samples[pulses] for pulses in groups), NUMEROLOGY, pulses=640)
     whole = estimate_clock(samples, NUMEROLOGY)
     assert part.cfo_hz == pytest.approx(whole.cfo_hz, abs=4 * part.cfo_std_hz)
     assert part.cfo_hz == pytest.approx(9600, abs=20)
@@ -122,18 +122,18 @@ def test_a_clock_is_measured_as_well_on_stretches_of_a_long_flight():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("moved_m", [0.0, 9.0])
-def test_jitter_of_a_long_flight_is_not_taken_for_wrong_pulses(moved_m):
-    """The highest of 300 000 medians is further out than that of a thousand; what moves further still is seen."""
+@pytest.mark.parametrize("displacement_m", [0.0, 9.0])
+def test_jitter_of_a_long_flight_is_no_wrong_association(displacement_m):
+    """The largest of 300 000 medians exceeds that of a thousand; a larger displacement is still detected."""
     rng = np.random.default_rng(3)
     delay_m = 12 + rng.uniform(-12, 12, 300_000)
-    delay_m[100_000:100_300] += moved_m
+    delay_m[100_000:100_300] += displacement_m
     found = detect_wrong_association(baseline_residual(delay_m, np.full(300_000, 12.0)))
-    assert (found is not None) == (moved_m > 0)
+    assert (found is not None) == (displacement_m > 0)
 
 
-def test_saturation_is_that_of_all_blocks_together():
-    """Extremes that only a later block reaches replace those of the earlier ones."""
+def test_saturation_counts_all_blocks():
+    """Extremes reached only by a later block replace those of earlier blocks."""
     saturation = Saturation()
     for values in ([1, 5, 5, -3], [7, 7, 7, -3], [7, 0, 0, -9]):
         saturation.count({"radar": np.array(values, np.int16).reshape(1, 2, 2)})
@@ -141,20 +141,20 @@ def test_saturation_is_that_of_all_blocks_together():
 
 
 def symbols(generator, captures):
-    """Noise with the envelope of OFDM symbols, 12 dB of crest factor, as (capture, sample, 2) counts."""
+    """Return noise with the envelope of OFDM symbols, crest factor 12 dB, as (capture, sample, 2) counts."""
     return generator.normal(0, 1500, (captures, 2048, 2))
 
 
 def limited(iq, share):
-    """Limit each component to a share of its largest value."""
+    """Limit each component to a share of its maximum."""
     return iq.clip(-share * np.abs(iq).max(), share * np.abs(iq).max())
 
 
 @pytest.mark.parametrize(
     ("share", "every", "flagged"), [(1 / 8, 5, True), (1 / 4, 5, True), (1 / 2, 5, False), (1 / 8, 100, False)]
 )
-def test_captures_that_the_receiver_limited_are_counted(share, every, flagged):
-    """At half of the peak, 2.6 deviations of a component, limiting costs less than 0.1 dB; of 1 % of captures too."""
+def test_limited_captures_are_counted(share, every, flagged):
+    """Limiting at half of the peak, 2.6 standard deviations, costs under 0.1 dB, as does limiting 1 % of captures."""
     generator, saturation = np.random.default_rng(1), Saturation()
     iq = symbols(generator, 200)
     iq[::every] = limited(iq[::every], share)
@@ -164,12 +164,12 @@ def test_captures_that_the_receiver_limited_are_counted(share, every, flagged):
     assert line.startswith("40 of 200 captures of channel radar: crest factor") if flagged else line == ""
 
 
-def test_captures_that_are_weak_or_hold_a_tone_are_not_limited():
-    """Fading lowers the peak alone; a strong tone lowers the crest factor alone; lost pulses leave noise."""
+def test_weak_captures_and_tones_are_not_counted_as_limited():
+    """Fading lowers only the peak; a strong tone lowers only the crest factor; lost pulses leave noise."""
     generator, saturation = np.random.default_rng(2), Saturation()
     faded = symbols(generator, 200) * np.geomspace(1, 0.01, 200)[:, None, None]
-    turn = 0.3 * np.arange(2048)
-    tone = symbols(generator, 20) + 20000 * np.stack([np.cos(turn), np.sin(turn)], -1)
+    phase_rad = 0.3 * np.arange(2048)
+    tone = symbols(generator, 20) + 20000 * np.stack([np.cos(phase_rad), np.sin(phase_rad)], -1)
     pulse = symbols(generator, 40) * 0.01
     pulse[:30, 100:140] += 9000
     for name, iq in (("faded", faded), ("tone", np.concatenate([faded, tone])), ("pulses", pulse)):
@@ -177,15 +177,15 @@ def test_captures_that_are_weak_or_hold_a_tone_are_not_limited():
     assert "captures_limited" not in saturation.flags
 
 
-def test_a_long_flight_takes_no_more_memory_than_a_short_one(monkeypatch):
-    """Ten times the pulses, the same peak but for a few numbers per pulse; captures come from nowhere."""
+def test_memory_does_not_grow_with_the_length_of_a_flight(monkeypatch):
+    """Ten times the pulses with the same peak except a few numbers per pulse; captures are generated on reading."""
     monkeypatch.setattr(transfer, "_STRETCH", 8)
-    some = recorded(64)["radar"]
+    captures = recorded(64)["radar"]
     peaks = []
     for pulses in (500, 5000):
         tracemalloc.start()
         measured = transfer_by_code(
-            lambda wanted: {"radar": some[wanted % 64]}, 1 / CODES, NUMEROLOGY, time_s=np.arange(pulses) / 20
+            lambda pulses: {"radar": captures[pulses % 64]}, 1 / CODES, NUMEROLOGY, time_s=np.arange(pulses) / 20
         )
         for block in blocks_of(np.arange(pulses)):
             assert measured.form(block).shape == (len(block), 200)

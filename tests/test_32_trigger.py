@@ -1,4 +1,4 @@
-"""Triggering on a preamble in a recording that never stops: what is detected, what is not, at what cost."""
+"""Triggering on a preamble in a continuous recording: detections, misses and false alarms."""
 
 import tracemalloc
 
@@ -46,7 +46,7 @@ def find(recording, *, block=50_000, false_alarms_per_s=ALARMS_PER_S):
 
 @pytest.mark.parametrize("snr_db", [-10, 10, 30])
 @pytest.mark.parametrize("block", [333, 50_000, 10**9])
-def test_every_preamble_is_detected_where_it_is_however_the_stream_is_cut(snr_db, block):
+def test_preambles_are_located_for_any_block_size(snr_db, block):
     rng = np.random.default_rng(1)
     starts = 70_000 * np.arange(4) + rng.integers(10, 60_000, 4)
     detections = find(record(starts, snr_db, 300_000, rng), block=block)
@@ -54,14 +54,14 @@ def test_every_preamble_is_detected_where_it_is_however_the_stream_is_cut(snr_db
     assert np.mean([detection.snr_db for detection in detections]) == pytest.approx(snr_db, abs=1)
 
 
-def test_a_preamble_across_the_seam_of_two_transforms_is_detected():
+def test_preamble_across_two_transforms_is_detected():
     rng = np.random.default_rng(2)
-    step = 2**16 - (FRAMING.template().size - 1)  # places that one transform decides
+    step = 2**16 - (FRAMING.template().size - 1)  # positions decided by one transform
     starts = [step, 2 * step - 1, 3 * step + 3]
     assert [detection.sample for detection in find(record(starts, 20, 250_000, rng))] == starts
 
 
-def test_a_clock_of_10_khz_off_does_not_hide_a_preamble():
+def test_clock_offset_of_10_khz_does_not_hide_a_preamble():
     starts = [4000]
     detections = find(record(starts, -12, 20_000, np.random.default_rng(3), cfo_hz=10e3))
     assert [detection.sample for detection in detections] == pytest.approx(starts, abs=1)
@@ -69,18 +69,18 @@ def test_a_clock_of_10_khz_off_does_not_hide_a_preamble():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [3.0, 1000.0])
-def test_noise_triggers_at_the_set_rate_at_any_level(sigma):
+def test_noise_triggers_at_the_configured_rate_at_any_level(sigma):
     rng = np.random.default_rng(4)
     samples = 4_000_000
-    alarms_per_s = 2e-5 * RATE_HZ  # one in 50 000 samples, so that 80 can be expected
+    alarms_per_s = 2e-5 * RATE_HZ  # one in 50 000 samples, so that 80 are expected
     detections = find(record([], 0, samples, rng, sigma=sigma), false_alarms_per_s=alarms_per_s)
     expected = alarms_per_s * samples / RATE_HZ
-    # neighbouring samples alarm together and a frame of silence follows: fewer than set, never more
+    # neighbouring samples alarm together and a frame of dead time follows: fewer than configured, never more
     assert 0.6 * expected < len(detections) < expected + 2 * np.sqrt(expected)
 
 
 def theory(snr_db, false_alarm):
-    """Return the chance that |Σ template*·x|² passes the threshold: noncentral χ² of two degrees."""
+    """Return the probability that |Σ template*·x|² exceeds the threshold: noncentral χ² with two degrees of freedom."""
     length, ratio = FRAMING.template().size, 10 ** (snr_db / 10)
     threshold = score_threshold(length, false_alarm) * (length * (1 + ratio))
     return ncx2.sf(2 * threshold, 2, 2 * length * ratio)
@@ -88,7 +88,7 @@ def theory(snr_db, false_alarm):
 
 @pytest.mark.quick("-13.0")
 @pytest.mark.parametrize("snr_db", [-17.5, -16.0, -15.0, -13.0])
-def test_detection_probability_is_that_of_theory_and_99_percent_at_minus_13_db(snr_db):
+def test_detection_probability_matches_theory(snr_db):
     rng = np.random.default_rng(5)
     trials = 300
     starts = 5000 * np.arange(trials) + rng.integers(100, 1000, trials)
@@ -99,7 +99,7 @@ def test_detection_probability_is_that_of_theory_and_99_percent_at_minus_13_db(s
     assert hits >= 0.99 * trials or snr_db < -13
 
 
-def test_the_symbol_behind_a_preamble_does_not_trigger_again():
+def test_symbol_after_a_preamble_does_not_trigger():
     rng = np.random.default_rng(6)
     starts = 8000 * np.arange(30) + 100
     detections = find(record(starts, 25, 8000 * 31, rng), false_alarms_per_s=1e-5 * RATE_HZ)
@@ -108,7 +108,7 @@ def test_the_symbol_behind_a_preamble_does_not_trigger_again():
     assert set(starts) <= {detection.sample for detection in detections}
 
 
-def test_the_counter_of_a_frame_is_read_and_wraps():
+def test_frame_counter_is_read_and_wraps():
     rng = np.random.default_rng(7)
     starts = 6000 * np.arange(80) + 50
     recording = record(starts, 5, 6000 * 81, rng, cfo_hz=5e3)
@@ -116,7 +116,7 @@ def test_the_counter_of_a_frame_is_read_and_wraps():
     assert numbers == [(200 + i) % 256 for i in range(80)]
 
 
-def test_a_counter_drowned_in_noise_is_absent_rather_than_wrong():
+def test_counter_in_noise_is_absent_rather_than_wrong():
     rng = np.random.default_rng(8)
     starts = 6000 * np.arange(80) + 50
     recording = record(starts, -15, 6000 * 81, rng)
@@ -142,7 +142,7 @@ def test_memory_does_not_grow_with_the_recording():
     assert peak(80) < 1.05 * peak(8)
 
 
-def test_a_recording_shorter_than_its_preamble_holds_none():
+def test_recording_shorter_than_a_preamble_has_none():
     assert find(record([], 0, 500, np.random.default_rng(10))) == []
 
 
@@ -151,6 +151,6 @@ def test_silence_does_not_trigger():
 
 
 @pytest.mark.parametrize("rate", [0.0, -1.0, 2e8])
-def test_an_impossible_rate_of_false_alarms_is_refused(rate):
+def test_invalid_false_alarm_rate_is_rejected(rate):
     with pytest.raises(ValueError, match="false_alarm"):
         find(np.zeros((5000, 2), np.int16), false_alarms_per_s=rate)

@@ -1,4 +1,4 @@
-"""Terrain: heights where they are true, datums never guessed, and what of it a radar can see."""
+"""Terrain from DEMs: heights at their positions, vertical datums, voids, coverage."""
 
 import struct
 from dataclasses import replace
@@ -30,7 +30,7 @@ def write_dem(path, heights, transform, crs="EPSG:32632", **profile):
 
 
 def plane_dem(path, slope=(0.0, 0.0), base=600.0, crs="EPSG:32632", **profile):
-    """Posts every 2 m from (500000, 5400100) to the south-east; `slope` east and north, metres per metre."""
+    """Write a DEM with 2 m posts south-east of (500000, 5400100); `slope` to east and north, metres per metre."""
     east, north = 500001.0 + 2 * np.arange(60), 5400099.0 - 2 * np.arange(60)
     heights = base + slope[0] * (east[None] - 500060) + slope[1] * (north[:, None] - 5400040)
     return write_dem(path, heights, from_origin(500000, 5400100, 2, 2), crs, **profile)
@@ -39,14 +39,14 @@ def plane_dem(path, slope=(0.0, 0.0), base=600.0, crs="EPSG:32632", **profile):
 # Heights
 
 
-def test_a_plane_comes_out_of_the_dem_as_a_plane(tmp_path):
+def test_plane_is_interpolated_exactly(tmp_path):
     heights = open_dem(plane_dem(tmp_path / "dem.tif", (0.3, -0.2)), UTM_GRID.crs, datum="ellipsoid").heights(UTM_GRID)
     expected = 600 + 0.3 * (UTM_GRID.x_m[None] - 500060) - 0.2 * (UTM_GRID.y_m[:, None] - 5400040)
     np.testing.assert_allclose(heights, expected, atol=1e-6)
 
 
-def test_heights_above_a_geoid_are_raised_by_its_undulation(tmp_path):
-    """Of a geoid that slopes to the east, 40 m above the ellipsoid at 8° and 48 m at 10°; the scene lies at 9°."""
+def test_geoid_undulation_is_added_to_heights(tmp_path):
+    """A geoid that slopes to the east, 40 m above the ellipsoid at 8° and 48 m at 10°; the scene is at 9°."""
     gtx = tmp_path / "sloping.gtx"
     posts = np.broadcast_to([40.0, 44.0, 48.0], (3, 3)).astype(">f4")
     gtx.write_bytes(struct.pack(">4d2i", 47.0, 8.0, 1.0, 1.0, *posts.shape) + posts.tobytes())
@@ -56,8 +56,8 @@ def test_heights_above_a_geoid_are_raised_by_its_undulation(tmp_path):
     assert (np.diff(raised[0]) > 0).all()
 
 
-def test_a_dem_in_another_crs_puts_its_posts_where_they_are(shared):
-    """Each post of the isce3 DEM, looked up at its own place in UTM, has its own height."""
+def test_dem_in_another_crs_keeps_post_heights(shared):
+    """The height at each post's own position in UTM equals that of the post of the isce3 DEM."""
     path = shared / "dem_isce3" / "SanAnd_dem.tif"
     with rasterio.open(path) as raster:
         posts, transform = raster.read(1), raster.transform
@@ -65,12 +65,12 @@ def test_a_dem_in_another_crs_puts_its_posts_where_they_are(shared):
     terrain = open_dem(path, "EPSG:32611", datum="ellipsoid")
     for row, column in ((0, 0), (120, 50), (251, 107)):
         x, y = to_utm.transform(*(transform @ (column + 0.5, row + 0.5)))
-        place = SceneGrid("EPSG:32611", x - 0.5, y + 0.5, 1.0, (1, 1))
-        assert terrain.heights(place)[0, 0] == pytest.approx(posts[row, column], abs=2e-3)
+        post_grid = SceneGrid("EPSG:32611", x - 0.5, y + 0.5, 1.0, (1, 1))
+        assert terrain.heights(post_grid)[0, 0] == pytest.approx(posts[row, column], abs=2e-3)
 
 
-def test_egm96_heights_become_ellipsoidal_by_the_undulation_in_the_grid_file(shared):
-    """Against the .gtx read directly, without PROJ."""
+def test_egm96_heights_are_converted_by_the_grid_file(shared):
+    """Compared with the .gtx read directly, without PROJ."""
     path, gtx = shared / "dem_isce3" / "SanAnd_dem.tif", shared / "dem_isce3" / "egm96_15.gtx"
     grid = SceneGrid("EPSG:32611", 368000.0, 3783000.0, 40.0, (60, 50))
     raised = open_dem(path, grid.crs, datum="egm96", geoid=gtx).heights(grid)
@@ -87,7 +87,7 @@ def test_egm96_heights_become_ellipsoidal_by_the_undulation_in_the_grid_file(sha
     assert -36 < (raised - raw).mean() < -34
 
 
-def test_a_pixel_has_the_same_height_in_whatever_window(shared):
+def test_height_of_a_pixel_does_not_depend_on_the_window(shared):
     path, gtx = shared / "dem_isce3" / "SanAnd_dem.tif", shared / "dem_isce3" / "egm96_15.gtx"
     grid = SceneGrid("EPSG:32611", 368000.0, 3783000.0, 7.0, (100, 130))
     terrain = open_dem(path, grid.crs, datum="egm96", geoid=gtx)
@@ -96,7 +96,7 @@ def test_a_pixel_has_the_same_height_in_whatever_window(shared):
         np.testing.assert_array_equal(terrain.heights(grid[window]), whole[window])
 
 
-def test_a_missing_geoid_grid_is_an_error_that_names_it(shared, monkeypatch, tmp_path):
+def test_missing_geoid_grid_is_named(shared, monkeypatch, tmp_path):
     monkeypatch.setattr(geoid, "grid_folders", lambda: [tmp_path])
     path = shared / "dem_isce3" / "SanAnd_dem.tif"
     with pytest.raises(CampaignError, match=r"us_nga_egm96_15\.tif or egm96_15\.gtx.*scene\.geoid"):
@@ -107,7 +107,7 @@ def test_a_missing_geoid_grid_is_an_error_that_names_it(shared, monkeypatch, tmp
         open_dem(path, "EPSG:32611", datum="egm96", geoid=tmp_path / "nowhere.gtx")
 
 
-def test_a_geoid_grid_is_taken_from_the_search_path_of_proj(shared, monkeypatch, tmp_path):
+def test_geoid_grid_is_found_in_the_proj_search_path(shared, monkeypatch, tmp_path):
     folder = tmp_path / "with space"
     folder.mkdir()
     (folder / "egm96_15.gtx").write_bytes((shared / "dem_isce3" / "egm96_15.gtx").read_bytes())
@@ -117,31 +117,31 @@ def test_a_geoid_grid_is_taken_from_the_search_path_of_proj(shared, monkeypatch,
     assert np.isfinite(terrain.heights(SceneGrid("EPSG:32611", 368000.0, 3783000.0, 40.0, (3, 3)))).all()
 
 
-def test_a_geoid_grid_in_the_working_folder_opens_by_its_bare_name(shared, monkeypatch):
-    """As the workflow names it, from inside the campaign folder."""
+def test_geoid_grid_in_the_working_folder_is_opened(shared, monkeypatch):
+    """As named by the workflow, from inside the campaign folder."""
     monkeypatch.chdir(shared / "dem_isce3")
     terrain = open_dem(Path("SanAnd_dem.tif"), "EPSG:32611", datum="egm96", geoid=Path("egm96_15.gtx"))
     assert np.isfinite(terrain.heights(SceneGrid("EPSG:32611", 368000.0, 3783000.0, 40.0, (3, 3)))).all()
 
 
-def test_the_grid_of_another_geoid_is_refused(shared):
+def test_grid_of_another_geoid_is_rejected(shared):
     with pytest.raises(CampaignError, match="a geoid other than egm2008"):
         geoid.geoid_file("egm2008", shared / "dem_isce3" / "egm96_15.gtx")
 
 
-def test_what_the_dem_carries_is_taken_or_must_agree(shared, tmp_path, monkeypatch):
+def test_vertical_datum_of_the_dem_is_used_or_must_agree(shared, tmp_path, monkeypatch):
     monkeypatch.setattr(geoid, "grid_folders", lambda: [tmp_path])
     gtx = shared / "dem_isce3" / "egm96_15.gtx"
-    carrying = plane_dem(tmp_path / "carrying.tif", crs="EPSG:32632+5773")
-    silent = plane_dem(tmp_path / "silent.tif")
-    carried = open_dem(carrying, UTM_GRID.crs, datum="carried", geoid=gtx).heights(UTM_GRID)
-    stated = open_dem(silent, UTM_GRID.crs, datum="egm96", geoid=gtx).heights(UTM_GRID)
+    compound = plane_dem(tmp_path / "carrying.tif", crs="EPSG:32632+5773")
+    horizontal = plane_dem(tmp_path / "silent.tif")
+    carried = open_dem(compound, UTM_GRID.crs, datum="carried", geoid=gtx).heights(UTM_GRID)
+    stated = open_dem(horizontal, UTM_GRID.crs, datum="egm96", geoid=gtx).heights(UTM_GRID)
     np.testing.assert_allclose(carried, stated, atol=1e-6)
     assert 45 < (carried - 600).mean() < 50
     with pytest.raises(CampaignError, match="heights of egm96 declared by its own CRS"):
-        open_dem(carrying, UTM_GRID.crs, datum="ellipsoid")
+        open_dem(compound, UTM_GRID.crs, datum="ellipsoid")
     with pytest.raises(CampaignError, match="a CRS without heights"):
-        open_dem(silent, UTM_GRID.crs, datum="carried")
+        open_dem(horizontal, UTM_GRID.crs, datum="carried")
     with pytest.raises(CampaignError, match=r"de_bkg_gcg2016\.tif"):
         open_dem(plane_dem(tmp_path / "de.tif", crs="EPSG:25832+7837"), UTM_GRID.crs, datum="carried")
 
@@ -149,7 +149,7 @@ def test_what_the_dem_carries_is_taken_or_must_agree(shared, tmp_path, monkeypat
 @pytest.mark.parametrize(
     ("west", "sides"), [(499990.0, "to the west"), (500100.0, "to the east"), (500200.0, "100.0 % of the scene")]
 )
-def test_a_dem_that_does_not_reach_says_how_much_is_missing_and_where(tmp_path, west, sides):
+def test_incomplete_cover_is_reported_with_share_and_side(tmp_path, west, sides):
     terrain = open_dem(plane_dem(tmp_path / "dem.tif"), UTM_GRID.crs, datum="ellipsoid")
     terrain.check_cover(UTM_GRID)
     grid = SceneGrid(UTM_GRID.crs, west, 5400060.0, 0.5, (70, 90))
@@ -162,7 +162,7 @@ def test_a_dem_that_does_not_reach_says_how_much_is_missing_and_where(tmp_path, 
 
 
 @pytest.mark.parametrize("void", ["nan", "nodata"])
-def test_a_void_reaches_as_far_as_its_post_counts_and_no_further(tmp_path, void):
+def test_void_affects_only_pixels_around_its_post(tmp_path, void):
     heights = np.full((60, 60), 600.0, np.float32)
     heights[30, 20] = np.nan if void == "nan" else -9999
     nodata = {} if void == "nan" else {"nodata": -9999}
@@ -174,8 +174,8 @@ def test_a_void_reaches_as_far_as_its_post_counts_and_no_further(tmp_path, void)
 
 
 @pytest.mark.parametrize("wild", [-9999.0, -32768.0, 3.4e38, 29029.0])
-def test_a_height_that_no_land_has_is_counted_where_it_counts(tmp_path, wild):
-    """Posts 20 and 21 of row 30 are under the scene, row 2 is not; in a local frame anything goes."""
+def test_implausible_heights_are_rejected_within_the_scene(tmp_path, wild):
+    """Posts 20 and 21 of row 30 are in the scene, row 2 is not; in a local frame any height is accepted."""
     heights = np.full((60, 60), 600.0)
     heights[2] = wild
     path, corner = tmp_path / "dem.tif", from_origin(500000, 5400100, 2, 2)
@@ -192,8 +192,8 @@ def test_a_height_that_no_land_has_is_counted_where_it_counts(tmp_path, wild):
 @pytest.mark.quick("EPSG:31467-EPSG:31287", "EPSG:4326-EPSG:32632")
 @pytest.mark.parametrize("crs", ["EPSG:31467", "EPSG:31287", "EPSG:25832", "EPSG:32632"])
 @pytest.mark.parametrize("dem_crs", ["EPSG:31467", "EPSG:32632", "EPSG:4326"])
-def test_heights_of_a_scene_count_from_wgs_84_whatever_its_crs(tmp_path, crs, dem_crs):
-    """Bessel's ellipsoid lies 47 m below WGS 84 there; a DEM at 620 m above WGS 84 and flat ground at 620 m are one."""
+def test_heights_refer_to_wgs_84_for_any_crs(tmp_path, crs, dem_crs):
+    """Bessel's ellipsoid is 47 m below WGS 84 there; a DEM and flat ground, both 620 m above WGS 84, must agree."""
     x, y = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(9.955, 48.42)
     grid = SceneGrid(crs, x, y, 1.0, (8, 8))
     west, north = Transformer.from_crs("EPSG:4326", dem_crs, always_xy=True).transform(9.954, 48.421)
@@ -209,8 +209,8 @@ def test_heights_of_a_scene_count_from_wgs_84_whatever_its_crs(tmp_path, crs, de
 
 @pytest.mark.parametrize("fill", [0, -1, 1, 255, 999])
 @pytest.mark.parametrize("side", [1, 2, 12])
-def test_a_void_filled_with_a_constant_is_refused_where_it_counts(tmp_path, fill, side):
-    """In hilly land near 400 m; the same block beside the scene does no harm."""
+def test_void_filled_with_a_constant_is_rejected_in_the_scene(tmp_path, fill, side):
+    """In hilly terrain near 400 m; the same block outside the scene is accepted."""
     heights = 400 + np.random.default_rng(5).normal(0, 3, (60, 60)).astype(np.float32)
     heights[2 : 2 + side, 50 - side : 50] = fill
     path, corner = tmp_path / "dem.tif", from_origin(500000, 5400100, 2, 2)
@@ -226,7 +226,7 @@ def test_a_void_filled_with_a_constant_is_refused_where_it_counts(tmp_path, fill
 
 
 @pytest.mark.parametrize("kind", ["sea cliff", "coast", "lake", "declared"])
-def test_land_that_has_a_height_of_fill_values_is_no_void(tmp_path, kind):
+def test_terrain_at_the_height_of_fill_values_is_no_void(tmp_path, kind):
     heights = 400 + np.random.default_rng(5).normal(0, 3, (60, 60))
     if kind == "sea cliff":
         heights[:, 25:] = 0
@@ -245,7 +245,7 @@ def test_land_that_has_a_height_of_fill_values_is_no_void(tmp_path, kind):
 @pytest.mark.parametrize(
     ("drop_m", "over_m", "found"), [(400, 2, True), (130, 2, True), (80, 2, False), (110, 40, False), (400, 40, True)]
 )
-def test_a_step_of_the_ground_is_found_where_it_is_steeper_than_79_degrees(tmp_path, drop_m, over_m, found):
+def test_terrain_step_steeper_than_79_degrees_is_found(tmp_path, drop_m, over_m, found):
     east = np.arange(60) * 2.0
     heights = 600 - drop_m * np.clip((east - 30) / over_m, 0, 1) + np.zeros((60, 1))
     path = write_dem(tmp_path / "dem.tif", heights.astype(np.float32), from_origin(500000, 5400100, 2, 2))
@@ -256,7 +256,7 @@ def test_a_step_of_the_ground_is_found_where_it_is_steeper_than_79_degrees(tmp_p
         assert 500020 < step.x_m < 500065
 
 
-def test_a_file_that_is_no_dem_is_refused(tmp_path):
+def test_invalid_dem_file_is_rejected(tmp_path):
     (tmp_path / "dem.tif").write_text("not a raster")
     for path, expected in (
         (tmp_path / "dem.tif", "not readable"),
@@ -269,18 +269,12 @@ def test_a_file_that_is_no_dem_is_refused(tmp_path):
         open_dem(plane_dem(tmp_path / "utm.tif"), "local", datum="carried")
 
 
-# Focusing
-
-
-# Seeing
-
-
-# From Python
+# Python interface
 
 
 @pytest.mark.slow
-def test_from_python_a_target_on_a_slope_is_imaged_where_it_stands_by_its_dem(tmp_path):
-    """1.8 m lower flat ground puts it elsewhere; the raster lies in geographic coordinates, the scene in UTM."""
+def test_target_on_a_slope_is_imaged_at_its_position_with_a_dem(tmp_path):
+    """Flat ground 1.8 m lower displaces it; the raster is in geographic coordinates, the scene in UTM."""
     grid = ap.SceneGrid("EPSG:32632", 500059.0, 5400041.0, 0.1, (40, 40))
     path = geographic_dem(tmp_path / "dem.tif", slope=(0.3, -0.2))
     terrain = ap.open_dem(str(path), grid, datum="ellipsoid")
@@ -299,7 +293,7 @@ def test_from_python_a_target_on_a_slope_is_imaged_where_it_stands_by_its_dem(tm
 
 
 def geographic_dem(path, slope):
-    """Posts 0.00002° apart around (500060, 5400040) on a plane of the map of 600 m there."""
+    """Write a DEM of a plane in map coordinates, 600 m at (500060, 5400040), with posts every 0.00002°."""
     to_map = Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True)
     longitude, latitude = to_map.transform(500060, 5400040, direction="INVERSE")
     step = 2e-5
@@ -311,22 +305,22 @@ def geographic_dem(path, slope):
     )
 
 
-def test_from_python_a_datum_that_nothing_states_is_asked_for(tmp_path):
+def test_dem_without_a_datum_is_rejected(tmp_path):
     with pytest.raises(
         CampaignError, match=r"without heights.*ellipsoid, egm96 or egm2008.*from Python: path and datum"
     ):
         ap.open_dem(plane_dem(tmp_path / "dem.tif"), UTM_GRID.crs)
 
 
-def test_from_python_a_dem_that_ends_inside_the_scene_is_refused(tmp_path):
-    path, beyond = plane_dem(tmp_path / "dem.tif"), ap.SceneGrid("EPSG:32632", 500100.0, 5400060.0, 0.5, (40, 80))
+def test_dem_that_ends_inside_the_scene_is_rejected(tmp_path):
+    path, grid = plane_dem(tmp_path / "dem.tif"), ap.SceneGrid("EPSG:32632", 500100.0, 5400060.0, 0.5, (40, 80))
     with pytest.raises(CampaignError, match=r"dem\.tif: .* % of the scene lies outside the DEM, to the east"):
-        ap.open_dem(path, beyond, datum="ellipsoid")
-    assert np.isnan(ap.open_dem(path, beyond.crs, datum="ellipsoid").heights(beyond)).any()
+        ap.open_dem(path, grid, datum="ellipsoid")
+    assert np.isnan(ap.open_dem(path, grid.crs, datum="ellipsoid").heights(grid)).any()
 
 
 @pytest.mark.parametrize("grids", ["nadgrids=/elsewhere/g.gsb", "nadgrids=~/g.gsb", "geoidgrids=../g.gtx"])
-def test_a_crs_that_names_a_file_is_told_from_those_that_name_a_known_grid(grids):
+def test_crs_that_names_a_file_is_detected(grids):
     assert NAMES_FILES.search(CRS(f"+proj=utm +zone=32 +ellps=bessel +{grids} +units=m +type=crs").to_wkt())
     for code in ("EPSG:25832", "EPSG:31467", "EPSG:26711", "EPSG:25832+7837", "EPSG:4326+5773", "EPSG:5555"):
         assert not NAMES_FILES.search(CRS(code).to_wkt())

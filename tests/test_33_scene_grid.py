@@ -1,4 +1,4 @@
-"""The grid of a campaign: pixels, windows and positions; automatic bounds and spacing; the range it takes up."""
+"""Grid of a campaign: pixels, windows and positions; automatic bounds and spacing; swath."""
 
 from dataclasses import replace
 
@@ -23,13 +23,13 @@ from apertura.core.scene.terrain import FlatGround
 from apertura.stages.scene import Flown, settled
 
 
-def test_places_above_the_scene_come_back_as_rows_columns_and_heights():
+def test_positions_above_the_scene_convert_to_pixels_and_heights():
     antenna = UTM_GRID.positions_at([3.0], [-20.0], 650.0)
     np.testing.assert_allclose(UTM_GRID.pixel_below(antenna), [[3.0, -20.0, 650.0]], atol=1e-6)
     np.testing.assert_allclose(projected_from_ecef(UTM_GRID.crs, antenna)[0, 2], 650.0, atol=1e-6)
 
 
-def test_the_grid_is_anchored_at_its_north_west_corner():
+def test_grid_is_anchored_at_its_north_west_corner():
     grid = SceneGrid.from_bounds("EPSG:32632", (570656.9, 5363687.65, 570670.9, 5363701.65), spacing_m=0.05)
     assert grid.shape == (280, 280)
     np.testing.assert_allclose(grid.bounds_m, (570656.9, 5363687.65, 570670.9, 5363701.65), atol=1e-6)
@@ -37,7 +37,7 @@ def test_the_grid_is_anchored_at_its_north_west_corner():
     assert grid.y_m[0] == pytest.approx(5363701.625)
 
 
-def test_tiles_cover_the_grid_once_and_slicing_keeps_the_places():
+def test_tiles_cover_the_grid_once_with_unchanged_positions():
     grid = SceneGrid("EPSG:32632", 570656.9, 5363701.65, 0.05, (100, 70))
     count = np.zeros(grid.shape, int)
     whole = grid.positions(620.0)
@@ -55,16 +55,14 @@ def test_tiles_cover_the_grid_once_and_slicing_keeps_the_places():
     data=st.data(),
 )
 @tried(40, derandomize=False)
-def test_map_frame_and_pixel_are_one_another_undone_and_windows_have_the_coordinates_of_the_whole(
-    crs, spacing_m, shape, side, data
-):
+def test_coordinate_conversions_are_invertible_in_any_window(crs, spacing_m, shape, side, data):
     grid = SceneGrid(crs, 570656.9, 5363701.65, spacing_m, shape)
     window = data.draw(st.sampled_from(list(grid.tiles(side))))
     part = grid[window]
     np.testing.assert_array_equal(part.x_m, grid.x_m[window[1]])
     np.testing.assert_array_equal(part.y_m, grid.y_m[window[0]])
     row, column, height_m = (data.draw(st.floats(-5.0, 700.0)) for _ in range(3))
-    tolerance_px = 1e-8 / spacing_m + 1e-9  # coordinates of millions of metres hold a nanometre or so
+    tolerance_px = 1e-8 / spacing_m + 1e-9  # coordinates of millions of metres resolve about a nanometre
     np.testing.assert_allclose(part.pixel_of(*part.map_at(row, column)), (row, column), atol=tolerance_px)
     place = part.pixel_below(part.positions_at(row, column, height_m))
     np.testing.assert_allclose(place, (row, column, height_m), rtol=0, atol=10 * tolerance_px + 1e-8)
@@ -75,8 +73,8 @@ def test_map_frame_and_pixel_are_one_another_undone_and_windows_have_the_coordin
 @pytest.mark.quick("0.002-*", "300.0-EPSG:2056")
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:2056", "EPSG:3413", "EPSG:3857"])
 @pytest.mark.parametrize("spacing_m", [0.002, 1.0, 30.0, 300.0])
-def test_pixels_are_where_proj_puts_them_on_any_ground(crs, spacing_m):
-    """To 10 nm, far below the wavelength; in between nodes, across blocks, on and high above the ellipsoid."""
+def test_pixel_positions_match_proj_on_any_terrain(crs, spacing_m):
+    """To 10 nm, far below the wavelength: between nodes, across blocks, on and high above the ellipsoid."""
     west_m, north_m = {"EPSG:32632": (330e3, 9.2e6), "EPSG:2056": (2.6e6, 1.2e6)}.get(crs, (1e6, -2e6))
     grid = SceneGrid(crs, west_m, north_m, spacing_m, (300, 270))[3:, 5:]
     height = np.random.default_rng(1).uniform(-400, 4000, grid.shape)
@@ -85,13 +83,13 @@ def test_pixels_are_where_proj_puts_them_on_any_ground(crs, spacing_m):
         np.testing.assert_allclose(grid.positions(above), exact, rtol=0, atol=1e-8)
 
 
-def test_blocks_too_wide_for_polynomials_are_placed_by_proj():
+def test_blocks_too_wide_for_polynomials_use_proj():
     options = ("EPSG:32632", (9.2e6, 330e3))
     assert block(*options, 1.0, (0, 0)).exact
     assert not block(*options, 300.0, (0, 0)).exact
 
 
-def test_pixels_are_where_their_coordinates_say():
+def test_pixel_positions_match_their_coordinates():
     grid = SceneGrid("EPSG:32632", 570656.9, 5363701.65, 0.05, (4, 4))
     np.testing.assert_allclose(
         projected_from_ecef("EPSG:32632", grid.positions(620.0))[1, 2], [570657.025, 5363701.575, 620.0], atol=1e-4
@@ -105,12 +103,12 @@ def test_pixels_are_where_their_coordinates_say():
 
 
 @pytest.mark.parametrize(("crs", "expected"), [("EPSG:4326", "not projected"), ("EPSG:99999", "unknown to PROJ")])
-def test_a_crs_that_is_no_map_in_metres_is_refused(crs, expected):
+def test_crs_that_is_not_projected_is_rejected(crs, expected):
     with pytest.raises(CampaignError, match=expected):
         SceneGrid.from_bounds(crs, (0, 0, 1, 1), spacing_m=1)
 
 
-def test_the_swath_holds_every_pixel_and_little_more():
+def test_swath_contains_every_pixel_closely():
     grid = SceneGrid("local", -4.0, 14.0, 0.1, (80, 80))
     tx = np.array([[0.0, 0.0, 5.0], [1.0, 11.0, 3.0]])
     rx = tx + [1.0, 2.0, 0.0]
@@ -122,37 +120,38 @@ def test_the_swath_holds_every_pixel_and_little_more():
     assert (far - near - np.ptp(path, axis=1)).max() < 1.5
 
 
-def test_automatic_bounds_hold_ground_on_both_sides_of_the_track():
+def test_automatic_bounds_extend_to_both_sides_of_the_track():
     tx = np.stack([np.linspace(-4, 4, 5), np.zeros(5), np.full(5, 5.0)], -1)
     _, ymin, _, ymax = auto_bounds(Aperture(tx, tx), crs="local", height_m=0.0, path_limit_m=np.inf)
     assert ymax == -ymin == pytest.approx(5 / np.tan(np.radians(10)), abs=1)
     xmin, ymin, xmax, ymax = auto_bounds(Aperture(tx, tx), crs="local", height_m=0.0, path_limit_m=20.0)
     farthest = Aperture(tx, tx).path(np.array([[x, y, 0.0] for x in (xmin, xmax) for y in (ymin, ymax)])).max()
-    assert 16 < farthest <= 20  # the corners, from the ends of the track; in whole metres
+    assert 16 < farthest <= 20  # at the corners, from the ends of the track; rounded to metres
     assert utm_crs(ecef_from_projected("EPSG:32755", *map(np.array, (5e5, 6.1e6, 0.0)))) == "EPSG:32755"
 
 
-def test_an_automatic_grid_has_no_more_pixels_than_the_pass_recorded_samples_for(tiny):
-    """A circle of 5 m over 30 m resolves 6 cm everywhere: 9 pixels per sample of 100 pulses of 512 subcarriers."""
-    turn = np.linspace(0, 2 * np.pi, 100)
-    circle = np.stack([5 * np.sin(turn), 5 * np.cos(turn), np.full(100, 30.0)], -1)
+def test_automatic_grid_is_limited_by_the_recorded_samples(tiny):
+    """A circle of 5 m at 30 m height resolves 6 cm; limit: 9 pixels per sample, 100 pulses × 512 subcarriers."""
+    angle = np.linspace(0, 2 * np.pi, 100)
+    circle = np.stack([5 * np.sin(angle), 5 * np.cos(angle), np.full(100, 30.0)], -1)
     frequency = 1.2e9 + 4e5 * np.arange(512)
     flown = Flown(Aperture(circle, circle), frequency, np.inf)
     campaign = Campaign.load(tiny)
     scene = Scene(crs="local")
     campaign = replace(campaign, settings=campaign.settings.model_copy(update={"scene": scene}))
-    grid, _, chosen = settled(campaign, lambda: flown)
+    grid, _, reasons = settled(campaign, lambda: flown)
     assert np.prod(grid.shape) <= 9 * 100 * 512
     assert (
-        "than the limit of 0.461 Mpx for this flight; for a finer spacing, state scene.bounds_m" in chosen["spacing_m"]
+        "than the limit of 0.461 Mpx for this flight; for a finer spacing, state scene.bounds_m" in reasons["spacing_m"]
     )
     small = campaign.settings.model_copy(update={"scene": Scene(crs="local", bounds_m=(-200, -200, 200, 200))})
-    grid, _, chosen = settled(replace(campaign, settings=small), lambda: flown)  # bounds that somebody wants stay fine
-    assert chosen["spacing_m"].startswith("a third of the finest resolution cell")
+    # configured bounds keep the fine spacing
+    grid, _, reasons = settled(replace(campaign, settings=small), lambda: flown)
+    assert reasons["spacing_m"].startswith("a third of the finest resolution cell")
 
 
-def test_a_flight_at_the_edge_of_a_utm_zone_gets_automatic_bounds_that_its_zone_takes():
-    """Three metres east of 12° E: zone 33, bounds that reach over the edge."""
+def test_automatic_bounds_at_the_edge_of_a_utm_zone_are_valid():
+    """Three metres east of 12° E: zone 33, with bounds beyond the edge."""
     edge_m, north_m, _ = projected_from_ecef("EPSG:32633", ecef_from_geodetic(48.0, 12.0, 600.0))
     east_m, height_m = np.full((2, 41), [[edge_m + 3], [610.0]])
     track = ecef_from_projected("EPSG:32633", east_m, north_m + np.linspace(-20, 20, 41), height_m)
@@ -164,7 +163,7 @@ def test_a_flight_at_the_edge_of_a_utm_zone_gets_automatic_bounds_that_its_zone_
 
 
 @pytest.mark.parametrize("zone", ["EPSG:32632", "EPSG:32633"])
-def test_bounds_across_an_edge_of_zones_are_taken_by_both(zone):
+def test_bounds_across_an_edge_of_utm_zones_are_valid_in_both(zone):
     x, y, _ = projected_from_ecef(zone, ecef_from_geodetic(48.0, 12.0, 600.0)).round()
     grid = SceneGrid.from_bounds(zone, (x - 50, y - 50, x + 50, y + 50), spacing_m=1.0)
     place = projected_from_ecef(zone, grid.positions_at([50.0], [50.0], 600.0))[0]
@@ -180,23 +179,23 @@ def test_bounds_across_an_edge_of_zones_are_taken_by_both(zone):
         ("EPSG:3832", 20.0, 150.0),
     ],
 )
-def test_a_crs_in_use_across_the_180th_meridian_is_taken(crs, latitude, longitude):
+def test_crs_across_the_180th_meridian_is_accepted(crs, latitude, longitude):
     x, y, _ = projected_from_ecef(crs, ecef_from_geodetic(latitude, longitude, 10.0)).round()
     assert SceneGrid.from_bounds(crs, (x, y, x + 10, y + 10), spacing_m=1.0).shape == (10, 10)
 
 
-@pytest.mark.parametrize(("longitude", "taken"), [(3.1, True), (2.9, False), (14.9, True), (15.1, False)])
-def test_utm_is_taken_to_three_degrees_beyond_its_zone(longitude, taken):
+@pytest.mark.parametrize(("longitude", "accepted"), [(3.1, True), (2.9, False), (14.9, True), (15.1, False)])
+def test_utm_is_accepted_up_to_3_degrees_beyond_its_zone(longitude, accepted):
     x, y, _ = projected_from_ecef("EPSG:32632", ecef_from_geodetic(48.0, longitude, 10.0)).round()
     bounds = (x, y, x + 10, y + 10)
-    if taken:
+    if accepted:
         SceneGrid.from_bounds("EPSG:32632", bounds, spacing_m=1.0)
     else:
         with pytest.raises(CampaignError, match=r"within 3 degrees of the area of use of WGS 84 / UTM zone 32N"):
             SceneGrid.from_bounds("EPSG:32632", bounds, spacing_m=1.0)
 
 
-def test_coordinates_that_a_projection_does_not_lead_back_from_are_refused():
-    """Beyond the end of Mercator's map: longitude 181 would be -179 again."""
+def test_coordinates_without_an_inverse_projection_are_rejected():
+    """Beyond the edge of the Mercator map, where longitude 181 equals -179."""
     with pytest.raises(CampaignError, match="reach longitude"):
         SceneGrid.from_bounds("EPSG:3857", (20037500.0, 0.0, 20037520.0, 10.0), spacing_m=1.0)

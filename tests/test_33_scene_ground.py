@@ -1,4 +1,4 @@
-"""Flat ground, planes and DEMs under a scene: heights where they are true, targets where they stand."""
+"""Flat ground, planes and DEMs under a scene: heights, target positions, clearance of antennas."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ LOCAL = SceneGrid("local", -3.0, 15.0, 0.1, (60, 60))
 
 
 def history(track, targets):
-    """Exact echoes of unit points at `targets`, monostatic."""
+    """Return exact monostatic echoes of unit points at `targets`."""
     path = 2 * np.linalg.norm(track[:, None] - np.atleast_2d(targets), axis=-1)
     echo = np.exp(-2j * np.pi * FREQUENCY[None, None] * path[..., None] / SPEED_OF_LIGHT_M_S).sum(axis=1)
     zeros = np.zeros(len(track))
@@ -42,28 +42,28 @@ def focus(spectra, heights=0.0):
     return reference.form(spectra, LOCAL.positions(heights)) / len(spectra.transfer)
 
 
-def test_a_constant_dem_equals_a_lowered_track():
+def test_constant_dem_equals_a_lowered_track():
     spectra = history(track_at(8.0), [0.5, 12.0, 3.0])
     lowered = history(track_at(5.0), [0.5, 12.0, 0.0])
     raised = focus(spectra, np.full(LOCAL.shape, 3.0))
     np.testing.assert_allclose(raised, focus(lowered), atol=1e-5 * np.abs(raised).max())
 
 
-def test_a_raised_target_is_laid_over_on_flat_ground_and_true_on_its_dem():
-    """On flat ground a target h high appears where the ground has its range: √(y² − 2Hh + h²)."""
+def test_raised_target_is_displaced_on_flat_ground_but_not_on_its_dem():
+    """On flat ground a target of height h appears at the point of equal range: √(y² − 2Hh + h²)."""
     spectra = history(track_at(8.0), [0.5, 12.0, 1.2])
     y = np.broadcast_to(LOCAL.y_m[:, None], LOCAL.shape)
-    for heights, place in ((0.0, np.sqrt(12.0**2 - 2 * 8 * 1.2 + 1.2**2)), (np.where(y > 10.5, 1.2, 0.0), 12.0)):
+    for heights, expected_y_m in ((0.0, np.sqrt(12.0**2 - 2 * 8 * 1.2 + 1.2**2)), (np.where(y > 10.5, 1.2, 0.0), 12.0)):
         image = focus(spectra, heights)
         peak = find_peak(image, *np.unravel_index(np.abs(image).argmax(), image.shape))
         place_m = LOCAL.map_at(peak.row, peak.column)
         assert place_m[0] == pytest.approx(0.5, abs=0.02)
-        assert place_m[1] == pytest.approx(place, abs=0.02)
+        assert place_m[1] == pytest.approx(expected_y_m, abs=0.02)
 
 
 @pytest.mark.parametrize("facing", [20.0, -20.0])
-def test_every_target_on_a_plane_tilted_by_20_degrees_is_focused_by_its_dem_and_not_by_flat_ground(facing):
-    """The plane rises across and along the track; on flat ground there is next to nothing where the targets stand."""
+def test_targets_on_a_tilted_plane_focus_only_with_a_dem(facing):
+    """The plane rises across and along the track; on flat ground the targets lose more than half of their amplitude."""
     slope = np.tan(np.radians(facing))
     y, x = np.meshgrid(LOCAL.y_m, LOCAL.x_m, indexing="ij")
     plane = slope * ((y - 12) + x) / np.sqrt(2)
@@ -81,7 +81,7 @@ def test_every_target_on_a_plane_tilted_by_20_degrees_is_focused_by_its_dem_and_
             assert abs(reference.form(spectra, np.array([[px, py, 0.0]]))[0]) / len(spectra.transfer) < 0.5
 
 
-def test_the_swath_holds_the_path_of_every_pixel_on_terrain():
+def test_swath_contains_the_path_of_every_pixel_on_terrain():
     generator = np.random.default_rng(4)
     heights = 3 * generator.standard_normal((150, 90))
     grid = SceneGrid("local", 0.0, 15.0, 0.1, (150, 90))
@@ -93,8 +93,8 @@ def test_the_swath_holds_the_path_of_every_pixel_on_terrain():
     assert (far - near).max() < np.ptp(path) + 4 * np.ptp(heights)
 
 
-def test_windows_read_together_are_bounded_as_each_by_itself():
-    """Strips of 1200 × 1800 pixels are read in two, windows that are not neighbours each by itself."""
+def test_bounds_of_windows_do_not_depend_on_joint_reading():
+    """Strips of 1200 × 1800 pixels are read in two parts, windows that are not neighbours one by one."""
     grid = SceneGrid("local", 0.0, 120.0, 0.1, (1200, 1800))
     terrain = GridHeights(grid, np.random.default_rng(5).standard_normal(grid.shape))
     tiles = list(grid.tiles(600))
@@ -105,18 +105,17 @@ def test_windows_read_together_are_bounded_as_each_by_itself():
     assert np.array_equal(radius_m, np.concatenate([radius for _, radius in alone]))
 
 
-def test_clearance_is_height_above_the_pixel_below_on_earth_too():
+def test_clearance_is_the_height_above_the_pixel_below():
     heights = np.add.outer(np.arange(70.0), np.zeros(90))
     antenna = UTM_GRID.positions_at([10, 10.3, 500], [7, 80, 3], np.array([12.0, 15.0, 20.0]))
     above, ground = clearance(UTM_GRID, GridHeights(UTM_GRID, heights), antenna)
-    np.testing.assert_allclose(above, [2, 5, np.nan])  # beside the scene: not known
+    np.testing.assert_allclose(above, [2, 5, np.nan])  # outside the scene: unknown
     np.testing.assert_allclose(ground, [10, 10, np.nan])
-    np.testing.assert_allclose(
-        clearance(UTM_GRID, FlatGround(600.0), antenna)[0][2], 20 - 600
-    )  # but flat ground goes on
+    # flat ground extends beyond the scene
+    np.testing.assert_allclose(clearance(UTM_GRID, FlatGround(600.0), antenna)[0][2], 20 - 600)
 
 
-def test_an_antenna_below_flat_ground_is_refused_and_below_a_dem_beside_it_is_flagged():
+def test_antenna_below_ground_is_rejected_and_outside_a_dem_flagged():
     hill = GridHeights(UTM_GRID, np.full(UTM_GRID.shape, 650.0))
     track = UTM_GRID.positions_at(np.arange(5.0), -40.0, np.array([660.0, 651.0, 649.5, 655.0, 660.0]))
     high = UTM_GRID.positions_at(np.arange(5.0), 10.0, 700.0)
@@ -133,8 +132,8 @@ def test_an_antenna_below_flat_ground_is_refused_and_below_a_dem_beside_it_is_fl
 
 
 @pytest.mark.parametrize("grid", [UTM_GRID, LOCAL], ids=["on Earth", "local"])
-def test_flat_ground_a_level_plane_and_a_constant_dem_are_one_ground(grid):
-    """Positions agree to two units in the last place of ECEF; so does everything between pixels."""
+def test_flat_ground_level_plane_and_constant_dem_agree(grid):
+    """Positions agree to two units in the last place of ECEF, also between pixels."""
     level = [
         FlatGround(612.5),
         Plane(grid.west_m, grid.north_m, 612.5, 0.0, 0.0),
@@ -148,7 +147,7 @@ def test_flat_ground_a_level_plane_and_a_constant_dem_are_one_ground(grid):
         np.testing.assert_array_equal(ground.heights_at(grid, [3.2, 7.0], [5.0, 0.4]), 612.5)
 
 
-def test_a_constant_dem_and_a_level_plane_give_the_image_of_flat_ground_to_the_bit():
+def test_constant_dem_and_level_plane_images_equal_flat_ground():
     spectra = history(track_at(8.0), [0.5, 12.0, 1.2])
     images = [
         reference.form(spectra, ground.positions(LOCAL))
@@ -158,7 +157,7 @@ def test_a_constant_dem_and_a_level_plane_give_the_image_of_flat_ground_to_the_b
         np.testing.assert_array_equal(image, images[0])
 
 
-def test_heights_between_pixels_follow_a_plane_across_tiles_and_windows():
+def test_heights_between_pixels_follow_a_plane():
     grid = SceneGrid("local", -300.0, 600.0, 1.0, (600, 700))
     plane = Plane(0.0, 0.0, 5.0, east=0.3, north=-0.1)
     stored = GridHeights(grid, plane.heights(grid))

@@ -1,4 +1,4 @@
-"""Which pulses make a pixel: looks, the centre of its aperture, and what lies outside."""
+"""Pulses that contribute to a pixel: number of looks, aperture centre, illumination."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ FLOWN = monostatic(straight_track(6000, length_m=150.0))
 
 
 def sideways(pulses, *, beamwidth_deg=(30.0, 8.0)):
-    """A beam that looks north and 30° down; it ends at -20 dB."""
+    """Return a beam that looks north and 30° down and ends at -20 dB."""
     down = np.radians(30)
     axes = np.array([[0, np.cos(down), -np.sin(down)], [1, 0, 0], [0, np.sin(down), np.cos(down)]])
     cuts = [gaussian_cut(width, cutoff_db=-20.0, limit_rad=np.pi / 2) for width in beamwidth_deg]
@@ -59,7 +59,7 @@ def every_weight(beams, points):
 
 
 @pytest.mark.parametrize("kind", ["sector", "wide"])
-def test_looks_between_nodes_are_those_of_every_pulse_at_every_pixel(kind):
+def test_interpolated_looks_match_the_exact_ones(kind):
     looks = Looks.of(GRID, GROUND, FLOWN, WEIGHED[kind], threads=2)
     rows, columns, points = some_pixels()
     weight = every_weight(WEIGHED[kind], points)
@@ -71,54 +71,52 @@ def test_looks_between_nodes_are_those_of_every_pulse_at_every_pixel(kind):
 
 
 def of_sums(looks):
-    """S₁²/S₂ with both sums bilinear between nodes, in float64."""
+    """Return S₁²/S₂ with both sums bilinear between nodes, in float64."""
     whole = tuple(slice(0, size) for size in looks.grid.shape)
-    total, squares = (looks.lattice.between(one.astype(float), whole) for one in (looks.total, looks.squares))
+    total, squares = (looks.lattice.between(sums.astype(float), whole) for sums in (looks.total, looks.squares))
     return total**2 / squares
 
 
-@pytest.mark.parametrize("turn", [0.019, 0.021])
+@pytest.mark.parametrize("step", [0.019, 0.021])
 @pytest.mark.parametrize("growth", [1.0, 0.55, 1.9])
-def test_looks_are_bilinear_where_both_sums_change_alike_and_those_of_the_sums_elsewhere(turn, growth):
-    """The worst that is allowed errs by 0.08 % at most, and by something; a little more is refused."""
+def test_looks_are_bilinear_only_where_both_sums_change_alike(step, growth):
+    """The largest tolerated change gives a non-zero error of at most 0.08 %; above it the sums are interpolated."""
     looks = Looks.of(GRID, GROUND, FLOWN, None)
     row, column = np.ogrid[: looks.lattice.shape[0], : looks.lattice.shape[1]]
     total = 1e3 * growth ** (row % 2) * np.ones(column.shape)
-    squares = total * (1 + turn * (column % 2))
-    of = replace(looks, total=total.astype(np.float32), squares=squares.astype(np.float32))
-    found, exact = assembled(of, of.effective), of_sums(of)
-    off = np.abs(found / exact - 1).max()
-    if turn > 0.02:
-        assert off < 1e-6
+    squares = total * (1 + step * (column % 2))
+    changed = replace(looks, total=total.astype(np.float32), squares=squares.astype(np.float32))
+    found, exact = assembled(changed, changed.effective), of_sums(changed)
+    error = np.abs(found / exact - 1).max()
+    if step > 0.02:
+        assert error < 1e-6
     else:
-        assert 1e-5 < off < 8e-4
+        assert 1e-5 < error < 8e-4
 
 
-def test_looks_at_an_edge_are_those_of_the_sums():
-    """A sum that falls to less than half from node to node, or ends, is not passed over."""
+def test_looks_at_an_edge_use_the_sums():
+    """A sum that falls to less than half between nodes, or to zero, is not interpolated bilinearly."""
     looks = Looks.of(GRID, GROUND, FLOWN, None)
     total = np.full(looks.lattice.shape, 1e3, np.float32)
     total[:, 3:] *= 0.45
     squares = 1.015 ** np.arange(total.shape[1], dtype=np.float32) * total
     steep = replace(looks, total=total, squares=squares)
-    off = np.abs(assembled(steep, steep.effective) / of_sums(steep) - 1)
-    assert off[:, :BLOCK_PX].max() < 1e-6
-    assert 1e-5 < off[:, BLOCK_PX:].max() < 1e-4  # beyond the fall both change alike
+    error = np.abs(assembled(steep, steep.effective) / of_sums(steep) - 1)
+    assert error[:, :BLOCK_PX].max() < 1e-6
+    assert 1e-5 < error[:, BLOCK_PX:].max() < 1e-4  # beyond the drop both sums change alike
     dark = np.arange(total.shape[1]) >= 3
     ends = replace(looks, total=np.where(dark, 0, total), squares=np.where(dark, 0, squares))
-    beside = assembled(ends, ends.effective)[
-        :, 3 * looks.lattice.pitch_px - 1
-    ]  # of the pulses of the last node with any
-    assert np.abs(beside / (1e3 / 1.015**2) - 1).max() < 1e-6
+    last_lit = assembled(ends, ends.effective)[:, 3 * looks.lattice.pitch_px - 1]  # looks of the last node with pulses
+    assert np.abs(last_lit / (1e3 / 1.015**2) - 1).max() < 1e-6
 
 
-def test_rows_and_columns_lie_between_their_own_nodes():
+def test_interpolation_uses_the_nodes_of_rows_and_columns():
     lattice, window = Lattice.of((300, 500), 32), (slice(280, 300), slice(280, 300))
     found = lattice.between(np.subtract.outer(lattice.nodes[0], 1000.0 * lattice.nodes[1]), window)
     assert np.allclose(found, np.subtract.outer(np.arange(280, 300), 1000.0 * np.arange(280, 300)), atol=1e-9)
 
 
-def test_values_of_float32_are_interpolated_in_float32_and_others_in_float64():
+def test_interpolation_keeps_float32_and_float64():
     lattice, rng = Lattice.of((300, 500), 32), np.random.default_rng(2)
     values, window = 50 + rng.random((*lattice.shape, 2)), (slice(100, 300), slice(7, 450))
     exact = lattice.between(values, window)
@@ -131,7 +129,7 @@ def test_values_of_float32_are_interpolated_in_float32_and_others_in_float64():
 
 
 @pytest.mark.parametrize("kind", ["sector", "beam"])
-def test_pulses_of_a_node_weigh_half_or_more_and_are_spread_evenly(kind):
+def test_pulses_of_a_node_have_half_weight_and_even_spread(kind):
     looks = Looks.of(GRID, GROUND, FLOWN, WEIGHED[kind])
     rows, columns = np.meshgrid(*looks.lattice.nodes, indexing="ij")
     weight = np.abs(every_weight(WEIGHED[kind], GROUND.positions_at(GRID, rows.ravel(), columns.ravel())))
@@ -145,7 +143,7 @@ def test_pulses_of_a_node_weigh_half_or_more_and_are_spread_evenly(kind):
         assert np.abs(place - np.linspace(0, 1, SPREAD)).max() < 0.06
 
 
-def test_looks_are_the_pulses_that_count_and_fewer_at_a_smooth_edge():
+def test_looks_are_the_effective_number_of_pulses():
     looks = Looks.of(GRID, GROUND, FLOWN, WEIGHED["sector"])
     middle = looks.effective((slice(0, 200), slice(0, 256)))[100, 240]
     weight = every_weight(WEIGHED["sector"], GROUND.positions_at(GRID, [100], [240]))
@@ -155,25 +153,26 @@ def test_looks_are_the_pulses_that_count_and_fewer_at_a_smooth_edge():
 
 @pytest.mark.quick("sector")
 @pytest.mark.parametrize("kind", WEIGHED)
-def test_outside_is_exact_at_every_pixel(kind):
+def test_illumination_is_exact_at_every_pixel(kind):
     looks = Looks.of(GRID, GROUND, FLOWN, WEIGHED[kind], threads=2)
-    seen = assembled(looks, looks.illuminated).astype(bool)
+    illuminated = assembled(looks, looks.illuminated).astype(bool)
     rows, columns, points = some_pixels(1500)
-    assert np.array_equal(seen[rows, columns], (every_weight(WEIGHED[kind], points) != 0).any(axis=0))
+    assert np.array_equal(illuminated[rows, columns], (every_weight(WEIGHED[kind], points) != 0).any(axis=0))
     if kind in {"sector", "wide"}:
-        assert seen.all()
+        assert illuminated.all()
         return
-    edge = np.argwhere(seen[:, 1:] != seen[:, :-1])[::7]  # where a row passes from dark to lit
+    # boundaries between dark and illuminated pixels of a row
+    edge = np.argwhere(illuminated[:, 1:] != illuminated[:, :-1])[::7]
     points = GROUND.positions_at(GRID, *np.concatenate([edge, edge + [0, 1]]).T)
-    told = np.concatenate([seen[tuple(edge.T)], seen[tuple((edge + [0, 1]).T)]])
-    assert np.array_equal(told, (every_weight(WEIGHED[kind], points) != 0).any(axis=0))
-    assert not seen.all()
-    assert (assembled(looks, looks.effective)[~seen] == 0).all()
+    at_edge = np.concatenate([illuminated[tuple(edge.T)], illuminated[tuple((edge + [0, 1]).T)]])
+    assert np.array_equal(at_edge, (every_weight(WEIGHED[kind], points) != 0).any(axis=0))
+    assert not illuminated.all()
+    assert (assembled(looks, looks.effective)[~illuminated] == 0).all()
 
 
 @pytest.mark.parametrize("beams", [None, Beams(sector=Sector.of(FLOWN, chord_m=2.0, centre=0.2, half=0.1))])
-def test_the_centre_of_an_aperture_is_the_closest_approach(beams):
-    """Beside a straight track at the pixel's east, or behind it where the sector looks ahead by s = 2 sin(squint)."""
+def test_aperture_centre_is_the_closest_approach(beams):
+    """Abeam of a straight track, or behind where the sector looks ahead by s = 2 sin(squint)."""
     looks, (rows, columns, points) = Looks.of(GRID, GROUND, FLOWN, beams), some_pixels()
     east = assembled(looks, lambda tile: looks.centre(tile)[0][..., 0])[rows, columns]
     squint = 0.0 if beams is None else np.arcsin(0.2)
@@ -184,8 +183,8 @@ def test_the_centre_of_an_aperture_is_the_closest_approach(beams):
 
 
 @pytest.mark.parametrize("passes", [1, 2])
-def test_angles_over_level_ground_are_those_of_every_pixel(passes):
-    """Between nodes a 48th of the range apart to 0.006°; pixel by pixel where the nearest pass changes."""
+def test_interpolated_angles_over_level_terrain_are_accurate(passes):
+    """Within 0.006° between nodes spaced by 1/48 of the range; computed per pixel where the nearest pass changes."""
     along = np.linspace(-80, 80, 600)
     tx = np.concatenate([np.stack([along, 0 * along + y, 0 * along + 200], -1) for y in (0.0, 860.0)[:passes]])
     grid = SceneGrid("local", -60.0, 470.0, 0.25, (300, 300))
@@ -203,12 +202,12 @@ def test_angles_over_level_ground_are_those_of_every_pixel(passes):
     assert np.ptp(across) > 0.2
 
 
-def test_a_centre_that_goes_over_to_another_pass_is_not_taken_between_them():
+def test_aperture_centre_is_not_interpolated_between_passes():
     east = np.linspace(-60, 60, 800)
     south, north = (np.stack([east, np.full(800, y), np.full(800, 10.0)], -1) for y in (0.0, 90.0))
     track = np.concatenate([south, north])
     looks = Looks.of(GRID, GROUND, Aperture(track, track), None)
     passed = assembled(looks, lambda tile: looks.centre(tile)[1][..., 1])
     assert set(np.unique(passed.round(6))) == {0.0, 90.0}
-    assert (passed[:80] == 90).all()  # north of 50 m; the middle lies at 45 m
+    assert (passed[:80] == 90).all()  # north of 50 m; the boundary is at 45 m
     assert (passed[120:] == 0).all()

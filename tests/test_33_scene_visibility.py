@@ -1,4 +1,4 @@
-"""What a radar can see of its ground: shadow, layover, incidence and bistatic angle."""
+"""Visibility of terrain: shadow, layover, incidence and bistatic angle."""
 
 import numpy as np
 import pytest
@@ -16,52 +16,54 @@ STREET = SceneGrid("local", 0.0, 3.0, 0.25, (12, 240))
 ROW = (slice(6, 7), slice(0, 240))
 
 
-def seen(heights, antenna, grid=STREET, window=ROW):
+def mask_of(heights, antenna, grid=STREET, window=ROW):
     relief = Relief.of(grid, GridHeights(grid, heights), 0.0)
     pulses = relief.above(np.atleast_2d(np.asarray(antenna, float)))
     return visibility(relief, pulses, pulses, window)
 
 
 @pytest.mark.parametrize("wall_m", [1.5, 2.0, 3.0])
-def test_a_wall_shades_and_folds_as_far_as_triangles_say(wall_m):
-    """Shadow h·d/(H − h) behind; in front all ground farther than the wall's top: d − √(d² − 2Hh + h²)."""
+def test_shadow_and_layover_of_a_wall_follow_the_geometry(wall_m):
+    """Shadow length h·d/(H − h) behind the wall; layover length d − √(d² − 2Hh + h²) in front of it."""
     heights = np.zeros(STREET.shape)
     heights[:, 80] = wall_m
     antenna, wall_x = np.array([-10.0, 1.375, 8.0]), STREET.x_m[80]
-    mask, away = seen(heights, antenna)[0], wall_x + 10.0
+    mask, distance_m = mask_of(heights, antenna)[0], wall_x + 10.0
     shade = np.flatnonzero(mask & 1)
     fold = np.flatnonzero(mask & 2)
     assert shade[0] == 81
-    assert len(shade) * 0.25 == pytest.approx(wall_m * away / (8 - wall_m), abs=0.25)
+    assert len(shade) * 0.25 == pytest.approx(wall_m * distance_m / (8 - wall_m), abs=0.25)
     assert fold[-1] == 80
-    assert (len(fold) - 1) * 0.25 == pytest.approx(away - np.sqrt(away**2 - 16 * wall_m + wall_m**2), abs=0.25)
+    assert (len(fold) - 1) * 0.25 == pytest.approx(
+        distance_m - np.sqrt(distance_m**2 - 16 * wall_m + wall_m**2), abs=0.25
+    )
 
 
-def test_flat_ground_is_seen_once_and_plainly_even_right_below():
+def test_flat_ground_has_no_shadow_or_layover():
     grid = SceneGrid("local", -10.0, 10.0, 0.5, (40, 40))
     everything = (slice(0, 40), slice(0, 40))
-    assert not seen(np.zeros(grid.shape), [0.1, 0.2, 6.0], grid, everything).any()
+    assert not mask_of(np.zeros(grid.shape), [0.1, 0.2, 6.0], grid, everything).any()
 
 
 @pytest.mark.parametrize(("slope_deg", "expected"), [(-60.0, 1), (-20.0, 0), (20.0, 0), (75.0, 2)])
-def test_a_tilted_plane_is_dark_beyond_grazing_and_folds_beyond_incidence(slope_deg, expected):
-    """Seen from about 40° of grazing: a plane falling by more is in shadow, one rising by more than 50° in layover."""
+def test_steep_planes_are_in_shadow_or_layover(slope_deg, expected):
+    """At about 40° grazing angle: a plane that falls more steeply is in shadow, one that rises above 50° in layover."""
     middle = STREET.x_m - 30
     heights = np.broadcast_to(np.tan(np.radians(slope_deg)) * middle, STREET.shape)
     antenna = np.array([30.0 - 300.0, 1.375, 300 * np.tan(np.radians(40.0))])
-    inner = seen(heights, antenna)[0, 2:-2]
+    inner = mask_of(heights, antenna)[0, 2:-2]
     np.testing.assert_array_equal(inner, expected)
 
 
-def test_shadow_on_random_hills_is_what_dense_sampling_of_every_line_says():
-    """The walk that skips whole blocks against brute force over bilinear ground."""
+def test_shadow_on_random_hills_matches_dense_sampling():
+    """The search that skips whole blocks agrees with dense sampling of bilinear terrain."""
     from scipy.ndimage import gaussian_filter, map_coordinates
 
     generator = np.random.default_rng(1)
     grid = SceneGrid("local", 0.0, 30.0, 0.5, (60, 60))
     hills = 40 * gaussian_filter(generator.standard_normal(grid.shape), 4)
-    antenna = np.array([-60.0, 12.0, 20.0])  # far to the west: every line leaves the scene on a column of pixels
-    mask = seen(hills, antenna, grid, (slice(0, 60), slice(0, 60))) & 1
+    antenna = np.array([-60.0, 12.0, 20.0])  # far to the west: every line leaves the scene at a column of pixels
+    mask = mask_of(hills, antenna, grid, (slice(0, 60), slice(0, 60))) & 1
     row, column, up = grid.pixel_below(antenna)
     margin = np.full(grid.shape, -np.inf)
     for i, j in np.ndindex(grid.shape):
@@ -77,30 +79,30 @@ def test_shadow_on_random_hills_is_what_dense_sampling_of_every_line_says():
     np.testing.assert_array_equal(mask[clear], margin[clear] > 0)
 
 
-def test_a_pixel_shaded_at_few_pulses_is_not_in_shadow_and_either_antenna_counts():
+def test_shadow_needs_most_pulses_of_either_antenna():
     heights = np.zeros(STREET.shape)
     heights[:, 80] = 2.0
     low, high = [-10.0, 1.375, 8.0], [-10.0, 1.375, 200.0]
     behind = (6, 90)
     for antennas, dark in (([low, low, high], 1), ([low, high, high], 0)):
-        assert seen(heights, antennas)[0, behind[1]] & 1 == dark
+        assert mask_of(heights, antennas)[0, behind[1]] & 1 == dark
     relief = Relief.of(STREET, GridHeights(STREET, heights), 0.0)
     tx, rx = (relief.above(np.array([antenna])) for antenna in (high, low))
     for pair in ((tx, rx), (rx, tx)):
         assert visibility(relief, *pair, ROW)[0, behind[1]] & 1 == 1
 
 
-def test_the_ground_curves_away_below_a_long_line():
-    """5 km away and level with the eye, ground is hidden by the bulge d²/8R of half a metre; not in a plane."""
+def test_earth_curvature_hides_distant_terrain():
+    """At 5 km and antenna height, terrain is hidden by the bulge d²/8R of half a metre; not in a plane frame."""
     for crs, west, north, dark in (("local", 0.0, 0.0, 0), ("EPSG:32632", 500000.0, 5400000.0, 1)):
         grid = SceneGrid(crs, west, north, 25.0, (3, 200))
-        place = (west, north - 37.5, 0.3)
-        antenna = place if crs == "local" else grid.positions_at([1.0], [-0.5], np.array([0.3]))[0]
-        mask = seen(np.zeros(grid.shape), antenna, grid, (slice(1, 2), slice(0, 200)))
+        antenna_position = (west, north - 37.5, 0.3)
+        antenna = antenna_position if crs == "local" else grid.positions_at([1.0], [-0.5], np.array([0.3]))[0]
+        mask = mask_of(np.zeros(grid.shape), antenna, grid, (slice(1, 2), slice(0, 200)))
         assert mask[0, 198] & 1 == dark
 
 
-def test_incidence_counts_from_the_normal_of_the_slope():
+def test_incidence_is_measured_from_the_surface_normal():
     grid = SceneGrid(UTM_GRID.crs, UTM_GRID.west_m, UTM_GRID.north_m, 0.5, (9, 9))
     tilt = np.tan(np.radians(15.0))
     east = np.broadcast_to((grid.x_m - grid.x_m[4])[None], grid.shape)
@@ -111,12 +113,12 @@ def test_incidence_counts_from_the_normal_of_the_slope():
         assert incidence == pytest.approx(expected, abs=0.05)
 
 
-def test_the_bistatic_angle_is_zero_for_one_place_and_right_across_for_two():
+def test_bistatic_angle_is_zero_for_a_monostatic_pair():
     target = np.array([0.0, 10.0, 0.0])
     tx, rx = np.array([-5.0, 0.0, 0.0]), np.array([5.0, 0.0, 0.0])
     assert bistatic_angle_deg(target, tx, tx) == 0
     assert bistatic_angle_deg(target, tx, rx) == pytest.approx(2 * np.degrees(np.arctan(0.5)))
 
 
-def test_the_bits_of_the_mask_are_those_that_are_exported():
+def test_mask_bits_equal_the_exported_ones():
     assert (SHADOW, LAYOVER) == (exported.SHADOW, exported.LAYOVER)

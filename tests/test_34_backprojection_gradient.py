@@ -187,7 +187,7 @@ def test_invalid_slopes_and_points_are_refused(slope, points, message):
         path_gradient(PROFILES, points, slope)
 
 
-def test_profile_stage_is_accepted_like_arrays_and_other_stages_are_refused():
+def test_profile_stage_is_accepted_and_other_stages_are_refused():
     profiles = ap.range_compress(point_history(), TARGET_GRID, ap.FlatGround(0.0))
     patch, slope = TARGET_GRID[60:70, 60:70], np.full((10, 10), 1 + 1j)
     stage = xr.Dataset(
@@ -205,7 +205,7 @@ def test_profile_stage_is_accepted_like_arrays_and_other_stages_are_refused():
     from_arrays, from_stage = (ap.gradient(profile_input, patch, slope) for profile_input in (profiles, stage))
     assert np.array_equal(from_arrays.rx_m, from_stage.rx_m)
     for profile_input in (point_history(), stage.drop_vars("profile")):
-        with pytest.raises(CampaignError, match="expected Profiles, or a stage profile"):
+        with pytest.raises(CampaignError, match="expected Profiles, or the dataset of stage profile"):
             ap.gradient(profile_input, patch, slope)
 
 

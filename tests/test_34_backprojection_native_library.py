@@ -58,7 +58,7 @@ def test_library_of_another_layout_is_refused_with_the_field_name(declaration, c
     contract.write_text(contract.read_text() + exports)
     subprocess.run([compiler, "-std=c++17", "-shared", "-fPIC", contract, "-o", library], check=True)
     monkeypatch.setenv("APERTURA_KERNEL", str(library))
-    with pytest.raises(CampaignError, match=rf"{field} at .*; expected {field} at byte \d+, \d+ bytes") as refused:
+    with pytest.raises(CampaignError, match=rf"{field}: .*; expected {field}: byte \d+, \d+ bytes") as refused:
         native.instruction_set()
     assert str(library) in str(refused.value)
 

@@ -28,7 +28,7 @@ def test_pulses_are_presummed_only_if_the_aperture_is_oversampled(step_m, summed
         assert plan(**job).predicted_seconds <= min(seconds) / 0.9
 
 
-def test_a_presum_beyond_the_doppler_band_of_a_wide_scene_is_refused():
+def test_presum_beyond_the_doppler_bandwidth_is_refused():
     with pytest.raises(CampaignError, match="presum factor 32"):
         plan(overrides={"presum": 32}, aperture=monostatic(straight_track(length_m=30)))
 
@@ -45,7 +45,7 @@ def oversampled(noise: float = 1.0):
 
 @pytest.mark.slow
 @compiled
-def test_presummed_image_equals_that_of_all_pulses_but_a_decimated_one_does_not():
+def test_presummed_image_equals_that_of_all_pulses_unlike_a_decimated_one():
     drawn, widest = oversampled()
     presum = design(400, 4, widest_cycles=widest)
     points = drawn.job.points_m

@@ -35,7 +35,7 @@ FLAT = FlatGround(0.0)
 
 
 @pytest.fixture(scope="module")
-def flown():
+def flight():
     pixels = pixel_grid(40, 60)
     scene = fly(scatter(pixels), pulses=131)
     return SimpleNamespace(
@@ -72,18 +72,18 @@ def test_weight_is_largest_at_the_shortest_total_path():
 @compiled
 @pytest.mark.parametrize("half", [0.04, 0.1, 0.25])
 @pytest.mark.parametrize("antenna", [False, True])
-def test_engines_agree_on_both_sides_of_the_edge(isa, flown, half, antenna):
+def test_engines_agree_on_both_sides_of_the_edge(isa, flight, half, antenna):
     """Pulses inside, at the edge and outside; the sector ends within the last, incomplete batch."""
-    beam = swaying_beam(flown.scene.tx, (12, 0, 0)) if antenna else None
-    beams, points = Beams(beam, None, sector_of(flown.aperture, half)), ecef(flown.pixels)
-    weight = beams.sector.weight(flown.aperture, points.reshape(-1, 3))
+    beam = swaying_beam(flight.scene.tx, (12, 0, 0)) if antenna else None
+    beams, points = Beams(beam, None, sector_of(flight.aperture, half)), ecef(flight.pixels)
+    weight = beams.sector.weight(flight.aperture, points.reshape(-1, 3))
     assert {0.0, 1.0} <= set(weight[:, 0]) or half == 0.25
-    truth, counts = reference.form(flown.scene.history(), points, beams=beams), np.zeros(4, np.int64)
-    image = native.form(native.prepare(flown.profiles), points, beams=beams, counts=counts)
-    other = numba.form(numba.prepare(flown.profiles), points, beams=beams)
+    truth, counts = reference.form(flight.scene.history(), points, beams=beams), np.zeros(4, np.int64)
+    image = native.form(native.prepare(flight.profiles), points, beams=beams, counts=counts)
+    other = numba.form(numba.prepare(flight.profiles), points, beams=beams)
     assert decibels(image - truth, truth) <= -70
     assert decibels(other - truth, truth) <= -70
-    whole = reference.form(flown.scene.history(), points, beams=beams.antennas)
+    whole = reference.form(flight.scene.history(), points, beams=beams.antennas)
     assert decibels(whole - truth, truth) > -25  # the sector matters
     assert counts[3] > 0 or half == 0.25
 
@@ -92,18 +92,18 @@ def test_engines_agree_on_both_sides_of_the_edge(isa, flown, half, antenna):
 @compiled
 @pytest.mark.parametrize("half", [0.04, 0.1, 0.25])
 @pytest.mark.parametrize("rough", [False, True])
-def test_engines_agree_if_the_sector_centre_follows_the_flight(isa, flown, half, rough):
+def test_engines_agree_if_the_sector_centre_follows_the_flight(isa, flight, half, rough):
     """Sector far ahead of the flight: each pixel has its own centre, which varies within patches and blocks."""
-    pixels = flown.pixels.copy()
+    pixels = flight.pixels.copy()
     if rough:
         pixels[..., 2] = 0.05 * np.sin(2 * pixels[..., 0])
     points = ecef(pixels)
-    ahead = sector_of(flown.aperture, half, centre=0.6).following(flown.aperture, points[::8, ::8].reshape(-1, 3))
+    ahead = sector_of(flight.aperture, half, centre=0.6).following(flight.aperture, points[::8, ::8].reshape(-1, 3))
     centres, beams = ahead.centre_at(points), Beams(sector=ahead)
     assert np.ptp(centres) > 0.05
     assert centres.max() < 0.6
-    truth, counts = reference.form(flown.scene.history(), points, beams=beams), np.zeros(4, np.int64)
-    tables = native.prepare(flown.scene.profiles(points))
+    truth, counts = reference.form(flight.scene.history(), points, beams=beams), np.zeros(4, np.int64)
+    tables = native.prepare(flight.scene.profiles(points))
     image = native.form(tables, points, beams=beams, counts=counts)
     assert decibels(image - truth, truth) <= -70
     assert counts[1] > 0 or rough  # weighted block by block, not only pixel by pixel
@@ -112,34 +112,34 @@ def test_engines_agree_if_the_sector_centre_follows_the_flight(isa, flown, half,
 
 
 @compiled
-def test_rough_surface_is_weighted_at_its_height_at_the_edge(isa, flown):
-    rough = flown.pixels.copy()
+def test_rough_surface_is_weighted_at_its_height_at_the_edge(isa, flight):
+    rough = flight.pixels.copy()
     rough[..., 2] = 0.3 * np.sin(2 * rough[..., 0]) + 0.04 * np.random.default_rng(6).standard_normal(rough.shape[:2])
-    points, beams = ecef(rough), Beams(sector=sector_of(flown.aperture, 0.15))
-    image = native.form(native.prepare(flown.scene.profiles(points)), points, beams=beams)
-    truth = reference.form(flown.scene.history(), points, beams=beams)
+    points, beams = ecef(rough), Beams(sector=sector_of(flight.aperture, 0.15))
+    image = native.form(native.prepare(flight.scene.profiles(points)), points, beams=beams)
+    truth = reference.form(flight.scene.history(), points, beams=beams)
     assert decibels(image - truth, truth) <= -65
 
 
 @compiled
-def test_pulses_inside_a_sector_use_the_unweighted_path(isa, flown):
+def test_pulses_inside_a_sector_use_the_unweighted_path(isa, flight):
     """The whole scene is inside: same path variants, bit-identical images."""
-    tables, points = native.prepare(flown.profiles), ecef(flown.pixels)
+    tables, points = native.prepare(flight.profiles), ecef(flight.pixels)
     counts = np.zeros((2, 4), np.int64)
     plain = native.form(tables, points, counts=counts[0])
-    within = native.form(tables, points, beams=Beams(sector=sector_of(flown.aperture, 2.0)), counts=counts[1])
+    within = native.form(tables, points, beams=Beams(sector=sector_of(flight.aperture, 2.0)), counts=counts[1])
     np.testing.assert_array_equal(plain.view(np.uint32), within.view(np.uint32))
     np.testing.assert_array_equal(*counts)
 
 
 @compiled
-def test_tiled_images_have_no_seams(isa, flown):
+def test_tiled_images_have_no_seams(isa, flight):
     """Tiles are bit-identical to the whole; weights vary across tile borders as little as inside tiles."""
-    beams, points = Beams(sector=sector_of(flown.aperture, 0.1)), ecef(flown.pixels)
-    tables = native.prepare(flown.profiles)
+    beams, points = Beams(sector=sector_of(flight.aperture, 0.1)), ecef(flight.pixels)
+    tables = native.prepare(flight.profiles)
     whole, part = (native.form(tables, pixels, beams=beams) for pixels in (points, points[16:, 32:]))
     np.testing.assert_array_equal(part.view(np.uint32), whole[16:, 32:].view(np.uint32))
-    weight = beams.sector.weight(flown.aperture, points.reshape(-1, 3)).reshape(131, *points.shape[:2])
+    weight = beams.sector.weight(flight.aperture, points.reshape(-1, 3)).reshape(131, *points.shape[:2])
     steps = np.abs(np.diff(weight, axis=2)).max(axis=(0, 1))
     assert steps[31] <= 1.5 * np.median(steps)
 
@@ -226,7 +226,7 @@ def test_tiles_beyond_the_swath_are_not_formed():
 
 @pytest.mark.slow
 def test_range_window_is_limited_by_the_sector():
-    """It covers all weighted pixels at any flight length, and is empty for pulses without weight in the scene."""
+    """The window covers weighted pixels at any flight length and is empty for pulses without weight in the scene."""
     spans = []
     for length in (150.0, 600.0):
         aperture, grid = strip(int(20 * length), length)

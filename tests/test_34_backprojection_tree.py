@@ -235,7 +235,7 @@ def test_sector_edges_use_the_tree(isa, plain, centre, half, nodes_db):
 @pytest.mark.parametrize("relief_m", [0.0, 0.4])
 @pytest.mark.parametrize("antenna", [False, True])
 def test_weights_of_a_whole_tile_hold_at_every_pixel(antenna, relief_m):
-    """Eq. 12, random tiles of a swaying flight: weight 1 inside a sector, weight 0 of silent pulses."""
+    """Eq. 12, random tiles of a swaying flight: weight 1 inside a sector, weight 0 of skipped pulses."""
     generator, along = np.random.default_rng(3), np.linspace(-60, 60, 3200)
     sway = np.stack([along, 2 * np.sin(along / 9), 20 + np.cos(along / 5)], -1)
     aperture = Aperture(sway, sway + [3.0, 0.5, 1.0])
@@ -435,10 +435,10 @@ def test_tile_band_is_the_largest_phase_slope_plus_an_airy_tail():
     at, step = np.linspace(-1, 1, 201), 1e-4
 
     def paths(xi, eta, pulses):
-        place = (
+        point = (
             surface.centre_m + xi[..., None] * surface.coefficients[0, 1] + eta[..., None] * surface.coefficients[1, 0]
         )
-        return aperture[pulses].path(place)
+        return aperture[pulses].path(point)
 
     def slopes(xi, eta, pulses):
         return (paths(xi + step, eta, pulses) - paths(xi - step, eta, pulses)) / (2 * step)

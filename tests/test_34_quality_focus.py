@@ -213,7 +213,7 @@ def test_constant_path_error_offsets_the_phase():
 
 
 def test_unconfigured_position_accuracy_follows_from_the_receiver_solution():
-    """Same effect as if configured, except for the accuracy; a float solution has larger and longer errors."""
+    """Same effect as if configured, except for the automatic accuracy; a float solution has larger, longer errors."""
     paths = straight()
     (fixed,) = position_lines(paths, [NodePositions(None, 1.0, receiver="fix")], sidelink=False)
     (configured,) = position_lines(paths, [NodePositions((0.01,) * 3, 1.0, "config")], sidelink=False)
@@ -315,7 +315,7 @@ def test_bright_points_do_not_depend_on_windows_or_their_order():
 
 
 @pytest.mark.parametrize("rotations", range(4))
-def test_skirt_of_a_point_does_not_hide_a_weaker_maximum_in_the_next_square(rotations):
+def test_skirt_of_a_point_does_not_hide_a_weaker_maximum_next_to_it(rotations):
     image = np.zeros((64, 64), np.complex64)
     image[20, 31:33], image[20, 36] = (1.0, 0.9), 0.5  # squares of 8 pixels start at 24 and 32
     image = np.rot90(image, rotations)

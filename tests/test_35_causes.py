@@ -17,8 +17,8 @@ GROUND = FlatGround(0.0)
 def test_adjoint_of_a_cause_is_its_transpose():
     generator, knots_s = np.random.default_rng(4), np.arange(0, 5, 0.1)
     flight = Prior({node: NodePrior.of(TrackErrors((0.01,) * 3), knots_s, np.eye(3)) for node in "ab"})
-    flown = {node: (np.arange(0, 5, 0.01), generator.standard_normal((500, 3))) for node in "ab"}
-    for cause in (late_logs("ab", flown), other_height("ab", flown["a"][0], np.array([0.0, 0.6, 0.8]))):
+    logs = {node: (np.arange(0, 5, 0.01), generator.standard_normal((500, 3))) for node in "ab"}
+    for cause in (late_logs("ab", logs), other_height("ab", logs["a"][0], np.array([0.0, 0.6, 0.8]))):
         prior = CausePrior.of(cause, flight, knots_s)
         unknowns = generator.standard_normal(prior.size)
         gradient = {node: generator.standard_normal((50, 3)) for node in "ab"}

@@ -145,7 +145,7 @@ def test_description_of_position_correlation_s_matches_its_use():
     """The description converts a correlation time at 1/e to the configured one: factor 1/0.63."""
     description = Node.model_fields["position_correlation_s"].description
     share = 1 - 1 / np.e
-    assert float(re.search(r"to zero there, to 1/e at ([0-9.]+) of it", description)[1]) == pytest.approx(
+    assert float(re.search(r"to zero there, and to 1/e at ([0-9.]+) of it", description)[1]) == pytest.approx(
         share, abs=0.005
     )
     assert autocorrelation(np.array([share, 1.0]), 1.0) == pytest.approx([1 / np.e, 0.0])
@@ -281,7 +281,7 @@ def test_exact_tracks_are_left_unchanged():
     result = refine(simulated.records, GRID, FlatGround(0.0), simulated.errors)
     assert not result.accepted
     assert not result.flags.keys() - {"position_error_overstated"}  # correct for tracks without error and 2 cm stated
-    assert "the logs are as good" in result.reason
+    assert "no improvement over the logs" in result.reason
 
 
 def test_track_slip_is_found_by_delays_and_corrected():

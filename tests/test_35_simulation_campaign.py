@@ -50,7 +50,7 @@ def leaves(tree, prefix=""):
 def test_folder_has_the_files_and_keys_of_the_real_sample(demo):
     sample = SHARED / "campaign-sample"
     if not sample.exists():
-        pytest.skip("campaign-sample is not here")
+        pytest.skip("campaign-sample is not available")
     assert set(contents(demo)) == set(contents(sample))
     simulated, real = (yaml.safe_load((root / "config/config.yaml").read_text()) for root in (demo, sample))
     assert leaves(simulated) == leaves(real)
@@ -66,7 +66,7 @@ def test_folder_has_the_files_and_keys_of_the_real_sample(demo):
 @pytest.mark.parametrize("name", ["uav1", "uav2"])
 def test_recordings_are_valid_sigmf_and_contain_the_pulses_of_truth_json(demo, name):
     recording = sigmf.fromfile(str(demo / f"raw/f01/{name}.sigmf-meta"))
-    recording.validate()  # schema
+    recording.validate()  # against the schema
     recording.calculate_hash()  # raises an error if the data do not match the hash
     node = json.loads((demo / "truth.json").read_text())["flights"]["f01"]["nodes"][name]
     kept = node["kept"] or list(range(24))
@@ -101,11 +101,11 @@ def test_same_seed_writes_identical_bytes(tmp_path):
 
 
 def test_non_empty_folder_is_left_unchanged(tmp_path):
-    (tmp_path / "there").mkdir()
-    (tmp_path / "there" / "mine.txt").write_text("mine")
+    (tmp_path / "occupied").mkdir()
+    (tmp_path / "occupied" / "mine.txt").write_text("mine")
     with pytest.raises(CampaignError, match="already exists and is not an empty folder"):
-        simulate(tmp_path / "there", small_simulation(), seed=0)
-    assert contents(tmp_path) == {"there/mine.txt": b"mine"}
+        simulate(tmp_path / "occupied", small_simulation(), seed=0)
+    assert contents(tmp_path) == {"occupied/mine.txt": b"mine"}
 
 
 @pytest.mark.parametrize(("atmosphere", "index"), [("vacuum", 1.0), (320.0, 1.00032)])
@@ -132,7 +132,7 @@ def test_recorded_samples_have_the_phase_of_the_logged_geometry(tmp_path, atmosp
     frequency = 1.2e9 + 4567e3 + 250e3 * np.arange(64)
     residual = np.angle(transfer * np.exp(2j * np.pi * frequency * path_m[:, None] / C))
     assert abs(residual.mean(axis=1)).max() < 1e-3
-    assert abs(residual).max() < 5e-3  # 14 bits
+    assert abs(residual).max() < 5e-3  # quantisation with 14 bits
 
 
 def test_gps_time_is_18_s_ahead_of_utc(tmp_path):
@@ -221,7 +221,7 @@ def test_wobble_has_the_requested_deviation_and_is_resolved_by_the_log():
 def test_waypoints_of_a_real_log_are_reproduced():
     log = SHARED / "dji_rtk_ansfl" / "GTExtended.csv"
     if not log.exists():
-        pytest.skip("dji_rtk_ansfl is not here")
+        pytest.skip("dji_rtk_ansfl is not available")
     table = np.genfromtxt(log, delimiter=",", skip_header=1)[:200]
     time_s, geodetic = table[:, 0] / 1e3, table[:, 1:4]
     origin = Origin(*geodetic[0])

@@ -154,7 +154,7 @@ def test_periodic_synthesis_is_refused_for_a_non_periodic_symbol():
         replace(channel, sfo_hz=10.0),
         replace(channel, paths=replace(paths, delay_rate=paths.delay_s)),
     ):
-        with pytest.raises(ValueError, match="needs exact synthesis"):
+        with pytest.raises(ValueError, match="requires exact synthesis"):
             periodic_samples(non_periodic, None, np.arange(2))
 
 

@@ -40,7 +40,7 @@ def test_amplitudes_are_divided_in_double_precision():
 
 
 def test_empty_image_is_refused():
-    with pytest.raises(ValueError, match="empty image"):
+    with pytest.raises(ValueError, match="exclude pairs whose image is empty"):
         coherent_sum(np.zeros((2, 4, 4), np.complex64), np.array([1.0, 0.0]))
 
 

@@ -42,24 +42,24 @@ def track(height_m, along_m=0.0, pulses=80, length_m=10.0):
     return np.stack([along, np.full(pulses, -25.0), np.full(pulses, height_m)], -1)
 
 
-def image(flown, points_m, amplitude):
+def image(aperture, points_m, amplitude):
     """Form the image of points on flat terrain from the sum of their echoes."""
-    path = flown.path(points_m)
+    path = aperture.path(points_m)
     phasor = np.exp(-2j * np.pi * FREQUENCY[0] * path / C) * amplitude
     step = np.exp(-2j * np.pi * (FREQUENCY[1] - FREQUENCY[0]) * path / C)
-    echo = np.empty((len(flown), len(FREQUENCY)), np.complex64)
+    echo = np.empty((len(aperture), len(FREQUENCY)), np.complex64)
     for number in range(len(FREQUENCY)):
         echo[:, number] = phasor.sum(axis=1)
         phasor *= step
     weight = np.full(len(FREQUENCY), 1 / len(FREQUENCY))
-    history = ap.PhaseHistory(echo, FREQUENCY, weight, np.zeros(len(flown)), flown)
+    history = ap.PhaseHistory(echo, FREQUENCY, weight, np.zeros(len(aperture)), aperture)
     return ap.backproject(history, GRID, -50, certified_pixels=0).values
 
 
-def legs_of(flown):
-    looks = Looks.of(GRID, FlatGround(0.0), flown, None)
+def legs_of(aperture):
+    looks = Looks.of(GRID, FlatGround(0.0), aperture, None)
     pulses = looks.pulses.reshape(-1, looks.pulses.shape[-1])
-    return looks.lattice, tuple(leg[pulses] for leg in flown.legs)
+    return looks.lattice, tuple(leg[pulses] for leg in aperture.legs)
 
 
 def sensitivity_of(first, second):
@@ -104,9 +104,11 @@ def two_tracks(rise_m, along_m=0.0, common=1.0, marked=False):
         )
         first, second = (np.append(values, [47.0, 47.0]) for values in (first, second))
     points = np.stack([east, north, ramp_m(east, north)], -1)
-    flown = [ap.Aperture(aperture, aperture) for aperture in (track(25.0), track(25.0 + rise_m, along_m))]
-    images = [image(aperture, points, amplitude) for aperture, amplitude in zip(flown, (first, second), strict=True)]
-    return *images, sensitivity_of(*flown)
+    apertures = [ap.Aperture(path, path) for path in (track(25.0), track(25.0 + rise_m, along_m))]
+    images = [
+        image(aperture, points, amplitude) for aperture, amplitude in zip(apertures, (first, second), strict=True)
+    ]
+    return *images, sensitivity_of(*apertures)
 
 
 def imaged_heights(response):
@@ -126,9 +128,9 @@ def independent(count):
 
 
 def at_middle(first, second):
-    flown = [np.broadcast_to(path, (1, *path.shape)) for path in (first, second)]
+    tracks = [np.broadcast_to(path, (1, *path.shape)) for path in (first, second)]
     band = (FREQUENCY[0], FREQUENCY[-1])
-    return sensitivity(np.zeros((1, 3)), np.eye(3), (flown[0],) * 2, (flown[1],) * 2, band_hz=band)
+    return sensitivity(np.zeros((1, 3)), np.eye(3), (tracks[0],) * 2, (tracks[1],) * 2, band_hz=band)
 
 
 # Section 2: sensitivity to height
@@ -215,7 +217,7 @@ def test_height_deviation_includes_that_of_the_reference_point():
     offset_m = tied.level.std_rad / np.abs(np.median(response.slope))
     assert wider[valid].min() > 0.7 * offset_m
     flat = Unwrapped(np.zeros((1, 4), np.float32), np.ones((1, 4), np.uint32), "", 0, 0, 0)
-    four = [KnownHeight(str(place), 0, place, 0.0, measured_rad=0.0, std_rad=0.2) for place in range(4)]
+    four = [KnownHeight(str(index), 0, index, 0.0, measured_rad=0.0, std_rad=0.2) for index in range(4)]
     assert level(flat, four[:1]).std_rad == pytest.approx(0.2)
     assert level(flat, four).std_rad == pytest.approx(0.2 / 2 * np.sqrt(np.pi / 2), abs=1e-6)
     scattered = [replace(point, measured_rad=value) for point, value in zip(four, (-0.9, -0.3, 0.3, 0.9), strict=True)]
@@ -241,12 +243,12 @@ def test_phase_deviation_of_track_errors_equals_monte_carlo_deviation(same, corr
     generator, time_s, std_m = np.random.default_rng(5), np.linspace(0, 30, 301), np.array([0.01, 0.02, 0.015])
     points = np.array([[x, y, 0.0] for x in (-20.0, 0.0, 25.0) for y in (20.0, 60.0)])
     along = np.stack([np.linspace(-15, 15, 301), np.zeros(301), np.full(301, 20.0)], -1)
-    flown = [("a", 1, along), ("a" if same else "b", -1, along + [0, 0, 1.0]), ("c", -1, along + [3.0, 0, 0])]
+    legs = [("a", 1, along), ("a" if same else "b", -1, along + [0, 0, 1.0]), ("c", -1, along + [3.0, 0, 0])]
     sampled, k = slice(3, None, 18), 2 * np.pi / WAVELENGTH
     times = np.tile(time_s[sampled], (6, 1))
     antennas = [
         FlownAntenna(name, sign, np.broadcast_to(leg[sampled], (6, 17, 3)), times, std_m, correlation_s)
-        for name, sign, leg in flown
+        for name, sign, leg in legs
     ]
     reference = [0, 5]
     predicted = TrackPhase(points, np.eye(3), antennas, k).std(reference)
@@ -254,7 +256,7 @@ def test_phase_deviation_of_track_errors_equals_monte_carlo_deviation(same, corr
     root = np.linalg.cholesky(autocorrelation(lag, correlation_s) + 1e-9 * np.eye(301))
     error = {name: np.einsum("tu,dux->dtx", root, generator.standard_normal((300, 301, 3)) * std_m) for name in "abc"}
     phase = np.zeros((300, 6))
-    for name, sign, leg in flown:
+    for name, sign, leg in legs:
         line_of_sight = leg[:, None] - points
         unit = line_of_sight / np.linalg.norm(line_of_sight, axis=-1, keepdims=True)
         phase += sign * k * np.tensordot(error[name], unit / 301, axes=([1, 2], [0, 2]))

@@ -110,13 +110,13 @@ def coverage_map(monkeypatch, tmp_path, several, **options):
 
 def test_single_pair_has_one_panel_and_a_distant_scene_a_second(monkeypatch, tmp_path):
     labels, texts, figure = coverage_map(monkeypatch, tmp_path, [covered()])
-    assert labels == ["Easting, m", "Northing, m", "pulses that make a pixel"]
-    assert texts[-2].startswith("80.0 % of the scene is seen by 1 pair of 1 flight;")
+    assert labels == ["Easting, m", "Northing, m", "pulses per pixel"]
+    assert texts[-2].startswith("80.0 % of the scene is covered by 1 pair of 1 flight;")
     assert not figure.legends
     far = np.stack([np.linspace(-400, 900, 9), np.full(9, -60.0), np.full(9, 30.0)], -1)
     coverage = Covered("f01", "a-a", {"transmitter": far}, 7 * RING)
     labels, _, figure = coverage_map(monkeypatch, tmp_path, [coverage])
-    assert labels[-1].replace("\n", " ") == "pulses that make a pixel, the scene alone"
+    assert labels[-1].replace("\n", " ") == "pulses per pixel, scene only"
     assert figure.axes[2].get_xlim() == (100, 120)
     figure.canvas.draw()
     wide, high = (figure.axes[2].bbox.size / figure.dpi).tolist()
@@ -132,7 +132,7 @@ def test_texts_of_a_narrow_map_are_not_cut(monkeypatch, tmp_path):
     north = np.stack([np.full(9, 110.0), np.linspace(20, 85, 9), np.full(9, 30.0)], -1)
     coverage = Covered("f01", "a-a", {"transmitter": north}, 7 * RING, {"transmitter": [north[3:6]]})
     _, texts, figure = coverage_map(monkeypatch, tmp_path, [coverage])
-    assert any(line.endswith("thick: makes the image) and footprints") for line in texts)
+    assert any(line.endswith("thick: used for the image) and footprints") for line in texts)
     figure.canvas.draw()
     boxes = [text.get_window_extent() for text in figure.texts if text.get_text()]
     assert all(box.x1 <= figure.bbox.x1 for box in boxes)
@@ -142,7 +142,7 @@ def test_texts_of_a_narrow_map_are_not_cut(monkeypatch, tmp_path):
 def test_legend_is_off_the_data_and_pair_counts_are_integers(monkeypatch, tmp_path):
     several = [covered(f"f{number // 5:02d}", np.roll(RING, number, axis=1)) for number in range(40)]
     _, texts, figure = coverage_map(monkeypatch, tmp_path, several)
-    assert "seen by 40 pairs of 8 flights" in " ".join(texts)
+    assert "covered by 40 pairs of 8 flights" in " ".join(texts)
     (legend,) = figure.legends
     figure.canvas.draw()
     box = legend.get_window_extent()
@@ -154,14 +154,14 @@ def test_legend_is_off_the_data_and_pair_counts_are_integers(monkeypatch, tmp_pa
 
 def test_uniform_number_of_pairs_is_stated_and_not_drawn(monkeypatch, tmp_path):
     labels, texts, _ = coverage_map(monkeypatch, tmp_path, [covered(), covered("f02")])
-    assert [label.replace("\n", " ") for label in labels[2:]] == ["pulses that make a pixel, all pairs"]
-    assert "80.0 % of the scene is seen by 2 pairs of 2 flights, each place of it by 2" in " ".join(texts)
+    assert [label.replace("\n", " ") for label in labels[2:]] == ["pulses per pixel, all pairs"]
+    assert "80.0 % of the scene is covered by 2 pairs of 2 flights, every pixel by 2" in " ".join(texts)
 
 
 def test_tracks_of_many_flights_have_one_colour_and_a_common_footprint(monkeypatch, tmp_path):
     several = [covered(f"f{number:02d}", np.roll(RING, number, axis=1)) for number in range(50)]
     _, texts, figure = coverage_map(monkeypatch, tmp_path, several)
-    assert "edge of what is seen" in " ".join(texts)
+    assert "edge of the covered area" in " ".join(texts)
     assert not figure.legends
     lines = figure.axes[0].get_lines()
     assert len({line.get_color() for line in lines}) == 2

@@ -176,7 +176,7 @@ def test_cphd_written_in_blocks_reads_back_bit_identical(tmp_path):
 
 
 def test_missing_pulses_are_refused_and_leave_no_file(tmp_path):
-    with pytest.raises(ValueError, match="5 pulses: must be 6"):
+    with pytest.raises(ValueError, match="5 pulses, must be 6"):
         write_cphd(tmp_path / "a.cphd", collection(), [noise(5)])
     assert list(tmp_path.iterdir()) == []
 
@@ -201,7 +201,7 @@ def test_cphd_is_produced_on_request_and_becomes_out_of_date(fine_tiny):
     assert stale_results(fine_tiny) == {}
     path = fine_tiny.result("f01", "uav1-uav1", "phase_history.cphd")
     path.write_bytes(path.read_bytes()[:-1])
-    assert stale_results(fine_tiny) == {cphd_results[0].manifest: "phase_history.cphd is not as it was written"}
+    assert stale_results(fine_tiny) == {cphd_results[0].manifest: "phase_history.cphd has changed since it was written"}
 
 
 def test_scene_in_another_frame_than_the_cphd_file_is_refused(tmp_path):
@@ -214,4 +214,4 @@ def test_scene_in_another_frame_than_the_cphd_file_is_refused(tmp_path):
     (tmp_path / "config/flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\nf01\timage\ta\ta\n")
     messages = [str(problem) for problem in problems(tmp_path, without=["memory"])]
     assert len(messages) == 1
-    assert "local for phase history with positions on Earth; expected an EPSG code, or auto" in messages[0]
+    assert "local for a phase history with positions in ECEF; expected an EPSG code, or auto" in messages[0]

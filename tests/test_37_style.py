@@ -89,7 +89,7 @@ def test_nodata_is_ignored_in_the_colours_of_a_file_and_of_a_mosaic(tmp_path):
 
 def test_radiometry_of_sums_lists_divisors_and_pairs():
     radiometry = of_sums({"a-a": 4.0, "a-b": 2.0, "a-c": 1.0}, {"a-a": 0.0, "a-b": 0.7})
-    assert radiometry["coherent"].amplitude == "mean of 2 peak-normalised images, added with phase"
+    assert radiometry["coherent"].amplitude == "coherent mean of 2 peak-normalised images"
     assert radiometry["coherent"].divided_by == {"a-a": 4.0, "a-b": 2.0}
     assert radiometry["coherent"].phases_removed_rad == {"a-a": 0.0, "a-b": 0.7}
     assert radiometry["noncoherent"].power == "mean power of 3 peak-normalised images"

@@ -127,7 +127,7 @@ def test_chart_distinguishes_the_verdicts(monkeypatch, tmp_path):
     monkeypatch.setattr(sweep, "save_png", lambda figure, _: figures.append(figure))
     charts.draw_losses("losses", rows, tmp_path / "losses.png")
     five, dense = figures[0].axes
-    marked = [marks(five, label).tolist() for label in (*VERDICTS, "what was refused")]
+    marked = [marks(five, label).tolist() for label in (*VERDICTS, "refused estimate")]
     assert marked == [[[1.0, 0.2]], [[2.0, 0.2]], [[3.0, 6.0]], [[5.0, 10.0]], [[3.0, 0.2]]]
     assert marks(dense, TOO_FEW)[:, 0].tolist() == [1.0, 2.0, 3.0, 5.0]
     assert "2 of 4 accepted, 0 of them worse" in five.get_title()
@@ -209,6 +209,6 @@ def test_figure_of_a_refused_refinement_shows_the_image_of_the_logs(monkeypatch,
     monkeypatch.setattr(charts, "save_png", lambda figure, _: figures.append(figure))
     charts.draw_case("five", tmp_path / "five.png")
     logs, after, _ = [axes for axes in figures[0].axes if axes.images][:3]
-    assert after.get_title().startswith("refused: the logs stay")
+    assert after.get_title().startswith("refused: logged tracks are used")
     assert (logs.images[0].get_array() == after.images[0].get_array()).all()
     assert "flags: refinement_rejected" in figures[0].get_suptitle()

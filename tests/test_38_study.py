@@ -81,7 +81,7 @@ def test_derived_parameters_match_the_paper():
     assert (sfo.paper, sfo.computed) == ("200", "199.96")
     assert rows["timing of the samples 2δR/c, δR = 2 cm"].computed == "133.4"
     differ = {"OFDM symbol T against 1/Δf", "effective chirp bandwidth B(T − Δt_max)/T, Δt_max = T_cp"}
-    differ |= {"CFO of a clock off by 10 ppb", "SFO of a clock off by 10 ppb"}
+    differ |= {"CFO of a clock error of 10 ppb", "SFO of a clock error of 10 ppb"}
     differ.add("clock error of each node at the SFO limit, ±")
     assert {name for name, row in rows.items() if row.verdict != AGREES} == differ
     assert rows["effective chirp bandwidth B(T − Δt_max)/T, Δt_max = T_cp"].verdict == UNTESTABLE
@@ -99,8 +99,8 @@ def test_printed_values_are_quoted_digit_by_digit():
         "97.64",
         EXPLAINED,  # two clocks with opposite offsets, rounded
     )
-    assert printed["CFO of a clock off by 10 ppb"] == ("41", "12", EXPLAINED)
-    assert printed["SFO of a clock off by 10 ppb"] == ("12", "40.96", EXPLAINED)
+    assert printed["CFO of a clock error of 10 ppb"] == ("41", "12", EXPLAINED)
+    assert printed["SFO of a clock error of 10 ppb"] == ("12", "40.96", EXPLAINED)
     assert not any("8.3" in row.paper for row in rows.values())
 
 
@@ -111,7 +111,7 @@ def test_converter_samples_the_band_without_aliasing():
 
 def test_contradictions_of_the_paper_are_noted():
     rows = by_claim([*parameter_claims(), *uav_table(pulses=60)])
-    for name in ("CFO of a clock off by 10 ppb", "UAV flight: cross-range width as printed"):
+    for name in ("CFO of a clock error of 10 ppb", "UAV flight: cross-range width as printed"):
         assert "contradicts itself" in rows[name].note
         assert rows[name].verdict == EXPLAINED
 
@@ -163,7 +163,7 @@ def test_errors_along_the_sidelink_cancel_only_if_common_to_both_nodes():
     claim = position_claims(draws=1)[-1]
     assert (claim.about, claim.verdict) == (PAPER, AGREES)
     alone_cm = 1 - 2.35 / np.hypot(2.35, np.hypot(15, 10))  # the sidelink grows by 1 cm, the echo path by less
-    assert f"of one node alone, of which the paper says nothing, leaves {alone_cm:.2f} cm" in claim.note
+    assert f"of a single node, which the paper does not discuss, leaves {alone_cm:.2f} cm" in claim.note
 
 
 def test_worst_bistatic_path_error_is_root_2_times_the_monostatic_one():
@@ -199,8 +199,8 @@ def test_swarm_receivers_sum_in_phase_with_gain_10_lg_n():
 
 
 def test_trigger_finds_every_pulse_at_its_position():
-    found, error = trigger_claims(pulses=4)
-    assert (found.computed, found.verdict, error.verdict) == ("1", AGREES, AGREES)
+    detected, error = trigger_claims(pulses=4)
+    assert (detected.computed, detected.verdict, error.verdict) == ("1", AGREES, AGREES)
 
 
 @pytest.mark.parametrize(
@@ -231,7 +231,7 @@ def test_loss_of_localization_errors_matches_the_independent_model(monkeypatch):
     (claim,) = loss_claims("localization", draws=6)
     assert (claim.paper, claim.independent_model) == ("", "-1.24")
     assert claim.verdict == AGREES
-    assert "±1 dB allowed here; mean of 6 draws, spread" in claim.note
+    assert "tolerance ±1 dB; mean of 6 draws, spread" in claim.note
 
 
 @pytest.mark.parametrize("name", ERRORS)
@@ -341,22 +341,21 @@ def test_loss_row_is_marked_destroyed_only_if_both_values_are(monkeypatch):
 
 def test_claim_states_its_reference_and_every_difference():
     own = require("x", 0.02, "dB", limit="below 0.01 dB", met=False, note="n")
-    assert own == Claim("x", "", "", "0.02", "dB", OWN, DISAGREES, "required here: below 0.01 dB; n")
+    assert own == Claim("x", "", "", "0.02", "dB", OWN, DISAGREES, "required: below 0.01 dB; n")
     from_paper = require("x", 0.02, "dB", limit="below 0.01 dB", met=False, words="none", note="n")
-    assert (from_paper.about, from_paper.note) == (PAPER, "the paper: none; read here as: below 0.01 dB; n")
+    assert (from_paper.about, from_paper.note) == (PAPER, "the paper: none; interpreted as: below 0.01 dB; n")
     both = compare("x", 1.0, "1", paper="2.0", independent_model=1.0, within=0.1)
     assert (both.paper, both.independent_model, both.about, both.verdict) == ("2.0", "1", PAPER, DISAGREES)
     assert both.note == "differs by -50.0 %"
     known = compare("x", 1.0, "1", paper="2.0", within=0.1, reason="swapped", note="n")
     assert (known.verdict, known.note) == (EXPLAINED, "differs by -50.0 %; swapped; n")
     assert (
-        compare("x", 2.0, "1", paper="2.0", within=0.1, reason="swapped").note
-        == "differs by +0.0 %, ±10 % allowed here"
+        compare("x", 2.0, "1", paper="2.0", within=0.1, reason="swapped").note == "differs by +0.0 %, tolerance ±10 %"
     )
     # Only values that round to the printed digits agree.
     assert [compare("x", value, "1", paper="2.0").verdict for value in (2.049, 2.06)] == [AGREES, DISAGREES]
     assert compare("x", 1.0, "1", independent_model=1.0).about == MODEL
-    with pytest.raises(ValueError, match="neither"):
+    with pytest.raises(ValueError, match="no value of the paper or of a model"):
         compare("x", 1.0, "1", within=0.1)
 
 

@@ -1,4 +1,4 @@
-"""The front door from Python: lazy, planned, certified, and the same bits on every scheduler."""
+"""Python function `backproject`: lazy, planned and certified images, identical on every scheduler."""
 
 import json
 from dataclasses import replace
@@ -21,7 +21,7 @@ def image() -> xr.DataArray:
     return ap.backproject(point_history(), TARGET_GRID, tile_px=64)
 
 
-def test_an_image_is_lazy_and_its_chunks_are_the_tiles(image):
+def test_image_is_lazy_and_its_chunks_are_the_tiles(image):
     assert image.chunks == ((64, 64, 32), (64, 64, 32))
     assert image.dtype == np.complex64
     assert image.attrs["units"] == "1"
@@ -29,15 +29,15 @@ def test_an_image_is_lazy_and_its_chunks_are_the_tiles(image):
     assert image.spatial_ref.attrs["crs_wkt"].startswith("LOCAL_CS")
 
 
-def test_a_target_focuses_where_it_is_with_the_amplitude_of_its_echo(image):
+def test_target_focuses_at_its_position_with_its_echo_amplitude(image):
     level = abs(image).compute()
     peak = level[level.argmax(...)]
     assert float(peak) == pytest.approx(1.0, abs=0.05)
     assert (float(peak.x), float(peak.y)) == (pytest.approx(1.25, abs=0.05), pytest.approx(-0.75, abs=0.05))
 
 
-def test_the_certificate_is_what_a_comparison_with_the_double_sum_measures():
-    """On speckle, where no pixel holds most of the power; what it states is what the error stays below."""
+def test_certified_error_matches_a_comparison_with_the_double_sum():
+    """On speckle, where no pixel dominates the power; the certified error is an upper bound."""
     drawn = draw(np.random.default_rng(4), pixels=80, pulses=60)
     noise = np.random.default_rng(6).standard_normal((2, *drawn.history.transfer.shape))
     history = replace(drawn.history, transfer=(noise[0] + 1j * noise[1]).astype(np.complex64))
@@ -54,8 +54,8 @@ def test_the_certificate_is_what_a_comparison_with_the_double_sum_measures():
 @pytest.mark.quick("871")
 @compiled
 @pytest.mark.parametrize("seed", [860, 863, 871])
-def test_the_bound_at_pixels_drawn_blindly_is_no_lower_than_the_error_predicted(seed):
-    """Four of them miss what is bright; alone their bound lies up to 9 dB below the error."""
+def test_bound_from_few_pixels_is_not_below_the_predicted_error(seed):
+    """Four pixels miss the bright ones; the bound from them alone is up to 9 dB below the error."""
     drawn = draw(np.random.default_rng(seed), pixels=48, pulses=60)
     image = ap.backproject(
         drawn.history, drawn.grid, -40, engine="tree", integration="all", certified_pixels=4, judge=False
@@ -63,8 +63,8 @@ def test_the_bound_at_pixels_drawn_blindly_is_no_lower_than_the_error_predicted(
     assert image.attrs["numerical_error_db"] >= image.attrs["predicted_error_db"]
 
 
-def test_profiles_alone_give_the_same_image_and_a_certificate_of_their_own(image):
-    """Their error counts against band-limited interpolation; what range compression errs by is -130 dB."""
+def test_profiles_give_the_same_image_and_their_own_certificate(image):
+    """Their error is relative to band-limited interpolation; the error of range compression is -130 dB."""
     profiles = ap.range_compress(point_history(), TARGET_GRID, ap.FlatGround(0.0))
     alone = ap.backproject(profiles, TARGET_GRID, tile_px=64)
     assert alone.attrs["numerical_error_db"] < -60
@@ -74,27 +74,27 @@ def test_profiles_alone_give_the_same_image_and_a_certificate_of_their_own(image
         ap.backproject(profiles, TARGET_GRID, engine="reference")
 
 
-def test_a_stage_of_a_campaign_gives_the_image_of_its_workflow(finished_tiny):
+def test_campaign_stage_gives_the_image_of_the_workflow(finished_tiny):
     campaign = ap.open_campaign(finished_tiny.root)
     flight, pairs = next(iter(campaign.pairs.items()))
     scene, echo = campaign.scene, campaign.stage("echo", flight, pairs[0])
-    front = ap.backproject(echo, scene.grid, terrain=scene.terrain, certified_pixels=0)
-    np.testing.assert_array_equal(front.values, campaign.image(flight, pairs[0]).values)
+    image = ap.backproject(echo, scene.grid, terrain=scene.terrain, certified_pixels=0)
+    np.testing.assert_array_equal(image.values, campaign.image(flight, pairs[0]).values)
     assert campaign.report(flight, pairs[0])["flags"] == campaign.flags(flight, pairs[0])
-    told, by_workflow = ap.judge(front), campaign.report(flight, pairs[0])["focus"]
+    result, workflow_focus = ap.judge(image), campaign.report(flight, pairs[0])["focus"]
     for name in ("verdict", "reason", "points", "parts"):
-        assert told.focus[name] == by_workflow[name]
+        assert result.focus[name] == workflow_focus[name]
 
 
 @pytest.mark.slow
-def test_threads_processes_and_one_thread_give_the_same_bits(image):
+def test_threads_processes_and_one_thread_give_identical_images(image):
     alone = image.compute(scheduler="synchronous").values
     np.testing.assert_array_equal(image.compute(scheduler="threads").values, alone)
     np.testing.assert_array_equal(image.compute(scheduler="processes", num_workers=2).values, alone)
 
 
 @pytest.mark.slow
-def test_a_local_cluster_of_two_processes_gives_the_same_bits(image):
+def test_local_cluster_gives_an_identical_image(image):
     distributed = pytest.importorskip("distributed")
     alone = image.compute(scheduler="synchronous").values
     with (
@@ -104,64 +104,64 @@ def test_a_local_cluster_of_two_processes_gives_the_same_bits(image):
         np.testing.assert_array_equal(image.compute().values, alone)
 
 
-def test_one_tile_alone_is_that_of_the_whole_image(image):
+def test_single_tile_equals_that_of_the_whole_image(image):
     np.testing.assert_array_equal(image[64:128, 128:160].compute().values, image.values[64:128, 128:160])
 
 
 @pytest.mark.slow
-def test_a_toy_engine_is_planned_where_it_is_exact_enough(toy):
+def test_toy_engine_is_used_if_accurate_enough(toy):
     rough = ap.backproject(point_history(), TARGET_GRID, accuracy_db=-20.0)
     assert rough.attrs["setting"].startswith("toy refine=")
     assert rough.attrs["numerical_error_db"] < -20
     assert not ap.backproject(point_history(), TARGET_GRID, accuracy_db=-60.0).attrs["setting"].startswith("toy")
-    asked = ap.backproject(point_history(), TARGET_GRID, accuracy_db=-10.0, engine_options={"toy": {"refine": 2}})
-    assert json.loads(asked.attrs["models"])["refine"] == "2: requested; nearest sample of a refined profile"
+    requested = ap.backproject(point_history(), TARGET_GRID, accuracy_db=-10.0, engine_options={"toy": {"refine": 2}})
+    assert json.loads(requested.attrs["models"])["refine"] == "2: requested; nearest sample of a refined profile"
 
 
-def test_a_setting_that_misses_on_pixels_gives_way_to_the_next(toy):
-    """The toy engine's sample of a profile, its prediction flattered."""
-    asked = {"engine": "toy", "engine_options": {"toy": {"refine": 2}}}
-    missed = ap.backproject(point_history(), TARGET_GRID, accuracy_db=-60.0, **asked)
-    assert not missed.attrs["setting"].startswith("toy")
-    assert missed.attrs["numerical_error_db"] < -60
-    models = json.loads(missed.attrs["models"])
+def test_setting_that_misses_the_accuracy_is_replaced_by_the_next(toy):
+    """The toy engine takes the nearest sample of a profile and predicts too small an error."""
+    requested = {"engine": "toy", "engine_options": {"toy": {"refine": 2}}}
+    image = ap.backproject(point_history(), TARGET_GRID, accuracy_db=-60.0, **requested)
+    assert not image.attrs["setting"].startswith("toy")
+    assert image.attrs["numerical_error_db"] < -60
+    models = json.loads(image.attrs["models"])
     assert "missed the requested accuracy" in models["engine"]
     assert "refine" not in models
-    assert "accuracy_not_met" not in json.loads(missed.attrs["flags"])
+    assert "accuracy_not_met" not in json.loads(image.attrs["flags"])
 
 
-def test_what_no_setting_meets_is_flagged():
-    """Profiles without the double sum to fall back on."""
+def test_accuracy_met_by_no_setting_is_flagged():
+    """Profiles do not permit the double sum as a fallback."""
     profiles = ap.range_compress(point_history(), TARGET_GRID, ap.FlatGround(0.0))
     flags = json.loads(ap.backproject(profiles, TARGET_GRID, accuracy_db=-120.0).attrs["flags"])
     assert "-120 dB requested" in flags["accuracy_not_met"]
 
 
-def test_an_image_can_be_written_with_its_plan_and_certificate(image, tmp_path):
+def test_image_can_be_written_with_plan_and_certificate(image, tmp_path):
     parts = xr.Dataset({"real": image.real, "imag": image.imag}, attrs=image.attrs)
     parts.to_netcdf(tmp_path / "image.nc", engine="scipy")
     assert xr.open_dataset(tmp_path / "image.nc", engine="scipy").attrs["models"] == image.attrs["models"]
 
 
 @pytest.mark.parametrize(
-    ("by_m", "grid", "options", "complaint"),
+    ("offset_m", "grid", "options", "complaint"),
     [
         (1e6, TARGET_GRID, {}, "the samples contain no echo of the scene"),
         (0.0, SceneGrid("EPSG:32632", 5e5, 5e6, 0.5, (9, 9)), {"terrain": 0.0}, "no echo of the scene"),
         (0.0, SceneGrid("EPSG:32632", 5e5, 5e6, 0.5, (9, 9)), {}, "no terrain for a georeferenced grid"),
     ],
 )
-def test_a_scene_elsewhere_is_refused_with_one_message(by_m, grid, options, complaint):
+def test_scene_outside_the_samples_is_refused(offset_m, grid, options, complaint):
     history = point_history()
-    moved = ap.Aperture(history.aperture.tx_m + by_m, history.aperture.rx_m + by_m)
+    displaced = ap.Aperture(history.aperture.tx_m + offset_m, history.aperture.rx_m + offset_m)
     with pytest.raises(CampaignError, match=complaint):
-        ap.backproject(replace(history, aperture=moved), grid, **options)
+        ap.backproject(replace(history, aperture=displaced), grid, **options)
 
 
-def test_lists_are_taken_as_arrays():
+def test_lists_are_accepted_as_arrays():
     history = point_history()
-    given = replace(history, weight=list(history.weight), reference_delay_s=[0.0] * len(history))
-    np.testing.assert_array_equal(given.weight, history.weight)
+    from_lists = replace(history, weight=list(history.weight), reference_delay_s=[0.0] * len(history))
+    np.testing.assert_array_equal(from_lists.weight, history.weight)
     assert len(ap.Aperture([[0.0, 0, 9], [1, 0, 9]], [[0.0, 0, 9], [1, 0, 9]])) == 2
     with pytest.raises(CampaignError, match=r"tx_m \(3,\).*one row of x, y and z per pulse"):
         ap.Aperture([0.0, 0, 9], [0.0, 0, 9])
@@ -176,7 +176,7 @@ def test_profiles_that_end_within_the_scene_are_flagged():
 
 
 @pytest.mark.slow
-def test_the_window_over_subcarriers_that_is_asked_for_is_taken(finished_tiny):
+def test_requested_subcarrier_window_is_used(finished_tiny):
     campaign = ap.open_campaign(finished_tiny.root)
     flight, pairs = next(iter(campaign.pairs.items()))
     echo, scene = campaign.stage("echo", flight, pairs[0]), campaign.scene

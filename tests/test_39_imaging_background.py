@@ -1,4 +1,4 @@
-"""Removal of echoes at constant delay: what it restores, what targets lose by it, and when it is left out."""
+"""Removal of echoes at constant delay: effect on the image, loss of targets, and the decision to apply it."""
 
 import shutil
 from dataclasses import dataclass, replace
@@ -33,7 +33,7 @@ PRF_HZ = 100.0
 
 @dataclass
 class Recording:
-    """Transfer functions of targets with noise, and the coupling that was added."""
+    """Transfer functions of targets with noise, and with added coupling."""
 
     transfer: np.ndarray
     aperture: Aperture
@@ -109,7 +109,7 @@ def median_db(recording, background=None):
 @pytest.mark.parametrize(
     "level_db", [0, pytest.param(20, marks=pytest.mark.slow), pytest.param(40, marks=pytest.mark.slow), 60]
 )
-def test_targets_are_restored_and_the_rest_of_the_image_does_not_depend_on_the_coupling(level_db):
+def test_removal_restores_targets_and_clutter_at_any_coupling_level(level_db):
     clean = recorded(straight())
     disturbed = coupled(clean, level_db)
     removal = disturbed.decided()
@@ -122,12 +122,12 @@ def test_targets_are_restored_and_the_rest_of_the_image_does_not_depend_on_the_c
 
 
 @pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 20))])
-def test_no_background_is_found_in_a_recording_without_one(seed):
+def test_no_background_is_detected_without_coupling(seed):
     assert recorded(straight(), seed=seed, noise=3.0 if seed % 2 else 0.1).excess_db < 0
 
 
-def test_the_predicted_loss_of_a_target_is_that_of_its_image():
-    """Short passes, on which the range hardly changes."""
+def test_predicted_loss_of_a_target_equals_that_of_its_image():
+    """Short passes with little change of range."""
     target = np.array([[0.0, 25.0, 0.0]])
     losses = []
     for length_m in (1.5, 3.0, 6.0):
@@ -148,7 +148,7 @@ def circle(pulses=400, radius_m=15.0):
 CENTRE = np.array([[0.0, 25.0, 0.0]])
 
 
-def test_a_target_circled_at_constant_range_is_not_removed():
+def test_target_circled_at_constant_range_is_not_removed():
     recording = recorded(circle(), CENTRE)
     removal = recording.decided()
     assert recording.excess_db > 0
@@ -158,7 +158,7 @@ def test_a_target_circled_at_constant_range_is_not_removed():
     assert np.linalg.norm(steadiest(recording.scene) - CENTRE[0]) < 0.01
 
 
-def test_coupling_is_removed_at_all_delays_but_that_of_the_circled_target():
+def test_coupling_is_removed_at_all_delays_except_a_circled_target():
     clean = recorded(circle(), CENTRE)
     disturbed = coupled(clean, 20)
     removal = disturbed.decided()
@@ -168,7 +168,13 @@ def test_coupling_is_removed_at_all_delays_but_that_of_the_circled_target():
     assert median_db(disturbed, removal.background) < median_db(disturbed) - 10
 
 
-def test_a_configured_method_removes_the_circled_target_and_raises_a_flag():
+def test_coupling_left_at_the_delay_of_a_circled_target_is_flagged():
+    removal = coupled(recorded(circle(), CENTRE), 60).decided()
+    assert removal.background is not None
+    assert "background" in removal.flags
+
+
+def test_configured_method_removes_a_circled_target_with_a_flag():
     recording = recorded(circle(), CENTRE)
     removal = recording.decided("median")
     lost_db = 20 * np.log10(np.abs(recording.image(CENTRE, removal.background) / recording.image(CENTRE))[0])
@@ -176,15 +182,15 @@ def test_a_configured_method_removes_the_circled_target_and_raises_a_flag():
     assert f"{-removal.loss_db:.1f} dB" in removal.flags["background_loss"]
 
 
-def test_arcs_stay_and_raise_a_flag_where_every_target_would_be_lost():
-    """A platform that hovers: 5 cm of track."""
+def test_coupling_is_kept_and_flagged_if_every_target_would_be_lost():
+    """Hovering platform: 5 cm of track."""
     removal = coupled(recorded(straight(length_m=0.05)), 10).decided()
     assert removal.background is None
     assert removal.loss_db < -10
     assert "background" in removal.flags
 
 
-def test_coupling_that_drifts_is_removed_by_a_running_median():
+def test_drifting_coupling_is_removed_by_a_running_median():
     clean = recorded(straight(1600, 60.0))
     drifting = coupled(clean, 40, drift=6.0)
     removal = drifting.decided()
@@ -194,20 +200,20 @@ def test_coupling_that_drifts_is_removed_by_a_running_median():
     assert np.abs(peaks_db(drifting, median) - peaks_db(clean)).max() > 1.0
 
 
-def test_bursts_in_a_tenth_of_the_pulses_do_not_move_the_median():
+def test_bursts_in_a_tenth_of_the_pulses_do_not_change_the_median():
     recording = coupled(recorded(straight()), 20)
     burst = recording.transfer.copy()
     burst[100:140] += 1000
     values = [
-        GroupMeans.of(lambda some, of=of: of[some], recording.time_s).background("median").values
-        for of in (recording.transfer, burst)
+        GroupMeans.of(lambda pulses, transfer=transfer: transfer[pulses], recording.time_s).background("median").values
+        for transfer in (recording.transfer, burst)
     ]
     assert np.abs(values[1] - values[0]).max() < 1.0
 
 
 @pytest.fixture(scope="module")
 def leaking(tmp_path_factory):
-    """Campaigns whose antennas couple 40 dB above the echoes, at the delay of the scene: auto, and not removed."""
+    """Process campaigns with coupling 40 dB above the echoes at the delay of the scene: removal auto and off."""
     plan = replace(preset("demo", pulses=150), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
     leaks = Leakage(level_db=40.0, path_m=20.0)
     nodes = {
@@ -223,8 +229,8 @@ def leaking(tmp_path_factory):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
-def test_the_image_of_a_campaign_is_that_of_its_echo_without_the_background(leaking, pair):
-    """Profiles, certificate and reports are of the same transfer functions; the coupling is gone from the image."""
+def test_image_of_a_campaign_is_formed_without_the_background(leaking, pair):
+    """Profiles, certificate and reports use the same transfer functions; the image contains no coupling."""
     images = {name: open_stage(campaign.stage("image", "f01", pair), "image") for name, campaign in leaking.items()}
     quality = images["auto"].attrs["quality"]
     assert quality["background"]["removed"] == "median"
@@ -239,7 +245,7 @@ def test_the_image_of_a_campaign_is_that_of_its_echo_without_the_background(leak
 
 
 @pytest.mark.slow
-def test_the_reflector_of_a_real_uav_flight_is_its_highest_peak_where_it_was_surveyed(shared, tmp_path):
+def test_reflector_of_a_real_flight_is_the_highest_peak_at_its_survey_point(shared, tmp_path):
     root = tmp_path / "uav_flight"
     shutil.copytree(ROOT / "examples" / "uav_flight", root)
     (root / "raw" / "f01").mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""The certificate of an image: tiles that miss the accuracy are formed again, and what is still missed is flagged."""
+"""Certificate of an image: tiles that miss the accuracy are recomputed, a remaining excess is flagged."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ SIDE_PX = 32
 
 @pytest.fixture(scope="module")
 def speckle() -> Formation:
-    """An image of noise alone, nine tiles of the same brightness."""
+    """Plan an image of noise: nine tiles of equal brightness."""
     drawn = draw(np.random.default_rng(4), pixels=80, pulses=60)
     noise = np.random.default_rng(6).standard_normal((2, *drawn.history.transfer.shape))
     history = replace(drawn.history, transfer=(noise[0] + 1j * noise[1]).astype(np.complex64))
@@ -35,7 +35,7 @@ def certify(formation, target, accuracy_db=-60.0):
     return certified(formation, target, accuracy_db=accuracy_db, threads=1)
 
 
-def test_an_image_as_exact_as_asked_is_left_as_it_is(speckle):
+def test_image_that_meets_the_accuracy_is_unchanged(speckle):
     target = speckle.image.compute()
     before = target.copy()
     report = certify(speckle, target)
@@ -45,32 +45,32 @@ def test_an_image_as_exact_as_asked_is_left_as_it_is(speckle):
     np.testing.assert_array_equal(target, before)
 
 
-def test_the_error_reported_is_an_upper_bound_of_that_of_all_pixels(speckle):
+def test_reported_error_is_an_upper_bound_over_all_pixels(speckle):
     target = speckle.image.compute()
-    every = np.argwhere(np.ones(target.shape, bool))
-    true_db = numerical_error_db(target.ravel(), speckle.exact(every))
+    pixels = np.argwhere(np.ones(target.shape, bool))
+    true_db = numerical_error_db(target.ravel(), speckle.exact(pixels))
     report = certify(speckle, target)
     assert report["numerical_error_estimate_db"] == pytest.approx(true_db, abs=1.0)
     assert true_db < report["numerical_error_db"] < true_db + 2
     assert report["numerical_error_confidence"] == 0.95
 
 
-def test_a_tile_that_misses_is_formed_again_with_the_first_fallback_and_no_other_tile(speckle):
-    good = speckle.image.compute()
-    spoilt, window = good.copy(), speckle.windows[4]
-    spoilt[window] *= 1.01
-    report = certify(speckle, spoilt)
+def test_only_a_tile_that_misses_is_recomputed_with_the_first_fallback(speckle):
+    accurate = speckle.image.compute()
+    target, window = accurate.copy(), speckle.windows[4]
+    target[window] *= 1.01
+    report = certify(speckle, target)
     fallback = speckle.plan.fallbacks[0]
     assert report["recomputed"] == [{"tiles": 1, "with": f"{fallback.line}, every pulse"}]
     assert report["numerical_error_db"] < -60
     assert report["flags"] == {}
-    np.testing.assert_array_equal(spoilt[window], speckle.image_by(fallback)[window].compute())
-    spoilt[window] = good[window]
-    np.testing.assert_array_equal(spoilt, good)
+    np.testing.assert_array_equal(target[window], speckle.image_by(fallback)[window].compute())
+    target[window] = accurate[window]
+    np.testing.assert_array_equal(target, accurate)
 
 
-def test_tiles_fall_back_until_they_are_exact_enough_and_a_rest_is_flagged(speckle):
-    """At -125 dB only the double sum in float64, kept as complex64, is left; at -200 dB not even that suffices."""
+def test_tiles_fall_back_until_accurate_and_the_rest_is_flagged(speckle):
+    """-125 dB requires the float64 double sum, stored as complex64; -200 dB is not met by any engine."""
     target = speckle.image.compute()
     report = certify(speckle, target, accuracy_db=-125.0)
     assert report["recomputed"][-1]["with"] == "reference, every pulse"
@@ -81,20 +81,20 @@ def test_tiles_fall_back_until_they_are_exact_enough_and_a_rest_is_flagged(speck
     assert report["flags"] == {"accuracy_not_met": f"{bound}, -200.0 dB requested"}
 
 
-def test_what_no_tile_misses_for_itself_but_the_bound_does_is_formed_again(speckle):
-    """Every pixel errs by as much, a little less than asked: not sure enough."""
+def test_all_tiles_are_recomputed_if_only_the_bound_misses(speckle):
+    """Uniform error slightly below the requested one: the confidence bound exceeds it."""
     exact = speckle.exact(np.argwhere(np.ones(speckle.grid.shape, bool))).reshape(speckle.grid.shape)
-    turned = np.exp(2j * np.pi * np.random.default_rng(3).random(exact.shape))
-    target = (exact + 1e-3 * np.sqrt(np.mean(np.abs(exact) ** 2)) * turned).astype(np.complex64)
+    phasors = np.exp(2j * np.pi * np.random.default_rng(3).random(exact.shape))
+    target = (exact + 1e-3 * np.sqrt(np.mean(np.abs(exact) ** 2)) * phasors).astype(np.complex64)
     stated = certify(speckle, target, accuracy_db=np.inf)
     between_db = (stated["numerical_error_db"] + stated["numerical_error_estimate_db"]) / 2
     report = certify(speckle, target, accuracy_db=between_db)
-    assert [one["tiles"] for one in report["recomputed"]] == [len(speckle.windows)]
+    assert [entry["tiles"] for entry in report["recomputed"]] == [len(speckle.windows)]
     assert report["flags"] == {}
     assert report["numerical_error_db"] < between_db
 
 
-def test_the_brightest_target_is_measured_where_it_stands_with_its_amplitude_and_width():
+def test_brightest_target_is_measured_with_position_amplitude_and_width():
     history, ground = point_history(), GroundModels.flat(0.0)
     aperture, frequency = history.aperture, history.frequency_hz
     job = imaging_job(aperture, frequency, history.weight, TARGET_GRID, ground)

@@ -1,4 +1,4 @@
-"""Ways to use the Python door wrongly: each is refused with one message, or its image carries a flag or a verdict."""
+"""Misuse of the Python functions: refused with one message, or the image has a flag or a verdict."""
 
 import json
 from dataclasses import replace
@@ -36,8 +36,8 @@ def echo_of(path_m, **fields):
     return of(transfer=echo.astype(np.complex64), **fields)
 
 
-def wide(pulses):
-    """A beam of one gain everywhere, over some pulses."""
+def uniform_beam(pulses):
+    """Return a beam of uniform gain for a number of pulses."""
     angle = np.linspace(-3, 3, 9)
     return Beams(transmit=Beam(np.tile(np.eye(3), (pulses, 1, 1)), angle, np.ones(9), angle, np.ones(9)))
 
@@ -64,12 +64,12 @@ REFUSED = {
     "weights negative": (of(weight=np.linspace(-1, 1, 200)), {}, "no negative weight"),
     "weights NaN": (of(weight=np.full(200, np.nan)), {}, "not finite"),
     "weights by pulse": (of(weight=np.ones(96)), {}, r"weight \(96,\)"),
-    "delay one number": (of(reference_delay_s=0.0), {}, r"reference_delay_s \(\)"),
+    "delay a scalar": (of(reference_delay_s=0.0), {}, r"reference_delay_s \(\)"),
     "delay NaN": (of(reference_delay_s=np.full(96, np.nan)), {}, "not finite"),
     "delay in ns": (of(reference_delay_s=np.full(96, 150.0)), {}, "seconds"),
     "transposed": (of(transfer=ECHO.T), {}, "Transpose"),
     "transfer flat": (of(transfer=ECHO.ravel()), {}, r"transfer \(19200,\)"),
-    "transfer of words": (of(transfer="echo.npy"), {}, "complex numbers"),
+    "transfer a string": (of(transfer="echo.npy"), {}, "complex numbers"),
     "transfer None": (of(transfer=None), {}, "complex numbers"),
     "transfer of objects": (of(transfer=np.array([["a"] * 200] * 96)), {}, "complex numbers"),
     "transfer NaN": (of(transfer=np.full_like(ECHO, np.nan)), {}, "96 of 96 pulses"),
@@ -77,21 +77,21 @@ REFUSED = {
     "real samples": (of(transfer=np.abs(ECHO)), {}, "complex"),
     "fewer pulses": (of(transfer=ECHO[:95]), {}, "aperture of 96 pulses"),
     "no pulses": (lambda: HISTORY[:0], {}, "no pulses"),
-    "aperture an array": (of(aperture=APERTURE.tx_m), {}, "Make one by Aperture"),
-    "aperture None": (of(aperture=None), {}, "Make one by Aperture"),
-    "track of one place": (lambda: ap.Aperture([0.0, 0, 9], [0.0, 0, 9]), {}, "x, y and z of each pulse"),
-    "track transposed": (lambda: ap.Aperture(APERTURE.tx_m.T, APERTURE.rx_m.T), {}, "x, y and z of each pulse"),
+    "aperture an array": (of(aperture=APERTURE.tx_m), {}, "Create one with Aperture"),
+    "aperture None": (of(aperture=None), {}, "Create one with Aperture"),
+    "track of one position": (lambda: ap.Aperture([0.0, 0, 9], [0.0, 0, 9]), {}, "one row of x, y and z per pulse"),
+    "track transposed": (lambda: ap.Aperture(APERTURE.tx_m.T, APERTURE.rx_m.T), {}, "one row of x, y and z per pulse"),
     "track in two dimensions": (flown(APERTURE.tx_m[:, :2], APERTURE.rx_m[:, :2]), {}, "x, y and z"),
-    "track of words": (lambda: ap.Aperture("track.csv", "track.csv"), {}, "real numbers"),
+    "track a string": (lambda: ap.Aperture("track.csv", "track.csv"), {}, "real numbers"),
     "track None": (lambda: ap.Aperture(APERTURE.tx_m, None), {}, "real numbers"),
     "track complex": (flown(APERTURE.tx_m * 1j), {}, "real"),
     "track NaN": (flown(APERTURE.tx_m + np.nan), {}, "phase centres are not finite"),
     "track in mm": (flown(APERTURE.tx_m * 1e3, APERTURE.rx_m * 1e3), {}, "no echo of the scene|below the ground"),
     "track of another frame": (flown(APERTURE.tx_m + 5e6, APERTURE.rx_m + 5e6), {}, "no echo of the scene"),
-    "track under ground": (flown(-APERTURE.tx_m, -APERTURE.rx_m), {}, "at or below the terrain"),
+    "track below the terrain": (flown(-APERTURE.tx_m, -APERTURE.rx_m), {}, "at or below the terrain"),
     "speed of sound": (of(wave_speed_m_s=343.0), {}, "light"),
     "speed in km/s": (of(wave_speed_m_s=299792.458), {}, "light"),
-    "speed a word": (of(wave_speed_m_s="air"), {}, "light"),
+    "speed a string": (of(wave_speed_m_s="air"), {}, "light"),
     "an array for the echo": (lambda: ECHO, {}, "expected PhaseHistory"),
     "a path for the echo": (lambda: "results/f01", {}, "expected PhaseHistory"),
     "another dataset": (lambda: xr.Dataset({"image": ("x", [1.0])}), {}, "a dataset of stage echo"),
@@ -99,7 +99,7 @@ REFUSED = {
     "grid None": (lambda: HISTORY, {"grid": None}, "a SceneGrid"),
     "grid in degrees": (lambda: HISTORY, {"grid": lambda: ap.SceneGrid("EPSG:4326", 5, 5, 0.5, (9, 9))}, "in metres"),
     "grid unknown": (lambda: HISTORY, {"grid": lambda: ap.SceneGrid("UTM32", 5e5, 5e6, 0.5, (9, 9))}, "UTM32"),
-    "grid of no spacing": (lambda: HISTORY, {"grid": lambda: ap.SceneGrid("local", 0, 0, 0.0, (9, 9))}, "spacing_m"),
+    "grid spacing zero": (lambda: HISTORY, {"grid": lambda: ap.SceneGrid("local", 0, 0, 0.0, (9, 9))}, "spacing_m"),
     "grid of one side": (
         lambda: HISTORY,
         {"grid": lambda: ap.SceneGrid("local", 0.0, 0.0, 0.1, 9)},
@@ -115,7 +115,7 @@ REFUSED = {
     "terrain NaN": (lambda: HISTORY, {"terrain": np.nan}, "a finite number of metres"),
     "terrain above the antennas": (lambda: HISTORY, {"terrain": 15.0}, "at or below the terrain"),
     "accuracy positive": (lambda: HISTORY, {"accuracy_db": 60.0}, "accuracy_db"),
-    "accuracy a word": (lambda: HISTORY, {"accuracy_db": "high"}, "accuracy_db"),
+    "accuracy a string": (lambda: HISTORY, {"accuracy_db": "high"}, "accuracy_db"),
     "accuracy None": (lambda: HISTORY, {"accuracy_db": None}, "accuracy_db"),
     "engine unknown": (lambda: HISTORY, {"engine": "gpu"}, "unknown engine"),
     "engine None": (lambda: HISTORY, {"engine": None}, "engine"),
@@ -123,12 +123,12 @@ REFUSED = {
     "beams a number": (lambda: HISTORY, {"beams": 30.0}, "Beams"),
     "beams of other pulses": (
         lambda: HISTORY,
-        {"beams": lambda: wide(50)},
+        {"beams": lambda: uniform_beam(50)},
         "50 pulses",
     ),
     "atmosphere dry": (lambda: HISTORY, {"atmosphere": "dry"}, "atmosphere"),
     "atmosphere an index": (lambda: HISTORY, {"atmosphere": [1.0003]}, "atmosphere"),
-    "calibration a word": (lambda: HISTORY, {"calibration": "auto"}, "calibration"),
+    "calibration a string": (lambda: HISTORY, {"calibration": "auto"}, "calibration"),
     "calibration negative": (lambda: HISTORY, {"calibration": -1.0}, "calibration"),
     "track in half precision": (flown(APERTURE.tx_m.astype(np.float16)), {}, "float16, whose neighbouring numbers"),
     "track with a mask": (
@@ -141,38 +141,38 @@ REFUSED = {
         {},
         "no subcarrier",
     ),
-    "pixels a truth": (lambda: HISTORY, {"certified_pixels": True}, "certified_pixels"),
-    "pixels without end": (lambda: HISTORY, {"certified_pixels": 10**12}, "0 to 1000000"),
+    "pixels a boolean": (lambda: HISTORY, {"certified_pixels": True}, "certified_pixels"),
+    "pixels too many": (lambda: HISTORY, {"certified_pixels": 10**12}, "0 to 1000000"),
     "pixels negative": (lambda: HISTORY, {"certified_pixels": -1}, "certified_pixels"),
-    "pixels a word": (lambda: HISTORY, {"certified_pixels": "all"}, "certified_pixels"),
-    "judge a word": (lambda: HISTORY, {"judge": "later"}, "judge"),
+    "pixels a string": (lambda: HISTORY, {"certified_pixels": "all"}, "certified_pixels"),
+    "judge a string": (lambda: HISTORY, {"judge": "later"}, "judge"),
     "integration unknown": (lambda: HISTORY, {"integration": {"metres": 3}}, "integration"),
-    "tile of no patch": (lambda: HISTORY, {"tile_px": 100}, "tile_px"),
+    "tile not a multiple of the patch": (lambda: HISTORY, {"tile_px": 100}, "tile_px"),
     "presum zero": (lambda: HISTORY, {"presum": 0}, "presum"),
     "window unknown": (lambda: HISTORY, {"window": "hamming"}, "window"),
     "carrier of profiles in GHz": (profiles(centre_frequency_hz=1.2), {}, "values are in GHz"),
     "step of profiles zero": (profiles(step_m=0.0), {}, "step_m"),
-    "step of profiles a word": (profiles(step_m="5 cm"), {}, "step_m"),
-    "profiles hardly sampled": (profiles(oversampling=0.5), {}, "oversampling"),
+    "step of profiles a string": (profiles(step_m="5 cm"), {}, "step_m"),
+    "profiles undersampled": (profiles(oversampling=0.5), {}, "oversampling"),
     "profiles NaN": (profiles(samples=np.full_like(PROFILES.samples, np.nan)), {}, "pulses are not finite"),
     "starts NaN": (profiles(start_m=np.full(96, np.nan)), {}, "not finite"),
     "starts of other pulses": (profiles(start_m=PROFILES.start_m[:50]), {}, r"start_m \(50,\)"),
-    "echo over time": (of(transfer=np.fft.ifft(ECHO, axis=1).astype(np.complex64)), {}, "numpy.fft.fft"),
+    "echo in the time domain": (of(transfer=np.fft.ifft(ECHO, axis=1).astype(np.complex64)), {}, "numpy.fft.fft"),
 }
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_is_no_recording_is_refused_in_one_line(name):
-    given, options, complaint = REFUSED[name]
+def test_invalid_arguments_are_refused_in_one_line(name):
+    make_input, options, complaint = REFUSED[name]
 
-    def formed():
-        made = {key: value() if callable(value) else value for key, value in options.items()}
-        return ap.backproject(given(), made.pop("grid", TARGET_GRID), **made)
+    def form():
+        arguments = {key: value() if callable(value) else value for key, value in options.items()}
+        return ap.backproject(make_input(), arguments.pop("grid", TARGET_GRID), **arguments)
 
-    with pytest.raises(CampaignError, match=complaint) as told:
-        formed()
-    assert "\n" not in str(told.value)
-    assert "self." not in str(told.value)
+    with pytest.raises(CampaignError, match=complaint) as raised:
+        form()
+    assert "\n" not in str(raised.value)
+    assert "self." not in str(raised.value)
 
 
 FLAGGED = {
@@ -187,32 +187,32 @@ FLAGGED = {
     "carrier 10 % off": (of(frequency_hz=FREQUENCY + 1.2e8), "defocused"),
     "band twice as wide": (of(frequency_hz=FREQUENCY[0] + 2 * (FREQUENCY - FREQUENCY[0])), "echo_outside_scene"),
     "track 5 cm wrong at random": (flown(APERTURE.tx_m + WRONG_TRACK, APERTURE.rx_m + WRONG_TRACK), "defocused"),
-    "track a pulse late": (flown(np.roll(APERTURE.tx_m, 9, 0), np.roll(APERTURE.rx_m, 9, 0)), None),
+    "track nine pulses late": (flown(np.roll(APERTURE.tx_m, 9, 0), np.roll(APERTURE.rx_m, 9, 0)), None),
     "track half as long": (
         flown(APERTURE.tx_m * [0.5, 1, 1], APERTURE.rx_m * [0.5, 1, 1]),
         "defocused",
     ),
     "conjugated profiles": (profiles(samples=PROFILES.samples.conj()), "defocused"),
     "power for amplitude": (profiles(samples=np.abs(PROFILES.samples).astype(np.complex64) ** 2), None),
-    "starts of one leg": (profiles(start_m=PROFILES.start_m / 2), None),
+    "starts of one-way paths": (profiles(start_m=PROFILES.start_m / 2), None),
     "starts in km": (profiles(start_m=PROFILES.start_m / 1e3), "scene_beyond_samples"),
     "pulses shuffled": (of(transfer=np.random.default_rng(2).permutation(ECHO)), None),
-    "step of one leg": (profiles(step_m=PROFILES.step_m / 2), None),
+    "step of one-way paths": (profiles(step_m=PROFILES.step_m / 2), None),
 }
 
 
 @pytest.mark.quick("conjugated", "track 5 cm wrong at random", "starts in km", "conjugated profiles", "pulses shuffled")
 @pytest.mark.parametrize("name", FLAGGED)
-def test_what_forms_an_image_of_nothing_is_flagged(name):
-    given, flag = FLAGGED[name]
-    image = ap.backproject(given(), TARGET_GRID)
+def test_plausible_but_wrong_input_is_flagged(name):
+    make_input, flag = FLAGGED[name]
+    image = ap.backproject(make_input(), TARGET_GRID)
     flags = json.loads(image.attrs["flags"])
     assert flags, image.attrs["verdict"]
     assert flag is None or flag in flags
 
 
 @pytest.mark.slow
-def test_samples_of_the_other_sign_are_told_as_such():
+def test_conjugated_samples_are_identified():
     for name in ("conjugated", "I and Q swapped", "conjugated profiles"):
         (line,) = json.loads(ap.backproject(FLAGGED[name][0](), TARGET_GRID).attrs["flags"]).values()
         assert "I and Q are swapped" in line
@@ -221,36 +221,36 @@ def test_samples_of_the_other_sign_are_told_as_such():
         assert "I and Q" not in ap.backproject(FLAGGED[name][0](), TARGET_GRID).attrs["flags"]
 
 
-def test_what_the_pulses_cannot_tell_is_not_called_focused():
-    """Half-spectra swapped: two peaks in range, and nothing that tells them from two targets."""
+def test_ambiguous_spectrum_gives_no_verdict():
+    """Swapped halves of the spectrum give two peaks in range, not distinguishable from two targets."""
     swapped = replace(HISTORY, transfer=np.fft.fftshift(ECHO, axes=1))
     assert ap.backproject(swapped, TARGET_GRID).attrs["verdict"] == "inconclusive"
 
 
-def test_a_right_image_is_called_focused_without_a_flag():
+def test_correct_image_is_focused_without_a_flag():
     for inputs in (HISTORY, PROFILES):
         attributes = ap.backproject(inputs, TARGET_GRID).attrs
         assert (attributes["verdict"], attributes["flags"]) == ("focused", "{}")
 
 
-def test_an_echo_outside_is_no_fault_where_the_scene_has_points_of_its_own():
-    """A house 30 dB brighter than the scene's target, 40 m farther: its sidelobes are weaker still."""
+def test_outside_echo_is_not_flagged_if_the_scene_has_points():
+    """A house 30 dB brighter than the target, 40 m farther, whose sidelobes are weaker than the target."""
     window = np.hanning(202)[1:-1]
     house = 30 * np.exp(-2j * np.pi * FREQUENCY * (PATH_M + 40)[:, None] / SPEED_OF_LIGHT_M_S)
-    beside = replace(HISTORY, transfer=(ECHO + house).astype(np.complex64), weight=window / window.sum())
-    assert "echo_outside_scene" not in json.loads(ap.backproject(beside, TARGET_GRID).attrs["flags"])
+    with_target = replace(HISTORY, transfer=(ECHO + house).astype(np.complex64), weight=window / window.sum())
+    assert "echo_outside_scene" not in json.loads(ap.backproject(with_target, TARGET_GRID).attrs["flags"])
     alone = replace(HISTORY, transfer=house.astype(np.complex64))
     assert "echo_outside_scene" in json.loads(ap.backproject(alone, TARGET_GRID).attrs["flags"])
 
 
-def test_a_lazy_image_is_judged_when_asked_and_by_all_of_it():
+def test_lazy_image_is_judged_on_request_and_as_a_whole():
     lazy = ap.backproject(HISTORY, TARGET_GRID, judge=False, tile_px=64)
     assert lazy.attrs["verdict"] == "not judged"
     assert "apertura.judge" in lazy.attrs["verdict_reason"]
-    told = ap.judge(abs(lazy)[:9, :9])
-    assert (told.verdict, dict(told.flags)) == ("focused", {})
-    assert told.focus["points"][0]["x_m"] == pytest.approx(TARGET[0, 0], abs=0.03)
-    assert [line["cause"] for line in told.budget] == [
+    result = ap.judge(abs(lazy)[:9, :9])
+    assert (result.verdict, dict(result.flags)) == ("focused", {})
+    assert result.focus["points"][0]["x_m"] == pytest.approx(TARGET[0, 0], abs=0.03)
+    assert [line["cause"] for line in result.budget] == [
         "positions",
         "heights",
         "calibration",
@@ -263,13 +263,13 @@ def test_a_lazy_image_is_judged_when_asked_and_by_all_of_it():
         ap.judge(lazy + ap.backproject(HISTORY, TARGET_GRID, judge=False))
 
 
-def test_errors_of_positions_that_are_stated_are_expected():
-    sent, received = 0.01 * np.random.default_rng(3).standard_normal((2, len(HISTORY), 3))
-    image = ap.backproject(flown(APERTURE.tx_m + sent, APERTURE.rx_m + received)(), TARGET_GRID)
+def test_stated_position_errors_are_expected():
+    transmit_error, receive_error = 0.01 * np.random.default_rng(3).standard_normal((2, len(HISTORY), 3))
+    image = ap.backproject(flown(APERTURE.tx_m + transmit_error, APERTURE.rx_m + receive_error)(), TARGET_GRID)
     assert "loss_unexpected" in json.loads(image.attrs["flags"])
-    told = ap.judge(image, position_std_m=0.01, time_s=10.0 * np.arange(len(HISTORY)))
-    assert told.focus["loss_db"] == pytest.approx(told.focus["expected_db"], abs=0.3)
-    assert not told.flags
+    result = ap.judge(image, position_std_m=0.01, time_s=10.0 * np.arange(len(HISTORY)))
+    assert result.focus["loss_db"] == pytest.approx(result.focus["expected_db"], abs=0.3)
+    assert not result.flags
     with pytest.raises(CampaignError, match="in time_s"):
         ap.judge(image, position_std_m=0.01)
     with pytest.raises(CampaignError, match="times of 96 pulses"):
@@ -285,7 +285,7 @@ def judged(**stated):
 
 
 @pytest.mark.parametrize(
-    ("call", "told"),
+    ("call", "message"),
     [
         (lambda: ap.range_compress("x", TARGET_GRID, 0.0), "type str; expected PhaseHistory"),
         (lambda: ap.range_compress(PROFILES, TARGET_GRID, 0.0), "range profiles; expected a PhaseHistory"),
@@ -329,18 +329,18 @@ def judged(**stated):
         (lambda: judged(position_std_m=0.01, time_s=SECONDS[::-1]), "times in seconds, from any origin"),
     ],
 )
-def test_other_doors_refuse_what_is_of_another_kind(call, told):
+def test_other_functions_refuse_invalid_arguments(call, message):
     with pytest.raises(CampaignError) as refused:
         call()
-    assert told in str(refused.value)
+    assert message in str(refused.value)
 
 
-def test_one_height_is_flat_ground_for_every_door():
+def test_single_height_is_accepted_as_flat_terrain():
     assert np.array_equal(ap.range_compress(HISTORY, TARGET_GRID, 0.0).samples, PROFILES.samples)
 
 
 @pytest.mark.parametrize(
-    "as_given",
+    "convert",
     [
         pytest.param(np.matrix, id="matrix", marks=pytest.mark.filterwarnings("ignore:the matrix subclass")),
         pytest.param(np.ma.masked_array, id="masked nowhere"),
@@ -350,39 +350,39 @@ def test_one_height_is_flat_ground_for_every_door():
         ),
     ],
 )
-def test_arrays_of_every_kind_give_the_image_of_plain_ones(as_given):
-    given = replace(HISTORY, transfer=as_given(ECHO), aperture=ap.Aperture(*map(as_given, APERTURE.legs)))
-    images = [ap.backproject(one, TARGET_GRID, judge=False).values for one in (given, HISTORY)]
+def test_other_numpy_arrays_give_the_same_image(convert):
+    converted = replace(HISTORY, transfer=convert(ECHO), aperture=ap.Aperture(*map(convert, APERTURE.legs)))
+    images = [ap.backproject(echo, TARGET_GRID, judge=False).values for echo in (converted, HISTORY)]
     np.testing.assert_allclose(images[0], images[1], atol=1e-5)
 
 
-def test_numbers_of_few_bits_are_sizes_of_a_grid():
-    few = replace(TARGET_GRID, shape=tuple(map(np.uint8, TARGET_GRID.shape)))
-    images = [ap.backproject(HISTORY, grid, judge=False).values for grid in (few, TARGET_GRID)]
+def test_small_integer_types_are_accepted_as_grid_shape():
+    small_integers = replace(TARGET_GRID, shape=tuple(map(np.uint8, TARGET_GRID.shape)))
+    images = [ap.backproject(HISTORY, grid, judge=False).values for grid in (small_integers, TARGET_GRID)]
     np.testing.assert_array_equal(*images)
 
 
-def test_an_image_of_one_pixel_is_judged():
-    one = ap.SceneGrid("local", -0.05, 0.05, 0.1, (1, 1))
-    assert ap.backproject(HISTORY, one, judge=True).attrs["verdict"] == "inconclusive"
+def test_single_pixel_image_is_judged():
+    grid = ap.SceneGrid("local", -0.05, 0.05, 0.1, (1, 1))
+    assert ap.backproject(HISTORY, grid, judge=True).attrs["verdict"] == "inconclusive"
 
 
 @pytest.mark.slow
-def test_arrays_of_xarray_and_dask_are_arrays():
-    given = replace(HISTORY, transfer=xr.DataArray(ECHO), aperture=ap.Aperture(*map(xr.DataArray, APERTURE.legs)))
+def test_xarray_and_dask_arrays_are_accepted():
+    labelled = replace(HISTORY, transfer=xr.DataArray(ECHO), aperture=ap.Aperture(*map(xr.DataArray, APERTURE.legs)))
     lazy = replace(HISTORY, transfer=xr.DataArray(ECHO).chunk().data)
     expected = ap.backproject(HISTORY, TARGET_GRID).values
-    assert all(np.array_equal(ap.backproject(one, TARGET_GRID).values, expected) for one in (given, lazy))
+    assert all(np.array_equal(ap.backproject(echo, TARGET_GRID).values, expected) for echo in (labelled, lazy))
 
 
-def test_what_the_arithmetic_could_not_form_is_not_called_focused():
-    """Profiles that begin a thousandth of the way out: no pixel lies in them."""
+def test_image_without_samples_is_not_called_focused():
+    """Profile starts in km: no pixel lies within the samples."""
     image = ap.backproject(replace(PROFILES, start_m=PROFILES.start_m / 1e3), TARGET_GRID, judge=True)
     assert image.attrs["verdict"] == "inconclusive"
 
 
-def test_an_image_is_of_the_track_that_was_given_whatever_becomes_of_its_array():
-    """It is lazy: what is computed later must not follow an array that the caller goes on using."""
+def test_lazy_image_does_not_follow_later_changes_of_the_track_array():
+    """A lazy image is computed later, when the caller may have changed the array."""
     track = APERTURE.tx_m.copy()
     first, second = (
         ap.backproject(replace(HISTORY, aperture=ap.Aperture(track, track)), TARGET_GRID, judge=False) for _ in range(2)
@@ -392,10 +392,10 @@ def test_an_image_is_of_the_track_that_was_given_whatever_becomes_of_its_array()
     np.testing.assert_array_equal(second.values, expected)
 
 
-def test_the_budget_of_arrays_states_what_air_would_do_where_vacuum_is_assumed():
-    """N = 300 makes every path longer by 300 parts in a million: of a range R the image lies 300e-6 R farther."""
+def test_error_budget_contains_the_atmosphere_if_vacuum_is_assumed():
+    """N = 300 lengthens every path by 300 ppm, which displaces a point at range R by 300e-6 R."""
     budget = json.loads(ap.backproject(HISTORY, TARGET_GRID, judge=False).attrs["budget"])
-    line = next(one for one in budget if one["cause"] == "atmosphere")
+    line = next(entry for entry in budget if entry["cause"] == "atmosphere")
     slant_m = np.linalg.norm(APERTURE.tx_m.mean(axis=0) - TARGET)
     ground_m = np.linalg.norm((APERTURE.tx_m.mean(axis=0) - TARGET)[0, :2])
     assert "N = 300" in line["stated"]
@@ -405,11 +405,11 @@ def test_the_budget_of_arrays_states_what_air_would_do_where_vacuum_is_assumed()
 
 
 @pytest.mark.parametrize(("accuracy_db", "replaced"), [(-60.0, False), (-100.0, True)])
-def test_a_requested_engine_that_is_too_coarse_is_replaced_and_that_is_flagged(accuracy_db, replaced):
+def test_requested_engine_that_misses_the_accuracy_is_replaced_and_flagged(accuracy_db, replaced):
     image = ap.backproject(HISTORY, TARGET_GRID, engine="native", accuracy_db=accuracy_db, judge=False)
     flags = json.loads(image.attrs["flags"])
     assert ("engine_replaced" in flags) == replaced
     if replaced:
         assert flags["engine_replaced"] == "the image formed by reference: the requested native misses -100 dB"
-    left_to_the_planner = ap.backproject(HISTORY, TARGET_GRID, accuracy_db=accuracy_db, judge=False)
-    assert "engine_replaced" not in json.loads(left_to_the_planner.attrs["flags"])
+    automatic = ap.backproject(HISTORY, TARGET_GRID, accuracy_db=accuracy_db, judge=False)
+    assert "engine_replaced" not in json.loads(automatic.attrs["flags"])

@@ -1,4 +1,4 @@
-"""Looks of mean power, by the correlation of speckle and as found, and a filter that keeps means, edges and points."""
+"""Number of looks by speckle correlation and as measured, and a speckle filter that keeps means, edges and points."""
 
 from dataclasses import replace
 from itertools import product
@@ -12,7 +12,7 @@ SIZE, SIDE = 384, 4
 
 
 def speckle(band, seed=1, *, window="none", size=SIZE, sigma0=1.0):
-    """Developed speckle of a band, cycles per pixel, flat or under a Hann window, of ground of some σ⁰."""
+    """Draw developed speckle of given σ⁰ with a band in cycles per pixel, flat or with a Hann window."""
     generator = np.random.default_rng(seed)
     frequency = np.abs(np.fft.fftfreq(size))
     weight = np.where(frequency < band / 2, np.cos(np.pi * frequency / band) ** 2 if window == "hann" else 1.0, 0.0)
@@ -30,63 +30,63 @@ def whole(multilook):
     return multilook.mean((slice(0, multilook.shape[0]), slice(0, multilook.shape[1])))
 
 
-def counted(power):
+def measured_looks(power):
     return power.mean() ** 2 / power.var()
 
 
 @pytest.mark.parametrize(("window", "squares"), [("none", 1.0), ("hann", 35 / 128 / (3 / 8) ** 2)])
-def test_pixels_that_vary_as_one_are_those_of_the_band(window, squares):
-    """∫|ρ|² = ∫|U|⁴/(∫|U|²)²: 1/B of a flat band, 1.94/B under a Hann window, in either direction."""
+def test_correlated_pixels_follow_from_the_band(window, squares):
+    """∫|ρ|² = ∫|U|⁴/(∫|U|²)²: 1/B for a flat band, 1.94/B with a Hann window, in either direction."""
     measured = Speckle.of(blocks(speckle(0.4, window=window)))
     assert measured.area_px == pytest.approx((squares / 0.4) ** 2, rel=0.08)
 
 
 @pytest.mark.parametrize("side", [2, 4, 8])
-def test_looks_by_correlation_are_those_that_mean_power_has(side):
-    """Eq. 3: neither the pixels of a square nor their number over the cell's area."""
+def test_looks_by_correlation_equal_those_of_the_mean_power(side):
+    """Eq. 3: neither the number of pixels nor that of cells per square."""
     image = speckle(0.4)
     measured = Multilook.of(image.__getitem__, image.shape, side)
     scatter = np.sqrt(2 / (SIZE / side) ** 2 * measured.looks + 4 / (SIZE / 2.5) ** 2)
-    assert measured.looks == pytest.approx(counted(whole(measured)), rel=max(0.05, 4 * scatter))
+    assert measured.looks == pytest.approx(measured_looks(whole(measured)), rel=max(0.05, 4 * scatter))
     assert measured.found == pytest.approx(measured.looks, rel=0.15)
 
 
-def test_looks_are_found_where_squares_are_finer_than_cells():
-    """Eq. 4: a window of 49 squares has eleven looks, so its variance is a tenth less than that of squares."""
+def test_looks_are_measured_for_squares_smaller_than_cells():
+    """Eq. 4: a window of 49 squares has only eleven independent looks, which lowers its variance by a tenth."""
     measured = Multilook.of((image := speckle(0.1)).__getitem__, image.shape, SIDE)
     assert measured.within == pytest.approx(11.1, rel=0.1)
     assert measured.found == pytest.approx(measured.looks, rel=0.15)
 
 
-def test_the_correlation_stands_where_the_carrier_bends():
-    """Direction of view turns across a block: by half the band here, which would halve the correlation."""
+def test_correlation_is_unchanged_by_a_varying_carrier():
+    """The carrier varies across a block by half of the band, which would halve the correlation."""
     flat = speckle(0.3)
     row, column = np.mgrid[:SIZE, :SIZE] / 128
-    bent = flat * np.exp(2j * np.pi * 128 * (0.1 * row**2 / 2 + 0.07 * row * column + 0.31 * column))
-    assert Speckle.of(blocks(bent)).area_px == pytest.approx(Speckle.of(blocks(flat)).area_px, rel=0.05)
+    with_varying_carrier = flat * np.exp(2j * np.pi * 128 * (0.1 * row**2 / 2 + 0.07 * row * column + 0.31 * column))
+    assert Speckle.of(blocks(with_varying_carrier)).area_px == pytest.approx(Speckle.of(blocks(flat)).area_px, rel=0.05)
 
 
-def test_looks_are_found_on_the_homogeneous_part_of_a_scene():
-    """Half is texture, with an edge and points besides, which would draw a mean or a median of local looks down."""
+def test_looks_are_measured_on_the_homogeneous_part_of_a_scene():
+    """Texture in half of the scene, an edge and points would lower a mean or median of local looks."""
     generator = np.random.default_rng(4)
     sigma0 = np.where(np.arange(SIZE) < SIZE // 3, 8.0, 1.0) * np.ones((SIZE, 1))
     sigma0[: SIZE // 2] *= generator.gamma(1.0, 1.0, (SIZE // 8, SIZE // 8)).repeat(8, 0).repeat(8, 1)[: SIZE // 2]
     sigma0[tuple(generator.integers(0, SIZE, (2, 10)))] = 3e3
     measured = Multilook.of((image := speckle(0.4, sigma0=sigma0)).__getitem__, image.shape, SIDE)
     assert measured.found == pytest.approx(measured.looks, rel=0.15)
-    assert counted(whole(measured)) < measured.looks / 2
+    assert measured_looks(whole(measured)) < measured.looks / 2
 
 
-def test_the_filter_keeps_the_mean_of_speckle_and_raises_its_looks():
+def test_filter_keeps_the_mean_of_speckle_and_raises_its_looks():
     plain = Multilook.of((image := speckle(0.4)).__getitem__, image.shape, SIDE)
     before, after = whole(plain), whole(replace(plain, filtered=True))
     assert 10 * np.log10(after.mean() / before.mean()) == pytest.approx(0, abs=0.05)
-    assert 10 * np.log10(np.median(after) / np.median(before)) > 0.2  # the mean is kept, the median is not
-    assert counted(after) > 8 * counted(before)
+    assert 10 * np.log10(np.median(after) / np.median(before)) > 0.2  # the filter keeps the mean, not the median
+    assert measured_looks(after) > 8 * measured_looks(before)
 
 
-def test_the_filter_keeps_an_edge_and_a_point():
-    """Beside a step of 10 dB a mean of the window would be 7 dB too high; and a peak stays."""
+def test_filter_keeps_an_edge_and_a_point():
+    """Next to a step of 10 dB a plain window mean would be 7 dB too high."""
     generator = np.random.default_rng(2)
     ground = np.where(np.arange(200) < 100, 1.0, 10.0) * np.ones((200, 1))
     power = ground * generator.gamma(10.0, 0.1, ground.shape)
@@ -97,8 +97,8 @@ def test_the_filter_keeps_an_edge_and_a_point():
     assert smooth[50, 30] == pytest.approx(1000, rel=0.02)
 
 
-def test_the_noise_taken_off_leaves_the_ground_in_the_mean():
-    """Where it is as strong as the ground and where nothing is but noise: there half of the squares lie below zero."""
+def test_noise_subtraction_leaves_the_mean_power_of_the_terrain():
+    """For noise as strong as the terrain echo, and for noise only, where half of the squares are negative."""
     noise = 1.0
     ground = np.where(np.arange(SIZE) < SIZE // 2, 1.0, 0.0) * np.ones((SIZE, 1))
     image = speckle(0.4, sigma0=ground + noise)
@@ -118,17 +118,19 @@ def test_the_noise_taken_off_leaves_the_ground_in_the_mean():
         assert (power[:, inner:] < 0).mean() > 0.4
 
 
-def test_windows_of_mean_power_have_no_seams():
+def test_mean_power_by_windows_has_no_seams():
     image = speckle(0.4, size=150)[:, :130].astype(np.complex64)
     image[20:40, 30:60] = np.nan
-    done = Multilook.of(image.__getitem__, image.shape, 4, noise=lambda at: np.ones(image[at].shape), filtered=True)
-    assert (done.filtered, done.shape) == (True, (38, 33))
+    multilook = Multilook.of(
+        image.__getitem__, image.shape, 4, noise=lambda window: np.ones(image[window].shape), filtered=True
+    )
+    assert (multilook.filtered, multilook.shape) == (True, (38, 33))
     part = (slice(7, 30), slice(11, 33))
-    np.testing.assert_array_equal(done.mean(part), whole(done)[part])
-    assert np.isnan(done.mean((slice(5, 10), slice(8, 15)))).all()
+    np.testing.assert_array_equal(multilook.mean(part), whole(multilook)[part])
+    assert np.isnan(multilook.mean((slice(5, 10), slice(8, 15)))).all()
 
 
-def test_a_square_of_which_less_than_half_is_known_is_not_told():
+def test_square_with_less_than_half_valid_pixels_is_undefined():
     values = np.arange(12.0).reshape(3, 4)
     values[0, :2] = np.nan
     np.testing.assert_array_equal(block_means(values, 2), [[4.5, 4.5], [8.5, 10.5]])
@@ -136,28 +138,28 @@ def test_a_square_of_which_less_than_half_is_known_is_not_told():
     assert np.isnan(block_means(values, 2)[0, 0])
 
 
-def test_what_is_hardly_seen_has_no_looks_and_no_filter():
+def test_mostly_undefined_image_has_no_looks_and_no_filter():
     image = np.full((64, 64), np.nan, np.complex64)
     image[:8] = 1
-    done = Multilook.of(image.__getitem__, image.shape, 2, filtered=True)
-    assert (done.filtered, np.isnan(done.looks)) == (False, True)
+    multilook = Multilook.of(image.__getitem__, image.shape, 2, filtered=True)
+    assert (multilook.filtered, np.isnan(multilook.looks)) == (False, True)
     assert np.isnan(found_looks([], 10.0))
 
 
-def test_ground_without_any_power_stays_zero_and_counts_for_no_looks():
-    """As simulations without noise have it beside their targets."""
+def test_pixels_without_power_stay_zero_and_are_excluded_from_looks():
+    """As in simulations without noise, next to their targets."""
     image = speckle(0.4) * (np.arange(SIZE) < SIZE // 2)
-    done = Multilook.of(image.__getitem__, image.shape, SIDE, filtered=True)
-    assert (whole(done)[:, -20:] == 0).all()
-    assert done.found == pytest.approx(Multilook.of(speckle(0.4).__getitem__, image.shape, SIDE).looks, rel=0.2)
+    multilook = Multilook.of(image.__getitem__, image.shape, SIDE, filtered=True)
+    assert (whole(multilook)[:, -20:] == 0).all()
+    assert multilook.found == pytest.approx(Multilook.of(speckle(0.4).__getitem__, image.shape, SIDE).looks, rel=0.2)
 
 
 @pytest.mark.parametrize(("shape", "side"), [((1, 1), 1), ((3, 40), 2), ((40, 30), 100)])
-def test_an_image_smaller_than_a_window_has_its_mean(shape, side):
+def test_image_smaller_than_a_window_has_its_mean(shape, side):
     image = np.ones(shape, np.complex64)
-    done = Multilook.of(image.__getitem__, shape, side, filtered=True)
-    values = whole(done)
+    multilook = Multilook.of(image.__getitem__, shape, side, filtered=True)
+    values = whole(multilook)
     assert values.shape == tuple(-(-size // side) for size in shape)
-    assert np.isnan(done.found)
-    known = values[np.isfinite(values)]
-    assert known == pytest.approx(1)
+    assert np.isnan(multilook.found)
+    valid = values[np.isfinite(values)]
+    assert valid == pytest.approx(1)

@@ -1,4 +1,4 @@
-"""A finished campaign opened from Python: pairs, stages, images, reports and flags by name."""
+"""Access to a finished campaign from Python: pairs, stages, images, reports and flags."""
 
 import json
 import shutil
@@ -26,11 +26,11 @@ def opened(finished_tiny) -> OpenCampaign:
     return open_campaign(finished_tiny.root)
 
 
-def test_pairs_are_those_of_the_flights_that_become_images(opened):
+def test_pairs_are_those_of_the_image_flights(opened):
     assert opened.pairs == {"f01": ("uav1-uav1", "uav1-uav2")}
 
 
-def test_an_image_is_that_of_the_raster_on_the_same_grid(opened):
+def test_image_equals_the_raster_on_the_same_grid(opened):
     image = opened.image(*PAIR)
     with rasterio.open(str(opened.campaign.results / "f01" / "uav1-uav2" / "slc.tif")) as raster:
         np.testing.assert_array_equal(image.values, raster.read(1))
@@ -41,14 +41,14 @@ def test_an_image_is_that_of_the_raster_on_the_same_grid(opened):
     assert "UTM zone 32N" in image.spatial_ref.attrs["crs_wkt"]
 
 
-def test_stages_go_by_name_and_by_what_they_are_of(opened):
+def test_stages_are_opened_by_name_and_identifiers(opened):
     assert opened.stage("raw", "f01", "uav1").attrs["node"] == "uav1"
     assert opened.stage("echo", *PAIR).sizes["subcarrier"] == 1024
     assert opened.stage("profile", *PAIR).sizes["pulse"] == opened.stage("echo", *PAIR).sizes["pulse"]
     assert opened.stage("cube").attrs["pairs"] == ["uav1-uav1", "uav1-uav2"]
 
 
-def test_a_report_is_image_json_of_a_pair_or_of_what_was_fused(finished_tiny, tmp_path):
+def test_report_is_image_json_of_a_pair_or_of_the_fused_image(finished_tiny, tmp_path):
     opened = open_campaign(copy_writable(finished_tiny.root, tmp_path / "campaign"))
     for pair in ("uav1-uav2", "fused"):
         path = opened.campaign.results / "f01" / pair / "image.json"
@@ -59,7 +59,7 @@ def test_a_report_is_image_json_of_a_pair_or_of_what_was_fused(finished_tiny, tm
         assert opened.flags("f01", pair) == {"clipped": f"in {pair}"}
 
 
-def test_what_the_workflow_did_not_make_is_named(finished_tiny, tmp_path):
+def test_missing_result_is_named(finished_tiny, tmp_path):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     shutil.rmtree(root / "results" / "f01" / "uav1-uav2")
     opened = open_campaign(root)
@@ -70,7 +70,7 @@ def test_what_the_workflow_did_not_make_is_named(finished_tiny, tmp_path):
     assert opened.report("f01", "uav1-uav1")["engine"]
 
 
-def test_before_the_first_run_the_scene_says_what_is_missing_and_what_makes_it(tiny):
+def test_missing_scene_before_the_first_run_is_reported_with_a_remedy(tiny):
     opened = open_campaign(tiny)
     for work in (lambda: opened.scene, lambda: score(opened.campaign)):
         message = complaint(work)
@@ -81,7 +81,7 @@ def test_before_the_first_run_the_scene_says_what_is_missing_and_what_makes_it(t
     assert "Delete" not in message
 
 
-def test_a_name_that_does_not_exist_is_answered_with_those_that_do(opened):
+def test_unknown_name_is_refused_with_the_list_of_names(opened):
     names = "expected one of raw, track, echo, transfer, profile, refined_track, terrain, image, cube."
     assert names in complaint(lambda: opened.stage("ecko", *PAIR))
     assert "no flight 'f02'; expected one of f01." in complaint(lambda: opened.stage("echo", "f02", "uav1-uav2"))
@@ -92,15 +92,15 @@ def test_a_name_that_does_not_exist_is_answered_with_those_that_do(opened):
     assert "no node 'uav3'; expected one of uav1, uav2." in complaint(lambda: opened.stage("raw", "f01", "uav3"))
 
 
-def test_a_stage_that_is_asked_for_without_its_place_says_what_is_missing(opened):
+def test_missing_identifiers_of_a_stage_are_reported(opened):
     message = complaint(lambda: opened.stage("echo", "f01"))
     assert "campaign.stage('echo'): arguments: f01; expected a flight and a pair" in message
     assert "arguments: none; expected a flight and a node" in complaint(lambda: opened.stage("raw"))
     assert "arguments: f01; expected no further arguments" in complaint(lambda: opened.stage("cube", "f01"))
 
 
-def test_the_plan_of_every_pair_lies_on_the_one_grid_that_the_workflow_settles(tiny):
-    """Automatic bounds hold what all pairs of the first image flight see, not what the planned pair does."""
+def test_planned_grid_equals_the_grid_of_the_workflow(tiny):
+    """Automatic bounds cover all pairs of the first image flight, not only the planned pair."""
     edit_config(tiny, lambda document: document["scene"].update(bounds_m="auto", spacing_m="auto"))
     campaign = Campaign.load(tiny)
     expected = expected_scene(campaign, lambda: first_flight(campaign)).grid
@@ -113,8 +113,8 @@ def test_the_plan_of_every_pair_lies_on_the_one_grid_that_the_workflow_settles(t
 
 @pytest.mark.quick("uav1-uav2")
 @pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
-def test_the_prefix_ends_where_the_plan_expects_it(tiny, pair):
-    """Automatic bounds may end there: path offsets and the sidelink's length count before the echo is formed."""
+def test_path_limit_of_the_prefix_equals_the_planned_one(tiny, pair):
+    """The prefix may limit automatic bounds: path offsets and sidelink length are included before the echo exists."""
     campaign = Campaign.load(tiny)
     expected_m = open_pair(campaign, "f01", pair).path_limit_m
     ingest_all(campaign)

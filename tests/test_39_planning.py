@@ -1,4 +1,4 @@
-"""The planner: each rule on both sides of its edge, what it predicts against what is certified, and its thrift."""
+"""Planner: decision rules on both sides of their limits, predicted against certified errors, and cost."""
 
 import re
 from dataclasses import replace
@@ -19,10 +19,10 @@ from apertura.core.planning.planner import MARGIN_DB, SettingSearch, make_plan
 from apertura.core.quality.measures import numerical_error_db
 
 
-def error_db(drawn, image, where=(...,)):
-    """Return the error over all pixels, or those of a window, as eq. (6a) has it."""
-    exact = reference.form(drawn.history, drawn.grid.positions(0.0)[where])
-    return numerical_error_db(image[where].astype(np.complex64), exact)
+def error_db(drawn, image, window=(...,)):
+    """Return the error over all pixels or those of a window, eq. 6a, dB."""
+    exact = reference.form(drawn.history, drawn.grid.positions(0.0)[window])
+    return numerical_error_db(image[window].astype(np.complex64), exact)
 
 
 def formed(drawn, setting, profiles):
@@ -32,13 +32,13 @@ def formed(drawn, setting, profiles):
 
 
 def certified(drawn) -> tuple[float, int]:
-    """Return the certified error and how often a better setting was needed, as the image step goes about it."""
+    """Return certified error and number of fallbacks used, with the procedure of the image step."""
     planned = make_plan(drawn.job, accuracy_db=drawn.accuracy_db)
     error = error_db(drawn, formed(drawn, planned.setting, planned.inputs(drawn.profiles)))
-    for recomputed, better in enumerate(planned.fallbacks):
+    for recomputed, fallback in enumerate(planned.fallbacks):
         if error <= drawn.accuracy_db:
             return error, recomputed
-        error = error_db(drawn, formed(drawn, better, drawn.profiles))
+        error = error_db(drawn, formed(drawn, fallback, drawn.profiles))
     return error, len(planned.fallbacks)
 
 
@@ -54,21 +54,21 @@ SETTINGS = (
 @compiled
 @pytest.mark.parametrize("window", ["none", "hann"])
 @pytest.mark.parametrize("seed", [1, 3, 9])
-def test_measured_errors_lie_from_3_5_db_below_to_1_5_db_above_the_predicted(seed, window):
-    """White echoes under both windows: Hann lets the same table err up to 17 dB less, and that is predicted."""
+def test_measured_errors_are_within_minus_3_5_and_1_5_db_of_the_prediction(seed, window):
+    """White echoes with both windows: Hann lowers the error of a table by up to 17 dB, as predicted."""
     generator = np.random.default_rng(seed)
-    draws = [white(seed, window, generator) for _ in range(12)]  # a small scene is only a few cells of speckle
-    job, places = draws[0].job, draws[0].grid.positions(0.0)
-    exact = np.concatenate([reference.form(drawn.history, places[::5, ::5]).ravel() for drawn in draws])
-    for asked in SETTINGS:
-        setting = SettingSearch(job, options=asked).settings(len(job.aperture))[0]
+    draws = [white(seed, window, generator) for _ in range(12)]  # a small scene contains only a few speckle cells
+    job, points = draws[0].job, draws[0].grid.positions(0.0)
+    exact = np.concatenate([reference.form(drawn.history, points[::5, ::5]).ravel() for drawn in draws])
+    for options in SETTINGS:
+        setting = SettingSearch(job, options=options).settings(len(job.aperture))[0]
         images = [formed(drawn, setting, drawn.profiles)[::5, ::5].ravel() for drawn in draws]
         error = numerical_error_db(np.concatenate(images).astype(np.complex64), exact)
         assert setting.error_db - 3.5 <= error <= setting.error_db + 1.5, setting.line
 
 
 def white(seed: int, window: str, generator: np.random.Generator):
-    """A drawn campaign that received nothing but noise."""
+    """Draw a campaign whose echo is noise only."""
     drawn = draw(np.random.default_rng(seed), pixels=48, pulses=32)
     shape = drawn.history.transfer.shape
     noise = generator.standard_normal(shape) + 1j * generator.standard_normal(shape)
@@ -80,7 +80,7 @@ def white(seed: int, window: str, generator: np.random.Generator):
 
 @pytest.mark.quick("1")
 @pytest.mark.parametrize("seed", range(6))
-def test_the_certified_error_is_met_and_the_first_setting_does(seed):
+def test_first_setting_meets_the_certified_error(seed):
     drawn = draw(np.random.default_rng(seed), pixels=48, pulses=90)
     error, recomputed = certified(drawn)
     assert error <= drawn.accuracy_db
@@ -88,7 +88,7 @@ def test_the_certified_error_is_met_and_the_first_setting_does(seed):
 
 
 @pytest.mark.slow
-def test_over_30_random_campaigns_the_certified_error_is_met():
+def test_certified_error_is_met_in_30_random_campaigns():
     recomputed = 0
     for seed in range(30):
         drawn = draw(np.random.default_rng(seed), pixels=80, pulses=160)
@@ -99,15 +99,15 @@ def test_over_30_random_campaigns_the_certified_error_is_met():
 
 
 @pytest.mark.slow
-def test_the_same_job_gives_the_same_plan():
+def test_same_job_gives_the_same_plan():
     first, second = plan(), plan()
     assert first.setting == second.setting
     assert first.reasons == second.reasons
-    assert plan(threads=4).setting == first.setting  # what is chosen may not depend on who computes
+    assert plan(threads=4).setting == first.setting  # the choice must not depend on the number of threads
 
 
 @pytest.mark.slow
-def test_predictions_fall_as_more_is_asked_and_cost_does_not():
+def test_predicted_error_falls_and_cost_rises_with_accuracy():
     plans = [plan(accuracy) for accuracy in (-40.0, -50.0, -60.0, -70.0, -80.0, -90.0)]
     errors, seconds = [p.predicted_error_db for p in plans], [p.predicted_seconds for p in plans]
     assert all(
@@ -119,8 +119,8 @@ def test_predictions_fall_as_more_is_asked_and_cost_does_not():
 
 @pytest.mark.quick("609")
 @pytest.mark.parametrize("seed", [609, 625, 636])
-def test_predictions_hold_over_all_pixels_whatever_the_scene_holds(seed):
-    """One to 24 targets in noise; errors weigh 10 dB more in a quarter of the first that is dark beside them."""
+def test_predicted_error_holds_over_all_pixels_for_any_scene(seed):
+    """1 to 24 targets in noise; in a dark quarter of the first scene the relative error is 10 dB larger."""
     drawn = draw(np.random.default_rng(seed), pixels=96, pulses=80)
     planned = make_plan(drawn.job, accuracy_db=drawn.accuracy_db)
     image = formed(drawn, planned.setting, planned.inputs(drawn.profiles))
@@ -129,17 +129,17 @@ def test_predictions_hold_over_all_pixels_whatever_the_scene_holds(seed):
         quarters = [
             (rows, columns) for rows in (slice(0, 48), slice(48, 96)) for columns in (slice(0, 44), slice(44, 89))
         ]
-        dark = min(quarters, key=lambda where: np.abs(image[where]).mean())
+        dark = min(quarters, key=lambda quarter: np.abs(image[quarter]).mean())
         assert error_db(drawn, image, dark) > drawn.accuracy_db
 
 
-def test_an_accuracy_beyond_every_table_is_left_to_the_double_sum():
+def test_accuracy_beyond_every_table_uses_the_double_sum():
     assert plan(-120.0).engine == "reference"
     assert plan(-120.0).presum is None
 
 
 @compiled
-def test_the_compiled_engine_is_chosen_where_it_was_built_and_numba_where_it_was_not(monkeypatch):
+def test_compiled_engine_is_chosen_if_built_and_numba_otherwise(monkeypatch):
     assert plan(shape=(100, 100)).engine == "native"
     assert plan(shape=(4000, 4000), overrides={"presum": 1}).engine == "tree"
     without_library(monkeypatch)
@@ -162,7 +162,7 @@ def test_the_compiled_engine_is_chosen_where_it_was_built_and_numba_where_it_was
         ("presum", 1),
     ],
 )
-def test_each_choice_can_be_overridden_and_the_plan_says_so(key, value):
+def test_each_choice_can_be_overridden_with_a_stated_reason(key, value):
     option = key in native.Options.model_fields
     planned = plan(overrides={"engine_options": {"native": {key: value}}} if option else {key: value})
     decision = next(decision for decision in planned.decisions if decision.name == key)
@@ -180,8 +180,8 @@ def test_an_override_that_misses_the_accuracy_is_kept_and_predicted():
 
 
 @compiled
-def test_an_engine_that_compiles_itself_first_is_taken_by_name_alone_where_another_was_built():
-    """Ten seconds for the first of its tiles; the fallbacks of a plan are of these settings."""
+def test_jit_engine_is_used_only_if_requested_when_another_is_built():
+    """Compilation takes ten seconds; fallbacks of a plan are selected from the same settings."""
     job = planning_job()
     assert "numba" not in {setting.engine for setting in SettingSearch(job).settings(300)}
     assert {setting.engine for setting in SettingSearch(job, "numba").settings(300)} == {"numba"}
@@ -189,8 +189,8 @@ def test_an_engine_that_compiles_itself_first_is_taken_by_name_alone_where_anoth
 
 @pytest.mark.slow
 @compiled
-def test_every_setting_that_is_offered_may_be_asked_for():
-    """Down to the coarsest: what the planner may choose an engine takes."""
+def test_every_candidate_setting_may_be_requested():
+    """Engine options accept every setting that the planner may choose."""
     job = planning_job(shape=(4000, 4000))
     for name in ("native", "tree", "numba", "reference"):
         engine = load_engine(name)
@@ -200,7 +200,7 @@ def test_every_setting_that_is_offered_may_be_asked_for():
             )
 
 
-def test_each_fallback_errs_6_db_less_than_the_last():
+def test_each_fallback_has_6_db_less_error_than_the_previous():
     planned = plan()
     errors = [planned.setting.error_db, *(setting.error_db for setting in planned.fallbacks)]
     assert all(after <= before - 6 for before, after in pairwise(errors))
@@ -209,43 +209,43 @@ def test_each_fallback_errs_6_db_less_than_the_last():
 
 @compiled
 @pytest.mark.parametrize(
-    ("spacing_m", "range_m", "way"),
+    ("spacing_m", "range_m", "variant"),
     [(0.05, 12, 0), (0.05, 60, 0), (0.05, 4, 1), (0.02, 0.6, 2), (0.6, 60, 2), (2.0, 60, 2)],
 )
-def test_which_path_variants_native_takes_is_predicted(spacing_m, range_m, way, monkeypatch):
-    """Shared curvature counts in the kernel's tally whatever its window; own curvature and exact paths apart."""
+def test_path_variants_of_native_are_predicted(spacing_m, range_m, variant, monkeypatch):
+    """The kernel counts shared curvature for any window; own curvature and exact paths are counted separately."""
     pixels = spacing_m * np.stack(np.meshgrid(np.arange(48.0), -np.arange(48.0)), -1)
-    places = np.concatenate([pixels - pixels.mean((0, 1)) + [0, range_m], np.zeros((48, 48, 1))], -1)
+    points = np.concatenate([pixels - pixels.mean((0, 1)) + [0, range_m], np.zeros((48, 48, 1))], -1)
     tx = straight_track(64, length_m=range_m, height_m=range_m)
-    near = np.linalg.norm(places[None, ::8, ::8] - tx[:, None, None], axis=-1)
+    near = np.linalg.norm(points[None, ::8, ::8] - tx[:, None, None], axis=-1)
     step = C / 800e6
     start = 2 * near.min((1, 2)) - 40 * step
     count = int(np.ceil((2 * near.max() - start.min()) / step)) + 80
     profiles = Profiles(np.ones((64, count), np.complex64), start, step, 1.2e9, 2.0, monostatic(tx))
     tally = np.zeros(4, np.int64)
-    native.form(native.prepare(profiles), places, counts=tally)
-    seen = view_of(planning_job(aperture=monostatic(tx), ground_m=places[::6, ::6], spacing_m=spacing_m))
-    shares, _ = path_variants(seen, cell_m=step / 3, wavenumber_rad_m=2 * np.pi / WAVELENGTH, tolerance_rad=1.5e-3)
+    native.form(native.prepare(profiles), points, counts=tally)
+    view = view_of(planning_job(aperture=monostatic(tx), ground_m=points[::6, ::6], spacing_m=spacing_m))
+    shares, _ = path_variants(view, cell_m=step / 3, wavenumber_rad_m=2 * np.pi / WAVELENGTH, tolerance_rad=1.5e-3)
     assert shares[2] == pytest.approx(tally[2] / tally.sum(), abs=0.15)
-    assert (shares[2] > 0.5) == (way == 2)
-    if spacing_m < 0.1:  # windows are narrow: only curvature decides between the first two
+    assert (shares[2] > 0.5) == (variant == 2)
+    if spacing_m < 0.1:  # narrow windows: only the curvature decides between the first two variants
         assert shares[1] == pytest.approx(tally[1] / tally.sum(), abs=0.15)
-        assert (shares[1] > 0.5) == (way == 1)
+        assert (shares[1] > 0.5) == (variant == 1)
 
 
 @compiled
-def test_coarse_pixels_get_a_coarser_table_that_keeps_its_windows():
+def test_coarse_pixels_get_a_coarser_table():
     coarse = planning_job(ground_m=20 * ground_points(), spacing_m=0.35)
-    offered = SettingSearch(coarse).settings(len(coarse.aperture))
-    cheapest = next(setting for setting in offered if setting.engine == "native" and setting.error_db < -50)
-    fine = next(s for s in offered if s.options == {"degree": 2, "oversampling": 6} and s.error_db < -70)
+    settings = SettingSearch(coarse).settings(len(coarse.aperture))
+    cheapest = next(setting for setting in settings if setting.engine == "native" and setting.error_db < -50)
+    fine = next(s for s in settings if s.options == {"degree": 2, "oversampling": 6} and s.error_db < -70)
     assert cheapest.options["oversampling"] < 6
     assert int(re.search(r"exact paths (\d+) %", fine.reasons["tolerance_rad"])[1]) > 90
     assert cheapest.seconds < fine.seconds / 3
 
 
-def test_what_costs_no_more_is_made_more_exact():
-    """Of settings within 5 % of the time, the most exact."""
+def test_most_accurate_setting_of_equal_cost_is_chosen():
+    """Most accurate of the settings within 5 % of the shortest time."""
     planned = plan(-50.0)
     within = [s for s in SettingSearch(planning_job()).settings(300) if s.seconds <= planned.setting.seconds]
     assert planned.setting.error_db == min(setting.error_db for setting in within)

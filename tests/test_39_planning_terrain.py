@@ -1,4 +1,4 @@
-"""Which model of the ground is simple enough, and which is good enough."""
+"""Choice of the terrain model: plane, tilted plane or DEM."""
 
 import numpy as np
 import pytest
@@ -13,21 +13,21 @@ from apertura.core.scene.terrain import FlatGround, Plane
 def terrain(height_m: float, *, slope: float = 0.0, wobble_m: float = 0.1, spacing_m: float = 10.0):
     heights = np.tile(slope * np.arange(5.0)[:, None], 5)
     heights[2, 2] += height_m
-    asked = planning_job(
+    job = planning_job(
         aperture=monostatic(straight_track(wobble_m=wobble_m)), terrain=ground_of(heights), spacing_m=spacing_m
     )
-    return decide_terrain(asked).value
+    return decide_terrain(job).value
 
 
-def test_ground_is_taken_as_flat_as_long_as_focus_allows():
-    """4πd·Δθ/(√2λ) < 0.4 with d the wobble's amplitude 0.1 m and Δθ = δh/20 m: δh < 2.25 m."""
+def test_flat_terrain_is_assumed_within_the_focus_limit():
+    """4πd·Δθ/(√2λ) < 0.4 with wobble amplitude d = 0.1 m and Δθ = δh/20 m: δh < 2.25 m."""
     limit_m = 0.4 * np.sqrt(2) * WAVELENGTH * 20 / (4 * np.pi * 0.1)
     assert terrain(0.97 * limit_m) == "plane"
     assert terrain(1.1 * limit_m) == "dem"
     assert terrain(1.1 * limit_m, wobble_m=0.05) == "plane"
 
 
-def test_ground_is_taken_as_flat_as_long_as_positions_allow():
+def test_flat_terrain_is_assumed_within_the_displacement_limit():
     """Half a pixel of 0.2 m at height 10 m over ground range 20 m: δh < 0.2 m."""
     assert terrain(0.15, wobble_m=0.0, spacing_m=0.2) == "plane"
     assert terrain(0.25, wobble_m=0.0, spacing_m=0.2) == "dem"
@@ -38,8 +38,8 @@ def test_a_slope_is_a_tilted_plane():
     assert terrain(0.0, slope=0.3) == "plane"
 
 
-def test_a_tilted_plane_is_laid_through_the_dem():
-    """1 cm per row and 5 cm per column of pixels; pixel (0, 0) lies 7 m below level ground."""
+def test_tilted_plane_is_fitted_to_the_dem():
+    """1 cm per row and 5 cm per column of pixels; pixel (0, 0) is 7 m below the level surface."""
     row, column = np.indices((200, 200))
     heights = 0.01 * row + 0.05 * column - 2.0
     sloped = plan(terrain=ground_of(heights, level_m=5.0))
@@ -54,7 +54,7 @@ def test_a_tilted_plane_is_laid_through_the_dem():
     )
 
 
-def test_flat_ground_and_rough_ground_are_taken_as_they_are():
+def test_flat_and_rough_terrain_use_plane_and_dem():
     smooth, rough = (
         ground_of(heights) for heights in (np.full((9, 9), 1e-4), np.random.default_rng(0).normal(size=(9, 9)))
     )
@@ -65,5 +65,5 @@ def test_flat_ground_and_rough_ground_are_taken_as_they_are():
         plan(overrides={"terrain": "dem"})
 
 
-def test_without_a_dem_the_plan_says_what_height_error_is_tolerated():
+def test_plan_without_a_dem_states_the_tolerated_height_error():
     assert "no DEM; tolerated height error" in plan().reasons["terrain"]

@@ -1,4 +1,4 @@
-"""ap.write_campaign: what is given comes back, what is wrong is named, and nothing half-written is left."""
+"""ap.write_campaign: data read back unchanged, errors are reported, and no partial files remain."""
 
 from dataclasses import replace
 
@@ -48,24 +48,24 @@ def opened(folder):
 
 
 @pytest.mark.parametrize("dtype", ["int8", "int16", "int32", "float32", ">i2"])
-def test_samples_of_any_dtype_come_back_with_tags_frames_and_positions(tmp_path, dtype):
+def test_samples_of_any_dtype_read_back_with_tags_frames_and_positions(tmp_path, dtype):
     samples = (NODE.samples % 100).astype(dtype)
     attitude = np.array([[1.0, 2.0, 359.0], [-1.0, -2.0, 1.0]])
-    made = write(tmp_path / "c", replace(NODE, samples=samples, frame=[7, 8, 10], attitude_deg=attitude))
-    recording, track = opened(made)
+    root = write(tmp_path / "c", replace(NODE, samples=samples, frame=[7, 8, 10], attitude_deg=attitude))
+    recording, track = opened(root)
     np.testing.assert_array_equal(recording.samples.captures(recording.captures.start, 24), samples)
     np.testing.assert_array_equal(recording.captures.time, np.array(TAGS, "datetime64[ns]"))
     assert recording.captures.frame.tolist() == [7, 8, 10]
     np.testing.assert_allclose(geodetic_from_ecef(track.position.values), NODE.track, atol=1e-5)
     np.testing.assert_allclose(np.degrees(track.attitude.values), attitude, atol=1e-4)
-    sigmf.fromfile(str(made / "raw/f01/uav1")).validate()
+    sigmf.fromfile(str(root / "raw/f01/uav1")).validate()
 
 
 def along(latitude, longitude, speed_m_s, unit=np.degrees):
-    """A log of one epoch per second along a meridian, in degrees or radians."""
+    """Return a node with a log of one epoch per second along a meridian, in degrees or radians."""
     north = np.radians(latitude) + speed_m_s * np.arange(10) / 6.37e6
-    place = np.stack([unit(north), unit(np.full(10, np.radians(longitude))), np.full(10, 600.0)], -1)
-    return replace(NODE, track=place, track_utc=np.datetime64("2025-05-14T09:30", "ns") + np.arange(10) * 10**9)
+    track = np.stack([unit(north), unit(np.full(10, np.radians(longitude))), np.full(10, 600.0)], -1)
+    return replace(NODE, track=track, track_utc=np.datetime64("2025-05-14T09:30", "ns") + np.arange(10) * 10**9)
 
 
 NEAR = {"crs": "EPSG:32632", "bounds_m": [574000, 5317000, 574010, 5317010], "height_m": 500.0}  # at 48 N, 10 E
@@ -73,7 +73,7 @@ GULF = {"crs": "EPSG:32631", "bounds_m": [184000, 92000, 184010, 92010], "height
 
 
 @pytest.mark.parametrize("scene", [None, NEAR])
-def test_a_track_in_radians_is_refused(tmp_path, scene):
+def test_track_in_radians_is_refused(tmp_path, scene):
     config = CONFIG | ({"scene": scene} if scene else {})
     message = complaint(lambda: write(tmp_path / "c", along(48.0, 10.0, 8.0, np.float64), config=config))
     assert "apparently in radians, for which the" in message
@@ -82,7 +82,7 @@ def test_a_track_in_radians_is_refused(tmp_path, scene):
 
 
 @pytest.mark.parametrize(("speed_m_s", "scene"), [(8.0, None), (8.0, GULF), (0.4, GULF)])
-def test_a_track_in_degrees_beside_the_gulf_s_origin_is_taken(tmp_path, speed_m_s, scene):
+def test_track_in_degrees_near_latitude_and_longitude_zero_is_accepted(tmp_path, speed_m_s, scene):
     config = CONFIG | ({"scene": scene} if scene else {})
     assert write(tmp_path / "c", along(0.83, 0.16, speed_m_s), config=config).is_dir()
 
@@ -90,7 +90,7 @@ def test_a_track_in_degrees_beside_the_gulf_s_origin_is_taken(tmp_path, speed_m_
 @pytest.mark.slow
 @tried(20)
 @given(gaps=st.lists(st.integers(1, 10**12), min_size=1, max_size=9), between=st.integers(0, 5))
-def test_captures_come_back_to_the_nanosecond_whatever_lies_between_them(tmp_path_factory, gaps, between):
+def test_captures_with_any_gaps_read_back_to_the_nanosecond(tmp_path_factory, gaps, between):
     time = np.datetime64("2025-05-14T09:30:00", "ns") + np.cumsum(gaps).astype("timedelta64[ns]")
     start = np.arange(len(gaps)) * (24 + between)
     samples = np.random.default_rng(1).integers(1, 99, (start[-1] + 24 + between, 1, 2), dtype=np.int16)
@@ -101,7 +101,7 @@ def test_captures_come_back_to_the_nanosecond_whatever_lies_between_them(tmp_pat
     np.testing.assert_array_equal(recording.samples.read(0, len(samples)), samples)
 
 
-def test_samples_and_logs_may_lie_in_files(tmp_path):
+def test_samples_and_logs_are_accepted_as_files(tmp_path):
     np.save(tmp_path / "iq.npy", NODE.samples)
     NODE.samples.astype("<i2").tofile(tmp_path / "iq.bin")
     (tmp_path / "log.csv").write_text(
@@ -132,14 +132,14 @@ def test_samples_and_logs_may_lie_in_files(tmp_path):
         ({"frame": [1, 2]}, "and 2 frame numbers"),
         ({"frame": [1, 2, -7]}, "captures.2.apertura:frame"),
         ({"track": NODE.track[:, :2]}, "track of shape (2, 2); expected shape (2, 3)"),
-        ({"track": NODE.track * np.nan}, "0 epochs (2 left out: no fix)"),
-        ({"track_utc": NODE.track_utc[::-1]}, "an earlier time"),
+        ({"track": NODE.track * np.nan}, "0 epochs (2 excluded: no fix)"),
+        ({"track_utc": NODE.track_utc[::-1]}, "is before that of the previous epoch"),
         ({"track": "nowhere.pos"}, "nowhere.pos: no such file"),
         ({"attitude_deg": np.ones((3, 3))}, "attitude_deg of shape (3, 3)"),
         ({"channels": ("sidelink",)}, "apertura:channels ['sidelink']"),
     ],
 )  # fmt: skip
-def test_a_recording_that_cannot_be_is_named_and_nothing_is_left(tmp_path, change, expected):
+def test_invalid_recording_is_refused_and_leaves_no_file(tmp_path, change, expected):
     message = complaint(lambda: write(tmp_path / "c", replace(NODE, **change)))
     assert expected in message
     assert ".wip" not in message
@@ -163,21 +163,21 @@ def test_a_recording_that_cannot_be_is_named_and_nothing_is_left(tmp_path, chang
         ({"config": CONFIG | {"waveform": WAVEFORM | {"codes": "../codes.npy"}}}, "leads out of the campaign folder"),
     ],
 )
-def test_a_config_or_flight_that_cannot_be_is_named_and_nothing_is_left(tmp_path, change, expected):
+def test_invalid_config_or_flight_is_refused_and_leaves_no_file(tmp_path, change, expected):
     message = complaint(lambda: write(tmp_path / "c", **change))
     assert expected in message
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["../f01", "fused", "f 01", ""])
-def test_the_name_of_a_flight_leads_nowhere_else(tmp_path, name):
+def test_flight_name_outside_the_folder_is_refused(tmp_path, name):
     flights = {name: ap.RecordedFlight("uav1", {"uav1": NODE})}
     complaint(lambda: ap.write_campaign(tmp_path / "c", CONFIG, flights, sent=np.ones(8)))
     assert list(tmp_path.iterdir()) == []
 
 
-def test_nothing_is_written_over(tmp_path):
-    made = write(tmp_path / "c")
-    before = contents(made)
+def test_existing_campaign_is_not_overwritten(tmp_path):
+    root = write(tmp_path / "c")
+    before = contents(root)
     assert "already exists and is not an empty folder" in complaint(lambda: write(tmp_path / "c"))
-    assert contents(made) == before
+    assert contents(root) == before

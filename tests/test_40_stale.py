@@ -371,5 +371,5 @@ def test_plan_follows_the_config_and_not_outdated_results(tiny, capsys):
     assert planned_spacing_m(edited) == 0.2
     print_plan(edited)
     printed = capsys.readouterr().out
-    assert "1 result out of date (results/scene.manifest.json): planned from the config" in printed
+    assert "1 result out of date (results/scene.manifest.json): plan from the config" in printed
     assert "pixels of 0.2 m" in " ".join(printed.split())

@@ -8,7 +8,7 @@ import pytest
 from folders import STAND_ON_ALL, copy_writable, edit_config, image_of, quality_of, run_steps, state
 from spoiling.logs import read_log, write_log
 from spoiling.of_logs import noisy
-from track_noise import saying
+from track_noise import declare_std
 
 from apertura.campaign.config.processing import Processing
 from apertura.campaign.store import open_stage
@@ -54,7 +54,7 @@ def campaigns(tmp_path_factory):
     corrected = copy_writable(right, folder / "corrected")
     for path in sorted((corrected / "raw" / "f01").glob("*.track.*")):
         log = noisy(0.02, seed=3)(read_log(path))
-        write_log(path, log if log.attitude_deg is not None else saying(0.02)(log))
+        write_log(path, log if log.attitude_deg is not None else declare_std(0.02)(log))
     edit_config(corrected, lambda document: [node.update(position_std_m=0.02) for node in document["nodes"].values()])
     state(right, "processing", autofocus="off")
     return {root.name: run_steps(root, exports=root is corrected) for root in (right, corrected)}

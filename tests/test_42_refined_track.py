@@ -10,7 +10,7 @@ from folders import STAND_ON_ALL, copy_writable, edit_config, image_of, ingest_a
 from judging.bases import curved
 from spoiling.logs import read_log, write_log
 from spoiling.of_logs import late, noisy
-from track_noise import saying
+from track_noise import declare_std
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage, save_stage

@@ -159,7 +159,7 @@ def test_single_outlier_is_corrected_and_counted(tmp_path):
 
     edit_track(campaign.root, "a", epochs(spiked))
     dataset = echo_of(campaign)
-    assert "1 found, worst 0.500 m at 09:30:0" in dataset.attrs["flags"]["track_outlier"]
+    assert "1 fault, the worst 0.500 m at 09:30:0" in dataset.attrs["flags"]["track_outlier"]
     assert dataset.attrs["pulses"]["used"] == 40
     np.testing.assert_allclose(dataset.tx_position.values, clean, atol=1e-4)
 
@@ -280,7 +280,7 @@ def test_single_wrong_tag_is_excluded(tmp_path):
     edit_meta(campaign.root, "b", late)
     attrs = echo_of(campaign).attrs
     assert attrs["pulses"] == {"used": 39, "dropped": 1, "reasons": {"time_tag_outlier": 1}}
-    assert attrs["flags"]["time_tag_outlier"].startswith("1 of 40 pulses left out")
+    assert attrs["flags"]["time_tag_outlier"].startswith("1 of 40 pulses excluded")
 
 
 @pytest.mark.parametrize(("arm_m", "flagged"), [(0.3, True), (0.0, False)])

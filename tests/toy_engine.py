@@ -1,4 +1,4 @@
-"""An engine from outside: one file and one row, and every room knows it. Nearest sample, no interpolation."""
+"""An engine outside the package: one file and one row of the engine table. Nearest sample, no interpolation."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -11,11 +11,11 @@ from apertura.core.backprojection.job import Job
 
 READS = "profiles"
 CALLS: list[str] = []
-"""What was called, in order."""
+"""Functions called, in order."""
 
 
 class Options(EngineOptions):
-    """What may be asked of it."""
+    """Options of the engine."""
 
     refine: int | None = None
 
@@ -25,7 +25,7 @@ def available() -> bool:
 
 
 def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterator[Setting]:
-    """Yield a setting per refinement: so cheap that the planner takes it wherever -20 dB are enough."""
+    """Yield a setting per refinement, so cheap that the planner selects it wherever -20 dB suffice."""
     for refine in (requested.get("refine"),) if requested.get("refine") else (1, 4):
         yield Setting(
             "toy",
@@ -43,7 +43,7 @@ def prepare(profiles: Profiles, *, refine: int) -> tuple[Profiles, int]:
 
 
 def form(prepared: tuple[Profiles, int], pixels: np.ndarray, *, beams: Any = None) -> np.ndarray:
-    """Return the sum over the pulses of the nearest of refined samples, the carrier turned back."""
+    """Return the sum over the pulses of the nearest refined samples, with the carrier phase restored."""
     CALLS.append("form")
     profiles, refine = prepared
     length = profiles.samples.shape[1]

@@ -1,4 +1,4 @@
-"""Flights that a tree images: what it predicts of them, what it makes of them, and which way that went."""
+"""Flights imaged by the tree engine: its predictions, its images, and the share of each summation method."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -19,19 +19,19 @@ WAVENUMBERS = {"wavenumber_rad_m": 2 * np.pi * 1.2e9 / C, "band_rad_m": np.pi * 
 
 
 def seen(scene, pixels):
-    """A flight and profiles that hold what lies around its pixels, too: filters of trees are long."""
+    """Return a flight with profiles that extend beyond its pixels: filters of trees are long."""
     around = [pixels[::9, ::9].reshape(-1, 3) + [east, north, 0] for east in (-5, 5) for north in (-5, 5)]
     wide = scene.profiles(ecef(np.concatenate(around)))
     return SimpleNamespace(scene=scene, pixels=pixels, profiles=wide, aperture=Aperture(scene.tx, scene.rx))
 
 
 def flown(pixels, **options):
-    """A flight over pixels on which scatterers stand."""
+    """Return a flight over pixels with scatterers on them."""
     return seen(fly(scatter(pixels), **options), pixels)
 
 
 def setting(flight, **requested) -> Setting:
-    """What the tree predicts of a flight with these options."""
+    """Return the setting that the tree predicts for a flight with these options."""
     places, shape = ecef(flight.pixels), flight.pixels.shape[:2]
     corners = places[np.ix_(*(np.linspace(0, size - 1, 3).astype(int) for size in shape))]
     signal = Signal(flight.scene.carrier_hz, 2.0, STEP_M, flight.profiles.samples.shape[1])
@@ -41,7 +41,7 @@ def setting(flight, **requested) -> Setting:
 
 
 def shaken(flight, jitter_m, *, together=False):
-    """The flight with white noise on its track, on both nodes alike or each its own, and what it hears of nothing."""
+    """Return the flight with white noise on its track, common to both nodes or independent, and without echoes."""
     white = jitter_m * np.random.default_rng(8).standard_normal((2, *flight.scene.tx.shape))
     scene = replace(flight.scene, tx=flight.scene.tx + white[0], rx=flight.scene.rx + white[0 if together else 1])
     silent = replace(scene, transfer=np.zeros_like(scene.transfer))
@@ -49,7 +49,7 @@ def shaken(flight, jitter_m, *, together=False):
 
 
 def heard(flight):
-    """The flight with profiles that hold nothing but noise of the band."""
+    """Return the flight with profiles that contain only band-limited noise."""
     shape, generator = flight.profiles.samples.shape, np.random.default_rng(9)
     lines = np.fft.fft(generator.standard_normal((*shape, 2)).view(complex)[..., 0], axis=1)
     lines[:, shape[1] // 4 : -(shape[1] // 4)] = 0
@@ -58,7 +58,7 @@ def heard(flight):
 
 
 def formed(flight, pixels=None, *, beams=None, **requested):
-    """The image, and which part of it went by tree, directly and silently."""
+    """Return the image, and the shares of it summed by tree, directly and not at all."""
     chosen, counts = setting(flight, **{"nodes_db": -74} | requested), np.zeros(3, np.int64)
     places = ecef(flight.pixels if pixels is None else pixels)
     trees = tree.prepare(flight.profiles, **chosen.options)
@@ -68,7 +68,7 @@ def formed(flight, pixels=None, *, beams=None, **requested):
 
 
 def counted(aperture, pixels, nodes_db=-74, *, presum_db=-74, carrier_hz=1.2e9):
-    """Numbers of nodes and of pulses made of a leaf's on one tile of pixels, from one chunk of pulses."""
+    """Return the numbers of nodes and of virtual pulses of a leaf on one tile of pixels, for one chunk of pulses."""
     (surface,) = surfaces_of(np.ascontiguousarray(pixels), [tuple(slice(0, size) for size in pixels.shape[:2])])
     view = view_of_tile(
         aperture, surface, subaperture_sizes(256), **WAVENUMBERS | {"wavenumber_rad_m": 2 * np.pi * carrier_hz / C}

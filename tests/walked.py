@@ -1,4 +1,4 @@
-"""Pages of docs/ that run as they stand: their blocks, and what is shown below each as its output."""
+"""Pages of docs/ that are executed: their blocks, and the output shown below each."""
 
 import os
 import re
@@ -14,16 +14,16 @@ _NUMBER = re.compile(r"-?\d+\.\d+(?:e-?\d+)?")
 
 
 def blocks(page: Path):
-    """Yield (line, kind, block, shown) of a page: shown is the output that stands below the block."""
+    """Yield (line, kind, block, shown) of a page: `shown` is the output below the block."""
     text = page.read_text(encoding="utf-8")
     for block in re.finditer(r"^```(python|console)\n(.*?)^```\n(?:\n```text\n(.*?)^```\n)?", text, re.M | re.S):
         yield text.count("\n", 0, block.start()) + 2, block[1], block[2], block[3] or ""
 
 
 def walk(page: Path) -> dict[str, object]:
-    """Run a page's blocks in the working folder and return the names that they leave.
+    """Run a page's blocks in the working folder and return the names that they define.
 
-    Words and whole numbers that are printed are those shown; numbers with a decimal point differ by 5 % at most.
+    Printed words and integers must equal those shown; numbers with a decimal point may differ by 5 %.
     """
     names: dict[str, object] = {}
     for line, kind, block, shown in blocks(page):
@@ -49,5 +49,5 @@ def run_commands(block: str) -> None:
 
 
 def _parts(text: str) -> tuple[list[str], list[float]]:
-    """Return the words of a text with a mark for every number that has a decimal point, and these numbers."""
+    """Return the words of a text, with a mark for every number that has a decimal point, and these numbers."""
     return _NUMBER.sub("#", text).split(), [float(number) for number in _NUMBER.findall(text)]

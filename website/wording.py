@@ -43,6 +43,7 @@ WORDS = {
 NAMES = frozenset({"told", "untold", "asked", "nobody", "vague", "said", "wanted"})
 """Names of variables that describe no value."""
 
+_CODE = re.compile(r"`[^`]*`")
 _WORD = re.compile(rf"(?<![\w-])({'|'.join(map(re.escape, WORDS))})(?![\w-])", re.IGNORECASE)
 
 
@@ -73,7 +74,7 @@ def faults_of_code(text: str) -> Iterator[tuple[int, str]]:
 
 
 def faults_of_document(text: str) -> Iterator[tuple[int, str]]:
-    """Check a document in Markdown: yield line and fault, outside blocks of code.
+    """Check a document in Markdown: yield line and fault, outside code.
 
     Examples
     --------
@@ -84,7 +85,7 @@ def faults_of_document(text: str) -> Iterator[tuple[int, str]]:
     for number, line in enumerate(text.splitlines(), 1):
         fenced ^= line.lstrip().startswith("```")
         if not fenced and not line.startswith("    "):
-            yield from ((number, fault) for fault in _words(line))
+            yield from ((number, fault) for fault in _words(_CODE.sub("", line)))
 
 
 def _words(line: str) -> Iterator[str]:

@@ -1,1 +1,1 @@
-"""Right campaigns of every kind, drawn at random."""
+"""Random error-free campaigns."""

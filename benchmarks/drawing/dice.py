@@ -1,31 +1,31 @@
-"""What is drawn of a campaign, from its seed and number."""
+"""Random draws of the parameters of a campaign, from its seed and number."""
 
 from typing import Any
 
 import numpy as np
 
 CHANCE_OF_A_FLAW = 0.08
-"""How often something is imperfect on purpose."""
+"""Probability of each intentional flaw."""
 
 
 class Dice:
-    """Draws of one campaign."""
+    """Random draws of one campaign."""
 
     def __init__(self, seed: int, number: int) -> None:
         self.generator = np.random.default_rng([seed, number])
 
     def between(self, low: float, high: float) -> float:
-        """Return a number whose logarithm is uniform."""
+        """Draw a number with a uniform logarithm."""
         return float(np.exp(self.generator.uniform(np.log(low), np.log(high))))
 
     def uniform(self, low: float, high: float) -> float:
-        """Return a uniform number."""
+        """Draw a uniform number."""
         return float(self.generator.uniform(low, high))
 
     def one_of(self, *choices: Any) -> Any:
-        """Return one of some values."""
+        """Draw one of the given values."""
         return choices[int(self.generator.integers(len(choices)))]
 
     def chance(self, of: float) -> bool:
-        """Return true as often as asked."""
+        """Draw True with a given probability."""
         return bool(self.generator.random() < of)

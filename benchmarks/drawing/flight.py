@@ -1,4 +1,4 @@
-"""Where a drawn campaign flies and what it sees."""
+"""Random geometry of a campaign: tracks and scene."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,7 +17,7 @@ LARGEST_IMAGE_PX = 320
 
 @dataclass(frozen=True)
 class Geometry:
-    """Where it flies and what it sees: angles in radians, lengths in metres, speed in m/s."""
+    """Geometry of a campaign: angles in radians, lengths in metres, speed in m/s."""
 
     kind: str
     range_m: float
@@ -32,7 +32,7 @@ class Geometry:
 
     @property
     def ground_range_m(self) -> float:
-        """Horizontal distance of the track's middle from the scene's."""
+        """Horizontal distance of the track's middle from the scene's middle."""
         return float(np.sqrt(self.range_m**2 - self.up_m**2))
 
     @property
@@ -42,20 +42,21 @@ class Geometry:
 
 
 def draw_geometry(dice: Dice, highest_hz: float, bandwidth_hz: float, true: dict[str, str]) -> Geometry:
-    """Draw a track that samples its scene without ambiguity, unless it is one of those that do not."""
+    """Draw a track that samples its scene without ambiguity, or, as an intentional flaw, one that undersamples it."""
     kind, pulses = dice.one_of(*KINDS), int(dice.between(80, 200))
     farthest_m = (MOST_SUBCARRIERS * C / bandwidth_hz - 8.0) / 4.0
     range_m = dice.between(max(8.0, 10 * C / bandwidth_hz), min(300.0, farthest_m))
     up_m = range_m * dice.uniform(0.25, 0.7)
     wavelength_m, down_cell_m = C / highest_hz, C / (2 * bandwidth_hz) / np.sqrt(1 - (up_m / range_m) ** 2)
-    widest = pulses * wavelength_m / (48 * down_cell_m)  # ten cells down fit into two fifths of what is unambiguous
+    # Ten range cells must fit into two fifths of the unambiguous cross-range extent.
+    widest = pulses * wavelength_m / (48 * down_cell_m)
     aperture_rad = min(dice.between(max(0.04, 10 * wavelength_m / range_m), 0.8), widest)
     cross_cell_m = wavelength_m / (2 * aperture_rad)
     cell_m = min(cross_cell_m, down_cell_m)
     half_m = min(0.2 * pulses * cross_cell_m, 0.25 * range_m, LARGEST_IMAGE_PX / 6 * cell_m)
     if dice.chance(CHANCE_OF_A_FLAW):
         pulses //= 5
-        true["azimuth_undersampled"] = "a fifth of the pulses that the scene needs"
+        true["azimuth_undersampled"] = "a fifth of the pulses required by the scene"
     step_m = aperture_rad * range_m / (pulses - 1)
     heading = dice.uniform(0, 2 * np.pi)
     return Geometry(
@@ -73,7 +74,7 @@ def draw_geometry(dice: Dice, highest_hz: float, bandwidth_hz: float, true: dict
 
 
 def track(geometry: Geometry, behind_rad: float, farther: float) -> Track:
-    """Return a track about the origin, seen from there by an angle before the transmitter's and at another range."""
+    """Return a track about the origin, rotated by an angle against the transmitter's and at another range."""
     ground, up = geometry.ground_range_m * farther, geometry.up_m * farther
     duration_s = (geometry.pulses - 1) / geometry.prf_hz
     middle = geometry.heading_rad + behind_rad + (np.radians(30) if geometry.kind == "squinted" else 0.0)
@@ -87,8 +88,8 @@ def track(geometry: Geometry, behind_rad: float, farther: float) -> Track:
     climb = 0.3 if geometry.kind == "climbing" else 0.0
     velocity = geometry.speed_m_s * (course + [0, 0, climb]) / np.hypot(1, climb)
     start = ground * away + [0, 0, up] - velocity * duration_s / 2
-    first, then = _vectors([start, velocity])
-    return Straight(first, then, wobble)
+    start_m, velocity_m_s = _vectors([start, velocity])
+    return Straight(start_m, velocity_m_s, wobble)
 
 
 def _direction(angle_rad: float) -> np.ndarray:

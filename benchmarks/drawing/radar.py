@@ -1,4 +1,4 @@
-"""What a drawn campaign transmits, and what its nodes are."""
+"""Random waveform and nodes of a campaign."""
 
 from dataclasses import replace
 from math import ceil, log10
@@ -14,8 +14,8 @@ from drawing.flight import MOST_SUBCARRIERS, Geometry, track
 
 
 def draw_waveform(dice: Dice, geometry: Geometry, carrier_hz: float, bandwidth_hz: float) -> WaveformSpecification:
-    """Draw a symbol whose prefix holds every echo, and whose period holds the prefix."""
-    longest_m = 3.2 * (geometry.range_m + geometry.half_width_m) + 8.0  # of the farthest receiver's total path
+    """Draw an OFDM symbol with a prefix longer than all echo delays and a period longer than the prefix."""
+    longest_m = 3.2 * (geometry.range_m + geometry.half_width_m) + 8.0  # longest total path of the farthest receiver
     needed = ceil(longest_m / C * bandwidth_hz)
     subcarriers = int(2 ** np.ceil(np.log2(max(needed, dice.between(64, MOST_SUBCARRIERS / 2)))))
     spacing_hz = bandwidth_hz / subcarriers
@@ -46,7 +46,7 @@ def draw_nodes(
     missed = round(dice.one_of(0.0, dice.uniform(0, 0.2)), 3)
     radar_db = snr_db + 10 * log10(waveform.sample_rate_hz / waveform.subcarrier_spacing_hz / waveform.subcarriers)
     arms = {point: tuple(np.round(dice.generator.uniform(-0.3, 0.3, 3), 3)) for point in ("radar_tx", "radar_rx")}
-    # a node that stamps its own pulses knows the time: what scatters moves its antennas by less than λ/100
+    # The transmitting node tags its own pulses: the jitter of its time tags displaces antennas by less than λ/100.
     jitter_s = min(1e-3, C / waveform.carrier_hz / 100 / geometry.speed_m_s) * dice.uniform(0, 1)
     own = Impairments(radar_snr_db=radar_db, missed_fraction=missed, time_tag=TimeTag(jitter_s=jitter_s))
     nodes = {"uav1": SimulatedNode(arms, {"radar": round(dice.uniform(0, 1.5), 3)}, impairments=own)}
@@ -61,7 +61,7 @@ def draw_nodes(
 def _secondary(
     dice: Dice, geometry: Geometry, waveform: WaveformSpecification, own: Impairments, true: dict[str, str]
 ) -> SimulatedNode:
-    """Draw a node with a clock of its own: offset, phase, tags."""
+    """Draw a node with an independent clock: frequency offset, phase and time tags."""
     interval_s = 1 / geometry.prf_hz
     sidelink_db = dice.uniform(15, 40)
     if dice.chance(CHANCE_OF_A_FLAW):

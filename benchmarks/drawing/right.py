@@ -1,4 +1,4 @@
-"""Right campaigns drawn over all that a small UAV radar may be, each with what is imperfect in it on purpose."""
+"""Random error-free campaigns over the parameter envelope of small UAV radars, with their intentional flaws."""
 
 from dataclasses import dataclass
 from math import log10
@@ -26,16 +26,16 @@ _POINTS_OF_CLUTTER = 250
 
 @dataclass(frozen=True)
 class Drawn:
-    """A right campaign.
+    """Error-free campaign.
 
     Attributes
     ----------
     specification
-        What `ap.simulate` makes of it.
+        Input of `ap.simulate`.
     parameters
         Name with unit → value, for a table.
     true_flags
-        Flag that would be a true statement → what was made imperfect on purpose.
+        Flag that is correct for this campaign → its intentional flaw.
     """
 
     specification: CampaignSpecification
@@ -44,7 +44,7 @@ class Drawn:
 
 
 def draw_right(number: int, *, seed: int = 0) -> Drawn:
-    """Return one campaign of the envelope; the same numbers give the same one."""
+    """Draw one campaign of the envelope; the same seed and number give the same campaign."""
     dice, true = Dice(seed, number), dict[str, str]()
     carrier_hz = dice.between(0.4e9, 10e9)
     bandwidth_hz = min(dice.between(50e6, 1e9), 0.4 * carrier_hz)
@@ -61,7 +61,7 @@ def draw_right(number: int, *, seed: int = 0) -> Drawn:
     _weak_echoes(waveform, snr_db, scene, true)
     lasting_s = waveform.cyclic_prefix_s + waveform.symbol_s
     if (lasting_s - 1 / waveform.subcarrier_spacing_hz) * waveform.sample_rate_hz < 40:
-        true["clock_unmeasured"] = "symbols hardly longer than their period"
+        true["clock_unmeasured"] = "symbols less than 40 samples longer than their period"
     missed = max(node.impairments.missed_fraction for node in nodes.values())
     if missed > 0:
         true["pulses_missing"] = f"a node misses {100 * missed:.0f} % of its triggers"
@@ -78,7 +78,7 @@ def _grid(dice: Dice, geometry: Geometry, origin: Origin, true: dict[str, str]) 
     spacing_m = geometry.cell_m / 3
     if dice.chance(CHANCE_OF_A_FLAW):
         spacing_m *= 5
-        true["spacing_coarse"] = "pixels wider than a cell"
+        true["spacing_coarse"] = "pixel spacing larger than a resolution cell"
     spacing_m = float(f"{spacing_m:.2g}")
     half_m = max(8, round(geometry.half_width_m / spacing_m)) * spacing_m
     if dice.chance(0.7) or "spacing_coarse" in true:
@@ -105,11 +105,11 @@ def _targets(dice: Dice, geometry: Geometry, scene: str) -> tuple[Target, ...]:
 
 
 def _weak_echoes(waveform: WaveformSpecification, snr_db: float, scene: str, true: dict[str, str]) -> None:
-    """Say where a single pulse shows no echo: the flags about the code are then true."""
+    """Add the flag on the code if the echoes of a single pulse are below the noise after compression."""
     gathered_db = snr_db + 10 * log10(waveform.subcarriers)
     spread_db = 8 if "clutter" in scene else 0
     if gathered_db < 12 + spread_db:
-        true["code_unconfirmed"] = f"echoes of one pulse {gathered_db:.0f} dB over noise after compression"
+        true["code_unconfirmed"] = f"echoes of one pulse {gathered_db:.0f} dB above the noise after compression"
 
 
 def _parameters(waveform: WaveformSpecification, geometry: Geometry, bandwidth_hz: float) -> dict[str, Any]:

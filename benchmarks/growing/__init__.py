@@ -1,1 +1,1 @@
-"""What `benchmarks/growth.py` compares: scenes of every size, contestants, and a chart of what was measured."""
+"""Scenes, contestants, tables and charts of `benchmarks/growth.py`."""

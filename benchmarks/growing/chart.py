@@ -1,4 +1,4 @@
-"""A chart of rows of growth: seconds against size, and what accuracy costs on one scene."""
+"""Chart of the growth benchmark: run time against image size, and error against run time on one scene."""
 
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ _SECONDS = "CPU seconds of one thread, from echoes to image"
 
 
 def draw(rows: list[Row], path: Path) -> None:
-    """Write a PNG of three panels: seconds by size of both geometries, and error by seconds of one scene."""
+    """Draw a PNG with three panels: time against size for both geometries, and error against time for one scene."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -39,20 +39,20 @@ def draw(rows: list[Row], path: Path) -> None:
     plt.close(figure)
 
 
-def _growth(axis: Any, found: dict[str, list[Row]], geometry: str) -> None:
-    """Draw medians with their least and most, and the power law through them."""
-    for name, some in found.items():
-        size, seconds = (np.array([row[key] for row in some], float) for key in ("size", "seconds_from_echoes"))
-        spread = np.abs(np.array([row["spread"] for row in some]).T - seconds)
-        fitted, style = power_law(some), _style(some[0])
-        points = {"marker": _marker(some[0]), "markersize": 5, "color": style["color"], "linestyle": ""}
+def _growth(axis: Any, by_contestant: dict[str, list[Row]], geometry: str) -> None:
+    """Draw medians with minimum and maximum, and the power law fitted to them."""
+    for name, rows in by_contestant.items():
+        size, seconds = (np.array([row[key] for row in rows], float) for key in ("size", "seconds_from_echoes"))
+        spread = np.abs(np.array([row["spread"] for row in rows]).T - seconds)
+        fitted, style = power_law(rows), _style(rows[0])
+        points = {"marker": _marker(rows[0]), "markersize": 5, "color": style["color"], "linestyle": ""}
         axis.errorbar(size, seconds, yerr=spread, capsize=2, **points)
         line = seconds if fitted is None else np.exp(fitted[1]) * size ** fitted[0]
-        grows = "" if fitted is None else f": size$^{{{fitted[0]:.2f}}}$"
-        axis.plot(size, line, label=name + grows, linewidth=1.2, **style)
-    axis.set(xscale="log", yscale="log", xlabel="pixels along a side; twice as many pulses", ylabel=_SECONDS)
-    axis.set_title(f"{geometry}, flat ground: points measured, lines fitted")
-    sizes = sorted({row["size"] for some in found.values() for row in some})
+        exponent = "" if fitted is None else f": size$^{{{fitted[0]:.2f}}}$"
+        axis.plot(size, line, label=name + exponent, linewidth=1.2, **style)
+    axis.set(xscale="log", yscale="log", xlabel="pixels per side; twice as many pulses", ylabel=_SECONDS)
+    axis.set_title(f"{geometry}, flat terrain: measured points, fitted lines")
+    sizes = sorted({row["size"] for rows in by_contestant.values() for row in rows})
     axis.set_xticks(sizes, [str(size) for size in sizes])
     axis.minorticks_off()
     axis.grid(alpha=0.3)
@@ -63,9 +63,9 @@ def _accuracy(axis: Any, rows: list[Row]) -> None:
     for row in rows:
         place = (row["seconds_from_echoes"], row["error_db"])
         axis.plot(*place, marker=_marker(row), color=_style(row)["color"])
-        below = row["name"] == "native"  # which is as exact as a tree for -80 dB
+        below = row["name"] == "native"  # keeps its label apart from that of the tree at -80 dB
         axis.annotate(label(row), place, xytext=(6, -11 if below else 4), textcoords="offset points", fontsize=8)
-    axis.set(xscale="log", xlabel=_SECONDS, ylabel="error, dB RMS: more exact upwards")
+    axis.set(xscale="log", xlabel=_SECONDS, ylabel="RMS error, dB (more accurate upwards)")
     geometry, surface, size, pulses = _SHOWN
     axis.set_title(f"{size}² × {pulses}, {geometry}, {surface}")
     axis.margins(x=0.32, y=0.1)

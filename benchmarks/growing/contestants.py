@@ -1,4 +1,4 @@
-"""Our engines on a scene, each as its planner sets it: whole calls, tables and sums, tile by tile."""
+"""Engines of apertura on a scene, with the planner's settings: complete calls, with tables and sums, tile by tile."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -20,31 +20,31 @@ from growing.scene import TILE_PX, Scene, Window
 
 Image = NDArray[np.complex64]
 PATIENCE = 5.0
-"""Of so many times the limit the least part may be that can stand for an image."""
+"""Multiple of the time limit that the smallest representative part of an image may take."""
 
 
 @dataclass
 class Contestant:
-    """One way to the image of a scene.
+    """Image formation of a scene by one program.
 
     Attributes
     ----------
     name, setting
-        Who, and how it is set.
+        Name of the program and its settings.
     scene
-        What is imaged.
+        Imaged scene.
     run
-        Returns the image at the checks, CPU seconds of what all pixels share, and those of the pixels.
+        Returns the image at the checks, the CPU seconds common to all pixels, and the CPU seconds of the pixels.
     share
-        Of the image's pixels that `run` forms; the second seconds are divided by it.
+        Share of the image's pixels that `run` forms; the CPU seconds of the pixels are divided by it.
     aim_db
-        Asked for; None where nothing can be asked.
+        Requested accuracy; None if the program has no such setting.
     from_echoes
-        Whether range compression is inside.
+        True if `run` includes range compression.
     ways
-        Way that pixels × pulses went, where an engine has several → how many, in the last run.
+        Path variant of an engine with several → number of pixels × pulses in the last run.
     planning_s
-        CPU seconds of our planner, which count in no others; fastsar plans inside `run`.
+        CPU seconds of apertura's planner, not included in other times; fastsar plans inside `run`.
     """
 
     name: str
@@ -61,7 +61,7 @@ class Contestant:
     error_db: float = np.nan
 
     def go(self) -> None:
-        """Run once, note the time, and measure the error."""
+        """Run once, record the time and measure the error."""
         values, shared, pixels = self.run()
         self.shared.append(shared)
         self.seconds.append(shared + pixels / self.share)
@@ -69,11 +69,11 @@ class Contestant:
 
     @property
     def spent(self) -> float:
-        """CPU seconds that all runs took."""
+        """CPU seconds of all runs."""
         return sum(a + (b - a) * self.share for a, b in zip(self.shared, self.seconds, strict=True))
 
     def row(self, compression_s: float) -> dict[str, object]:
-        """Return what was measured; seconds of the whole image from profiles, and from echoes with their spread."""
+        """Return the results: seconds for the whole image from profiles, and from echoes with their spread."""
         seconds, size, pulses = median(self.seconds), self.scene.size, len(self.scene.history)
         echoes = seconds + (0.0 if self.from_echoes else compression_s)
         return {
@@ -88,7 +88,7 @@ class Contestant:
             "seconds": None if self.from_echoes else _digits(seconds),
             "seconds_from_echoes": _digits(echoes),
             "seconds_shared": _digits(median(self.shared)),
-            "spread": [_digits(found(self.seconds) + echoes - seconds) for found in (min, max)],
+            "spread": [_digits(extreme(self.seconds) + echoes - seconds) for extreme in (min, max)],
             "planning_seconds": _digits(self.planning_s),
             "pixel_pulses_per_s": _digits(size**2 * pulses / echoes),
             "ways": {way: _digits(count / max(1, sum(self.ways.values()))) for way, count in self.ways.items()},
@@ -100,105 +100,105 @@ class Contestant:
 
 
 class SkippedError(Exception):
-    """Why somebody does not take part."""
+    """Reason for skipping a contestant."""
 
 
 def _digits(value: float) -> float:
     return float(f"{value:.3g}")
 
 
-class House:
-    """What our engines are given of a scene: profiles, and the planner's job."""
+class EngineInput:
+    """Input of apertura's engines for a scene: profiles, and the planner's job."""
 
     def __init__(self, scene: Scene):
         self.scene, history, grid = scene, scene.history, scene.grid
         self.profiles: Profiles = range_compress(history, grid, scene.ground)
         self.compressions: list[float] = []
-        known = (history.aperture, history.frequency_hz, history.weight)
+        inputs = (history.aperture, history.frequency_hz, history.weight)
         models = GroundModels.of(scene.ground, None, grid)
-        self.job: Job = imaging_job(*known, grid, models, integration="all")
+        self.job: Job = imaging_job(*inputs, grid, models, integration="all")
 
     def compress(self) -> None:
-        """Compress once more in range, and note the time."""
+        """Repeat range compression and record the time."""
         begin = time.process_time()
         range_compress(self.scene.history, self.scene.grid, self.scene.ground)
         self.compressions.append(time.process_time() - begin)
 
     def planned(self, engine: str, aim_db: float, limit_s: float, *, fields: bool = False) -> Contestant:
-        """Return an engine as the planner sets it for an accuracy.
+        """Return an engine with the planner's setting for an accuracy.
 
         Parameters
         ----------
         engine
-            A key of `ENGINES`, which may not be there yet.
+            A key of `ENGINES`; engines missing in this version are skipped.
         limit_s
-            Predicted seconds above which only some of the tiles are formed.
+            Predicted time in seconds above which only a part of the tiles is formed.
         fields
-            Whether fields of clutter alone may stand for the image, where the engine works pixel by pixel.
+            True if fields of clutter may represent the image, for engines that work pixel by pixel.
 
         Raises
         ------
         SkippedError
-            If the engine is not there, cannot run here, or would take too long.
+            If the engine is unknown, is not built on this machine, or takes too long.
         """
         if engine not in ENGINES:
-            raise SkippedError(f"{engine} is no engine of this version")
+            raise SkippedError(f"this version has no engine {engine}")
         if not load_engine(engine).available():
-            raise SkippedError(f"{engine} was not built here")
+            raise SkippedError(f"{engine} is not built on this machine")
         flat = isinstance(self.scene.ground, FlatGround)
-        asked = {"engine": engine} | ({} if flat else {"terrain": "dem"})
+        overrides = {"engine": engine} | ({} if flat else {"terrain": "dem"})
         begin = time.process_time()
-        plan = make_plan(self.job, accuracy_db=aim_db, overrides=asked)
+        plan = make_plan(self.job, accuracy_db=aim_db, overrides=overrides)
         planning_s = time.process_time() - begin
         setting, inputs = plan.setting, plan.inputs
         windows = _formed(self.scene, setting.form_seconds, limit_s, fields=fields)
         module, ground, grid = load_engine(engine), plan.terrain, self.scene.grid
 
-        ways: tuple[str, ...] = getattr(module, "VARIANTS", ())
-        went: dict[str, int] = {}
+        variants: tuple[str, ...] = getattr(module, "VARIANTS", ())
+        variant_counts: dict[str, int] = {}
 
         def run() -> tuple[Image, float, float]:
-            counts = np.zeros(len(ways), np.int64)
-            counted = {"counts": counts} if ways else {}
+            counts = np.zeros(len(variants), np.int64)
+            counted = {"counts": counts} if variants else {}
             image = np.zeros(grid.shape, np.complex64)
             begin, pixels_s = time.process_time(), 0.0
-            given = inputs(self.profiles)
+            profiles = inputs(self.profiles)
             shared_s = time.process_time() - begin
-            for block in pulse_blocks_of(len(given), setting.pulse_blocks, any_start=True):
+            for block in pulse_blocks_of(len(profiles), setting.pulse_blocks, any_start=True):
                 begin = time.process_time()
-                tables = module.prepare(given[block], **setting.options)
+                tables = module.prepare(profiles[block], **setting.options)
                 shared_s += time.process_time() - begin
                 for window in windows:
                     places = ground.positions(grid[window])
                     begin = time.process_time()
                     image[window] += module.form(tables, places, **setting.form_options, **counted)
                     pixels_s += time.process_time() - begin
-            went.update(zip(ways, counts.tolist(), strict=True))
+            variant_counts.update(zip(variants, counts.tolist(), strict=True))
             return image[*self.scene.checks], shared_s, pixels_s
 
         line = setting.line + (f", presum {plan.presum.factor}" if plan.presum else "")
         share = share_of(self.scene, windows)
-        return Contestant(engine, line, self.scene, run, share, aim_db, planning_s=planning_s, ways=went)
+        return Contestant(engine, line, self.scene, run, share, aim_db, planning_s=planning_s, ways=variant_counts)
 
 
 def share_of(scene: Scene, windows: Iterable[Window]) -> float:
-    """Return the share of the image's pixels that lie in windows."""
+    """Return the share of the image's pixels within the given windows."""
     return sum((rows.stop - rows.start) * (columns.stop - columns.start) for rows, columns in windows) / scene.size**2
 
 
 def _formed(scene: Scene, predicted_s: float, limit_s: float, *, fields: bool) -> list[Window]:
-    """Return the most that is predicted to take no longer than the limit, or the least if it takes a little longer."""
+    """Return the largest set of windows predicted within the time limit, or the smallest if it is slightly over it."""
     for windows in _samples(scene, fields=fields):
         seconds = predicted_s * share_of(scene, windows)
         if seconds <= limit_s:
             return windows
     if seconds > PATIENCE * limit_s:
-        raise SkippedError(f"the least part of it would take {seconds:.0f} s")
+        raise SkippedError(f"the smallest representative part takes {seconds:.0f} s")
     return windows
 
 
 def _samples(scene: Scene, *, fields: bool) -> Iterator[list[Window]]:
-    """Yield fewer and fewer windows of the image, each of which hold all pixels that are compared."""
+    """Yield smaller and smaller sets of windows of the image, each with all compared pixels."""
     every, most = 1, -(-scene.size // TILE_PX)
     while every <= most:
         yield scene.tiles(every)

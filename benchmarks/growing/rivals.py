@@ -1,6 +1,6 @@
-"""fastsar on a scene: its exact formers and its factorized one, from phase history, each call whole.
+"""fastsar on a scene: its exact formers and its factorized former, from phase history, in complete calls.
 
-Its images are of a plane centred on the origin, (column, row), and its samples refer to one way of range.
+Its images are (column, row), of a plane centred on the origin, and its samples refer to one-way range.
 """
 
 import time
@@ -15,12 +15,12 @@ from apertura.core.scene.terrain import FlatGround
 from growing.contestants import PATIENCE, Contestant, Image, SkippedError, share_of
 from growing.scene import Scene
 
-_AXES = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0))  # columns go east, rows go south
-_POINT_S, _EXACT_S = 2.5e-8, 4.5e-9  # a pixel and a pulse, roughly
+_AXES = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0))  # columns to the east, rows to the south
+_POINT_S, _EXACT_S = 2.5e-8, 4.5e-9  # approximate seconds per pixel and pulse
 
 
 class Fastsar:
-    """A scene as fastsar reads it."""
+    """Scene in the conventions of fastsar."""
 
     def __init__(self, scene: Scene):
         import fastsar
@@ -34,42 +34,42 @@ class Fastsar:
         self.middle = scene.grid.positions_at([scene.size // 2], [scene.size // 2], 0.0)[0]
 
     def factorized(self, name: str, finer: int = 1, **options: Any) -> Contestant:
-        """Return its factorized former, planned and called; on finer pixels, of which one in so many is kept.
+        """Return its factorized former with planning, on pixels finer by a factor and then decimated.
 
-        Its smallest patches have 16 pixels: only finer pixels make them smaller, and the image more exact.
+        Its smallest patches have 16 pixels: only finer pixels reduce their size, and the error of the image.
         """
         scene = self.scene
         if scene.geometry == "bistatic":
-            raise SkippedError("its factorized former is monostatic")
+            raise SkippedError("its factorized former supports monostatic geometries only")
         if not isinstance(scene.ground, FlatGround):
-            raise SkippedError("its factorized former images planes")
+            raise SkippedError("its factorized former supports planes only")
         size, spacing = scene.size * finer, scene.grid.spacing_m / finer
         if size > 16384:
             raise SkippedError(f"{size}² pixels do not fit into memory")
 
         def run() -> tuple[Image, float, float]:
             begin = time.process_time()
-            with warnings.catch_warnings(action="ignore"):  # of its own accuracy, which is measured here
+            with warnings.catch_warnings(action="ignore"):  # warns of its accuracy, which is measured below
                 former = self.package.ImageFormer(*self._grid(size, spacing), **self._options, **options)
             planned = time.process_time()
             image = former(scene.history.transfer)
             formed = time.process_time()
             return image[::finer, ::finer].T[*scene.checks], planned - begin, formed - planned
 
-        words = [f"{name}={value}" for name, value in options.items()] + ([f"pixels/{finer}"] if finer > 1 else [])
-        return Contestant(name, " ".join(words) or "defaults", scene, run, from_echoes=True)
+        settings = [f"{name}={value}" for name, value in options.items()] + ([f"pixels/{finer}"] if finer > 1 else [])
+        return Contestant(name, " ".join(settings) or "defaults", scene, run, from_echoes=True)
 
     def exact(self, limit_s: float) -> Contestant:
-        """Return its exact former of planes, tile by tile; range compression, which every call does, counts once."""
+        """Return its exact former of planes, tile by tile; range compression, part of every call, is counted once."""
         scene = self.scene
         if scene.geometry == "bistatic" or not isinstance(scene.ground, FlatGround):
-            raise SkippedError("its exact former is monostatic and images planes")
+            raise SkippedError("its exact former supports monostatic geometries and planes only")
         predicted, every = _EXACT_S * scene.size**2 * len(scene.history), 1
         while predicted / every > limit_s and scene.tiles(2 * every) != scene.tiles(every):
             every *= 2
         tiles = scene.tiles(every)
         if predicted * share_of(scene, tiles) > PATIENCE * limit_s:
-            raise SkippedError(f"its least part would take {predicted * share_of(scene, tiles):.0f} s")
+            raise SkippedError(f"the smallest representative part takes {predicted * share_of(scene, tiles):.0f} s")
 
         def run() -> tuple[Image, float, float]:
             image = np.zeros(scene.grid.shape, np.complex64)
@@ -88,11 +88,11 @@ class Fastsar:
         return Contestant("fastsar exact", "cubic, 8×", scene, run, share, from_echoes=True)
 
     def points(self, limit_s: float) -> Contestant:
-        """Return its bistatic former of points, of those in the middle of fields; its cost grows with them."""
+        """Return its bistatic former of points, for the middles of the fields; its cost grows with their number."""
         scene, sample = self.scene, scene_points(self.scene)
         predicted = _POINT_S * sample.shape[0] * sample.shape[1] * sample.shape[2] * len(scene.history)
         if predicted > PATIENCE * limit_s:
-            raise SkippedError(f"the least part of it would take {predicted:.0f} s")
+            raise SkippedError(f"the smallest representative part takes {predicted:.0f} s")
         legs = [leg - self.middle for leg in scene.history.aperture.legs]
         options = {"rcv": legs[1], "ref": self.one_way_m, "backend": "cpu", "window": False}
 
@@ -119,7 +119,7 @@ class Fastsar:
         return {"backend": "cpu", "window": False, "ref": self.one_way_m}
 
     def _compression(self, upsample: int) -> float:
-        """Return CPU seconds of its range compression, in its own chunks."""
+        """Return CPU seconds of its range compression with its chunk size."""
         history = self.scene.history.transfer
         begin = time.process_time()
         for first in range(0, len(history), 256):
@@ -128,5 +128,5 @@ class Fastsar:
 
 
 def scene_points(scene: Scene) -> NDArray[np.float64]:
-    """Return (field, row, column, 3) positions of the pixels of fields' middles, metres."""
+    """Return positions of the pixels in the middles of fields, (field, row, column, 3) metres."""
     return np.stack([scene.ground.positions(scene.grid[window]) for window in scene.inner])

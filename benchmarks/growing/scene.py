@@ -1,11 +1,12 @@
-"""Scenes whose aperture grows with the image, of clutter and noise.
+"""Scenes of clutter and noise whose aperture grows with the image.
 
-A flight to and fro beside the image is as long as that is wide, and its height and distance grow with it: 10 m and 5 m
-at 512 pixels of 5 cm, and so at every size where it is `low`. `spotlight` is a straight one 10 km away.
+The flight goes back and forth next to the image over its full width; its height and distance, 10 m and 5 m at 512
+pixels of 5 cm, grow with the image, except for geometry `low`, where they are constant. Geometry `spotlight` is a
+straight flight at 10 km.
 
-Fields of clutter stand in tiles spread over the image, one for each row and column of tiles, and noise of equal power
-in every sample: errors of single pulses show as undiminished as the planner predicts them. Pixels compared lie in the
-fields, so that a few bright ones do not decide the error.
+Fields of clutter are spread over the tiles of the image, one per row and column of tiles; every sample contains noise
+of equal power, so that errors of single pulses are as large as the planner predicts. Compared pixels are in the fields,
+so that the error is not dominated by a few bright pixels.
 """
 
 from dataclasses import dataclass
@@ -35,20 +36,21 @@ _FIELDS, _CHECKS, _SCATTERER_PX = 16, 40, 4
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """One job.
+    """Simulated scene with its echoes.
 
     Attributes
     ----------
     geometry, surface
-        Which flight, which ground.
+        Kinds of flight and terrain.
     history
-        Transfer functions, the delay of the scene's middle taken out.
+        Transfer functions, with the delay of the scene's middle removed.
     grid, ground
-        Of the image, in a local frame.
+        Grid and terrain of the image, in a local frame.
     fields
         Windows of clutter.
     checks, exact
-        (2, check) rows and columns, and the double sum over pulses and subcarriers there, (check,) complex128.
+        Rows and columns of the compared pixels, (2, check), and the double sum over pulses and subcarriers at these
+        pixels, (check,) complex128.
     """
 
     geometry: Geometry
@@ -62,21 +64,21 @@ class Scene:
 
     @property
     def inner(self) -> list[Window]:
-        """The middle of each field, where pixels are compared."""
+        """Windows of the compared pixels, the middle of each field."""
         return [_inner(field) for field in self.fields]
 
     @property
     def size(self) -> int:
-        """Pixels along a side."""
+        """Pixels per side."""
         return self.grid.shape[0]
 
     @property
     def name(self) -> str:
-        """Size, pulses, geometry and ground."""
+        """Size, pulses, geometry and terrain."""
         return f"{self.size}² × {len(self.history)}, {self.geometry}, {self.surface}"
 
     def tiles(self, every: int) -> list[Window]:
-        """Return one tile in so many, as many of each column; those of 4 are among those of 2, and fields in all."""
+        """Return one tile in `every`, evenly over the columns; all sets are nested and contain the fields."""
         return _tiles(self.size, every)
 
     def error_db(self, value: NDArray[np.complex64]) -> float:
@@ -87,7 +89,7 @@ class Scene:
 
 
 def build(size: int, pulses: int, geometry: Geometry, surface: Surface, *, noise_db: float = 0.0) -> Scene:
-    """Return a job; `noise_db` is the power of the image's noise over that of its clutter."""
+    """Simulate a scene; `noise_db` is the noise power of the image relative to its clutter."""
     generator = np.random.default_rng(1)
     flight, spacing_m, west_m, centre_hz, cell_m = _flight(geometry, size, pulses, generator)
     half_m = size * spacing_m / 2
@@ -120,18 +122,18 @@ def build(size: int, pulses: int, geometry: Geometry, surface: Surface, *, noise
 def _flight(
     geometry: Geometry, size: int, pulses: int, generator: np.random.Generator
 ) -> tuple[Aperture, float, float, float, float]:
-    """Return the flight, the pixels' spacing, the west edge of the image, the carrier and a cell c/B of total path."""
-    if geometry == "spotlight":  # 10 km away, grazing at 30°: 0.3 m along and across
+    """Return the flight, the pixel spacing, the west edge of the image, the carrier and the cell c/B of total path."""
+    if geometry == "spotlight":  # 10 km distance, grazing angle 30°: resolution 0.3 m along and across
         wavelength, spacing_m = C / 9.6e9, 0.2
         along = np.linspace(-0.5, 0.5, pulses) * 1e4 * wavelength / 0.6
         track = np.stack([np.full(pulses, -1e4 * np.cos(np.pi / 6)), along, np.full(pulses, 5e3)], -1)
         return Aperture(track, track), spacing_m, -size * spacing_m / 2, 9.6e9, 0.6
     spacing_m, wavelength = 0.05, C / 1.2e9
     scale, length = 1.0 if geometry == "low" else size / 512, 1.25 * size * spacing_m
-    way = np.arange(pulses) * wavelength / 8
-    passes = max(1.0, way[-1] / length)
-    along = np.abs(np.remainder(way, 2 * length) - length) - length / 2
-    along += 0.5 * (length - way[-1]) if passes == 1 else 0.0
+    travelled = np.arange(pulses) * wavelength / 8
+    passes = max(1.0, travelled[-1] / length)
+    along = np.abs(np.remainder(travelled, 2 * length) - length) - length / 2
+    along += 0.5 * (length - travelled[-1]) if passes == 1 else 0.0
     drift = np.linspace(-0.5, 0.5, pulses) * (passes - 1)
     wobble = [_wobble(generator, pulses, sigma) for sigma in (0.05, 0.02, 0.05, 0.05, 0.02, 0.05)]
     tx = [wobble[0] - drift * scale, along + wobble[1], (10 + drift) * scale + wobble[2]]
@@ -145,7 +147,7 @@ def _flight(
 
 
 def _ground(grid: SceneGrid, surface: Surface, generator: np.random.Generator) -> Terrain:
-    """Return flat ground, or relief of 1 m over 8 m, smooth or with 1 cm RMS over a quarter metre on it."""
+    """Return flat terrain, or relief of 1 m over 8 m, smooth or with a roughness of 1 cm RMS over a quarter metre."""
     if surface == "flat":
         return FlatGround(0.0)
     heights = np.sin(grid.x_m / 8) * np.cos(grid.y_m[:, None] / 10)
@@ -162,7 +164,7 @@ def _tiles(size: int, every: int) -> list[Window]:
 
 
 def _fields(size: int, generator: np.random.Generator) -> list[Window]:
-    """Return windows apart from each other, as many in each of the fewest tiles."""
+    """Draw separate windows, equally many in each tile of the smallest set."""
     tiles, fields = _tiles(size, size), []
     for tile in tiles:
         first = np.stack(np.meshgrid(*(np.arange(part.start, part.stop, FIELD_PX) for part in tile)), -1).reshape(-1, 2)
@@ -189,7 +191,7 @@ def _clutter(places: NDArray[np.float64], generator: np.random.Generator) -> Sca
     return Scatterers(places, generator.standard_normal((2, len(places))).T.copy().view(np.complex128)[:, 0])
 
 
-def _round_up(wanted: float) -> int:
-    """Return the next count of 2^a or 3·2^a subcarriers."""
-    power = 2 ** int(np.ceil(np.log2(wanted)))
-    return power * 3 // 4 if power * 3 // 4 >= wanted else power
+def _round_up(count: float) -> int:
+    """Round a number of subcarriers up to 2^a or 3·2^a."""
+    power = 2 ** int(np.ceil(np.log2(count)))
+    return power * 3 // 4 if power * 3 // 4 >= count else power

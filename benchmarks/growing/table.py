@@ -1,4 +1,4 @@
-"""What was measured, in words: a table in Markdown, and the exponents with which seconds grow."""
+"""Results of the growth benchmark: a Markdown table, and the exponents of the growth of run times."""
 
 from typing import Any
 
@@ -8,21 +8,21 @@ Row = dict[str, Any]
 
 
 def label(row: Row) -> str:
-    """Return who it was, and what was asked of it."""
+    """Return the name of a contestant with its requested accuracy."""
     return row["name"] if row["aim_db"] is None else f"{row['name']} −{abs(row['aim_db']):.0f} dB"
 
 
 def ladder(rows: list[Row], geometry: str) -> dict[str, list[Row]]:
-    """Return the rows of flat scenes with twice as many pulses as pixels along a side, by contestant and size."""
-    found: dict[str, list[Row]] = {}
+    """Return the rows of flat scenes with twice as many pulses as pixels per side, by contestant and size."""
+    by_contestant: dict[str, list[Row]] = {}
     for row in sorted(rows, key=lambda row: int(row["size"])):
         if (row["geometry"], row["surface"]) == (geometry, "flat") and row["pulses"] == 2 * row["size"]:
-            found.setdefault(label(row), []).append(row)
-    return found
+            by_contestant.setdefault(label(row), []).append(row)
+    return by_contestant
 
 
 def power_law(rows: list[Row]) -> tuple[float, float] | None:
-    """Return p and log a of seconds = a·sizeᵖ by least squares of logarithms; None of fewer than three sizes."""
+    """Fit seconds = a·sizeᵖ by least squares of logarithms; return p and log a, or None for fewer than three sizes."""
     if len(rows) < 3:
         return None
     size, seconds = (np.log([row[key] for row in rows]) for key in ("size", "seconds_from_echoes"))
@@ -31,13 +31,13 @@ def power_law(rows: list[Row]) -> tuple[float, float] | None:
 
 
 def exponents(rows: list[Row]) -> str:
-    """Return the growth of each contestant, a line each: pulses grow with the size, so direct sums take size³."""
+    """Return a Markdown table of the growth exponents; pulses grow with the size, so that direct sums take size³."""
     lines = ["| geometry | contestant | sizes | seconds grow as |", "|---|---|---|---|"]
     for geometry in ("monostatic", "bistatic"):
-        for name, some in ladder(rows, geometry).items():
-            if (fitted := power_law(some)) is not None:
+        for name, sizes in ladder(rows, geometry).items():
+            if (fitted := power_law(sizes)) is not None:
                 lines.append(
-                    f"| {geometry} | {name} | {some[0]['size']} to {some[-1]['size']} | size^{fitted[0]:.2f} |"
+                    f"| {geometry} | {name} | {sizes[0]['size']} to {sizes[-1]['size']} | size^{fitted[0]:.2f} |"
                 )
     return "\n".join(lines)
 
@@ -48,9 +48,9 @@ def _directly(row: Row) -> str:
 
 
 def markdown(rows: list[Row]) -> str:
-    """Return all rows as a table, ratios against native at −60 dB of the same scene: from profiles and from echoes."""
+    """Return all rows as a table, with speeds relative to native at −60 dB on the same scene."""
     lines = [
-        "| image × pulses | geometry, ground | contestant | setting | seconds | from echoes | least … most "
+        "| image × pulses | geometry, terrain | contestant | setting | seconds | from echoes | minimum … maximum "
         "| × native −60, from echoes | 10⁹ pixel·pulses/s | error dB | share, rounds, load, directly |",
         "|---" * 11 + "|",
     ]
@@ -58,9 +58,9 @@ def markdown(rows: list[Row]) -> str:
     for row in rows:
         scenes.setdefault((row["geometry"], row["surface"], row["size"], row["pulses"]), []).append(row)
     for scene in sorted(scenes):
-        some = scenes[scene]
-        base = next((row for row in some if label(row) == "native −60 dB"), None)
-        for row in some:
+        of_scene = scenes[scene]
+        base = next((row for row in of_scene if label(row) == "native −60 dB"), None)
+        for row in of_scene:
             ratios = [base[key] / row[key] if base and row[key] else None for key in ("seconds", "seconds_from_echoes")]
             ratio = ", ".join("–" if one is None else f"{one:.3g}" for one in ratios)
             seconds = "" if row["seconds"] is None else f"{row['seconds']:.3g}"

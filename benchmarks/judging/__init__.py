@@ -1,1 +1,1 @@
-"""Campaigns carried through the pipeline in this process, and what became of the targets that truth.json puts there."""
+"""Processing of campaigns within this process, and evaluation of the targets listed in truth.json."""

@@ -1,4 +1,4 @@
-"""The right campaigns that mistakes are made in: the sample, and one along a strongly curved track."""
+"""Error-free base campaigns into which mistakes are introduced: the sample, and one with a strongly curved track."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,17 +21,17 @@ SHARED = Path(__file__).parents[2].parent / "shared" / "data"
 
 
 def sample(target: Path) -> Path:
-    """Copy the sample campaign, made by a model independent of this project: nearly straight tracks, four targets."""
+    """Copy the sample campaign of an independent simulator: nearly straight tracks, four targets."""
     return copy_writable(SHARED / "campaign-sample", target)
 
 
 def curved(target: Path) -> Path:
-    """Simulate two nodes on bows of 36° about five targets, one 4 m behind the other and 0.4 m higher."""
+    """Simulate two nodes on arcs of 36° about five targets, one node 4 m behind the other and 0.4 m higher."""
     return ap.simulate(target, curved_specification(), seed=9)
 
 
 def curved_specification() -> CampaignSpecification:
-    """Return what `curved` simulates; nodes, logs, waveform and grid are those of the demo."""
+    """Return the specification of `curved`; nodes, logs, waveform and grid are those of the demo."""
     demo = preset("demo")
     primary, secondary = demo.nodes["uav1"], demo.nodes["uav2"]
     tag = TimeTag(offset_s=0.5e-3, jitter_s=0.1e-3)
@@ -44,14 +44,14 @@ def curved_specification() -> CampaignSpecification:
 
 
 def bow(first_deg: float, up_m: float) -> Waypoints:
-    """Return 36° about the origin in 7 s as flown by hand: speed, distance and height change.
+    """Return an arc of 36° about the origin in 7 s, as flown manually with varying speed, distance and height.
 
-    A time offset on an even circle only turns the image; here it bends what is straight.
+    On a uniform circle, a time offset only rotates the image; on this arc it distorts the image.
     """
     time_s = np.arange(-5.0, 12.5, 0.5)
-    turns = 2 * np.pi * time_s / 7.0
-    angle = np.radians(first_deg + 5.2 * time_s + 1.5 * np.sin(turns))
-    distance, up = 11.5 + 0.7 * np.cos(turns), up_m + 0.3 * np.sin(turns)
+    phase_rad = 2 * np.pi * time_s / 7.0
+    angle = np.radians(first_deg + 5.2 * time_s + 1.5 * np.sin(phase_rad))
+    distance, up = 11.5 + 0.7 * np.cos(phase_rad), up_m + 0.3 * np.sin(phase_rad)
     position = np.column_stack([distance * np.cos(angle), distance * np.sin(angle), up])
     return Waypoints(tuple(time_s.tolist()), tuple(map(tuple, position.tolist())), wobble=Wobble())
 

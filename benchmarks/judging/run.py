@@ -1,4 +1,4 @@
-"""One campaign through every step in this process: what was said of each image, and its pixels."""
+"""Processing of one campaign by all steps within this process: reports and pixels of each image."""
 
 import contextlib
 import io
@@ -25,20 +25,20 @@ from apertura.stages.scene import settled_scene
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a campaign.
+    """Results of a campaign.
 
     Attributes
     ----------
     error
-        First line of the error that ended it; empty: it came to its end.
+        First line of the error that stopped the processing; empty without an error.
     reports
         Image (a pair, or fused) → its image.json.
     images
         Image → (y, x) complex64.
     grid
-        On which they lie.
+        Grid of the images.
     seconds
-        Time from the folder to the last file.
+        Wall-clock time of the processing.
     """
 
     error: str
@@ -49,7 +49,7 @@ class Outcome:
 
 
 def copy_writable(source: Path, target: Path) -> Path:
-    """Copy a campaign, which may be read-only, without its results to a new folder; return that."""
+    """Copy a campaign, which may be read-only, without its results to a new folder; return the folder."""
     shutil.rmtree(target, ignore_errors=True)
     shutil.copytree(source, target, copy_function=shutil.copyfile, ignore=shutil.ignore_patterns("results"))
     for folder in (target, *(path for path in target.rglob("*") if path.is_dir())):
@@ -58,8 +58,8 @@ def copy_writable(source: Path, target: Path) -> Path:
 
 
 def run_campaign(root: Path) -> Outcome:
-    """Carry a campaign folder of one image flight through every step; errors are part of the outcome."""
-    begun = time.perf_counter()
+    """Process a campaign folder with one image flight by all steps; errors are part of the outcome."""
+    start_s = time.perf_counter()
     shutil.rmtree(root / "results", ignore_errors=True)
     try:
         with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
@@ -68,16 +68,16 @@ def run_campaign(root: Path) -> Outcome:
             flight = campaign.image_flights[0]
             _steps(campaign, flight)
     except CampaignError as error:
-        return Outcome(str(error).splitlines()[0].replace(f"{root}/", ""), time.perf_counter() - begun)
-    except Exception as error:  # a crash is a finding too, and the others must go on
+        return Outcome(str(error).splitlines()[0].replace(f"{root}/", ""), time.perf_counter() - start_s)
+    except Exception as error:  # a crash is a result, too; the other campaigns must still be processed
         text = f"crash: {type(error).__name__}: {error}"
-        return Outcome(text.splitlines()[0], time.perf_counter() - begun)
-    seconds = time.perf_counter() - begun
+        return Outcome(text.splitlines()[0], time.perf_counter() - start_s)
+    seconds = time.perf_counter() - start_s
     return Outcome("", seconds, _reports(campaign, flight), dict(_images(campaign, flight)), _grid(campaign))
 
 
 def image_steps(campaign: Campaign, flight: Flight) -> None:
-    """Run what the rules of the workflow run of a flight, in their order, from its recordings to what to add up."""
+    """Run the steps of a flight in the order of the workflow, from its recordings to the assessed images."""
     for node in flight.participants:
         ingest.ingest(campaign, flight.name, node)
     for pair in flight.pairs:
@@ -119,13 +119,13 @@ def _images(campaign: Campaign, flight: Flight) -> Iterator[tuple[str, NDArray[n
 
 
 def verdict_of(report: dict[str, Any]) -> str:
-    """Return what an image.json says of its focus, in one line; empty where it says nothing."""
-    found = report.get("verdict") or report.get("focus", {}).get("verdict", "")
-    return found if isinstance(found, str) else json.dumps(found)
+    """Return the focus verdict of an image.json in one line; empty without a verdict."""
+    verdict = report.get("verdict") or report.get("focus", {}).get("verdict", "")
+    return verdict if isinstance(verdict, str) else json.dumps(verdict)
 
 
 def hypothesis_of(report: dict[str, Any]) -> str:
-    """Return the first hypothesis of an image.json in one line; empty where there is none."""
-    found = report.get("hypotheses") or []
-    first = next(iter(found.items() if isinstance(found, dict) else found), "")
+    """Return the first hypothesis of an image.json in one line; empty without any."""
+    hypotheses = report.get("hypotheses") or []
+    first = next(iter(hypotheses.items() if isinstance(hypotheses, dict) else hypotheses), "")
     return first if isinstance(first, str) else json.dumps(first)

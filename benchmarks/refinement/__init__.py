@@ -1,1 +1,1 @@
-"""Refinement of tracks judged case by case; run as `python -m benchmarks.refinement`."""
+"""Evaluation of the track refinement case by case; run as `python -m benchmarks.refinement`."""

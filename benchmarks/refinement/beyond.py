@@ -1,7 +1,7 @@
-"""What a refinement makes of errors that are not those of positions: attitude, lever arm, heights of the ground.
+"""Track refinement with errors other than positions: attitude, lever arm and terrain height.
 
-`python -m benchmarks.refinement.beyond`: forty points, tracks as the logs have them but for 1 cm, five draws each;
-mended, refused, or what is left.
+`python -m benchmarks.refinement.beyond`: forty points, logs with errors of 1 cm, five draws each; prints residual loss
+and displacement, acceptance and flags.
 """
 
 import dataclasses
@@ -32,13 +32,13 @@ OTHERS = {
     "attitude 2 deg, arm 25 cm": (0.25 * np.radians(2.0), 0.0, 0.0),
     "lever arm 5 cm": (0.05, 0.0, 0.0),
     "lever arm 5 cm, drift stated": (0.05, 0.0, 0.05),
-    "ground 20 cm higher": (0.0, 0.2, 0.0),
+    "terrain 20 cm higher": (0.0, 0.2, 0.0),
 }
-"""What else is wrong → arm of the first node, metres to the right of its course; height, metres; drift stated."""
+"""Additional error → lever arm of the first node, metres to the right of its course; height, metres; stated drift."""
 
 
-def spoilt(flight_name: str, arm_m: float, height_m: float, drift_m: float, seed: int) -> AutofocusCase:
-    """Return a case whose first node's antenna is off to its right, and whose ground lies higher than is taken."""
+def erroneous_case(flight_name: str, arm_m: float, height_m: float, drift_m: float, seed: int) -> AutofocusCase:
+    """Return a case with a lever arm error of the first node to its right, and terrain above its assumed height."""
     of_tracks, of_scene, of_noise = np.random.default_rng(seed).spawn(3)
     flight, scatterers = FLIGHTS[flight_name](), SCENES["forty"](of_scene)
     errors = TrackErrors((SIGMA_M,) * 3)
@@ -49,15 +49,15 @@ def spoilt(flight_name: str, arm_m: float, height_m: float, drift_m: float, seed
     course /= np.linalg.norm(course, axis=1, keepdims=True)
     arm = np.concatenate([course[:, 1:], -course[:, :1], np.zeros((len(course), 1))], axis=1) * arm_m
     truth = TrackCorrection(flight.time_s, {**moved, NODES[0]: moved[NODES[0]] + arm})
-    lifted = dataclasses.replace(scatterers, position_m=scatterers.position_m + [0, 0, height_m])
+    raised = dataclasses.replace(scatterers, position_m=scatterers.position_m + [0, 0, height_m])
     probes = TargetScene(PROBES_M + [0, 0, height_m], np.ones(len(PROBES_M), complex), np.arange(len(PROBES_M)))
     noises = of_noise.spawn(2)
     return AutofocusCase(
         ("forty", flight_name, "joint", SIGMA_M, 10.0, seed),
-        tuple(record(pair, flight, truth, lifted, 10.0, one) for pair, one in zip(PAIRS["joint"], noises, strict=True)),
+        tuple(record(pair, flight, truth, raised, 10.0, one) for pair, one in zip(PAIRS["joint"], noises, strict=True)),
         dict.fromkeys(NODES, TrackErrors((SIGMA_M,) * 3, drift_std_m=drift_m)),
         truth,
-        lifted.position_m[lifted.targets] * [1, 1, 0],
+        raised.position_m[raised.targets] * [1, 1, 0],
         tuple(record(pair, flight, truth, probes, None, one) for pair, one in zip(PAIRS["joint"], noises, strict=True)),
         flight.reach_m,
     )
@@ -68,23 +68,23 @@ def main() -> None:
         for name, (arm_m, height_m, drift_m) in OTHERS.items():
             rows = []
             for seed in range(300, 302 if flight_name == "circle" else 305):
-                one = spoilt(flight_name, arm_m, height_m, drift_m, seed)
-                found = refine(one.records, GRID, FlatGround(0.0), one.errors)
-                before, after = judge(one), judge(one, found.correction)
+                one = erroneous_case(flight_name, arm_m, height_m, drift_m, seed)
+                result = refine(one.records, GRID, FlatGround(0.0), one.errors)
+                before, after = judge(one), judge(one, result.correction)
                 rows.append(
                     (
                         before.probe_loss_db,
                         after.probe_loss_db,
                         before.probe_shift_cm,
                         after.probe_shift_cm,
-                        found.accepted,
-                        " ".join(found.flags),
+                        result.accepted,
+                        " ".join(result.flags),
                     )
                 )
-            loss, left, shift, moved, accepted, flags = zip(*rows, strict=True)
+            loss, residual_loss, shift, residual_shift, accepted, flags = zip(*rows, strict=True)
             print(
-                f"{flight_name}, {name}: loss {np.mean(loss):.2f} → {np.mean(left):.2f} dB, "
-                f"shift against the true tracks {np.median(shift):.1f} → {np.median(moved):.1f} cm, "
+                f"{flight_name}, {name}: loss {np.mean(loss):.2f} → {np.mean(residual_loss):.2f} dB, "
+                f"displacement from the true tracks {np.median(shift):.1f} → {np.median(residual_shift):.1f} cm, "
                 f"accepted {sum(accepted)} of {len(rows)}; flags: {sorted(set(' '.join(flags).split())) or 'none'}",
                 flush=True,
             )

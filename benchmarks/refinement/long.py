@@ -1,9 +1,9 @@
-"""Refinement of a long flight: CPU seconds and peak memory against its length.
+"""Track refinement of long flights: CPU seconds and peak memory against the length of the flight.
 
-`python -m benchmarks.refinement.long WORK --minutes 1 2 5 10` makes range profiles of three pairs as `--preset flight`
-flies them (one transmitter and two receivers at 5 m/s and 500 Hz past twelve points on 410 m of ground), in WORK, half
-a gigabyte a minute; logs err by 2 cm. Each length is refined in a process of its own, wrong heights and times tried
-beside errors of the logs. Run with OPENBLAS_NUM_THREADS=1: seconds are then those of one core.
+`python -m benchmarks.refinement.long WORK --minutes 1 2 5 10` simulates range profiles of the three pairs of `--preset
+flight` (one transmitter and two receivers at 5 m/s and 500 Hz past twelve points on 410 m of terrain) into WORK, half a
+gigabyte per minute; the logs have errors of 2 cm. Each length is refined in a separate process, with height and time
+errors as possible causes. Run with OPENBLAS_NUM_THREADS=1 to measure times of one core.
 """
 
 import argparse
@@ -35,27 +35,27 @@ HALF_M = 204.8
 GRID, GROUND = SceneGrid("local", -HALF_M, HALF_M, 0.1, (4096, 4096)), FlatGround(0.0)
 BEGIN_M = dict(zip((*NODES, "uav3"), ((0.0, -270.0, 80.0), (12.0, -270.0, 82.0), (-15.0, -270.0, 82.0)), strict=True))
 TARGETS_M = np.array([(x, y, 0.0) for x in (-150.0, -50.0, 50.0, 150.0) for y in (-160.0, -40.0, 80.0)])
-_AT_ONCE, _GUARD = 4096, 40  # pulses; samples before and behind the scene
+_AT_ONCE, _GUARD = 4096, 40  # pulses per block; samples before and behind the scene
 _TAPS = np.arange(-24, 25)
 
 
 def main() -> None:
-    """Refine flights of the lengths asked for, each in a process of its own, and print what they took."""
-    asked = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    asked.add_argument("work", type=Path)
-    asked.add_argument("--minutes", type=float, nargs="+", default=[1, 2, 5, 10])
-    given = asked.parse_args()
-    given.work.mkdir(parents=True, exist_ok=True)
-    if len(given.minutes) == 1:
-        print(measured(given.work, given.minutes[0]))
+    """Refine flights of the requested lengths, each in a separate process, and print times and memory."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--minutes", type=float, nargs="+", default=[1, 2, 5, 10])
+    options = parser.parse_args()
+    options.work.mkdir(parents=True, exist_ok=True)
+    if len(options.minutes) == 1:
+        print(measured(options.work, options.minutes[0]))
         return
-    for minutes in given.minutes:
-        one = [sys.executable, "-m", __spec__.name, str(given.work), "--minutes", f"{minutes:g}"]
-        subprocess.run(one, check=True)
+    for minutes in options.minutes:
+        command = [sys.executable, "-m", __spec__.name, str(options.work), "--minutes", f"{minutes:g}"]
+        subprocess.run(command, check=True)
 
 
 def measured(work: Path, minutes: float) -> str:
-    """Return what the refinement of a flight took, a line."""
+    """Refine a flight; return a line with its time, memory and result."""
     time_s = np.arange(round(60 * minutes * PULSES_HZ)) / PULSES_HZ
     logged = {
         node: begin + SPEED_M_S * (time_s - time_s[-1] / 2)[:, None] * [1, 0, 0] for node, begin in BEGIN_M.items()
@@ -71,10 +71,10 @@ def measured(work: Path, minutes: float) -> str:
     tracks = {node: (time_s, places) for node, places in logged.items()}
     late = [late_logs([node], tracks) for node in tracks]
     causes = [other_height(list(tracks), time_s, np.array([0.0, 0, 1])), *late, late_logs(list(tracks), tracks)]
-    before_mb, begun = _peak_mb(), process_time()
-    found = refine(records, GRID, GROUND, errors, causes=causes)
-    took = f"{process_time() - begun:6.1f} CPU s, peak {_peak_mb():5.0f} MB ({before_mb:.0f} MB before)"
-    return f"{minutes:4g} min: {took}; {'accepted' if found.accepted else 'rejected'}: {found.reason}"
+    before_mb, start_s = _peak_mb(), process_time()
+    result = refine(records, GRID, GROUND, errors, causes=causes)
+    cost = f"{process_time() - start_s:6.1f} CPU s, peak {_peak_mb():5.0f} MB ({before_mb:.0f} MB before)"
+    return f"{minutes:4g} min: {cost}; {'accepted' if result.accepted else 'rejected'}: {result.reason}"
 
 
 def _peak_mb() -> float:
@@ -82,7 +82,7 @@ def _peak_mb() -> float:
 
 
 class Recorded:
-    """Samples (pulse, range) complex64 of a file, read when they are asked for as an array."""
+    """Samples in a file, (pulse, range) complex64, read on conversion to an array."""
 
     ndim, dtype = 2, np.dtype(np.complex64)
 
@@ -105,11 +105,11 @@ class Recorded:
 def _record(
     path: Path, tx: str, rx: str, time_s: Floats, logged: dict[str, Floats], flown: dict[str, Floats]
 ) -> PairRecord:
-    """Return a pair along its logs, with the echoes of the tracks that were flown, in a file."""
+    """Return a pair with its logged tracks, and write the echoes of its true tracks to a file."""
     aperture, step_m = Aperture(logged[tx], logged[rx]), SPEED_OF_LIGHT_M_S / BAND_HZ / 2
     edge = np.array([(x, y, 0.0) for x in (-HALF_M, HALF_M) for y in (-HALF_M, HALF_M)])
-    beside = np.clip((logged[tx] + logged[rx])[:, 0] / 2, -HALF_M, HALF_M)
-    nearest = np.stack([beside, np.full(len(time_s), -HALF_M), np.zeros(len(time_s))], axis=-1)
+    abreast_m = np.clip((logged[tx] + logged[rx])[:, 0] / 2, -HALF_M, HALF_M)
+    nearest = np.stack([abreast_m, np.full(len(time_s), -HALF_M), np.zeros(len(time_s))], axis=-1)
     start_m = sum(np.linalg.norm(nearest - leg, axis=1) for leg in aperture.legs) - _GUARD * step_m
     farthest_m = np.max([aperture.path(place[None])[:, 0] for place in edge], axis=0)
     samples = int(np.ceil((farthest_m - start_m).max() / step_m)) + _GUARD
@@ -117,13 +117,13 @@ def _record(
         longer_m = np.linalg.norm(flown[tx] - flown[rx], axis=1) - np.linalg.norm(logged[tx] - logged[rx], axis=1)
         with path.open("wb") as file:
             for first in range(0, len(time_s), _AT_ONCE):
-                some = slice(first, first + _AT_ONCE)
-                at = Aperture(flown[tx][some], flown[rx][some])
-                _echo(at, longer_m[some], start_m[some], step_m, samples, first).tofile(file)
+                block = slice(first, first + _AT_ONCE)
+                at = Aperture(flown[tx][block], flown[rx][block])
+                _echo(at, longer_m[block], start_m[block], step_m, samples, first).tofile(file)
     profiles = Profiles(
         np.broadcast_to(np.zeros(1, np.complex64), (len(time_s), samples)), start_m, step_m, CENTRE_HZ, 2.0, aperture
     )
-    object.__setattr__(profiles, "samples", Recorded(path, (len(time_s), samples)))  # as a stage is: read on access
+    object.__setattr__(profiles, "samples", Recorded(path, (len(time_s), samples)))  # read on access, like a stage
     sector = decide_integration(aperture, CENTRE_HZ, GRID, GROUND).sector
     between_m = None if tx == rx else aperture.tx_m - aperture.rx_m
     return PairRecord(f"{tx}-{rx}", profiles, time_s, between_m, Beams.within(sector, None))
@@ -132,7 +132,7 @@ def _record(
 def _echo(
     aperture: Aperture, longer_m: Floats, start_m: Floats, step_m: float, samples: int, seed: int
 ) -> NDArray[np.complex64]:
-    """Return (pulse, range): the targets by spreading, their sidelink's length given back, and noise."""
+    """Simulate profiles, (pulse, range): targets with spreading loss and the restored sidelink length, and noise."""
     generator, pulse = np.random.default_rng(seed), np.arange(len(longer_m))[:, None]
     noise = generator.standard_normal((2, len(longer_m), samples))
     echo: NDArray[np.complex64] = np.asarray(NOISE * (noise[0] + 1j * noise[1]), np.complex64)

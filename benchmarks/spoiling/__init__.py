@@ -1,1 +1,1 @@
-"""Mistakes that people make with a campaign folder, each a small function that makes one in a copy."""
+"""Typical mistakes in campaign folders, each a small function that modifies a copy."""

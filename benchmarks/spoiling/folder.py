@@ -1,4 +1,4 @@
-"""A campaign folder of two nodes that may be spoilt: its config, recordings, logs and codes, each changed in place."""
+"""Modification of a campaign folder of two nodes in place: config, recordings, logs and codes."""
 
 import hashlib
 import json
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from spoiling.logs import Log, read_log, write_log
 
 TX, RX = "uav1", "uav2"
-"""The node that transmits and receives, whose log is a CSV with attitude; the one that receives, with a .pos."""
+"""Transmitting and receiving node, with a CSV log with attitude; receiving node, with a .pos log."""
 
 Captures = NDArray[np.int16]
 Document = dict[str, Any]
@@ -22,12 +22,12 @@ Document = dict[str, Any]
 
 @dataclass(frozen=True)
 class Folder:
-    """A copy of a campaign with one flight f01 of nodes `TX` and `RX`."""
+    """Copy of a campaign with one flight f01 of nodes `TX` and `RX`."""
 
     root: Path
 
     def edit_config(self, change: Callable[[Document], object]) -> None:
-        """Change config.yaml as a document."""
+        """Change the document in config.yaml."""
         path = self.root / "config" / "config.yaml"
         document = yaml.safe_load(path.read_text(encoding="utf-8"))
         change(document)
@@ -39,16 +39,16 @@ class Folder:
         np.save(path, change(np.load(path)).astype(np.complex64))
 
     def edit_meta(self, node: str, change: Callable[[Document], object]) -> None:
-        """Change what the SigMF metadata of a node say."""
+        """Change the SigMF metadata of a node."""
         path = self._raw(f"{node}.sigmf-meta")
         meta = json.loads(path.read_text(encoding="utf-8"))
         change(meta)
         path.write_text(json.dumps(meta), encoding="utf-8")
 
     def edit_captures(self, node: str, change: Callable[[Captures], NDArray[Any]]) -> None:
-        """Replace the samples of a node, (capture, sample, channel, 2) counts of I and Q; fewer captures may come back.
+        """Replace the samples of a node, (capture, sample, channel, 2) counts of I and Q; captures may be removed.
 
-        Counts are rounded and clipped to int16; tags of captures that are gone stay until `edit_meta` removes them.
+        Counts are rounded and clipped to int16; metadata of removed captures remain until `edit_meta` removes them.
         """
         path = self._raw(f"{node}.sigmf-data")
         meta = json.loads(self._raw(f"{node}.sigmf-meta").read_text(encoding="utf-8"))
@@ -59,7 +59,7 @@ class Folder:
         self.edit_meta(node, lambda meta: meta["global"].update({"core:sha512": digest}))
 
     def log(self, node: str) -> Log:
-        """Return the flight log of a node."""
+        """Read the flight log of a node."""
         return read_log(self._log_path(node))
 
     def edit_log(self, node: str, change: Callable[[Log], Log]) -> None:
@@ -73,29 +73,29 @@ class Folder:
         return self.root / "raw" / "f01" / name
 
 
-Spoil = Callable[[Folder], None]
+FolderChange = Callable[[Folder], None]
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """One mistake that may be made with a campaign.
+    """Mistake in a campaign.
 
     Attributes
     ----------
     words
-        What was done wrong, in a few words.
-    spoil
-        Makes it.
+        Short description.
+    apply
+        Function that introduces the mistake.
     cause
-        Which cause a hypothesis should name: one of `CAUSES`, or empty where none of the cheap ones fits.
+        Cause of the expected hypothesis: one of `CAUSES`, or empty if no tested hypothesis applies.
     control
-        Nothing in it is wrong: the image must stay right, and a flag on it is a false alarm.
+        True for a change without effect on the image: a flag on it is a false alarm.
     alike
-        Bases in which it moves everything alike: nothing inside the campaign can tell.
+        Bases in which the mistake displaces the whole scene, which is not observable within the campaign.
     """
 
     words: str
-    spoil: Spoil
+    apply: FolderChange
     cause: str = ""
     control: bool = False
     alike: tuple[str, ...] = ()

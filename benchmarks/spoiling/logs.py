@@ -1,4 +1,4 @@
-"""Flight logs as values that can be changed and written back in their own format."""
+"""Reading, modification and writing of flight logs in their own format."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from apertura.simulation.targets import Origin
 
 @dataclass(frozen=True)
 class Log:
-    """A flight log of either format.
+    """Flight log of either format.
 
     Attributes
     ----------
@@ -26,9 +26,9 @@ class Log:
     attitude_deg
         (epoch, 3) float64: roll, pitch, yaw; None in RTKLIB solutions.
     header, quality
-        Of an RTKLIB solution: the lines before, and what follows the position in each line.
+        Header lines of an RTKLIB solution, and the columns behind the position of each line.
     begun
-        UTC of the log's first epoch as it was read.
+        UTC of the first epoch of the log when it was read.
     """
 
     time_s: Floats
@@ -40,15 +40,15 @@ class Log:
 
     @property
     def enu_m(self) -> Floats:
-        """(epoch, 3) float64, metres east, north, up of the first epoch."""
+        """Positions in east, north and up from the first epoch, (epoch, 3) float64 metres."""
         return self._origin.enu(ecef_from_geodetic(*self.geodetic.T))
 
     def moved(self, by_m: Floats | tuple[float, float, float]) -> "Log":
-        """Return the log with (epoch, 3) or (3,) metres east, north, up added."""
+        """Return the log displaced by (epoch, 3) or (3,) metres in east, north and up."""
         return replace(self, geodetic=geodetic_from_ecef(self._origin.ecef(self.enu_m + np.asarray(by_m))))
 
     def picked(self, epochs: NDArray[np.int_] | slice) -> "Log":
-        """Return the log with some of its epochs only."""
+        """Return the log with the selected epochs."""
         attitude = None if self.attitude_deg is None else self.attitude_deg[epochs]
         quality = tuple(np.array(self.quality)[epochs]) if self.quality else ()
         return replace(
@@ -61,7 +61,7 @@ class Log:
 
 
 def read_log(path: Path) -> Log:
-    """Return a log: .csv with attitude, or an RTKLIB .pos."""
+    """Read a log: a .csv with attitude, or an RTKLIB .pos."""
     lines = path.read_text(encoding="utf-8").splitlines()
     if path.suffix == ".csv":
         rows = [line.split(",") for line in lines[1:]]
@@ -77,7 +77,7 @@ def read_log(path: Path) -> Log:
 
 
 def write_log(path: Path, log: Log) -> None:
-    """Write a log in the format that it was read from."""
+    """Write a log in its original format."""
     time = log.begun + np.rint(log.time_s * 1e9).astype("timedelta64[ns]")
     if log.attitude_deg is not None:
         write_csv_log(path, time.astype("datetime64[us]"), log.geodetic, np.radians(log.attitude_deg))
@@ -96,5 +96,5 @@ def _seconds(time: NDArray[np.datetime64]) -> Floats:
 
 
 def _is_gpst(header: tuple[str, ...]) -> bool:
-    """Return whether the times of an RTKLIB solution are GPS time."""
+    """Return True if the times of an RTKLIB solution are GPS time."""
     return header[-1].split()[1] == "GPST"

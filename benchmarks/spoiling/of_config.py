@@ -6,18 +6,18 @@ from collections.abc import Callable
 import numpy as np
 from judging.bases import SHARED
 
-from spoiling.folder import RX, TX, Document, Folder, Mistake, Spoil
+from spoiling.folder import RX, TX, Document, Folder, FolderChange, Mistake
 
 _ARMS = ("radar_tx", "radar_rx", "sidelink")
 
 
-def config(change: Callable[[Document], object]) -> Spoil:
-    """Return what changes the config."""
+def config(change: Callable[[Document], object]) -> FolderChange:
+    """Return a mistake that changes the config."""
     return lambda folder: folder.edit_config(change)
 
 
-def section(name: str, **changes: Callable[[float], object] | object) -> Spoil:
-    """Return what replaces keys of a section by values, or by what functions make of the old value."""
+def section(name: str, **changes: Callable[[float], object] | object) -> FolderChange:
+    """Return a mistake that replaces keys of a section by values, or by functions of their old values."""
 
     def change(document: Document) -> None:
         for key, new in changes.items():
@@ -26,8 +26,10 @@ def section(name: str, **changes: Callable[[float], object] | object) -> Spoil:
     return config(change)
 
 
-def arms(*factors: float, plus: tuple[float, float, float] = (0, 0, 0), points: tuple[str, ...] = _ARMS) -> Spoil:
-    """Return what multiplies lever arms of the transmitting node axis by axis, and adds metres."""
+def arms(
+    *factors: float, plus: tuple[float, float, float] = (0, 0, 0), points: tuple[str, ...] = _ARMS
+) -> FolderChange:
+    """Return a mistake that multiplies lever arms of the transmitting node axis by axis, and adds metres."""
 
     def change(document: Document) -> None:
         stated = document["nodes"][TX]["lever_arms_m"]
@@ -37,8 +39,8 @@ def arms(*factors: float, plus: tuple[float, float, float] = (0, 0, 0), points: 
     return config(change)
 
 
-def offset(node: str, channel: str, *, plus: float = 0.0, times: float = 1.0) -> Spoil:
-    """Return what changes a node's path offset."""
+def offset(node: str, channel: str, *, plus: float = 0.0, times: float = 1.0) -> FolderChange:
+    """Return a mistake that changes a node's path offset."""
 
     def change(document: Document) -> None:
         stated = document["nodes"][node]["path_offset_m"]
@@ -47,13 +49,13 @@ def offset(node: str, channel: str, *, plus: float = 0.0, times: float = 1.0) ->
     return config(change)
 
 
-def codes(change: Callable[[np.ndarray], np.ndarray]) -> Spoil:
-    """Return what changes the code symbols."""
+def codes(change: Callable[[np.ndarray], np.ndarray]) -> FolderChange:
+    """Return a mistake that changes the code symbols."""
     return lambda folder: folder.edit_codes(change)
 
 
-def prefix(samples: int) -> Spoil:
-    """Return what states a cyclic prefix some samples longer than sent, without changing the DFT window's length."""
+def prefix(samples: int) -> FolderChange:
+    """Return a mistake that configures too long a cyclic prefix, without changing the length of the DFT window."""
 
     def change(document: Document) -> None:
         waveform = document["waveform"]
@@ -63,8 +65,8 @@ def prefix(samples: int) -> Spoil:
     return config(change)
 
 
-def spacing(extra_bins: int) -> Spoil:
-    """Return what states a subcarrier spacing that makes the DFT longer."""
+def spacing(extra_bins: int) -> FolderChange:
+    """Return a mistake that configures a subcarrier spacing with a longer DFT."""
     return section("waveform", subcarrier_spacing_hz=lambda hz: 1.024e9 / (round(1.024e9 / hz) + extra_bins))
 
 
@@ -91,10 +93,10 @@ def _above_a_geoid(folder: Folder) -> None:
 
 
 def _arms_in_enu(folder: Folder) -> None:
-    """State the lever arms of the transmitter east, north and up instead of forward, right and down."""
+    """Configure the lever arms of the transmitter in east, north and up instead of forward, right and down."""
     first, last = folder.log(TX).enu_m[[0, -1]]
     yaw = np.arctan2(*(last - first)[:2])
-    # forward = (sin yaw, cos yaw, 0), right = (cos yaw, −sin yaw, 0), down = (0, 0, −1) in east, north, up
+    # In east, north, up: forward = (sin yaw, cos yaw, 0), right = (cos yaw, −sin yaw, 0), down = (0, 0, −1).
     axes = np.array([[np.sin(yaw), np.cos(yaw), 0], [np.cos(yaw), -np.sin(yaw), 0], [0, 0, -1]])
 
     def change(document: Document) -> None:
@@ -124,59 +126,67 @@ def _shift(east_m: float, north_m: float) -> Callable[[list[float]], list[float]
 
 
 MISTAKES = {
-    "height_47m": Mistake("ground 47 m too high", section("scene", height_m=lambda m: m + 47), "height"),
-    "height_2m": Mistake("ground 2 m too high", section("scene", height_m=lambda m: m + 2), "height"),
-    "height_3m": Mistake("ground 3 m too high", section("scene", height_m=lambda m: m + 3), "height"),
-    "height_0m5": Mistake("ground 0.5 m too high", section("scene", height_m=lambda m: m + 0.5), "height"),
-    "height_below_0m5": Mistake("ground 0.5 m too low", section("scene", height_m=lambda m: m - 0.5), "height"),
-    "height_below_1m": Mistake("ground 1 m too low", section("scene", height_m=lambda m: m - 1.0), "height"),
-    "height_egm96": Mistake("ellipsoidal height taken for one above EGM96", _above_a_geoid, "height"),
+    "height_47m": Mistake("terrain 47 m too high", section("scene", height_m=lambda m: m + 47), "height"),
+    "height_2m": Mistake("terrain 2 m too high", section("scene", height_m=lambda m: m + 2), "height"),
+    "height_3m": Mistake("terrain 3 m too high", section("scene", height_m=lambda m: m + 3), "height"),
+    "height_0m5": Mistake("terrain 0.5 m too high", section("scene", height_m=lambda m: m + 0.5), "height"),
+    "height_below_0m5": Mistake("terrain 0.5 m too low", section("scene", height_m=lambda m: m - 0.5), "height"),
+    "height_below_1m": Mistake("terrain 1 m too low", section("scene", height_m=lambda m: m - 1.0), "height"),
+    "height_egm96": Mistake("ellipsoidal height configured as a height above EGM96", _above_a_geoid, "height"),
     "arm_z_1m2": Mistake("lever arms 1.2 m too low", arms(plus=(0, 0, 1.2)), "arm"),
     "arm_y_sign": Mistake("y of the lever arms with the wrong sign", arms(1, -1, 1), "arm"),
     "arm_x_sign": Mistake("x of the lever arms with the wrong sign", arms(-1, 1, 1), "arm"),
     "arm_z_sign": Mistake("z of the lever arms with the wrong sign", arms(1, 1, -1), "arm"),
-    "arms_xy_swapped": Mistake("lever arms right-forward-down", config(lambda d: [
+    "arms_xy_swapped": Mistake("lever arms in right-forward-down", config(lambda d: [
         d["nodes"][TX]["lever_arms_m"].update({p: [a[1], a[0], a[2]]})
         for p, a in list(d["nodes"][TX]["lever_arms_m"].items())
     ]), "arm"),
-    "arms_in_enu": Mistake("lever arms east-north-up along the mean course", _arms_in_enu, "arm"),
+    "arms_in_enu": Mistake("lever arms in east-north-up for the mean course", _arms_in_enu, "arm"),
     "arms_in_cm": Mistake("lever arms in centimetres", arms(100, 100, 100), "arm"),
     "arms_forgotten": Mistake("no lever arms", config(lambda d: d["nodes"][TX].update(lever_arms_m={})), "arm"),
     "sidelink_arm_forgotten": Mistake("no lever arm of the sidelink", arms(0, 0, 0, points=("sidelink",)), "arm"),
     "attitude_none": Mistake("attitude none with lever arms", config(lambda d: d["nodes"][TX].update(attitude="none"))),
     "attitude_none_no_arms": Mistake("no attitude, hence no lever arms", config(_no_attitude_no_arms), "arm"),
     "attitude_course": Mistake("attitude from the course", config(lambda d: d["nodes"][TX].update(attitude="course"))),
-    "tx_offset_0m3": Mistake("path offset of the monostatic channel 0.3 m off", offset(TX, "radar", plus=0.3), "range"),
-    "tx_offset_5cm": Mistake("the same 5 cm off", offset(TX, "radar", plus=0.05), "range"),
-    "tx_offset_sign": Mistake("the same with the wrong sign", offset(TX, "radar", times=-1), "range"),
-    "rx_offset_0m3": Mistake("path offset of the bistatic channel 0.3 m off", offset(RX, "radar", plus=0.3), "range"),
-    "rx_offset_5cm": Mistake("the same 5 cm off: a range bias of one pair", offset(RX, "radar", plus=0.05), "range"),
-    "rx_offset_sign": Mistake("the same with the wrong sign", offset(RX, "radar", times=-1), "range"),
-    "sidelink_offset_0m3": Mistake("path offset of the sidelink 0.3 m off", offset(RX, "sidelink", plus=0.3), "range"),
-    "sidelink_offset_sign": Mistake("the same with the wrong sign", offset(RX, "sidelink", times=-1), "range"),
+    "tx_offset_0m3": Mistake("0.3 m error of the monostatic path offset", offset(TX, "radar", plus=0.3), "range"),
+    "tx_offset_5cm": Mistake("5 cm error of the monostatic path offset", offset(TX, "radar", plus=0.05), "range"),
+    "tx_offset_sign": Mistake("monostatic path offset with the wrong sign", offset(TX, "radar", times=-1), "range"),
+    "rx_offset_0m3": Mistake("0.3 m error of the bistatic path offset", offset(RX, "radar", plus=0.3), "range"),
+    "rx_offset_5cm": Mistake("5 cm error of the bistatic path offset", offset(RX, "radar", plus=0.05), "range"),
+    "rx_offset_sign": Mistake("bistatic path offset with the wrong sign", offset(RX, "radar", times=-1), "range"),
+    "sidelink_offset_0m3": Mistake(
+        "0.3 m error of the sidelink path offset", offset(RX, "sidelink", plus=0.3), "range"
+    ),
+    "sidelink_offset_sign": Mistake(
+        "sidelink path offset with the wrong sign", offset(RX, "sidelink", times=-1), "range"
+    ),
     "offsets_of_nodes_swapped": Mistake("path offsets of the nodes swapped", config(_swap_offsets), "range"),
     "offsets_of_channels_swapped": Mistake(
-        "radar's and sidelink's offsets swapped", config(_swap_channels_offsets), "range"
+        "path offsets of radar and sidelink swapped", config(_swap_channels_offsets), "range"
     ),
     "prefix_1_long": Mistake("cyclic prefix one sample too long", prefix(1), "prefix"),
     "prefix_20_short": Mistake("cyclic prefix 20 samples too short", prefix(-20), "prefix"),
     "prefix_5_long": Mistake("cyclic prefix 5 samples too long", prefix(5), "prefix"),
-    "code_of_another_seed": Mistake("code of another seed", codes(_other_code)),
+    "code_of_another_seed": Mistake("code with another seed", codes(_other_code)),
     "code_conjugated": Mistake("code conjugated", codes(np.conj)),
     "code_shifted": Mistake("code shifted by one subcarrier", codes(lambda code: np.roll(code, 1))),
-    "code_reversed": Mistake("code from the highest subcarrier down", codes(lambda code: code[::-1])),
+    "code_reversed": Mistake("code in descending order of subcarriers", codes(lambda code: code[::-1])),
     "code_one_symbol": Mistake("one symbol of the code wrong", codes(_one_symbol), control=True),
     "carrier_is_centre": Mistake(
-        "band start taken for band centre", section("waveform", carrier_is="band_centre"), "carrier_is"
+        "band start configured as band centre", section("waveform", carrier_is="band_centre"), "carrier_is"
     ),
-    "carrier_5mhz_config": Mistake("carrier 5 MHz off in config", section("waveform", carrier_hz=lambda hz: hz + 5e6)),
-    "carrier_5mhz": Mistake("carrier 5 MHz off everywhere", _carrier_everywhere),
+    "carrier_5mhz_config": Mistake(
+        "carrier error of 5 MHz in the config", section("waveform", carrier_hz=lambda hz: hz + 5e6)
+    ),
+    "carrier_5mhz": Mistake("carrier error of 5 MHz in config and metadata", _carrier_everywhere),
     "spacing_1_bin": Mistake("subcarrier spacing 0.04 % too narrow", spacing(1)),
-    "prf_doubled": Mistake("PRF of the config twice the true one", section("waveform", prf_hz=lambda hz: 2 * hz)),
-    "zone_33": Mistake("scene in the neighbouring zone", section("scene", crs="EPSG:32633")),
-    "zone_south": Mistake("scene in the southern zone", section("scene", crs="EPSG:32732")),
-    "scene_moved_1m": Mistake("scene cut 1 m further east", section("scene", bounds_m=_shift(1.0, 0.0)), control=True),
+    "prf_doubled": Mistake("configured PRF twice the true one", section("waveform", prf_hz=lambda hz: 2 * hz)),
+    "zone_33": Mistake("scene in the neighbouring UTM zone", section("scene", crs="EPSG:32633")),
+    "zone_south": Mistake("scene in the southern UTM zone", section("scene", crs="EPSG:32732")),
+    "scene_moved_1m": Mistake(
+        "scene bounds 1 m farther east", section("scene", bounds_m=_shift(1.0, 0.0)), control=True
+    ),
     "scene_moved_100m": Mistake(
-        "scene 100 m further north", section("scene", bounds_m=_shift(0.0, 100.0)), alike=("sample", "curved")
+        "scene bounds 100 m farther north", section("scene", bounds_m=_shift(0.0, 100.0)), alike=("sample", "curved")
     ),
 }  # fmt: skip

@@ -1,4 +1,4 @@
-"""The table of all mistakes."""
+"""Table of all mistakes."""
 
 from spoiling import of_config, of_logs, of_recordings
 from spoiling.folder import Mistake

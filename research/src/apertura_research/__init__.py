@@ -1,6 +1,6 @@
-"""Studies of what apertura can do: the paper's figures, stability, refinement, the error atlas.
+"""Performance studies of apertura: the paper's figures, stability, refinement and the error atlas.
 
-A distribution of its own, for who develops or judges methods: `make setup` installs it, ``pip install apertura`` does
-not. Imports every layer of apertura; nothing of apertura imports it. `apertura study` comes with it, by an entry point
-of group ``apertura.commands``.
+A separate distribution for developers and reviewers of methods: `make setup` installs it, ``pip install apertura``
+does not. It imports every layer of apertura; apertura does not import it. Its entry point of the group
+``apertura.commands`` adds the command `apertura study`.
 """

@@ -1,4 +1,4 @@
-"""`apertura study …`: each job of the studies as one command; a file that exists is complete."""
+"""`apertura study …`: one command per job of the studies; every output file that exists is complete."""
 
 import pkgutil
 from collections.abc import Collection
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="The paper's claims, the stability of every correction, autofocus, and the error atlas: what spoils an image.",
+    help="Studies: the paper's claims, stability of the corrections, autofocus, and the error atlas (image errors).",
 )
 
 RESULTS = Path("results/study")
@@ -25,7 +25,7 @@ STUDIES = {
     "error_atlas": "apertura_research.error_atlas.summary:STUDY",
     "autofocus": "apertura_research.autofocus.charts:STUDY",
 }
-"""Sweeps by name → where each `Study` stands; its results go to a folder of its name."""
+"""Name of a sweep → location of its `Study`; results are written to a folder of that name."""
 
 _LOSS = "losses:loss_claims"
 PAPER_PARTS = {
@@ -41,10 +41,10 @@ PAPER_PARTS = {
     "clock": "corrections:clock_claims",
     "swarm": "corrections:swarm_claims",
 }
-"""Files of rows that make up claims.csv, in its order → what computes them; `loss_…` gives its error as argument."""
+"""Part of claims.csv, in the order of its rows → function that computes it; `loss_…` passes its error as argument."""
 
 PAPER_READS = {"coherence": ("lab", "static"), "fusion": ("uav",)}
-"""Part → the experiments whose campaigns it reads, from a folder that it is given."""
+"""Part → experiments whose campaigns it reads, from the folder `CAMPAIGNS`."""
 
 CAMPAIGNS = "campaigns"
 
@@ -54,13 +54,13 @@ PAPER_FIGURES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("static_profile", "static_phase"), ("static",)),
     **dict.fromkeys(("uav_geometry", "uav_images", "uav_cuts"), ("uav",)),
 }
-"""The paper's figures with data, in its order → the experiments whose campaigns they show."""
+"""The paper's figures with data, in its order → experiments whose campaigns they show."""
 
-Folder = Annotated[Path, typer.Option("--folder", callback=given, help="where results are written")]
+Folder = Annotated[Path, typer.Option("--folder", callback=given, help="output folder")]
 StudyName = Annotated[str, typer.Argument(metavar="study", help=f"one of {', '.join(STUDIES)}")]
 StudyFolder = Annotated[
     Path | None,
-    typer.Option("--folder", help="where results are written", show_default="results/study/STUDY"),
+    typer.Option("--folder", help="output folder", show_default="results/study/STUDY"),
 ]
 
 
@@ -70,7 +70,7 @@ def study_of(name: str) -> "Study[Any]":
     Raises
     ------
     CampaignError
-        If there is none of that name.
+        If no study has that name.
     """
     require("study", name, STUDIES)
     study: Study[Any] = pkgutil.resolve_name(STUDIES[name])
@@ -79,7 +79,7 @@ def study_of(name: str) -> "Study[Any]":
 
 @app.command()
 def paper_part(part: str, folder: Folder = PAPER) -> None:
-    """Compute some rows of the claims table, parts/PART.csv."""
+    """Compute one part of the claims table: parts/PART.csv."""
     from apertura.common.tables import write_table
 
     require("part", part, PAPER_PARTS)
@@ -91,7 +91,7 @@ def paper_part(part: str, folder: Folder = PAPER) -> None:
 
 
 def require(kind: str, name: str, choices: Collection[str]) -> None:
-    """Raise CampaignError with the choices there are unless a name is one of them."""
+    """Raise CampaignError with the available choices unless a name is one of them."""
     if name not in choices:
         heads, tails = (dict.fromkeys(one.partition(".")[part] for one in choices) for part in (0, 2))
         expected = f"one of {', '.join(heads)}" + (f", each with .{', .'.join(tails)}" if any(tails) else "")
@@ -100,7 +100,7 @@ def require(kind: str, name: str, choices: Collection[str]) -> None:
 
 @app.command()
 def paper_claims(folder: Folder = PAPER) -> None:
-    """Put the parts together: claims.csv."""
+    """Merge the parts of the claims table: claims.csv."""
     from apertura.common.tables import read_table, write_table
     from apertura_research.paper.claims import Claim
 
@@ -111,7 +111,7 @@ def paper_claims(folder: Folder = PAPER) -> None:
 
 @app.command()
 def paper_figure(name: str, folder: Folder = PAPER) -> None:
-    """Draw one figure of the paper, NAME.png."""
+    """Draw one figure of the paper: NAME.png."""
     require("figure", name, PAPER_FIGURES)
     path = folder / f"{name}.png"
     if PAPER_FIGURES[name]:
@@ -131,7 +131,7 @@ def _results(name: str, folder: Path | None) -> Path:
 
 @app.command()
 def sweep(name: StudyName, part: str, folder: StudyFolder = None) -> None:
-    """Run one part of a study, parts/PART.csv; a killed one goes on after the last case that it has finished."""
+    """Run one part of a study: parts/PART.csv; a killed run resumes after its last finished case."""
     study = study_of(name)
     require("part", part, study.parts)
     typer.echo(study.compute(part, _results(name, folder)))
@@ -139,7 +139,7 @@ def sweep(name: StudyName, part: str, folder: StudyFolder = None) -> None:
 
 @app.command()
 def chart(name: StudyName, chart: str, folder: StudyFolder = None) -> None:
-    """Put the parts of a chart together and draw them: CHART.csv and .png."""
+    """Merge the parts of a chart and draw them: CHART.csv and CHART.png."""
     study = study_of(name)
     require("chart", chart, study.charts)
     typer.echo(study.chart(chart, _results(name, folder)))
@@ -147,7 +147,7 @@ def chart(name: StudyName, chart: str, folder: StudyFolder = None) -> None:
 
 @app.command()
 def summary(name: StudyName, folder: StudyFolder = None) -> None:
-    """Write the tables and the picture of all parts of a study."""
+    """Write the summary tables and plot of all parts of a study."""
     study = study_of(name)
     require("study with a summary", name, [one for one in STUDIES if study_of(one).summaries])
     for path in study.summary(_results(name, folder)):
@@ -156,7 +156,7 @@ def summary(name: StudyName, folder: StudyFolder = None) -> None:
 
 @app.command()
 def autofocus_picture(scene: str, folder: Folder = RESULTS / "autofocus") -> None:
-    """Draw one case of a scene before and after autofocus, with the errors of its tracks, SCENE.png."""
+    """Draw one case of a scene before and after autofocus, with its track errors: SCENE.png."""
     from apertura_research.autofocus.charts import draw_case
     from apertura_research.autofocus.outcomes import KINDS
 

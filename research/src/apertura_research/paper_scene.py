@@ -1,4 +1,4 @@
-"""The scene of every study: the paper's five targets as arrays, and what a receiver measures of them."""
+"""The scene of every study: the paper's five targets as arrays, and their transfer functions at a receiver."""
 
 from dataclasses import dataclass, replace
 from math import factorial
@@ -28,7 +28,7 @@ from apertura.simulation.targets import Scatterers
 from apertura.simulation.waveform import TransmitWaveform, newman_codes, qpsk_codes
 
 LENGTH_M = 30.0
-"""Aperture, flown at 1 m/s."""
+"""Length of the aperture, flown at 1 m/s."""
 
 RX_AHEAD_M = 4.7
 """Distance of the receiver ahead of the transmitter, along the track, in the bistatic studies."""
@@ -38,7 +38,7 @@ RX_AHEAD_M = 4.7
 class PaperScene:
     """Waveform, targets and logged positions of the paper's scene.
 
-    In local Cartesian metres: along the track, across it, up.
+    Coordinates are local Cartesian metres: along track, across track, up.
     """
 
     waveform: TransmitWaveform
@@ -47,19 +47,19 @@ class PaperScene:
 
 
 def reduced_scene(*, pulses: int, subcarriers: int, rx_ahead_m: float = 0.0, qpsk: bool = False) -> PaperScene:
-    """Return the paper's simulated scene with fewer pulses and subcarriers over the same 30 m at 1 m/s and band.
+    """Return the paper's simulated scene with fewer pulses and subcarriers over the same track and band.
 
     Parameters
     ----------
     pulses
-        Along the aperture, at least 150: then no grating lobe of one target falls on another.
+        Pulses along the aperture; at least 150, so that no grating lobe of one target falls on another.
     subcarriers
-        A divisor of 4096, at least 128: then the scene is shorter than the unambiguous path c/Δf.
+        A divisor of 4096; at least 128, so that the scene is shorter than the unambiguous path c/Δf.
     rx_ahead_m
         Distance of the receiver ahead of the transmitter; 0 for the monostatic pair.
     qpsk
-        Random QPSK codes, whose leakage between subcarriers is like noise, instead of the flat quadratic-phase
-        code, which turns part of it into a shift.
+        Random QPSK codes, whose leakage between subcarriers is noise-like, instead of the flat quadratic-phase code,
+        where part of the leakage is a displacement.
 
     Notes
     -----
@@ -88,9 +88,9 @@ class Disturbance:
     Attributes
     ----------
     sampled
-        Go through samples (clock errors, Doppler, the converter) instead of transfer functions.
+        True: simulate samples (with clock errors, Doppler and converter) instead of transfer functions.
     quantised
-        Pass the samples through the converter of the receiver.
+        True: quantise the samples by the receiver's converter.
     """
 
     receiver: Impairments = NO_IMPAIRMENTS
@@ -105,7 +105,7 @@ UNDISTURBED = Disturbance()
 def receive_pair(
     scene: PaperScene, disturbance: Disturbance, generator: Generator
 ) -> tuple[Complexes, Complexes, Observation]:
-    """Return transfer functions of radar and sidelink, (pulse, subcarrier) complex64, and what was drawn.
+    """Simulate the transfer functions of radar and sidelink, (pulse, subcarrier) complex64, with the observation.
 
     Examples
     --------
@@ -127,7 +127,7 @@ def receive_pair(
 
 
 def receive_undisturbed(scene: PaperScene) -> Complexes:
-    """Return the radar's transfer functions, (pulse, subcarrier) complex64, with nothing wrong and without noise."""
+    """Simulate the radar's transfer functions, (pulse, subcarrier) complex64, without errors or noise."""
     return receive_pair(scene, UNDISTURBED, np.random.default_rng(0))[0]
 
 
@@ -149,10 +149,10 @@ _DOPPLER_ORDER = 3
 
 
 def window_samples(channel: Channel, generator: Generator | None) -> NDArray[np.complex128]:
-    """Return the (pulse, sample) complex128 samples of every capture that the DFT takes.
+    """Simulate the samples of every capture in the DFT window, (pulse, sample) complex128.
 
-    Equal to `apertura.simulation.synthesis.samples` from the end of the prefix on, as long as every path has
-    arrived by then; twenty times faster, because no edge of any path has to be placed. Without generator, no noise.
+    Equal to `apertura.simulation.synthesis.samples` from the end of the prefix on if every path arrives within the
+    prefix; twenty times faster, because the edges of paths are not computed. Without a generator, no noise is added.
 
     Notes
     -----
@@ -161,16 +161,16 @@ def window_samples(channel: Channel, generator: Generator | None) -> NDArray[np.
     waveform, rate = channel.waveform, sampling_rate(channel)
     index = waveform.prefix_samples + np.arange(waveform.dft_samples)
     numbers = subcarrier_numbers(len(waveform.codes), carrier_is=waveform.carrier_is)
-    turns = waveform.subcarrier_spacing_hz / rate
-    lead = turns * waveform.prefix_samples - waveform.subcarrier_spacing_hz * waveform.cyclic_prefix_s
+    cycles = waveform.subcarrier_spacing_hz / rate
+    lead = cycles * waveform.prefix_samples - waveform.subcarrier_spacing_hz * waveform.cyclic_prefix_s
     factor = waveform.codes * channel.response * np.exp(2j * np.pi * lead * numbers)
-    mixer = np.exp(2j * np.pi * (turns * numbers[0] * np.arange(index.size) - channel.cfo_hz / rate * index))
-    zoom = CZT(len(factor), index.size, w=np.exp(2j * np.pi * turns))
+    mixer = np.exp(2j * np.pi * (cycles * numbers[0] * np.arange(index.size) - channel.cfo_hz / rate * index))
+    zoom = CZT(len(factor), index.size, w=np.exp(2j * np.pi * cycles))
     out = np.empty((len(channel.phase_rad), index.size), np.complex128)
     for first in range(0, len(out), _PULSES_AT_ONCE):
         pulses = slice(first, first + _PULSES_AT_ONCE)
-        turned = mixer * np.exp(1j * channel.phase_rad[pulses, None])
-        out[pulses] = _symbols(channel, pulses, zoom, factor, index / rate) * turned
+        pulse_mixer = mixer * np.exp(1j * channel.phase_rad[pulses, None])
+        out[pulses] = _symbols(channel, pulses, zoom, factor, index / rate) * pulse_mixer
     if generator is not None and channel.noise_variance:
         out += noise(generator, out.shape, channel.noise_variance)
     return out
@@ -179,7 +179,7 @@ def window_samples(channel: Channel, generator: Generator | None) -> NDArray[np.
 def _symbols(
     channel: Channel, pulses: slice, zoom: CZT, factor: NDArray[np.complex128], time_s: NDArray[np.float64]
 ) -> NDArray[np.complex128]:
-    """Return the window before the mixer: a Taylor series in t of the Doppler of each path."""
+    """Return the DFT window before the mixer, with the Doppler of each path as a Taylor series in t."""
     waveform, paths = channel.waveform, channel.paths.at(pulses)
     middle_s = waveform.duration_s / 2
     late_s = paths.delay_s + paths.delay_rate * middle_s - channel.start_s[pulses, None]
@@ -193,7 +193,7 @@ def _symbols(
 
 
 def demodulated(samples: NDArray[np.complexfloating], waveform: TransmitWaveform) -> NDArray[np.complex64]:
-    """Return (pulse, subcarrier) complex64 transfer functions: the DFT of window samples, code removed.
+    """Demodulate window samples into transfer functions, (pulse, subcarrier) complex64: DFT and code removal.
 
     Examples
     --------

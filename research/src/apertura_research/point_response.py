@@ -1,4 +1,4 @@
-"""The response to known targets without forming an image: peaks, widths, coherence and error floor."""
+"""Response to known targets without image formation: peaks, widths, coherence and error floor."""
 
 from collections.abc import Callable
 
@@ -18,10 +18,10 @@ from apertura.core.quality.point_targets import half_power_width, locate_maximum
 from apertura_research.paper_scene import PaperScene, receive_undisturbed
 
 SWATH_MARGIN_M = 6.0
-"""Total path kept beyond the targets on both sides: the neighbourhoods of the peaks, and the taps of the engine."""
+"""Total path beyond the targets on both sides, for the neighbourhoods of the peaks and the taps of the engine."""
 
 REACH_M = (0.16, 0.5)
-"""How far along and across the track a peak is looked for; five steps of 10 cm across."""
+"""Half widths, along and across the track, of the area in which a peak is searched; five steps of 10 cm across."""
 
 _STEP_M = (0.02, 0.1)
 _REFINEMENTS = 4
@@ -35,16 +35,16 @@ def phase_history(
     pulses: NDArray[np.bool_] | None = None,
     window: str = "none",
 ) -> PhaseHistory:
-    """Return transfer functions of total paths tx → target → rx with the phase centres of the scene's logs.
+    """Return the phase history of total paths tx → target → rx with the logged phase centres of the scene.
 
     Parameters
     ----------
     transfer
         (pulse, subcarrier) complex64 of the kept pulses.
     divided
-        Whether the path of the sidelink, whose logged length is put back, was taken off that of the echoes.
+        True if the echoes were divided by the sidelink; its logged length is then restored.
     pulses
-        (pulse,) bool, which of the scene's are kept; None: all.
+        (pulse,) bool, mask of the scene's pulses to keep; None: all.
     window
         Key of `apertura.core.echo.compression.WINDOWS`.
     """
@@ -59,7 +59,7 @@ def phase_history(
 
 
 def range_tables(history: PhaseHistory, targets_m: Floats) -> numba.OversampledTables:
-    """Return range tables that cover some metres around every target, (target, 3) float64, for `numba.form`."""
+    """Return range tables for `numba.form` that cover the surroundings of every target, (target, 3) float64."""
     path_m = history.aperture.path(targets_m)
     step_m, length = range_step(history.frequency_hz, oversampling=2.0)
     start_m = path_m.min(axis=1) - SWATH_MARGIN_M
@@ -77,35 +77,35 @@ def range_tables(history: PhaseHistory, targets_m: Floats) -> numba.OversampledT
 
 
 def undisturbed_tables(scene: PaperScene, *, window: str = "none") -> numba.OversampledTables:
-    """Return the range tables of a scene with nothing wrong and without noise."""
+    """Return the range tables of a scene without errors or noise."""
     history = phase_history(scene, receive_undisturbed(scene), window=window)
     return range_tables(history, scene.scatterers.position_m)
 
 
 def pixels_around(centre_m: Floats, along_m: Floats, across_m: Floats) -> Floats:
-    """Return (along, across, 3) float64 pixels on the ground around a point."""
+    """Return pixels around a point at its height, (along, across, 3) float64."""
     along, across = np.meshgrid(along_m, across_m, indexing="ij")
     return np.asarray(centre_m + np.stack([along, across, np.zeros_like(along)], axis=-1))
 
 
 def random_pixels(generator: Generator) -> Floats:
-    """Return (1, 256, 3) float64 pixels between the five targets, uniformly distributed."""
+    """Draw uniformly distributed pixels in the area of the five targets, (1, 256, 3) float64."""
     along_m, across_m = generator.uniform(-6, 6, 256), generator.uniform(5, 25, 256)
     return np.column_stack([along_m, across_m, np.zeros(256)])[None]
 
 
 def mean_image(tables: numba.OversampledTables, pixels_m: Floats) -> Complexes:
-    """Return the image at (y, x, 3) pixels, per pulse."""
+    """Return the image at pixels (y, x, 3), divided by the number of pulses."""
     return np.asarray(numba.form(tables, pixels_m) / len(tables.start_m), np.complex64)
 
 
 def find_peaks(
     tables: numba.OversampledTables, targets_m: Floats, *, reach_m: tuple[float, float] = REACH_M
 ) -> tuple[Floats, Floats]:
-    """Return positions (target, 3) and magnitudes (target,) of the maxima near each target.
+    """Return positions (target, 3) and magnitudes (target,) of the maximum near each target.
 
     The matched filter is evaluated on a coarse grid, `reach_m` along and across the track, then three times on a
-    finer one about the best pixel: no image is formed and nothing is interpolated between pixels.
+    finer grid about the highest pixel, so that no interpolation between pixels is needed.
     """
     peaks = [_find_peak(tables, target, reach_m) for target in targets_m]
     return np.stack([position for position, _ in peaks]), np.array([level for _, level in peaks])
@@ -125,8 +125,8 @@ def _find_peak(tables: numba.OversampledTables, target_m: Floats, reach_m: tuple
 def half_power_widths(image: Callable[[Floats], Complexes], peak_m: Floats) -> tuple[float, float]:
     """Return the −3 dB widths across (ground range) and along the track (cross-range) through a peak, metres.
 
-    `image` gives the values (y, x) complex64 at (y, x, 3) pixels. NaN where the main lobe is wider than 1 m (across)
-    or 0.4 m (along) to either side.
+    `image` returns values (y, x) complex64 at pixels (y, x, 3). A width is NaN if the main lobe extends beyond 1 m
+    (across) or 0.4 m (along) on either side.
     """
     centre, across_m, along_m = np.zeros(1), np.linspace(-1, 1, 401), np.linspace(-0.4, 0.4, 401)
     across = np.abs(image(pixels_around(peak_m, centre, across_m))).ravel() ** 2
@@ -136,19 +136,19 @@ def half_power_widths(image: Callable[[Floats], Complexes], peak_m: Floats) -> t
 
 
 def coherence_factors(history: PhaseHistory, points_m: Floats) -> Floats:
-    """Return Γ at each of (point, 3), from what each pulse adds there by the double sum."""
+    """Return the coherence factor Γ at each point (point, 3), from the pulse contributions to the double sum."""
     return np.array([coherence_factor(column) for column in reference.terms(history, points_m).T])
 
 
 def error_floor_db(values: Complexes, ideal: Complexes, peaks: Floats) -> float:
-    """Return the RMS of what is wrong with an image, after one complex gain, against its mean peak, dB.
+    """Return the RMS error of an image after one complex gain, relative to its mean peak, dB.
 
     Parameters
     ----------
     values, ideal
-        Complex64 of one shape: the image and the undisturbed one.
+        The image and the undisturbed image, complex64 of equal shape.
     peaks
-        (target,) float64, magnitudes.
+        (target,) float64, magnitudes of the peaks.
     """
     gain = np.vdot(ideal, values) / np.vdot(ideal, ideal).real
     return float(amplitude_db(np.sqrt(np.mean(np.abs(values - gain * ideal) ** 2)) / peaks.mean()))

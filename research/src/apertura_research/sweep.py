@@ -1,7 +1,7 @@
-"""The harness of every sweep: cases are run one by one into tables, tables become charts and a summary.
+"""Framework of the sweeps: cases are computed into tables, and tables are drawn as charts and a summary.
 
-A study is divided into parts, each a job of its own, and a part into cases. A file that exists is complete; the cases
-that a killed job has finished are kept beside it, under the hash of the code that ran.
+A study is divided into parts, each a separate job, and a part into cases. Every file that exists is complete; finished
+cases of a killed job are kept next to it, under the hash of the code that computed them.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -25,26 +25,26 @@ Row = TypeVar("Row")
 
 @dataclass(frozen=True)
 class Study(Generic[Row]):
-    """Sweep, run of a case, and drawings of a study.
+    """Study: its cases, their computation, and its charts.
 
     Attributes
     ----------
     row
-        Dataclass of one row of its tables, with fields of str, int and float.
+        Dataclass of a table row, with fields of str, int and float.
     charts
-        Chart → the parts whose rows it shows.
+        Chart → parts whose rows it shows.
     cases
         Part → its cases, in order.
     run
-        Part and one of its cases → rows; its module is the code that a part depends on.
+        Part and one of its cases → rows; parts depend on the code of the module of this function.
     draw
-        Chart, its rows and the path of the PNG → the picture.
+        Draws a chart: its name, its rows and the path of the PNG.
     summaries
         Names of the files that `summarise` writes.
     summarise
-        Rows of all parts and the folder → the tables and the picture of them all.
+        Writes the summary: rows of all parts, and the folder.
     digits
-        Significant digits of the tables of parts; None: all.
+        Significant digits in the tables of parts; None: all.
     """
 
     row: type[Row]
@@ -58,16 +58,16 @@ class Study(Generic[Row]):
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Every part, in the order of the charts."""
+        """All parts, in the order of the charts."""
         return tuple(dict.fromkeys(part for parts in self.charts.values() for part in parts))
 
     def rows(self, part: str) -> Iterator[Row]:
-        """Yield the rows of a part, case by case, without files."""
+        """Compute the rows of a part, case by case, without files."""
         for case in self.cases(part):
             yield from self.run(part, case)
 
     def compute(self, part: str, folder: Path) -> Path:
-        """Write parts/PART.csv; cases that a killed run with the same code has finished are not run again."""
+        """Write parts/PART.csv; cases that a killed run finished with the same code are not recomputed."""
         path = part_path(folder, part)
         finished = path.with_name(f".{part}.{code_sha256(self.run.__module__)[:12]}")
         rows: list[Row] = []
@@ -82,24 +82,24 @@ class Study(Generic[Row]):
         return path
 
     def read(self, folder: Path, parts: Sequence[str]) -> list[Row]:
-        """Return the rows of some parts from their files.
+        """Read the rows of parts from their files.
 
         Raises
         ------
         CampaignError
-            If one is not there.
+            If a file is missing.
         """
         return [row for part in parts for row in read_table(part_path(folder, part), self.row)]
 
     def chart(self, name: str, folder: Path) -> Path:
-        """Put the parts of a chart together, NAME.csv, and draw them, NAME.png."""
+        """Merge the parts of a chart, NAME.csv, and draw them, NAME.png."""
         rows = self.read(folder, self.charts[name])
         write_table(folder / f"{name}.csv", rows)
         self.draw(name, rows, folder / f"{name}.png")
         return folder / f"{name}.png"
 
     def summary(self, folder: Path) -> list[Path]:
-        """Write the tables and the picture of all parts, and return them."""
+        """Write the summary tables and plot of all parts, and return their paths."""
         self.summarise(self.read(folder, self.parts), folder)
         return [folder / name for name in self.summaries]
 
@@ -110,16 +110,16 @@ def part_path(folder: Path, part: str) -> Path:
 
 
 def crossing(sizes: Floats, losses_db: Floats, level_db: float, *, logarithmic: bool) -> float:
-    """Return the size at which the loss first passes a level, interpolated; NaN if it never does.
+    """Return the interpolated size at which the loss first exceeds a level; NaN if it does not.
 
     Parameters
     ----------
     sizes, losses_db
-        (size,) float64, from negligible to destructive; sizes rise or fall.
+        (size,) float64, from negligible to destructive; sizes may increase or decrease.
     level_db
-        What is passed.
+        Level of the loss.
     logarithmic
-        Interpolate in the logarithm of the size.
+        True: interpolate in the logarithm of the size.
 
     Examples
     --------
@@ -140,7 +140,7 @@ def crossing(sizes: Floats, losses_db: Floats, level_db: float, *, logarithmic: 
 
 
 def with_unit(title: str, unit: str) -> str:
-    """Return the label of an axis; unit 1 is left out.
+    """Return the label of an axis; unit 1 is omitted.
 
     Examples
     --------
@@ -152,12 +152,12 @@ def with_unit(title: str, unit: str) -> str:
 
 @contextmanager
 def panels(path: Path, size: tuple[float, float], shape: tuple[int, int], **options: Any) -> Iterator[list[Axes]]:
-    """Give the panels of a chart, row by row; the legend of the first stands below, then the PNG is written.
+    """Provide the panels of a chart, row by row; then add the legend of the first panel below and write the PNG.
 
     Parameters
     ----------
     path
-        Of the PNG.
+        Path of the PNG.
     size
         Width and height, inches.
     shape
@@ -175,7 +175,7 @@ def panels(path: Path, size: tuple[float, float], shape: tuple[int, int], **opti
 
 
 def order_sizes(axes: Axes, sizes: Sequence[float] | Floats, *, logarithmic: bool) -> None:
-    """Let the axis of sizes run from negligible to destructive."""
+    """Direct the axis of sizes from negligible to destructive."""
     if logarithmic:
         axes.set_xscale("log")
     if sizes[0] > sizes[-1]:
@@ -191,20 +191,20 @@ def draw_table(
     title: str,
     scale: str = "",
 ) -> None:
-    """Draw a table whose cells are coloured from bad (0) to good (1).
+    """Draw a table with cells coloured from bad (0) to good (1).
 
     Parameters
     ----------
     path
-        Of the PNG.
+        Path of the PNG.
     cells, goodness
-        Text, and 0…1 or NaN for no colour, row by row.
+        Text and rating of the cells, row by row; ratings 0…1, or NaN for no colour.
     names
-        Of the rows, and of the columns.
+        Names of the rows, and of the columns.
     title
-        Above the table.
+        Title above the table.
     scale
-        What the colour means; empty: no scale is drawn.
+        Label of the colour scale; empty: no scale is drawn.
     """
     rows, columns = names
     figure = Figure(figsize=(14, 0.42 * len(rows) + 2.2), layout="constrained")

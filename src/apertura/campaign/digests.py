@@ -39,7 +39,7 @@ def digest_of(
     algorithm
         sha256 or sha512; with sha512, both are computed in one pass, because recordings need both.
     paranoid
-        Read the file in any case.
+        True to read the file even if its state is unchanged.
 
     Raises
     ------

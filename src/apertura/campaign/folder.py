@@ -112,7 +112,7 @@ class RawFolder:
         return existing or [name for name in self._recorded_sources(flight, node) if _is_log(Path(name), node)]
 
     def _recorded_sources(self, flight: str, node: str) -> list[str]:
-        """Return the files of a node in the manifests of results, if raw/ has none, as in a copy without raw/."""
+        """Return a node's files listed in manifests of results if raw/ contains none, as in a copy without raw/."""
         from apertura.campaign.store import read_manifest  # loads zarr, which reading the config does not need
 
         sources, folder = set[str](), f"raw/{flight}/"
@@ -243,7 +243,7 @@ class Campaign(RawFolder):
 
     @cached_property
     def calibrated(self) -> bool:
-        """True if images are calibrated, with a configured radio of its pairs or with measured constants."""
+        """True if images are calibrated, by the configured radio of the pairs or by measured constants."""
         if self.settings.processing.radiometric_calibration:
             return True
         radios = (radio_of(self.settings.nodes, pair) for pair in self._pairs)
@@ -251,7 +251,7 @@ class Campaign(RawFolder):
 
     @property
     def coefficients(self) -> tuple[str, ...]:
-        """Names of the backscattering coefficients to write, none for relative images, and of multilooked powers."""
+        """Names of multilooked powers and of backscattering coefficients to write (none for relative images)."""
         processing = self.settings.processing
         written = processing.radiometry if self.calibrated else ()
         if processing.multilook is None:
@@ -261,7 +261,7 @@ class Campaign(RawFolder):
         return (*written, *averaged, *noise, "multilook_coherent", "multilook_noncoherent")
 
     def check_radio(self) -> None:
-        """Check that the radio of the pairs is configured completely or not at all; measured constants replace it."""
+        """Check that the radio of the pairs is configured completely or not at all, unless constants are measured."""
         if self.settings.processing.radiometric_calibration:
             return
         sampled = isinstance(self.settings.waveform, SampledWaveform)
@@ -327,7 +327,7 @@ class Campaign(RawFolder):
         return path.relative_to(self.root).as_posix()
 
     def height_files(self) -> dict[str, ConfinedPath]:
-        """Return role → file of the DEM and of the geoid grid, as far as the config names them."""
+        """Return role → file of the DEM and of the geoid grid, for those that the config names."""
         scene = self.settings.scene
         named = {"dem": scene.dem, "geoid": scene.geoid}
         return {role: self.file(name, f"scene.{role}") for role, name in named.items() if name}

@@ -75,7 +75,7 @@ CHECKS: Mapping[str, Check] = {
 """Name of each check → function of an `Examination` that yields problems, or raises one."""
 
 LAST = frozenset({"imaging", "plan"})
-"""Checks that run only without other problems: they open pairs as the steps do, and would repeat these problems."""
+"""Checks that run only if there are no problems so far: they open pairs, and would repeat these problems."""
 
 
 def problems(root: str | Path, *, without: Collection[str] = ()) -> list[CampaignError]:
@@ -205,7 +205,7 @@ def _problems_of_check(check: Check, examined: "Examination") -> Iterator[Campai
 
 
 class _AnyNode(frozenset[str]):
-    """Set that contains any name: replaces the nodes of an unreadable configuration."""
+    """Set that contains every name, used instead of the nodes of an unreadable configuration."""
 
     def __contains__(self, _: object) -> bool:
         return True

@@ -259,7 +259,7 @@ class Examination:
 
     @property
     def level_m(self) -> float:
-        """Height of flat ground under the grid, metres above the ellipsoid; with a DEM, the height of the track."""
+        """Height of flat terrain under the grid, metres above the ellipsoid; with a DEM, the height of the track."""
         return self._ground[2]
 
     @cached_property

@@ -31,7 +31,7 @@ PRODUCT_TAG = "APERTURA_VERSION"
 """Tag of every raster written by apertura."""
 
 METRES = frozenset({"", "m", "metre", "meter", "metres", "meters"})
-"""Unit names of heights in metres; an empty name is taken as metres."""
+"""Unit names of heights in metres; an empty name is interpreted as metres."""
 
 WAVE_M = 0.25
 """Wavelength for the tolerance of errors between epochs of a log without a campaign, metres: L-band."""

@@ -42,9 +42,9 @@ def check_flights(examined: "Examination") -> Iterator[CampaignError]:
 def check_files(examined: "Examination") -> Iterator[CampaignError]:
     """Yield a problem for each file that is missing, empty, dated in the future or not readable."""
     campaign = examined.campaign
-    wanted = _wanted(examined)
+    required_by = _wanted(examined)
     for flight in campaign.flights:
-        yield from _recorded(campaign, flight, wanted)
+        yield from _recorded(campaign, flight, required_by)
     lookups: list[Callable[[], dict[str, ConfinedPath]]] = [
         lambda: {f"scene.{role}": path for role, path in campaign.height_files().items()}
     ]
@@ -78,14 +78,14 @@ def _wanted(examined: Examination) -> Callable[[str], str | None]:
         except CampaignError:  # reported by other checks
             return None
 
-    def wanted(name: str) -> str | None:
+    def required_by(name: str) -> str | None:
         known = files()
         return known[0].get(name, "") if known and name in known[1] else None
 
-    return wanted
+    return required_by
 
 
-def _recorded(campaign: Campaign, flight: Flight, wanted: Callable[[str], str | None]) -> Iterator[CampaignError]:
+def _recorded(campaign: Campaign, flight: Flight, required_by: Callable[[str], str | None]) -> Iterator[CampaignError]:
     """Yield problems of the files of a flight: samples and logs, or phase history."""
     if not isinstance(campaign.settings.waveform, SampledWaveform):
         for node in flight.nodes:
@@ -105,7 +105,7 @@ def _recorded(campaign: Campaign, flight: Flight, wanted: Callable[[str], str | 
             except CampaignError as problem:  # a link
                 yield problem
                 continue
-            if exists or (result := wanted(campaign.relative(path))) is None:
+            if exists or (result := required_by(campaign.relative(path))) is None:
                 yield from _readable(path, expected, remedy)
             elif result:
                 yield from _readable(path, f"{expected}, to recompute {result}", f"{remedy} {_KEPT}")
@@ -168,7 +168,7 @@ def check_raw_root(examined: "Examination") -> Iterator[CampaignError]:
 
 
 def check_links(examined: "Examination") -> Iterator[CampaignError]:
-    """Yield a problem for each symbolic link in, or in place of, the folders results and .snakemake."""
+    """Yield a problem for each symbolic link that replaces, or lies in, the folders results and .snakemake."""
     root = examined.campaign.root
     for top in (root / "results", root / ".snakemake"):
         below = () if top.is_symlink() else (folder / name for folder, _, names in top.walk() for name in names)
@@ -221,7 +221,7 @@ def _is_damaged(path: ConfinedPath) -> bool:
 _BASE_BYTES = 120_000_000  # the interpreter and its libraries
 _CAPTURE_BYTES = 1100  # memory per capture for its metadata while they are read; samples are read in blocks
 _RAW_BYTES = 10  # per capture in the stage raw, compressed
-_ECHO_SHARE = 0.95  # of 8 bytes per pulse and subcarrier, uncompressed; a share of the pulses may be excluded
+_ECHO_SHARE = 0.95  # least fraction of the pulses that is not excluded; 8 bytes per pulse and subcarrier
 PIXEL_BYTES = 36  # per pixel and pair: image, its share of the cube, three rasters, compressed; 76 uncompressed
 MEMINFO = Path("/proc/meminfo")
 

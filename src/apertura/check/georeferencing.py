@@ -23,7 +23,7 @@ TALLEST_M = 500.0
 `_STEEPEST_POSTS` post widths."""
 
 _NEAR_M = 20e3
-"""Largest distance between scene and track with which a hypothetical mistake explains their separation, metres."""
+"""Largest distance of scene and track, after correction of a mistake, at which the mistake is reported, metres."""
 
 _STEEPEST_POSTS = 10.0
 _PER_POST = 2  # samples per post
@@ -39,7 +39,7 @@ _NOWHERE = (np.nan, np.nan)
 
 
 def check_scene_crs(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a problem if the CRS is not in metres, has another frame than positions, or is unsuitable for the area."""
+    """Yield a problem if the CRS is not in metres, does not fit the positions' frame, or is unsuitable for the area."""
     crs = examined.campaign.settings.scene.crs
     if examined.other_frame:
         local = crs == LOCAL
@@ -156,7 +156,7 @@ def check_spikes(examined: Examination) -> Iterator[CampaignError]:
     Heights are sampled twice per post. A morphological opening with a window of seven samples removes peaks narrower
     than the window and preserves slopes, ridges and cliffs of any height; a closing does the same for pits. A removed
     height is a spike if it exceeds 500 m and the width of ten posts: steeper than 80° on all sides. If the scene has
-    more than a million samples, this number about its middle is tested.
+    more than a million samples, this number about its centre is tested.
     """
     dem, grid = examined.ground and examined.ground.dem, examined.grid
     if not dem or not grid:
@@ -189,7 +189,7 @@ def _heights(dem: Dem, grid: SceneGrid, window: SceneGrid) -> NDArray[np.float64
 
 
 def post_width_m(dem: Dem, grid: SceneGrid) -> float:
-    """Return the post spacing of a DEM at the middle of a grid, metres, along the finer axis."""
+    """Return the post spacing of a DEM at the centre of a grid, metres, along the finer axis."""
     xmin, ymin, xmax, ymax = grid.bounds_m
     x, y = (xmin + xmax) / 2 + np.array([0.0, 1.0, 0.0]), (ymin + ymax) / 2 + np.array([0.0, 0.0, 1.0])
     if grid.crs != LOCAL:
@@ -276,7 +276,7 @@ def _place(crs: str, x: float, y: float) -> Place:
 
 
 def _distance_m(*places: Place) -> float:
-    """Return the straight distance of two locations; inf if one of them is not on Earth."""
+    """Return the straight-line distance between two locations; inf if one of them is not on Earth."""
     if not all(abs(latitude) <= 90 and abs(longitude) <= 180 for latitude, longitude in places):
         return np.inf
     first, second = (ecef_from_geodetic(*(np.array(value) for value in (*place, 0.0))) for place in places)

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 _TAGS = 256  # largest number of time tags of a pair at which distances are computed
 _POINTS = 9  # points along each side of the scene
-_CURVATURE = 0.99  # factor on the straight path: the curved ground of a scene of unknown height recedes from the track
+_CURVATURE = 0.99  # factor on the straight path: the curved terrain of a scene of unknown height recedes from the track
 _LEAST_M = 1e-3  # least height above the terrain: an antenna at terrain height is below it at half of the pulses
 _MOSTLY = 0.9  # share of the distance above which a height difference is its cause
 _CHECK = (
@@ -55,7 +55,7 @@ _CALIBRATION = f"{CONFIG}: calibration"
 
 
 def check_nodes_apart(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a problem for nodes of one flight beyond the radio horizon of each other, by their logs."""
+    """Yield a problem for nodes of one flight beyond the radio horizon of each other, according to their logs."""
     for flight in examined.campaign.flights if examined.waveform else ():
         for node in flight.nodes:
             key, other = (flight.name, flight.transmitter), (flight.name, node)
@@ -177,7 +177,7 @@ def _length(metres: float) -> str:
 
 
 def check_aperture(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a problem for pairs of image flights within range of the scene whose nodes are stationary by their logs."""
+    """Yield a problem for each pair within range of the scene if the logs contain no motion of its nodes."""
     waveform, transmitted = examined.waveform, examined.transmitted
     if waveform is None or transmitted is None:
         return
@@ -202,7 +202,7 @@ def check_aperture(examined: Examination) -> Iterator[CampaignError]:
 
 
 def check_ground(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a problem for image flights with a node at or below the terrain at most pulses, or over 30 km above it."""
+    """Yield a problem for image flights in which a node is mostly at or below the terrain, or over 30 km above it."""
     waveform, grid, ground = examined.waveform, examined.grid, examined.ground
     if grid is None or ground is None:
         return

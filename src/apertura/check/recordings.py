@@ -86,7 +86,7 @@ def check_histories(examined: Examination) -> Iterator[CampaignError]:
 
 
 def check_intervals(examined: Examination) -> Iterator[CampaignError]:
-    """Yield problems of recordings whose time tag interval differs from 1/prf_hz, except by missed pulses.
+    """Yield problems of recordings whose time tag interval differs from 1/prf_hz, other than by missed pulses.
 
     A receiver may record only every second or third pulse: each of these pulses has a match at the transmitter.
     """

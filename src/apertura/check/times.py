@@ -196,8 +196,9 @@ def frame_numbers(recording: Recording) -> NDArray[np.int64]:
 def common_pulses(tx: Recording, rx: Recording, prf_hz: float) -> Times:
     """Return the transmitter's time tags of pulses that certainly have a match in the receiver's recording.
 
-    Matched by equal frame numbers if both nodes have them, else by time tags without one interval at either end. Empty
-    if a counter wraps or a recording is continuous: the pulses are then not known from headers.
+    Pulses are matched by frame numbers if both nodes record them, else by the time span, reduced by one interval at
+    either end. The result is empty if a counter wraps or a recording is continuous: headers then do not contain the
+    pulses.
 
     Parameters
     ----------
@@ -259,6 +260,6 @@ def seconds_between(first: Span, second: Span) -> float:
 
 
 def shift_s(first: Span, second: Span) -> float:
-    """Return the delay of the second span's middle relative to the first span's, seconds."""
+    """Return the delay of the second span's midpoint relative to the first span's, seconds."""
     one_second = np.timedelta64(1, "s")
     return float(((second[0] - first[0]) / one_second + (second[1] - first[1]) / one_second) / 2)

@@ -38,7 +38,7 @@ def check_tracks(examined: Examination) -> Iterator[CampaignError]:
 def check_attitude(examined: Examination) -> Iterator[CampaignError]:
     """Yield problems of nodes whose log lacks the required attitude, or has it in radians or anticlockwise.
 
-    A wrong unit or sense is certain only with courses in most directions; otherwise the echo is flagged.
+    A wrong unit or sense of rotation is certain only with courses in most directions; else step `echo` raises a flag.
     """
     from apertura.stages.node_log import yaw_fault_of
 

@@ -1,6 +1,6 @@
 """Basis of all layers: errors, flags, documents, confined paths, atomic writes, constants, contracts, provenance.
 
-Provides small types and functions without radar or campaign logic. It imports none of the other layers and computes no
-pixels. All access to a campaign folder goes through `confined`. `contracts` defines the content of each stage;
+The package provides small types and functions without radar or campaign logic. It imports no other layer and computes
+no pixels. All access to a campaign folder goes through `confined`. `contracts` defines the content of each stage;
 `code_imports` and `provenance` record the code and inputs of a result.
 """

@@ -82,8 +82,8 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
 def write_beside(path: Path, content: bytes) -> None:
     """Write a file with a single writer under a temporary name, flush it to disk and rename it; create its folder.
 
-    After a power failure the file is complete or absent. A killed writer leaves ``<name>.….partial``, which the owner
-    of the folder has to remove. `replacement` removes such files itself but is slower.
+    After a power failure the file is complete or absent. A killed writer leaves a file ``<name>.….partial``, which the
+    owner of the folder has to remove. `replacement` is slower but removes such files.
 
     Examples
     --------
@@ -126,13 +126,13 @@ def date(paths: Iterable[ConfinedPath], *, earliest_ns: int, latest_ns: int) -> 
 
 
 def remove(path: Path) -> None:
-    """Remove a file, or a folder with its contents, if it exists; targets of links are kept."""
+    """Remove a file, or a folder with its contents, if it exists; targets of links remain."""
     ConfinedPath.of(path).remove()
 
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Add the path to an `OSError` raised in the body; errors of write calls contain none.
+    """Add the path to an `OSError` raised in the body, because errors of write calls contain no path.
 
     Examples
     --------
@@ -150,7 +150,7 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def confined_target(path: Path) -> ConfinedPath:
-    """Return an output path as a confined path; for an unconfined path, missing parent folders are created."""
+    """Return an output path as a confined path; missing parent folders of an unconfined path are created."""
     if not isinstance(path, ConfinedPath):
         path.parent.mkdir(parents=True, exist_ok=True)
     return ConfinedPath.of(path)

@@ -36,7 +36,7 @@ _TEXT_OR_COMMENT = re.compile(
     re.DOTALL,
 )
 _GOES_ON = frozenset("([{,=+-*/%|&<>\\")
-"""Last characters of a line whose statement continues: a string on the next line is a value, not a docstring."""
+"""Last characters of a line whose statement continues; a string on the next line is a value, not a docstring."""
 
 
 def import_closure(modules: Iterable[str], *, package: Path = PACKAGE) -> dict[str, Path]:
@@ -143,7 +143,7 @@ _KEPT = PACKAGE / "__pycache__" / "imports.json"
 
 @functools.cache
 def _kept() -> dict[str, list[Any]]:
-    """Return the cached imports of earlier processes; this process adds to them."""
+    """Return the imports cached by earlier processes, to which this process adds its own."""
     with suppress(OSError, ValueError):
         kept: dict[str, list[Any]] = json.loads(_KEPT.read_text(encoding="utf-8"))
         return kept
@@ -156,7 +156,7 @@ def _keep_at_exit() -> None:
 
     def keep() -> None:
         ours = {path: entry for path, entry in _kept().items() if Path(path).is_relative_to(PACKAGE)}
-        with suppress(OSError):  # in a read-only installation, each process parses the sources
+        with suppress(OSError):  # a read-only installation has no cache: each process parses the sources
             part = _KEPT.with_suffix(f".{os.getpid()}")
             part.write_text(json.dumps(ours), encoding="utf-8")
             part.replace(_KEPT)

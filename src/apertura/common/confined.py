@@ -44,9 +44,10 @@ _REMEDY = "Remove it. The campaign folder itself may be a link, and `raw_root` i
 class ConfinedPath(PosixPath):
     """Path in a campaign folder, through which no file outside the folder can be accessed.
 
-    It has the methods of `pathlib.Path` that apertura uses. Reading and writing through a symbolic link, and opening
-    anything but a regular file or folder, raise `CampaignError`; removing a link does not affect its target. Derived
-    paths are confined, too. It is not an `os.PathLike`: a library that opens files by name needs `on_disk`.
+    The class has the methods of `pathlib.Path` that apertura uses. Reading and writing through a symbolic link, and
+    opening anything but a regular file or folder, raise `CampaignError`; removing a link does not affect its target.
+    Paths derived from a confined path are confined, too. The class is not an `os.PathLike`: for libraries that open
+    files by name, use `on_disk`.
 
     Examples
     --------
@@ -70,9 +71,9 @@ class ConfinedPath(PosixPath):
         Parameters
         ----------
         folder
-            The root folder; its path may contain links or be one.
+            The root folder; its path may be or contain a link.
         elsewhere
-            Name of a subfolder → folder outside the root that replaces it, under the same rules.
+            Name of a subfolder → folder outside the root that replaces the subfolder, accessed under the same rules.
         """
         if isinstance(folder, ConfinedPath):
             return folder
@@ -286,7 +287,7 @@ class ConfinedPath(PosixPath):
     def copy_to(self, target: Path, *, link: bool = False) -> None:
         """Copy a file; if `link`, as a hard link where possible."""
         if link:
-            with suppress(OSError), self._within() as (folder, name):  # another disk, or a file of another user
+            with suppress(OSError), self._within() as (folder, name):  # not on another disk, or for another user's file
                 os.link(name, target, src_dir_fd=folder, follow_symlinks=False)
                 return
         with self.open("rb") as source, target.open("wb") as copy:
@@ -306,8 +307,8 @@ class ConfinedPath(PosixPath):
     def on_disk(self) -> Iterator[Path]:
         """Yield an ordinary path to this file or folder, for libraries that open files by name.
 
-        The path is valid in this process and its forks until the context exits. Accesses of a library to the content
-        of a folder are not confined: apertura passes only files, and folders that it has just created.
+        The path is valid in this process and its forks until the context exits. As the access of a library to the
+        content of a folder is not confined, apertura only passes files, and folders that it has just created.
         """
         if self.is_dir():
             with self.folder() as opened:
@@ -322,7 +323,7 @@ class ConfinedPath(PosixPath):
     # ---- Reading ----------------------------------------------------------------------------------------------------
 
     def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:
-        """Override `pathlib.Path.stat`; CampaignError for a link that would be followed."""
+        """Override `pathlib.Path.stat`; raise CampaignError for a link that would be followed."""
         with self._within() as (folder, name):
             state = os.stat(name, dir_fd=folder, follow_symlinks=False)
         if follow_symlinks and stat.S_ISLNK(state.st_mode):
@@ -340,15 +341,15 @@ class ConfinedPath(PosixPath):
             return 0
 
     def exists(self, *, follow_symlinks: bool = True) -> bool:
-        """Override `pathlib.Path.exists`; CampaignError at a link."""
+        """Override `pathlib.Path.exists`; raise CampaignError at a link."""
         return self._mode(follow_symlinks=follow_symlinks) != 0
 
     def is_file(self, *, follow_symlinks: bool = True) -> bool:
-        """Override `pathlib.Path.is_file`; CampaignError at a link."""
+        """Override `pathlib.Path.is_file`; raise CampaignError at a link."""
         return stat.S_ISREG(self._mode(follow_symlinks=follow_symlinks))
 
     def is_dir(self, *, follow_symlinks: bool = True) -> bool:
-        """Override `pathlib.Path.is_dir`; CampaignError at a link."""
+        """Override `pathlib.Path.is_dir`; raise CampaignError at a link."""
         return stat.S_ISDIR(self._mode(follow_symlinks=follow_symlinks))
 
     def is_symlink(self) -> bool:
@@ -379,7 +380,7 @@ class ConfinedPath(PosixPath):
         return os.fdopen(opened, mode, buffering, encoding, errors, newline)
 
     def read_bytes(self, largest: int = LARGEST_READ) -> bytes:
-        """Read the bytes of a file; CampaignError if it is larger than `largest`."""
+        """Read the bytes of a file; raise CampaignError if it is larger than `largest`."""
         with self.open("rb", buffering=0) as stream:
             size = os.fstat(stream.fileno()).st_size
             if size > largest:
@@ -416,9 +417,9 @@ class ConfinedPath(PosixPath):
         yield from (self / name for name, _ in self._entries())
 
     def walk(self, *_: Any, **__: Any) -> Iterator[tuple["ConfinedPath", list[str], list[str]]]:
-        """Yield each folder, this one first, with the sorted names of its folders and other entries; follow no links.
+        """Yield this folder and all folders below it, with sorted names of subfolders and other entries.
 
-        Nothing is yielded for a missing folder.
+        Links are not followed. Nothing is yielded for a missing folder.
         """
         entries = self._entries()
         if not entries and not self.is_dir():
@@ -468,7 +469,7 @@ class ConfinedPath(PosixPath):
                     os.close(self._entered(folder, name))
 
     def unlink(self, missing_ok: bool = False) -> None:
-        """Override `pathlib.Path.unlink`: a link is removed, its target is kept."""
+        """Override `pathlib.Path.unlink`: a link is removed, its target remains."""
         try:
             with self._within() as (folder, name):
                 os.unlink(name, dir_fd=folder)
@@ -482,7 +483,7 @@ class ConfinedPath(PosixPath):
             os.rmdir(name, dir_fd=folder)
 
     def remove(self) -> None:
-        """Remove a file, or a folder with its contents, if it exists; targets of links are kept."""
+        """Remove a file, or a folder with its contents, if it exists; targets of links remain."""
         with suppress(FileNotFoundError), self._within() as (folder, name):
             if stat.S_ISDIR(os.stat(name, dir_fd=folder, follow_symlinks=False).st_mode):
                 shutil.rmtree(name, dir_fd=folder)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _RASTERS, _SUMS, _IMAGES, _FLIGHTS = ("flight", "pair", "y", "x"), ("flight", "y", "x"), ("flight", "pair"), ("flight",)
 
 CF_SIGMA0 = "surface_backwards_scattering_coefficient_of_radar_wave"
-"""Standard name of σ⁰ in CF (Standard Name Table, https://cfconventions.org); γ⁰ and β⁰ have none."""
+"""Standard name of σ⁰ in CF (Standard Name Table, https://cfconventions.org); γ⁰ and β⁰ have no standard name."""
 
 STANDARD_NAMES = {"incidence": "angle_of_incidence", "centre_frequency": "sensor_band_central_radiation_frequency"}
 """Variable of the cube → CF standard name; CF defines none for the other variables."""
@@ -54,7 +54,7 @@ MEASURED: dict[str, Row] = {
 """Quantities measured while the rasters are written."""
 
 SUMMED = frozenset(name for name, row in (*RASTERS.items(), *MEASURED.items()) if row[0] in {_SUMS, _FLIGHTS})
-"""Variables that require a flight with at least two pairs; NaN for flights with a single pair."""
+"""Variables that require a flight with at least two pairs; they are NaN for flights with a single pair."""
 
 QUOTED: dict[str, Row] = {
     "heading": (_IMAGES, "float64", "degree", "direction of flight, clockwise from grid north"),
@@ -77,7 +77,7 @@ QUOTED: dict[str, Row] = {
     "verdict": (_IMAGES, "T", "", "focus: focused, defocused or inconclusive; empty: no flight"),
     "flags": (_IMAGES, "T", "", "comma-separated names of the image's flags"),
 }
-"""Quality of each image; NaN where not measured."""
+"""Quality measures of each image; NaN where not measured."""
 
 COORDINATES: dict[str, Row] = {
     "flight": (("flight",), "T", "", "name of the flight"),
@@ -305,7 +305,7 @@ def check(dataset: "xr.Dataset", stage: str) -> "xr.Dataset":
     Raises
     ------
     ContractError
-        If variables or attributes are missing or have other dimensions or dtype; lists all of them.
+        If variables or attributes are missing, or dimensions or dtypes differ; the message lists all of them.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Reading of untrusted files as text, YAML or JSON, and their validation; every error is reported as one message."""
+"""Reading and validation of untrusted text, YAML and JSON files; every error is reported as a single message."""
 
 import difflib
 import json
@@ -193,14 +193,14 @@ def read_json(path: Path, *, expected: str, remedy: str, largest: int = LARGEST_
 
 @contextmanager
 def undamaged(path: Path, *, expected: str, remedy: str) -> Iterator[None]:
-    """Convert errors raised while a document is parsed into one message about its file.
+    """Convert errors that are raised while a document is parsed into a single message about the file.
 
     Parameters
     ----------
     path
         The file that the document was read from.
     expected, remedy
-        Parts of the message; the remedy for a result is to delete it and run again.
+        Parts of the message; the remedy for a damaged result is to delete it and run again.
 
     Raises
     ------
@@ -261,11 +261,11 @@ _TYPE = r"(constrained-\w+|literal\[.*|function-.*|tuple\[.*|bool|int|float|str)
 _MOST_COMPLAINTS = 12
 
 LARGEST_NUMBER = 1e15
-"""Largest length, time, frequency or count accepted: beyond it, float64 sums lose significant digits."""
+"""Largest accepted length, time, frequency or count; sums of larger float64 values lose significant digits."""
 
 
 def validated(model: type[T], document: object, *, where: object, expected: str) -> T:
-    """Validate `document` as a `model`; one message lists every invalid key with the nearest valid one.
+    """Validate `document` as a `model`; a single message lists every invalid key with the most similar valid key.
 
     Parameters
     ----------
@@ -279,7 +279,7 @@ def validated(model: type[T], document: object, *, where: object, expected: str)
     Raises
     ------
     CampaignError
-        If keys or values are invalid; states file, key, value found and valid value.
+        If keys or values are invalid; the message states file, key, value found and valid value.
     """
     adapter = TypeAdapter(model)
     try:
@@ -289,7 +289,7 @@ def validated(model: type[T], document: object, *, where: object, expected: str)
         if all(item["type"] == "value_error" for item in error.errors(include_url=False, include_context=False)):
             expected = "consistent values"  # keys and types are valid
         raise CampaignError(found, where=where, expected=expected, remedy="Correct these keys.") from error
-    except ArithmeticError as error:  # each number is permitted, their combination is not
+    except ArithmeticError as error:  # each number is valid, but their combination is not
         found = f"numeric overflow or underflow ({error})"
         raise CampaignError(found, where=where, expected=expected, remedy="Correct the most extreme value.") from error
     for key, number in _numbers(adapter.dump_python(value, warnings=False), ()):
@@ -323,7 +323,7 @@ def _complaints(error: ValidationError, schema: dict[str, Any]) -> str:
 
 
 def _complaint(item: dict[str, Any], schema: dict[str, Any]) -> tuple[str, str]:
-    """Return a key and its error; names of alternative types are dropped from the location of the key."""
+    """Return a key and its error; names of alternative types are removed from the location of the key."""
     tags = _collected(schema, lambda part: part.get("discriminator", {}).get("mapping", {}))
     parts, unknown = [*map(str, item["loc"])], item["type"] in {"extra_forbidden", "unexpected_keyword_argument"}
     own = parts[-1:] if unknown else []  # always a key, even if it has the name of an alternative type

@@ -1,4 +1,4 @@
-"""Errors that a user can correct, and messages for errors of the machine: full, read-only or failing disk, memory."""
+"""Errors that a user can correct, and messages for errors of the machine, such as a full or failing disk."""
 
 import errno
 import logging
@@ -96,7 +96,7 @@ def quoted(value: object, longest: int = 80) -> str:
     """
     try:
         text = repr(value[:longest] + "…" if isinstance(value, str) and len(value) > longest else value)
-    except ValueError:  # an integer of thousands of digits
+    except ValueError:  # Python does not convert an integer of thousands of digits
         text = f"a {type(value).__name__} too long to show"
     return shown(text, longest + 3)
 
@@ -120,7 +120,7 @@ class CampaignError(ValueError):
     Attributes
     ----------
     found, where, expected, remedy
-        The same, formatted for display.
+        The parameters, formatted for display.
 
     Examples
     --------
@@ -155,7 +155,7 @@ def explained(error: BaseException) -> str | None:
     Returns
     -------
     str or None
-        Message with path, free disk space and remedy; None for any other error, an internal error of the product.
+        Message with path, free disk space and remedy; None for any other error, which is an internal error.
 
     Examples
     --------
@@ -181,11 +181,11 @@ def explained(error: BaseException) -> str | None:
 
 _OF_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _OF_PLACE = {errno.ENOENT, errno.EEXIST}
-"""Errors that are internal unless they name a file: the user has no means to correct them."""
+"""Errors that are internal, i.e. not to be corrected by the user, unless they contain the name of a file."""
 
 
 def _error_number(error: BaseException) -> int | None:
-    """Return the errno of an exception; for GDAL's errors, that of the system message they quote."""
+    """Return the errno of an exception; for GDAL errors, the errno of the system message that they quote."""
     if isinstance(error, OSError) and error.errno is not None:
         known = error.errno in _REMEDIES and (error.filename is not None or error.errno not in _OF_PLACE)
         return error.errno if known else None

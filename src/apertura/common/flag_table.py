@@ -381,7 +381,7 @@ _OF_IMAGES = {
         "core/planning/plan.py",
     ),
     "azimuth_undersampled": Flag(
-        "spread of Doppler, cycles per pulse; share that is aliased, and its level, dB",
+        "Doppler spread, cycles per pulse; aliased fraction of the scene and its level, dB",
         "the aperture is undersampled: azimuth ambiguities are visible",
         "scene.bounds_m; flight speed and waveform.prf_hz",
         "core/planning/plan.py",

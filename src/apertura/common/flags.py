@@ -16,7 +16,7 @@ class Flags(dict[str, str]):
     Raises
     ------
     KeyError
-        If a name is not in that table.
+        If a name is not in this table.
 
     Examples
     --------
@@ -50,7 +50,7 @@ class Flags(dict[str, str]):
 
     @classmethod
     def merged(cls, *several: Mapping[str, str]) -> Self:
-        """Merge flags from several sources, in order; a flag raised by several sources keeps the lines of each.
+        """Merge flags from several sources, in order; a flag raised by several sources has the lines of each.
 
         A line that is contained whole in another line, followed by "; ", " (" or the end, is omitted.
         """

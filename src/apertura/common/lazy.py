@@ -8,7 +8,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Lazy:
-    """Reference to a package, module or function by dotted path; attributes are references, and a call imports.
+    """Reference to a package, module or function by dotted path; attributes are references, a call imports the module.
 
     Examples
     --------

@@ -40,7 +40,7 @@ def gps_ahead_s(time_utc: Times | np.datetime64) -> NDArray[np.int64]:
     Returns
     -------
     ndarray
-        Offset in s, int64, of the same shape. Constant after `KNOWN_UNTIL`, with a warning.
+        Offset in s, int64, of the same shape. The offset is constant after `KNOWN_UNTIL`, with a warning.
 
     Raises
     ------

@@ -27,16 +27,17 @@ INTERRUPTED = 130
 SIGNALLED = 128
 """Base of the exit status of a process that was terminated by a signal; the signal number is added, as in shells."""
 STATUS_FILE = "APERTURA_STATUS_FILE"
-"""Environment variable: file for the exit status of a step, which Snakemake does not pass on, as a reference of
-`ConfinedPath`."""
+"""Environment variable: file for the exit status of a step, which Snakemake does not pass on; given as
+`ConfinedPath.reference`."""
 
 ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 """Signals that terminate a run."""
 
 ALGEBRA_THREADS = "OPENBLAS_NUM_THREADS"
-"""Environment variable, read when numpy is imported: 1 in every command. OpenBLAS only multiplies small matrices, for
-which its threads wait for each other longer than they compute (simulation of the demo: 6.8 CPU seconds with two
-threads, 1.9 with one). Engines have their own threads. Results are then bit-identical for any number of cores."""
+"""Environment variable for the number of OpenBLAS threads, read when numpy is imported; 1 in every command. As OpenBLAS
+only multiplies small matrices, its threads wait for each other longer than they compute (simulation of the demo: 6.8
+CPU seconds with two threads, 1.9 with one). With one thread, results are bit-identical for any number of cores. Engines
+have their own threads."""
 
 _PR_SET_PDEATHSIG = 1  # of prctl(2)
 
@@ -49,7 +50,7 @@ def leave_status(status: int) -> None:
     """Report the exit status of a step to its run, if any."""
     if STATUS_FILE in os.environ and status:
         file = ConfinedPath.referenced(os.environ[STATUS_FILE])
-        with suppress(OSError, CampaignError), file.open("a", encoding="utf-8") as stream:  # on another node
+        with suppress(OSError, CampaignError), file.open("a", encoding="utf-8") as stream:  # absent on another node
             stream.write(f"{status}\n")
 
 
@@ -87,7 +88,7 @@ def ended_by_signals() -> Iterator[None]:
 #
 # Python and libraries load modules and settings from the working folder (``yaml.py``, numba's ``.numba_config.yaml``
 # with its cache of pickled code, ``matplotlibrc``). Users run commands in campaign folders, and Snakemake starts every
-# step in one.
+# step in such a folder.
 
 SAFE_PATH = "PYTHONSAFEPATH"
 """Environment variable that prevents Python, including ``python -m snakemake``, from importing from the working
@@ -98,7 +99,7 @@ _left: list[Path] = []
 
 
 def leave_working_folder() -> None:
-    """Change the working folder to the package folder, and `isolate`; `given` then resolves paths of the command line.
+    """Change the working folder to the package folder, and call `isolate`; `given` resolves paths of the command line.
 
     Raises
     ------
@@ -163,7 +164,7 @@ def _is_writable(folder: Path | None) -> bool:
 
 
 def _private_folder() -> Path:
-    """Return this user's folder in the temporary folder; a new one if the standard name belongs to another user."""
+    """Return this user's folder in the temporary folder; a new folder if the standard name belongs to another user."""
     folder = Path(tempfile.gettempdir()) / f"apertura-cache-{os.getuid()}"
     with suppress(FileExistsError):
         folder.mkdir(mode=0o700)
@@ -221,7 +222,7 @@ _VERSION, _PATH_BENEATH, _PR_SET_NO_NEW_PRIVS = 1, 1, 38
 _CHANGES = sum(1 << right for right in (1, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13))
 """Landlock rights: write a file; remove and create folders and files of every kind; move between folders."""
 _TRUNCATE, _MOVES, _TRUNCATES = 1 << 14, 2, 3
-"""Right to truncate; Landlock ABI versions that support moves and truncation."""
+"""Landlock right to truncate files; Landlock ABI versions that support moves and truncation."""
 
 
 def confine_changes(root: Path, *others: Path) -> bool:
@@ -240,8 +241,8 @@ def confine_changes(root: Path, *others: Path) -> bool:
     Returns
     -------
     bool
-        True if confined; False if the kernel has no Landlock or too old a version. Links are then detected only by the
-        check before a run.
+        True if confined; False if the kernel has no Landlock or an older version of it. In this case, links are only
+        detected by the check before a run.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     version = libc.syscall(_CREATE_RULESET, None, ctypes.c_size_t(0), _VERSION)
@@ -250,7 +251,7 @@ def confine_changes(root: Path, *others: Path) -> bool:
     rights = _CHANGES | (_TRUNCATE if version >= _TRUNCATES else 0)
     ruleset = libc.syscall(_CREATE_RULESET, struct.pack("=Q", rights), ctypes.c_size_t(8), 0)
     cache = _user_folder(_CACHE, ".cache") or _private_folder()
-    with suppress(OSError):  # create it now: Snakemake cannot once changes are confined
+    with suppress(OSError):  # created now, because Snakemake cannot create it once changes are confined
         cache.mkdir(parents=True, exist_ok=True)
     folders = [*others, cache, Path(__file__).parents[1], Path("/dev"), Path("/proc")]
     with ExitStack() as stack:
@@ -281,7 +282,7 @@ def hold(root: Path) -> IO[str]:
     Raises
     ------
     CampaignError
-        If another process holds the lock; states process ID, machine and start time.
+        If another process holds the lock; the message states process ID, machine and start time.
 
     Examples
     --------
@@ -334,7 +335,7 @@ def holder(root: Path) -> str | None:
 
 
 def _take(lock: IO[str]) -> None:
-    """Acquire the lock; retry while `holder` holds it for an instant."""
+    """Acquire the lock; retry, because `holder` acquires it for an instant."""
     for attempt in range(_TRIES):
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -53,14 +53,14 @@ def progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
     Parameters
     ----------
     what
-        Unit of work: ``tiles``, ``pulses``.
+        Unit of work, such as ``tiles`` or ``pulses``.
     total
         Number of units.
 
     Yields
     ------
     callable
-        Adds a number of finished units; callable from any thread.
+        Function that adds a number of finished units; may be called from any thread.
 
     Examples
     --------
@@ -86,7 +86,7 @@ def progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
 
 
 def _write(what: str, done: int, total: int, since_s: float) -> None:
-    """Replace the file atomically; a failure to write it never stops the step."""
+    """Replace the file atomically; a failure to write the file never stops the step."""
     report = {"what": what, "done": done, "total": total, "since": since_s, "at": round(time.time(), 1)}
     for file in _files[-1:]:
         partial = file.with_suffix(".partial")

@@ -1,4 +1,4 @@
-"""Provenance of a product: settings, inputs, code and software versions of its stage and all upstream stages."""
+"""Provenance of a product: settings, inputs, code and software versions of its stage and of all upstream stages."""
 
 import hashlib
 import json
@@ -45,7 +45,7 @@ def _packages() -> tuple[tuple[str, str], ...]:
         if "extra ==" not in requirement and (name := _NAME.match(requirement)):
             try:
                 versions[name[0].lower()] = version(name[0])
-            except PackageNotFoundError:  # for example a distribution with another name in conda
+            except PackageNotFoundError:  # for example a distribution that has another name in conda
                 versions[name[0].lower()] = "unknown"
     return tuple(sorted(versions.items()))
 
@@ -53,7 +53,7 @@ def _packages() -> tuple[tuple[str, str], ...]:
 def software() -> dict[str, str]:
     """Return `packages` with the versions of GDAL (of rasterio) and PROJ (of pyproj).
 
-    ``proj`` is the library of pyproj, which computes pixel coordinates; rasterio may ship another one.
+    ``proj`` is the library of pyproj, which computes pixel coordinates; rasterio may contain another version.
 
     Examples
     --------
@@ -103,7 +103,7 @@ class Provenance:
     code_sha256
         Chained code hash of the stage and its upstream stages.
     software
-        Name → version of the software of this and the upstream stages; several versions if they differ.
+        Name → version of the software of this stage and the upstream stages; several versions if these differ.
     """
 
     runspec: Mapping[str, Any]
@@ -128,7 +128,7 @@ class Provenance:
         modules
             Dotted names of the executed modules; their import closure is hashed.
         parents
-            Upstream stages of a single chain, whose settings agree; or name → stage of several chains, such as the
+            Upstream stages of a single chain, whose settings agree; or name → stage for several chains, such as the
             pairs of a flight, whose settings are stored separately under these names.
         settings, inputs
             Settings, and role → SHA-256 of the input files, of the new stage alone.
@@ -193,10 +193,11 @@ def sha256_text(text: str) -> str:
 
 
 LARGEST_DOCUMENT = 1_000_000_000
-"""Maximum size of a JSON document to be hashed, bytes; an RO-Crate lists every chunk with about 300 bytes."""
+"""Maximum size of a JSON document to be hashed, bytes; an RO-Crate has about 300 bytes for every chunk."""
 
 LARGEST_RESULT = 1 << 36
-"""Maximum size of a result file to be hashed, bytes; the largest stages have several GB, in chunks of several MB."""
+"""Maximum size of a result file to be hashed, bytes; results of the largest stages occupy several GB, stored in chunks
+of several MB."""
 
 
 def sha256_file(path: Path) -> str:
@@ -221,7 +222,7 @@ def check_size(path: Path, size: int) -> None:
 
 
 def hashes_of_file(path: Path, algorithms: Sequence[str]) -> dict[str, str]:
-    """Return algorithm → hash of a file, hex; the file is read once, and each hash has its own thread."""
+    """Return algorithm → hash of a file, hex; the file is read once, and each hash is computed in its own thread."""
     digests = {name: hashlib.new(name) for name in algorithms}
     updates = list[Future[None]]()
     with path.open("rb", buffering=0) as stream, ThreadPoolExecutor(len(digests)) as pool:
@@ -242,9 +243,10 @@ def sha256_tree(folder: Path) -> dict[str, str]:
 def code_sha256(*modules: str, package: Path = PACKAGE) -> str:
     """Hash the source of `modules` and of every apertura module in their import closure.
 
-    The hash of a stage changes if and only if executable code in that closure changes; comments and docstrings are
+    The hash of a stage changes if and only if executable code in this closure changes; comments and docstrings are
     ignored. Compiled code is represented by the hash of its sources, a file ``*.sha256`` installed in the folder of
-    one of the modules. For tables of `apertura.common.lazy.Lazy` rows, `modules` contains the functions' modules.
+    one of the modules. For a table with rows of `apertura.common.lazy.Lazy`, `modules` contains the modules of the
+    functions.
 
     Parameters
     ----------

@@ -34,7 +34,7 @@ LARGEST_SIDE = 1 << 30
 
 @contextmanager
 def opened_raster(path: Path, *, expected: str, remedy: str) -> Iterator[Any]:
-    """Open a GeoTIFF for reading; errors on opening and in the context are reported as one message.
+    """Open a GeoTIFF for reading; errors on opening and in the context are reported as a single message.
 
     Parameters
     ----------
@@ -75,6 +75,6 @@ def opened_raster(path: Path, *, expected: str, remedy: str) -> Iterator[Any]:
 def _opened(name: str) -> Any:
     import rasterio
 
-    if name.startswith("/vsi"):  # an absolute path has no scheme
+    if name.startswith("/vsi"):  # the path is absolute and thus has no scheme such as zip:
         raise OSError("a path that GDAL interprets as a virtual file system")
     return rasterio.open(name, driver="GTiff", sharing=False)

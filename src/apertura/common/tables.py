@@ -1,7 +1,7 @@
-"""CSV tables of the studies: one dataclass per row, one file per table; a file that exists is complete.
+"""CSV tables of the studies: one dataclass instance per row, one file per table; a file that exists is complete.
 
-The csv module is used instead of pandas: importing pandas takes a second of a job that takes a few, and pandas converts
-text columns that look like numbers.
+The csv module is used instead of pandas: importing pandas takes one second, a large part of a job of a few seconds, and
+pandas converts text columns that resemble numbers.
 """
 
 import csv
@@ -17,7 +17,7 @@ Row = TypeVar("Row")
 
 
 def write_table(path: Path, rows: Iterable[Any], *, digits: int | None = None) -> None:
-    """Write rows as CSV, one line each; an interrupted process leaves a complete file or none.
+    """Write rows as CSV, one line each; an interrupted process leaves a complete file or no file.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ def write_table(path: Path, rows: Iterable[Any], *, digits: int | None = None) -
     rows
         At least one dataclass instance or mapping, all with the columns of the first.
     digits
-        Significant digits of floats; None: the shortest representation that is exact.
+        Significant digits of floats; None: the shortest exact representation.
     """
     records = [_record(row, digits) for row in rows]
     with replacement(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
@@ -43,7 +43,7 @@ def _record(row: Any, digits: int | None) -> Mapping[str, object]:
 
 
 def read_table(path: Path, kind: type[Row]) -> list[Row]:
-    """Read a file of `write_table`, each row as an instance of dataclass `kind` with str, int and float fields.
+    """Read a file of `write_table`; each row becomes an instance of dataclass `kind` with str, int and float fields.
 
     Raises
     ------

@@ -16,13 +16,13 @@ from apertura.core.quality.agreement import OUT_OF_PHASE_RAD, Agreement
 
 @dataclass(frozen=True)
 class InPhase:
-    """Share of the power of its images that a coherent sum retains at bright points.
+    """Share of the power of the images at bright points that is preserved in their coherent sum.
 
     Attributes
     ----------
     coherence, std
-        |Σ_i a_i|²/(n Σ_i |a_i|²) of the amplitudes a_i of n images, power-weighted mean over the points, and its
-        standard deviation: 1 in phase, `chance` for random phases.
+        Power-weighted mean over the points of |Σ_i a_i|²/(n Σ_i |a_i|²), with the amplitudes a_i of n images, and its
+        standard deviation. The mean is 1 for images in phase, and `chance` for random phases.
     chance
         1/n.
     places
@@ -36,7 +36,7 @@ class InPhase:
 
     @property
     def loss_db(self) -> float:
-        """Peak loss of the sum by phase differences between its images, dB, 0 or less."""
+        """Peak loss of the sum from phase differences between its images, dB, 0 or less."""
         return decibels(max(self.coherence, 1e-6))
 
     @property
@@ -71,7 +71,7 @@ def in_phase(amplitudes: NDArray[np.complex128], background: NDArray[np.float64]
     coherence = np.abs(amplitudes.sum(axis=1)) ** 2 / (count * np.maximum(power, 1e-30))
     share = power / power.sum()
     mean = float((share * coherence).sum())
-    # Scatter between points, plus the error of each by its background, which is all there is for a single point.
+    # Scatter between points, plus the error of each point by its background; for a single point only the latter.
     scatter = ((coherence - mean) ** 2 + background**2 / 4) * share**2
     return InPhase(mean, float(np.sqrt(scatter.sum())), 1 / count, len(amplitudes))
 
@@ -89,8 +89,8 @@ def clutter_reduction_db(single_db: Sequence[float], coherent_db: float) -> floa
     Returns
     -------
     float
-        dB; 10 lg of the number of images if the targets add in phase and the clutter does not, 0 if the images
-        are identical, less if the targets do not add in phase.
+        Reduction, dB: 10 lg of the number of images if the targets add in phase and the clutter does not; 0 if the
+        images are identical; less if the targets do not add in phase.
 
     Raises
     ------
@@ -115,10 +115,12 @@ def clutter_reduction_db(single_db: Sequence[float], coherent_db: float) -> floa
 
 
 MOST_SETS_OF = 12
-"""Largest number of pairs of which all 4096 subsets are tried; of more pairs, those that agree with most others."""
+"""Largest number of pairs of which all 4096 subsets are tried; with more pairs, those that agree with most others are
+used."""
 
 _SURE = 3.09
-"""Standard deviations that a normal variable exceeds once in 1000: threshold at which a set is inconsistent."""
+"""Quantile of a normal variable, standard deviations, exceeded with probability 1/1000: above it a set is
+inconsistent."""
 
 
 @dataclass(frozen=True)
@@ -130,9 +132,9 @@ class CoherentSum:
     reference
         The best focused member, the reference of the phases.
     phases_rad
-        Pair → phase removed before it is added; 0 if none was requested or needed.
+        Pair → phase removed before the pair is added; 0 if no removal was requested or needed.
     excluded
-        Excluded pair → reason, one line; it is part of the non-coherent sums only.
+        Excluded pair → reason, one line. Excluded pairs are part of the non-coherent sums only.
     why
         Included pair → reason, one line.
     agreeing
@@ -142,9 +144,10 @@ class CoherentSum:
     unmeasured
         Pair that is added with phase 0 because its phase is not measurable → reason, one line.
     ties
-        Other consistent sets of the same size that contradict this one: the images do not show which is correct.
+        Other consistent sets of the same size that contradict `agreeing`: which set is correct is not observable.
     misfit, freedom
-        χ² of the set's differences about one phase and position per pair, and its degrees of freedom.
+        χ² of the measured differences within the set, relative to a model with one phase and one position per pair, and
+        its degrees of freedom.
     """
 
     reference: str
@@ -193,10 +196,10 @@ def choose_fusion(
     between
         Two pairs, in the order of `rank` → difference of the second from the first; None if not measurable.
     hidden
-        Two pairs of which the second should contain the bright points of the first and contains none: it would add
-        only noise.
+        Two pairs: the second should contain the bright points of the first but contains none, so that it adds only
+        noise.
     coarse
-        Reason why no two images can be compared, if their pixels are too wide for a comparison.
+        Reason why no two images can be compared, if the pixels are too wide for that.
     align
         True if a constant phase is removed from each pair: members may then differ by any constant phase.
 
@@ -257,7 +260,7 @@ def _named(pairs: Collection[str]) -> str:
 
 
 def _phase_line(difference: Agreement, reference: str) -> str:
-    """Return the phase difference, its reference and the features it was measured on, in one line."""
+    """Return the phase difference, its reference and the features on which it was measured, in one line."""
     speckle = " of speckle" if difference.by == "looks" else ""
     phase = f"{difference.phase_rad:+.2f} ± {difference.phase_std_rad:.2f} rad"
     return f"{phase} from {reference} at {difference.evidence}{speckle}"
@@ -277,7 +280,7 @@ def _reason(difference: Agreement, agreeing: str, reference: str, *, align: bool
 
 @dataclass(frozen=True)
 class _Set:
-    """Pairs with one phase and position each, by least squares over the differences measured between them.
+    """Set of pairs, and the phase and position of each, by least squares over the differences measured between them.
 
     Attributes
     ----------
@@ -316,7 +319,7 @@ class _Set:
         return consistent if align or in_phase_as_recorded else None
 
     def against(self, pair: str, measured: Mapping[tuple[str, str], Agreement], reference: str) -> Agreement | None:
-        """Return the difference of a pair from the set's reference, by all measurements between it and the set.
+        """Return the difference of a pair from the set's reference, from all measurements between the pair and the set.
 
         The phase is the weighted mean over the members; None if the pair was measured against no member.
         """
@@ -335,7 +338,7 @@ class _Set:
         phases = np.array([difference.phase_rad + state[0] for difference, state in of_members])
         weights = np.array([1 / difference.phase_std_rad**2 for difference, _ in of_members])
         phase = float(np.angle((weights * np.exp(1j * phases)).sum()))
-        # The outlier's own noise is common to all differences: their mean is no more certain than the best of them.
+        # The noise of the outlier is common to all differences: their mean is not more accurate than the best of them.
         is_displaced = sum(difference.shifted for difference, _ in of_members) > len(of_members) / 2
         best = min(
             (difference for difference, _ in of_members if difference.shifted == is_displaced),
@@ -374,7 +377,7 @@ def _largest(
 def _without_the_worst(
     pairs: Sequence[str], measured: Mapping[tuple[str, str], Agreement], *, align: bool
 ) -> list[str]:
-    """Return `MOST_SETS_OF` pairs, without those that agree pairwise with the fewest others."""
+    """Return `MOST_SETS_OF` pairs: those that agree pairwise with the fewest others are omitted."""
     agreeing = {
         pair: sum(_Set.of(two, measured, align=align) is not None for two in combinations(pairs, 2) if pair in two)
         for pair in pairs
@@ -384,7 +387,7 @@ def _without_the_worst(
 
 
 def agreement_between(between: Mapping[tuple[str, str], Agreement | None], first: str, second: str) -> Agreement | None:
-    """Return the difference of a second pair from a first, in whichever order they were compared; None: unknown.
+    """Return the difference of a second pair from a first, regardless of the order of comparison; None: unknown.
 
     Examples
     --------
@@ -396,7 +399,7 @@ def agreement_between(between: Mapping[tuple[str, str], Agreement | None], first
 
 
 def _along(pairs: Sequence[str], edges: Mapping[tuple[str, str], Agreement]) -> NDArray[np.float64] | None:
-    """Return phases of pairs relative to the first, along the most certain differences; None if not all connected."""
+    """Return phases of pairs relative to the first, by the most accurate differences; None if not all are connected."""
     phases = {pairs[0]: 0.0}
     for _ in pairs[1:]:
         open_ends = [
@@ -442,7 +445,7 @@ def _wrapped(phase_rad: float) -> float:
 
 
 def _chi2_limit(freedom: int) -> float:
-    """Return the χ² exceeded once in 1000, by the Wilson-Hilferty approximation: its cube root is nearly normal."""
+    """Return the χ² exceeded with probability 1/1000, by Wilson and Hilferty: its cube root is nearly normal."""
     variance = 2 / (9 * freedom)
     return float(freedom * (1 - variance + _SURE * np.sqrt(variance)) ** 3)
 
@@ -461,8 +464,8 @@ def coherent_sum(
     Parameters
     ----------
     images
-        (pair, y, x) complex64 on one grid or a block of it, carriers kept; NaN where no pulse of a pair illuminates
-        the pixel: such pairs do not contribute to it.
+        (pair, y, x) complex64 on one grid or a block of it, with the carrier phase. NaN where no pulse of a pair
+        illuminates the pixel: the pair does not contribute to that pixel.
     peaks
         (pair,) float64, largest magnitude of each whole image.
     phases_rad

@@ -1,6 +1,7 @@
 """Kaiser window, and the Kaiser-windowed sinc that interpolates band-limited samples.
 
-Implemented in numpy: scipy.signal offers the window at integer samples only, and takes a second to import.
+The window is implemented in numpy, because scipy.signal provides it only at integer samples and takes a second to
+import.
 """
 
 import numpy as np

@@ -22,7 +22,7 @@ def read_beam_pattern(path: Path) -> tuple[Samples, Samples]:
     """Read the azimuth and elevation cuts of a CSV file.
 
     The columns are cut (azimuth or elevation), angle_deg (from boresight, increasing within each cut), gain_db and, if
-    measured, phase_deg: far-field phase relative to the end of the lever arm, positive if the field leads.
+    measured, phase_deg: phase of the far field relative to the end of the lever arm, positive if the field leads.
 
     Raises
     ------

@@ -82,8 +82,8 @@ def write_recording(
     blocks
         (sample, channel, 2), I and Q with a dtype of `DATATYPES`, in order; written one by one.
     captures
-        First sample, UTC time tag of the node's clock (datetime64, written in its unit) and transmitted frame number,
-        if any, of each trigger.
+        First sample, UTC time tag of the node's clock (datetime64, written in its unit) and, if any, transmitted frame
+        number of each trigger.
     frequency_hz
         RF frequency at zero baseband frequency.
     extra
@@ -143,11 +143,13 @@ def write_csv_log(
     position
         (epoch, 3) float64: latitude and longitude (degrees), metres above the ellipsoid.
     attitude_rad
-        (epoch, 3) float64: roll, pitch, yaw (clockwise from north); None: not logged. NaN is written as an empty cell.
+        (epoch, 3) float64: roll, pitch, yaw (clockwise from north); None: no attitude columns. NaN becomes an empty
+        cell.
     local
         True if positions are metres to east, north and up in the campaign's local frame.
     extra_columns
-        Additional columns: name → (epoch,); integers and text unchanged, floats to 10 µm, NaN as an empty cell.
+        Additional columns: name → (epoch,); integers and text are written unchanged, floats to 10 µm, NaN as an empty
+        cell.
     """
     axes = ("east_m", "north_m", "up_m") if local else ("latitude_deg", "longitude_deg", "height_m")
     columns = ["time_utc", *axes]

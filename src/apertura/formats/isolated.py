@@ -24,7 +24,7 @@ from apertura.common.errors import shown
 from apertura.common.lazy import module_of, name_of
 
 SPARE_BYTES = 1 << 30
-"""Fixed part of a reader's limit of address space, bytes; `BYTES_PER_BYTE` × its largest file is added."""
+"""Fixed part of a reader's limit of address space, bytes; `BYTES_PER_BYTE` times the largest file size is added."""
 
 BYTES_PER_BYTE = 16
 """Limit of address space per byte of the largest file."""
@@ -132,7 +132,7 @@ def _read(folder: Path, number: int) -> dict[str, NDArray[Any]]:
 
 
 def _main(function: str, memory_bytes: str, seconds: str, folder: str, *paths: str) -> int:
-    """Set the limits of this process and read files in it; write the arrays of each file, then their names."""
+    """Read files in this process, within the limits that it sets; write the arrays of each file, then their names."""
     limits = {
         resource.RLIMIT_AS: int(memory_bytes),
         resource.RLIMIT_FSIZE: int(memory_bytes),

@@ -1,8 +1,8 @@
 """Tables of recorders, flight logs and phase histories: recognition of a file's format, and its reader.
 
 Rows refer to readers lazily: looking up a file name imports no reader, and the code hash of a result
-(`apertura.workflow.lineage`) covers only the readers of its own campaign. A new format takes one file with its reader
-and one row in this module.
+(`apertura.workflow.lineage`) covers only the readers that its campaign uses. A new format requires one file with its
+reader and one row in this module.
 """
 
 from collections.abc import Callable, Mapping
@@ -114,7 +114,7 @@ def recording_files(folder: Path, node: str) -> tuple[Path, ...]:
     Raises
     ------
     CampaignError
-        If metadata that state file names cannot be read.
+        If file names are stated in metadata that cannot be read.
     """
     present = (row for row in RECORDERS if any((folder / f"{node}{suffix}").is_file() for suffix in row))
     row = next(present, next(iter(RECORDERS)))
@@ -125,7 +125,7 @@ def recording_files(folder: Path, node: str) -> tuple[Path, ...]:
 
 
 def log_format(path: Path, options: LogOptions = DEFAULT_OPTIONS) -> str:
-    """Determine the format of a log, a key of `TRACKS`: as configured, otherwise by suffix and heading.
+    """Determine the format of a log, a key of `TRACKS`: as configured, otherwise by suffix and first bytes.
 
     Raises
     ------

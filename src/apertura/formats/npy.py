@@ -24,7 +24,7 @@ def read_npy(path: Path, *, kinds: str, most: int, expected: str, remedy: str) -
     most
         Maximum number of values.
     expected, remedy
-        Parts of the message.
+        Parts of the error message.
 
     Raises
     ------

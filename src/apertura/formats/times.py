@@ -51,7 +51,7 @@ def utc_times(texts: Sequence[str]) -> NDArray[np.datetime64]:
 LEAP_SECOND = "within a leap second"
 """Reason for excluding an epoch: datetime64 cannot represent 23:59:60 UTC."""
 
-_LEAP_SECOND = re.compile(r"[T ]\d\d:[25]9:60(?!\d)", re.ASCII)  # zones with whole or half hours
+_LEAP_SECOND = re.compile(r"[T ]\d\d:[25]9:60(?!\d)", re.ASCII)  # :29 or :59, for zones with whole or half hours
 
 
 def in_leap_second(texts: Sequence[str]) -> NDArray[np.bool_]:

@@ -15,7 +15,7 @@ from apertura.common.arrays import Floats
 from apertura.common.leap_seconds import LATEST_S
 
 LEAST_GAIN_DB = 0.5
-"""Least power of points that a cause must recover to be reported, dB; errors of the logs explain smaller losses."""
+"""Least power of points that the correction of a reported cause recovers, dB; log errors explain smaller losses."""
 
 # ---- Times of another time system -----------------------------------------------------------------------------------
 
@@ -33,7 +33,7 @@ _LONGEST_ZONE_S = 14 * 3600.0
 
 
 def mistaken_time(shift_s: float, *, tolerance_s: float = _NEAR_S) -> str:
-    """Return the probable mistake behind a delay of the times, to end a sentence; '' if no known mistake explains it.
+    """Return the probable cause of a delay of the times, as the end of a sentence; '' if no known mistake explains it.
 
     Examples
     --------
@@ -64,14 +64,14 @@ class Quantity:
     sentence
         Message template, with fields for the error, its size and direction, and other arguments.
     directions
-        Words for a positive and for a negative error.
+        Words that describe a positive and a negative error.
     sizes
-        Trial errors, applied with both signs, the likeliest first.
+        Magnitudes of the trial errors, applied with both signs, the likeliest first.
     std
-        Standard deviation of a fitted error: as wide as configuration mistakes, so that the images decide, not the
-        prior.
+        Prior standard deviation of a fitted error: as large as configuration mistakes, so that the estimate depends on
+        the images rather than on the prior.
     question
-        Returns the probable mistake behind an error, to end the sentence.
+        Function that returns the probable mistake behind an error, as the end of the sentence.
 
     Examples
     --------
@@ -119,7 +119,7 @@ HEIGHT = Quantity(
     ("above", "below"),
     (50.0, 47.0, 20.0, 10.0, 5.0, 4.0, 3.0, 2.5, 2.0, 1.5, 1.0, 0.5),
     std=3.0,
-    # an error of 10 m or more may come from geoid heights taken for ellipsoidal heights, or the reverse
+    # an error of 10 m or more may be due to geoid heights that are interpreted as ellipsoidal, or the reverse
     question=lambda height_m: ": another vertical datum?" if abs(height_m) >= 10.0 else "",
 )
 PREFIX = Quantity(
@@ -135,7 +135,7 @@ CHANNELS = Quantity("channels", "the channels of {node} are swapped")
 
 
 def whose(nodes: Sequence[str]) -> str:
-    """Return the logs with wrong times for the message of `TIME`: the log of a single node, or all logs."""
+    """Return the logs with wrong times as named in the message of `TIME`: the log of a single node, or all logs."""
     return f"the log of {nodes[0]}" if len(nodes) == 1 else "all logs"
 
 
@@ -144,7 +144,7 @@ def whose(nodes: Sequence[str]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """A wrong quantity whose error displaces nodes in proportion.
+    """A wrong quantity that displaces nodes in proportion to its error.
 
     Attributes
     ----------
@@ -177,12 +177,12 @@ class Cause:
         return np.full(len(next(iter(self.moved_m.values()))), self.quantity.std)
 
     def line(self, values: Floats) -> str:
-        """Describe the wrong quantity and its error."""
+        """Return a sentence that states the wrong quantity and its error."""
         return self.quantity.line(*values.tolist(), **self.words)
 
 
 def late_logs(nodes: Sequence[str], flown: Mapping[str, tuple[Floats, Floats]]) -> Cause:
-    """Return the cause that the logs of the given nodes have one common time delay.
+    """Return the cause of a time delay that is common to the logs of the given nodes.
 
     Parameters
     ----------
@@ -192,14 +192,14 @@ def late_logs(nodes: Sequence[str], flown: Mapping[str, tuple[Floats, Floats]]) 
         Node → (sample,) seconds and (sample, 3) metres: logged positions.
     """
     time_s, moved = flown[nodes[0]][0], dict[str, Floats]()
-    for node in nodes:  # the epochs of the logs differ: interpolate to those of the first log
+    for node in nodes:  # as the epochs of the logs differ, interpolate to the epochs of the first log
         own_s, speed = flown[node][0], np.gradient(flown[node][1], flown[node][0], axis=0)
         moved[node] = np.stack([np.interp(time_s, own_s, axis) for axis in speed.T], axis=-1)[None]
     return Cause(TIME, time_s, moved, {"whose": whose(nodes), "digits": 3})
 
 
 def other_arm(node: str, time_s: Floats, body_axes: Floats) -> Cause:
-    """Return the cause that the lever arms of a node, or its attitude, have a constant error.
+    """Return the cause of a constant error of the lever arms or of the attitude of a node.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ def other_arm(node: str, time_s: Floats, body_axes: Floats) -> Cause:
 
 
 def other_height(nodes: Sequence[str], time_s: Floats, up: Floats) -> Cause:
-    """Return the cause that the terrain lies higher than configured, as if all nodes flew lower.
+    """Return the cause of a terrain height above the configured one, equivalent to lower heights of all nodes.
 
     `up` is the (3,) unit vector in the frame.
     """

@@ -44,12 +44,12 @@ from apertura.workflow.stale import absent_lines, any_is_missing, forms_results,
 Show = Literal["errors", "steps", "snakemake"]
 
 _GRACE_S = 3.0
-_LOOK_S, _REST = 0.2, 20  # polling interval, and least ratio of rest to polling time: 10^5 jobs take long to poll
+_LOOK_S, _REST = 0.2, 20  # polling interval, and least ratio of idle to polling time: polling 10^5 jobs takes long
 _COUNTERS = Path("/proc/vmstat")
 _ELSEWHERE = ("memory", "plan")
 """Checks of this machine, omitted if steps run on other machines."""
 _HOLDS_CODE = ("--profile", "--workflow-profile", "--configfiles", "--snakefile", "--jobscript", "--js")
-"""Options of Snakemake whose values are files from which it executes code; it accepts abbreviations of them."""
+"""Options of Snakemake whose values are files from which it executes code; abbreviations of them are accepted."""
 _HOLDS_NONE = ("--config", "--jobs")
 _PICKLED = "--trust-io-cache"
 """Option of Snakemake: read the state of files from a pickle in the working folder."""
@@ -104,7 +104,7 @@ class _Files:
         return {**os.environ, "PATH": path, **files, **({CONFINED: self.confined} if self.confined else {})}
 
     def status_of(self, status: int) -> int:
-        """Return the exit status of a run: Snakemake's, 2 if no step had an internal error, or 1 after a signal."""
+        """Return the exit status: 1 after a signal, 2 if steps failed without internal error, else Snakemake's."""
         if _ended_by(status):
             return 1
         reported = self.status.read_text(encoding="utf-8").split() if self.status.is_file() else []
@@ -258,7 +258,7 @@ def _words(root: Path, cores: int, arguments: Sequence[str]) -> list[str]:
 
 
 def _ended_by(status: int) -> str:
-    """Return the signal that terminated a process, from its or a shell's exit status; empty: exit, or interrupt."""
+    """Return the signal that terminated a process, from its or a shell's exit status; empty after exit or SIGINT."""
     number = -status if status < 0 else status - SIGNALLED
     return signal.Signals(number).name if status != INTERRUPTED and number in set(signal.Signals) else ""
 
@@ -273,7 +273,7 @@ def _killed_for_memory() -> int:
 
 
 def code_from_outside(root: Path, arguments: Sequence[str]) -> list[str]:
-    """Make the paths of files absolute from which Snakemake executes code, and refuse files in the campaign folder.
+    """Make paths of files with code for Snakemake absolute, and refuse files in the campaign folder.
 
     Snakemake is started in a different folder than the caller's. Profiles and configurations may contain Python (YTE).
 

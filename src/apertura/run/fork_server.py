@@ -169,7 +169,7 @@ def _import() -> None:
     software()
     code_sha256(*(rule.module for rule in RULES.values()))
     gc.collect()
-    gc.freeze()  # objects so far are excluded from garbage collection, so that their pages stay shared
+    gc.freeze()  # existing objects are excluded from garbage collection, so that their pages stay shared
 
 
 def _redirect(file: ConfinedPath) -> None:

@@ -9,11 +9,11 @@ durations in this run, the job is expected to take
 
 The third prediction is displayed only for jobs dominated by start-up, w ≤ b, after such jobs of two rules were
 measured: start-up times are similar, but the first jobs of a run wait for common imports. The time left of the run is
-displayed while at most a fifth of it is due to jobs without a displayed prediction: if these took no time, it would be
-1.25 times the truth; if they took six times as long, half of it. It is not displayed before an imaging job was
-measured, since engine and accuracy change its duration a thousandfold; nor for an imaging job that takes 1.5 times as
-long as expected, since its tiles are being recomputed. Any other overdue job is expected to run on for as long as it is
-overdue.
+displayed while at most a fifth of it is due to jobs without a displayed prediction: if these took no time, the
+displayed value would be 1.25 times the true one; if they took six times as long, half of it. It is not displayed
+before an imaging job was measured, since engine and accuracy change its duration a thousandfold; nor for an imaging job
+that takes 1.5 times as long as expected, since its tiles are being recomputed. Any other overdue job is expected to run
+on for as long as it is overdue.
 """
 
 import json

@@ -32,7 +32,7 @@ class FmcwFlight:
     began
         UTC of the first sweep.
     nodes
-        Node → east, north, up at half of the flight, metres from the origin.
+        Node → east, north, up at the midpoint of the flight, metres from the origin.
     speed_m_s
         Speed, eastward.
     targets
@@ -42,7 +42,7 @@ class FmcwFlight:
     half_width_m, spacing_m
         Half width and pixel spacing of the scene about `middle`.
     middle
-        East and north of the middle of the scene, metres from the origin.
+        East and north of the scene centre, metres from the origin.
     """
 
     sweep: FrequencySweep

@@ -2,7 +2,7 @@
 
 H_n = Σ_j a_j·exp(-j2πf_n ρ_j/c) at equally spaced f_n is a Fourier sum at non-uniform delays, evaluated as a
 non-uniform FFT. Each echo, with the carrier phase at band centre, is spread over `_TAPS` samples of a range profile
-with an oversampling of 2, and the spectrum is divided by that of the spreading function. Relative error 3e-6.
+with an oversampling of 2, and the spectrum is divided by that of the spreading function. The relative error is 3e-6.
 """
 
 import numba
@@ -86,7 +86,7 @@ def _add(ranges, points, paths, per_m, tables, spreading):  # type: ignore[no-un
             phase = (phase - np.floor(phase)) * fine
             nearest = int(phase)
             small = -2 * np.pi * (phase - nearest) / fine
-            # the phasor of the remainder, less than 1.6 mrad, to the third order
+            # phasor of the remaining phase, below 1.6 mrad, to the third order
             echo = phasors[nearest] * complex(1 - small * small / 2, small - small**3 / 6)
             echo *= amplitude[scatterer] / (tx_range * rx_range) if spreading else amplitude[scatterer]
             position = path * samples_per_m

@@ -31,16 +31,16 @@ EXPERIMENT_ORIGIN = Origin(48.42255, 9.95509, 620.0)
 _UTM = "EPSG:32632"
 STATIC_PULSES = 200
 RADAR_CABLE_M, SIDELINK_CABLE_M = 10.0, 5.0
-"""Metres, electrical lengths of the radar path and the sidelink in the laboratory experiment."""
+"""Electrical lengths of the radar path and of the sidelink in the laboratory experiment, metres."""
 
 COHERENT_SNR_DB = {"cables": 18.5, "first cylinder": 40.0, "second cylinder": 33.0}
-"""dB, SNR per compressed pulse at which M = 200 pulses have the published coherence factors: 0.986 for the cables,
+"""SNR per compressed pulse, dB, at which M = 200 pulses have the published coherence factors: 0.986 for the cables,
 0.9999 and 0.9995 for the cylinders. The SNR is not published; docs/theory/study.md, "Coherence factor"."""
 
 _JOINT_M = 1e-3  # the point target of the cable is 1 mm from its connectors, with the amplitude of a direct connection
 
 SEPARATION_M = 4.7
-"""Metres, distance between the two nodes in flight."""
+"""Distance between the two nodes in flight, metres."""
 
 SEGMENT_M, GAP_M, SPEED_M_S, FLIGHT_PRF_HZ = 3.4, 2.4, 0.5, 20.0
 """Length of the track segment of each image and gap between the two segments (metres, both for the midpoint of the
@@ -59,11 +59,11 @@ def paper_lab(*, pulses: int = STATIC_PULSES, snr_db: float = COHERENT_SNR_DB["c
 
     Notes
     -----
-    Published for the laboratory experiment: coaxial cables, a radar path of 10 m, a sidelink of 5 m, no target; Γ =
-    0.986 after correction. Published in the table of parameters: the waveform, at 100 Hz; in the text on clocks:
-    10 ppb. Not published: the SNR (assumed: in the radar channel that of the published Γ, in the sidelink 40 dB per
-    subcarrier), start and phase of the secondary's captures (±40 ns, ±π), losses of cables and attenuators (none), and
-    the type of the lengths (electrical).
+    The paper states for the laboratory experiment: coaxial cables, a radar path of 10 m, a sidelink of 5 m, no
+    target; Γ = 0.986 after correction. Its table of parameters states the waveform, at 100 Hz, and its text on clocks
+    10 ppb. Not published, with the assumed values in parentheses: the SNR (in the radar channel the value that gives
+    the published Γ, in the sidelink 40 dB per subcarrier), start and phase of the secondary's captures (±40 ns, ±π),
+    losses of cables and attenuators (none), and the type of the lengths (electrical).
     """
     joint = (PointTarget((0.0, 0.0, 1.0 - _JOINT_M), _JOINT_M**2),)
     cable_m = RADAR_CABLE_M - 2 * _JOINT_M
@@ -76,11 +76,12 @@ def paper_static(*, pulses: int = STATIC_PULSES) -> CampaignSpecification:
 
     Notes
     -----
-    Published for the static experiment: an anechoic chamber (no clutter), cylinders with a diameter of 15 cm, a
-    sidelink by antennas, mono- and bistatic recordings of one split receive signal; Γ = 0.9999 at the first, 0.9995
-    at the second. Not published: distances of the cylinders (assumed: 4 m and 6.5 m), their height (15 cm; lines
-    without a diameter), the SNR (that of the published Γ), common noise of the split signal (none), the clock of the
-    secondary (as in the laboratory). Different from the paper: the sidelink is the cable of the laboratory experiment.
+    The paper states for the static experiment: an anechoic chamber (no clutter), cylinders with a diameter of
+    15 cm, an over-the-air sidelink, and monostatic and bistatic recordings of one split receive signal; Γ = 0.9999 for
+    the first cylinder and 0.9995 for the second. Not published, with the assumed values in parentheses: distances of
+    the cylinders (4 m and 6.5 m), their height (15 cm; they are lines without a diameter), the SNR (the value that
+    gives the published Γ), common noise of the split signal (none), and the clock of the secondary (as in the
+    laboratory experiment). Unlike in the paper, the sidelink is the cable of the laboratory experiment.
     """
     near_m, far_m, antenna_up_m = 4.0, 6.5, 1.0
     weaker_db = COHERENT_SNR_DB["first cylinder"] - COHERENT_SNR_DB["second cylinder"]
@@ -110,11 +111,12 @@ def paper_uav(*, pulses: int = 275) -> CampaignSpecification:
 
     Notes
     -----
-    Published in the table of the flight: 20 Hz, 0.5 m/s, height 4.5 to 5 m (used: 4.8 m), ground range 11.5 m, L =
-    3.4 m, 4.7 m between the UAVs, one behind the other. Published on the images: 12 m × 4 m (used: 12 m along track),
-    an extended target, a power generator. Not published: its size (assumed: rough, 1.2 m × 1.2 m), other targets (four
-    points, to measure widths and phases), the clutter (17 dB below a point per m²), the SNR (0 dB per subcarrier, 30 dB
-    in the sidelink), lever arms, wobble, and the track segments of the images (a gap of 2.4 m between them).
+    The table of the flight states 20 Hz, 0.5 m/s, a height of 4.5 to 5 m (used: 4.8 m), a ground range of 11.5 m, L =
+    3.4 m, and 4.7 m between the UAVs, one behind the other. The text on the images states 12 m × 4 m (used: 12 m along
+    track) and an extended target, a power generator. Not published, with the assumed values in parentheses: the size of
+    the target (rough, 1.2 m × 1.2 m), other targets (four points, to measure widths and phases), the clutter (17 dB
+    below a point per m²), the SNR (0 dB per subcarrier, 30 dB in the sidelink), lever arms, wobble, and the track
+    segments of the images (a gap of 2.4 m between them).
     """
     targets = (
         PointTarget((0.0, 0.0, 0.0)),
@@ -330,7 +332,7 @@ def _secondary(radar_m: float, sidelink_m: float, *, tag_s: float, missed: float
 
 
 def _pass_by(middle_m: float, pulses: int, *, right_m: float = -11.5, up_m: float = 4.8) -> Straight:
-    """Return a track along azimuth 40° at 0.5 m/s, scene on the right; its middle is `middle_m` ahead of the scene."""
+    """Return a track along azimuth 40° at 0.5 m/s, scene on the right, midpoint `middle_m` ahead of the scene."""
     along = np.array([np.sin(np.radians(40.0)), np.cos(np.radians(40.0)), 0.0])
     right = np.array([along[1], -along[0], 0.0])
     duration_s = (pulses - 1) / _DEMO_WAVEFORM.prf_hz

@@ -121,7 +121,7 @@ def _summed(
 def _gridded(
     scatterers: Scatterers, aperture: Aperture, frequency_hz: Floats, longer_m: Floats, *, spreading: bool
 ) -> NDArray[np.complex128]:
-    from apertura.simulation.gridding import gridded_sum  # numba is slow to import, and the exact sum needs none
+    from apertura.simulation.gridding import gridded_sum  # numba is slow to import, and not required for the exact sum
 
     points = scatterers.position_m, scatterers.amplitude
     return gridded_sum(points, aperture.legs, frequency_hz, longer_m, spreading=spreading)

@@ -27,7 +27,7 @@ from apertura.simulation.waveform import TransmitWaveform
 
 Complex = NDArray[np.complex128]
 
-_SHORT = 64  # samples, longest interval that is summed directly; longer ones are taken from a transform
+_SHORT = 64  # longest interval that is summed directly, samples; longer intervals are taken from a transform
 _DOPPLER_ORDER = 3  # order of the Taylor series of exp(-j2πf·rate·t); the next term is below -150 dB (100 m/s, 1.6 GHz)
 
 
@@ -123,7 +123,8 @@ def _capture(channel: Channel, pulse: int, count: int) -> Complex:
     first, end = waveform.presence(arrival, rate)
     differs = np.diff(first) + np.diff(end) > 0
     spectra = _cumulative_spectra(channel, pulse, order, np.flatnonzero(differs) + 1)
-    groups = np.concatenate([[0], np.cumsum(np.append(order.size > 0, differs))])  # complete among the first paths
+    # number of complete groups among the first paths
+    groups = np.concatenate([[0], np.cumsum(np.append(order.size > 0, differs))])
     capture = np.zeros(count, np.complex128)
     edges = np.unique(np.clip(np.concatenate([first, end]), 0, count))
     for start, stop in pairwise(edges):
@@ -221,9 +222,9 @@ def periodic_samples(channel: Channel, generator: Generator | None, pulses: NDAr
 
     Notes
     -----
-    Source: docs/theory/simulate.md, "Long flights". After the prefix equal to
-    `apertura.simulation.synthesis.samples`, to the rounding of complex64, for echoes within the prefix; echoes that are
-    not complete within the window of the DFT are omitted.
+    Source: docs/theory/simulate.md, "Long flights". After the prefix, the samples of echoes within the prefix
+    are those of `apertura.simulation.synthesis.samples` up to the rounding of complex64; echoes that are not complete
+    within the window of the DFT are omitted.
 
     Examples
     --------

@@ -30,7 +30,7 @@ _RATE_TOLERANCE = 1e-9
 def check_rates(waveform: SampledWaveform, recorded: Mapping[str, float], *, where: Path | str) -> None:
     """Check the recorded sample_rate_hz and carrier_hz against the waveform; raise CampaignError if they differ.
 
-    A value of 0 means that the recording does not state it; the configured value is used.
+    A recorded value of 0 means "not stated"; the configured value is then used.
     """
     for key, value in recorded.items():
         stated = float(getattr(waveform, key))

@@ -194,7 +194,7 @@ def bright_points_within(
 def agreement_of(
     first: ComparedImage, second: ComparedImage, grid: SceneGrid, windows: Sequence[Window]
 ) -> Agreement | None:
-    """Compare a second image with a first by bright points, or by distributed clutter where common points are missing.
+    """Compare a second image with a first by bright points, or without common points by distributed clutter.
 
     None if neither is possible, or if pixels are wider than a resolution cell and do not resolve a point's position.
     """

@@ -27,17 +27,17 @@ _PHASE = "pairs_out_of_phase"
 _LOOKS_WRONG = frozenset(
     {"defocused", "loss_unexpected", "echo_outside_scene", "pairs_displaced", _PHASE, "pair_unconfirmed"}
 )
-"""Flags that a wrong geometry raises; hypotheses are tried where one is raised."""
+"""Flags that indicate a wrong geometry; hypotheses are tested if one of them is raised."""
 
 _TIED = "as many pairs contradict this, and the images do not show which pairs are wrong"
 
 _SPREAD = ", by amounts that differ between points by more than a resolution cell"
 
 _EXPLAINED_SIGMAS = 3.0
-"""Limit of a phase difference between pairs that log errors explain, in its standard deviations."""
+"""Largest phase difference between pairs that is attributed to log errors, in standard deviations."""
 
 _REGAINED_SIGMAS = 3.0
-"""Smallest peak loss, in its standard deviations, to which a cause identified for another image is applied."""
+"""Smallest peak loss, in standard deviations, to which a cause identified for another image is applied."""
 
 _VISIBLE_SNR_DB = 20.0
 """SNR from which a bright point is expected in every image of the scene, dB."""
@@ -120,10 +120,10 @@ def _flags(
     """Return pair → flags of disagreement.
 
     The flags are raised on the pairs outside the largest set that agrees. If an equally large set contradicts that
-    set, as with two pairs that differ, the images do not show which is wrong, and the pairs of both are flagged.
+    set, as with two pairs that differ, the images do not determine the wrong one, and the pairs of both are flagged.
     With refined tracks, the phase is corrected before pairs are added, and flagged only if log errors do not explain
-    it. `explained_rad`: pair → standard deviation of the phase difference to the first pair that log errors explain;
-    None with tracks that were not refined.
+    it. `explained_rad`: pair → standard deviation of its phase difference from the first pair due to log errors; None
+    if the tracks were not refined.
     """
     flags = {pair: Flags() for pair in pairs}
     for pair in pairs:
@@ -202,7 +202,7 @@ def _rank(focus: Mapping[str, Any]) -> tuple[int, float]:
 def _disagreement(chosen: CoherentSum, pair: str, blind: Sequence[str]) -> dict[str, str]:
     """Return the flags of a pair outside the set that agrees.
 
-    `blind`: members of the set none of whose bright points the pair shows.
+    `blind`: members of the set whose bright points are all missing in the image of the pair.
     """
     agreeing, measured = " and ".join(chosen.agreeing), chosen.apart.get(pair)
     if measured is None:

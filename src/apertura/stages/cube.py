@@ -48,7 +48,7 @@ def labels(images: Images, assessed: Mapping[str, Mapping[str, Any]], sums: Sums
     assessed
         Flight → its assessment by step `assess`.
     sums
-        Coherent sums, of the flights with several pairs.
+        Coherent sums of the flights with several pairs.
     pairs
         Every pair of the campaign.
     """
@@ -96,7 +96,8 @@ def _middle_time(images: Images, flight: str) -> Any:
 def _quoted_values(image: xr.Dataset, assessed: Mapping[str, Any]) -> dict[str, float | str | None]:
     """Return the quality of an image and its assessment: name of a row of `QUOTED` → value or None."""
     quality = image.attrs["quality"]
-    view, focus, pulses = quality["view"], quality["focus"], quality.get("pulses", {})  # none from a phase history
+    # a phase history has no counts of pulses
+    view, focus, pulses = quality["view"], quality["focus"], quality.get("pulses", {})
     flags = {*image.attrs["flags"], *assessed["flags"]}
     return {
         "heading": view["heading_deg"],
@@ -126,7 +127,7 @@ _TILES_AT_ONCE = 4
 """Tiles per side of a block that is read at once, so that tiles share the margin of their windows."""
 
 Compared = Mapping[str, Mapping[tuple[str, str], tuple[str, str]]]
-"""'pair' or 'flight' → image, by flight and pair → the image it is compared with."""
+"""'pair' or 'flight' → flight and pair of an image → flight and pair of its reference image."""
 
 
 def compared(images: Images, references: Mapping[str, str], first_flights: Mapping[str, str]) -> Compared:
@@ -186,7 +187,7 @@ def write_phase(
     Returns
     -------
     tuple
-        Both values; NaN for images without a common tile.
+        Looks and coherence bias; NaN for images without a common tile.
     """
     inverse_looks: list[float] = []
     for block in grid.tiles(_TILES_AT_ONCE * side):

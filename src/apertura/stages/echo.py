@@ -83,7 +83,7 @@ def pair_echo(
     *,
     hovers: bool = False,
 ) -> PairEcho:
-    """Return the echo of a pair from its nodes' recordings, with calibrated path offsets or else configured ones.
+    """Return the echo of a pair from its nodes' recordings, with calibrated or else configured path offsets.
 
     Pulses of a hover are excluded unless `hovers` is True, as in `apertura.stages.positions.place`.
     """
@@ -241,7 +241,7 @@ def _repeat_flags(rx: Acquisition, pulses: Association, repeats: NDArray[np.bool
 def _pulse_counts(
     sent: int, pulses: Association, repeats: NDArray[np.bool_], positions: PulsePositions, measured: Transfer
 ) -> dict[str, Any]:
-    """Count the transmitted pulses that are used, and those that are dropped by reason."""
+    """Count the transmitted pulses that are used, and the excluded ones by reason."""
     used = int(measured.kept.sum())
     reasons = {
         "unpaired": pulses.tx_dropped,

@@ -286,8 +286,9 @@ def _in_phase(
 ) -> tuple[InPhase | None, bool]:
     """Measure the phase agreement of the summed images at bright points of the noncoherent sum.
 
-    None for a single image. The second value is True if the points are isolated and shown by all images. If there
-    are none, the brightest pixels are used; in cells with several scatterers, phases of images need not agree.
+    None for a single image. The second value is True if the points are isolated and present in all images. If
+    there are no such points, the brightest pixels are used; in cells with several scatterers, phases of images
+    need not agree.
     """
     added = assessed["fusion"]["phases_rad"]
     compared = {pair: ComparedImage.of(images[pair], grid, windows) for pair in added}
@@ -387,7 +388,7 @@ def _flags_of_choice(fusion: Mapping[str, Any]) -> Flags:
 
 
 def _worst(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the largest errors of the images, as those of their sum, and the error budget of each image."""
+    """Return the largest errors of the images, reported for their sum, and the error budget of each image."""
     qualities = [image.attrs["quality"] for image in images.values()]
     worst = max(qualities, key=lambda quality: quality["numerical_error_db"])
     without = "".join(f"; without {pair}: {reason}" for pair, reason in fusion["excluded"].items())

@@ -40,7 +40,7 @@ MOST_PULSES = 512
 """Largest number of pulses per pair on which hypotheses are tested, evenly spaced."""
 
 RANDOM_TRACKS = 48
-"""Number of wrong tracks drawn at random; a third each has an offset, a slope and a sinusoidal error."""
+"""Number of wrong tracks drawn at random, with an offset, a slope or a sinusoidal error in equal numbers."""
 
 _RANDOM_SIZE_M, _RANDOM_PERIODS = (0.03, 2.0), (0.25, 1.5)  # ranges of track errors, and of periods per aperture
 _AXES = ("forward", "right", "down")
@@ -193,7 +193,7 @@ def _focused_power(
 ) -> float:
     """Return the joint peak power if every pair were focused at one point and in phase.
 
-    A focused pair contributes its own peak, another pair the strongest echo of its pulses.
+    A focused pair contributes its own peak; any other pair contributes the strongest echo of its pulses.
     """
     amplitudes = np.array(
         [
@@ -248,7 +248,7 @@ def _grid_around(scene: OpenScene, point: tuple[float, float], cell_m: float) ->
 def _displaced(
     scene: OpenScene, point: tuple[float, float], geometries: Sequence[PairGeometry], hypothesis: Hypothesis
 ) -> tuple[float, float]:
-    """Return the expected position of a bright point: displaced with the mean antenna, and by the terrain height."""
+    """Return a bright point displaced by the mean antenna displacement and by the change of the terrain height."""
     shifts = []
     for geometry, history in zip(geometries, hypothesis.histories, strict=True):
         for before, after in zip(geometry.history.aperture.legs, history.aperture.legs, strict=True):
@@ -288,7 +288,7 @@ def subset_geometry(nodes: Mapping[str, Acquisition], pair: str, echo: xr.Datase
 def with_logs(
     nodes: Mapping[str, Acquisition], geometries: Sequence[PairGeometry], late_s: Mapping[str, float] | None = None
 ) -> list[PairGeometry]:
-    """Return the echoes with antenna positions and sidelink lengths from other logs, or from logs that are late.
+    """Return the echoes with antenna positions and sidelink lengths from other logs, or from delayed logs.
 
     Raises
     ------
@@ -315,7 +315,7 @@ def _sidelink_m(tx: Acquisition, rx: Acquisition, tx_at: Times, rx_at: Times) ->
 
 
 def _other_geometries(nodes: Mapping[str, Acquisition], geometries: Sequence[PairGeometry]) -> Iterator[Hypothesis]:
-    """Yield hypotheses on logs, lever arms, heights and paths, the likeliest first, as far as the logs cover them."""
+    """Yield hypotheses on logs (if these cover the pulses), lever arms, heights and paths, the likeliest first."""
     for what, kind, changed, late_s in _other_logs(nodes):
         with suppress(CampaignError):
             moved = with_logs({**nodes, **changed}, geometries, late_s)
@@ -417,7 +417,7 @@ def _random_tracks(
 ) -> Iterator[Hypothesis]:
     """Yield smooth wrong tracks drawn at random, against which the gain of a hypothesis is compared.
 
-    Node, direction and size of the error are drawn; it is an offset, a slope or sinusoidal.
+    Node, direction and size of the error are drawn; the error is an offset, a slope or a sinusoid.
     """
     for number in range(RANDOM_TRACKS):
         size_m = float(np.exp(generator.uniform(*np.log(_RANDOM_SIZE_M))))
@@ -442,7 +442,7 @@ LEAST_SHARE = 0.7
 """Smallest share of the loss in dB that a hypothesis must recover to be reported."""
 
 LEAST_AGAINST_NEXT = 2.0
-"""Smallest ratio, in dB over dB, of its gain to that of the best other cause and of the best random track."""
+"""Smallest ratio of a hypothesis's gain in dB to that of the best other cause and of the best random track."""
 
 CLEAR_DB = 10.0
 """Difference in dB from which a gain exceeds another with certainty, even if the ratio is below the limit."""

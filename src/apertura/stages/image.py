@@ -59,7 +59,7 @@ _QUOTED = (
 def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Path:
     """Write results/<flight>/<pair>/image.zarr.
 
-    Existing tiles are kept, from a run that was killed or from the jobs of rule `tiles`.
+    Existing tiles, from a run that was killed or from the jobs of rule `tiles`, are kept.
     """
     lineage = result_of(campaign, "image", flight, pair).begin(campaign.root)
     work = _open(campaign, flight, pair, threads=threads)

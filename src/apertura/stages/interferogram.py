@@ -149,7 +149,7 @@ def _nodes(scene: OpenScene, looks: Looks) -> NDArray[np.float64]:
 
 
 def _track_std(phase: TrackPhase, lattice: Lattice, known: Sequence[KnownHeight]) -> NDArray[np.float64]:
-    """Return the standard deviation of every pixel's phase from track errors, for heights relative to known points."""
+    """Return the standard deviation of every pixel's phase due to track errors, relative to points of known height."""
     columns = lattice.shape[1]
     nearest = [
         int(np.abs(lattice.nodes[0] - point.row).argmin()) * columns
@@ -210,7 +210,7 @@ def _known_height(
     height_m: NDArray[np.float64],
     shift_px: NDArray[np.float64],
 ) -> KnownHeight | None:
-    """Return the pixel at which a point is imaged, and the phase of its height there; None outside the grid."""
+    """Return the pixel at which a point is imaged, and its topographic phase there; None outside the grid."""
     x_m, y_m, z_m = point["position_m"]
     map_pixel = np.array(scene.grid.pixel_of(x_m, y_m))
     pixel = np.round(map_pixel).astype(int)

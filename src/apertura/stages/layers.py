@@ -166,7 +166,7 @@ def _multilooked(
 ) -> tuple[LazyLayer, dict[str, Any]]:
     """Return the mean power on a coarser grid, and its radiometric report.
 
-    `pulse_noise`: noise power of a pixel per sum of its squared pulse weights, Σw².
+    `pulse_noise`: noise power of a pixel divided by the sum of its squared pulse weights, Σw².
     """
 
     def noise(window: Window) -> Floats:
@@ -277,7 +277,7 @@ def _inside(looks: Looks, window: Window, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _mask(scene: OpenScene, looks: Looks) -> Callable[[Window], NDArray[np.uint8]]:
-    """Return the function that computes the mask of a window, with the pulses of the nearest lattice node per pixel."""
+    """Return the function that computes the mask of a window, from the pulses of each pixel's nearest lattice node."""
 
     def outside(window: Window) -> NDArray[np.uint8]:
         return np.where(looks.illuminated(window), 0, OUTSIDE).astype(np.uint8)

@@ -241,7 +241,7 @@ def open_pair(
 ) -> OpenPair:
     """Open a pair from its stage `echo` if it is formed, else from the flight logs.
 
-    If `recorded` is given, the time tags of pulses that both nodes recorded, the logs are used in any case.
+    With `recorded`, the time tags of pulses that both nodes recorded, the logs are used even if the stage is formed.
     """
     waveform = campaign.settings.waveform
     if echo is None and recorded is None and campaign.is_current(campaign.stage("echo", flight, pair)):

@@ -45,7 +45,7 @@ from apertura.stages.scene import OpenScene
 
 _MS, _CM, _PPM = 1e-3, 1e-2, 1e-6
 _OBSERVABLE_CELLS = 0.01
-"""Smallest observable displacement in range cells, of a point of 20 dB SNR (docs/theory/focus.md, eq. 6)."""
+"""Smallest observable displacement of a point with 20 dB SNR, range cells (docs/theory/focus.md, eq. 6)."""
 
 
 def budget_of(
@@ -212,13 +212,13 @@ def air_decision(pair: OpenPair) -> Decision:
     reason = (
         f"{air['source']}; mean along the paths from {air['antennas_m']:.0f} m height; displacement of the image "
         f"relative to {reference} {100 * displaced_m:.2g} cm in slant range, {displaced_m / cell_m:.2g} cells"
-        f"{observable}; residual of one value for all pulses {100 * residual_m:.1g} cm of path"
+        f"{observable}; path error of a single value for all pulses {100 * residual_m:.1g} cm"
     )
     return Decision("atmosphere", f"N = {air['refractivity_n']:.1f}", reason)
 
 
 def background_decision(pair: OpenPair) -> Decision:
-    """Return the decision on the background: from stage `profile`, or what decides it once there is one."""
+    """Return the decision on background removal: that of stage `profile`, or the setting before this stage exists."""
     report = pair.report.get("background")
     if report is None:
         return Decision("background", "auto", "decided when range profiles are formed")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from apertura.campaign.config import SEGMENTS, Node, PhaseHistoryWaveform
 from apertura.campaign.folder import Campaign
 from apertura.common.arrays import Times
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, number_of
 from apertura.common.flags import Flags
 from apertura.core.geometry.atmosphere import Atmosphere, FlightAir, SceneAir
 from apertura.core.geometry.geodesy import LOCAL, frame_from_map, map_from_frame
@@ -139,7 +139,7 @@ def place(tx: NodeLog, rx: NodeLog, at: Times, *, hovers: bool = False) -> Pulse
 
 
 def _log_report(node: NodeLog) -> dict[str, Any]:
-    """Return smoothing residual, source and remarks of a log, as far as there are any."""
+    """Return smoothing residual, source and remarks of a log; values that do not exist are omitted."""
     values = {"smoothing_residual_m": node.smoothing_residual_m} | {
         name: node.track.attrs.get(name) for name in ("source", "remarks")
     }
@@ -205,7 +205,7 @@ def _flags(node: NodeLog, at: Times, excluded: dict[str, NDArray[np.bool_]]) -> 
         if faults:
             time_s, size_m = faults[0]
             size = f"{size_m:.3f} m " if size_m else ""
-            worst = f"; {len(faults)} in the log, largest {size}at {node.log_time(time_s)}"
+            worst = f"; {number_of(len(faults), 'fault')}, the worst {size}at {node.log_time(time_s)}"
         longest = _longest_hole(node, checked, name) if count else ""
         reason = fault.format(poorest_fix=node.settings.poorest_fix)
         lines[name] = f"{node.name}: {count} of {len(at)} pulses excluded: {reason}{longest}{worst}"

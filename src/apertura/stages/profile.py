@@ -71,7 +71,7 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
 
 
 def _interference(echo: PairEcho, *, requested: str, window: str) -> Interference | None:
-    """Measure the interference of a pair; None if it is not to be excluded."""
+    """Measure the interference of a pair; None if exclusion of interference is off."""
     if requested == "none":
         return None
     pulses, subcarriers = echo.shape
@@ -80,7 +80,7 @@ def _interference(echo: PairEcho, *, requested: str, window: str) -> Interferenc
 
 
 def _removal(echo: PairEcho, scene: OpenScene, *, method: str | float, window: str) -> Removal | None:
-    """Decide on the removal of the background; None if none is requested, or the recording has none."""
+    """Decide on the removal of the background; None if removal is off, or the recording has no background."""
     pulses, subcarriers = echo.shape
     if method == "none" or (method == "auto" and background_excess_db(echo.recorded_at, pulses, subcarriers) < 0):
         return None

@@ -57,7 +57,7 @@ class AntennaShape(_Part):
 
 
 class Radar(_Part):
-    """Signal and antennas with which a calibration constant was measured; it is valid for the same ones only.
+    """Signal and antennas with which a calibration constant was measured; it is valid only for these.
 
     `sent_power` is the mean power of the transmitted signal in the units by which echoes are divided; None for phase
     histories.
@@ -103,7 +103,7 @@ class Radar(_Part):
         for name in type(self).model_fields:
             was, now = getattr(self, name), getattr(other, name)
             if name == "polarisation" and None in (was, now):
-                continue  # the polarisation of one of them is not configured
+                continue  # not configured for one of the two radars
             numbers = isinstance(was, float) and isinstance(now, float)
             if not (abs(was - now) <= _TOLERANCE * abs(was) if numbers else was == now):
                 new, old = (f"{value:g}" if isinstance(value, float) else str(value) for value in (now, was))
@@ -130,7 +130,7 @@ class PairConstant(_Part):
 
     @property
     def constant(self) -> float:
-        """K, m⁴ per m²."""
+        """Calibration constant K, m⁴ per m²."""
         return float(10 ** (self.constant_db / 10))
 
 
@@ -206,9 +206,9 @@ def check_pairs(constants: Constants, campaign: Campaign, path: Path) -> None:
 LEAST_CONTRAST = 10.0
 """Smallest ratio of peak power to noise and clutter for a cross-section; weaker peaks may be noise or clutter."""
 
-_UNSTATED_STD_DB, _FIGURE_STD_DB = 1.0, 0.5  # standard deviations: radio without amplitude_std_db; noise figure
+_UNSTATED_STD_DB, _FIGURE_STD_DB = 1.0, 0.5  # assumed, dB: radio without amplitude_std_db; noise figure
 _SIDELINK_STD_DB = 0.3  # standard deviation of the predicted sidelink noise
-_MOST_POINTS = 50  # the brightest points, whose cross-sections are reported
+_MOST_POINTS = 50  # number of brightest points whose cross-sections are reported
 
 POINTS_LISTED = {
     "most": _MOST_POINTS,
@@ -312,7 +312,7 @@ class CalibratedPair:
         Returns
         -------
         list of dict
-            rcs_m2, rcs_dbsm, std_db and scatter_db of each; None if a peak does not exceed its surroundings enough.
+            rcs_m2, rcs_dbsm, std_db and scatter_db of each; None if a peak does not exceed noise and clutter enough.
 
         Notes
         -----

@@ -48,7 +48,7 @@ LEAST_STD_M = 1e-3
 """Lower bound of a stated position accuracy, metres: a prior of zero would fix the track."""
 
 ONE_PHASE = "minimum_entropy"
-"""Method of `auto` if one phase per pulse suffices; accepted as often as phase_gradient or more, at equal cost."""
+"""Method of `auto` if one phase per pulse suffices; accepted at least as often as phase_gradient, at equal cost."""
 
 
 def autofocus_of(campaign: Campaign, pairs: Sequence[OpenPair], scene: OpenScene) -> tuple[Decision, ...]:
@@ -246,7 +246,7 @@ def expected_track(
 ) -> tuple[list[OpenPair], tuple[Decision, ...]]:
     """Return the pairs of a flight with refined tracks if they exist, and the decisions on the refinement.
 
-    Before step `refine`, the pairs are those of the logs, whatever the decision.
+    Before step `refine`, the pairs are those of the logs, regardless of the decision.
     """
     if campaign.is_current(campaign.stage("refined_track", pairs[0].flight)):
         track = open_refined(campaign, pairs[0].flight)

@@ -87,7 +87,7 @@ def _jobs(campaign: Campaign, results: Sequence[_FinishedResult], hashes: Mappin
     results
         Finished results.
     hashes
-        File of the campaign → SHA-256, of inputs when they were first read, of results as they are now.
+        File of the campaign → SHA-256, of inputs when they were first read, of results at present.
     """
     jobs = dict[tuple[str, tuple[str, ...]], list[_FinishedResult]]()
     for one in results:

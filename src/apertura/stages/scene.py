@@ -76,7 +76,7 @@ class ConfiguredGround:
 
     @property
     def inputs(self) -> dict[str, str]:
-        """Role → SHA-256 of the DEM and of the geoid grid, as far as they are used."""
+        """Role → SHA-256 of the DEM and of the geoid grid, for those in use."""
         files = {"dem": self.dem.path if self.dem else None, "geoid": self.dem.geoid if self.dem else self.geoid}
         return {role: sha256_file(path) for role, path in files.items() if path}
 
@@ -269,7 +269,7 @@ def open_scene(campaign: Campaign) -> OpenScene:
 
 
 def expected_scene(campaign: Campaign, flown: Callable[[], Flown]) -> OpenScene:
-    """Return the scene as `open_scene` does, or the planned scene before that; voids of a DEM raise CampaignError.
+    """Return the scene with its terrain, finished or else planned; voids of a DEM raise CampaignError.
 
     `flown` returns the apertures of the first image flight; it is called only for `auto` settings.
     """

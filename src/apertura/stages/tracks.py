@@ -53,7 +53,7 @@ def tracks(campaign: Campaign, flight: str) -> list[Path]:
 
 
 def _positions(campaign: Campaign, flight: str, node: str) -> xr.Dataset:
-    """Return the positions of a node in the form of stage `track`: logged, else of its antenna at the pulses."""
+    """Return positions in the form of stage `track`: those logged, else those of the node's antenna at the pulses."""
     if is_sampled(campaign):
         track: xr.Dataset = open_stage(campaign.stage("track", flight, node), "track")
         return track

@@ -62,9 +62,9 @@ class PairEcho:
     saturation
         Saturation of the samples read so far.
     removed
-        Background that `stage` is without.
+        Background that is subtracted in `stage`; None: no background is subtracted.
     gain
-        (subcarrier,) float32, factors of `stage`: 0 where interference is excluded.
+        (subcarrier,) float32, factors that `stage` applies: 0 for subcarriers with interference; None: no factors.
     """
 
     dataset: xr.Dataset
@@ -116,7 +116,7 @@ class PairEcho:
 
     @classmethod
     def cleaned(cls, campaign: Campaign, flight: str, pair: str) -> "PairEcho":
-        """Return a finished echo without what a finished stage `profile` removes: background and interference."""
+        """Open a finished echo without the background and interference that a finished stage `profile` removes."""
         echo, folder = cls.opened(campaign, flight, pair), campaign.stage("profile", flight, pair)
         if not campaign.is_current(folder):
             return echo
@@ -143,7 +143,7 @@ class PairEcho:
 
     @property
     def stage(self) -> xr.Dataset:
-        """Stage `echo`, whose `transfer` is read or formed on access, without removed background and interference."""
+        """Stage `echo`, whose `transfer` is formed or read on access, after removal of background and interference."""
         if "transfer" in self.dataset and self.removed is None and self.gain is None:
             return self.dataset
         return self.dataset.assign(transfer=xr.Variable(_HISTORY, indexing.LazilyIndexedArray(_Transfer(self))))
@@ -171,24 +171,24 @@ class PairEcho:
 
     @property
     def time_s(self) -> Floats:
-        """(pulse,) float64, seconds from the first pulse."""
+        """(pulse,) float64, seconds since the first pulse."""
         time = self.dataset.time.values
         return seconds_since(time, time[0])
 
     @property
     def extra_s(self) -> Floats:
-        """(pulse,) float64, delay of an echo in the recorder beyond geometry."""
+        """(pulse,) float64, recorded delay of an echo in addition to the geometric one, seconds."""
         if "path_removed" not in self.dataset:
             return np.zeros(len(self.dataset.time))
         return np.asarray(self.dataset.path_removed.values / SPEED_OF_LIGHT_M_S)
 
     @property
     def delay_s(self) -> Floats:
-        """(pulse,) float64, delay that is removed from the recorder's transfer functions."""
+        """(pulse,) float64, delay that is removed from the recorder's transfer functions, seconds."""
         return np.asarray(self.extra_s + self.dataset.reference_delay.values)
 
     def read(self, pulses: Pulses) -> Complexes:
-        """Return the transfer functions of a few pulses, ascending, without removed background and interference."""
+        """Return the transfer functions of ascending pulse indices after removal of background and interference."""
         transfer = self.dataset.transfer[pulses].values if "transfer" in self.dataset else self.form(pulses)
         if self.gain is not None:
             transfer = transfer * self.gain
@@ -198,7 +198,7 @@ class PairEcho:
         return np.asarray(transfer - self.removed.at(self.time_s[pulses], frequency_hz, self.delay_s[pulses]))
 
     def recorded_at(self, pulses: Pulses) -> Complexes:
-        """Return the transfer functions of a few pulses, ascending, in delays of the recorder."""
+        """Return the transfer functions of ascending pulse indices, on the delay scale of the recorder."""
         return remove_path(self.read(pulses), self.dataset.frequency.values, delay_s=-self.delay_s[pulses])
 
     def blocks(self) -> Iterator[Complexes]:
@@ -265,7 +265,7 @@ def recorded_echo(campaign: Campaign, flight: str, pair: str) -> xr.Dataset:
     Raises
     ------
     CampaignError
-        If positions are neither stored with the samples nor in a flight log, or in both; or if their frame is not that
+        If positions are stored neither with the samples nor in a flight log, or in both; or if their frame is not that
         of the scene.
     """
     tx, rx = pair.split("-")

@@ -193,7 +193,7 @@ def align(
     Returns
     -------
     Alignment
-        Alignment in the seconds of `Unaligned`.
+        Alignment, with times in seconds as in `Unaligned`.
     dict
         offset_s for clocks.tsv as text with all digits, drift_ppm, and path_offset_m for the config.
 

@@ -21,7 +21,7 @@ VERDICTS = ("image", "verdict", "peak loss", "expected loss", "numerical error",
 DECISIONS = ("decision", "value", "reason")
 BUDGET = ("cause", "size", "peak loss", "displacement", "phase")
 FLAGGED = ("flag", "images", "measurement", "meaning", "advice")
-"""Headings of the tables."""
+"""Table headers."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ def sentences(name: str, report: Report) -> Iterator[str]:
 
 
 def _cut_sentence(brightest: Mapping[str, Any]) -> str:
-    """Return a sentence with the −3 dB widths and sidelobe ratios of a target, as far as its cuts contain them."""
+    """Return a sentence with the −3 dB widths and sidelobe ratios of a target, for those that its cuts contain."""
     parts = []
     for name, direction in (("cross_range", "in cross-range"), ("ground_range", "in ground range")):
         width, pslr = brightest.get(f"{name}_width_m"), brightest.get(f"{name}_pslr_db")
@@ -238,7 +238,7 @@ def shared_rows(reports: Mapping[str, Report]) -> list[Cells]:
 
 
 def budget_rows(lines: Sequence[Report]) -> list[Cells]:
-    """Return table rows of an error budget, with the columns `BUDGET`; effects that do not count are in brackets.
+    """Return table rows of an error budget, with the columns `BUDGET`; effects that are not summed are in brackets.
 
     Examples
     --------

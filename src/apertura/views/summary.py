@@ -88,7 +88,7 @@ def print_summary(campaign: Campaign) -> None:
 def print_stale(campaign: Campaign) -> None:
     """Print the number of results that are out of date, except those made on demand.
 
-    Missing recordings, for which this cannot be determined, are reported in a further line.
+    Missing recordings, which cannot be compared, are reported in another line.
     """
     print(*(f"{line}\n" for line in absent_lines(campaign)), sep="", end="")
     if stale := [manifest for manifest in stale_results(campaign) if not on_demand(campaign, manifest)]:

@@ -2,5 +2,5 @@
 
 `rules` has one row per rule; `lineage` determines sources, settings and code of a result; `stale` compares them with
 the manifests of results; `resources` estimates memory and time; `jobs` provides inputs, resources and parameters for
-`workflow/*.smk`. Imports `apertura.campaign` and the layers below; runs nothing.
+`workflow/*.smk`. The package imports `apertura.campaign` and the layers below, and does not run jobs.
 """

@@ -63,7 +63,7 @@ class Jobs:
         return lambda wildcards: manifests_below(self._scope(wildcards, of), row)
 
     def files(self, source: Callable[[JobScope], Iterable[str]], of: Scope | None = None) -> FilesOfJob:
-        """Return the input function of the files of a function in `apertura.workflow.rule_inputs`."""
+        """Return an input function with the files that a function of `apertura.workflow.rule_inputs` returns."""
         root = self.campaign.root
         return lambda wildcards: [str((root / name).location) for name in source(self._scope(wildcards, of))]
 

@@ -158,7 +158,7 @@ def _manifest(rule: Rule, where: Iterable[str]) -> str:
 
 
 def manifests_below(scope: JobScope, rule: Rule) -> list[str]:
-    """Return the manifests of a rule's results within the scope of a job, as far as the campaign has them."""
+    """Return the manifests of a rule's results within the scope of a job; results not in the campaign are omitted."""
     return [_manifest(rule, where) for where in _needed(rule, scope.campaign, scope.below(rule.of))]
 
 

@@ -19,8 +19,8 @@ from apertura.common.errors import CampaignError
 from apertura.workflow.rules import RULES, Cost, Demand
 
 _CAPTURE_BYTES = 64  # smallest size of a capture's metadata
-_UNKNOWN_PIXELS = 4096**2  # assumed for a grid that is derived from the first flight, for resources
-_USUAL_MPX = 0.25  # assumed for such a grid, for the run time
+_UNKNOWN_PIXELS = 4096**2  # pixels assumed in resources for a grid that is derived from the first flight
+_USUAL_MPX = 0.25  # megapixels assumed in run times for such a grid
 _AT_ONCE_PIXELS = 4096**2  # pixels in memory at once; larger rasters are processed in blocks
 _AT_ONCE_BYTES = 1_000_000_000  # range profiles in memory at once; larger ones are processed in blocks of pulses
 _OVERSAMPLING = 2  # oversampling of range profiles
@@ -55,8 +55,8 @@ class Work:
 
 
 _SNAKEMAKE_MB = 300  # two Snakemake processes, which a batch system counts as part of the job
-_LEAST_MINUTES = 10  # for the start on a busy node, and slow file systems
-_SLOWER = 3  # assumed factor to the run times on the machine where the constants were measured
+_LEAST_MINUTES = 10  # allows for a start on a busy node, and for slow file systems
+_SLOWER = 3  # assumed factor relative to run times on the machine where the constants were measured
 
 
 @dataclass(frozen=True)

@@ -199,7 +199,7 @@ def ground_under_air(scope: JobScope) -> Iterable[str]:
 
 
 def air(scope: JobScope) -> Mapping[str, Any]:
-    """Return the settings of the atmosphere; the terrain height is rounded to the step that affects it."""
+    """Return the settings of the atmosphere; the terrain height is rounded to the step used for the refractivity."""
     stated = scope.campaign.values["scene"]
     if stated["atmosphere"] == "vacuum":
         return {"scene": {"atmosphere": "vacuum"}}

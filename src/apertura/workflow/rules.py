@@ -86,7 +86,7 @@ class Cost:
 
     @property
     def of_rasters(self) -> bool:
-        """True if a job mainly reads and writes rasters; run times of such jobs deviate alike from expected ones."""
+        """True if a job mainly reads and writes rasters; predictions for such jobs have similar errors."""
         return bool(self.mpx_s) and not self.mb_s and not self.mb_mpx_s
 
 
@@ -136,7 +136,7 @@ class Rule:
     forms
         True if its step reads transfer functions of its pairs, which are formed from the recordings of receivers.
     reads
-        Readers whose code affects the result if its step reads recorded files: of recordings, of logs.
+        Readers (of recordings, of logs) whose code affects the result, if its step reads recorded files.
     command
         Name of its `apertura step` command; empty: the name of the rule.
     arguments, options

@@ -1,4 +1,4 @@
-"""Detection of results that are out of date, because a source, a setting or the code changed; file times do not count.
+"""Detection of results that are out of date, because a source, a setting or the code changed; file times are ignored.
 
 The comparison uses the hashes in the manifests of results.
 """
@@ -83,14 +83,14 @@ def wanted_files(campaign: Campaign, stale: Collection[str]) -> dict[str, str]:
 
     `stale`: manifests of `stale_results`.
     """
-    wanted = dict[str, str]()
+    missing = dict[str, str]()
     for name, where, result in places_of(campaign):
         is_current = (campaign.root / result.manifest).is_file() and result.manifest not in stale
         if not is_current and not on_demand(campaign, result.manifest):
             for source in files_read(campaign, name, *where):
                 if source.startswith(_RAW) and not (campaign.root / source).is_file():
-                    wanted.setdefault(source, result.manifest)
-    return wanted
+                    missing.setdefault(source, result.manifest)
+    return missing
 
 
 def absent_lines(campaign: Campaign) -> Iterator[str]:
@@ -112,7 +112,7 @@ def settle_times(campaign: Campaign, stale: Collection[str]) -> None:
     """Set the file times of current results: not older than their sources, and not later than now.
 
     Snakemake recomputes results that are older than their input, even if a copy lost the file times, and rejects
-    inputs from the future, which a clock that was set back leaves.
+    inputs with times in the future, which occur after a clock was set back.
     """
     results, now_ns = [result for _, result in results_of(campaign)], time.time_ns()
     inputs = {source for result in results for source in result.sources if not source.startswith("results/")}
@@ -123,7 +123,7 @@ def settle_times(campaign: Campaign, stale: Collection[str]) -> None:
         if result.manifest not in stale and path.is_file():
             files = [path.parent / file for file in read_manifest(path)["files"] if ".zarr/" not in file]
             date([path, *files], earliest_ns=newest_ns, latest_ns=now_ns)
-    # Benchmark files are outputs of the rules, too: the oldest output decides in Snakemake.
+    # Benchmark files are outputs of the rules, too: Snakemake compares the oldest output.
     benchmarks = (campaign.root / "results" / "benchmarks").rglob("*.tsv")
     date(benchmarks, earliest_ns=newest_ns, latest_ns=now_ns)
 
@@ -136,7 +136,7 @@ def make_again(campaign: Campaign, stale: Mapping[str, str], *, remove: bool) ->
     """Print the results that will be recomputed, and `remove` their manifests, so that they count as unfinished."""
     for line in stale_lines(stale):
         print(line, file=sys.stderr, flush=True)
-    # Dependent results first, so that a kill leaves no finished result that depends on an unfinished one.
+    # Dependent results first, so that after a kill no finished result depends on an unfinished one.
     for manifest in reversed(list(stale)) if remove else ():
         for kept in _set_aside(campaign.root, manifest):
             print(f"a manually edited file is kept as {kept}", file=sys.stderr, flush=True)

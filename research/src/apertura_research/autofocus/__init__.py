@@ -1,1 +1,1 @@
-"""Scenes, flights and measures by which a refinement of tracks is judged; loss against sigma, pictures."""
+"""Scenes, flights and metrics that evaluate the track refinement; charts of loss against sigma, and images."""

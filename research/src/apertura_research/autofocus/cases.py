@@ -1,4 +1,4 @@
-"""Cases by which autofocus is judged: a scene, a flight with errors in its logs, echoes and the truth."""
+"""Test cases of autofocus: a scene, a flight with errors in its logs, its echoes and the true tracks."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -23,17 +23,17 @@ from apertura.simulation.targets import Scatterers
 AREA_M = (-9.0, 5.0, 9.0, 25.0)
 GRID = SceneGrid("local", -10.0, 26.0, 0.05, (440, 400))
 CELL_M2 = 0.07 * 0.4
-"""A resolution cell of the flight past the scene, roughly."""
+"""Approximate area of a resolution cell of the straight flight."""
 
 
 @dataclass(frozen=True, eq=False)
 class TargetScene(Scatterers):
-    """Scatterers at places east, north and up, some of them targets.
+    """Scatterers in east, north and up, some of them targets.
 
     Attributes
     ----------
     targets
-        (target,) int64, the scatterers whose peaks can be measured.
+        (target,) int64, indices of the scatterers whose peaks can be measured.
     """
 
     targets: NDArray[np.int64]
@@ -45,7 +45,7 @@ def _five(generator: np.random.Generator) -> TargetScene:
 
 
 def _forty(generator: np.random.Generator) -> TargetScene:
-    """Points within 20 dB at the receiver; the fifteen brightest are measured."""
+    """Return forty points within 20 dB at the receiver; the fifteen brightest are measured."""
     places = _spread(40, generator)
     level = 10 ** (generator.uniform(-20, 0, 40) / 20)
     amplitude = level * _phases(40, generator) * (np.hypot(places[:, 1], 10) / 18) ** 2
@@ -53,7 +53,7 @@ def _forty(generator: np.random.Generator) -> TargetScene:
 
 
 def _texture(generator: np.random.Generator) -> TargetScene:
-    """Clutter whose power is log-normal, in spots of half a metre."""
+    """Return clutter of log-normal power, correlated over half a metre."""
     clutter = _clutter(6000, generator)
     spots = generator.standard_normal((64, 64))
     waves = np.fft.fftfreq(64)[:, None] ** 2 + np.fft.fftfreq(64) ** 2
@@ -67,7 +67,7 @@ def _texture(generator: np.random.Generator) -> TargetScene:
 
 def _points_over_clutter(above_db: float) -> Callable[[np.random.Generator], TargetScene]:
     def scene(generator: np.random.Generator) -> TargetScene:
-        """Eight points so far above the clutter of one cell."""
+        """Return eight points at `above_db` above the clutter of one resolution cell."""
         clutter, places = _clutter(6000, generator), _spread(8, generator)
         places[:, 0] *= 0.8
         in_cell = CELL_M2 * 6000 / _area_m2()
@@ -80,18 +80,18 @@ def _points_over_clutter(above_db: float) -> Callable[[np.random.Generator], Tar
 
 
 def _field(generator: np.random.Generator) -> TargetScene:
-    """Speckle that goes on beyond the scene on all sides: no edge of it is in the image."""
+    """Return speckle that extends beyond the scene on all sides, so that the image contains no edge of it."""
     return _clutter(60_000, generator, (-18.0, 1.0, 18.0, 37.0))
 
 
 def _dense(generator: np.random.Generator) -> TargetScene:
-    """Fully developed speckle: three scatterers in a cell, no point."""
+    """Return fully developed speckle: three scatterers per resolution cell, without points."""
     return _clutter(40_000, generator)
 
 
 def _few(count: int) -> Callable[[np.random.Generator], TargetScene]:
     def scene(generator: np.random.Generator) -> TargetScene:
-        """Points within 6 dB at the receiver in 14 by 14 m, 1.5 m apart at least."""
+        """Return points within 6 dB at the receiver in 14 by 14 m, at least 1.5 m from each other."""
         places: list[Floats] = []
         while len(places) < count:
             place = generator.uniform((-7, 8, 0), (7, 22, 0))
@@ -104,7 +104,7 @@ def _few(count: int) -> Callable[[np.random.Generator], TargetScene]:
 
 
 def _thirty(generator: np.random.Generator) -> TargetScene:
-    """Thirty points 15 to 25 dB above the clutter of one cell."""
+    """Return thirty points at 15 to 25 dB above the clutter of one resolution cell."""
     clutter, places = _clutter(6000, generator), _spread(30, generator)
     level = 10 ** (generator.uniform(15, 25, 30) / 20) * np.sqrt(CELL_M2 * 6000 / _area_m2())
     return TargetScene(
@@ -150,12 +150,12 @@ def _area_m2() -> float:
 
 PULSES_HZ = 100.0
 NODES = ("uav1", "uav2")
-_APART_M = 4.7
+_NODE_SPACING_M = 4.7
 
 
 @dataclass(frozen=True, eq=False)
 class LoggedFlight:
-    """Positions of both nodes by their logs, metres, east, north, up.
+    """Logged positions of both nodes, metres, east, north, up.
 
     Attributes
     ----------
@@ -164,7 +164,7 @@ class LoggedFlight:
     logged_m
         Node → (pulse, 3) float64.
     reach_m
-        East and north of a point, within which its peak is looked for.
+        Half widths, east and north, of the area about a point in which its peak is searched.
     """
 
     time_s: Floats
@@ -175,14 +175,14 @@ class LoggedFlight:
 def _straight() -> LoggedFlight:
     time_s = np.arange(3000) / PULSES_HZ
     first = np.stack([time_s - 15, 0 * time_s, np.full(3000, 10.0)], -1)
-    return LoggedFlight(time_s, dict(zip(NODES, (first, first + [_APART_M, 0, 0]), strict=True)))
+    return LoggedFlight(time_s, dict(zip(NODES, (first, first + [_NODE_SPACING_M, 0, 0]), strict=True)))
 
 
 def _short() -> LoggedFlight:
-    """Return a first flight: 20 m in 7.5 s, 150 pulses."""
+    """Return a short flight, as of a first test: 20 m in 7.5 s, 150 pulses."""
     time_s = np.arange(150) / 20
     first = np.stack([20 / 7.5 * (time_s - 3.725), 0 * time_s, np.full(150, 10.0)], -1)
-    return LoggedFlight(time_s, dict(zip(NODES, (first, first + [_APART_M, 0, 0]), strict=True)))
+    return LoggedFlight(time_s, dict(zip(NODES, (first, first + [_NODE_SPACING_M, 0, 0]), strict=True)))
 
 
 def _wobble() -> LoggedFlight:
@@ -196,22 +196,23 @@ def _wobble() -> LoggedFlight:
 
 
 def _circle() -> LoggedFlight:
-    """Around the scene's middle at 14 m, once."""
+    """Return one full circle about the middle of the scene with a radius of 14 m."""
     radius = 14.0
     time_s = np.arange(int(2 * np.pi * radius * PULSES_HZ)) / PULSES_HZ
 
-    def around(turn: Floats) -> Floats:
-        return np.stack([radius * np.sin(turn), 15 - radius * np.cos(turn), np.full(len(turn), 10.0)], -1)
+    def position(angle: Floats) -> Floats:
+        return np.stack([radius * np.sin(angle), 15 - radius * np.cos(angle), np.full(len(angle), 10.0)], -1)
 
-    turn = time_s / radius
-    return LoggedFlight(time_s, dict(zip(NODES, (around(turn), around(turn + _APART_M / radius)), strict=True)))
+    angle = time_s / radius
+    second = angle + _NODE_SPACING_M / radius
+    return LoggedFlight(time_s, dict(zip(NODES, (position(angle), position(second)), strict=True)))
 
 
 def _far() -> LoggedFlight:
-    """Past the scene at a kilometre, ten times as fast: one phase per pulse is the same for all of it."""
+    """Return a pass at a distance of 1 km and ten times the speed: a track error has one phase for the whole scene."""
     time_s = np.arange(3000) / PULSES_HZ
     first = np.stack([10 * (time_s - 15), np.full(3000, -985.0), np.full(3000, 300.0)], -1)
-    return LoggedFlight(time_s, dict(zip(NODES, (first, first + [_APART_M, 0, 0]), strict=True)), (1.2, 0.6))
+    return LoggedFlight(time_s, dict(zip(NODES, (first, first + [_NODE_SPACING_M, 0, 0]), strict=True)), (1.2, 0.6))
 
 
 FLIGHTS: Mapping[str, Callable[[], LoggedFlight]] = {
@@ -224,7 +225,7 @@ FLIGHTS: Mapping[str, Callable[[], LoggedFlight]] = {
 
 
 def drawn_errors(time_s: Floats, errors: TrackErrors, generator: np.random.Generator) -> Floats:
-    """Return (pulse, 3) metres: white noise after a moving average over the correlation time, and a slow drift."""
+    """Draw position errors, (pulse, 3) metres: white noise averaged over the correlation time, and a slow drift."""
     step_s = time_s[1] - time_s[0]
     width = max(1, round(errors.correlation_s / step_s))
     total = np.cumsum(np.vstack([np.zeros(3), generator.standard_normal((len(time_s) + width, 3))]), axis=0)
@@ -232,19 +233,21 @@ def drawn_errors(time_s: Floats, errors: TrackErrors, generator: np.random.Gener
     return np.asarray(noise * errors.std_m + _drift(time_s) @ generator.standard_normal((4, 3)) * errors.drift_std_m)
 
 
-_STEP_BESIDE_M = 0.005  # what errs beside a step
+_STEP_NOISE_M = 0.005
+"""Standard deviation of the noise that is added to a step."""
 
 
 def _step(time_s: Floats, errors: TrackErrors, generator: np.random.Generator) -> Floats:
-    """Return (pulse, 3) metres: half a centimetre of noise, and a step of the stated size, as where a fix changes."""
-    noise = drawn_errors(time_s, replace(errors, std_m=(_STEP_BESIDE_M,) * 3), generator)
+    """Draw position errors, (pulse, 3) metres: noise of 0.5 cm and a step of `std_m`, as at a change of the fix."""
+    noise = drawn_errors(time_s, replace(errors, std_m=(_STEP_NOISE_M,) * 3), generator)
     at_s = time_s[0] + generator.uniform(0.35, 0.65) * (time_s[-1] - time_s[0])
-    way = generator.standard_normal(3)
-    return noise + np.where(time_s[:, None] > at_s, np.array(errors.std_m) * way / np.linalg.norm(way), 0.0)
+    direction = generator.standard_normal(3)
+    step_m = np.array(errors.std_m) * direction / np.linalg.norm(direction)
+    return noise + np.where(time_s[:, None] > at_s, step_m, 0.0)
 
 
 def _walk(time_s: Floats, errors: TrackErrors, generator: np.random.Generator) -> Floats:
-    """Return (pulse, 3) metres: a random walk of the stated size in a second."""
+    """Draw position errors, (pulse, 3) metres: a random walk with a standard deviation of `std_m` after one second."""
     steps = generator.standard_normal((len(time_s), 3)) * np.sqrt(time_s[1] - time_s[0]) * np.array(errors.std_m)
     walk = np.cumsum(steps, axis=0)
     return np.asarray(walk - walk.mean(axis=0))
@@ -254,15 +257,15 @@ _LOG_HZ, _WOBBLE_HZ = 2.0, (0.3, 1.5)
 
 
 def _sparse(time_s: Floats, errors: TrackErrors, generator: np.random.Generator) -> Floats:
-    """Return (pulse, 3) metres: what a spline through a log at 2 Hz misses of a platform that wobbles up to 1.5 Hz."""
+    """Draw position errors, (pulse, 3) metres: a spline through a 2 Hz log of motion with frequencies up to 1.5 Hz."""
     from scipy.interpolate import CubicSpline
 
     logged_s = np.arange(time_s[0], time_s[-1] + 1 / _LOG_HZ, 1 / _LOG_HZ)
     at_s = np.concatenate([time_s, logged_s])[:, None, None]
     frequency_hz = generator.uniform(*_WOBBLE_HZ, (3, 12))
     wobble = np.cos(2 * np.pi * (frequency_hz * at_s + generator.random((3, 12)))).sum(axis=-1)
-    missed = wobble[: len(time_s)] - CubicSpline(logged_s, wobble[len(time_s) :])(time_s)
-    return np.asarray(missed / missed.std(axis=0) * errors.std_m)
+    spline_error = wobble[: len(time_s)] - CubicSpline(logged_s, wobble[len(time_s) :])(time_s)
+    return np.asarray(spline_error / spline_error.std(axis=0) * errors.std_m)
 
 
 ERRORS: Mapping[str, Callable[[Floats, TrackErrors, np.random.Generator], Floats]] = {
@@ -271,11 +274,11 @@ ERRORS: Mapping[str, Callable[[Floats, TrackErrors, np.random.Generator], Floats
     "walk": _walk,
     "sparse": _sparse,
 }
-"""Kinds of errors of the logs."""
+"""Models of the logs' errors by name."""
 
 
 def _drift(time_s: Floats) -> Floats:
-    """Return (pulse, 4): offset, slope and a bow either way, together of about unit variance."""
+    """Return (pulse, 4): constant, slope, half sine and half cosine, together of about unit variance."""
     part = (time_s - time_s[0]) / (time_s[-1] - time_s[0])
     return np.stack([np.ones_like(part), 2 * part - 1, np.sin(np.pi * part), np.cos(np.pi * part)], -1) / 2
 
@@ -289,24 +292,24 @@ PROBES_M[:, 0] += np.tile([0.3, -0.4, 0.0, 0.5, -0.2], 3)
 
 @dataclass(frozen=True, eq=False)
 class AutofocusCase:
-    """Inputs of a refinement, and the truth that it is judged by.
+    """Inputs of a refinement, and the true tracks that it is compared with.
 
     Attributes
     ----------
     name
-        scene, geometry, pairs, sigma (m), SNR (dB) and seed.
+        Scene, geometry, pairs, sigma (m), SNR (dB) and seed.
     records
-        Of all pairs, as the logs have them.
+        Echoes of all pairs, with the logged positions.
     errors
-        Node → what is known of the errors of its log.
+        Node → stated errors of its log.
     truth
-        What must be added to the logs.
+        Correction that turns the logged positions into the true ones.
     targets_m
-        (target, 3) float64, of scatterers whose peaks can be measured.
+        (target, 3) float64, positions of the scatterers whose peaks can be measured.
     probes
-        The same pairs over fifteen points elsewhere, `PROBES_M`, without noise: no refinement uses them.
+        Noise-free echoes of the same pairs from fifteen other points, `PROBES_M`, which no refinement uses.
     reach_m
-        East and north of a point, within which its peak is looked for.
+        Half widths, east and north, of the area about a point in which its peak is searched.
     """
 
     name: tuple[str, str, str, float, float | None, int]
@@ -331,31 +334,33 @@ def case(
     kind: str = "smooth",
     stated_m: float | None = None,
 ) -> AutofocusCase:
-    """Return a case; tracks, scene and noise of a seed are drawn apart, so that each stays when another is changed.
+    """Return a case; tracks, scene and noise have separate random streams, so that each stays when another changes.
 
     Parameters
     ----------
     scene, geometry, pairs
-        Rows of `SCENES`, `FLIGHTS` and `PAIRS`.
+        Names in `SCENES`, `FLIGHTS` and `PAIRS`.
     sigma_m, drift_m
         Standard deviations of the logs' errors in each axis.
     snr_db
-        Range-compressed, per pulse, of the rms target, or of the mean range cell where the scene has no target;
-        None is without noise.
+        Range-compressed, per pulse, of the rms target, or of the mean range cell if the scene has no target;
+        None: no noise.
     seed
-        Of everything random.
+        Seed of all random streams.
     correlation_s
-        How long an error lasts.
+        Correlation time of the errors.
     kind
-        Row of `ERRORS`.
+        Name in `ERRORS`.
     stated_m
-        What logs state instead of `sigma_m`.
+        Standard deviation that the refinement is given instead of `sigma_m`.
     """
     of_tracks, of_scene, of_noise, of_probes = np.random.default_rng(seed).spawn(4)
     flight, scatterers = FLIGHTS[geometry](), SCENES[scene](of_scene)
     errors = TrackErrors((sigma_m,) * 3, correlation_s, drift_m)
     streams = zip(NODES, of_tracks.spawn(len(NODES)), strict=True)
-    truth = TrackCorrection(flight.time_s, {node: ERRORS[kind](flight.time_s, errors, one) for node, one in streams})
+    truth = TrackCorrection(
+        flight.time_s, {node: ERRORS[kind](flight.time_s, errors, generator) for node, generator in streams}
+    )
     stated = errors if stated_m is None else replace(errors, std_m=(stated_m,) * 3)
     probes = _probes(of_probes)
     noises = dict(zip(PAIRS["joint"], of_noise.spawn(2), strict=True))
@@ -373,14 +378,14 @@ def case(
 # ---- Flights with one wrong constant of the config ------------------------------------------------------------------
 
 _SWAY = {"yaw": ((8.0, 3.1), (4.0, 1.3)), "roll": ((5.0, 2.3),)}
-"""Degrees and seconds of the sway of a body about its course, as wind makes it."""
+"""Amplitudes (degrees) and periods (seconds) of the attitude oscillation of a platform in wind."""
 
 _WIDEST = {"time": 0.2, "lever arm": 0.3, "height": 0.5}
-"""Of what is drawn: seconds, metres in each axis, metres."""
+"""Largest drawn error: seconds, metres in each axis, metres."""
 
 
 def body_axes(flight: LoggedFlight, node: str, generator: np.random.Generator) -> Floats:
-    """Return forward, right, down of a body that follows its course and sways, (pulse, 3, 3): columns, in the frame."""
+    """Return forward, right and down of a body that sways about its course, (pulse, 3, 3): columns, in the frame."""
     east, north, _ = np.gradient(flight.logged_m[node], flight.time_s, axis=0).T
     angle = {
         name: sum(
@@ -400,19 +405,19 @@ def body_axes(flight: LoggedFlight, node: str, generator: np.random.Generator) -
 def wrong_case(
     kind: str, scene: str, geometry: str, sigma_m: float, seed: int, *, snr_db: float = 10.0
 ) -> tuple[AutofocusCase, tuple[Cause, ...], tuple[str, Floats]]:
-    """Return a case of both pairs with one wrong constant beside the logs' errors, what may be wrong, and what is.
+    """Return a case of both pairs with one wrong constant in addition to the logs' errors, and its possible causes.
 
     Parameters
     ----------
     kind
         time, lever arm, height, or nothing.
     scene, geometry, sigma_m, seed, snr_db
-        As of `case`.
+        See `case`.
 
     Returns
     -------
     tuple
-        The case; all causes that a campaign with such logs has; node, or 'all', and the values.
+        The case; all possible causes in a campaign with such logs; the true cause: node, or 'all', and its values.
     """
     one, flight, generator = case(scene, geometry, "joint", sigma_m, snr_db, seed), FLIGHTS[geometry](), _drawn(seed)
     axes = {node: body_axes(flight, node, generator) for node in NODES}
@@ -436,13 +441,13 @@ def wrong_case(
     _, of_scene, of_noise, of_probes = np.random.default_rng(seed).spawn(4)
     scatterers, probes = SCENES[scene](of_scene), _probes(of_probes)
     noises = dict(zip(PAIRS["joint"], of_noise.spawn(2), strict=True))
-    made = replace(
+    wrong_constant = replace(
         one,
         truth=truth,
         records=tuple(record(pair, flight, truth, scatterers, snr_db, noises[pair]) for pair in PAIRS["joint"]),
         probes=tuple(record(pair, flight, truth, probes, None, noises[pair]) for pair in PAIRS["joint"]),
     )
-    return made, tuple(causes), (node, values)
+    return wrong_constant, tuple(causes), (node, values)
 
 
 def _drawn(seed: int) -> np.random.Generator:
@@ -462,22 +467,22 @@ def record(
     snr_db: float | None,
     generator: np.random.Generator,
 ) -> PairRecord:
-    """Record the echoes of some scatterers by a pair, with the length of the sidelink that the logs have restored.
+    """Simulate the echoes of scatterers that a pair records, with the sidelink length restored from the logs.
 
     Parameters
     ----------
     pair
-        transmitter-receiver, one of `NODES` each.
+        transmitter-receiver, each one of `NODES`.
     flight
-        Where the logs have the nodes.
+        Logged positions of the nodes.
     truth
-        What must be added to the logs.
+        Correction that turns the logged positions into the true ones.
     scatterers
-        What echoes.
+        Scatterers of the scene.
     snr_db
-        As of `case`; None is without noise.
+        See `case`; None: no noise.
     generator
-        Of the noise.
+        Random generator of the noise.
     """
     tx, rx = pair.split("-")
     logged = Aperture(flight.logged_m[tx], flight.logged_m[rx])
@@ -495,7 +500,7 @@ def record(
 
 
 def _signal_power(echo: NDArray[np.complex64], scatterers: TargetScene, flown: Aperture) -> float:
-    """Return the mean power of a target's echo, or of a range cell c/B of total path."""
+    """Return the mean echo power of a target, or of a range cell of c/B in total path if there is no target."""
     if not len(scatterers.targets):
         paths = flown[::10].path(scatterers.position_m[::10])
         cells = np.ptp(paths, axis=1).mean() / (SPEED_OF_LIGHT_M_S / BANDWIDTH_HZ)

@@ -1,4 +1,4 @@
-"""The autofocus study: loss of peak against sigma of the tracks' errors, and images before and after."""
+"""The autofocus study: peak loss against sigma of the track errors, and images before and after refinement."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -42,30 +42,33 @@ _MARKS = {
     TOO_FEW: ("s", "#d55e00", "none"),
 }
 _LEVELS_DB = (0, 0.1, 0.3, 1, 3, 10)
-_LINEAR_DB = 0.3  # below it the axis is linear: losses may be zero, or a little less
-_BESIDE = 0.06  # of the marks of a size's seeds, cm: they do not hide each other
+_LINEAR_DB = 0.3
+"""Loss below which the axis is linear: losses may be zero or slightly negative."""
+
+_MARK_SPACING_CM = 0.06
+"""Horizontal spacing of the marks of one sigma, so that seeds do not hide each other."""
 
 
 def draw_losses(_: str, outcomes: Sequence[AutofocusRow], path: Path) -> None:
-    """Draw a panel per scene: means over the seeds from logs and as the product leaves it, and its verdict on each."""
+    """Draw a panel per scene: mean losses of logged and refined tracks over the seeds, and the verdict on each seed."""
     scenes = [scene for scene in KINDS if any(one.scene == scene for one in outcomes)]
     seeds = len({one.seed for one in outcomes})
-    title = f"Loss at 15 places that no refinement uses, both pairs, SNR {SNR_DB:g} dB; lines: mean of {seeds} draws"
+    title = f"Peak loss at 15 probes, which no refinement uses; both pairs, SNR {SNR_DB:g} dB, mean of {seeds} draws"
     with panels(path, (4 * len(scenes) + 1, 5.6), (1, len(scenes)), title=title, sharey=True) as every:
         for axes, scene in zip(every, scenes, strict=True):
             rows = [one for one in outcomes if one.scene == scene]
             _draw_scene(axes, rows)
             _mark_verdicts(axes, rows)
             axes.set_title(f"{KINDS[scene]}\n{tally(rows)}", fontsize=10)
-            axes.set_xlabel("σ of each log per axis, over 1 s, cm")
+            axes.set_xlabel("σ of each log per axis, correlated over 1 s, cm")
         _scale(every[0], outcomes)
 
 
 def _draw_scene(axes: Axes, rows: Sequence[AutofocusRow]) -> None:
     sizes = sorted({one.sigma_cm for one in rows})
     for name, colour, style, label in (
-        ("loss_db", _LOGS, "--", "from the logs"),
-        ("product_loss_db", _PRODUCT, "-", "as the product leaves it"),
+        ("loss_db", _LOGS, "--", "logged tracks"),
+        ("product_loss_db", _PRODUCT, "-", "tracks used by the product"),
     ):
         means = [np.mean([getattr(one, name) for one in rows if one.sigma_cm == size]) for size in sizes]
         axes.plot(sizes, means, color=colour, linestyle=style, marker="_", markersize=12, zorder=1, label=label)
@@ -74,24 +77,24 @@ def _draw_scene(axes: Axes, rows: Sequence[AutofocusRow]) -> None:
 
 
 def _mark_verdicts(axes: Axes, rows: Sequence[AutofocusRow]) -> None:
-    """Mark each draw by its verdict; where it was refused also what it would have become."""
-    seeds = sorted({one.seed for one in rows})
-    beside = {seed: _BESIDE * (number - (len(seeds) - 1) / 2) for number, seed in enumerate(seeds)}
+    """Mark each draw by its verdict; if the refinement was refused, also the loss of the refused estimate."""
+    seeds = sorted({row.seed for row in rows})
+    offset_cm = {seed: _MARK_SPACING_CM * (number - (len(seeds) - 1) / 2) for number, seed in enumerate(seeds)}
     for verdict, (marker, edge, face) in _MARKS.items():
-        some = [one for one in rows if one.verdict == verdict]
-        places = [one.sigma_cm + beside[one.seed] for one in some]
-        losses = [one.product_loss_db for one in some]
-        axes.plot(places, losses, marker, color=edge, markerfacecolor=face, markersize=7, alpha=0.75, label=verdict)
-    refused = [one for one in rows if one.verdict == REFUSED]
+        marked = [row for row in rows if row.verdict == verdict]
+        sigmas_cm = [row.sigma_cm + offset_cm[row.seed] for row in marked]
+        losses = [row.product_loss_db for row in marked]
+        axes.plot(sigmas_cm, losses, marker, color=edge, markerfacecolor=face, markersize=7, alpha=0.75, label=verdict)
+    refused = [row for row in rows if row.verdict == REFUSED]
     axes.plot(
-        [one.sigma_cm + beside[one.seed] for one in refused],
-        [one.estimate_loss_db for one in refused],
-        "x", color="0.45", markersize=6, label="what was refused",
+        [row.sigma_cm + offset_cm[row.seed] for row in refused],
+        [row.estimate_loss_db for row in refused],
+        "x", color="0.45", markersize=6, label="refused estimate",
     )  # fmt: skip
 
 
 def tally(rows: Sequence[AutofocusRow]) -> str:
-    """Count the refinements that were accepted, and those of them that did harm.
+    """Count the accepted refinements, and those of them with more loss than the logged tracks.
 
     Examples
     --------
@@ -109,13 +112,15 @@ def _scale(axes: Axes, outcomes: Sequence[AutofocusRow]) -> None:
     axes.set_yticks(_LEVELS_DB, [f"{level:g}" for level in _LEVELS_DB])
     axes.set_yticks([], minor=True)
     axes.set_ylim(min(-0.05, *losses), 1.2 * max(3.0, *losses))
-    axes.set_ylabel("Loss of peak, dB (linear below 0.3)")
+    axes.set_ylabel("Peak loss, dB (linear below 0.3)")
 
 
 SIGMA_CM, SEED = 2.0, 1
 DEPTH_DB = 35.0
 
-_MIDDLE_M, _WITHIN_M = (0.0, 15.0), 4.0  # what is looked at closely is the brightest of the scene's middle
+_MIDDLE_M, _WITHIN_M = (0.0, 15.0), 4.0
+"""Centre and radius of the area whose brightest point is enlarged."""
+
 _CLOSE_M, _FINE_M = 3.0, 0.015
 _AXES = ("east", "north", "up")
 _PANELS: list[Any] = [
@@ -125,20 +130,21 @@ _PANELS: list[Any] = [
     ["path"] * 3,
 ]
 _COLOURS = ("#0072b2", "#d55e00")
-_LETTERS = 125  # of a line of the title
+_TITLE_CHARACTERS = 125
+"""Characters per line of the title."""
 
 
 def draw_case(scene: str, path: Path, *, sigma_cm: float = SIGMA_CM, seed: int = SEED) -> None:
-    """Draw one case of a scene of `KINDS` as PNG: the whole scene, a close look, and errors of the tracks over time.
+    """Draw one case of a scene of `KINDS` as PNG: the whole scene, an enlarged part, and track errors over time.
 
     Parameters
     ----------
     scene
-        A row of `KINDS`.
+        Name in `KINDS`.
     path
-        Of the PNG.
+        Path of the PNG.
     sigma_cm, seed
-        Of the logs' errors.
+        Standard deviation and seed of the logs' errors.
     """
     one = case_of(scene, sigma_cm, seed)
     result = refine_case(one)
@@ -149,30 +155,31 @@ def draw_case(scene: str, path: Path, *, sigma_cm: float = SIGMA_CM, seed: int =
     for number, name in enumerate(_AXES):
         _draw_errors(panels[name], one, used, number)
         panels[name].set_title(name, fontsize=10)
-    panels[_AXES[0]].set_ylabel("Error of the tracks, cm")
+    panels[_AXES[0]].set_ylabel("Track error, cm")
     _draw_paths(panels["path"], one, used, place_m)
     figure.suptitle(_title(one, result), fontsize=11)
     save_png(figure, path)
 
 
 def _named(result: Refinement) -> str:
-    return "refined tracks" if result.accepted else "refused: the logs stay"
+    return "refined tracks" if result.accepted else "refused: logged tracks are used"
 
 
 def _title(one: AutofocusCase, result: Refinement) -> str:
     row = outcome_of(one, result)
-    flags = f"flags: {row.flags.replace(' ', ', ')}" if row.flags else "no flag"
+    flags = f"flags: {row.flags.replace(' ', ', ')}" if row.flags else "no flags raised"
     head = (
-        f"{KINDS[row.scene]}, σ = {row.sigma_cm:g} cm: loss at probes {row.loss_db:.2f} dB from the logs, "
-        f"{row.product_loss_db:.2f} dB as the product leaves it"
+        f"{KINDS[row.scene]}, σ = {row.sigma_cm:g} cm: peak loss at the probes {row.loss_db:.2f} dB with the logged "
+        f"tracks, {row.product_loss_db:.2f} dB with the tracks used by the product"
     )
-    return f"{fill(head, _LETTERS)}\n{fill(f'{row.verdict}: {row.reason}; {flags}', _LETTERS)}"
+    verdict = f"{row.verdict}: {row.reason}; {flags}"
+    return f"{fill(head, _TITLE_CHARACTERS)}\n{fill(verdict, _TITLE_CHARACTERS)}"
 
 
 def _draw_images(
     figure: Figure, panels: Mapping[str, Axes], one: AutofocusCase, tracks: Mapping[str, TrackCorrection]
 ) -> Floats:
-    """Draw the first pair's images from each of some tracks, the last the true ones, and return what is looked at."""
+    """Draw the first pair's image from each set of tracks (the last: true), and return the enlarged point."""
     true = image(one, one.truth, GRID)
     place_m = _brightest(true)
     for view, grid in (("whole", GRID), ("close", _about(place_m))):
@@ -181,15 +188,16 @@ def _draw_images(
         row = [panels[f"{view} {number}"] for number in range(len(images))]
         for axes, (name, values) in zip(row, images.items(), strict=True):
             shown = _draw_image(axes, values / peak, grid)
-            higher = f", peak {20 * np.log10(values.max() / peak):+.1f} dB" if view == "close" else ""
-            axes.set_title(name + higher, fontsize=10)  # pixels of the whole scene miss peaks by tenths of a decibel
+            # Pixels of the whole scene sample peaks with an error of tenths of a decibel.
+            peak_text = f", peak {20 * np.log10(values.max() / peak):+.1f} dB" if view == "close" else ""
+            axes.set_title(name + peak_text, fontsize=10)
         row[0].set_ylabel("North, m")
-        figure.colorbar(shown, ax=row, label="dB against the true tracks' peak", pad=0.01, shrink=0.8)
+        figure.colorbar(shown, ax=row, label="dB relative to the peak with the true tracks", pad=0.01, shrink=0.8)
     return place_m
 
 
 def image(one: AutofocusCase, correction: TrackCorrection, grid: SceneGrid) -> Floats:
-    """Return (row, column), magnitude: the first pair's image from corrected tracks."""
+    """Return the magnitude of the first pair's image from corrected tracks, (row, column)."""
     return np.asarray(np.abs(native.form(native.prepare(one.records[0].moved(correction)), grid.positions(0.0))))
 
 
@@ -213,36 +221,34 @@ def _draw_image(axes: Axes, magnitude: Floats, grid: SceneGrid) -> AxesImage:
 
 
 def _draw_errors(axes: Axes, one: AutofocusCase, used: TrackCorrection, number: int) -> None:
-    """Draw what logs are wrong by along one axis, and what is left of it as images are formed."""
+    """Draw the errors of the logs along one axis, and the residual errors of the tracks used for imaging."""
     time_s = one.truth.time_s
     for node, colour in zip(NODES, _COLOURS, strict=True):
-        wrong = one.truth.at(node, time_s)[:, number]
-        _draw_pair(axes, time_s, (wrong, wrong - used.at(node, time_s)[:, number]), (node, colour))
+        log_error = one.truth.at(node, time_s)[:, number]
+        _draw_pair(axes, time_s, (log_error, log_error - used.at(node, time_s)[:, number]), (node, colour))
 
 
 def _draw_paths(axes: Axes, one: AutofocusCase, used: TrackCorrection, place_m: Floats) -> None:
-    """Draw by how much paths to a place are wrong, but for their mean: this is what blurs it."""
+    """Draw the errors of paths to a point less their means: the part that defocuses the point."""
     for record, colour in zip(one.records, _COLOURS, strict=False):
         true, logged, now = (_path(record, tracks, place_m) for tracks in (one.truth, UNCORRECTED, used))
         errors = tuple(error - error.mean() for error in (true - logged, true - now))
         _draw_pair(axes, record.time_s, errors, (record.pair, colour))
-    axes.set_title(
-        f"path to the place looked at closely, {place_m[0]:.1f} m east, {place_m[1]:.1f} m north", fontsize=10
-    )
-    axes.set_ylabel("Error less its mean, cm")
+    axes.set_title(f"path to the enlarged point at {place_m[0]:.1f} m east, {place_m[1]:.1f} m north", fontsize=10)
+    axes.set_ylabel("Path error less its mean, cm")
 
 
 def _path(record: PairRecord, tracks: TrackCorrection, place_m: Floats) -> Floats:
-    """Return (pulse,) metres: the path that tracks expect of a place's echo (docs/theory/autofocus.md, eq. 1)."""
+    """Return the path of a point's echo that tracks predict, (pulse,) metres (docs/theory/autofocus.md, eq. 1)."""
     aperture = tracks.aperture(record.profiles.aperture, record.pair, record.time_s)
     longer_m = tracks.longer_m(record.pair, record.time_s, record.sidelink_m)
     return np.asarray(aperture.path(place_m[None])[:, 0] - longer_m)
 
 
 def _draw_pair(axes: Axes, time_s: Floats, errors: tuple[Floats, Floats], named: tuple[str, str]) -> None:
-    (log, left), (name, colour) = errors, named
+    (log, residual), (name, colour) = errors, named
     axes.plot(time_s, 100 * log, color=colour, alpha=0.35, linewidth=1, label=f"{name}, log")
-    axes.plot(time_s, 100 * left, color=colour, linewidth=1.2, label=f"{name}, left")
+    axes.plot(time_s, 100 * residual, color=colour, linewidth=1.2, label=f"{name}, residual")
     axes.axhline(0, color="0.3", linewidth=0.6)
     axes.set_xlabel("Time, s")
     axes.grid(alpha=0.3)
@@ -256,4 +262,4 @@ STUDY = Study(
     run=run_case,
     draw=draw_losses,
 )
-"""A part is a scene; a case is a size of the logs' errors and a seed."""
+"""A part is a scene; a case is a standard deviation of the logs' errors and a seed."""

@@ -1,4 +1,4 @@
-"""Costs of track errors with and without autofocus: losses and shifts of peaks against the true tracks."""
+"""Cost of track errors with and without autofocus: loss and displacement of peaks relative to the true tracks."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +16,8 @@ from apertura.methods.autofocus.refine import refine
 from apertura_research.autofocus.cases import GRID, PROBES_M, AutofocusCase, case
 
 UNCORRECTED = TrackCorrection(np.zeros(1), {})
-_SEARCHES = ((33, 25), (9, 9), (9, 9))  # places east and north of ever finer searches for a peak
+_SEARCHES = ((33, 25), (9, 9), (9, 9))
+"""Points east and north of successively finer searches for a peak."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +29,7 @@ class PointPeaks:
     height
         (pair, point) float64, magnitude.
     place_m
-        (pair, point, 3) float64.
+        (pair, point, 3) float64, position of the peak.
     """
 
     height: Floats
@@ -38,7 +39,7 @@ class PointPeaks:
 def peaks(
     records: Sequence[PairRecord], correction: TrackCorrection, points_m: Floats, reach_m: tuple[float, float]
 ) -> PointPeaks:
-    """Return the highest peaks within reach of points (point, 3) as imaged from corrected tracks."""
+    """Return the highest peaks within reach of points (point, 3), imaged from corrected tracks."""
     by_pair = []
     for one in records:
         tables = native.prepare(one.moved(correction))
@@ -61,14 +62,14 @@ def _peak(tables: Tables, middle_m: Floats, reach_m: tuple[float, float]) -> tup
 
 @dataclass(frozen=True)
 class CorrectionEffect:
-    """Effect of a correction on a case; NaN of targets where the scene has none.
+    """Effect of a correction on a case; target values are NaN if the scene has no targets.
 
     Attributes
     ----------
     probe_loss_db, probe_worst_db, target_loss_db
-        Mean and lowest peak of probes, mean of targets, over points and pairs, against the true tracks.
+        Mean and lowest peak of probes, mean of targets, over points and pairs, relative to the true tracks.
     probe_shift_cm, target_shift_cm
-        Median distance of peaks from where the true tracks have them.
+        Median distance of peaks from their positions with the true tracks.
     """
 
     probe_loss_db: float
@@ -79,9 +80,9 @@ class CorrectionEffect:
 
 
 def judge(one: AutofocusCase, correction: TrackCorrection = UNCORRECTED) -> CorrectionEffect:
-    """Return the effect of a correction on a case; that of the logs themselves by default.
+    """Measure the effect of a correction on a case; by default, of the uncorrected logs.
 
-    The probes are the honest ones: a fit to noise can lift a target's peak, not theirs.
+    The probes are independent of the estimate: a fit to noise can raise the peak of a target, but not of a probe.
     """
     probe_loss, probe_shift = _against_truth(one, one.probes, PROBES_M, correction)
     target_loss, target_shift = _against_truth(one, one.records, one.targets_m, correction)
@@ -93,7 +94,7 @@ def judge(one: AutofocusCase, correction: TrackCorrection = UNCORRECTED) -> Corr
 def _against_truth(
     one: AutofocusCase, records: Sequence[PairRecord], points_m: Floats, correction: TrackCorrection
 ) -> tuple[Floats, Floats]:
-    """Return loss (dB) and shift (cm) of points, (pair, point) float64 each."""
+    """Return peak levels relative to the true tracks (dB) and displacements (cm), (pair, point) float64 each."""
     true, now = (peaks(records, tracks, points_m, one.reach_m) for tracks in (one.truth, correction))
     loss = 20 * np.log10(now.height / true.height)
     return loss, 100 * np.linalg.norm(now.place_m - true.place_m, axis=-1)
@@ -108,10 +109,10 @@ def _median(values: Floats) -> float:
 
 
 def image_seconds(one: PairRecord, *, thinning: int = 5) -> float:
-    """Return the processor time of an image of the whole scene of every fifth pulse, by the native engine."""
-    begun = process_time()
+    """Measure the processor time of an image of the whole scene from every fifth pulse, by the native engine."""
+    start_s = process_time()
     native.form(native.prepare(one.profiles[::thinning]), GRID.positions(0.0))
-    return process_time() - begun
+    return process_time() - start_s
 
 
 KINDS: Mapping[str, str] = {
@@ -120,32 +121,32 @@ KINDS: Mapping[str, str] = {
     "texture": "texture",
     "dense": "fully developed speckle",
 }
-"""Rows of `SCENES` that are tried → how charts call them."""
+"""Scenes of the study, names in `SCENES` → labels in charts."""
 
 SIGMAS_CM = (0.0, 0.5, 1.0, 2.0, 3.0, 5.0)
 SEEDS = (1, 2, 3)
 SNR_DB = 10.0
 
 LEAST_STATED_M = 0.005
-"""Logs without error are stated to have this: with less no refinement is requested."""
+"""Smallest stated standard deviation: with less, the refinement is not requested."""
 
-ACCEPTED, FLAGGED, REFUSED, TOO_FEW = "accepted", "accepted with a flag", "refused", "refused: no bright place"
+ACCEPTED, FLAGGED, REFUSED, TOO_FEW = "accepted", "accepted with a flag", "refused", "refused: no bright point"
 VERDICTS = (ACCEPTED, FLAGGED, REFUSED, TOO_FEW)
 
 
 @dataclass(frozen=True)
 class AutofocusRow:
-    """Effect of errors of one size on one case, mono- and bistatic pair together: a row of the CSV.
+    """Effect of errors of one standard deviation on one case, both pairs together: a row of the CSV.
 
     Attributes
     ----------
     loss_db, product_loss_db, estimate_loss_db
-        Mean over the probes, which no refinement uses, against the true tracks; positive where peaks are too low:
-        of the logs, of the tracks that the product images from, and of its estimate, accepted or not.
+        Mean peak loss of the probes, which no refinement uses, relative to the true tracks; positive if peaks are too
+        low: with the logs, with the tracks that the product uses, and with its estimate, accepted or not.
     verdict
         One of `VERDICTS`.
     flags, why
-        As the product writes them.
+        Flags and reason reported by the product.
     """
 
     scene: str
@@ -160,14 +161,14 @@ class AutofocusRow:
 
 
 def cases_of(scene: str) -> list[tuple[float, int]]:  # noqa: ARG001
-    """Return size (cm) and seed of every case of a scene of `KINDS`."""
+    """Return sigma (cm) and seed of every case of a scene of `KINDS`."""
     return [(sigma_cm, seed) for sigma_cm in SIGMAS_CM for seed in SEEDS]
 
 
 def run_case(scene: str, size_and_seed: tuple[float, int]) -> list[AutofocusRow]:
-    """Return the outcome of one size and seed on one scene of `KINDS`, both pairs past it together.
+    """Run one sigma and seed on one scene of `KINDS` with both pairs together.
 
-    Tracks of a seed are the same in every scene and in every size but for their scale.
+    A seed gives the same track errors in every scene; only their scale depends on sigma.
     """
     one = case_of(scene, *size_and_seed)
     return [outcome_of(one, refine_case(one))]
@@ -179,7 +180,7 @@ def case_of(scene: str, sigma_cm: float, seed: int) -> AutofocusCase:
 
 
 def refine_case(one: AutofocusCase) -> Refinement:
-    """Refine a case whose errors are stated as they are."""
+    """Refine a case with the true standard deviations stated."""
     return refine(one.records, GRID, FlatGround(0.0), {node: _stated(known) for node, known in one.errors.items()})
 
 
@@ -189,7 +190,7 @@ def _stated(known: TrackErrors) -> TrackErrors:
 
 
 def outcome_of(one: AutofocusCase, result: Refinement) -> AutofocusRow:
-    """Return the loss of a case that a refinement leaves, and the verdict on it."""
+    """Measure the residual loss of a case after a refinement, and its verdict."""
     before, after = (0.0 - judge(one, tracks).probe_loss_db for tracks in (UNCORRECTED, result.correction))
     return AutofocusRow(
         scene=one.name[0],

@@ -1,1 +1,1 @@
-"""Errors of an image, from negligible to destructive: their cost, the expected cost, and the flags raised."""
+"""Image errors from negligible to destructive size: measured and expected loss, and the flags raised."""

@@ -1,4 +1,4 @@
-"""Every cause that spoils an image, from negligible to destructive, and what the budget expects of it."""
+"""Causes of image errors, from negligible to destructive size, and the effect that the error budget expects."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -29,22 +29,22 @@ _DEM_CORRELATION_M = 3.0
 
 @dataclass(frozen=True)
 class AssumedError:
-    """One cause and the sizes at which it is tried, from negligible to destructive.
+    """Cause of an image error and its simulated sizes, from negligible to destructive.
 
     Attributes
     ----------
     assume
-        Flight, size and generator → what the pipeline assumes.
+        Flight, size and generator → assumptions of the pipeline.
     expect
-        Flight, pair and size → what the budget expects when the size is stated.
+        Flight, pair and size → effect that the budget expects if the size is configured.
     stated
-        How it is stated to the budget, in a few words.
+        Term of the budget to which the size is configured.
     draws
-        How often it is drawn.
+        Number of random draws.
     added
-        It shows in the coherent sum of both pairs, and its loss is that of the sum.
+        True if the error affects only the coherent sum of both pairs; the loss is then that of the sum.
     pulses
-        Of the 10 s.
+        Number of pulses in 10 s.
     """
 
     title: str
@@ -64,12 +64,12 @@ class AssumedError:
 
 
 def nothing(flown: TrueFlight, pair: str, size: float) -> Effect:  # noqa: ARG001
-    """Return that the budget has no line for it."""
+    """Return no expected effect, for causes without a line in the budget."""
     return Effect(0.0, 0.0, 0.0)
 
 
 def positions(flown: TrueFlight, pair: str, *known: NodePositions) -> Effect:
-    """Return the line of positions: of one or both nodes of a pair, in the order a, b; a node not given is exact."""
+    """Return the expected effect of position errors of a pair's nodes, in the order a, b; omitted nodes are exact."""
     exact = NodePositions((1e-9,) * 3, 1.0, "truth")
     nodes = [*known, exact, exact]
     return position_lines(flown.paths(pair), nodes[: len(set(pair.split("-")))], sidelink=pair == "a-b")[0].effect
@@ -78,7 +78,7 @@ def positions(flown: TrueFlight, pair: str, *known: NodePositions) -> Effect:
 def offset(
     flown: TrueFlight, pair: str, slope: Callable[..., np.ndarray], size: float, *, common: bool = False
 ) -> Effect:
-    """Return the line of a constant error, whose path per unit follows from the paths of a point."""
+    """Return the expected effect of a constant error; `slope` gives its path per unit from the paths of a point."""
     paths = flown.paths(pair)
     return offset_line(paths, "", slope(paths), size, unit="", common=common).effect
 
@@ -100,7 +100,7 @@ def _higher(flown: TrueFlight, pair: str, higher_cm: float) -> Effect:
 
 
 def _only(pair: str, effect: Callable[..., Effect]) -> Expect:
-    """Return an expectation that touches one pair."""
+    """Return an expectation that applies to one pair only."""
     return lambda flown, one, size: effect(flown, one, size) if one == pair else Effect(0.0, 0.0, 0.0)
 
 
@@ -154,14 +154,15 @@ CAUSES: Mapping[str, AssumedError] = {
         "interpolation_m as positions",
     ),
     "tags_common": AssumedError(
-        "Tags of both nodes late", "ms", (1, 3, 10, 30, 60, 100, 300, 1000), _late_nodes, _late, "time tags", draws=2,
+        "Time tags of both nodes late", "ms", (1, 3, 10, 30, 60, 100, 300, 1000), _late_nodes, _late, "time tags",
+        draws=2,
     ),
     "tags_of_one": AssumedError(
-        "LogErrors of the receiver late", "ms", (0.3, 1, 3, 10, 20, 50, 100, 300), _late_receiver, _only("a-b", _late),
+        "Time tags of the receiver late", "ms", (0.3, 1, 3, 10, 20, 50, 100, 300), _late_receiver, _only("a-b", _late),
         "time tags", draws=2,
     ),
     "height": AssumedError(
-        "Ground taken too high", "cm", (0.3, 1, 3, 10, 20, 40, 100),
+        "Assumed terrain too high", "cm", (0.3, 1, 3, 10, 20, 40, 100),
         lambda flown, size, _: replace(flown.truth, terrain=FlatGround(_CM * size)),
         _higher, "heights", draws=2,
     ),
@@ -169,7 +170,7 @@ CAUSES: Mapping[str, AssumedError] = {
         "Error of the DEM, correlated over 3 m, rms", "cm", (0.3, 1, 3, 10, 20, 40, 60), _rough, _higher, "heights",
     ),
     "arm": AssumedError(
-        "Lever arm of the transmitting node off, in each axis", "cm", (0.1, 0.3, 1, 3, 10, 30, 100),
+        "Lever arm error of the transmitting node, in each axis", "cm", (0.1, 0.3, 1, 3, 10, 30, 100),
         lambda flown, size, _: replace(
             flown.truth, apertures=flown.apertures(a=flown.antenna("a", arm_m=(_CM * size,) * 3))
         ),
@@ -177,20 +178,20 @@ CAUSES: Mapping[str, AssumedError] = {
         "positions, one error for the whole flight", draws=2,
     ),
     "prf": AssumedError(
-        "One pulse imaged of so many, of 30 per metre", "1", (1, 2, 3, 4, 6, 8, 12, 16), _every, nothing,
+        "Decimation of pulses, of 30 per metre", "1", (1, 2, 3, 4, 6, 8, 12, 16), _every, nothing,
         "missing pulses (no loss)", draws=2,
     ),
     "presum": AssumedError(
-        "Pulses made one, of 120 per metre", "1", (1, 2, 3, 4, 5, 6, 8),
+        "Presumming of pulses, of 120 per metre", "1", (1, 2, 3, 4, 5, 6, 8),
         lambda flown, size, _: replace(flown.truth, presum=round(size)), nothing, "arithmetic, as measured", draws=1,
         pulses=1200,
     ),
     "antenna": AssumedError(
-        "Boresight off in azimuth, beam of 60°", "deg", (1, 3, 6, 10, 20, 30, 45, 60),
+        "Boresight error in azimuth, beam of 60°", "deg", (1, 3, 6, 10, 20, 30, 45, 60),
         lambda flown, size, _: replace(flown.truth, beams=flown.beams(size)), nothing, "no line", draws=2, beamed=True,
     ),
     "calibration": AssumedError(
-        "Path offset of the bistatic pair off", "cm", (0.1, 0.3, 1, 2, 3, 6, 10, 30),
+        "Path offset error of the bistatic pair", "cm", (0.1, 0.3, 1, 2, 3, 6, 10, 30),
         lambda flown, size, _: replace(flown.truth, longer_m={"a-b": _CM * size}),
         _only("a-b", lambda flown, pair, size: offset(flown, pair, lambda p: np.full(len(p.time_s), _CM), size)),
         "calibration", draws=2,
@@ -200,7 +201,7 @@ CAUSES: Mapping[str, AssumedError] = {
         _only("a-b", lambda flown, pair, size: _late(flown, pair, size * flown.time_s[1] / _MS)), "time tags", draws=2,
     ),
     "fusion_phase": AssumedError(
-        "Phase between the pairs", "rad", (0.1, 0.3, 0.6, 0.8, 1, 1.3, 1.6, 2.4, 3.1),
+        "Phase difference between the pairs", "rad", (0.1, 0.3, 0.6, 0.8, 1, 1.3, 1.6, 2.4, 3.1),
         lambda flown, size, _: replace(flown.truth, turned_rad={"a-b": size}),
         lambda _, __, size: Effect(20 * float(np.log10(max(abs(np.cos(size / 2)), 1e-3))), 0.0, size),
         "phase of a pair", draws=2, added=True,

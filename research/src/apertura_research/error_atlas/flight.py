@@ -1,4 +1,4 @@
-"""The flight of the error atlas: two nodes over five targets, what they receive, and what the pipeline assumes."""
+"""The flight of the error atlas: two nodes over five targets, their echoes, and the pipeline's assumptions."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -29,7 +29,7 @@ from apertura.simulation.targets import GaussianBeam, Sampled, Straight, Wobble
 from apertura_research.paper_scene import RX_AHEAD_M, Disturbance, PaperScene, receive_pair, reduced_scene
 
 PAIRS = ("a-a", "a-b")
-"""A node that sends and receives, and one ahead of it that receives."""
+"""Monostatic pair of node a, and bistatic pair with the receiver b ahead of it."""
 
 LASTING_S, SUBCARRIERS = 10.0, 256
 GRID = SceneGrid("local", -6.0, 27.0, 0.08, (300, 150))
@@ -48,9 +48,9 @@ class Received:
     Attributes
     ----------
     transfer
-        (pulse, subcarrier) complex64; divided by the sidelink where it is bistatic.
+        (pulse, subcarrier) complex64; divided by the sidelink if the pair is bistatic.
     sidelink_m
-        (pulse,) float64, path of the sidelink as measured; None of one node alone.
+        (pulse,) float64, measured path of the sidelink; None for a monostatic pair.
     """
 
     transfer: Complexes
@@ -59,24 +59,24 @@ class Received:
 
 @dataclass(frozen=True, eq=False)
 class AssumedFlight:
-    """Assumptions of the pipeline about a flight, right or wrong.
+    """Assumptions of the pipeline about a flight, correct or erroneous.
 
     Attributes
     ----------
     apertures
         Pair → phase centres.
     terrain
-        The ground.
+        Surface of the scene.
     longer_m, turned_rad
-        Pair → path and phase that stay uncorrected in its echo.
+        Pair → uncorrected path and phase in its echo.
     used
-        Pulses that are imaged; None: all.
+        Mask of the imaged pulses; None: all pulses.
     beams
         Pair → beams; empty: isotropic.
     presum
-        Pulses that are made one; None: as the planner likes.
+        Presumming factor; None: chosen by the planner.
     flags
-        Flags that the checks of logs have raised.
+        Flags raised by the checks of the logs.
     """
 
     apertures: Mapping[str, Aperture]
@@ -89,7 +89,7 @@ class AssumedFlight:
     flags: Mapping[str, str] = field(default_factory=dict)
 
     def history(self, pair: str, received: Received, frequency_hz: Floats) -> PhaseHistory:
-        """Return the phase history of a pair as the pipeline would make it."""
+        """Return the phase history of a pair as the pipeline computes it."""
         aperture, used = self.apertures[pair], slice(None) if self.used is None else self.used
         longer_m = np.full(len(aperture), self.longer_m.get(pair, 0.0))
         if received.sidelink_m is not None:
@@ -100,7 +100,7 @@ class AssumedFlight:
         return PhaseHistory(received.transfer[used] * turn, frequency_hz, weight, delay_s, aperture[used])
 
     def sidelink_flags(self, pair: str, received: Received) -> dict[str, str]:
-        """Return the flag of a sidelink that does not move as the logs say."""
+        """Return the flag of a sidelink whose length disagrees with the logs."""
         if received.sidelink_m is None:
             return {}
         used = slice(None) if self.used is None else self.used
@@ -111,18 +111,18 @@ class AssumedFlight:
 
 @dataclass(frozen=True, eq=False)
 class TrueFlight:
-    """True flight: 10 m at 1 m/s and 10 m above the ground, shaken by the wind as far as `Wobble` says.
+    """True flight: 10 m at 1 m/s, 10 m above the terrain, with the wind disturbances of `Wobble`.
 
     Attributes
     ----------
     nodes
-        Node → how it flew.
+        Node → true trajectory.
     scene
         Waveform and scatterers.
     time_s
         (pulse,) float64, seconds.
     beamed
-        Whether the antennas of node a have beams; else all are isotropic.
+        True if the antennas of node a have beams; all others are isotropic.
     """
 
     nodes: Mapping[str, Sampled]
@@ -131,27 +131,27 @@ class TrueFlight:
     beamed: bool = False
 
     def antenna(self, node: str, at_s: Floats | None = None, arm_m: tuple[float, float, float] = (0, 0, 0)) -> Floats:
-        """Return (pulse, 3) float64 places of a node's antennas, which lie `arm_m` from its logged point."""
+        """Return antenna positions of a node, (pulse, 3) float64, with lever arm `arm_m` from its logged point."""
         at_s = self.time_s if at_s is None else at_s
         return np.asarray(self.nodes[node].position(at_s) + self.turn(node, at_s) @ np.array(arm_m, np.float64))
 
     def turn(self, node: str, at_s: Floats) -> Floats:
-        """Return (pulse, 3, 3) float64, forward-right-down of a node into east-north-up."""
+        """Return the rotation of a node from forward-right-down to east-north-up, (pulse, 3, 3) float64."""
         to_ned = body_axes(self.nodes[node].attitude(at_s))
         return np.stack([to_ned[:, 1], to_ned[:, 0], -to_ned[:, 2]], axis=1)
 
     def apertures(self, **moved: Floats) -> dict[str, Aperture]:
-        """Return pair → phase centres, with some nodes elsewhere, (pulse, 3) metres."""
+        """Return pair → phase centres, with the positions of some nodes replaced, (pulse, 3) metres."""
         places = {node: moved.get(node, self.antenna(node)) for node in self.nodes}
         return {pair: Aperture(*(places[node] for node in pair.split("-"))) for pair in PAIRS}
 
     @property
     def truth(self) -> AssumedFlight:
-        """Assumptions of a pipeline that knows everything."""
+        """Assumptions without any error."""
         return AssumedFlight(self.apertures(), beams=self.beams())
 
     def beams(self, off_deg: float = 0.0) -> dict[str, Beams]:
-        """Return pair → beams of node a's antennas, turned off their boresight in azimuth."""
+        """Return pair → beams of node a's antennas, with a boresight error in azimuth."""
         if not self.beamed:
             return {}
         axes = antenna_axes(self.turn("a", self.time_s), (_LOOKING_DEG[0] + off_deg, _LOOKING_DEG[1]))
@@ -160,7 +160,7 @@ class TrueFlight:
         return {"a-a": Beams(beam, beam), "a-b": Beams(transmit=beam)}
 
     def receive(self, pair: str, generator: np.random.Generator) -> Received:
-        """Return the echoes of a pair, with 20 dB SNR per subcarrier and 30 dB of the sidelink."""
+        """Simulate the echoes of a pair, with an SNR per subcarrier of 20 dB, and 30 dB for the sidelink."""
         tx_m, rx_m = self.apertures()[pair].legs
         geometry = Geometry(tx_m, rx_m, tx_m, rx_m, gain=self._gain(pair))
         scene = PaperScene(self.scene.waveform, self.scene.scatterers, geometry)
@@ -171,7 +171,7 @@ class TrueFlight:
         return Received(METHODS["divide"](radar, sidelink), measure(sidelink).delay_cells * cell_m)
 
     def paths(self, pair: str) -> PointPaths:
-        """Return the paths of a point in the middle of the scene, which the budget is of."""
+        """Return the paths of a point in the middle of the scene, for which the budget is computed."""
         return PointPaths.of(
             self.apertures()[pair],
             self.time_s,
@@ -200,7 +200,7 @@ class TrueFlight:
 
 @cache
 def flight(*, pulses: int = 300, beamed: bool = False) -> TrueFlight:
-    """Return the flight of every sweep, with so many pulses."""
+    """Return the flight of every sweep with a given number of pulses."""
     generator = np.random.default_rng(7)
     nodes = {
         node: Wobble().around(Straight((middle_m - LASTING_S / 2, 0.0, 10.0), (1.0, 0.0, 0.0)), LASTING_S, generator)
@@ -211,7 +211,7 @@ def flight(*, pulses: int = 300, beamed: bool = False) -> TrueFlight:
 
 
 NOISE_M = 0.002
-"""Of every epoch by itself."""
+"""Standard deviation of the uncorrelated noise of every epoch, metres per axis."""
 
 USUAL_HZ = 20.0
 _MARGIN_S = 9.0
@@ -227,9 +227,9 @@ class LogErrors:
     rate_hz
         Epochs per second.
     wander_m, correlation_s
-        Error of every epoch, per axis: white noise after a moving average of so long.
+        Standard deviation and correlation time of the position error per axis: white noise after a moving average.
     gap_s
-        Length of what is missing in the middle.
+        Length of the gap in the middle of the log.
     """
 
     rate_hz: float = USUAL_HZ
@@ -238,14 +238,14 @@ class LogErrors:
     gap_s: float = 0.0
 
     def checked(self, flown: TrueFlight, node: str, generator: Generator) -> tuple[Floats, CheckedTrack]:
-        """Return (pulse, 3) float64 positions as the log gives them, and what its checks say."""
+        """Return the logged positions of the pulses, (pulse, 3) float64, and the results of the log's checks."""
         end_s = float(flown.time_s[-1])
         time_s = np.arange(-_MARGIN_S, end_s + _MARGIN_S, 1 / self.rate_hz)
         place_m = flown.nodes[node].position(time_s)
         place_m += NOISE_M * generator.standard_normal(place_m.shape)
         place_m += self.wander_m * self._wander(len(time_s), generator)
-        there = np.abs(time_s - end_s / 2) >= self.gap_s / 2
-        time_s, place_m = time_s[there], place_m[there]
+        logged = np.abs(time_s - end_s / 2) >= self.gap_s / 2
+        time_s, place_m = time_s[logged], place_m[logged]
         wavelength_m = flown.paths("a-a").wavelength_m
         checked = check_track(
             time_s,
@@ -257,14 +257,14 @@ class LogErrors:
         return np.asarray(spline(flown.time_s)), checked
 
     def _wander(self, count: int, generator: Generator) -> Floats:
-        """Return (epoch, 3) float64 of unit variance."""
+        """Draw correlated errors of unit variance, (epoch, 3) float64."""
         width = max(1, round(self.correlation_s * self.rate_hz))
         white = generator.standard_normal((count + width - 1, 3)) / np.sqrt(width)
         return np.stack([np.convolve(axis, np.ones(width), "valid") for axis in white.T], -1)
 
 
 def assumed_from_logs(flown: TrueFlight, generator: Generator, **logs: LogErrors) -> AssumedFlight:
-    """Return the assumptions of a pipeline whose nodes have these logs; nodes without one are where they truly are."""
+    """Return the assumptions of a pipeline with erroneous logs; nodes without one have their true positions."""
     places, used, flags = {}, np.ones(len(flown.time_s), bool), dict[str, str]()
     for node, log in logs.items():
         places[node], checked = log.checked(flown, node, generator)
@@ -277,7 +277,7 @@ def assumed_from_logs(flown: TrueFlight, generator: Generator, **logs: LogErrors
 
 
 def between_epochs(flown: TrueFlight, log: LogErrors) -> NodePositions:
-    """Return the error of the spline between a log's epochs by its checks, as the budget takes positions."""
+    """Return the position accuracy between a log's epochs, estimated by the checks of the log, for the budget."""
     _, checked = log.checked(flown, "a", np.random.default_rng(0))
     std_m = checked.interpolation_m or 0.0
     return NodePositions((std_m,) * 3, 1 / log.rate_hz, "the log's own epochs")

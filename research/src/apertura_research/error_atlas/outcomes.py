@@ -1,4 +1,4 @@
-"""Effect of each size of a cause on images, the effect that the budget expects, and the flags raised."""
+"""Measured effect of each size of a cause on images, the effect that the budget expects, and the flags raised."""
 
 import contextlib
 import io
@@ -28,32 +28,32 @@ from apertura_research.error_atlas.causes import CAUSES
 from apertura_research.error_atlas.flight import GRID, PAIRS, AssumedFlight, Received, TrueFlight
 
 ACCURACY_DB = -70.0
-"""Worse arithmetic moves the flat tops of wide lobes by millimetres."""
+"""Requested numerical accuracy: a larger error displaces the flat peaks of wide main lobes by millimetres."""
 
 _TILE_PX = 256
 _REACH_M = 2.4
-_BESIDE_M = 1.5
+_GHOST_DISTANCE_M = 1.5
 _ROUNDS = 4
 
 
 @dataclass(frozen=True, eq=False)
 class PairImage:
-    """The image of one pair: what the pipeline reports of it, and where its targets are.
+    """Image of one pair, with the pipeline's report and the peaks of its targets.
 
     Attributes
     ----------
     image
         (y, x) complex64.
     at
-        Rows and columns, (n, m) float64 each → the image there, formed there by the same engine.
+        Rows and columns, (n, m) float64 each → values of the image at these points, formed by the same engine.
     focus, flags
-        As image.json has them.
+        Entries of image.json.
     carriers
-        Of points over the image, `carriers_of`.
+        Result of `carriers_of`, for points over the image.
     peaks
         (target, 3) float64: row, column, amplitude.
     error_db
-        Numerical, as certified.
+        Certified numerical error.
     """
 
     image: NDArray[np.complex64]
@@ -66,26 +66,26 @@ class PairImage:
 
     @property
     def ghost_db(self) -> float:
-        """Brightest pixel far from all targets, wherever these appear, against the brightest of all, dB."""
+        """Level of the brightest pixel away from all imaged targets, relative to the brightest pixel, dB."""
         rows, columns = np.indices(self.image.shape)
         away = np.ones(self.image.shape, bool)
         for row, column, _ in self.peaks:
-            away &= np.hypot(rows - row, columns - column) * GRID.spacing_m > _BESIDE_M
+            away &= np.hypot(rows - row, columns - column) * GRID.spacing_m > _GHOST_DISTANCE_M
         return float(decibels(np.abs(self.image[away]).max() / np.abs(self.image).max()))
 
 
 def form_images(flown: TrueFlight, assumed: AssumedFlight, received: dict[str, Received]) -> dict[str, PairImage]:
-    """Return both images of a flight, and what the pipeline reports of each and of both together."""
+    """Form both images of a flight, with the pipeline's report on each, and on both together."""
     images = {pair: _pair_image(flown, assumed, pair, received[pair]) for pair in PAIRS}
     together = _between(images)
     return {pair: replace(one, flags={**one.flags, **together}) for pair, one in images.items()}
 
 
 def _pair_image(flown: TrueFlight, assumed: AssumedFlight, pair: str, received: Received) -> PairImage:
-    """Return one image, as step image does."""
+    """Form one image in the same way as step image."""
     formation = _formation(assumed, pair, assumed.history(pair, received, flown.frequency_hz))
     image = np.asarray(formation.image.compute(scheduler="synchronous"))
-    with contextlib.redirect_stdout(io.StringIO()):  # the bars of tiles formed again
+    with contextlib.redirect_stdout(io.StringIO()):  # the progress bars of recomputed tiles
         certificate = certified(formation, image, accuracy_db=ACCURACY_DB, threads=1)
     focus = focus_report(formation, image)
     flags = {**assumed.flags, **assumed.sidelink_flags(pair, received), **formation.plan.flags, **certificate["flags"]}
@@ -110,7 +110,7 @@ def _formation(assumed: AssumedFlight, pair: str, history: Any) -> Formation:
 
 
 def _interpolator(formation: Formation) -> Callable[[Floats, Floats], NDArray[np.complex64]]:
-    """Return the planned image at any place, formed there: a raster locates a peak to a centimetre only."""
+    """Return a function that forms the planned image at any point: a raster locates a peak to a centimetre only."""
     setting, inputs = formation.plan.setting, formation.plan.inputs(formation.profiles)
     engine = load_engine(setting.engine)
     tables = engine.prepare(inputs, **setting.options)
@@ -124,7 +124,7 @@ def _interpolator(formation: Formation) -> Callable[[Floats, Floats], NDArray[np
 
 
 def _peaks(image: NDArray[np.complex64], at: Callable[..., NDArray[np.complex64]], targets_m: Floats) -> Floats:
-    """Return (target, 3) float64: row, column and amplitude of the highest place near each target."""
+    """Return row, column and amplitude of the peak near each target, (target, 3) float64."""
     peaks = []
     reach = round(_REACH_M / GRID.spacing_m)
     for row, column in np.transpose(GRID.pixel_of(targets_m[:, 0], targets_m[:, 1])).round().astype(int):
@@ -138,14 +138,14 @@ def _peaks(image: NDArray[np.complex64], at: Callable[..., NDArray[np.complex64]
 
 
 def _between(images: dict[str, PairImage]) -> dict[str, str]:
-    """Return the flags that step assess raises on two images."""
+    """Return the flags that step assess raises for a pair of images."""
     two = [images[pair] for pair in PAIRS]
     windows = list(GRID.tiles(_TILE_PX))
     first, second = (ComparedImage.from_raster(one.image, one.focus, one.carriers, GRID, windows) for one in two)
     agreement = agreement_of(first, second, GRID, windows)
     if agreement is None:
-        sure = any(point["snr_db"] > 20.0 for point in two[0].focus["points"])
-        return {"pair_unconfirmed": "no point in common"} if sure else {}
+        has_bright_point = any(point["snr_db"] > 20.0 for point in two[0].focus["points"])
+        return {"pair_unconfirmed": "no common point"} if has_bright_point else {}
     shifted = {"pairs_displaced": f"{agreement.shift_m:.3f} m"} if agreement.shifted else {}
     return shifted | ({"pairs_out_of_phase": f"{agreement.phase_rad:.2f} rad"} if agreement.out_of_phase else {})
 
@@ -162,20 +162,19 @@ class ErrorAtlasRow:
     Attributes
     ----------
     pair
-        For which the budget expects more, the monostatic where it expects nothing: losses and shifts are its.
+        Pair of the losses and displacements: that with the larger expected effect, or the monostatic one without any.
     loss_db, shift_m
-        Mean over the five targets, against the same draw with nothing wrong.
+        Mean over the five targets, relative to the same draw without the error.
     phase_rad
-        Between both pairs halfway between their peaks, against the same draw with nothing wrong.
+        Phase difference of the pairs halfway between their peaks, relative to the same draw without the error.
     ghost_db
-        How much brighter, against the brightest target, the brightest pixel became that is 1.5 m from all of them.
+        Increase of the brightest pixel at 1.5 m or more from all targets, relative to the brightest target.
     cell_m
         Resolution cell.
     expected_loss_db, expected_shift_m, expected_phase_rad
-        By the budget when the size is stated; arithmetic as measured.
+        Effects expected by the budget if the size is configured, with the measured numerical error.
     flags
-        Names of what was raised on either pair, with blanks between; `refused`: an error instead of an image, whose
-        losses are NaN.
+        Flags raised on either pair, separated by blanks; `refused`: an error was raised instead, and losses are NaN.
     """
 
     cause: str
@@ -195,12 +194,12 @@ class ErrorAtlasRow:
 
 
 def draws_of(cause: str) -> range:
-    """Return the numbers of the draws of one of `CAUSES`."""
+    """Return the draw numbers of one of `CAUSES`."""
     return range(CAUSES[cause].draws)
 
 
 def run_draw(name: str, draw: int, *, seed: int = 1) -> Iterator[ErrorAtlasRow]:
-    """Yield one draw at each size of one of `CAUSES`; every size gets the same random numbers."""
+    """Simulate one draw at each size of one of `CAUSES`, with the same random numbers for every size."""
     cause = CAUSES[name]
     flown = cause.flight()
     generator = np.random.default_rng([seed, draw])
@@ -248,22 +247,22 @@ def _outcome(
 
 
 def _harm(right: dict[str, PairImage], wrong: dict[str, PairImage], pair: str) -> tuple[float, float, float, float]:
-    """Return loss (dB), shift (m), phase (rad) and rise of ghosts (dB)."""
+    """Return loss (dB), displacement (m), phase (rad) and increase of ghosts (dB)."""
     loss_db = -float(decibels(wrong[pair].peaks[:, 2] / right[pair].peaks[:, 2]).mean())
-    moved = (wrong[pair].peaks - right[pair].peaks)[:, :2] * GRID.spacing_m
+    displacement_m = (wrong[pair].peaks - right[pair].peaks)[:, :2] * GRID.spacing_m
     before, after = _phasors(right), _phasors(wrong)
-    turned = ((after[1] * after[0].conj()) * (before[1] * before[0].conj()).conj()).sum()
+    phase_change = ((after[1] * after[0].conj()) * (before[1] * before[0].conj()).conj()).sum()
     ghost_db = max(wrong[one].ghost_db - right[one].ghost_db for one in PAIRS)
-    return loss_db, float(np.hypot(*moved.T).mean()), float(abs(np.angle(turned))), ghost_db
+    return loss_db, float(np.hypot(*displacement_m.T).mean()), float(abs(np.angle(phase_change))), ghost_db
 
 
 def _sum_loss_db(right: dict[str, PairImage], wrong: dict[str, PairImage]) -> float:
-    """Return the loss of the coherent sum of both pairs, dB, mean over the targets."""
+    """Return the loss of the coherent sum of both pairs, averaged over the targets, dB."""
     before, after = (np.abs(_phasors(images).sum(axis=0)) for images in (right, wrong))
     return -float(decibels(after / before).mean())
 
 
 def _phasors(images: dict[str, PairImage]) -> NDArray[np.complex128]:
-    """Return (pair, target) complex128, both images halfway between their peaks."""
+    """Return values of both images halfway between their peaks, (pair, target) complex128."""
     middle = np.mean([one.peaks[:, :2] for one in images.values()], axis=0)
     return np.array([one.at(middle[:, :1], middle[:, 1:])[:, 0] for one in images.values()], np.complex128)

@@ -1,4 +1,4 @@
-"""The error atlas as a study: its parts, its tables of harm and flags, and its charts."""
+"""The error atlas as a study: its parts, its tables of losses and flags, and its charts."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,13 +14,13 @@ from apertura_research.error_atlas.outcomes import ErrorAtlasRow, draws_of, run_
 from apertura_research.sweep import Study, crossing, draw_table, order_sizes, panels, with_unit
 
 HARMFUL_DB, HARMFUL_CELLS = 1.0, 0.5
-"""An image that lost more, or lies further off, is wrong: without a flag, an alarm is missed."""
+"""Peak loss or displacement above which an image is wrong: without a flag, it counts as a missed alarm."""
 
 HARMLESS_DB, HARMLESS_CELLS, HARMLESS_RAD, HARMLESS_GHOST_DB = 0.3, 0.1, 0.3, 3.0
-"""An image with less of all of these is right: with a flag, an alarm is false."""
+"""Limits below all of which an image is right: with a flag, it counts as a false alarm."""
 
 _MEASURABLE_DB = 0.5
-"""Losses above which the ratio of expected to measured loss is formed."""
+"""Smallest loss for which the ratio of expected to measured loss is computed."""
 
 
 @dataclass(frozen=True)
@@ -30,22 +30,22 @@ class CauseSummary:
     Attributes
     ----------
     size_at_1_db, expected_at_1_db
-        Where the mean loss measured, and the loss expected, pass 1 dB, interpolated; NaN: nowhere in the sweep.
+        Interpolated sizes at which the mean measured loss and the expected loss exceed 1 dB; NaN: not in the sweep.
     size_of_harm
-        The first size at which most draws are wrong: more than 1 dB or half a cell.
+        The first size at which most draws are wrong: more than 1 dB or half a resolution cell.
     size_of_flag
         The first size at which most draws have a flag.
     expected_over_measured
-        Of the losses in dB, mean over the sizes that cost more than 0.5 dB; of the shifts where none does: more than a
-        tenth of a cell.
+        Ratio of losses in dB, averaged over the sizes that cost more than 0.5 dB; without any, ratio of displacements,
+        over those of more than a tenth of a resolution cell.
     ratio_of
-        loss, shift or nothing.
+        Quantity of the ratio: loss, shift or nothing.
     wrong, missed
-        Draws that are wrong, and the share of them without a flag.
+        Number of wrong draws, and the share of them without a flag.
     right, false
-        Draws that are right, and the share of them with a flag.
+        Number of right draws, and the share of them with a flag.
     flags
-        Raised at any size, with blanks between.
+        Flags raised at any size, separated by blanks.
     """
 
     cause: str
@@ -71,13 +71,13 @@ class Alarm:
     Attributes
     ----------
     raised
-        Draws of all causes with it.
+        Number of draws of all causes with the flag.
     wrong, missed
-        Draws that are wrong by causes that raise it at some size, and the share of them without it.
+        Number of wrong draws of the causes that raise the flag at any size, and the share of them without it.
     unflagged
-        The share of the same without any flag.
+        Share of these wrong draws without any flag.
     right, false
-        Draws of all causes that are right, and the share of them with it.
+        Number of right draws of all causes, and the share of them with the flag.
     """
 
     flag: str
@@ -90,12 +90,12 @@ class Alarm:
 
 
 def is_wrong(one: ErrorAtlasRow) -> bool:
-    """Test whether the image of a draw should have a flag."""
+    """Return True if the image of a draw should have a flag."""
     return one.loss_db > HARMFUL_DB or one.shift_m > HARMFUL_CELLS * one.cell_m
 
 
 def is_right(one: ErrorAtlasRow) -> bool:
-    """Test whether the image of a draw should have none."""
+    """Return True if the image of a draw should have no flag."""
     return (
         one.loss_db < HARMLESS_DB
         and one.shift_m < HARMLESS_CELLS * one.cell_m
@@ -105,14 +105,14 @@ def is_right(one: ErrorAtlasRow) -> bool:
 
 
 def by_size(outcomes: Sequence[ErrorAtlasRow]) -> dict[float, list[ErrorAtlasRow]]:
-    """Return size → its draws, in the order of the sweep."""
+    """Group draws by size, in the order of the sweep."""
     sizes = dict.fromkeys(one.size for one in outcomes)
     return {size: [one for one in outcomes if one.size == size] for size in sizes}
 
 
-def mean_of(some: Sequence[ErrorAtlasRow], name: str) -> float:
-    """Return the mean of one column over draws that were not refused; NaN without any."""
-    values = [value for one in some if np.isfinite(value := getattr(one, name))]
+def mean_of(rows: Sequence[ErrorAtlasRow], name: str) -> float:
+    """Return the mean of one column over the draws that were not refused; NaN without any."""
+    values = [value for row in rows if np.isfinite(value := getattr(row, name))]
     return float(np.mean(values)) if values else float("nan")
 
 
@@ -172,13 +172,13 @@ def alarms(outcomes: Sequence[ErrorAtlasRow]) -> list[Alarm]:
     return rows
 
 
-def share(some: Sequence[ErrorAtlasRow], holds: Callable[[ErrorAtlasRow], bool]) -> float:
-    """Return the share of draws of which something holds; NaN without any."""
-    return _rounded(np.mean([holds(one) for one in some])) if some else float("nan")
+def share(rows: Sequence[ErrorAtlasRow], condition: Callable[[ErrorAtlasRow], bool]) -> float:
+    """Return the share of draws that meet a condition; NaN without any draw."""
+    return _rounded(np.mean([condition(row) for row in rows])) if rows else float("nan")
 
 
 def summarise(outcomes: Sequence[ErrorAtlasRow], folder: Path) -> None:
-    """Write summary.csv and .png, what each cause comes to, and flags.csv, how well each flag warns."""
+    """Write summary.csv and summary.png, a row per cause, and flags.csv, the reliability of each flag."""
     rows = [summary_of([one for one in outcomes if one.cause == cause]) for cause in CAUSES]
     write_table(folder / "flags.csv", alarms(outcomes))
     write_table(folder / "summary.csv", rows)
@@ -186,7 +186,7 @@ def summarise(outcomes: Sequence[ErrorAtlasRow], folder: Path) -> None:
 
 
 def _ratio(groups: dict[float, list[ErrorAtlasRow]]) -> tuple[float, str]:
-    """Return expected over measured, and of what."""
+    """Return the mean ratio of expected to measured effect, and the name of the quantity."""
     cell_m = next(iter(groups.values()))[0].cell_m
     for what, name, least in (("loss", "loss_db", _MEASURABLE_DB), ("shift", "shift_m", HARMLESS_CELLS * cell_m)):
         ratios = []
@@ -203,9 +203,11 @@ def _raises(flag: str, one: ErrorAtlasRow) -> bool:
     return flag in one.flags.split()
 
 
-def _first(groups: dict[float, list[ErrorAtlasRow]], holds: Callable[[ErrorAtlasRow], bool]) -> float:
-    """Return the first size at which most draws hold; NaN where none does."""
-    return next((size for size, some in groups.items() if np.mean([holds(one) for one in some]) > 0.5), float("nan"))
+def _first(groups: dict[float, list[ErrorAtlasRow]], condition: Callable[[ErrorAtlasRow], bool]) -> float:
+    """Return the first size at which most draws meet a condition; NaN without any."""
+    return next(
+        (size for size, rows in groups.items() if np.mean([condition(row) for row in rows]) > 0.5), float("nan")
+    )
 
 
 def _rounded(value: float | np.floating) -> float:
@@ -214,21 +216,21 @@ def _rounded(value: float | np.floating) -> float:
 
 _MEASURED, _EXPECTED, _FLAGGED = "#0072b2", "#d55e00", "#cc0000"
 _LEAST = {"loss_db": 0.01, "shift_m": 0.05, "phase_rad": 0.01}
-"""Smaller values are drawn at the lower edge, in the unit of the axis."""
+"""Lower ends of the axes, in their units; smaller values are drawn there."""
 
 
 def draw_cause(name: str, outcomes: Sequence[ErrorAtlasRow], path: Path) -> None:
-    """Draw loss, shift and phase against the size of one cause: measured, expected, and where a flag was raised."""
+    """Draw measured and expected loss, displacement and phase against the size of one cause, and mark raised flags."""
     cause, cell_m = CAUSES[name], outcomes[0].cell_m
     quantities = (
-        ("loss_db", 1.0, "Loss of the coherent sum, dB" if cause.added else "Loss of peak, dB", HARMFUL_DB, "1 dB"),
-        ("shift_m", 100.0, "Shift over ground, cm", 100 * HARMFUL_CELLS * cell_m, "half a cell"),
-        ("phase_rad", 1.0, "Phase between the pairs, rad", None, ""),
+        ("loss_db", 1.0, "Loss of the coherent sum, dB" if cause.added else "Peak loss, dB", HARMFUL_DB, "1 dB"),
+        ("shift_m", 100.0, "Horizontal displacement, cm", 100 * HARMFUL_CELLS * cell_m, "half a resolution cell"),
+        ("phase_rad", 1.0, "Phase difference between the pairs, rad", None, ""),
     )
     names = " ".join(sorted({flag for one in outcomes for flag in one.flags.split()})) or "none"
     title = (
-        f"{cause.title} — stated to the budget as: {cause.stated}\n"
-        f"flags: {names}; what is too small for an axis stands on its edge"
+        f"{cause.title} — line of the error budget: {cause.stated}\n"
+        f"flags: {names}; values below an axis are drawn at its lower end"
     )
     with panels(path, (12.5, 4.6), (1, len(quantities)), title=title) as every:
         for axes, (quantity, scale, label, limit, text) in zip(every, quantities, strict=True):
@@ -248,7 +250,7 @@ def _draw_panel(axes: Axes, outcomes: Sequence[ErrorAtlasRow], name: str, scale:
     means = np.array([max(scale * mean_of(some, name), least) for some in groups.values()])
     ends = np.abs([[some.min(), some.max()] for some in drawn] - means[:, None]).T
     axes.errorbar(
-        sizes, means, ends, color=_MEASURED, marker="o", capsize=3, label="measured: mean, least and most of the draws"
+        sizes, means, ends, color=_MEASURED, marker="o", capsize=3, label="measured: mean, minimum, maximum of draws"
     )
     expected = [mean_of(some, f"expected_{name}") for some in groups.values()]
     axes.plot(
@@ -257,10 +259,10 @@ def _draw_panel(axes: Axes, outcomes: Sequence[ErrorAtlasRow], name: str, scale:
         color=_EXPECTED,
         linestyle="--",
         zorder=3,
-        label="expected by budget",
+        label="expected by the budget",
     )
     shares = np.array([np.mean([bool(one.flags) for one in some]) for some in groups.values()])
-    for most, label in ((True, "flag in most draws"), (False, "flag in some")):
+    for most, label in ((True, "flag in most draws"), (False, "flag in fewer draws")):
         at = (shares > 0.5) if most else (shares > 0) & (shares <= 0.5)
         face = _FLAGGED if most else "none"
         axes.plot(
@@ -276,18 +278,18 @@ def _draw_panel(axes: Axes, outcomes: Sequence[ErrorAtlasRow], name: str, scale:
 
 
 def draw_summary(rows: Sequence[CauseSummary], path: Path) -> None:
-    """Draw a table: per cause where harm and flag begin, how well it was expected, which alarms fail."""
+    """Draw a table: per cause, sizes of first loss and first flag, expected over measured effect, and alarm rates."""
     headings = (
-        "1 dB lost at", "1 dB expected at", "wrong from", "flag from", "expected /\nmeasured", "alarms missed",
-        "alarms false",
+        "1 dB loss at", "1 dB expected at", "wrong from", "flag from", "expected /\nmeasured", "missed alarms",
+        "false alarms",
     )  # fmt: skip
     draw_table(
         path,
         [_texts(row) for row in rows],
         [[_colour(row, column) for column in range(len(headings))] for row in rows],
         ([with_unit(CAUSES[row.cause].title, row.unit) for row in rows], headings),
-        title="What spoils an image, and whether a flag says so. Wrong: more than 1 dB or half a cell; right: less\n"
-        "than 0.3 dB, a tenth of a cell, 0.3 rad and 3 dB of ghosts. Missed: wrong, no flag; false: right with one.",
+        title="Causes of image errors and their flags. Wrong: more than 1 dB or half a resolution cell; right: less\n"
+        "than 0.3 dB, a tenth of a cell, 0.3 rad and 3 dB of ghosts. Missed: wrong, no flag; false: right with a flag.",
     )
 
 
@@ -304,7 +306,7 @@ def _texts(row: CauseSummary) -> list[str]:
 
 
 def _colour(row: CauseSummary, column: int) -> float:
-    """Return the quality of a cell, 0…1; NaN where it is neither good nor bad."""
+    """Return the rating of a table cell, 0…1; NaN for columns without a rating."""
     ratio = row.expected_over_measured
     if column == 4 and ratio > 0:
         return float(np.clip(1 - abs(np.log(ratio)) / np.log(3), 0, 1))

@@ -1,15 +1,15 @@
-"""One row of the claims table: what is printed, what this project computes, and what the verdict is about."""
+"""Row of the claims table: the printed value, the computed value, the verdict, and the reference it compares with."""
 
 from dataclasses import dataclass, replace
 from math import isinf
 
-AGREES, DISAGREES, EXPLAINED, UNTESTABLE = "agrees", "disagrees", "explained", "not testable here"
+AGREES, DISAGREES, EXPLAINED, UNTESTABLE = "agrees", "disagrees", "explained", "not testable"
 VERDICTS = (AGREES, DISAGREES, EXPLAINED, UNTESTABLE)
-"""`explained`: it differs from what is expected and the note says why, or agrees by construction; `not testable here`:
-the note says what lacks."""
+"""`explained`: the value differs for a reason stated in the note, or agrees by construction; `not testable`: the
+note states the missing information."""
 
 PAPER, MODEL, OWN = "paper", "model", "own limit"
-"""What a verdict is about: a number or words of the source paper; another model; a limit that this project sets."""
+"""References of a verdict: a number or statement of the source paper; another model; a limit set by this project."""
 
 
 @dataclass(frozen=True)
@@ -19,15 +19,15 @@ class Claim:
     Attributes
     ----------
     paper
-        Number that the source paper prints for it, digit by digit; empty where it prints none.
+        Number printed in the source paper, digit by digit; empty if it prints none.
     independent_model
-        Value of a model that shares no code with this project, or of a closed form; empty where there is none.
+        Value of a model that shares no code with this project, or of a closed form; empty if there is none.
     about
-        What the verdict is about: `PAPER`, `MODEL` or `OWN`.
+        Reference of the verdict: `PAPER`, `MODEL` or `OWN`.
     verdict
         One of `VERDICTS`.
     note
-        By how much it differs, why, from what it is computed, and where the paper contradicts itself.
+        Size and reason of a difference, inputs of the computation, and contradictions in the paper.
     """
 
     claim: str
@@ -53,24 +53,24 @@ def compare(
     reason: str = "",
     note: str = "",
 ) -> Claim:
-    """Return a row whose verdict compares what is computed with the paper or, where it is silent, with a model.
+    """Return a row whose verdict compares the computed value with the paper or, without a printed value, with a model.
 
     Parameters
     ----------
     claim, computed, unit, paper, independent_model, note
         Columns of `Claim`; at least one of `paper`, as printed, and `independent_model`.
     within
-        Largest difference that still agrees: a share of the expected value, or in `unit` if not `relative`; None: what
-        rounds to the digits that the paper prints agrees.
+        Largest difference that still agrees: a share of the expected value, or in `unit` if not `relative`; None:
+        values that round to the printed digits agree.
     style
         Format of `computed`.
     reason
-        What explains a difference, if one is known; empty: a difference is a disagreement.
+        Known reason of a difference; empty: a difference is a disagreement.
 
     Raises
     ------
     ValueError
-        If there is nothing to compare with.
+        If there is no value to compare with.
 
     Examples
     --------
@@ -80,10 +80,10 @@ def compare(
     >>> row.paper, row.independent_model, row.about, row.verdict, row.note
     ('', '-1', 'model', 'disagrees', 'differs by -0.7 dB; few draws')
     >>> compare("width", 57.35, "cm", paper="58", within=0.05).note
-    'differs by -1.1 %, ±5 % allowed here'
+    'differs by -1.1 %, tolerance ±5 %'
     """
     if not paper and independent_model is None:
-        raise ValueError(f"{claim}: neither a value of the paper nor of a model to compare with")
+        raise ValueError(f"{claim}: no value of the paper or of a model to compare with")
     expected = float(paper or independent_model or 0.0)
     difference = computed - expected
     allowed = half_digit(paper) if within is None else within * (abs(expected) if relative else 1)
@@ -92,14 +92,14 @@ def compare(
     by = f"{100 * difference / abs(expected):+.1f} %" if relative else f"{difference:+.3g} {unit}"
     if abs(difference) <= allowed * (1 + 1e-9):
         share = f"{100 * within:g} %" if within and relative else f"{allowed:.2g} {unit}"
-        chosen = "" if within is None or isinf(within) else f"differs by {by}, ±{share} allowed here"
-        return Claim(claim, paper, modelled, shown, unit, about, AGREES, _join(chosen, note))
+        tolerance = "" if within is None or isinf(within) else f"differs by {by}, tolerance ±{share}"
+        return Claim(claim, paper, modelled, shown, unit, about, AGREES, _join(tolerance, note))
     verdict = EXPLAINED if reason else DISAGREES
     return Claim(claim, paper, modelled, shown, unit, about, verdict, _join(f"differs by {by}", reason, note))
 
 
 def half_digit(printed: str) -> float:
-    """Return the largest distance of a number from a printed one to which it still rounds.
+    """Return half a unit in the last printed digit: the largest difference of a number that rounds to it.
 
     Examples
     --------
@@ -121,39 +121,39 @@ def require(
     reason: str = "",
     note: str,
 ) -> Claim:
-    """Return a row of something without a number, compared with a limit of this project's own.
+    """Return a row that compares a computed value with a limit set by this project.
 
     Parameters
     ----------
     claim, computed, unit, style, reason, note
-        As for `compare`.
+        See `compare`.
     limit, met
-        What is required, in words, and whether `computed` meets it.
+        The requirement as text, and True if `computed` meets it.
     words
-        What the paper says, which the verdict is about then: the limit is how it is read here.
+        Statement of the paper that the limit quantifies; the verdict then refers to this statement.
 
     Examples
     --------
     >>> row = require("loss", 0.004, "dB", limit="below 0.01 dB", met=True, note="worst of five")
     >>> row.about, row.verdict, row.note
-    ('own limit', 'agrees', 'required here: below 0.01 dB; worst of five')
+    ('own limit', 'agrees', 'required: below 0.01 dB; worst of five')
     >>> row = require("loss", 4.0, "dB", limit="below 1 dB", met=False, words="may be ignored", note="")
     >>> row.about, row.verdict, row.note
-    ('paper', 'disagrees', 'the paper: may be ignored; read here as: below 1 dB')
+    ('paper', 'disagrees', 'the paper: may be ignored; interpreted as: below 1 dB')
     """
     verdict = AGREES if met else EXPLAINED if reason else DISAGREES
-    said = (f"the paper: {words}", f"read here as: {limit}") if words else (f"required here: {limit}",)
+    requirement = (f"the paper: {words}", f"interpreted as: {limit}") if words else (f"required: {limit}",)
     about = PAPER if words else OWN
-    return Claim(claim, "", "", f"{computed:{style}}", unit, about, verdict, _join(*said, reason, note))
+    return Claim(claim, "", "", f"{computed:{style}}", unit, about, verdict, _join(*requirement, reason, note))
 
 
 def fitted_to(row: Claim) -> Claim:
-    """Return a row as explained where it agrees with what was chosen for it: that proves nothing.
+    """Mark an agreeing row as explained if its parameters were fitted to the printed value: it is no confirmation.
 
     Examples
     --------
-    >>> fitted_to(compare("width", 11.0, "cm", paper="11", note="place chosen for it")).note
-    'agrees by construction; place chosen for it'
+    >>> fitted_to(compare("width", 11.0, "cm", paper="11", note="fitted position")).note
+    'agrees by construction; fitted position'
     """
     if row.verdict != AGREES:
         return row

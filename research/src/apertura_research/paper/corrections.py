@@ -1,4 +1,4 @@
-"""Accuracy of the corrections: by the sidelink, of clocks, of positions, and for a swarm of receivers."""
+"""Accuracy of the corrections: sidelink, clocks, positions, and a swarm of receivers."""
 
 import json
 from dataclasses import replace
@@ -51,7 +51,7 @@ LARGEST_LOSS_DB = 0.01
 
 
 def corrected_claims(*, seed: int = 1) -> list[Claim]:
-    """Return the cost of carrier phase and timing after each sidelink correction, as large as the prefix allows."""
+    """Return the loss after each sidelink correction of the largest phase and timing errors within the prefix."""
     scene = reduced_scene(pulses=150, subcarriers=4096, rx_ahead_m=RX_AHEAD_M, qpsk=True)
     clocks = Impairments(carrier_phase=UniformPhase(), timing=Timing(half_width_s=2e-6))
     disturbed = Disturbance(clocks, sampled=True)
@@ -61,7 +61,7 @@ def corrected_claims(*, seed: int = 1) -> list[Claim]:
     rows = []
     for name, correct in METHODS.items():
         worst_db = float(np.abs(amplitude_db(_peaks(scene, correct(radar, sidelink)) / ideal)).max())
-        title = f"loss after {name}: carrier phase ±π and timing ±2 µs per pulse, inside the prefix"
+        title = f"loss after {name}: carrier phase ±π and timing ±2 µs per pulse, within the prefix"
         limit, met = f"below {LARGEST_LOSS_DB:g} dB", worst_db < LARGEST_LOSS_DB
         note = "worst of five targets, from samples"
         rows.append(require(title, worst_db, "dB", limit=limit, met=met, style=".4f", note=note))
@@ -74,10 +74,10 @@ def _peaks(scene: PaperScene, corrected: Complexes) -> Floats:
 
 
 def clock_claims(*, pulses: int = 150) -> list[Claim]:
-    """Return the floor that a fast clock leaves in the divided image, without and with correction in the samples.
+    """Return the error floor of the divided image with a fast clock, without and with correction of the samples.
 
-    Samples are noisy, 20 dB in the radar and 30 dB in the sidelink per subcarrier, so that the model which made them is
-    not simply taken back: a perfect clock with the same noise is what the correction is held against.
+    The samples contain noise, 20 dB SNR in the radar and 30 dB in the sidelink per subcarrier, so that the correction
+    does not simply invert the simulation; the reference is a perfect clock with the same noise.
     """
     scene = reduced_scene(pulses=pulses, subcarriers=4096, rx_ahead_m=RX_AHEAD_M, qpsk=True)
     wave = scene.waveform
@@ -98,14 +98,14 @@ def clock_claims(*, pulses: int = 150) -> list[Claim]:
     perfect_db, before_db, after_db = (error_floor_db(values, ideal, peaks) for values, peaks in images)
     return [
         require(
-            f"{CLOCK_PPM:g} ppm clock corrected in the samples: floor above that of a perfect clock, same noise",
+            f"{CLOCK_PPM:g} ppm clock corrected in the samples: error floor above that of a perfect clock, same noise",
             after_db - perfect_db,
             "dB",
             limit=f"at most {LARGEST_EXCESS_DB:g} dB",
             met=after_db - perfect_db <= LARGEST_EXCESS_DB,
             style=".2f",
-            note=f"floor {before_db:.1f} dB without, {after_db:.1f} dB with, {perfect_db:.1f} dB with a perfect clock; "
-            f"measured as {offset.sfo_ppm:.4f} ppm",
+            note=f"error floor {before_db:.1f} dB without correction, {after_db:.1f} dB with it, {perfect_db:.1f} dB "
+            f"with a perfect clock; estimated clock error {offset.sfo_ppm:.4f} ppm",
         )
     ]
 
@@ -131,10 +131,10 @@ SIGMA_CM = 1.0
 
 
 def position_claims(*, draws: int = DRAWS, seed: int = 3) -> list[Claim]:
-    """Return the value and cost of λ/10, the needs of a bistatic pair against a monostatic one, and what cancels."""
+    """Return value and loss of λ/10, the accuracy required by a bistatic pair, and the cancelling error components."""
     tenth_cm = 10 * SPEED_OF_LIGHT_M_S / float(paper_waveform().frequency_hz.mean())
     generators = [partial(np.random.default_rng, [seed, draw]) for draw in range(draws)]
-    # errors are proportional to their deviation: the same draw as large as the largest error may be
+    # Errors are proportional to their standard deviation: each draw is scaled so that its largest error is λ/10.
     sigmas_cm = [tenth_cm * SIGMA_CM / largest_range_error_cm(SIGMA_CM, drawn()) for drawn in generators]
     bounded_db = float(np.mean([_monostatic_db(s, drawn()) for s, drawn in zip(sigmas_cm, generators, strict=True)]))
     mono_db = float(np.mean([_monostatic_db(SIGMA_CM, drawn()) for drawn in generators]))
@@ -144,30 +144,31 @@ def position_claims(*, draws: int = DRAWS, seed: int = 3) -> list[Claim]:
                 note="at the middle of the band; the requirement rows use δR = 2 cm one way"),
         require(f"loss at range errors of at most λ/10, {draws} draws", bounded_db, "dB",
                 limit=f"at most {TOLERATED_DB:g} dB", met=bounded_db >= -TOLERATED_DB, style=".2f",
-                words="positions suffice whose range error is λ/10 at most",
-                note=f"monostatic, moving average of 1 s, each draw as large as the largest of all pulses and targets "
-                f"allows: σ = {np.mean(sigmas_cm):.2f} cm per axis in the mean"),
+                words="positions with a range error of at most λ/10 suffice",
+                note="monostatic, moving average of 1 s; each draw is scaled to a largest error of λ/10 over all "
+                f"pulses and targets: mean σ = {np.mean(sigmas_cm):.2f} cm per axis"),
         fitted_to(
             require(f"bistatic over monostatic loss at {SIGMA_CM:g} cm", bistatic_db / mono_db, "1", style=".2f",
-                    limit="1 ± 0.35", met=abs(bistatic_db / mono_db - 1) <= 0.35, words="the need is about equal",
-                    note=f"the width of 'about' is chosen here; mono {mono_db:.2f} dB, bistatic {bistatic_db:.2f} dB, "
-                    f"{draws} draws")),
+                    limit="1 ± 0.35", met=abs(bistatic_db / mono_db - 1) <= 0.35,
+                    words="the required accuracy is about equal",
+                    note=f"the tolerance for 'about' was chosen by this project; mono {mono_db:.2f} dB, bistatic "
+                    f"{bistatic_db:.2f} dB, {draws} draws")),
         _worst_bistatic(),
         _along_the_sidelink(),
     ]  # fmt: skip
 
 
 def largest_range_error_cm(sigma_cm: float, generator: np.random.Generator) -> float:
-    """Return the largest range error, one way, of all pulses and targets that `_monostatic_db` draws."""
+    """Return the largest one-way range error over all pulses and targets that `_monostatic_db` draws."""
     scene = _monostatic_scene()
     wrong = Impairments(localization=Localization(sigma_cm / 100))
     observe(scene.waveform, scene.scatterers, scene.geometry, generator, receiver=Impairments(), sidelink=False)
-    seen = observe(scene.waveform, scene.scatterers, scene.geometry, generator, receiver=wrong, sidelink=False)
-    told, true = (
+    observed = observe(scene.waveform, scene.scatterers, scene.geometry, generator, receiver=wrong, sidelink=False)
+    logged_m, true_m = (
         np.linalg.norm(antenna_m[:, None] - scene.scatterers.position_m, axis=-1)
-        for antenna_m in (scene.geometry.radar_rx, seen.truth.radar_rx)
+        for antenna_m in (scene.geometry.radar_rx, observed.truth.radar_rx)
     )
-    return 100 * float(np.abs(told - true).max())
+    return 100 * float(np.abs(logged_m - true_m).max())
 
 
 def _monostatic_scene() -> PaperScene:
@@ -180,7 +181,7 @@ def _monostatic_db(size_cm: float, generator: np.random.Generator) -> float:
     levels = []
     for sigma_m in (0.0, size_cm / 100):
         wrong = Impairments(localization=Localization(sigma_m))
-        # one antenna position for both legs: no transmitter of its own
+        # Both one-way paths have the same antenna position: there is no separate transmitter.
         observed = observe(scene.waveform, scene.scatterers, scene.geometry, generator, receiver=wrong, sidelink=False)
         transfer = transfer_functions(observed.channels["radar"], None).astype(np.complex64)
         levels.append(find_peaks(range_tables(phase_history(scene, transfer), targets), targets)[1])
@@ -188,7 +189,7 @@ def _monostatic_db(size_cm: float, generator: np.random.Generator) -> float:
 
 
 def worst_bistatic_growth() -> float:
-    """Return the largest error of R_tx + R_rx − R_sl, for one of either node of at most 1, over all triangles.
+    """Return the largest error of R_tx + R_rx − R_sl over all triangles, for errors of at most 1 at each node.
 
     Notes
     -----
@@ -200,35 +201,35 @@ def worst_bistatic_growth() -> float:
 
 
 def _worst_bistatic() -> Claim:
-    """Return the accuracy that a bistatic pair needs at worst, of a monostatic one's: 2e for an error e."""
+    """Return the worst-case accuracy required by a bistatic pair, relative to a monostatic pair (2e for an error e)."""
     share = 2 / worst_bistatic_growth()
     note = (
-        "errors of both nodes add up: e each of R_tx and R_rx and 2e of R_sl are 4e against the 2e of a monostatic "
-        f"pair, but no triangle has all four: at most {worst_bistatic_growth():.2f}e, of a far target abreast"
+        "the errors of both nodes add: e each in R_tx and R_rx and 2e in R_sl are 4e, against 2e of a monostatic pair; "
+        f"no triangle reaches this sum: the largest is {worst_bistatic_growth():.2f}e, for a far target abreast"
     )
     return require(
-        "accuracy of positions that a bistatic pair needs at worst, over a monostatic one's", share, "1",
-        limit="0.5, to 5 %", met=abs(share - 0.5) < 0.025, words="in the worst case half", style=".3f",
-        reason="half is on the safe side", note=note,
+        "worst-case position accuracy required by a bistatic pair, over that of a monostatic pair", share, "1",
+        limit="0.5 ± 5 %", met=abs(share - 0.5) < 0.025, words="in the worst case half", style=".3f",
+        reason="half is conservative", note=note,
     )  # fmt: skip
 
 
 def _along_the_sidelink() -> Claim:
-    """Return the error in the corrected path of a target abreast of the pair by 1 cm along the sidelink."""
+    """Return the error of the corrected path to a target abreast of the pair, for errors of 1 cm along the sidelink."""
     half_m, error_m = RX_AHEAD_M / 2, 0.01
     target = np.array([[0.0, 15.0, 0.0]])
     ends = np.array([[-half_m, 0.0, 10.0]]), np.array([[half_m, 0.0, 10.0]])
 
-    def wrong_cm(tx_m: float, rx_m: float) -> float:
-        moved = ends[0] + [tx_m, 0, 0], ends[1] + [rx_m, 0, 0]
-        return 100 * abs(_corrected_m(*moved, target) - _corrected_m(*ends, target))
+    def path_error_cm(tx_m: float, rx_m: float) -> float:
+        displaced = ends[0] + [tx_m, 0, 0], ends[1] + [rx_m, 0, 0]
+        return 100 * abs(_corrected_m(*displaced, target) - _corrected_m(*ends, target))
 
-    both, one = wrong_cm(error_m, error_m), wrong_cm(0.0, error_m)
+    both_cm, single_cm = path_error_cm(error_m, error_m), path_error_cm(0.0, error_m)
     return require(
-        "path that is left of an offset of 1 cm of both nodes along the sidelink", both, "cm",
-        limit="less than 0.1 cm", met=both < 0.1, words="offsets of both nodes cancel", style=".3f",
-        note="R_tx + R_rx − R_sl, target abreast of the middle, 15 m away and 10 m below; the image is shifted along "
-        f"the track; an offset of one node alone, of which the paper says nothing, leaves {one:.2f} cm",
+        "residual path of an offset of 1 cm of both nodes along the sidelink", both_cm, "cm",
+        limit="less than 0.1 cm", met=both_cm < 0.1, words="offsets of both nodes cancel", style=".3f",
+        note="R_tx + R_rx − R_sl, target abreast of the middle, 15 m away and 10 m below; the image is displaced "
+        f"along track; an offset of a single node, which the paper does not discuss, leaves {single_cm:.2f} cm",
     )  # fmt: skip
 
 
@@ -239,11 +240,11 @@ def _corrected_m(tx_m: Floats, rx_m: Floats, target_m: Floats) -> float:
 RECEIVERS = 4
 SPACING_M = 4.7
 SNR_DB = -10.0
-"""Of the radar per subcarrier: noise, so that adding receivers gains something."""
+"""SNR of the radar channel per subcarrier: low, so that additional receivers improve the image."""
 
 
 def swarm_claims(*, pulses: int = 150, seed: int = 1) -> list[Claim]:
-    """Return the gain of a swarm's receivers, each corrected by its own sidelink alone, and the detection of pulses."""
+    """Return the gain of a swarm of receivers, each corrected by its own sidelink only, and the detection of pulses."""
     images = [_receiver(number, pulses, np.random.default_rng([seed, number])) for number in range(1, RECEIVERS + 1)]
     peaks, noises = (np.array([image[part] for image in images]) for part in (0, 1))
     efficiency = float((np.abs(peaks.sum(axis=0)) / np.abs(peaks).sum(axis=0)).min())
@@ -252,16 +253,16 @@ def swarm_claims(*, pulses: int = 150, seed: int = 1) -> list[Claim]:
     return [
         compare(f"swarm: coherent sum of {RECEIVERS} receivers over the sum of their peaks", efficiency, "1",
                 independent_model=1.0, within=0.02, style=".4f",
-                note="worst of five targets; each receiver has a clock of its own and its own sidelink"),
+                note="worst of five targets; each receiver has its own clock and its own sidelink"),
         compare(f"swarm: gain in SNR by {RECEIVERS} receivers", 10 * float(np.log10(together / alone)), "dB",
                 independent_model=10 * np.log10(RECEIVERS), within=0.5, relative=False, style=".2f",
-                note="10·lg N: receivers only listen, so one transmitter serves any number of them"),
+                note="10·lg N: receivers are passive, so one transmitter serves any number of them"),
         *trigger_claims(),
     ]  # fmt: skip
 
 
 def _receiver(number: int, pulses: int, generator: np.random.Generator) -> tuple[Complexes, Complexes]:
-    """Return a receiver's image at the targets without noise, and what noise adds at random places."""
+    """Return a receiver's noise-free image at the targets, and its noise at random points."""
     clocks = Impairments(carrier_phase=UniformPhase(), timing=Timing(half_width_s=40e-9), sidelink_snr_db=30.0)
     scene = reduced_scene(pulses=pulses, subcarriers=512)
     along = scene.geometry.radar_tx[:, 0]
@@ -269,7 +270,7 @@ def _receiver(number: int, pulses: int, generator: np.random.Generator) -> tuple
     state = generator.bit_generator.state
     images = []
     for impairments in (clocks, replace(clocks, radar_snr_db=SNR_DB)):
-        generator.bit_generator.state = state  # the same clocks and the same noise of the sidelink
+        generator.bit_generator.state = state  # draws the same clocks and the same sidelink noise
         radar, sidelink, _ = receive_pair(scene, Disturbance(impairments), generator)
         history = phase_history(scene, divide(radar, sidelink), divided=True)
         tables = range_tables(history, scene.scatterers.position_m)
@@ -285,7 +286,7 @@ def _places() -> Floats:
 
 
 def trigger_claims(*, pulses: int = 12) -> list[Claim]:
-    """Compare the pulses that the trigger finds in recordings that ran through with the true ones."""
+    """Compare the pulses that the trigger detects in continuous recordings with the true pulses."""
     with TemporaryDirectory() as folder:
         campaign = Campaign.load(simulate(Path(folder) / "made", preset("continuous", pulses=pulses)))
         nodes = json.loads((campaign.root / "truth.json").read_text(encoding="utf-8"))["flights"]["f01"]["nodes"]
@@ -299,9 +300,10 @@ def trigger_claims(*, pulses: int = 12) -> list[Claim]:
             if len(since_s) == len(starts):
                 errors.append(np.abs(since_s * raw.attrs["sample_rate_hz"] - (starts - starts[0])).max())
     return [
-        compare("trigger: pulses found by the preamble", detected / (pulses * len(nodes)), "1", independent_model=1.0,
-                within=1e-9, note=f"of {pulses} pulses in each of {len(nodes)} recordings that ran through"),
+        compare("trigger: pulses detected by the preamble", detected / (pulses * len(nodes)), "1",
+                independent_model=1.0, within=1e-9,
+                note=f"of {pulses} pulses in each of {len(nodes)} continuous recordings"),
         require("trigger: largest error of a capture's start", float(np.max(errors)), "samples",
                 limit="at most 2 samples, which the sidelink removes", met=bool(np.max(errors) <= 2), style=".2f",
-                note="from pulse to pulse, against the simulation's truth"),
+                note="relative to the first pulse, against the true starts of the simulation"),
     ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""The paper's three experiments through the ordinary pipeline, and the coherence that they reach."""
+"""The paper's three experiments, processed by the regular pipeline, and their coherence."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -38,14 +38,14 @@ FLIGHT, MONOSTATIC, BISTATIC = "f01", "uav1-uav1", "uav1-uav2"
 
 @dataclass(frozen=True)
 class Experiment:
-    """One experiment: what was simulated, and the campaign as the pipeline left it.
+    """One experiment: its simulation and its processed campaign.
 
     Attributes
     ----------
     places_m
-        (target, 3) float64 ECEF: points, and the middles of lines, in the order of the specification.
+        (target, 3) float64 ECEF: points, and centres of lines, in the order of the specification.
     rough_m
-        (target, 3) float64 ECEF: middles of patches of random points, but for the last one, which is the ground.
+        (target, 3) float64 ECEF: centres of patches of random points, without the last patch, which is the terrain.
     """
 
     specification: CampaignSpecification
@@ -58,9 +58,9 @@ class Experiment:
         return phase_history_of(self.opened.stage("echo", FLIGHT, pair), window)
 
     def uncorrected(self, window: str = "hann") -> PhaseHistory:
-        """Return the bistatic captures demodulated by the code alone, as if there were no sidelink.
+        """Demodulate the bistatic captures by the code only, without the sidelink.
 
-        The electrical path of the radar channel is taken off, as in the echo stage.
+        The electrical path of the radar channel is removed, as in the echo stage.
         """
         campaign = self.opened.campaign
         waveform = campaign.settings.waveform
@@ -79,7 +79,7 @@ class Experiment:
 
 
 def open_experiment(folder: Path, name: str) -> Experiment:
-    """Return the experiment `lab`, `static` or `uav` that lies in a folder of campaigns."""
+    """Open the experiment `lab`, `static` or `uav` in a folder of campaigns."""
     specification = preset(f"paper-{name}")
     ends = [_ends(target) for target in specification.targets]
     middles = [np.add(*both) / 2 for both in ends]
@@ -100,11 +100,11 @@ def _ends(target: Target) -> tuple[Vector, Vector]:
             return target.start_m, target.end_m
         case Clutter(bounds_m=(west, south, east, north)):
             return (west, south, target.up_m), (east, north, target.up_m)
-    raise TypeError(f"{target!r} stands in none of the experiments")
+    raise TypeError(f"the experiments contain no target {target!r}")
 
 
 def profiles_at(history: PhaseHistory, slant_m: Floats) -> Complexes:
-    """Return (pulse, range) complex64: each pulse compressed at given halves of the total path.
+    """Range-compress each pulse at given halves of the total path, (pulse, range) complex64.
 
     Σ_n w_n G_n exp(j2πf_nτ), the inner sum of eq. 6 of docs/theory.md, as one matrix product.
     """
@@ -114,19 +114,19 @@ def profiles_at(history: PhaseHistory, slant_m: Floats) -> Complexes:
 
 
 def terms_at(history: PhaseHistory, place_m: Floats) -> NDArray[np.complex128]:
-    """Return (pulse,) complex128: what each pulse adds at a place."""
+    """Return the contribution of each pulse at a point, (pulse,) complex128."""
     return reference.terms(history, place_m[None])[:, 0]
 
 
 def noise_power(history: PhaseHistory, slant_m: Floats) -> float:
-    """Return the variance over pulses of the profile, averaged over halves of the total path without any echo."""
+    """Return the variance of the profile over pulses, averaged over echo-free halves of the total path."""
     silent = profiles_at(history, slant_m)
     return float(np.mean(np.abs(silent - silent.mean(axis=0)) ** 2) * len(silent) / (len(silent) - 1))
 
 
 def by_pair(experiment: Experiment, window: str = "hann") -> Mapping[str, PhaseHistory]:
-    """Return words → echo of both pairs."""
-    return {words: experiment.history(pair, window) for words, pair in (("mono", MONOSTATIC), ("bistatic", BISTATIC))}
+    """Return label → echo of both pairs."""
+    return {label: experiment.history(pair, window) for label, pair in (("mono", MONOSTATIC), ("bistatic", BISTATIC))}
 
 
 PRINTED_UNCORRECTED = "0.0034"
@@ -134,20 +134,20 @@ PRINTED = {
     "lab": (("cables", "0.986"),),
     "static": (("first cylinder", "0.9999"), ("second cylinder", "0.9995")),
 }
-"""Experiment → its targets in order, and the coherence factor that is printed of each after correction."""
+"""Experiment → its targets in order, and their printed coherence factors after correction."""
 
 SILENT_M = np.linspace(45.0, 60.0, 60)
-"""Halves of total paths beyond every echo of both experiments."""
+"""Halves of total paths beyond all echoes of both experiments, metres."""
 
 ALIKE_RAD, ALIKE_DB = 0.05, 0.2
-"""Between mono- and bistatic recordings of one signal."""
+"""Largest differences between mono- and bistatic recordings of one signal, rad and dB."""
 
 WITHIN = 0.3
-"""Share of 1 − Γ by which it may differ from what the noise allows: of 200 pulses, 10 % are chance (1σ)."""
+"""Tolerance of 1 − Γ relative to its value from noise; for 200 pulses its standard deviation is 10 %."""
 
 
 def coherence_claims(folder: Path) -> list[Claim]:
-    """Return coherence, and phase and gain between the pairs, of both experiments in a folder of campaigns."""
+    """Return the coherence, and the phase and gain between the pairs, of both experiments in a folder of campaigns."""
     experiments = {name: open_experiment(folder, name) for name in PRINTED}
     return [
         _uncorrected(experiments),
@@ -163,18 +163,18 @@ def _uncorrected(experiments: Mapping[str, Experiment]) -> Claim:
     pulses = len(terms["lab"])
     low, high = (-np.log(1 - share) / pulses for share in (0.025, 0.975))  # of random phases MΓ is exponential
     note = (
-        f"of the cables; {factors['static']:.2g} of the first cylinder: it is not known here of which one is printed; "
+        f"for the cables; {factors['static']:.2g} for the first cylinder: the paper does not state which is printed; "
         f"random phases: mean 1/M = {1 / pulses:g}, median {np.log(2) / pulses:.4f}; 95 % of recordings give "
-        f"{low:.4f} to {high:.4f}, so that any value there would agree"
+        f"{low:.4f} to {high:.4f}, so that any value in this interval agrees"
     )
-    chance = all(low <= value <= high for value in (*factors.values(), float(PRINTED_UNCORRECTED)))
-    shown, verdict = f"{factors['lab']:.2g}", UNTESTABLE if chance else DISAGREES
+    is_random = all(low <= value <= high for value in (*factors.values(), float(PRINTED_UNCORRECTED)))
+    shown, verdict = f"{factors['lab']:.2g}", UNTESTABLE if is_random else DISAGREES
     name = "coherence factor without correction"
     return Claim(name, PRINTED_UNCORRECTED, f"{1 / pulses:g}", shown, "1", PAPER, verdict, note)
 
 
 def _corrected(name: str, experiment: Experiment) -> list[Claim]:
-    """Return each target's factor beside the printed one, and beside what the noise of echo-free ranges allows."""
+    """Compare each target's coherence factor with the printed one, and with the limit by noise of echo-free ranges."""
     rows, histories = [], by_pair(experiment, "none")
     noise = {pair: noise_power(history, SILENT_M) for pair, history in histories.items()}
     for place, (target, printed) in zip(experiment.places_m, PRINTED[name], strict=True):
@@ -184,18 +184,18 @@ def _corrected(name: str, experiment: Experiment) -> list[Claim]:
         pulses, factor = len(terms["bistatic"]), factors["bistatic"]
         needed_db = _db(snr_of_coherence_factor(float(printed), pulses))
         reason = (
-            f"the paper prints no SNR, on which alone the factor depends: {needed_db:.1f} dB per compressed pulse were "
-            f"chosen for it; bistatic, ± {(1 - factor) / np.sqrt(pulses):.2g} by chance; mono {factors['mono']:.5f}"
+            f"the factor depends only on the SNR, which the paper does not print: {needed_db:.1f} dB per compressed "
+            f"pulse were chosen; bistatic, 1σ = {(1 - factor) / np.sqrt(pulses):.2g}; mono {factors['mono']:.5f}"
         )
         title = f"coherence factor after correction, {name}, {target}"
-        chance = half_digit(printed) + 3 * (1 - factor) / np.sqrt(pulses)
-        rows.append(fitted_to(compare(title, factor, "1", paper=printed, within=chance, relative=False, style=".5f",
+        tolerance = half_digit(printed) + 3 * (1 - factor) / np.sqrt(pulses)
+        rows.append(fitted_to(compare(title, factor, "1", paper=printed, within=tolerance, relative=False, style=".5f",
                                       note=reason)))  # fmt: skip
         lack = {pair: (1 - factors[pair]) / (1 - coherence_of_snr(snr[pair], pulses)) for pair in terms}
-        title = f"lack of coherence 1 − Γ over what noise allows, {name}, {target}"
+        title = f"lack of coherence 1 − Γ over its value from noise alone, {name}, {target}"
         note = (
-            f"bistatic; mono {lack['mono']:.2f}; the model is the closed form at the noise of echo-free ranges, "
-            f"{_db(snr['bistatic']):.1f} dB under the target: nothing but noise is left"
+            f"bistatic; mono {lack['mono']:.2f}; the model is the closed form for the noise of echo-free ranges, "
+            f"{_db(snr['bistatic']):.1f} dB below the target: the residual is noise only"
         )
         rows.append(compare(title, lack["bistatic"], "1", independent_model=1.0, within=WITHIN, style=".2f", note=note))
     return rows
@@ -222,14 +222,14 @@ def _alike(name: str, experiment: Experiment) -> list[Claim]:
     mono, bistatic = (terms_at(history, experiment.places_m[0]).mean() for history in by_pair(experiment).values())
     phase, gain_db = float(np.angle(bistatic / mono)), 2 * _db(abs(bistatic / mono))
     words = "mono- and bistatic recordings of one split receive signal agree" if name == "static" else ""
-    note = f"{PRINTED[name][0][0]}, at the true place, electrical paths known"
+    note = f"{PRINTED[name][0][0]}, at its true position, electrical paths known"
     rows = [
         require(f"phase of bistatic less monostatic, {name}", phase, "rad", limit=f"within ±{ALIKE_RAD:g} rad",
                 met=abs(phase) <= ALIKE_RAD, words=words, style=".4f", note=note),
         require(f"gain of bistatic over monostatic, {name}", gain_db, "dB", limit=f"within ±{ALIKE_DB:g} dB",
                 met=abs(gain_db) <= ALIKE_DB, words=words, style=".3f", note=note),
     ]  # fmt: skip
-    return [fitted_to(row) for row in rows] if words else rows  # one simulated signal is split
+    return [fitted_to(row) for row in rows] if words else rows  # the simulation splits one signal
 
 
 def _snr(terms: NDArray[np.complex128], noise: float) -> float:

@@ -1,4 +1,4 @@
-"""The paper's figures with data: simulated scenes and experiments."""
+"""The paper's data figures: simulated scenes and experiments."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -32,11 +32,11 @@ from apertura_research.paper_scene import UNDISTURBED, PaperScene, receive_pair
 from apertura_research.point_response import amplitude_db, find_peaks, range_tables, undisturbed_tables
 
 SHOWN = ("no_errors", "sfo", "cfo", "carrier_phase", "timing", "localization")
-"""Figures of data and image: without error, and of each of `ERRORS` at all sizes of its table of losses."""
+"""Figures of data and image: without error, and for each of `ERRORS` at all sizes of its loss table."""
 
 RANGE_DB = 50.0
 PULSES = 600
-"""At least: fewer show grating lobes beside the track."""
+"""Smallest number of pulses: fewer cause grating lobes along the track."""
 
 _GRID = SceneGrid.from_bounds("local", (-7.0, 2.0, 7.0, 28.0), spacing_m=0.025)
 _CORNERS_M = np.array([[x, y, 0.0] for x in (-7.0, 7.0) for y in (2.0, 28.0)])
@@ -45,9 +45,9 @@ _COLUMNS = 500
 
 
 def draw_simulated(name: str, path: Path, *, seed: int = 1) -> Path:
-    """Draw data above image at every size of one error, of `SHOWN`, as PNG; return its path.
+    """Draw data above image at every size of one error of `SHOWN` as PNG, and return its path.
 
-    All panels are in dB against the peak of the same scene without error, so that losses are visible.
+    All panels are in dB relative to the peak of the same scene without error, so that losses are visible.
     """
     error = ERRORS["timing" if name == "no_errors" else name]
     title, either = error.sweep.title.removesuffix(" ±"), error.sweep.title.endswith(" ±")
@@ -76,7 +76,7 @@ def draw_simulated(name: str, path: Path, *, seed: int = 1) -> Path:
 
 
 def _draw_data(axes: Axes, scene: PaperScene, data: numba.OversampledTables, peak: float) -> None:
-    """Draw the profiles on one axis of total path, whatever the path at which each pulse begins."""
+    """Draw the profiles on a common axis of total path, although pulses start at different paths."""
     every = max(1, len(data.samples) // _COLUMNS)
     levels = [_level_at(data, pulse) for pulse in range(0, len(data.samples), every)]
     along = scene.geometry.radar_tx[:, 0]
@@ -104,7 +104,7 @@ def _draw_image(axes: Axes, image: Complexes, peak: float) -> AxesImage:
 
 
 def draw_scene(path: Path) -> Path:
-    """Draw where the simulated track and targets are, from above and along the track."""
+    """Draw the simulated track and targets in plan view and along the track."""
     scene = ERRORS["timing"].scene(PULSES)
     track, targets = scene.geometry.radar_tx, scene.scatterers.position_m
     figure = Figure(figsize=(11, 4.2), layout="compressed")
@@ -121,23 +121,23 @@ def draw_scene(path: Path) -> Path:
         aside.annotate(f"{number}", (y, 0.0), (4, 5), textcoords="offset points")
         aside.plot([0, y], [track[0, 2], 0.0], ":", color="0.6", linewidth=1)
     above.annotate("track, 30 m at 1 m/s", (0, 0), (-50, 8), textcoords="offset points")
-    aside.annotate("track, 10 m high", (0, 10), (8, 4), textcoords="offset points")
+    aside.annotate("track, height 10 m", (0, 10), (8, 4), textcoords="offset points")
     above.set(xlabel="Cross-range, m", ylabel="Ground range, m", ylim=(-2, 28))
     aside.set(xlabel="Ground range, m", ylabel="Height, m", xlim=(-2, 28), ylim=(-2, 13))
-    above.set_title("(a) From above", loc="left")
-    aside.set_title("(b) Seen along the track", loc="left")
+    above.set_title("(a) Plan view", loc="left")
+    aside.set_title("(b) View along the track", loc="left")
     save_png(figure, path)
     return path
 
 
 BLUE, ORANGE, GREEN, BLACK = "#0072B2", "#D55E00", "#009E73", "black"
-"""Okabe and Ito's, which the colour-blind tell apart."""
+"""Colours of Okabe and Ito, distinguishable with colour vision deficiencies."""
 
 DEPTH_DB = 40.0
 SPANS_M = {"lab": (-6.0, 10.0), "static": (0.0, 12.0)}
-"""Halves of total paths, beyond those of the cables, that are drawn."""
+"""Range axes: halves of total paths beyond the cables, metres."""
 
-TITLES = ("(a) Monostatic", "(b) Bistatic, code alone", "(c) Bistatic, divided by the sidelink")
+TITLES = ("(a) Monostatic", "(b) Bistatic, code only", "(c) Bistatic, divided by the sidelink")
 
 
 def draw_profile(name: str, folder: Path, path: Path) -> Path:
@@ -164,7 +164,7 @@ def draw_profile(name: str, folder: Path, path: Path) -> Path:
 
 
 def draw_phase(name: str, folder: Path, path: Path) -> Path:
-    """Draw the phase of every pulse at the targets of `lab` or `static`, about its mean, with the coherence factor."""
+    """Draw the phase of every pulse at the targets of `lab` or `static` about its mean, with the coherence factor."""
     experiment = open_experiment(folder, name)
     figure = Figure(figsize=(12, 4.2), layout="constrained")
     panels = figure.subplots(1, 3)
@@ -203,28 +203,28 @@ def _half_path_m(history: PhaseHistory, place_m: Floats) -> float:
 
 
 def draw_geometry(folder: Path, path: Path) -> Path:
-    """Draw the UAVs' tracks, the segments that image, and the targets: from above, and the heights."""
+    """Draw the UAVs' tracks, the imaged segments and the targets: plan view and heights."""
     experiment = open_experiment(folder, "uav")
     enu = experiment.specification.origin.enu
     tracks = {node: enu(experiment.opened.stage("track", "f01", node).position.values) for node in ("uav1", "uav2")}
     middles = {
-        words: enu(experiment.history(pair).aperture.middle_m)
-        for words, pair in (("mono segment, antennas", MONOSTATIC), ("bistatic segment, midpoint", BISTATIC))
+        label: enu(experiment.history(pair).aperture.middle_m)
+        for label, pair in (("mono segment, antennas", MONOSTATIC), ("bistatic segment, midpoint", BISTATIC))
     }
     figure = Figure(figsize=(11, 5.2), layout="constrained")
     above, heights = figure.subplots(1, 2)
     for axes, up in ((above, 1), (heights, 2)):
         for (node, track), style in zip(tracks.items(), ("-", "--"), strict=True):
-            axes.plot(track[:, 0], track[:, up], style, color="0.5", linewidth=1, label=f"{node}, as logged")
-        for (words, middle), colour in zip(middles.items(), (BLUE, ORANGE), strict=True):
-            axes.plot(middle[:, 0], middle[:, up], color=colour, linewidth=4, label=words)
+            axes.plot(track[:, 0], track[:, up], style, color="0.5", linewidth=1, label=f"{node}, logged track")
+        for (label, middle), colour in zip(middles.items(), (BLUE, ORANGE), strict=True):
+            axes.plot(middle[:, 0], middle[:, up], color=colour, linewidth=4, label=label)
         axes.set_xlabel("Cross-range (east), m")
         axes.grid(alpha=0.3)
     targets = enu(experiment.places_m)
     above.plot(targets[:, 0], targets[:, 1], "D", color=GREEN, label="targets")
     above.set(ylabel="Ground range (north), m", aspect="equal")
     heights.set(ylabel="Height above the scene, m", ylim=(4.0, 5.6))
-    above.set_title("(a) From above", loc="left")
+    above.set_title("(a) Plan view", loc="left")
     heights.set_title("(b) Height", loc="left")
     above.legend(fontsize=8, loc="center left")
     save_png(figure, path)
@@ -240,7 +240,7 @@ PANELS = {
 
 
 def draw_images(folder: Path, path: Path) -> Path:
-    """Draw the four images of the UAV experiment on one scale, each relative to its own peak."""
+    """Draw the four images of the UAV experiment on a common scale, each relative to its own peak."""
     experiment = open_experiment(folder, "uav")
     images, grid = open_images(experiment), experiment.opened.scene.grid
     middle_m = grid.map_at(*images.pixel[0])
@@ -261,18 +261,18 @@ def draw_images(folder: Path, path: Path) -> Path:
 
 
 def draw_cuts(folder: Path, path: Path) -> Path:
-    """Draw cuts through the brightest target along and across the track, of all four images."""
+    """Draw cuts through the brightest target of all four images, along and across the track."""
     images = open_images(open_experiment(folder, "uav"))
     figure = Figure(figsize=(12, 4.8), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
     kinds = (("(a) Cross-range", "East", 1.0, 0.0), ("(b) Ground range", "North", 0.0, 1.0))
-    for axes, (title, words, east, north) in zip(panels, kinds, strict=True):
+    for axes, (title, direction, east, north) in zip(panels, kinds, strict=True):
         for name, colour, style in zip(PANELS, (BLUE, ORANGE, BLACK, GREEN), ("--", "-.", "-", ":"), strict=True):
             along_m, level_db = _cut_db(images, name, east, north)
             axes.plot(along_m, level_db, style, color=colour, label=PANELS[name][4:])
         axes.axhline(-3, color="0.6", linewidth=0.8)
         axes.annotate("−3 dB", (1.28, -2.8), fontsize=8, color="0.4")
-        axes.set(xlabel=f"{words} of the coherent peak, m", xlim=(-1.5, 1.5), ylim=(-DEPTH_DB, 2))
+        axes.set(xlabel=f"{direction} of the coherent peak, m", xlim=(-1.5, 1.5), ylim=(-DEPTH_DB, 2))
         axes.set_title(title, loc="left")
         axes.grid(alpha=0.3)
     panels[0].set_ylabel("Magnitude, dB re peak of each image")
@@ -302,4 +302,4 @@ DRAWN: dict[str, Callable[[Path, Path], Path]] = {
     "uav_images": draw_images,
     "uav_cuts": draw_cuts,
 }
-"""Figure → what draws it, from a folder of campaigns to a PNG."""
+"""Figure → function that draws it from a folder of campaigns as a PNG."""

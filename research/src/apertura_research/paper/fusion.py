@@ -1,4 +1,4 @@
-"""Fusion of the UAV experiment's images: phase, clutter, sidelobes and widths, in the products of the pipeline."""
+"""Fusion of the UAV experiment's images: phase, clutter, sidelobes and widths, measured in the pipeline's products."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +21,7 @@ from apertura_research.paper.experiments import (
 
 EAST, NORTH = (1.0, 0.0), (0.0, 1.0)
 REACH_M = 1.5
-"""How far cuts go, and what is left out about each target where clutter is measured."""
+"""Half length of cuts, and radius about each target that is excluded from clutter measurements."""
 
 WITHIN = 0.05
 LARGEST_PHASE_RAD = 0.3
@@ -29,14 +29,14 @@ LARGEST_PHASE_RAD = 0.3
 
 @dataclass(frozen=True)
 class Images:
-    """The four images of the flight on one grid, each (y, x), 1 at its brightest target.
+    """Four images of the flight on one grid, each (y, x), normalised to 1 at its brightest target.
 
     Attributes
     ----------
     amplitude
-        `mono`, `bistatic`, `coherent` (complex64) and `noncoherent`, the sum of magnitudes as the paper has it.
+        `mono`, `bistatic`, `coherent` (complex64) and `noncoherent`, the sum of magnitudes as in the paper.
     pixel
-        (target, 2) float64, row and column of each target, rough ones last.
+        (target, 2) float64, row and column of each target, patches of random points last.
     """
 
     amplitude: dict[str, NDArray[np.complex64]]
@@ -44,7 +44,7 @@ class Images:
     spacing_m: float
 
     def cut(self, name: str, direction: tuple[float, float]) -> Cut:
-        """Return width and sidelobes of an image through the brightest target."""
+        """Measure the width and sidelobes of an image through its brightest target."""
         image = self.amplitude[name]
         peak = find_peak(image, *self.brightest(name))
         return cut_through(image, peak, direction=direction, spacing_m=self.spacing_m, reach_m=REACH_M)
@@ -56,7 +56,7 @@ class Images:
         return row, column
 
     def clutter(self) -> NDArray[np.bool_]:
-        """Return (y, x) bool: the pixels farther than `REACH_M` from every target."""
+        """Return the mask of pixels farther than `REACH_M` from every target, (y, x) bool."""
         rows, columns = self.amplitude["mono"].shape
         places = np.stack(np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"), -1)
         away = np.linalg.norm(places[:, :, None] - self.pixel, axis=-1)
@@ -64,7 +64,7 @@ class Images:
 
 
 def open_images(experiment: Experiment) -> Images:
-    """Return the images of pairs and their sums as the cube holds them."""
+    """Read the images of the pairs and their sums from the cube."""
     cube, grid = experiment.opened.stage("cube"), experiment.opened.scene.grid
     pairs = dict(zip(cube.attrs["pairs"], cube.image.values[0], strict=True))
     amplitude = {"mono": pairs[MONOSTATIC], "bistatic": pairs[BISTATIC], "coherent": cube.coherent.values[0]}
@@ -76,7 +76,7 @@ def open_images(experiment: Experiment) -> Images:
 
 
 def fusion_claims(folder: Path) -> list[Claim]:
-    """Return the gain and cost of fusion in the UAV experiment that lies in a folder of campaigns."""
+    """Return the gain and cost of fusion in the UAV experiment of a folder of campaigns."""
     experiment = open_experiment(folder, "uav")
     images = open_images(experiment)
     return [_phase(experiment), *_widths(images), *_clutter(images), *_sidelobes(images)]
@@ -94,19 +94,19 @@ def _phase(experiment: Experiment) -> Claim:
         limit=f"within ±{LARGEST_PHASE_RAD:g} rad",
         met=worst <= LARGEST_PHASE_RAD,
         style=".3f",
-        note=f"worst of {len(mono)} targets, by the double sum at the true place of each; clutter is in it",
+        note=f"worst of {len(mono)} targets, by the double sum at the true position of each, clutter included",
     )
 
 
 def _widths(images: Images) -> list[Claim]:
     reason = (
-        f"two parts of the track of {SEGMENT_M:g} m with {GAP_M:g} m between them, at midpoints, not fitted: "
-        "the paper does not print which parts it used"
+        f"two track segments of {SEGMENT_M:g} m with a gap of {GAP_M:g} m, at midpoints, not fitted: the paper does "
+        "not state which segments it used"
     )
     rows = []
-    for what, direction, printed in (("cross-range", EAST, "11"), ("ground-range", NORTH, "49")):
+    for axis, direction, printed in (("cross-range", EAST, "11"), ("ground-range", NORTH, "49")):
         width_cm = 100 * images.cut("coherent", direction).width_m
-        name = f"UAV experiment: {what} width, coherent sum"
+        name = f"UAV experiment: {axis} width, coherent sum"
         rows.append(compare(name, width_cm, "cm", paper=printed, within=WITHIN, style=".3g", reason=reason))
     single_m, noncoherent_m = (
         [images.cut(name, direction).width_m for direction in (EAST, NORTH)] for name in ("mono", "noncoherent")
@@ -115,16 +115,15 @@ def _widths(images: Images) -> list[Claim]:
     rows.append(
         require("UAV experiment: width of the noncoherent sum over that of the monostatic image", finer, "1",
                 limit="at least 0.9", met=finer >= 0.9, words="noncoherent fusion gains no resolution", style=".2f",
-                note="the smaller of cross- and ground-range, cm: "
+                note="the smaller ratio of cross- and ground-range widths, cm: "
                 + " against ".join(f"{100 * one[0]:.0f} × {100 * one[1]:.0f}" for one in (noncoherent_m, single_m)))
     )  # fmt: skip
     return rows
 
 
 MAGNITUDES_DB, MAGNITUDES_CONTRAST = 0.49, 0.72
-"""Of the sum of magnitudes of two independent Rayleigh clutters of equal power: (|a| + |b|)²/4 has the mean (1 + π/4)/2
-and the contrast √((10 + 3π)/(2 + π/2)² − 1); docs/theory/study.md, "Where the paper holds
-less than it says"."""
+"""Clutter suppression and contrast of the sum of magnitudes of two independent Rayleigh clutters of equal power:
+(|a| + |b|)²/4 has the mean (1 + π/4)/2 and the contrast √((10 + 3π)/(2 + π/2)² − 1); docs/theory/study.md."""
 
 
 def _clutter(images: Images) -> list[Claim]:
@@ -136,7 +135,7 @@ def _clutter(images: Images) -> list[Claim]:
     gained_db = {kind: single_db - level_db[kind] for kind in ("coherent", "noncoherent")}
     rows = [
         compare(
-            f"clutter suppression by the {kind} sum: mean clutter against targets",
+            f"clutter suppression by the {kind} sum: mean clutter relative to targets",
             gained_db[kind],
             "dB",
             independent_model=expected,
@@ -147,17 +146,18 @@ def _clutter(images: Images) -> list[Claim]:
             f"{level_db[kind]:.1f} dB in the sum; {reason}",
         )
         for kind, expected, reason in (
-            ("coherent", 3.0, "targets add in amplitude, clutter of two look angles in power: 3 dB"),
+            ("coherent", 3.0, "targets add in amplitude, clutter of two look angles adds in power: 3 dB"),
             ("noncoherent", MAGNITUDES_DB, "magnitudes add: the clutter only becomes smoother"),
         )
     ]
-    apart_db = gained_db["coherent"] - gained_db["noncoherent"]
+    difference_db = gained_db["coherent"] - gained_db["noncoherent"]
     return [
         *rows,
-        require("clutter suppression by the coherent sum over that by the noncoherent one", apart_db, "dB",
-                limit="within ±1 dB", met=abs(apart_db) <= 1.0, words='that of the noncoherent sum is "comparable"',
-                style=".2f", note=f"{gained_db['coherent']:.1f} dB against {gained_db['noncoherent']:.1f} dB; what is "
-                "comparable is how smooth it looks: the next row"),
+        require("clutter suppression by the coherent sum over that by the noncoherent one", difference_db, "dB",
+                limit="within ±1 dB", met=abs(difference_db) <= 1.0,
+                words='that of the noncoherent sum is "comparable"', style=".2f",
+                note=f"{gained_db['coherent']:.1f} dB against {gained_db['noncoherent']:.1f} dB; only the contrast "
+                "of the clutter is comparable, see the next row"),
         compare("contrast of clutter in the noncoherent sum over that of one image",
                 2 * contrast["noncoherent"] / (contrast["mono"] + contrast["bistatic"]), "1",
                 independent_model=MAGNITUDES_CONTRAST, within=0.15, style=".2f",
@@ -169,8 +169,8 @@ def _sidelobes(images: Images) -> list[Claim]:
     cuts = {name: images.cut(name, EAST) for name in ("mono", "coherent")}
     expected_db = two_segment_sidelobe_db(SEGMENT_M, GAP_M)
     note = (
-        f"mono {cuts['mono'].pslr_db:.1f} dB; the model is sin(πLu)/(πLu)·cos(πDu), D = L + gap, without clutter and "
-        "for equal segments seen at right angles"
+        f"mono {cuts['mono'].pslr_db:.1f} dB; the model is sin(πLu)/(πLu)·cos(πDu), D = L + gap, without clutter, for "
+        "equal segments at broadside"
     )
     name = "highest cross-range sidelobe of the coherent sum, from the gap between segments"
     return [

@@ -1,4 +1,4 @@
-"""Effect of each error of the paper on a range profile and on the peaks, uncorrected."""
+"""Effect of each uncorrected error of the paper on a range profile and on the peaks."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -36,21 +36,21 @@ _SLANT_M = np.linspace(17.5, 18.7, 4801)
 
 @dataclass(frozen=True)
 class Profile:
-    """One target's range profile on a fine axis, referenced to the band's start as the paper writes it."""
+    """Range profile of one target on a fine axis, with phase referenced to the start of the band as in the paper."""
 
     values: Complexes
     carrier_hz: float
 
     @property
     def peak(self) -> int:
-        """Place of its maximum."""
+        """Index of the maximum."""
         return int(np.abs(self.values).argmax())
 
     @property
     def phase(self) -> float:
-        """At its peak, rad: that of exp(−j2πf_cτ), the carrier's turn over the true delay."""
-        turned = self.carrier_hz * 2 * _SLANT_M[self.peak] / SPEED_OF_LIGHT_M_S
-        return float(np.angle(self.values[self.peak] * np.exp(-2j * np.pi * (turned % 1.0))))
+        """Phase at the peak, rad: that of exp(−j2πf_cτ), the carrier over the true delay."""
+        cycles = self.carrier_hz * 2 * _SLANT_M[self.peak] / SPEED_OF_LIGHT_M_S
+        return float(np.angle(self.values[self.peak] * np.exp(-2j * np.pi * (cycles % 1.0))))
 
 
 def effect_claims() -> list[Claim]:
@@ -69,36 +69,37 @@ def effect_claims() -> list[Claim]:
     return [
         *_timing(scene, still, moved, TIMING_S),
         require(
-            "a timing offset of 0.5 ns leaves the range profile",
+            "range profile with a timing offset of 0.5 ns: displacement",
             _shift_cells(scene, still, little),
             "cells",
             limit="less than half a cell c/2B",
             met=_shift_cells(scene, still, little) < 0.5,
-            words="0.5 ns leaves the range profile",
+            words="0.5 ns leaves the range profile unchanged",
             style=".3f",
-            note=f"its peak is {20 * np.log10(_level(little) / _level(still)):+.3f} dB; the phase turns by "
-            f"{360 * scene.waveform.carrier_hz * SMALL_TIMING_S:.0f}°, which is what defocuses",
+            note=f"its peak changes by {20 * np.log10(_level(little) / _level(still)):+.3f} dB; its phase changes by "
+            f"{360 * scene.waveform.carrier_hz * SMALL_TIMING_S:.0f}°, which defocuses the image",
         ),
         require(
-            "a carrier phase leaves the magnitude of the range profile",
+            "range profile with a carrier phase: change of magnitude",
             magnitude_db,
             "dB",
             limit="below −90 dB of the peak",
             met=magnitude_db < -90,
-            words="a carrier phase leaves the magnitude",
+            words="a carrier phase leaves the magnitude unchanged",
             style=".0f",
-            note=f"largest change anywhere; the phase turned by {np.degrees(turned.phase - still.phase) % 360:.0f}°",
+            note=f"largest change in the profile; its phase changes by "
+            f"{np.degrees(turned.phase - still.phase) % 360:.0f}°",
         ),
     ]
 
 
 def _timing(scene: PaperScene, still: Profile, moved: Profile, late_s: float) -> list[Claim]:
-    """Return shift and phase of a capture that starts late: every echo seems earlier by as much."""
+    """Return displacement and phase for a capture that starts late: every echo arrives earlier by the same time."""
     bandwidth_hz = len(scene.waveform.codes) * scene.waveform.subcarrier_spacing_hz
-    turn = (moved.phase - still.phase) / (2 * np.pi) % 1.0
+    phase_cycles = (moved.phase - still.phase) / (2 * np.pi) % 1.0
     return [
         compare(
-            f"shift of the profile by a timing offset of {1e9 * late_s:g} ns, B·T",
+            f"displacement of the profile by a timing offset of {1e9 * late_s:g} ns, B·T",
             _shift_cells(scene, still, moved),
             "cells",
             independent_model=bandwidth_hz * late_s,
@@ -106,14 +107,14 @@ def _timing(scene: PaperScene, still: Profile, moved: Profile, late_s: float) ->
             note="closed form B·T with B = 409.6 MHz",
         ),
         compare(
-            f"phase of the peak by a timing offset of {1e9 * late_s:g} ns, 2πf_cT",
-            turn,
-            "turns",
+            f"phase change of the peak by a timing offset of {1e9 * late_s:g} ns, 2πf_cT",
+            phase_cycles,
+            "cycles",
             independent_model=scene.waveform.carrier_hz * late_s % 1.0,
             within=0.005,
             relative=False,
-            note="closed form f_cT modulo one turn, profile referenced to the start of the band; about the band's "
-            "middle, as this project's profiles are, it is f_mid·T",
+            note="closed form f_cT modulo one cycle, for a profile referenced to the start of the band; this project "
+            "references profiles to the middle of the band, where it is f_mid·T",
         ),
     ]
 
@@ -136,7 +137,7 @@ def _shift_cells(scene: PaperScene, still: Profile, moved: Profile) -> float:
 
 
 def _change_db(still: Profile, turned: Profile) -> float:
-    """Return the largest change of magnitude anywhere, against the peak."""
+    """Return the largest change of magnitude in the profile, relative to the peak."""
     before, after = np.abs(still.values), np.abs(turned.values)
     return 20 * float(np.log10(np.abs(after - before).max() / before.max()))
 
@@ -146,7 +147,7 @@ def _level(profile: Profile) -> float:
 
 
 DESTROYED_DB = -12.0
-"""Beyond it there is no peak to measure: the largest speckle near the target is reported."""
+"""Loss beyond which no peak is measurable: the largest speckle near the target is reported."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,17 +157,17 @@ class UncorrectedError:
     Attributes
     ----------
     sweep
-        The impairment; here it comes alone.
+        The impairment, applied without any other.
     independent_model_db
-        Size → mean peak loss of an independent model, dB; `within_db` of it agrees.
+        Size → mean peak loss of an independent model, dB; differences up to `within_db` agree.
     pulses
-        That settle the losses: 150 agree with 300 to 0.03 dB where nothing is random.
+        Number of pulses at which the losses converge: 150 and 300 agree within 0.03 dB for deterministic errors.
     draws
-        Over which the loss is averaged; 1 where nothing is random.
+        Number of draws over which the loss is averaged; 1 for deterministic errors.
     divided
-        Whether the sidelink is divided out (and its length is as wrong as the positions).
+        True if the echo is divided by the sidelink (whose length then has the error of the positions).
     reach_m
-        How far peaks are looked for.
+        Half widths of the area in which peaks are searched.
     """
 
     sweep: ImpairmentSweep
@@ -181,17 +182,17 @@ class UncorrectedError:
     note: str = ""
 
     def scene(self, pulses: int) -> PaperScene:
-        """Return the scene with so many pulses."""
+        """Return the scene with a given number of pulses."""
         qpsk = self.sweep.sampled
         return reduced_scene(pulses=pulses, subcarriers=self.subcarriers, rx_ahead_m=self.rx_ahead_m, qpsk=qpsk)
 
     def disturbance(self, size: float) -> Disturbance:
-        """Return the errors of one size."""
+        """Return the disturbance of a given size."""
         return self.sweep.disturbance(size, besides=NO_IMPAIRMENTS)
 
 
 def _sfo(khz: float) -> dict[str, object]:
-    """Return a sampling rate off by so much, the time error counted from the start of the DFT window."""
+    """Return a sampling frequency offset whose time error starts at the DFT window."""
     wave, off_hz = paper_waveform(), 1e3 * khz
     start_s = wave.cyclic_prefix_s * off_hz / (wave.sample_rate_hz + off_hz)
     return {"clock": Clock(sfo_hz=off_hz), "timing": Timing(offset_s=start_s)}
@@ -206,12 +207,12 @@ ERRORS: Mapping[str, UncorrectedError] = {
     ),
     "cfo": UncorrectedError(
         SWEEPS["cfo"], {10: -0.15, 30: -1.39, 50: -4.1, 100: -31.5}, pulses=150, subcarriers=4096,
-        note="random QPSK code; a quadratic-phase code loses half as much, in dB, and shifts the targets",
+        note="random QPSK code; a quadratic-phase code loses half as much in dB, but displaces the targets",
     ),
     "sfo": UncorrectedError(
         replace(SWEEPS["sfo"], receiver=_sfo), {100: -1.05, 200: -4.0, 400: -9.3, 1000: -15.0},
         pulses=150, subcarriers=4096, reach_m=(0.16, 1.5),
-        note="time error counted from the DFT window; counted from the prefix a third more is lost, by defocusing",
+        note="time error counted from the DFT window; from the prefix, defocusing increases the loss by a third",
     ),
     "localization": UncorrectedError(
         replace(SWEEPS["localization"], title=SWEEPS["localization"].title + ", bistatic"),
@@ -226,9 +227,9 @@ TOLERATED_DB = 1.0
 
 
 def loss_claims(name: str, *, draws: int | None = None, seed: int = 1) -> list[Claim]:
-    """Return a row for each size of a key of `ERRORS`: mean peak loss over five targets and all draws.
+    """Return a row for each size of one of `ERRORS`: mean peak loss over five targets and all draws.
 
-    Of the sampling offset, one more says what the paper holds of it at its limit.
+    The sampling frequency offset has an additional row for the paper's statement on its limit.
     """
     error = ERRORS[name]
     count = draws or error.draws
@@ -250,12 +251,12 @@ def _ignored(loss_db: float) -> Claim:
         met=loss_db >= -TOLERATED_DB,
         words='an SFO of up to 200 kHz can be "safely ignored"',
         style=".2f",
-        note="mean of five targets; 1 dB is lost at half the limit already",
+        note="mean of five targets; the loss reaches 1 dB at half the limit",
     )
 
 
 def peak_losses_db(error: UncorrectedError, size: float, generator: np.random.Generator) -> Floats:
-    """Return (target,) loss of the peaks against the undisturbed scene, dB, negative."""
+    """Return the peak levels relative to the undisturbed scene, (target,) dB; losses are negative."""
     scene = _scene(error)
     targets = scene.scatterers.position_m
     radar, sidelink, _ = receive_pair(scene, error.disturbance(size), generator)
@@ -265,7 +266,7 @@ def peak_losses_db(error: UncorrectedError, size: float, generator: np.random.Ge
 
 
 def history_of(scene: PaperScene, radar: Complexes, sidelink: Complexes, *, divided: bool) -> PhaseHistory:
-    """Return the phase history to be focused: the radar alone, or divided by the sidelink."""
+    """Return the phase history of the radar channel, or of the radar divided by the sidelink."""
     return point_response.phase_history(scene, divide(radar, sidelink) if divided else radar, divided=divided)
 
 
@@ -282,8 +283,8 @@ def _undisturbed_peaks(error: UncorrectedError) -> Floats:
 def _row(error: UncorrectedError, size: float, expected_db: float, losses_db: Floats) -> Claim:
     mean_db, count = float(losses_db.mean()), losses_db.size
     destroyed = expected_db < DESTROYED_DB and mean_db < DESTROYED_DB
-    how = "destroyed: no peak is left to compare" if destroyed else ""
-    over = f"mean of {count} draws, spread {losses_db.std():.2f} dB" if count > 1 else "nothing random"
+    no_peak = "destroyed: no peak to compare" if destroyed else ""
+    statistics = f"mean of {count} draws, spread {losses_db.std():.2f} dB" if count > 1 else "deterministic"
     return compare(
         f"uncorrected loss: {error.sweep.title} {size:g} {error.sweep.unit}",
         mean_db,
@@ -292,5 +293,5 @@ def _row(error: UncorrectedError, size: float, expected_db: float, losses_db: Fl
         within=np.inf if destroyed else error.within_db,
         relative=False,
         style=".2f",
-        note="; ".join(filter(None, (how, over, error.note))),
+        note="; ".join(filter(None, (no_peak, statistics, error.note))),
     )

@@ -1,4 +1,4 @@
-"""The paper's equations, and the parameters that it derives from them."""
+"""The paper's equations and derived parameters."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ Source: F. J. Harris, "On the use of windows for harmonic analysis with the DFT"
 
 
 def sfo_limit_hz(sample_rate_hz: float, bandwidth_hz: float, symbol_s: float) -> float:
-    """Return f_s(1 − 1/(1 + 1/(BT))): the last subcarrier drifts by one turn over the symbol.
+    """Return the SFO limit f_s(1 − 1/(1 + 1/(BT))), where the last subcarrier drifts by one cycle over the symbol.
 
     Examples
     --------
@@ -28,7 +28,7 @@ def sfo_limit_hz(sample_rate_hz: float, bandwidth_hz: float, symbol_s: float) ->
 
 
 def cfo_limit_hz(subcarrier_spacing_hz: float) -> float:
-    """Return Δf/10, which costs 20·lg sinc(0.1) = −0.14 dB.
+    """Return the CFO limit Δf/10, with a loss of 20·lg sinc(0.1) = −0.14 dB.
 
     Examples
     --------
@@ -41,7 +41,7 @@ def cfo_limit_hz(subcarrier_spacing_hz: float) -> float:
 def ground_range_resolution_m(
     bandwidth_hz: float, ground_range_m: float, height_m: float, *, half_power: float = HALF_POWER_OF_SINC
 ) -> float:
-    """Return half_power·c/2B·R/r_g, the −3 dB width on the ground abreast of the track.
+    """Return the −3 dB width in ground range abreast of the track, half_power·c/2B·R/r_g.
 
     Examples
     --------
@@ -53,7 +53,7 @@ def ground_range_resolution_m(
 
 
 def cross_range_resolution_m(frequency_hz: float, slant_range_m: float, aperture_m: float) -> float:
-    """Return 0.886·λR/2L, the −3 dB width along the track of a short aperture.
+    """Return the −3 dB width along the track of a short aperture, 0.886·λR/2L.
 
     Examples
     --------
@@ -65,7 +65,7 @@ def cross_range_resolution_m(frequency_hz: float, slant_range_m: float, aperture
 
 
 def coherence_of_snr(snr: float, pulses: int) -> float:
-    """Return Γ = (SNR + 1/M)/(SNR + 1) of M equal echoes in white noise of a given power SNR per compressed pulse.
+    """Return the coherence factor Γ = (SNR + 1/M)/(SNR + 1) of M equal echoes at a power SNR per compressed pulse.
 
     Examples
     --------
@@ -76,7 +76,7 @@ def coherence_of_snr(snr: float, pulses: int) -> float:
 
 
 def snr_of_coherence_factor(coherence: float, pulses: int) -> float:
-    """Return the power SNR of one compressed pulse at which M equal echoes in white noise are so coherent.
+    """Return the power SNR per compressed pulse at which M equal echoes have a given coherence factor.
 
     Notes
     -----
@@ -92,13 +92,13 @@ def snr_of_coherence_factor(coherence: float, pulses: int) -> float:
 
 BITS = 14
 ADC_RATE_HZ = 4.096e9
-"""Before decimation by 4."""
+"""Sampling rate of the converter before decimation by 4."""
 
 CLOCK_ERROR = 1e-8
 
 
 def parameter_claims() -> list[Claim]:
-    """Return bandwidth, duty cycles, data rates, clock limits, timing requirements, sampling and chirp bandwidth.
+    """Return the claims on bandwidth, duty cycle, data rate, clock limits, timing, sampling and chirp bandwidth.
 
     Examples
     --------
@@ -116,7 +116,7 @@ def _waveform() -> list[Claim]:
         duty, at = (wave.symbol_s + wave.cyclic_prefix_s) * prf_hz, f"at {prf_hz:.0f} Hz"
         note = "γ = (T + T_cp)·f_prf, not T alone"
         rows.append(compare(f"duty cycle {at}", 100 * duty, "%", paper=percent, style=".5g", note=note))
-        note = "2·f_s·ν·γ: I and Q both counted"
+        note = "2·f_s·ν·γ, with I and Q"
         rows.append(
             compare(
                 f"mean data rate {at}", 2 * wave.sample_rate_hz * BITS / 1e6 * duty, "Mbit/s", paper=mbit_s, note=note
@@ -124,13 +124,13 @@ def _waveform() -> list[Claim]:
         )
     period_us, symbol_us = 1e6 / wave.subcarrier_spacing_hz, 1e6 * wave.symbol_s
     contradiction = (
-        f"the paper prints T and Δf and not that T holds {symbol_us / period_us:g} periods of 1/Δf; the symbol is "
-        f"periodic, so a DFT of f_s/Δf = {wave.dft_samples} samples (not N = {len(wave.codes)}) still separates "
-        f"the subcarriers exactly; prefix and symbol together are {wave.capture_samples} samples"
+        f"the paper prints T and Δf, but not that T contains {symbol_us / period_us:g} periods of 1/Δf; the symbol is "
+        f"periodic, so that a DFT of f_s/Δf = {wave.dft_samples} samples (not N = {len(wave.codes)}) still separates "
+        f"the subcarriers exactly; prefix and symbol together have {wave.capture_samples} samples"
     )
     rows.append(compare("OFDM symbol T against 1/Δf", period_us, "µs", paper="12.5", reason=contradiction))
     kept = (wave.symbol_s - wave.cyclic_prefix_s) / wave.symbol_s
-    share = f"{100 * kept:g} % of B; the paper prints the formula and names no delay"
+    share = f"{100 * kept:g} % of B; the paper prints the formula without a delay"
     name = "effective chirp bandwidth B(T − Δt_max)/T, Δt_max = T_cp"
     rows.append(Claim(name, "", "", f"{band_mhz * kept:g}", "MHz", PAPER, UNTESTABLE, share))
     top_ghz, half_ghz = float(wave.frequency_hz[-1]) / 1e9, ADC_RATE_HZ / 2e9
@@ -148,19 +148,19 @@ def _clocks() -> list[Claim]:
     sfo_hz, cfo_hz = sfo_limit_hz(wave.sample_rate_hz, band_hz, wave.symbol_s), cfo_limit_hz(wave.subcarrier_spacing_hz)
     sfo_ppm, cfo_ppm = 1e6 * sfo_hz / wave.sample_rate_hz, 1e6 * cfo_hz / wave.carrier_hz
     at_carrier_hz, at_converter_hz = CLOCK_ERROR * wave.carrier_hz, CLOCK_ERROR * ADC_RATE_HZ
-    opposite = f"two clocks off in opposite directions differ by {sfo_ppm:.0f} ppm of f_s = 1.024 GS/s, the 200 kHz"
-    first = f"{cfo_ppm:.1f} ppm of the carrier: reached first where one clock feeds carrier and converter"
+    opposite = f"two opposite clock errors differ by {sfo_ppm:.0f} ppm of f_s = 1.024 GS/s, the 200 kHz"
+    first = f"{cfo_ppm:.1f} ppm of the carrier: reached before the SFO limit if one clock feeds carrier and converter"
     swapped = (
         "the paper contradicts itself: it prints 41 Hz for the CFO at the carrier of 1.2 GHz and 12 Hz for the SFO at "
-        "the converter's 4.096 GS/s; each is computed where the other is printed"
+        "the converter's 4.096 GS/s; the computed values are the other way round"
     )
     return [
         compare("SFO limit f_s(1 − 1/(1 + 1/BT))", sfo_hz / 1e3, "kHz", paper="200", style=".5g"),
         compare("clock error of each node at the SFO limit, ±", sfo_ppm / 2, "ppm", paper="100",
-                reason=f"the paper counts two clocks that err in opposite directions, and rounds: {opposite}"),
+                reason=f"the paper assumes two clocks with opposite errors, and rounds: {opposite}"),
         compare("CFO limit Δf/10", cfo_hz / 1e3, "kHz", paper="10", note=first),
-        compare("CFO of a clock off by 10 ppb", at_carrier_hz, "Hz", paper="41", reason=swapped),
-        compare("SFO of a clock off by 10 ppb", at_converter_hz, "Hz", paper="12", reason=swapped),
+        compare("CFO of a clock error of 10 ppb", at_carrier_hz, "Hz", paper="41", reason=swapped),
+        compare("SFO of a clock error of 10 ppb", at_converter_hz, "Hz", paper="12", reason=swapped),
     ]  # fmt: skip
 
 
@@ -175,22 +175,22 @@ def _timing() -> list[Claim]:
 
 
 STORAGE_MBIT_S = 240.0
-"""What a memory card of video speed class V30 sustains, 30 MB/s (SD Physical Layer Specification)."""
+"""Sustained rate of a memory card of video speed class V30, 30 MB/s (SD Physical Layer Specification)."""
 
 
 def _storage() -> list[Claim]:
-    """Return the storage of a node, as files of int16 pairs hold what the paper counts as 14 bits, and by its count."""
+    """Return the storage rate of a node for files of int16 pairs, and for the paper's count of 14 bits."""
     wave = paper_waveform()
     stored = 2 * 16 * wave.capture_samples * float(wave.prf_hz) / 1e6
     counted = 2 * BITS * (wave.symbol_s + wave.cyclic_prefix_s) * wave.sample_rate_hz * float(wave.prf_hz) / 1e6
     continuous = 2 * 16 * wave.sample_rate_hz / 1e6
-    wider = "recordings hold 16 bits for 14, and a secondary node stores two channels"
+    wider = "recordings store 14 bits in 16, and a secondary node stores two channels"
     return [
         require("data rate of a secondary node at 100 Hz against storage", 2 * stored, "Mbit/s",
                 limit=f"below {STORAGE_MBIT_S:g} Mbit/s, a V30 card, and without trigger above", style=".1f",
                 met=2 * stored < STORAGE_MBIT_S < 2 * continuous,
                 note=f"{wider}; without trigger {2 * continuous / 1e3:.1f} Gbit/s"),
-        compare("data rate of a channel at 20 Hz as it is stored", stored / 5, "Mbit/s",
+        compare("stored data rate of a channel at 20 Hz", stored / 5, "Mbit/s",
                 independent_model=counted / 5 * 16 / BITS,
                 note=f"{wider}: {2 * stored / 5:.1f} Mbit/s, {2 * stored / 5 * 3600 / 8e3:.1f} GB an hour"),
     ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Resolutions of the paper's scene and flight, measured in simulated images beside their closed forms."""
+"""Resolutions of the paper's scene and flight, measured in simulated images and compared with closed forms."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,7 +18,7 @@ from apertura_research.paper_scene import PaperScene, reduced_scene
 from apertura_research.point_response import find_peaks, half_power_widths, mean_image, undisturbed_tables
 
 WITHIN = 0.05
-"""Share by which widths may differ and still agree."""
+"""Relative tolerance of widths."""
 
 GROUND_CM = (43.7, 30.2, 32.0, 30.7, 33.4)
 CROSS_CM = (5.51, 6.34, 7.12, 8.45, 9.51)
@@ -26,19 +26,19 @@ CROSS_CM = (5.51, 6.34, 7.12, 8.45, 9.51)
 
 UAV_TARGET_M = np.array([[0.0, 11.5, 0.0]])
 UAV_HEIGHT_M = 4.8
-"""Within the 4.5 to 5 m of the flight."""
+"""Height of the simulated tracks; the flight was at 4.5 to 5 m."""
 
 UAV_APERTURE_M = 3.4
 MONO_SEGMENT_M, BISTATIC_MIDPOINT_M, SEGMENT_LENGTH_M = -1.88, 4.38, 4.7
-"""Chosen so that the fused widths are the paper's, which gives none of the three."""
+"""Fitted to the paper's fused widths; the paper states none of the three."""
 
 SEPARATION_M = 4.7
 
 
 def simulated_table(*, pulses: int = 600) -> list[Claim]:
-    """Return ground-range and cross-range widths of the five targets beside an independent model and closed forms.
+    """Compare the ground- and cross-range widths of the five targets with an independent model and closed forms.
 
-    Of the paper's 3000 pulses as few as 150 do not change the widths.
+    The widths converge with 150 of the paper's 3000 pulses.
     """
     scene = reduced_scene(pulses=pulses, subcarriers=256)
     targets = scene.scatterers.position_m
@@ -53,7 +53,7 @@ def simulated_table(*, pulses: int = 600) -> list[Claim]:
         closed = 100 * ground_range_resolution_m(_bandwidth_hz(scene), peak[1], height_m)
         closed_cm.append(closed)
         crosses_cm.append(cross)
-        note = f"closed form 0.886·c/2B·R/r_g {closed:.1f} cm: a long aperture is finer, as it adds look angles"
+        note = f"closed form 0.886·c/2B·R/r_g {closed:.1f} cm: a long aperture is finer because it adds look angles"
         name = f"{title}: ground-range width"
         rows.append(compare(name, ground, "cm", independent_model=ground_cm, within=WITHIN, note=note))
         closed = 100 * cross_range_resolution_m(middle_hz, float(np.hypot(peak[1], height_m)), aperture_m)
@@ -64,7 +64,7 @@ def simulated_table(*, pulses: int = 600) -> list[Claim]:
 
 
 def uav_table(*, pulses: int = 200) -> list[Claim]:
-    """Return the widths of the UAV flight with a Hann window, mono and fused, from `pulses` per segment."""
+    """Return the widths of the UAV flight with a Hann window, monostatic and fused, from `pulses` per segment."""
     scene = reduced_scene(pulses=pulses, subcarriers=512)
     ground_m, slant_m = UAV_TARGET_M[0, 1], float(np.hypot(UAV_TARGET_M[0, 1], UAV_HEIGHT_M))
     closed_m = ground_range_resolution_m(_bandwidth_hz(scene), ground_m, UAV_HEIGHT_M, half_power=HALF_POWER_OF_HANN)
@@ -75,11 +75,11 @@ def uav_table(*, pulses: int = 200) -> list[Claim]:
     )
     other_length = (
         f"the paper contradicts itself: its table's L = 3.4 m gives {100 * short_m:.1f} cm by the closed form; "
-        f"L = 4.7 m, which it prints as R_sl, would give {100 * long_m:.1f} cm"
+        f"L = 4.7 m, which it prints as R_sl, gives {100 * long_m:.1f} cm"
     )
     fitted = (
-        "mono segment at −1.88 m, bistatic midpoint at +4.38 m and L = 4.7 m, which the paper "
-        "does not give, were chosen for 11 cm × 49 cm; other plausible segments give 11–24 cm × 48–57 cm"
+        "mono segment at −1.88 m, bistatic midpoint at +4.38 m and L = 4.7 m were fitted to 11 cm × 49 cm, because the "
+        "paper does not state them; other plausible segments give 11–24 cm × 48–57 cm"
     )
     middle_m = BISTATIC_MIDPOINT_M - SEPARATION_M / 2
     mono = _uav_widths_cm([_segment(scene, 0.0, UAV_APERTURE_M)])
@@ -96,10 +96,10 @@ def uav_table(*, pulses: int = 200) -> list[Claim]:
 
 
 def _printed_table(ground_cm: list[float], cross_cm: list[float]) -> list[Claim]:
-    """Return the widths that the paper prints for its simulated scene, beside closed forms."""
+    """Compare the widths that the paper prints for its simulated scene with closed forms."""
     far = (
-        f"of the farthest target, the widest; the five measure {min(cross_cm):.1f} to {max(cross_cm):.1f} cm; it "
-        "is not known here which of them the paper's 9 cm are"
+        f"farthest target, which is the widest; the widths of the five targets are {min(cross_cm):.1f} to "
+        f"{max(cross_cm):.1f} cm; the paper does not state which target its 9 cm refer to"
     )
     return [
         compare("ground-range width, closed form, farthest target", ground_cm[-1], "cm", paper="35", within=WITHIN),
@@ -119,7 +119,7 @@ def _segment(scene: PaperScene, middle_m: float, length_m: float, *, rx_ahead_m:
 
 
 def _uav_widths_cm(segments: list[PaperScene]) -> tuple[float, float]:
-    """Return the widths across and along the track of the coherent sum of images of equal peaks."""
+    """Return the widths across and along the track of the coherent sum of images with equal peaks."""
     images = [_normalised(segment) for segment in segments]
     width_m = half_power_widths(lambda pixels: np.asarray(sum(image(pixels) for image in images)), UAV_TARGET_M[0])
     return 100 * width_m[0], 100 * width_m[1]

@@ -1,1 +1,1 @@
-"""Every impairment against every correction."""
+"""Effect of every impairment under every correction."""

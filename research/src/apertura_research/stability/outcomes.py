@@ -17,7 +17,7 @@ from apertura_research.point_response import find_peaks, mean_image
 from apertura_research.stability.sweeps import SWEEPS, ImpairmentSweep
 
 REFUSED_DB = 40.0
-"""Loss entered where nothing is imaged; larger ones are clipped to it."""
+"""Loss recorded if no pulse is imaged; larger losses are clipped to it."""
 
 _REACH_M = (0.16, 1.0)
 
@@ -29,17 +29,17 @@ class StabilityRow:
     Attributes
     ----------
     loss_db, loss_spread_db
-        Loss of the five peaks against the undisturbed scene, and its standard deviation over the draws.
+        Mean loss of the five peaks relative to the undisturbed scene, and its standard deviation over the draws.
     coherence_factor
         Mean over the targets and draws.
     ground_width_m, cross_width_m
-        −3 dB widths of the third target, median over the draws; NaN where it has no main lobe.
+        −3 dB widths of the third target, median over the draws; NaN if it has no main lobe.
     floor_db
-        RMS of what is wrong at random pixels of the scene, against the mean peak.
+        RMS error at random pixels of the scene, relative to the mean peak.
     pulses_used
-        Mean share of the pulses that were imaged.
+        Mean share of imaged pulses.
     chosen
-        Method that was applied in most draws; `refused` where none locks.
+        Method applied in most draws; `refused` if the sidelink locks in no pulse.
     """
 
     impairment: str
@@ -59,14 +59,14 @@ class StabilityRow:
 
 
 def sizes_of(part: str) -> tuple[float, ...]:
-    """Return the sizes that a part, `IMPAIRMENT.METHOD`, is tried at."""
+    """Return the simulated sizes of a part, `IMPAIRMENT.METHOD`."""
     return SWEEPS[part.partition(".")[0]].sizes
 
 
 def run_size(part: str, size: float, *, seed: int = 1) -> list[StabilityRow]:
-    """Return the outcome of one size of an impairment of `SWEEPS` under a correction of `CHOICES`.
+    """Simulate one size of an impairment of `SWEEPS` under a correction of `CHOICES`.
 
-    Draws depend on the seed and on their number alone: every method and size gets the same random numbers.
+    Draws depend only on the seed and their number: every method and size gets the same random numbers.
     """
     impairment, _, method = part.partition(".")
     sweep = SWEEPS[impairment]
@@ -110,7 +110,7 @@ class _Ideal(NamedTuple):
 
 
 def _undisturbed(sweep: ImpairmentSweep) -> _Ideal:
-    """Return the peaks, and the image at random pixels, of the scene with nothing wrong."""
+    """Return the peaks and the image at random pixels of the undisturbed scene."""
     scene = sweep.flown(0.0)
     tables = point_response.undisturbed_tables(scene)
     pixels = point_response.random_pixels(np.random.default_rng(0))
@@ -121,7 +121,7 @@ def _undisturbed(sweep: ImpairmentSweep) -> _Ideal:
 def _draw(
     sweep: ImpairmentSweep, size: float, method: str, ideal: _Ideal, generator: np.random.Generator
 ) -> tuple[_Measured, str]:
-    """Return the measures of one draw, and the method applied."""
+    """Return the metrics of one draw and the applied method."""
     flown = sweep.flown(size)
     radar, sidelink, observation = receive_pair(flown, sweep.disturbance(size), generator)
     logged = sweep.logged(flown, size, generator)
@@ -135,9 +135,9 @@ def _draw(
 def correct(
     method: str, radar: Complexes, sidelink: Complexes, recorded: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], Complexes, str]:
-    """Return the pulses kept, their corrected transfer functions, and the method applied.
+    """Return the mask of used pulses, their corrected transfer functions, and the applied method.
 
-    Pulses whose sidelink does not lock are dropped, as the pipeline drops them.
+    Pulses whose sidelink does not lock are excluded, as in the pipeline.
 
     Parameters
     ----------

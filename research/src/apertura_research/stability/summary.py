@@ -1,4 +1,4 @@
-"""The stability study: every impairment against every correction, its tables of tolerance and its charts."""
+"""The stability study: effect of every impairment under every correction, with tables of tolerance and charts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,11 +17,11 @@ LEVELS_DB = (1.0, 3.0)
 EXPECTED = {
     "divide": "SNR < 6 dB: gain −4 dB at 0 dB, −20 dB at −10 dB",
     "wiener": "floor 5 to 9 dB better than divide below 6 dB, biases the peak",
-    "gated": "noise inside ±16 cells stays",
+    "gated": "noise within ±16 cells remains",
     "two_parameter": "works down to −20 dB",
     "auto": "within 0.2 dB of the best",
 }
-"""What an independent model predicts of each method."""
+"""Method → prediction of an independent model."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class Tolerance:
     Attributes
     ----------
     size_at_1_db, size_at_3_db
-        Interpolated; NaN where the peaks never get that wrong, too low or too high.
+        Interpolated sizes at which the peak error, of either sign, reaches 1 and 3 dB; NaN if it does not.
     first_size, last_size
-        Between which sizes it was tried.
+        Range of the simulated sizes.
     """
 
     impairment: str
@@ -48,7 +48,7 @@ class Tolerance:
 
 
 def tolerance_of(outcomes: Sequence[StabilityRow]) -> Tolerance:
-    """Return the sizes at which one impairment under one correction costs 1 and 3 dB, or gains as much wrongly."""
+    """Return the sizes at which one impairment under one correction changes the peaks by 1 and 3 dB."""
     first, last = outcomes[0], outcomes[-1]
     sizes, losses = (np.array([getattr(one, name) for one in outcomes]) for name in ("size", "loss_db"))
     logarithmic = SWEEPS[first.impairment].logarithmic
@@ -59,7 +59,7 @@ def tolerance_of(outcomes: Sequence[StabilityRow]) -> Tolerance:
 
 
 def summarise(outcomes: Sequence[StabilityRow], folder: Path) -> None:
-    """Write summary.csv and .png, where each correction fails, and the tables of the sidelink."""
+    """Write summary.csv and summary.png, the tolerances of each correction, and the sidelink tables."""
     by_key = {
         (name, method): [one for one in outcomes if (one.impairment, one.method) == (name, method)]
         for name in SWEEPS
@@ -76,9 +76,9 @@ def _of_method(outcomes: Sequence[StabilityRow], method: str) -> list[StabilityR
 
 
 def write_sidelink_tables(outcomes: Sequence[StabilityRow], folder: Path) -> None:
-    """Write sidelink.csv: each method at each SNR of the sidelink, the best, and how far `auto` is from it.
+    """Write sidelink.csv: the loss of each method at each sidelink SNR, the best method, and the excess loss of `auto`.
 
-    Beside it sidelink_methods.csv lists at which SNR each method fails.
+    sidelink_methods.csv lists the SNR at which each method fails.
     """
     methods = [method for method in CHOICES if method not in ("none", "auto")]
     write_table(folder / "sidelink.csv", _snr_rows(outcomes, methods))
@@ -129,7 +129,7 @@ def draw_impairment(impairment: str, outcomes: Sequence[StabilityRow], path: Pat
         ("loss_db", 1.0, "Peak loss, dB (mean of five targets)"),
         ("coherence_factor", 1.0, "Coherence factor"),
         ("cross_width_m", 100.0, "Cross-range width at −3 dB, cm"),
-        ("floor_db", 1.0, "Error floor against the peaks, dB"),
+        ("floor_db", 1.0, "Error floor relative to the peaks, dB"),
     )
     with panels(path, (10, 7.5), (2, 2), title=sweep.title, legend_columns=len(CHOICES), sharex=True) as every:
         for axes, (name, scale, label) in zip(every, quantities, strict=True):
@@ -148,7 +148,7 @@ def draw_impairment(impairment: str, outcomes: Sequence[StabilityRow], path: Pat
 
 def _draw_line(axis: Axes, method: str, sizes: list[float], values: list[float]) -> None:
     colour, marker, style = _STYLES[method]
-    below = method == "auto"  # a broad band under the method it takes
+    below = method == "auto"  # drawn as a broad line below that of the method it selects
     axis.plot(
         sizes,
         values,
@@ -172,20 +172,20 @@ def _mark_losses(axis: Axes) -> None:
 
 
 def _draw_tolerances(tolerances: Sequence[Tolerance], path: Path) -> None:
-    """Draw a table of where each correction loses 1 dB and 3 dB, coloured by the share of the sweep below 1 dB."""
+    """Draw the table of sizes with 1 dB and 3 dB of peak error, coloured by the share of the sweep below 1 dB."""
     table = [tolerances[first : first + len(CHOICES)] for first in range(0, len(tolerances), len(CHOICES))]
     draw_table(
         path,
         [[_text(one) for one in row] for row in table],
         [[_share(one) for one in row] for row in table],
         ([with_unit(sweep.title, sweep.unit) for sweep in SWEEPS.values()], CHOICES),
-        title="Size at which the peaks are wrong by 1 dB | 3 dB (> or <: not within the sweep)",
+        title="Size at which the peak error reaches 1 dB | 3 dB (> or <: not within the sweep)",
         scale="Share of the sweep below 1 dB",
     )
 
 
 def _share(tolerance: Tolerance) -> float:
-    """Return the share of its sweep that the impairment passes before the loss exceeds 1 dB, 0…1."""
+    """Return the share of the sweep with a loss below 1 dB, 0…1."""
     if np.isnan(tolerance.size_at_1_db):
         return 1.0
     sweep = SWEEPS[tolerance.impairment]

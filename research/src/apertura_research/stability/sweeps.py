@@ -1,4 +1,4 @@
-"""Every impairment, from negligible to destructive: what stability is tried against."""
+"""Impairments of the stability study, from negligible to destructive size."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -24,31 +24,31 @@ from apertura.simulation.presets import paper_waveform
 from apertura_research.paper_scene import RX_AHEAD_M, Disturbance, PaperScene, reduced_scene
 
 CHOICES = ("none", *METHODS, "auto")
-"""Every correction: the radar alone, each method of the sidelink, and the one `auto` takes."""
+"""Corrections: none (the radar channel only), each method of the sidelink, and the automatic choice."""
 
 PULSES = 240
 ORDINARY = Impairments(radar_snr_db=20.0, sidelink_snr_db=30.0)
-"""What else is wrong while one impairment is swept."""
+"""Impairments that are present in addition to the swept one."""
 
 _CELL_M = SPEED_OF_LIGHT_M_S / 409.6e6
 
 
 @dataclass(frozen=True)
 class ImpairmentSweep:
-    """One impairment and the sizes at which it is tried, from negligible to destructive.
+    """Impairment and its simulated sizes, from negligible to destructive.
 
     Attributes
     ----------
     receiver, transmitter
-        Size → the fields of `Impairments` that it sets in the receiving node, and all of the transmitting one's.
+        Size → fields of `Impairments` that it sets in the receiving node, and all impairments of the transmitting node.
     subcarriers
-        1024 where the band matters, 4096 where the SNR or the spacing of the subcarriers does.
+        1024 if the result depends on the bandwidth, 4096 if it depends on the SNR or the subcarrier spacing.
     logarithmic
-        Whether sizes are drawn and interpolated on a logarithmic axis.
+        True if sizes are drawn and interpolated on a logarithmic axis.
     draws
-        Over which results are averaged.
+        Number of draws over which results are averaged.
     moving, tagged
-        Size is the speed, m/s, of both nodes; or the error of the receiver's time tags, ms.
+        True if the size is the speed of both nodes (m/s), or the error of the receiver's time tags (ms).
     """
 
     title: str
@@ -65,12 +65,12 @@ class ImpairmentSweep:
     tagged: bool = False
 
     def disturbance(self, size: float, *, besides: Impairments = ORDINARY) -> Disturbance:
-        """Return the errors of one size, and `besides` in the receiving node."""
+        """Return the disturbance of a given size, in addition to the impairments `besides` of the receiving node."""
         receiver = replace(besides, **self.receiver(size))  # type: ignore[arg-type]
         return Disturbance(receiver, self.transmitter(size), self.sampled, self.quantised)
 
     def flown(self, size: float) -> PaperScene:
-        """Return the scene as it is: the receiver 4.7 m ahead of the transmitter, 30 m at 1 m/s."""
+        """Return the true scene: the receiver 4.7 m ahead of the transmitter, a track of 30 m at 1 m/s."""
         clocked = self.sampled and not self.quantised
         scene = reduced_scene(pulses=PULSES, subcarriers=self.subcarriers, rx_ahead_m=RX_AHEAD_M, qpsk=clocked)
         if not self.moving:
@@ -79,7 +79,7 @@ class ImpairmentSweep:
         return replace(scene, geometry=replace(scene.geometry, tx_velocity=velocity, rx_velocity=velocity))
 
     def logged(self, flown: PaperScene, size: float, generator: np.random.Generator) -> PaperScene:
-        """Return the scene as the logs say: the receiver is where it was at its wrong time tags."""
+        """Return the logged scene: the receiver has its positions at the erroneous time tags."""
         if not self.tagged:
             return flown
         along = np.outer(1e-3 * size * generator.standard_normal(PULSES), [1.0, 0.0, 0.0])
@@ -94,7 +94,7 @@ def _one_clock(size: float) -> dict[str, object]:
 
 
 def _ripple(field: str) -> Callable[[float], dict[str, object]]:
-    # five cells: inside the gate, as the ripple of a cable or of an antenna is
+    # A period of five range cells is within the gate, like the ripple of a cable or an antenna.
     return lambda size: {field: Ripple(size, 5 / 409.6e6)}
 
 
@@ -154,7 +154,7 @@ SWEEPS: Mapping[str, ImpairmentSweep] = {
         lambda size: {"sidelink_blockage": Blockage(size)}, logarithmic=False, draws=4,
     ),
     "leakage": ImpairmentSweep(
-        "Leakage into the radar against the echo", "dB", (-20, -10, 0, 10, 20, 30, 40),
+        "Leakage into the radar relative to the echo", "dB", (-20, -10, 0, 10, 20, 30, 40),
         lambda size: {"leakage": Leakage(float(size))}, logarithmic=False, draws=1,
     ),
     "transmit_ripple": ImpairmentSweep(
@@ -174,7 +174,7 @@ SWEEPS: Mapping[str, ImpairmentSweep] = {
         lambda size: {"adc": Adc(bits=int(size))}, sampled=True, quantised=True, logarithmic=False, draws=1,
     ),
     "adc_clipping": ImpairmentSweep(
-        "Full scale of the converter over the RMS", "dB", (14, 9, 6, 3, 0, -6, -12, -20),
+        "Full scale of the converter relative to the RMS", "dB", (14, 9, 6, 3, 0, -6, -12, -20),
         lambda size: {"adc": Adc(backoff_db=float(size))}, sampled=True, quantised=True, logarithmic=False, draws=1,
     ),
     "localization": ImpairmentSweep(

@@ -23,9 +23,9 @@ CONFIG = Path("config/config.yaml")
 
 
 class Metadata(Section):
-    """Metadata of the campaign that its files do not contain."""
+    """Metadata of the campaign that recordings and logs do not contain."""
 
-    author: Title | None = Field(None, description="who recorded the campaign; null: not stated")
+    author: Title | None = Field(None, description="author of the recordings; null: not stated")
     licence: Licence | None = Field(
         None, description="licence of the products, an SPDX identifier such as CC-BY-4.0; null: not stated"
     )
@@ -37,22 +37,22 @@ class Settings(Section):
     """Content of config/config.yaml."""
 
     campaign: Title = Field(description="name of the campaign", examples=["my_campaign"])
-    waveform: Waveform = Field(description="what was transmitted")
+    waveform: Waveform = Field(description="transmitted waveform")
     raw_root: RawRoot | None = Field(
         None,
-        description="absolute path of a folder that is read in place of raw/, as on another disk; null: raw/ itself",
+        description="absolute path of a folder that replaces raw/, such as on another disk; null: raw/",
     )
-    nodes: dict[Name, Node] = Field(min_length=1, description="one section per UAV, named as in flights.tsv")
-    scene: Scene = Field(default_factory=Scene, description="the grid of every raster of the campaign")
-    processing: Processing = Field(default_factory=Processing, description="how to compute")
+    nodes: dict[Name, Node] = Field(min_length=1, description="one section per node, named as in flights.tsv")
+    scene: Scene = Field(default_factory=Scene, description="output grid of the campaign")
+    processing: Processing = Field(default_factory=Processing, description="processing settings")
     calibration: CalibrationSettings | None = Field(
-        None, description="path offsets from a calibration flight: flight, reflector_m, search_m; null: as stated above"
+        None,
+        description="path offsets from a calibration flight: flight, reflector_m, search_m; null: "
+        "nodes.<name>.path_offset_m",
     )
-    bench: BenchSettings = Field(
-        default_factory=BenchSettings, description="what is known of a set-up on the bench, before a flight"
-    )
+    bench: BenchSettings = Field(default_factory=BenchSettings, description="set-up of bench recordings")
     interferometry: Interferometry = Field(
-        default_factory=Interferometry, description="images compared in phase, two by two, for coherence and heights"
+        default_factory=Interferometry, description="pairs of images for interferometry: coherence and heights"
     )
     metadata: Metadata = Field(
         default_factory=Metadata, description="author, licence, platform and DOI for GeoTIFF tags, STAC and RO-Crate"

@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 FLIGHTS = Path("config/flights.tsv")
 _COLUMNS = ["flight", "kind", "transmitter", "nodes"]
 KINDS = ("bench", "calibration", "image")
-"""Kinds of flights: stationary radar; flight past a reflector, whose calibration other flights use; images."""
+"""Kinds of flights: stationary radar; calibration flight past a reflector; imaging flight."""
 _NAME: TypeAdapter[str] = TypeAdapter(Name)
 
 FUSED = "fused"
-"""Name of the sums of a flight's pairs, as image and folder name."""
+"""Name of the sums of a flight's pairs, used as image name and as folder name."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Flight:
 
     @property
     def images(self) -> tuple[str, ...]:
-        """Names of its images: its pairs, and their sums if there are several pairs.
+        """Names of the images of the flight: its pairs, and 'fused' if there are several pairs.
 
         Examples
         --------
@@ -199,7 +199,7 @@ def read_segments(path: Path, *, flights: Sequence[Flight]) -> Iterator[Segment]
 
 
 def _utc(text: str) -> datetime | None:
-    """Parse a time as UTC, which is also assumed without a time zone; None if it is not valid."""
+    """Parse a time as UTC, also if it has no time zone; return None if it is not valid."""
     try:
         time = datetime.fromisoformat(text)
         time = time.astimezone(UTC).replace(tzinfo=None) if time.tzinfo else time

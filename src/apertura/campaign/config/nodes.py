@@ -24,36 +24,40 @@ class Log(Section):
 
     format: str | None = Field(None, description=f"one of {', '.join(TRACKS)}; null: by the file's suffix and heading")
     time_system: Literal["utc", "gpst"] | None = Field(
-        None, description="of times whose log does not say whether they are utc or gpst, which is ahead by leap seconds"
+        None, description="time system of logs that do not state it: utc or gpst (ahead of UTC by the leap seconds)"
     )
     start_utc: str | None = Field(
         None,
-        description="time zero of a log that counts from its beginning, or the day of one that writes times of day "
-        "only, ISO 8601 in UTC",
+        description="time zero of a log with relative times, or the date of a log with times of day only, ISO 8601 "
+        "in UTC",
     )
     columns: dict[Cell, Cell] = Field(
-        default_factory=dict, description="column that apertura reads → its name in a CSV log"
+        default_factory=dict, description="column read by apertura → its name in the CSV log"
     )
     scales: dict[Cell, Annotated[float, Field(gt=0, le=1e12)]] = Field(
-        default_factory=dict, description="column that apertura reads → factor of its numbers in a CSV log: 1e-7, 0.001"
+        default_factory=dict,
+        description="column read by apertura → factor of its numbers in the CSV log, such as 1e-7 or 0.001",
     )
     quality: Literal["rtklib", "gga"] | None = Field(
         None,
-        description="how a CSV log numbers kinds of solution: rtklib (1 fix, 2 float, 5 single) or gga (4 fix, 5 "
-        "float, 1 single); null: it names them",
+        description="numbers of solution types in a CSV log: rtklib (1 fix, 2 float, 5 single) or gga (4 fix, 5 "
+        "float, 1 single); null: the log contains names",
     )
     base: tuple[Latitude, Longitude, float] | None = Field(
-        None, description="where baselines begin: latitude, longitude (deg), ellipsoidal height (m), WGS 84"
+        None, description="base station of baselines: latitude, longitude (deg), ellipsoidal height (m), WGS 84"
     )
-    body: str | None = Field(None, description="which rigid body or device, where the log holds several")
+    body: str | None = Field(None, description="name of the rigid body or device, if the log contains several")
     height_offset_m: float | None = Field(
-        None, description="to be added to logged heights to give ellipsoidal ones, where the log has others, m"
+        None, description="offset added to logged heights to obtain ellipsoidal heights, m"
     )
     longest_gap_s: float | None = Field(
-        None, gt=0, description="pulses in longer gaps between epochs are left out, s; null: where a spline may err"
+        None,
+        gt=0,
+        description="longest gap between epochs that is interpolated, s; pulses in longer gaps are excluded; null: "
+        "by the interpolation error",
     )
     smoothing_m: float | None = Field(
-        None, gt=0, description="noise of logged positions that a smoothing spline takes off, m; null: none is"
+        None, gt=0, description="noise of logged positions that a smoothing spline removes, m; null: no smoothing"
     )
 
     @field_validator("format")
@@ -87,11 +91,11 @@ class Antenna(Section):
     )
     pattern: str | None = Field(
         None,
-        description="instead of beamwidth_deg a CSV of both cuts: columns cut (azimuth, elevation), angle_deg, "
-        "gain_db, and phase_deg where it is known",
+        description="CSV file with both cuts of the pattern, instead of beamwidth_deg: columns cut (azimuth, "
+        "elevation), angle_deg, gain_db and optionally phase_deg",
     )
     cutoff_db: float = Field(
-        -20.0, ge=-80, le=-3, description="gain below which a cut ends: pulses beyond are left out, dB under its peak"
+        -20.0, ge=-80, le=-3, description="gain relative to the peak below which pulses are excluded, dB"
     )
 
     @model_validator(mode="after")
@@ -120,10 +124,10 @@ class Antennas(Section):
         None, description="peak gain of the receiving radar antenna, to which its beam is relative, dBi"
     )
     radar_tx_polarisation: Polarisation | None = Field(
-        None, description="what the transmitting radar antenna sends: H, V, L or R; null: not stated"
+        None, description="polarisation of the transmitting radar antenna: H, V, L or R; null: not configured"
     )
     radar_rx_polarisation: Polarisation | None = Field(
-        None, description="what the receiving radar antenna takes in: H, V, L or R; null: not stated"
+        None, description="polarisation of the receiving radar antenna: H, V, L or R; null: not configured"
     )
 
     def any(self) -> bool:
@@ -154,7 +158,9 @@ class Receiver(Section):
     """Receiver chain from the port of the receiving radar antenna to the recorded numbers."""
 
     full_scale_counts: float = Field(
-        gt=0, le=2**32, description="|I + jQ| of a complex sine at full scale, in the numbers recorded: 8192 of 14 bits"
+        gt=0,
+        le=2**32,
+        description="magnitude |I + jQ| of a complex sine at full scale in recorded counts, such as 8192 for 14 bits",
     )
     full_scale_dbm: Decibels | None = Field(None, description="power of that sine at the converter's input, dBm")
     full_scale_v: Annotated[float, Field(gt=0, le=1e6)] | None = Field(
@@ -162,7 +168,7 @@ class Receiver(Section):
     )
     gain_db: Decibels = Field(description="from the antenna's port to the converter's input, cables included, dB")
     noise_figure_db: Annotated[float, Field(ge=0, le=100)] | None = Field(
-        None, description="noise figure at the antenna's port, dB: what measured noise is compared with; null: unknown"
+        None, description="noise figure at the antenna port, dB, for comparison with the measured noise; null: unknown"
     )
 
     @model_validator(mode="after")
@@ -188,68 +194,72 @@ class Receiver(Section):
 class Node(Section):
     """UAV with its equipment."""
 
-    lever_arms_m: LeverArms = Field(default_factory=LeverArms, description="logged point → phase centres, body axes")
-    antennas: Antennas = Field(default_factory=Antennas, description="beams: where the antennas look, in body axes")
+    lever_arms_m: LeverArms = Field(
+        default_factory=LeverArms, description="lever arms from the logged point to the phase centres, in body axes"
+    )
+    antennas: Antennas = Field(default_factory=Antennas, description="antenna beams, in body axes")
     path_offset_m: PathOffsets = Field(
-        default_factory=PathOffsets, description="electrical path beyond geometry, as receiver"
+        default_factory=PathOffsets, description="electrical path beyond geometry when receiving"
     )
     transmit_power_dbm: Decibels | None = Field(
-        None, description="mean power at the transmitting antenna's port while the signal is sent, dBm; null: unknown"
+        None, description="mean power at the port of the transmitting antenna during a pulse, dBm; null: unknown"
     )
     iq: Literal["complex", "swapped", "conjugate"] | None = Field(
-        None, description="order of I and Q in its recordings, in place of waveform.iq; null: as waveform.iq"
+        None, description="order of I and Q in the recordings of this node; null: waveform.iq"
     )
     receiver: Receiver | None = Field(
         None,
-        description="its radar receiver: full_scale_counts, full_scale_dbm or full_scale_v, gain_db, noise_figure_db; "
-        "with transmit_power_dbm and both gains of antennas images are calibrated to sigma0; null: they are relative",
+        description="radar receiver: full_scale_counts, full_scale_dbm or full_scale_v, gain_db, noise_figure_db; "
+        "with transmit_power_dbm and both antenna gains, images are calibrated to sigma0; null: "
+        "relative images",
     )
     amplitude_std_db: Annotated[float, Field(ge=0, le=100)] | None = Field(
         None,
-        description="error of what is stated of power, antenna gains and receiver together, standard deviation, dB; "
-        "null: nobody knows",
+        description="combined standard deviation of the configured power, antenna gains and receiver, dB; null: "
+        "unknown",
     )
     attitude: Literal["log", "course", "none"] = Field(
-        "none", description="where attitude comes from: the log, the course over ground, or none"
+        "none", description="source of the attitude: log, course (course over ground), or none"
     )
-    log: Log = Field(default_factory=Log, description="how the flight log is read, where it leaves that open")
+    log: Log = Field(
+        default_factory=Log, description="options for reading the flight log, where the log itself does not state them"
+    )
     worst_fix: Literal["auto", "fix", "float", "any"] = Field(
         "auto",
-        description="poorest solution to image with, where the log says: fix, float, or any; auto: fix where the log "
-        "has RTK at all, else any; pulses of poorer ones are left out",
+        description="minimum solution type, if the log states it: fix, float or any; auto: fix if the log contains "
+        "RTK solutions, otherwise any; pulses below it are excluded",
     )
     position_std_m: StandardDeviation | tuple[StandardDeviation, StandardDeviation, StandardDeviation] | None = Field(
         None,
-        description="error of logged positions, standard deviation, m: one number, or [north, east, up]; null: what "
-        "the log itself states, if it does",
+        description="standard deviation of logged positions, m: one number, or [north, east, up]; null: as stated "
+        "by the log, if it is",
     )
     position_correlation_s: float = Field(
         1.0,
         gt=0,
-        description="how long an error of position lasts, as white noise after a moving average so long: its "
-        "autocorrelation falls in a straight line to zero there, to 1/e at 0.63 of it, s",
+        description="correlation time of position errors, s: length of the moving average over white noise; the "
+        "autocorrelation falls linearly to zero there, and to 1/e at 0.63 of it",
     )
     position_drift_m: float = Field(
         0.0,
         ge=0,
-        description="slow error of position over a flight, offset, slope and bow, standard deviation in each axis, m: "
-        "what a refinement of tracks may correct beside what position_std_m allows",
+        description="standard deviation of slow position errors over a flight (offset, slope and curvature) per "
+        "axis, m, which track refinement may correct in addition to position_std_m",
     )
     attitude_std_deg: StandardDeviation | tuple[StandardDeviation, StandardDeviation] | None = Field(
         None,
-        description="error of attitude, standard deviation, deg: one number, or [roll and pitch, heading]; null: "
-        "nobody knows, and the budget takes that of a small inertial unit, or of the course",
+        description="standard deviation of the attitude, deg: one number, or [roll and pitch, heading]; null: "
+        "unknown, the budget assumes that of a small inertial unit, or of the course",
     )
     attitude_correlation_s: float = Field(
-        100.0, gt=0, description="how long an error of attitude lasts, as position_correlation_s, s"
+        100.0, gt=0, description="correlation time of attitude errors, as position_correlation_s, s"
     )
     lever_arm_std_m: StandardDeviation | None = Field(
         None,
-        description="error of lever_arms_m in each axis, standard deviation, m; null: nobody knows, and the budget "
-        "takes 1 cm",
+        description="standard deviation of lever_arms_m per axis, m; null: unknown, the budget assumes 1 cm",
     )
     time_tag_std_s: float = Field(
-        3e-3, ge=0, description="error that all time tags of a flight share, standard deviation, s"
+        3e-3, ge=0, description="standard deviation of the time offset common to all time tags of a flight, s"
     )
 
     @property

@@ -19,18 +19,20 @@ class Fusion(Section):
     """Settings of the sum of the images of a flight's pairs."""
 
     align_phase: bool = Field(
-        False, description="take a constant phase between pairs, measured at bright points, off before they are added"
+        False, description="remove the phase offset between pairs, measured at bright points, before the coherent sum"
     )
 
 
 class Multilooking(Section):
     """Settings of multilooking: mean power on a coarser grid."""
 
-    spacing_m: float = Field(gt=0, description="side of the squares that power is averaged over, to whole pixels, m")
-    subtract_noise: bool = Field(
-        False, description="take the noise measured off: what is left of places without echo scatters about zero"
+    spacing_m: float = Field(
+        gt=0, description="side of the squares over which power is averaged, rounded to whole pixels, m"
     )
-    speckle_filter: Literal["none", "lee"] = Field("none", description="what is done against the speckle that is left")
+    subtract_noise: bool = Field(
+        False, description="subtract the measured noise power: pixels without echo then scatter about zero"
+    )
+    speckle_filter: Literal["none", "lee"] = Field("none", description="filter for the remaining speckle")
 
 
 class RunningBackground(Section):
@@ -43,7 +45,7 @@ class Processing(ImagingChoices):
     """Processing settings; every key has a default."""
 
     sidelink: Literal["auto", "divide", "wiener", "gated", "two_parameter"] = Field(
-        "auto", description="correction of a secondary node by its sidelink; auto takes the cheapest adequate"
+        "auto", description="correction of a receiving node by its sidelink; auto: the simplest adequate method"
     )
     background: Literal["auto", "none", "median", "mean"] | RunningBackground = Field(
         "auto",
@@ -54,43 +56,44 @@ class Processing(ImagingChoices):
         "auto",
         description="auto: subcarriers with narrow-band interference are excluded if that raises the SNR",
     )
-    fusion: Fusion = Field(default_factory=Fusion, description="how the images of a flight's pairs are added up")
+    fusion: Fusion = Field(default_factory=Fusion, description="sum of the images of a flight's pairs")
     autofocus: Literal["auto", "on", "off"] = Field(
         "auto",
-        description="tracks refined by the images themselves; auto: where errors of position that are stated cost more "
-        "than they should",
+        description="track refinement from the images; auto: if the configured position errors cost more than the "
+        "tolerated loss",
     )
     autofocus_method: Literal["auto", "tracks", "phase_gradient", "minimum_entropy"] = Field(
         "auto",
-        description="what is refined: tracks, or one phase per pulse and pair by either method; auto: one phase, by "
-        "minimum_entropy, where all of the scene sees errors of position alike, else tracks",
+        description="refined quantity: tracks, or one phase per pulse and pair by phase_gradient or "
+        "minimum_entropy; auto: minimum_entropy if position errors have the same effect on the whole "
+        "scene, otherwise tracks",
     )
     radiometry: tuple[Literal["sigma0", "gamma0", "beta0"], ...] = Field(
         ("sigma0",),
-        description="which backscattering coefficients are written of calibrated images, sigma0_db.tif and so on",
+        description="backscattering coefficients written for calibrated images, as sigma0_db.tif and so on",
     )
     radiometric_calibration: str | None = Field(
         None,
-        description="file that `apertura reflectors` wrote of flights of this radar: its constants calibrate images in "
-        "place of the radio that nodes state; null: that radio",
+        description="file of calibration constants, written by `apertura reflectors`, that replaces the radio "
+        "configured for the nodes; null: the configured radio",
     )
     multilook: Multilooking | None = Field(
         None,
-        description="mean power of squares of pixels, multilook_db.tif and so on, such as {spacing_m: 1.0, "
-        "subtract_noise: true, speckle_filter: lee}; null: none",
+        description="multilooking, written as multilook_db.tif and so on, such as {spacing_m: 1.0, subtract_noise: "
+        "true, speckle_filter: lee}; null: none",
     )
     keep: tuple[Literal["echo"], ...] = Field(
         (),
-        description="what is written though no image needs it: echo, the transfer functions of every pulse in "
-        "transfer.zarr, from which pairs are imaged again where the recording is no longer there",
+        description="additional results to keep: echo, the transfer functions of every pulse in transfer.zarr, from "
+        "which images can be recomputed without the recording",
     )
     scheduler: str = Field(
         "threads",
-        description="who forms the tiles: threads of the step, or the dask scheduler at tcp://host:port, if whoever "
-        "runs this names the same in DASK_SCHEDULER_ADDRESS",
+        description="scheduler that forms the tiles: threads of the step, or a dask scheduler at tcp://host:port, "
+        "which must also be stated in the environment variable DASK_SCHEDULER_ADDRESS",
     )
     false_alarms_per_s: float = Field(
-        1e-3, gt=0, description="how often noise alone may trigger in a continuous recording, per second"
+        1e-3, gt=0, description="false alarm rate of the trigger in a continuous recording, per second"
     )
 
     @property
@@ -116,7 +119,7 @@ class CalibrationSettings(Section):
 
     flight: Name = Field(description="flight of kind calibration whose offsets the imaging flights use")
     reflector_m: Metres3 = Field(description="reflector: easting, northing in scene.crs, ellipsoidal height, m")
-    search_m: float = Field(10.0, gt=0, description="offsets of either sign up to this are considered, m")
+    search_m: float = Field(10.0, gt=0, description="largest magnitude of path offsets searched, m")
 
 
 class BenchSettings(Section):
@@ -125,12 +128,13 @@ class BenchSettings(Section):
     radar_m: float | None = Field(
         None,
         ge=0,
-        description="path of the strongest echo, or of its cable, from transmitter to receiver, m; null: unknown",
+        description="path of the strongest echo, or length of the cable, from transmitter to receiver, m; null: "
+        "unknown",
     )
     sidelink_m: float | None = Field(
-        None, ge=0, description="path of the sidelink, or of its cable, without path_offset_m, m; null: unknown"
+        None, ge=0, description="path of the sidelink, or length of its cable, without path_offset_m, m; null: unknown"
     )
-    split: bool = Field(False, description="whether one signal is split to the radar channels of all nodes")
+    split: bool = Field(False, description="true if one signal is split to the radar channels of all nodes")
 
 
 # ---- Section `interferometry`: pairs of images for interferograms ---------------------------------------------------
@@ -146,11 +150,14 @@ class Interferometry(Section):
 
     pairs: Mapping[Name, tuple[str, str]] = Field(
         default_factory=dict,
-        description="name → two images, [flight/transmitter-receiver, flight/transmitter-receiver], such as "
-        "two_tracks: [f01/uav1-uav1, f02/uav1-uav1]; none by default",
+        description="name of an interferogram → its two images, such as two_tracks: [f01/uav1-uav1, f02/uav1-uav1]; "
+        "none by default",
     )
     window_px: int = Field(
-        15, ge=LEAST_WINDOW_PX, le=255, description="side of the square that coherence and phase are means of, odd"
+        15,
+        ge=LEAST_WINDOW_PX,
+        le=255,
+        description="side of the averaging window of coherence and phase, odd number of pixels",
     )
 
     @field_validator("pairs")
@@ -212,7 +219,7 @@ def check_interferometry(requested: Interferometry, known: Sequence[str], *, whe
 class KnownPoint(Section):
     """Bright point of known position, which fixes the position of refined tracks."""
 
-    name: Title = Field(description="what it is called")
+    name: Title = Field(description="name")
     position_m: Metres3 = Field(description="easting, northing in scene.crs, ellipsoidal height (z in local), m")
     std_m: float = Field(gt=0, description="standard deviation of each coordinate, m")
 
@@ -224,23 +231,25 @@ _SIZES = {"trihedral": "[leg]", "dihedral": "[across the seam, along it]", "sphe
 class KnownReflector(KnownPoint):
     """Reflector whose radar cross-section follows from its shape."""
 
-    kind: Literal["trihedral", "dihedral", "sphere"] = Field(description="of three triangles, two rectangles, a sphere")
+    kind: Literal["trihedral", "dihedral", "sphere"] = Field(description="kind of reflector")
     size_m: tuple[Annotated[float, Field(gt=0, le=100)], ...] = Field(
-        description="trihedral: [leg of its triangles]; dihedral: [across the seam, along it]; sphere: [radius], m"
+        description="size, m: trihedral [leg of its triangles], dihedral [across the seam, along it], sphere [radius]"
     )
     azimuth_deg: float | None = Field(
-        None, ge=-360, le=360, description="where its boresight points, clockwise from the north of scene.crs, deg"
+        None, ge=-360, le=360, description="azimuth of the boresight, clockwise from the north of scene.crs, deg"
     )
-    elevation_deg: float | None = Field(None, ge=-90, le=90, description="and above the horizontal, deg")
+    elevation_deg: float | None = Field(
+        None, ge=-90, le=90, description="elevation of the boresight above the horizontal, deg"
+    )
     roll_deg: float = Field(
         0.0,
         ge=-360,
         le=360,
-        description="clockwise about the boresight, seen along it from behind; 0: seam of a dihedral level, one seam "
-        "of a trihedral upward in the vertical plane of the boresight, deg",
+        description="roll clockwise about the boresight, seen from behind, deg; 0: seam of a dihedral horizontal, "
+        "one seam of a trihedral upwards in the vertical plane of the boresight",
     )
     rcs_std_db: float = Field(
-        0.0, ge=0, le=100, description="error of its cross-section as built and set up, standard deviation, dB"
+        0.0, ge=0, le=100, description="standard deviation of the cross-section as built and installed, dB"
     )
 
     @model_validator(mode="after")
@@ -260,11 +269,16 @@ class KnownReflector(KnownPoint):
 class Air(Section):
     """Atmosphere at the terrain, instead of the standard atmosphere: measured weather, or refractivity."""
 
-    temperature_c: float | None = Field(None, ge=-60, le=60, description="at the ground, °C")
-    pressure_hpa: float | None = Field(None, ge=300, le=1100, description="at the ground, not reduced to the sea, hPa")
-    relative_humidity: float | None = Field(None, ge=0, le=100, description="at the ground, %")
+    temperature_c: float | None = Field(None, ge=-60, le=60, description="temperature at the ground, °C")
+    pressure_hpa: float | None = Field(
+        None, ge=300, le=1100, description="pressure at the ground, not reduced to sea level, hPa"
+    )
+    relative_humidity: float | None = Field(None, ge=0, le=100, description="relative humidity at the ground, %")
     refractivity_n: float | None = Field(
-        None, ge=0, le=LARGEST_REFRACTIVITY, description="(n - 1)·10⁶ at the ground, instead of the other three"
+        None,
+        ge=0,
+        le=LARGEST_REFRACTIVITY,
+        description="refractivity (n - 1)·10⁶ at the ground, instead of the other three",
     )
 
     @model_validator(mode="after")
@@ -295,48 +309,52 @@ class Scene(Section):
 
     crs: CrsName = Field(
         "auto",
-        description="authority and code, such as EPSG:32632, auto (UTM zone of the track) or local (a frame without a "
-        "place on Earth)",
+        description="authority and code, such as EPSG:32632; auto (UTM zone of the track) or local (a frame that is "
+        "not georeferenced)",
     )
     bounds_m: tuple[float, float, float, float] | Literal["auto"] = Field(
         "auto", description="[xmin, ymin, xmax, ymax], outer pixel edges in crs, or auto"
     )
     spacing_m: float | Literal["auto"] = Field("auto", description="pixel spacing, m, or auto")
-    height_m: float = Field(0.0, description="height of flat ground, m; not used where there is a dem")
+    height_m: float = Field(0.0, description="height of flat terrain, m; ignored if dem is set")
     height_std_m: float | None = Field(
-        None, ge=0, description="standard deviation of the ground's heights, m; null: not stated"
+        None, ge=0, description="standard deviation of the terrain heights, m; null: not configured"
     )
-    height_datum: Literal["ellipsoid", "egm96", "egm2008"] = Field("ellipsoid", description="what height_m counts from")
-    dem: str | None = Field(None, description="terrain instead of flat ground: a GeoTIFF of heights, in any CRS")
+    height_datum: Literal["ellipsoid", "egm96", "egm2008"] = Field(
+        "ellipsoid", description="vertical datum of height_m"
+    )
+    dem: str | None = Field(None, description="DEM that replaces flat terrain: GeoTIFF of heights, in any CRS")
     dem_datum: Literal["ellipsoid", "egm96", "egm2008", "carried"] | None = Field(
-        None, description="what the heights of dem count from; carried: its own CRS says it"
+        None, description="vertical datum of dem; carried: as its own CRS states"
     )
     geoid: str | None = Field(
-        None, description="grid file of the geoid heights count from (.gtx, .tif); null: looked for where PROJ looks"
+        None,
+        description="grid file of the geoid to which heights refer (.gtx, .tif); null: searched for in the folders "
+        "of PROJ",
     )
     atmosphere: Literal["auto", "vacuum"] | Air = Field(
         "auto",
-        description="air that the waves fly through: auto, standard atmosphere at the ground's height with 50 % "
-        "humidity; {temperature_c: x, pressure_hpa: y, relative_humidity: z} measured at the ground; "
-        "{refractivity_n: 290} there, 0 for recordings simulated in vacuum; vacuum, an approximation whose error is "
-        "in the budget; air thins with height",
+        description="atmosphere: auto (standard atmosphere at the terrain height, 50 % humidity), {temperature_c: "
+        "x, pressure_hpa: y, relative_humidity: z} measured at the ground, {refractivity_n: 290} at the "
+        "ground (0 for recordings simulated in vacuum), or vacuum (an approximation whose error is in "
+        "the budget); refractivity decreases with height",
     )
     reference_points: tuple[KnownPoint, ...] = Field(
         (),
-        description="bright points whose places are known, which tracks refined are tied to: a list of name, "
-        "position_m [easting, northing, ellipsoidal height] and std_m",
+        description="bright points at known positions, to which refined tracks are tied: list of name, position_m "
+        "[easting, northing, ellipsoidal height] and std_m",
     )
 
     reflectors: tuple[KnownReflector, ...] = Field(
         (),
-        description="reflectors of known cross-section, which `apertura reflectors` measures constants at: a list of "
-        "name, position_m and std_m as of reference_points, kind (trihedral, dihedral, sphere), size_m, and of corners "
-        "azimuth_deg and elevation_deg",
+        description="reflectors of known cross-section, at which `apertura reflectors` measures calibration "
+        "constants: list of name, position_m and std_m as in reference_points, kind (trihedral, "
+        "dihedral, sphere), size_m, and for corner reflectors azimuth_deg and elevation_deg",
     )
 
     @property
     def height_is_default(self) -> bool:
-        """True if the height of flat terrain is 0 m, as in the template, which is unlikely."""
+        """True if the height of flat terrain is the 0 m of the template, which is an unlikely height."""
         return self.dem is None and self.height_m == 0
 
     @model_validator(mode="after")

@@ -92,7 +92,7 @@ Name = Annotated[str, AfterValidator(_plain_name)]
 """Name of a flight or a node."""
 
 CrsName = Annotated[str, AfterValidator(plain_crs)]
-"""Coordinate reference system by authority and code, two of them joined by ``+``, 'auto' or 'local'."""
+"""Coordinate reference system: authority and code (two joined by ``+`` if compound), 'auto' or 'local'."""
 
 RawRoot = Annotated[str, AfterValidator(_absolute)]
 """Path of a folder outside the campaign."""

@@ -23,7 +23,7 @@ class SampledWaveform(Section):
     limit_name: ClassVar[str]
 
     kind: str = Field(description=WAVEFORM_KINDS)
-    carrier_hz: float = Field(gt=0, description="RF carrier: what lies at baseband zero, Hz", examples=[1.2e9])
+    carrier_hz: float = Field(gt=0, description="RF carrier, the frequency at baseband zero, Hz", examples=[1.2e9])
     sample_rate_hz: float = Field(gt=0, description="complex sample rate f_s, Hz", examples=[1.024e9])
     prf_hz: float = Field(gt=0, description="pulse repetition frequency, Hz", examples=[100.0])
     iq: Literal["complex", "swapped", "conjugate"] = Field(
@@ -76,7 +76,8 @@ class OfdmWaveform(SampledWaveform):
     kind: Literal["ofdm"] = Field(description=WAVEFORM_KINDS)
     codes: str = Field("raw/codes.npy", description="transmitted code symbols, complex64 (subcarriers,)")
     carrier_is: Literal["band_start", "band_centre"] = Field(
-        "band_start", description="which subcarrier the carrier is: n = 0…N-1 (band_start) or -N/2…N/2-1 (band_centre)"
+        "band_start",
+        description="subcarrier numbers relative to the carrier: n = 0…N-1 (band_start) or -N/2…N/2-1 (band_centre)",
     )
     subcarriers: int = Field(gt=1, description="number of subcarriers N", examples=[4096])
     subcarrier_spacing_hz: float = Field(gt=0, description="subcarrier spacing Δf, Hz", examples=[100e3])
@@ -147,16 +148,20 @@ class PulseWaveform(SampledWaveform):
     pulse: str = Field(
         "raw/pulse.npy", description="the pulse at sample_rate_hz: .npy of (sample,) complex, or (sample, 2) integers"
     )
-    pulse_s: float = Field(gt=0, description="how long the pulse lasts: all of the file, s", examples=[1e-6])
-    lead_s: float = Field(0.0, ge=0, description="how long before the pulse a capture begins, s")
-    listen_s: float = Field(gt=0, description="longest delay whose echo a capture holds to its end, s", examples=[2e-6])
+    pulse_s: float = Field(gt=0, description="pulse duration: that of the whole file, s", examples=[1e-6])
+    lead_s: float = Field(0.0, ge=0, description="time from the start of a capture to the pulse, s")
+    listen_s: float = Field(
+        gt=0, description="longest delay of an echo that a capture contains completely, s", examples=[2e-6]
+    )
     band_hz: tuple[float, float] | None = Field(
-        None, description="baseband frequencies that images are made of, Hz; null: where the pulse has its energy"
+        None,
+        description="baseband frequencies used for imaging, [lowest, highest], Hz; null: where the pulse has its "
+        "energy",
     )
     filter: Literal["auto", "inverse", "matched"] = Field(
         "auto",
-        description="inverse leaves the window's sidelobes, matched the least noise; "
-        "auto: inverse, unless the spectrum is flat or has too many gaps",
+        description="range filter: inverse (sidelobes of the window alone) or matched (least noise); auto: inverse, "
+        "unless the spectrum is flat or has too many gaps",
     )
 
     @property
@@ -236,16 +241,18 @@ class PhaseHistoryWaveform(Section):
 
     air: Literal["auto", "measured", "point", "corrected"] = Field(
         "auto",
-        description="air in the delays of the files: measured, delays as they were; point, samples are referred to a "
-        "point whose distance the file states, so that only what lies beyond it is delayed by air; corrected, whoever "
-        "made them took it out; auto: point for afrl_mat and cphd, else measured",
+        description="atmospheric delay in the files: measured (delays as recorded), point (samples are referred to "
+        "a point at a stated distance; only the excess path is delayed), corrected (removed before); "
+        "auto: point for afrl_mat and cphd, otherwise measured",
     )
-    channel: str | None = Field(None, description="of a CPHD file with several channels the one to image")
+    channel: str | None = Field(None, description="channel to image, for CPHD files with several channels")
     corrections: Literal["none", "stored"] = Field(
-        "none", description="of afrl_mat files that hold corrections of their passes (data.af): stored applies them"
+        "none", description="phase corrections contained in afrl_mat files (data.af): none, or stored to apply them"
     )
     iq: Literal["complex", "conjugate"] = Field(
-        "complex", description="complex: samples as recorded; conjugate: their conjugates, where phases count upwards"
+        "complex",
+        description="complex: samples as recorded; conjugate: their complex conjugates, for files with the opposite "
+        "sign of phase",
     )
 
     @field_validator("format")
@@ -267,9 +274,13 @@ class Trigger(Section):
 
     sync_channel: int = Field(1, ge=1, le=64, description="channel of the sync pulses, counted from 1")
     beat_channel: int = Field(2, ge=1, le=64, description="channel of the beat signal, counted from 1")
-    edge: Literal["rising", "falling"] = Field("rising", description="of the sync pulses, where a sweep begins")
+    edge: Literal["rising", "falling"] = Field("rising", description="edge of the sync pulses at which a sweep starts")
     threshold: float = Field(
-        0.3, gt=0, lt=1, description="how far beyond the middle of its levels sync must go, of half their distance"
+        0.3,
+        gt=0,
+        lt=1,
+        description="trigger level of the sync signal above the mean of its two levels, as a fraction of half their "
+        "difference",
     )
 
 
@@ -286,24 +297,26 @@ class FmcwWaveform(Section):
         gt=0, description="RF frequency at the first sample of a sweep, or at its trigger, Hz", examples=[2.2e9]
     )
     bandwidth_hz: float = Field(
-        description="what frequency rises by in sweep_s, Hz; negative: sweeps that fall", examples=[400e6]
+        description="frequency change during sweep_s, Hz; negative for falling sweeps", examples=[400e6]
     )
-    sweep_s: float = Field(gt=0, description="how long a sweep is linear, s", examples=[20e-6])
-    sample_rate_hz: float = Field(gt=0, description="of the beat signal, Hz", examples=[25e6])
+    sweep_s: float = Field(gt=0, description="duration of the linear sweep, s", examples=[20e-6])
+    sample_rate_hz: float = Field(gt=0, description="sample rate of the beat signal, Hz", examples=[25e6])
     iq: Literal["real", "complex", "conjugate"] = Field(
         "real",
-        description="real: one mixer; complex: I+jQ of echo times conjugate sweep, whose beats are negative in a "
-        "sweep that rises; conjugate: the other way about",
+        description="real: a single mixer; complex: I+jQ of the echo times the conjugate sweep, with negative beat "
+        "frequencies for rising sweeps; conjugate: the opposite sign",
     )
-    settle_s: float = Field(0.0, ge=0, description="left out at the beginning of every sweep, s")
+    settle_s: float = Field(0.0, ge=0, description="settling time excluded at the start of every sweep, s")
     reference_path_m: float = Field(0.0, ge=0, description="path of the sweep to the mixer inside the radar, m")
-    prf_hz: float | None = Field(None, ge=1e-3, description="sweeps per second, Hz; null: files hold times or triggers")
+    prf_hz: float | None = Field(
+        None, ge=1e-3, description="sweep repetition frequency, Hz; null: the files contain times or triggers"
+    )
     start_utc: str | None = Field(
         None,
-        description="when files without times began, ISO 8601 in UTC by the recorder; null: 1970, config/clocks.tsv "
-        "says the rest",
+        description="start of recordings without times, by the recorder's clock, ISO 8601 in UTC; null: 1970, "
+        "corrected by config/clocks.tsv",
     )
-    trigger: Trigger = Field(default_factory=Trigger, description="where sweeps begin in a .wav file")
+    trigger: Trigger = Field(default_factory=Trigger, description="sweep trigger in a .wav file")
 
     @field_validator("format")
     @classmethod

@@ -191,7 +191,7 @@ def skeleton(
     chunks
         Array that is written chunk by chunk → shape of its chunks.
     packed
-        True if those arrays are compressed, which has no effect on noise.
+        True if those arrays are compressed, which does not reduce the size of noise.
     consolidated
         True if the metadata of the stage repeat those of its arrays, for readers that open several of them.
     """

@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 def writing(folder: Path) -> Iterator[ConfinedPath]:
     """Lock `folder` for writing and yield the folder of work in progress.
 
-    A kernel lock, which is released when its process ends, excludes a second writer: a new step waits for one that is
-    still running after its snakemake was killed. A finished folder with unchanged files becomes work in progress
-    again, so that nothing is computed twice.
+    A kernel lock, which is released when its process ends, excludes a second writer: a new step waits for a step
+    that is still running after its snakemake was killed. A finished folder with unchanged files becomes work in
+    progress again, so that its chunks are not recomputed.
 
     Yields
     ------

@@ -18,7 +18,7 @@ LIMITS_RAD = {"azimuth": np.pi, "elevation": np.pi / 2}
 """Largest angle from the boresight of each cut, radians."""
 
 _SAMPLES = 513  # linear interpolation has an error of -100 dB with a cutoff of -20 dB
-_FINE = 4097  # samples of a cut; 0.09° over 360°
+_FINE = 4097  # samples of a cut; their spacing is 0.09° over 360°
 
 
 def antenna_axes(body_axes: NDArray[np.float64], boresight_deg: tuple[float, float]) -> NDArray[np.float64]:
@@ -34,8 +34,8 @@ def antenna_axes(body_axes: NDArray[np.float64], boresight_deg: tuple[float, flo
     Returns
     -------
     ndarray
-        (pulse, 3, 3) float64; rows are unit vectors along boresight, growing azimuth (in the forward-right plane) and
-        growing elevation.
+        (pulse, 3, 3) float64; rows are unit vectors along boresight, towards increasing azimuth (in the forward-right
+        plane) and towards increasing elevation.
 
     Notes
     -----
@@ -93,13 +93,13 @@ def sampled_cut(angle_deg: NDArray[np.float64], gain_db: NDArray[np.float64], *,
     angle_deg
         (sample,) float64, ascending, degrees from boresight.
     gain_db
-        (sample,) float64, dB relative to any level; linear between samples.
+        (sample,) float64, dB relative to any level; interpolated linearly between samples.
     cutoff_db
         Gain at which the cut ends, dB relative to its peak.
 
     Notes
     -----
-    The sign of the field changes at a null, and a gain in dB does not contain it: sidelobes are excluded.
+    Sidelobes are excluded, because the sign of the field changes at a null, and a gain in dB does not contain the sign.
 
     Examples
     --------
@@ -141,15 +141,15 @@ class Beam:
     Attributes
     ----------
     axes
-        (pulse, 3, 3) float64, rows are unit vectors along boresight, growing azimuth and growing elevation,
-        at right angles, in the frame of the pixels.
+        (pulse, 3, 3) float64; rows are orthogonal unit vectors along boresight, towards increasing azimuth and towards
+        increasing elevation, in the frame of the pixels.
     azimuth_rad, elevation_rad
         (n,) and (m,) float64, equally spaced and ascending.
     azimuth_gain, elevation_gain
         (n,) and (m,) float64, field (not power) relative to boresight.
     azimuth_phase_rad, elevation_phase_rad
-        (n,) and (m,) float64, phase of the field; the phases of both cuts add. None: unknown. Engines do not
-        compensate it.
+        (n,) and (m,) float64, phase of the field, the sum of the phases of both cuts; None: unknown. Engines do not
+        compensate this phase.
 
     Raises
     ------
@@ -191,7 +191,7 @@ class Beam:
 
     def __getitem__(self, pulses: slice | NDArray[np.int64]) -> "Beam":
         """Return the beam over the selected pulses."""
-        selected = copy(self)  # the fields have been checked: not checked again
+        selected = copy(self)  # the fields of this beam are valid and not checked again
         object.__setattr__(selected, "axes", self.axes[pulses])
         return selected
 
@@ -279,9 +279,9 @@ class Beams:
     Attributes
     ----------
     transmit, receive
-        Beam over the pulses of an image; None is isotropic.
+        Beam over the pulses of an image; None: isotropic.
     sector
-        Sector over the same pulses; None integrates all pulses.
+        Sector over the same pulses; None: all pulses are integrated.
 
     Examples
     --------
@@ -328,7 +328,7 @@ class Beams:
         return np.asarray(np.sum(known, axis=0)) if known else None
 
     def weight(self, aperture: Aperture, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the product of both gains and the sector's weight, (pulse, pixel) float64; else as `Beam.gain`."""
+        """Return the product of both gains and the sector's weight, (pulse, pixel) float64; see `Beam.gain`."""
         total = np.ones((len(aperture), len(pixels)))
         for beam, position_m in zip((self.transmit, self.receive), aperture.legs, strict=True):
             if beam is not None:

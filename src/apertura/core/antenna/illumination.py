@@ -9,7 +9,7 @@ from apertura.core.antenna.beam import Beam, Beams
 from apertura.core.geometry.aperture import Aperture
 
 _PULSES = 1024  # largest number of pulses evaluated
-_AT_ONCE = 64  # pulses, or blocks, evaluated together; limits memory
+_AT_ONCE = 64  # pulses or blocks evaluated together, to limit memory
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def illuminate(beams: Beams, aperture: Aperture, point_m: NDArray[np.float64]) -
     beams
         Beams of all pulses.
     aperture
-        Aperture of all pulses; of more than 1024 pulses an evenly spaced sample is evaluated.
+        Aperture of all pulses; for more than 1024 pulses, an evenly spaced sample is evaluated.
     point_m
         (point, 3) float64, metres.
     """
@@ -111,7 +111,8 @@ def illumination_mask(
 def _block_mask(
     beams: Beams, aperture: Aperture, middle_m: NDArray[np.float64], radius_m: NDArray[np.float64], pulses: int
 ) -> NDArray[np.bool_]:
-    # For all pulses of a block, its middle pulse is evaluated, with spheres enlarged by the distance to the others.
+    # For each block, only its middle pulse is evaluated, with spheres enlarged by the distance to the block's other
+    # pulses.
     starts = np.arange(0, len(aperture), pulses)
     middles = np.minimum(starts + pulses // 2, len(aperture) - 1)
     block = np.arange(len(aperture)) // pulses
@@ -142,7 +143,8 @@ def _in_pattern(
 ) -> NDArray[np.bool_]:
     """Return a mask of the spheres, (block, sphere), that may intersect the pattern's cone and elevations."""
     range_m = np.linalg.norm(offset_m, axis=-1)
-    tolerance = np.arcsin(np.minimum(1.0, radius_m / range_m)) + 1e-6  # half angle of the sphere, plus rotation below
+    # half angle of the sphere; the rotation is added below
+    tolerance = np.arcsin(np.minimum(1.0, radius_m / range_m)) + 1e-6
     from_boresight, from_up = (np.empty(range_m.shape) for _ in range(2))
     for axis, angle in ((0, from_boresight), (2, from_up)):
         vector = beam.axes[:, axis]

@@ -18,10 +18,11 @@ from apertura.core.windowed_sinc import kaiser_sinc
 # ---- Contributions of profiles by band-limited interpolation in float64
 
 _HALF_TAPS = KERNEL.term_taps // 2
-_KAISER_BETA = 16.0  # with this number of taps the error is below -148 dB, with half the band as transition
-_FRACTIONS = 4096  # tabulated weights per sample; with linear interpolation the error of a weight is 3e-8
-_PULSES_AT_ONCE = 256  # pulses whose terms are in memory
-_ROWS_AT_ONCE = 16  # pulses whose samples numpy gathers at once, to fit the cache
+# shape of the window: the error is below -148 dB with `_HALF_TAPS` and half of the band as transition
+_KAISER_BETA = 16.0
+_FRACTIONS = 4096  # number of tabulated weights per sample; with linear interpolation the error of a weight is 3e-8
+_PULSES_AT_ONCE = 256  # number of pulses whose terms are in memory at once
+_ROWS_AT_ONCE = 16  # number of pulses whose samples numpy gathers at once, to fit into the cache
 
 
 def band_limited_image(
@@ -57,8 +58,8 @@ def band_limited_terms(
 
     Notes
     -----
-    Source: docs/theory.md, eq. 6. The error is -148 dB for a tone at the band edge. Computed in float64 by code that no
-    engine uses; numpy replaces the compiled library if that is not available.
+    Source: docs/theory.md, eq. 6. The error is -148 dB for a tone at the band edge. The computation is in float64 and
+    independent of all engines; it uses numpy if the compiled library is not available.
     """
     terms = (_compiled_terms if available() else _terms)(profiles, np.ascontiguousarray(pixels, np.float64))
     if beams is not None:
@@ -121,8 +122,8 @@ def _paired_weights() -> NDArray[np.float64]:
 
 TAPS, DEGREE = KERNEL.echo_taps, KERNEL.echo_degree
 
-_BYTES_AT_ONCE = 2**25  # of samples in memory
-_VALUES_AT_ONCE = 2**17  # pulses × points, for beams and without the compiled library
+_BYTES_AT_ONCE = 2**25  # bytes of samples in memory at once
+_VALUES_AT_ONCE = 2**17  # limit of pulses × points, for beams and for the computation without the compiled library
 
 
 @lru_cache
@@ -227,7 +228,7 @@ class Echoes:
     def at(self, places_m: NDArray[np.float64]) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
         """Return s(R)·exp(j2πf_mid R/c) at points and its derivative with respect to the path R.
 
-        The same computation as in the compiled library, in float64.
+        The computation is the same as in the compiled library, in float64.
 
         Parameters
         ----------
@@ -335,7 +336,7 @@ def block_contributions(
     Notes
     -----
     Source: docs/theory/autofocus.md, eq. 4 and 5. The error is below -65 dB over the whole band of twice oversampled
-    profiles. Paths and carrier phase are computed in float64. numpy replaces the compiled library if that is not
+    profiles. Paths and carrier phase are computed in float64. The computation uses numpy if the compiled library is not
     available.
 
     Examples
@@ -449,7 +450,7 @@ def path_gradient(
     slope
         (point,) complex, G = ∂J/∂Re + j·∂J/∂Im: the objective changes by Re Σ G*·change of the sum.
     beams
-        Weight of each pulse at each point, whose dependence on the phase centres is neglected. None by default.
+        Weight of each pulse at each point; its dependence on the phase centres is neglected. None by default.
 
     Returns
     -------
@@ -463,7 +464,7 @@ def path_gradient(
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 6 to 8. numpy replaces the compiled library if that is not available.
+    Source: docs/theory/autofocus.md, eq. 6 to 8. The computation uses numpy if the compiled library is not available.
     """
     if places_m.shape != (*slope.shape, 3) or slope.ndim != 1:
         raise ValueError(f"{places_m.shape=}, {slope.shape=}: must be (point, 3) and (point,)")
@@ -471,7 +472,7 @@ def path_gradient(
         raise ValueError("points and slopes of the objective must be finite")
     derivatives, largest = np.zeros((7, len(profiles))), float(np.abs(slope).max(initial=0.0))
     if largest:
-        # Normalised, as the library uses float32 and the unit of the objective is arbitrary.
+        # Slopes are normalised, as the library uses float32 and the unit of the objective is arbitrary.
         places_m, slope = np.ascontiguousarray(places_m, np.float64), (slope / largest).astype(np.complex64)
         for first in range(0, len(profiles), pulses_at_once(profiles)):
             part = slice(first, min(first + pulses_at_once(profiles), len(profiles)))
@@ -486,7 +487,7 @@ def _derivatives(
     slope: NDArray[np.complex64],
     beams: Beams | None,
 ) -> NDArray[np.float64]:
-    """Return (7, pulse) derivatives by transmitter, receiver and path."""
+    """Return (7, pulse) derivatives with respect to transmitter, receiver and path."""
     echoes = Echoes.read(profiles, [part])
     derivatives = np.zeros((7, len(echoes)))
     add = _differentiate_compiled if available() else _differentiate

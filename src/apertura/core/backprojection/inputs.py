@@ -18,8 +18,8 @@ def _as_arrays(inputs: Any, kinds: dict[str, type]) -> None:
     Raises
     ------
     CampaignError
-        If a value is not an array of numbers, `aperture` is not an `Aperture`, or the speed is not that of a radio
-        wave.
+        If a value is not an array of numbers, `aperture` is not an `Aperture`, or the wave speed is not plausible for a
+        radio wave.
     """
     where = type(inputs).__name__
     for name, kind in kinds.items():
@@ -225,7 +225,7 @@ class Profiles:
         return len(self.samples)
 
     def __getitem__(self, pulses: slice) -> "Profiles":
-        """Return the profiles of a slice of pulses, as views; images of pulse blocks add up to the image of all."""
+        """Return the profiles of a slice of pulses, as views; the images of pulse blocks add up to the whole image."""
         return replace(
             self,
             samples=self.samples[pulses],
@@ -259,11 +259,11 @@ class Profiles:
         aperture
             Phase centres of the same number of pulses.
         extra_path_m
-            (pulse,) float64, growth of the measured path of every echo of a pulse, metres.
+            (pulse,) float64, increase of the measured path of all echoes of a pulse, metres.
 
         Notes
         -----
-        Source: docs/theory/autofocus.md, eq. 3: an echo at path R is shifted to R + ∆ and gets the phase of R + ∆.
+        Source: docs/theory/autofocus.md, eq. 3: an echo at path R is shifted to R + ∆ and has the phase of R + ∆.
         """
         rotated = (
             PhaseRotated(self.samples, np.exp(-1j * self.wavenumber_rad_m * extra_path_m))

@@ -65,7 +65,7 @@ class Integration:
     report
         Section of image.json.
     flags
-        Flag → measured values, of exceeded limits.
+        Flag → measured values, for exceeded limits.
     """
 
     sector: Sector | None
@@ -98,22 +98,23 @@ class Job:
     frame
         'ecef' or 'local'.
     tile_px, threads
-        Side of a tile; number of tiles formed at once.
+        Side of a tile, pixels; number of tiles formed at once.
     terrain
-        Terrain of the scene and its cheaper models.
+        Terrain of the scene and its simplified models.
     path_limit_m
         Longest total path inside the cyclic prefix.
     memory_bytes
         Memory limit of the imaging step.
     beams, illumination
-        Weights and illumination by antennas, if they have beams, and by the integrated sector; over all pulses.
+        Weights from antenna beams and the integrated sector, and illumination by the beams, over all pulses; None
+        without beams and sector.
     integration
         Integrated part of the flight; None for the whole flight.
     recorded
         True if a phase history is available, which the double sum requires.
     patches_on
-        Function of a terrain that returns pixel positions in windows of the scene, each (y, x, 3) float64, metres; None
-        if unknown.
+        Function of a terrain that returns pixel positions in windows of the scene, (y, x, 3) float64 each, metres; None
+        if pixel positions are not known.
     patches_m
         Pixel positions in these windows on the selected terrain model; if empty, planes about points of `ground_m`.
     """
@@ -166,7 +167,7 @@ class Job:
 
     @property
     def share(self) -> float:
-        """Summed share of pixels × pulses."""
+        """Share of pixel-pulse combinations that is summed."""
         return 1.0 if self.integration is None else self.integration.share
 
     @property
@@ -186,5 +187,5 @@ class Job:
 
     @property
     def points_m(self) -> NDArray[np.float64]:
-        """`ground_m` as (point, 3), with the scene's middle at the middle index."""
+        """`ground_m` as (point, 3), with the scene centre at the middle index."""
         return self.ground_m.reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""dask graph of the requested tiles; separate from `tiles` so that importing that does not load dask."""
+"""dask graph of the requested tiles; separate from `tiles`, so that dask is not loaded on importing `tiles`."""
 
 from collections.abc import Callable, Collection, Iterable
 from typing import Any
@@ -12,8 +12,8 @@ class TilesLayer(MaterializedLayer):
     """Tasks of the requested tiles of an image.
 
     Pulse blocks are processed in sequence: the tables of a block are prepared when every tile includes the previous
-    block. By these dependencies dask would compute all tiles to obtain one; this graph contains the requested tiles
-    only.
+    block. With these dependencies, dask would compute all tiles to obtain a single one; this graph therefore contains
+    only the requested tiles.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""Presumming of pulses of an oversampled aperture by a low-pass filter, aligned to the middle of the scene.
+"""Presumming of pulses of an oversampled aperture by a low-pass filter, with pulses aligned to the scene centre.
 
-Decimation without a filter would alias noise and echoes into the image. Presumming uses every pulse: the value of a
-pulse at a pixel is interpolated from every k-th position, so that the sum over k times fewer virtual pulses equals the
-sum over all pulses (docs/theory/planner.md, "Pulses").
+Decimation without a filter would alias noise and echoes into the image. In presumming, all pulses contribute: the value
+of a pulse at a pixel is interpolated from virtual pulses at every k-th position, so that the sum over the virtual
+pulses, weighted by this interpolation, equals the sum over all pulses (docs/theory/planner.md, "Pulses").
 """
 
 from dataclasses import dataclass
@@ -50,7 +50,8 @@ class Presum:
         weight = self.weight[virtual]
         first, last = int(weight.indices.min(initial=weight.shape[1] - 1)), int(weight.indices.max(initial=0))
         at = self.at[virtual]
-        # positions between two pulses require both; positions beyond an end are extrapolated from the two outermost
+        # a position between two pulses requires both; positions beyond an end are extrapolated from the two outermost
+        # pulses
         first = max(0, min(first, int(at[0]), weight.shape[1] - 2))
         last = min(weight.shape[1], max(last, int(at[-1]) + 1, 1) + 1)
         return Presum(self.factor, at - first, weight[:, first:last]), slice(first, last)
@@ -66,7 +67,7 @@ def design(pulses: int, factor: int, *, widest_cycles: float, error_db: float = 
     factor
         Pulses per virtual pulse.
     widest_cycles
-        Largest phase rate of a pixel relative to the scene's middle, cycles per pulse.
+        Largest phase rate of a pixel relative to the scene centre, cycles per pulse.
     error_db
         Tolerated error of the filter.
 
@@ -109,13 +110,13 @@ def presum_error_db(presum: Presum, aperture: Aperture, place_m: NDArray[np.floa
     aperture
         Aperture of all pulses.
     place_m
-        (point, 3) float64, grid of points over the scene with its middle at the middle of the array, metres.
+        (point, 3) float64, grid of points over the scene, with the scene centre at the middle of the array, metres.
     highest_hz
         Upper band edge, at which phases change fastest.
     """
     k = 2 * np.pi * highest_hz / SPEED_OF_LIGHT_M_S
     paths = (each.path(place_m) for each in (aperture, _virtual(aperture, presum)))
-    # Paths relative to the middle of the scene.
+    # Paths relative to the scene centre.
     real, virtual = (path_m - path_m[:, [path_m.shape[1] // 2]] for path_m in paths)
     interpolated = presum.weight.T @ np.exp(1j * k * virtual)
     return decibels(float((np.abs(interpolated - np.exp(1j * k * real)) ** 2).mean()) + 1e-16)

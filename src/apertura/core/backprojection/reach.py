@@ -1,4 +1,4 @@
-"""Selection of the pulses that may contribute to windows of a scene; others are not read, prepared or summed."""
+"""Selection of the pulses that may contribute to windows of a scene; other pulses are not read, prepared or summed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from apertura.core.scene.swath import balls
 from apertura.core.scene.terrain import Terrain
 
 PULSES = 64
-"""Pulses of a block. Engines sum in blocks of this size: skipping blocks without contribution changes no bit."""
+"""Number of pulses of a block. Engines sum blocks of this size: omitting blocks without contribution changes no bit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class Reach:
         terrain: Terrain,
         windows: Sequence[tuple[slice, slice]],
     ) -> "Reach":
-        """Return the mask for windows of a scene; without beams or sector every pulse contributes to all windows.
+        """Return the mask for windows of a scene; without beams and sector, every pulse contributes to all windows.
 
         Parameters
         ----------
@@ -69,7 +69,7 @@ class Reach:
         return np.asarray(self.mask.any(axis=0))
 
     def within(self, piece: int, block: slice) -> slice | None:
-        """Return the first to the last pulse of a block that may illuminate a window, counted from the block's start.
+        """Return the first to the last pulse of a block that may illuminate a window, relative to the block's start.
 
         None if no pulse does. `block` starts at a multiple of 64, unless every pulse contributes to the window.
         """

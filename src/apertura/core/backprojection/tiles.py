@@ -35,11 +35,11 @@ if TYPE_CHECKING:
 
 KEY = "processing.scheduler"
 NAMED_BY = "DASK_SCHEDULER_ADDRESS"
-"""dask's environment variable for the scheduler address, which must confirm the config: a client executes data from the
-scheduler, and a config is untrusted."""
+"""dask's environment variable with the scheduler address, which must agree with that of the config: a client executes
+data from the scheduler, and a config is untrusted."""
 
 _CONNECT_S = 5.0  # timeout for the connection to a scheduler
-_WORKERS_S = 10.0  # timeout for its first worker
+_WORKERS_S = 10.0  # timeout for the first worker of a scheduler
 
 
 def cluster_tiles(
@@ -60,7 +60,8 @@ def cluster_tiles(
     Raises
     ------
     CampaignError
-        If the environment names another scheduler or none, it is not reachable, or it has no workers with this code.
+        If the environment names no scheduler or a different one, or the scheduler is not reachable or has no workers
+        with this code.
     """
     with _connected(scheduler) as client:
         from distributed import as_completed
@@ -127,7 +128,7 @@ def _unusable(scheduler: str, found: str, remedy: str) -> CampaignError:
 
 
 def _forget_threads() -> None:
-    """Reset dask's thread pools in a forked child, which inherits no threads and would wait for them forever."""
+    """Reset dask's thread pools in a forked child, which inherits no threads and would wait indefinitely."""
     threaded: Any = sys.modules.get("dask.threaded")
     if threaded is not None:
         threaded.default_pool, threaded.main_thread = None, threading.current_thread()
@@ -152,9 +153,9 @@ def image_array(
     """Return an image, the mean over the pulses, as a dask array with square tiles as chunks.
 
     Tables are prepared once per pulse block and shared by all tiles. With several blocks, the tables of a block are
-    prepared when the tiles of the previous block are done, so that only one block's inputs and tables are in memory. A
-    tile uses the pulses of a block that may contribute to it. Its bits do not depend on the other computed tiles, on
-    their order, or on the use of threads, processes or a cluster.
+    prepared when the tiles of the previous block are done, so that only one block's inputs and tables are in memory.
+    Only pulses that may contribute to a tile are summed for it. The bits of a tile do not depend on the other computed
+    tiles, on their order, or on the use of threads, processes or a cluster.
 
     Parameters
     ----------
@@ -172,8 +173,8 @@ def image_array(
     Returns
     -------
     dask.array.Array
-        (row, column) complex64; 1 is the amplitude of an echo in all counted pulses; 0 where no pulse illuminates the
-        pixel.
+        (row, column) complex64, in units of the amplitude of an echo present in all counted pulses; 0 where no pulse
+        illuminates the pixel.
     """
     from dask.array.core import Array
     from dask.highlevelgraph import HighLevelGraph
@@ -202,7 +203,7 @@ class Weighing:
     count
         Divisor of the sum; the number of all pulses by default.
     variant_counts
-        Variant of the engine's sum → pixels × pulses summed by it in this process.
+        Variant of the engine's sum → number of pixel-pulse contributions summed by it in this process.
     """
 
     beams: Beams | None = None
@@ -247,7 +248,8 @@ def _graph(forming: _Forming, inputs: PhaseHistory | Profiles, places: Collectio
         if not covering:
             continue
         first, last = min(part.start for part in covering.values()), max(part.stop for part in covering.values())
-        block = slice(pulse_block.start + first, pulse_block.start + last)  # pulses of no tile are not read
+        # pulses that contribute to no tile are not read
+        block = slice(pulse_block.start + first, pulse_block.start + last)
         tables = f"{name}-tables-{number}"
         graph[tables] = (partial(_prepare, forming.setting, presum, block), f"{name}-inputs", before)
         before = []
@@ -308,7 +310,7 @@ def _form(  # noqa: PLR0917
 
 
 def _nothing(_done: Any) -> None:
-    """Return None, as a signal without data that a tile is done."""
+    """Return None, to signal without data that a tile is complete."""
 
 
 def compute_tiles(

@@ -1,4 +1,4 @@
-"""Association of captures with transmitted pulses, its checks by time tags and sidelink, and missing pulses."""
+"""Association of captures with transmitted pulses, its checks with time tags and sidelink, and missing pulses."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -15,13 +15,14 @@ from apertura.core.echo.trigger import ABSENT
 
 Integers = NDArray[np.int64]
 Pairs = tuple[Integers, Integers]
-"""Time tags, or indices of paired pulses, of the transmitter and of the receiver."""
+"""Values of the transmitter and of the receiver: time tags, or indices of paired pulses."""
 
 LARGEST_DRIFT_PPM = 100.0
-"""ppm, search limit of the drift between the time tags; free-running crystals drift by less."""
+"""Search limit of the drift between the time tags, ppm; free-running crystals drift by less."""
 
 
-_MOST_TAGS = 16_384  # spread over the flight; more do not improve the offset modulo the interval
+# number of tags used, spread over the flight; more tags do not improve the offset modulo the interval
+_MOST_TAGS = 16_384
 
 
 class TagLine(NamedTuple):
@@ -36,7 +37,8 @@ def fit_modulo_interval(tags: Pairs, interval_ns: float) -> TagLine:
     """Fit the offset line that best aligns the receiver's tags with the transmitter's, modulo the interval."""
     tx, rx = tags
     rx = rx[:: -(-rx.size // _MOST_TAGS)]
-    nearby = np.minimum(np.searchsorted(tx, rx), tx.size - 1)  # any nearby pulse gives the same modulo the interval
+    # any nearby pulse gives the same offset modulo the interval
+    nearby = np.minimum(np.searchsorted(tx, rx), tx.size - 1)
     cycles = (rx - tx[nearby]) / interval_ns
     elapsed_ns = (rx - rx[0]).astype(np.float64)
     reach = LARGEST_DRIFT_PPM * 1e-6 * elapsed_ns[-1] / interval_ns
@@ -63,12 +65,13 @@ def nearest_pairs(tags: Pairs, line: TagLine, interval_ns: float) -> Pairs:
 
 
 def fit_pairs(tags: Pairs, pairs: Pairs, interval_ns: float) -> TagLine:
-    """Fit a line (Theil-Sen slope, then median) to the offsets of pairs; tolerates less than half of wrong pairs."""
+    """Fit a line (Theil-Sen slope, then median) to the offsets of pairs; tolerates less than half wrong pairs."""
     tx_tag, rx_tag = tags[0][pairs[0]], tags[1][pairs[1]]
     offset_ns = (rx_tag - tx_tag).astype(np.float64)
     elapsed_ns = (rx_tag - rx_tag[0]).astype(np.float64)
     drift = 0.0
-    if LARGEST_DRIFT_PPM * 1e-6 * elapsed_ns[-1] > interval_ns / 100:  # else jitter would be fitted as drift
+    # for shorter intervals, jitter would be fitted as drift
+    if LARGEST_DRIFT_PPM * 1e-6 * elapsed_ns[-1] > interval_ns / 100:
         sample = np.unique(np.linspace(0, rx_tag.size - 1, 300).astype(int))
         drift = _theil_sen_slope(elapsed_ns[sample], offset_ns[sample])
     return TagLine(float(np.median(offset_ns - drift * elapsed_ns)), drift, int(rx_tag[0]))
@@ -108,10 +111,10 @@ class Association:
     residual_s
         RMS residual of the tags from the offset line, seconds.
     method
-        Basis of the pairs: frame numbers or time tags.
+        Basis of the association: frame numbers or time tags.
     outlier
-        (pair,) bool, True where the tags deviate from the line by more than the error of a tag: one of the two is
-        wrong.
+        (pair,) bool, True where the tags deviate from the line by more than the error of a tag, so that one of the two
+        tags is wrong.
     tx_dropped, rx_dropped
         Number of unpaired pulses of each recording.
     flags
@@ -143,20 +146,20 @@ def associate(
 ) -> Association:
     """Pair the pulses of a transmitter with the captures of a receiver.
 
-    Frame numbers decide if both nodes record them. Otherwise the receiver's tags are assumed to lead or lag by less
-    than half a repetition interval at its first pulse, and to drift by at most 100 ppm.
+    If both nodes record frame numbers, pulses are associated by these. Otherwise the receiver's tags are assumed to
+    lead or lag by less than half a repetition interval at its first pulse, and to drift by at most 100 ppm.
 
     Parameters
     ----------
     tx_time_ns, rx_time_ns
-        (pulse,) int64, UTC time tags of each node's own clock, nanoseconds, ascending; any common origin.
+        (pulse,) int64, UTC time tags by the clock of each node, nanoseconds, ascending; with any common origin.
     repetition_interval_s
         Nominal time between pulses, seconds.
     tx_frame, rx_frame
         (pulse,) int64 frame numbers, -1 where the payload was not decoded; None without a counter.
     frame_modulus
-        Count at which the counter returns to zero. None: the next power of two above the largest number, if
-        a counter steps back.
+        Count at which the counter returns to zero. None: if a counter steps back, the next power of two above the
+        largest number.
     speed_m_s
         Speed of the transmitter, metres per second, to convert a tag offset into a displacement; None: unknown.
     where
@@ -237,7 +240,7 @@ def _no_common_pulse(tags: Pairs, repetition_interval_s: float, where: str) -> C
 def _agreed_pairs(
     tags: Pairs, by_frame: Pairs, frames: tuple[Integers | None, Integers | None], interval_ns: float
 ) -> tuple[Pairs, int]:
-    """Drop frame pairs that the tags contradict, add pairs without a decoded number; count the dropped pairs."""
+    """Remove frame pairs that contradict the tags, add pairs without a decoded number, and count the removed pairs."""
     if by_frame[0].size == 0:
         return by_frame, 0
     line = fit_pairs(tags, by_frame, interval_ns)
@@ -288,23 +291,25 @@ def _unwrapped(count: Integers, tags: Integers, interval_ns: float, modulus: int
 # ---- Flags of an association
 
 LARGEST_JITTER = 1 / 6
-"""RMS scatter of the tags, in repetition intervals, at which one pulse in 370 (3σ) is closer to its neighbour."""
+"""RMS scatter of the tags, in repetition intervals, at which one tag in 370 (3σ) is closer to the neighbouring
+pulse."""
 
 AMBIGUOUS_SHARE = 0.4
-"""Offset as a share of a repetition interval; a larger one may be that of the neighbouring pulse (limit: one half)."""
+"""Largest unambiguous offset as a share of a repetition interval, with a margin: beyond one half, a neighbour is
+closer."""
 
 LARGEST_OFFSET_S = 20e-3
-"""Seconds, largest offset between two nodes' tags that is explained by errors of a few milliseconds each."""
+"""Largest offset between the tags of two nodes, seconds, that is explained by errors of a few milliseconds each."""
 
 OUTLIER_S = 5e-3
-"""Seconds, deviation of a tag from the line within the accuracy of time tags."""
+"""Deviation of a tag from the line, seconds, within the accuracy of time tags."""
 
 _OUTLIER_SIGMA = 6.0  # standard deviations of all tags: an outlier exceeds both this and `OUTLIER_S`
 
 LARGEST_UNPAIRED = 0.05
-"""Share of the transmitter's pulses before or after the other recording above which a flag is raised."""
+"""Share of the transmitter's pulses before or after the receiver's recording, above which a flag is raised."""
 
-_FEW = 2  # pulses by which a recorder may start late or stop early
+_FEW = 2  # number of pulses by which a recorder may start late or stop early
 
 
 def is_outlier(residual_s: Floats) -> NDArray[np.bool_]:
@@ -329,7 +334,7 @@ def tag_jitter_s(time_ns: Integers) -> float:
 
     Notes
     -----
-    The result is an upper bound if the trigger intervals are not equal. An error common to all tags is not measured.
+    The result is an upper bound if the trigger intervals are unequal. An error common to all tags is not measured.
 
     Examples
     --------
@@ -340,7 +345,8 @@ def tag_jitter_s(time_ns: Integers) -> float:
     if time_ns.size < 3:
         return 0.0
     steps = np.diff(time_ns)
-    number = np.concatenate([[0.0], np.cumsum(np.round(steps / np.median(steps)))])  # pulse number, missed ones counted
+    # pulse number, missing pulses included
+    number = np.concatenate([[0.0], np.cumsum(np.round(steps / np.median(steps)))])
     elapsed_s = (time_ns - time_ns[0]) * 1e-9
     return round(float(np.std(elapsed_s - np.polyval(np.polyfit(number, elapsed_s, 1), number))), 9)
 
@@ -359,7 +365,7 @@ def association_flags(
     interval_s
         Nominal time between pulses, seconds.
     conflicts
-        Number of pairs by frame counter that the tags contradict.
+        Number of pairs by frame number that contradict the tags.
     speed_m_s
         Speed of the transmitter; None: unknown.
 
@@ -427,25 +433,27 @@ def _unpaired(association: "Association", tags: Pairs, interval_s: float) -> str
 # ---- Check of the association: sidelink delay against the baseline of the tracks
 
 EXPLAINED_M = 0.05
-"""Metres, residual of a sidelink path that errors of the logged positions alone may explain."""
+"""Residual of a sidelink path, metres, that may be due to errors of the logged positions alone."""
 
 SIGMAS = 5.0
-"""Threshold in standard deviations of a median's noise: 1000 windows of noise exceed it in one of 3000 flights."""
+"""Threshold in standard deviations of a median's noise: among 1000 windows of noise, it is exceeded in one of 3000
+flights."""
 
 _MEDIAN_PULSES = 15, 61, 241
-"""Lengths of the running medians that separate motion from jitter, odd; a longer one has less noise and bandwidth."""
+"""Lengths (odd) of the running medians that separate motion from jitter; longer ones have less noise and less
+bandwidth."""
 
 _ENOUGH = 64  # disjoint windows required to estimate the noise of the median
 
 
 @dataclass(frozen=True)
 class BaselineResidual:
-    """Residual of the measured delay against the baseline, without a constant and a linear drift.
+    """Difference of the measured delay from the baseline, after removal of a constant and a linear drift.
 
     Attributes
     ----------
     residual_m, noise_m
-        RMS of the residual's running median, metres, and the standard deviation of that median by jitter alone.
+        RMS of the residual's running median, metres, and the standard deviation of that median from jitter alone.
     jitter_m
         Standard deviation of a single pulse, metres; mostly trigger jitter.
     largest_m, pulse
@@ -495,12 +503,12 @@ def _smoothed(pulse: NDArray[np.intp], residual: Floats, jitter_m: float, width:
     """Return the residual measured by a running median of `width` pulses."""
     from scipy import ndimage
 
-    inside = slice(width // 2, -(width // 2))  # full windows
+    inside = slice(width // 2, -(width // 2))  # complete windows only
     smooth, middle = ndimage.median_filter(residual, width)[inside], pulse[inside]
     smooth = smooth - np.polyval(np.polyfit(middle, smooth, 1), middle)
     noise_m = 1.2533 * jitter_m / np.sqrt(width)  # standard deviation of a median of `width` Gaussian samples
     steps = np.diff(smooth[::width])
-    if steps.size >= _ENOUGH:  # jitter need not be normal: the median of uniform jitter is noisier
+    if steps.size >= _ENOUGH:  # jitter may not be Gaussian: the median of uniform jitter has more noise
         noise_m = max(noise_m, 1.4826 * float(np.median(np.abs(steps))) / 2**0.5)
     worst = int(np.argmax(np.abs(smooth)))
     largest_m = float(abs(smooth[worst]))
@@ -515,7 +523,7 @@ def _smoothed(pulse: NDArray[np.intp], residual: Floats, jitter_m: float, width:
 
 
 def sigmas(windows: int) -> float:
-    """Return the threshold of the largest of a number of windows, standard deviations, at a constant false-alarm rate.
+    """Return the threshold for the maximum of a number of windows, standard deviations, at a constant false-alarm rate.
 
     Examples
     --------
@@ -529,8 +537,8 @@ def detect_wrong_association(residual: BaselineResidual | None) -> str | None:
     """Report a deviation of the measured sidelink from the geometry of its pulses, in one line; None if there is none.
 
     A constant and a linear drift are attributed to the clocks. Trigger jitter does not explain a residual above
-    `EXPLAINED_M` and above five times its own noise (six in a long flight): captures have the positions of other
-    pulses, or positions are wrong.
+    `EXPLAINED_M` and above five times its own noise (six in a long flight): captures are assigned to wrong pulses, or
+    positions are wrong.
 
     Notes
     -----
@@ -556,11 +564,12 @@ def detect_wrong_association(residual: BaselineResidual | None) -> str | None:
 # ---- Missing pulses
 
 LARGEST_SIDELOBE = 0.1
-"""Largest sidelobe by missing pulses, amplitude relative to the peak: -20 dB, one gap of a tenth of the aperture."""
+"""Largest tolerated sidelobe from missing pulses, amplitude relative to the peak: -20 dB, a gap of a tenth of the
+aperture."""
 
 
 def missing_pulses(time_ns: Integers) -> tuple[int, float]:
-    """Return the number of pulses missing between the first and the last, and the highest sidelobe that they cause.
+    """Return the number of pulses missing between the first and the last, and the highest sidelobe from the gaps.
 
     Parameters
     ----------
@@ -589,7 +598,7 @@ def missing_pulses(time_ns: Integers) -> tuple[int, float]:
     if time_ns.size < 3:
         return 0, 0.0
     steps = np.diff(time_ns)
-    usual = np.partition(steps, middle := (len(steps) - 1) // 2)[middle]  # lower median: always an occurring step
+    usual = np.partition(steps, middle := (len(steps) - 1) // 2)[middle]  # the lower median is always one of the steps
     single = steps[np.abs(steps / usual - 1) < 0.25].mean()
     number = np.concatenate([[0], np.cumsum(np.maximum(np.round(steps / single), 1).astype(np.int64))])
     absent = np.ones(number[-1] + 1)

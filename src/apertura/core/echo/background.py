@@ -1,7 +1,7 @@
 """Background of a recording: echoes at constant delay while the antennas move, such as antenna coupling.
 
-docs/theory/background.md: signal model (eq. 1), Doppler test (eq. 2), estimators (eq. 3). The decision whether it is
-removed is made where the scene is known: `apertura.core.imaging.background`.
+docs/theory/background.md: signal model (eq. 1), Doppler test (eq. 2), estimators (eq. 3). The decision on its removal
+requires the scene, and is made by `apertura.core.imaging.background`.
 """
 
 import math
@@ -20,18 +20,20 @@ from apertura.core.echo.compression import window_weights
 from apertura.core.echo.demodulate import remove_path
 
 Read = Callable[[Pulses], Complexes]
-"""Pulse numbers, ascending → (pulse, subcarrier) transfer functions in delays of the recorder, G of eq. 1."""
+"""Pulse numbers, ascending → (pulse, subcarrier) transfer functions G of eq. 1, with delays in the recorder's time
+base."""
 
 _GROUPS = 512
-"""Groups of pulses whose means estimators use: a burst of interference corrupts few of them."""
+"""Number of groups of pulses whose means are used for estimates: a burst of interference corrupts few of them."""
 
-_SAMPLED_GROUPS, _SAMPLED_EACH = 64, 8  # pulses of the test
-_DOPPLER_CELLS = 3, 12  # that zero Doppler is compared with, in units of 1/duration: beyond a slow drift of coupling
+_SAMPLED_GROUPS, _SAMPLED_EACH = 64, 8  # groups of pulses used by the test, and pulses per group
+# Doppler frequencies compared with zero Doppler, in units of 1/duration: higher than those of a slow drift of coupling
+_DOPPLER_CELLS = 3, 12
 _FALSE_ALARM = 1e-6
 """Probability that noise alone passes the test."""
 
 _LEAST_GROUPS = 16
-"""Groups in the length of a running median, at least; of pulses, the fewest that the test is made of."""
+"""Least length of a running median in groups; least number of pulses for the test."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +52,7 @@ class Background:
     time_s: Floats
 
     def outside(self, delays: NDArray[np.bool_]) -> "Background":
-        """Return the background without some delays, (subcarrier,) bool in steps of the resolution from zero."""
+        """Return the background without the delays of a mask, (subcarrier,) bool in steps of the resolution."""
         profiles = scipy.fft.ifft(self.values, axis=1) * ~delays
         return Background(scipy.fft.fft(profiles, axis=1).astype(np.complex64), self.time_s)
 
@@ -83,7 +85,7 @@ class Background:
 
 
 def background_excess_db(read: Read, count: int, subcarriers: int) -> float:
-    """Return the excess of zero Doppler in some hundred pulses above its detection threshold, dB; negative: none found.
+    """Return the excess of zero Doppler in some hundred pulses over its threshold, dB; negative: not detected.
 
     Parameters
     ----------
@@ -94,8 +96,8 @@ def background_excess_db(read: Read, count: int, subcarriers: int) -> float:
 
     Notes
     -----
-    Source: docs/theory/background.md, eq. 2. Echoes of the scene cross zero Doppler no slower than the cells beside it,
-    and noise is white: neither raises the ratio.
+    Source: docs/theory/background.md, eq. 2. Echoes of the scene pass zero Doppler at least as fast as the neighbouring
+    cells, and noise is white: neither increases the ratio.
 
     Examples
     --------
@@ -152,7 +154,7 @@ class GroupMeans:
         return _LEAST_GROUPS * float(np.ptp(self.time_s)) / len(self.time_s)
 
     def background(self, method: str | float) -> Background:
-        """Estimate the background (eq. 3): median or mean of all groups, or a running median of a length in s.
+        """Estimate the background (eq. 3): median or mean of all groups, or a running median with a length in seconds.
 
         Examples
         --------
@@ -164,7 +166,7 @@ class GroupMeans:
             return Background(_middle(self.values, method)[None], np.zeros(1))
         first, last = float(self.time_s[0]), float(self.time_s[-1])
         knots = np.linspace(first, last, max(2, math.ceil(2 * (last - first) / method) + 1))
-        # Towards the ends the window is one-sided, so that it keeps its length.
+        # Near the ends the window is one-sided, so that its length is constant.
         starts = np.clip(knots - method / 2, first, max(first, last - method))
         windows = [(self.time_s >= start) & (self.time_s <= start + method) for start in starts]
         return Background(np.stack([_middle(self.values[window], "median") for window in windows]), knots)

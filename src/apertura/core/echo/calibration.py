@@ -21,10 +21,10 @@ FALSE_REFLECTOR = 1e-3
 """Probability that clutter or noise alone is detected as a reflector."""
 
 NEEDED_STD_M = 0.02
-"""Metres, standard deviation of a path offset above which coherent sums of several nodes lose focus."""
+"""Standard deviation of a path offset, metres, above which coherent sums of several nodes are defocused."""
 
 RIVAL_DB = -6.0
-"""dB relative to the reflector, level of a second echo above which the identity of the reflector is uncertain."""
+"""Level of a second echo, dB relative to the reflector, above which the identity of the reflector is uncertain."""
 
 _GROUPS = 16
 _OVERSAMPLING = 8
@@ -48,7 +48,8 @@ class PathOffset:
         Metres of total path. Monostatic: `path_offset_m.radar`. Bistatic: radar minus sidelink, the only
         combination observable in echoes divided by the sidelink.
     std_m
-        Standard deviation, from the scatter over sixteenths and quarters of the flight; infinite below 16 pulses.
+        Standard deviation, from the scatter over sixteenths and quarters of the flight; infinite for fewer than 16
+        pulses.
     contrast_db
         Power of the reflector relative to its surroundings.
     pulses
@@ -96,7 +97,7 @@ def estimate_path_offset(
     Notes
     -----
     Source: docs/theory/echo_methods.md, "Calibration". Pulses are added coherently within a sixteenth of the flight,
-    over which track errors are constant; the sixteenths are added in power.
+    over which track errors are constant; powers of the sixteenths are added.
 
     Examples
     --------
@@ -180,7 +181,7 @@ def _offset_profile(groups: NDArray[np.complex128], frequency_hz: Floats, search
 
 
 def _require_visible(power: Floats, peak: int, surroundings: float, groups: int, search_m: float, where: str) -> None:
-    """Raise CampaignError if the peak does not exceed the highest of as many cells of clutter, or is at the edge."""
+    """Raise CampaignError if the peak is at the edge, or not above the maximum expected of as many clutter cells."""
     cells = power.size / _OVERSAMPLING
     highest = gammainccinv(groups, FALSE_REFLECTOR / cells) / groups
     ratio_db, needed_db = (decibels(r) for r in (power[peak] / max(surroundings, 1e-30), highest))
@@ -199,7 +200,7 @@ def _require_visible(power: Floats, peak: int, surroundings: float, groups: int,
 
 
 def _refine(groups: NDArray[np.complex128], frequency_hz: Floats, start_m: float) -> Floats:
-    """Maximise the power of each group by Newton's method, within half a cell of the start; return (group,) metres."""
+    """Maximise the power of each group by Newton's method within half a cell of the start; return (group,) metres."""
     cell_m = SPEED_OF_LIGHT_M_S / float(frequency_hz[-1] - frequency_hz[0])
     phase_per_m = 2j * np.pi * (frequency_hz - frequency_hz.mean()) / SPEED_OF_LIGHT_M_S
     offset = np.full(len(groups), start_m)

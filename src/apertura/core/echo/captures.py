@@ -24,7 +24,8 @@ AT_ONCE = 64
 """Captures processed at a time; their number is limited by the processor caches."""
 
 SATURATED_SHARE = 1e-4
-"""Share of samples at the converter's end stops above which it clips; a symbol 12 dB below has one or two samples."""
+"""Share of samples at the end stops of a converter, above which it clips; a symbol 12 dB below has one or two such
+samples."""
 
 
 def ordered(iq: Samples, order: str) -> Samples:
@@ -66,9 +67,9 @@ def blocks_of(pulses: Pulses, size: int = AT_ONCE) -> Iterator[Pulses]:
 
 
 def spread(count: int, *, groups: int, each: int) -> list[Pulses]:
-    """Return groups of neighbouring pulses, centred in equal parts of a flight; all pulses of a short flight.
+    """Return groups of neighbouring pulses, centred in equal parts of a flight; of a short flight, all pulses.
 
-    A few thousand pulses suffice to estimate properties common to all pulses, for any length of the flight.
+    Properties common to all pulses are estimated from a few thousand pulses, for any length of the flight.
 
     Examples
     --------
@@ -82,18 +83,18 @@ def spread(count: int, *, groups: int, each: int) -> list[Pulses]:
 
 
 _CREST_SAMPLES = 256
-"""Samples of a capture used for its crest factor; that of noise alone is below 3 in 2 of 10⁶ captures."""
+"""Number of samples used for the crest factor of a capture; for noise alone it is below 3 in 2 of 10⁶ captures."""
 
 _LIMITED_CREST = 3.0
-"""Largest crest factor (peak power over mean power) of a limited capture; 6 to 10 for noise and OFDM, 1 for a square
-wave."""
+"""Largest crest factor (peak power over mean power) of a limited capture. It is 6 to 10 for noise and OFDM, and 1 for a
+square wave."""
 
 _LIMITED_SHARE = 0.5
-"""Limit of peak power and of crest factor relative to unlimited captures: a limited capture is below it in both."""
+"""Limit of peak power and of crest factor relative to unlimited captures: for a limited capture, both are below it."""
 
 _LIMITED_CAPTURES = 0.02
-"""Tolerated share of limited captures: their distortion is 34 dB below the image. The dependent samples of a symbol of
-128 subcarriers have a low crest factor in 2 of 1000 captures without a limiter."""
+"""Tolerated share of limited captures: their distortion is 34 dB below the image. Without a limiter, 2 of 1000 symbols
+of 128 subcarriers have a low crest factor, because their samples are not independent."""
 
 
 class Saturation:
@@ -101,10 +102,10 @@ class Saturation:
 
     Notes
     -----
-    A clipping converter accumulates samples at its end stops, for any number of bits; without clipping the extreme
+    With a clipping converter of any number of bits, samples accumulate at the end stops; without clipping the extreme
     values occur once or twice. A limiter in front of the converter lowers both the peak of a capture and its crest
     factor, max|s|²/mean|s|². A weak capture has a lower peak and an unchanged crest factor; a strong tone has a lower
-    crest factor and an unchanged peak. Captures are compared with the 90th percentile of all.
+    crest factor and an unchanged peak. Captures are compared with the 90th percentile of all captures.
 
     Examples
     --------
@@ -139,14 +140,14 @@ class Saturation:
     @property
     def shares(self) -> dict[str, float]:
         """Share of each channel's samples that repeat its largest or smallest value."""
-        return {  # one occurrence of each extreme is no repetition
+        return {  # a single occurrence of an extreme is not a repetition
             name: (sum(extreme.times for extreme in self._extremes[name]) - 2) / count
             for name, count in self._samples.items()
         }
 
     @property
     def flags(self) -> Flags:
-        """Flags of channels whose converter clipped, and of captures limited in front of it."""
+        """Flags of channels with a clipping converter, and of captures limited in front of the converter."""
         clipped = {
             f"saturated_{name}": f"{share:.2%} of the samples of channel {name} are at the converter's end stops"
             for name, share in self.shares.items()
@@ -214,7 +215,7 @@ def correct_clock(samples: Complexes, numerology: Numerology, *, cfo_hz: Floats,
     Notes
     -----
     Source: docs/theory/echo_methods.md, "Clock": rotation, then interpolation at the fractional sample positions by a
-    Kaiser-windowed sinc, which is shortest with the occupied band centred on zero.
+    Kaiser-windowed sinc, which is shortest if the occupied band is centred on zero.
 
     Examples
     --------
@@ -227,7 +228,7 @@ def correct_clock(samples: Complexes, numerology: Numerology, *, cfo_hz: Floats,
     rate_hz = numerology.sample_rate_hz * (1 + sfo_ppm * 1e-6)
     recorded_s, resampled_s = np.arange(samples.shape[1]) / rate_hz, np.arange(count) / numerology.sample_rate_hz
     index, taps = _fractional_taps(resampled_s * rate_hz, numerology)
-    # beyond the ends of the capture the symbol continues periodically
+    # beyond the ends of the capture, the symbol is continued periodically
     index = np.where(index >= samples.shape[1], index - numerology.dft_samples, index)
     index = np.where(index < 0, index + numerology.dft_samples, index)
     to_band = np.exp(2j * np.pi * numerology.middle_hz * resampled_s)

@@ -1,9 +1,9 @@
-"""Clock offset of a receiver from the transmitter: measurement on the sidelink, and decision on its correction.
+"""Clock offset of a receiver from the transmitter: measurement on the sidelink, and decision on correction.
 
 The symbol has the period 1/Δf and is longer than one period, so the start of a capture repeats at its end, rotated by
 the carrier offset and shifted by the sampling offset. The measurement requires neither code nor delay.
-A pulse that is sent once has no repetition: its clock is not measurable, and division by the sidelink does not need it
-(docs/theory/waveforms.md, "Clock").
+A pulse that is sent once has no repetition: the clock offset is not measurable, and division by the sidelink does not
+require it (docs/theory/waveforms.md, "Clock").
 """
 
 from collections.abc import Iterable
@@ -22,15 +22,15 @@ SIGMAS = 3.0
 """Standard deviations below which a clock offset is not significant and is not corrected."""
 
 AMBIGUOUS_SHARE = 0.4
-"""Share of Δf beyond which the sign of an offset is uncertain, since offsets wrap at one half."""
+"""Share of Δf above which the sign of an offset is uncertain, because offsets are ambiguous beyond one half."""
 
 GROUPS = 16
-"""Parts of the flight whose scatter gives the standard deviation of the clock."""
+"""Number of parts of the flight from whose scatter the standard deviation of the clock offset is computed."""
 
-_SMALLEST_REPEAT = 32  # fewest repeated samples of a capture
+_SMALLEST_REPEAT = 32  # least number of repeated samples of a capture
 _TAPERED = 0.25
 """Tapered share of the repeated samples, both ends together. A capture that is triggered late extends beyond the end of
-the symbol; without a taper this error was 70 standard deviations of the phase of a chirp-like code, 0.1 ppm or more."""
+the symbol; without a taper, the phase error for a chirp-like code was 70 standard deviations, 0.1 ppm or more."""
 
 
 @dataclass(frozen=True)
@@ -42,13 +42,13 @@ class ClockOffset:
     cfo_hz
         Receiver's oscillator frequency minus transmitter's at the middle of the flight, hertz.
     cfo_slope_hz
-        Its change per pulse, hertz; 0 if it is not significant.
+        Change of the carrier offset per pulse, hertz; 0 if it is not significant.
     sfo_ppm
         Receiver's sampling rate above nominal, parts per million of the transmitter's.
     cfo_std_hz, sfo_std_ppm
-        Standard deviations from the scatter over the flight; that of `sfo_ppm` is of its direct measurement.
+        Standard deviations from the scatter over the flight; for `sfo_ppm`, of the direct measurement.
     one_clock
-        True if `sfo_ppm` is derived from the carrier offset, with which its direct measurement agrees.
+        True if `sfo_ppm` is derived from the carrier offset, because the direct measurement agrees with it.
     """
 
     cfo_hz: float
@@ -101,7 +101,7 @@ def clock_of(groups: Iterable[Complexes], numerology: Numerology, *, pulses: int
     ----------
     groups
         (pulse, sample) complex64 each, captures from the start of the cyclic prefix to the end of the symbol
-        (T_cp + T), no longer, from equal parts of the flight; pulses without signal are permitted.
+        (T_cp + T) and not beyond, from equal parts of the flight; pulses without signal are permitted.
     numerology
         Numerology of the symbol.
     pulses
@@ -131,7 +131,7 @@ def clock_of(groups: Iterable[Complexes], numerology: Numerology, *, pulses: int
     one_clock = abs(sfo_ppm - joint_ppm) <= 3 * sfo_std_ppm
     sfo_ppm = joint_ppm if one_clock else sfo_ppm
     cfo_std_hz = phase_std / (2 * np.pi * period_s)
-    if not one_clock:  # the error of the slope adds, by which the carrier is extrapolated from the middle of the band
+    if not one_clock:  # plus the error of the slope, with which the carrier is extrapolated from the middle of the band
         cfo_std_hz = float(np.hypot(cfo_std_hz, centre_hz * sfo_std_ppm * 1e-6))
     return ClockOffset(
         cfo_hz=-phase / (2 * np.pi * period_s) - centre_hz * sfo_ppm * 1e-6,
@@ -255,7 +255,7 @@ def _phase_and_slope(
 
 
 def _line(values: Floats) -> tuple[float, float]:
-    """Return the slope per step, 0 if below four standard deviations, and the standard deviation of the mean."""
+    """Return the slope per step (0 if below four standard deviations) and the standard deviation of the mean."""
     count = values.size
     if count < 3:
         return 0.0, np.inf

@@ -14,7 +14,7 @@ from apertura.core.windowed_sinc import kaiser_window
 
 
 def unit_phasor(cycles: NDArray[np.float64]) -> NDArray[np.complex64]:
-    """Return exp(j2π·cycles), complex64; integer cycles are removed in float64, the rest is evaluated in float32.
+    """Return exp(j2π·cycles), complex64; integer cycles are removed in float64, the remainder is evaluated in float32.
 
     Examples
     --------
@@ -47,7 +47,7 @@ def phasors(cycles: NDArray[np.float64], count: int, *, first: float = 0.0) -> N
 
     Notes
     -----
-    Computed as products of coarse and fine phasors, exact to the rounding of complex64, to save exponentials.
+    Computed as products of coarse and fine phasors, to evaluate fewer exponentials; exact to the rounding of complex64.
 
     Examples
     --------
@@ -62,7 +62,7 @@ def phasors(cycles: NDArray[np.float64], count: int, *, first: float = 0.0) -> N
 
 # ---- Range compression
 
-_PULSES_AT_ONCE = 32  # limited by the processor caches
+_PULSES_AT_ONCE = 32  # number of pulses per block, limited by the processor caches
 
 _TAPS = 7
 _ROOM = 2.0
@@ -74,7 +74,7 @@ WINDOWS: Mapping[str, Callable[[int], NDArray[np.float64]]] = {"hann": np.hannin
 
 
 def window_weights(name: str, count: int) -> NDArray[np.float64]:
-    """Return the weights of a window, normalised to the sum 1: a profile then peaks at the amplitude of the echo.
+    """Return the weights of a window, normalised to the sum 1, so that a profile peaks at the amplitude of the echo.
 
     Examples
     --------
@@ -167,9 +167,9 @@ def compress(
 
     Notes
     -----
-    Source: docs/theory.md, eq. 4. Referring the profile to the band centre halves the bandwidth that interpolation
-    must handle; backprojection applies the factor exp(+j2πf_mid·ρ/v). If the swath is only a part of the unambiguous
-    range, the subcarriers are first decimated to it (docs/theory.md, eq. 4a), at the accuracy of complex64.
+    Source: docs/theory.md, eq. 4. With the profile referenced to the band centre, the bandwidth for interpolation is
+    halved; backprojection applies the factor exp(+j2πf_mid·ρ/v). If the swath is only a part of the unambiguous range,
+    the subcarriers are first decimated to it (docs/theory.md, eq. 4a), at the accuracy of complex64.
 
     Examples
     --------
@@ -211,8 +211,8 @@ def compress(
 def _decimation(subcarriers: int, length: int, count: int) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
     """Return the decimation filter, (factor, tap), and the inverse of its response over the swath, (count,).
 
-    The factor is the largest that leaves an unambiguous range of `_ROOM` times the swath; 1 if the swath fills the
-    range.
+    The factor is the largest for which the unambiguous range is at least `_ROOM` times the swath; it is 1 if the swath
+    fills the unambiguous range.
     """
     offset, middle = np.arange(count) - count // 2, subcarriers // 2
     factors = [factor for factor in range(4, _LARGEST_FACTOR + 1) if length % factor == 0]

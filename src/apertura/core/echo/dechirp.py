@@ -22,7 +22,7 @@ _MOTION_WAVES = 1 / 8
 """Tolerated change of total path within a sweep, wavelengths: a motion by λ/16 of a monostatic antenna."""
 
 _FASTEST = 95.0
-"""Percentile of the speeds between pulses that is evaluated; single errors of a log do not affect it."""
+"""Percentile of the speeds between pulses that is evaluated, so that single errors of a log have no effect."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class FrequencySweep:
 
     @property
     def path_limit_m(self) -> float:
-        """Total path beyond which a beat frequency is ambiguous, or half of its band is lost, metres (eq. 4)."""
+        """Total path, metres, beyond which a beat frequency is ambiguous or half of its band is lost (eq. 4)."""
         longest_s = min(self.beats_hz[1] / abs(self.slope_hz_s), self.samples / self.sample_rate_hz / 2)
         return SPEED_OF_LIGHT_M_S * (self.reference_delay_s + longest_s)
 
@@ -129,7 +129,7 @@ def transfer_of(
     late_s
         (pulse,) float64, delay of the first sample of each sweep after its start, seconds; None: 0.
     deskewed
-        False retains the residual video phase, for comparison.
+        If False, the residual video phase is retained, for comparison.
 
     Returns
     -------
@@ -186,9 +186,9 @@ def sweep_motion_flags(
     time
         (pulse,) datetime64[ns], the middles of the sweeps.
     antennas
-        Positions of transmitter and receiver, (pulse, 3) float64 metres each, in one Cartesian frame.
+        Positions of the transmitting and the receiving antenna, (pulse, 3) float64 metres each, in one Cartesian frame.
     lasting_s
-        Length of the part of a sweep that is used, seconds; 0: no sweep.
+        Length of the used part of a sweep, seconds; 0: no sweep.
     frequency_hz
         (subcarrier,) float64, ascending.
 

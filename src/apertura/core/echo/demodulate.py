@@ -30,8 +30,8 @@ class Numerology:
     dft_samples
         f_s/Δf, length of the DFT window.
     longest_samples
-        Largest delay, samples, of which captures contain the complete echo of a pulse sent once. None: a symbol of
-        period 1/Δf, whose echoes are complete up to the length of the prefix.
+        Largest delay, samples, at which captures contain the complete echo of a pulse sent once. None: symbol with the
+        period 1/Δf, whose echoes are complete for delays up to the length of the prefix.
     """
 
     carrier_hz: float
@@ -111,7 +111,8 @@ def demodulate(captures: NDArray[np.complex64], numerology: Numerology) -> NDArr
         raise ValueError(f"{samples=}: a capture must have at least {stop} (prefix and DFT window)")
     symbols = np.empty((pulses, numerology.numbers.size), np.complex64)
     count, lowest = numerology.numbers.size, int(numerology.numbers[0]) % numerology.dft_samples
-    below = min(count, numerology.dft_samples - lowest)  # negative frequencies; the others start at bin 0
+    # bins of negative frequencies; the other frequencies start at bin 0
+    below = min(count, numerology.dft_samples - lowest)
     for first in range(0, pulses, _PULSES_AT_ONCE):
         spectrum = scipy.fft.fft(captures[first : first + _PULSES_AT_ONCE, start:stop], axis=1, norm="forward")
         rows = slice(first, first + len(spectrum))

@@ -1,4 +1,4 @@
-"""Narrow-band interference: subcarriers whose noise exceeds that of their neighbours, excluded by weights.
+"""Narrow-band interference: exclusion of subcarriers whose noise exceeds that of their neighbours, by weights.
 
 docs/theory/interference.md: detection (eq. 1), weights (eq. 2), cost (eq. 3).
 """
@@ -18,15 +18,15 @@ from apertura.common.flags import Flags
 from apertura.common.units import decibels
 from apertura.core.echo.captures import Pulses, spread
 
-_GROUPS, _EACH = 64, 8  # pulses of the test
-_NEIGHBOURS = 32  # parts of the band over which the median of the noise is taken
+_GROUPS, _EACH = 64, 8  # groups of pulses used by the test, and pulses per group
+_NEIGHBOURS = 32  # inverse share of the band in half the window of the noise median
 _FEWEST_NEIGHBOURS = 8
 
 EXCESS_DB = 6.0
-"""dB of noise above the neighbours', from which a subcarrier is excluded."""
+"""Excess of the noise over that of the neighbours, dB, above which a subcarrier is excluded."""
 
 LEAST_GAIN_DB = 0.1
-"""dB of SNR that the exclusion must gain; less is not worth its sidelobes."""
+"""Least gain in SNR by the exclusion, dB; a smaller gain does not justify its sidelobes."""
 
 SERVICES: tuple[tuple[float, float, str], ...] = (
     (420e6, 450e6, "radar, amateur radio"),
@@ -119,7 +119,7 @@ class Interference:
 
     @property
     def excluded(self) -> NDArray[np.bool_]:
-        """(subcarrier,) bool, subcarriers with interference."""
+        """(subcarrier,) bool, True for subcarriers with interference."""
         return self.excess >= 10 ** (EXCESS_DB / 10)
 
     @property
@@ -148,7 +148,7 @@ class Interference:
 
     @property
     def gain(self) -> NDArray[np.float32]:
-        """(subcarrier,) float32, factors of eq. 2: 0 where excluded, else such that echoes keep their amplitude."""
+        """(subcarrier,) float32, factors of eq. 2: 0 for excluded subcarriers; the rest preserves echo amplitudes."""
         return np.where(self.excluded, 0.0, 1 / (1 - self.lost_share)).astype(np.float32)
 
     @property
@@ -167,7 +167,7 @@ class Interference:
 
     @property
     def flags(self) -> Flags:
-        """`interference` if any subcarrier has it."""
+        """Flag `interference` if any subcarrier has interference."""
         if not self.excluded.any():
             return Flags()
         excess, strongest = decibels(float(self.excess.max())), float(self.frequency_hz[self.excess.argmax()])
@@ -182,4 +182,4 @@ class Interference:
         return Flags({"interference": f"{where} ({service}): noise {excess:.1f} dB above the neighbours; {done}"})
 
 
-_LISTED = 32  # frequencies in a report, at most
+_LISTED = 32  # largest number of frequencies in a report

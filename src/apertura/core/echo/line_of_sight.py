@@ -15,7 +15,7 @@ LOCK_FALSE_ALARM = 1e-3
 
 _PULSES_AT_ONCE = 64
 _GROUPS = 32
-_NOISE_CELLS = 256  # number of cells at which their median is accurate to 0.4 dB
+_NOISE_CELLS = 256  # number of cells for which the median is accurate to 0.4 dB
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def fit_block(sidelink: Complexes) -> tuple[LineOfSight, Complexes]:
     direct = profile[:, 0].astype(np.complex128)
     cells = profile[:, :: max(1, subcarriers // _NOISE_CELLS)]
     power = np.square(cells.real) + np.square(cells.imag)
-    # the median of an exponential variable is ln 2 of its mean; a few strong cells (echoes, ripple) do not affect it
+    # the median of an exponential variable is ln 2 times its mean; a few strong cells (echoes, ripple) have no effect
     half = power.shape[1] // 2
     power.sort(axis=1)  # five times as fast as numpy.median
     middle = (power[:, half] + power[:, (power.shape[1] - 1) // 2]).astype(np.float64) / 2
@@ -136,7 +136,7 @@ def _residual_cells(sums: NDArray[np.complex128], number: Floats, subcarriers: i
 
 
 def _lock_threshold(subcarriers: int) -> float:
-    """Return the threshold relative to the mean noise of a delay cell that noise exceeds once in 1/P_fa pulses.
+    """Return the threshold relative to the mean noise of a delay cell for the false-alarm probability P_fa per pulse.
 
     |h(τ)|² of noise of bandwidth B crosses T times its mean √(πT/3)·exp(-T) times per cell of 1/B; there are N cells.
     """

@@ -14,11 +14,11 @@ from apertura.common.units import decibels
 FALSE_ALARM = 1e-5
 """Probability that a wrong code is confirmed."""
 
-_COHERENT_PULSES = 8, 32, 128  # pulses added coherently, at each Doppler frequency
-_GUARD_CELLS = 8  # on both sides of the prefix, for sidelobes of echoes inside
-_FEWEST_CELLS = 32  # outside the prefix, required to estimate the floor
+_COHERENT_PULSES = 8, 32, 128  # number of pulses added coherently, at each Doppler frequency
+_GUARD_CELLS = 8  # cells excluded on both sides of the prefix, for sidelobes of echoes inside the prefix
+_FEWEST_CELLS = 32  # cells outside the prefix required to estimate the floor
 _NOISE_SIGMAS = 6.0  # excess scatter above which cells outside the prefix may contain more than noise
-_SPREAD_SIGMAS = 10.0  # excess scatter above which they certainly do
+_SPREAD_SIGMAS = 10.0  # excess scatter above which these cells certainly contain more than noise
 
 
 @dataclass(frozen=True)
@@ -43,12 +43,12 @@ class CodeEvidence:
 
     @property
     def flags(self) -> dict[str, str]:
-        """A flag if the recording does not contain the code."""
+        """Flag raised if the recording does not contain the code."""
         return {"code_unconfirmed": self.evidence} if self.carried is False else {}
 
 
 def own_code(transfer: NDArray[np.complex64], *, prefix_cells: int) -> CodeEvidence:
-    """Test the code of monostatic echoes: with the right code they are compressed inside the prefix.
+    """Test the code of monostatic echoes: the correct code compresses echoes inside the prefix.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def own_code(transfer: NDArray[np.complex64], *, prefix_cells: int) -> CodeEvide
 
 
 def _strongest(profile: NDArray[np.complex64], run: int, inside: int, beyond: slice) -> tuple[float, float, float]:
-    """Return the strongest cell inside the prefix, its threshold, and the excess scatter of cells outside, in σ.
+    """Return the strongest cell inside the prefix, its threshold, and the excess scatter of cells outside it, in σ.
 
     Levels are relative to the mean beyond the prefix at the same Doppler frequency.
     """
@@ -110,8 +110,8 @@ def _strongest(profile: NDArray[np.complex64], run: int, inside: int, beyond: sl
     scatter = floor.std(1) / mean
     false_alarm = FALSE_ALARM / (inside * len(power))  # per cell
     sigmas = (blocks * scatter**2 - 1) / np.sqrt((2 + 6 / blocks) / floor.shape[1])
-    # The floor of a wrong code repeats in all pulses: unlike noise, it is exponentially distributed over the cells for
-    # any number of pulses added.
+    # The floor of a wrong code is the same in all pulses: unlike noise, it is exponentially distributed over the cells
+    # for any number of added pulses.
     is_noise = sigmas.max() < _NOISE_SIGMAS
     needed = (
         scipy.special.gammainccinv(blocks, false_alarm) / blocks
@@ -132,9 +132,9 @@ STEADY = 0.93
 """Least agreement of magnitudes from pulse to pulse: it is π/4 for independent speckle, 0.95 at an SNR of 10 dB."""
 
 ECHO_DB = 13.0
-"""dB above the noise, least mean power of the cells evaluated; noise dominates the phase of weaker cells."""
+"""Least mean power of evaluated cells relative to the noise, dB; in weaker cells, noise dominates the phase."""
 
-_FEWEST_TRIPLES = 20  # triples of consecutive pulses required to estimate a coherence
+_FEWEST_TRIPLES = 20  # least number of triples of consecutive pulses to estimate a coherence
 _EVEN = 0.25  # tolerated deviation from the median interval, as a share; a larger one indicates missing pulses
 
 
@@ -147,7 +147,7 @@ class PhaseStability:
     coherence
         |mean exp(jφ'')| of the second differences φ'' of phase, weighted by power; 1 for smooth motion.
     steadiness
-        Agreement of the magnitudes of neighbouring pulses; 1 if the scatterers do not change.
+        Agreement of the magnitudes of neighbouring pulses; 1 for constant scatterers.
     """
 
     coherence: float
@@ -165,7 +165,7 @@ class PhaseStability:
 
     @property
     def flags(self) -> dict[str, str]:
-        """A flag if echoes of constant magnitude have a random phase from pulse to pulse."""
+        """Flag raised if echoes of constant magnitude have a random phase from pulse to pulse."""
         if self.steadiness < STEADY or self.coherence >= LEAST_COHERENCE:
             return {}
         line = (

@@ -15,19 +15,21 @@ from apertura.common.arrays import Floats
 from apertura.common.units import decibels
 
 BAND_FLOOR_DB = -10.0
-"""dB relative to the highest power of the pulse, level of the band edges if the band is not configured."""
+"""Level of the band edges if the band is not configured, dB relative to the highest power of the pulse."""
 
 NULL_DB = -20.0
-"""dB relative to the mean, level below which bins are attenuated, not divided: limits noise amplification to 20 dB."""
+"""Level below which bins are attenuated instead of divided, dB relative to the mean: limits noise amplification to 20
+dB."""
 
 FLAT_DB = -30.0
-"""dB, ripple power below which a spectrum is not divided: its range sidelobes are lower."""
+"""Ripple power below which a spectrum is not divided, dB: the range sidelobes from ripple are below this level."""
 
 SIDELOBES_DB = -25.0
-"""dB, range sidelobes above which a flag is raised; those of the Hann window are -31.5 dB."""
+"""Level of range sidelobes above which a flag is raised, dB; that of the Hann window is -31.5 dB."""
 
 MOST_LOSS_DB = 6.0
-"""dB of SNR, largest loss at which the inverse filter is chosen; a flag is raised if a requested filter exceeds it."""
+"""Largest loss of SNR for which the inverse filter is chosen, dB; if the loss of a requested filter exceeds it, a flag
+is raised."""
 
 _SMOOTH = 64  # the level is averaged over this fraction (1/64) of the sampled band
 
@@ -98,7 +100,7 @@ def occupied_band(power: Floats) -> tuple[int, int]:
     top = int(level.argmax())
     first = int(below[below < top].max(initial=-1)) + 1
     last = int(below[below > top].min(initial=length)) - 1
-    # the running mean widens the band at its edges: restrict it to bins that exceed the threshold themselves
+    # the running mean widens the band: restrict it to bins whose own power exceeds the threshold
     strong = first + np.flatnonzero(ordered[first : last + 1] >= threshold)
     return int(strong[0]) - length // 2, int(strong[-1]) - length // 2
 
@@ -111,7 +113,7 @@ def pulse_filter(spectrum: NDArray[np.complexfloating], *, requested: str) -> Pu
     spectrum
         (bin,) complex, spectrum S of the pulse over the band.
     requested
-        inverse, matched, or auto: matched for a flat spectrum, else inverse where it is adequate.
+        'inverse', 'matched', or 'auto': matched for a flat spectrum, otherwise inverse if it is adequate.
 
     Raises
     ------
@@ -162,7 +164,7 @@ def pulse_filter(spectrum: NDArray[np.complexfloating], *, requested: str) -> Pu
 def truncation_flags(
     delay_s: Floats, *, lead_s: float, pulse_s: float, listen_s: float, cell_s: float
 ) -> dict[str, str]:
-    """Return the flag of captures that truncate the direct pulse; {} if there are none.
+    """Return the flag of captures that truncate the direct pulse; {} without such captures.
 
     Parameters
     ----------
@@ -181,7 +183,7 @@ def truncation_flags(
     """
     known = delay_s[np.isfinite(delay_s)]
     length_s = lead_s + pulse_s + listen_s
-    # a delay is known modulo the capture's length: half of the pulse may be missing on either side
+    # a delay is known only modulo the length of the capture: up to half of the pulse may be missing on either side
     after_s = (known + lead_s + pulse_s / 2) % length_s - pulse_s / 2
     cut = int(((after_s < -cell_s) | (after_s > lead_s + listen_s + cell_s)).sum())
     line = f"captures of {cut} of {len(delay_s)} pulses start or end within the direct pulse"

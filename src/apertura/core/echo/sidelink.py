@@ -1,8 +1,9 @@
 """Correction of an echo by the sidelink: removal of clock, phase, timing and transmit ripple common to both channels.
 
 Every method replaces the radar's transfer function R by R·A/S. S is the sidelink or a model of it, and A is its
-amplitude in the same pulse: images remain in the units of the radar channel, comparable with monostatic images, and a
-fading sidelink does not amplify its pulse. A new method requires a function, a row in `METHODS`, and limits in `edges`.
+amplitude in the same pulse: images remain in the units of the radar channel, comparable with monostatic images, and
+fading of the sidelink does not amplify a pulse. A new method requires a function, a row in `METHODS`, and limits in
+`edges`.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,16 +20,16 @@ from apertura.core.echo.sidelink_state import ECHO_DB, GATE_CELLS, NULL_DB, Side
 __all__ = ["METHODS", "choose", "divide", "edges", "gated", "measure", "two_parameter", "wiener"]
 
 DIVIDE_SNR_DB = 10.0
-"""dB per subcarrier, least SNR for `divide` (docs/theory/echo_methods.md, "Which correction")."""
+"""Least SNR per subcarrier for `divide`, dB (docs/theory/echo_methods.md, "Which correction")."""
 
 WIENER_SNR_DB = 6.0
-"""dB per subcarrier, least SNR for `wiener` (same source)."""
+"""Least SNR per subcarrier for `wiener`, dB (same source)."""
 
 RIPPLE_DB = 0.5
-"""dB peak to peak, largest residual ripple of a method that does not remove ripple (same source)."""
+"""Largest ripple that may remain after a correction, dB peak to peak (same source)."""
 
 FIT_SNR_DB = 13.4
-"""dB, N·SNR of the whole pulse, below which errors of the two fitted parameters cause a loss of more than 0.2 dB."""
+"""N·SNR of the whole pulse, dB, below which errors of the two fitted parameters cause a loss of more than 0.2 dB."""
 
 _PULSES_AT_ONCE = 64
 _Inverse = Callable[[Complexes, LineOfSight], Complexes]
@@ -37,20 +38,20 @@ _Inverse = Callable[[Complexes, LineOfSight], Complexes]
 def divide(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None) -> Complexes:
     """Return R·A/S, (pulse, subcarrier) complex64 in the units of `radar`.
 
-    Where |S| is more than 20 dB below A, in a spectral null or by noise, it is set to 20 dB below A: a null attenuates
-    its subcarrier, and no subcarrier is amplified more than tenfold.
+    Where |S| is more than 20 dB below A, in a spectral null or due to noise, it is set to 20 dB below A: a subcarrier
+    in a null is attenuated, and no subcarrier is amplified more than tenfold.
 
     Parameters
     ----------
     radar, sidelink
         (pulse, subcarrier) complex64 of the same captures.
     path
-        The sidelink's direct path, if `measure` has fitted it already.
+        The direct path of the sidelink as fitted by `measure`; fitted here by default.
 
     Notes
     -----
-    Source: docs/theory/echo_methods.md, "Corrections". The only method that is exact for any transmit ripple and for
-    a wrong code.
+    Source: docs/theory/echo_methods.md, "Corrections". This is the only method that is exact for any transmit ripple
+    and for a wrong code.
 
     Examples
     --------
@@ -101,7 +102,8 @@ def gated(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None
         subcarriers = symbols.shape[1]
         direct = phasor(path, subcarriers)
         profile = scipy.fft.ifft(symbols * direct.conj(), axis=1)
-        profile[:, GATE_CELLS + 1 : subcarriers - GATE_CELLS] = 0  # no cells to remove below 33 subcarriers
+        # with fewer than 33 subcarriers, all cells are inside the gate
+        profile[:, GATE_CELLS + 1 : subcarriers - GATE_CELLS] = 0
         clean = scipy.fft.fft(profile, axis=1) * direct
         return _bounded_inverse(clean, path.amplitude[:, None].astype(np.float32))
 
@@ -134,7 +136,7 @@ METHODS: Mapping[str, Callable[..., Complexes]] = {
 
 
 DIVIDING = "divide", "wiener"
-"""Methods that remove any transmitted spectrum; the others assume a flat spectrum and a single path."""
+"""Methods that remove any transmitted spectrum; the other methods assume a flat spectrum and a single path."""
 
 
 def edges(method: str, state: SidelinkState) -> dict[str, str]:
@@ -186,7 +188,7 @@ def choose(state: SidelinkState) -> tuple[str, str]:
     )
     if adequate:
         return adequate[0], f"{summary}: adequate method of lowest cost"
-    # two_parameter makes every locked pulse coherent: ghosts may remain, but the image is formed
+    # two_parameter makes every locked pulse coherent: an image can be formed, possibly with ghosts
     fallback = "wiener" if "wrong_code" in state.flags else "two_parameter"
     return fallback, f"{summary}: no method is adequate, smallest error ({'; '.join(exceeded[fallback].values())})"
 
@@ -210,7 +212,7 @@ def _bounded_inverse(symbols: Complexes, amplitude: NDArray[np.float32]) -> Comp
 
 
 def _weakest(amplitude: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the |S| below which a subcarrier is attenuated instead of divided; it and its square are never zero."""
+    """Return the |S| below which a subcarrier is attenuated instead of divided; neither it nor its square is zero."""
     return np.asarray(np.maximum(amplitude * 10 ** (NULL_DB / 20), 1e-15), np.float32)
 
 

@@ -87,9 +87,10 @@ GATE_CELLS = 16
 
 
 def strongest_echo(average: SidelinkAverage) -> tuple[float, int]:
-    """Measure level (dB) and delay (cells, 0 if none) of the strongest arrival in addition to the direct path.
+    """Measure level (dB) and delay (cells; 0 without a detection) of the strongest arrival besides the direct path.
 
-    Ripple causes echoes on both sides of the direct path, a reflection on one side. The excess of one side is measured.
+    Ripple causes echoes on both sides of the direct path, a reflection causes an echo on one side. Measured is the
+    power on one side in excess of the other.
     """
     cells = np.arange(2, average.power.size - 1)
     excess = average.power - average.noise
@@ -99,7 +100,7 @@ def strongest_echo(average: SidelinkAverage) -> tuple[float, int]:
     # threshold of the highest of N averages of exponentially distributed noise, at the false-alarm rate of the lock
     highest = scipy.special.gammainccinv(average.pulses, LOCK_FALSE_ALARM / average.power.size) / average.pulses
     threshold = average.noise * (float(highest) - 1)
-    # an arrival whose delay changes from pulse to pulse averages out: another transmitter with its own clock
+    # an arrival with a varying delay, as from another transmitter with its own clock, averages out
     highest_noise = average.noise * np.log(average.power.size / LOCK_FALSE_ALARM)
     if average.second_power > max(4 * average.power[average.second_cell], highest_noise, level):
         level, cell = average.second_power, average.second_cell
@@ -113,7 +114,7 @@ def ripple(average: SidelinkAverage, *, one_sided: bool) -> tuple[float, int, fl
 
     Ripple is measured by the echoes common to all pulses: a cosine of amplitude a causes two echoes of a/2, a
     reflection in the transmitter one echo of a. Outside the gate, and inside unless `one_sided`, an echo on one side
-    only is attributed to another path of the sidelink.
+    only is attributed to a second path of the sidelink.
     """
     power = np.abs(average.mean / average.mean[0]) ** 2
     cells = np.arange(1, power.size // 2)
@@ -144,13 +145,15 @@ def _peak_to_peak_db(amplitude: float) -> float:
 # ---- State of a sidelink
 
 ECHO_DB = -20.0
-"""dB relative to the image, tolerated level of ghosts; an echo of the sidelink causes a ghost of the same level."""
+"""Tolerated level of ghosts, dB relative to the image; an echo of the sidelink causes a ghost of the same level."""
 
 SECOND_ARRIVAL_DB = -6.0
-"""dB relative to the direct path above which another arrival indicates a second transmitter or a strong reflection."""
+"""Level, dB relative to the direct path, above which another arrival indicates a second transmitter or strong
+reflection."""
 
 NULL_DB = -20.0
-"""dB relative to the mean below which a subcarrier is a null: division would amplify its noise by more than 20 dB."""
+"""Level, dB relative to the mean, below which a subcarrier is a null: division would amplify its noise by more than 20
+dB."""
 
 
 @dataclass(frozen=True)
@@ -167,9 +170,10 @@ class SidelinkState:
     echo_cells
         Delay of that arrival after the direct path, in cells of 1/B; 0 if none was detected.
     echo_steady
-        True if its phase relative to the direct path is the same in most pulses: its cause may be the transmitter.
+        True if the phase of that arrival relative to the direct path is the same in most pulses, so that its cause may
+        be the transmitter.
     ripple_db
-        Peak-to-peak ripple common to all pulses and resolved within the gate, as of one sinusoid.
+        Peak-to-peak ripple common to all pulses and resolved within the gate, modelled as one sinusoid.
     ripple_cells
         Distance of the strongest arrival of `ripple_db` from the direct path, in cells of 1/B; 0 without ripple.
     fine_ripple_db
@@ -203,18 +207,18 @@ class SidelinkState:
 
     @property
     def delay_cells(self) -> Floats:
-        """(pulse,) float64, delay of the direct path in cells of 1/B; NaN where it did not lock."""
+        """(pulse,) float64, delay of the direct path in cells of 1/B; NaN in pulses without lock."""
         return np.where(self.path.locked, self.path.delay_cells, np.nan)
 
     @property
     def snr_of_pulses_db(self) -> Floats:
-        """(pulse,) float64, SNR per subcarrier of each pulse, dB; NaN where it did not lock."""
+        """(pulse,) float64, SNR per subcarrier of each pulse, dB; NaN in pulses without lock."""
         snr = self.path.amplitude**2 / np.maximum(self.path.noise_power, 1e-30)
         return np.where(self.path.locked, 10 * np.log10(np.maximum(snr, 1e-30)), np.nan)
 
     @property
     def phase_rad(self) -> Floats:
-        """(pulse,) float64, phase of the direct path at the middle of the band, radians; NaN where it did not lock."""
+        """(pulse,) float64, phase of the direct path at the middle of the band, radians; NaN in pulses without lock."""
         return np.where(self.path.locked, self.path.phase_rad, np.nan)
 
 
@@ -277,7 +281,7 @@ def _state_of(path: LineOfSight, average: SidelinkAverage) -> SidelinkState:
         ripple_cells=ripple_cells,
         fine_ripple_db=fine_ripple_db,
         near_db=changing_near(average),
-        # a null is measurable only where the noise is well below it
+        # a null is measurable only if the noise is well below its level
         null_share=float(np.mean(flat < flat.mean() * 10 ** (NULL_DB / 10))) if snr > 10 else 0.0,
         locked=path.locked,
         path=path,
@@ -301,7 +305,8 @@ def _measure_without_code(blocks: Callable[[], Iterable[Complexes]], path: LineO
     locked = np.zeros(pulses, bool)
     locked[1:] |= common.locked
     locked[:-1] |= common.locked
-    snr_db = decibels(product + np.sqrt(product**2 + product))  # noise of both factors: product = snr²/(2·snr + 1)
+    # SNR of the product of two noisy factors: product = snr²/(2·snr + 1)
+    snr_db = decibels(product + np.sqrt(product**2 + product))
     line = (
         f"the sidelink (SNR {snr_db:.0f} dB) does not contain the configured code: division by the sidelink is valid "
         "for any code, so this image is right; monostatic images of the transmitter are wrong"
@@ -325,7 +330,7 @@ def _flags(state: SidelinkState) -> dict[str, str]:
     flags = {}
     unlocked = int((~state.locked).sum())
     if unlocked:
-        flags["sidelink_lost"] = f"{unlocked} of {state.locked.size} pulses excluded: their sidelink does not lock"
+        flags["sidelink_lost"] = f"{unlocked} of {state.locked.size} pulses excluded: no sidelink detected"
     if state.echo_cells and state.echo_db > SECOND_ARRIVAL_DB:
         flags["second_arrival"] = (
             f"a second arrival of {state.echo_db:.1f} dB relative to the direct path, {state.echo_cells:+d} cells from "

@@ -1,8 +1,8 @@
-"""Transfer functions from the captures of a pair: by the code alone, or corrected by the sidelink.
+"""Transfer functions from the captures of a pair: with the code alone, or corrected by the sidelink.
 
-Two passes over the captures: the first measures clock and sidelink, a few numbers per pulse; the second computes
-transfer functions from these numbers, block by block and on demand. Memory holds one block of captures, for any length
-of the flight.
+Captures are read in two passes: the first measures clock and sidelink, a few numbers per pulse; the second computes
+transfer functions from the captures and these numbers, block by block and on demand. Only one block of captures is in
+memory at a time, for any length of the flight.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -39,10 +39,10 @@ _INVERTED = (
     "the conjugate samples contain the code: set waveform.iq to swapped if I and Q are swapped, or to conjugate if the "
     "local oscillator is above the band; for a single node, set nodes.<n>.iq"
 )
-_COMPRESSED = 4.0  # least ratio of the peak-to-mean ratios of delay profiles, of conjugate samples to samples
+_COMPRESSED = 4.0  # least ratio of the peak-to-mean ratio of delay profiles of conjugate samples to that of the samples
 
-_STRETCH = 128  # consecutive pulses, of each part of the flight, in which code and phase are checked
-_CLOCK_STRETCH = 256  # consecutive pulses, of each part of the flight, in which the clock is measured
+_STRETCH = 128  # number of consecutive pulses in each part of the flight in which code and phase are checked
+_CLOCK_STRETCH = 256  # number of consecutive pulses in each part of the flight in which the clock is measured
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Correction:
     clock_hz
         (pulse,) float64, carrier offset removed from the samples of the receiver; None: not corrected.
     sfo_ppm
-        Offset of its sampling rate, corrected together with the carrier offset.
+        Offset of the receiver's sampling rate, corrected together with the carrier offset.
     """
 
     method: str
@@ -128,7 +128,7 @@ class Transfer:
         Decisions with reasons: clock, sidelink, code.
     sidelink_delay_m, sidelink_snr_db, sidelink_phase_rad
         (pulse,) float64, measurements of the sidelink in the captures used: delay times c, metres, SNR per
-        subcarrier and phase at mid-band; NaN where it did not lock, None without a sidelink.
+        subcarrier and phase at mid-band; NaN in pulses without lock, None without a sidelink.
     form
         Function of ascending capture numbers that returns their transfer functions, (pulse, subcarrier) complex64.
         The code is removed; electrical paths are not removed.
@@ -150,7 +150,7 @@ class Transfer:
 
 
 def transfer_by_code(read: Read, inverse: Complexes, numerology: Numerology, *, time_s: Floats) -> Transfer:
-    """Return the monostatic transfer functions of a node, whose receiver has the clock of the transmitter.
+    """Return the monostatic transfer functions of a node; its transmitter and receiver have the same clock.
 
     Parameters
     ----------
@@ -234,7 +234,7 @@ def transfer_by_sidelink(
     Notes
     -----
     Source: docs/theory/echo_methods.md. The clock is measured on up to 4096 captures, in 16 groups spread over the
-    flight, the state of the sidelink on all captures.
+    flight; the state of the sidelink is measured on all captures.
     """
     # First pass: measure the clock on a sample of captures, the state of the sidelink on all.
     demodulator = Demodulator(inverse, numerology, symbol_samples)
@@ -328,7 +328,7 @@ class _Receiver:
     count: int  # number of captures
     report: dict[str, Any]
     clock_flags: dict[str, str]
-    clock_hz: Floats | None = None  # carrier offset of each capture; None: not corrected
+    clock_hz: Floats | None = None  # carrier offset of each capture, Hz; None: not corrected
     sfo_ppm: float = 0.0
 
     @classmethod

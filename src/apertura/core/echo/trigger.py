@@ -20,7 +20,7 @@ ABSENT = -1
 
 @dataclass(frozen=True)
 class PulseFraming:
-    """Framing of a pulse: preamble | counter, most significant bit first | inverted counter | guard | prefix, symbol.
+    """Framing of a pulse: preamble | counter, high bit first | inverted counter | guard | prefix and symbol.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class PulseFraming:
     counter_bits
         Width of the frame counter; 0 without payload.
     bit_chips
-        Chips per payload bit, all of one sign: +1 for a one.
+        Chips per payload bit, all with the same sign: +1 for a one, -1 for a zero.
     guard_samples
         Length of the pause between payload and cyclic prefix.
     """
@@ -63,7 +63,7 @@ class PulseFraming:
         return np.asarray(np.repeat(self.preamble, self.chip_samples) * self._carrier(0, len(self.preamble)))
 
     def read_counter(self, samples: Samples) -> int:
-        """Decode the frame number of a capture that starts with its preamble; -1 if a bit is not certain.
+        """Decode the frame number of a capture that starts with its preamble; -1 if a bit is uncertain.
 
         Parameters
         ----------
@@ -88,7 +88,7 @@ class PulseFraming:
         carrier = self._carrier(len(self.preamble), 2 * self.counter_bits * self.bit_chips)
         sums = (iq[length:] * carrier.conj()).reshape(2 * self.counter_bits, -1).sum(1)
         soft, inverse = np.split(np.real(sums * phase.conj()) / np.abs(phase) ** 2 * length, 2)
-        expected = self.bit_chips * self.chip_samples  # magnitude of a bit without noise
+        expected = self.bit_chips * self.chip_samples  # magnitude of a noise-free bit
         bits = soft > inverse
         if (np.sign(soft) == np.sign(inverse)).any() or (np.abs(soft - inverse) < expected).any():
             return ABSENT
@@ -103,7 +103,8 @@ class PulseFraming:
 
 
 _SMALLEST_TRANSFORM = 2**16
-_NO_SIGNAL = 1e-10  # energy under a preamble relative to that of the window, below which rounding dominates
+# energy over the length of a preamble relative to that of the window, below which rounding errors dominate
+_NO_SIGNAL = 1e-10
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,7 @@ class Detection:
     sample
         Its first sample, counted from the start of the recording.
     score
-        Squared normalised correlation: share of the energy that is due to the preamble, 0…1.
+        Squared normalised correlation, 0…1: share of the energy that is due to the preamble.
     snr_db
         SNR per sample, derived from the score.
     """
@@ -169,7 +170,7 @@ def find_preambles(
 
 
 def score_threshold(template_samples: int, false_alarm: float) -> float:
-    """Return the score that noise exceeds with probability `false_alarm` at one sample.
+    """Return the score that is exceeded by noise with probability `false_alarm` at one sample.
 
     For white Gaussian noise the score is the squared cosine between two directions, one of which is random. Its
     distribution is Beta(1, L-1) at any noise level, so P(score > γ) = (1-γ)^(L-1).
@@ -223,10 +224,10 @@ def _windows(blocks: Iterable[Samples], size: int, *, overlap: int) -> Iterator[
 
 
 class _PeakSearch:
-    """Search for the highest score within one preamble length of the first above threshold, then a dead time.
+    """Search for the highest score within one preamble length of the first score above threshold; a dead time follows.
 
-    The sidelobes of a strong preamble exceed the threshold before its main peak, by less than the preamble length. The
-    dead time is a frame.
+    Sidelobes of a strong preamble exceed the threshold up to one preamble length before its main peak. The dead time is
+    the length of a frame.
     """
 
     def __init__(self, threshold: float, reach: int, dead_time: int) -> None:
@@ -281,7 +282,7 @@ class SampleSource(Protocol):
 
 @dataclass(frozen=True)
 class TriggeredCaptures:
-    """Captures extracted from a continuous recording, as a triggered recorder stores them.
+    """Captures extracted from a continuous recording, in the form stored by a triggered recorder.
 
     Attributes
     ----------

@@ -15,12 +15,12 @@ Weigh = Callable[[slice, NDArray[np.float64]], NDArray[np.float64]]
 """Pulses and points (point, 3) → (pulse, point) float64."""
 
 _PULSES_AT_ONCE = 2048
-_STRETCHES = 64  # parts of the aperture at which phase rates are evaluated
-_STEPS_IN_A_ROW = 63  # consecutive steps whose median is used, so that missed pulses have no effect
+_STRETCHES = 64  # number of subapertures at which phase rates are evaluated
+_STEPS_IN_A_ROW = 63  # number of consecutive steps whose median is used, so that missing pulses have no effect
 
 
 _COARSEST_M = 2.0**-10
-"""Metres, spacing of floating-point numbers above which a track is rejected: its rounding error is 0.01 cycles of
+"""Spacing of floating-point numbers, metres, above which a track is rejected: the rounding error is 0.01 cycles of
 two-way path at L-band."""
 
 
@@ -34,8 +34,8 @@ def distance(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray
 
     Notes
     -----
-    Equal to `numpy.linalg.norm` of the difference to the last bit, in a quarter of its time or less, because the axes
-    are processed separately.
+    The result equals `numpy.linalg.norm` of the difference to the last bit. The computation takes a quarter of the time
+    or less, because the axes are processed separately.
 
     Examples
     --------
@@ -57,7 +57,8 @@ def as_array(value: Any, kind: type, where: str) -> Any:
     value
         An array, a list or a number.
     kind
-        ``np.float64`` or ``np.complex64``; real numbers are not accepted as complex samples: their phase is lost.
+        ``np.float64`` or ``np.complex64``. Real numbers are not accepted as complex samples, because their phase is
+        lost.
     where
         Name of the argument in errors.
 
@@ -72,7 +73,7 @@ def as_array(value: Any, kind: type, where: str) -> Any:
     array([1., 2.])
     """
     try:
-        # Arrays that are lazy by rows (tables of other modules) stay lazy; those of dask are computed.
+        # Arrays that are lazy by rows (tables of other modules) remain lazy; dask arrays are computed.
         lazy = hasattr(value, "ndim") and not hasattr(value, "__dask_graph__")
         array = value if lazy else np.asarray(value)
         usable = array.dtype.kind in ("c" if kind is np.complex64 else "iuf")
@@ -239,19 +240,19 @@ class Aperture:
         return gradient
 
     def phase_rates(self, points_m: NDArray[np.float64], *, wavelength_m: float) -> tuple[float, float]:
-        """Return the spread of phase rates over the scene, and the largest relative to its middle, cycles per pulse.
+        """Return the spread of phase rates over the scene, and the largest relative to its centre, cycles per pulse.
 
         Parameters
         ----------
         points_m
-            (point, 3) float64, metres: spread over the scene, its middle at the middle of the array.
+            (point, 3) float64, metres: spread over the scene, with its centre at the middle of the array.
         wavelength_m
             Wavelength of the highest frequency.
 
         Notes
         -----
         Source: docs/theory/planner.md, "Pulses". A spread above 1 causes azimuth ambiguities. The spread is the largest
-        median of 63 consecutive steps, so that missed pulses and gaps are not mistaken for undersampling.
+        median of 63 consecutive steps, so that missing pulses and gaps are not mistaken for undersampling.
 
         Examples
         --------
@@ -272,7 +273,7 @@ class Aperture:
         return float(np.median(windows, axis=1).max()) / wavelength_m, widest / wavelength_m
 
     def ambiguities(self, points_m: NDArray[np.float64], *, wavelength_m: float) -> NDArray[np.float64]:
-        """Return the level of azimuth ambiguities of the scene's own echo at each of its points.
+        """Return the level of azimuth ambiguities at each point of the scene, from echoes of the scene itself.
 
         Parameters
         ----------
@@ -284,8 +285,9 @@ class Aperture:
         Returns
         -------
         ndarray
-            (point,) float64: number of orders n ≠ 0, mean over the pulses, for which the scene has a phase rate n
-            cycles per pulse from that of the point. 0: unambiguous; 1: ambiguities as strong as the surroundings.
+            (point,) float64: number of orders n ≠ 0, mean over the pulses, for which some point of the scene has a
+            phase rate that differs by n cycles per pulse from that of the point. 0: unambiguous; 1: ambiguities as
+            strong as the surroundings.
 
         Notes
         -----
@@ -342,7 +344,7 @@ class Aperture:
         return 1 / widest
 
     def cross_cell_m(self, ground_m: NDArray[np.float64], *, wavelength_m: float) -> float:
-        """Return the cross-range resolution at the middle of the scene, metres; infinite without motion.
+        """Return the cross-range resolution at the scene centre, metres; infinite without motion.
 
         Parameters
         ----------

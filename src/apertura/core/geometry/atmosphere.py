@@ -12,21 +12,22 @@ from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import LOCAL, geodetic_from_ecef
 
 SCALE_HEIGHT_M = 7350.0
-"""Metres, height over which the refractivity of air decreases to 1/e: global mean profile of ITU-R P.453."""
+"""Height over which the refractivity of air decreases to 1/e, metres: global mean profile of ITU-R P.453."""
 
 STANDARD_HUMIDITY_PERCENT = 50.0
-"""Percent, relative humidity if none is configured; the standard atmosphere is dry."""
+"""Relative humidity if none is configured, percent; the standard atmosphere is dry."""
 
 USUAL_N = 300.0
-"""N units, typical refractivity at the terrain, the error if vacuum is assumed for a recorded flight."""
+"""Typical refractivity at the terrain, N units: the error if vacuum is assumed for a recorded flight."""
 
 _STANDARD_K, _STANDARD_HPA, _LAPSE_K_M, _BAROMETRIC = 288.15, 1013.25, 6.5e-3, 5.2559  # ISO 2533, below 11 km
-_HIGHEST_M = 11_000.0  # upper limit of this lapse rate
+_HIGHEST_M = 11_000.0  # upper height limit of this lapse rate
 _UNKNOWN = 10.0, 20.0, 100 / np.sqrt(12)  # K, hPa, % (uniform): standard deviations about the standard atmosphere
 _MEASURED = 1.0, 1.0, 5.0  # K, hPa, %: accuracy of thermometer, barometer and hygrometer in the field
 _STATED_N = 1.0  # N units: accuracy of a configured refractivity
 _LEAST_N, _MOST_N = 20.0, 1000.0  # N units: 20 at an altitude of 20 km, 500 in the hottest and wettest air at sea level
-_PROFILE = 0.1  # error of the decrease from the terrain to the mean of the path: scale heights of 6.5 to 8.2 km
+# relative error of the decrease from the terrain to the mean along the path, for scale heights of 6.5 to 8.2 km
+_PROFILE = 0.1
 
 
 def refractivity(temperature_c: float, pressure_hpa: float, relative_humidity: float) -> float:
@@ -189,7 +190,8 @@ class Atmosphere:
         tx_m, rx_m
             (pulse,) float64, heights of the antennas, metres.
         range_m
-            (pulse,) float64 each: distances of both antennas from the scene, metres, the weights of both one-way paths.
+            (pulse,) float64 each: distances of both antennas from the scene, metres, used as weights of the one-way
+            paths.
         """
         legs = np.stack([self.mean_n(tx_m, self.ground_m), self.mean_n(rx_m, self.ground_m)])
         length_m = np.stack(range_m)
@@ -215,17 +217,17 @@ class FlightAir:
     Attributes
     ----------
     refractivity_n
-        Mean of N over pulses and along both one-way paths.
+        Mean of N along both one-way paths and over the pulses.
     std_n
         Its standard deviation, N units.
     atmosphere
-        Atmosphere over which it is averaged.
+        Atmosphere whose refractivity is averaged.
     antennas_m
         Mean height of the antennas, metres.
     path_m
         Mean total path to the scene, metres.
     left_m
-        Largest error of a total path by the constant refractivity, metres.
+        Largest error of a total path due to the constant refractivity, metres.
     """
 
     refractivity_n: float
@@ -266,7 +268,7 @@ class SceneAir:
     atmosphere
         Refractivity as a function of height.
     middle_m
-        (3,) float64, metres, in the frame of the antennas: the middle of the scene.
+        (3,) float64, metres, in the frame of the antennas: the scene centre.
     frame
         'ecef' (heights above the ellipsoid) or 'local' (heights are z).
     """
@@ -284,7 +286,7 @@ class SceneAir:
     def electrical_m(self, one_m: Floats, other_m: Floats) -> Floats:
         """Return the electrical length (c times delay) of straight paths between antennas (pulse, 3), (pulse,) metres.
 
-        It uses the refractivity at the height of the antennas, which is lower than that along paths to the scene.
+        The refractivity at the height of the antennas is used, which is lower than that along paths to the scene.
         """
         length_m = np.linalg.norm(one_m - other_m, axis=1)
         mean_n = self.atmosphere.mean_n(self._heights(one_m), self._heights(other_m))

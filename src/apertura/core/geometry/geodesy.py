@@ -1,6 +1,6 @@
 """Geodetic, projected and Earth-centred coordinates, and rotations of body axes.
 
-Positions are processed in ECEF (EPSG:4978), float64, which has no zones, no scale factor and no curvature to model.
+Positions are processed in ECEF (EPSG:4978), float64, so that no zones, scale factors or Earth curvature are modelled.
 """
 
 from functools import lru_cache
@@ -84,7 +84,7 @@ def ecef_from_projected(crs: str, x: Positions, y: Positions, height_m: Position
     """
     if is_on_wgs84(crs):
         position = np.stack(_transformer(crs, ECEF).transform(x, y, height_m), axis=-1)
-    else:  # horizontally only: heights above its own ellipsoid differ by tens of metres
+    else:  # horizontal coordinates only: heights above the ellipsoid of `crs` differ by tens of metres
         longitude, latitude = _transformer(crs, _PLANE).transform(x, y)
         position = ecef_from_geodetic(latitude, longitude, height_m)
     if not np.isfinite(position).all():
@@ -123,7 +123,7 @@ def is_on_wgs84(crs: str) -> bool:
 def longitude_range(longitude_deg: NDArray[np.float64]) -> tuple[float, float]:
     """Return the westernmost and easternmost of longitudes in -180 to 180°; west > east across the antimeridian.
 
-    The widest gap between neighbours on the circle lies outside the range (RFC 7946, section 5.2).
+    The range excludes the widest gap between neighbouring longitudes on the circle (RFC 7946, section 5.2).
 
     Examples
     --------
@@ -132,7 +132,7 @@ def longitude_range(longitude_deg: NDArray[np.float64]) -> tuple[float, float]:
     """
     ordered = np.sort(longitude_deg)
     gaps = np.append(np.diff(ordered), ordered[0] + 360 - ordered[-1])
-    last = int(gaps[::-1].argmax())  # among equal gaps, the one over the antimeridian
+    last = int(gaps[::-1].argmax())  # of equal gaps, the one across the antimeridian is selected
     end = len(ordered) - 1 - last
     return float(ordered[(end + 1) % len(ordered)]), float(ordered[end])
 

@@ -26,13 +26,13 @@ class TrackCorrection:
     Attributes
     ----------
     time_s
-        (knot,) float64, seconds of the flight's clock, ascending; corrections are linear between knots and constant
-        beyond the ends.
+        (knot,) float64, seconds of the flight's clock, ascending; corrections are interpolated linearly between knots
+        and constant beyond the ends.
     moved_m
-        Node → (knot, 3) float64, displacement of all its points, metres, in the frame of the phase centres.
+        Node → (knot, 3) float64, displacement of all antennas of the node, metres, in the frame of the phase centres.
     extra_path_m
-        Pair → (knot,) float64, metres of total path added to all its echoes, in addition to the positions of its
-        nodes; 0 for a pair that is not listed.
+        Pair → (knot,) float64, metres of total path added to all echoes of the pair, in addition to the effect of
+        displaced nodes; 0 for a pair that is not listed.
 
     Examples
     --------
@@ -65,7 +65,7 @@ class TrackCorrection:
     def longer_m(
         self, pair: str, time_s: NDArray[np.float64], between_m: NDArray[np.float64] | None
     ) -> NDArray[np.float64]:
-        """Return the path added to all echoes of a pair: ∆ of the sidelink, and the pair's own correction.
+        """Return the path added to all echoes of a pair: ∆ of the sidelink, and the correction of the pair itself.
 
         Parameters
         ----------
@@ -213,8 +213,8 @@ def position_spline(
     position
         (epoch, 3) float64, metres.
     smoothing_m
-        Noise of the epochs in each axis, metres: the spline has the fewest knots with this rms residual; None: the
-        spline interpolates all epochs.
+        Noise of the epochs in each axis, metres: the spline has the smallest number of knots that yields this RMS
+        residual; None: the spline interpolates all epochs.
 
     Notes
     -----

@@ -9,10 +9,10 @@ from apertura.common.units import decibels
 from apertura.core.geometry.aperture import Aperture, Weigh, distance
 
 TAPER = 0.1
-"""Half width of an edge as a share of the sector's half width: the weight decreases from 1 to 0 between 1 - TAPER and
-1 + TAPER (docs/theory/integration.md)."""
+"""Half width of an edge as a share of the sector's half width: the weight decreases from 1 to 0 between (1 - TAPER) and
+(1 + TAPER) times the half width (docs/theory/integration.md)."""
 
-_SAMPLES = 256  # of the window: -3 dB width and sidelobe to 1e-6
+_SAMPLES = 256  # number of samples of the window, for a relative accuracy of 1e-6 of -3 dB width and sidelobe
 _TRIED = 256  # pulses searched for the extremes of s
 _END = 0.01  # tolerated error of these extremes as a share of the half width
 
@@ -29,13 +29,14 @@ class Sector:
     Attributes
     ----------
     tx_axis, rx_axis
-        (pulse, 3) float64: displacement of each antenna relative to the summed displacements of both; their lengths sum
-        to 1. They are 0 if no antenna moves, so that every pixel is at its closest approach.
+        (pulse, 3) float64: displacement of each antenna divided by the sum of the lengths of both displacements, so
+        that the lengths of both axes sum to 1. Both are 0 if no antenna moves: every pixel is then at its closest
+        approach.
     centre, half
         Centre and half width of the interval of s; the weight is one half at the centre ± `half`.
     ends
-        Pulses at which s of any pixel is smallest or largest, and the sector of these pulses; None: all pixels have the
-        same `centre`.
+        Pulses that include those at which s of any pixel is smallest or largest, and the sector of these pulses; None:
+        all pixels have the same `centre`.
 
     Raises
     ------
@@ -88,7 +89,7 @@ class Sector:
         return replace(self, tx_axis=self.tx_axis[pulses], rx_axis=self.rx_axis[pulses])
 
     def following(self, aperture: Aperture, points_m: NDArray[np.float64]) -> "Sector":
-        """Return the sector with the centre of each pixel limited to the part of the flight past it.
+        """Return the sector with the centre of each pixel limited so that the sector lies within the flight.
 
         Parameters
         ----------
@@ -114,7 +115,8 @@ class Sector:
         offset = sector.place(sample, points_m)
         if (offset.min(axis=0) <= -self.outer).all() and (offset.max(axis=0) >= self.outer).all():
             return self  # the flight contains the complete sector of every point
-        # Select the fewest pulses that contain the extremes of s of every point, to `_END` of the half width.
+        # Select the smallest set of pulses with the extremes of s of every point, to an accuracy of `_END` of the half
+        # width.
         is_extreme = np.concatenate([offset, -offset], axis=1)
         is_extreme = is_extreme <= is_extreme.min(axis=0) + _END * self.half
         ends: list[int] = []
@@ -135,7 +137,7 @@ class Sector:
         return np.asarray(np.clip(self.centre, lowest, highest))
 
     def axis_change(self, other: "Sector") -> NDArray[np.float64]:
-        """Return the largest change of s by the axes of another sector of the same number of pulses, (pulse,)."""
+        """Return the largest change of s, (pulse,), for the axes of another sector with the same number of pulses."""
         axes = ((self.tx_axis, other.tx_axis), (self.rx_axis, other.rx_axis))
         return np.asarray(sum(np.linalg.norm(own - others, axis=1) for own, others in axes))
 
@@ -179,7 +181,7 @@ class Sector:
         return edge((self.outer - np.abs(self.place(aperture, points_m))) / (self.outer - self.inner))
 
     def over(self, aperture: Aperture) -> Weigh:
-        """Return a function of a slice of pulses and points that gives their weights."""
+        """Return a function that computes the weights of a slice of pulses at points."""
         return lambda pulses, points_m: self[pulses].weight(aperture[pulses], points_m)
 
     def slack(
@@ -211,7 +213,7 @@ class Sector:
 
 
 def edge(depth: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the weight at a depth inside a sector, in widths of its edge: smoothstep from 0 at 0 to 1 at 1.
+    """Return the weight at a depth inside a sector in units of the edge width: smoothstep from 0 at 0 to 1 at 1.
 
     Examples
     --------
@@ -223,7 +225,7 @@ def edge(depth: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def flight_axes(aperture: Aperture, *, chord_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the axes of a `Sector` at each pulse, over a distance `chord_m` about it that is clipped at the ends.
+    """Return the axes of a `Sector` at each pulse, over a distance `chord_m` about the pulse, clipped at the ends.
 
     Examples
     --------
@@ -263,7 +265,7 @@ def response() -> tuple[float, float]:
     """
     cosine = (np.arange(_SAMPLES) + 0.5) / _SAMPLES * (1 + TAPER)
     window = edge(((1 + TAPER) - cosine) / (2 * TAPER))
-    position = np.linspace(0, 4, 2001)  # in inverses of the width between half weights
+    position = np.linspace(0, 4, 2001)  # in units of the inverse width between half weights
     power = np.abs(np.cos(np.pi * np.multiply.outer(position, cosine)) @ window) ** 2
     power /= power[0]
     first = int(np.argmax(np.diff(power) > 0))

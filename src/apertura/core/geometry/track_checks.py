@@ -20,21 +20,22 @@ from apertura.core.geometry.lever_arms import position_spline
 
 
 LEAST_FAULT_M = 5e-3
-"""Metres, smallest error of single epochs that is distinguished from noise; 5 mm is λ/48 at L-band."""
+"""Smallest error of single epochs that is distinguished from noise, metres; 5 mm is λ/48 at L-band."""
 
 FINEST_GRAIN_M = 0.01
-"""Metres, largest rounding step of a log that resolves centimetres: upper limit of the scatter of a static log."""
+"""Largest rounding step of a log that resolves centimetres, metres: upper limit of the scatter of a static log."""
 
 _SIGMA = 10.0  # least size of a fault relative to the scatter of the log
 _SMOOTHER = {1: 7.0, 2: 12.0, 3: 20.0}  # number of faulty epochs → least size relative to the residual misfits
 _STEP_SMOOTHER = 10.0  # least size of a step relative to the residual misfits
-_AGILE_M_S2 = 10.0  # acceleration, in both directions within an interval, that a node may fly: smaller steps are motion
+# acceleration that a node may have, in both directions within an interval: smaller steps are attributed to motion
+_AGILE_M_S2 = 10.0
 _CHI3_MEDIAN = 1.538  # median length of a vector of three standard normal components
 _MOST_ROUNDS = 20
 
 
 class Fault(NamedTuple):
-    """Epochs first…last with an error of `size_m`; a step lies between them."""
+    """Fault: epochs first…last with an error of `size_m`; for a step, the two epochs before and after it."""
 
     first: int
     last: int
@@ -77,7 +78,7 @@ def misfits(time_s: Floats, position_m: Floats) -> Floats:
 def scatter_m(misfit_m: Floats) -> float:
     """Return the robust scatter of `misfits` per axis, metres, also for a log that mostly repeats one position.
 
-    If most epochs repeat a coarsely rounded position exactly, the scatter is estimated from the epochs that change.
+    If most epochs repeat a coarsely rounded position exactly, the scatter is estimated from the other epochs.
 
     Examples
     --------
@@ -122,7 +123,7 @@ def find_spikes(time_s: Floats, position_m: Floats) -> list[Fault]:
 
 
 def find_steps(time_s: Floats, position_m: Floats) -> list[Fault]:
-    """Detect steps: pairs of epochs between which the position is offset at once, as by a new GNSS fix.
+    """Detect steps: pairs of epochs between which the position changes abruptly, as by a new GNSS fix.
 
     Examples
     --------
@@ -159,7 +160,7 @@ def _outlying(misfit_m: Floats, scatter: float) -> list[int]:
 
 
 def _spike(time_s: Floats, position_m: Floats, epoch: int, scatter: float) -> Fault | None:
-    """Return the smallest group of epochs about an outlying one without which its neighbours are smooth."""
+    """Return the smallest group of epochs about an outlier whose removal leaves a smooth log."""
     for count, smoother in _SMOOTHER.items():
         for first in range(epoch - count, epoch + 2):
             last = first + count - 1
@@ -201,9 +202,10 @@ def _step(time_s: Floats, misfit_m: Floats, before: int, scatter: float) -> Faul
 def find_frozen(time_s: Floats, position_m: Floats) -> NDArray[np.bool_]:
     """Detect epochs that repeat the preceding position although the node was moving, (epoch,) bool.
 
-    A node that stops decelerates and accelerates. If it moved just before and just after the repeated positions, and
-    the distance between them agrees with that speed, it did not stop. Noise may repeat a coarsely rounded position, so
-    at least three consecutive repeats are required, unless more than every tenth epoch is a repeat.
+    A node that stops decelerates first and accelerates afterwards. A run of repeated positions is frozen if the node
+    moved just before and just after it and the distance covered agrees with that speed. Noise may also lead to repeats
+    of a coarsely rounded position: at least three consecutive repeats are required, unless more than a tenth of the
+    epochs are repeats.
 
     Examples
     --------
@@ -221,7 +223,7 @@ def find_frozen(time_s: Floats, position_m: Floats) -> NDArray[np.bool_]:
     travel = np.minimum(speed[:-2], speed[2:]) * (time_s[last] - time_s[first])[:-1]
     is_frozen_run = np.append((np.minimum(travel, jump) > 3 * FINEST_GRAIN_M) & (jump > travel / 2), False)
     length = last - first
-    is_frozen_run[-1] = length[-1] <= length[is_frozen_run].max(initial=-1)  # a landing is longer
+    is_frozen_run[-1] = length[-1] <= length[is_frozen_run].max(initial=-1)  # longer runs may be landings
     frozen = repeats & is_frozen_run[run]
     return np.asarray(frozen if frozen.mean() > 0.1 else frozen & (length >= 3)[run])
 
@@ -282,7 +284,7 @@ def rounded_position_m(time_s: Floats, position_m: Floats, *, least_m: float) ->
     -----
     A coordinate rounded to a step g has an error of g/√12. The step is the greatest common divisor of the differences
     of all values of a coordinate: of the axes of the frame and, for ECEF positions, of latitude, longitude and height.
-    It is accepted if positions scatter by at least a tenth of it. Steps up to 1.5 cm are those of logs that resolve
+    It is accepted if positions scatter by at least a tenth of it. Steps up to 1.5 cm occur in logs that resolve
     centimetres, and are ignored. Source: docs/theory/tracks.md, "Rounded positions".
 
     Examples
@@ -310,7 +312,7 @@ def rounded_position_m(time_s: Floats, position_m: Floats, *, least_m: float) ->
 
 
 _ON_EARTH_M = 1e6
-_DEGREE_M = 111_195.0  # of latitude
+_DEGREE_M = 111_195.0  # metres per degree of latitude
 _ROUGH = 0.1  # least scatter of rounded positions as a share of the rounding step
 _SAME_M = 1e-5  # difference below which two values are equal
 _COARSE_M = 1.5e-2  # receivers that resolve centimetres write multiples of 1e-7 degrees, 1.1 cm
@@ -336,14 +338,14 @@ def _grain(values_m: Floats, least_m: float) -> float:
 # ---- Valid epochs and gaps
 
 LONG_GAP = 3.5
-"""Gap, in median intervals between epochs, above which its interpolation error is estimated."""
+"""Length of a gap, in median intervals between epochs, above which its interpolation error is estimated."""
 
 _TRIED = 40  # artificial gaps of the same length elsewhere in the log, to measure the error of the spline
 _SUPPORT = 6  # epochs on either side of an artificial gap
 
 
 class Hole(NamedTuple):
-    """Interval without valid positions, seconds of the log: its cause, and the error (m) of a spline through it."""
+    """Interval without valid positions, seconds of the log, with its cause and the error (m) of a spline through it."""
 
     start_s: float
     end_s: float
@@ -444,7 +446,7 @@ def check_track(
 
 
 def _classified(time_s: Floats, position_m: Floats, poor_fix: NDArray[np.bool_]) -> tuple[NDArray[np.str_], Floats]:
-    """Return the flag that excludes each epoch, '' if it is valid, and the size of its error, (epoch,) each."""
+    """Return the flag that excludes each epoch ('' for a valid epoch) and the size of its error, (epoch,) each."""
     cause, size = np.where(poor_fix, "fix_quality_low", "").astype("U16"), np.zeros(len(time_s))
     cause[find_frozen(time_s, position_m) & ~poor_fix] = "track_frozen"
     for part in _parts(time_s, cause):
@@ -466,7 +468,7 @@ def _parts(time_s: Floats, cause: NDArray[np.str_]) -> list[NDArray[np.intp]]:
 def _holes(
     time_s: Floats, position_m: Floats, cause: NDArray[np.str_], tolerated_m: float, longest_gap_s: float
 ) -> list[Hole]:
-    """Return the intervals between valid epochs that are too long to interpolate, or have a poor fix."""
+    """Return the intervals between valid epochs that are too long to interpolate or contain epochs with a poor fix."""
     valid = np.flatnonzero(cause == "")
     if valid.size < 2:
         return [Hole(-np.inf, np.inf, str(cause[0]) or "track_gap", np.inf)]
@@ -509,7 +511,7 @@ def _gap_error_m(time_s: Floats, position_m: Floats, missing: int) -> float:
 
 
 def _interpolation_m(time_s: Floats, position_m: Floats) -> float | None:
-    """Estimate the RMS error of the spline between epochs per axis, metres: 2⁻⁴ of that through every second epoch."""
+    """Estimate the RMS error of the spline between epochs per axis, metres: 2⁻⁴ of that with every second epoch."""
     if len(time_s) < 12:
         return None
     error_m = position_spline(time_s[::2], position_m[::2])(time_s[1:-1:2]) - position_m[1:-1:2]
@@ -519,17 +521,20 @@ def _interpolation_m(time_s: Floats, position_m: Floats) -> float | None:
 
 # ---- Yaw against the course
 
-_COURSE_STEP_M = 2.0  # distance over ground that determines a course: 1 cm of noise is an error of 0.4°
+_COURSE_STEP_M = 2.0  # distance over ground from which a course is determined: 1 cm of noise causes an error of 0.4°
 _LEAST_STEPS = 10
-_FOLLOWS = 0.85  # least mean phasor of yaw minus course, if yaw follows it: 33° rms by wind, sideslip and manual turns
-_LEAVES = 0.8  # largest mean phasor if yaw does not follow the course: 38° rms
+# least mean phasor of yaw minus course if yaw follows the course: 33° RMS from wind, sideslip and manual turns
+_FOLLOWS = 0.85
+_LEAVES = 0.8  # largest mean phasor if yaw does not follow the course: 38° RMS
 _CLOSER = 2.0  # least ratio of the scatter of yaw about the course as logged to that by another convention
-_ROUND_DEG = 60.0  # widest gap between courses at which a constant heading, or one towards the scene, is excluded
+# widest gap between courses for which a constant heading, or a heading towards the scene, can be excluded
+_ROUND_DEG = 60.0
 _WHOLE_TURN = 1.01 * 2 * np.pi  # limit of an angle in radians
 _UPSIDE = 1.01 * np.pi / 2  # limit of roll and pitch in radians of an upright node
 _LEVEL = 0.6  # limit of roll and pitch in radians in level flight; values in degrees exceed it in any flight
 _STILL = 1e-3  # smallest range of roll or pitch that is accepted as measured
-_NEAR_DEG, _FAR_DEG = 20.0, 45.0  # limits of yaw minus course in straight flight, by the other convention and as logged
+# limits of yaw minus course in straight flight: by the other convention, and as logged
+_NEAR_DEG, _FAR_DEG = 20.0, 45.0
 
 
 class YawFault(NamedTuple):
@@ -542,7 +547,7 @@ class YawFault(NamedTuple):
     certain
         True if the course covers so many directions that there is no other explanation.
     as_logged_deg, otherwise_deg
-        Scatter of yaw minus course, RMS about its mean, as logged and by the convention; in straight flight the mean.
+        RMS scatter of yaw minus course about its mean, as logged and by `convention`; in straight flight, its mean.
     """
 
     convention: str
@@ -562,8 +567,8 @@ class YawFault(NamedTuple):
 def check_yaw(position_m: Floats, attitude_rad: Floats, ned: Floats) -> YawFault | None:
     """Detect a wrong convention of yaw: another convention follows the course over ground, and the logged yaw does not.
 
-    A node that flies sideways, backwards, in wind or with a constant heading is not reported: its yaw does not follow
-    the course by any convention, or follows it as logged.
+    A node that flies sideways, backwards, in wind or with a constant heading is not reported: its yaw follows the
+    course by no convention, or as logged.
 
     Parameters
     ----------
@@ -633,16 +638,18 @@ def _scatter_deg(mean: complex) -> float:
 # ---- Hovers: pulses transmitted while the antennas are stationary
 
 HOVER_SPEED = 0.2
-"""Limit of the speed in a hover relative to that of the flight: below a turn or climb, above a hover in wind."""
+"""Limit of the speed in a hover relative to that of the flight: lower than in turns or climbs, higher than in a hover
+in wind."""
 
 HOVER_S, HOVER_SHARE = 5.0, 0.05
-"""Least duration of a hover, seconds, and least share of pulses in hovers; fewer cause a pedestal below -26 dB."""
+"""Least duration of a hover, seconds, and least share of pulses in hovers: a smaller share causes a pedestal below -26
+dB."""
 
-_HOVER_WINDOW_S = 2.0  # interval of the speed estimate: 1 cm of log noise is an error of 1 cm/s
+_HOVER_WINDOW_S = 2.0  # interval of the speed estimate: 1 cm of log noise causes an error of 1 cm/s
 
 
 def hovering(time_s: Floats, legs: Sequence[Floats]) -> NDArray[np.bool_]:
-    """Detect the pulses of long hovers within a flight, (pulse,) bool; none in a recording that is static throughout.
+    """Detect the pulses of long hovers within a flight, (pulse,) bool; none if the whole recording is static.
 
     Parameters
     ----------

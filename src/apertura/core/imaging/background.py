@@ -1,4 +1,4 @@
-"""Decision on the background of a pair: what its removal gains in the image, and what targets lose by it.
+"""Decision on the background of a pair: gain in the image by its removal, and loss of targets.
 
 docs/theory/background.md: loss of targets (eq. 4), gain measured on pixels of the scene (eq. 5), decision (eq. 6).
 """
@@ -22,28 +22,30 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
 
 LEAST_NET_DB = 0.5
-"""dB of gain less loss that `auto` removes a background for: less is not visible in the image."""
+"""Least gain minus loss, dB, for which `auto` removes a background: a smaller one is not visible in the image."""
 
 MOST_LOSS_DB = 3.0
-"""dB that `auto` lets a target lose, whatever the gain: half of its power."""
+"""Largest loss of a target, dB, that `auto` accepts, whatever the gain: half of its power."""
 
 FLAGGED_LOSS_DB = 1.0
-"""dB that a target loses by the removal, above which `background_loss` is raised."""
+"""Loss of a target by the removal, dB, above which `background_loss` is raised."""
 
 FLAGGED_GAIN_DB = 3.0
-"""dB that a removal left undone would gain, above which `background` is raised."""
+"""Gain of an omitted removal, dB, above which `background` is raised."""
 
 SIMPLER_DB = 2.0
-"""dB of net gain that a method must add over a simpler one: longer windows come first, all delays before some."""
+"""Least additional net gain, dB, for which a method is preferred to a simpler one. Longer windows are simpler than
+shorter ones, and removal at all delays is simpler than removal at some."""
 
 RUNNING = 4, 8, 16
-"""Running medians that `auto` tries: parts of the duration."""
+"""Lengths of the running medians that `auto` tries, as fractions of the duration."""
 
-_BLOCKS, _PULSES, _PIXELS = 4, 2048, 256  # of the gain: blocks of consecutive pulses, and random pixels
+# for the gain: length of blocks of consecutive pulses, and number of random pixels
+_BLOCKS, _PULSES, _PIXELS = 4, 2048, 256
 _LOSS_PULSES, _STEADY_PULSES = 2**10, 512
 _LATTICE, _ZOOMED = 33, 9
 _WAVELENGTHS = 1 / 64  # step of the last lattice
-_SIDELOBES = 3  # cells on either side of a target that are left to it
+_SIDELOBES = 3  # cells on either side of a target at which nothing is removed
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,17 +55,18 @@ class Removal:
     Attributes
     ----------
     background
-        The component that is removed; None: nothing is.
+        The component that is removed; None: nothing is removed.
     value
         Method, or none.
     reason
         A phrase.
     gain_db
-        Median power of pixels without the removal relative to that with it, dB, by the method or by the best one.
+        Ratio of the median pixel power without and with the removal, dB, for `value`; for the best method if none is
+        used.
     loss_db
-        Change of the peak of the target that loses most by it, dB, 0 or less.
+        Change of a target's peak by the removal, dB, 0 or less: that of the target with the largest loss.
     middle_loss_db
-        The same of a target in the middle of the scene.
+        The same for a target at the scene centre.
     """
 
     background: Background | None
@@ -72,11 +75,16 @@ class Removal:
     gain_db: float
     loss_db: float
     middle_loss_db: float
+    left_db: float = 0.0
 
     @property
     def net_db(self) -> float:
         """Gain less the largest loss, dB (eq. 6)."""
         return self.gain_db + self.loss_db
+
+    def undone(self, reason: str, most_db: float) -> "Removal":
+        """Return the decision against the removal, which leaves the gain of the best method unused."""
+        return replace(self, background=None, value="none", reason=reason, left_db=most_db)
 
     @property
     def report(self) -> dict[str, Any]:
@@ -86,7 +94,7 @@ class Removal:
 
     @property
     def flags(self) -> Flags:
-        """`background` if arcs remain in the image, `background_loss` if targets lose by the removal."""
+        """Flags: `background` if arcs remain in the image, `background_loss` if targets lose power by the removal."""
         flags, removed = Flags(), self.background is not None
         if not removed and self.gain_db >= FLAGGED_GAIN_DB:
             flags["background"] = f"{self.gain_db:.1f} dB; {self.reason}"
@@ -97,7 +105,7 @@ class Removal:
 
 @dataclass(frozen=True, eq=False)
 class BackgroundScene:
-    """Recording of a pair over its scene, as far as the decision needs both.
+    """Data of a pair and of its scene that the decision requires.
 
     Attributes
     ----------
@@ -106,7 +114,7 @@ class BackgroundScene:
     delay_s
         (pulse,) float64, delay removed from the recorder's transfer functions.
     extra_s
-        (pulse,) float64, delay of an echo in the recorder beyond geometry.
+        (pulse,) float64, delay of an echo in the recorder in addition to the geometric delay.
     time_s
         (pulse,) float64, seconds from the first pulse.
     grid, ground
@@ -125,7 +133,7 @@ class BackgroundScene:
         return self.grid.positions_at(rows, columns, self.ground.height_m)
 
     def delays(self, points_m: Floats, pulses: int) -> tuple[Floats, Floats]:
-        """Return delays (pulse, point) of (point, 3) points in the recorder and times, s, of at most `pulses`."""
+        """Return recorder delays of (point, 3) points, (pulse, point), and times, s, of at most `pulses` pulses."""
         some = slice(None, None, -(-len(self.time_s) // pulses))
         path_s = self.history.aperture[some].path(points_m) / self.history.wave_speed_m_s
         return path_s + self.extra_s[some, None], self.time_s[some]
@@ -137,7 +145,7 @@ class BackgroundScene:
         return np.asarray(np.rint(delays_s / step_s).astype(np.int64) % len(frequency))
 
     def cells_of(self, point_m: Floats) -> NDArray[np.bool_]:
-        """Return the delays at which the echo of a target lies, (subcarrier,) bool in steps of the resolution."""
+        """Return a mask of delays with the echo of a target, (subcarrier,) bool in steps of the resolution."""
         cells = np.unique(self.cells(self.delays(point_m[None], _STEADY_PULSES)[0]))
         mask = np.zeros(len(self.history.frequency_hz), np.bool_)
         mask[(cells[:, None] + np.arange(-_SIDELOBES, _SIDELOBES + 1)) % len(mask)] = True
@@ -145,7 +153,7 @@ class BackgroundScene:
 
     @property
     def wavelength_m(self) -> float:
-        """Of the highest frequency, metres."""
+        """Wavelength at the highest frequency, metres."""
         return self.history.wave_speed_m_s / float(self.history.frequency_hz[-1])
 
     def pixel_powers(self, backgrounds: Sequence[Background | None], generator: np.random.Generator) -> list[float]:
@@ -177,11 +185,12 @@ def decide_removal(
     means, scene
         Of the pair.
     method
-        auto: the median or a running median, at all delays or without that of the steadiest target, whichever gains
-        most, if targets gain by it wherever they are and none loses more than `MOST_LOSS_DB`; any other method of
-        `GroupMeans.background` is applied at all delays whatever it costs.
+        auto: the median or a running median, at all delays or at all except those of the target with the most stable
+        delay, whichever has the largest gain. It is used only if the gain exceeds the loss of a target at any position,
+        and no loss exceeds `MOST_LOSS_DB`. Any other method of `GroupMeans.background` is applied at all delays,
+        regardless of the loss.
     generator
-        Draws the pixels.
+        Random generator that draws the pixels.
 
     Notes
     -----
@@ -214,18 +223,20 @@ def decide_removal(
         best = other if other.net_db > best.net_db + SIMPLER_DB else best
     if method != "auto":
         return replace(best, reason=f"configured; {best.reason}")
+    most_db = max(one.gain_db for one in tried)
     if best.loss_db < -MOST_LOSS_DB:
-        return replace(best, background=None, value="none", reason=f"auto: too high a loss by {best.reason}")
+        return best.undone(f"auto: too high a loss by {best.reason}", most_db)
     if best.net_db < LEAST_NET_DB:
-        return replace(best, background=None, value="none", reason=f"auto: no net gain by {best.reason}")
-    return replace(best, reason=f"auto: {best.reason}")
+        return best.undone(f"auto: no net gain by {best.reason}", most_db)
+    return replace(best, reason=f"auto: {best.reason}", left_db=most_db - best.gain_db)
 
 
 def steadiest(scene: BackgroundScene, *, without: NDArray[np.bool_] | None = None) -> Floats:
     """Return the position of the target whose delay changes least over the pulses, (3,) float64.
 
-    A lattice over the grid, then finer ones about its best point, down to a small part of the wavelength: the standard
-    deviation of the delay is smooth in the position. Targets at the delays `without`, as of `cells_of`, do not count.
+    Searches a lattice over the grid, then finer ones about its best point, down to a small fraction of the wavelength:
+    the standard deviation of the delay is a smooth function of the position. Targets at the delays `without`, as
+    returned by `cells_of`, are excluded.
     """
     shape = scene.grid.shape
     axes = [np.linspace(0, size - 1, _LATTICE) for size in shape]
@@ -256,15 +267,15 @@ def target_loss(
     scene
         Of the pair.
     method
-        A name: over all pulses; a number: length of the running median, s.
+        A name: method over all pulses; a number: length of the running median, s.
     point_m
         (3,) float64, position of the target.
     without
-        Delays that are not removed, as of `BackgroundScene.cells_of`.
+        Delays that are not removed, as returned by `BackgroundScene.cells_of`.
     """
     frequency, weight = scene.history.frequency_hz, scene.history.weight
     delays, times = scene.delays(point_m[None], _LOSS_PULSES)
-    # exp(−jφ) of the echo at every pulse and frequency, and its part μ in the background
+    # exp(−jφ) of the echo at every pulse and frequency, and its share μ in the background
     echo = np.exp(-2j * np.pi * np.remainder(delays * frequency, 1.0))
     part = GroupMeans(echo, times).background("mean" if isinstance(method, str) else method)
     if without is not None and without.any():

@@ -67,8 +67,9 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, for completion in 
     ----------
     profiles
         Range profiles; or calibrated transfer functions, which are compressed in range first; or the dataset of a
-        campaign's stage `profile` or `echo`. They contain the wave speed: that in vacuum unless stated,
-        ``ap.wave_speed(285)`` for a refractivity of 285 N units, or that of the configured atmosphere in a stage.
+        campaign's stage `profile` or `echo`. They contain the wave speed: by default that in vacuum;
+        ``ap.wave_speed(285)`` for a refractivity of 285 N units; in the dataset of a stage, that of the configured
+        atmosphere.
     grid
         Pixels; their frame is that of the phase centres: ECEF, or the local frame of a grid with ``crs="local"``.
     accuracy_db
@@ -82,25 +83,26 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, for completion in 
         Antenna beams (default: isotropic).
     atmosphere
         Atmosphere that replaces the wave speed in `profiles`: 'auto', the standard atmosphere over the terrain; an
-        `Atmosphere`; the refractivity at the terrain, N units; 'vacuum'. It yields one wave speed for the flight, from
-        its heights.
+        `Atmosphere`; the refractivity at the terrain, N units; 'vacuum'. The wave speed is constant over the flight and
+        is computed from its heights.
     calibration
         K, |H|² of a target of 1 m² on both boresights with R_tx·R_rx = 1 m²: ``ap.Link(...).constant(...)``, or
-        measured on a reflector. The image then has the coordinates `sigma0` and `rcs`.
+        measured on a reflector. With it, the image has the coordinates `sigma0` and `rcs`.
     certified_pixels
         Number of random pixels that are also computed exactly, immediately, for the certificate; 0 for none. The error
         bound is no lower than the predicted error. A setting that misses the accuracy at these pixels is replaced by
         the next setting of the plan.
     judge
-        If True, the image is formed immediately, in addition to the lazy image, and judged by its focus and by echoes
-        missing from it, as by `apertura.judge`. 'auto': if the predicted run time is at most ten seconds.
+        If True, the image is formed immediately, in addition to the lazy image, and its focus and unfocused echoes are
+        assessed as by `apertura.judge`. 'auto': if the predicted run time is at most ten seconds.
     terrain_model
         Terrain model: 'auto', 'plane', 'tilted_plane' or 'dem'.
     window
         Window over the subcarriers of transfer functions; profiles are already windowed.
     integration
-        Extent of the pass that a pixel is integrated over: 'auto', as much as the pixel spacing can represent; 'all';
-        ``{"degrees": x}`` of a straight pass; ``{"resolution_m": x}`` along the flight.
+        Extent of the pass over which a pixel is integrated: 'auto', as much as the pixel spacing can represent; 'all',
+        the whole pass; ``{"degrees": x}``, integration angle of a straight pass; ``{"resolution_m": x}``, resolution
+        along the flight.
     presum
         Number of pulses that a low-pass sum combines into one where the aperture is oversampled; 1: no presumming.
     pulse_blocks
@@ -113,11 +115,11 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, for completion in 
     Returns
     -------
     xarray.DataArray
-        (y, x) complex64, carrier phase preserved, 1 is the amplitude of an echo present in every pulse; a dask array
-        for the scheduler of the caller. Attributes: units; `wave_speed_m_s`; the plan: `setting`, `predicted_error_db`,
-        and as JSON `models` (choice → value and reason) and `flags` (exceeded limit → measured value); the judgement:
-        `verdict` ('not judged' if deferred), `verdict_why`, and as JSON `budget`; the certificate:
-        `numerical_error_db`, an upper bound at `numerical_error_confidence` for the whole image, and
+        (y, x) complex64 with the carrier phase, in units of the amplitude of an echo present in every pulse; a dask
+        array, computed by the caller's scheduler. Attributes: units; `wave_speed_m_s`; the plan: `setting`,
+        `predicted_error_db`, and as JSON `models` (choice → value and reason) and `flags` (exceeded limit → measured
+        value); the judgement: `verdict` ('not judged' if deferred), `verdict_why`, and as JSON `budget`; the
+        certificate: `numerical_error_db`, an upper bound at `numerical_error_confidence` for the whole image, and
         `numerical_error_estimate_db`, relative to the double sum over pulses and subcarriers, or, for profiles alone,
         to their band-limited interpolation in float64. With `calibration` also lazy coordinates (y, x) float32:
         `sigma0` of terrain, noise included, and `rcs`, the cross-section (m²) of a point at the pixel; NaN where no
@@ -262,13 +264,13 @@ def _check_kinds(inputs: PhaseHistory | Profiles, beams: Any, certified_pixels: 
 
 
 _MOST_CERTIFIED = 1_000_000
-"""Largest number of pixels compared with the exact sum: a hundredth of them yields a practically equal bound."""
+"""Largest number of pixels compared with the exact sum: a hundredth of it yields practically the same bound."""
 
 _SUM = 1e-3
 """Tolerated deviation of the sum of weights from 1: a hundredth of a decibel."""
 
 _AT_ONCE_S = 10.0
-"""Longest predicted run time (s) of an image that is formed immediately and judged with judge='auto'."""
+"""Longest predicted run time (s) up to which judge='auto' forms and assesses the image immediately."""
 
 
 def _judged(formation: Formation, judge: bool | str, *, error_db: float | None) -> Judgement:
@@ -287,7 +289,7 @@ def _judged(formation: Formation, judge: bool | str, *, error_db: float | None) 
 def _wave_speed(
     atmosphere: "Atmosphere | float | Literal['auto', 'vacuum']", grid: SceneGrid, ground: Terrain, aperture: Aperture
 ) -> float:
-    """Return the mean wave speed between the middle of a scene and the antennas."""
+    """Return the mean wave speed between the scene centre and the antennas."""
     middle_m = ground.positions_at(grid, *(np.array([size // 2]) for size in grid.shape))[0]
     frame = LOCAL if grid.crs == LOCAL else "ecef"
     ground_m = float(middle_m[2] if frame == LOCAL else geodetic_from_ecef(middle_m)[2])
@@ -378,7 +380,7 @@ def _calibrated(
 
 
 def _certified(formation: Formation, accuracy_db: float, count: int) -> tuple[Formation, ErrorBound]:
-    """Return the image formation with the plan's first setting whose error bound meets the accuracy, else the last."""
+    """Return the image formation with the plan's first setting whose error bound meets the accuracy, or its last."""
     pixels = np.random.default_rng(0).integers(0, formation.grid.shape, (count, 2))
     exact = formation.exact(pixels)
     error = _error(formation, pixels, exact)
@@ -391,7 +393,7 @@ def _certified(formation: Formation, accuracy_db: float, count: int) -> tuple[Fo
 
 
 def _error(formation: Formation, pixels: NDArray[np.int64], exact: NDArray[np.complex128]) -> ErrorBound:
-    """Return the error bound at uniformly drawn pixels, at least the predicted error: they may miss bright points."""
+    """Return the error bound from uniformly drawn pixels, not below the predicted error."""
     values, power = formation.values(pixels)
     error = error_bound(values, exact, np.ones(len(pixels)), power=power)
     return replace(error, bound_db=max(error.bound_db, formation.plan.predicted_error_db))

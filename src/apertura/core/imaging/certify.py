@@ -16,9 +16,11 @@ from apertura.core.quality.point_targets import CUT_REACH_M, cuts_report, find_p
 from apertura.core.scene.grid import SceneGrid
 
 RANDOM_PIXELS, BRIGHT_PIXELS = 160, 112
-"""Numbers of pixels recomputed exactly: drawn evenly over the tiles, and by brightness (docs/theory.md, eq. 6a)."""
+"""Numbers of pixels recomputed exactly: drawn uniformly over the tiles, and drawn with probabilities that increase with
+brightness (docs/theory.md, eq. 6a)."""
 
-_MOST_TILES = 1024  # tiles (8192 x 8192 pixels) with a random pixel each; an exact pixel costs as much as 500 by `tree`
+# number of tiles (8192 x 8192 pixels) that receive a random pixel; an exact pixel costs as much as 500 by `tree`
+_MOST_TILES = 1024
 
 
 def certified(
@@ -45,14 +47,15 @@ def certified(
     scheduler
         Scheduler for recomputed tiles, as for `compute_tiles`.
     rewriting
-        Called with the tiles before they are recomputed, so that a killed run resumes with their planned setting.
+        Called with the tiles before they are recomputed, so that a killed run recomputes them with their planned
+        setting on resuming.
     """
     count = min(max(RANDOM_PIXELS, len(formation.windows)), _MOST_TILES)
     drawn, certificate = random_pixels(formation.windows, count, np.random.default_rng(0)), None
     settings, recomputed, flags = iter(formation.plan.fallbacks), [], Flags()
     while True:
         brightness, setting = Brightness.of(target, formation.windows), next(settings, None)
-        # Bright pixels depend on the image, random ones do not: for the first image, pulses are read once for both.
+        # Bright pixels depend on the image, random pixels do not: for the first image, pulses are read once for both.
         bright = brightness.draw(target, formation.windows, BRIGHT_PIXELS, np.random.default_rng(1))
         pixels = bright if certificate else np.concatenate([drawn, bright])
         exact = formation.exact(pixels, threads=threads)

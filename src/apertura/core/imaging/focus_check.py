@@ -57,8 +57,8 @@ def part_images(
     Returns
     -------
     ndarray
-        (patch, 2, subaperture, y, x) complex64: from the even and from the odd pulses of each subaperture. No patch
-        with fewer than four pulses per subaperture.
+        (patch, 2, subaperture, y, x) complex64: from the even and from the odd pulses of each subaperture. Patches with
+        fewer than four pulses per subaperture are omitted.
     """
     images = np.zeros((len(places), 2, PARTS, PART_PX, PART_PX), np.complex64)
     aperture = profiles.aperture
@@ -110,14 +110,16 @@ def _around(profiles: Profiles, places: NDArray[np.float64]) -> Profiles:
 # ---- Strongest echoes outside the scene
 
 OUTSIDE_ECHO_DB = 20.0
-"""Level above the strongest echo of the scene, dB: a stronger echo outside is no sidelobe; the scene is misplaced."""
+"""Level above the strongest echo of the scene, dB: an echo outside above it is not a sidelobe; the scene is
+misplaced."""
 
 UNFOCUSED_ECHO_DB = 25.0
 """Level above the median over the scene's ranges, dB: an echo above it is a point target, which must focus at some
-pixel; speckle reaches 10 dB."""
+pixel; speckle reaches only 10 dB."""
 
 LEAST_PULSES = 64
-"""Least number of pulses to determine if a point dominates its cell: 2 in each of the 32 blocks of `point_focus`."""
+"""Least number of pulses to determine whether a point dominates its cell: 2 in each of the 32 blocks of
+`point_focus`."""
 
 _MOST_PULSES = 64  # pulses sampled in the search for echoes outside the scene
 _NEAR_CELLS = 4  # range cells excluded about the direct path and at the swath's edges: sidelobes of point responses
@@ -125,7 +127,7 @@ _NEAR_CELLS = 4  # range cells excluded about the direct path and at the swath's
 
 LEAST_GATHERED = 0.2
 """Least ratio of the focused power of an image's points to the strongest echo in its pulses. Points in one range cell
-sum to one echo, and half of it may not be counted; an image with a peak loss of 7 dB has a lower ratio."""
+sum to one echo, of which up to half may not be counted; an image with a peak loss of 7 dB has a lower ratio."""
 
 _BY_CHANCE = 2.0  # in units of ln(pixels)/pulses, the largest coherence factor of contributions with random phases
 
@@ -138,7 +140,7 @@ def echo_outside_scene(
     points: Sequence[NDArray[np.complex128]] = (),
     measured: bool = False,
 ) -> str | None:
-    """Detect a strong echo in the pulses that an image does not focus, and describe it in one line; None without any.
+    """Detect a strong echo in the pulses that is not focused in the image, described in one line; None without one.
 
     Parameters
     ----------
@@ -149,8 +151,8 @@ def echo_outside_scene(
     points
         `Formation.contributions` at each bright point of the image, (pulse,) complex128.
     measured
-        True if points of the image dominate their range cells. An echo outside is then reported only if these points
-        may be its range sidelobes.
+        True if points of the image dominate their range cells. In that case an echo outside the scene is reported only
+        if these points may be its range sidelobes.
 
     Notes
     -----
@@ -170,7 +172,7 @@ def echo_outside_scene(
     within = np.where(beyond, np.nan, power)
     inside = np.nanmax(within, axis=1)
     scene = f"those of the scene are {nearest.min():.1f} to {farthest.max():.1f} m"
-    # An echo outside that is stronger than all inside, and no sidelobe of an echo that the image focuses.
+    # An echo outside the scene that is stronger than all echoes inside and is not a sidelobe of a focused echo.
     above_db = _median_db(outside / np.maximum(inside, 1e-30))
     alone = min(above_db, _median_db(outside / np.maximum(np.median(power, axis=1), 1e-30))) > OUTSIDE_ECHO_DB
     if alone and measured:
@@ -186,7 +188,7 @@ def echo_outside_scene(
         )
     if measured:
         return None
-    # An echo inside, too strong for speckle, that no point of the image focuses.
+    # An echo inside the scene, too strong for speckle, that is not focused at any point of the image.
     alone_db = _median_db(inside / np.maximum(np.nanmedian(within, axis=1), 1e-30))
     if len(inputs) < LEAST_PULSES or alone_db <= UNFOCUSED_ECHO_DB:
         return None
@@ -211,7 +213,7 @@ _LOBE_SAMPLES = 8  # samples of a response per range cell
 def _sidelobe_db(inputs: PhaseHistory | Profiles, cells: float) -> float:
     """Return the sidelobe level relative to the peak at a distance in range cells, plus a margin; dB.
 
-    For profiles, with an unknown window, the level without a window: 1/(π·cells).
+    For profiles, whose window is unknown, the level without a window is used: 1/(π·cells).
     """
     if isinstance(inputs, Profiles):
         return float(20 * np.log10(1 / (np.pi * max(cells, 1.0)))) + _SIDELOBE_MARGIN_DB
@@ -261,7 +263,7 @@ def _profiles(
 
 # ---- Joint focus of several pairs, to compare hypotheses
 
-_EVERY = 8  # points along a side of a patch, from which its paths are bounded
+_EVERY = 8  # number of points along a side of a patch from which bounds of its paths are computed
 
 
 def joint_peak_power(histories: Sequence[PhaseHistory], grid: SceneGrid, height_m: float) -> float:
@@ -279,8 +281,8 @@ def joint_peak_power(histories: Sequence[PhaseHistory], grid: SceneGrid, height_
     Returns
     -------
     float
-        0 to 1: mean of the incoherent and the coherent sum over pairs, relative to an echo with all the energy of its
-        pulses. Two hypotheses about the same recording are compared by the ratio of their values.
+        0 to 1: mean of the incoherent and the coherent sum over pairs, relative to an echo that contains all the energy
+        of its pulses. Two hypotheses about the same recording are compared by the ratio of their values.
 
     Raises
     ------
@@ -344,14 +346,15 @@ def _echo_power(history: PhaseHistory) -> float:
 
 # ---- Focus report of an image
 
-_SQUARE_CELLS, _LEAST_PX = 2.0, 4  # side of the squares whose brightest maximum is evaluated: cells, and least pixels
-_PATCHES = 4  # patches imaged by subapertures, at the brightest points
+# side of the squares whose brightest maximum is evaluated: in resolution cells, and at least in pixels
+_SQUARE_CELLS, _LEAST_PX = 2.0, 4
+_PATCHES = 4  # number of patches imaged by subapertures, at the brightest points
 _PATCHES_APART = PART_PX / 2  # least distance of two patches, in patch pixels, for independent measurements
 _PLACES_PER_CELL = 2.5  # pixels of a patch per resolution cell, along a side
 _CELL_POINTS = 5  # points along a side of the scene at which the resolution cell is computed
 _BAND_SAMPLES = 9  # frequency samples of the spatial spectrum
-_UNEXPECTED_SIGMAS = 3.0  # significance of a loss beyond the expected loss, above which it is flagged
-_RESPONSE_OVERSAMPLING = 8.0  # of a pulse's response, which is interpolated linearly between samples
+_UNEXPECTED_SIGMAS = 3.0  # standard deviations by which a loss must exceed the expected loss to be flagged
+_RESPONSE_OVERSAMPLING = 8.0  # oversampling of a pulse's response, which is interpolated linearly between samples
 _WINDOWED = 0.62  # standard deviation of a Hann-windowed band relative to that of the unwindowed band
 
 
@@ -404,7 +407,7 @@ def _shown(
 
 
 def _spectrum(formation: Formation) -> NDArray[np.float64]:
-    """Return the covariance of a point's spatial spectrum in the scene's middle, east and north."""
+    """Return the covariance of a point's spatial spectrum at the scene centre, east and north."""
     profiles, grid = formation.profiles, formation.grid
     row, column = ((size - 1) / 2 for size in grid.shape)
     middle_m, axes = ground_axes(formation, row, column)
@@ -441,7 +444,7 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
     inputs, has_points = formation.history or formation.profiles, verdict.points > 0
     elsewhere = echo_outside_scene(inputs, grid, formation.plan.terrain, points=terms, measured=has_points)
     if elsewhere:
-        measured = [None] * len(points)  # the points may be its sidelobes
+        measured = [None] * len(points)  # the points may be sidelobes of an echo outside the scene
     if elsewhere or not has_points:
         verdict = judge_parts(parts, cell_m=cell_m)
     peak = max((point.amplitude for point in points), default=0.0)
@@ -464,11 +467,11 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
 
 _CONJUGATED_LOSS_DB = -6.0  # loss beyond which the samples of a defocused image are tested for conjugation
 _CONJUGATED_DB = 10.0  # least gain in peak by conjugation; a track error does not cause such a gain
-_CONJUGATED_S = 60.0  # longest predicted run time of the image for this test
+_CONJUGATED_S = 60.0  # longest predicted run time (s) of an image to which this test is applied
 
 
 def _conjugated(formation: Formation, peak: float) -> str | None:
-    """Detect conjugated samples by a much brighter peak of their conjugate's image, described in one line; else None.
+    """Detect conjugated samples by a much brighter peak in the image of their conjugates; one line, or None.
 
     Notes
     -----
@@ -510,8 +513,8 @@ def focus_flags(report: dict[str, Any], expected: Effect) -> Flags:
 
     Notes
     -----
-    Source: docs/theory/focus.md, "Focus of a point". Both losses have a standard deviation: that of the measured loss
-    is estimated from its points, that of the expected loss is its variation between flights.
+    Source: docs/theory/focus.md, "Focus of a point". The standard deviation of the measured loss is estimated from its
+    points; that of the expected loss describes its variation between flights.
     """
     flags = Flags({"echo_outside_scene": report["elsewhere"]} if "elsewhere" in report else {})
     budget = f"{abs(expected.loss_db):.1f} ± {expected.loss_std_db:.1f} dB expected from the error budget"

@@ -78,7 +78,7 @@ class Formation:
 
     @cached_property
     def windows(self) -> list[Window]:
-        """Tiles that a pulse may illuminate, a full-sized one first if any; all others are zero and not computed."""
+        """Tiles that a pulse may illuminate, a full-sized one first if any; other tiles are zero and not computed."""
         tiles = self.tiles
         reach = Reach.of(self.beams, self.profiles.aperture, self.grid, self.plan.terrain, tiles)
         formed = [tile for tile, illuminated in zip(tiles, reach.illuminated, strict=True) if illuminated]
@@ -88,7 +88,7 @@ class Formation:
 
     @cached_property
     def variant_counts(self) -> Counter[str]:
-        """Variant of the engine's sum → pixels × pulses computed by it in this process; empty if there is only one."""
+        """Variant of the engine's sum → number of pixel-pulse contributions; empty with a single variant."""
         return Counter()
 
     @cached_property
@@ -97,11 +97,11 @@ class Formation:
 
     @property
     def image(self) -> "Array":
-        """The image by the planned setting: a dask array, (row, column) complex64, whose chunks are the tiles."""
+        """The image with the planned setting: a dask array, (row, column) complex64, whose chunks are the tiles."""
         return self._array(self.plan.setting, presum=True)
 
     def image_by(self, setting: Setting) -> "Array":
-        """Return the image by another setting, without presumming."""
+        """Return the image computed with another setting, without presumming."""
         return self._array(setting, presum=False)
 
     def positions_at(self, row: ArrayLike, column: ArrayLike) -> NDArray[np.float64]:
@@ -177,7 +177,7 @@ class Formation:
         return image
 
     def contributions(self, row: ArrayLike, column: ArrayLike) -> list[NDArray[np.complex128]]:
-        """Return the contributions of the pulses that illuminate each fractional pixel, (pulse,) complex128 each.
+        """Return for each fractional pixel the contributions of the pulses that illuminate it, (pulse,) complex128.
 
         Computed by the sum over a history's subcarriers, or by band-limited interpolation of profiles.
         """
@@ -194,7 +194,7 @@ class Formation:
     def illuminating_pulses(
         self, points_m: NDArray[np.float64]
     ) -> Iterator[tuple[slice, list[tuple[slice, NDArray[np.bool_]]]]]:
-        """Yield pulse blocks to read, each with its sub-blocks that may illuminate points, and the masks of the points.
+        """Yield pulse blocks to read, each with sub-blocks that may illuminate points, and masks of these points.
 
         Parameters
         ----------

@@ -32,11 +32,11 @@ def gradient(
     profiles
         Range profiles, oversampled by at least 2, or the dataset of a campaign's stage `profile`.
     grid
-        Pixels of the image, often a patch of it such as ``grid[40:60, 10:30]``.
+        Pixels of the image, often only a patch of a grid, such as ``grid[40:60, 10:30]``.
     dj_dimage
         (y, x) complex: G with J(I + dI) = J(I) + Re Σ conj(G)·dI, that is ∂J/∂Re I + j·∂J/∂Im I; for J = Σ|I|⁴ it is
         4|I|²·I. PyTorch's gradient of a complex tensor is this G, JAX's is its conjugate. The image I is that of
-        `backproject`, with the carrier phase, divided by the number of pulses, and with integration='all'.
+        `backproject` with integration='all': with the carrier phase, and divided by the number of pulses.
     terrain
         As for `backproject`.
     beams
@@ -59,7 +59,7 @@ def gradient(
     Notes
     -----
     Source: docs/theory/autofocus.md, eq. 6 to 8: the exact derivative of the interpolated, rotated and summed samples.
-    Finite differences of images by `backproject` agree within the error of their engine.
+    Finite differences of images formed by `backproject` agree with the gradient within the error of their engine.
 
     Examples
     --------

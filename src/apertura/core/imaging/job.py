@@ -27,7 +27,7 @@ from apertura.core.scene.terrain import FlatGround, GroundModels, Terrain
 _POINTS = 9  # sample points along a side of the scene
 _PULSES = 256  # pulses sampled for total paths
 _RADIO_HZ = (1e5, 1e12)  # accepted radio frequencies, wider than any radar band
-_USUAL_HZ = (1e7, 1e12)  # a frequency with the wrong unit is recognised if its conversion lies in this interval
+_USUAL_HZ = (1e7, 1e12)  # a frequency in a wrong unit is recognised if the converted value lies in this interval
 
 
 def check_inputs(inputs: PhaseHistory | Profiles, grid: SceneGrid, terrain: Terrain) -> dict[str, str]:
@@ -132,11 +132,12 @@ def _check_samples(inputs: PhaseHistory | Profiles) -> None:
 
 
 _LEAST_BAND = 0.05
-"""Least share of subcarriers that contain a pulse's energy: an echo fills its band, but only a few samples of time."""
+"""Least share of subcarriers that contain a pulse's energy: an echo fills the band in frequency, but few samples in
+time."""
 
 
 def _check_spectrum(history: PhaseHistory) -> None:
-    """Raise CampaignError if samples appear to be in time, not in frequency: few of them contain a pulse's energy."""
+    """Raise CampaignError if samples appear to be in the time domain: few of them contain a pulse's energy."""
     transfer = np.asarray(history[history.aperture.sample(_PULSES)].transfer)
     power = np.abs(transfer).astype(np.float64) ** 2
     total = power.sum(axis=1)
@@ -154,7 +155,7 @@ def _check_spectrum(history: PhaseHistory) -> None:
 def _outside(inputs: PhaseHistory | Profiles, points: np.ndarray) -> float:
     """Return the share of total paths, from sampled pulses to sampled points, that lie beyond the samples.
 
-    A phase history is periodic with c/Δf; total paths farther than that from its reference count as beyond.
+    A phase history has the period c/Δf; total paths that differ from its reference by more than that lie beyond it.
     """
     sampled = inputs[inputs.aperture.sample(_PULSES)]
     path_m = sampled.aperture.path(points)
@@ -227,7 +228,7 @@ def imaging_job(
     Returns
     -------
     Job
-        Without limits of path and memory, and with default tiles and threads; to be replaced by the caller.
+        Without limits of path and memory, and with default tiles and threads; the caller replaces these.
     """
     centre, count = centre_frequency(frequency_hz), len(frequency_hz)
     ground_m = grid.sample_points(_POINTS, ground.level.height_m)
@@ -285,7 +286,7 @@ def profiles_job(
 
 
 def _patches(grid: SceneGrid, ground: Terrain) -> tuple[NDArray[np.float64], ...]:
-    """Return the positions of the pixels of windows in the corners and in the middle of a scene."""
+    """Return the positions of the pixels of windows in the corners and at the centre of a scene."""
     sides = [min(_PATCH_PX, size) for size in grid.shape]
     ends = [(0, (size - side) // 2, size - side) for size, side in zip(grid.shape, sides, strict=True)]
     corners = {(ends[0][row], ends[1][column]) for row, column in ((0, 0), (0, 2), (1, 1), (2, 0), (2, 2))}

@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _CM = 1e-2
-_APERTURE_S = 10.0  # assumed duration of the aperture without times; position errors last one second, a tenth of it
+# assumed duration of an aperture without times; the correlation time of position errors, one second, is a tenth of it
+_APERTURE_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class Judgement:
     flags
         Exceeded limit → measured value, as listed in docs/flags.md.
     budget
-        Error sources, each with its configured or assumed size, `loss_db`, `shift_m` and `phase_rad`.
+        Error sources, each with its configured or assumed size and its effects `loss_db`, `shift_m` and `phase_rad`.
     focus
         Section `focus` of image.json: loss, its standard deviation, the loss expected from the budget, and each bright
         point.
@@ -78,7 +79,7 @@ def judgement(formation: Formation, target: Any, lines: Sequence[BudgetLine]) ->
     focus |= {"expected_db": round(effect.loss_db, 3), "expected_std_db": round(effect.loss_std_db, 3)}
     focus |= {"expected_shift_m": round(effect.shift_m, 3)}
     still = formation.plan.flags.get("no_aperture")
-    if still:  # range resolution only: the focus measures of points are meaningless
+    if still:  # the image resolves range only: focus measures of points are meaningless
         focus = {key: value for key, value in focus.items() if key not in {"loss_db", "std_db", "elsewhere", "points"}}
         focus |= {"verdict": "inconclusive", "reason": f"no aperture: {still}", "points": []}
     flags = Flags.merged(antenna_flags(lines), {} if still else focus_flags(focus, effect))
@@ -95,10 +96,10 @@ def judge(
     ----------
     image
         Result of `apertura.backproject`, still lazy: its graph contains the echoes, the phase centres and the terrain.
-        Any lazy selection or function of it is judged by the whole image.
+        For a lazy selection or function of it, the whole image is assessed.
     position_std_m
         Standard deviation of the phase centres in each axis, metres, from which the expected loss is computed
-        (default: not stated, no loss expected).
+        (default: not stated; no loss is expected).
     time_s
         (pulse,) float64, transmit times of the pulses, seconds; position errors have a correlation time of one second.
 
@@ -110,7 +111,8 @@ def judge(
     Raises
     ------
     CampaignError
-        If the array has no image of `backproject` in its graph, or several; or position_std_m is given without times.
+        If the graph of the array contains no image of `backproject`, or several; or position_std_m is given without
+        times.
 
     Notes
     -----

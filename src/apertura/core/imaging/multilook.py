@@ -23,8 +23,9 @@ WINDOW = 7
 """Side of the window of the filter and of the local ENL, pixels of the multilooked raster, as in Lee (1980)."""
 
 _PARTS = 4  # subdivisions of a block per axis, for the variation of the look direction across it
-_MOST_CHANCE = 0.5  # |ρ|² at large lags: reached by blocks of two resolution cells, or a constant image
-_FEWEST_PX = 10  # least side of a block: a smaller one has only lags close to zero
+# |ρ|² at large lags above which a block is excluded: blocks of two resolution cells, or a constant image
+_MOST_CHANCE = 0.5
+_FEWEST_PX = 10  # least side of a block: a smaller block has only lags close to zero
 _STEP, _SCATTER = 0.02, 0.2  # of ln(ENL): histogram bin, and standard deviation of a local estimate, for smoothing
 
 
@@ -36,7 +37,8 @@ def block_means(values: Floats, side: int) -> Floats:
     values
         (row, column) real; NaN is excluded.
     side
-        Side of a block, pixels. A block across the edge is the mean of its pixels inside.
+        Side of a block, pixels. The value of a block that extends beyond the image is the mean of its pixels inside the
+        image.
 
     Returns
     -------
@@ -188,7 +190,7 @@ def found_looks(rasters: Iterable[Floats], within: float) -> float:
     rasters
         (row, column) float64, multilooked power in blocks of the image.
     within
-        Looks of the mean over a whole window, `Speckle.looks`.
+        Number of looks of the mean over a whole window, from `Speckle.looks`.
 
     Returns
     -------
@@ -229,7 +231,7 @@ def lee(power: Floats, *, looks: float, within: float) -> Floats:
     looks
         Equivalent number of looks of a pixel.
     within
-        Equivalent number of looks of the mean over a whole window, `Speckle.looks`.
+        Equivalent number of looks of the mean over a whole window, from `Speckle.looks`.
 
     Returns
     -------
@@ -271,8 +273,8 @@ class Multilook:
     filtered
         True if speckle is filtered, before noise is subtracted; False if the number of looks is unknown.
     looks, within, found
-        Equivalent number of looks of a square and of the filter's window, both from the speckle correlation, and of a
-        square of homogeneous terrain as measured. NaN if the image has too few valid pixels.
+        Equivalent numbers of looks: of a square and of the filter's window, both computed from the speckle correlation;
+        and of a square of homogeneous terrain, measured. NaN if the image has too few valid pixels.
     """
 
     image: Callable[[Window], NDArray[np.complex64]]
@@ -308,8 +310,8 @@ class Multilook:
         >>> multilook.shape, round(multilook.looks), multilook.mean((slice(0, 2), slice(5, 8))).shape
         ((128, 128), 16, (2, 3))
         """
-        wanted = min(max(_MEASURED_PX, _MEASURED_WINDOWS * WINDOW * side), _LARGEST_PX)
-        rows, columns = (min(wanted, size) // side * side or min(wanted, size) for size in pixels)
+        size_px = min(max(_MEASURED_PX, _MEASURED_WINDOWS * WINDOW * side), _LARGEST_PX)
+        rows, columns = (min(size_px, size) // side * side or min(size_px, size) for size in pixels)
         count = max(1, min(_MEASURED_BLOCKS, min(_MOST_PX, 2 * pixels[0] * pixels[1]) // (rows * columns)))
         corners = np.random.default_rng(0).uniform(size=(count, 2)) * (pixels[0] - rows, pixels[1] - columns)
         starts = sorted({(int(row) // side * side, int(column) // side * side) for row, column in corners})

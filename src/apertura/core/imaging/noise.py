@@ -1,4 +1,4 @@
-"""Noise power of a pulse, measured at Doppler frequencies outside the scene's, and the share added by a sidelink."""
+"""Noise power of a pulse, measured at Doppler frequencies outside the scene's, and the noise added by a sidelink."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -21,19 +21,21 @@ _PLACES, _BLOCKS = 64, 8
 """Number of random points, and largest number of 64-pulse blocks, at which the noise is measured."""
 
 _MARGIN, _BAND = 2.0, (0.25, 0.4375)
-"""Excluded Doppler band: twice the scene's, to cover echoes from its surroundings; limits in cycles per pulse."""
+"""Excluded Doppler band: twice the scene's band, to cover echoes from its surroundings; limits of the band in cycles
+per pulse."""
 
 _LEAKED_DB = 0.6
-"""Excess (dB) of the measured noise from echoes outside the scene where the PRF is too low for that margin: +0.1 to
-+0.6 dB in images of five flights at a PRF of 40 Hz with 18 Hz of Doppler."""
+"""Increase (dB) of the measured noise by echoes outside the scene if the PRF is too low for that margin: +0.1 to +0.6
+dB in images of five flights at a PRF of 40 Hz with a Doppler bandwidth of 18 Hz."""
 
 _LEAK = 1e-5
 """Largest share of a taper's energy within the excluded band."""
 
-_GROUPS, _ALIKE = 16, 8  # groups on which sidelink noise is drawn, and pulses per group, which share their geometry
+# number of groups for which sidelink noise is drawn, and pulses per group, for which one geometry is assumed
+_GROUPS, _ALIKE = 16, 8
 _BLOCKS_DRAWN = 16  # random draws per group
 _FEWEST = 16  # least number of pulses in a block
-_LEAST_WEIGHT = 0.1  # relative to the largest weight of a block at a point; points with less are excluded
+_LEAST_WEIGHT = 0.1  # least weight of a block at a point, relative to the largest; points below it are excluded
 
 
 def noise_places(grid: SceneGrid, terrain: Terrain) -> NDArray[np.float64]:
@@ -73,7 +75,8 @@ def noise_power(
     -------
     PulseNoise
         NaN if no block illuminates a point. An upper bound if the PRF is so low that echoes of every other pulse alias.
-        If twice the scene's Doppler fills the band, the standard deviation includes echoes from outside the scene.
+        If twice the scene's Doppler band fills the whole band, the standard deviation includes the effect of echoes
+        from outside the scene.
 
     Notes
     -----
@@ -121,7 +124,7 @@ def _numbers(block: slice, time_s: NDArray[np.float64] | None) -> NDArray[np.flo
 def _tapers(number: tuple[float, ...], band: float) -> NDArray[np.float64]:
     """Return tapers over pulses, (taper, pulse) float64 of norm 1, that suppress |f| < band (cycles per pulse).
 
-    At least one taper, that with the least leakage.
+    At least one taper is returned: that with the least leakage.
     """
     leak, taper = np.linalg.eigh(2 * band * np.sinc(2 * band * np.subtract.outer(number, number)))
     return np.asarray(taper[:, leak <= max(_LEAK, float(leak[0]))].T)
@@ -182,5 +185,5 @@ def sidelink_noise(
     if not weights.any():
         return 0.0
     local = local[weights > _LEAST_WEIGHT * weights.max()]
-    # Summed over a pulse block the power is exponentially distributed with this mean; `noise_power` uses the median.
+    # The power of a sum over a pulse block is exponentially distributed with this mean; `noise_power` uses the median.
     return float(np.median(local * generator.exponential(size=(_BLOCKS_DRAWN, *local.shape))) / np.log(2))

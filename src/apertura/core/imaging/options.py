@@ -24,7 +24,7 @@ class IntegrationResolution(BaseModel):
 
 
 PLANNED = ("engine", "engine_options", "presum", "pulse_blocks", "terrain")
-"""Options decided by the planner where they are 'auto'."""
+"""Options for which 'auto' leaves the decision to the planner."""
 
 
 def _options_of_each_engine(schema: dict[str, Any]) -> None:
@@ -46,7 +46,8 @@ class ImagingChoices(BaseModel):
     window: Literal["hann", "none"] = Field("hann", description="weighting over the subcarriers")
     accuracy_db: Annotated[float, Field(le=-10, ge=-120)] | Literal["auto"] = Field(
         "auto",
-        description="numerical error asked of the image, dB; auto: 10 dB below what else spoils it, from -40 to -60",
+        description="requested numerical error of the image, dB; auto: 10 dB below the largest other error, between "
+        "-40 and -60",
     )
     engine: str = Field(
         "auto",
@@ -55,24 +56,26 @@ class ImagingChoices(BaseModel):
     )
     engine_options: dict[str, dict[str, Any]] = Field(
         default_factory=dict,
-        description="options of engines that the planner shall not choose: engine → option → value",
+        description="engine options that override the planner: engine → option → value",
         examples=[{}],
         json_schema_extra=_options_of_each_engine,
     )
     tile_px: int = Field(256, ge=PATCH_PX, multiple_of=PATCH_PX, description="side of a tile, pixels")
     presum: Annotated[int, Field(ge=1, le=64)] | Literal["auto"] = Field(
-        "auto", description="pulses that a low-pass sum makes one, where the aperture is oversampled; 1 keeps all"
+        "auto", description="presumming factor, for oversampled apertures; 1: no presumming"
     )
     pulse_blocks: Annotated[int, Field(ge=1, le=1024)] | Literal["auto"] = Field(
-        "auto", description="blocks of pulses whose tables are in memory at once, one after the other; 1 takes them all"
+        "auto",
+        description="number of pulse blocks that are processed one after the other, to limit memory; 1: all pulses "
+        "at once",
     )
     integration: Literal["auto", "all"] | IntegrationAngle | IntegrationResolution = Field(
         "auto",
-        description="how much of a pass a pixel is integrated over: auto, what the pixels' spacing carries; all; "
-        "{degrees: x} of a straight pass; {resolution_m: x} along the flight",
+        description="integration angle of a pixel: auto (as much as the pixel spacing can represent), all, "
+        "{degrees: x} of a straight pass, or {resolution_m: x} along the track",
     )
     terrain: Literal["auto", "plane", "tilted_plane", "dem"] = Field(
-        "auto", description="what stands for the ground; auto takes the simplest that keeps focus and place"
+        "auto", description="terrain model; auto: the simplest that preserves focus and position"
     )
 
     @property

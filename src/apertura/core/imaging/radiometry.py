@@ -22,7 +22,7 @@ Quantity = Literal["sigma0", "beta0", "gamma0"]
 # ---- Radio link of a pair: from radar cross-section to recorded samples
 
 MOST_DBM = 90.0
-"""Largest accepted transmit power, dBm: above a megawatt the unit is taken to be wrong."""
+"""Largest accepted transmit power, dBm: above one megawatt a wrong unit is assumed."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Link:
         Raises
         ------
         CampaignError
-            If one of them is not a number above 0.
+            If an argument is not a number above 0.
         """
         for name, value in (("wavelength_m", wavelength_m), ("sent_power", sent_power)):
             if not (is_number(value) and value > 0):
@@ -109,7 +109,7 @@ class Link:
 def cell_constant(frequency_hz: Floats, weight: Floats) -> float:
     """Return c²/Δf · Σ w_n²/f_n, m²: contribution of the band to the area of a resolution cell (eq. 5).
 
-    λ·c/B of a flat band without window.
+    It is λ·c/B for a flat band without window.
 
     Parameters
     ----------
@@ -127,7 +127,8 @@ def cell_constant(frequency_hz: Floats, weight: Floats) -> float:
 
 
 Turn = tuple[Floats, tuple[bool, bool]]
-"""Attitude error: rotation vector (3,), rad, and flags: rotates the transmitting, rotates the receiving antenna."""
+"""Attitude error: rotation vector (3,), rad, and two booleans: applies to the transmitting antenna, to the receiving
+one."""
 
 
 def pointing_std_db(beams: Beams | None, aperture: Aperture, place_m: Floats, turns: Sequence[Turn]) -> float:
@@ -177,10 +178,11 @@ def pointing_std_db(beams: Beams | None, aperture: Aperture, place_m: Floats, tu
 
 _RANGE_SHARE = 24  # node pitch is range / 24: interpolation error of log gain and area 0.1 dB in a beam of 20°
 _PULSES = 128  # at least this number of pulses, at most twice as many, are summed for a block of the lattice
-_POINT_PULSES = 8192  # the same for a single point
+_POINT_PULSES = 8192  # the same limit for a single point
 _BINS = 32  # bins of the pulse density over spatial frequency, whose square is integrated
 _LEAST = 1e-3  # weight relative to the strongest pulse, below which a pulse does not extend the aperture
-_STEEPEST = 0.1  # n·n_s below which σ⁰ is NaN: 1° of slope error is 0.7 dB there, and 0 is the onset of layover
+# n·n_s below which σ⁰ is NaN: there, a slope error of 1° causes an error of 0.7 dB; n·n_s = 0 is the onset of layover
+_STEEPEST = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +196,7 @@ class Calibration:
     aperture, beams
         All pulses, and their weights in image formation: antennas and sector.
     count
-        M, by which the image's sum was divided.
+        M, divisor of the image's sum.
     constant
         K of eq. 2, configured or measured.
     cell_m2
@@ -357,8 +359,8 @@ class Calibration:
         -------
         ndarray
             (row, column) float64. NaN where no pulse illuminates the pixel; for sigma0 of level terrain also within
-            5.7° of nadir; with normals also at layover and close to it, where the area is ill-conditioned, and on
-            slopes that face away (gamma0).
+            5.7° of nadir; with `normal`, also in and near layover, where the area is ill-conditioned, and for gamma0 on
+            slopes that face away.
         """
         level = self.rcs_power(window) * self.cell(window)
         if quantity == "sigma0" and (normal is None or isinstance(self.terrain, FlatGround)):
@@ -444,7 +446,7 @@ def _across(gradient: Floats, parts: Floats, up: Floats) -> Floats:
     """Return the sine of the incidence angle across the track, (point,).
 
     Half the RMS of the horizontal gradient's component perpendicular to the principal axis of its spread over the
-    pulses: sin θ beside a straight track, and of the same order at the centre of a circular one.
+    pulses: sin θ to the side of a straight track, and of the same order at the centre of a circular track.
     """
     size = np.abs(parts)
     weight = size / np.maximum(size.sum(axis=0), 1e-300)
@@ -463,7 +465,8 @@ def _spread(gradient: Floats, parts: Floats, up: Floats) -> Floats:
     """Return ∫(dU/ds)² ds / U² at each point, per unit of spatial frequency on level ground: eq. 5.
 
     Pulses are sorted by azimuth, so that contributions of an irregular or repeated track accumulate at their spatial
-    frequency. Their density is averaged over bins of the aperture: finer structure scatters far beyond the cell.
+    frequency. Their density is averaged over bins of the aperture: its finer structure affects only points far from the
+    cell.
 
     Parameters
     ----------
@@ -477,8 +480,8 @@ def _spread(gradient: Floats, parts: Floats, up: Floats) -> Floats:
     Returns
     -------
     ndarray
-        (point,) float64; NaN where fewer than two pulses have a significant weight, or all of these have the same
-        spatial frequency.
+        (point,) float64; NaN where fewer than two pulses have a significant weight, or all pulses with one have the
+        same spatial frequency.
     """
     # Spatial frequency of each pulse on level ground: its azimuth relative to the mean, and its squared magnitude.
     points, pulses = parts.shape

@@ -55,7 +55,7 @@ class RangeWindow:
 
     @property
     def contributing(self) -> NDArray[np.bool_]:
-        """(pulse,) bool, True where a pulse may contribute to a pixel; other profiles are never read."""
+        """(pulse,) bool, True where a pulse may contribute to a pixel; profiles of other pulses are never read."""
         return np.isfinite(self.farthest_m)
 
     @classmethod
@@ -86,8 +86,8 @@ class RangeWindow:
         wave_speed_m_s
             Speed of the wave along the paths.
         together
-            Number of consecutive pulses whose windows are bounded from one of them: faster, and wider by the motion
-            of the antennas during these pulses.
+            Number of consecutive pulses whose windows are bounded by the window of one of them: faster to compute, and
+            wider by the motion of the antennas during these pulses.
 
         Notes
         -----
@@ -181,7 +181,7 @@ def range_compress(
 
 
 class CompressionError:
-    """Error of range profiles relative to their transfer functions, at random samples of random pulses of each block.
+    """Error of range profiles relative to their transfer functions, at random samples of random pulses per block.
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ class CompressionError:
 
 # ---- Stages as inputs of engines
 
-_SPARSE_STEP = 64  # pulses; at larger steps pulses are read individually
+_SPARSE_STEP = 64  # pulses; slices with larger steps are read pulse by pulse
 
 
 class Rows:
@@ -306,7 +306,7 @@ def aperture_of(stage: xr.Dataset) -> Aperture:
 
 
 def inputs_of(given: PhaseHistory | Profiles | xr.Dataset, window: str = "hann") -> PhaseHistory | Profiles:
-    """Return the inputs of an engine: arrays unchanged, or those in the dataset of stage `echo` or `profile`.
+    """Return the inputs of an engine: the given arrays, or the arrays in the dataset of stage `echo` or `profile`.
 
     Raises
     ------

@@ -27,7 +27,8 @@ _SEAMS = np.array(
         [0.0, np.sqrt(2 / 3), 1 / np.sqrt(3)],
     ]
 )
-"""Seams of a trihedral, (seam, axis): right, up, ahead; the third lies in the vertical plane of the boresight."""
+"""Seams of a trihedral, (seam, axis), with the axes right, up, ahead; the third seam lies in the boresight's vertical
+plane."""
 
 _HEXAGON = 5 / (36 * np.sqrt(3))  # mean square of a coordinate over a regular hexagon, divided by its area
 _DB = 20 / np.log(10)  # dB per relative error of an amplitude
@@ -45,7 +46,8 @@ class Reflector:
     shape
         'trihedral' (three right-angled triangles), 'dihedral' (two rectangles) or 'sphere'.
     size_m
-        Leg of the triangles; width across and length along the seam of the rectangles; radius of the sphere.
+        Trihedral: leg of the triangles. Dihedral: width across and length along the seam of the rectangles. Sphere:
+        radius.
     axes
         (3, 3) float64, unit vectors right, up and ahead along the boresight, as rows, in the frame of the antennas; the
         seam of a dihedral lies to the right.
@@ -107,7 +109,8 @@ class Reflector:
 
         Notes
         -----
-        An image sums amplitudes, not powers: the root of the cross-section is averaged over the pulses.
+        An image is a sum of amplitudes, not of powers: the square root of the cross-section is averaged over the
+        pulses.
 
         Examples
         --------
@@ -161,8 +164,8 @@ def _dihedral(size_m: Sequence[float], tx: Floats, rx: Floats, k: float) -> tupl
 def _sphere(radius_m: float, cosine: Floats, k: float) -> tuple[Floats, Floats]:
     """Return the cross-section of a conducting sphere by Mie's series at cosines of the scattering angle: eq. 13.
 
-    The mean of both polarisations, which are equal only in backscattering; half of their difference is taken as the
-    standard deviation.
+    Returns the mean over both polarisations, which are equal only for backscattering; half of their difference is used
+    as the standard deviation.
     """
     from scipy.special import spherical_jn, spherical_yn
 

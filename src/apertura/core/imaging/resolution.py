@@ -18,7 +18,7 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.looks import Lattice, fill, pulses_of
 from apertura.core.scene.terrain import FlatGround, Terrain
 
-_ORDER = 4  # highest order of moments: the second yields the width, the fourth the shape of the spectrum
+_ORDER = 4  # highest order of moments: the second order yields the width of the spectrum, the fourth its shape
 _ORDERS = [(east, total - east) for total in range(_ORDER + 1) for east in range(total + 1)]
 _PULSES = 128  # at least this number of pulses, at most twice as many, are summed for a block of the lattice
 _HALF_POWER = np.log(2) / 2  # -ln|p| where |p|² is one half
@@ -28,7 +28,7 @@ _LEAST_SPREAD = 1e-12  # cycles² per m²: a spectrum with a smaller second mome
 
 @dataclass(frozen=True, eq=False)
 class Resolution:
-    """Moments of the spatial spectrum on a lattice, from which the width of a point follows in any direction.
+    """Moments of the spatial spectrum on a lattice, from which the width of a point in any direction follows.
 
     Attributes
     ----------
@@ -37,9 +37,9 @@ class Resolution:
     lattice
         Nodes at which the moments are computed.
     moments
-        (node row, node column, moment) float64, cycles per metre to their power, of the spectrum's density: those of
-        `_ORDERS` over level ground, eastward and northward (the first is 1, or 0 where no pulse illuminates the node),
-        then those with the vertical u: u, east·u, north·u and u².
+        (node row, node column, moment) float64, moments of the spectral density, cycles per metre to the power of their
+        order: first those of `_ORDERS` over level ground, eastward and northward (the first is 1, or 0 where no pulse
+        illuminates the node), then those that involve the vertical u: u, east·u, north·u and u².
 
     Notes
     -----
@@ -76,8 +76,8 @@ class Resolution:
 
         Examples
         --------
-        A straight track of 20 m, at 30 m horizontal distance and 30 m height: λR/2L along the track, and c/2B divided
-        by the sine of 45° in ground range, both times the 0.886 of a flat spectrum.
+        Straight track of 20 m at 30 m horizontal distance and 30 m height. The widths are λR/2L along the track and
+        c/2B divided by the sine of 45° in ground range, both multiplied by 0.886 for a flat spectrum.
 
         >>> from apertura.core.scene.terrain import FlatGround
         >>> along = np.linspace(-10, 10, 401)
@@ -131,7 +131,7 @@ class Resolution:
         return replace(images[0], moments=total / np.maximum(total[..., :1], 1e-300))
 
     def axes(self, window: Window) -> tuple[Floats, Floats, Floats]:
-        """Return −3 dB widths of a point along the finest and the coarsest direction, and the azimuth of the finest.
+        """Return −3 dB widths of a point in the finest and the coarsest direction, and the azimuth of the finest.
 
         Parameters
         ----------
@@ -141,8 +141,8 @@ class Resolution:
         Returns
         -------
         tuple of ndarray
-            (row, column) float64: metres, metres, and degrees clockwise from the grid's north, −90 to 90; NaN where no
-            pulse illuminates the pixel, infinite along a direction without resolution.
+            (row, column) float64 each: both widths in metres, and the azimuth in degrees clockwise from grid north, −90
+            to 90. NaN where no pulse illuminates the pixel; widths are infinite in a direction without resolution.
         """
         if isinstance(self.terrain, FlatGround):
             fine, coarse, azimuth = self._axes_at_nodes
@@ -159,7 +159,7 @@ class Resolution:
         return fine, coarse, np.degrees(azimuth)
 
     def look_azimuth_deg(self, window: Window) -> Floats:
-        """Return the azimuth of the steepest increase of paths on the ground, degrees clockwise from grid north."""
+        """Return the azimuth of the steepest increase of the total path, degrees clockwise from grid north."""
         east, north = (self._between(self._raw(order), window) for order in ((1, 0), (0, 1)))
         return np.asarray(np.degrees(np.arctan2(east, north)))
 

@@ -1,4 +1,4 @@
-"""Imaging geometry of a pair at the scene's middle: direction, angles, distance and band."""
+"""Imaging geometry of a pair at the scene centre: direction, angles, distance and band."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from apertura.core.imaging.formation import Formation
 from apertura.core.scene.angles import bistatic_angle_deg, incidence_deg
 
 _COUNTS = 0.5
-"""Least weight of a pulse that illuminates the scene's middle: half amplitude."""
+"""Least weight for which a pulse counts as illuminating the scene centre: half amplitude."""
 
 _ONE_SIDE = 0.95
 """Share of pulses with the scene on one side, above which the image is assigned that side."""
@@ -21,7 +21,7 @@ _PULSES = 1024  # pulses sampled for the carriers, which are means over a smooth
 
 
 def view_report(formation: Formation, began: np.datetime64, time_s: NDArray[np.float64]) -> dict[str, Any]:
-    """Report the imaging geometry at the scene's middle for image.json; angles and distance at closest approach.
+    """Report the imaging geometry at the scene centre for image.json; angles and distance at closest approach.
 
     Parameters
     ----------
@@ -33,18 +33,17 @@ def view_report(formation: Formation, began: np.datetime64, time_s: NDArray[np.f
     Returns
     -------
     dict
-        `first_utc`, `last_utc`: first and last pulse that illuminate the middle (all pulses if none does).
+        `first_utc`, `last_utc`: first and last pulse that illuminate the scene centre; of all pulses if none does.
         `heading_deg`, `look_deg`: heading and look direction of the antennas' midpoint, clockwise from grid north.
-        `incidence_deg`: incidence angle of the transmitter, from the vertical. `bistatic_angle_deg`. `range_m`:
-        half the total path. `height_m`: height of the midpoint above the terrain. `speed_m_s`: mean speed of the
-        midpoint. `side`: side of the heading on which the scene lies, right, left, or both where the track
-        encircles it; `side_mirror_rad`: RMS phase between the echoes of the scene and of the mirrored scene;
-        `side_observable`: true if it exceeds 1 rad, so that a mirrored image is defocused. `centre_hz`, `band_hz`.
-        `carrier_cycles_m`: centre of the image's spatial frequency band, east and north
-        (docs/theory/interferometry.md, eq. 1). `carriers_cycles_m`: the same at 3 x 3 points from corner to corner
-        (`carrier_at`).
+        `incidence_deg`: incidence angle of the transmitter, from the vertical. `bistatic_angle_deg`. `range_m`: half
+        the total path. `height_m`: height of the midpoint above the terrain. `speed_m_s`: mean speed of the midpoint.
+        `side`: side of the heading on which the scene lies, right, left, or both where the track encircles it;
+        `side_mirror_rad`: RMS phase between the echoes of the scene and of the mirrored scene; `side_observable`: true
+        if it exceeds 1 rad, so that a mirrored image is defocused. `centre_hz`, `band_hz`. `carrier_cycles_m`: centre
+        of the image's spatial frequency band, east and north (docs/theory/interferometry.md, eq. 1).
+        `carriers_cycles_m`: the same at 3 x 3 points from corner to corner (`carrier_at`).
     """
-    # The scene's middle, and the pulses that illuminate it.
+    # The scene centre, and the pulses that illuminate it.
     point, (east, north) = ground_axes(formation, *((size - 1) / 2 for size in formation.grid.shape))
     profiles, beams = formation.profiles, formation.beams
     weight = np.ones(len(profiles)) if beams is None else beams.weight(profiles.aperture, point[None])[:, 0]
@@ -83,9 +82,9 @@ def view_report(formation: Formation, began: np.datetime64, time_s: NDArray[np.f
 
 
 def carriers_of(formation: Formation) -> NDArray[np.float64]:
-    """Return the carriers of points at corners, edges and middle of the scene, (3, 3, 2) as `carrier_at` takes them.
+    """Return the carriers of points at corners, edges and centre of the scene, (3, 3, 2) as required by `carrier_at`.
 
-    Means over the pulses that illuminate a point (all pulses if none does).
+    Each is a mean over the pulses that illuminate the point, or over all pulses if none does.
     """
     profiles, beams, shape = formation.profiles, formation.beams, formation.grid.shape
     sampled = profiles.aperture.sample(_PULSES)
@@ -101,7 +100,7 @@ def carriers_of(formation: Formation) -> NDArray[np.float64]:
 
 
 def ground_axes(formation: Formation, row: float, column: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return a point on the terrain, (3,) metres, and unit vectors along the grid's east and north there, (2, 3)."""
+    """Return a point on the terrain, (3,) metres, and unit vectors along the grid's east and north at it, (2, 3)."""
     point, east, north = formation.positions_at([row, row, row - 0.5], [column, column + 0.5, column])
     axes = np.stack([east - point, north - point])
     return point, axes / np.linalg.norm(axes, axis=1, keepdims=True)

@@ -50,8 +50,8 @@ def decide_accuracy(lines: Sequence[BudgetLine]) -> Decision:
 TOLERATED_LOSS_DB = 0.2
 """Peak loss from position errors that is tolerated without autofocus, dB.
 
-RTK at its best, half a centimetre in each log, costs 0.3 dB at L-band. A smaller loss is not visible in an image, and
-does not justify a job that reads all pairs of a flight together.
+The best RTK accuracy, half a centimetre in each log, causes a loss of 0.3 dB at L-band. A smaller loss is not visible
+in an image, and does not justify a step that reads all pairs of a flight together.
 """
 
 
@@ -92,7 +92,7 @@ FOCUS_RAD = 0.4
 """
 
 SHIFT_PIXELS = 0.5
-"""Tolerated displacement by a simpler terrain model, pixels: a point stays in its own pixel."""
+"""Tolerated displacement by a simpler terrain model, pixels: a point remains in its pixel."""
 
 
 def decide_terrain(job: Job, *, requested: str | None = None, where: str = "processing") -> Decision:
@@ -164,7 +164,7 @@ MOST_ASPECT = 1.5
 """Ratio of a point's aspect angle to the integration angle, above which `track_turns` is raised."""
 
 _PULSES = 256  # pulses sampled for the geometry
-_FEWEST = 3  # least pulses at the pixel with the most: focus cannot be judged from two
+_FEWEST = 3  # least number of pulses at the pixel with the most pulses: focus cannot be assessed from two pulses
 _COUNTED = 16384  # pulses sampled to count the pulses per pixel
 
 
@@ -240,7 +240,7 @@ def sector_half(
     per_path
         Change of the path gradient along the flight per change of s: 2 for antennas on parallel tracks.
     squint
-        s of the sector's middle.
+        s at the centre of the sector.
 
     Notes
     -----
@@ -335,7 +335,7 @@ def _pulses_per_place(
 
 
 def _aspect_deg(sector: Sector, aperture: Aperture, points: NDArray[np.float64], up: NDArray[np.float64]) -> float:
-    """Return the aspect angle of a point over the pulses inside the sector, median over the points, degrees."""
+    """Return the range of aspect angles over the pulses inside the sector, median over the points, degrees."""
     sampled = aperture.sample(4 * _PULSES)
     pulses, inside = aperture[sampled], sector[sampled]
     summed, gradient = inside.weight(pulses, points) >= 0.5, pulses.path_gradient(points)

@@ -102,15 +102,15 @@ def no_aperture(aperture: Aperture, ground_m: NDArray[np.float64], *, wavelength
 
 
 GHOST_DB, REACHED = -20.0, 0.1
-"""Level of ghosts relative to their point, dB, and ambiguous share of the scene, mean over the pulses, above which
-ghosts are visible."""
+"""Limits above which ghosts are visible: level of ghosts relative to their point, dB, and ambiguous share of the scene,
+mean over the pulses."""
 
 FOLDED_DB = 1.0
 """Mean increase of the scene's power by aliased echoes, dB, above which they are visible between targets."""
 
 
 def undersampling(job: Job) -> str | None:
-    """Detect undersampling of the aperture with visible ambiguities, described in one line; None if not visible.
+    """Detect undersampling of the aperture with visible ambiguities, described in one line; None if none is visible.
 
     Notes
     -----
@@ -154,7 +154,7 @@ def check_positions(aperture: Aperture) -> None:
 def _over(
     position_m: NDArray[np.float64], ground_m: NDArray[np.float64], up: NDArray[np.float64], spacing_m: float
 ) -> NDArray[np.bool_]:
-    """Return a mask of the pulses above the scene."""
+    """Return a mask of the antenna positions above the scene."""
     corner, over = ground_m[0, 0], np.ones(len(position_m), bool)
     right, down = ground_m[0, -1] - corner, ground_m[-1, 0] - corner
     lengths = [float(np.linalg.norm(side)) for side in (right, down)]
@@ -211,12 +211,12 @@ class Decision:
     Attributes
     ----------
     name, value
-        Option and its value: a key of section `processing` of the configuration, or an option of the engine, by which
-        the decision can be overridden.
+        Option and its value. The option, a key of section `processing` of the configuration or an option of the engine,
+        can be set to override the decision.
     reason
         Reason with its numbers, one line.
     error_db
-        Error added by this decision, relative to the full model; None if it adds none.
+        Error added by this decision, relative to the full model; None if the decision adds no error.
     """
 
     name: str
@@ -240,7 +240,7 @@ class Plan:
     accuracy_db
         Requested numerical error.
     predicted_error_db
-        Predicted RMS error at random pixels, of the setting and of the models.
+        Predicted RMS error at random pixels, from the setting and the models together.
     predicted_seconds
         Predicted run time for tables and tiles.
     memory_bytes, disk_bytes
@@ -252,7 +252,7 @@ class Plan:
     terrain
         Terrain model of the image: the full terrain, a plane through it, or level ground.
     beams, integration, illumination
-        Those of the job.
+        As in the job.
     fixed_engine
         True if the engine of `setting` was requested.
     """
@@ -286,7 +286,7 @@ class Plan:
 
     @property
     def choices(self) -> dict[str, Any]:
-        """Option → value: all decisions on which the image's pixels depend, without predictions."""
+        """Option → value: all decisions that affect the image's pixels; no predictions."""
         return {decision.name: decision.value for decision in self.decisions} | {"ground": self.terrain.spec}
 
     @property
@@ -320,7 +320,7 @@ class Plan:
         )
 
     def replaced_by(self, setting: Setting, what: str) -> Flags:
-        """Return a flag if a requested engine is replaced for `what`, the image or a number of its tiles."""
+        """Return a flag if a requested engine is replaced for `what`: the image, or a number of its tiles."""
         if not self.fixed_engine or setting.engine == self.engine:
             return Flags()
         line = f"{what} formed by {setting.engine}: the requested {self.engine} misses {self.accuracy_db:.0f} dB"
@@ -337,17 +337,18 @@ BLOCK_BYTES = 512 << 20
 """Largest size of a pulse block in memory, samples and tables, so that memory does not grow with the flight."""
 
 _BASE_BYTES = 350_000_000  # the interpreter and its libraries
-_PULSE_BYTES = 500  # per pulse without its samples: phase centres, axes, copies of them
-_TILE_BYTES = 150  # per pixel being formed: positions, their projection, the sum
-_READ_BYTES = 3  # per byte of a block while it is read: compressed, decoded, and in its destination
-_SUM_BYTES = 8  # per pixel of the sum over pulse blocks
+_PULSE_BYTES = 500  # bytes per pulse in addition to its samples: phase centres, axes, and copies of them
+_TILE_BYTES = 150  # bytes per pixel during formation: positions, their projection, the sum
+_READ_BYTES = 3  # bytes in memory per byte of a block while it is read: compressed, decoded, and in its destination
+_SUM_BYTES = 8  # bytes per pixel for the sum over pulse blocks
 _CHECKED_PULSES, _CHECKED_BYTES = 1024, 40  # pulses per read for certificate and focus; bytes per subcarrier and pulse
 _LEAST_PULSES = 64  # least pulses of a block: batch size of the kernel
-_PRODUCT_BYTES = 76  # per pixel: image, its share of the cube, three rasters with overviews, before compression
+# bytes per pixel on disk before compression: image, its share of the cube, three rasters with overviews
+_PRODUCT_BYTES = 76
 
 
 def pulse_blocks(setting: Setting, job: Job, presum: Presum | None, *, requested: int | None = None) -> int:
-    """Return the number of pulse blocks: the requested number, or the least that fits into the job's memory.
+    """Return the number of pulse blocks: the requested number, or the smallest whose blocks fit into the job's memory.
 
     If not even the smallest blocks fit, these are used, and the plan's memory exceeds the limit.
     """
@@ -405,7 +406,7 @@ def memory_limit(*, groups: Path = Path("/proc/self/cgroup"), root: Path = Path(
     Parameters
     ----------
     groups, root
-        File with the control groups of the process, and root folder of the control groups.
+        File that lists the control groups of the process, and root folder of the control groups.
 
     Notes
     -----

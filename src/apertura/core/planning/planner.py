@@ -22,7 +22,7 @@ EQUAL_COST = 1.05
 """Cost relative to the cheapest setting up to which settings count as equally cheap; the most exact one is chosen."""
 
 _PLACE_S = {"ecef": 2.0e-8, "local": 2.7e-9}  # seconds per pixel position
-_TILE_S = 4.0e-3  # seconds per tile: task and write
+_TILE_S = 4.0e-3  # seconds per tile, for its task and for writing
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class SettingSearch:
 
     @property
     def tile_seconds(self) -> float:
-        """Seconds for all tiles, without their sums: pixel positions and writing."""
+        """Seconds for pixel positions and writing of all tiles, without their sums."""
         return self.job.pixels * _PLACE_S[self.job.frame] + self.job.tiles * _TILE_S
 
     def cheapest(self, pulses: int, target_db: float) -> Setting:
@@ -99,7 +99,7 @@ class SettingSearch:
         return {option: value for option, value in self.options.get(engine, {}).items() if value is not None}
 
     def fallbacks(self, chosen: Setting) -> tuple[Setting, ...]:
-        """Return the cheapest setting for each gain of 6 dB, regardless of the request, ending with the exact sum."""
+        """Return the cheapest setting per 6 dB of accuracy, regardless of the request; the last is the exact sum."""
         if chosen.engine == "reference":
             return ()
         is_restricted = self.engine is not None or any(self._requested(engine) for engine in self.options)
@@ -139,8 +139,8 @@ class SettingSearch:
     def _engines(self) -> list[str]:
         """Return the available engines that match the request.
 
-        Engines without a measured cost are included only if requested. A substitute engine that is compiled at run
-        time, for ten seconds, is excluded if the engine that it substitutes was built.
+        Engines without a measured cost are included only if requested. A substitute engine, whose compilation at run
+        time takes ten seconds, is excluded if the engine for which it is the substitute was built.
         """
         reads = {"profiles", "phase_history"} if self.job.recorded else {"profiles"}
         runnable = [name for name in ENGINES if load_engine(name).available() and load_engine(name).READS in reads]
@@ -171,13 +171,15 @@ class SettingSearch:
 # ---- The planner
 
 MARGIN_DB = 3.0
-"""Margin of predicted errors below the requested accuracy, dB: error of the predictions (benchmarks/planner.py)."""
+"""Margin of predicted errors below the requested accuracy, dB: the uncertainty of the predictions
+(benchmarks/planner.py)."""
 
 _PRESUM_DB = 6.0
-"""Margin of the presumming error below the total error, dB: a quarter of its power, the rest is left to tables."""
+"""Margin of the presumming error below the total error, dB: a quarter of the error power is assigned to presumming, the
+rest to tables."""
 
 PRESUM_FACTORS = (16, 12, 8, 6, 5, 4, 3, 2)
-"""Candidate numbers of pulses per virtual (presummed) pulse, the largest first."""
+"""Candidate numbers of pulses per virtual (presummed) pulse, in descending order."""
 
 
 def make_plan(
@@ -193,7 +195,7 @@ def make_plan(
         Requested numerical error.
     overrides
         Option → requested value: engine, engine_options (engine → option → value), presum, pulse_blocks, terrain.
-        'auto' or None leaves the decision to the planner.
+        With 'auto' or None the planner decides.
     where
         Section of the configuration with the request, for messages.
 

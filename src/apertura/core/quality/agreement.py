@@ -1,4 +1,4 @@
-"""Agreement of two images of one scene: relative shift and phase, from common bright points or patches of terrain."""
+"""Agreement of two images of one scene: relative shift and phase, from bright points or patches of terrain."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -16,14 +16,15 @@ from apertura.core.quality.measures import BlockRaster, weighted_median
 from apertura.core.quality.point_targets import PATCH_PX, BandLimitedPatch
 
 REACH_M = 4.0
-"""Largest shift between two images that is searched, metres (at least 12 cells): beyond it other points would match."""
+"""Largest shift between two images that is searched, metres (at least 12 cells): with larger shifts, other points
+match."""
 
 WIDEST_PIXEL = 1.05
-"""Largest pixel spacing, finest resolution cells: pixels of 1.13 cells sample a flat band critically."""
+"""Largest pixel spacing in units of the finest resolution cell: pixels of 1.13 cells sample a flat band critically."""
 
 SHIFTED = 0.18
-"""Tolerated shift of two images in units of eq. 6, a tenth of the resolution cell. Images with a significantly larger
-shift are displaced."""
+"""Tolerated shift of two images in units of eq. 6, corresponding to a tenth of the resolution cell. Images with a
+significantly larger shift are considered displaced."""
 
 OUT_OF_PHASE_RAD = 0.6
 """Tolerated phase difference of two images, radians: the loss of their sum is 0.4 dB."""
@@ -36,16 +37,15 @@ LARGEST_PHASE_STD_RAD = 0.4
 
 _MOST_PATCHES = 16  # largest number of patches compared, the brightest ones
 _LEAST_LOOKS = 12
-"""Least number of independent samples: fewer may be one flank of a point response (eq. 6 of interferometry)."""
-_BY_CHANCE = 0.001  # significance level: probability that unrelated images are taken for coherent
+"""Least number of independent samples: fewer may lie on one flank of a point response (eq. 6 of interferometry)."""
+_BY_CHANCE = 0.001  # significance level: probability with which unrelated images are classified as coherent
 _WIDER = (2.0, 4.0, 8.0)  # resolution cells: gates within which points with different shifts are matched
-_FEWEST_SPREAD = 3  # least points for a wide gate: a match of two may be accidental
+_FEWEST_SPREAD = 3  # least number of points for a wide gate: matches of two points may be accidental
 _FAR = 4.0  # standard deviations from the median shift, beyond which a match is an outlier
-_MARGIN = (
-    1.4  # factor on the bounds of phase and position by looks: excess scatter of terrain (eq. 8 of interferometry)
-)
+# factor on the bounds of phase and position from looks, for the excess scatter of terrain (eq. 8 of interferometry)
+_MARGIN = 1.4
 
-_HALF_CYCLE = 0.5  # carrier cycles: a larger shift is closer to a path error of a wavelength than to none
+_HALF_CYCLE = 0.5  # carrier cycles: a larger shift is closer to that by a path error of one wavelength than to no shift
 _POINT = 0.09  # in units of eq. 6: neighbours displace a peak by about a twentieth of a cell
 _POINT_RAD = 0.05  # phase error of a peak caused by neighbours
 
@@ -57,16 +57,17 @@ class Agreement:
     Attributes
     ----------
     by
-        'bright points', or 'looks': independent samples of terrain patches.
+        Features compared: 'bright points', or 'looks' (independent samples of terrain patches).
     points
         Number of common points or looks.
     shift_east_m, shift_north_m, shift_std_m
         Mean shift over the points, and its standard deviation along one axis, metres.
     shift_units, shift_std_units
-        The same in units of eq. 6, in which a resolution cell is about 1.8 in every direction.
+        Mean shift and its standard deviation in units of eq. 6; a resolution cell is about 1.8 units in every
+        direction.
     cycles, cycles_std
-        Shift in cycles of the carrier, along which a path error displaces a point: below half a cycle the path error
-        follows unambiguously from the phase; 0 by looks.
+        Shift in the direction of the carrier, in which a path error displaces a point, and its standard deviation, in
+        cycles: below half a cycle the phase determines the path error unambiguously. 0 for looks.
     phase_rad, phase_std_rad
         Mean phase over the points, and its standard deviation.
     coherence
@@ -137,7 +138,7 @@ class Agreement:
 
     @property
     def reversed(self) -> "Agreement":
-        """Agreement of the first image relative to the second."""
+        """Agreement with the images exchanged: of the first image relative to the second."""
         signed = ("shift_east_m", "shift_north_m", "cycles", "phase_rad")
         return replace(self, **{name: -getattr(self, name) for name in signed})
 
@@ -172,7 +173,7 @@ def agreement(
     spectrum
         (2, 2) float64, covariance of a point's spatial spectrum east and north, cycles² per m².
     alone
-        True if neither image has other bright points: one common point at any position is then sufficient.
+        True if neither image has other bright points: in that case one common point at any position is sufficient.
 
     Notes
     -----
@@ -237,9 +238,9 @@ def _common_points(
 ) -> tuple[list[tuple[int, int]], bool]:
     """Return the common points of two images, and True if their shifts differ by more than a cell.
 
-    Evidence is half of the points of either image within one cell of a common shift, or the brightest points of both
-    images in one cell. Errors of height, heading and drift displace points by different amounts: within wider gates
-    points are matched if the number of matches is statistically significant.
+    Required are matches within one cell, after a common shift, for half of the points of either image; or the brightest
+    points of both images in one cell. Height, heading and drift errors displace points by different amounts. Points are
+    therefore also matched within wider gates, provided that the number of matches is statistically significant.
     """
     reach, fewest = max(REACH_M, 12 * cell_m), min(map(len, lists))
     _, matched = common_shift(lists[0], lists[1], reach=reach, gate=cell_m)
@@ -253,10 +254,10 @@ def _common_points(
 
 
 def _chance(lists: Sequence[Sequence[tuple[float, float, float]]], matches: int, reach: float, gate: float) -> float:
-    """Return an upper bound of the probability of `matches` accidental matches, under any shift, of unrelated points.
+    """Return an upper bound of the probability of `matches` accidental matches of unrelated points under any shift.
 
-    Trials are the shifts within reach at intervals of a gate. At each of them a point has a match with the probability
-    p, the share of the area that is covered by the gates of the denser image's points (binomial distribution).
+    Shifts within reach are tested at intervals of one gate. At each shift, a point has a match with the probability p,
+    the share of the area that is covered by the gates of the denser image's points (binomial distribution).
     """
     fewer, more = sorted(lists, key=len)
     position = np.array([point[:2] for point in more])
@@ -284,7 +285,7 @@ def _weighted_shift(
     """Return the mean of (point, 2) shifts, metres, and its standard deviation along an axis, units of eq. 6.
 
     The given variances of the points are lower bounds: they are increased if the points scatter more. Outliers far from
-    the median, accidental matches with other points, are excluded.
+    the median are excluded as accidental matches with other points.
     """
     middle = np.array([weighted_median(along, 1 / variance) for along in shifts.T])
     off = np.abs((shifts - middle) @ unit) / np.sqrt(variance)[:, None]
@@ -360,12 +361,12 @@ def agreement_of_ground(
     powers = (np.abs(patches) ** 2).sum(axis=(1, 2, 3)) if patches.size else np.zeros(2)
     if not powers.all():
         return None
-    first, second = np.fft.fft2(patches, (2 * PATCH_PX,) * 2)  # zero-padded, against circular correlation
+    first, second = np.fft.fft2(patches, (2 * PATCH_PX,) * 2)  # zero-padded to avoid circular correlation
     scale = float(np.sqrt(powers.prod()))
     looks = _looks(first, second, np.abs(patches), powers)
     level = np.abs(np.fft.ifft2((second * first.conj()).sum(axis=0))) / scale  # |R| of eq. 6
     far = max(2, min(PATCH_PX // 2, int(max(REACH_M, 12 * cell_m) / spacing_m)))
-    # Maximum within reach, if significant: |R|² > 1 − (0.001/n)^{1/(L−1)} for n cells and L looks.
+    # Maximum within reach, if statistically significant: |R|² > 1 − (0.001/n)^{1/(L−1)} for n cells and L looks.
     lags = np.arange(-far, far + 1)
     near = level[np.ix_(lags, lags)]
     cells = max(1.0, near.size * 12 * float(np.sqrt(max(np.linalg.det(spectrum), 0.0))) * spacing_m**2)
@@ -421,7 +422,7 @@ def _looks(
     size: NDArray[np.float64],
     powers: NDArray[np.float64],
 ) -> float:
-    """Return the number of independent samples of patches: resolution cells, reduced if power is concentrated."""
+    """Return the number of independent samples of patches: resolution cells, fewer if power is concentrated."""
     by_band = powers.prod() * first[0].size * PATCH_PX**2 / (np.abs(first) ** 2 * np.abs(second) ** 2).sum()
     joint = size.prod(axis=0)
     by_power = 2 * by_band * joint.sum() ** 2 / (np.count_nonzero(joint) * (joint**2).sum())

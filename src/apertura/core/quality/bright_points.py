@@ -12,19 +12,19 @@ from apertura.core.quality.measures import BlockRaster
 from apertura.core.quality.point_targets import PATCH_PX, find_peak
 
 SPECKLE = 0.06
-"""Power around a bright point relative to its own, above which it may be speckle: 0.07 for the brightest of 10⁶ pixels.
+"""Power around a bright point relative to the point, above which it may be speckle: 0.07 for the brightest of 10⁶.
 """
 
 # ---- Point response at other points
 
 SMEARED_CELLS = 6.0
-"""Cells across the line of sight over which phase errors may spread a point, and within which eq. 1b is used."""
+"""Cells across the line of sight over which phase errors may smear a point, and within which eq. 1b is used."""
 
 OVER_RESPONSE = 2.0
-"""Least ratio of a point's amplitude to the responses of brighter points there: 6 dB, since tapers and phase errors
-displace and raise sidelobes."""
+"""Least ratio of a point's amplitude to the responses of brighter points at its position: 6 dB, because tapers and
+phase errors displace and raise sidelobes."""
 
-_RESPONSE_PULSES = 512  # sampled pulses, sufficient for up to a quarter as many phase cycles
+_RESPONSE_PULSES = 512  # number of sampled pulses, sufficient for a quarter of this number of phase cycles
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class PointResponse:
         Phase centres of the pair, all pulses.
     envelope
         (sample,) complex, range response of a pulse over a period of the total path, referred to band centre; 1 at the
-        middle sample, at the path of the point.
+        middle sample, which lies at the path of the point.
     step_m
         Total path between samples.
     wavelength_m
@@ -113,14 +113,14 @@ class PointResponse:
 def separated(
     amplitude: NDArray[np.floating], shown: Callable[[int, NDArray[np.int64]], NDArray[np.float64]], *, most: int
 ) -> list[int]:
-    """Select the maxima that are separate points, not sidelobes or skirts of brighter ones.
+    """Select the maxima that are separate points, not sidelobes or flanks of brighter points.
 
     Parameters
     ----------
     amplitude
         (maximum,) float, brightest first.
     shown
-        A maximum and others → (other,) float64, response of a point at the first there, as `PointResponse.at`.
+        A maximum and others → (other,) float64, response at the others of a point at the first, as `PointResponse.at`.
     most
         Largest number of points.
 
@@ -151,7 +151,7 @@ def separated(
 
 
 _LOBE_CELLS = 2.0
-_CELL_UNITS = 1.8  # a resolution cell in units of docs/theory/focus.md, eq. 6, in every direction
+_CELL_UNITS = 1.8  # size of a resolution cell in every direction, in units of docs/theory/focus.md, eq. 6
 
 
 def near(
@@ -213,7 +213,7 @@ class BrightPoint:
     background
         Mean power of the surrounding speckle relative to the point's, from the median over a patch.
     carrier
-        Spatial frequency of the carrier down and right, cycles per pixel; None: the aliased frequency.
+        Spatial frequency of the carrier down and right, cycles per pixel; None: the aliased frequency is used.
     """
 
     row: float
@@ -241,7 +241,7 @@ def bright_points(
     cell_px
         Side of the squares in each of which only the brightest maximum is considered.
     shown
-        (2,) int64 pixel of a point and (n, 2) int64 pixels → (n,) float64, response of the point there, as
+        (2,) int64 pixel of a point and (n, 2) int64 pixels → (n,) float64, response of the point at these pixels, as
         `PointResponse.at`.
 
     Examples
@@ -364,7 +364,7 @@ def common_shift(
     reach
         Largest shift considered, in the unit of x and y.
     gate
-        Differences closer than this count as the same shift.
+        Largest distance between differences of positions that count as the same shift.
 
     Returns
     -------

@@ -15,17 +15,17 @@ ARITHMETIC_BELOW_DB = 10.0
 """Margin of the numerical error below the largest other error, dB: it then adds 0.4 dB to the sum."""
 
 LEAST_ACCURACY_DB, MOST_ACCURACY_DB = -40.0, -60.0
-"""Range of `accuracy_db: auto`, dB: errors above the first are visible as sidelobes, errors below the second are
+"""Range of `accuracy_db: auto`, dB: errors above the first limit are visible as sidelobes, errors below the second are
 invisible."""
 
-NO_EFFECT = Effect(0.0, 0.0, 0.0)  # effect of an error source without error
+NO_EFFECT = Effect(0.0, 0.0, 0.0)  # effect of an error source whose error is zero
 
 _NOT_STATED, _ASSUMED = "not stated", "assumed"
 
 RECEIVER_STD_M = {"fix": 0.01, "float": 0.3, "sbas": 1.0, "dgps": 0.5, "single": 1.0, "ppp": 0.1, "unknown": 0.01}
 """Assumed standard deviation of positions in each axis by solution class, metres, if no accuracy is stated: one
 centimetre for a fixed RTK solution, decimetres for a float solution, metres without RTK. A log without a solution class
-is taken as fixed, which a radar image requires."""
+is assumed to be fixed, as required for a radar image."""
 
 ATTITUDE_STD_DEG = {"log": (1.0, 3.0), "course": (8.0, 10.0)}
 """Assumed standard deviations of roll and pitch (each) and of heading by attitude source, degrees, if none are stated.
@@ -34,7 +34,7 @@ the course assume a level body that flies straight ahead, but multirotors tilt b
 
 LEVER_ARM_STD_M = 0.01
 """Assumed standard deviation of a lever arm in each axis, metres, if none is stated: measured with a ruler to a phase
-centre that is not exactly known."""
+centre whose position is not exactly known."""
 
 LEAST_FIELD = 0.1
 """Least field of a pulse relative to the strongest, for the effect of the pattern's phase."""
@@ -44,12 +44,12 @@ UNDETECTABLE_LOSS_DB = 0.2
 
 GROUND_STD_M = 3.0
 """Assumed standard deviation of the terrain height, metres, if none is stated and it is not observable in the image:
-that of map contours, barometers, crops and roofs. A confusion of geoid and ellipsoid, tens of metres, raises an error
-elsewhere."""
+it covers errors of map contours and barometers, and crops and roofs. A confusion of geoid and ellipsoid, tens of
+metres, raises an error in other checks."""
 
 _SMALL_M = 1e-2  # height error for which the loss is quadratic
 
-_FEWEST_PULSES = 3  # least pulses to separate a horizontal shift from the residual
+_FEWEST_PULSES = 3  # least number of pulses to separate a horizontal shift from the residual
 
 _FIXED = frozenset({"fix", "unknown"})
 _SLOW_S = 100.0
@@ -66,13 +66,14 @@ class BudgetLine:
     cause
         Name of the error source.
     stated
-        Stated or measured size, a phrase; None if unstated: the effect is then that of `unit`.
+        Stated or measured size, a phrase. None if unstated: the effect is that of an error of the size `unit`.
     unit
         Size for which the effect is computed if none is stated.
     effect
         Expected effect.
     assumed
-        Size that is assumed if none is stated, with the reason; its effect is expected. None: no size is assumed.
+        Size that is assumed if none is stated, with the reason; the effect of this size is expected. None: no size is
+        assumed.
     """
 
     cause: str
@@ -132,7 +133,7 @@ class NodePositions:
     correlation_s
         Correlation time of `autocorrelation`, seconds.
     stated_by
-        Source of the accuracy: config or log.
+        Source of the accuracy: 'config' or 'log'.
     drift_m
         Standard deviation of a slow error over the whole flight, in each axis.
     receiver
@@ -147,7 +148,7 @@ class NodePositions:
 
     @property
     def assumed(self) -> "NodePositions":
-        """The same, with the accuracy of the solution class if none is stated."""
+        """Accuracy as stated, else that of the solution class."""
         if self.std_m is not None or self.receiver is None:
             return self
         correlation_s = self.correlation_s if self.receiver in _FIXED else max(self.correlation_s, _SLOW_S)
@@ -155,14 +156,14 @@ class NodePositions:
 
 
 def position_lines(paths: PointPaths, nodes: Sequence[NodePositions], *, sidelink: bool) -> list[BudgetLine]:
-    """Return the budget lines of position errors: stated, assumed by solution class, or per centimetre if unknown.
+    """Return the budget lines of position errors: stated, assumed by solution class, else per centimetre of error.
 
     Parameters
     ----------
     paths
-        Paths to a point in the middle of the scene.
+        Paths to a point at the scene centre.
     nodes
-        One node that transmits and receives, or transmitter and receiver with independent errors.
+        One node that transmits and receives, or a transmitter and a receiver with independent errors.
     sidelink
         As for `PointPaths.by_node`.
     """
@@ -236,7 +237,7 @@ class NodeAttitude:
 
 
 Growth = Sequence[NDArray[np.float64]]
-"""Derivatives of the path by the positions of the antennas of `NodeAttitude.arms_m`, (pulse, 3) each."""
+"""Derivatives of the path with respect to the positions of the antennas of `NodeAttitude.arms_m`, (pulse, 3) each."""
 
 
 def attitude_lines(paths: PointPaths, nodes: Sequence[NodeAttitude | None], *, sidelink: bool) -> list[BudgetLine]:
@@ -245,10 +246,10 @@ def attitude_lines(paths: PointPaths, nodes: Sequence[NodeAttitude | None], *, s
     Parameters
     ----------
     paths
-        Paths to a point in the middle of the scene.
+        Paths to a point at the scene centre.
     nodes
-        One node that transmits and receives, or transmitter and receiver, at the pulses of `paths`; None without lever
-        arms.
+        One node that transmits and receives, or a transmitter and a receiver, at the pulses of `paths`; None for a node
+        without lever arms.
     sidelink
         As for `PointPaths.by_node`.
 
@@ -305,10 +306,10 @@ def antenna_line(paths: PointPaths, phase_rad: NDArray[np.float64], weight: NDAr
     Parameters
     ----------
     paths
-        Paths to a point in the middle of the scene.
+        Paths to a point at the scene centre.
     phase_rad, weight
-        (pulse,) float64: phase of both antennas towards the point, and their field; pulses with a field below
-        `LEAST_FIELD` of the strongest are excluded.
+        (pulse,) float64: sum of the phases, and product of the fields, of both antennas towards the point; pulses with
+        a field below `LEAST_FIELD` of the strongest are excluded.
 
     Notes
     -----
@@ -343,7 +344,7 @@ def offset_line(
     Parameters
     ----------
     paths
-        Paths to a point in the middle of the scene.
+        Paths to a point at the scene centre.
     cause
         Name of the error source.
     slope
@@ -373,7 +374,7 @@ def height_line(paths: PointPaths, std_m: float | None, *, expected_db: float = 
     Parameters
     ----------
     paths
-        Paths to a point in the middle of the scene.
+        Paths to a point at the scene centre.
     std_m
         Configured standard deviation of the heights, metres; None: not configured.
     expected_db
@@ -437,7 +438,7 @@ def noise_loss(variance_rad2: float) -> Effect:
 
 
 def strictest_accuracy_db(requested: float | Literal["auto"]) -> float:
-    """Return the smallest numerical error that an image may request, which determines the accuracy of the echo.
+    """Return the smallest numerical error that may be requested, which determines the accuracy of the echo.
 
     Examples
     --------

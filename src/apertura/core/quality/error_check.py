@@ -11,14 +11,15 @@ from apertura.core.quality.measures import BlockRaster
 
 # ---- Error bound from drawn pixels
 
-CONFIDENCE = 0.95  # of the error bound, which was valid in at least 98.5 % of images (benchmarks/certificate.py)
+# confidence of the error bound; it was valid in at least 98.5 % of images (benchmarks/certificate.py)
+CONFIDENCE = 0.95
 
 _SIGMAS = 2.0  # instead of 1.645, the 95 % quantile of a Gaussian: sums of skewed errors have longer tails
 
 
 @dataclass(frozen=True)
 class ErrorBound:
-    """RMS error over all pixels of an image, as the difference from the exact sum, relative to the image's RMS.
+    """RMS difference of all pixels of an image from the exact sum, relative to the RMS of the image.
 
     Attributes
     ----------
@@ -32,7 +33,7 @@ class ErrorBound:
     estimate_db: float
 
     def with_error(self, error_db: float | None) -> "ErrorBound":
-        """Return the bound combined with an independent error, dB; None: no further error.
+        """Return the bound combined with an independent error, dB; None: no additional error.
 
         Examples
         --------
@@ -60,7 +61,7 @@ def error_bound(
     computed, exact
         (draw,) complex, values at the drawn pixels; a pixel drawn twice is listed twice.
     density
-        (draw,) float64, expected number of draws of that pixel.
+        (draw,) float64, expected number of draws of each drawn pixel.
     power
         Σ|I|² over all pixels of the image; or (draw,) float64, mean |I|² around each drawn pixel.
 
@@ -92,7 +93,8 @@ def error_bound(
         limit_db = _db(0.0 if not error else np.inf)
         return ErrorBound(limit_db, limit_db)
     deviation = np.sqrt(errors.size) * float((errors - error / total * levels).std())  # √K·s
-    # q at 95 %: an error as large as the largest may have been missed, and the brightest pixel drawn by chance.
+    # q at 95 %: the draws may have missed an error as large as the largest, and may include the brightest pixel by
+    # chance.
     above = (error + float(errors.max())) / (total - largest) * np.exp(_SIGMAS * deviation / error)
     return ErrorBound(_db(above), _db(error / total))
 
@@ -109,12 +111,12 @@ _BLOCK_PX = 256
 
 
 def random_pixels(windows: Sequence[Window], count: int, generator: np.random.Generator) -> NDArray[np.int64]:
-    """Draw random pixels spread evenly over the tiles, (count, 2) int64 rows and columns.
+    """Draw random pixels uniformly over the tiles, (count, 2) int64 rows and columns.
 
     Parameters
     ----------
     windows
-        All tiles; each in turn receives a pixel, in random order, until `count` pixels are drawn.
+        All tiles; a pixel is drawn from one tile after the other, in random order, until `count` pixels are drawn.
     count
         Number of pixels.
     generator
@@ -169,8 +171,8 @@ class Brightness:
     ) -> NDArray[np.float64]:
         """Return the expected number of draws of drawn pixels by `random_pixels` and `draw`, (pixel,) float64.
 
-        `pixels` are the (pixel, 2) int64 of both draws, the `random` pixels of `random_pixels` first; `values` the
-        image there.
+        `pixels`: (pixel, 2) int64, pixels of both draws, starting with the `random` pixels from `random_pixels`.
+        `values`: the image at these pixels.
         """
         density = np.zeros(len(pixels))
         for window in windows:
@@ -187,7 +189,7 @@ class Brightness:
     def draw(
         self, image: BlockRaster, windows: Sequence[Window], count: int, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Draw pixels with probabilities by their brightness, (count, 2) int64; none if the image is zero."""
+        """Draw pixels with probabilities that increase with brightness, (count, 2) int64; none if the image is zero."""
         if not (count and self.power.any()):
             return np.empty((0, 2), np.int64)
         edges = np.cumsum((self.power / self.power.sum() + self.level / self.level.sum()) / 2)
@@ -210,7 +212,7 @@ def _level(block: NDArray[np.complexfloating]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """Exact values at the pixels drawn by `random_pixels`, independent of the values of the image.
+    """Exact values at the pixels drawn by `random_pixels`, which do not depend on the values of the image.
 
     Attributes
     ----------
@@ -230,9 +232,9 @@ class Certificate:
         """Return (tiles without a drawn pixel, tiles that miss the accuracy); both are empty if all tiles pass.
 
         A tile fails if the mean squared difference at its pixels exceeds the accuracy times the larger of `power`, the
-        mean |I|² of the image, and the mean exact |I|² at these pixels: errors scale with bright targets. The pixels do
-        not depend on the image, so a run that was killed while it recomputed tiles selects the same tiles again,
-        provided the failing tiles are recomputed last.
+        mean |I|² of the image, and the mean exact |I|² at these pixels: errors are proportional to the amplitude of
+        bright targets. The pixels do not depend on the image, so a run that was killed while it recomputed tiles
+        selects the same tiles again, provided the failing tiles are recomputed last.
         """
         squared, exact_power = np.abs(values_at(image, self.pixels) - self.exact) ** 2, np.abs(self.exact) ** 2
         tolerated = 10 ** (accuracy_db / 10)
@@ -250,7 +252,7 @@ class Certificate:
     ) -> ErrorBound:
         """Estimate the error of the whole image from its random pixels and `bright` pixels drawn by `brightness`.
 
-        `bright` are (pixel, 2) int64 rows and columns, `exact` (pixel,) complex128 the exact sum there.
+        `bright`: (pixel, 2) int64, rows and columns. `exact`: (pixel,) complex128, the exact sum at these pixels.
         """
         pixels = np.concatenate([self.pixels, bright])
         values = values_at(image, pixels)

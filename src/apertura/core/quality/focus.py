@@ -44,8 +44,8 @@ def compare_parts(parts: NDArray[np.complex64], *, spacing_m: float, generator: 
     Parameters
     ----------
     parts
-        (patch, 2, subaperture, y, x) complex64: patches from the even and the odd pulses of each subaperture; their sum
-        is the image.
+        (patch, 2, subaperture, y, x) complex64: patches from the even and the odd pulses of each subaperture; the sum
+        over both and over the subapertures is the image.
     spacing_m
         Pixel spacing of the patches.
     generator
@@ -128,8 +128,8 @@ MOST_INTERFERENCE = 0.08
 """Log-amplitude variance of a point over the aperture, above which it does not dominate its cell."""
 
 LEAST_PEAK_SHARE = 0.35
-"""Least ratio of the amplitude at the point to the largest over all linear phases: below it the point is a sidelobe of
-another echo."""
+"""Least ratio of the amplitude at the point to the largest amplitude over all linear phases: below it, the point is a
+sidelobe of another echo."""
 
 DEFOCUSED_DB = -1.0
 """Peak loss beyond which an image is defocused, dB."""
@@ -162,8 +162,8 @@ GEOMETRY_CONTRADICTED = frozenset(
         "wrong_code",
     }
 )
-"""Flags that contradict the geometry, the clocks or the code of image formation: with any of them an image is not
-reported as focused."""
+"""Flags that show a contradiction in the geometry, the clocks or the code of image formation: an image with any of them
+is not reported as focused."""
 
 _TREND = 5  # degree of the polynomial that models patterns, range and aspect in the log-amplitude
 _PADDING = 8  # zero-padding factor of the spectrum of blocks, whose maximum removes a linear phase
@@ -182,7 +182,7 @@ class PointFocus:
     interference
         Power of noise and neighbours relative to the point: the log-amplitude variance.
     pulses
-        Pulses per block; faster phase errors are not measured.
+        Pulses per block; phase errors that vary within a block are not measured.
     snr_db
         SNR of the point in the image, from its even and odd pulses; NaN with fewer than four pulses.
     coherence, coherence_noise_limit
@@ -208,7 +208,7 @@ def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
     Notes
     -----
     Source: docs/theory/focus.md, eq. 1. Phase errors do not change the amplitude of a contribution, while noise and
-    neighbours change phase and amplitude equally: the log-amplitude variance is their share of the phase variance.
+    neighbours change phase and amplitude equally: the log-amplitude variance equals the phase variance that they cause.
     Pulses are averaged in the shortest blocks that the point dominates.
 
     Examples
@@ -354,7 +354,7 @@ def focus_with_flags(
 
     Examples
     --------
-    >>> focus_with_flags({"verdict": "focused", "why": "peak loss 0.02 dB"}, ["wrong_code"])["verdict"]
+    >>> focus_with_flags({"verdict": "focused", "reason": "peak loss 0.02 dB"}, ["wrong_code"])["verdict"]
     'inconclusive'
     """
     against = sorted(GEOMETRY_CONTRADICTED.intersection(flags))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 
 class BlockRaster(Protocol):
-    """2-D array that returns numpy blocks: a numpy or zarr array."""
+    """2-D array whose slices are numpy arrays: a numpy or zarr array."""
 
     @property
     def shape(self) -> tuple[int, ...]: ...  # noqa: D102
@@ -70,7 +70,7 @@ class ImageStatistics:
     Attributes
     ----------
     entropy
-        Shannon entropy −Σ q ln q of the shares q of power, nats: the lower, the better focused.
+        Shannon entropy −Σ q ln q of the power shares q of the pixels, nats: lower for a better focused image.
     noise_floor_db
         Median power relative to peak power, to 0.01 dB: the level between targets.
     peak
@@ -95,7 +95,7 @@ def image_statistics(image: BlockRaster, windows: Iterable[tuple[slice, slice]])
     Parameters
     ----------
     image
-        (y, x) complex64, any array that returns numpy blocks; NaN is excluded.
+        (y, x) complex64, any array whose slices are numpy arrays; NaN is excluded.
     windows
         Windows that cover the image once.
 

@@ -108,13 +108,13 @@ class PointPaths:
         axes: NDArray[np.float64],
         wavelength_m: float,
     ) -> "PointPaths":
-        """Return the paths to a point at evenly spaced pulses; parameters as the attributes, for all pulses."""
+        """Return the paths to a point at evenly spaced pulses; parameters are the attributes for all pulses."""
         sampled = aperture.sample(MOST_PULSES)
         return cls(aperture[sampled], time_s[sampled], point_m, axes, wavelength_m)
 
     @property
     def gradient(self) -> NDArray[np.float64]:
-        """(pulse, 3) float64, derivative of the path by the point's position east, north, up."""
+        """(pulse, 3) float64, derivative of the path with respect to the point's position east, north, up."""
         return self.aperture.path_gradient(self.point_m) @ self.axes.T
 
     @property
@@ -123,14 +123,15 @@ class PointPaths:
         return np.gradient(self.aperture.path(self.point_m), self.time_s)
 
     def by_node(self, *, same: bool, sidelink: bool) -> tuple[NDArray[np.float64], ...]:
-        """Return the derivatives of the measured path by position errors of each node, (pulse, 3) east, north, up.
+        """Return the derivatives of the measured path by the position of each node, (pulse, 3) east, north, up.
 
         Parameters
         ----------
         same
-            True if one node transmits and receives, so that its error acts on both one-way paths: one array, not two.
+            True if one node transmits and receives, so that its error affects both one-way paths: a single array is
+            returned.
         sidelink
-            True if the echo was divided by a sidelink whose length is computed from the same logs.
+            True if the echo was corrected by the sidelink, whose path length is computed from the same logs.
 
         Notes
         -----
@@ -141,7 +142,7 @@ class PointPaths:
         return tuple(leg @ self.axes.T for leg in legs)
 
     def by_point(self, *, sidelink: bool) -> tuple[NDArray[np.float64], ...]:
-        """Return the derivatives of the measured path by position errors of each antenna.
+        """Return the derivatives of the measured path with respect to the position of each antenna.
 
         Parameters
         ----------

@@ -15,7 +15,7 @@ CUT_REACH_M = 3.0
 """Half length of the cuts through an image's brightest target, metres: main lobe and first sidelobes."""
 
 _REFINEMENTS = 7
-"""Refinement rounds by a factor of four, from one pixel to a grid of 6e-5 pixel."""
+"""Number of refinement rounds, each by a factor of four: from one pixel to a grid of 6e-5 pixel."""
 
 
 class BandLimitedPatch:
@@ -33,9 +33,9 @@ class BandLimitedPatch:
 
     Notes
     -----
-    The bins of the patch's discrete Fourier transform are assigned frequencies about the centre of the band, wherever
-    the carrier aliased it; between pixels the trigonometric polynomial is evaluated exactly. Splines of real and
-    imaginary parts are unsuitable: the carrier phase changes by more than a radian per pixel.
+    The bins of the patch's discrete Fourier transform are assigned frequencies about the centre of the band, also if
+    the band is aliased; between pixels the trigonometric polynomial is evaluated exactly. Splines of real and imaginary
+    parts are unsuitable: the carrier phase changes by more than a radian per pixel.
     """
 
     def __init__(self, image: BlockRaster, row: int, column: int, carrier: tuple[float, float] | None = None) -> None:
@@ -188,7 +188,7 @@ class Cut:
     width_m
         −3 dB width, metres; NaN if the main lobe extends beyond the cut.
     pslr_db, islr_db
-        Peak and integrated sidelobe ratio along the line, dB; NaN without sidelobes.
+        Peak and integrated sidelobe ratio along the cut, dB; NaN without sidelobes.
     """
 
     width_m: float

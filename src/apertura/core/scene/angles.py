@@ -21,7 +21,7 @@ def surface_normals(position: Floats) -> Floats:
     Returns
     -------
     ndarray
-        (row, column, 3) float64; central differences, one-sided at the edges.
+        (row, column, 3) float64, from central differences, at the edges from one-sided differences.
 
     Examples
     --------
@@ -60,7 +60,7 @@ def surface(grid: SceneGrid, terrain: Terrain, window: Window) -> tuple[Floats, 
     wider = replace(grid, first=(grid.first[0] + rows[0], grid.first[1] + columns[0]), shape=(rows.size, columns.size))
     heights = terrain.heights(grid[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1])
     padding = [(0, axis.size - size) for axis, size in zip(extended, heights.shape, strict=True)]
-    position = wider.positions(np.pad(heights, padding, mode="edge"))  # extends a grid of one row or column
+    position = wider.positions(np.pad(heights, padding, mode="edge"))  # extends a grid with a single row or column
     inner = tuple(slice(part.start - axis[0], part.stop - axis[0]) for part, axis in zip(window, extended, strict=True))
     return position[inner], surface_normals(position)[inner]
 
@@ -100,7 +100,7 @@ def bistatic_angle_deg(position: Floats, tx: Floats, rx: Floats) -> Floats:
 
 
 def _angle(first: Floats, second: Floats) -> Floats:
-    chord = _unit(first) - _unit(second)  # exact for small angles, where the arc cosine is not
+    chord = _unit(first) - _unit(second)  # accurate for small angles, unlike the arc cosine
     return np.asarray(2 * np.arcsin(np.minimum(1.0, np.sqrt(np.einsum("...i,...i", chord, chord)) / 2)))
 
 

@@ -11,7 +11,7 @@ from apertura.core.geometry.geodesy import frame_from_map, geodetic_from_ecef, m
 from apertura.core.scene.grid import SceneGrid
 
 GRAZING_LIMIT_DEG = 10.0
-"""Degrees, smallest grazing angle within automatic bounds; below it backscatter and terrain accuracy decrease."""
+"""Smallest grazing angle within automatic bounds, degrees; below it, backscatter and terrain accuracy decrease."""
 
 PIXELS_PER_CELL = 3.0
 """Pixels per finest resolution cell; the Nyquist limit of a band-limited magnitude is 2."""
@@ -50,7 +50,7 @@ def auto_bounds(
     crs
         CRS of the bounds, or 'local'.
     height_m
-        Terrain height, ellipsoidal or z.
+        Terrain height, metres above the ellipsoid, or z of the local frame.
     path_limit_m
         Longest total path within the cyclic prefix, metres; inf if unlimited.
 
@@ -126,7 +126,7 @@ def auto_spacing(
 MOST_PIXELS = 25_000_000
 """Largest number of pixels of an automatic grid: 200 MB per image."""
 
-_FEWEST_PIXELS = 250_000  # permitted for any recording
+_FEWEST_PIXELS = 250_000  # number of pixels permitted for any recording
 
 
 def most_pixels(pulses: int, subcarriers: int) -> int:
@@ -143,7 +143,7 @@ def most_pixels(pulses: int, subcarriers: int) -> int:
 
 
 def coarsened(spacing_m: float, bounds_m: tuple[float, float, float, float], most: int) -> float:
-    """Return a spacing of the series 1-2-5, at least the given one, that limits the pixels within bounds to `most`.
+    """Return a spacing of the series 1-2-5, not below the given one, that limits the pixels within bounds to `most`.
 
     Examples
     --------

@@ -27,8 +27,7 @@ def clearance(
     Returns
     -------
     tuple of ndarray
-        (pulse,) float64 metres each. Outside the scene a flat terrain is continued; the height of a DEM is unknown
-        there: NaN.
+        (pulse,) float64 metres each. Outside the scene, a flat terrain is extrapolated, and heights over a DEM are NaN.
 
     Examples
     --------
@@ -56,12 +55,13 @@ def check_antennas(grid: SceneGrid, terrain: Terrain, aperture: Aperture, *, whe
     Returns
     -------
     dict
-        Flag → measured values, one line. Only a flag, because a radar outside the scene may image a hillside above it.
+        Flag → measured values, one line. It is no error, because a radar outside the scene may image a hillside above
+        the radar.
 
     Raises
     ------
     CampaignError
-        If an antenna is at or below the terrain below it; the error names the source of the terrain height.
+        If an antenna is not above the terrain at its map position; the error names the source of the terrain height.
     """
     flags = Flags()
     for antenna, which in zip(aperture.legs, ("transmitter", "receiver"), strict=True):

@@ -22,13 +22,14 @@ from apertura.core.scene.terrain import Terrain, bilinear
 # ---- Ellipsoidal heights of a DEM at the pixels of a grid
 
 LATTICE_M = 50.0
-"""Metres between nodes at which coordinates of another CRS are computed; bilinear in between, to 0.1 mm."""
+"""Metres between nodes at which coordinates of another CRS are computed; bilinear interpolation between them has an
+error of 0.1 mm."""
 
 COVER_NODES = 129
 """Nodes along each side of the scene at which coverage is checked."""
 
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
-"""Metres, range of land heights on Earth above any datum: Dead Sea −430 m, Everest 8849 m."""
+"""Range of land heights on Earth above any datum, metres: Dead Sea −430 m, Everest 8849 m."""
 
 MOST_POSTS = 100_000_000
 """Largest number of posts of a DEM in memory at once: 0.8 GB of float64."""
@@ -37,12 +38,12 @@ FILLS = (0.0, -1.0, 1.0, 255.0, -99.0, 99.0, 999.0, -100.0, -499.0)
 """Common fill values of voids within the range of land heights."""
 
 STEEPEST = 5.0
-"""Slope, rise over run, above which terrain is suspect: 79 degrees, over `STEP_M` or one post."""
+"""Slope, rise over run, over `STEP_M` or one post, above which a flag is raised: 79 degrees."""
 
 STEP_M = 20.0
-"""Metres of horizontal distance over which a step is measured: 100 m of height at the limit."""
+"""Horizontal distance over which a step is measured, metres: at the limit the step is 100 m high."""
 
-_FILL_MARGIN = 16  # posts around the scene that are read to find the edges of a void
+_FILL_MARGIN = 16  # number of posts around the scene that are also read, to find the edges of a void
 _MOST_STEPS = 1_000_000
 _TILE_PX = 512
 _SAME_RASTER = "the raster that was opened before"
@@ -67,7 +68,7 @@ class Dem(Terrain):
     geoid
         Grid of undulations; None if heights are ellipsoidal.
     metres_per_unit
-        Unit of the raster's heights in metres, negative if they are positive downward.
+        Unit of the raster's heights, metres; negative if heights are positive downward.
 
     Notes
     -----
@@ -99,8 +100,8 @@ class Dem(Terrain):
         Raises
         ------
         CampaignError
-            If a height depends on a post outside the range of land heights, or on a block of posts equal to one of
-            `FILLS` with steep walls all round: an undeclared void, or another unit.
+            If a height depends on a post outside the range of land heights (undeclared void or wrong unit), or on a
+            block of posts equal to one of `FILLS` and surrounded by steep walls (undeclared void).
         """
         side = max(1, int(LATTICE_M / grid.spacing_m))
         rows, columns = (np.arange(size) + first for size, first in zip(grid.shape, grid.first, strict=True))
@@ -148,7 +149,7 @@ class Dem(Terrain):
         return np.asarray(a * x + b * y + c - 0.5), np.asarray(d * x + e * y + f - 0.5)
 
     def _shift(self, crs: str, xy_m: Floats) -> Floats:
-        """Return the offset from heights of the DEM to those of a grid in `crs`, above WGS 84, metres."""
+        """Return the offset that converts heights of the DEM to heights of a grid in `crs`, above WGS 84, metres."""
         if crs == LOCAL:
             return np.zeros(xy_m.shape[:-1])
         longitude, latitude = _transformer(crs, CRS(self.geodetic).to_2d()).transform(xy_m[..., 0], xy_m[..., 1])
@@ -196,7 +197,7 @@ class Dem(Terrain):
         return sampled
 
     def _check_fills(self, raster: Any, first: list[int], counts: list[int], index: tuple[Floats, Floats]) -> None:
-        """Raise CampaignError if a height depends on a block of posts of one fill value with steep walls all round.
+        """Raise CampaignError if a height depends on a block of posts of one fill value surrounded by steep walls.
 
         Posts around the requested ones are also read, because only a block that ends within the window is a void.
         """
@@ -269,7 +270,7 @@ def walled(heights: Floats, same: NDArray[np.bool_], *, wall_m: float) -> tuple[
     from scipy.ndimage import label
 
     padded, inner = np.pad(heights, 1, constant_values=np.nan), np.pad(same, 1)
-    step_m = np.full(same.shape, np.inf)  # smallest difference from a neighbour outside the block
+    step_m = np.full(same.shape, np.inf)  # smallest height difference from a neighbour outside the block
     for neighbour in ((slice(None, -2), slice(1, -1)), (slice(2, None), slice(1, -1))):
         for rows, columns in (neighbour, neighbour[::-1]):
             difference_m = np.where(inner[rows, columns], np.nan, np.abs(padded[rows, columns] - heights))
@@ -286,7 +287,7 @@ def walled(heights: Floats, same: NDArray[np.bool_], *, wall_m: float) -> tuple[
 
 @dataclass(frozen=True)
 class UncheckedDem(Terrain):
-    """DEM of a scene before the stage `terrain` has checked it: voids raise the same error as in that stage.
+    """DEM of a scene not yet checked by the stage `terrain`: voids raise the same error as in that stage.
 
     Attributes
     ----------
@@ -358,7 +359,8 @@ class Step(NamedTuple):
 def steepest_step(terrain: Terrain, grid: SceneGrid) -> Step | None:
     """Return the highest step of the terrain that is steeper than `STEEPEST` over `STEP_M`; None if there is none.
 
-    Cliffs are rarely as steep. Typical causes are voids filled with a constant, and parts of another datum or source.
+    Cliffs are rarely that steep. Typical causes are voids filled with a constant, and areas with another datum or
+    source.
 
     Parameters
     ----------
@@ -399,7 +401,7 @@ def _transformer(source: str | CRS, target: str | CRS) -> Transformer:
 _COLOURS = {"red", "green", "blue", "palette", "hue", "saturation", "lightness", "cyan", "magenta", "yellow"}
 _EXPECTED = "the DEM of scene.dem, a GeoTIFF of heights"
 NAMES_FILES = re.compile(r'\+proj=|grids=|init=|"PROJ4"|PARAMETERFILE\["[^"]*","[^"]*[/\\:~]', re.IGNORECASE)
-"""Parts of a CRS (WKT) that cause PROJ to open files other than the grids in its own folders."""
+"""Keywords of a CRS (WKT) that cause PROJ to open files other than the grids in its own folders."""
 
 _REMEDY = "Correct the DEM, or scene.dem and scene.dem_datum (from Python: path and datum)."
 
@@ -416,16 +418,16 @@ def open_dem(
     scene
         The grid that the DEM must cover; or only its CRS, a pyproj definition or 'local', to skip the coverage check.
     datum
-        Datum of the heights: 'ellipsoid', 'egm96', 'egm2008', or 'carried' (declared by the raster's CRS; in a local
-        scene: z of the frame).
+        Datum of the heights: 'ellipsoid', 'egm96', 'egm2008', or 'carried': that declared by the raster's CRS, in a
+        local scene z of the frame.
     geoid
         Grid of undulations; searched on PROJ's path if None.
 
     Raises
     ------
     CampaignError
-        If the file is not a DEM, its CRS contradicts `datum` or declares none, the grid of undulations is missing, or
-        the DEM does not cover the scene.
+        If the file is not a DEM, its CRS contradicts `datum` or is required to declare a datum but does not, the grid
+        of undulations is missing, or the DEM does not cover the scene.
 
     Examples
     --------
@@ -538,7 +540,7 @@ def _datum(path: Path, system: CRS, configured: str) -> str:
 
 
 def _metres_per_unit(path: Path, system: CRS, unit: str) -> float:
-    """Return the unit of a raster's heights in metres, negative if they are positive downward."""
+    """Return the unit of a raster's heights, metres; negative if heights are positive downward."""
     axis = system.axis_info[-1]
     if len(system.axis_info) == 3:
         return float(axis.unit_conversion_factor * (-1 if axis.direction == "down" else 1))

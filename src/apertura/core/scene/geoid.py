@@ -21,17 +21,17 @@ from apertura.core.scene.terrain import bilinear
 
 # ---- Grids of undulations: checked headers and values
 #
-# PROJ reads .gtx. Its TIFF reader divides by zero for a damaged file, so GDAL reads TIFF grids, as it does DEMs.
+# PROJ reads .gtx. Its TIFF reader divides by zero for a damaged file; TIFF grids are therefore read by GDAL, like DEMs.
 
 HIGHEST_M = 150.0
-"""Metres, limit of the magnitude of undulations: −107 m south of India, +86 m in New Guinea."""
+"""Limit of the magnitude of undulations, metres: −107 m south of India, +86 m in New Guinea."""
 
 MOST_POSTS = 300_000_000
 """Largest number of posts of a grid: a global grid of one arc minute has 233 million."""
 
 _STEPS_DEG = (1e-4, 30.0)  # limits of the spacing of posts
 _GTX = struct.Struct(">4d2i")
-"""Latitude and longitude of the first post, steps of both, degrees; rows, columns."""
+"""Header of a grid: latitude and longitude of the first post, and steps of both, degrees; rows and columns."""
 
 _EXPECTED = "a .gtx or .tif grid of undulations in the format of PROJ's grid collection"
 _REMEDY = "Download the file again, or correct scene.geoid."
@@ -43,7 +43,7 @@ def check_grid(path: Path) -> None:
     if path.suffix.lower() == ".tif":
         with opened_raster(path, expected=_EXPECTED, remedy=_REMEDY) as raster:
             posts, affine = raster.width * raster.height, raster.transform
-        valid_steps = all(_STEPS_DEG[0] <= abs(step) <= _STEPS_DEG[1] for step in (affine.a, affine.e))  # not for NaN
+        valid_steps = all(_STEPS_DEG[0] <= abs(step) <= _STEPS_DEG[1] for step in (affine.a, affine.e))  # False for NaN
         valid_origin = abs(affine.c) <= 2 * 360 and abs(affine.f) <= 2 * 90
         if posts > MOST_POSTS or affine.b or affine.d or not (valid_steps and valid_origin):
             wrong = f"{posts} posts with the transform {[float(value) for value in affine[:6]]}"
@@ -107,7 +107,8 @@ def undulation(grid: Path, longitude_deg: Floats, latitude_deg: Floats) -> Float
 def _of_gtx(grid: Path, longitude: Floats, latitude: Floats) -> Floats:
     """Return undulations interpolated by PROJ.
 
-    The operation contains the absolute path of the grid: PROJ skips missing grids, and searches bare names elsewhere.
+    The operation contains the absolute path of the grid, because PROJ skips missing grids and searches a name without a
+    path in other folders.
     """
     with on_disk(grid.absolute().parent) as folder:  # PROJ derives the format from the file name
         steps = f'+step +proj=vgridshift +grids="{folder / grid.name}" +multiplier=1'
@@ -154,7 +155,7 @@ _MARKS = {"egm96": ("egm96",), "egm2008": ("egm08", "egm2008")}
 
 
 def geoid_file(datum: str, given: Path | None, *, names: Sequence[str] = ()) -> Path:
-    """Return the grid of undulations of a datum: the configured file, else a file on PROJ's search path.
+    """Return the grid of undulations of a datum: the configured file, or a file on PROJ's search path.
 
     Parameters
     ----------
@@ -168,7 +169,7 @@ def geoid_file(datum: str, given: Path | None, *, names: Sequence[str] = ()) -> 
     Raises
     ------
     CampaignError
-        If there is no such file; heights are never processed as ellipsoidal because a grid is missing.
+        If there is no such file: heights are not processed as ellipsoidal heights instead.
 
     Examples
     --------

@@ -24,7 +24,7 @@ class SceneGrid:
     crs
         A pyproj definition, or 'local' for Cartesian axes without a geodetic position (x east, y north, z up).
     west_m, north_m
-        Outer corner of the whole grid, metres in `crs`.
+        Outer north-west corner of the whole grid, metres in `crs`.
     spacing_m
         Pixel spacing, metres.
     shape
@@ -200,8 +200,8 @@ class SceneGrid:
         Parameters
         ----------
         height_m
-            Scalar or (row, column) float64: height of all pixels or of each, metres above the ellipsoid of `crs` (z in
-            a local frame).
+            Scalar or (row, column) float64: one height of all pixels, or the height of each pixel, metres above the
+            ellipsoid of `crs` (z in a local frame).
 
         Returns
         -------
@@ -218,7 +218,7 @@ class SceneGrid:
         return positions
 
     def _blocks(self) -> Iterator[tuple[slice, slice]]:
-        """Yield the parts of the whole grid's blocks that lie in this window."""
+        """Yield the intersections of the whole grid's blocks with this window."""
         rows, columns = (
             [slice(*cuts) for cuts in pairwise([0, *range(BLOCK_PX - first % BLOCK_PX, size, BLOCK_PX), size])]
             for first, size in zip(self.first, self.shape, strict=True)

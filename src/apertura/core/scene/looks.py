@@ -82,8 +82,8 @@ class Lattice:
         window
             Window of pixels.
         farthest
-            Length of the difference (last axis) of two corners of a cell above which the value of the nearest corner is
-            used.
+            Largest length of the difference (along the last axis) between two corners of a cell for which values are
+            interpolated; above it, the value of the nearest corner is used.
         """
         (low, high, up), (left, right, across) = self._cells(window)
         extra, dtype = (1,) * (values.ndim - 2), np.float32 if values.dtype == np.float32 else np.float64
@@ -172,7 +172,7 @@ def fill(
     lattice, grid, terrain, aperture, beams
         As of `Looks`.
     block
-        Function of a window of nodes and a mask of pulse blocks, (block,) bool.
+        Function called with a window of nodes and a mask of pulse blocks, (block,) bool.
     threads
         Number of blocks processed in parallel.
     """
@@ -187,19 +187,23 @@ SPREAD = 17
 """Number of pulses, evenly spread over those that illuminate a pixel, used to decide on shadow."""
 
 PITCHES_PX = (128, 64, 32, 16)
-"""Pitches of a lattice, pixels; the widest pitch of sufficient accuracy is used."""
+"""Candidate pitches of a lattice, pixels; the widest pitch with sufficient accuracy is used."""
 
-_RANGE_SHARE = 48  # range in pitches: the number of looks between nodes then has an error of 0.3 % in a beam of 20°
-_PULSES = 256  # pulses summed for a block of the lattice, or up to twice as many
-_FEWEST, _MOST = 48, 2048  # least number with weight at half of the nodes (else more are summed), and their limit
+# least ratio of range to pitch: the error of the number of looks between nodes is 0.3 % in a beam of 20°
+_RANGE_SHARE = 48
+_PULSES = 256  # least number of pulses summed for a block of the lattice; at most twice as many are summed
+# least number of pulses with weight at half of the nodes (if fewer, more pulses are summed), and limit of that sum
+_FEWEST, _MOST = 48, 2048
 AT_ONCE = 64  # block size in pulses of the illumination test
 _EXACT = (AT_ONCE, 8)  # block sizes in pulses of the exact illumination test, from coarse to fine
 _CELL_PX = 8  # side, pixels, of the cells that are tested as a whole first
 _PIXELS = 4096  # pixels tested together
-_DARK_PULSES = 64  # pulses evaluated for centres of a block without illumination, with which neighbours interpolate
-_NO_WEIGHT_PENALTY = 1e6  # added to the distance of a pulse without weight: it is a centre only if none has weight
+# number of pulses evaluated for the centres of a block without illumination, needed to interpolate in its neighbours
+_DARK_PULSES = 64
+# added to the distance of a pulse without weight, which is selected as centre only if no pulse has weight
+_NO_WEIGHT_PENALTY = 1e6
 _ALIKE = 0.02  # largest change of Σ|w|/Σw² between nodes for bilinear looks: error of 0.08 % relative to the two sums
-_JUMP_PITCHES = 4.0  # node pitches: centres of neighbouring nodes with a larger distance belong to different passes
+_JUMP_PITCHES = 4.0  # in node pitches: centres of neighbouring nodes that are farther apart belong to different passes
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,8 +223,8 @@ class Looks:
     centres
         (node row, node column, 2, 3) float64, metres: transmitter and receiver at the closest approach.
     pulses
-        (node row, node column, `SPREAD`) int32, a selection of the pulses with at least half of the largest weight; of
-        all pulses if none has weight.
+        (node row, node column, `SPREAD`) int32, a selection of the pulses with at least half of the largest weight, or
+        of all pulses if no pulse has weight.
 
     Notes
     -----
@@ -327,7 +331,7 @@ class Looks:
         if not cells or self.beams is None:
             return
         middle_m, radius_m = balls(part, self.terrain, cells)
-        # Exclude cells and pulses that cannot illuminate each other, with ever smaller blocks of pulses.
+        # Exclude combinations of cells and pulse blocks without illumination, with successively smaller pulse blocks.
         reached, pulses = np.arange(len(cells)), np.arange(len(self.aperture))
         for size in _EXACT:
             reaching = illumination_mask(
@@ -345,7 +349,7 @@ class Looks:
             mask[rows[pixels], columns[pixels]] = _any(self.beams, self.aperture, points[pixels], pulses)
 
     def _sums(self, tile: Window) -> list[NDArray[np.float32]]:
-        """Interpolate Σ|w| and Σw² at the pixels of a tile between nodes that have pulses; 0 if none has."""
+        """Interpolate Σ|w| and Σw² at the pixels of a tile between nodes with pulses; 0 if no node has pulses."""
         sums = [self.lattice.between(values, tile) for values in (self.total, self.squares)]
         lit = self.total[self.lattice.around(tile)] > 0
         if not lit.all():
@@ -357,7 +361,8 @@ class Looks:
     def effective(self, tile: Window) -> NDArray[np.float32]:
         """Return the number of looks of the pixels of a tile, (row, column) float32; 0 without illumination.
 
-        It is bilinear between nodes if Σ|w| and Σw² change alike, else computed from these two interpolated sums.
+        The number is interpolated bilinearly between nodes if Σ|w| and Σw² change by equal factors, else computed from
+        the interpolated Σ|w| and Σw².
         """
         if self._alike(tile):
             looks = self.lattice.between(self._node_looks, tile)
@@ -373,7 +378,7 @@ class Looks:
         return np.asarray(self.total**2 / np.where(self.squares > 0, self.squares, np.float32(np.inf)))
 
     def _alike(self, tile: Window) -> bool:
-        """Return True if both sums change alike between nodes, and at most by a factor of two (layers.md, eq. 4)."""
+        """Return True if both sums change by equal factors between nodes, at most by two (layers.md, eq. 4)."""
         nodes = self.lattice.around(tile)
         total = self.total[nodes]
         if not total.all():
@@ -401,7 +406,7 @@ class Looks:
     def incidence_deg(self, tile: Window) -> NDArray[Any]:
         """Return the incidence angle of the transmitter at closest approach, (row, column) degrees.
 
-        Over level terrain it is bilinear between nodes (docs/theory/layers.md, section 4).
+        Over level terrain the angle is interpolated bilinearly between nodes (docs/theory/layers.md, section 4).
         """
         if self._smooth(tile):
             return self.lattice.between(self._angles_deg[0], tile)
@@ -424,7 +429,7 @@ class Looks:
         return angles[0].astype(np.float32), angles[1].astype(np.float32)
 
     def _smooth(self, tile: Window) -> bool:
-        """Return True if angles can be interpolated: level terrain, a pitch small against the range, one pass."""
+        """Return True if angles can be interpolated: level terrain, a pitch far below the range, and one pass."""
         if not isinstance(self.terrain, FlatGround) or self.lattice.pitch_px == PITCHES_PX[-1]:
             return False
         nodes = self.lattice.around(tile)
@@ -441,7 +446,7 @@ def pulses_of(reaching: NDArray[np.bool_], pulses: int) -> slice:
 
 
 def pitch_px(grid: SceneGrid, terrain: Terrain, aperture: Aperture, *, share: float) -> int:
-    """Return the pitch of a lattice that is at most a fraction 1/`share` of the range to the scene, pixels.
+    """Return the widest pitch of a lattice, pixels, that is at most 1/`share` of the range to the scene.
 
     Parameters
     ----------
@@ -462,8 +467,8 @@ def _any(
 ) -> NDArray[np.bool_]:
     """Return a mask of the points (point, 3) at which any of the pulses has a weight.
 
-    One pulse of each block is evaluated first. Blocks that cannot illuminate a point are then excluded, with ever
-    smaller blocks, so that all pulses are evaluated only near the edges of beams.
+    One pulse of each block is evaluated first. Blocks that cannot illuminate a point are then excluded. This is
+    repeated with smaller blocks, so that all pulses are evaluated only near the edges of beams.
     """
     if not pulses.size or not len(points):
         return np.zeros(len(points), bool)
@@ -482,7 +487,8 @@ def _any(
 
 def _centres(aperture: Aperture, beams: Beams | None, points: Floats, weight: Floats) -> Floats:
     """Return both antenna positions at the closest approach to each point, (point, 2, 3), interpolated over pulses."""
-    # The pulse of shortest total path, or smallest |s| in a sector; a pulse without weight only if none has weight.
+    # The pulse with the shortest total path, or the smallest |s| in a sector; one without weight only if none has
+    # weight.
     sector = None if beams is None else beams.sector
     distance = aperture.path(points) if sector is None else sector.place(aperture, points) ** 2
     dark = weight == 0
@@ -491,7 +497,7 @@ def _centres(aperture: Aperture, beams: Beams | None, points: Floats, weight: Fl
     legs = np.stack(aperture.legs, axis=1)
     if len(aperture) < 3:
         return np.asarray(legs[best])
-    # A parabola through it and its neighbours, if all three have weight or none has.
+    # A parabola through this pulse and its neighbours, if all three have weight or none has weight.
     inner = np.clip(best, 1, len(aperture) - 2)
     before, middle, after = (distance[inner + step, column] for step in (-1, 0, 1))
     same_weighting = (dark[inner - 1, column] == dark[inner, column]) & (dark[inner, column] == dark[inner + 1, column])

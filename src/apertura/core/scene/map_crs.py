@@ -15,10 +15,11 @@ from apertura.core.geometry.geodesy import ecef_from_geodetic, ecef_from_project
 # ---- Checks of a scene's CRS
 
 MARGIN_DEG = 3.0
-"""Degrees beyond its area of use at which a projection is accepted: half a UTM zone, 0.5 % of scale error."""
+"""Largest distance from its area of use at which a projection is accepted, degrees: half a UTM zone, with a scale error
+of 0.5 %."""
 
 RETURN_M = 1e-3
-"""Metres, round-trip error of a projection above which a point is outside its domain."""
+"""Round-trip error of a projection, metres, above which a point is outside the projection's domain."""
 
 _WHERE = "scene"
 
@@ -108,7 +109,7 @@ def check_crs(crs: str, bounds_m: tuple[float, float, float, float]) -> None:
     try:
         _check_usable(system, bounds_m)
         projected_from_ecef(crs, ecef_from_geodetic(*(np.array(angle) for angle in (0.0, 0.0, 0.0))))
-    except ProjError as error:  # such as a datum that needs a grid of shifts
+    except ProjError as error:  # for instance a datum that requires a grid of datum shifts
         raise CampaignError(
             f"this installation of PROJ has no exact transformation from {crs} ({system.name}) to WGS 84",
             where=_WHERE,
@@ -158,18 +159,18 @@ def _near(
 
 
 # ---- Positions of the pixels of a projected grid
-#
-# PROJ takes as long for a pixel as the integration of hundreds of pulses. Over a block of pixels, polynomials of degree
-# four are as accurate as positions in float64 (docs/theory/planner.md, "Pixel positions").
+# The transformation of a pixel by PROJ takes as long as the integration of hundreds of pulses. Over a block of pixels,
+# polynomials of degree four are as accurate as positions in float64 (docs/theory/planner.md, "Pixel positions").
 
 BLOCK_PX = 256
 
 DEGREE = 4
 
 TOLERANCE_M = 3e-8
-"""Metres, error of a block's polynomials between nodes above which PROJ computes each pixel; float64 has 1e-9 m."""
+"""Error of a block's polynomials between nodes, metres, above which each pixel is transformed with PROJ; the rounding
+error of float64 is 1e-9 m."""
 
-_CLIMB_M = 1e4  # height difference: ECEF is exactly linear in ellipsoidal height, so that two heights suffice
+_CLIMB_M = 1e4  # metres between the two heights evaluated: two suffice, as ECEF is exactly linear in ellipsoidal height
 _NODES = np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))
 _BETWEEN = np.array([-1.0, -0.5, 0.45, 1.0])
 
@@ -184,7 +185,7 @@ class Block:
         (3,) float64, ECEF metres, on the ellipsoid.
     offset_m, normal
         (DEGREE + 1, DEGREE + 1, 3) float64, coefficients of u^k v^l: ECEF metres from the middle, on the ellipsoid; and
-        their change per metre of height.
+        the change of these positions per metre of height.
     exact
         True if the polynomials are within `TOLERANCE_M` of PROJ.
     """
@@ -204,7 +205,7 @@ class Block:
         row, column
             (row,) and (column,) int64, counted from the block's corner.
         height_m
-            () or (row, column) float64, ellipsoidal height of all pixels or of each.
+            () or (row, column) float64, ellipsoidal height: one for all pixels, or one for each pixel.
         """
         down, right = ((2 * index + 1) / BLOCK_PX - 1 for index in (row, column))
         if height_m.ndim == 0:  # a constant height: only one polynomial is evaluated

@@ -15,8 +15,8 @@ from apertura.core.scene.terrain import Terrain
 
 _BLOCKS = 33
 _PULSES_AT_ONCE = 256
-_PIXELS_AT_ONCE = 2**20  # heights read together, because a DEM is slow to open and to read in parts
-_MOST_PULSES = 4096  # largest number of pulses whose paths are computed; those of others are bounded
+_PIXELS_AT_ONCE = 2**20  # number of heights read together, because a DEM is slow to open and to read piecewise
+_MOST_PULSES = 4096  # largest number of pulses whose paths are computed; paths of the other pulses are bounded
 
 
 def swath(
@@ -25,7 +25,7 @@ def swath(
     """Return a lower and an upper bound of the total paths from each pulse to the scene.
 
     The scene is divided into about 33 × 33 blocks of pixels, each contained in a sphere; within a block the total path
-    changes by at most twice the radius. In a long flight the paths of a sample of pulses bound those in between: a path
+    changes by at most twice the radius. In a long flight, bounds are computed from a sample of the pulses: a path
     changes by at most the sum of both antennas' displacements.
 
     Parameters
@@ -37,12 +37,13 @@ def swath(
     beams
         Weights of pulses: blocks of pixels that a pulse cannot illuminate are excluded.
     together
-        Least number of pulses whose paths are bounded by one of them.
+        Least number of consecutive pulses whose paths are bounded from the path of one of them.
 
     Returns
     -------
     tuple of ndarray
-        (pulse,) float64 metres each. Infinite and minus infinite for a pulse that illuminates no pixel.
+        (pulse,) float64 metres each. For a pulse that illuminates no pixel, the lower bound is infinite and the upper
+        bound minus infinite.
 
     Examples
     --------
@@ -72,7 +73,7 @@ def _spans(
     radius_m: NDArray[np.float64],
     every: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the swath of a block of pulses; the middle one of each `every` pulses bounds the others."""
+    """Return the swath of a block of pulses, bounded from the middle pulse of every `every` pulses."""
     block = np.arange(len(aperture)) // every
     middle = aperture[np.minimum(np.arange(0, len(aperture), every) + every // 2, len(aperture) - 1)]
     displacement = sum(
@@ -90,7 +91,7 @@ def _spans(
 def balls(
     grid: SceneGrid, terrain: Terrain, windows: Sequence[Window]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the middles (window, 3) and radii (window,), metres, of spheres that contain the pixels of windows."""
+    """Return the centres (window, 3) and radii (window,), metres, of spheres that contain the pixels of windows."""
     centre = np.array([[(part.start + part.stop - 1) / 2 for part in window] for window in windows])
     half_m = np.array([[(part.stop - part.start - 1) / 2 * grid.spacing_m for part in window] for window in windows])
     low, high = np.array([ends for strip in _strips(windows) for ends in _height_ranges(grid, terrain, strip)]).T

@@ -1,4 +1,4 @@
-"""Terrain of a scene: a constant height, a plane, or heights from a DEM; and its two simplified models."""
+"""Terrain of a scene (a constant height, a plane, or heights from a DEM), and its two simplified models."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -98,7 +98,7 @@ class FlatGround(Terrain):
         return np.full(np.broadcast_shapes(np.shape(row), np.shape(column)), self.height_m)
 
     def positions(self, grid: SceneGrid) -> Floats:
-        """Return the positions of the pixels at the constant height, which is faster than at varying heights."""
+        """Return the positions of the pixels at the constant height, computed faster than for varying heights."""
         return grid.positions(self.height_m)
 
     @property
@@ -166,7 +166,7 @@ class Plane(Terrain):
 
 
 def ground_of(terrain: Terrain | float | None, grid: SceneGrid) -> Terrain:
-    """Return the terrain of an argument: flat for a number, and of height 0 by default in a local frame.
+    """Return the terrain of an argument: flat for a number; in a local frame of height 0 by default.
 
     Raises
     ------
@@ -225,7 +225,7 @@ class GridHeights(Terrain):
     height_m: _Array
 
     def heights(self, grid: SceneGrid) -> Floats:
-        """Return the heights of a window of the grid; those of other grids are bilinear between its pixels."""
+        """Return the heights of a window of the grid; for other grids, heights are interpolated bilinearly."""
         if (grid.crs, grid.west_m, grid.north_m, grid.spacing_m) != (
             self.grid.crs, self.grid.west_m, self.grid.north_m, self.grid.spacing_m,
         ):  # fmt: skip
@@ -288,9 +288,9 @@ class GroundModels:
 
     @classmethod
     def of(cls, terrain: Terrain, level: FlatGround | None, grid: SceneGrid) -> "GroundModels":
-        """Fit the models of a terrain to its heights in the middle of blocks of pixels.
+        """Fit the models of a terrain to its heights at the centres of blocks of pixels.
 
-        If no level is given, it is the mean of these heights, or the terrain itself if that is flat.
+        If no level is given, the mean of these heights is used, or the terrain itself if it is flat.
 
         Examples
         --------
@@ -303,7 +303,7 @@ class GroundModels:
         heights = terrain.heights(blocks)
         if level is None:
             level = terrain if isinstance(terrain, FlatGround) else FlatGround(float(np.nanmean(heights)))
-        heights = np.where(np.isfinite(heights), heights, level.height_m)  # voids between pixels do not matter
+        heights = np.where(np.isfinite(heights), heights, level.height_m)  # voids between pixels have no effect
         plane = Plane.through(blocks, heights)
         off_m = (np.abs(heights - model.heights(blocks)).max() for model in (level, plane))
         return cls(terrain, level, plane, *map(float, off_m))

@@ -22,13 +22,13 @@ SHADOW, LAYOVER = 1, 2
 """Bits of the mask."""
 
 BLOCK = 16
-"""Pixels, side of the blocks whose highest terrain is precomputed."""
+"""Side of the blocks whose highest terrain is precomputed, pixels."""
 
 TOLERANCE_M = 1e-3
-"""Metres, height of terrain above a line of sight that does not block it: float32 rounding of a relief."""
+"""Largest height of terrain above a line of sight that does not block it, metres: float32 rounding of a relief."""
 
 STRAIGHT_BELOW = 0.05
-"""Horizontal gradient of the path, m/m, below which the antenna is overhead and layover is undefined."""
+"""Horizontal gradient of the path, m/m, below which the antenna is above the pixel and layover is undefined."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -79,13 +79,14 @@ def _blocked(antenna, row, column, highest, top, ground):  # type: ignore[no-unt
     while t < steps:
         r, c = row + t * dr, column + t * dc
         terrain = _interpolated(height, r, c)
-        if np.isnan(terrain):  # the line has left the scene: terrain outside it is ignored
+        if np.isnan(terrain):  # the line has left the scene: terrain outside the scene is ignored
             return False
         line = own + up * t / steps - bend * t * (steps - t)
         if terrain > line + TOLERANCE_M:
             return True
-        # `least` is a lower bound of a rising line from here on. Above all terrain of the scene it is not blocked.
-        # Above all terrain of this block (and one pixel around it) the search skips to the last step inside the block.
+        # `least` is a lower bound of the rest of a rising line, which is not blocked if it is above all terrain of the
+        # scene. If the line is above all terrain of this block and one pixel around it, the search skips to the last
+        # step inside the block.
         leap, least = 1, line - bend * steps
         if up > 0 and least > top:
             return False
@@ -99,14 +100,15 @@ def _blocked(antenna, row, column, highest, top, ground):  # type: ignore[no-unt
 def mark_shadow(mask, first, legs, highest, ground):  # type: ignore[no-untyped-def]
     """Set `SHADOW` in `mask`, (row, column) uint8 with first pixel `first`, where most pulses are blocked.
 
-    A pulse is blocked if its line of sight to the transmitter or to the receiver is; more than half must be blocked.
+    A pulse is blocked if its line of sight to the transmitter or to the receiver is blocked. A pixel is in shadow if
+    more than half of the pulses are blocked.
     """
     pulses, top = legs.shape[0], highest.max()
     for i in range(mask.shape[0]):
         for j in range(mask.shape[1]):
             blocked = 0
             for pulse in range(pulses):
-                # Stop if more than half are already blocked, or can no longer be.
+                # Stop if more than half are already blocked, or if this is no longer possible.
                 if 2 * blocked > pulses or 2 * (pulse - blocked) >= pulses:
                     break
                 for leg in range(legs.shape[1]):
@@ -119,13 +121,13 @@ def mark_shadow(mask, first, legs, highest, ground):  # type: ignore[no-untyped-
 
 @numba.njit(cache=True, nogil=True)
 def _total_path(legs, pixel, height_m, ground):  # type: ignore[no-untyped-def]
-    """Return the total path from one antenna to a pixel (row, column) at a height and to the other antenna."""
+    """Return the total path from one antenna via a pixel (row, column) at a height to the other antenna."""
     _, spacing, curvature = ground
     path = 0.0
     for leg in range(2):
         south, east = (pixel[0] - legs[leg, 0]) * spacing, (pixel[1] - legs[leg, 1]) * spacing
         flat = south * south + east * east
-        # Below the horizontal plane of the antenna the curved Earth falls by d²/2R.
+        # The curved Earth lies d²/2R below the horizontal plane of the antenna.
         up = legs[leg, 2] - height_m + curvature * flat
         path += np.sqrt(flat + up * up)
     return path
@@ -136,7 +138,8 @@ def _in_layover(direction, legs, pixel, extreme, ground):  # type: ignore[no-unt
     """Return True if terrain along `direction` (rows and columns per step, sign) has the same total path as the pixel.
 
     Without layover, paths behind the pixel (sign +1) are longer, and those in front of it (−1) shorter. `extreme` is
-    the height that violates this at the largest distance: the highest terrain behind, the lowest in front.
+    the height that violates this condition at the largest distance: the highest terrain behind the pixel, the lowest in
+    front of it.
     """
     height, sign = ground[0], direction[2]
     own = _total_path(legs, pixel, height[pixel[0], pixel[1]], ground)
@@ -146,7 +149,7 @@ def _in_layover(direction, legs, pixel, extreme, ground):  # type: ignore[no-unt
         height_m = _interpolated(height, point[0], point[1])
         if np.isnan(height_m):  # outside the scene
             return False
-        # From here on, not even the most extreme terrain of the scene can have the same path.
+        # Beyond this distance, not even the most extreme terrain of the scene can have the same path.
         if sign * (_total_path(legs, point, extreme, ground) - own) > 0:
             return False
         if sign * (_total_path(legs, point, height_m, ground) - own) <= 0:
@@ -156,7 +159,7 @@ def _in_layover(direction, legs, pixel, extreme, ground):  # type: ignore[no-unt
 
 @numba.njit(cache=True, nogil=True)
 def _path_gradient(legs, pixel, height_m, spacing):  # type: ignore[no-untyped-def]
-    """Return the horizontal gradient of the total path along rows and columns, the horizontal line of sight."""
+    """Return the horizontal gradient of the total path by row and column, which gives the horizontal line of sight."""
     down, right = 0.0, 0.0
     for leg in range(2):
         south, east = (pixel[0] - legs[leg, 0]) * spacing, (pixel[1] - legs[leg, 1]) * spacing
@@ -182,7 +185,7 @@ def mark_layover(mask, first, legs, extremes, ground):  # type: ignore[no-untype
                     nearest, least = pulse, path
             down, right = _path_gradient(legs[nearest], pixel, own, spacing)
             steep = max(abs(down), abs(right))
-            if steep < STRAIGHT_BELOW:  # overhead
+            if steep < STRAIGHT_BELOW:  # antenna directly above the pixel
                 continue
             # Search away from the antenna, then towards it, with one pixel per step along the steeper axis.
             dr, dc = down / steep, right / steep
@@ -206,7 +209,7 @@ class Relief:
     Attributes
     ----------
     grid, base_m
-        Grid of the scene, and reference of the other heights, metres.
+        Grid of the scene, and reference level of the following heights, metres.
     height_m
         (row, column) float32, metres above `base_m`.
     highest_m
@@ -223,7 +226,7 @@ class Relief:
 
     @classmethod
     def of(cls, grid: SceneGrid, terrain: Terrain, base_m: float) -> "Relief":
-        """Return the relief of a scene above a height (m) near its terrain, so that float32 resolves micrometres."""
+        """Return the relief of a scene relative to a height (m) near its terrain, for micrometres in float32."""
         relative = np.empty(grid.shape, np.float32)
         for row in range(0, grid.shape[0], _STRIP):
             strip = (slice(row, min(row + _STRIP, grid.shape[0])), slice(0, grid.shape[1]))
@@ -238,7 +241,7 @@ class Relief:
 
     @property
     def curvature_per_m(self) -> float:
-        """1/2R, fall of the Earth below a horizontal line over squared distance, 1/m; 0 in a local frame."""
+        """1/2R, 1/m: depth of the Earth below a horizontal line per squared distance; 0 in a local frame."""
         return 0.0 if self.grid.crs == LOCAL else 0.5 / EARTH_RADIUS_M
 
     def above(self, antenna: Floats) -> Floats:
@@ -257,7 +260,7 @@ def visibility(relief: Relief, tx: Floats, rx: Floats, window: Window) -> NDArra
 
     Shadow: at more than half of the given pulses, terrain of the scene blocks the line of sight to the transmitter or
     to the receiver. Layover: at the pulse with the shortest total path, another point along the line of sight has the
-    same path, because the path does not increase monotonically. Terrain outside the scene causes neither.
+    same path, because the path does not increase monotonically. Terrain outside the scene is ignored.
 
     Parameters
     ----------

@@ -52,7 +52,7 @@ class CrateJob:
     settings
         Settings that affect the job.
     sources
-        Names of its sources: results by their manifests (``results/…``), and inputs.
+        Names of its sources: results, named by their manifests (``results/…``), and inputs.
     files
         Output files, manifests last.
     doubts
@@ -91,9 +91,9 @@ class CrateRun:
     inputs
         Input files in the campaign folder.
     workflow
-        Files of the workflow, as copied to the folder of the crate.
+        Files of the workflow, copied to the folder of the crate.
     author, licence, doi
-        Configured name, SPDX identifier and DOI; None: not configured.
+        Configured name of the author, SPDX identifier and DOI; None: not configured.
     """
 
     campaign: str
@@ -131,7 +131,7 @@ _RUN, _ORGANISED, _LOCK = "#run", "#organised", "#lock"
 
 
 def crate_document(run: CrateRun) -> dict[str, Any]:
-    """Build the metadata document of a run; the same run gives the same document.
+    """Build the metadata document of a run; identical runs give identical documents.
 
     Examples
     --------
@@ -352,7 +352,7 @@ def _id(file: Listed) -> str:
 
 
 def _refs(ids: Iterable[str]) -> dict[str, str] | list[dict[str, str]]:
-    """Return references as a list, or as a single value if there is only one, as RO-Crate recommends."""
+    """Return references as a list, or a single reference without a list, as RO-Crate recommends."""
     references = [{"@id": identifier} for identifier in dict.fromkeys(ids)]
     return references[0] if len(references) == 1 else references
 
@@ -379,7 +379,7 @@ class CrateFile:
 
 
 def recorded_files(root: Path, *, inputs: bool = True) -> dict[str, CrateFile]:
-    """Return the files with hashes in a crate, by their names in it; the files are not opened.
+    """Return the files whose hashes a crate lists, by their names in the crate; the files are not opened.
 
     Parameters
     ----------

@@ -42,7 +42,7 @@ _BANDS_GHZ = {
     "K": (18.0, 26.5),
     "Ka": (26.5, 40.0),
 }
-"""Frequency bands of the SAR extension, which defines none below P and above Ka."""
+"""Frequency bands of the SAR extension, which defines no bands below P and above Ka."""
 
 _FIRST_CLOCK = datetime(1980, 1, 6, tzinfo=UTC)  # epoch of GPS time; earlier times are pulse counters
 _NO_CLOCK = "none: the recording contains no time of day; times are pulse numbers in seconds since 1970-01-01"
@@ -72,7 +72,7 @@ class AcquisitionTime:
 
     @property
     def fields(self) -> dict[str, Any]:
-        """Fields of the SAR extension, without the frequency band if it has no letter."""
+        """Fields of the SAR extension; the frequency band is omitted if no letter is defined for it."""
         ghz = self.centre_hz / 1e9
         band = next((name for name, (low, high) in _BANDS_GHZ.items() if low <= ghz < high), None)
         return {
@@ -84,7 +84,7 @@ class AcquisitionTime:
 
     @classmethod
     def together(cls, parts: Sequence["AcquisitionTime"]) -> "AcquisitionTime":
-        """Combine the acquisitions of a sum: from the first to the last pulse, over all frequencies.
+        """Combine the acquisitions of the images of a sum: from the first to the last pulse, over all frequencies.
 
         Examples
         --------
@@ -178,7 +178,7 @@ class FileFacts:
     bands
         For a raster: common fields and those of the raster extension, one mapping per band.
     inputs
-        For a raster: source file → SHA-256.
+        For a raster: source file → SHA-256 of the file.
     place
         For a raster: shape and transform, fields of the projection extension.
     """
@@ -401,9 +401,9 @@ def catalog_files(
     campaign
         Name of the campaign, free text.
     images
-        The images, in any order; their files are in the parent folder of the catalog's folder.
+        The images, in any order; their files are below the parent folder of the catalog's folder.
     licence, author, doi
-        SPDX identifier, name and DOI for all images; None: not stated.
+        SPDX identifier, name of the author, and DOI of all images; None: not stated.
     """
     ordered = sorted(images, key=lambda image: (image.flight, image.name))
     times = min(image.acquisition.start for image in ordered), max(image.acquisition.end for image in ordered)
@@ -429,7 +429,7 @@ def catalog_files(
 
 
 def _layout() -> CustomLayoutStrategy:
-    """Return the layout of the files: catalog.json, in the same folder the parent, images/<flight>/<image>.json."""
+    """Return the file layout: catalog.json and the parent of the items in one folder, images/<flight>/<image>.json."""
 
     def path_of(item: pystac.Item, folder: str) -> str:
         flight, _, name = item.id.partition("-")

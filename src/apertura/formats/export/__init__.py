@@ -49,10 +49,10 @@ SOURCES: Mapping[str, str] = {
 ``image`` is the complex image of a pair. ``coherent`` is the complex sum and ``noncoherent`` the power sum of a
 flight's pairs, the latter as complex amplitude without phase; ``magnitude`` is the sum of their magnitudes. Layers are
 real rasters that describe the image of a pair, in the same folder. Rasters of radiometry exist for calibrated pairs, in
-the folder of the layers: complex amplitudes, whose power is the named coefficient. Rasters of multilook exist if
-requested: mean power of square blocks of pixels, real, on a coarser grid; ``multilook_noise`` is the mean noise power
-that is subtracted from the echo power. Rasters of an interferogram belong to two images; ``panels`` are all of them by
-name.
+the folder of the layers; they are complex amplitudes whose power is the named coefficient. Rasters of multilook exist
+if requested; they contain the mean power of square blocks of pixels, on a coarser grid. ``multilook_noise`` is the mean
+noise power that is subtracted from the echo power. Rasters of an interferogram belong to two images; ``panels`` is a
+mapping of all of them by name.
 """
 
 
@@ -70,9 +70,9 @@ class Export:
         Function that writes the file, ``write(path, raster, transform=…, crs=…, tags=…, title=…)``; see
         `apertura.formats.export.cog.write_slc`.
     pictured
-        True if the workflow report shows the file.
+        True if the workflow report contains the file as a picture.
     opened
-        Hint in the summary on how to open the file; empty: the summary does not list the file.
+        Hint for opening the file, shown in the summary; empty: the summary does not list the file.
     mosaicked
         True if the rasters of all flights are mosaicked; GDAL cannot mosaic complex rasters.
     """
@@ -184,10 +184,10 @@ EXPORTS: tuple[Export, ...] = (
 _OPTIONAL = ("radiometry", "multilook", "multilook_fused")  # kinds whose rows are only written if requested
 
 PHASE_HISTORY = "phase_history.cphd"
-"""Transfer functions of a pair; written only if requested, because the file is as large as the echo."""
+"""Product with the transfer functions of a pair; written only if requested, as the file is as large as the echo."""
 
 COVERAGE = ("coverage.png", "coverage.geojson")
-"""Coverage of the whole campaign, as plot and as GeoJSON."""
+"""Files with the coverage of the whole campaign, a plot and GeoJSON."""
 
 MOSAICS = "mosaic"
 """Folder of the mosaics of all flights."""
@@ -216,7 +216,7 @@ def added_exports(folder: str) -> list[Export]:
 
 
 def product(source: str, function: str) -> Export:
-    """Return the row of the file that a function writes from a source.
+    """Return the row of the file that a function writes from a source raster.
 
     Examples
     --------
@@ -227,7 +227,7 @@ def product(source: str, function: str) -> Export:
 
 
 def export_modules(folder: str) -> list[str]:
-    """List the modules that write the files of a kind of folder; a change of their code makes the files out of date.
+    """List the modules that write the files of a kind of folder; the files are out of date if their code changes.
 
     Examples
     --------
@@ -240,7 +240,7 @@ def export_modules(folder: str) -> list[str]:
 def mosaics(images: Mapping[str, Sequence[str]], coefficients: Sequence[str] = ()) -> dict[str, list[str]]:
     """Return the mosaics of all flights: path relative to `MOSAICS` → source rasters, relative to the results.
 
-    Only images of the same pair, or the sums of flights, are combined; other images have different view geometry or
+    Only images of the same pair, or the same sums of flights, are combined; other images differ in view geometry or
     meaning.
 
     Parameters
@@ -248,7 +248,7 @@ def mosaics(images: Mapping[str, Sequence[str]], coefficients: Sequence[str] = (
     images
         Flight → its images, as in `product_files`; the lowest flight first.
     coefficients
-        Written sources of kinds ``radiometry`` and ``multilook``.
+        Sources of kinds ``radiometry`` and ``multilook`` that are written.
 
     Examples
     --------
@@ -274,7 +274,7 @@ def mosaic_files(images: Mapping[str, Sequence[str]], coefficients: Sequence[str
 
 
 def _written(image: str, coefficients: Sequence[str]) -> Iterator[Export]:
-    """Yield the rows of the files in the folder of an image; of optional kinds, only those of the coefficients."""
+    """Yield the rows of the files in the folder of an image; of optional kinds, only the rows of `coefficients`."""
     kinds = ("fused", "multilook_fused") if image == "fused" else ("pair", "layers", "radiometry", "multilook")
     rows = (row for kind in kinds for row in exports_in(kind))
     return (row for row in rows if SOURCES[row.source] not in _OPTIONAL or row.source in coefficients)
@@ -323,8 +323,8 @@ def write_exports(
     folder
         Output folder.
     rasters, titles
-        Source → (y, x) raster on the campaign's grid, and its title; of ``radiometry`` and ``multilook`` only the
-        requested ones.
+        Source → (y, x) raster on the campaign's grid, and its title; of kinds ``radiometry`` and ``multilook``, only
+        the requested sources.
     tags
         Tags of every file, name → text.
     radiometry

@@ -64,7 +64,7 @@ class Band:
     colours
         Value → (red, green, blue), 0 to 255, for a band of classes.
     smooth
-        True if neighbouring floating-point pixels have similar values; selects the predictor of the compression.
+        True if neighbouring floating-point pixels have similar values; determines the predictor of the compression.
     """
 
     dtype: str
@@ -86,8 +86,8 @@ def write_slc(
 ) -> None:
     """Write the complex image unchanged, with carrier phase, as a CFloat32 COG.
 
-    Overviews have the mean magnitude and the phase of the mean, because the carrier phase changes from pixel to pixel
-    and would cancel in a complex average.
+    Overviews contain the mean magnitude and the phase of the mean: as the carrier phase changes from pixel to pixel,
+    pixels cancel in a complex mean.
 
     Parameters
     ----------
@@ -175,9 +175,9 @@ def write_cog(
     band
         Dtype, no-data value, unit and description.
     value
-        Function from a block of `image` to the values that are averaged in overviews.
+        Function that converts a block of `image` to the values that are averaged in overviews.
     shown
-        Function from these values, at full resolution or of an overview, to pixels of the file in the dtype of `band`.
+        Function that converts these values, at full resolution or in an overview, to pixels in the dtype of `band`.
 
     Raises
     ------
@@ -265,7 +265,7 @@ def placed(image: NorthUpRaster, transform: Affine, crs: str) -> dict[str, Any]:
 
 
 def halved(pixels: Pixels, band: Band) -> Pixels:
-    """Resample pixels to half the resolution, from groups of two by two valid pixels, fewer at an odd edge.
+    """Resample pixels to half the resolution, from the valid pixels of groups of two by two, fewer at an odd edge.
 
     The result is their mean (AVERAGE), their mean magnitude with the phase of their mean (AVERAGE_MAGPHASE), their most
     frequent value, the first one of equally frequent values (MODE), or the first pixel (NEAREST).
@@ -327,7 +327,8 @@ def _fill(
 ) -> int:
     """Write a tiled GeoTIFF with tags and its overviews block by block; return a checksum of its pixels.
 
-    Overviews are computed from the blocks in memory: GDAL reads them again and takes several times as long.
+    Overviews are computed from the blocks in memory, because GDAL reads the blocks again and takes several times as
+    long.
     """
     checksum, shape = 0, (georeference["height"], georeference["width"])
     levels = min(max(0, ceil(log2(max(shape) / BLOCK))), int(log2(READ)))
@@ -370,7 +371,7 @@ def _finish(source: Path, target: Path, band: Band) -> None:
         target,
         driver="COG",
         COMPRESS="DEFLATE",
-        LEVEL=1,  # higher levels do not compress noise better and take twice as long
+        LEVEL=1,  # higher levels take twice as long and do not compress noise better
         PREDICTOR="NO" if band.dtype.startswith("complex") else predictor,
         BLOCKSIZE=BLOCK,
         BIGTIFF="IF_SAFER",

@@ -22,7 +22,7 @@ from apertura.common.errors import number_of
 from apertura.formats.export.map_layout import DPI, MapLayout
 
 MARGIN = 0.04
-"""Margin around tracks and scene, relative to the longer side."""
+"""Margin around tracks and scene, relative to the longer side of their bounds."""
 
 _NAMED = 8  # largest number of flights that are distinguished by colours
 _HALF_DEG = 180.0  # a larger difference of longitude between neighbours indicates the antimeridian
@@ -45,8 +45,8 @@ class Covered:
     looks
         (row, column) float32: number of pulses at each point of the scene.
     imaged_m
-        Antenna → parts of its track used for the image, a list of (vertex, 2 or 3), metres; empty if the whole track is
-        used.
+        Antenna → parts of its track that contribute to the image, a list of (vertex, 2 or 3), metres; empty if the
+        whole track contributes.
     """
 
     flight: str
@@ -149,7 +149,7 @@ def placed_footprint(
     polygons = [[placed(ring) for ring in rings] for rings in footprint(looks, transform)]
     if not any(np.ptp(ring[:, 0]) > _HALF_DEG for rings in polygons for ring in rings):
         return polygons
-    # For each side, take the pixels that extend into it, and clip their vertices to the antimeridian.
+    # For each side of the antimeridian, select the pixels that extend into it, and clip their vertices to it.
     down, right = np.mgrid[: looks.shape[0] + 1, : looks.shape[1] + 1]
     corners = np.stack(transform @ (right.ravel(), down.ravel()), -1)
     offset_deg = (placed(corners)[:, 0] % 360 - _HALF_DEG).reshape(down.shape)
@@ -217,7 +217,7 @@ def write_coverage(
     tags: Mapping[str, str],
     local: bool = False,
 ) -> None:
-    """Plot the pulses of all pairs at each point as a PNG, with a second map of the number of pairs or of the scene.
+    """Plot the number of pulses at each point as a PNG, with a second map of the number of pairs or of the scene.
 
     The number of pairs is plotted if it varies within the scene. Footprints are plotted for up to eight flights.
 
@@ -325,7 +325,7 @@ def _draw_lines(layout: MapLayout, covered: Sequence[Covered], transform: Affine
 def _draw_overview(
     layout: MapLayout, covered: Sequence[Covered], total: NDArray[np.float32], transform: Affine
 ) -> None:
-    """Draw the tracks of more than `_NAMED` flights in a single colour, and the edge of the area covered by any."""
+    """Draw the tracks of more than `_NAMED` flights in a single colour, and the edge of the area that they cover."""
     line: dict[str, Any] = {"color": "0.45", "alpha": 0.6, "linewidth": 0.7}
     for coverage in covered:
         for style, track_m in zip(("-", "--"), coverage.tracks_m.values(), strict=False):
@@ -336,7 +336,7 @@ def _draw_overview(
 
 
 def _draw_direction(layout: MapLayout, leg_m: NDArray[np.float64], colour: Any) -> None:
-    """Draw an arrow in the direction of flight at the middle of a leg."""
+    """Draw an arrow in the direction of flight at the centre of a track segment."""
     middle = max(1, len(leg_m) // 2)
     if len(leg_m) > 1 and (leg_m[middle, :2] != leg_m[middle - 1, :2]).any():
         arrow = {"arrowstyle": "-|>", "color": colour, "mutation_scale": 12}

@@ -19,7 +19,7 @@ from apertura.core.geometry.geodesy import geodetic_from_ecef
 
 
 PATH_LIMIT = "APERTURA_PATH_LIMIT"
-"""Per-vector parameter in addition to those of the standard: longest total path within the cyclic prefix, m."""
+"""Per-vector parameter added to those of the standard: longest total path within the cyclic prefix, m."""
 
 _OVERSAMPLED = 1.25
 """Oversampling of the frequencies relative to the swath; the standard requires 1.2."""
@@ -44,7 +44,7 @@ class CphdCollection:
     time
         (pulse,) datetime64[ns], UTC.
     tx_m, rx_m
-        (pulse, 3) float64: phase centres at `time`, ECEF, metres; both at the same instant as in stage echo.
+        (pulse, 3) float64: phase centres at `time`, ECEF, metres; both refer to the same instant, as in stage echo.
     frequency_hz
         (subcarrier,) float64, in equal steps.
     path_limit_m
@@ -105,7 +105,7 @@ class CphdCollection:
     def swath_s(self) -> tuple[float, float]:
         """First and last delay of echoes in the samples, relative to that of the reference point, seconds.
 
-        Limited by the frequency spacing and by the cyclic prefix.
+        Both are limited by the frequency spacing and by the cyclic prefix.
         """
         half = 0.5 / (_OVERSAMPLED * self._step_hz)
         latest = float((self.path_limit_m / self.wave_speed_m_s - self.reference_delay_s).min())
@@ -315,7 +315,7 @@ def _layout(pulses: NDArray[Any]) -> dict[str, Any]:
 
 
 def _dwell(collection: CphdCollection) -> dict[str, Any]:
-    """Return centre time and dwell time of the scene; all pulses are assumed to illuminate all of it."""
+    """Return centre time and dwell time of the scene; all pulses are assumed to illuminate the whole scene."""
     exposed_s = collection.exposed_s
     return {
         "NumCODTimes": 1,

@@ -21,17 +21,17 @@ def write_db(
     title: str = "",
     value: Callable[[Pixels], Pixels] = power,
 ) -> None:
-    """Write 20 log10 |image| as a float32 COG, with overviews in dB of the averaged power.
+    """Write 20 log10 |image| as a float32 COG; overviews contain the averaged power in dB.
 
-    A pixel with zero power is nodata (NaN), never -inf, but counts as zero in the averaged power of the overviews. For
-    parameters and errors see `write_slc`.
+    A pixel with zero power is nodata (NaN), never -inf, but contributes zero to the averaged power of the overviews.
+    For parameters and errors see `write_slc`.
 
     Parameters
     ----------
     path, image, transform, crs, tags, title
         See `write_slc`.
     value
-        Function from a block of `image` to its power.
+        Function that returns the power of a block of `image`.
 
     Notes
     -----
@@ -60,7 +60,7 @@ def write_mean_db(
 ) -> None:
     """Write 10 log10 of a multilooked power, (y, x) float32; NaN where it is not positive.
 
-    Overviews are in dB of the mean of all pixels, including negative ones. Otherwise as `write_db`.
+    Overviews contain the mean of all pixels in dB, including negative pixels. Otherwise as `write_db`.
 
     Examples
     --------

@@ -11,7 +11,7 @@ from apertura.formats.export.cog import Band, NorthUpRaster, only, write_cog
 from apertura.formats.export.radiometry import TAG
 
 SHADOW, LAYOVER, OUTSIDE = 1, 2, 255
-"""Bits of the mask, and its value for pixels without pulses; 0: imaged without shadow or layover."""
+"""Bits of the mask, and its value for pixels without pulses; pixels without shadow and layover are 0."""
 
 CLASSES = {
     0: ("valid", (255, 255, 255)),
@@ -65,7 +65,7 @@ def write_mask(
 ) -> None:
     """Write the shadow and layover mask, (y, x) uint8 sums of `SHADOW` and `LAYOVER`, or `OUTSIDE`.
 
-    Overviews have the most frequent value, so that bits are never mixed. Otherwise as `cog.write_slc`.
+    Overviews contain the most frequent value, so that bits are never mixed. Otherwise as `cog.write_slc`.
 
     Examples
     --------
@@ -84,7 +84,7 @@ def write_mask(
 def write_looks(
     path: Path, looks: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write the number of pulses in each pixel, (y, x) float32, no data 0. Otherwise as `cog.write_slc`."""
+    """Write the number of pulses in each pixel, (y, x) float32, nodata 0. Otherwise as `cog.write_slc`."""
     write_cog(path, looks, LOOKS, transform=transform, crs=crs, tags=tags, title=title, value=only("float32"))
 
 

@@ -23,14 +23,14 @@ LEFT, RIGHT, TOP, BOTTOM = 1.0, 1.4, 0.85, 1.6  # margins around the image, inch
 LEAST_WIDTH, LEAST_HEIGHT = 4.2, 1.6  # minimum space for text and colour bar of a narrow or flat image, inch
 PART_HEIGHT = 3.2  # minimum height if a part of the map is plotted separately, inch
 LETTER = 0.073  # width of a character in the label of a colour bar, inch
-LONGEST_FLAG = 24  # longest flag name with comma, characters; the first of two lines may be that much shorter
+LONGEST_FLAG = 24  # longest flag name with comma, characters; by this number the first of two lines may be shorter
 
 Marker = tuple[float, float, str]
 
 
 @dataclass(frozen=True)
 class MapLayout:
-    """Figure with an image true to scale; lengths on the figure in inches from the lower left corner.
+    """Figure with an image true to scale; positions on the figure are in inches from the lower left corner.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class MapLayout:
         return cls(figure, axes, bounds, scale, local=local)
 
     def beside(self, bounds: tuple[float, float, float, float] | None = None) -> "MapLayout":
-        """Add the next map to the right of this one: with the same bounds, or with `bounds` at the largest scale."""
+        """Add a map to the right of this map, with the same bounds or with `bounds` at the largest scale."""
         width, height = self.figure.get_size_inches()
         room = max((self.bounds[2] - self.bounds[0]) * self.inch_per_m, LEAST_WIDTH), height - TOP - BOTTOM
         left = self.left + room[0] + RIGHT + LEFT
@@ -106,7 +106,7 @@ class MapLayout:
         self._write(LEFT, 0.58, crs_name, size=8)
 
     def draw_colour_bar(self, picture: AxesImage, label: str, *, beyond: str = "both") -> Colorbar:
-        """Draw the colour bar to the right of the image; values exceed `beyond` 'both' ends, 'min' or 'neither'."""
+        """Draw the colour bar to the right of the image; `beyond` is Matplotlib's parameter `extend`."""
         width, height = self.figure.get_size_inches()
         wide, high = ((self.bounds[2 + side] - self.bounds[side]) * self.inch_per_m for side in (0, 1))
         high = max(high, LEAST_HEIGHT)
@@ -178,7 +178,7 @@ class MapLayout:
 
 
 def _scale_in(room: tuple[float, float], bounds: tuple[float, float, float, float]) -> float:
-    """Return the scale, inches per metre, at which bounds fit into a space of the given width and height in inches."""
+    """Return the scale, inches per metre, at which bounds fit into a given width and height in inches."""
     return min(length / (bounds[2 + side] - bounds[side]) for side, length in enumerate(room))
 
 
@@ -204,7 +204,7 @@ def flag_words(flags: Sequence[str], most: int) -> str:
 
 
 def round_origin(low_m: float, high_m: float) -> float:
-    """Return a round offset of coordinates at or below `low_m`; 0 if the coordinates are short without one.
+    """Return a round offset of coordinates at or below `low_m`; 0 if the coordinates have few digits without an offset.
 
     Examples
     --------
@@ -230,7 +230,7 @@ def round_length(most_m: float) -> float:
 
 
 def from_origin(origin: float, value: float, _position: int | None) -> str:
-    """Format the label of a tick relative to an origin, as a Matplotlib formatter."""
+    """Return a Matplotlib formatter of tick labels relative to an origin."""
     return number(value - origin)
 
 

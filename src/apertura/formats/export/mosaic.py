@@ -19,14 +19,14 @@ _TYPES = {"uint8": "Byte", "float32": "Float32"}
 
 
 def write_mosaic(path: Path, rasters: Sequence[Path], *, title: str = "") -> None:
-    """Write a VRT of rasters on the same grid; where several have data, the last one is used.
+    """Write a VRT of rasters on the same grid; where several rasters have data, the last of them is used.
 
     Parameters
     ----------
     path
         ``….vrt``; complete or absent. Paths of the rasters are relative to it, so that the folder may be moved.
     rasters
-        Real single-band files on the same grid, lowest first.
+        Real single-band files on the same grid; later files cover earlier ones.
     title
         Title, written as ImageDescription.
 

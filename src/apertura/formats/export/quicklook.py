@@ -35,7 +35,8 @@ def write_quicklook(
 
     An image with more pixels than the plot has dots is reduced by averaging power, so that no target is lost between
     samples. The colour scale covers `dynamic_range_db` below the peak. If no more than three dots lie within 20 dB of
-    the peak, it starts at the fourth brightest dot, rounded up to 5 dB, so that an outlier does not darken the scene.
+    the peak, the scale starts at the power of the fourth brightest dot, rounded up to 5 dB, so that an outlier does not
+    darken the scene.
 
     Parameters
     ----------
@@ -46,7 +47,8 @@ def write_quicklook(
     transform, crs
         See `apertura.formats.export.cog.write_slc`.
     tags
-        Provenance, stored in the file; flags, version, numerical error and code hash are also printed in the footer.
+        Provenance, name → text; stored in the file. Flags, version, numerical error and code hash are also printed in
+        the footer.
     title, subtitle
         Flight and pair; summary of the most important information.
     markers
@@ -175,7 +177,7 @@ def shrink(image: NorthUpRaster, most: int) -> tuple[NDArray[np.float64], int]:
     height, width = image.shape
     factor = ceil(max(height, width) / most)
     mean = np.full((ceil(height / factor), ceil(width / factor)), np.nan)
-    step = max(1, READ // factor)  # groups along a side of a block in memory
+    step = max(1, READ // factor)  # pixel groups along a side of a block in memory
     for row in range(0, mean.shape[0], step):
         for column in range(0, mean.shape[1], step):
             groups = slice(row, row + step), slice(column, column + step)
@@ -221,5 +223,5 @@ def below_peak(mean: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     if not brightest.size:
         return decibel, 0.0
     decibel -= brightest[-1]
-    fourth = float(brightest[0] - brightest[-1])  # a target covers several dots, an outlier may be a single one
+    fourth = float(brightest[0] - brightest[-1])  # a target covers several dots, an outlier may cover a single dot
     return decibel, 0.0 if fourth > -20 else 5.0 * ceil(fourth / 5)

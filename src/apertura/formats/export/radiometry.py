@@ -8,10 +8,10 @@ from typing import Any
 from apertura.common.contracts import CF_SIGMA0
 
 TAG = "APERTURA_RADIOMETRY"
-"""Tag of a raster with the meaning of its values, as JSON."""
+"""Name of the tag that contains the meaning of a raster's values as JSON."""
 
 CROSS_SECTIONS = "radiometry.json"
-"""Report of the radiometric calibration of a pair, in the folder of the layers."""
+"""File name of the report of a pair's radiometric calibration, in the folder of the layers."""
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,11 @@ class Radiometry:
     amplitude, power
         Names of the amplitude and of its square.
     one_is
-        Reference with value 1, or 0 dB.
+        Reference to which the value 1, or 0 dB, corresponds.
     divided_by
-        Pair → largest amplitude of its image, by which it was divided before summation.
+        Pair → largest amplitude of its image, by which the image was divided before summation.
     phases_removed_rad
-        Pair → constant phase removed before summation; pairs excluded from a coherent sum are missing.
+        Pair → constant phase removed before summation; without pairs that are excluded from the coherent sum.
     peak_db, noise_floor_re_peak_db
         Power of the brightest target, dB re 1; median power relative to the peak, dB; None: not measured.
     """
@@ -86,7 +86,7 @@ def of_coefficient(
     polarisation
         Transmit and receive polarisation, such as HV; None: not stated.
     noise
-        Treatment of noise power: 'in it', 'subtracted', or 'alone' for a raster of noise.
+        Treatment of noise power: 'in it' (included), 'subtracted', or 'alone' for a raster of noise.
 
     Examples
     --------

@@ -72,7 +72,7 @@ def write_db_style(path: Path, *_: object, **__: object) -> None:
 def write_linear_style(path: Path, *_: object, **__: object) -> None:
     """Write the style of power or magnitude: black at zero, white from a tenth of the largest value.
 
-    Parameters as `write_db_style`. With a style, QGIS does not compute statistics of the raster and write them into a
+    Parameters as `write_db_style`. Without a style, QGIS computes statistics of the raster and writes them into a
     mosaic or a sidecar file.
     """
     with _opened_raster_of(path) as raster:
@@ -142,13 +142,13 @@ def _subsampled(raster: rasterio.DatasetReader) -> NDArray[np.float32]:
     """Read a raster averaged to at most `_DOTS` pixels along the longer side, NaN for no data."""
     factor = max(1.0, max(raster.shape) / _DOTS)
     shape = tuple(ceil(size / factor) for size in raster.shape)
-    # not as a masked array: for its mask rasterio reads every pixel of a mosaic
+    # not read as a masked array, for whose mask rasterio reads every pixel of a mosaic
     values = raster.read(1, out_shape=shape, resampling=Resampling.average)
     return np.where(values == raster.nodata, np.nan, values).astype(np.float32, copy=False)
 
 
 def _round_limits(values: NDArray[np.float32]) -> tuple[float, float]:
-    """Return minimum and maximum, rounded outwards to a tenth of the power of ten below their difference."""
+    """Return minimum and maximum, rounded outwards to a tenth of the largest power of ten below their difference."""
     low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
     step = 10.0 ** floor(log10(high - low)) / 10 if high > low else 1.0
     return floor(low / step) * step, max(ceil(high / step), floor(low / step) + 1) * step
@@ -166,7 +166,7 @@ def _grey(low: float, high: float, *, unit: str = "") -> ET.Element:
 
 @contextmanager
 def _opened_raster_of(path: Path) -> Iterator[rasterio.DatasetReader]:
-    """Open the raster of a style; a mosaic by its full path, to which the paths of its rasters are relative."""
+    """Open the raster of a style; a mosaic is opened by its absolute path, as its paths of rasters are relative."""
     file = next(file for file in map(path.with_suffix, (".tif", ".vrt")) if file.is_file())
     opened_path = nullcontext(Path(file.absolute())) if file.suffix == ".vrt" else on_disk(file)
     with opened_path as name, rasterio.Env(**ISOLATED), rasterio.open(name) as raster:

@@ -41,15 +41,15 @@ class RefinedLog:
     node
         Name of the node.
     track
-        Stage `track`: the logged point, not an antenna, in the frame of the log.
+        Stage `track`: positions of the logged point, not of an antenna, in the frame of the log.
     moved_m
         (epoch, 3) float64: correction to be added to the logged point, metres in that frame.
     left_m
         (epoch, 3) float64: standard deviation of the residual error along the axes of that frame, metres; NaN where the
         refinement did not estimate the error of the node.
     stated_m
-        (epoch, 3) float64: standard deviation of the log to east, north and up, metres, as logged or configured; NaN if
-        neither.
+        (epoch, 3) float64: logged or configured standard deviation of the log to east, north and up, metres; NaN if
+        neither logged nor configured.
 
     Examples
     --------
@@ -135,7 +135,7 @@ def write_pos(path: Path, log: RefinedLog, *, outcome: str, version: str) -> Non
     log
         Refined log in a georeferenced frame.
     outcome
-        Result of the refinement, or the reason why tracks are unchanged, in one line.
+        Result of the refinement, or the reason for unchanged tracks, in one line.
     version
         Version of apertura.
     """
@@ -203,7 +203,7 @@ def write_picture(path: Path, logs: Sequence[RefinedLog], *, title: str, outcome
     title
         Title of the plot.
     outcome
-        Result of the refinement, or the reason why tracks are unchanged.
+        Result of the refinement, or the reason for unchanged tracks.
     tags
         Provenance, name → text; stored in the file.
     """
@@ -251,7 +251,7 @@ def _draw_logged(figure: Figure, logs: Sequence[RefinedLog]) -> tuple[list[Any],
 
 
 def _draw(column: Sequence[Axes], log: RefinedLog) -> None:
-    """Plot the three axes of a node one below the other, over the refined epochs if any, otherwise the whole log."""
+    """Plot the three axes of a node one below the other, over the refined epochs or, without these, the whole log."""
     time_s, refined = log.time_s, log.refined
     epochs = np.flatnonzero(refined) if refined.any() else np.arange(len(time_s))
     margin_s = 0.04 * float(time_s[epochs[-1]] - time_s[epochs[0]])

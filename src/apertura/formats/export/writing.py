@@ -47,7 +47,7 @@ def gdal_replacement(path: Path, *, size: int) -> Iterator[Path]:
     Raises
     ------
     OSError
-        With errno and `path`: `ENOSPC` if the disk is full, `EIO` if GDAL does not state the cause.
+        With `path` and an errno: `ENOSPC` if the disk is full, `EIO` if GDAL does not state the cause.
     """
     with replacement(path) as temporary, rasterio.Env(**GDAL):
         if size <= IN_MEMORY_BYTES:

@@ -33,13 +33,14 @@ def read_afrl_mat(
 ) -> xr.Dataset:
     """Read the .mat files of a pass, concatenated in the order of their names, as `echo` stage.
 
-    Each file contains fp (subcarrier, pulse), freq (Hz), x, y, z and r0 (m). Monostatic: both phase centres are the
-    antenna. Samples are referred to a delay of 2 r0/c. The data contain no times: `time` is the pulse number in seconds
-    since 1970. Frame 'local': metres from the scene centre.
+    Each file contains fp (subcarrier, pulse), freq (Hz), x, y, z and r0 (m). The radar is monostatic: the antenna is
+    the phase centre of transmission and reception. Samples are referred to a delay of 2 r0/c. The data contain no
+    times: `time` is the pulse number in seconds since 1970. The frame is 'local': metres from the scene centre.
 
     Files may contain corrections of their passes, data.af: r_correct (m) to be added to r0, and ph_correct (rad) to be
-    added to the phase of samples. They are applied if section `waveform` (`described`) has corrections: stored;
-    otherwise they are only reported in `remarks`. They displace targets by decimetres and align the passes.
+    added to the phase of samples. These corrections displace targets by decimetres and align the passes. They are
+    applied if section `waveform` (`described`) contains ``corrections: stored``; otherwise they are only reported in
+    `remarks`.
 
     Raises
     ------

@@ -35,7 +35,7 @@ _LARGEST = {
     "TOA1": 1.0,
     "TOA2": 1.0,
 }
-"""Largest accepted per-vector parameters, s and Hz; 1e8 m for positions."""
+"""Largest accepted value of each per-vector parameter, s and Hz; 1e8 m for positions."""
 
 _CYCLES = 1e-5
 """Tolerated phase error at the edge of the swath due to frequency differences between pulses, cycles (-84 dB)."""
@@ -44,9 +44,9 @@ _NORMAL = 1
 """SIGNAL of a pulse with an echo; 0: none, 2: noise, 3: noise of normal level."""
 
 _ATMOSPHERE_S = 1e-7
-"""Tolerance of delays, s (30 m of path), for a delay of troposphere and ionosphere that a file does not state."""
+"""Tolerance of delays, s (30 m of path), which allows for an unstated delay of troposphere and ionosphere."""
 
-_REACH = 1e-3  # tolerance for rounding of FX1 and FX2, frequency steps
+_REACH = 1e-3  # tolerance for rounding of FX1 and FX2, in frequency steps
 
 
 def read_cphd(paths: Sequence[Path], *, pair: str, described: Mapping[str, Any]) -> xr.Dataset:
@@ -58,8 +58,8 @@ def read_cphd(paths: Sequence[Path], *, pair: str, described: Mapping[str, Any])
     Raises
     ------
     CampaignError
-        If a file is not as described by `_EXPECTED`, its CollectType contradicts the pair, it is truncated or contains
-        NaN, or frequencies differ between pulses.
+        If a file violates `_EXPECTED`, has a CollectType that contradicts the pair, is truncated or contains NaN, or
+        frequencies differ between pulses.
 
     Notes
     -----
@@ -78,7 +78,7 @@ def read_cphd(paths: Sequence[Path], *, pair: str, described: Mapping[str, Any])
 
 
 def of_channel(path: Path, fields: dict[str, NDArray[Any]], requested: str | None) -> dict[str, NDArray[Any]]:
-    """Select the fields of the requested channel, or of the only one."""
+    """Select the fields of the requested channel, or of the only channel."""
     names = list(map(str, fields["channels"]))
     if names.count(requested or "") != 1 and (requested is not None or len(names) != 1):
         raise CampaignError(
@@ -222,7 +222,7 @@ def _check_frequencies(
 
 
 def _flags(fields: dict[str, NDArray[Any]], delay_s: NDArray[np.float64], normal: NDArray[np.bool_]) -> dict[str, str]:
-    """Return a flag if the times of a file contradict its positions, the only redundancy in a file."""
+    """Return a flag if the times of a file contradict its positions; a file contains no other redundant values."""
     known = sum(np.nan_to_num(fields[name]) for name in ("TDTropoSRP", "TDIonoSRP") if name in fields)
     error_s = np.abs(fields["RcvTime"] - fields["TxTime"] - delay_s - known)[normal]
     worst, number = int(error_s.argmax()), np.flatnonzero(normal)

@@ -11,10 +11,10 @@ PULSE_FIELDS = ("TxTime", "TxPos", "RcvTime", "RcvPos", "SRPPos", "FX1", "FX2", 
 
 _LONGEST_KIND = 64
 PATH_LIMIT = "APERTURA_PATH_LIMIT"
-"""Per-vector parameter added in files of apertura: `path_limit` of stage echo, m."""
+"""Per-vector parameter that apertura adds to its files: `path_limit` of stage echo, m."""
 
 FRAME = "APERTURA_FRAME"
-"""Collection parameter added in files of apertura: frame of stage echo."""
+"""Collection parameter that apertura adds to its files: frame of stage echo."""
 
 OPTIONAL_FIELDS = ("AmpSF", "SIGNAL", "TDTropoSRP", "TDIonoSRP", PATH_LIMIT)
 """Optional per-vector parameters."""
@@ -35,12 +35,12 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
         `OPTIONAL_FIELDS` present, (pulse,) or (pulse, 3) float64; ``layout``: offset of the samples in the signal
         block in bytes, number of pulses, samples per pulse, int64. For all channels: ``block``: offset of the signal
         block in the file; ``start``: datetime64[ns], UTC; ``origin`` (3,) and ``axes`` (3, 3) float64 of the plane of
-        the image area, zeros if it is not a plane; ``sign``; and as text ``format``, ``collect_type``, ``frame``.
+        the image area, zeros without a plane; ``sign``; and ``format``, ``collect_type`` and ``frame`` as text.
 
     Raises
     ------
     ValueError
-        If the file is not such a file, or is not suitable for image formation.
+        If the file is not CPHD of these versions, or is not suitable for image formation.
     """
     import sarkit.cphd as skcphd
     from lxml import etree
@@ -98,7 +98,7 @@ def _of_channel(channel: Any, pulses: NDArray[Any]) -> dict[str, NDArray[Any]]:
 
 
 def _plane(xml: Any) -> dict[str, NDArray[np.float64]]:
-    """Return reference point and axes of the image area in ECEF; in files of apertura, axes are east, north and up."""
+    """Return reference point and axes of the image area in ECEF; axes of apertura's files are east, north and up."""
     scene = "SceneCoordinates"
     axes = [_found(xml, f"{scene}/ReferenceSurface/Planar/{name}") for name in ("uIAX", "uIAY")]
     if axes[0] is None or axes[1] is None:

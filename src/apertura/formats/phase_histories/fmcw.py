@@ -25,7 +25,7 @@ from apertura.formats.times import utc_times
 _TIMES = ".time.npy"
 _MOST_VALUES = 1 << 34
 _LARGEST = 1e15
-"""Largest sample, whose square is within the range of float32."""
+"""Largest accepted sample; its square is within the range of float32."""
 
 _FARTHEST_S = 2.0**33
 """Largest time since 1970 that int64 nanoseconds can represent, s."""
@@ -37,7 +37,7 @@ _LEAST_STEP = 0.9
 """Minimum interval between sweep starts, relative to the sweep duration; float64 seconds since 1970 resolve 0.2 us."""
 
 _MOST_INTERVALS = 1.05
-"""Maximum length of a row relative to the interval between sweeps."""
+"""Maximum duration of a row of samples relative to the interval between sweeps."""
 
 _EXPECTED = "beat signals (sweep, sample), real or complex as configured in waveform.iq, all finite"
 _REMEDY = "Correct the file, or waveform in the config."
@@ -71,8 +71,8 @@ class Sweeps:
 def read_beat_npy(paths: Sequence[Path], *, pair: str, described: Mapping[str, Any]) -> xr.Dataset:
     """Read <node>.npy or <node>.<part>.npy, (sweep, sample), as `echo` stage without positions.
 
-    An additional file <stem>.time.npy may contain the start of each sweep in <stem>.npy: datetime64, or float64 seconds
-    since 1970.
+    An additional file <stem>.time.npy may contain the start of each sweep in <stem>.npy, as datetime64 or as float64
+    seconds since 1970.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def read_fields(
 
 
 def sweeps_of(path: Path, variables: Mapping[str, NDArray[Any]]) -> Sweeps:
-    """Convert the variables beat and time of a MATLAB file to sweeps; CampaignError if time is invalid."""
+    """Convert the variables beat and time of a MATLAB file to sweeps; raise CampaignError if time is invalid."""
     return Sweeps(path, variables["beat"], _times(variables["time"], path) if "time" in variables else None)
 
 
@@ -218,7 +218,7 @@ def _check(file: Sweeps, sweep: FrequencySweep, described: Mapping[str, Any]) ->
 
 
 def _is_by_columns(file: Sweeps, sweep: FrequencySweep, described: Mapping[str, Any]) -> bool:
-    """Return True if the columns of an array are sweeps, judged by its times, shape and the sweep interval."""
+    """Return True if the columns of an array are sweeps, according to its times, its shape and the sweep interval."""
     rows, columns = file.beat.shape
     if file.time is not None and rows != columns and len(file.time) in {rows, columns}:
         return bool(len(file.time) == columns)
@@ -232,7 +232,7 @@ def _is_by_columns(file: Sweeps, sweep: FrequencySweep, described: Mapping[str, 
 
 
 def _regular(file: Sweeps, described: Mapping[str, Any], *, is_single: bool) -> Times:
-    """Return sweep starts at a rate of waveform.prf_hz from waveform.start_utc on."""
+    """Return sweep starts at rate waveform.prf_hz, the first at waveform.start_utc."""
     if described["prf_hz"] is None or not is_single:
         found = "no sweep times" if is_single else "several files without sweep times"
         raise _error(found, file.path, "sweep times in the file, or a single file and waveform.prf_hz")
@@ -242,7 +242,7 @@ def _regular(file: Sweeps, described: Mapping[str, Any], *, is_single: bool) -> 
 
 
 def beginning(described: Mapping[str, Any], path: Path) -> np.datetime64:
-    """Return waveform.start_utc; default 1970, to be related to the log's times by a configured clock offset."""
+    """Return waveform.start_utc; the default is 1970, which a configured clock offset relates to the log's times."""
     start_utc = described["start_utc"]
     try:
         first: np.datetime64 = np.datetime64("1970-01-01", "ns") if start_utc is None else utc_times([start_utc])[0]
@@ -274,7 +274,7 @@ def _times(stored: NDArray[Any], path: Path) -> Times:
 
 
 def _are_datenum(time: NDArray[np.float64]) -> bool:
-    """Return True if times are MATLAB days of 1980 to 2199; as seconds, they would lie in January 1970."""
+    """Return True if times are MATLAB days of 1980 to 2199, which as seconds lie in January 1970."""
     return bool(time.size and (time > _DATENUM[0]).all() and (time < _DATENUM[1]).all() and np.ptp(time) < 1)
 
 
@@ -291,7 +291,7 @@ _SAME_RATE = 1e-6
 
 
 def read_beat_wav(paths: Sequence[Path], *, pair: str, described: Mapping[str, Any]) -> xr.Dataset:
-    """Read a .wav file as `echo` stage: a sweep starts where the sync channel crosses the mean of its two levels.
+    """Read a .wav file as `echo` stage; a sweep starts where the sync channel crosses the mean of its two levels.
 
     Sweeps truncated by the next trigger or the end of the file are excluded and counted.
 
@@ -372,7 +372,7 @@ def trigger_starts(sync: NDArray[np.float64], *, threshold: float) -> NDArray[np
     up = sync[marks] > middle
     rises = marks[1:][up[1:] & ~up[:-1]]
     below = np.flatnonzero(sync <= middle)
-    last = below[np.searchsorted(below, rises) - 1]  # last sample below the mean; exists, since a low mark precedes
+    last = below[np.searchsorted(below, rises) - 1]  # last sample below the mean; exists, as a low level precedes
     at: NDArray[np.float64] = last + (middle - sync[last]) / (sync[last + 1] - sync[last])
     return at
 

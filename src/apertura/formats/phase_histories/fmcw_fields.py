@@ -21,7 +21,7 @@ def read_beat_fields(path: Path) -> dict[str, NDArray[Any]]:
     Raises
     ------
     ValueError
-        If there is no variable beat.
+        If the file does not contain variable beat.
     """
     variables = read_variables(path, ["beat", "time"])
     if "beat" not in variables:

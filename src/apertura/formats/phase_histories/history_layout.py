@@ -93,8 +93,8 @@ def history(path: Path, fields: Mapping[str, NDArray[Any]]) -> History:
     path
         The file or folder, for messages.
     fields
-        Arrays of `LAYOUT` with the dimensions required by `check_array`, and ``frame`` as text, which is used if there
-        are positions.
+        Arrays of `LAYOUT` with the dimensions required by `check_array`, and text ``frame``, which is used if the file
+        contains positions.
 
     Raises
     ------

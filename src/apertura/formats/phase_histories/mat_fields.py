@@ -41,7 +41,7 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def read_variables(path: Path, names: list[str]) -> dict[str, Any]:
-    """Read variables of a MATLAB file: an array for each, or a mapping of field → value for a structure.
+    """Read variables of a MATLAB file: an array for each variable, or a mapping field → value for a structure.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def read_variables(path: Path, names: list[str]) -> dict[str, Any]:
     """
     with path.open("rb") as stream:
         stream.seek(_USER_BLOCK)
-        is_hdf5 = stream.read(len(_HDF5)) == _HDF5  # as `save -v7.3` writes
+        is_hdf5 = stream.read(len(_HDF5)) == _HDF5  # signature written by `save -v7.3`
     if is_hdf5:
         import h5py
 

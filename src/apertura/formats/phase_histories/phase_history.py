@@ -147,7 +147,7 @@ def joined(histories: Sequence[History], *, pair: str, expected: str) -> "xr.Dat
     ------
     CampaignError
         If a file contains no pulse, an antenna position far from the Earth, frequencies that do not increase in equal
-        steps, or times that do not increase; or if it differs from the first in its frequencies or its frame.
+        steps, or times that do not increase; or if its frequencies or frame differ from those of the first file.
     """
     import dask.array as da
     import xarray as xr
@@ -221,7 +221,7 @@ def _check_times(histories: Sequence[History], expected: str) -> None:
 
 
 def _even(history: History, expected: str) -> Floats:
-    """Return equally spaced frequencies, without the rounding of files to float32."""
+    """Return equally spaced frequencies, without the rounding error of files that contain float32."""
     frequency = history.frequency
     if frequency.size and 0 < frequency[-1] < LOWEST_HZ:
         found = f"frequencies of {frequency[0]:g} to {frequency[-1]:g}, probably not in Hz"

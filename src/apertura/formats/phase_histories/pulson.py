@@ -1,6 +1,6 @@
 """Scans of Time Domain PulsON P4xx radars (.out): real echo samples in messages MRM_SCAN_INFO.
 
-They are read as stage `echo`: the radar itself correlates the samples. Its clock counts milliseconds since power-on.
+They are read as stage `echo`, because the radar itself correlates the samples. Times are milliseconds since power-on.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ BAND_HZ = 3.1e9, 5.3e9
 """Frequency band of the radar according to its data sheet."""
 
 _CONFIG_BYTES = 32  # radar configuration at the start of a file
-_SAMPLES = 350  # in each message
+_SAMPLES = 350  # samples of a scan in each message
 MESSAGE = np.dtype(
     [("type", ">u2"), ("id", ">u2"), ("source", ">u4"), ("time_ms", ">u4"), ("reserved", "V16")]
     + [("start_ps", ">i4"), ("stop_ps", ">i4"), ("step_bins", ">i2")]
@@ -51,13 +51,13 @@ def read_pulson(paths: Sequence[Path], *, pair: str) -> xr.Dataset:
     Raises
     ------
     CampaignError
-        If a file contains no such messages, or scans with different delay windows or antennas.
+        If a file contains no scan messages, or scans with different delay windows or antennas.
 
     Notes
     -----
     Source: Time Domain, "Monostatic Radar Module Application Programming Interface (API) Specification", messages
-    MRM_SCAN_INFO and MRM_SET_CONFIG_REQUEST; docs/formats.md. A scan is the real echo at `SAMPLE_RATE_HZ`: the bins of
-    its Fourier transform inside `BAND_HZ` are the transfer function, referred to the start of the scan.
+    MRM_SCAN_INFO and MRM_SET_CONFIG_REQUEST; docs/formats.md. A scan is the real echo sampled at `SAMPLE_RATE_HZ`; the
+    bins of its Fourier transform inside `BAND_HZ` are the transfer function, referred to the start of the scan.
     """
     scans = [_scans(path) for path in sorted(paths)]
     messages = np.concatenate([first for first, _, _ in scans])
@@ -111,7 +111,7 @@ def _scans(path: Path) -> tuple[NDArray[np.void], NDArray[np.float64], int]:
     numbers = np.unique(messages["id"].astype(np.int64) << 32 | messages["time_ms"])
     _check(complete[:, 0], path)
     samples = complete["scan"].reshape(len(complete), -1)[:, :total].astype(np.float64)
-    # A truncated last message starts another scan only after a complete one; otherwise its scan is already counted.
+    # A truncated last message starts another scan only after a complete scan; otherwise its scan is already counted.
     starts_scan = cut and messages["index"][-1] == count - 1
     return complete[:, 0], samples, len(numbers) - len(complete) + int(starts_scan)
 

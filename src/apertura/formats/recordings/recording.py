@@ -57,11 +57,11 @@ class Recording:
     sample_rate_hz, frequency_hz
         Complex samples per second, and RF frequency at zero baseband frequency.
     captures
-        One capture per trigger; a single one with all samples for a continuous recording.
+        One capture per trigger; for a continuous recording, a single capture with all samples.
     framing
         Preamble and payload before each symbol of a continuous recording; otherwise None.
     files
-        Metadata first, samples last, for messages and hashes; may be a single file.
+        Metadata files first, sample file last, for messages and hashes; may be a single file.
     sha512
         Hash of the sample file stated by the recorder; None: not stated.
     """
@@ -123,7 +123,7 @@ class Recording:
         )
 
     def _repeats(self, captures: Captures) -> NDArray[np.bool_]:
-        """Find captures that are bit-identical to an earlier one, which noise excludes; (capture,) bool.
+        """Find captures that are bit-identical to an earlier capture, which noise makes impossible; (capture,) bool.
 
         Captures whose first samples are unique are not read further.
 

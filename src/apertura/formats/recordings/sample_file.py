@@ -18,10 +18,10 @@ from apertura.core.echo.captures import ordered
 # ---- Real samples at an intermediate frequency to complex baseband --------------------------------------------------
 
 SETTLING = 63
-"""Half length of the filter in samples; this number of samples at both ends of a capture is invalid."""
+"""Half length of the filter in samples; at both ends of a capture, this number of samples is invalid."""
 
 EDGE = 0.025
-"""Minimum distance of a band from the ends of its Nyquist zone, relative to the sample rate; image rejection 80 dB."""
+"""Minimum distance of a band from the ends of its Nyquist zone over the sample rate, for 80 dB of image rejection."""
 
 _KAISER = 8.0
 
@@ -38,7 +38,7 @@ class Mixing:
     sample_rate_hz
         Real samples per second, equal to the complex samples per second after mixing.
     restarts
-        True: the phase is zero (n = 0) at the first sample of every capture; False: at that of the file.
+        True: the phase is zero (n = 0) at the first sample of every capture; False: at the first sample of the file.
 
     Notes
     -----
@@ -88,7 +88,7 @@ class Mixing:
         return np.asarray(mixed.astype(np.complex64)[..., None].view(np.float32))
 
     def problem(self, lowest_hz: float, highest_hz: float, prefix_samples: int) -> str | None:
-        """Return the reason why a band cannot be extracted from these samples; None if it can.
+        """Return the reason why a band cannot be extracted from these samples; None if it can be extracted.
 
         Parameters
         ----------
@@ -137,7 +137,7 @@ DATATYPES = "ci16_le: c or r (complex, real); i8, u8, or i16, u16, i32, u32, f16
 """Supported datatypes, for messages."""
 
 _EXAMINED_BYTES = 1 << 16
-# of plausible floats: fewest non-zero numbers, fewest distinct values, smallest magnitude, share of usual magnitudes
+# plausible floats: least number of non-zero and of distinct values, smallest magnitude, share of usual magnitudes
 _FEWEST, _DISTINCT, _TINIEST, _USUAL = 256, 32, 1e-12, 0.999
 _HALF = 0.45
 
@@ -160,7 +160,7 @@ class SampleLayout:
         Bytes at the end of the file that are not samples.
     segment_start, skipped_bytes
         (segment,) int64: first sample after bytes that are not samples, ascending, and the total number of such bytes
-        before it in the file; empty if there are none.
+        before this sample in the file; empty if all bytes are samples.
     mixing
         Mixing of real samples; None: complex samples.
 
@@ -199,7 +199,7 @@ class SampleLayout:
         Raises
         ------
         ValueError
-            If a float is not finite or exceeds 1e15; the second argument is the index of the first one.
+            If a float is not finite or exceeds 1e15; the second argument of the error is the index of the first.
         """
         stored = data.view(self.stored)
         if stored.dtype.kind == "u":
@@ -238,7 +238,7 @@ class SampleLayout:
 # file crashes the process instead of raising an error.
 
 Spans = Sequence[tuple[int, int]]
-"""First sample, and sample after the last, of each span."""
+"""First sample of each span, and sample after its last."""
 
 
 def _are_samples(numbers: NDArray[np.floating[Any]]) -> bool:
@@ -309,8 +309,8 @@ class SampleFile:
     def floats_among_counts(self, first: int) -> str | None:
         """Detect floats in a file whose layout declares integers; return their datatype, such as f32_le, or None.
 
-        Integer samples interpreted as floats are NaN or of implausible magnitude; floats are finite and within a few
-        orders of magnitude throughout.
+        Integer samples interpreted as floats are NaN or of implausible magnitude; actual floats are finite and within a
+        few orders of magnitude.
 
         Parameters
         ----------
@@ -327,7 +327,7 @@ class SampleFile:
         plausible = [kind for kind in ("<f4", ">f4", "<f8", ">f8") if _are_samples(np.frombuffer(data, kind))]
         if not plausible:
             return None
-        # doubles with few digits look like floats alternating with zeros
+        # doubles with few digits resemble floats that alternate with zeros
         are_doubles = np.mean(np.frombuffer(data, "<u4") == 0) > _HALF
         kind = np.dtype(next((kind for kind in plausible if kind.endswith("8") == bool(are_doubles)), plausible[0]))
         return f"f{8 * kind.itemsize}_{'b' if kind.str.startswith('>') else 'l'}e"

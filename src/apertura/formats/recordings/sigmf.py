@@ -36,7 +36,7 @@ _EXPECTED = "SigMF metadata with one capture segment per trigger, each with core
 
 _REMEDY = "Correct the metadata or record again."
 
-_AT_ONCE = 4096  # captures
+_AT_ONCE = 4096  # captures in memory
 
 Model = TypeVar("Model")
 
@@ -64,7 +64,7 @@ class SigmfFraming(BaseModel):
 
 
 class Extension(BaseModel):
-    """SigMF extension used in metadata."""
+    """SigMF extension declared in metadata."""
 
     name: Annotated[str, Field(max_length=200)]
     optional: bool = True
@@ -125,7 +125,7 @@ class StatedCaptures(NamedTuple):
 def read_meta(path: Path) -> tuple[Global, StatedCaptures]:
     """Read the metadata of a recording.
 
-    A long flight has some hundred thousand captures; at most a few thousand JSON objects are in memory at a time.
+    A long flight has some hundred thousand captures; at most a few thousand JSON objects are kept in memory at a time.
 
     Raises
     ------
@@ -253,10 +253,10 @@ class SigmfCollection(BaseModel):
 
 
 def find_sigmf(folder: Path, node: str) -> tuple[Path, Path]:
-    """Return the paths of metadata and samples of a node's recording, whether or not they exist.
+    """Return the paths of the metadata and sample files of a node's recording, whether or not they exist.
 
-    The metadata are <node>.sigmf-meta, or if that is missing those of the stream that `apertura:nodes` of a collection
-    in the folder assigns to the node. The samples have the same name, or that of `core:dataset`.
+    The metadata file is <node>.sigmf-meta or, if that is missing, the file of the stream that `apertura:nodes` of a
+    collection in the folder assigns to the node. The sample file has the same name, or the name in `core:dataset`.
 
     Raises
     ------
@@ -477,7 +477,7 @@ def _length(captures: StatedCaptures, total: int, path: Path) -> int:
 
 
 def _usable(length: int, layout: SampleLayout, path: Path) -> int:
-    """Return the number of usable samples per capture; real captures lose the filter's settling time at their end."""
+    """Return the number of usable samples per capture; the filter for real samples settles at the end of a capture."""
     if layout.mixing is None or not layout.mixing.restarts:
         return length
     if length <= 2 * SETTLING:
@@ -502,7 +502,7 @@ def _checked(tags: NDArray[np.datetime64], path: Path) -> NDArray[np.datetime64]
 
 _DECODER = json.JSONDecoder()
 _BETWEEN = re.compile(r"[\s,:]*")
-_KNOWN_BYTES = 256  # bytes before the read position, compared to detect that metadata were only appended to
+_KNOWN_BYTES = 256  # bytes before the read position; if unchanged, metadata were only appended
 
 
 class GrowingSigmf:
@@ -548,7 +548,7 @@ class GrowingSigmf:
         self._read_to, self._known, self._closed = 0, b"", False
 
     def read(self) -> Recording | None:
-        """Return the recording with its complete captures; None before its second capture has started.
+        """Return the recording with its complete captures; None until its second capture has started.
 
         Raises
         ------
@@ -588,12 +588,12 @@ class GrowingSigmf:
             stream.seek(self._read_to - len(self._known))
             known, appended = stream.read(len(self._known)), stream.read(LARGEST_META)
         if known != self._known:
-            if len(known) == len(self._known):  # otherwise the recorder is rewriting the file at this moment
+            if len(known) == len(self._known):  # otherwise the recorder is rewriting the file
                 self._forget()
                 self._read_meta()
             return
         mark = len(BOM_UTF8) if not self._read_to and appended.startswith(BOM_UTF8) else 0
-        text = appended[mark:].decode("utf-8", errors="ignore")  # a truncated character is after all complete objects
+        text = appended[mark:].decode("utf-8", errors="ignore")  # a truncated character follows all complete objects
         at = 0 if self._header else self._start(text)
         documents: list[object] = []
         for document, end in _complete_objects(text, at):

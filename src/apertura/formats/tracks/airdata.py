@@ -24,12 +24,12 @@ _SATELLITES = "satellites"
 _FEWEST = 4  # with fewer satellites, positions are dead reckoning
 
 _APART = 1.5
-"""Difference between the steps of UTC and clock that indicates a stopped clock, in units of UTC; truncation to whole
-seconds explains at most 1."""
+"""Difference between the increments of UTC and of the clock above which the clock is considered stopped, in units of
+UTC; truncation of UTC explains at most 1."""
 
 _TOLERANCE_S = 0.1
-"""Required accuracy of a segment's clock offset, and tolerance of an epoch outside its second, s: AirData's sampling
-interval."""
+"""Required accuracy of a segment's clock offset, and tolerated distance of an epoch from its second, s; both equal
+AirData's sampling interval."""
 
 _ROUNDING_S = 1e-6
 
@@ -47,12 +47,12 @@ _EXPECTED = f"AirData's CSV: {_CLOCK}, {_UTC}, {', '.join(_PLACE)}, altitude_abo
 def read_airdata(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> xr.Dataset:
     """Read a DJI flight exported by AirData, at 10 Hz, as `track` stage.
 
-    datetime(utc) contains whole seconds, or whole minutes if a spreadsheet saved the export, truncated: UTC is the
-    clock time(millisecond) plus the offset for which every epoch lies within its second. Dates may have any format of
-    an AirData account, provided that the rows determine which number is the day. The clock stops while the motors are
-    off, so each segment between stops has its own offset; segments too short to determine it are excluded. Misfits are
-    reported in the remarks. Heights are above mean sea level: options.height_offset_m is required. The log does not
-    contain the solution type (RTK or not).
+    Column datetime(utc) is truncated to whole seconds, or to whole minutes if a spreadsheet saved the export. UTC is
+    therefore computed as time(millisecond) plus the offset for which every epoch lies within its second or minute.
+    Dates may have any format of an AirData account, provided that the rows determine which number is the day. The clock
+    stops while the motors are off, so each segment between stops has its own offset; segments too short to determine
+    the offset are excluded. Misfits are reported in the remarks. Heights are above mean sea level, so that
+    options.height_offset_m is required. The log does not contain the solution type (RTK or not).
 
     Raises
     ------
@@ -111,7 +111,7 @@ def _measured(table: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, int]]:
 
 
 class _DateError(ValueError):
-    """Invalid or ambiguous dates."""
+    """Error for invalid or ambiguous dates."""
 
 
 def _dates(texts: Sequence[str]) -> tuple[NDArray[np.datetime64], str]:
@@ -161,7 +161,7 @@ def _utc(
 ) -> tuple[NDArray[np.datetime64], NDArray[np.bool_], float, int]:
     """Estimate UTC of epochs from a clock and truncated UTC; ValueError if they disagree.
 
-    Also returns a mask of the epochs in segments long enough to determine the clock offset, the largest misfit in
+    Also returned are a mask of the epochs in segments long enough to determine the clock offset, the largest misfit in
     seconds, and the number of segments.
     """
     unit_s = {"second": 1.0, "minute": 60.0}[unit]

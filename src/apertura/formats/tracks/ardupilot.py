@@ -27,9 +27,9 @@ _KINDS = {3: FIXES["single"], 4: FIXES["dgps"], 5: FIXES["float"], 6: FIXES["fix
 _DELAYS = (("GPS_DELAY_MS", "GPS1_DELAY_MS"), ("GPS_DELAY_MS2", "GPS2_DELAY_MS"))
 _TYPES = (("GPS_TYPE", "GPS1_TYPE"), ("GPS_TYPE2", "GPS2_TYPE"))
 _DELAY_S = 0.12
-_NOVATEL = 15  # its driver reverses the sign of the geoid undulation, so AEl is wrong
+_NOVATEL = 15  # GPS1_TYPE of NovAtel receivers: the driver reverses the sign of the undulation, so AEl is wrong
 _LAST_WEEK, _WEEK_MS = 11_000, 604_800_000
-_LOWEST_M = -1e6  # an unknown AEl is logged as the lowest integer
+_LOWEST_M = -1e6  # an unknown AEl is logged as the lowest integer, which is below this height
 _EXPECTED = f"an ArduPilot DataFlash log whose GPS messages contain {', '.join(NEEDED)}"
 
 
@@ -37,9 +37,9 @@ def read_ardupilot(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIO
     """Read a DataFlash log as `track` stage; its attribute `source` states the receiver used and all receivers.
 
     Receiver 0 is used, or the receiver with the number ``options.body``. GPS week and milliseconds are converted to UTC
-    by the table of leap seconds. Heights are GPA.AEl, above the ellipsoid; logs without it contain only GPS.Alt, above
-    sea level, and require ``options.height_offset_m``. GPA.Und of some versions is not used, because its sign depends
-    on the driver.
+    by the table of leap seconds. Heights above the ellipsoid are read from GPA.AEl; logs without this field contain
+    only GPS.Alt, above sea level, and require ``options.height_offset_m``. GPA.Und of some versions is not used,
+    because its sign depends on the driver.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def _receiver(fields: Fields, options: LogOptions, node: str, where: Path) -> tu
 
 
 def _accuracy(fields: Fields, receiver: int, time_us: Floats) -> dict[str, Floats]:
-    """Return HAcc, VAcc, AEl (m), VV (VZ is valid) of the GPA message of each epoch; NaN if there is none."""
+    """Return HAcc, VAcc, AEl (m) and VV (VZ is valid) from the GPA message of each epoch; NaN without a message."""
     own = fields["GPA/I"] == receiver
     times, order = np.unique(fields["GPA/TimeUS"][own], return_index=True)
     index = np.searchsorted(times, time_us)

@@ -1,4 +1,4 @@
-"""Logs of autopilots: epochs of a GNSS receiver in UTC, attitude by the autopilot's clock, Doppler velocities."""
+"""Logs of autopilots: GNSS epochs in UTC, attitude with times of the autopilot's clock, Doppler velocities."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from apertura.formats.times import utc_times
 from apertura.formats.tracks.log_options import LogOptions
 from apertura.formats.tracks.track import make_track
 
-# ---- Autopilot's clock relative to UTC: a line through the times of its receiver ------------------------------------
+# ---- Autopilot's clock relative to UTC: line fitted to the times of the receiver ------------------------------------
 
 
 _AGREES_S = 0.25  # latency of receiver messages: about 0.1 s, occasionally some tens of milliseconds more
@@ -91,7 +91,7 @@ def clock_of(
     ahead, centred_s = since - boot_s, boot_s - zero
     line = np.array([0.0, float(np.median(ahead))])
     tolerance_s = _AGREES_S + _FASTEST * float(np.ptp(boot_s)) / 2
-    for _ in range(2):  # the first pass removes outliers of seconds
+    for _ in range(2):  # the first pass removes outliers of several seconds
         near = np.abs(ahead - np.polyval(line, centred_s)) <= tolerance_s
         if near.sum() >= 8 and np.ptp(centred_s[near]) * _FASTEST > 0.01:
             line = np.polyfit(centred_s[near], ahead[near], 1)
@@ -115,16 +115,16 @@ def clock_of(
 
 # ---- Consistency of a receiver's positions and Doppler velocities ---------------------------------------------------
 
-_NEAR_M, _CURVED_M_S2 = 0.5, 2.5  # noise of both; an eighth of the largest acceleration between epochs, 20 m/s²
+_NEAR_M, _CURVED_M_S2 = 0.5, 2.5  # noise of position and velocity; 1/8 of the largest acceleration, 20 m/s²
 _MOST, _FEW = 0.5, 10
 
 
 def contradicted(time_utc: NDArray[np.datetime64], geodetic: Floats, velocity: Floats) -> NDArray[np.bool_]:
     """Return a mask of the epochs whose positions contradict their neighbours and the velocities.
 
-    The residual of the step from an epoch to the next is |p_{i+1} − p_i − (v_i + v_{i+1})·Δt/2|; an epoch is
-    contradicted if the residuals of all its steps are too large. If that holds for more than half of ten or more steps,
-    the velocities are assumed to be wrong, and no epoch is contradicted.
+    The residual of the step from an epoch to the next is |p_{i+1} − p_i − (v_i + v_{i+1})·Δt/2|; the position of an
+    epoch is rejected if the residuals of all its steps are too large. If more than half of ten or more steps have too
+    large a residual, the velocities are assumed to be wrong, and no position is rejected.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def contradicted(time_utc: NDArray[np.datetime64], geodetic: Floats, velocity: F
     wrong = np.zeros(len(time_utc), bool)
     if len(wrong) < 3:
         return wrong
-    ends = velocity[:-1], velocity[1:]  # at start and end of each step; an unknown one is replaced by the other
+    ends = velocity[:-1], velocity[1:]  # at start and end of each step; an unknown velocity is replaced by the other
     with np.errstate(invalid="ignore"):  # invalid coordinates are rejected later
         position = ecef_from_geodetic(*geodetic.T)
         steps = np.einsum("eij,ei->ej", ned_axes(position)[:-1], np.diff(position, axis=0))
@@ -168,7 +168,7 @@ def contradicted(time_utc: NDArray[np.datetime64], geodetic: Floats, velocity: F
     return np.asarray(np.concatenate([[True], too_large]) & np.concatenate([too_large, [True]]))
 
 
-# ---- Track of an autopilot's log: epochs of the receiver in UTC, attitude by the autopilot's clock ------------------
+# ---- Track of an autopilot's log: epochs of the receiver in UTC, interpolated attitude ------------------------------
 
 _WORST_STD_M = 1e4
 _UNIT = 1e-2
@@ -290,7 +290,7 @@ def autopilot_track(
 
 
 def _counted(boot_s: Floats, options: LogOptions, node: str, where: Path) -> NDArray[np.datetime64]:
-    """Convert times of the autopilot's clock to UTC by the configured time zero."""
+    """Convert times of the autopilot's clock to UTC with the configured time zero."""
     key = f"nodes.{node}.log.start_utc"
     try:
         start = utc_times([options.start_utc or ""])[0]
@@ -312,7 +312,7 @@ def _repeated(epochs: Epochs) -> NDArray[np.bool_]:
 
 
 def _angles_deg(attitude: Attitude, boot_s: Floats) -> Floats | None:
-    """Interpolate (epoch, 3) roll, pitch, yaw in degrees to times of the autopilot's clock; NaN in gaps of the log."""
+    """Interpolate roll, pitch and yaw, (epoch, 3) degrees, to times of the autopilot's clock; NaN in gaps of a log."""
     from scipy.spatial.transform import Rotation, Slerp
 
     norm = np.linalg.norm(attitude.quaternion, axis=1)

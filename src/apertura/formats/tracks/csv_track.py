@@ -35,7 +35,7 @@ LARGEST_LOG = 500_000_000
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf)", re.ASCII | re.IGNORECASE)
 _NOT_FINITE = re.compile(r"([+-]?)(?:nan\(\w*\)|(inf)inity|1\.#(inf)\d*|1\.#\w+)", re.ASCII | re.IGNORECASE)
-"""NaN and infinity as printed by C libraries: nan(ind), infinity, 1.#INF, -1.#IND, 1.#QNAN, and 1.#J (either one,
+"""NaN and infinity as printed by C libraries: nan(ind), infinity, 1.#INF, -1.#IND, 1.#QNAN, and 1.#J (NaN or infinity,
 rounded)."""
 
 
@@ -83,7 +83,7 @@ def read_table(
     ----------
     path
         UTF-8, with or without byte-order mark; the first line contains the column names, case-insensitive. Lines that
-        start with # are comments; the last comment before the first row may be the heading. A repeated heading, as in
+        start with # are comments; the last comment before the first row may be the header. A repeated header, as in
         concatenated files, is skipped.
     required, optional
         Names of required and optional columns; each may occur only once.
@@ -94,7 +94,7 @@ def read_table(
     ------
     ValueError
         If the file is not a table, its cells are separated by semicolons or tabs, a column is missing or repeated, it
-        contains a second, different heading, or a line has more or fewer cells than the heading.
+        contains a second, different header, or a line has more or fewer cells than the header.
     """
     if path.stat().st_size > LARGEST_LOG:
         raise ValueError(f"{path.stat().st_size} bytes, at most {LARGEST_LOG} are supported")
@@ -105,7 +105,7 @@ def read_table(
         raise ValueError(_not_utf8(path)) from error
     names = _named(heading, known)
     with path.open(encoding="utf-8-sig", newline="") as stream, warnings.catch_warnings():
-        warnings.simplefilter("error", pd.errors.ParserWarning)  # otherwise pandas drops cells beyond the heading
+        warnings.simplefilter("error", pd.errors.ParserWarning)  # otherwise pandas drops cells beyond the header
         plain = len(others) == 1
         try:
             table = pd.read_csv(
@@ -154,12 +154,12 @@ def _not_utf8(path: Path) -> str:
 
 
 def _checked_cells(path: Path, known: Sequence[str]) -> tuple[list[str], set[int]]:
-    """Return the heading and the indices of rows without values: comments and all repetitions of the heading.
+    """Return the header and the indices of rows without data: comments and repeated header rows.
 
     Raises
     ------
     ValueError
-        If a line has fewer cells than the heading, so that part of a number may be lost, or more.
+        If a line has more cells than the header, or fewer, so that part of a number may be lost.
     """
     with path.open(encoding="utf-8-sig", newline="") as stream:
         rows = csv.reader(stream, skipinitialspace=True)
@@ -239,7 +239,7 @@ class _Log(NamedTuple):
 def read_csv_track(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> xr.Dataset:
     """Read a CSV flight log as `track` stage.
 
-    Its columns, or those that options.columns maps to them, are
+    The columns, under these names or under those configured in options.columns, are
 
     - one of time_utc (ISO 8601), time (ISO 8601 with a zone in each cell or in options.time_system) and time_s
       (seconds since options.start_utc, or with time_system gpst since 1980-01-06, GPS time);
@@ -248,8 +248,8 @@ def read_csv_track(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIO
     - optionally roll_deg, pitch_deg, yaw_deg; std_north_m, std_east_m, std_up_m (standard deviations); quality
       (solution type: a name of `FIXES`, or a number as defined by options.quality). Their cells may be empty.
 
-    Numbers are multiplied by options.scales. Epochs within a leap second, and those whose GGA quality states that they
-    are not measured, are excluded and counted.
+    Numbers are multiplied by options.scales. Epochs within a leap second, and epochs whose GGA quality marks a position
+    that is not measured, are excluded and counted.
 
     Raises
     ------
@@ -353,7 +353,7 @@ def _error(found: str, log: _Log, remedy: str) -> CampaignError:
 
 
 def _missing_column(name: str, table: pd.DataFrame, log: _Log) -> CampaignError:
-    """Return the error for a log without a column: its columns, and the setting that maps one of them."""
+    """Return the error for a missing column, with the columns of the log and the setting that maps one of them."""
     key = f"nodes.{log.node}.log.columns"
     remedy = (
         f"If the column has another name, set {key}: {{{name}: NAME}}; to try a name, use --set columns.{name}=NAME."
@@ -362,7 +362,7 @@ def _missing_column(name: str, table: pd.DataFrame, log: _Log) -> CampaignError:
 
 
 def _frame(table: pd.DataFrame, log: _Log) -> Literal["geodetic", "ecef", "local"]:
-    """Return the first frame with all its columns; CampaignError names a column that the most complete frame lacks."""
+    """Return the first frame with all its columns; the error names a missing column of the most complete frame."""
     missing = {frame: [name for name in names if name not in table] for frame, names in _POSITIONS.items()}
     nearest = min(missing, key=lambda frame: len(missing[frame]))
     if missing[nearest]:

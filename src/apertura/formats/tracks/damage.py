@@ -13,7 +13,7 @@ _CHAIN = 3
 """Consecutive valid messages required to resume reading; a random header is plausible with probability 1/256."""
 
 Span = tuple[int, int]
-"""Offset of the first byte, and of the byte after the last."""
+"""Offset of the first byte, and offset of the byte after the last."""
 
 
 def foreign_bytes(
@@ -21,8 +21,8 @@ def foreign_bytes(
 ) -> tuple[list[Span], int]:
     """Find the spans of a log that are not valid messages, and the end of the last message.
 
-    The message before such a span is included in it, because it may be truncated with foreign bytes at its end. A
-    message truncated by the end of the log, and padding after the last message, are not damage.
+    Each span includes the message before the invalid bytes, because that message may be truncated and end with foreign
+    bytes. A message truncated by the end of the log, and padding after the last message, are not damage.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def damage_of(spans: NDArray[np.int64], unit: str = "bytes") -> str:
     Parameters
     ----------
     spans
-        (span, 2) int64: first byte or line, and the one after the last; the last row is the whole log.
+        (span, 2) int64: first byte or line, and the byte or line after the last; the last row is the whole log.
     unit
         Unit of the spans, bytes or lines.
 

@@ -21,7 +21,7 @@ COLUMNS = {
 NEEDED = tuple(name for name in COLUMNS["GPS"] if name != "I")
 """GPS columns that every version since 3.3 logs; a missing one indicates a damaged log."""
 
-_SECOND = {"GPS2": "GPS", "GPA2": "GPA"}  # second receiver in older versions; now I = 1 of the same message
+_SECOND = {"GPS2": "GPS", "GPA2": "GPA"}  # second receiver in older versions; newer ones log I = 1 in GPS and GPA
 _BINARY = b"\xa3\x95"
 _FMT, _FMT_BYTES = 128, 89
 DAMAGE = {"bytes": "damage/bytes", "lines": "damage/lines"}
@@ -54,7 +54,7 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
         name = str(path)
         if is_binary:
             spans, ended = _foreign(data)
-            if spans:  # the parser stops at an unknown type, and only reads files
+            if spans:  # the parser stops at an unknown type, and reads only from files
                 file = stack.enter_context(tempfile.NamedTemporaryFile())
                 file.write(without(data[:ended], spans))
                 file.flush()
@@ -98,7 +98,7 @@ def _foreign(data: bytes) -> tuple[list[Span], int]:
 
 
 def _wrong_lines(data: bytes) -> tuple[list[Span], int]:
-    """Find the lines of a text log, numbered from 1, of unknown type or with too few columns; also count all lines."""
+    """Find the lines of a text log, numbered from 1, with unknown type or too few columns, and count all lines."""
     columns, wrong = {"FMT": 5}, list[Span]()
     lines = data[data.find(b"FMT,") :].splitlines()
     for number, line in enumerate(lines, 1 + data[: data.find(b"FMT,")].count(b"\n")):

@@ -40,9 +40,9 @@ class Mission:
     reference
         Height reference.
     speed_m_s
-        (waypoint,) float64: speed on the leg to each waypoint; NaN where not stated in the mission.
+        (waypoint,) float64: speed on the way to each waypoint; NaN where the mission does not state it.
     home_deg
-        Latitude and longitude of the take-off point; None: not stated, the first waypoint is used.
+        Latitude and longitude of the take-off point; None: the mission states none, and the first waypoint is used.
     """
 
     place: Floats

@@ -74,11 +74,11 @@ class _Log:
 def read_nmea(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> xr.Dataset:
     """Read an NMEA 0183 log of any talkers as `track` stage.
 
-    Positions, solution types and geoid separation are those of GGA: ellipsoidal height is altitude plus separation. The
-    date of a GGA is that of the preceding RMC (valid) or ZDA, otherwise that of options.start_utc, and advances at
-    midnight; if both exist, they must agree. GST contains standard deviations. If several talkers report an epoch, that
-    of GN is used. A log without any checksum is read with a remark; in other logs, sentences with a wrong checksum,
-    without a checksum and truncated sentences are excluded and counted by reason.
+    Positions, solution types and geoid separation are read from GGA: ellipsoidal height is altitude plus separation.
+    The date of a GGA is that of the preceding valid RMC or of the preceding ZDA, otherwise that of options.start_utc,
+    and advances at midnight; logged and configured dates must agree. Standard deviations are read from GST. If several
+    talkers report an epoch, the GN sentence is used. A log without any checksum is read with a remark; in other logs,
+    truncated sentences and sentences with a wrong or missing checksum are excluded and counted by reason.
 
     Raises
     ------
@@ -215,7 +215,7 @@ def _take(sentence: Any, log: _Log) -> None:
 
 
 def _nearest(of_day: int, log: _Log) -> int:
-    """Return the date and time of a time of day nearest to the previous epoch; the first date is the configured one."""
+    """Return a time of day with the date that is nearest to the previous epoch; the config states the first date."""
     if log.now_ns is None:
         found = "times of day only, no RMC or ZDA with a date"
         start = start_time(log.options, found, node=log.node, where=log.path)

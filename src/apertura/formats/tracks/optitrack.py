@@ -24,21 +24,22 @@ _ENU_FROM_MOTIVE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
 """Rows are east, north and up in Motive's x, y (up) and z."""
 
 _NED_FROM_MOTIVE = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""Rows are north, east and down; for a body forward, right and down: as defined, a body is level and faces north."""
+"""Rows are north, east and down, and forward, right and down of a body, which is level and faces north when defined."""
 
 
 def read_optitrack(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> xr.Dataset:
     """Read a rigid body of a motion capture as `track` stage; options.body selects one of several bodies.
 
-    Frame 'local': east is Motive's x, north its −z, up its y. Attitude is that of axes forward, right, down that were
-    −z, x and −y when the body was defined. Times are options.start_utc plus the seconds of the take, whose Capture
-    Start Time is local time without a zone. Frames in which the body was not tracked are excluded and counted.
+    The frame is 'local': east is Motive's x, north is −z, up is y. The body axes forward, right and down are Motive's
+    −z, x and −y at the time when the body was defined. Times are options.start_utc plus the seconds of the take,
+    because the Capture Start Time of a take is local time without a zone. Frames in which the body was not tracked are
+    excluded and counted.
 
     Raises
     ------
     CampaignError
-        If the file is not such a table, the body is missing or not selected, a line is incomplete, or start_utc is not
-        configured.
+        If the file is not a Motive table, the body is missing or not selected, a line is incomplete, or start_utc is
+        not configured.
 
     Notes
     -----

@@ -21,7 +21,7 @@ from apertura.formats.tracks.ulog_fields import ATTITUDE, CORRUPT, DAMAGE, DELAY
 Fields = Mapping[str, NDArray[Any]]
 
 _KINDS = {3: FIXES["single"], 4: FIXES["dgps"], 5: FIXES["float"], 6: FIXES["fix"]}
-"""fix_type; below 3 there is no height, 8 is extrapolated."""
+"""Solution type of each fix_type; below 3 there is no height, 8 is extrapolated."""
 
 _STATES = {"dead_reckoning": 0, "lat_lon_valid": 1, "alt_valid": 1}
 """State flag of fused positions → its value while GNSS is used; each version of PX4 logs some of the flags."""
@@ -42,11 +42,11 @@ _EXPECTED = f"a PX4 ULog with positions in {', '.join((*RECEIVERS, FUSED))}"
 def read_px4_ulog(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> xr.Dataset:
     """Read a PX4 ULog as `track` stage; its attribute `source` states the topic and instance used.
 
-    The source is vehicle_gps_position if logged, otherwise sensor_gps: the solution of the receiver for its antenna, at
-    the UTC of the receiver; otherwise vehicle_global_position, whose height follows a barometer and whose time is
-    derived from that of the receiver. ``options.body`` selects a topic, or one of several receivers as
-    ``sensor_gps:1``. Attitude is read from vehicle_attitude. Heights are ellipsoidal; if the driver logs none, or
-    copies heights above sea level, ``options.height_offset_m`` converts the latter.
+    The topic is vehicle_gps_position if logged, otherwise sensor_gps; both contain the receiver's solution for its
+    antenna, with UTC. If neither is logged, it is vehicle_global_position, whose height follows a barometer and whose
+    time is derived from the receiver's UTC. ``options.body`` selects a topic, or one of several receivers as
+    ``sensor_gps:1``. Attitude is read from vehicle_attitude. Heights are ellipsoidal; if the driver logs no ellipsoidal
+    heights, or copies of those above sea level, the latter are converted by ``options.height_offset_m``.
 
     Parameters
     ----------
@@ -195,7 +195,7 @@ def _height(
     ellipsoidal, sea_level = (_first(fields, source, names) for names in (_ELLIPSOIDAL, _SEA_LEVEL))
     copied = ellipsoidal is None or not has_fix.any()
     if ellipsoidal is not None and has_fix.any():
-        # a driver without geoid undulation logs 0, or the same height twice; a real undulation is never zero to 1 mm
+        # a driver without geoid undulation logs 0, or the same height twice; an actual undulation is never below 1 mm
         copied = not ellipsoidal[has_fix].any()
         copied |= sea_level is not None and bool(np.abs((ellipsoidal - sea_level)[has_fix]).max() < 1e-3)
     if not copied:

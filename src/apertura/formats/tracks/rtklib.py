@@ -26,7 +26,7 @@ _POSITIONS = {
     "ecef": ("x-ecef(m)", "y-ecef(m)", "z-ecef(m)"),
     "baseline": ("e-baseline(m)", "n-baseline(m)", "u-baseline(m)"),
 }
-"""Position format → its columns; an angle in degrees, minutes and seconds takes three cells."""
+"""Position format → its columns; an angle in degrees, minutes and seconds occupies three cells."""
 
 _STD = ("sdn(m)", "sde(m)", "sdu(m)")
 _STD_ECEF = ("sdx(m)", "sdy(m)", "sdz(m)", "sdxy(m)", "sdyz(m)", "sdzx(m)")
@@ -45,7 +45,7 @@ _GEOCENTRIC = re.compile(r"(?:WGS|ITRF|IGS|IGB)[-_ ]?\d*", re.I)
 _INTERVAL = re.compile(
     r"(?:obs|sol|inp) (?:start|end)\b.*?\b(GPST|UTC|JST)\b|out-timesys\s*[=:]\s*(gpst|utc|jst)\b", re.I
 )
-"""Time system in a comment of the header, in addition to that of the column heading."""
+"""Time system in a comment of the header, in addition to the one stated with the column names."""
 
 _STATES = re.compile(rf"ref pos\s*:|{_DATUM.pattern}|{_INTERVAL.pattern}", re.I)
 _EXPECTED = "an RTKLIB solution whose header contains column names and time system (GPST, UTC or JST)"
@@ -68,15 +68,15 @@ def read_rtklib_pos(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTI
 
     A header states whether times are GPST, UTC or JST (as calendar dates or week and seconds), and whether positions
     are latitude, longitude (decimal degrees, or degrees, minutes and seconds) and height, ECEF, or a baseline to east,
-    north and up from ``ref pos`` or options.base. Columns Q and standard deviations are read if present; those in ECEF
+    north and up from ``ref pos`` or options.base. Q and standard deviations are read if present; deviations in ECEF
     are rotated to north, east and up with their covariances. Lines with Q = 0 (no solution) and epochs within a leap
     second are excluded and counted.
 
     Raises
     ------
     CampaignError
-        If a header has no column names, two time systems or another datum than WGS 84, heights are above a geoid and
-        options.height_offset_m is not configured, a baseline has no base, or a line cannot be read.
+        If a header lacks column names, states two time systems or a datum other than WGS 84, heights are above a geoid
+        and options.height_offset_m is not configured, a baseline has no base, or a line cannot be read.
 
     Notes
     -----
@@ -132,7 +132,7 @@ def _joined(values: list[Any], unknown: Callable[[int], NDArray[Any]], parts: Se
 
 
 def _parts(lines: list[str], path: Path) -> Iterator[tuple[_Header, list[tuple[int, str]]]]:
-    """Yield each header of a file with its numbered solution lines; RTKLIB writes a header after every restart.
+    """Yield each header of a file with its numbered solution lines; RTKLIB writes a new header after every restart.
 
     Comments without header fields do not start a new part.
     """
@@ -172,7 +172,7 @@ def _solutions(
 
 
 def _kind(line: str) -> str:
-    """Return the key of `_POSITIONS` whose columns a comment line lists; empty if the line is not a heading."""
+    """Return the key of `_POSITIONS` whose columns a comment line lists; empty if it does not list column names."""
     names = set(_CELLS.split(line.strip("% \t")))
     return next((kind for kind, columns in _POSITIONS.items() if set(columns) <= names), "")
 
@@ -233,7 +233,7 @@ def _check_stated(header: _Header, options: LogOptions, *, node: str, where: Pat
     if header.geodetic_height == "geodetic" and options.height_offset_m is None:
         raise unstated(
             "height_offset_m",
-            "heights are geodetic (above a geoid)",
+            "heights are above a geoid (geodetic in RTKLIB)",
             node=node,
             where=where,
             remedy=", or export ellipsoidal heights",
@@ -245,7 +245,7 @@ def _check_stated(header: _Header, options: LogOptions, *, node: str, where: Pat
 def _rows(
     lines: list[tuple[int, str]], header: _Header, path: Path
 ) -> tuple[list[str | np.datetime64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return for each solution its time (dates as text), position as logged, and Q and standard deviations or NaN."""
+    """Return time (dates as text), logged position, Q and standard deviations (NaN if missing) of each solution."""
     sexagesimal = header.position == "sexagesimal"
     angles = [header.cell_of[name] for name in _POSITIONS[header.position]]
     std_names = _STD_ECEF if header.position == "ecef" else _STD
@@ -349,7 +349,7 @@ def _base(header: _Header, options: LogOptions, *, node: str, where: Path) -> ND
 
 
 def _std(logged: NDArray[np.float64], ecef: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return standard deviations to north, east and up; in ECEF the log also has signed roots of covariances."""
+    """Return standard deviations to north, east and up, in ECEF with the logged signed roots of covariances."""
     if not logged.shape[1]:
         return None
     if logged.shape[1] == len(_STD):

@@ -56,13 +56,13 @@ def make_track(
     Parameters
     ----------
     time_utc
-        (epoch,) datetime64[ns], UTC, strictly increasing; or strictly decreasing, as from a backward filter: the epochs
-        are then reversed, with a remark.
+        (epoch,) datetime64[ns], UTC, strictly increasing. If times are strictly decreasing, as from a backward filter,
+        the epochs are reversed, with a remark.
     position
         (epoch, 3) float64 in `frame`.
     frame
         geodetic: WGS 84 latitude (deg), longitude (deg), ellipsoidal height (m); epochs at latitude 0, longitude 0 have
-        no fix and are dropped. ecef: metres. local: metres to east, north and up in the campaign's local frame.
+        no fix and are excluded. ecef: metres. local: metres to east, north and up in the campaign's local frame.
     attitude_deg
         (epoch, 3) float64: roll, pitch, yaw in degrees, yaw clockwise from north; NaN or None: not logged.
     position_std_m
@@ -153,7 +153,7 @@ def remarked(track: xr.Dataset, remark: str, where: Path) -> xr.Dataset:
 
 
 def damaged(track: xr.Dataset, found: str, where: Path) -> xr.Dataset:
-    """Add a remark on damage of a log to its track, and set its attribute `damage`, which raises a flag on its images.
+    """Add a remark on damage of a log to its track, and set the attribute `damage`, which raises a flag of the images.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def damaged(track: xr.Dataset, found: str, where: Path) -> xr.Dataset:
 
 
 def receivers_remark(kinds: Mapping[str, NDArray[np.int8]], selected: str, node: str) -> str:
-    """Format the remark on a log with several receivers, none of which is selected in the config.
+    """Format the remark on a log with several receivers if the config does not select one of them.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def receivers_remark(kinds: Mapping[str, NDArray[np.int8]], selected: str, node:
 
 
 def _rolled_over(time_utc: NDArray[np.datetime64]) -> list[str]:
-    """Return a remark if times are old enough for a GPS week rollover: a receiver that counts weeks modulo 1024."""
+    """Return a remark if times are so early that the receiver may count GPS weeks modulo 1024 (week rollover)."""
     periods = (KNOWN_UNTIL - time_utc[-1]) // _ROLLOVER
     if periods < 1:
         return []

@@ -18,8 +18,8 @@ DELAY = "EKF2_GPS_DELAY"
 """Parameter: latency of the receiver assumed by the autopilot, ms."""
 
 DAMAGE, DROPOUTS, CORRUPT = "damage", "dropouts", "corrupt"
-"""Spans of bytes that are not valid messages, then (0, total bytes); duration of each logger dropout, ms; True if
-pyulog reports damage."""
+"""Names of three arrays: spans of bytes that are not valid messages, then (0, total bytes); duration of each logger
+dropout, ms; True if pyulog reports damage."""
 
 _BYTES = {
     **dict.fromkeys(("int8_t", "uint8_t", "bool", "char"), 1),
@@ -107,7 +107,7 @@ _PLAUSIBLE: Mapping[str, Callable[[bytes, int, int], bool]] = {
 
 
 class _Messages:
-    """Message formats and topics of a ULog that are known up to the current offset."""
+    """Message formats and topics of a ULog that are defined before the current offset."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data

@@ -1,1 +1,1 @@
-"""Recorder clock relative to the flight log, estimated from echoes of a known point or from the image sharpness."""
+"""Estimation of the recorder's clock offset from the flight log, by echoes of a known point or by image sharpness."""

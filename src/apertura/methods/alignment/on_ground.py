@@ -24,8 +24,8 @@ from apertura.methods.autofocus.motion import Logged, Recorded, plausible_offset
 MOST_PIXELS = 96
 """Maximum pixels along a side of the coarse image on which offsets are tried."""
 
-_OVERSAMPLING = 2.0  # of range profiles
-_ABOUT_CELLS = 8  # range cells: half a side of the fine image about the brightest point
+_OVERSAMPLING = 2.0  # oversampling of range profiles
+_ABOUT_CELLS = 8  # half a side of the fine image about the brightest point, range cells
 _FINE = 4  # pixels per range cell of the fine image
 _MAXIMA = 3  # number of maxima of the coarse search that are refined
 
@@ -37,7 +37,7 @@ class SceneSharpness:
     Attributes
     ----------
     profiles
-        Range profiles of the recorder, (pulse, range), over its whole range; their aperture is a placeholder.
+        Range profiles of the recorder over the whole range, (pulse, range), with a placeholder as aperture.
     time_s
         (pulse,) float64, seconds of the recorder's clock.
     log
@@ -53,7 +53,7 @@ class SceneSharpness:
 
     @classmethod
     def of(cls, echo: Recorded, log: Logged, places_m: Floats) -> "SceneSharpness":
-        """Return the sharpness function of echoes; pulses are compressed once."""
+        """Return the sharpness function of echoes, whose pulses are compressed once."""
         frequency = echo.frequency_hz
         speed = echo.wave_speed_m_s
         step_m, length = range_step(frequency, oversampling=_OVERSAMPLING, wave_speed_m_s=speed)
@@ -74,7 +74,7 @@ class SceneSharpness:
         return cls(profiles, echo.time_s, log, places_m)
 
     def image(self, offset_s: float, path_m: float) -> NDArray[np.complex64]:
-        """Return the image at the pixels; pulses are weighted by the distance flown between them."""
+        """Return the image at the pixels; each pulse is weighted by the distance flown between pulses."""
         at_s = self.time_s + offset_s
         kept = self.log.inside(at_s)
         speed = self.log.speeds_m_s(at_s)[kept]
@@ -91,7 +91,7 @@ class SceneSharpness:
         return np.asarray(np.nan_to_num(engine.form(engine.prepare(at_offset), self.places_m)))
 
     def value(self, offset_s: float, path_m: float) -> float:
-        """Return the sharpness: mean squared power over squared mean power; 2 for speckle, larger for points."""
+        """Return the sharpness: mean squared power over squared mean power; 2 for speckle, more for points."""
         power = np.abs(self.image(offset_s, path_m)).astype(np.float64) ** 2
         return float((power**2).mean() / max(float(power.mean()) ** 2, 1e-300))
 
@@ -112,11 +112,11 @@ def align_on_scene(
     echo, log
         Echoes on the recorder's clock; antenna positions on the log's clock.
     grid, terrain
-        The scene, which must contain bright points.
+        Grid and terrain of the scene, which must contain bright points.
     within_s
         Smallest and largest offset to search, seconds.
     search_m
-        Largest path of either sign to search, metres; 0 keeps the path fixed.
+        Limit of the searched paths of either sign, metres; 0 keeps the path fixed.
 
     Raises
     ------
@@ -126,7 +126,7 @@ def align_on_scene(
     Notes
     -----
     Source: docs/theory/tracks.md, "Clock of the recorder". Only the curvature of a point's phase history separates
-    path from offset, and position from path: the aperture must not be short against the distance.
+    path, offset and position of the point: the aperture must not be short compared with the distance.
     """
     pulses = echo.moving()[:: -(-len(echo) // MOST_PULSES)]
     low, high = plausible_offsets(echo, log, within_s)
@@ -138,7 +138,7 @@ def align_on_scene(
     paths_m = np.arange(-search_m, search_m + cell_m, 2 * cell_m) if search_m > 0 else np.zeros(1)
     values = np.array([[coarse.value(offset_s, path_m) for path_m in paths_m] for offset_s in offsets_s])
     steps = float(offsets_s[1] - offsets_s[0]), 2 * cell_m if search_m > 0 else 0.0
-    # Best maxima of the coarse search, each refined about the brightest point of its image; the brightest one is kept.
+    # Best maxima of the coarse search, each refined about the brightest point of its image; the highest peak is kept.
     maxima = []
     for index in np.argsort(-values, axis=None)[:_MAXIMA]:
         row, column = np.unravel_index(int(index), values.shape)

@@ -16,16 +16,16 @@ from apertura.methods.autofocus.motion import Logged, Recorded, plausible_offset
 # ---- Offset and path by coherent sum at a known point ---------------------------------------------------------------
 
 MOST_PULSES = 1024
-"""Maximum pulses, evenly spaced over the recording, on which offsets are tried: each offset costs one sum over them."""
+"""Maximum number of pulses, evenly spaced over the recording, that are summed for each trial offset."""
 
 AMBIGUITY_DB = -1.0
 """Level of the second-best offset relative to the best, dB, above which the best is ambiguous."""
 
 LEAST_CONTRAST_DB = 6.0
-"""Least peak power over the median of all offsets, dB; less is not significant."""
+"""Least significant peak power relative to the median of all offsets, dB."""
 
 _STEPS_PER_WAVE = 8  # offset steps while the fastest path changes by a wavelength
-_OVERSAMPLING = 8  # of paths
+_OVERSAMPLING = 8  # oversampling of paths
 _WIDTH_DB = -1.0  # level below the peak at which widths are measured
 
 
@@ -44,7 +44,7 @@ class Alignment:
     report
         Method and search, as JSON values.
     drift_ppm
-        Microseconds to add, beyond the offset, for every second since the first pulse.
+        Microseconds to be added, in addition to the offset, for every second since the first pulse.
     flags
         Flag → measured values, one line.
     """
@@ -76,7 +76,7 @@ class PointSharpness:
     point_m: Floats
 
     def spectrum(self, offset_s: float) -> Complexes:
-        """Return (subcarrier,) complex64, the sum of pulses referred to the point's path, by distance flown."""
+        """Return (subcarrier,) complex64, sum of pulses referred to the point's path, weighted by distance flown."""
         at_s = self.echo.time_s + offset_s
         kept = self.log.inside(at_s)
         pulses, speed = self.echo[kept], self.log.speeds_m_s(at_s)[kept]
@@ -120,7 +120,7 @@ def align_on_point(
     within_s
         Smallest and largest offset to search, seconds.
     search_m
-        Largest path of either sign to search, metres; 0 keeps the path fixed.
+        Limit of the searched paths of either sign, metres; 0 keeps the path fixed.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def align_on_point(
     within = np.abs(searched[0][0]) <= max(search_m, 1e-9)
     paths_m, power = searched[0][0][within], np.array([powers[within] for _, powers in searched])
     row, column = np.unravel_index(int(power.argmax()), power.shape)
-    # Its maximum, the widths 1 dB below it, and its contrast against the median of the search.
+    # Maximum of J, its widths 1 dB below the peak, and its contrast relative to the median of the search.
     refined = refine_maximum(
         sharpness.power, float(offsets_s[row]), float(paths_m[column]), _steps(offsets_s, paths_m, search_m)
     )
@@ -188,7 +188,7 @@ def refine_maximum(
 def peak_widths(
     power: Callable[[float, float], float], offset_s: float, path_m: float, steps: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return the errors of offset and path that each lower the peak by 1 dB."""
+    """Return the error of the offset, and that of the path, which alone lowers the peak by 1 dB."""
     least = power(offset_s, path_m) * 10 ** (_WIDTH_DB / 10)
 
     def width(step: float, at: Callable[[float], float]) -> float:
@@ -202,7 +202,7 @@ def peak_widths(
 
 
 def alignment_flags(power: Floats, offsets_s: Floats, best_s: float, width_s: float, contrast_db: float) -> Flags:
-    """Return the flags of an offset: ambiguous, at the edge of the search, low contrast."""
+    """Return the flags of an offset that is ambiguous, at the edge of the search, or has low contrast."""
     flags = Flags()
     away = np.abs(offsets_s - best_s) > 4 * width_s
     second = float(power.max(initial=0.0, where=away)) / float(power.max())
@@ -229,7 +229,7 @@ MOST_PPM = 200.0
 
 
 def apply_drift(time_s: Floats, drift_ppm: float) -> Floats:
-    """Correct the times of a recorder for a clock that is slow by `drift_ppm`, about their middle.
+    """Correct the times of a recorder for a clock that is slow by `drift_ppm`; the mid-time remains unchanged.
 
     Examples
     --------
@@ -240,12 +240,12 @@ def apply_drift(time_s: Floats, drift_ppm: float) -> Floats:
     return np.asarray(middle_s + (time_s - middle_s) * (1 + drift_ppm * 1e-6))
 
 
-def estimate_drift(found: Alignment, echo: Recorded, log: Logged, point_m: Floats) -> Alignment:
+def estimate_drift(alignment: Alignment, echo: Recorded, log: Logged, point_m: Floats) -> Alignment:
     """Add the drift that maximises the coherent sum at a known point to an alignment, if the recording resolves it.
 
     Parameters
     ----------
-    found
+    alignment
         Alignment without drift.
     echo, log
         Echoes on the recorder's clock; antenna positions on the log's clock.
@@ -254,7 +254,7 @@ def estimate_drift(found: Alignment, echo: Recorded, log: Logged, point_m: Float
 
     Notes
     -----
-    Source: docs/theory/tracks.md, "Clock of the recorder". The drift is fitted about the middle of the recording,
+    Source: docs/theory/tracks.md, "Clock of the recorder". The drift is fitted about the mid-time of the recording,
     where it is independent of the offset; the returned drift counts from the first pulse, as in config/clocks.tsv. A
     drift that changes no path by an eighth of a wavelength over half of the recording is not estimated.
     """
@@ -266,17 +266,17 @@ def estimate_drift(found: Alignment, echo: Recorded, log: Logged, point_m: Float
     step_ppm = 1e6 * offset_step_s(echo, log) / max(half_s, 1e-12)
     if step_ppm > MOST_PPM:
         line = f"not observable: a drift below {step_ppm:.0f} ppm changes no path by 1/{_STEPS_PER_WAVE} wavelength"
-        return replace(found, report={**found.report, "drift": line})
+        return replace(alignment, report={**alignment.report, "drift": line})
 
     def power(ppm: float, offset_s: float, path_m: float) -> float:
         times_s = apply_drift(time_s, ppm)
         return PointSharpness(replace(pulses, time_s=times_s), log, point_m).power(offset_s, path_m)
 
-    # Drift alone on a grid, then jointly with the offset and, unless it is fixed, the path by the simplex method.
+    # Drift on a grid, then jointly with the offset and, unless fixed, the path by the simplex method.
     drifts_ppm = np.arange(-MOST_PPM, MOST_PPM + step_ppm, step_ppm)
-    start = found.offset_s, found.path_m
+    start = alignment.offset_s, alignment.path_m
     best_ppm = float(drifts_ppm[int(np.argmax([power(ppm, *start) for ppm in drifts_ppm]))])
-    steps = np.array([found.offset_width_s / 2, max(found.path_width_m, 0.0) / 2, step_ppm])
+    steps = np.array([alignment.offset_width_s / 2, max(alignment.path_width_m, 0.0) / 2, step_ppm])
     free = np.flatnonzero(steps)
 
     def displaced(by: Floats) -> tuple[float, float, float]:
@@ -294,5 +294,5 @@ def estimate_drift(found: Alignment, echo: Recorded, log: Logged, point_m: Float
     offset_s, path_m, ppm = displaced(result.x)
     gain_db = decibels(-result.fun / max(power(0.0, *start), 1e-300))
     first_s = float(apply_drift(time_s, ppm)[0] - time_s[0])
-    report = {**found.report, "drift": f"peak {gain_db:.2f} dB higher than without drift"}
-    return replace(found, offset_s=offset_s + first_s, path_m=path_m, drift_ppm=ppm, report=report)
+    report = {**alignment.report, "drift": f"peak {gain_db:.2f} dB higher than without drift"}
+    return replace(alignment, offset_s=offset_s + first_s, path_m=path_m, drift_ppm=ppm, report=report)

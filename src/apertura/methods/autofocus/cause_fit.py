@@ -1,4 +1,4 @@
-"""Fit of one wrong quantity, as the only error of a flight, to all bright points, compared with errors of the logs."""
+"""Fit of one wrong quantity to all bright points, and comparison with the explanation by errors of the logs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,22 +12,22 @@ from apertura.methods.autofocus.solve import Gauge, Problem, prominent_point_sta
 from apertura.methods.causes import ARM, LEAST_GAIN_DB, Cause
 
 NEAR = 10.0
-"""Least difference of the objective between two causes, or between a cause and random tracks, to distinguish them."""
+"""Least difference of the objective that distinguishes two causes, or a cause from random tracks."""
 
 LEAST_EVIDENCE = 40.0
 """Least reduction of the objective by a cause together with errors of the logs, relative to errors of the logs alone.
-Of 54 flights without a cause one reached 26, at 4 cm and with three points; lever arms wrong by 20 cm reach 250 to
-1300."""
+The largest of 54 flights without a cause was 26, with log errors of 4 cm and three points; lever-arm errors of 20 cm
+give 250 to 1300."""
 
 CHANCES = 6
-"""Number of wrong tracks drawn at random for comparison, each with three unknowns like a lever arm."""
+"""Number of wrong tracks drawn at random for comparison, each with three unknowns, the same number as a lever arm."""
 
 _STAGES = 2  # iterations of caching contributions and maximising sharpness
 
 
 @dataclass(frozen=True, eq=False)
 class CausePrior(Prior):
-    """Prior of a flight whose tracks only a cause displaces.
+    """Prior of a flight whose tracks are displaced by a cause only.
 
     Attributes
     ----------
@@ -52,11 +52,11 @@ class CausePrior(Prior):
         return len(next(iter(self.shapes_m.values())))
 
     def tracks(self, unknowns: Floats) -> dict[str, Floats]:
-        """Return node → (..., knot, 3) float64 corrections, metres, of (..., size) unknowns."""
+        """Return node → (..., knot, 3) float64 corrections, metres, for (..., size) unknowns."""
         return {node: np.tensordot(unknowns, shape, axes=(-1, 0)) for node, shape in self.shapes_m.items()}
 
     def adjoint(self, gradient: Mapping[str, Floats]) -> Floats:
-        """Return (..., size) derivatives by the unknowns from derivatives by the corrections of each node."""
+        """Return (..., size) derivatives with respect to unknowns, from those with respect to nodes' corrections."""
         return np.asarray(
             sum(np.tensordot(gradient[node], shape, axes=((-2, -1), (1, 2))) for node, shape in self.shapes_m.items())
         )
@@ -75,7 +75,7 @@ class CauseFit:
     objective
         Objective of eq. 11.
     gain_db
-        Power that points gain by the correction, mean over points and pairs.
+        Mean power gain of points due to the correction, over points and pairs.
     alike
         Descriptions of other causes that explain the images equally well.
     """
@@ -99,7 +99,7 @@ class CauseFit:
         values = [alone.value(state, all_used, start.statistics) for state in states]
         best = int(np.argmin(values))
         state = states[best]
-        # Gain of points in dB, from √(Σ|I|⁴); the floor is for patches that their points leave.
+        # Gain of points in dB, from √(Σ|I|⁴); the floor is for patches from which the points are displaced.
         before, after = (
             np.array([np.sqrt(image.contrast) * image.energy for images in each.statistics for image in images])
             for each in (start, state)
@@ -110,7 +110,7 @@ class CauseFit:
 
     @property
     def what(self) -> str:
-        """Description of the cause and of equally good ones, one line."""
+        """Description of the cause and of equally good causes, one line."""
         return ", or ".join([self.cause.line(self.values), *self.alike])
 
     @property
@@ -119,7 +119,7 @@ class CauseFit:
         return 0.5 * float(((self.values / self.cause.std) ** 2).sum())
 
     def more(self, problem: Problem, axes: Floats) -> "CauseFit":
-        """Return the fit with the residual error added, fitted to a problem with logs corrected for this cause."""
+        """Return the fit plus the residual error, which is fitted to a problem with logs corrected for this cause."""
         residual = CauseFit.of(problem, self.cause, axes)
         if residual.gain_db <= 0:
             return self
@@ -127,7 +127,7 @@ class CauseFit:
         return replace(self, values=self.values + residual.values, correction=correction, gain_db=gain_db)
 
     def with_rest(self, rest: Refinement, evidence: float) -> Refinement:
-        """Return the refinement by this cause, followed by the refinement of the corrected logs if it is accepted.
+        """Return the refinement by this cause, followed by the refinement of the corrected logs if that is accepted.
 
         Parameters
         ----------
@@ -145,7 +145,7 @@ class CauseFit:
             "gain_db": round(self.gain_db, 2),
             "evidence": round(evidence, 1),
         }
-        rejected = {"refinement_rejected", "refinement_no_bright_point"}  # the cause alone is then corrected
+        rejected = {"refinement_rejected", "refinement_no_bright_point"}  # then only the cause is corrected
         flags = {name: text for name, text in rest.flags.items() if name not in rejected} | {"cause_corrected": line}
         return Refinement(total, rest.std_m, True, f"{line}; {rest.reason}", {**rest.report, "cause": report}, flags)
 
@@ -153,7 +153,7 @@ class CauseFit:
 def explained(
     problem: Problem, causes: Sequence[Cause], axes: Floats, generator: np.random.Generator
 ) -> CauseFit | None:
-    """Return the cause that explains the images best, of equally good ones the one with the fewest unknowns.
+    """Return the cause that explains the images best; of equally good causes, that with the fewest unknowns.
 
     The result is None if no cause gains `LEAST_GAIN_DB`, or random tracks explain the images equally well.
 
@@ -171,7 +171,7 @@ def explained(
     Notes
     -----
     Source: docs/theory/autofocus.md, eq. 16b. A cause has at most three unknowns and is fitted to all bright points of
-    all pairs; the gain of random tracks with as many unknowns is measured, not derived.
+    all pairs; the gain of random tracks with the same number of unknowns is measured, not derived.
     """
     fits = [CauseFit.of(problem, cause, axes) for cause in causes]
     lowest = min((fit.objective for fit in fits), default=np.inf)

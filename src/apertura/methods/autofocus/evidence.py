@@ -21,10 +21,10 @@ from apertura.methods.autofocus.solve import Problem, State
 
 
 MOST_RATIO = 1e3
-"""Peak-to-background power ratio above which neighbours of a point, not noise, limit the accuracy of its phase."""
+"""Peak-to-background power ratio above which neighbours of a point, instead of noise, limit its phase accuracy."""
 
 FOLDS = 4
-"""Folds of the cross-validation: a quarter of the patches is held out of a fit and validates it."""
+"""Number of folds of the cross-validation: a quarter of the patches is held out of each fit and validates it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Remaining:
     phase_rad
         Residual phase at the patches, rms.
     shift_m
-        Uncertainty of the image position, which only the logs and reference points determine, rms over patches.
+        Uncertainty of the image position, which is determined only by logs and reference points, rms over patches.
     """
 
     std_m: Mapping[str, Floats]
@@ -56,7 +56,7 @@ class Remaining:
 
 
 def remaining(problem: Problem, state: State) -> Remaining:
-    """Estimate the residual errors per knot from the logs' prior and all phases within an error's correlation time.
+    """Estimate the residual errors per knot from the logs' prior and from all phases within the correlation time.
 
     Notes
     -----
@@ -64,7 +64,7 @@ def remaining(problem: Problem, state: State) -> Remaining:
     """
     nodes, knots = problem.prior.nodes, len(problem.knots_s)
     columns_of = {node: slice(3 * number, 3 * number + 3) for number, node in enumerate(nodes)}
-    # Information on the errors of all nodes at each knot: from the logs, and from all phases within a correlation time.
+    # Information on the errors of all nodes at each knot, from the logs and from all phases within a correlation time.
     information = np.zeros((knots, 3 * len(nodes), 3 * len(nodes)))
     for node, prior in nodes.items():
         information[:, columns_of[node], columns_of[node]] += prior.axes.T @ np.diag(1 / prior.std_m**2) @ prior.axes
@@ -79,7 +79,7 @@ def remaining(problem: Problem, state: State) -> Remaining:
             if len(row):
                 information[patch.blocks] += 2 * ratio / len(row) * smooth * row[:, :, None] * row[:, None, :]
                 rows.append((patch.blocks, row))
-    # Residual covariance; the phase variances at the patches, and the standard deviations including the gauge's.
+    # Residual covariance, phase variances at the patches, and standard deviations including those of the gauge.
     covariance = np.linalg.inv(information)
     phase_variances = [np.einsum("bi,bij,bj->b", row, covariance[blocks], row).mean() for blocks, row in rows]
     gauge_tracks = problem.prior.tracks(problem.gauge.modes)
@@ -103,11 +103,12 @@ DOUBT = 2.0
 """Standard deviations subtracted from the mean gain."""
 
 _SCATTER, _SCATTER_DB, _DEGREES = 0.5, 0.5, 2
-"""Prior scatter of the gains: half of their mean, and 0.5 dB, with the weight of two patches. It dominates for few
-patches; for many the measured scatter does."""
+"""Prior scatter of the gains: half of their mean, and 0.5 dB, with the weight of two patches. The prior dominates with
+few patches, the measured scatter with many."""
 
 LEAST_FITTED_DB = 0.3
-"""Least contrast gain of fitted patches that are confirmed points, dB; a fit to noise gains 0.1 dB at 10 dB a pulse."""
+"""Least contrast gain of fitted patches that are confirmed points, dB; a fit to noise gains 0.1 dB at an SNR of 10 dB
+per pulse."""
 
 MOST_APART_SIGMA = 4.0
 """Largest disagreement of point positions between pairs, in standard deviations; more indicates cycle slips."""
@@ -116,17 +117,17 @@ PARTS = 8
 """Number of subapertures whose images of a point are compared in range to detect cycle slips."""
 
 _BY_CHANCE = 1e-3  # false alarm rate of the test of the configured log errors
-_SLACK = 1.5  # factor on the variance: the image does not fully determine its modes
-_REACH_CELLS, _STEPS = 3.0, 37  # search line for a point in range: range cells on either side, samples
-_SLIP_SIGMA = 4.0  # least shift in range of a slip, standard deviations
+_SLACK = 1.5  # factor on the variance, because the image does not fully determine its modes
+_REACH_CELLS, _STEPS = 3.0, 37  # search line for a point in range: range cells on either side; number of samples
+_SLIP_SIGMA = 4.0  # least shift in range of a cycle slip, standard deviations
 _NEARER, _NEARER_OF_FEW = 0.6, 0.75
-"""Least shift of a slip in wavelengths, of many and of few points: half a wavelength, and a margin for noise."""
+"""Least shift of a cycle slip, wavelengths, for many and for few points: half a wavelength plus a margin for noise."""
 _NOTHING = 1e-9  # floor of the contrast ratio, for a patch without echoes
 _SCATTERING_POINTS, _POINT_STD_CELLS = 3, 0.055
-"""Least number of points from whose scatter the deviation of a shift is estimated; and the deviation assumed for each
-point of fewer, in cells c/B of path, that of a point 20 dB above the noise of a subaperture."""
+"""Least number of points for estimating the standard deviation of a shift from their scatter; and the standard
+deviation assumed per point for fewer points, cells c/B of path: that of a point 20 dB above the subaperture's noise."""
 _DOMINATES = 4.0  # least peak power of a point in a subaperture image over the median of the search line
-_LEAST_SLOPE = 0.05  # least gradient of the path over ground: a point seen from all sides has no range direction
+_LEAST_SLOPE = 0.05  # least gradient of the path over ground: a point viewed from all sides has no range direction
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,18 +139,18 @@ class Evidence:
     fitted_db, held_out_db
         (pair, patch) float64, contrast gain of the fitted patches and of the held-out patches.
     settled
-        (mode,) float64, unknowns that the image alone determines; their variance is 1 if the errors of the logs are
+        (mode,) float64, unknowns that the image alone determines; they have unit variance if the errors of the logs are
         configured correctly.
     before, after
         Shifts of points in range between subapertures.
     wavelength_m
         Wavelength at the band centre.
     steady
-        Variance of the log-amplitude along the aperture: least of the pairs, most of the patches. A point that
-        dominates its cell has that of its noise, speckle 0.4. Infinite if the blocks are too few.
+        Variance of the log-amplitude along the aperture: maximum over patches of the minimum over pairs. It is that of
+        the noise for a point that dominates its cell, and 0.4 for speckle; infinite if there are too few blocks.
     apart_sigma
-        Disagreement of point positions between pairs that no tracks within the errors of the logs resolve, rms, in
-        standard deviations.
+        Rms disagreement of point positions between pairs, in standard deviations, that remains for all tracks within
+        the errors of the logs.
     """
 
     fitted_db: Floats
@@ -168,7 +169,7 @@ class Evidence:
 
     @property
     def believed(self) -> bool:
-        """True if held-out patches, or fitted patches that are confirmed points, show that the tracks are better."""
+        """True if the tracks significantly increase the contrast of held-out patches, or of fitted confirmed points."""
         points = self.steady <= MOST_INTERFERENCE and float(self.fitted_db.mean()) > LEAST_FITTED_DB
         return self.gain.certain or points
 
@@ -179,7 +180,7 @@ class Evidence:
 
     @property
     def promising(self) -> bool:
-        """True if fitted patches gained contrast or a slip was found; else the logs are as good as the tracks."""
+        """True if fitted patches gained contrast or a cycle slip was found; otherwise the logs are as good."""
         return bool(self.slip) or float(self.fitted_db.mean()) > LEAST_GAIN_DB
 
     @property
@@ -244,7 +245,7 @@ class Evidence:
 
     @property
     def flags(self) -> dict[str, str]:
-        """Flag → measured values, of exceeded limits."""
+        """Flag → measured values for exceeded limits."""
         flags = {} if self.accepted or not self.promising else {"refinement_rejected": self.reason}
         if self.inconsistent:
             flags["position_error_overstated" if self._motion_power < 1 else "position_error_understated"] = (
@@ -281,7 +282,7 @@ class MeanGain:
 
     @property
     def certain(self) -> bool:
-        """True if it exceeds `LEAST_GAIN_DB` by `DOUBT` standard deviations."""
+        """True if the gain exceeds `LEAST_GAIN_DB` by `DOUBT` standard deviations."""
         return self.mean_db - DOUBT * self.std_db > LEAST_GAIN_DB
 
 
@@ -290,7 +291,8 @@ def mean_gain(held_out_db: Floats) -> MeanGain:
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 16a. The images of a patch by several pairs share its neighbours: one sample.
+    Source: docs/theory/autofocus.md, eq. 16a. The images of a patch from several pairs count as one sample, because
+    they contain the same neighbours of the point.
 
     Examples
     --------
@@ -307,7 +309,7 @@ def mean_gain(held_out_db: Floats) -> MeanGain:
 
 
 def unsteady(initial: State, state: State) -> float:
-    """Return the log-amplitude variance along the aperture at the patches' peaks: least of pairs, most of patches.
+    """Return the log-amplitude variance along the aperture at the patches' peaks: least of pairs, largest of patches.
 
     Parameters
     ----------
@@ -316,8 +318,8 @@ def unsteady(initial: State, state: State) -> float:
 
     Notes
     -----
-    Source: docs/theory/focus.md, eq. 1. Blocks are averaged along the logs, as `point_focus` averages pulses: fitted
-    phases would make averages of speckle steady, although no fit changes the amplitudes.
+    Source: docs/theory/focus.md, eq. 1. Blocks are averaged along the logged tracks, as `point_focus` averages pulses:
+    with fitted phases, averages of speckle would be steady as well, although no fit changes the amplitudes.
     """
     worst = []
     for number in range(len(state.images[0])):
@@ -330,7 +332,7 @@ def unsteady(initial: State, state: State) -> float:
 
 
 def steadiness(along: NDArray[np.complex128]) -> float:
-    """Return the log-amplitude variance of contributions (block,): the least over averages of 1, 2, 4, … blocks."""
+    """Return the log-amplitude variance of contributions (block,): the minimum over averages of 1, 2, 4, … blocks."""
     least = float("inf")
     while len(along) >= LEAST_BLOCKS:
         amplitude = np.abs(along)
@@ -341,7 +343,7 @@ def steadiness(along: NDArray[np.complex128]) -> float:
 
 
 def gains_db(before: Sequence[Sequence[PatchImage]], after: Sequence[Sequence[PatchImage]]) -> Floats:
-    """Return (pair, patch) float64, the growth of the contrast Σ|I|⁴/(Σ|I|²)² in dB.
+    """Return (pair, patch) float64, the increase of the contrast Σ|I|⁴/(Σ|I|²)² in dB.
 
     Examples
     --------
@@ -384,7 +386,7 @@ class RangeShifts:
 
     @cached_property
     def std_m(self) -> Floats:
-        """(pair, part) float64, standard deviation of the shift: from the scatter of points, or assumed for few."""
+        """(pair, part) float64, standard deviation of the shift: from the points' scatter; assumed for few points."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
             spread = 1.4826 * np.nanmedian(np.abs(self.by_point_m - self.shift_m[:, None]), axis=1)
@@ -398,7 +400,7 @@ class RangeShifts:
         return round(float(np.sqrt((known**2).mean())), 5) if known.size else None
 
     def slipped(self, wavelength_m: float) -> NDArray[np.bool_]:
-        """Return (pair, part) bool, True for subapertures shifted significantly closer to a wavelength than to 0."""
+        """Return (pair, part) bool, True where the shift is significantly closer to a wavelength than to 0."""
         size_m = np.abs(self.shift_m)
         least = np.where(self.points < _SCATTERING_POINTS, _NEARER_OF_FEW, _NEARER)
         consistent = (self.points > 0) & (self.std_m < wavelength_m / 2 / np.sqrt(np.maximum(self.points, 1)))
@@ -436,7 +438,7 @@ def range_shifts(problem: Problem, state: State, axes: Floats, *, parts: int = P
 def _of_most(shifts_m: Floats, within_m: float) -> Floats:
     """Return (pair, patch, 1), the mean shift of the largest set of subapertures that agree within `within_m`.
 
-    It is the offset of the delay from the brightest pixel, common to all subapertures.
+    This is the offset of the delay from the brightest pixel, which is common to all subapertures.
     """
     near = np.abs(shifts_m[..., None] - shifts_m[..., None, :]) < within_m
     most = np.take_along_axis(near, near.sum(axis=-1).argmax(axis=-1)[..., None, None], axis=-2)[..., 0, :]

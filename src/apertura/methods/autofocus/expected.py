@@ -1,4 +1,4 @@
-"""Expected outcome of a refinement before a flight: measured limits of docs/theory/autofocus.md, "Where it ends"."""
+"""Prediction of a refinement before a flight, from measured limits of docs/theory/autofocus.md, "Where it ends"."""
 
 import math
 from collections.abc import Iterable
@@ -6,16 +6,17 @@ from collections.abc import Iterable
 from apertura.methods.autofocus.inputs import TrackErrors
 
 LARGEST_ERROR_WAVES = 0.19
-"""Standard deviation of positions per axis, in wavelengths, above which refinements fail: 4 cm at 21 cm."""
+"""Standard deviation of positions per axis, in wavelengths, above which refinements fail: 4 cm at a wavelength of
+21 cm."""
 
 SHORTEST_ERROR_S, SHORTEST_ERROR_PULSES = 0.5, 10
-"""Correlation time of position errors below which refinements fail, seconds and pulses."""
+"""Correlation time of position errors below which refinements fail, in seconds and in pulses."""
 
 LEAST_POINTS, LEAST_SNR_DB = 3, 10.0
 """Number of bright points in the scene, and single-pulse SNR of each, at which refinements succeeded."""
 
 _REMAINDERS_DB = ((0.096, -0.3), (LARGEST_ERROR_WAVES, -0.5))
-"""Position error in wavelengths → residual loss at points outside the fit: 2 and 4 cm at 21 cm."""
+"""Position error in wavelengths → residual loss at points outside the fit; measured with 2 and 4 cm at 21 cm."""
 
 
 def expected_remainder(
@@ -35,9 +36,9 @@ def expected_remainder(
     Returns
     -------
     loss_db
-        Loss by position errors after the refinement, 0 or less; NaN if a limit is exceeded.
+        Loss due to position errors after the refinement, 0 or less; NaN if a limit is exceeded.
     obstacles
-        Measured limits that the flight exceeds, one phrase each; empty if none is exceeded.
+        Measured limits that the flight exceeds, one phrase for each limit.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Refinement of tracks by the coherence of speckle between two pairs at equal spatial frequencies of the ground."""
+"""Refinement of tracks by the coherence of speckle between two pairs at equal spatial frequencies of the terrain."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 
 MOST_TILES = 64
-"""Maximum number of tiles; of a larger scene the tiles about its middle are used."""
+"""Maximum number of tiles; if a scene has more, the tiles about its centre are used."""
 
 SAMPLING = 0.85
-"""Pixel density relative to the Nyquist rate of the image; below 1, as products of two images are only summed."""
+"""Pixel density relative to the Nyquist rate of the image; less than 1 suffices, as products of images are summed."""
 
 _CELLS_WIDE = 2.5  # width of a tile, in cross-range cells of the aperture flown within a correlation time
 _STEPS = 64  # pulses sampled for the size and pixels of a tile
@@ -41,7 +41,7 @@ class SpeckleTile:
     Attributes
     ----------
     patch
-        Middle and pixels of the tile.
+        Centre and pixels of the tile.
     sides_m
         (2, 3) float64, vectors from the northern to the southern and from the western to the eastern edge, metres in
         the frame.
@@ -79,8 +79,8 @@ def tiles(
     >>> silent = np.zeros((200, 100), np.complex64)
     >>> profiles = Profiles(silent, np.full(200, 20.0), 0.366, 1.4e9, 2.0, Aperture(track, track))
     >>> grid = SceneGrid("local", -9.0, 24.0, 0.5, (36, 36))
-    >>> found = tiles([PairRecord("a-a", profiles, time_s)], grid, FlatGround(0.0), correlation_s=1.0)
-    >>> len(found), found[0].sides_m.round(1).tolist()
+    >>> scene_tiles = tiles([PairRecord("a-a", profiles, time_s)], grid, FlatGround(0.0), correlation_s=1.0)
+    >>> len(scene_tiles), scene_tiles[0].sides_m.round(1).tolist()
     (9, [[0.0, -6.0, 0.0], [6.0, 0.0, 0.0]])
     """
     middle = terrain.positions_at(grid, (grid.shape[0] - 1) / 2, (grid.shape[1] - 1) / 2)
@@ -99,7 +99,7 @@ def tile_side_m(place_m: Floats, records: Sequence[PairRecord], *, correlation_s
     Parameters
     ----------
     place_m
-        (3,) float64, middle of the scene, metres in the frame.
+        (3,) float64, scene centre, metres in the frame.
     records
         Records of all pairs.
     correlation_s
@@ -146,10 +146,10 @@ def _tile(
     return SpeckleTile(Patch(place, pixels.reshape(-1, 3)), sides_m)
 
 
-# ---- Coherence of two pairs at equal spatial frequencies of the ground ----------------------------------------------
+# ---- Coherence of two pairs at equal spatial frequencies of the terrain ---------------------------------------------
 
 WEIGHT = 0.2
-"""Weight of a resolution cell that two pairs share in the objective; docs/theory/autofocus.md, "Speckle"."""
+"""Weight in the objective of a resolution cell that two pairs share; docs/theory/autofocus.md, "Speckle"."""
 
 _BLOCKS = 64  # blocks of the first pair that are multiplied at once with overlapping blocks of the second
 
@@ -161,15 +161,15 @@ class TileCoherence:
     Attributes
     ----------
     product
-        (block of the first, block of the second) sparse complex64: Σ conj(B)·B' over the tile, divided by the energy
-        of its two images and weighted by the spatial frequencies that both blocks share.
+        (block of the first pair, block of the second pair) sparse complex64: Σ conj(B)·B' over the tile, divided by the
+        energy of the two images of the tile and weighted by the spatial frequencies that both blocks share.
     cells
-        Effective number of resolution cells: all cells of a speckle tile; few if a point dominates, as the spatial
-        frequencies of a point are not independent.
+        Effective number of resolution cells: all cells of a tile with speckle; few if a point dominates the tile, as
+        the spatial frequencies of a point are not independent.
     brightness
         Mean power of both images.
     contributions
-        Blocks of each pair that illuminate the tile and their path gradients, without values.
+        Blocks of each pair that illuminate the tile, and their path gradients; the values are omitted.
     """
 
     product: "csr_array"
@@ -179,7 +179,7 @@ class TileCoherence:
 
     @classmethod
     def of(cls, tile: SpeckleTile, first: Contribution, second: Contribution) -> "TileCoherence":
-        """Return the coherence of a tile from the contributions of two pairs, along their cached tracks."""
+        """Return the coherence of a tile from the cached contributions of two pairs."""
         powers = np.stack([np.abs(one.values.sum(axis=1)).astype(np.float64) ** 2 for one in (first, second)])
         energy = np.maximum(powers.sum(axis=1), 1e-300)
         even = 2 * energy**2 / np.maximum((powers**2).sum(axis=1), 1e-300)
@@ -196,7 +196,7 @@ class TileCoherence:
     def coherence(self, moved: Sequence[Tracks]) -> tuple[complex, list[NDArray[np.complex64]]]:
         """Return the coherence Σ conj(I)·I', normalised by the energies, and the share of each block of both pairs.
 
-        `moved` contains the displacements of the nodes of each pair, node → (block, 3), metres.
+        `moved` contains the displacements of the nodes of each pair, node → (block, 3) metres.
         """
         first, second = (
             np.exp(sign * 1j * phases(contribution, one)).astype(np.complex64)
@@ -209,14 +209,14 @@ class TileCoherence:
 def _product(tile: SpeckleTile, first: Contribution, second: Contribution) -> "csr_array":
     """Return (block, block) complex64, O ∘ BᴴB' of eq. 21.
 
-    O is 1 for two blocks with the same direction of view and 0 from the angular resolution of the tile on. Only blocks
-    that share spatial frequencies are multiplied and stored; their number per block does not depend on the length of
-    the flight.
+    O is 1 for two blocks with the same direction of view, and 0 if the directions differ by the angular resolution of
+    the tile or more. Only blocks that share spatial frequencies are multiplied and stored; their number per block does
+    not depend on the length of the flight.
     """
     from scipy.sparse import csr_array  # slow to import
 
-    # Spatial frequencies k·g of each block, cycles over the tile's sides, (block, 2); `across` is the unit normal of
-    # those of the first pair, along which those of the second are compared.
+    # Spatial frequencies k·g of each block, cycles over the tile's sides, (block, 2); `across` is the unit normal to
+    # the frequencies of the first pair, along which the frequencies of the second are compared.
     cycles = [one.wavenumber / (2 * np.pi) * sum(one.slopes.values()) @ tile.sides_m.T for one in (first, second)]
     across = cycles[0][:, ::-1] * [-1, 1] / np.linalg.norm(cycles[0], axis=1, keepdims=True)
     along = np.sum(across * cycles[0], axis=1)[:, None]
@@ -263,7 +263,7 @@ class SpeckleAgreement:
     weight: float = WEIGHT
 
     def __call__(self, tracks: Tracks) -> tuple[float, dict[str, Floats]]:
-        """Return the value and its derivatives by the corrections, node → (knot, 3)."""
+        """Return the value and its derivatives with respect to the corrections, node → (knot, 3)."""
         moved, coherences = self._evaluate(tracks)
         total = sum(tile.cells * coherence for tile, (coherence, _) in zip(self.tiles, coherences, strict=True))
         rotation = np.exp(-1j * np.angle(total))
@@ -315,7 +315,7 @@ class SpeckleTiles:
         return cls(pairs, tiles, [blocks.echoes([tile.patch for tile in tiles]) for blocks in pairs])
 
     def agreements(self, tracks: Tracks, used: NDArray[np.bool_] | None = None) -> list[SpeckleAgreement]:
-        """Return the coherence objective of every two pairs on the used tiles, with node → (knot, 3) corrections."""
+        """Return the coherence objective of every two pairs on the used tiles; corrections are node → (knot, 3)."""
         moved = [blocks.moves(tracks) for blocks in self.pairs]
         coherences: dict[tuple[int, int], list[TileCoherence]]
         coherences = {pairs: [] for pairs in combinations(range(len(self.pairs)), 2)}
@@ -337,9 +337,9 @@ class SpeckleTiles:
     def _weighted_by_brightness(
         self, coherences: Sequence[TileCoherence], pair: int, used: NDArray[np.bool_] | None
     ) -> list[TileCoherence]:
-        """Return the tiles with the cells of dark tiles reduced, as sidelobes of brighter tiles cover them.
+        """Return the tiles with fewer cells for dark tiles, in which sidelobes of brighter tiles may dominate.
 
-        Brightness is corrected for the squares of both distances, by which echoes fall off.
+        Brightness is corrected for the decrease of echo power with the squares of both distances.
         """
         brightness = []
         for coherence, tile in zip(
@@ -358,16 +358,16 @@ class SpeckleTiles:
 
 
 LEAST_COHERENCE = 0.75
-"""Least coherence of held-out tiles, 0 to 1; tracks with errors of cycles reach less."""
+"""Least coherence of held-out tiles, 0 to 1; tracks with errors of a cycle or more do not reach it."""
 
 LEAST_GAIN = 0.1
-"""Least growth of the coherence of held-out tiles."""
+"""Least increase of the coherence of held-out tiles."""
 
 LEAST_EVEN = 0.25
-"""Least share of resolution cells that contribute speckle; sidelobes of a few points may agree for wrong tracks."""
+"""Least share of resolution cells that contribute speckle; sidelobes of few points may be coherent for wrong tracks."""
 
 LEAST_TILES = 8
-"""Least number of tiles, which provides some for validation."""
+"""Least number of tiles, some of which are held out for validation."""
 
 _STAGES, _ITERATIONS = 2, 15  # rounds of caching contributions; steps of L-BFGS-B in each round
 _HELD_OUT = 4  # every fourth tile is held out of the fit
@@ -384,7 +384,7 @@ class SpeckleEvidence:
     tiles
         Number of tiles.
     even
-        Effective share of resolution cells, which contribute speckle.
+        Effective share of resolution cells that contribute speckle.
     """
 
     before: float
@@ -425,8 +425,8 @@ def refined_by_speckle(ground: SpeckleTiles, prior: Prior, knots_s: Floats) -> R
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, "Speckle". The standard deviations are those of the logs; eq. 23 would reduce
-    them by no more than a half.
+    Source: docs/theory/autofocus.md, "Speckle". The returned standard deviations are those of the logs; eq. 23 would
+    reduce them by at most a half.
     """
     unrefined, count = np.zeros(prior.size), len(ground.tiles)
     std_m = {
@@ -463,10 +463,9 @@ def _solved(ground: SpeckleTiles, prior: Prior, used: Bools) -> Floats:
         agreements = ground.agreements(prior.tracks(unknowns), used)
 
         def value(tracks: Tracks, every: Sequence[SpeckleAgreement] = agreements) -> tuple[float, dict[str, Floats]]:
-            found = [one(tracks) for one in every]
-            return sum(one for one, _ in found), {
-                node: np.sum([by[node] for _, by in found], axis=0) for node in tracks
-            }
+            evaluated = [agreement(tracks) for agreement in every]
+            gradient = {node: np.sum([by_node[node] for _, by_node in evaluated], axis=0) for node in tracks}
+            return sum(of_pairs for of_pairs, _ in evaluated), gradient
 
         unknowns = minimise(value, prior, Gauge.none(prior.size), unknowns, iterations=_ITERATIONS)
     return unknowns

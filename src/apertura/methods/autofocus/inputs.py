@@ -29,8 +29,8 @@ class PairRecord:
     time_s
         (pulse,) float64, seconds of the flight's clock, common to all pairs.
     sidelink_m
-        (pulse, 3) float64, logged vector from the receiver's sidelink antenna to the transmitter's, metres; None if
-        delays are not measured relative to a sidelink.
+        (pulse, 3) float64, logged vector from the receiver's sidelink antenna to that of the transmitter, metres; None
+        if delays are not measured relative to a sidelink.
     beams
         Antenna weights of pulses in the image; None for equal weights.
     """
@@ -48,13 +48,13 @@ class PairRecord:
         return tx, rx
 
     def extreme_errors(self, errors: Mapping[str, "TrackErrors"]) -> tuple[float, float]:
-        """Return the shortest correlation time of the nodes' errors, s, and the phase of the largest error, rad rms."""
+        """Return the shortest correlation time of the nodes' errors, s, and the rms phase of the largest, rad."""
         of_nodes = [errors[node] for node in self.nodes]
         largest_m = max(max(error.std_m) for error in of_nodes)
         return min(error.correlation_s for error in of_nodes), 2 * self.profiles.wavenumber_rad_m * largest_m
 
     def moved(self, correction: TrackCorrection) -> Profiles:
-        """Return the profiles over corrected tracks (docs/theory/autofocus.md, eq. 3)."""
+        """Return the profiles along corrected tracks (docs/theory/autofocus.md, eq. 3)."""
         aperture = correction.aperture(self.profiles.aperture, self.pair, self.time_s)
         return self.profiles.moved(aperture, correction.longer_m(self.pair, self.time_s, self.sidelink_m))
 
@@ -133,7 +133,7 @@ class NodePrior:
     axes
         (3, 3) float64, rows are the unit vectors east, north, up in the frame of the phase centres.
     smooth
-        w, correlation time in knots.
+        Correlation time w in knots.
     slow
         (knot, mode) float64, slow modes scaled by their standard deviation; no columns without a slow error.
 
@@ -172,7 +172,7 @@ class NodePrior:
         return 3 * (self.knots + self.smooth - 1 + int(self.slow.shape[1]))
 
     def tracks(self, unknowns: Floats) -> Floats:
-        """Return (..., knot, 3) float64 corrections, metres in the frame, of (..., size) unknowns."""
+        """Return (..., knot, 3) float64 corrections, metres in the frame, for (..., size) unknowns."""
         white = unknowns.reshape(*unknowns.shape[:-1], -1, 3)
         noise, slow = white[..., : self.knots + self.smooth - 1, :], white[..., self.knots + self.smooth - 1 :, :]
         total = np.cumsum(np.concatenate([np.zeros_like(noise[..., :1, :]), noise], axis=-2), axis=-2)
@@ -180,7 +180,7 @@ class NodePrior:
         return np.asarray((smoothed * self.std_m + self.slow @ slow) @ self.axes)
 
     def adjoint(self, gradient: Floats) -> Floats:
-        """Return (..., size) derivatives by the unknowns from (..., knot, 3) derivatives by the corrections."""
+        """Return (..., size) derivatives with respect to unknowns, from those by corrections, (..., knot, 3)."""
         along_axes = gradient @ self.axes.T
         scaled = along_axes * self.std_m / np.sqrt(self.smooth)
         nothing = np.zeros((*scaled.shape[:-2], self.smooth, 3))
@@ -208,11 +208,11 @@ class Prior:
         return sum(node.size for node in self.nodes.values())
 
     def tracks(self, unknowns: Floats) -> dict[str, Floats]:
-        """Return node → (..., knot, 3) float64 corrections, metres, of (..., size) unknowns."""
+        """Return node → (..., knot, 3) float64 corrections, metres, for (..., size) unknowns."""
         return {name: node.tracks(unknowns[..., part]) for (name, node), part in self._parts()}
 
     def adjoint(self, gradient: Mapping[str, Floats]) -> Floats:
-        """Return (..., size) derivatives by the unknowns from derivatives by the corrections of each node."""
+        """Return (..., size) derivatives with respect to unknowns, from those with respect to nodes' corrections."""
         return np.concatenate([node.adjoint(gradient[name]) for name, node in self.nodes.items()], axis=-1)
 
     def _parts(self) -> list[tuple[tuple[str, NodePrior], slice]]:

@@ -1,4 +1,4 @@
-"""Plausible clock offsets from the motion of a node: logged speeds against pulse-to-pulse changes of the echoes."""
+"""Plausible clock offsets of a node, from logged speeds correlated with pulse-to-pulse changes of the echoes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from apertura.common.arrays import Complexes, Floats
 from apertura.core.geometry.aperture import Aperture
 
 PhaseCentres = Callable[[Floats], Aperture]
-"""Seconds of the log's clock (time,), inside the log → phase centres."""
+"""Function of times (time,) inside the log, seconds of its clock, that returns phase centres."""
 
 LEAST_COVERED = 0.5
 """Least share of the pulses inside the log."""
@@ -57,7 +57,7 @@ class Recorded:
         return self.wave_speed_m_s / float(self.frequency_hz[-1])
 
     def moving(self) -> "Recorded":
-        """Return the echoes without the mean of all pulses, which contains coupling and echoes at rest."""
+        """Return the echoes minus the mean of all pulses, which contains coupling and echoes at a constant delay."""
         return replace(self, transfer=self.transfer - self.transfer.mean(axis=0))
 
 
@@ -92,7 +92,7 @@ class Logged:
 
 
 def plausible_offsets(echo: Recorded, log: Logged, within_s: tuple[float, float]) -> tuple[float, float]:
-    """Return the smallest and largest clock offset at which logged motion matches changes of the echoes, seconds.
+    """Return the smallest and largest clock offset at which the logged motion matches changes of the echoes, seconds.
 
     Parameters
     ----------
@@ -109,8 +109,8 @@ def plausible_offsets(echo: Recorded, log: Logged, within_s: tuple[float, float]
     Notes
     -----
     Source: docs/theory/tracks.md, "Clock of the recorder". The difference between consecutive pulses is correlated with
-    the logged displacement between them, limited to the distance beyond which pulses are uncorrelated. Uniform motion
-    excludes no offset.
+    the logged displacement between them, limited to the distance beyond which pulses are uncorrelated. If the motion is
+    uniform, no offset is excluded.
     """
     # |H_p − H_{p−1}|/|H_p|, between pulses, and the node's speed on a grid of the log's times.
     change = np.linalg.norm(np.diff(echo.transfer, axis=0), axis=1) / np.linalg.norm(echo.transfer[1:], axis=1)
@@ -121,7 +121,7 @@ def plausible_offsets(echo: Recorded, log: Logged, within_s: tuple[float, float]
     offsets_s = np.arange(within_s[0], within_s[1] + step_s / 2, step_s)
     correlation = np.full(len(offsets_s), -1.0)
     changed = np.log(np.maximum(change, 1e-12))
-    # Correlation of its logarithm with min(4π·v(t + δ)·Δt/λ, 1) at each offset; −1 if the log covers too few pulses.
+    # Correlation of the logarithm with min(4π·v(t + δ)·Δt/λ, 1) at each offset; −1 if the log covers too few pulses.
     for number, offset_s in enumerate(offsets_s):
         kept = log.inside(middle_s + offset_s)
         if kept.mean() < LEAST_COVERED:
@@ -133,9 +133,9 @@ def plausible_offsets(echo: Recorded, log: Logged, within_s: tuple[float, float]
     covered = np.array([log.inside(echo.time_s + offset_s).mean() >= LEAST_COVERED for offset_s in offsets_s])
     if not covered.any():
         raise ValueError("no offset puts half of the pulses inside the log")
-    # Offsets within three deviations, (1 − r²)/√n, of the best correlation r.
+    # Offsets within three standard deviations, (1 − r²)/√n, of the best correlation r.
     best = float(correlation.max())
-    independent = max(4.0, len(change) * float(np.median(interval_s)) * 4)  # samples: motion is correlated over 0.25 s
+    independent = max(4.0, len(change) * float(np.median(interval_s)) * 4)  # samples; motion correlates over 0.25 s
     std = (1 - max(best, 0.0) ** 2) / np.sqrt(independent)
     kept = offsets_s[covered & (correlation >= best - _SIGMA * std)] if best > _SIGMA * std else offsets_s[covered]
     margin_s = _MARGIN * step_s

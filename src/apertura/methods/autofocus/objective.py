@@ -28,7 +28,7 @@ _MARGIN = 10  # range samples beyond a patch, for interpolation and for displace
 
 @dataclass(frozen=True, eq=False)
 class PatchEcho:
-    """Echoes of a patch, summed over the pulses of each illuminating block of a pair with focus on the patch's middle.
+    """Echoes of a patch, summed over the pulses of each illuminating block of a pair with focus on the patch centre.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class PatchEcho:
     blocks
         Illuminating blocks of the pair.
     profiles
-        Range profiles about the patch, one virtual pulse per block at the mean position of its pulses.
+        Range profiles about the patch: one virtual pulse per block, at the mean position of the block's pulses.
     """
 
     patch: Patch
@@ -114,7 +114,7 @@ class Blocks:
         Notes
         -----
         Source: docs/theory/autofocus.md, eq. 9: within a patch, path differences between the pulses of a block are
-        those at the patch's middle.
+        approximated by those at the patch centre.
         """
         profiles, beams, edges = self.record.profiles, self.record.beams, self.edges
         starts = [self._offsets(patch) for patch in patches]
@@ -138,7 +138,7 @@ class Blocks:
         return [self._echo(*arguments) for arguments in zip(patches, starts, sums, strict=True)]
 
     def _offsets(self, patch: Patch) -> Floats:
-        """Return (sample,) float64, path offsets that cover a patch about its middle, metres of total path."""
+        """Return (sample,) float64, path offsets that cover a patch about its centre, metres of total path."""
         pulses = self.record.profiles.aperture.sample(64)
         aperture, step_m = self.record.profiles.aperture[pulses], self.record.profiles.step_m
         corners = patch.pixels_m[:: max(1, len(patch.pixels_m) - 1)]
@@ -175,7 +175,7 @@ class Blocks:
             length = np.linalg.norm(corrected, axis=1)
             extra_path_m = length - np.linalg.norm(between, axis=1)
             along = corrected / np.maximum(length, 1e-9)[:, None]
-        # Slopes ∂ρ/∂m of eq. 2: unit vectors from the patch to the antennas, ∓s for the sidelink.
+        # Slopes ∂ρ/∂m of eq. 2: unit vectors from the patch to the antennas, and ∓s for the sidelink.
         away = [leg - echo.patch.place_m for leg in aperture.legs]
         unit = [vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-9) for vector in away]
         slopes = {tx: unit[0] + unit[1]} if tx == rx else {tx: unit[0] - along, rx: unit[1] + along}
@@ -201,7 +201,7 @@ class Contribution:
     blocks
         Illuminating blocks of the pair.
     slopes
-        Node → (block, 3) float64, gradient of the path to the patch by the node's position (eq. 2).
+        Node → (block, 3) float64, gradient of the path to the patch with respect to the node's position (eq. 2).
     wavenumber
         2πf_mid/c, rad/m.
     band
@@ -235,7 +235,7 @@ def _towards(
 MOST_WEIGHT = 1e4  # largest weight of a patch, which limits the influence of one bright point (eq. 11)
 _WEIGHT_OF_RATIO = 3.0  # weight of a patch per peak-to-background power ratio (eq. 11)
 _SIDELOBES = 1e-3
-"""Relative power of a point's sidelobes outside its patch, of an unweighted aperture with any tracks."""
+"""Relative power of a point's sidelobes outside its patch, for an unweighted aperture and any tracks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +260,7 @@ class PatchImage:
     def of(cls, image: NDArray[np.complex64], brightest: float = 0.0) -> "PatchImage":
         """Return the statistics of an image (pixel,); `brightest` is the largest pixel power of all patches."""
         power = np.abs(image).astype(np.float64) ** 2
-        energy = max(float(power.sum()), 1e-150)  # its square must not underflow for pulses without echoes
+        energy = max(float(power.sum()), 1e-150)  # squared below: must not underflow for pulses without echoes
         background = max(float(np.median(power)) / np.log(2), _SIDELOBES * brightest, 1e-300)
         return cls(energy, float((power**2).sum()) / energy**2, float(power.max()) / background)
 
@@ -299,7 +299,7 @@ class Sharpness:
     used: NDArray[np.bool_]
 
     def __call__(self, tracks: Tracks) -> tuple[float, dict[str, Floats]]:
-        """Return the value and its derivatives by the corrections, node → (knot, 3)."""
+        """Return the value and its derivatives with respect to the corrections, node → (knot, 3)."""
         total = 0.0
         gradient = {node: np.zeros_like(track) for node, track in tracks.items()}
         for blocks, patches, statistics in zip(self.pairs, self.cached, self.statistics, strict=True):
@@ -317,7 +317,7 @@ class Sharpness:
 
 
 def phases(patch: Contribution, moved: Tracks) -> Floats:
-    """Return (block,) float64, phase change of the contributions by the displacements of the nodes, rad."""
+    """Return (block,) float64, phase change of the contributions due to displacements of the nodes, rad."""
     path = np.zeros(patch.blocks.stop - patch.blocks.start)
     for node, slope in patch.slopes.items():
         path += np.einsum("bi,bi->b", slope, moved[node][patch.blocks])
@@ -325,7 +325,7 @@ def phases(patch: Contribution, moved: Tracks) -> Floats:
 
 
 def _patch(patch: Contribution, cached: PatchImage, moved: Tracks) -> tuple[float, Floats]:
-    """Return the objective of a patch and its derivative by the phase of each block."""
+    """Return the objective of a patch and its derivative with respect to the phase of each block."""
     rotation = np.exp(1j * phases(patch, moved)).astype(np.complex64)
     image = patch.values @ rotation  # I = B e^{jθ}
     power = (image.real**2 + image.imag**2).astype(np.float64)

@@ -12,21 +12,21 @@ from apertura.common.arrays import Floats
 from apertura.core.quality.path_errors import PointPaths
 from apertura.methods.autofocus.inputs import NodePrior, TrackErrors
 
-# ---- Space variance: path errors at the scene's edges relative to its middle ----------------------------------------
+# ---- Space variance: path errors at the scene edges relative to the scene centre ------------------------------------
 
 
 MOST_LOSS_DB = 0.1
-"""Largest peak loss at the scene's edges for which one phase per pulse suffices, dB."""
+"""Largest peak loss at the scene edges for which one phase per pulse suffices, dB."""
 
 
 @dataclass(frozen=True)
 class SpaceVariance:
-    """Residual path errors at points of a scene after correction by the path errors at its middle.
+    """Residual path errors at points of a scene after correction by the path errors at the scene centre.
 
     Attributes
     ----------
     residual_rad
-        Residual phase, rms over pulses and points.
+        Residual phase in radians, rms over pulses and points.
     loss_db
         Peak loss, mean over the points, 0 or less; errors that only shift a point are excluded.
     """
@@ -36,7 +36,7 @@ class SpaceVariance:
 
     @property
     def method(self) -> Literal["one_phase", "tracks"]:
-        """Simplest sufficient method."""
+        """Simplest sufficient method of autofocus."""
         return "one_phase" if self.loss_db >= -MOST_LOSS_DB else "tracks"
 
     @property
@@ -49,16 +49,16 @@ class SpaceVariance:
 
 
 def space_variance(middle: PointPaths, points_m: Floats, errors: Sequence[TrackErrors]) -> SpaceVariance:
-    """Estimate the residual errors at points after correction by one phase per pulse, that of the scene's middle.
+    """Estimate the residual errors at points after correction by one phase per pulse, the phase at the scene centre.
 
     Parameters
     ----------
     middle
-        Paths of a pair to the middle of the scene.
+        Paths of a pair to the scene centre.
     points_m
         (point, 3) float64, corners of the scene, metres in the frame of the phase centres.
     errors
-        Error statistics of the logs: one for a monostatic pair, else those of transmitter and receiver.
+        Error statistics of the logs: one for a monostatic pair, otherwise those of transmitter and receiver.
 
     Notes
     -----
@@ -97,14 +97,14 @@ def _at(middle: PointPaths, point_m: Floats, errors: Sequence[TrackErrors]) -> t
 # ---- Estimators of one phase per block: phase gradient and minimum entropy ------------------------------------------
 
 Patches = Sequence[NDArray[np.complex64]]
-"""Block contributions to the pixels of each patch, (pixel, block)."""
+"""Block contributions to the pixels, (pixel, block), one array for each patch."""
 
 _SHRINK = 0.7  # ratio of the window widths of consecutive passes
-_EDGE_DB, _WIDER = 10.0, 1.5  # least window: extent of the blurred points down to this level, times this factor
+_EDGE_DB, _WIDER = 10.0, 1.5  # least window: extent of the blurred points down to this level, and factor applied to it
 _LEAST_VARIANCE = 0.02  # floor of a line's amplitude variance relative to its squared mean
 _SETTLED_RAD = 0.05  # rms phase change below which the passes stop
 _MOST_PASSES = 30  # maximum passes of phase gradient
-_CHOICES = 2  # selections of the brightest pixels: from the initial and from the sharpened image
+_CHOICES = 2  # selections of the brightest pixels: one in the initial image, one in the sharpened image
 _MOST_STEPS = 100  # maximum steps of L-BFGS-B in minimum entropy
 
 
@@ -137,7 +137,7 @@ def phase_gradient(patches: Patches) -> Floats:
     cycles = np.abs(np.fft.fftfreq(2 * count, 1 / count))
     phase, window = np.zeros(count), float(count)
     for _ in range(_MOST_PASSES):
-        # Window about each line's point: 0.7 of the previous width, but no narrower than the blurred point.
+        # Window about the point of each line: 0.7 of the previous width, but no narrower than the blurred point.
         spectrum = np.fft.fft(_lines(patches, phase), 2 * count, axis=1)
         least = _spread(spectrum, cycles)
         is_narrow = window <= least
@@ -180,7 +180,7 @@ def minimum_entropy(patches: Patches) -> Floats:
 
 
 def entropy(lines: NDArray[np.complex128], phase: Floats) -> tuple[float, Floats]:
-    """Return the entropy of image lines and its derivative by the phase of each block.
+    """Return the entropy of image lines and its derivative with respect to the phase of each block.
 
     Parameters
     ----------
@@ -233,7 +233,7 @@ def _spread(spectrum: NDArray[np.complex128], cycles: Floats) -> float:
 
 
 def _amplitude_variance(windowed: NDArray[np.complex128]) -> Floats:
-    """Return (line, 1), amplitude variance of each line, caused by clutter and noise in addition to its point."""
+    """Return (line, 1), the amplitude variance of each line that clutter and noise cause in addition to the point."""
     level = np.abs(windowed)
     return np.asarray(level.var(axis=1) + _LEAST_VARIANCE * level.mean(axis=1) ** 2)[:, None] + 1e-300
 

@@ -24,18 +24,18 @@ from apertura.methods.autofocus.inputs import PairRecord, Refinement, TrackError
 
 
 MOST_PATCHES, CLEAR = 32, 20.0
-"""Maximum number of patches; and peak-to-background power ratio of a clear point, a dozen of which suffice."""
+"""Maximum number of patches; and peak-to-background power ratio of a clear point: a dozen such points suffice."""
 
 MOST_VALUES = 2**27
-"""Maximum number of complex values of block contributions, a gigabyte; it limits the number of patches."""
+"""Maximum number of complex values of block contributions (1 GB), which limits the number of patches."""
 
 _ENOUGH = 12 * CLEAR  # sum of the ratios at which the selection of patches stops
-_SAMPLING = 0.7  # pixel spacing in resolution cells: 0.5 gains nothing, at 0.85 positions are less accurate
+_SAMPLING = 0.7  # pixel spacing in resolution cells: 0.5 is no better, and at 0.85 positions are less accurate
 _RANGE_CELLS = 1.5  # half the size of a patch along the line of sight
 _LEAST_CELLS, _MOST_CELLS = 6.0, 24.0  # half the size of a patch across the line of sight
-_BANDWIDTH = 0.66  # bandwidth of errors with correlation time τ, in 1/τ: their sidelobes shall lie in the patch
-_MOST_PIXELS = 1000  # of a patch
-_PULSES = 256  # pulses sampled for the directions and cells of a patch
+_BANDWIDTH = 0.66  # bandwidth of errors with correlation time τ, in 1/τ; the patch must contain their sidelobes
+_MOST_PIXELS = 1000  # maximum pixels of a patch
+_PULSES = 256  # number of pulses sampled for the directions and cells of a patch
 _SHARE = 0.4  # largest share of all patches in one ninth of the scene
 
 
@@ -97,7 +97,7 @@ def separated(places_m: Floats, ratio: Floats, axes: Floats, *, apart_m: float) 
 
 
 def patch_at(place_m: Floats, records: Sequence[PairRecord], axes: Floats, *, correlation_s: float) -> Patch:
-    """Return the patch about a point: as fine as the sharpest pair requires, as wide as errors spread its energy.
+    """Return the patch about a point: as fine as the sharpest pair requires, as wide as errors spread the energy.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def patch_at(place_m: Floats, records: Sequence[PairRecord], axes: Floats, *, co
 
 
 def count_in_memory(values: Sequence[int]) -> int:
-    """Count the patches that fit in memory, given the number of complex values of each.
+    """Count the patches that fit in memory, given the number of complex values of each patch.
 
     Examples
     --------
@@ -141,14 +141,14 @@ def count_in_memory(values: Sequence[int]) -> int:
 
 
 def _spans(place_m: Floats, record: PairRecord, axes: Floats, correlation_s: float) -> tuple[Floats, Floats, Floats]:
-    """Return the directions along and across the line of sight, cell sizes and half patch sizes (cells) along both."""
+    """Return the directions along and across the line of sight, and cell sizes and half patch sizes in cells."""
     profiles = record.profiles
     pulses = profiles.aperture.sample(_PULSES)
     slope, time_s = profiles.aperture[pulses].path_gradient(place_m) @ axes[:2].T, record.time_s[pulses]
     if record.beams is not None:
         illuminated = record.beams[pulses].weight(profiles.aperture[pulses], place_m[None])[:, 0] > 0
         slope, time_s = (slope[illuminated], time_s[illuminated]) if illuminated.sum() > 2 else (slope, time_s)
-    # Cycles per metre along and across the mean line of sight, over pulses and band; cells are their inverse extents.
+    # Cycles per metre along and across the mean line of sight, over pulses and band; cell sizes are inverse extents.
     along_sight = slope.mean(axis=0)
     along_sight = (
         along_sight / np.linalg.norm(along_sight) if np.linalg.norm(along_sight) > 1e-3 else np.array([0.0, 1.0])
@@ -170,22 +170,22 @@ LEAST_RATIO = 5.0
 """Least peak-to-background power ratio of a point, summed over subapertures."""
 
 HELPFUL_RATIO = 3.5
-"""Least ratio of weaker points, which are used in addition if the scene has points."""
+"""Least ratio of weaker points, which are used as well if the scene has points of `LEAST_RATIO`."""
 
-_SHARE_OF_CLEAREST = 0.05  # least ratio relative to the clearest point; fainter points may be its sidelobes
+_SHARE_OF_CLEAREST = 0.05  # least ratio relative to the clearest point; fainter points may be sidelobes of it
 _APART = 0.6  # least distance of patches, in half patch sizes
 
 MOST_LOOKS = 128
-"""Maximum number of subapertures from which a point is visible: the shorter, the coarser their images."""
+"""Maximum number of subapertures from which a point is visible; shorter subapertures have coarser images."""
 
 REFINED_LOOKS = 4
-"""Least number of subapertures for refined tracks: long ones resolve neighbours, several average their sidelobes."""
+"""Least number of subapertures along refined tracks: long ones resolve neighbours, several average sidelobes."""
 
-_BLURRED_RAD2 = 3.0  # growth of the phase-error variance in a subaperture whose image keeps most of a point's power
+_BLURRED_RAD2 = 3.0  # growth of the phase-error variance up to which an image keeps most of a point's power
 _BY_CHANCE = 1e-3  # false alarm rate of points from speckle, per scene
 _SIDE_PX = 256  # side of image tiles, pixels
-_WEIGHED_PX, _WEIGHED_PULSES = 16, 8  # spacing of antenna and sector weights in pixels; pulses averaged for a weight
-_TREE_PULSES = 256  # pulses of a subaperture from which engine tree is faster than the direct sum
+_WEIGHED_PX, _WEIGHED_PULSES = 16, 8  # pixel spacing of antenna and sector weights; pulses averaged for a weight
+_TREE_PULSES = 256  # number of pulses of a subaperture above which engine tree is faster than the direct sum
 _ABOUT_CELLS = 12  # radius of the background in range cells
 _SIDELOBES = 1e-3  # power relative to the brightest point, below which points may be its sidelobes
 _MOST_PLACES = 500  # maximum number of candidates
@@ -230,8 +230,8 @@ class Candidates:
         errors
             Node → error statistics of its log.
         looks
-            Least number of subapertures; the pixel spacing may require more. By default the shortest subapertures
-            that the errors of the logs may require and that show at least half as many bright points as any others.
+            Least number of subapertures; the pixel spacing may require more. By default, of the subaperture lengths
+            that the errors of the logs may require, the shortest with at least half as many bright points as any other.
         """
         correlation_s = min(one.correlation_s for one in errors.values())
         if looks:
@@ -258,7 +258,7 @@ class Candidates:
         return cls([patch_at(place, records, axes, correlation_s=correlation_s) for place in chosen], points, axes)
 
     def rejected(self, errors: Mapping[str, TrackErrors], by_speckle: Refinement | None = None) -> Refinement:
-        """Return a rejected refinement without corrections: no bright point, and the reason against speckle."""
+        """Return a rejected refinement without corrections: reasons are no bright point, and those against speckle."""
         line = f"no point of the scene exceeds its background by {decibels(LEAST_RATIO):.0f} dB"
         report: dict[str, Any] = {"patches": self.points}
         if by_speckle is not None:
@@ -269,7 +269,7 @@ class Candidates:
 
 
 def looks_of(records: Sequence[PairRecord], errors: Mapping[str, TrackErrors], place_m: Floats) -> list[int]:
-    """Return candidate numbers of subapertures of the time in which a point is visible, shortest subapertures first.
+    """Return candidate numbers of subapertures of the time for which a point is visible, shortest subapertures first.
 
     Notes
     -----
@@ -295,8 +295,8 @@ def sampled_looks(records: Sequence[PairRecord], grid: SceneGrid, terrain: Terra
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 10b. Images of longer subapertures would have points between pixels, and
-    their pulses would occupy memory in proportion to the flight.
+    Source: docs/theory/autofocus.md, eq. 10b. In images of longer subapertures, points may lie between pixels; memory
+    for their pulses is proportional to the duration of the flight.
     """
     place_m, step_m = _middle(grid, terrain), _step(records, grid) * grid.spacing_m
     most = 1.0
@@ -312,7 +312,7 @@ def sampled_looks(records: Sequence[PairRecord], grid: SceneGrid, terrain: Terra
 
 
 def least_ratio(looks: int, cells: int) -> float:
-    """Return the power ratio to the mean that speckle, averaged over looks, exceeds in one scene of a thousand.
+    """Return the ratio to the mean power that speckle, averaged over looks, exceeds in one of a thousand scenes.
 
     Examples
     --------
@@ -348,8 +348,8 @@ def bright_places(
     Notes
     -----
     Source: docs/theory/autofocus.md, "Patches". Power is summed over images of subapertures on a thinned pixel grid;
-    a subaperture that is short against the correlation time of the errors is focused for any errors. The pulses of a
-    subaperture have Hann weights: cross-range sidelobes, which could pass for points, fall below −31 dB.
+    a subaperture that is short compared with the correlation time of the errors is focused for any errors. The pulses
+    of a subaperture have Hann weights: cross-range sidelobes, which may be mistaken for points, are below −31 dB.
     """
     from scipy.ndimage import maximum_filter, median_filter  # slow to import
 
@@ -369,7 +369,7 @@ def bright_places(
                 image[window] += power_of(pixels)
         power += image / max(float(np.nanmean(image)), 1e-300)
     power = np.nan_to_num(power)
-    # Background: median within `_ABOUT_CELLS` on a thinned lattice, or sidelobes of the brightest point.
+    # Background: the median within `_ABOUT_CELLS` on a thinned lattice, or the sidelobes of the brightest point.
     reach = max(3, round(_ABOUT_CELLS * cell_m / (step * grid.spacing_m)))
     thin = max(1, reach // 3)
     background = median_filter(power[::thin, ::thin], size=7, mode="nearest")
@@ -404,12 +404,12 @@ def _step(records: Sequence[PairRecord], grid: SceneGrid) -> int:
 
 
 def _middle(grid: SceneGrid, terrain: Terrain) -> Floats:
-    """Return (3,) float64, middle of the scene, metres in the frame."""
+    """Return (3,) float64, scene centre, metres in the frame."""
     return np.asarray(terrain.positions_at(grid, (grid.shape[0] - 1) / 2, (grid.shape[1] - 1) / 2))
 
 
 def _visible_share(record: PairRecord, place_m: Floats) -> float:
-    """Return the share of pulses from which antennas and sector show a point; 1 also if no sampled pulse does."""
+    """Return the fraction of pulses for which a point is within beams and sector; 1 also if there is no such pulse."""
     if record.beams is None:
         return 1.0
     pulses = record.profiles.aperture.sample(_PULSES)
@@ -421,8 +421,8 @@ def _looks(record: PairRecord, looks: int, place_m: Floats) -> Iterator[Callable
     """Yield, for each subaperture of a flight, the function that returns the power at pixels (y, x, 3).
 
     Subapertures have equal length and overlap by a half; their pulses have Hann weights. The image of a subaperture is
-    weighted by the mean antenna and sector weight, which changes slowly. The tables of a subaperture are computed once
-    for all pixels.
+    multiplied by the mean antenna and sector weight, which changes slowly with position. The tables of a subaperture
+    are computed once for all pixels.
     """
     count = max(1, round(looks / _visible_share(record, place_m)))
     ends = np.linspace(0, len(record.time_s), count + 2 if count > 1 else 2).astype(int)
@@ -443,7 +443,7 @@ def _looks(record: PairRecord, looks: int, place_m: Floats) -> Iterator[Callable
 def _power(
     form: Callable[[Floats], NDArray[np.complex64]], beams: Beams | None, aperture: Aperture, pixels: Floats
 ) -> Floats:
-    """Return (y, x) float64, image power with the mean weight of `beams` over `aperture`; 0 if no pixel is visible."""
+    """Return (y, x) float64, image power times the mean weight of `beams` over `aperture`; 0 if no pixel is visible."""
     weight: Floats = np.ones((1, 1))
     if beams is not None:
         rows, columns = (

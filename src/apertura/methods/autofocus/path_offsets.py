@@ -20,15 +20,15 @@ from apertura.methods.autofocus.one_phase import METHODS, Patches
 from apertura.methods.autofocus.patches import Candidates, Patch, count_in_memory
 
 _APART_CELLS = 2.0  # range cells c/B of total path within which patches share noise
-_BLOCKS_PER_CORRELATION_TIME = 10  # least number
+_BLOCKS_PER_CORRELATION_TIME = 10  # least number of blocks within a correlation time
 _BETWEEN_BLOCKS_RAD2 = 0.1  # largest growth of the phase-error variance between blocks
-_LINEAR = 1 / 8  # residual share of that growth with offsets interpolated linearly between blocks
+_LINEAR = 1 / 8  # share of this growth that remains with offsets interpolated linearly between blocks
 _PULSES = 4096  # pulses read at a time
-_SHIFTS = 0.5  # variation of the path gradient, relative to the largest, of directions in which phases shift the image
+_SHIFTS = 0.5  # variation of the path gradient in directions of image shifts, relative to the largest
 
 
 def refine_one_phase(
-    records: Sequence[PairRecord], found: Candidates, errors: Mapping[str, TrackErrors], *, method: str
+    records: Sequence[PairRecord], candidates: Candidates, errors: Mapping[str, TrackErrors], *, method: str
 ) -> Refinement:
     """Estimate path offsets of the pairs by one-phase autofocus, accepted by the contrast gain of held-out patches.
 
@@ -36,7 +36,7 @@ def refine_one_phase(
     ----------
     records
         Records of all pairs.
-    found
+    candidates
         Candidate points of the scene.
     errors
         Node → error statistics of its log.
@@ -45,33 +45,34 @@ def refine_one_phase(
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, "One phase per pulse". Each quarter of the patches is validated with offsets
-    fitted to those of the other patches that share no range with it. Of these offsets and those fitted to all patches,
-    the sharpest are returned. Tracks are not corrected: the position errors of a node remain those of its log.
+    Source: docs/theory/autofocus.md, "One phase per pulse". Each quarter of the patches is validated with offsets that
+    are fitted to the other patches, without those that share a range with it. Of these offsets and those fitted to all
+    patches, the offsets with the sharpest images are returned. Tracks are not corrected: the position errors of a node
+    remain those of its log.
     """
-    if not found.patches:
-        return found.rejected(errors)
-    fits = [_Pair.of(record, found.patches, errors).fitted(method) for record in records]
+    if not candidates.patches:
+        return candidates.rejected(errors)
+    fits = [_Pair.of(record, candidates.patches, errors).fitted(method) for record in records]
     gain_db = np.concatenate([fit.gain_db for fit in fits])
     gain = mean_gain(gain_db[None])
     reason = (
         f"{gain_db.size} held-out images of bright points gained {gain.mean_db:.2f} ± {gain.std_db:.2f} dB of contrast"
     )
-    knots_s = np.unique(np.concatenate([fit.time_s for fit in fits]))  # union of all knots: no offset is smoothed
+    knots_s = np.unique(np.concatenate([fit.time_s for fit in fits]))  # union of all knots, to smooth no offset
     correction = TrackCorrection(
         knots_s,
         {node: np.zeros((len(knots_s), 3)) for node in errors},
         {fit.pair: np.interp(knots_s, fit.time_s, fit.extra_path_m) for fit in fits},
     )
-    std_m = {node: np.tile(error.along(found.axes), (len(knots_s), 1)) for node, error in errors.items()}
+    std_m = {node: np.tile(error.along(candidates.axes), (len(knots_s), 1)) for node, error in errors.items()}
     report = {
         "method": method,
-        "patches": len(found.patches),
+        "patches": len(candidates.patches),
         "gain_held_out_db": round(gain.mean_db, 3),
         "gain_std_db": round(gain.std_db, 3),
-        **_residuals(fits, [_log_effect(record, found, errors) for record in records]),
+        **_residuals(fits, [_log_effect(record, candidates, errors) for record in records]),
     }
-    promising = not gain.certain and abs(gain.mean_db) > LEAST_GAIN_DB  # else no improvement over the logs
+    promising = not gain.certain and abs(gain.mean_db) > LEAST_GAIN_DB  # otherwise no improvement over the logs
     return Refinement(
         correction, std_m, gain.certain, reason, report, {"refinement_rejected": reason} if promising else {}
     )
@@ -79,7 +80,7 @@ def refine_one_phase(
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Path offsets of a pair's echoes relative to its logs, in total path.
+    """Path offsets of a pair's echoes relative to its logged tracks, in total path.
 
     Attributes
     ----------
@@ -88,7 +89,7 @@ class _Fit:
     time_s, extra_path_m
         (block,) float64, seconds of the flight's clock and metres; offsets are linear between blocks.
     gain_db
-        (patch,) float64, contrast gain of each patch when held out of the fit.
+        (patch,) float64, contrast gain of each patch, held out of the fit.
     residual_rad2
         Expected variance of the residual phase.
     """
@@ -131,7 +132,7 @@ class _Pair:
         return cls(record.pair, time_s, growth_rad2, cached, path_m, cell_m, slope, profiles.wavenumber_rad_m)
 
     def fitted(self, method: str) -> _Fit:
-        """Return the fitted offsets, and the contrast gain of each patch by offsets fitted without it.
+        """Return the fitted offsets, and the contrast gain of each patch with offsets fitted without this patch.
 
         The returned offsets are the fit to all patches or to a subset that gives the largest mean gain of all patches.
         """
@@ -147,7 +148,7 @@ class _Pair:
         return _Fit(self.name, self.time_s, -phase / self.wavenumber, held_out_db, residual_rad2)
 
     def without(self, held_out: Bools) -> Bools:
-        """Return (patch,) bool, True for patches that share no range, and thus no noise, with the held-out ones."""
+        """Return (patch,) bool, True for patches that share no range, and thus no noise, with the held-out patches."""
         near = np.abs(self.path_m[:, None] - self.path_m[held_out]) < _APART_CELLS * self.cell_m
         return np.asarray(~near.any(axis=1))
 
@@ -163,7 +164,7 @@ class _Pair:
         return np.asarray(centred - shifting @ (shifting.T @ centred))
 
     def statistics(self, phase: Floats | None = None) -> list[PatchImage]:
-        """Return the statistics of the patches with the blocks rotated by `phase`; by default along the logs."""
+        """Return the statistics of the patches after rotation of the blocks by `phase`; by default along the logs."""
         rotation = np.exp(1j * (np.zeros(len(self.time_s)) if phase is None else phase)).astype(np.complex64)
         return [PatchImage.of(patch @ rotation) for patch in self.cached]
 
@@ -195,14 +196,14 @@ def _contributions(
     return cached
 
 
-def _log_effect(record: PairRecord, found: Candidates, errors: Mapping[str, TrackErrors]) -> Effect:
-    """Return the effect of the logs' errors on the image of a pair."""
+def _log_effect(record: PairRecord, candidates: Candidates, errors: Mapping[str, TrackErrors]) -> Effect:
+    """Return the effect of log errors on the image of a pair."""
     profiles = record.profiles
     paths = PointPaths.of(
         profiles.aperture,
         record.time_s,
-        point_m=np.mean([patch.place_m for patch in found.patches], axis=0),
-        axes=found.axes,
+        point_m=np.mean([patch.place_m for patch in candidates.patches], axis=0),
+        axes=candidates.axes,
         wavelength_m=profiles.wavelength_m,
     )
     nodes = [NodePositions(errors[node].std_m, errors[node].correlation_s) for node in dict.fromkeys(record.nodes)]
@@ -211,9 +212,9 @@ def _log_effect(record: PairRecord, found: Candidates, errors: Mapping[str, Trac
 
 
 def _residuals(fits: Sequence[_Fit], log_effects: Sequence[Effect]) -> dict[str, float]:
-    """Return the residual errors at the scene's middle.
+    """Return the residual errors at the scene centre.
 
-    Shift and mean phase are those of the logs, as the path offsets contain neither.
+    Shift and mean phase are those due to log errors, as the path offsets contain neither.
     """
     residual_rad2 = float(np.mean([fit.residual_rad2 for fit in fits]))
     mean_rad2 = float(np.mean([effect.phase_rad**2 for effect in log_effects]))

@@ -1,4 +1,4 @@
-"""Refinement of the tracks of a flight by the images of all its pairs and by reference points of known position."""
+"""Refinement of the tracks of a flight from the images of all its pairs and from reference points."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -50,7 +50,7 @@ from apertura.methods.causes import Cause
 
 
 _LEAST_RATIO = 30.0  # least peak-to-background power ratio of a point for a position measurement
-_LEAST_STD_M = 0.01  # of point positions between pairs, as bistatic scattering centres differ
+_LEAST_STD_M = 0.01  # least std of positions between pairs, as bistatic scattering centres differ
 _ZOOMS, _SIDE = 3, 9  # search for the position of a point: rounds, samples along a side
 _MEDIAN_OF_TWO = 2 * np.log(2)  # median of the sum of two squared standard normal values
 _ROUNDS = 3  # least-squares iterations in the gauge, each with a new linearisation
@@ -60,7 +60,7 @@ _ROUNDS = 3  # least-squares iterations in the gauge, each with a new linearisat
 class _MeasuredPosition:
     """Position of a point in the image of a pair, east and north (m), its standard deviation, and its shifts.
 
-    `shift_m` (2, mode) is the shift per unit of the gauge's modes, `longer` (2, 1) per metre of common path change.
+    `shift_m` (2, mode) is the shift per unit of the gauge modes, `longer` (2, 1) the shift per metre of common path.
     """
 
     place_m: Floats
@@ -108,8 +108,8 @@ def fix_gauge(
             )
         matrix = np.concatenate([matrix, reference_rows])
         residuals = np.concatenate([residuals, reference_residuals])
-        # Normal equations of eq. 15, with the prior |y|². The shift by the modes of previous iterations is added back
-        # to `residuals`; path lengths are not part of the tracks, so that the residuals still contain their effect.
+        # Normal equations of eq. 15, with the prior |y|². The shift due to previous iterations is added back
+        # to `residuals`; as path offsets are not part of the tracks, the residuals still contain their effect.
         normal = matrix.T @ matrix + np.eye(len(step))
         target = matrix[:, :modes] @ step[:modes] - residuals
         step = np.asarray(np.linalg.solve(normal, matrix.T @ target), np.float64)
@@ -122,9 +122,9 @@ def fix_gauge(
 
 
 def path_std_m(problem: Problem) -> dict[str, float]:
-    """Return the standard deviation of each pair's mean path relative to the first pair's, by errors of the logs.
+    """Return the standard deviation, due to log errors, of each pair's mean path relative to that of the first pair.
 
-    Pair → metres at the first patch, from random draws of the prior.
+    The result is pair → metres at the first patch, estimated from random draws of the prior.
     """
     draws = problem.prior.tracks(np.random.default_rng(0).standard_normal((_DRAWS, problem.prior.size)))
     paths = []
@@ -158,7 +158,7 @@ def pair_disagreement(problem: Problem, tracks: Tracks, axes: Floats) -> tuple[f
 def _pair_residuals(problem: Problem, tracks: Tracks, axes: Floats) -> tuple[Floats, Floats]:
     """Return design rows and residuals, in standard deviations, of each pair's points relative to the first pair.
 
-    Rows have a column for each mode of the gauge, and one for the path offset of each pair but the first.
+    Rows have a column for each mode of the gauge, and a column for the path offset of each pair except the first.
     """
     rows, residuals = [np.zeros((0, len(problem.gauge.modes) + len(problem.pairs) - 1))], [np.zeros(0)]
     modes = problem.prior.tracks(problem.gauge.modes)
@@ -199,7 +199,7 @@ def _reference_residuals(
 
 
 def _path_columns(position: _MeasuredPosition, number: int, problem: Problem) -> Floats:
-    """Return (2, pair), shift of a position per standard deviation of the path offset of each pair but the first."""
+    """Return (2, pair), shift of a position per standard deviation of the path offset of each pair except the first."""
     columns = np.zeros((2, len(problem.pairs) - 1))
     if number:
         columns[:, number - 1] = PATH_STD_M * position.longer[:, 0]
@@ -248,8 +248,8 @@ def _cell_m(echo: PatchEcho) -> float:
 def _distance_sigma(residuals: Floats) -> float:
     """Return the distance of points between pairs, in standard deviations; 0 without points.
 
-    `residuals` contains two values per point. The median is robust against patches in which each pair shows a different
-    one of two neighbouring points.
+    `residuals` contains two values per point. The median is robust against patches in which pairs measure different
+    points of two neighbours.
     """
     if not residuals.size:
         return 0.0
@@ -261,32 +261,33 @@ def _distance_sigma(residuals: Floats) -> float:
 
 
 PATH_STD_M = 0.1
-"""Prior standard deviation of path offsets between pairs for other reasons than tracks, metres. Path offsets wrong by
-fractions of a wavelength must not bend tracks; the ties between pairs along range lose little."""
+"""Prior standard deviation of path offsets between pairs due to causes other than the tracks, metres. Errors of path
+offsets by fractions of a wavelength must not bend tracks; the constraints between pairs in range are hardly weaker."""
 
 PATH_SIGMAS = 3.0
-"""Standard deviations above which a path difference between pairs is not attributed to the tracks."""
+"""Number of standard deviations above which a path difference between pairs is not attributed to the tracks."""
 
 _DRAWS = 200  # random draws of the prior for the standard deviation of a mean path
 
-_KNOTS_PER_CORRELATION_TIME = 10  # least knots of corrections within the shortest correlation time
-_LEAST_KNOTS = 64  # least knots of a flight
-_FEW = 8  # patches; with fewer, every quarter of the patches is held out in turn
-_LOST_TO_TIES_DB = 0.1  # largest loss of contrast by fixing the gauge
-_SLIPS = 3  # searches from delays while subapertures have cycle slips
+_KNOTS_PER_CORRELATION_TIME = 10  # least number of knots of corrections within the shortest correlation time
+_LEAST_KNOTS = 64  # least number of knots of a flight
+_FEW = 8  # number of patches; with fewer, every quarter of the patches is held out in turn
+_LOST_TO_TIES_DB = 0.1  # largest loss of contrast due to fixing the gauge
+_SLIPS = 3  # maximum searches that start from delays while subapertures have cycle slips
 _STAGES = 3  # iterations of caching contributions and maximising sharpness
 
 MOST_ROUNDS = 4
-"""Maximum rounds of detecting bright points, which errors may have hidden, in the refined image and refining by all."""
+"""Maximum number of rounds. Each detects bright points in the refined image, also points that errors have hidden so
+far, and refines the tracks with all of them."""
 
 LEAST_FURTHER_DB = 0.05
 """Least contrast gain of held-out patches over the previous round for another round, dB."""
 
 _BETWEEN_KNOTS_RAD2 = 0.05
-"""Phase variance by errors between knots, which costs 0.2 dB."""
+"""Phase variance due to errors between knots, which causes a loss of 0.2 dB."""
 
 _MOST_KNOTS_PER_CORRELATION_TIME = (
-    32  # sufficient for 4 cm at L-band; the budget contains the residual of larger errors
+    32  # sufficient for 4 cm at L-band; the error budget contains the residual of larger errors
 )
 
 
@@ -310,13 +311,14 @@ def refine(
     errors
         Node → error statistics of its log.
     reference_points
-        Points of known position, which fix the position of the image.
+        Points of known position, which determine the position of the image.
     causes
         Possible errors of configured constants, tried if errors of the logs alone do not explain the images.
 
     Notes
     -----
-    Source: docs/theory/autofocus.md. A rejected refinement keeps its corrections; images are formed without them.
+    Source: docs/theory/autofocus.md. A rejected refinement contains its corrections, but images are formed without
+    them.
     """
     logs_only = _Model.of(records, grid, terrain, errors)
     result = logs_only.refinement(errors, reference_points)
@@ -331,7 +333,7 @@ def refine(
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """Error model with errors of the logs alone or together with a cause: its search and the results."""
+    """Search and results for an error model: errors of the logs alone or together with a cause."""
 
     search: "TrackSearch"
     best: "Round | None"
@@ -343,7 +345,7 @@ class _Model:
     ) -> "_Model":
         search = TrackSearch.begin(records, grid, terrain, errors)
         best = search.rounds(grid, terrain, errors) if search.problem.patches else None
-        # Speckle is tried if the tracks from few bright points are not accepted.
+        # Refinement by speckle is tried if the tracks from few bright points are not accepted.
         if best is not None and (best.evidence.accepted or len(best.search.problem.patches) >= _FEW):
             return cls(search, best, None)
         return cls(search, best, search.by_speckle(grid, terrain, errors))
@@ -375,12 +377,12 @@ class _Model:
 
         Notes
         -----
-        Source: docs/theory/autofocus.md, eq. 16b: evaluated over the bright points of both models. A cause must not
-        blur points that are sharp along the logs.
+        Source: docs/theory/autofocus.md, eq. 16b, evaluated over the bright points of both models, so that a cause must
+        not blur points that are sharp along the logs.
         """
         if self.best is None or logs_only.best is None:
             return -np.inf
-        # Tracks of both models at the points of either search: with the cause, and without.
+        # Tracks of both models, with and without the cause, at the points of each search.
         by_cause = cause.correction.moved_m
         rest, alone = self.best.state.tracks, logs_only.best.state.tracks
         total = {node: by_cause[node] + track for node, track in rest.items()}
@@ -404,7 +406,7 @@ class Round:
     search
         Search over these points.
     state, evidence
-        Tracks fitted to all points; and their evidence, including held-out points.
+        Tracks fitted to all points; and the evidence for them, including held-out points.
     gain_db
         Contrast gain of held-out points relative to the tracks of the previous round; 0 in the first.
     number
@@ -484,7 +486,7 @@ class TrackSearch:
     def rounds(self, grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]) -> Round:
         """Run rounds of detection and refinement; return the last round with a gain."""
         best = self.solve()
-        # Tracks without a gain leave the image unchanged: another detection would find the same points.
+        # Tracks without a gain leave the image unchanged, so that another detection finds the same points.
         while best.number < MOST_ROUNDS and mean_gain(best.evidence.fitted_db).mean_db >= LEAST_FURTHER_DB:
             search = best.search.again(best.state, grid, terrain, errors)
             if search is None:
@@ -498,7 +500,7 @@ class TrackSearch:
         return best
 
     def _known(self, candidates: Candidates) -> bool:
-        """Return True if the candidates are the points of this round, each in a patch of its own."""
+        """Return True if the candidates are the points of this round, each in a separate patch."""
         patches = self.problem.patches
         if len(patches) != len(candidates.patches):
             return False
@@ -516,7 +518,7 @@ class TrackSearch:
         return self.candidates.axes
 
     def solve(self) -> Round:
-        """Return the tracks fitted to all patches, and the evidence of held-out patches."""
+        """Return the tracks fitted to all patches, and the evidence from held-out patches."""
         problem, initial = self.problem, self.initial
         held_out_db = np.full((len(problem.pairs), len(problem.patches)), np.nan)
         round_gain_db = np.full_like(held_out_db, np.nan)
@@ -534,7 +536,7 @@ class TrackSearch:
             if not few and mean_gain(held_out_db[:, np.isfinite(held_out_db[0])]).certain:
                 break
         # Fit of all patches from the best of these fits; the search is repeated for cycle slips (eq. 16).
-        assert lowest is not None  # a single patch is fitted directly, of several patches at least one fold is
+        assert lowest is not None  # set: a single patch is fitted directly, several patches have at least one fold
         state = problem.sharper(lowest, everything, stages=_STAGES - 1 if few else 1)
         state, shifts = self._unslipped(state, everything)
         apart_sigma = self._apart_sigma(state)
@@ -605,7 +607,7 @@ class TrackSearch:
     def cause(
         self, grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors], causes: Sequence[Cause]
     ) -> CauseFit | None:
-        """Return the cause that explains the images best, with its error refined in rounds as points become visible."""
+        """Return the cause that explains the images best; its error is refined in rounds as points become visible."""
         if not causes or not self.problem.patches:
             return None
         fit = explained(self.problem, causes, self.axes, np.random.default_rng(0))
@@ -621,7 +623,7 @@ class TrackSearch:
         return fit
 
     def blur(self, tracks: Tracks) -> float:
-        """Return the objective of tracks without their prior, at the points of this search."""
+        """Return the objective of tracks without the prior, at the points of this search."""
         value = self.problem.value(
             self.problem.at(tracks), np.ones(len(self.problem.patches), bool), self.initial.statistics
         )
@@ -640,7 +642,7 @@ class TrackSearch:
 
 
 def _knots(records: Sequence[PairRecord], errors: Mapping[str, TrackErrors]) -> Floats:
-    """Return equally spaced knot times: several within the correlation time, but not closer than pulses."""
+    """Return equally spaced knot times: several within the correlation time, but not closer than the pulses."""
     first = min(float(record.time_s[0]) for record in records)
     last = max(float(record.time_s[-1]) for record in records)
     pulse_s = max(float(np.median(np.diff(record.time_s))) for record in records)

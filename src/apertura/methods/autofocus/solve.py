@@ -1,4 +1,4 @@
-"""Search for the tracks of maximum sharpness: gauge modes, optimisation, and its starting points."""
+"""Search for the tracks of maximum sharpness: gauge modes, optimisation, and starting points of the search."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,13 +20,13 @@ LEAST_PHASE_RAD = 0.03
 """Radians rms over the aperture, per standard deviation of the log, below which a mode does not affect the focus."""
 
 LEAST_SHIFT_M = 3e-4
-"""Metres per standard deviation of the log; modes that shift patches by less are no gauge modes."""
+"""Least shift of patches by a gauge mode, metres per standard deviation of the log."""
 
 LEAST_INFORMATION = 10.0
-"""Least information of the image, relative to the log's (1), on a mode that the image alone determines."""
+"""Least information that the image provides on a mode that it alone determines, relative to that of the log (1)."""
 
-_MODES = 32  # smooth motions evaluated at once
-_PIECES = 5  # cubic pieces of a smooth mode within the illumination time of a patch
+_MODES = 32  # number of smooth motions evaluated at once
+_PIECES = 5  # number of cubic pieces of a smooth mode within the illumination time of a patch
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +38,10 @@ class Gauge:
     modes
         (mode, unknown) float64, orthonormal, in the prior's unknowns.
     shift_m
-        (mode, pair and patch, 2) float64, shift of every patch's image east and north, metres per unit of a mode.
+        (mode, pair and patch, 2) float64, shift of the image of every patch east and north, metres per unit of a mode.
     blurs_rad2, shapes, smooth
-        (other,) mean square phase error by orthonormal modes, largest last; (other, smooth) float64, these modes as
-        sums of smooth motions; and the smooth motions.
+        (other,) mean square phase error due to other orthonormal modes, largest last; (other, smooth) float64, these
+        modes as sums of smooth motions; and the smooth motions.
 
     Notes
     -----
@@ -55,12 +55,12 @@ class Gauge:
     smooth: "SmoothMotions"
 
     def project_out(self, unknowns: Floats) -> Floats:
-        """Return unknowns, or a gradient, without their component along the modes."""
+        """Return unknowns, or a gradient, without the component along the modes."""
         return np.asarray(unknowns - self.modes.T @ (self.modes @ unknowns))
 
     @property
     def std_m(self) -> float:
-        """Standard deviation of the image position by the errors of the logs, metres, rms over patches."""
+        """Standard deviation of the image position due to errors of the logs, metres, rms over patches."""
         return float(np.sqrt((self.shift_m**2).sum(axis=(0, 2)).mean())) if len(self.modes) else 0.0
 
     @classmethod
@@ -78,8 +78,8 @@ class Gauge:
         unknowns
             Solved unknowns.
         information
-            Information of the phases on a mode with a phase effect of 1 rad: twice the peak-to-background power ratios,
-            summed over pairs and patches.
+            Information that the phases provide on a mode with a phase effect of 1 rad: twice the peak-to-background
+            power ratios, summed over pairs and patches.
         """
         return np.asarray(self.shapes[self.blurs_rad2 * information > LEAST_INFORMATION] @ self.smooth.parts(unknowns))
 
@@ -102,7 +102,7 @@ def find_gauge(
     # F and S of eq. 14 for smooth motions: mean blur² of eq. 13 as a quadratic form, and shifts of the patches.
     blur_form, shifts = np.zeros((len(smooth), len(smooth))), []
     for blocks, patches in zip(pairs, cached, strict=True):
-        # Δρ of every block by each smooth motion, `_MODES` motions at a time.
+        # Δρ of every block due to each smooth motion, `_MODES` motions at a time.
         paths = [np.empty((patch.blocks.stop - patch.blocks.start, len(smooth))) for patch in patches]
         for columns, unknowns in smooth.rows():
             tracks = prior.tracks(unknowns)
@@ -121,7 +121,7 @@ def find_gauge(
     # Modes (F + ε²)⁻¹Sᵀv with σ_s > 0.3 mm, orthonormalised, and their shifts of every patch.
     modes, _ = np.linalg.qr(conditional @ eigenvectors[:, keep])
     shift_by_mode = np.stack([patch_shift @ modes for patch_shift in shifts])
-    # Eigenvectors of F: motions sorted by their blur, for the test of the configured log errors (eq. 17).
+    # Eigenvectors of F are the motions sorted by blur, for the test of the configured log errors (eq. 17).
     blurs_rad2, shapes = np.linalg.eigh(blur_form)
     return Gauge(smooth.sums(modes.T), np.moveaxis(shift_by_mode, -1, 0), blurs_rad2, shapes.T, smooth)
 
@@ -133,7 +133,7 @@ class SmoothMotions:
     Attributes
     ----------
     of_nodes
-        Index of a node's first unknown, and (mode, unknown of the node) float64: each mode displaces one node only.
+        Index of a node's first unknown, and (mode, unknown of the node) float64; each mode displaces a single node.
     size
         Number of unknowns of all nodes.
     """
@@ -145,7 +145,7 @@ class SmoothMotions:
     def of(
         cls, pairs: Sequence[Blocks], cached: Sequence[Sequence[Contribution]], prior: Prior, knots_s: Floats
     ) -> "SmoothMotions":
-        """Return the smooth motions that patches can resolve within their illumination time."""
+        """Return the smooth motions that patches resolve within their illumination time."""
         from scipy.interpolate import BSpline
 
         lengths = [patch.blocks.stop - patch.blocks.start for patches in cached for patch in patches]
@@ -212,14 +212,14 @@ def effects(patch: Contribution, moved: Mapping[str, Floats], axes: Floats) -> t
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 13: a constant phase does not blur, but over the band a shift must explain the
-    path itself.
+    Source: docs/theory/autofocus.md, eq. 13: a constant phase does not blur; over the band, however, the path change
+    including its mean blurs unless a shift explains it.
     """
     return effects_of_paths(patch, longer_paths(patch, moved), axes)
 
 
 def longer_paths(patch: Contribution, moved: Mapping[str, Floats]) -> Floats:
-    """Return (block, mode) float64, path changes in metres by displacements of the nodes, (mode, block, 3) each."""
+    """Return (block, mode) float64, path changes in metres due to displacements of the nodes, (mode, block, 3) each."""
     grown = (np.einsum("bi,mbi->bm", slope, moved[node][:, patch.blocks]) for node, slope in patch.slopes.items())
     return np.asarray(sum(grown), np.float64)
 
@@ -264,7 +264,7 @@ class Problem:
     prior
         Prior of the nodes.
     gauge
-        Modes that keep the value of the logs.
+        Modes along which the tracks remain those of the logs.
     """
 
     pairs: Sequence[Blocks]
@@ -306,7 +306,7 @@ class Problem:
         return state
 
     def value(self, state: "State", used: Bools, weights: Sequence[Sequence[PatchImage]]) -> float:
-        """Return the objective, with the weights and energies of another state."""
+        """Return the objective of a state, with the weights and energies of another state."""
         value, _ = Sharpness(self.pairs, state.cached, state.tracks, weights, used)(state.tracks)
         return value + 0.5 * float(state.unknowns @ state.unknowns)
 
@@ -356,7 +356,7 @@ def minimise(
     *,
     iterations: int = ITERATIONS,
 ) -> Floats:
-    """Minimise a function of the tracks plus half the squared unknowns, with fixed gauge; return the unknowns."""
+    """Minimise a function of the tracks plus half the sum of squared unknowns at fixed gauge; return the unknowns."""
     from scipy.optimize import minimize  # slow to import
 
     fixed = gauge.modes.T @ (gauge.modes @ start)
@@ -376,7 +376,7 @@ def minimise(
 # ---- Second start of the search: unwrapped phases of the brightest points -------------------------------------------
 
 SMOOTHED = (2.0, 1.5, 1.0)
-"""Standard deviation of the smoothing filter before phase unwrapping in each round, blocks."""
+"""Standard deviation of the smoothing filter that precedes phase unwrapping, in blocks, one for each round."""
 
 
 def prominent_point_start(problem: Problem, start: State, used: NDArray[np.bool_], axes: Floats) -> State:
@@ -396,7 +396,7 @@ def prominent_point_start(problem: Problem, start: State, used: NDArray[np.bool_
 
 @dataclass(frozen=True, eq=False)
 class _History:
-    """Unwrapped phase of a patch's brightest pixel over the blocks, and the subspace of position and constant phase."""
+    """Unwrapped phase of a patch's brightest pixel over blocks, and the subspace due to position and constant phase."""
 
     patch: Contribution
     phase: Floats
@@ -446,7 +446,7 @@ class _PhaseFit:
 # ---- Start of the search after a cycle slip: delays of the points in subapertures -----------------------------------
 
 _DELAY_STD_M = 0.03
-"""Standard deviation of a point's delay in a subaperture, metres of total path, for the balance with the prior."""
+"""Standard deviation of a point's delay in a subaperture, metres of total path; its weight against the prior."""
 
 
 def unslipped_start(problem: Problem, state: State, shifts_m: Floats) -> State:
@@ -485,7 +485,7 @@ class _DelayFit:
                 measured = np.isfinite(shift_m)
                 if measured.sum() < 2:
                     continue
-                # Mean path change of each subaperture by the tracks less its measured shift, about their mean.
+                # Mean path change of each subaperture due to the tracks minus the measured shift, without their mean.
                 path = phases(patch, moved) / patch.wavenumber
                 ends = np.linspace(0, len(path), len(shift_m) + 1).astype(np.int64)
                 size = np.diff(ends)
@@ -493,7 +493,7 @@ class _DelayFit:
                 residual = np.where(measured, np.add.reduceat(path, ends[:-1]) / size - np.nan_to_num(shift_m), 0.0)
                 residual = np.where(measured, residual - residual.sum() / measured.sum(), 0.0) / _DELAY_STD_M
                 total += 0.5 * float(residual @ residual)
-                # Derivative: the residual of a subaperture, divided over its blocks, along the slope of each node.
+                # Derivative: residual of a subaperture over the number of its blocks, along the slope of each node.
                 for node, slope in patch.slopes.items():
                     by_block = np.zeros_like(moved[node])
                     by_block[patch.blocks] = (residual / size / _DELAY_STD_M)[part][:, None] * slope

@@ -16,16 +16,17 @@ from apertura.core.echo.demodulate import Numerology
 # ---- Limits ---------------------------------------------------------------------------------------------------------
 
 SIGMAS = 5.0
-"""Standard deviations of a significant measurement: less than one false flag in 10⁴ bench reports of a dozen lines."""
+"""Standard deviations above which a measurement is significant: less than one false flag in 10⁴ reports of 12 lines."""
 
 MISSED_SHARE = 0.01
-"""Largest share of missed pulses among the pulses due at a node."""
+"""Largest share of missed pulses among the pulses that a node should have recorded."""
 
 DC_DB = -20.0
-"""Largest mean of I and Q relative to the signal, dB; over N = 1000 subcarriers it is a floor of −50 dB in range."""
+"""Largest mean of I and Q relative to the signal, dB; with N = 1000 subcarriers the floor in range is −50 dB."""
 
 IMAGE_DB = -25.0
-"""Largest mirror image by I/Q imbalance, dB; the image of a subcarrier is noise of this level on another one."""
+"""Largest I/Q image due to I/Q imbalance, dB; the image of a subcarrier acts as noise at this level on its mirror
+subcarrier."""
 
 FEWEST_COUNTS = 4.0
 """Least level of a channel with integer samples, counts rms; quantisation noise is 22 dB below it."""
@@ -41,9 +42,9 @@ class Triggers:
     Attributes
     ----------
     recorded, missed, false
-        Number of captures; of missing pulses between them; of captures between two pulses.
+        Numbers of captures, of pulses missing between captures, and of captures between two pulses.
     beyond
-        Pulses that another node recorded before the first or after the last capture of this node.
+        Number of pulses that another node recorded before the first or after the last capture of this node.
     """
 
     recorded: int
@@ -58,7 +59,7 @@ class Triggers:
 
     @property
     def flags(self) -> dict[str, str]:
-        """Flag → measured values, of exceeded limits."""
+        """Flag → measured values for exceeded limits."""
         flags, due, lost = {}, self.due + self.beyond, self.missed + self.beyond
         if lost > MISSED_SHARE * due:
             ends = f", {self.beyond} of them before its first capture or after its last" if self.beyond else ""
@@ -104,9 +105,9 @@ class MeasuredChannel:
     dc_db
         Mean of I and Q relative to the mean power, dB.
     image_db
-        Mirror image, dB; eq. 2.
+        Level of the I/Q image, dB; eq. 2.
     image_floor_db
-        Detection limit of the mirror image, which the code itself sets if both sidebands are occupied, dB.
+        Detection limit of the I/Q image, dB; if both sidebands are occupied, it depends on the code.
     integers
         True if samples are integers.
     stuck
@@ -123,7 +124,7 @@ class MeasuredChannel:
 
     @property
     def flags(self) -> dict[str, str]:
-        """Flag → measured values, of exceeded limits."""
+        """Flag → measured values for exceeded limits."""
         flags = {}
         if self.integers and self.counts < FEWEST_COUNTS:
             flags["channel_weak"] = f"channel {self.name}: level {self.counts:.1f} counts rms"
@@ -144,9 +145,9 @@ def measure_channel(name: str, blocks: Iterable[Samples], numerology: Numerology
     name
         Name of the channel.
     blocks
-        (capture, sample, 2) each, I and Q from the start of the prefix.
+        Arrays (capture, sample, 2): I and Q from the start of the prefix.
     numerology
-        Numerology of the symbol, over one period of which different subcarriers are orthogonal.
+        Numerology of the symbol; different subcarriers are orthogonal over one period.
 
     Notes
     -----
@@ -177,11 +178,11 @@ def measure_channel(name: str, blocks: Iterable[Samples], numerology: Numerology
         power += float((np.abs(rest) ** 2).mean(axis=1).sum())
         square += complex((rest**2).mean(axis=1).sum())
     mirrored = np.isin(-numerology.numbers % numerology.dft_samples, numerology.numbers % numerology.dft_samples)
-    # If the image of a subcarrier coincides with another one, products of code symbols do not cancel: the sum of N
-    # random products is about √N, and three times this is significant.
+    # If the image of a subcarrier coincides with another subcarrier, products of code symbols do not cancel: the sum of
+    # N random products is about √N, and three times this value is significant.
     floor = 3 / (2 * np.sqrt(numerology.numbers.size)) if mirrored.mean() > 0.5 else 0.0
     power = max(power, 1e-30)
-    # Eq. 1a: constant bits between changing bits; constant bits below the lowest changing one are padding.
+    # Eq. 1a: constant bits between changing bits; constant bits below the lowest changing bit are padding.
     changing = ones & zeros
     stuck = tuple(
         bit for bit in range(changing.bit_length()) if changing & ((1 << bit) - 1) != 0 and not changing >> bit & 1

@@ -29,22 +29,22 @@ WEAK_DB = 10.0
 """Least SNR of a compressed pulse, dB; below it Γ is less than 0.91 and phases scatter by 0.22 rad."""
 
 PHASE_RAD = 0.05
-"""Largest phase scatter beyond noise, rms, and largest phase drift over the recording; it costs an image 0.01 dB."""
+"""Largest phase scatter beyond noise, rms, and largest phase drift over the recording; each causes 0.01 dB of loss."""
 
 AMPLITUDE_DB = 0.5
-"""Largest amplitude scatter beyond noise, dB rms; a tight contact has hundredths of a dB."""
+"""Largest amplitude scatter beyond noise, dB rms; tight connectors cause some hundredths of a dB."""
 
 DROPOUT_DB, DROPOUT_SHARE = -6.0, 0.01
-"""Level of a dropout relative to the median, dB, and largest share of dropouts of a tight contact."""
+"""Level of a dropout relative to the median, dB, and largest share of dropouts with tight connectors."""
 
 LEAKAGE_DB, APART_CELLS = -20.0, 3.0
-"""Largest level at the sidelink's delay relative to the strongest path, dB; and least distance of that path, cells."""
+"""Largest level at the sidelink's delay relative to the strongest path, dB; least distance between both, cells."""
 
 TONE_DB = 13.0
-"""Largest pulse-to-pulse change of one subcarrier relative to the median, dB; noise of 20 pulses reaches 5 dB."""
+"""Largest pulse-to-pulse change of a subcarrier relative to the median, dB; with 20 pulses, noise reaches 5 dB."""
 
 UNLOCKED_PPM = 0.3
-"""Largest offset between locked oscillators; disciplined ones (GNSS, 10 MHz cable) stay below 0.1 ppm."""
+"""Largest offset between locked oscillators; the offset of disciplined ones (GNSS, 10 MHz cable) is below 0.1 ppm."""
 
 DRIFT_PPM = 0.02
 """Largest clock drift over the recording; a carrier of 1.2 GHz then drifts by 24 Hz."""
@@ -53,7 +53,7 @@ PATH_CELLS = 0.1
 """Largest difference between measured and configured path, cells c/B; a wrong constant displaces the whole image."""
 
 SPLIT_DB, SPLIT_RAD = 1.0, 0.3
-"""Largest differences of gain, and of phase beyond the path difference, between two channels fed by one signal."""
+"""Largest differences between two channels fed by one signal: of gain, and of phase beyond the path difference."""
 
 
 # ---- Links: one path from pulse to pulse ----------------------------------------------------------------------------
@@ -72,7 +72,7 @@ class Contact:
     moves_db
         Largest amplitude difference between eighths of the recording; 0 if not significant.
     dropouts, pulses
-        Number of pulses without lock or 6 dB below the median; and of all pulses.
+        Number of pulses without lock or 6 dB below the median; number of all pulses.
     snr_db
         SNR of a compressed pulse.
     """
@@ -86,7 +86,7 @@ class Contact:
 
     @classmethod
     def of(cls, name: str, amplitude: Floats, noise: float, pulses: int) -> "Contact":
-        """Return the stability from (pulse,) amplitudes of locked pulses and their relative noise in one component."""
+        """Return the stability from (pulse,) amplitudes of locked pulses and their relative noise in I or Q."""
         median = float(np.median(amplitude))
         rms, snr_db = float(np.std(amplitude)) / median, -20 * np.log10(np.sqrt(2) * noise)
         threshold = 1 + SIGMAS * np.sqrt(2 / len(amplitude))
@@ -104,7 +104,7 @@ class Contact:
 
     @property
     def flags(self) -> dict[str, str]:
-        """Flag of an unsteady amplitude."""
+        """Flag for an unsteady amplitude."""
         is_steady = max(self.scatter_db, self.moves_db) <= AMPLITUDE_DB
         if self.dropouts <= DROPOUT_SHARE * self.pulses and is_steady:
             return {}
@@ -143,7 +143,7 @@ def measure_contact(name: str, form: Callable[[Pulses], Complexes], pulses: int)
 
 @dataclass(frozen=True)
 class Arrival:
-    """Further arrival: path beyond the strongest path in metres, and level relative to it in dB."""
+    """Further arrival: path beyond the strongest path in metres, and level relative to the strongest path in dB."""
 
     later_m: float
     level_db: float
@@ -162,8 +162,8 @@ class MeasuredLink:
     pulses
         Number of pulses of the link, locked or not.
     path_m, path_std_m
-        Electrical length relative to the start of the capture or, after division by the sidelink, to the sidelink,
-        metres of total path in vacuum; and standard deviation of its mean, from the scatter of the pulses.
+        Electrical length, metres of total path in vacuum, relative to the start of the capture or, after division by
+        the sidelink, to the sidelink; and standard deviation of its mean, from the scatter of the pulses.
     cell_m
         Range cell c/B of total path.
     frequency_hz
@@ -175,12 +175,12 @@ class MeasuredLink:
     arrivals
         Further arrivals, strongest first.
     direct_db
-        Level at the sidelink's delay relative to the path, dB; None if the path is there or the level is not
+        Level at the sidelink's delay relative to the path, dB; None if the path has that delay or the level is not
         significant.
     mean
         (subcarrier,) complex128, mean of the pulses.
     jumped, jump_m
-        Number of pulses locked at another delay, and median distance of their path, metres.
+        Number of pulses locked at another delay, and median difference of their path, metres.
     tone_hz, tone_db
         Frequency of the largest pulse-to-pulse change, and its level relative to the median of the band, dB.
     delay_ps
@@ -235,12 +235,12 @@ class MeasuredLink:
 
     @property
     def coherence_std(self) -> float:
-        """Standard deviation of Γ by noise, eq. 5."""
+        """Standard deviation of Γ due to noise, eq. 5."""
         return (1 - self.coherence_limit) / float(np.sqrt(max(len(self.terms) - 1, 1)))
 
     @property
     def noise_rad(self) -> float:
-        """Phase noise expected from the SNR, rms."""
+        """Phase noise expected at the measured SNR, rms."""
         return float(np.sqrt(1 / (2 * self.snr)))
 
     @property
@@ -250,7 +250,7 @@ class MeasuredLink:
 
     @property
     def phase_excess_rad(self) -> float:
-        """Phase noise beyond that expected from the SNR, rms about a straight line; 0 if not significant."""
+        """Phase noise in excess of that expected at the SNR, rms about a straight line; 0 if not significant."""
         residual = self.phase_rad - np.polyval(self._line(self.phase_rad)[0], self._centred_s)
         rms, allowed = float(np.sqrt(np.mean(residual**2))), self.noise_rad
         threshold = 1 + SIGMAS * np.sqrt(2 / len(residual))
@@ -258,13 +258,13 @@ class MeasuredLink:
 
     @property
     def phase_drift_rad(self) -> tuple[float, float]:
-        """Phase change over the recording by a linear fit, and its standard deviation."""
+        """Phase change over the recording from a linear fit, and its standard deviation."""
         (slope, _), std = self._line(self.phase_rad)
         return slope * self.lasts_s, std * self.lasts_s
 
     @property
     def delay_drift_ps(self) -> tuple[float, float]:
-        """Delay change over the recording by a linear fit, and its standard deviation."""
+        """Delay change over the recording from a linear fit, and its standard deviation."""
         (slope, _), std = self._line(self.delay_ps)
         return slope * self.lasts_s, std * self.lasts_s
 
@@ -296,7 +296,7 @@ class MeasuredLink:
         Parameters
         ----------
         interval_s
-            Pulse interval, seconds; differences with a missing pulse are omitted.
+            Pulse interval, seconds; differences that involve a missing pulse are omitted.
         """
         index = np.round((self.time_s - self.time_s[0]) / interval_s).astype(np.int64)
         error_s = np.full(int(index[-1]) + 1, np.nan)
@@ -313,7 +313,7 @@ class MeasuredLink:
 
     @property
     def flags(self) -> dict[str, str]:
-        """Flag → measured values, of exceeded limits."""
+        """Flag → measured values for exceeded limits."""
         flags, snr_db = {}, decibels(self.snr)
         if snr_db < WEAK_DB:
             flags["link_weak"] = f"{self.name}: SNR {snr_db:.1f} dB in a compressed pulse"
@@ -347,10 +347,10 @@ class MeasuredLink:
         return Flags.merged(flags, self.contact.flags)
 
 
-_FEWEST_DIFFERENCES = 8  # second differences for an Allan deviation
+_FEWEST_DIFFERENCES = 8  # least number of second differences for an Allan deviation
 _PARTS = 8  # parts of a recording whose amplitudes are compared
-_SHOWN = 4  # reported arrivals
-_HANN_STD = 1.51  # noise deviation of a delay fitted under a Hann window relative to no window (measured)
+_SHOWN = 4  # number of reported arrivals
+_HANN_STD = 1.51  # standard deviation of a delay fitted under a Hann window over that without (measured)
 _STANDS_OUT = 20.0  # least power of an arrival relative to the noise of the mean profile: 13 dB
 
 
@@ -378,7 +378,7 @@ def measure_link(
     divided
         True if transfer functions are divided by the sidelink, whose delay is then zero.
     prefix_cells
-        Largest delay in cells; None for delays of either sign up to half of all cells.
+        Largest delay in cells; None permits delays of either sign up to half of all cells.
 
     Notes
     -----
@@ -396,12 +396,12 @@ def measure_link(
     count, subcarriers = len(time_s), numerology.numbers.size
     cell_m = SPEED_OF_LIGHT_M_S / (subcarriers * numerology.spacing_hz)
     numbers = np.arange(count)
-    # 1. The direct path of each pulse: delay, phase and amplitude by maximum likelihood.
+    # 1. Delay, phase and amplitude of each pulse's direct path by maximum likelihood.
     paths: LineOfSight = joined([fit_block(form(block))[0] for block in blocks_of(numbers)])
     locked = paths.locked
     if locked.sum() < 2:
         return None
-    # 2. One delay for all pulses: the median relative to the first, modulo the length of the profile.
+    # 2. One delay for all pulses: the median of delays relative to the first, modulo the length of the profile.
     first = float(paths.delay_cells[locked][0])
     relative = (paths.delay_cells - first + subcarriers / 2) % subcarriers - subcarriers / 2
     #    With several delays, the most frequent: a median might lie between them.
@@ -417,7 +417,7 @@ def measure_link(
         return None
     if prefix_cells is not None:
         delay %= subcarriers
-    # 3. Every pulse at this delay, its contribution to an image; noise from the pulse-to-pulse changes of all cells.
+    # 3. Value of every pulse at this delay, its contribution to an image; noise from pulse-to-pulse changes of cells.
     align = phasors(np.array([delay / subcarriers]), subcarriers, first=-(subcarriers - 1) / 2)
     power, total = np.zeros(subcarriers), np.zeros(subcarriers, np.complex128)
     band, band_total = np.zeros(subcarriers), np.zeros(subcarriers, np.complex128)
@@ -439,7 +439,7 @@ def measure_link(
     changing = np.maximum(band - np.abs(band_total) ** 2 / used, 1e-30)
     tone = int(changing.argmax())
     direct = _at_sidelink(mean, delay, noise / used) if divided else None
-    # 4. The path from the mean under a Hann window, as sidelobes of other arrivals displace it by millimetres.
+    # 4. Path from the mean under a Hann window; otherwise sidelobes of other arrivals displace the path by millimetres.
     windowed = (fft.fft(mean) * np.hanning(subcarriers)).astype(np.complex64)
     path_m = (delay + float(fit_block(windowed[None])[0].delay_cells[0])) * cell_m
     return MeasuredLink(
@@ -464,7 +464,7 @@ def measure_link(
 
 
 def _arrivals(mean: NDArray[np.complex128], noise: float, cell_m: float) -> tuple[Arrival, ...]:
-    """Return significant arrivals of the mean profile in addition to the path, which lies in cell 0."""
+    """Return significant arrivals of the mean profile other than the path, which lies in cell 0."""
     power, cells = np.abs(mean) ** 2, mean.size
     peaks = (power > np.roll(power, 1)) & (power >= np.roll(power, -1)) & (power > _STANDS_OUT * noise)
     later = np.arange(cells)
@@ -475,7 +475,7 @@ def _arrivals(mean: NDArray[np.complex128], noise: float, cell_m: float) -> tupl
 
 
 def _at_sidelink(mean: NDArray[np.complex128], delay_cells: float, noise: float) -> float | None:
-    """Return the level at zero delay relative to the path, dB; None if the path is near or the level insignificant."""
+    """Return the level at zero delay relative to the path, dB; None if the path is near or the level is noise."""
     if abs(delay_cells) < APART_CELLS:
         return None
     near = np.abs(mean[(round(-delay_cells) + np.arange(-1, 2)) % mean.size]) ** 2
@@ -487,7 +487,7 @@ def _at_sidelink(mean: NDArray[np.complex128], delay_cells: float, noise: float)
 
 
 def clock_flags(name: str, clock: ClockOffset, numerology: Numerology, pulses: int) -> dict[str, str]:
-    """Return flags of a receiver's clock relative to the transmitter's: no common reference, or drift.
+    """Return flags of a receiver's clock relative to the transmitter's clock: no common reference, or drift.
 
     Examples
     --------
@@ -511,7 +511,7 @@ class BenchPathOffset:
     Attributes
     ----------
     offset_m, std_m
-        Measured path offset, and its standard deviation by noise.
+        Measured path offset, and its standard deviation due to noise.
     stated_m
         Configured path offset.
     cell_m
@@ -535,7 +535,7 @@ class BenchPathOffset:
 
 
 def reversed_flags(link: MeasuredLink, expected_m: float | None) -> dict[str, str]:
-    """Return a flag if echoes of a link arrive before its sidelink, unless the set-up implies this."""
+    """Return a flag if echoes of a link arrive before its sidelink signal, unless the set-up explains this."""
     early_m = link.path_m
     if early_m > -APART_CELLS / 2 * link.cell_m or (expected_m is not None and expected_m < 0):
         return {}
@@ -555,7 +555,7 @@ class SplitAgreement:
     phase_rad, phase_std_rad
         Phase difference at the band centre beyond that of the path difference, and its standard deviation.
     band_rad, band_db
-        Residual phase and amplitude differences over the band, beyond the path difference and noise, rms.
+        Rms phase and amplitude differences over the band in excess of the path difference and noise.
     """
 
     gain_db: float
@@ -566,7 +566,7 @@ class SplitAgreement:
     band_db: float
 
     def flags(self, name: str) -> dict[str, str]:
-        """Return a flag if the channels differ by more than the limits of one signal."""
+        """Return a flag if the channels differ by more than the limits for channels fed by one signal."""
         differs = abs(self.phase_rad) > max(SPLIT_RAD, SIGMAS * self.phase_std_rad)
         if not differs and abs(self.gain_db) <= SPLIT_DB and self.band_rad <= SPLIT_RAD and self.band_db <= SPLIT_DB:
             return {}
@@ -636,5 +636,5 @@ def _over_the_band(first: MeasuredLink, second: MeasuredLink) -> tuple[float, fl
 
 
 def _band_noise(link: MeasuredLink) -> float:
-    """Return the phase variance by noise of a subcarrier of a link's mean transfer function, rad²."""
+    """Return the phase variance due to noise of a subcarrier in a link's mean transfer function, rad²."""
     return link.noise * link.mean.size / len(link.terms) / (2 * float(np.mean(np.abs(link.mean) ** 2)))

@@ -28,7 +28,7 @@ def common_band(
     Returns
     -------
     float
-        0 to 1, within 0.09 of the overlap of equally wide bands with sharp edges.
+        Coherence, 0 to 1; differs by up to 0.09 from the overlap of equally wide bands with sharp edges.
 
     Notes
     -----
@@ -56,7 +56,7 @@ def window_px(spectrum: NDArray[np.float64], spacing_m: float, *, looks: float =
     spacing_m
         Pixel spacing.
     looks
-        Independent samples for the coherence estimate.
+        Required number of independent samples for the coherence estimate.
     most
         Largest side of a window, pixels.
 
@@ -65,7 +65,7 @@ def window_px(spectrum: NDArray[np.float64], spacing_m: float, *, looks: float =
     >>> window_px(np.eye(2) / 12, 0.25), window_px(np.eye(2) / 12, 2.0)
     (17, 5)
     """
-    cells = 12 * np.sqrt(max(np.linalg.det(spectrum), 0.0)) * spacing_m**2  # of one pixel
+    cells = 12 * np.sqrt(max(np.linalg.det(spectrum), 0.0)) * spacing_m**2  # area of a pixel, in looks
     side = np.sqrt(looks / min(cells, 1)) if cells > 0 else np.inf
     return int(min(2 * np.ceil((side - 1) / 2) + 1, most))
 
@@ -78,14 +78,14 @@ def coherence(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
     """Return coherence and phase of two images over a window about each pixel, and the number of looks of the window.
 
-    Both images are backprojected to the same terrain: their phase difference contains neither flat-earth nor terrain
-    phase, and no carrier although each image has one. No slope is removed.
+    Both images are backprojected to the same terrain: their phase difference contains neither the flat-earth nor the
+    terrain phase, nor the carrier that each image has. No slope is removed.
 
     Parameters
     ----------
     first, second
-        (y, x) complex64 on one grid, or one block of it with `window` // 2 pixels more on each side. Pixels that are
-        NaN in either image are excluded from all windows.
+        (y, x) complex64 on one grid, or a block of this grid with `window` // 2 more pixels on each side. Pixels that
+        are NaN in either image are excluded from all windows.
     window
         Pixels along a side, odd. Pixels outside the block are excluded.
 
@@ -95,9 +95,10 @@ def coherence(
         (y, x) float32, 0 to 1, biased estimate: its mean for independent images is `chance(looks)`, which `unbiased`
         removes. NaN where either image is NaN or zero within the window.
     phase
-        (y, x) float32, phase of the first image minus that of the second, rad; NaN where the magnitude is.
+        (y, x) float32, phase of the first image minus that of the second, rad; NaN where the magnitude is NaN.
     looks
-        Independent samples in a whole window, from the autocorrelation of each image; NaN for blocks without a value.
+        Independent samples in a whole window, from the autocorrelation of each image; NaN for blocks without valid
+        pixels.
 
     Raises
     ------
@@ -160,7 +161,7 @@ def unbiased(magnitude: NDArray[np.float32], looks: float) -> NDArray[np.float32
     Raises
     ------
     ValueError
-        If `looks` is 1 or less: any two samples are coherent.
+        If `looks` is 1 or less, as any two single samples are coherent.
 
     Examples
     --------
@@ -198,11 +199,11 @@ def _looks(one: NDArray[np.complex128], other: NDArray[np.complex128], window: i
 
 def _correlation(image: NDArray[np.complex128], window: int) -> NDArray[np.complex128]:
     """Return the autocorrelation at lags below `window` along both axes, 1 at lag 0."""
-    # Zero-padded, else the correlation would be circular.
+    # Zero-padded, because the correlation is circular otherwise.
     padded = [scipy.fft.next_fast_len(size + window - 1) for size in image.shape]
     lags = np.arange(1 - window, window)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # Single precision suffices, as the image has it; a peak of 1 avoids overflow of the power.
+        # Single precision suffices, as the image is complex64; a peak of 1 avoids overflow of the power.
         spectrum = scipy.fft.fft2((image / np.abs(image).max()).astype(np.complex64), padded)
         correlation = spectrum.real**2 + spectrum.imag**2
         for axis in (0, 1):
@@ -221,7 +222,7 @@ def map_coherence(
     Parameters
     ----------
     first, second
-        (y, x) complex64 on one grid, NaN where no image was formed; read one tile with its margin at a time.
+        (y, x) complex64 on one grid, NaN where no image was formed; each tile is read with its margin.
     tiles
         Windows that cover the grid.
     window
@@ -230,7 +231,7 @@ def map_coherence(
     Returns
     -------
     magnitude, phase, looks
-        As from `coherence`; looks are the median over tiles, NaN without a finite value.
+        As returned by `coherence`; looks are the median over tiles, NaN without a finite value.
     shared
         (y, x) float32, effective share of a window's pixels that contribute its energy: about 1/2 for terrain,
         1/`looks` for a point (docs/theory/interferometry.md, eq. 6).

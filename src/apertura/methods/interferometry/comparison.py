@@ -40,15 +40,16 @@ class InterferogramCounts:
     common
         Number of pixels visible in both images, without shadow or layover.
     coherent
-        Number of common pixels with significant coherence; `sensitive`: with sufficient sensitivity to height.
+        Number of common pixels with significant coherence; `sensitive` counts those with sufficient sensitivity to
+        height.
     coherence, chance
-        Median estimated coherence of the common pixels, and expected value for independent images.
+        Median estimated coherence of the common pixels, and its expected value for independent images.
     overlap
-        Median share of the spectrum that both images sample.
+        Median share of the image spectrum that both images sample.
     ambiguity_m
         Median height of ambiguity, metres.
-    told
-        Number of pixels with unwrapped phase; `apart`: in components without a reference level.
+    unwrapped
+        Number of pixels with unwrapped phase; `apart` counts those in components without a reference level.
     residues, loops, jumps, by
         As in `apertura.methods.interferometry.heights.Unwrapped`.
     folded
@@ -64,7 +65,7 @@ class InterferogramCounts:
     chance: float
     overlap: float
     ambiguity_m: float
-    told: int = 0
+    unwrapped: int = 0
     apart: int = 0
     residues: int = 0
     loops: int = 0
@@ -81,11 +82,11 @@ MOST_RESIDUES = 1e-3
 """Largest number of residues per loop of four pixels."""
 
 MOST_FOLDED = 0.01
-"""Largest number of points imaged by several pixels, as a share of the unwrapped pixels."""
+"""Largest number of points imaged at several pixels, relative to the number of unwrapped pixels."""
 
 
 def interferogram_flags(measured: InterferogramCounts) -> Flags:
-    """Return flag → measured values, of the limits that an interferogram exceeds.
+    """Return flag → measured values for the limits that an interferogram exceeds.
 
     Examples
     --------
@@ -108,8 +109,8 @@ def interferogram_flags(measured: InterferogramCounts) -> Flags:
     ambiguous = []
     if counts.apart:
         ambiguous.append(
-            f"{counts.apart} of {counts.told} unwrapped pixels lie in other components, with unknown multiples of 2π: "
-            "excluded"
+            f"{counts.apart} of {counts.unwrapped} unwrapped pixels lie in other components, "
+            "with unknown multiples of 2π: excluded"
         )
     if counts.jumps and not counts.by:
         ambiguous.append(
@@ -121,16 +122,16 @@ def interferogram_flags(measured: InterferogramCounts) -> Flags:
     inconsistent = []
     if counts.residues > MOST_RESIDUES * counts.loops:
         inconsistent.append(f"{counts.residues} phase residues in {counts.loops} loops of four pixels")
-    if counts.folded > MOST_FOLDED * counts.told:
+    if counts.folded > MOST_FOLDED * counts.unwrapped:
         inconsistent.append(f"{number_of(counts.folded, 'point')} imaged by several pixels, excluded")
     if inconsistent:
         flags["unwrapping_inconsistent"] = (
             f"{'; '.join(inconsistent)}: heights may have errors of multiples of {counts.ambiguity_m:.3g} m"
         )
-    if counts.told and not counts.points:
+    if counts.unwrapped and not counts.points:
         flags["height_relative"] = (
-            "no point of known height is visible: the median phase is assigned to the terrain height, and its error is "
-            "a height error that varies with the height of ambiguity"
+            "no point of known height is visible: heights are relative to the terrain model; their offset varies "
+            "with the height of ambiguity"
         )
     return flags
 
@@ -138,7 +139,7 @@ def interferogram_flags(measured: InterferogramCounts) -> Flags:
 # ---- Interferogram: coherence, phase, and geocoded heights ----------------------------------------------------------
 
 LEAST_LOOKS = 4.0
-"""Least number of looks over which the energy of a window is spread; with fewer, a point off its middle dominates."""
+"""Least number of looks over which the energy of a window is spread; with fewer, a point off its centre dominates."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +159,7 @@ class AssumedGround:
     known
         Points of known height.
     track_std
-        Function of the reference points of the heights that returns the standard deviation of the phase by track
+        Function of the reference points of the heights that returns the standard deviation of the phase due to track
         errors, (y, x) float64 rad; None if the track errors are unknown.
     """
 
@@ -216,7 +217,7 @@ def form_interferogram(
 
     Examples
     --------
-    An image with itself is coherent everywhere, and the phase is insensitive to height.
+    Two copies of an image are coherent everywhere, and their phase is insensitive to height.
 
     >>> generator, one = np.random.default_rng(0), np.ones((32, 32))
     >>> image = (generator.normal(size=(32, 32)) + 1j * generator.normal(size=(32, 32))).astype(np.complex64)
@@ -226,10 +227,10 @@ def form_interferogram(
     >>> own.measured.coherent, own.measured.sensitive, bool(np.isnan(own.panels["height"]).all())
     (1024, 0, True)
     """
-    # Coherence, phase and looks of every window (eqs. 2 to 6); pixels whose phase determines a height.
+    # Coherence, phase and looks of every window (eqs. 2 to 6), and the pixels whose phase determines a height.
     magnitude, phase, looks, shared = map_coherence(first, second, tiles, window=window)
     common = ground.visible & np.isfinite(magnitude)
-    enough = looks > 1  # the coherence of a single look is 1 for any images
+    enough = looks > 1  # for a single look, the coherence of any two images is 1
     energy = looks * shared.astype(np.float64)  # looks over which the energy of the window is spread
     dominated = energy < LEAST_LOOKS
     valid = (
@@ -240,13 +241,13 @@ def form_interferogram(
     centred = np.where(valid, np.angle(np.exp(1j * (phase - centre))), np.nan).astype(np.float32)
     unwrapped = unwrap(centred, magnitude, looks=looks)
     effective_looks = np.minimum(looks, 2 * energy)
-    # Phase constant between the images from points of known height (eq. 15), else from the median.
+    # Phase constant between the images from points of known height (eq. 15), otherwise from the median.
     known = [
         replace(
             point,
             measured_rad=float(phase[point.row, point.column]) - centre,
-            # decorrelation about a point is spread over all looks of the window, of which the point occupies one; the
-            # point response lies in the middle of the window and is not truncated
+            # decorrelation about a point is spread over all looks of the window, one of which contains the point; the
+            # point response lies at the centre of the window and is not truncated
             std_rad=float(phase_std(unbiased(magnitude[point.row, point.column], looks), looks)) / MARGIN,
         )
         for point in ground.known
@@ -254,7 +255,7 @@ def form_interferogram(
     ]
     reference = level(unwrapped, known)
     height_phase = remove_level(unwrapped, reference) if reference else np.full(common.shape, np.nan, np.float32)
-    # σ_φ of eq. 8, combined with the deviations of the level and of the tracks; geocoded heights (eq. 16).
+    # σ_φ of eq. 8, combined with the standard deviations due to the level and the tracks; geocoded heights (eq. 16).
     scatter = phase_std(unbiased(magnitude, looks), effective_looks).astype(np.float64)
     if reference:
         scatter = np.hypot(scatter, reference.std_rad or 0.0)
@@ -315,11 +316,11 @@ def _unwrapping(
     reference: Level | None,
     geocoded: PlacedHeights,
 ) -> InterferogramCounts:
-    """Return the counts with those of unwrapping added."""
+    """Return the counts with the results of unwrapping added."""
     unwrapped, kept = int(np.isfinite(phase.phase).sum()), int(np.isfinite(height_phase).sum())
     return replace(
         counted,
-        told=unwrapped,
+        unwrapped=unwrapped,
         apart=unwrapped - kept,
         residues=phase.residues,
         loops=phase.loops,

@@ -24,15 +24,15 @@ class Unwrapped:
     phase
         (y, x) float32, rad; NaN where not valid.
     part
-        (y, x) uint32, connected component, 0 outside; the multiple of 2π between components is unknown.
+        (y, x) uint32, number of the connected component, 0 outside; the multiple of 2π between components is unknown.
     by
-        Library and version; empty: not unwrapped, the phase is within π of its reference.
+        Library and version; empty if the phase is not unwrapped but within π of its reference.
     residues
         Number of loops of four pixels with a nonzero sum of wrapped phase differences.
     loops
         Number of loops of four valid pixels.
     jumps
-        Number of neighbours with wrapped phases that differ by more than π, which unwrapping must resolve.
+        Number of neighbouring pixels whose wrapped phases differ by more than π, which unwrapping must resolve.
     """
 
     phase: NDArray[np.float32]
@@ -44,7 +44,7 @@ class Unwrapped:
 
 
 def unwrap(phase: NDArray[np.float32], coherence: NDArray[np.float32], *, looks: float) -> Unwrapped:
-    """Unwrap the phase by snaphu if it is installed; else return the wrapped phase.
+    """Unwrap the phase by snaphu if it is installed; otherwise return the wrapped phase.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def unwrap(phase: NDArray[np.float32], coherence: NDArray[np.float32], *, looks:
         wrapped, weight, max(1.0, looks), cost="smooth", mask=valid, min_conncomp_frac=_LEAST_SHARE
     )
     known = valid & (part > 0)
-    # snaphu's phase is rounded: only its multiples of 2π are used, added to the measured phase
+    # as snaphu rounds its phase, only the multiples of 2π are used and added to the measured phase
     cycles = np.round((np.where(known, whole, 0) - np.where(known, phase, 0)) / (2 * np.pi))
     return Unwrapped(
         np.where(known, phase + 2 * np.pi * cycles, np.nan).astype(np.float32),
@@ -154,13 +154,13 @@ class Level:
     phase_rad
         Phase constant.
     part
-        Component of the unwrapped phase for which it is valid; other components have unknown multiples of 2π.
+        Component of the unwrapped phase for which the constant is valid; other components have unknown multiples of 2π.
     points
-        Points of known height that determine it; empty if it is the median of the phase.
+        Points of known height that determine the constant; empty if the constant is the median of the phase.
     spread_rad
-        Largest distance of a point from the constant; None for fewer than two points.
+        Largest deviation of a point from the constant; None for fewer than two points.
     std_rad
-        Standard deviation of the constant, an error common to all heights; None without points, as it is unknown.
+        Standard deviation of the constant, whose error is common to all heights; None (unknown) without points.
     """
 
     phase_rad: float
@@ -205,7 +205,7 @@ def level(phase: Unwrapped, known: Sequence[KnownHeight]) -> Level | None:
 
 
 def _level_std(constants: Sequence[float], stds: Sequence[float]) -> float:
-    """Return the standard deviation of the median of constants, from their deviations or, if larger, their scatter.
+    """Return the standard deviation of the median of constants, from their standard deviations or, if larger, scatter.
 
     Source: docs/theory/interferometry.md, eq. 15a.
     """
@@ -216,14 +216,14 @@ def _level_std(constants: Sequence[float], stds: Sequence[float]) -> float:
 
 
 def _unwrapped(point: KnownHeight, phase: Unwrapped, valid: NDArray[np.int64]) -> tuple[float, int]:
-    """Return the unwrapped phase measured at a point, and the component, both from the nearest valid pixel."""
+    """Return the unwrapped phase and the component at the valid pixel nearest to a point."""
     near = tuple(valid[np.argmin(((valid - (point.row, point.column)) ** 2).sum(axis=1))])
     cycles = np.round((float(phase.phase[near]) - point.measured_rad) / (2 * np.pi))
     return float(point.measured_rad + 2 * np.pi * cycles), int(phase.part[near])
 
 
 def remove_level(phase: Unwrapped, reference: Level) -> NDArray[np.float32]:
-    """Return the phase due to height in the reference component, (y, x) float32 rad; wrapped if not unwrapped.
+    """Return the phase due to height in the reference component, (y, x) float32 rad; wrapped without unwrapping.
 
     Examples
     --------
@@ -243,8 +243,8 @@ MARGIN = 1.4
 """Factor on the Cramér-Rao bound of the phase; the phase scatter of simulated terrain stays below it."""
 
 
-_STEPS = 30  # iterations of the fixed-point search for the pixel that images a point
-_MOST_COVERED = 1.5  # largest number of pixels that image a point; 2 is layover
+_STEPS = 30  # iterations of the fixed-point search for the pixel at which a point is imaged
+_MOST_COVERED = 1.5  # largest number of pixels at which a point is imaged; 2 indicates layover
 _TOLERANCE_PX = 0.05  # tolerance of the fixed-point search
 
 
@@ -267,7 +267,7 @@ def phase_std(coherence: NDArray[np.float32], looks: float | NDArray[np.float64]
     coherence
         (...) float32, unbiased.
     looks
-        Independent samples averaged for the phase, of all pixels or of each.
+        Independent samples averaged for the phase: one number for all pixels, or one for each pixel.
 
     Examples
     --------
@@ -288,7 +288,7 @@ def height_valid(sensed: Sensitivity, coherence: NDArray[np.float32], looks: flo
     sensed
         Sensitivity at the pixels.
     coherence
-        (...) float32, biased estimate.
+        (...) float32, estimate with bias.
     looks
         As for `phase_std`.
     """
@@ -308,11 +308,11 @@ class PlacedHeights:
     Attributes
     ----------
     height
-        (y, x) float64, terrain height at the middle of each pixel, metres; NaN if no pixel or several pixels image it.
+        (y, x) float64, terrain height at the centre of each pixel, metres; NaN unless imaged at exactly one pixel.
     std
-        (y, x) float64, standard deviation by the scatter of phase and level, metres.
+        (y, x) float64, standard deviation due to the scatter of phase and level, metres.
     folded
-        Number of points imaged by more than one pixel at these heights, by layover or unwrapping errors.
+        Number of points that these heights image at more than one pixel, due to layover or unwrapping errors.
     """
 
     height: Floats
@@ -326,10 +326,10 @@ def place_heights(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Flo
     Parameters
     ----------
     ground_m
-        (y, x) float64, heights assumed by the images.
+        (y, x) float64, heights assumed in image formation.
     rise_m, std_m
-        (y, x) float64, height of the terrain imaged by a pixel above the assumed one, NaN if unknown; and its standard
-        deviation.
+        (y, x) float64, height of the terrain imaged at a pixel above the assumed height, NaN if unknown; and its
+        standard deviation.
     shift_px
         (y, x, 2) float64, rows and columns from a pixel to the terrain imaged there, per metre of rise.
 
@@ -350,7 +350,7 @@ def place_heights(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Flo
     if not known.any():
         return PlacedHeights(np.full(rise_m.shape, np.nan), np.full(rise_m.shape, np.nan), 0)
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
-    # Pixel that images each point, eq. 16, by fixed-point iteration; unknown rises are the nearest known ones.
+    # Pixel at which each point is imaged, eq. 16, by fixed-point iteration; unknown rises are set to the nearest known.
     shift = np.moveaxis(shift_px, -1, 0) * rise_m[tuple(nearest)]
     position = np.stack(np.meshgrid(*map(np.arange, rise_m.shape), indexing="ij")).astype(np.float64)
     imaged_at, error_px = position, np.full(rise_m.shape, np.inf)
@@ -359,7 +359,7 @@ def place_heights(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Flo
         error_px, imaged_at = np.abs(target - imaged_at).max(axis=0), target
         if not (error_px > _TOLERANCE_PX).any():
             break
-    # Points imaged by several pixels, and points without convergence, have no height.
+    # Points imaged at several pixels, and points without convergence, have no height.
     folds = _covered(position + shift, np.abs(_stretch(shift)) * known) > _MOST_COVERED
     converged = (error_px <= _TOLERANCE_PX) & ~folds
     height, std = (map_coordinates(values, imaged_at, order=1, cval=np.nan) for values in (ground_m + rise_m, std_m))
@@ -368,7 +368,7 @@ def place_heights(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Flo
 
 
 def _covered(positions: Floats, area: Floats) -> Floats:
-    """Return the number of pixels that image each point: mean over 3 × 3 pixels of the areas mapped to the point."""
+    """Return the number of pixels at which a point is imaged: mean over 3 × 3 pixels of the areas mapped to it."""
     from scipy.ndimage import uniform_filter
 
     inside = np.logical_and.reduce(
@@ -380,7 +380,7 @@ def _covered(positions: Floats, area: Floats) -> Floats:
 
 
 def _stretch(shift: Floats) -> Floats:
-    """Return the terrain area imaged by a pixel, in pixels; negative in layover."""
+    """Return the terrain area imaged at a pixel, in pixels; negative in layover."""
     size = shift.shape[1:]
     rows, columns = (
         [np.gradient(component, axis=axis) if size[axis] > 1 else np.zeros(size) for axis in (0, 1)]

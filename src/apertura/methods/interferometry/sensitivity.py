@@ -10,17 +10,17 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.quality.path_errors import autocorrelation
 
 Legs = tuple[Floats, Floats]
-"""Phase centres of transmitter and receiver of the pulses that image each point, (point, pulse, 3) metres each."""
+"""Phase centres of transmitter and receiver for the pulses that illuminate a point, (point, pulse, 3) metres each."""
 
 PROBE = 0.02
-"""Height step of the finite difference as a share of the range: large against rounding, small against the range."""
+"""Height step of the finite difference relative to the range: large against rounding, small against the range."""
 
-_STEPS = 4  # Gauss-Newton steps; the first is accurate to first order in PROBE, each further one squares the error
+_STEPS = 4  # Gauss-Newton steps; the first is accurate to first order in PROBE, and each further step squares the error
 
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """Sensitivity of the phase between two images to the terrain height above the assumed one.
+    """Sensitivity of the phase between two images to the terrain height above the assumed height.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class Sensitivity:
     shift
         (..., 2) float64, displacement of the imaged terrain from the pixel, metres east and north per metre of height.
     overlap
-        (...) float64, spectral overlap of the two images; 0: no coherence.
+        (...) float64, spectral overlap of the two images; 0 means no coherence.
     range_m
         (...) float64, half the mean of both total paths.
 
@@ -86,13 +86,13 @@ def sensitivity(
     band_hz
         Lowest and highest frequency.
     window
-        (subcarrier,) float64, weights over the band for the overlap; flat by default.
+        (subcarrier,) float64, weights over the band, which affect the overlap; flat by default.
 
     Examples
     --------
-    Two tracks along x, 20 m away and 20 m high; the second is 1 m higher, which makes its line of sight steeper by
-    0.0244 rad: the slope is 4π/λ times that over sin θ = 0.7, and higher terrain is displaced towards the radar by
-    cot θ.
+    Two tracks along x are 20 m away and 20 m high; the second is 1 m higher, so that its line of sight is steeper by
+    0.0244 rad. The slope is 4π/λ times 0.0244 rad over sin θ = 0.7, and terrain that is 1 m higher is displaced towards
+    the radar by cot θ.
 
     >>> along = np.linspace(-4.0, 4.0, 9)[None, :, None] * [1.0, 0.0, 0.0]
     >>> low, high = along + [0.0, -20.0, 20.0], along + [0.0, -20.0, 21.0]
@@ -122,8 +122,9 @@ def sensitivity(
 def _moved(places_m: Floats, axes: Floats, images: tuple[Legs, Legs], paths: list[Floats], height_m: Floats) -> Floats:
     """Locate the terrain that is `height_m` higher and imaged at `places_m` in both images.
 
-    Its path difference is constant over the pulses, else it would be focused elsewhere along the track, and has a mean
-    of zero over both images, else it would be imaged elsewhere in range (docs/theory/interferometry.md, eq. 10).
+    The path difference of this terrain is constant over the pulses, otherwise it would be focused elsewhere along the
+    track, and has a mean of zero over both images, otherwise it would be imaged elsewhere in range
+    (docs/theory/interferometry.md, eq. 10).
     """
     east_north, moved = axes[:2], places_m + height_m[:, None] * axes[2]
     for _ in range(_STEPS):
@@ -131,7 +132,7 @@ def _moved(places_m: Floats, axes: Floats, images: tuple[Legs, Legs], paths: lis
         for legs, path in zip(images, paths, strict=True):
             residuals.append(-_less(path, moved, legs))
             gradients.append(_gradient(moved, legs) @ east_north.T)
-        # Unknowns east and north: residuals of each image about their mean over pulses, and the mean of both images.
+        # Unknowns east and north; residuals: path differences of each image about their mean, and mean of both images.
         rows = [residual - residual.mean(axis=1, keepdims=True) for residual in residuals]
         slopes = [gradient - gradient.mean(axis=1, keepdims=True) for gradient in gradients]
         rows.append(sum(residual.mean(axis=1, keepdims=True) for residual in residuals) / 2)
@@ -149,7 +150,7 @@ def _path(places_m: Floats, legs: Legs) -> Floats:
 
 
 def _less(path: Floats, moved: Floats, legs: Legs) -> Floats:
-    """Return the paths minus those to the displaced points."""
+    """Return the paths to the points minus the paths to the displaced points."""
     return np.asarray(path - _path(moved, legs))
 
 
@@ -165,7 +166,7 @@ def _gradient(places_m: Floats, legs: Legs) -> Floats:
 def _overlap(
     places_m: Floats, axes: Floats, images: tuple[Legs, Legs], band_hz: tuple[float, float], window: Floats | None
 ) -> Floats:
-    """Return the spectral overlap of both images, the product of those in range and cross-range."""
+    """Return the spectral overlap of both images, the product of the overlaps in range and in cross-range."""
     ground = [_gradient(places_m, legs) @ axes[:2].T for legs in images]
     middle = [gradient.mean(axis=1) for gradient in ground]
     along = middle[0] + middle[1]
@@ -196,11 +197,11 @@ def _correlated(one: Floats, other: Floats, window: Floats) -> Floats:
 
 # ---- Track errors ---------------------------------------------------------------------------------------------------
 
-_BINS = 128  # time bins within which the error of a track is constant
+_BINS = 128  # time bins, in each of which the error of a track is constant
 _FINER = 8  # interpolated samples of the aperture per given pulse
-_WITHIN = 33  # lags at which the correlation of two bins is averaged, odd
+_WITHIN = 33  # number of lags over which the correlation of two bins is averaged, odd
 _NODES = 1024  # points processed at once
-_REFERENCES = 256  # points whose mean phase represents that of all
+_REFERENCES = 256  # points whose mean phase represents the mean phase of all points
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +234,7 @@ class FlownAntenna:
 
 @dataclass(frozen=True, eq=False)
 class TrackPhase:
-    """Errors of the phase between two images by track errors.
+    """Errors of the phase between two images due to track errors.
 
     Attributes
     ----------
@@ -266,8 +267,8 @@ class TrackPhase:
 
         Examples
         --------
-        Two flights past a scene 30 m away; the second has a constant error of 1 cm along its line of sight to the
-        first point: no phase error there, and k (1 cm) sin 45° at a point seen 45° off.
+        Two flights pass a scene 30 m away. The track of the second has a constant height error of 1 cm, across the line
+        of sight to the first point: the phase error is zero there, and k (1 cm) sin 45° at a point 45° above.
 
         >>> places = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 30.0]])
         >>> antenna = np.broadcast_to([0.0, -30.0, 0.0], (2, 5, 3))

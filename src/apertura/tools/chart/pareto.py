@@ -48,7 +48,7 @@ def with_front(points: Sequence[Point]) -> list[Point]:
     return marked
 
 
-_BESIDE = 3.0  # times the slowest other point: the exact sum is drawn on the axis up to this time
+_BESIDE = 3.0  # multiple of the slowest other time, up to which the exact sum is drawn on the axis
 
 
 def draw_points(points: Sequence[Point], path: Path, *, title: str, accuracy_db: float) -> None:

@@ -68,7 +68,7 @@ def design(
 
 
 def as_plan(plan: FlightPlan | Mapping[str, Any] | str | Path, root: Path | None) -> tuple[FlightPlan, Path]:
-    """Return a plan, read if it is a file, and the folder of the files that it names."""
+    """Return a plan, after reading it if it is a file, and the folder of the files that it names."""
     if isinstance(plan, str | Path):
         return read_flight_plan(Path(plan)), root or Path(plan).absolute().parent
     if not isinstance(plan, FlightPlan):

@@ -31,10 +31,10 @@ from apertura.stages.radiometry import CalibratedPair, calibrated_pair
 from apertura.stages.scene import OpenScene
 
 LOSS_NODES = 3
-"""Error budgets along each side of the scene, interpolated bilinearly: the effects vary with range only."""
+"""Number of error budgets along each side of the scene; interpolated bilinearly, as effects vary with range only."""
 
 AMBIGUITY_NODES = 9
-"""Points along each side of the scene at which ambiguous echoes and path margins are computed."""
+"""Number of points along each side of the scene at which ambiguous echoes and path margins are computed."""
 
 Layer = NDArray[Any]
 

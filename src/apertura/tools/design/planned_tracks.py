@@ -62,7 +62,7 @@ _ARC_S = 0.05  # interval between points of a circle
 _MOST_EPOCHS = 2_000_000
 _MOST_PULSES = 5_000_000
 _IMAGED_POINTS = 65  # points of each leg when tracks are displaced together
-_RADIAL = 0.25  # tracks whose mean lies within this share of their mean distance from the scene centre surround it
+_RADIAL = 0.25  # tracks surround the scene if |mean position| / mean distance from its centre is below this ratio
 _SEED = 31  # seed of the random deviation from the track: the same plan gives the same results
 
 

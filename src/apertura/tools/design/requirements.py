@@ -22,7 +22,10 @@ SHARE = 95.0
 """Percentage of the visible pixels that must meet a requirement, since edges of a scene are worse than its centre."""
 
 COARSE_PX = 64
-"""Pixels along the longer side of the grid on which changes are compared; the outermost centres lie 1 % inside."""
+"""Number of pixels along the longer side of the grid on which changes are compared.
+
+The centres of the outermost pixels are 1 % of the side from the edges.
+"""
 
 _LAYERS = {
     "resolution_m": ("resolution", "most"),
@@ -32,7 +35,7 @@ _LAYERS = {
     "loss_db": ("loss", "most"),
     "ambiguity": ("ambiguity", "most"),
 }
-"""Requirement → layer, and "most" for an upper limit of it or "least" for a lower one."""
+"""Requirement → layer, and "most" for an upper or "least" for a lower limit of its values."""
 
 LEAST_GAIN_DB = 0.05
 """Minimum gain of a listed change, unless the complete shortfall is smaller: smaller gains are printed as zero."""
@@ -84,7 +87,7 @@ class Verdict:
     def report(self) -> dict[str, Any]:
         """JSON values of the verdict."""
         found = float(f"{self.found:.4g}") if np.isfinite(self.found) else None
-        values = {"requirement": self.requirement, "asked": self.required, "found": found, "met": self.met}
+        values = {"requirement": self.requirement, "required": self.required, "found": found, "met": self.met}
         return values | {"image": self.image, "cause": self.cause}
 
 
@@ -396,7 +399,7 @@ def _with_halved_position_errors(plan: FlightPlan) -> FlightPlan:
 
 @dataclass(frozen=True)
 class Tried:
-    """A plan that a search tried.
+    """Plan evaluated by a search.
 
     Attributes
     ----------

@@ -162,7 +162,7 @@ def headline(verdicts: Sequence[Verdict], changes: Sequence[Change]) -> str:
 
 
 def value_table(design: Design) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Return headings and rows of a table of all images: median, value met by 95 %, and visible share of the scene."""
+    """Return header and rows of a table of all images: median, value met by 95 %, and visible share of the scene."""
     images = design.images.values()
     listed = [name for name in _LISTED if any(np.isfinite(image.layers.get(name, np.nan)).any() for image in images)]
     rows = list[tuple[str, ...]]()

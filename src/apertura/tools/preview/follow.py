@@ -42,9 +42,9 @@ from apertura.tools.preview.pair import PairSoFar, PulseBlock
 from apertura.views.quality import explained_flags
 from apertura.views.webmap.document import Layer, Place, crs_of, map_document, stated_places, true_places, url_of
 
-_POLLS = 2  # polls of the files for each update of the images
+_POLLS = 2  # number of polls of the files per update of the images
 _BEHIND = 3  # a delay of more update intervals than this doubles the decimation of pulses
-_AT_EASE = 0.3  # busy share of the time below which the decimation is halved
+_AT_EASE = 0.3  # fraction of busy time below which the decimation is halved
 _MOST_DECIMATED = 64
 
 

@@ -21,9 +21,9 @@ from apertura.stages.ingest import captures_of
 from apertura.stages.node_log import shortest_wave
 from apertura.stages.transmitted import Transmitted
 
-_MARGIN_S = 60.0  # log margin before and after the pulses of a block: farther epochs do not affect the spline
-_KNOWN_BYTES = 4096  # compared at either end of the samples that were read, to detect a restarted recording
-_EPOCHS = 4  # lead of the log over a pulse: later epochs change the spline there by 0.27⁴ of its error at the end
+_MARGIN_S = 60.0  # margin of the log before and after the pulses of a block: farther epochs do not affect the spline
+_KNOWN_BYTES = 4096  # number of bytes compared at either end of the samples read, to detect a restarted recording
+_EPOCHS = 4  # epochs required after a pulse: later ones change the spline there by 0.27⁴ of its error at the end
 
 
 class NotFollowedError(CampaignError):
@@ -34,7 +34,7 @@ class NodeSoFar:
     """Recording and log of a node so far, complete captures and lines only.
 
     Data read before are dropped if the files no longer begin with them, which means that the recorder was restarted
-    under the same name. A change in the middle of the samples is not detected; the workflow reads all samples.
+    under the same name. A change between the ends of the samples is not detected; the workflow reads all samples.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ class NodeSoFar:
         return "" if self.complete else f"the log of {self.name} ends before its last capture"
 
     def acquisition(self, captures: NDArray[np.int64]) -> Acquisition:
-        """Return selected captures with the log around their times; frame numbers count them, as they are paired."""
+        """Return paired captures with the log around their times; their frame numbers are consecutive from 0."""
         if self._recording is None or self.track is None:
             raise TypeError("no recording or log has been read yet")
         if self._found is not None:

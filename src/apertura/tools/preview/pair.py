@@ -119,8 +119,8 @@ class ImageSoFar:
     grid, terrain
         Pixels, and their heights.
     share
-        Divisor of bandwidth and of the integration angle: 2 uses the middle half of the subcarriers and half the angle,
-        whose resolution cells are twice as wide and need every second pixel only.
+        Divisor of bandwidth and of the integration angle: 2 selects the central half of the subcarriers and half the
+        angle, whose resolution cells are twice as wide and require only every second pixel.
     accuracy_db
         Requested numerical error.
     threads
@@ -270,7 +270,7 @@ class ImageSoFar:
         joined = Compressed.joined(self._kept)
         profiles, times = joined.profiles, joined.time
         beams = self._beams(profiles.aperture, joined.axes, profiles.centre_frequency_hz)
-        plan = replace(self._plan, beams=beams, integration=None, flags={})  # those of the plan are of its first block
+        plan = replace(self._plan, beams=beams, integration=None, flags={})  # the plan's refer to its first block
         side = self._campaign.settings.processing.tile_px
         formation = Formation(None, profiles, self.grid, plan, side)
         cell_m = resolution_cell_m(formation)

@@ -97,8 +97,8 @@ def surroundings(path: Path, settings: Sequence[str]) -> Surroundings:
     path
         Absolute path of the file.
     settings
-        KEY=VALUE, keys of `LogOptions`; a column is columns.NAME, its factor scales.NAME, a base three numbers
-        separated by commas.
+        KEY=VALUE with keys of `LogOptions`: columns.NAME for a column, scales.NAME for its factor; a base consists of
+        three numbers separated by commas.
 
     Raises
     ------

@@ -171,7 +171,7 @@ def _as_problem(error: Exception, path: Path) -> CampaignError:
 
 
 def _readers(path: Path, context: Surroundings) -> Iterator[tuple[str, str, Reader]]:
-    """Yield kind, format and reader for every table row that matches the name; for a configured format only that."""
+    """Yield kind, format and reader for each table row that matches the name, or only for the configured format."""
     stated = "" if "format" in context.typed or ".track." in path.name else str(context.waveform.get("format", ""))
     if stated in PHASE_HISTORIES and path.name.endswith(PHASE_HISTORIES[stated].suffix):
         yield "phase history", stated, partial(_history, path, stated, context)

@@ -133,7 +133,7 @@ class DrawnCut:
     along_m
         (sample,) float64, metres from the peak.
     power
-        (sample,) float64, linear, the peak in the middle.
+        (sample,) float64, linear, with the peak at the centre.
     width_m, pslr_db, islr_db
         −3 dB width, peak and integrated sidelobe ratio; NaN if the cut is too short to measure them.
     """
@@ -232,7 +232,7 @@ class Measured:
     loss_db, std_db
         Their peak loss, negative, and its standard deviation; None if no point is bright enough.
     expected_db
-        Peak loss expected by the error budget; None if the size of no cause is known.
+        Peak loss expected by the error budget; None if no cause has a known size.
     """
 
     loss_db: float | None = None

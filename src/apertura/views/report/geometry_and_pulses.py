@@ -23,7 +23,7 @@ _STYLES: Mapping[str, Any] = {
     "receiver": {"color": ORANGE, "linestyle": "--", "linewidth": 1.6},
 }
 _MARGIN, _BELOW = 0.18, 0.1
-"""Margin of the plan around tracks and scene, and its share below them for scale bar and arrow; 1 is their side."""
+"""Margin of the plan view around tracks and scene, and its downward shift for the scale bar; 1: their side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,7 +331,7 @@ class Waterfall:
         for row, line in enumerate(power):
             at = self._offset[first + row] + np.arange(line.size)
             lower = np.floor(at + 1e-9).astype(np.int64)
-            upper = np.clip(at - lower, 0, 1)  # linear share of the next cell: start paths lie between cells
+            upper = np.clip(at - lower, 0, 1)  # linear interpolation: start paths lie between cells
             for cells, share in ((lower, 1 - upper), (lower + 1, upper)):
                 into = np.minimum(cells // self._together, size - 1)
                 column = (first + row) // self._pulses

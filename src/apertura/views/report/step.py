@@ -35,7 +35,7 @@ from apertura.views.report.page import page as page_of
 from apertura.workflow.lineage import result_of
 
 SETTING_COLUMNS = ("key", "value")
-"""Headings of the settings table."""
+"""Header of the settings table."""
 
 
 def page(campaign: Campaign, flight: str) -> list[Path]:
@@ -193,7 +193,7 @@ def _why(scene: OpenScene, name: str) -> str:
 
 
 def landing(campaign: Campaign) -> dict[str, Any]:
-    """Return the parts of the first page of the workflow's report as reStructuredText, with tables as only markup."""
+    """Return parts of the first page of the workflow's report as reStructuredText, without markup except tables."""
     flights = {flight.name: flight.pairs for flight in campaign.image_flights}
     reports = {
         f"{flight} {name}": read_report(campaign, flight, name)
@@ -205,7 +205,7 @@ def landing(campaign: Campaign) -> dict[str, Any]:
     return {
         "title": rst_text(campaign.settings.campaign),
         "flights": rst_text(", ".join(f"{flight} ({', '.join(names)})" for flight, names in flights.items())),
-        "asked": rst_table(SETTING_COLUMNS, setting_rows(campaign)),
+        "configuration": rst_table(SETTING_COLUMNS, setting_rows(campaign)),
         "verdicts": rst_table(VERDICTS, [verdict_row(name, report) for name, report in reports.items()]),
         "sentences": [
             rst_text(" ".join(sentences(f"Sum of the pairs of {flight}", reports[f"{flight} {FUSED}"])))

@@ -83,7 +83,7 @@ class Links:
     >>> with TemporaryDirectory() as folder:
     ...     links = Links(Path(folder))
     ...     links.compare({"raw/codes.npy": "4c"}, "results/f01/a-a/echo.manifest.json")
-    >>> [(link.name, link.state, link.why) for link in links]
+    >>> [(link.name, link.state, link.reason) for link in links]
     [('raw/codes.npy', 'missing', ['recorded in results/f01/a-a/echo.manifest.json'])]
     """
 

@@ -89,7 +89,7 @@ class Tally:
         self.largest = max(self.largest, float(difference.max()))
         self.square += float((difference**2).sum())
         self.peak = max(self.peak, float(np.abs(a).max()), float(np.abs(b).max()))
-        if self._sums is None:  # sums about one of the real values: no loss of digits when the mean is subtracted
+        if self._sums is None:  # sums relative to a real value, so that subtraction of the mean loses no digits
             self._sums, self._about = np.zeros(5, complex), 0.0 if self.phased else float(a[0])
         a, b = a - self._about, b - self._about
         self._sums += [a.sum(), b.sum(), np.vdot(a, a), np.vdot(b, b), np.vdot(b, a)]
@@ -162,7 +162,7 @@ def differences(first: Path, second: Path) -> dict[str, list[str]]:
     elif first.suffix == ".png":
         images = [np.asarray(picture(path)).astype(np.float32) for path in (first, second)]
         tally = Tally.of([(images[0], images[1])]) if images[0].shape == images[1].shape else None
-        lines["pixels"] = list(difference_lines(tally, unit="of 255")) if tally else []  # sizes are in geometry
+        lines["pixels"] = list(difference_lines(tally, unit="of 255")) if tally else []  # sizes: see geometry
     if not any(lines.values()):
         offset = first_difference(first, second)
         lines["bytes"] = [] if offset is None else [f"first difference at byte {offset}"]
@@ -352,15 +352,15 @@ def print_reproduced(path: Path, *, cores: int, keep: Path | None = None) -> int
         expected = f"one of the {len(known)} results of its campaign"
         remedy = "Choose one of the output of `apertura list`."
         raise CampaignError("not a result of the campaign as configured", path, expected, remedy)
-    wanted = [manifest for manifest in known if (product.root / manifest).is_file()] if whole else [product.manifest]
-    if not wanted:
+    requested = [manifest for manifest in known if (product.root / manifest).is_file()] if whole else [product.manifest]
+    if not requested:
         raise CampaignError("no results", product.root, "a processed campaign", "Run the workflow: `apertura run`.")
-    on_request = [manifest for manifest in wanted if on_demand(campaign, manifest)]
+    on_request = [manifest for manifest in requested if on_demand(campaign, manifest)]
     with _scratch(campaign, keep) as again:
-        status = run_workflow(again, cores, *(["all", *on_request] if whole else wanted))
+        status = run_workflow(again, cores, *(["all", *on_request] if whole else requested))
         if status:
             return status
-        lines = _outcome(product.root, again, wanted, known)
+        lines = _outcome(product.root, again, requested, known)
     for line in lines:
         print(shown(line, _LONGEST))
     if keep is not None:
@@ -368,13 +368,13 @@ def print_reproduced(path: Path, *, cores: int, keep: Path | None = None) -> int
     return 0 if lines[0].startswith("same") else 1
 
 
-def _outcome(root: Path, again: Path, wanted: Sequence[str], known: Sequence[str]) -> list[str]:
+def _outcome(root: Path, again: Path, requested: Sequence[str], known: Sequence[str]) -> list[str]:
     """Return lines with the differences of the requested results and the first differing result, or their agreement."""
-    lines = [line for manifest in wanted for line in compared(root, again, manifest)]
+    lines = [line for manifest in requested for line in compared(root, again, manifest)]
     if not lines:
-        count, more = sum(len(_files(root, manifest)) for manifest in wanted), len(wanted) - 1
+        count, more = sum(len(_files(root, manifest)) for manifest in requested), len(requested) - 1
         others = f" and {more} more results" if more else ""
-        return [f"same     {number_of(count, 'file')}, byte for byte, of {wanted[0]}{others}"]
+        return [f"same     {number_of(count, 'file')}, byte for byte, of {requested[0]}{others}"]
     first = next((manifest for manifest in known if _differs(root, again, manifest)), None)
     if first is None:
         return [*lines, "the manifests agree: a file was changed after it was made, see `apertura verify`"]

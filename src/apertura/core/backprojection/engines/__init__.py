@@ -18,8 +18,8 @@ ENGINES: dict[str, str] = {
 """Name → module that implements `Engine`, imported when the engine is loaded."""
 
 PATCH_PX = 16
-"""Tiles start at multiples of this, so that an engine working in patches of this size gives the same bits in every
-tiling."""
+"""Side of a patch, pixels. Tiles start at multiples of it, so that an engine that forms patches of this size yields the
+same bits in every tiling."""
 
 
 def load_engine(name: str) -> "Engine":

@@ -1,10 +1,10 @@
 """Backprojection on an NVIDIA GPU with range tables and one thread block per patch of pixels; needs extra ``cuda``.
 
-`prepare` keeps profiles and filters; the first tile expands them on the device to tables, cells of polynomials that
-include the carrier (docs/theory/engine.md, "Cells"). `form` starts a thread block for each patch of 16 × 16 pixels.
-Paths are computed by a series about the patch's middle ("A GPU", eq. 8), or exactly in float64 if the error of the
-series is too large, and weighted by beams and sector. The kernels in `cuda_kernels` are compiled at their first use;
-`candidates` predicts error and cost.
+`prepare` stores profiles and filters. With the first tile they are expanded on the device to tables: cells of
+polynomials that include the carrier (docs/theory/engine.md, "Cells"). `form` starts a thread block for each patch of
+16 × 16 pixels. Paths are computed by a series about the patch's middle ("A GPU", eq. 8), or exactly in float64 if the
+error of the series is too large, and weighted by beams and sector. The kernels in `cuda_kernels` are compiled at their
+first use; `candidates` predicts error and cost.
 """
 
 import ctypes
@@ -36,7 +36,8 @@ from apertura.core.backprojection.inputs import Profiles
 # for its lock without the GIL.
 
 _LOCK = Lock()
-_THREADS, _CHUNK_THREADS = 128, 32  # threads per block of the kernels that fill tables, and that compare pulses
+# threads per block of the kernel that fills tables, and of the kernel that compares pulses
+_THREADS, _CHUNK_THREADS = 128, 32
 
 
 @cache
@@ -50,7 +51,7 @@ def available() -> bool:
     """
     try:
         if not simulated():
-            ctypes.CDLL("libcuda.so.1")  # the driver's library: fails early, before the slow import below
+            ctypes.CDLL("libcuda.so.1")  # fails without the driver's library, before the slow import below
         from numba import cuda
 
         return bool(cuda.is_available())
@@ -130,7 +131,8 @@ def sum_on_device(
         if not PHASE_POLYNOMIALS[tables.design.phase_polynomial][2]:
             phase[-1] = 0  # no reduction by multiples of π
         numbers = np.array([*scales, *phase, *bounds], np.float64)
-        # Weights, and the spread of axes and antennas within each chunk of 64 pulses, for the rejection of chunks.
+        # Weights; and the spread of axes and antenna positions within each chunk of 64 pulses, for the rejection of
+        # chunks.
         on_device = [cuda.to_device(array) for array in weights]
         spread = cuda.to_device(np.full((-(-len(start_m) // CHUNK) + 1, 2, 3), np.inf))
         if beams and rejecting:
@@ -255,7 +257,7 @@ class ResidentTables:
     places_m
         (pulse, 2, 3) float64, phase centres of transmitter and receiver in the frame of the pixels.
     start_m
-        (pulse,) float64, total path of sample 0 and at the middle of cell 0, metres.
+        (pulse,) float64, total path of sample 0, which is also that at the middle of cell 0, metres.
     cell_m
         Total path across one cell, metres.
     wavenumber_rad_m
@@ -281,7 +283,7 @@ class ResidentTables:
     resident: Resident
 
     def __getitem__(self, pulses: slice) -> "ResidentTables":
-        """Return the tables of a slice of pulses, which share the arrays on the device."""
+        """Return the tables of a slice of pulses, with the same arrays on the device."""
         first, last, _ = pulses.indices(self.pulses.stop - self.pulses.start)
         start = self.pulses.start
         return replace(self, pulses=slice(start + first, start + max(first, last)))
@@ -343,7 +345,7 @@ def form(
         Tables from `prepare`.
     pixels
         (y, x, 3) float64, metres, in the frame of the phase centres, on any surface. A tile of a larger grid that
-        starts at multiples of 16 pixels gets the same bits as in the larger grid.
+        starts at multiples of 16 pixels has the same bits as in the larger grid.
     beams
         Weight of each pulse at each pixel; none by default. Pulses whose beam or sector does not illuminate a patch
         cost little.
@@ -351,13 +353,13 @@ def form(
         Largest phase error of the path series anywhere in a patch of 16 × 16 pixels; paths of patches and pulses that
         exceed it are exact, computed pixel by pixel in float64.
     counts
-        (4,) int64 array to which the pixels × pulses are added that are summed by series, summed by exact paths, have
-        no echo, or have no echo in a whole chunk of 64 pulses, which costs very little.
+        (4,) int64 array to which the numbers of pixel-pulse contributions are added: summed with path series, summed
+        with exact paths, without an echo, and in chunks of 64 pulses without any echo, which cost very little.
 
     Returns
     -------
     ndarray
-        (y, x) complex64. Pulses whose profile does not reach a pixel add zero; a pixel without a finite position is
+        (y, x) complex64. Pulses whose profile does not cover a pixel add zero; a pixel without a finite position is
         NaN.
 
     Raises

@@ -48,26 +48,28 @@ def expand(samples, taps, lead, down, carrier, turn, cells):  # type: ignore[no-
 # ---- Sums of tables over patches on a GPU
 #
 # numba compiles these functions for the device, or its simulator runs them as Python (NUMBA_ENABLE_CUDASIM=1).
-# numba treats literals as float64: float32 constants have names, as a single literal would slow down every pixel.
-# Equations are those of docs/theory/engine.md, "A GPU"; for weights, of "Antennas" there and of integration.md.
+# numba treats literals as float64: float32 constants have names, because a single literal would slow down every pixel.
+# Equation numbers refer to docs/theory/engine.md, "A GPU"; for weights, to its section "Antennas" and integration.md.
 
-warnings.filterwarnings("ignore", "Grid size .* low occupancy")  # expected for the patches of the certificate
+warnings.filterwarnings("ignore", "Grid size .* low occupancy")  # a warning expected for the patches of the certificate
 
 ROWS = 4
 """Rows of threads of a patch: each thread sums every fourth pixel of a column, and reads common values once."""
 
 _PIXELS, _EACH, _LANES = SIDE * SIDE, SIDE // ROWS, SIDE * ROWS
-_SERIES, _EXACT, _SKIPPED, _UNSEEN = range(4)  # VARIANTS of the engine; _UNSEEN: a whole chunk without an echo
+# indices of the engine's VARIANTS; _UNSEEN: a whole chunk without an echo
+_SERIES, _EXACT, _SKIPPED, _UNSEEN = range(4)
 _NO_CELL = 2**32 - 1
-_ROUNDER = np.float32(1.5 * 2**23)  # adding and subtracting it rounds to an integer
+_ROUNDER = np.float32(1.5 * 2**23)  # adding and subtracting this number rounds to an integer
 _ONE, _ZERO, _TWO, _THREE = np.float32(1), np.float32(0), np.float32(2), np.float32(3)
-_B1, _B2, _B3, _B4 = np.float32(-1 / 4), np.float32(1 / 8), np.float32(-5 / 64), np.float32(7 / 128)  # of eq. 8
+# coefficients of eq. 8
+_B1, _B2, _B3, _B4 = np.float32(-1 / 4), np.float32(1 / 8), np.float32(-5 / 64), np.float32(7 / 128)
 _LEG, _MIDDLE, _WORDS = 5, 10, 11  # layout of a pulse in shared memory: five words per leg, position of the origin
 _CELLS_PER_M, _WAVENUMBER, _TOLERANCE, _CELLS, _PHASE = range(5)  # indices in `numbers`
 _CENTRE, _INNER, _OUTER = 13, 14, 15  # indices of the sector's parameters in `numbers`
 _X, _Y, _Z, _REACH, _PATCH_CENTRE, _CENTRE_REACH = range(
     6
-)  # indices in `patch`: origin, reach, sector centre, its reach
+)  # indices in `patch`: origin, its reach, sector centre, its reach
 _VARIANT, _ORIGIN, _ZONE = range(3)  # indices in `steps`: path variant, cell of the origin, zone of the sector
 
 
@@ -131,7 +133,7 @@ def _over_an_image(weighed):  # type: ignore[no-untyped-def]
 
 @cuda.jit(device=True)
 def _write(lane, positions, total, tally, results):  # type: ignore[no-untyped-def]
-    """Write the sums of a thread to the image; add pixels × pulses of its pulses to the counts of their variants."""
+    """Write the sums of a thread to the image; add the pixel-pulse contributions to the counts of their variants."""
     image, counts = results
     above, left = cuda.blockIdx.y * SIDE, cuda.blockIdx.x * SIDE
     for n in range(_EACH):
@@ -241,12 +243,12 @@ def _view(p, patch, numbers, tables, shared):  # type: ignore[no-untyped-def]
 
 
 @cuda.jit(device=True)
-def _chunk(chunk, mine, shared, given, weighing):  # type: ignore[no-untyped-def]
+def _chunk(chunk, mine, shared, inputs, weighing):  # type: ignore[no-untyped-def]
     """Add a chunk of pulses to a thread's pixels; the chunk is summed in float32 first."""
     first, count = chunk
     lane, positions, near, total = mine
     words, steps, patch = shared
-    (antennas, start_m, cells), turn, numbers = given
+    (antennas, start_m, cells), turn, numbers = inputs
     weights, weighed = weighing
     # Sums of this chunk in float32; rows of cells are read once for all pixels of a thread.
     part = cuda.local.array((_EACH, 2), np.float32)
@@ -349,10 +351,12 @@ def _carrier_at(turn, u):  # type: ignore[no-untyped-def]
 # are computed from them and the offsets from the origin.
 
 _INSIDE, _EDGE, _OUTSIDE = range(3)
-"""Zones of a patch by its weight: one inside the sector, variable at its edge, zero outside the sector or a beam."""
+"""Zones of a patch by weight: one inside the sector, variable at the sector's edge, zero outside the sector or a
+beam."""
 
 _ENDS, _SPREAD = 4, 5  # indices in `weights`
-_FIRST, _PER_RAD, _LAST = range(3)  # of a cut: first angle, samples per radian, index of the last sample (-1: no beam)
+# layout of a cut: first angle, samples per radian, index of the last sample (-1: no beam)
+_FIRST, _PER_RAD, _LAST = range(3)
 _ANTENNA_SPREAD, _BEAM_SPREAD, _SECTOR_SPREAD = range(
     3
 )  # largest differences of a chunk's pulses from its middle pulse
@@ -360,7 +364,8 @@ _SECTOR, _S, _BEAM, _BEAM_WORDS = 11, 19, 20, 12  # layout of a pulse in shared 
 _WEIGHED_WORDS = 45  # odd, to avoid bank conflicts of threads that write them
 _HALF_PI = np.float32(math.pi / 2)
 _PI = np.float32(math.pi)
-_MARGIN = 1e-5  # rad, and of s: larger than the float32 error, so that a weight of zero or one holds at each pixel
+# margin of angles, rad, and of s: exceeds the float32 error, so that a weight of zero or one is valid at each pixel
+_MARGIN = 1e-5
 
 
 @cuda.jit
@@ -368,7 +373,7 @@ def spread_of_chunks(antennas, sector_axes, beam_axes, spread):  # type: ignore[
     """Fill the spread of each chunk, (chunk, 2, 3), one thread per chunk.
 
     For each leg: the largest differences of the chunk's pulses from its middle pulse in position (metres), beam axes
-    and sector axis. The last row is that of a single pulse: zeros.
+    and sector axis. The last row applies to a single pulse and contains zeros.
     """
     chunk = cuda.grid(1)
     if chunk >= len(spread):
@@ -416,7 +421,7 @@ def _centres(lane, positions, weights, numbers, mine):  # type: ignore[no-untype
 
 @cuda.jit(device=True)
 def _centre(x, y, z, ends, numbers):  # type: ignore[no-untyped-def]
-    """Return the sector centre of a pixel: the configured centre, or the nearest one with a fully flown sector."""
+    """Return the sector centre of a pixel: the configured one, or the nearest whose sector lies within the flight."""
     if not len(ends):
         return numbers[_CENTRE]
     low, high = math.inf, -math.inf
@@ -433,12 +438,12 @@ def _centre(x, y, z, ends, numbers):  # type: ignore[no-untyped-def]
 
 
 @cuda.jit(device=True)
-def _is_reached(chunk, lane, patch, numbers, given):  # type: ignore[no-untyped-def]
+def _is_reached(chunk, lane, patch, numbers, inputs):  # type: ignore[no-untyped-def]
     """Return True if any pulse of a chunk may have a weight in a patch; one chunk per thread is evaluated at once."""
-    tables, weights, reached, words = given
+    tables, weights, reached, words = inputs
     if chunk % _LANES == 0:
         spread, mine = weights[_SPREAD], chunk + lane
-        cuda.syncthreads()  # until no thread reads the values that are overwritten below
+        cuda.syncthreads()  # wait until no thread reads the values that are overwritten below
         reached[lane] = 0
         if mine < len(spread) - 1:
             middle = min(mine * CHUNK + CHUNK // 2, len(tables[1]) - 1)
@@ -448,9 +453,9 @@ def _is_reached(chunk, lane, patch, numbers, given):  # type: ignore[no-untyped-
 
 
 @cuda.jit(device=True)
-def _weigh(p, patch, numbers, given, shared):  # type: ignore[no-untyped-def]
+def _weigh(p, patch, numbers, inputs, shared):  # type: ignore[no-untyped-def]
     """Write the weights of a pulse over a patch and its zone to shared memory; skip the pulse if they are zero."""
-    (tables, weights), (word, step) = given, shared
+    (tables, weights), (word, step) = inputs, shared
     if step[_VARIANT] != _SKIPPED:
         spread = weights[_SPREAD]
         step[_ZONE] = _zone(p, spread[len(spread) - 1], patch, numbers, (tables[0], weights, word))
@@ -521,9 +526,9 @@ def _last_angle(cut):  # type: ignore[no-untyped-def]
 
 
 @cuda.jit(device=True)
-def _weight(w, zone, near, legs, given):  # type: ignore[no-untyped-def]
+def _weight(w, zone, near, legs, inputs):  # type: ignore[no-untyped-def]
     """Return the weight of a pulse at a pixel from its offset to the origin, in float32; `legs` are s of eq. 8."""
-    (_, _, cuts, gains, _, _), numbers = given
+    (_, _, cuts, gains, _, _), numbers = inputs
     x, y, z, weight = near[0], near[1], near[2], _ONE
     if zone == _EDGE:
         # s of eq. 1 changes little over a patch: only this change has float32 errors.
@@ -576,9 +581,9 @@ def _look_up(radians, cut, gains):  # type: ignore[no-untyped-def]
 
 
 @cuda.jit(device=True)
-def _exact_weight(p, zone, pixel, centre, given):  # type: ignore[no-untyped-def]
+def _exact_weight(p, zone, pixel, centre, inputs):  # type: ignore[no-untyped-def]
     """Return the weight of a pulse at a pixel from its position, in float64."""
-    antennas, (sector_axes, beam_axes, cuts, gains, _, _), numbers = given
+    antennas, (sector_axes, beam_axes, cuts, gains, _, _), numbers = inputs
     positions, at = pixel
     s, weight = -centre, _ONE
     for leg in range(2):

@@ -17,7 +17,7 @@ from apertura.core.backprojection.engines.range_interpolation import design_tabl
 from apertura.core.backprojection.job import Job
 
 SIDE = KERNEL.patch_side
-"""Pixels along a patch, which one thread block sums; tiles start at multiples of it."""
+"""Pixels along a patch, which is summed by one thread block; tiles start at multiples of this number."""
 
 
 TAPS = KERNEL.taps
@@ -25,19 +25,20 @@ TAPS = KERNEL.taps
 
 
 DEGREE = 2
-"""Degree of the polynomials in a cell; linear ones save two of six look-ups but need 1.7 times as many cells."""
+"""Degree of the polynomials in a cell; degree 1 saves two of six look-ups but requires 1.7 times as many cells."""
 
 
 CHUNK = 64
-"""Pulses summed in float32; these partial sums are added in float64."""
+"""Number of pulses summed in float32; the partial sums are added in float64."""
 
 
 LAST_ORDER, LAST_TERM = 6, 21 / 1024
-"""First order of √(1 + s) neglected in eq. 8, and its coefficient; all neglected terms: at most that over 1 − |s|."""
+"""First order of √(1 + s) neglected in eq. 8, and its coefficient; all neglected terms sum to at most that term/(1 −
+|s|)."""
 
 
 FARTHEST = 0.5
-"""Largest |s| at which the series is used; beyond it the error bound is too loose."""
+"""Largest |s| at which the series is used; for larger |s| the error bound is too loose."""
 
 
 FLOAT32_ERROR, FLOAT32_RMS = 2.5e-7, 3.2e-8
@@ -87,13 +88,13 @@ _CELL_S, _SAMPLE_S = 2e-11, 8e-10  # per pulse and coefficient of a cell; per pu
 _PLACE_S = 3.2e-9  # per pixel: transfer of position and sum
 
 
-_SECTOR_S, _BEAM_S = 3e-11, 1e-10  # additional, at the edge of a sector and for each beam, from operation counts
+_SECTOR_S, _BEAM_S = 3e-11, 1e-10  # additional time at the edge of a sector and for each beam, from operation counts
 
 
 _START_S = 3.0
 
 
-_SIMULATED_S = 1e-4  # per pixel and pulse in the simulator, and half of it per weight (measured)
+_SIMULATED_S = 1e-4  # per pixel and pulse in the simulator, and half of that per weight (measured)
 
 
 def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterator[Setting]:
@@ -111,7 +112,7 @@ def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterat
 
 
 def series(view: View, *, wavenumber_rad_m: float, tolerance_rad: float) -> tuple[float, float]:
-    """Return the share of patches × pulses with exact paths, and the phase error of all paths.
+    """Return the share of patch-pulse combinations with exact paths, and the phase error of all paths.
 
     Parameters
     ----------
@@ -125,7 +126,7 @@ def series(view: View, *, wavenumber_rad_m: float, tolerance_rad: float) -> tupl
     Returns
     -------
     exact : float
-        Share of patches × pulses.
+        Share of patch-pulse combinations.
     error_rad : float
         RMS over patches, pulses and pixels.
 

@@ -35,7 +35,8 @@ class Setting:
         Predicted RMS error at random pixels, dB.
     form_seconds, table_seconds
         Predicted time for all pixels, and for the tables common to all tiles, on one core of a 2023 server with
-        AVX-512. Times of other machines have approximately the same ratios, so that a choice depends on the job alone.
+        AVX-512. On other machines, the times of settings have approximately the same ratios, so that the choice depends
+        only on the job.
     table_bytes
         Size of the tables of all pulses.
     reasons
@@ -88,9 +89,10 @@ class Engine(Protocol):
     available
         Returns True if the engine can run on this machine.
     NEEDS
-        Requirements, one phrase; omitted by an engine that runs everywhere.
+        Requirements, one phrase; omitted by an engine without requirements.
     TIMED
-        False if the cost of the engine has not been measured: the planner never selects it, it runs on request only.
+        False if the cost of the engine has not been measured: the engine is used only on request, never selected by the
+        planner.
     candidates
         (job, pulses=, requested=) → settings with predicted error and cost; `pulses` may be fewer than the job's,
         `requested` contains options fixed by the config.
@@ -103,8 +105,8 @@ class Engine(Protocol):
         (shape of a block of pixels, form_options) → windows that can be formed independently with the same bits;
         omitted by an engine that forms pixels in patches of `PATCH_PX`.
     VARIANTS
-        Names of the variants of the sum; `form` adds the pixels × pulses of each variant to an int64 array `counts`.
-        Omitted by an engine with one variant.
+        Names of the variants of the sum; `form` adds the number of pixel-pulse contributions of each variant to an
+        int64 array `counts`. Omitted by an engine with one variant.
     form
         (prepared, pixels (y, x, 3) float64, beams=None, **form_options) → (y, x) complex, the sum over the pulses;
         releases the GIL and starts no threads.

@@ -3,9 +3,9 @@
 1. `prepare` converts range profiles to tables (native/expand.hpp): each cell contains the least-squares polynomial of
    the profile, times the carrier (docs/theory/engine.md, "Cells"; `range_interpolation` designs the filters).
 2. `form` sums the tables over patches of 16 × 16 pixels (native/patch.cpp, batch.hpp). Paths are polynomials in blocks
-   of 4 × 4 pixels with one curvature for the patch or one for each block, or exact in float64: the cheapest within
-   `tolerance_rad` ("Paths"). Beam weights are polynomials over the patch if they are smooth (eq. 7), sector weights
-   polynomials at the edge of the sector (docs/theory/integration.md, eq. 3).
+   of 4 × 4 pixels with one curvature for the patch or one for each block, or are computed exactly in float64, whichever
+   has the lowest cost within `tolerance_rad` ("Paths"). Beam weights are polynomials over the patch if they are smooth
+   (eq. 7), sector weights polynomials at the edge of the sector (docs/theory/integration.md, eq. 3).
 3. `candidates` predicts the share of each path variant, error and cost (docs/theory/planner.md).
 
 `prepare` and `form` release the GIL and start no threads. `available` returns False if no compiler was present at
@@ -141,24 +141,24 @@ def form(
         Tables from `prepare`.
     pixels
         (y, x, 3) float64, metres, in the frame of the phase centres (ECEF or local), on any surface. A tile of a
-        larger grid that starts at multiples of 16 pixels gets the same bits as in the larger grid.
+        larger grid that starts at multiples of 16 pixels has the same bits as in the larger grid.
     beams
-        Weight of each pulse at each pixel; none by default. A beam or sector that does not illuminate a patch costs
-        little.
+        Weight of each pulse at each pixel; none by default. Pulses whose beam or sector does not illuminate a patch
+        cost little.
     accumulate
         Numeric type of the sum over pulse blocks.
     tolerance_rad
         Largest phase error of the path series anywhere in a patch of 16 × 16 pixels; paths of patches and pulses that
         exceed it are exact, computed pixel by pixel in float64.
     counts
-        (4,) int64 array to which the patches × pulses with shared curvature, own curvature, exact paths, and without
-        an echo are added.
+        (4,) int64 array to which the numbers of patch-pulse combinations are added: with shared curvature, own
+        curvature, exact paths, and without an echo.
 
     Returns
     -------
     ndarray
-        (y, x) complex64. Pulses whose profile does not reach a pixel add zero; a pixel without a finite
-        position is NaN.
+        (y, x) complex64. Pulses whose profile does not cover a pixel add zero; a pixel without a finite position is
+        NaN.
 
     Raises
     ------
@@ -204,7 +204,8 @@ def _expand(
     used = (length - 1) * design.up // design.down + 1
     steps = -(-used // (design.up * TAPS)) * TAPS
     width = -(-(used + 2 * MARGIN) // TAPS) * TAPS
-    width += 16 * (width % 256 == 0)  # else all rows map to the same cache lines: up to four times slower
+    # otherwise all rows map to the same cache lines, and the sum is up to four times slower
+    width += 16 * (width % 256 == 0)
     index = np.arange(steps) * design.up + np.arange(design.up)[:, None]
     carrier = _parts(np.exp(1j * _turn(np.asarray(carrier_rad_per_cell * index))), axis=1)
     cells = np.zeros((pulses, 2 * (degree + 1), width), np.float32)
@@ -230,18 +231,18 @@ def _turn(phase_rad: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class PatchWeights:
-    """Shares of patches × pulses by the method of computing antenna weights.
+    """Shares of patch-pulse combinations by the method of computing antenna weights.
 
     Attributes
     ----------
     smooth, pixelwise, dark
-        Shares weighted by a polynomial, weighted pixel by pixel, and not illuminated; they sum to 1.
+        Share weighted by a polynomial, share weighted pixel by pixel, and share not illuminated; they sum to 1.
     error
         RMS error of the polynomials relative to the RMS of the weights.
     antennas
         Number of beams.
     edge
-        Share at the smooth edge of the sector among those inside the sector.
+        Of the combinations inside the sector, the share at its smooth edge.
     """
 
     smooth: float = 1.0
@@ -282,7 +283,7 @@ def patch_weights(
     half_patch = (KERNEL.patch_side - 1) / 2  # pixels
     across = half_patch * np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), -1).reshape(9, 2)
     nodes = place_m + np.einsum("ns,spc->npc", across, steps_m)
-    # Share at the edge of the sector among the pulses inside it.
+    # Of the pulses inside the sector, the share at its edge.
     weight = None if beams.sector is None else beams.sector.weight(aperture, place_m)
     illuminated = np.array([]) if weight is None else weight > 0
     edge = float((weight[illuminated] < 1).mean()) if weight is not None and illuminated.any() else 0.0
@@ -328,10 +329,11 @@ TOLERANCES_RAD = (1.5e-3, 1e-3, 7e-4, 5e-4, 3e-4, 1.5e-4, 5e-5, 1.5e-5)
 """Candidate phase tolerances of the path series, rad."""
 
 WIDE_SUM_DB = -105.0
-"""Error below which the sum over pulses is float64; the error of a float32 sum is about -115 dB."""
+"""Tolerated error below which the sum over pulses is computed in float64; the error of a float32 sum is about -115
+dB."""
 
 _PULSES, _PULSES_OF_SECTOR = 48, 512  # pulses sampled for the geometry
-_WORST_TO_RMS = 1 / 3  # RMS phase error over the largest in a patch
+_WORST_TO_RMS = 1 / 3  # RMS phase error relative to the largest in a patch
 _FLOAT32_RAD = 2e-6  # rounding error of tables and look-ups
 _NO_ERROR = 1e-20  # added before a logarithm
 
@@ -344,9 +346,9 @@ _SECTOR_S = 6.7e-10  # per pixel and pulse at the edge of a sector (additional)
 
 
 _BLOCK_REACH = np.sqrt(2) * (KERNEL.patch_side - KERNEL.block_side) / 2
-"""D of a flat patch in pixels: distance from its middle to the centre of a corner block."""
+"""D of a flat patch, pixels: distance from the middle of the patch to the centre of a corner block."""
 _PIXEL_REACH = np.sqrt(2) * (KERNEL.block_side - 1) / 2
-"""δ in pixels: distance from the centre of a block to a corner pixel."""
+"""δ, pixels: distance from the centre of a block to a corner pixel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -401,7 +403,7 @@ def pixel_steps(ground_m: NDArray[np.float64], axis: int, spacing_m: float) -> N
 def path_variants(
     view: View, *, cell_m: float, wavenumber_rad_m: float, tolerance_rad: float
 ) -> tuple[tuple[float, float, float], float]:
-    """Return the share of pulses × patches of each path variant, and the phase error of their paths.
+    """Return the share of patch-pulse combinations with each path variant, and the phase error of the paths.
 
     Parameters
     ----------
@@ -417,7 +419,8 @@ def path_variants(
     Returns
     -------
     shares : tuple of float
-        Shares of shared curvature in narrow windows, of wide windows (shared or own curvature), and of exact paths.
+        Share with shared curvature in narrow windows, share with wide windows (shared or own curvature), and share with
+        exact paths.
     error_rad : float
         RMS over patches and pulses of the largest error in a patch.
 
@@ -444,7 +447,8 @@ def path_variants(
     step = np.abs(view.slope).sum(axis=0)
     curvature = KERNEL.curvature_span * view.spacing_m**2 * (1 / view.range_m).sum(axis=0)
     block_cells = ((KERNEL.block_side - 1) * step + 2 * curvature) / cell_m + 1
-    group_cells = block_cells + KERNEL.block_side * step / cell_m  # of the 2 × 2 blocks in a narrow window
+    # cells spanned by the 2 × 2 blocks in a narrow window
+    group_cells = block_cells + KERNEL.block_side * step / cell_m
     window_cells = KERNEL.window - KERNEL.window_margin
     # The cheapest variant with a bound within the tolerance, else exact paths.
     has_shared_curvature = (block_cells <= window_cells) & (shared_rad <= tolerance_rad)
@@ -514,8 +518,7 @@ def _reasons(
 ) -> dict[str, str]:
     shared, wide, exact = (100 * share for share in shares)
     paths = (
-        f"shares of pixels × pulses: shared curvature {shared:.0f} %, wide windows {wide:.0f} %, exact paths "
-        f"{exact:.0f} %"
+        f"pixel-pulse pairs with shared curvature {shared:.0f} %, wide windows {wide:.0f} %, exact paths {exact:.0f} %"
     )
     beams = "" if beams_db is None else f", antenna weights {beams_db:.1f} dB"
     return {

@@ -17,16 +17,15 @@ from apertura.core.antenna.beam import Beam, Beams
 from apertura.core.geometry.sector import Sector
 
 # ---- Sizes and error bounds of the compiled kernel
-#
-# The planner uses them also if the engine is not compiled; a test compares them with those of the library.
+# They are required by the planner also if the engine is not compiled; a test compares them with those of the library.
 
 
 @dataclass(frozen=True)
 class KernelConstants:
     """Sizes and error bounds of the kernel.
 
-    D is the largest distance of a block from its patch's origin, δ that of a pixel from its block's centre, R the
-    range; errors refer to the path of one leg, in the unit of D, δ and R.
+    D is the largest distance of a block from the origin of its patch, δ the largest distance of a pixel from the centre
+    of its block, and R the range; errors refer to the one-way path, in the unit of D, δ and R.
 
     Attributes
     ----------
@@ -39,12 +38,13 @@ class KernelConstants:
     window
         Table cells within reach of one look-up; tables have the same number of empty cells at both ends.
     echo_taps, echo_degree
-        Samples used for an echo at a single point, and degree of their weight polynomials (docs/theory/autofocus.md,
-        "What pulses add").
+        Number of samples used for an echo at a single point, and degree of their weight polynomials
+        (docs/theory/autofocus.md, "What pulses add").
     term_taps
-        Samples used for an echo in float64, for certificates.
+        Number of samples used for an echo in float64, for certificates.
     window_margin
-        Cells: a path lies up to ½ cell beyond the cell to which it is rounded; the rest covers float32 rounding.
+        Margin of a window, cells: a path lies up to ½ cell beyond the cell to which it is rounded; the rest is for
+        float32 rounding.
     fifth_order
         Factor of D⁵/R⁴. Order n of |w + d| is at most max |P_{n-2} − P_n| / (2n − 1) · dⁿ/Rⁿ⁻¹, 0.083 for n = 5, plus a
         margin for higher orders.
@@ -55,7 +55,8 @@ class KernelConstants:
     own_curvature_error
         Factor of D²δ²/R³ if each block has its own curvature: six terms of 1/8, which it includes except for a tenth.
     curvature_span
-        Second-order terms displace a pixel of a block by at most 1.5² their coefficients; twice that bounds all blocks.
+        Second-order terms displace a pixel of a block by at most 1.5² times their coefficients; twice that value is a
+        bound for all blocks.
     weight_change, weight_curvature
         Largest first and second differences of antenna weights between the nodes of a patch, relative to the beam's
         peak, for which the weights are a polynomial.
@@ -101,9 +102,9 @@ class TreeConstants:
     slots
         Number of slots for node counts and, above them, for sides of tiles in pixels, to which nodes are interpolated.
     leaf
-        Pulses of a leaf, all summed by one variant.
+        Number of pulses of a leaf, all summed by the same variant.
     virtual, virtual_margin
-        Largest number of virtual pulses of a leaf, and their number beyond the degree of their curve.
+        Largest number of virtual pulses of a leaf, and excess of their number over the degree of their curve.
     terms
         Number of polynomials of the track over a leaf: one more than the highest degree of a curve.
     degree
@@ -113,7 +114,7 @@ class TreeConstants:
     weights
         Coefficients of the antenna gain over a tile.
     weighted_rad
-        Band added at a tile's nodes by smooth weights, rad per half tile.
+        Additional band at the nodes of a tile due to smooth weights, rad per half tile.
     """
 
     nodes: int = 128
@@ -253,14 +254,14 @@ STRUCTS = (BeamJob, SectorJob, ApertureJob, TableJob, EchoJob, TermsJob, TreeTil
 # ---- Loading the compiled library
 #
 # Bound with ctypes: the GIL is released during a call, and one wheel supports every Python version. The library
-# reports the layout of its structs; a library with a layout different from this module is rejected on loading.
+# reports the layout of its structs; a library whose layout differs from that of this module is rejected on loading.
 
 INSTRUCTION_SETS = ("avx512", "avx2", "portable")
 
 NAMED_BY = "APERTURA_KERNEL"
 """Environment variable: path of a library that replaces the installed one."""
 
-# Resolved once, as calls may be short.
+# Resolved only once, as calls may be short.
 _BUILT = Path(str(files("apertura.core.backprojection.engines") / "_backprojection.so"))
 
 

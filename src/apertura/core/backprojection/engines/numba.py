@@ -27,15 +27,15 @@ from apertura.core.windowed_sinc import kaiser_sinc
 instruction_set = compiled_for
 READS: Literal["profiles"] = "profiles"
 STANDS_IN_FOR = "native"
-"""Engine that this one replaces in the planner's selection if that engine cannot run."""
+"""Engine for which this engine is the substitute in the planner's selection if that engine cannot run."""
 OVERSAMPLINGS = (2, 4, 6, 8, 12, 16, 24, 32)
 
 _SAMPLE_S = 3.1e-8  # seconds per pulse and table sample
 _PIXEL_S = 3.2e-8  # seconds per pixel and pulse
 _REFINED_DB = -98.0  # error of the sinc filter of the table
 _HALF_TAPS = 10
-_PIXELS_AT_ONCE = 1024  # pixels whose weights are in memory
-_KAISER_BETA = 10.0  # -100 dB, with half the band as transition
+_PIXELS_AT_ONCE = 1024  # number of pixels whose weights are in memory at once
+_KAISER_BETA = 10.0  # shape of the window for an error of -100 dB, with half the band as transition
 
 
 class Options(EngineOptions):

@@ -22,7 +22,7 @@ BAND = np.cos(np.pi * (np.arange(160) + 0.5) / 160)
 """Frequencies at which errors are evaluated, with the band edges at ±1: Chebyshev nodes, dense at the edges."""
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
-_WITHIN = _NODES / 2  # positions inside a cell, in cells
+_WITHIN = _NODES / 2  # positions inside a cell at which errors are evaluated, in cells
 _WITHIN_WEIGHTS = _WEIGHTS / 2
 
 
@@ -82,7 +82,7 @@ class TableDesign:
     Attributes
     ----------
     up, down
-        Number of cells that cover `down` samples, and number of these samples.
+        `up` cells cover `down` samples.
     taps
         (up, degree + 1, tap) float32, filters for each coefficient of each of the `up` cells.
     lead
@@ -138,7 +138,7 @@ def band_error_db(squared_error: NDArray[np.float64], window: NDArray[np.float64
 
 
 def ratio(profile_oversampling: float, oversampling: float) -> tuple[int, int]:
-    """Return the numbers of cells and samples of the same path, with at least `oversampling` cells per Nyquist cell.
+    """Return the numbers of cells and of samples of equal length, with at least `oversampling` cells per Nyquist cell.
 
     Examples
     --------
@@ -171,7 +171,7 @@ def design_table(
     Notes
     -----
     Source: docs/theory/engine.md, "Cells". The filters are least-squares optimal over the band of the profiles, so that
-    oversampled profiles require few taps.
+    oversampled profiles require a small number of taps.
 
     Examples
     --------
@@ -190,7 +190,7 @@ def design_table(
     basis = np.exp(1j * omega[:, None] * (np.arange(taps) - before))
     target = ideal.reshape(-1, omega.size).T
     filters = np.linalg.lstsq(_stacked(basis), _stacked(target), rcond=1e-9)[0].T.reshape(up, degree + 1, taps)
-    # Their error, with the carrier inside a cell as a short polynomial.
+    # Error of the polynomials, with the carrier inside a cell as a short polynomial.
     coefficients = np.einsum("pkt,wt->pkw", filters, basis)
     carrier_rad_per_cell = carrier_rad_per_sample * down / up
     polynomial, phase = _phase(carrier_rad_per_cell)

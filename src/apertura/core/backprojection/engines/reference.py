@@ -1,4 +1,4 @@
-"""Backprojection by the double sum over pulses and subcarriers in float64, the slow reference of all other engines."""
+"""Backprojection by the double sum over pulses and subcarriers in float64: the slow reference for all other engines."""
 
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -25,7 +25,7 @@ class Options(EngineOptions):
 
 
 def available() -> bool:
-    """Return True, as the engine runs everywhere."""
+    """Return True, as the engine has no requirements."""
     return True
 
 

@@ -4,10 +4,11 @@ Over a tile of up to 256 × 256 pixels, the sum of neighbouring pulses is band-l
 reference pulse (docs/theory/tree.md, eq. 3 and 4). It is therefore computed at a small number of nodes and
 interpolated:
 
-1. **Surface** (`tree_geometry`). The pixel positions of a tile are approximated by Legendre polynomials, plane or of
-   degree 6.
-2. **Plan** (native/tree_plan.hpp). Every subaperture of each level gets the fewest nodes that support its band (4b),
-   and every leaf of 64 pulses the fewest virtual pulses (8). Levels stop where 128 nodes are insufficient.
+1. **Surface** (`tree_geometry`). The pixel positions of a tile are approximated by a plane or by Legendre polynomials
+   of degree 6.
+2. **Plan** (native/tree_plan.hpp). Every subaperture of each level is assigned the smallest number of nodes that
+   supports its band (4b), and every leaf of 64 pulses the smallest number of virtual pulses (8). The highest level is
+   the last at which 128 nodes are sufficient.
 3. **Leaves** (native/tree_leaf.hpp). The pulses of a leaf are aligned to the tile's centre (7), presummed to virtual
    pulses (8), expanded to cells and summed at the nodes of the leaf, with the weights of antennas and sector (13).
 4. **Merges** (native/tree_merge.hpp). Subapertures of 64, 256 and `chunk` pulses are merged by two small matrix
@@ -15,10 +16,10 @@ interpolated:
 5. **Height layers** (`tree_geometry`). If pixels lie off the surface (9), the tile is formed on several parallel layers
    and interpolated between them (11).
 
-Parts that a tree cannot sum are summed on the quarters of the tile, then by the direct kernel (engine `native`): ends
-of profiles inside the tile, weights that are not smooth, more than 128 nodes, tiles below 32 × 32 pixels. A tile
-depends only on its own pixels. `tree_inputs` prepares the inputs common to all tiles and the jobs of the library,
-`tree_prediction` predicts the error (10) and cost of a setting.
+Contributions that a tree cannot sum are summed on the quarters of the tile, or otherwise by the direct kernel (engine
+`native`). This applies to ends of profiles inside the tile, weights that are not smooth, more than 128 nodes, and tiles
+below 32 × 32 pixels. A tile depends only on its own pixels. `tree_inputs` prepares the inputs common to all tiles and
+the jobs of the library, `tree_prediction` predicts error (10) and cost of a setting.
 """
 
 from collections.abc import Iterator, Mapping
@@ -112,19 +113,20 @@ def form(
     presum_db
         Tolerated error from deviations of the track from the curve of the virtual pulses, dB RMS.
     side_px
-        Largest side of the tiles into which the block is divided; the bits of a tile do not depend on the others.
+        Largest side of the tiles into which the block is divided; the bits of a tile do not depend on the other tiles.
     chunk
         Pulses of the largest subaperture.
     height_layers
         Largest number of height layers between which a tile of rough terrain is interpolated; tiles that require more
         are summed directly.
     counts
-        (3,) int64 array to which the pixels × pulses summed by tree, summed directly, and without an echo are added.
+        (3,) int64 array to which the numbers of pixel-pulse contributions are added: summed by tree, summed directly,
+        and without an echo.
 
     Returns
     -------
     ndarray
-        (y, x) complex64. Pulses whose profile does not reach a pixel add zero; a pixel without a finite position is
+        (y, x) complex64. Pulses whose profile does not cover a pixel add zero; a pixel without a finite position is
         NaN.
 
     Raises
@@ -171,7 +173,7 @@ def pieces(shape: tuple[int, ...], form_options: Mapping[str, Any]) -> Iterator[
 
 @dataclass(eq=False)
 class _Block:
-    """Sum of all pulses at a block of pixels: image, tolerated errors, and pixels × pulses of each variant."""
+    """Sum of all pulses at a block of pixels: image, tolerated errors, and number of contributions per variant."""
 
     trees: Trees
     nodes_db: int
@@ -183,7 +185,7 @@ class _Block:
     _quarters: dict[JobTile, list[JobTile]] = field(default_factory=dict)
 
     def tiles(self, tile_windows: list[Window]) -> list[JobTile]:
-        """Return the tiles of windows of the block; small and rough tiles are not summed by tree."""
+        """Return the tiles that correspond to windows of the block; small and rough tiles are not summed by tree."""
         limit = 2 * 10 ** (self.nodes_db / 10)
         return [
             JobTile(

@@ -154,7 +154,7 @@ def _sinc(band_rad: float, a: NDArray[np.float64], b: NDArray[np.float64]) -> ND
 
 
 def nodes_for(band_rad: NDArray[np.float64], error_db: int) -> NDArray[np.int64]:
-    """Return the least numbers of nodes that support bands; `TREE.nodes` + 1 if no allowed number does.
+    """Return the least numbers of nodes that support bands; `TREE.nodes` + 1 if no allowed number is sufficient.
 
     Examples
     --------
@@ -166,7 +166,7 @@ def nodes_for(band_rad: NDArray[np.float64], error_db: int) -> NDArray[np.int64]
 
 # ---- Tiles, and the smooth surface through their pixels
 
-_PLANE_M = 2e-5  # largest RMS distance of pixels from a plane for a plane surface
+_PLANE_M = 2e-5  # largest RMS distance of pixels from a plane for which a plane surface is used
 _THIN = 20  # largest number of pixels along a side in the fit of a surface
 
 
@@ -211,7 +211,7 @@ def windows(shape: tuple[int, ...], side_px: int) -> Iterator[Window]:
 
 
 def surfaces_of(pixels: NDArray[np.float64], parts: list[Window]) -> list[Surface]:
-    """Fit surfaces to the pixels of tiles: planes if these are accurate enough.
+    """Fit surfaces to the pixels of tiles: planes if they are sufficiently accurate.
 
     Parameters
     ----------
@@ -250,7 +250,7 @@ def _fit(pixels: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
     """Return the coefficients of the surface fitted to pixels of a tile."""
     middle = pixels[pixels.shape[0] // 2, pixels.shape[1] // 2]
     (rows, fit_rows), (columns, fit_columns) = (_fitting(size, degree) for size in pixels.shape[:2])
-    offsets = pixels[np.ix_(rows, columns)] - middle  # for accuracy, as positions may be geocentric
+    offsets = pixels[np.ix_(rows, columns)] - middle  # subtracted for accuracy, as positions may be geocentric
     coefficients = np.tensordot(fit_rows, fit_columns @ offsets, 1)
     coefficients[0, 0] += middle
     return np.ascontiguousarray(coefficients)
@@ -289,12 +289,12 @@ def _normal(coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
 # ---- Leaves and larger subapertures
 
 LEAF = TREE.leaf
-"""Pulses of a leaf, which are presummed to virtual pulses if possible, and summed at its nodes."""
+"""Number of pulses of a leaf; they are presummed to virtual pulses if possible, and summed at the nodes of the leaf."""
 
 DEGREES = (5, 9, 14, 20)
 """Candidate degrees of the curve through a leaf's track on which virtual pulses lie."""
 
-_SECOND = 256  # pulses of a subaperture of leaves
+_SECOND = 256  # number of pulses of a subaperture of several leaves
 
 
 def subaperture_sizes(chunk: int) -> tuple[int, ...]:
@@ -309,14 +309,14 @@ def subaperture_sizes(chunk: int) -> tuple[int, ...]:
 
 
 def leaves_of(places_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (leaf, pulse, 3) positions; the last position is repeated to fill its leaf."""
+    """Return (leaf, pulse, 3) positions; the last position is repeated to complete the last leaf."""
     count = -(-len(places_m) // LEAF)
     filling = np.repeat(places_m[-1:], count * LEAF - len(places_m), axis=0)
     return np.concatenate([places_m, filling]).reshape(count, LEAF, 3)
 
 
 def parabola_deviation(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (leaf,) largest distance of pulses from the parabola through the first, middle and last one, metres."""
+    """Return (leaf,) largest distance of pulses from the parabola through the first, middle and last pulse, metres."""
     x, nodes_of_parabola = np.linspace(-1, 1, LEAF), [0, (LEAF - 1) // 2, LEAF - 1]
     to_all = np.vander(x, 3) @ np.linalg.inv(np.vander(x[nodes_of_parabola], 3))
     residual = leaves_m - to_all @ leaves_m[:, nodes_of_parabola]
@@ -334,12 +334,12 @@ def leaf_roughness(one_m: NDArray[np.float64], other_m: NDArray[np.float64]) -> 
     Parameters
     ----------
     one_m, other_m
-        (leaf, pulse, 3) float64, phase centres of the two antennas, which may be on one platform.
+        (leaf, pulse, 3) float64, phase centres of the two antennas, possibly on one platform.
 
     Returns
     -------
     ndarray
-        (leaf, curve) float64, deviation of both legs together, metres RMS.
+        (leaf, curve) float64, deviation of both one-way paths together, metres RMS.
 
     Examples
     --------
@@ -388,9 +388,9 @@ def _polynomials() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 #
 # docs/theory/tree.md, "Height layers".
 
-MOST_LAYERS = 32  # largest number of layers of a tile; more cost more than the direct sum
+MOST_LAYERS = 32  # largest number of layers of a tile; with a larger number the direct sum is faster
 
-_TABLE = 8192  # heights with tabulated weights
+_TABLE = 8192  # number of heights with tabulated weights
 _SAMPLED = 64  # pulses sampled for the band
 
 
@@ -474,7 +474,7 @@ class HeightLayers:
 
     @classmethod
     def of(cls, relief: SurfaceResidual, band_rad: float, error_db: int) -> "HeightLayers":
-        """Return the fewest layers that support a band, at the nodes (eq. 6) of the tile's heights."""
+        """Return the smallest number of layers that supports a band, at the nodes (eq. 6) of the tile's heights."""
         middle, half = relief.span_m
         return cls(relief, middle + half * nodes(layers_for(band_rad, error_db), error_db), error_db)
 
@@ -492,7 +492,7 @@ class HeightLayers:
         return [(slice(n * rows, (n + 1) * rows), slice(0, columns)) for n in range(len(self.heights_m))]
 
     def read(self, images: NDArray[np.complex64], pulse: Aperture, wavenumber_rad_m: float) -> NDArray[np.complex64]:
-        """Interpolate the image at the pixels, (y, x) complex64, from that on the layers; `pulse` is s of eq. 11.
+        """Interpolate the image at the pixels, (y, x) complex64, from the image on the layers; `pulse` is s of eq. 11.
 
         Notes
         -----

@@ -57,7 +57,7 @@ _TOLERANCES_RAD = {-74: 1.5e-3, -80: 7e-4, -86: 3e-4, -92: 1.5e-4, -98: 1e-4}
 
 @lru_cache
 def direct_setting(nodes_db: int, profile_oversampling: float, carrier_rad_per_sample: float) -> DirectSetting:
-    """Return a setting of the direct kernel whose error is below that of trees with the error `nodes_db`.
+    """Return a setting of the direct kernel whose error is below that of trees with the node error `nodes_db`.
 
     Examples
     --------
@@ -74,7 +74,7 @@ def direct_setting(nodes_db: int, profile_oversampling: float, carrier_rad_per_s
 
 
 class DirectTables:
-    """Tables of the direct kernel, computed on the first request of a tile and shared by all tiles."""
+    """Tables of the direct kernel, computed when a tile first requires them, and shared by all tiles."""
 
     def __init__(self, profiles: Profiles):
         self._profiles, self._lock, self._tables = profiles, Lock(), dict[int, Tables]()
@@ -89,13 +89,13 @@ class DirectTables:
 # ---- Inputs common to all tiles
 
 CELLS_AT_ONCE = 4
-"""Divisor of the number of cells per sample, from the lanes of an AVX-512 vector."""
+"""Divisor of the number of cells per sample, given by the lanes of an AVX-512 vector."""
 
 LEAST_PIXELS = 32**2
-"""Least number of pixels of a tile; for fewer the overhead of a tree exceeds the cost of the direct sum."""
+"""Least number of pixels of a tile; for a smaller tile, the overhead of a tree exceeds the cost of the direct sum."""
 
 LEAST_QUARTER_PX = 64
-"""Least side of the quarter of a tile, pixels; the direct sum of smaller quarters is cheaper."""
+"""Least side of the quarter of a tile, pixels; for smaller quarters, the direct sum is cheaper."""
 
 _SAMPLED = 64  # pulses sampled for the roughness
 _DELAY_DEGREE = 9
@@ -113,7 +113,7 @@ class Trees:
         Filters of the cells.
     deviation_m
         (leaf,) float32, largest deviation of the pulses of a leaf from the parabola through its first, middle and last
-        one, metres.
+        pulse, metres.
     rough_m
         (leaf, 4) float32, deviation from curves of increasing degree, metres RMS.
     tracks_m
@@ -170,11 +170,11 @@ class Trees:
         return self.tables[self.direct_setting(nodes_db).oversampling][self.first : self.first + len(self)]
 
     def direct_setting(self, nodes_db: int) -> DirectSetting:
-        """Return the setting of the direct kernel for trees with the error `nodes_db`."""
+        """Return the setting of the direct kernel for trees with the node error `nodes_db`."""
         return direct_setting(nodes_db, self.profiles.oversampling, self.wavenumber_rad_m * self.profiles.step_m)
 
     def roughness(self, surface: Surface) -> float:
-        """Return the error by pixels off the surface of a tile, computed by the function `roughness`."""
+        """Return the error from pixels off the surface of a tile, computed by the function `roughness`."""
         aperture = self.profiles.aperture
         sampled = aperture[aperture.sample(_SAMPLED)]
         return roughness(sampled, surface, wavenumber_rad_m=self.wavenumber_rad_m, band_rad_m=self.band_rad_m)
@@ -196,7 +196,7 @@ class Trees:
 
 
 def roughness(aperture: Aperture, surface: Surface, *, wavenumber_rad_m: float, band_rad_m: float) -> float:
-    """Return the relative mean squared error by pixels off the surface of their tile.
+    """Return the relative mean squared error from pixels off the surface of their tile.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ def roughness(aperture: Aperture, surface: Surface, *, wavenumber_rad_m: float, 
     if not np.isfinite(surface.rough_m):
         return np.inf
     rate = aperture.path_gradient(surface.centre_m[None])[:, 0] @ surface.up
-    reference = rate[len(rate) // 2]  # the middle pulse of the flight, not of each chunk
+    reference = rate[len(rate) // 2]  # the middle pulse of the whole flight, not of a chunk
     of_phase, of_delay = wavenumber_rad_m**2 * ((rate - reference) ** 2).mean(), band_rad_m**2 / 3 * (rate**2).mean()
     return float(surface.rough_m**2 * (of_phase + of_delay))
 
@@ -320,9 +320,10 @@ class Weighed(NamedTuple):
     edge
         (group,) bool, True if the sector ends within the tile.
     slope
-        (group, 3) float32, change of the depth in that edge along ξ, along η and over the pulses, per half extent.
+        (group, 3) float32, change of the depth in the sector's edge along ξ, along η and over the pulses, per half
+        extent.
     each
-        (group,) bool, True if weights jump from pulse to pulse, which prevents presumming.
+        (group,) bool, True if weights change abruptly from pulse to pulse, which prevents presumming.
     """
 
     variant: NDArray[np.uint8]
@@ -507,7 +508,8 @@ class Chunk:
     def _fill(self, job: TreeJob, tiles: "ctypes.Array[TreeTile]") -> None:
         """Add to a planned job the nodes and the matrices A of eq. 5, 6 and 8 for its node counts.
 
-        The tables are indexed by node count; sides of tiles in pixels, the last target of a merge, have higher slots.
+        The tables are indexed by slot: the node count, or, for the pixels as targets of the last merge, a higher slot
+        for each side of a tile.
         """
         # Required A: from a child's node count to the slot of its parent's node count or of the pixels.
         slots: dict[int, int] = {}  # pixels along a side → slot

@@ -1,7 +1,7 @@
 """Prediction of the error, the directly summed share, and the cost of trees (docs/theory/tree.md, "Error" and "Cost").
 
 The library computes the bands of a sample of tiles and pulse chunks of the job. The bands determine the numbers of
-nodes and virtual pulses for every tolerated error, and these the predicted error and cost.
+nodes and virtual pulses for every tolerated error; these numbers determine the predicted error and cost.
 """
 
 import ctypes
@@ -62,7 +62,7 @@ class TileView:
     bands_rad
         (2,) float for each level, half width of the band along columns and rows, rad per half tile.
     turn_rad
-        Largest phase change of the carrier within half a leaf relative to the tile's centre.
+        Largest change of the carrier phase, relative to that at the tile's centre, within half a leaf.
     rough_rad
         (curve,) RMS phase of deviations from curves of increasing degree, eq. 8b.
     span_m
@@ -126,7 +126,7 @@ def view_of_tile(
     job.sizes[: len(sizes)] = sizes
     call("apertura_view_tree", job)
     bands = tuple(_widest_of_three(level) for level in np.split(band, np.cumsum(counts)[:-1]))
-    turn_rad, residual_rad_m = _widest_of_three(turn[: max(1, pulses // LEAF)]).tolist()  # of whole leaves
+    turn_rad, residual_rad_m = _widest_of_three(turn[: max(1, pulses // LEAF)]).tolist()  # of complete leaves only
     phase_rad = wavenumber_rad_m * tile.slope_rms / np.sqrt(3)
     return TileView(bands, turn_rad, residual_rad_m * _roughest_m(aperture), tile.span, float(phase_rad))
 
@@ -173,12 +173,12 @@ class Counts(NamedTuple):
     Attributes
     ----------
     nodes
-        (2,) numbers of nodes along columns and rows, of each level up to the first that requires too many; empty if no
-        tree is possible.
+        (2,) numbers of nodes along columns and rows for each level, up to the first level that requires too many nodes;
+        empty if no tree is possible.
     virtual
         Virtual pulses of a leaf; 0 if it is not presummed.
     presum_rad
-        RMS phase error by presumming.
+        RMS phase error from presumming.
     """
 
     nodes: tuple[tuple[int, int], ...]
@@ -247,9 +247,9 @@ class SampledTile(NamedTuple):
     surface, views
         Surface of the tile, and geometry for each chunk.
     rough
-        Mean squared error by pixels off the surface.
+        Mean squared error from pixels off the surface.
     layers_rad, aside_rad
-        Band along heights, and phase of the deviation perpendicular to them.
+        Band along the heights, and phase of the deviation perpendicular to the direction of heights.
     """
 
     surface: Surface
@@ -319,7 +319,7 @@ def _chunks(job: Job, surface: Surface, pulses: int, chunk: int) -> list[NDArray
 
 
 def _sampled_pulses(flown: int, pulses: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the indices of the summed pulses of a flight, and of sampled whole groups of 64; of a short flight all."""
+    """Return the indices of the summed pulses of a flight, and of sampled groups of 64 (all in a short flight)."""
     summed = np.linspace(0, flown - 1, pulses).astype(int)
     count = pulses // LEAF
     if not count:
@@ -336,11 +336,11 @@ class SampledWeights(NamedTuple):
     directly
         Share summed on smaller tiles or directly.
     edge
-        Share of the other groups at the edge of the sector.
+        Of the other groups, the share at the edge of the sector.
     slope
         (3,) RMS slope of the depth in the edge, as in `Weighed.slope`; None without an edge.
     each
-        True if the weights of most groups jump from pulse to pulse.
+        True if the weights of most groups change abruptly from pulse to pulse.
     """
 
     directly: float = 0.0
@@ -372,10 +372,10 @@ SETTINGS: Mapping[int, tuple[int, int]] = {
     -50: (8, 8), -56: (16, 8), -62: (16, 8), -68: (24, 8), -74: (24, 8), -80: (32, 16),
     -86: (64, 16), -92: (64, 16), -98: (64, 16),
 }  # fmt: skip
-"""Error of one interpolation, dB → table cells per resolution cell and taps, with an error below that of the nodes."""
+"""Error of one interpolation between nodes, dB → table cells per resolution cell and taps whose error is below it."""
 
 PRESUMS_DB = (0, 6, 12)
-"""Candidate errors of virtual pulses above the error of an interpolation, dB."""
+"""Candidate errors of virtual pulses, dB above the error of an interpolation."""
 
 SIDES_PX, CHUNKS = (64, 128, 256), (256, 1024, 2048)
 """Candidate sides of tiles, and pulses of the largest subaperture."""
@@ -383,10 +383,10 @@ SIDES_PX, CHUNKS = (64, 128, 256), (256, 1024, 2048)
 _FLOAT32_DB = -92.0  # error of float32 sums
 _FLOAT32 = 2e-7  # relative rounding error of phases: path lengths, and positions of cells
 
-# Seconds on one core, of the same machine as those of the direct kernel in native.py.
+# Seconds on one core, measured on the same machine as those of the direct kernel in native.py.
 _NODE_S = 7e-10  # per look-up of a pulse at a node
 _EXPAND_S = 2.6e-9  # per cell with sixteen filter taps
-_EACH_EXPAND_S = 4.6e-9  # the same for pulses without presumming, whose cells are common to neighbouring tiles
+_EACH_EXPAND_S = 4.6e-9  # per cell of pulses without presumming, whose cells are common to neighbouring tiles
 _ALIGN_S = 8e-11  # per sample and tap or pulse, for alignment to a tile and presumming
 _MIX_S = 5e-12  # per complex multiply-add of merges and pixels
 _LAYER_BYTES = 64  # per pixel of a height layer
@@ -400,8 +400,9 @@ _ANTENNA_S = 5e-7  # per pulse, antenna and tile, for gains and their polynomial
 _EDGE = 1.6  # cost of a look-up at the edge of a sector, relative to one inside
 _FORM_S = 4e-4  # per block of pixels
 _TYPICAL_DB = -74  # error of nodes for the selection of chunks
-_SMALL = 1e8  # pixels × pulses below which one candidate suffices, as the direct kernel is fast
-_START_S = 0.03  # once per job, for the weights of all numbers of nodes
+# number of pixel-pulse contributions below which one candidate is sufficient, as the direct kernel is fast
+_SMALL = 1e8
+_START_S = 0.03  # once per job, for the interpolation weights of all numbers of nodes
 
 
 def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterator[Setting]:
@@ -421,13 +422,13 @@ def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterat
                 setting = _setting(
                     job, pulses, _Options(oversampling, taps, nodes_db, presum_db, side_px, chunk, layers)
                 )
-                if setting.seconds < quickest:  # a larger tolerated error must save time
+                if setting.seconds < quickest:  # a larger tolerated error is a candidate only if it saves time
                     quickest = setting.seconds
                     yield setting
 
 
 def _partitions(job: Job, pulses: int, requested: Mapping[str, Any]) -> list[tuple[int, int]]:
-    """Return candidate sides of tiles and pulses of chunks; only one for a small job."""
+    """Return candidate sides of tiles and pulses of chunks; a single candidate for a small job."""
     pairs = list(product(option_values(requested, "side_px", SIDES_PX), option_values(requested, "chunk", CHUNKS)))
     most_px, most_pulses = 2 * min(job.tile_px, max(job.shape)), 8 * max(pulses, LEAF)
     fitting = [(side, chunk) for side, chunk in pairs if side < most_px and chunk < most_pulses] or pairs[:1]
@@ -435,7 +436,7 @@ def _partitions(job: Job, pulses: int, requested: Mapping[str, Any]) -> list[tup
 
 
 class _Options(NamedTuple):
-    """Options of the engine; if `height_layers` is None, the number follows from the cost."""
+    """Options of the engine; if `height_layers` is None, the number of layers is determined by the cost."""
 
     oversampling: int
     taps: int
@@ -448,7 +449,7 @@ class _Options(NamedTuple):
 
 def _setting(job: Job, pulses: int, options: _Options) -> Setting:
     signal, nodes_db = job.signal, options.nodes_db
-    # Direct kernel, tile by tile, for the share that no tree can sum.
+    # Direct kernel, tile by tile, for the share that cannot be summed by tree.
     carrier_rad = signal.wavenumber_rad_m * signal.step_m
     requested = {"degree": 2, **direct_setting(nodes_db, signal.oversampling, carrier_rad)._asdict()}
     direct = next(iter(native.candidates(job, pulses=pulses, requested=requested)))
@@ -472,7 +473,8 @@ def _setting(job: Job, pulses: int, options: _Options) -> Setting:
         {"oversampling": options.oversampling, "taps": options.taps},
         {name: getattr(options, name) for name in ("nodes_db", "presum_db", "side_px", "chunk")}
         | {"height_layers": cost.most_layers},
-        float(np.ceil(2 * error_db) / 2),  # rounded: 0.01 dB must not select tiles of half the side
+        # rounded, so that a difference of 0.01 dB does not lead to tiles of half the side
+        float(np.ceil(2 * error_db) / 2),
         cost.seconds,
         table_seconds=_START_S + (direct.table_seconds if cost.directly else 0.0),
         table_bytes=8 * pulses * signal.samples
@@ -496,9 +498,9 @@ class _Cost(NamedTuple):
     Attributes
     ----------
     seconds
-        Time of the image; for tiles of one side: if they summed the whole image.
+        Time of the image; for tiles of one side, the time if these tiles sum the whole image.
     directly
-        Share that no tree sums.
+        Share that is not summed by tree.
     presum_rad2
         Mean squared phase error of virtual pulses.
     most_layers
@@ -541,7 +543,7 @@ def _by_tree(job: Job, pulses: int, options: _Options, side: int, direct_s: floa
     """
     tiles = sample_tiles(job, pulses, side, options.chunk)
     counted = [_counted(job, pulses, options, side, tile) for tile in tiles]
-    # Each layer costs a tree and an interpolation: the largest number is the one that costs less than the direct sum.
+    # Each layer requires a tree and an interpolation: the number of layers is limited by the cost of the direct sum.
     tile_s = [value for _, seconds, _ in counted for value in seconds]
     once_s, read_s = float(np.mean(tile_s or [np.inf])), _READ_S * side**2
     most_layers = min(MOST_LAYERS, int(pulses * side**2 * direct_s / (once_s + read_s))) if direct_s else 0
@@ -573,7 +575,7 @@ def _by_tree(job: Job, pulses: int, options: _Options, side: int, direct_s: floa
 def _counted(
     job: Job, pulses: int, options: _Options, side: int, tile: SampledTile
 ) -> tuple[list[Counts], list[float], float]:
-    """Return counts of a tile for each sampled chunk, seconds of those with a tree, and the directly summed share."""
+    """Return counts of a tile per sampled chunk, seconds of the chunks with a tree, and the directly summed share."""
     counts, seconds, too_steep = list[Counts](), list[float](), list[bool]()
     if not tile.views:
         return counts, seconds, 0.0
