@@ -275,7 +275,7 @@ def add_noise(root, std_m, stated_m):
     """Add noise with a correlation time of 1 s to both logs and state its standard deviation."""
     for path in sorted((root / "raw" / "f01").glob("*.track.*")):
         log = noisy(std_m, seed=3)(read_log(path))
-        write_log(path, log if log.attitude_deg is not None else saying(stated_m)(log))
+        write_log(path, log if log.attitude_deg is not None else declare_std(stated_m)(log))
     edit_config(root, lambda document: [node.update(position_std_m=stated_m) for node in document["nodes"].values()])
 
 

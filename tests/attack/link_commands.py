@@ -66,7 +66,7 @@ COMMANDS: dict[str, Command] = {
     "design": Command("design plan.yaml design"),
     "init": Command("init new"),
     "preview": Command("preview ."),
-    "look --follow": Command("look . --follow --every 1 --end-after 1 --no-run"),
+    "preview --follow": Command("preview . --follow --every 1 --end-after 1 --no-run"),
     "map": Command("map ."),
     "clean": Command("clean . --yes"),
     "clean --wip": Command("clean . --yes --wip"),
