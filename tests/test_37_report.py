@@ -91,7 +91,7 @@ def budget(path):
         {"cause": "positions", "stated": "1 cm", "loss_db": -0.2, "shift_m": 0.01, "phase_rad": 0.1},
         {
             "cause": "between epochs",
-            "stated": "not stated; effect computed for 1 m",
+            "stated": "not configured; effect computed for 1 m",
             "loss_db": -3.0,
             "shift_m": 5.0,
             "phase_rad": None,

@@ -93,7 +93,7 @@ def test_product_reports_its_atmosphere_and_the_shift_in_vacuum(finished_tiny):
     assert air["vacuum_shift_m"] == pytest.approx(air["refractivity_n"] * 1e-6 * 12.2, rel=0.15)
     assert report["models"]["atmosphere"].startswith(f"N = {air['refractivity_n']:.1f}: standard atmosphere")
     (line,) = (line for line in report["budget"] if line["cause"] == "atmosphere")
-    assert line["stated"].startswith("not stated; assumed standard atmosphere")
+    assert line["stated"].startswith("not configured; assumed standard atmosphere")
     assert 1e-4 < line["shift_m"] < 1e-3  # 25 N over a path of 12 m
     assert 0 < line["phase_rad"] < 0.02
     stage = open_stage(finished_tiny.stage("profile", "f01", "uav1-uav2"), "profile")

@@ -61,7 +61,7 @@ def test_correct_campaign_is_focused_and_raises_no_flag(finished_sample):
 def test_every_image_states_its_budget(finished_sample):
     lines = {line["cause"]: line for line in reports_of(finished_sample)["uav1-uav2"]["budget"]}
     assert {"positions", "heights", "time tags", "calibration", "clock", "sidelink noise", "arithmetic"} <= set(lines)
-    assert lines["heights"]["stated"].startswith("not stated; assumed 3 m")  # not observable with a straight track
+    assert lines["heights"]["stated"].startswith("not configured; assumed 3 m")  # not observable with a straight track
     assert 0.6 < lines["heights"]["shift_m"] < 2.4
     assert lines["arithmetic"]["loss_db"] > -0.001
 
@@ -77,7 +77,7 @@ def test_summary_prints_each_flag_once(finished_sample, capsys, tmp_path):
     printed = capsys.readouterr().out
     assert printed.count("a line [with brackets]") == 1
     assert "not in the error budget, because no uncertainty is configured" in printed
-    assert re.search(r"geolocation uncertainty \d\.\d+ m, dominated by heights, not stated; assumed 3 m", printed)
+    assert re.search(r"geolocation uncertainty \d\.\d+ m, dominated by heights \(not configured; assumed 3 m", printed)
 
 
 def test_common_part_of_several_flags_is_printed_once():
@@ -275,7 +275,7 @@ def papers_flight(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    ("spacing_m", "reason"), [(0.1, ""), (0.11, "pixels of 0.11 m do not run_sample resolution cells of 0.0997 m")]
+    ("spacing_m", "reason"), [(0.1, ""), (0.11, "pixels of 0.11 m do not sample resolution cells of 0.0997 m")]
 )
 def test_pixels_much_wider_than_a_resolution_cell_are_not_compared(spacing_m, reason):
     """Resolution cell 9.97 cm, pixels 10 cm: the band is sampled at the Nyquist rate up to 1.13 cells."""

@@ -82,7 +82,7 @@ class ImageValues:
             most_lossy["cause"] if most_lossy else "",
             tuple(line["cause"] for line in budget if not is_counted(line)),
             focus.get("expected_shift_m") or 0.0,
-            f"{most_shifting['cause']}, {most_shifting['stated']}" if most_shifting else "",
+            f"{most_shifting['cause']} ({most_shifting['stated']})" if most_shifting else "",
             float(report["numerical_error_db"]),
             used,
             (used or 0) + (pulses.get("dropped") or 0),
@@ -242,9 +242,9 @@ def budget_rows(lines: Sequence[Report]) -> list[Cells]:
 
     Examples
     --------
-    >>> budget_rows([{"cause": "heights", "stated": "not stated; 1 m would do this", "loss_db": -0.02, "shift_m": 0.4,
-    ...               "phase_rad": None}])
-    [('heights', 'not stated; 1 m would do this', '(0.02 dB)', '(0.4 m)', '')]
+    >>> budget_rows([{"cause": "heights", "stated": "not configured; effect computed for 1 m", "loss_db": -0.02,
+    ...               "shift_m": 0.4, "phase_rad": None}])
+    [('heights', 'not configured; effect computed for 1 m', '(0.02 dB)', '(0.4 m)', '')]
     """
     rows: list[Cells] = []
     for line in lines:

@@ -20,7 +20,7 @@ invisible."""
 
 NO_EFFECT = Effect(0.0, 0.0, 0.0)  # effect of an error source whose error is zero
 
-_NOT_STATED, _ASSUMED = "not stated", "assumed"
+_NOT_STATED, _ASSUMED = "not configured", "assumed"
 
 RECEIVER_STD_M = {"fix": 0.01, "float": 0.3, "sbas": 1.0, "dgps": 0.5, "single": 1.0, "ppp": 0.1, "unknown": 0.01}
 """Assumed standard deviation of positions in each axis by solution class, metres, if no accuracy is stated: one
@@ -392,7 +392,7 @@ def height_line(paths: PointPaths, std_m: float | None, *, expected_db: float = 
     >>> track = np.stack([along, np.full(101, -10.0), np.full(101, 10.0)], -1)
     >>> paths = PointPaths(Aperture(track, track), along, np.zeros(3), np.eye(3), 0.2)
     >>> print(height_line(paths, None).report["stated"])
-    not stated; assumed 3 m: not observable with this track
+    not configured; assumed 3 m: not observable with this track
     """
     slope = -paths.gradient[:, 2]
     if std_m is not None:

@@ -219,7 +219,7 @@ _LEAST = {"loss_db": 1e-4, "shift_m": 1e-4, "phase_rad": 1e-4}
 _LABELS = {"loss_db": "peak loss, dB", "shift_m": "displacement, m", "phase_rad": "image phase, rad"}
 _STYLES: Mapping[bool, Any] = {
     True: {"color": BLUE, "label": "in the sum: size stated, measured or assumed"},
-    False: {"facecolor": "white", "edgecolor": GREY, "hatch": "/////", "label": "not in the sum: size not stated"},
+    False: {"facecolor": "white", "edgecolor": GREY, "hatch": "/////", "label": "not in the sum: size not configured"},
 }
 
 
@@ -313,11 +313,12 @@ def _names(lines: Sequence[Mapping[str, Any]]) -> list[str]:
 
     Examples
     --------
-    >>> _names([{"cause": "positions", "stated": "1 cm"}, {"cause": "positions", "stated": "not stated; assumed 2 cm"}])
-    ['positions, stated', 'positions, not stated']
+    >>> _names([{"cause": "positions", "stated": "1 cm"},
+    ...         {"cause": "positions", "stated": "not configured; assumed 2 cm"}])
+    ['positions, stated', 'positions, not configured']
     """
     causes = [str(line["cause"]) for line in lines]
-    origins = ["stated" if is_stated(line) else "not stated" for line in lines]
+    origins = ["stated" if is_stated(line) else "not configured" for line in lines]
     return [
         f"{cause}, {origin}" if causes.count(cause) > 1 else cause
         for cause, origin in zip(causes, origins, strict=True)

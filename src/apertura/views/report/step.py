@@ -79,7 +79,7 @@ def _pair_blocks(campaign: Campaign, flight: str, pair: str, report: Mapping[str
     yield Paragraph(" ".join(sentences(f"Image {pair}", report)))
     yield from _pictures(folder, shown)
     yield Table(
-        "Error budget; values in brackets: not in the sum, because the size of the error is not stated.",
+        "Error budget; values in brackets: not in the sum, because the size of the error is not configured.",
         BUDGET,
         budget_rows(report["budget"]),
     )
