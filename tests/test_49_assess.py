@@ -38,7 +38,7 @@ def flags_of(campaign):
 def run_sample(folder, change=lambda _: None):
     if not SHARED.is_dir():
         pytest.skip("../shared/data is absent")
-    root = copy_writable(SHARED / "campaign-run_sample", folder / "campaign")
+    root = copy_writable(SHARED / "campaign-sample", folder / "campaign")
     change(root)
     return run_steps(root)
 
