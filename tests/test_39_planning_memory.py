@@ -34,7 +34,7 @@ def test_tables_that_exceed_memory_are_computed_in_pulse_blocks():
     assert split.setting.pulse_blocks == split.choices["pulse_blocks"] == 3
     assert split.memory_bytes == other_bytes + sum_bytes + table_bytes // 3
     assert split.predicted_seconds > single_block.predicted_seconds
-    assert "are more than the" in split.reasons["pulse_blocks"]
+    assert "exceed the memory limit of a block" in split.reasons["pulse_blocks"]
     # Nothing else changes.
     assert (
         replace(split.setting, pulse_blocks=1, form_seconds=single_block.setting.form_seconds) == single_block.setting
@@ -58,7 +58,7 @@ def test_long_flight_is_summed_in_blocks_for_any_memory():
     assert long.setting.pulse_blocks == pytest.approx(3 * short.setting.pulse_blocks, rel=0.3)
     extra_bytes = 200_000 * 500  # phase centres and axes of every pulse
     assert long.memory_bytes - extra_bytes == pytest.approx(short.memory_bytes, rel=0.1)
-    assert "more than the 536.9 MB" in long.reasons["pulse_blocks"]
+    assert "exceed the memory limit of a block, 536.9 MB" in long.reasons["pulse_blocks"]
 
 
 @pytest.mark.slow

@@ -73,13 +73,13 @@ def dem_not_below_the_track(root):
 
 INVALID = {
     "wide scene": (wider_scene, "echoes of the scene arrive after the cyclic prefix"),
-    "in the ground": (raise_terrain, "is in or below the ground of the scene, worst at pulse"),
+    "in the ground": (raise_terrain, "is at or below the terrain of the scene, worst at pulse"),
     "beam to the other side": (antenna([-90.0, 0.0]), "no pulse illuminates the scene"),
     "beam to the sky": (antenna([90.0, 80.0]), "no pulse illuminates the scene"),
-    "sums of pulses under a beam": (antenna([90.0, 0.0], 120.0, presum=4), "presum is 4, and the antennas have beams"),
-    "sums of many pulses": (processing(presum=64), "presum is 64"),
-    "terrain without a DEM": (processing(terrain="dem"), "terrain is dem"),
-    "an unavailable engine": (processing(engine="cuda"), "engine cuda cannot run here"),
+    "sums of pulses under a beam": (antenna([90.0, 0.0], 120.0, presum=4), "presum factor 4 with antenna beams"),
+    "sums of many pulses": (processing(presum=64), "presum factor 64"),
+    "terrain without a DEM": (processing(terrain="dem"), "terrain model dem, but the scene has no DEM"),
+    "an unavailable engine": (processing(engine="cuda"), "engine cuda is not available on this machine"),
     "an integration angle of one pulse": (
         processing(integration={"degrees": 0.001}),
         "at most 2 pulses illuminate a pixel inside",
@@ -93,7 +93,7 @@ INVALID = {
     "no sidelink": (metadata("uav2", apertura_channels=["radar", "spare"]), "a channel named 'sidelink'"),
     "another rate": (metadata("uav2", core_sample_rate=1e9), "recorded with sample_rate_hz"),
     "no pulse in a segment": (segment, "no pulse of flight f01, pair uav1-uav1 within"),
-    "a duplicate tag": (lambda root: edit_meta(root, "uav2", tag_twice), "not after the one before"),
+    "a duplicate tag": (lambda root: edit_meta(root, "uav2", tag_twice), "not after the previous capture"),
     "a DEM not below the track": (dem_not_below_the_track, "below the track, which scene.bounds_m: auto requires"),
 }
 

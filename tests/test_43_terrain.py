@@ -297,7 +297,7 @@ def test_dem_above_the_antennas_is_flagged_and_flat_terrain_refused(tiny):
     campaign = edit_scene(tiny, dem=None, dem_datum=None, height_m=2034.0)
     message = complaint(lambda: expected_plan(campaign, *PAIR))
     assert message.startswith("scene.height_m: ")
-    assert "the ground has 2034.00 m" in message
+    assert "terrain height 2034.00 m" in message
 
 
 def test_command_line_names_the_file_of_a_key(tiny, monkeypatch, capsys):

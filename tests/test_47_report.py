@@ -82,7 +82,7 @@ def test_report_page_is_reproduced_byte_for_byte(reported):
 def test_landing_text_contains_no_markup_except_tables(reported):
     texts = landing(reported)
     body = publish_parts(
-        "\n\n".join([texts["title"], texts["asked"], texts["verdicts"], texts["decisions"]]), writer="html"
+        "\n\n".join([texts["title"], texts["configuration"], texts["verdicts"], texts["decisions"]]), writer="html"
     )
     assert "system-message" not in body["body"]
     assert "<a " not in body["body"]

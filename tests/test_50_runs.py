@@ -398,10 +398,10 @@ def test_internal_error_and_killed_step_are_distinguished(tmp_path):
     assert "internal error, please report it" in failed(
         tmp_path, "Traceback (most recent call last):\nZeroDivisionError: by zero\n"
     )
-    assert "it was killed, possibly out of memory" in failed(tmp_path, "10 of 20 tiles to form\n")
+    assert "it was killed, possibly out of memory" in failed(tmp_path, "forming 10 of 20 tiles\n")
 
 
-@pytest.mark.parametrize(("log", "killed"), [("10 of 20 tiles to form\n", True), ("error: codes.npy: gone\n", False)])
+@pytest.mark.parametrize(("log", "killed"), [("forming 10 of 20 tiles\n", True), ("error: codes.npy: gone\n", False)])
 def test_killed_step_is_recognised_by_its_log(tmp_path, log, killed):
     (tmp_path / "0.log").write_text(log)
     assert (

@@ -125,7 +125,7 @@ def test_killed_run_resumes_from_its_tiles_with_identical_results(tiny, uninterr
     code, output = finished(apertura("run", tiny, *TO_IMAGES))
     assert code == 0, output
     log = lines_of(tiny / "results" / "logs" / "f01", "*.image.log")
-    formed_again = sum(int(line.split()[0]) for line in log if "tiles to form" in line)
+    formed_again = sum(int(line.split()[1]) for line in log if line.startswith("forming "))
     assert formed_again <= 2 * 100 - finished_tiles
     assert contents(tiny) == uninterrupted
     assert not list((tiny / "results").rglob("*.wip"))
@@ -146,7 +146,7 @@ def test_killed_run_with_scattered_tiles_gives_identical_results(tiny, uninterru
     assert code == 0, output
     logs = tiny / "results" / "logs" / "f01"
     by_shares, by_image = (
-        sum(int(line.split()[0]) for line in lines_of(logs, pattern) if "tiles to form" in line)
+        sum(int(line.split()[1]) for line in lines_of(logs, pattern) if line.startswith("forming "))
         for pattern in ("*.tiles.*-of-4.log", "*.image.log")
     )
     assert 0 < by_shares <= 2 * 100 - finished_tiles

@@ -152,7 +152,7 @@ def test_partial_run_reports_finished_and_missing_results(finished_tiny, tmp_pat
     state(root, "processing", engine="numba")
     status, out, err = run_command("run", root, "--cores", 1, "--until", "image")
     assert status == 0, err
-    message = r"^\d+ results finished, \d+ results stale, \d+ results missing: `apertura run` computes the rest$"
+    message = r"^\d+ results finished, \d+ results out of date, \d+ results missing: `apertura run` computes the rest$"
     assert re.search(message, out, re.MULTILINE)
     assert "error" not in err
     assert run_command("summary", root)[0] == 2  # no image exists
