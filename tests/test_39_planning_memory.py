@@ -44,7 +44,7 @@ def test_tables_that_exceed_memory_are_computed_in_pulse_blocks():
     assert split.fallbacks[-1].pulse_blocks == 1
     check_fits(split, free_disk=None, where="f01/a-b", memory=split.memory_bytes)
     short = plan(**LONG, memory_bytes=other_bytes // 2)
-    with pytest.raises(CampaignError, match="imaging needs"):
+    with pytest.raises(CampaignError, match="image formation requires"):
         check_fits(short, free_disk=None, where="f01/a-b", memory=other_bytes // 2)
 
 

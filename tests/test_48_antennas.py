@@ -278,4 +278,4 @@ def test_phase_of_a_pattern_is_in_the_budget_and_flagged(beamed):
         line = next(line for line in report["budget"] if line["cause"] == "antenna")
         assert ("antenna_phase" in report["flags"]) is flagged
         assert (line["loss_db"] < -0.2) is flagged
-        assert "whose phase varies by" in line["with_antennas"]
+        assert "whose phase varies by" in line["stated"]
