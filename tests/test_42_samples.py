@@ -234,5 +234,5 @@ def test_pulse_of_the_how_to_agrees_with_its_config(tmp_path, monkeypatch):
     frequency_hz = np.fft.fftfreq(waveform.capture_samples, 1 / waveform.sample_rate_hz)
     inside = (frequency_hz >= waveform.band_hz[0]) & (frequency_hz <= waveform.band_hz[1])
     assert spectrum[inside].sum() > 0.95 * spectrum.sum()
-    stated_m = float(re.search(r"up to (\d+) m of total path", text)[1])
+    stated_m = float(re.search(r"total paths up to (\d+) m", text)[1])
     assert stated_m == pytest.approx(299792458 * waveform.longest_delay_s, rel=0.01)

@@ -261,7 +261,7 @@ def test_presumming_is_refused_with_beams(beamed):
     message = complaint(lambda: expected_plan(with_antennas(beamed, BEAM, presum=4), "f01", "uav1-uav1"))
     assert "config/config.yaml: processing.presum" in message
     reasons = expected_plan(with_antennas(beamed, BEAM), "f01", "uav1-uav1").reasons
-    assert "weigh every pulse" in reasons["presum"]
+    assert "the weights of the antennas differ" in reasons["presum"]
     assert reasons["antenna"].startswith("transmit, receive: each point of the scene is illuminated by ")
     assert " of 80 pulses (median " in reasons["antenna"]
     assert "antenna" not in expected_plan(with_antennas(beamed, None), "f01", "uav1-uav1").reasons

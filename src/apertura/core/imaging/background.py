@@ -31,7 +31,7 @@ FLAGGED_LOSS_DB = 1.0
 """Loss of a target by the removal, dB, above which `background_loss` is raised."""
 
 FLAGGED_GAIN_DB = 3.0
-"""Gain of an omitted removal, dB, above which `background` is raised."""
+"""Gain that the decision leaves unused, dB, above which `background` is raised."""
 
 SIMPLER_DB = 2.0
 """Least additional net gain, dB, for which a method is preferred to a simpler one. Longer windows are simpler than
@@ -67,6 +67,8 @@ class Removal:
         Change of a target's peak by the removal, dB, 0 or less: that of the target with the largest loss.
     middle_loss_db
         The same for a target at the scene centre.
+    left_db
+        Gain of the best method, whatever targets lose, relative to that of the method applied, dB.
     """
 
     background: Background | None
@@ -95,10 +97,10 @@ class Removal:
     @property
     def flags(self) -> Flags:
         """Flags: `background` if arcs remain in the image, `background_loss` if targets lose power by the removal."""
-        flags, removed = Flags(), self.background is not None
-        if not removed and self.gain_db >= FLAGGED_GAIN_DB:
-            flags["background"] = f"{self.gain_db:.1f} dB; {self.reason}"
-        if removed and self.loss_db <= -FLAGGED_LOSS_DB:
+        flags = Flags()
+        if self.left_db >= FLAGGED_GAIN_DB:
+            flags["background"] = f"{self.left_db:.1f} dB; {self.reason}"
+        if self.background is not None and self.loss_db <= -FLAGGED_LOSS_DB:
             flags["background_loss"] = f"at most {-self.loss_db:.1f} dB; removed: {self.value}"
         return flags
 
