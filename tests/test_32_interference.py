@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.echo.captures import sampled_pulses
 from apertura.core.echo.compression import compress, window_weights
 from apertura.core.echo.interference import EXCESS_DB, Interference
 
@@ -25,7 +26,7 @@ def received(*, tone_db=None, noise=1.0, pulses=400, seed=1):
 
 
 def measured(transfer):
-    return Interference.measured(transfer.__getitem__, len(transfer), FREQUENCY, WEIGHT)
+    return Interference.measured([transfer[group] for group in sampled_pulses(len(transfer))], FREQUENCY, WEIGHT)
 
 
 def profiles(transfer):

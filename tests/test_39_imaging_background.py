@@ -1,6 +1,7 @@
 """Removal of echoes at constant delay: effect on the image, loss of targets, and the decision to apply it."""
 
 import shutil
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.backprojection.contributions import band_limited_image
 from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.echo.background import GroupMeans, background_excess_db
+from apertura.core.echo.captures import Saturation, sampled_pulses
 from apertura.core.echo.compression import window_weights
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.background import BackgroundScene, decide_removal, steadiest, target_loss
@@ -23,6 +25,7 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.impairments import Leakage
+from apertura.stages import profile
 
 FREQUENCY = 1.2e9 + 3.2e6 * np.arange(128)
 GRID = SceneGrid("local", -5.0, 30.0, 0.1, (100, 100))
@@ -64,7 +67,7 @@ class Recording:
 
     @property
     def excess_db(self):
-        return background_excess_db(lambda pulses: self.history.transfer[pulses], *self.transfer.shape)
+        return background_excess_db([self.history.transfer[group] for group in sampled_pulses(len(self.transfer))])
 
     def decided(self, method="auto"):
         return decide_removal(self.means, self.scene, method=method, generator=np.random.default_rng(5))
@@ -259,3 +262,19 @@ def test_reflector_of_a_real_flight_is_the_highest_peak_at_its_survey_point(shar
     assert 10 * np.log10(power[row, column] / np.nanmedian(power)) > 27
     assert stage.attrs["quality"]["background"]["removed"].startswith("running median of ")
     assert "background_loss" in stage.attrs["flags"]
+
+
+def test_each_capture_is_checked_for_saturation_once(finished_tiny, tmp_path, monkeypatch):
+    """Captures that the decisions read before are not counted again in the flags of the profiles."""
+    campaign = Campaign.load(copy_writable(finished_tiny.root, tmp_path / "campaign"))
+    pulses = open_stage(campaign.stage("echo", "f01", "uav1-uav1"), "echo").sizes["pulse"]
+    counts, count = Counter(), Saturation.count
+
+    def counted(saturation, iq):
+        counts[id(saturation)] += len(iq["radar"])
+        count(saturation, iq)
+
+    monkeypatch.setattr(Saturation, "count", counted)
+    profile.profile(campaign, "f01", "uav1-uav1")
+    assert len(counts) == 2
+    assert min(counts.values()) == pulses

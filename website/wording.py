@@ -36,7 +36,6 @@ WORDS = {
     "wildest": "most extreme",
     "unlike chance": "statistically significant",
     "of ours": "internal",
-    "looks at first": "advice",
 }
 """Word → the standard terms for what it is used for."""
 

@@ -9,12 +9,15 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from apertura.campaign.config import Processing
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import blocks_of_rows, finish, write_blocks, writing
 from apertura.common.flags import Flags
 from apertura.common.provenance import merged
 from apertura.core.echo.background import GroupMeans, background_excess_db
+from apertura.core.echo.captures import sampled_pulses
 from apertura.core.echo.compression import centre_frequency, window_weights
+from apertura.core.echo.demodulate import remove_path
 from apertura.core.echo.interference import Interference
 from apertura.core.imaging.background import BackgroundScene, Removal, decide_removal
 from apertura.core.imaging.range_profiles import CompressionError, RangeWindow, phase_history_of, range_compress
@@ -30,11 +33,12 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     """Write results/<flight>/<pair>/profile.zarr, block by block."""
     lineage = result_of(campaign, "profile", flight, pair).begin(campaign.root)
     echo, scene = PairEcho.opened(campaign, flight, pair), open_scene(campaign)
-    method, requested = campaign.settings.processing.background_method, campaign.settings.processing.window
-    interference = _interference(echo, requested=campaign.settings.processing.interference, window=requested)
+    processing = campaign.settings.processing
+    method, requested = processing.background_method, processing.window
+    # Opened for itself: samples read for the decisions do not count twice among those checked for saturation.
+    interference, removal = _decisions(PairEcho.opened(campaign, flight, pair), scene, processing)
     if interference and interference.is_removed:
         echo = replace(echo, gain=interference.gain)
-    removal = _removal(echo, scene, method=method, window=requested)
     echo = replace(echo, removed=removal.background) if removal else echo
     source = echo.stage
     window = ranges_of(campaign, open_pair(campaign, flight, pair, echo=source), scene)
@@ -70,24 +74,27 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     return folder
 
 
-def _interference(echo: PairEcho, *, requested: str, window: str) -> Interference | None:
-    """Measure the interference of a pair; None if exclusion of interference is off."""
-    if requested == "none":
-        return None
-    pulses, subcarriers = echo.shape
-    frequency = echo.dataset.frequency.values
-    return Interference.measured(echo.read, pulses, frequency, window_weights(window, subcarriers))
-
-
-def _removal(echo: PairEcho, scene: OpenScene, *, method: str | float, window: str) -> Removal | None:
-    """Decide on the removal of the background; None if removal is off, or the recording has no background."""
-    pulses, subcarriers = echo.shape
-    if method == "none" or (method == "auto" and background_excess_db(echo.recorded_at, pulses, subcarriers) < 0):
-        return None
-    history = phase_history_of(echo.stage, window, lazy=True)
-    recorded = BackgroundScene(history, echo.delay_s, echo.extra_s, echo.time_s, scene.grid, scene.level)
+def _decisions(echo: PairEcho, scene: OpenScene, processing: Processing) -> tuple[Interference | None, Removal | None]:
+    """Decide on interference and background of a pair; None if a removal is off, or nothing is there to remove."""
+    method, frequency = processing.background_method, echo.dataset.frequency.values
+    pulses = sampled_pulses(echo.shape[0])
+    sampled = [echo.read(group) for group in pulses] if (processing.interference, method) != ("none", "none") else []
+    interference = None
+    if processing.interference != "none":
+        interference = Interference.measured(sampled, frequency, window_weights(processing.window, echo.shape[1]))
+        if interference.is_removed:
+            echo = replace(echo, gain=interference.gain)
+            sampled = [group * interference.gain for group in sampled]
+    if method == "none":
+        return interference, None
+    if method == "auto":
+        parts = zip(sampled, pulses, strict=True)
+        if background_excess_db([remove_path(part, frequency, delay_s=-echo.delay_s[at]) for part, at in parts]) < 0:
+            return interference, None
+    history = phase_history_of(echo.stage, processing.window, lazy=True)
+    over_scene = BackgroundScene(history, echo.delay_s, echo.extra_s, echo.time_s, scene.grid, scene.level)
     means = GroupMeans.of(echo.recorded_at, echo.time_s)
-    return decide_removal(means, recorded, method=method, generator=np.random.default_rng(0))
+    return interference, decide_removal(means, over_scene, method=method, generator=np.random.default_rng(0))
 
 
 def _compressed(

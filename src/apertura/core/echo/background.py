@@ -5,7 +5,7 @@ requires the scene, and is made by `apertura.core.imaging.background`.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.units import decibels
-from apertura.core.echo.captures import Pulses, blocks_of, spread
+from apertura.core.echo.captures import Pulses, blocks_of
 from apertura.core.echo.compression import window_weights
 from apertura.core.echo.demodulate import remove_path
 
@@ -26,7 +26,6 @@ base."""
 _GROUPS = 512
 """Number of groups of pulses whose means are used for estimates: a burst of interference corrupts few of them."""
 
-_SAMPLED_GROUPS, _SAMPLED_EACH = 64, 8  # groups of pulses used by the test, and pulses per group
 # Doppler frequencies compared with zero Doppler, in units of 1/duration: higher than those of a slow drift of coupling
 _DOPPLER_CELLS = 3, 12
 _FALSE_ALARM = 1e-6
@@ -84,15 +83,14 @@ class Background:
         return remove_path(values, frequency_hz, delay_s=delay_s)
 
 
-def background_excess_db(read: Read, count: int, subcarriers: int) -> float:
+def background_excess_db(groups: Sequence[Complexes]) -> float:
     """Return the excess of zero Doppler in some hundred pulses over its threshold, dB; negative: not detected.
 
     Parameters
     ----------
-    read
-        Of a pair.
-    count, subcarriers
-        Pulses and subcarriers of the pair.
+    groups
+        (pulse, subcarrier) transfer functions G of eq. 1 of the pulses of
+        `apertura.core.echo.captures.sampled_pulses`.
 
     Notes
     -----
@@ -103,15 +101,15 @@ def background_excess_db(read: Read, count: int, subcarriers: int) -> float:
     --------
     >>> rng = np.random.default_rng(1)
     >>> noise = (rng.normal(size=(400, 16, 2)) @ [1, 1j]).astype(np.complex64)
-    >>> [background_excess_db((noise + coupling).__getitem__, 400, 16) > 0 for coupling in (0, 3)]
+    >>> [background_excess_db(np.split(noise + coupling, 50)) > 0 for coupling in (0, 3)]
     [False, True]
     """
-    groups = spread(count, groups=_SAMPLED_GROUPS, each=_SAMPLED_EACH)
     cells = np.arange(*_DOPPLER_CELLS)
     cells = cells[cells < len(groups) // 2]
     if len(groups) < _LEAST_GROUPS:
         return -math.inf
-    means = np.stack([read(group).mean(axis=0, dtype=np.complex128) for group in groups])
+    means = np.stack([group.mean(axis=0, dtype=np.complex128) for group in groups])
+    subcarriers = means.shape[1]
     profiles = scipy.fft.ifft(means * window_weights("hann", subcarriers), axis=1)
     doppler = np.abs(scipy.fft.fft(profiles * window_weights("hann", len(groups))[:, None], axis=0)) ** 2
     others = doppler[np.concatenate([cells, len(groups) - cells])].mean(axis=0)

@@ -82,6 +82,18 @@ def spread(count: int, *, groups: int, each: int) -> list[Pulses]:
     return [np.arange(int(middle - each / 2), int(middle - each / 2) + each) for middle in middles]
 
 
+def sampled_pulses(count: int) -> list[Pulses]:
+    """Return the pulses on which a pair is tested for interference and background: 64 groups of 8 neighbours.
+
+    Examples
+    --------
+    >>> groups = sampled_pulses(100_000)
+    >>> len(groups), groups[0].tolist()
+    (64, [777, 778, 779, 780, 781, 782, 783, 784])
+    """
+    return spread(count, groups=64, each=8)
+
+
 _CREST_SAMPLES = 256
 """Number of samples used for the crest factor of a capture; for noise alone it is below 3 in 2 of 10⁶ captures."""
 

@@ -4,7 +4,7 @@ docs/theory/interference.md: detection (eq. 1), weights (eq. 2), cost (eq. 3).
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,9 +16,7 @@ from apertura.common.arrays import Complexes, Floats
 from apertura.common.errors import number_of
 from apertura.common.flags import Flags
 from apertura.common.units import decibels
-from apertura.core.echo.captures import Pulses, spread
 
-_GROUPS, _EACH = 64, 8  # groups of pulses used by the test, and pulses per group
 _NEIGHBOURS = 32  # inverse share of the band in half the window of the noise median
 _FEWEST_NEIGHBOURS = 8
 
@@ -76,17 +74,13 @@ class Interference:
     weight: Floats
 
     @classmethod
-    def measured(
-        cls, read: Callable[[Pulses], Complexes], count: int, frequency_hz: Floats, weight: Floats
-    ) -> "Interference":
-        """Measure the noise of each subcarrier on some hundred pulses.
+    def measured(cls, groups: Sequence[Complexes], frequency_hz: Floats, weight: Floats) -> "Interference":
+        """Measure the noise of each subcarrier on groups of consecutive pulses.
 
         Parameters
         ----------
-        read
-            Pulse numbers, ascending → (pulse, subcarrier) transfer functions.
-        count
-            Pulses of the pair.
+        groups
+            (pulse, subcarrier) transfer functions of the pulses of `apertura.core.echo.captures.sampled_pulses`.
         frequency_hz, weight
             Of the subcarriers.
 
@@ -100,15 +94,15 @@ class Interference:
         >>> received = (rng.normal(size=(400, 64, 2)) @ [1, 1j]).astype(np.complex64)
         >>> received[:, 20] += 20 * np.exp(2j * np.pi * rng.random(400))
         >>> frequency = 1.2e9 + 1e6 * np.arange(64)
-        >>> found = Interference.measured(received.__getitem__, 400, frequency, np.full(64, 1 / 64))
+        >>> found = Interference.measured(np.split(received, 50), frequency, np.full(64, 1 / 64))
         >>> np.flatnonzero(found.excluded).tolist(), found.is_removed
         ([20], True)
         >>> found.flags["interference"]
         '1 subcarrier at 1220.00 MHz (GNSS L2/E6, air surveillance radar): noise 22.6 dB above the neighbours; excluded'
         """
         total, differences = np.zeros(len(frequency_hz)), 0
-        for group in spread(count, groups=_GROUPS, each=_EACH):
-            change = np.abs(np.diff(read(group), axis=0)) ** 2 / 2
+        for group in groups:
+            change = np.abs(np.diff(group, axis=0)) ** 2 / 2
             total += change.sum(axis=0, dtype=np.float64)
             differences += len(change)
         noise = total / max(differences, 1)
