@@ -287,7 +287,7 @@ def test_moved_results_are_up_to_date(finished, tmp_path):
 # ---- Archived recordings and kept transfer functions ----------------------------------------------------------------
 
 SAMPLES = ["raw/f01/uav1.sigmf-data", "raw/f01/uav2.sigmf-data"]
-REMEDY = "expected the recording of node uav2 in flight f01, to make results/f01/uav1-uav2/image.manifest.json again"
+REMEDY = "expected the recording of node uav2 in flight f01, to recompute results/f01/uav1-uav2/image.manifest.json"
 
 
 def archive(root):
