@@ -229,7 +229,7 @@ STAGES: Mapping[str, Stage] = {
             **_FRAME,
             **_WAVE,
             "background": "echoes at constant delay: method requested, removed, and why",
-            "interference": "subcarriers with interference: how many, where, excluded or not",
+            "interference": "subcarriers and pulses with interference: how many, where, excluded or not",
             "step_m": "total path between range samples, m",
             "centre_frequency_hz": "f_mid, reference frequency of the profile, Hz",
             "oversampling": "samples per resolution cell c/B of total path",
@@ -245,6 +245,9 @@ STAGES: Mapping[str, Stage] = {
             ),
             "subcarrier_gain": Variable(
                 ("subcarrier",), "float32", "1", "factor of `transfer`: 0 where interference is excluded"
+            ),
+            "interference_level": Variable(
+                ("subcarrier",), "float32", "1", "median power of `transfer`; limit of pulsed interference"
             ),
             "background_time": Variable(("background_knot",), "float64", "s", "of its knots, from the first pulse"),
         },

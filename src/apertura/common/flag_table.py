@@ -677,6 +677,28 @@ _OF_BENCHES = {
         "other transmitters; spurious signals of the node's clocks; processing.interference",
         "methods/bench/links.py, core/echo/interference.py",
     ),
+    "interference_pulsed": Flag(
+        "proportion of pulses, strongest frequency and its usual service, power relative to the level of echoes and "
+        "noise, dB",
+        "interference in some subcarriers of single pulses adds noise at every range; pulses are used without these "
+        "subcarriers",
+        "other transmitters near this frequency; processing.interference",
+        "core/echo/interference.py",
+    ),
+    "interference_sidelink": Flag(
+        "proportion of pulses, strongest frequency and its usual service, power relative to the median subcarrier, dB",
+        "interference in the sidelink: limited subcarriers do not affect its delay and phase, but interference in the "
+        "whole band does",
+        "other transmitters near this frequency; antenna of the sidelink",
+        "core/echo/interference.py",
+    ),
+    "interference_bursts": Flag(
+        "number of pulses; noise relative to neighbouring pulses, dB",
+        "interference in the whole band of single pulses adds noise at every range; the pulses are excluded unless "
+        "there are too many",
+        "transmitters on the UAV, such as telemetry and video; radars; processing.interference",
+        "core/echo/interference.py",
+    ),
     "contact_intermittent": Flag(
         "change of amplitude in excess of noise; pulses lost or 6 dB low",
         "the amplitude is unstable with a stationary set-up",

@@ -121,13 +121,20 @@ def continuous_blocks(
     Raises
     ------
     CampaignError
-        If frames overlap.
+        If frames overlap, or a channel has interference.
 
     Notes
     -----
     Source: docs/theory/simulate.md, eq. 6. The local oscillator runs continuously, without a new phase at each pulse.
     """
     first = next(iter(channels.values()))
+    if any(channel.interference for channel in channels.values()):
+        raise CampaignError(
+            "interference in a continuous recording",
+            where="simulate: impairments.interference",
+            expected="interference only in recordings of single captures",
+            remedy="Remove it, or simulate captures.",
+        )
     regions = _regions(channels, time_s, framing)
     total = int(np.ceil(pulse_samples(first, time_s[-1:])[0] + 0.5 * sampling_rate(first) / first.waveform.prf_hz))
     scales = {name: full_scale(channel, adc) for name, channel in channels.items()}

@@ -114,6 +114,20 @@ class Leakage:
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
+class Interferer:
+    """Signal of another transmitter in a receiving channel; docs/theory/simulate.md, "Interference"."""
+
+    frequency_hz: float = Field(gt=0, description="RF centre frequency, Hz")
+    level_db: float = Field(description="power during transmission relative to the mean power of the echoes, dB")
+    bandwidth_hz: float = Field(default=0.0, ge=0, description="bandwidth of Gaussian noise, Hz; 0: a sine")
+    duration_s: float | None = Field(default=None, gt=0, description="duration of a pulse, s; null: continuous")
+    rate_hz: float = Field(default=0.0, ge=0, description="mean number of pulses per second, at random times")
+    envelope: Literal["rectangular", "hann"] = Field(default="rectangular", description="envelope of a pulse")
+    sweep_hz_per_s: float = Field(default=0.0, description="frequency rate during a pulse, Hz/s")
+    channel: ChannelName = Field(default="radar", description="channel that receives it")
+
+
+@dataclass(frozen=True, config=STRICT_KEYS)
 class Ripple:
     """Ripple by an internal reflection: response 1 + ρ·exp(-j2πf·delay).
 
@@ -192,6 +206,7 @@ class Impairments:
     sidelink_multipath: tuple[Reflection, ...] = Field(default=(), description="reflections of the sidelink")
     sidelink_blockage: Blockage | None = Field(default=None, description="shadowing of the sidelink")
     leakage: Leakage | None = Field(default=None, description="direct coupling into the radar channel")
+    interference: tuple[Interferer, ...] = Field(default=(), description="signals of other transmitters")
     transmit_ripple: Ripple | None = Field(default=None, description="ripple of the transmitter")
     radar_ripple: Ripple | None = Field(default=None, description="ripple of the radar receiver")
     sidelink_ripple: Ripple | None = Field(default=None, description="ripple of the sidelink receiver")

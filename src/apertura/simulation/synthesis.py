@@ -20,7 +20,7 @@ from scipy import fft
 from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.echo.compression import unit_phasor
-from apertura.simulation.impairments import Adc, ChannelName, ImpairmentDraw, Impairments, Ripple
+from apertura.simulation.impairments import Adc, ChannelName, ImpairmentDraw, Impairments, Interferer, Ripple
 from apertura.simulation.scatterers import Paths, TrueAir, direct_path, echo_paths, spectrum
 from apertura.simulation.targets import Scatterers
 from apertura.simulation.waveform import TransmitWaveform
@@ -49,6 +49,8 @@ class Channel:
         E|n|² of a complex sample.
     full_scale
         Full-scale amplitude of I + jQ if a radio is specified; None: derived from the backoff of the converter.
+    interference
+        Interferers with the mean power of their samples during transmission.
     """
 
     waveform: TransmitWaveform
@@ -60,6 +62,7 @@ class Channel:
     sfo_hz: float = 0.0
     noise_variance: float = 0.0
     full_scale: float | None = None
+    interference: tuple[tuple[Interferer, float], ...] = ()
 
 
 def transfer_functions(channel: Channel, generator: Generator | None) -> Complex:
@@ -112,6 +115,8 @@ def samples(
     clean *= np.exp(1j * channel.phase_rad[pulses, None])
     if generator is not None and channel.noise_variance:
         clean += noise(generator, clean.shape, channel.noise_variance)
+    if generator is not None:
+        clean += _interference(channel, clean.shape, generator)
     return np.asarray(clean)
 
 
@@ -252,7 +257,43 @@ def periodic_samples(channel: Channel, generator: Generator | None, pulses: NDAr
     if generator is not None and channel.noise_variance:
         parts = captures.view(np.float32)
         parts += generator.standard_normal(parts.shape, np.float32) * np.float32(np.sqrt(channel.noise_variance / 2))
+    if generator is not None:
+        captures = captures + _interference(channel, captures.shape, generator)
     return np.asarray(captures, np.complex64)
+
+
+def _interference(channel: Channel, shape: tuple[int, int], generator: Generator) -> Complex | float:
+    """Draw the interference in captures, (pulse, sample); docs/theory/simulate.md, eq. 8."""
+    if not channel.interference:
+        return 0.0
+    (generator,) = generator.spawn(1)  # the noise is the same with and without interference
+    rate = sampling_rate(channel)
+    time_s, total = np.arange(shape[1]) / rate, np.zeros(shape, np.complex128)
+    for source, power in channel.interference:
+        duration_s = source.duration_s or np.inf
+        # Pulses that overlap a capture start at any time from one duration before the capture to its end.
+        expected = 1.0 if source.duration_s is None else source.rate_hz * (shape[1] / rate + duration_s)
+        counts = np.ones(shape[0], int) if source.duration_s is None else generator.poisson(expected, shape[0])
+        for capture in np.repeat(np.arange(shape[0]), counts):
+            start_s = 0.0 if source.duration_s is None else generator.uniform(-duration_s, time_s[-1])
+            since_s = time_s - start_s
+            cycles = (
+                source.frequency_hz - channel.waveform.carrier_hz
+            ) * time_s + source.sweep_hz_per_s / 2 * since_s**2
+            signal = np.exp(2j * np.pi * (cycles + generator.random()))
+            if source.bandwidth_hz:
+                signal *= _band_limited(generator, shape[1], source.bandwidth_hz / rate)
+            if source.envelope == "hann" and source.duration_s:
+                signal *= np.sin(np.pi * since_s / duration_s) ** 2
+            total[capture] += np.sqrt(power) * signal * ((since_s >= 0) & (since_s < duration_s))
+    return total
+
+
+def _band_limited(generator: Generator, count: int, share: float) -> Complex:
+    """Draw Gaussian noise of unit mean power in a share of the sampling rate around zero frequency, complex128."""
+    bins = noise(generator, (count,), 1.0)
+    inside = np.abs(fft.fftfreq(count)) <= max(share / 2, 0.5 / count)
+    return np.asarray(fft.ifft(bins * inside, norm="ortho") * np.sqrt(count / inside.sum()))
 
 
 def _prefixed_echoes(channel: Channel, pulses: NDArray[np.intp]) -> NDArray[np.complex64]:
@@ -360,6 +401,11 @@ def receive(
             cfo_hz=impairments.clock.cfo_hz,
             sfo_hz=impairments.clock.sfo_hz,
             noise_variance=0.0 if snr_db is None else waveform.noise_at_unit_snr * power / 10 ** (snr_db / 10),
+            interference=tuple(
+                (source, power * waveform.mean_power * 10 ** (source.level_db / 10))
+                for source in impairments.interference
+                if source.channel == name
+            ),
         )
         for name, (paths, power, ripple, snr_db) in received.items()
     }

@@ -1,7 +1,7 @@
 """Rule `profile`: range profiles of a pair from its transfer functions, cropped to the ranges of the scene."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,11 @@ from apertura.campaign.folder import Campaign
 from apertura.campaign.store import blocks_of_rows, finish, write_blocks, writing
 from apertura.common.flags import Flags
 from apertura.common.provenance import merged
-from apertura.core.echo.background import GroupMeans, background_excess_db
+from apertura.core.echo.background import Background, GroupMeans, background_excess_db
 from apertura.core.echo.captures import sampled_pulses
 from apertura.core.echo.compression import centre_frequency, window_weights
 from apertura.core.echo.demodulate import remove_path
-from apertura.core.echo.interference import Interference
+from apertura.core.echo.interference import Bursts, Interference, PulsedInterference
 from apertura.core.imaging.background import BackgroundScene, Removal, decide_removal
 from apertura.core.imaging.range_profiles import CompressionError, RangeWindow, phase_history_of, range_compress
 from apertura.stages.pair import open_pair, pattern_digests
@@ -33,80 +33,147 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     """Write results/<flight>/<pair>/profile.zarr, block by block."""
     lineage = result_of(campaign, "profile", flight, pair).begin(campaign.root)
     echo, scene = PairEcho.opened(campaign, flight, pair), open_scene(campaign)
-    processing = campaign.settings.processing
-    method, requested = processing.background_method, processing.window
     # Opened for itself: samples read for the decisions do not count twice among those checked for saturation.
-    interference, removal = _decisions(PairEcho.opened(campaign, flight, pair), scene, processing)
-    if interference and interference.is_removed:
-        echo = replace(echo, gain=interference.gain)
-    echo = replace(echo, removed=removal.background) if removal else echo
+    cleaning = _decide(PairEcho.opened(campaign, flight, pair), scene, campaign.settings.processing)
+    echo = replace(echo, gain=cleaning.gain, removed=cleaning.background, pulsed=cleaning.pulsed)
+    settings = {**lineage.result.settings, **scene.spec}
+    inputs = merged(scene.inputs, pattern_digests(campaign, pair))
+    folder = campaign.stage("profile", flight, pair)
+
+    def write(wip: Path, echo: PairEcho, bursts: Bursts) -> float:
+        """Write the profiles of all pulses of an echo, add them to `bursts`; return the compression error, dB."""
+        source, error = echo.stage, CompressionError(np.random.default_rng(0))
+        window = ranges_of(campaign, open_pair(campaign, flight, pair, echo=source), scene)
+        dataset = _empty(echo, window, campaign.settings.processing.window)
+        parents = [source, *scene.parents]
+        stage = stamped(dataset, "profile", modules=lineage.modules, parents=parents, settings=settings, inputs=inputs)
+        write_blocks(wip, stage, "profile", _compressed(source, dataset.attrs["window"], window, scene, error, bursts))
+        return round(error.decibels, 2)
+
+    with writing(folder) as wip:
+        bursts = Bursts()
+        error_db = write(wip, echo, bursts)
+        if cleaning.interference is None:
+            bursts = Bursts()
+        elif bursts.excluded.any():
+            error_db = write(wip, echo.select(~bursts.excluded), Bursts())
+        attributes = {
+            "background": {"requested": campaign.settings.processing.background_method, **cleaning.background_report},
+            "interference": cleaning.interference_report(bursts),
+        }
+        flags = Flags.merged(echo.flags, cleaning.flags, bursts.flags)
+        finish(wip, folder, lineage=lineage, flags=flags, compression_error_db=error_db, **attributes)
+    return folder
+
+
+def _empty(echo: PairEcho, window: RangeWindow, requested: str) -> xr.Dataset:
+    """Return stage `profile` with zeros, which use no memory, in place of the profiles."""
     source = echo.stage
-    window = ranges_of(campaign, open_pair(campaign, flight, pair, echo=source), scene)
-    frequency = source.frequency.values
     zeros = np.broadcast_to(np.complex64(0), (source.sizes["pulse"], window.samples))
     dataset = source[["time", "tx_position", "rx_position"]].assign(
         profile=(("pulse", "range"), zeros), start=("pulse", window.start_m)
     )
     if echo.gain is not None:
         dataset["subcarrier_gain"] = ("subcarrier", echo.gain)
+    if echo.pulsed:
+        dataset["interference_level"] = ("subcarrier", echo.pulsed.level)
     if echo.removed:
         dataset["background"] = (("background_knot", "subcarrier"), echo.removed.values)
         dataset["background_time"] = ("background_knot", echo.removed.time_s)
+    frequency = source.frequency.values
     dataset.attrs = {name: source.attrs[name] for name in ("frame", "pair", "flags")} | {
-        "background": {"requested": method} | (removal.report if removal else {}),
-        "interference": interference.report if interference else {},
+        "background": {},  # set after the last pulse
+        "interference": {},
         "step_m": window.step_m,
         "centre_frequency_hz": centre_frequency(frequency),
         "oversampling": window.unambiguous / len(frequency),
         "window": requested,
         "wave_speed_m_s": window.wave_speed_m_s,
-        "compression_error_db": 0.0,  # set after the last pulse
+        "compression_error_db": 0.0,
     }
-    settings, parents = {**lineage.result.settings, **scene.spec}, [source, *scene.parents]
-    inputs = merged(scene.inputs, pattern_digests(campaign, pair))
-    origin: dict[str, Any] = {"modules": lineage.modules, "parents": parents, "settings": settings, "inputs": inputs}
-    stage, folder = stamped(dataset, "profile", **origin), campaign.stage("profile", flight, pair)
-    error = CompressionError(np.random.default_rng(0))
-    with writing(folder) as wip:
-        write_blocks(wip, stage, "profile", _compressed(source, requested, window, scene, error))
-        flags = Flags.merged(echo.flags, *(one.flags for one in (interference, removal) if one))
-        finish(wip, folder, lineage=lineage, flags=flags, compression_error_db=round(error.decibels, 2))
-    return folder
+    return dataset
 
 
-def _decisions(echo: PairEcho, scene: OpenScene, processing: Processing) -> tuple[Interference | None, Removal | None]:
-    """Decide on interference and background of a pair; None if a removal is off, or nothing is there to remove."""
+@dataclass(frozen=True)
+class _Cleaning:
+    """Decisions on interference and background of a pair; None: not requested, or nothing to remove."""
+
+    interference: Interference | None = None
+    removal: Removal | None = None
+    pulsed: PulsedInterference | None = None
+
+    @property
+    def gain(self) -> NDArray[np.float32] | None:
+        return self.interference.gain if self.interference and self.interference.is_removed else None
+
+    @property
+    def background(self) -> Background | None:
+        return self.removal.background if self.removal else None
+
+    @property
+    def background_report(self) -> dict[str, Any]:
+        return self.removal.report if self.removal else {}
+
+    def interference_report(self, bursts: Bursts) -> dict[str, Any]:
+        if not self.interference:
+            return {}
+        pulsed = {"pulsed": self.pulsed.report} if self.pulsed else {}
+        return {**self.interference.report, **pulsed, **({"bursts": bursts.report} if bursts.report else {})}
+
+    @property
+    def flags(self) -> Flags:
+        return Flags.merged(*(part.flags for part in (self.interference, self.removal, self.pulsed) if part))
+
+
+def _decide(echo: PairEcho, scene: OpenScene, processing: Processing) -> _Cleaning:
+    """Decide on the removal of interference and background of a pair."""
     method, frequency = processing.background_method, echo.dataset.frequency.values
-    pulses = sampled_pulses(echo.shape[0])
+    pulses, cleaning = sampled_pulses(echo.shape[0]), _Cleaning()
     sampled = [echo.read(group) for group in pulses] if (processing.interference, method) != ("none", "none") else []
-    interference = None
+    weight = window_weights(processing.window, echo.shape[1])
     if processing.interference != "none":
-        interference = Interference.measured(sampled, frequency, window_weights(processing.window, echo.shape[1]))
-        if interference.is_removed:
-            echo = replace(echo, gain=interference.gain)
-            sampled = [group * interference.gain for group in sampled]
-    if method == "none":
-        return interference, None
-    if method == "auto":
-        parts = zip(sampled, pulses, strict=True)
-        if background_excess_db([remove_path(part, frequency, delay_s=-echo.delay_s[at]) for part, at in parts]) < 0:
-            return interference, None
-    history = phase_history_of(echo.stage, processing.window, lazy=True)
-    over_scene = BackgroundScene(history, echo.delay_s, echo.extra_s, echo.time_s, scene.grid, scene.level)
-    means = GroupMeans.of(echo.recorded_at, echo.time_s)
-    return interference, decide_removal(means, over_scene, method=method, generator=np.random.default_rng(0))
+        cleaning = _Cleaning(Interference.measured(sampled, frequency, weight))
+        if cleaning.gain is not None:
+            echo = replace(echo, gain=cleaning.gain)
+            sampled = [group * cleaning.gain for group in sampled]
+            weight = weight * cleaning.gain
+    parts = zip(sampled, pulses, strict=True)
+    if method not in ("auto", "none") or (
+        method == "auto"
+        and background_excess_db([remove_path(part, frequency, delay_s=-echo.delay_s[at]) for part, at in parts]) >= 0
+    ):
+        history = phase_history_of(echo.stage, processing.window, lazy=True)
+        over_scene = BackgroundScene(history, echo.delay_s, echo.extra_s, echo.time_s, scene.grid, scene.level)
+        means = GroupMeans.of(echo.recorded_at, echo.time_s)
+        removal = decide_removal(means, over_scene, method=method, generator=np.random.default_rng(0))
+        cleaning = replace(cleaning, removal=removal)
+        if removal.background:
+            sampled = [
+                part - removal.background.at(echo.time_s[at], frequency, echo.delay_s[at])
+                for part, at in zip(sampled, pulses, strict=True)
+            ]
+    if cleaning.interference:
+        cleaning = replace(cleaning, pulsed=PulsedInterference.measured(sampled, frequency, weight))
+    return cleaning
 
 
 def _compressed(
-    source: xr.Dataset, requested: str, window: RangeWindow, scene: OpenScene, error: CompressionError
+    source: xr.Dataset,
+    requested: str,
+    window: RangeWindow,
+    scene: OpenScene,
+    error: CompressionError,
+    bursts: Bursts,
 ) -> Iterator[NDArray[np.complex64]]:
     """Yield the profiles of one chunk of the echo at a time; zeros if none of its pulses contributes to the scene."""
     for part in blocks_of_rows(source, "transfer"):
         if not window.contributing[part].any():
+            bursts.skip(part.stop - part.start)
             yield np.zeros((part.stop - part.start, window.samples), np.complex64)
             continue
         history = phase_history_of(source.isel(pulse=part), requested)
         chunk = replace(window, start_m=window.start_m[part], farthest_m=window.farthest_m[part])
         profiles = range_compress(history, scene.grid, scene.terrain, window=chunk)
         error.add(history, profiles)
+        bursts.add(history.transfer, profiles.samples)
         yield profiles.samples

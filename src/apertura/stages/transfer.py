@@ -24,8 +24,10 @@ from apertura.common.units import nanoseconds, seconds_since
 from apertura.core.echo.association import missing_flags
 from apertura.core.echo.background import Background
 from apertura.core.echo.captures import Pulses, Saturation, blocks_of
+from apertura.core.echo.compression import window_weights
 from apertura.core.echo.dechirp import sweep_motion_flags
 from apertura.core.echo.demodulate import remove_path
+from apertura.core.echo.interference import PulsedInterference
 from apertura.core.echo.line_of_sight import LineOfSight
 from apertura.core.echo.transfer import (
     Correction,
@@ -65,6 +67,8 @@ class PairEcho:
         Background that is subtracted in `stage`; None: no background is subtracted.
     gain
         (subcarrier,) float32, factors that `stage` applies: 0 for subcarriers with interference; None: no factors.
+    pulsed
+        Interference that `stage` removes from subcarriers of single pulses; None: nothing is removed.
     """
 
     dataset: xr.Dataset
@@ -72,6 +76,7 @@ class PairEcho:
     saturation: Saturation = field(default_factory=Saturation)
     removed: Background | None = None
     gain: NDArray[np.float32] | None = None
+    pulsed: PulsedInterference | None = None
 
     @classmethod
     def recorded(cls, echo: xr.Dataset) -> "PairEcho":
@@ -120,12 +125,24 @@ class PairEcho:
         echo, folder = cls.opened(campaign, flight, pair), campaign.stage("profile", flight, pair)
         if not campaign.is_current(folder):
             return echo
-        profile, removed = open_stage(folder, "profile"), None
+        profile, removed, pulsed = open_stage(folder, "profile"), None, None
         if "background" in profile:
             removed = Background(profile.background.values, profile.background_time.values)
         gain = profile.subcarrier_gain.values if "subcarrier_gain" in profile else None
+        if "interference_level" in profile:
+            weight = window_weights(profile.attrs["window"], profile.sizes["subcarrier"])
+            pulsed = PulsedInterference.of(profile.interference_level.values, weight, gain)
+        kept = np.isin(echo.dataset.time.values, profile.time.values)
+        echo = echo if kept.all() else echo.select(kept)
         reports = {name: profile.attrs[name] for name in ("background", "interference")}
-        return replace(echo, dataset=echo.dataset.assign_attrs(reports), removed=removed, gain=gain)
+        return replace(echo, dataset=echo.dataset.assign_attrs(reports), removed=removed, gain=gain, pulsed=pulsed)
+
+    def select(self, kept: NDArray[np.bool_]) -> "PairEcho":
+        """Return the echo with the pulses of a mask only."""
+        removed = self.removed
+        if removed:  # its times start at the first pulse
+            removed = replace(removed, time_s=removed.time_s - self.time_s[kept][0])
+        return replace(self, dataset=self.dataset.isel(pulse=kept), removed=removed)
 
     def within(self, campaign: Campaign, flight: str, pair: str) -> "PairEcho":
         """Return the echo without the pulses outside the segments of its pair."""
@@ -144,7 +161,7 @@ class PairEcho:
     @property
     def stage(self) -> xr.Dataset:
         """Stage `echo`, whose `transfer` is formed or read on access, after removal of background and interference."""
-        if "transfer" in self.dataset and self.removed is None and self.gain is None:
+        if "transfer" in self.dataset and self.removed is None and self.gain is None and self.pulsed is None:
             return self.dataset
         return self.dataset.assign(transfer=xr.Variable(_HISTORY, indexing.LazilyIndexedArray(_Transfer(self))))
 
@@ -192,10 +209,10 @@ class PairEcho:
         transfer = self.dataset.transfer[pulses].values if "transfer" in self.dataset else self.form(pulses)
         if self.gain is not None:
             transfer = transfer * self.gain
-        if self.removed is None:
-            return np.asarray(transfer)
-        frequency_hz = self.dataset.frequency.values
-        return np.asarray(transfer - self.removed.at(self.time_s[pulses], frequency_hz, self.delay_s[pulses]))
+        if self.removed is not None:
+            frequency_hz = self.dataset.frequency.values
+            transfer = transfer - self.removed.at(self.time_s[pulses], frequency_hz, self.delay_s[pulses])
+        return np.asarray(transfer if self.pulsed is None else self.pulsed.removed(transfer))
 
     def recorded_at(self, pulses: Pulses) -> Complexes:
         """Return the transfer functions of ascending pulse indices, on the delay scale of the recorder."""

@@ -204,6 +204,10 @@ def interference_floor_db(cfo_hz: float, sfo_ppm: float, numerology: Numerology)
     return decibels(2 * leakage / numerology.numbers.size)
 
 
+_INTERFERED = 20.0
+"""Power relative to the median, above which a frequency is not used."""
+
+
 def _repetition(groups: Iterable[Complexes], numerology: Numerology) -> tuple[Floats, NDArray[np.complex128]]:
     """Return the occupied frequencies and, per group of pulses, the cross-spectrum of the end with the start."""
     crosses = [_cross_spectrum(pulses, numerology) for pulses in groups]
@@ -213,7 +217,10 @@ def _repetition(groups: Iterable[Complexes], numerology: Numerology) -> tuple[Fl
         scipy.fft.fftfreq(size, 1 / numerology.sample_rate_hz) - lowest_hz
     ) % numerology.sample_rate_hz + lowest_hz
     occupied = np.abs(frequency_hz - numerology.middle_hz) <= numerology.numbers.size * numerology.spacing_hz / 2
-    return frequency_hz[occupied], np.array(crosses)[:, occupied]
+    parts = np.array(crosses)[:, occupied]
+    # Interference repeats with another phase. The signal itself has nearly the same power at all frequencies.
+    interfered = np.abs(parts) > _INTERFERED * np.median(np.abs(parts), axis=1, keepdims=True)
+    return frequency_hz[occupied], np.where(interfered, 0, parts)
 
 
 def _cross_spectrum(sidelink: Complexes, numerology: Numerology) -> NDArray[np.complex128]:

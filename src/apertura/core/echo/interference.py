@@ -1,11 +1,12 @@
-"""Narrow-band interference: exclusion of subcarriers whose noise exceeds that of their neighbours, by weights.
+"""Radio interference: exclusion of subcarriers, of subcarriers of single pulses, and of pulses.
 
-docs/theory/interference.md: detection (eq. 1), weights (eq. 2), cost (eq. 3).
+docs/theory/interference.md: subcarriers (eq. 1 to 3), subcarriers of single pulses (eq. 4 and 5), pulses (eq. 6 and 7).
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,14 +18,8 @@ from apertura.common.errors import number_of
 from apertura.common.flags import Flags
 from apertura.common.units import decibels
 
-_NEIGHBOURS = 32  # inverse share of the band in half the window of the noise median
-_FEWEST_NEIGHBOURS = 8
-
-EXCESS_DB = 6.0
-"""Excess of the noise over that of the neighbours, dB, above which a subcarrier is excluded."""
-
 LEAST_GAIN_DB = 0.1
-"""Least gain in SNR by the exclusion, dB; a smaller gain does not justify its sidelobes."""
+"""Least gain in SNR by an exclusion, dB; a smaller gain does not justify its sidelobes or the loss of pulses."""
 
 SERVICES: tuple[tuple[float, float, str], ...] = (
     (420e6, 450e6, "radar, amateur radio"),
@@ -52,9 +47,31 @@ SERVICES: tuple[tuple[float, float, str], ...] = (
 """Frequency bands (Hz) and their usual transmitters (ITU Radio Regulations, Article 5, abridged)."""
 
 
+def service_at(frequency_hz: float) -> str:
+    """Return the usual transmitters at a frequency.
+
+    Examples
+    --------
+    >>> service_at(1.09e9)
+    'DME, TACAN, secondary radar'
+    """
+    return next((name for low, high, name in SERVICES if low <= frequency_hz < high), "no usual service")
+
+
+# ---- Subcarriers with interference in most pulses --------------------------------------------------------------------
+
+EXCESS_DB = 6.0
+"""Excess of the noise over that of the neighbours, dB, above which a subcarrier is excluded."""
+
+_SAMPLES = 64  # number of subcarriers or ranges that represent a pulse
+_NEIGHBOURS = 32  # inverse share of the band in half the window of the noise median
+_FEWEST_NEIGHBOURS = 8
+_LISTED = 32  # largest number of frequencies in a report
+
+
 @dataclass(frozen=True, eq=False)
 class Interference:
-    """Subcarriers with interference.
+    """Subcarriers with interference in most pulses.
 
     Attributes
     ----------
@@ -100,15 +117,13 @@ class Interference:
         >>> found.flags["interference"]
         '1 subcarrier at 1220.00 MHz (GNSS L2/E6, air surveillance radar): noise 22.6 dB above the neighbours; excluded'
         """
-        total, differences = np.zeros(len(frequency_hz)), 0
-        for group in groups:
-            change = np.abs(np.diff(group, axis=0)) ** 2 / 2
-            total += change.sum(axis=0, dtype=np.float64)
-            differences += len(change)
-        noise = total / max(differences, 1)
-        size = 2 * max(_FEWEST_NEIGHBOURS, len(noise) // _NEIGHBOURS) + 1
-        usual = scipy.ndimage.median_filter(noise, size=min(size, len(noise)), mode="nearest")
-        excess = np.divide(noise, usual, out=np.ones_like(noise), where=usual > 0)
+        differences = [np.abs(np.diff(group, axis=0)) ** 2 / 2 for group in groups]
+        changes = np.concatenate(differences) if differences else np.zeros((0, len(frequency_hz)))
+        if not len(changes):
+            changes = np.zeros((1, len(frequency_hz)))
+        noise = changes.mean(axis=0, dtype=np.float64)
+        # The median ignores interference in single pulses, which `PulsedInterference` removes from these pulses only.
+        excess = np.minimum(*(values / _usual(values) for values in (noise, np.median(changes, axis=0))))
         return cls(frequency_hz, noise, excess, weight)
 
     @property
@@ -165,15 +180,323 @@ class Interference:
         if not self.excluded.any():
             return Flags()
         excess, strongest = decibels(float(self.excess.max())), float(self.frequency_hz[self.excess.argmax()])
-        service = next((name for low, high, name in SERVICES if low <= strongest < high), "no usual service")
         done = "excluded" if self.is_removed else "not excluded, as that gains nothing"
         number = number_of(int(self.excluded.sum()), "subcarrier")
-        where = (
-            f"{number} at {1e-6 * strongest:.2f} MHz"
-            if self.excluded.sum() == 1
-            else (f"{number}, the strongest at {1e-6 * strongest:.2f} MHz")
+        at = f"{1e-6 * strongest:.2f} MHz ({service_at(strongest)})"
+        where = f"{number} at {at}" if self.excluded.sum() == 1 else f"{number}, the strongest at {at}"
+        return Flags({"interference": f"{where}: noise {excess:.1f} dB above the neighbours; {done}"})
+
+
+def _usual(values: Floats) -> Floats:
+    """Return the median of (subcarrier,) powers over 1/16 of the band around each subcarrier; never zero."""
+    size = 2 * max(_FEWEST_NEIGHBOURS, len(values) // _NEIGHBOURS) + 1
+    usual = scipy.ndimage.median_filter(values, size=min(size, len(values)), mode="nearest")
+    return np.asarray(np.where(usual > 0, usual, np.maximum(values, np.finfo(np.float64).tiny)))
+
+
+# ---- Sidelink --------------------------------------------------------------------------------------------------------
+
+
+def limited(spectra: Complexes) -> tuple[Complexes, NDArray[np.bool_]]:
+    """Limit subcarriers of a sidelink to 20 times the median power of their pulse; return also which are limited.
+
+    A sidelink without interference is unchanged: its direct path has the same power in all subcarriers. A limited
+    subcarrier has no effect on delay and phase of the direct path, and attenuates the echo by which it is divided.
+
+    Parameters
+    ----------
+    spectra
+        (pulse, subcarrier) complex64.
+
+    Notes
+    -----
+    Source: docs/theory/interference.md, eq. 8.
+
+    Examples
+    --------
+    >>> sidelink = np.array([[1, 1j, 10, 1, -1j]], np.complex64)
+    >>> abs(limited(sidelink)[0]).round(2)
+    array([[1.  , 1.  , 4.47, 1.  , 1.  ]], dtype=float32)
+    """
+    power = np.square(spectra.real) + np.square(spectra.imag)
+    # The median of some subcarriers is sufficient, and faster.
+    usual = np.median(power[:, :: -(-power.shape[1] // _SAMPLES)], axis=1, keepdims=True)
+    over = (power > _HIT * usual) & (usual > 0)
+    if not over.any():
+        return spectra, over
+    scale = np.sqrt(_HIT * usual / np.where(over, power, 1.0))
+    return np.asarray(np.where(over, spectra * scale, spectra), np.complex64), over
+
+
+class SidelinkInterference:
+    """Limiter of a sidelink, block by block, with statistics of the limited subcarriers.
+
+    Examples
+    --------
+    >>> interference = SidelinkInterference(1e9 + 1e6 * np.arange(5))
+    >>> _ = interference.limit(np.array([[1, 1j, 10, 1, -1j]], np.complex64))
+    >>> interference.flags["interference_sidelink"].partition(": ")[2]
+    '20.0 dB above the median; limited to 13 dB'
+    """
+
+    def __init__(self, frequency_hz: Floats) -> None:
+        self._frequency_hz = frequency_hz
+        self._pulses = self._limited = 0
+        self._excess = np.zeros(len(frequency_hz))
+        self._count = np.zeros(len(frequency_hz), np.int64)
+
+    def limit(self, spectra: Complexes) -> Complexes:
+        """Limit the spectra of a block of pulses, (pulse, subcarrier) complex64."""
+        result, over = limited(spectra)
+        self._pulses += len(over)
+        if over.any():
+            self._limited += int(over.any(axis=1).sum())
+            self._excess += np.where(over, np.abs(spectra / np.where(over, result, 1)) ** 2 * _HIT, 0).sum(axis=0)
+            self._count += over.sum(axis=0)
+        return result
+
+    @property
+    def flags(self) -> Flags:
+        """Flag `interference_sidelink` if more than 0.1 % of the pulses are limited."""
+        if self._limited <= 1e-3 * self._pulses:
+            return Flags()
+        strongest = int(self._excess.argmax())
+        at_hz, excess = float(self._frequency_hz[strongest]), self._excess[strongest] / self._count[strongest]
+        line = (
+            f"{self._limited / self._pulses:.1%} of pulses, strongest at {1e-6 * at_hz:.2f} MHz ({service_at(at_hz)}): "
+            f"{decibels(float(excess)):.1f} dB above the median; limited to {decibels(_HIT):.0f} dB"
         )
-        return Flags({"interference": f"{where} ({service}): noise {excess:.1f} dB above the neighbours; {done}"})
+        return Flags({"interference_sidelink": line})
 
 
-_LISTED = 32  # largest number of frequencies in a report
+# ---- Subcarriers of single pulses ------------------------------------------------------------------------------------
+
+_HIT = 20.0
+"""Power relative to the median, above which a subcarrier of a pulse is excluded: for noise, with probability 2⁻²⁰."""
+
+_SKIRT = 8.0
+"""The same limit for the other subcarriers of that pulse, into which strong interference leaks: 0.4 % of noise."""
+
+_MOST_OF_PULSE = 0.5
+"""Largest share of a pulse's weights that is excluded; interference over more of the band affects the whole pulse."""
+
+
+@dataclass(frozen=True, eq=False)
+class PulsedInterference:
+    """Interference in some subcarriers of some pulses, such as DME, radar pulses, bursts and swept tones.
+
+    Attributes
+    ----------
+    level
+        (subcarrier,) float32, median power over the pulses, without interference.
+    weight
+        (subcarrier,) float64, of range compression, zero for subcarriers excluded in all pulses; sums to 1.
+    report
+        Measured on some pulses, as JSON values: shares, strongest frequency, excess and gain.
+    """
+
+    level: NDArray[np.float32]
+    weight: Floats
+    report: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, level: NDArray[np.float32], weight: Floats, gain: NDArray[np.float32] | None) -> "PulsedInterference":
+        """Return the interference for the weights of a window and the factors of eq. 2."""
+        return cls(level, weight if gain is None else weight * gain)
+
+    @classmethod
+    def measured(cls, groups: Sequence[Complexes], frequency_hz: Floats, weight: Floats) -> "PulsedInterference | None":
+        """Measure the interference on some pulses; None if its exclusion would gain less than `LEAST_GAIN_DB`.
+
+        Parameters
+        ----------
+        groups
+            (pulse, subcarrier) transfer functions, background removed.
+        frequency_hz, weight
+            Of the subcarriers.
+
+        Notes
+        -----
+        Source: docs/theory/interference.md, eq. 4 and 5.
+
+        Examples
+        --------
+        >>> rng = np.random.default_rng(1)
+        >>> received = (rng.normal(size=(400, 64, 2)) @ [1, 1j]).astype(np.complex64)
+        >>> received[::10, 20:22] += 40
+        >>> frequency = 1.05e9 + 1e6 * np.arange(64)
+        >>> pulsed = PulsedInterference.measured([received], frequency, np.full(64, 1 / 64))
+        >>> pulsed.flags["interference_pulsed"]
+        '10.0% of pulses, strongest at 1070.00 MHz (DME, TACAN, secondary radar): 28.8 dB above the level; excluded'
+        >>> np.flatnonzero(pulsed.removed(received[:1])[0] == 0).tolist()
+        [20, 21]
+        """
+        transfer = np.concatenate(groups)
+        level = np.median(np.abs(transfer) ** 2, axis=0).astype(np.float32)
+        pulsed = cls(level, weight)
+        hits = pulsed.hits(transfer)
+        power = np.abs(transfer) ** 2
+        # Power in the image is proportional to the sum of w²·|H|²; echoes add equally to both sums.
+        weighted = weight**2 * power
+        lost = (hits * weight).sum(axis=1)
+        gain_db = decibels(float(weighted.sum() / (weighted * ~hits / (1 - lost[:, None]) ** 2).sum()))
+        if not hits.any() or gain_db < LEAST_GAIN_DB:
+            return None
+        excess = np.divide(power, level, out=np.zeros_like(power), where=(level > 0) & hits) * np.log(2)
+        of_subcarrier = excess.sum(axis=0)
+        strongest = int(of_subcarrier.argmax())
+        report = {
+            "pulses_share": round(float(hits.any(axis=1).mean()), 4),
+            "excluded_share": float(f"{lost.mean():.2e}"),
+            "frequency_hz": float(frequency_hz[strongest]),
+            "excess_db": round(decibels(float(excess[hits].mean())), 1),
+            "gain_db": round(gain_db, 2),
+        }
+        return replace(pulsed, report=report)
+
+    def hits(self, transfer: Complexes) -> NDArray[np.bool_]:
+        """Return the subcarriers with interference in each pulse, (pulse, subcarrier) bool (eq. 4).
+
+        Powers are compared with the median of the same pulse: a strong echo raises all subcarriers of a pulse.
+        """
+        if not (self.level > 0).any():
+            return np.zeros(transfer.shape, np.bool_)
+        inverse = np.divide(1.0, self.level, out=np.zeros_like(self.level), where=self.level > 0)
+        relative = (np.square(transfer.real) + np.square(transfer.imag)) * inverse
+        relative /= np.maximum(np.median(relative[:, self.level > 0], axis=1, keepdims=True), np.finfo(np.float32).tiny)
+        limit = np.where(relative.max(axis=1) > _HIT, _SKIRT, _HIT)
+        hits = relative > limit[:, None]
+        hits &= (hits @ self.weight <= _MOST_OF_PULSE)[:, None]
+        return np.asarray(hits)
+
+    def removed(self, transfer: Complexes) -> Complexes:
+        """Return transfer functions without the interference; echoes keep their amplitudes (eq. 5)."""
+        hits = self.hits(transfer)
+        if not hits.any():
+            return transfer
+        gain = (1 / (1 - hits @ self.weight)).astype(np.float32)
+        return np.asarray(np.where(hits, 0, transfer * gain[:, None]), np.complex64)
+
+    @cached_property
+    def flags(self) -> Flags:
+        """Flag `interference_pulsed`."""
+        at_hz = self.report["frequency_hz"]
+        line = (
+            f"{self.report['pulses_share']:.1%} of pulses, strongest at {1e-6 * at_hz:.2f} MHz ({service_at(at_hz)}): "
+            f"{self.report['excess_db']:.1f} dB above the level; excluded"
+        )
+        return Flags({"interference_pulsed": line})
+
+
+# ---- Pulses with interference in the whole band ----------------------------------------------------------------------
+
+_BURST = 4.0
+"""Noise of a pulse relative to that of its neighbours, above which the pulse is excluded."""
+
+_BLOCK = 128  # pulses over which the usual noise is a quartile
+_MOST_PULSES = 0.3
+"""Largest share of pulses that is excluded; more is not interference, or cannot be distinguished from echoes."""
+
+
+class Bursts:
+    """Noise of each pulse, from transfer functions and range profiles, block by block.
+
+    Notes
+    -----
+    Source: docs/theory/interference.md, eq. 6. A burst raises both the difference from the neighbouring pulses, which
+    echoes do not, and the median over the ranges, which single targets do not.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> received = (rng.normal(size=(400, 64, 2)) @ [1, 1j]).astype(np.complex64)
+    >>> received[7] *= 10
+    >>> bursts = Bursts()
+    >>> bursts.add(received, np.fft.ifft(received, axis=1))
+    >>> np.flatnonzero(bursts.excluded).tolist(), bursts.flags["interference_bursts"]
+    ([7], '1 of 400 pulses: noise up to 20.5 dB above the neighbouring pulses; excluded')
+    """
+
+    def __init__(self) -> None:
+        self._noise: list[Floats] = [np.zeros(0)]
+        self._floor: list[Floats] = [np.zeros(0)]
+
+    def add(self, transfer: Complexes, profiles: Complexes) -> None:
+        """Add consecutive pulses: (pulse, subcarrier) transfer functions and (pulse, range) profiles."""
+        some = transfer[:, :: -(-transfer.shape[1] // _SAMPLES)]
+        change = (np.abs(np.diff(some, axis=0)) ** 2).mean(axis=1, dtype=np.float64) / 2
+        alone = np.zeros(len(some)) if not len(change) else None
+        # The difference from the nearer of both neighbours; a pulse at the end of a block has one.
+        noise = alone if alone is not None else np.minimum(np.append(change, change[-1]), np.append(change[0], change))
+        self._noise.append(np.asarray(noise))
+        samples = profiles[:, :: max(1, profiles.shape[1] // _SAMPLES)]
+        self._floor.append(np.median(np.abs(samples) ** 2, axis=1).astype(np.float64))
+
+    def skip(self, pulses: int) -> None:
+        """Add pulses that do not contribute to the scene."""
+        self._noise.append(np.zeros(pulses))
+        self._floor.append(np.zeros(pulses))
+
+    @cached_property
+    def _relative(self) -> Floats:
+        """(pulse,) float64, noise relative to that of the neighbouring pulses, by differences (eq. 6)."""
+        return np.maximum(2 * _over_neighbours(np.concatenate(self._noise)) - 1, 0.0)
+
+    @cached_property
+    def excess(self) -> Floats:
+        """(pulse,) float64, noise relative to that of the neighbouring pulses: the lower of both tests."""
+        return np.minimum(self._relative, _over_neighbours(np.concatenate(self._floor)))
+
+    @cached_property
+    def excluded(self) -> NDArray[np.bool_]:
+        """(pulse,) bool, True for pulses that are excluded: this gains SNR (eq. 7)."""
+        bursts = self.excess > _BURST
+        return bursts if bursts.any() and self.gain_db >= LEAST_GAIN_DB else np.zeros_like(bursts)
+
+    @property
+    def gain_db(self) -> float:
+        """SNR gained in the image by the exclusion, dB (eq. 7); 0 if more than 30 % of the pulses would be excluded."""
+        noise, bursts = self._relative, self.excess > _BURST
+        used = noise > 0
+        kept = used & ~bursts
+        if not kept.any() or bursts.sum() > _MOST_PULSES * used.sum():
+            return 0.0
+        return decibels(float(noise[used].sum() / noise[kept].sum() * (kept.sum() / used.sum()) ** 2))
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """As JSON values; {} if no pulse has interference."""
+        bursts = self.excess > _BURST
+        if not self.flags:
+            return {}
+        return {
+            "pulses": int(bursts.sum()),
+            "of": len(bursts),
+            "excess_db": round(decibels(float(self.excess.max())), 1),
+            "excluded": bool(self.excluded.any()),
+            "gain_db": round(self.gain_db, 2),
+        }
+
+    @property
+    def flags(self) -> Flags:
+        """Flag `interference_bursts` if pulses have interference that is excluded, or too many to be excluded."""
+        bursts = self.excess > _BURST
+        too_many = bursts.sum() > _MOST_PULSES * len(bursts)
+        if not self.excluded.any() and not too_many:
+            return Flags()
+        done = "not excluded, as these are too many" if too_many else "excluded"
+        excess_db = decibels(float(self.excess.max()))
+        line = (
+            f"{bursts.sum()} of {number_of(len(bursts), 'pulse')}: noise up to {excess_db:.1f} dB above the "
+            f"neighbouring pulses; {done}"
+        )
+        return Flags({"interference_bursts": line})
+
+
+def _over_neighbours(values: Floats) -> Floats:
+    """Return (pulse,) values relative to their lower quartile in some hundred neighbouring pulses; 0 where zero."""
+    blocks = np.array_split(values, max(1, round(len(values) / _BLOCK)))
+    low = np.array([np.quantile(block[block > 0], 0.25) if (block > 0).any() else 0.0 for block in blocks])
+    usual = scipy.ndimage.median_filter(low, size=min(3, len(low)), mode="nearest")
+    each = np.repeat(usual, [len(block) for block in blocks])
+    return np.asarray(np.divide(values, each, out=np.zeros_like(values), where=each > 0))

@@ -30,6 +30,7 @@ from apertura.core.echo.captures import (
 )
 from apertura.core.echo.clock import GROUPS, clock_of, decide_clock
 from apertura.core.echo.demodulate import Numerology, demodulate
+from apertura.core.echo.interference import SidelinkInterference, limited
 from apertura.core.echo.line_of_sight import LineOfSight
 from apertura.core.echo.own_pulses import CodeEvidence, own_code, phase_stability
 from apertura.core.echo.sidelink import DIVIDING, METHODS, choose, edges
@@ -111,7 +112,7 @@ class Demodulator:
             return self.symbols(iq["radar"])
         clock = correction.clock_hz, correction.sfo_ppm
         radar, sidelink = (self.symbols(iq[name], *clock) for name in ("radar", "sidelink"))
-        return METHODS[correction.method](radar, sidelink, correction.path)
+        return METHODS[correction.method](radar, limited(sidelink)[0], correction.path)
 
 
 @dataclass(frozen=True)
@@ -239,9 +240,10 @@ def transfer_by_sidelink(
     # First pass: measure the clock on a sample of captures, the state of the sidelink on all.
     demodulator = Demodulator(inverse, numerology, symbol_samples)
     receiver = _Receiver.measured(read, demodulator, len(sidelink_m), accuracy_db)
+    interference = SidelinkInterference(numerology.frequency_hz)
     with progress("sidelinks", len(sidelink_m)) as done:
         try:
-            state = measure_blocks(lambda: receiver.sidelink(done), f"{where}: sidelink")
+            state = measure_blocks(lambda: map(interference.limit, receiver.sidelink(done)), f"{where}: sidelink")
         except CampaignError as unlocked:
             if not _compresses_conjugated(read, demodulator, len(sidelink_m)):
                 raise
@@ -260,6 +262,7 @@ def transfer_by_sidelink(
     wrong = detect_wrong_association(residual)
     flags = Flags.merged(
         clock_flags,
+        interference.flags,
         state.flags,
         edges(chosen, state),
         second_path_flags(state, cell_m=cell_m),
