@@ -201,7 +201,7 @@ def test_dropouts_of_the_logger_are_reported(tmp_path):
     at = len(data) - 10 * len(_last_message(data))
     path.write_bytes(data[:at] + struct.pack("<HBH", 2, ord("O"), 1500) + data[at:])
     track = read_track(path, node="a")
-    assert track.attrs["remarks"] == ["1 dropouts of the logger, total 1.5 s: their messages are lost"]
+    assert track.attrs["remarks"] == ["1 dropouts of the logger, total 1.5 s: messages during dropouts are lost"]
     assert track.sizes["epoch"] == 60
 
 

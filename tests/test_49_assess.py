@@ -162,7 +162,7 @@ def test_random_log_errors_have_no_single_cause(tmp_path):
     reports = reports_of(run_sample(tmp_path, lambda root: edit_track(root, "uav1", noisy)))
     flags = reports["uav1-uav1"]["flags"]
     assert reports["uav1-uav1"]["hypotheses"] == []
-    assert "no single cause explains it" in flags["defocused"]
+    assert "no single cause explains this" in flags["defocused"]
 
 
 def trial(gain_db, kind, *, offset=False):

@@ -52,7 +52,7 @@ class NodeLog:
     log
         Log file, for messages.
     shortest_wave_m
-        Wavelength of the highest frequency, metres: scale of the tolerated error between epochs.
+        Wavelength of the highest frequency, metres; the tolerated error between epochs is proportional to it.
     """
 
     name: str
@@ -103,7 +103,7 @@ class NodeLog:
 
     @cached_property
     def smoothing_residual_m(self) -> float | None:
-        """RMS change per axis of the valid epochs by smoothing, metres; None without smoothing."""
+        """RMS change of the valid epochs due to smoothing, metres per axis; None without smoothing."""
         if self.settings.log.smoothing_m is None:
             return None
         times, position, _ = self._valid_epochs
@@ -168,7 +168,7 @@ def shortest_wave(frequency_hz: NDArray[np.float64]) -> float:
 def poorer_fix(fix: NDArray[np.int8], worst: Literal["auto", "fix", "float", "any"]) -> NDArray[np.bool_]:
     """Return (epoch,) bool, True for solutions poorer than `worst`.
 
-    Epochs without a logged solution are False, and all epochs for 'auto' if the log has no RTK solution.
+    Epochs without a logged solution are False. For 'auto', all epochs are False if the log has no RTK solution.
 
     Examples
     --------

@@ -21,7 +21,7 @@ SUFFIX = ".zarr"
 
 _EXPECTED = f"a Zarr folder (version 3) with {EXPECTED}"
 _SPARE_BYTES = 4 << 30
-"""Additional address space, bytes, for the threads and the event loop of zarr, which reserve more than they use."""
+"""Additional address space, bytes: the threads and the event loop of zarr reserve more memory than they use."""
 
 
 def read_zarr_history(paths: Sequence[Path], *, pair: str) -> "xr.Dataset":

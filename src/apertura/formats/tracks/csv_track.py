@@ -118,7 +118,7 @@ def read_table(
                 low_memory=False,
             )
         except pd.errors.ParserWarning as error:
-            raise ValueError("a line has more cells than the heading") from error
+            raise ValueError("a line has more cells than the header") from error
     missing = [name for name in required if name not in table.columns]
     if missing:
         raise ValueError(f"no column {missing[0]} among {quoted(list(table.columns), 300)}")
@@ -181,9 +181,9 @@ def _checked_cells(path: Path, known: Sequence[str]) -> tuple[list[str], set[int
                 elif row == heading:
                     others.add(index)
                 elif row and row[0].strip().casefold() in titles:
-                    raise ValueError(f"line {rows.line_num} is a second, different heading: concatenated files")
+                    raise ValueError(f"line {rows.line_num} is a second, different header: concatenated files")
                 elif row and len(row) - (row[-1] == "") != len(heading) != len(row):  # a comma may end the line
-                    raise ValueError(f"line {rows.line_num} has {len(row)} cells, the heading {len(heading)}")
+                    raise ValueError(f"line {rows.line_num} has {len(row)} cells, the header {len(heading)}")
         except csv.Error as error:
             raise ValueError(f"line {rows.line_num}: {error}") from error
     return heading, others
@@ -200,7 +200,7 @@ def _without(stream: TextIO, others: set[int]) -> TextIO:
 
 
 def numbers(columns: pd.DataFrame) -> NDArray[np.float64]:
-    """Convert columns to (row, column) float64, NaN for empty cells; ValueError at a cell that is not a number."""
+    """Convert columns to (row, column) float64, NaN for empty cells; ValueError if a cell is not a number."""
     for name in columns.columns:
         if columns[name].dtype.kind in "fiu":
             continue
@@ -393,7 +393,7 @@ def _time(table: pd.DataFrame, log: _Log) -> NDArray[np.datetime64]:
 
 
 def _iso(cells: "pd.Series[str]") -> NDArray[np.datetime64]:
-    """Parse times in ISO 8601, with decimal point or comma; ValueError at the first that is not a time."""
+    """Parse times in ISO 8601, with decimal point or comma; ValueError if a cell is not a time."""
     texts = cells.str.strip().str.replace(",", ".", regex=False)
     time = pd.to_datetime(texts, utc=True, format="ISO8601", errors="coerce")
     wrong = cells[time.isna() & cells.notna()]

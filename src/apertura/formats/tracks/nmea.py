@@ -84,7 +84,7 @@ def read_nmea(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -
     ------
     CampaignError
         If a date or the geoid separation is neither logged nor configured, the configured date differs from the logged
-        one, or times do not increase.
+        date, or times do not increase.
 
     Notes
     -----
@@ -97,7 +97,7 @@ def read_nmea(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -
     data = path.read_bytes()
     sealed = _SEALED.search(data) is not None
     log = _Log(path, node, options, data, sealed)
-    # first pass up to the first date, which also applies to the epochs before it
+    # first pass up to the first date, which also applies to the preceding epochs
     scanned = _sentences(_Log(path, node, options, data, sealed))
     dates = (_dated(sentence) for sentence in scanned if sentence.sentence_type in _DATED)
     log.now_ns = next((date for date in dates if date is not None), None)
@@ -119,7 +119,7 @@ def _check_day(first_ns: int, log: _Log) -> None:
 
 
 def _sentences(log: _Log) -> Iterator[Any]:
-    """Yield the complete sentences of the types to be read; count damaged ones."""
+    """Yield the complete sentences of the types to be read; count damaged sentences."""
     lines = log.data.splitlines()
     ended = not log.data or log.data[-1:] in b"\r\n"
     for row, line in enumerate(lines, 1):
@@ -133,7 +133,7 @@ def _sentences(log: _Log) -> Iterator[Any]:
 
 
 def _complete(text: str, checksum: bytes | None, log: _Log, *, ended: bool) -> Iterator[Any]:
-    """Yield a sentence if it is complete and of a type to be read; `ended`: a line end follows it."""
+    """Yield a sentence if it is complete and of a type to be read; `ended`: a line end follows the sentence."""
     unsealed = checksum is None and ended and text.count(",") >= _COMMAS.get(text[2:5], 1)
     if unsealed and not log.sealed:
         checksum, text = b"", text.rstrip()

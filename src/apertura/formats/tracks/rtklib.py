@@ -45,7 +45,7 @@ _GEOCENTRIC = re.compile(r"(?:WGS|ITRF|IGS|IGB)[-_ ]?\d*", re.I)
 _INTERVAL = re.compile(
     r"(?:obs|sol|inp) (?:start|end)\b.*?\b(GPST|UTC|JST)\b|out-timesys\s*[=:]\s*(gpst|utc|jst)\b", re.I
 )
-"""Time system in a comment of the header, in addition to the one stated with the column names."""
+"""Time system in a comment of the header, in addition to the time system stated with the column names."""
 
 _STATES = re.compile(rf"ref pos\s*:|{_DATUM.pattern}|{_INTERVAL.pattern}", re.I)
 _EXPECTED = "an RTKLIB solution whose header contains column names and time system (GPST, UTC or JST)"
@@ -206,11 +206,11 @@ def _height_datum(lines: list[str], system: str, path: Path, first: int) -> str:
         other = (interval[1] or interval[2]).upper() if interval else system
         if other != system:
             raise CampaignError(
-                f"times are {system} according to the column heading and {other} according to line {line}, "
+                f"times are {system} according to the column header and {other} according to line {line}, "
                 f"{quoted(text.strip(), 80)}",
                 path,
                 "a single time system",
-                f"Export the solution again. If the heading is correct, remove line {line}.",
+                f"Export the solution again. If the column header is correct, remove line {line}.",
             )
         if datum and datum[1] != "0" and not _GEOCENTRIC.fullmatch(datum[1]):
             raise CampaignError(
@@ -233,7 +233,7 @@ def _check_stated(header: _Header, options: LogOptions, *, node: str, where: Pat
     if header.geodetic_height == "geodetic" and options.height_offset_m is None:
         raise unstated(
             "height_offset_m",
-            "heights are above a geoid (geodetic in RTKLIB)",
+            "heights are orthometric (above a geoid; 'geodetic' in RTKLIB)",
             node=node,
             where=where,
             remedy=", or export ellipsoidal heights",
@@ -349,7 +349,7 @@ def _base(header: _Header, options: LogOptions, *, node: str, where: Path) -> ND
 
 
 def _std(logged: NDArray[np.float64], ecef: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return standard deviations to north, east and up, in ECEF with the logged signed roots of covariances."""
+    """Return standard deviations to north, east and up; those in ECEF are rotated, with the logged covariances."""
     if not logged.shape[1]:
         return None
     if logged.shape[1] == len(_STD):
@@ -408,7 +408,7 @@ def write_rtklib_pos(
     path
         ``….pos``.
     time_utc
-        (epoch,) datetime64, UTC; written in `system` with the milliseconds or finer digits needed.
+        (epoch,) datetime64, UTC; written in `system` with milliseconds, or with more digits if needed.
     geodetic
         (epoch, 3) float64: latitude and longitude (degrees), metres above the ellipsoid; written with a resolution of
         1 µm in arc length and 10 µm in height.

@@ -22,7 +22,7 @@ GGA_KINDS = {"1": "single", "2": "dgps", "3": "single", "4": "fix", "5": "float"
 """Quality indicator of NMEA GGA → solution type, a key of `FIXES`; 9 as defined by NovAtel."""
 
 GGA_NOT_MEASURED = {"": "no fix", "0": "no fix", "6": "dead reckoning", "7": "manual input", "8": "simulated"}
-"""Quality indicator of NMEA GGA → reason why the position is not a measured one."""
+"""Quality indicator of NMEA GGA → reason why the position is not measured."""
 
 LOWEST_M, HIGHEST_M = -1000.0, 100_000.0
 """Accepted heights above the ellipsoid, m, of aircraft and balloons."""
@@ -279,7 +279,7 @@ _UNIX = re.compile(r"1970-01-01(?:[T ]00:00(?::00(?:\.0+)?)?)?", re.ASCII)
 
 
 def unstated(key: str, found: str, *, node: str, where: Path, remedy: str = "") -> CampaignError:
-    """Return the error for a log without a value that the config must then state.
+    """Return the error for a log without a value that must then be configured.
 
     Parameters
     ----------

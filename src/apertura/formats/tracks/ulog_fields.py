@@ -193,7 +193,7 @@ def _appended(data: bytes) -> list[int]:
 
 
 def _joined(data: bytes) -> bytes:
-    """Remove the offsets of appended data from a ULog: without foreign bytes, these follow the other messages."""
+    """Remove the offsets of appended data from a ULog from which foreign bytes, and thus gaps, are to be removed."""
     if not _appended(data):
         return data
     at = _HEADER + _MESSAGE

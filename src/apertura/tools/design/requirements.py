@@ -1,4 +1,4 @@
-"""Verdicts on the requirements of a plan: dominant cause of a shortfall, most helpful changes, search for tracks."""
+"""Verdicts on the requirements of a plan, causes of shortfalls, single changes that help, and search for tracks."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -19,12 +19,12 @@ from apertura.tools.design.flight_plan import BesideTrack, FlightPlan, LineTrack
 from apertura.tools.design.layers import PlannedImage
 
 SHARE = 95.0
-"""Percentage of the visible pixels that must meet a requirement, since edges of a scene are worse than its centre."""
+"""Percentage of the visible pixels that must meet a requirement; image quality is lower at the edges of a scene."""
 
 COARSE_PX = 64
 """Number of pixels along the longer side of the grid on which changes are compared.
 
-The centres of the outermost pixels are 1 % of the side from the edges.
+The centres of the outermost pixels are 1 % of the side length away from the edges.
 """
 
 _LAYERS = {
@@ -38,7 +38,7 @@ _LAYERS = {
 """Requirement → layer, and "most" for an upper or "least" for a lower limit of its values."""
 
 LEAST_GAIN_DB = 0.05
-"""Minimum gain of a listed change, unless the complete shortfall is smaller: smaller gains are printed as zero."""
+"""Minimum gain of a listed change, dB, as smaller gains are printed as 0; or the whole shortfall, if smaller."""
 
 _LEAST = {"snr_db", "point_snr_db", "coverage", "coherence"}
 _IN_DB = {"nesz_db", "snr_db", "point_snr_db", "loss_db"}
@@ -53,7 +53,7 @@ class Verdict:
     requirement
         A key of `require`.
     required, found
-        Required and predicted value, in the unit of the requirement; `found` is NaN if the plan does not determine it.
+        Required and predicted value, in the unit of the requirement; `found` is NaN if not determined by the plan.
     image
         Name of the worst image.
     cause
@@ -169,7 +169,7 @@ def _cause(name: str, design: Design, image: PlannedImage, visible: np.ndarray, 
         spread_hz = max(pair.doppler_hz for pair in design.images.values() if pair.looks is not None)
         return f"Doppler spread of {spread_hz:.0f} Hz over the scene, from speed, range and beams"
     looks = float(np.median(image.layers["looks"][visible]))
-    return f"noise of {looks:.0f} pulses at the far side, from power, gains and range"
+    return f"noise with {looks:.0f} integrated pulses, from transmit power, antenna gains and range"
 
 
 def refinement_line(design: Design, flight: str) -> str:
@@ -179,12 +179,12 @@ def refinement_line(design: Design, flight: str) -> str:
         return f"refinement is not expected to succeed: {', '.join(refinement.obstacles)}"
     needs = f"requires {LEAST_POINTS} bright points in the scene, {_least_point(design, flight)}"
     if refinement.applied:
-        return f"tracks refined, which {needs}"
+        return f"tracks refined; the refinement {needs}"
     return f"tracks as logged; refinement (processing.autofocus: on) {needs}"
 
 
 def _least_point(design: Design, flight: str) -> str:
-    """Return the minimum SNR of a point for a refinement, with its cross-section for all pairs of a flight if known."""
+    """Return the minimum SNR of a point for a refinement, and if known the cross-section sufficient for all pairs."""
     minimum = f"{LEAST_SNR_DB:g} dB above the noise of one pulse"
     rcs_dbsm, excess_db = design.opened.plan.expect.rcs_dbsm, list[float]()
     for image in design.images.values():
@@ -241,7 +241,7 @@ class Change:
     found
         Requirement → predicted value with the change.
     breaks
-        Requirements that are met without the change only.
+        Requirements that are met only without the change.
     """
 
     words: str
@@ -257,15 +257,15 @@ def shortfall_db(verdicts: Sequence[Verdict]) -> float:
 
 
 def helpful_changes(plan: FlightPlan, root: Path, before: Sequence[Verdict], *, threads: int = 1) -> list[Change]:
-    """Return single changes that reduce the shortfall, sorted by the number of requirements they break and by gain.
+    """Return single changes that reduce the shortfall, sorted by number of requirements no longer met, then by gain.
 
     Parameters
     ----------
     plan, root
-        As `designed`.
+        As in `designed`.
     before
-        Verdicts of the unchanged plan on the full grid. Changes are evaluated on a coarser grid, and corrected for the
-        difference between both grids for the unchanged plan.
+        Verdicts of the unchanged plan on the full grid. Changes are evaluated on a coarser grid, and the values are
+        corrected by the difference between the two grids for the unchanged plan.
     threads
         Number of tiles computed in parallel.
     """
@@ -409,7 +409,7 @@ class Tried:
         Verdicts on all possible requirements.
     objective
         Minimised value, dB: ten times the total shortfall, plus the largest shortfall (or smallest margin, negative),
-        plus a hundredth of the mean, so that the minimum is Pareto-optimal.
+        plus a hundredth of the mean shortfall, so that the minimum is Pareto-optimal.
     on_front
         True if the plan is Pareto-optimal among those tried.
     """
@@ -435,7 +435,7 @@ def search(
     Parameters
     ----------
     plan, root
-        As `designed`.
+        As in `designed`.
     words
         Keys of `AXES`.
     most
@@ -458,7 +458,7 @@ def search(
     unknown = [word for word in words if word not in AXES]
     if unknown or not words:
         found = ",".join(words) or "an empty list"
-        raise CampaignError(found, "--optimise", f"one or more of {','.join(AXES)}", "Correct it.")
+        raise CampaignError(found, "--optimise", f"one or more of {','.join(AXES)}", "Correct the list.")
     if not plan.require.model_fields_set:
         raise CampaignError("no requirement", "the plan: require", "at least one requirement", "Add requirements.")
     keys, tried = [AXES[word] for word in words], list[Tried]()
@@ -480,7 +480,7 @@ def search(
     direct(objective, limits, maxfun=most, locally_biased=True, len_tol=1e-2, vol_tol=0.0)
     if not tried:
         raise CampaignError(
-            "no valid plan within the bounds", "the plan: bounds", "bounds with at least one valid plan", "Widen them."
+            "no valid plan within the bounds", "the plan: bounds", "at least one valid plan", "Widen the bounds."
         )
     best = min(tried, key=lambda trial: trial.objective)
     best_plan = plan.model_copy(update={"moved": plan.moved.model_copy(update=dict(best.moved))})
