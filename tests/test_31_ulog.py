@@ -131,7 +131,7 @@ def test_several_receivers_are_listed_with_their_solutions(tmp_path):
     track = read(tmp_path, *topics)
     assert track.attrs["remarks"] == [
         "the log contains receivers sensor_gps:0 (single 60) and sensor_gps:1 (fix 59, no fix 1); sensor_gps:0 is "
-        "used: select with nodes.a.log.body"
+        "used; select with nodes.a.log.body"
     ]
     selected = read(tmp_path, *topics, options=LogOptions(body="sensor_gps:1"))
     assert "remarks" not in selected.attrs

@@ -41,7 +41,7 @@ class LogFormat(NamedTuple):
     reader: Callable[..., Any]
     """reader(path, node=, options=) → `track`."""
     heading: str = ""
-    """Text in the first 8 KiB that distinguishes the format from others with the same suffix; empty: any."""
+    """Text in the first 8 KiB that distinguishes the format from others with the same suffix; empty: any text."""
     by_lines: bool = False
     """True if epochs are lines of text, so that a log that is being written is valid up to its last complete line."""
 

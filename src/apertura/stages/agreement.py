@@ -104,7 +104,7 @@ class ComparedImage:
     focus
         Section `focus` of image.json.
     carriers, grid
-        Spatial carriers of points over the image, as `apertura.core.imaging.view.carriers_of` returns them; and the
+        Spatial carriers of points over the image, as returned by `apertura.core.imaging.view.carriers_of`, and the
         image grid.
     """
 

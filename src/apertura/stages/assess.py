@@ -174,7 +174,8 @@ def _hypotheses(
     causes = hypotheses(campaign, flight, brightest=brightest, cell_m=quality["focus"]["cell_m"], focused=sharp)
     cause = "; no single cause explains this"
     if causes:
-        cause = f"; {causes[0]['gain_db']:.1f} of {causes[0]['lost_db']:.1f} dB are explained if {causes[0]['what']}"
+        cause = f"; {causes[0]['gain_db']:.1f} of {causes[0]['lost_db']:.1f} dB peak loss are explained if "
+        cause += str(causes[0]["what"])
     for pair, names in suspicious.items():
         for name in names:
             line = flags[pair].get(name) or images[pair].attrs["flags"][name]
@@ -200,7 +201,7 @@ def _rank(focus: Mapping[str, Any]) -> tuple[int, float]:
 
 
 def _disagreement(chosen: CoherentSum, pair: str, blind: Sequence[str]) -> dict[str, str]:
-    """Return the flags of a pair outside the set that agrees.
+    """Return the flags of a pair outside the set of agreeing pairs.
 
     `blind`: members of the set whose bright points are all missing in the image of the pair.
     """
@@ -240,8 +241,8 @@ def wrong_codes(codes: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str, 
     """Return pair, flag and line for each pair whose sidelink does not contain the configured code.
 
     If some receivers detect the configured code, the transmitter sent that code, and the other receivers recorded
-    another transmitter. If no receiver detects it, the transmitter sent another code, and all pairs of the transmitter
-    are flagged.
+    another transmitter. If no receiver detects the configured code, the transmitter sent another code, and all pairs of
+    the transmitter are flagged.
 
     Parameters
     ----------

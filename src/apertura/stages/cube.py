@@ -150,7 +150,7 @@ def compared(images: Images, references: Mapping[str, str], first_flights: Mappi
 
 
 def window_of(images: Images, spacing_m: float) -> int:
-    """Return the side of the coherence window, pixels: it contains at least 16 looks of every image."""
+    """Return the side of the coherence window, which contains at least 16 looks of every image, in pixels."""
     return max(window_px(_spectrum(image), spacing_m) for image in images.values())
 
 
@@ -169,7 +169,7 @@ def write_phase(
     window: int,
     workers: Executor,
 ) -> tuple[float, float]:
-    """Write coherence and phase of two images tile by tile; return looks, and the coherence bias of unrelated images.
+    """Write coherence and phase of two images tile by tile; return looks and coherence bias of unrelated images.
 
     Parameters
     ----------

@@ -205,7 +205,8 @@ def _noise_of_sum(
     paths = [campaign.result(flight, pair, kept) for pair in divisors]
     if multilook is None or not multilook.subtract_noise or not all(path.is_file() for path in paths):
         return None
-    # Noise is independent between pairs: powers add up, divided by n² in a mean of n amplitudes, by n in one of powers.
+    # Noise is independent between pairs: powers add up, divided by n² in a mean of n amplitudes, by n in a mean of n
+    # powers.
     count = len(divisors) ** (2 if source == "coherent" else 1)
 
     def noise(window: Window) -> Floats:

@@ -445,7 +445,7 @@ LEAST_AGAINST_NEXT = 2.0
 """Smallest ratio of a hypothesis's gain in dB to that of the best other cause and of the best random track."""
 
 CLEAR_DB = 10.0
-"""Difference in dB from which a gain is regarded as the larger one, even if the ratio is below `LEAST_AGAINST_NEXT`."""
+"""Difference in dB from which a gain is regarded as the larger gain, whatever the ratio of the gains is."""
 
 
 def explanation(trials: Sequence[Hypothesis], drawn: Sequence[Hypothesis], lost_db: float) -> list[dict[str, Any]]:

@@ -95,7 +95,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
         stage_flags = work.empty.attrs["flags"], work.track.stage.attrs["flags"]
         quality["flags"] = Flags.merged(*stage_flags, plan.flags, quality["flags"], judged.flags)
         finish(wip, folder, lineage=lineage, quality=quality, flags=quality["flags"])
-    # Removes all receipts, including those of an earlier run with another number of jobs.
+    # Remove all receipts, including those of an earlier run with another number of jobs.
     _receipts(folder).remove()
     return folder
 

@@ -40,7 +40,7 @@ from apertura.stages.transfer import PairEcho
 from apertura.workflow.lineage import result_of
 from apertura.workflow.rules import INTERFEROMETRY
 
-_BAND_TOLERANCE = 1e-6  # relative difference of two bands' limits that is tolerated
+_BAND_TOLERANCE = 1e-6  # tolerated relative difference between the limits of two bands
 
 
 @dataclass(frozen=True, eq=False)

@@ -351,7 +351,7 @@ def expected_pair(
 
 
 def _positions(stated: Mapping[str, Any]) -> NodePositions:
-    """Return the position accuracy of a node from an echo stage, whose standard deviations are north, east, up."""
+    """Return the position accuracy of a node from an echo stage, which lists it in the order north, east, up."""
     std = stated.get("std_m")
     axes = None if std is None else (float(std[1]), float(std[0]), float(std[2]))
     return NodePositions(

@@ -50,7 +50,7 @@ def inside_segments(campaign: Campaign, flight: str, pair: str, times: NDArray[n
 
 
 def keep_segments(campaign: Campaign, flight: str, pair: str, echo: xr.Dataset) -> xr.Dataset:
-    """Return an echo without the pulses outside the segments of its pair; attribute `pulses` contains their number."""
+    """Return an echo without the pulses outside the segments of its pair; attribute `pulses` reports both numbers."""
     if not campaign.segments_of(flight, pair):
         return echo
     inside = inside_segments(campaign, flight, pair, echo.time.values)
@@ -95,7 +95,7 @@ class PulsePositions:
 def place(tx: NodeLog, rx: NodeLog, at: Times, *, hovers: bool = False) -> PulsePositions:
     """Select the pulses of a pair, at the transmitter's time tags `at`, for which both logs have valid positions.
 
-    Pulses of a hover are excluded unless `hovers` is True, as it is for pairs with configured segments.
+    Pulses of a hover are excluded unless `hovers` is True, which is the case for pairs with configured segments.
 
     Raises
     ------

@@ -312,7 +312,7 @@ class CalibratedPair:
         Returns
         -------
         list of dict
-            rcs_m2, rcs_dbsm, std_db and scatter_db of each peak; None if noise and clutter are above `LEAST_CONTRAST`.
+            rcs_m2, rcs_dbsm, std_db and scatter_db of each peak; None if its contrast is below `LEAST_CONTRAST`.
 
         Notes
         -----

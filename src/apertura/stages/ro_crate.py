@@ -87,7 +87,7 @@ def _jobs(campaign: Campaign, results: Sequence[_FinishedResult], hashes: Mappin
     results
         Finished results.
     hashes
-        File of the campaign → SHA-256; that of an input when it was first read, that of a result at present.
+        File of the campaign → SHA-256: of an input, when the input was first read; of a result, at present.
     """
     jobs = dict[tuple[str, tuple[str, ...]], list[_FinishedResult]]()
     for one in results:
@@ -107,7 +107,7 @@ def _jobs(campaign: Campaign, results: Sequence[_FinishedResult], hashes: Mappin
 
 
 def _differences(recorded: Mapping[str, Any], result: Result, hashes: Mapping[str, str]) -> Iterator[str]:
-    """Yield the differences of a result's code, settings and sources from the current ones."""
+    """Yield the differences of a result's code, settings and sources from the current code, settings and sources."""
     if recorded["code"] != result.code_sha256:
         yield f"written by code that differs from the installed code of sha256 {result.code_sha256}"
     if recorded["settings"] != result.settings_sha256:

@@ -123,7 +123,7 @@ def symbol_numerology(waveform: OfdmWaveform) -> Numerology:
 
 
 def _chirp(waveform: PulseWaveform) -> NDArray[np.complex128]:
-    """Return a linear chirp over the band of a waveform, or over 0.8 of the sample rate."""
+    """Return a linear chirp over the configured band; without a configured band, over 0.8 of the sample rate."""
     half = 0.4 * waveform.sample_rate_hz
     low, high = waveform.band_hz or (-half, half)
     time = np.arange(round(waveform.pulse_s * waveform.sample_rate_hz)) / waveform.sample_rate_hz
@@ -176,7 +176,7 @@ def read_pulse(path: Path, waveform: PulseWaveform) -> NDArray[np.complex128]:
     )
     remedy = "Use the samples that were transmitted, or correct the waveform."
     if not path.is_file():
-        raise CampaignError("no such file", where=path, expected=expected, remedy="Copy it there.")
+        raise CampaignError("no such file", where=path, expected=expected, remedy="Copy the file there.")
     stored = read_npy(path, kinds="ci", most=2 * MOST_PULSE_SAMPLES, expected=expected, remedy=remedy)
     if waveform.capture_samples > MOST_PULSE_SAMPLES:
         raise CampaignError(
@@ -209,7 +209,7 @@ def read_codes(path: Path, subcarriers: int) -> NDArray[np.complex64]:
     expected = f"({subcarriers},) complex64 without zeros, for config/config.yaml: waveform.subcarriers"
     remedy = "Use the codes that were transmitted, or correct the waveform."
     if not path.is_file():
-        raise CampaignError("no such file", where=path, expected=expected, remedy="Copy it there.")
+        raise CampaignError("no such file", where=path, expected=expected, remedy="Copy the file there.")
     stored = read_npy(path, kinds="c", most=MOST_SYMBOLS, expected=expected, remedy=remedy)
     with np.errstate(over="ignore", invalid="ignore"):  # infinite and NaN values are rejected below
         codes = stored.astype(np.complex64)
@@ -250,7 +250,7 @@ def read_framing(path: Path, described: Mapping[str, Any], *, sample_rate_hz: fl
             "no such file",
             where=path,
             expected=f"the preamble named in {where.name}: apertura:framing",
-            remedy="Copy it there.",
+            remedy="Copy the file there.",
         )
     expected = f"a one-dimensional array of at most {MOST_CHIPS} chips, +1 or -1"
     remedy = "Save the preamble that was transmitted."

@@ -261,7 +261,7 @@ def write_clock(
 
 
 def print_alignment(campaign: Campaign, flight: str, node: str, *, write: bool, **options: Any) -> None:
-    """Align, print the result and the lines for the config, and with `write` write clocks.tsv."""
+    """Estimate the alignment; print the result and the lines for the config, and write clocks.tsv if `write` is set."""
     alignment, values = align(campaign, flight, node, **options)
     path_text = f"path offset {values['path_offset_m']:.4f} m"
     path_text += f" ± {alignment.path_width_m:.4f} m" if options["search_m"] > 0 else " (configured, not measured)"

@@ -294,7 +294,10 @@ class _View:
     def _response(
         self, pulses: Aperture, path_m: NDArray[np.float64], part: NDArray[np.float64], row: float, column: float
     ) -> complex:
-        """Return the complex pixel amplitude of a target of 1 m² with the given paths for K = 1: radiometry, eq. 15."""
+        """Return the complex pixel amplitude of a target of 1 m² with the given paths, for K = 1.
+
+        Source: docs/theory/radiometry.md, eq. 15.
+        """
         k = 2 * np.pi * centre_frequency(self.opened.frequency_hz) / self.opened.wave_speed_m_s
         phasors = np.exp(-1j * k * (path_m - pulses.path(self._pixel_position(row, column))))
         return complex((part * phasors).sum())

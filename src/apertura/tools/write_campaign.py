@@ -155,7 +155,7 @@ def _write_node(stem: Path, recorded: RecordedNode, waveform: SampledWaveform) -
     frame = [None] * len(time) if recorded.frame is None else np.asarray(recorded.frame).tolist()
     if not len(time) == len(start) == len(frame):
         found = f"{len(time)} time tags, {len(start)} starts and {len(frame)} frame numbers"
-        raise _wrong(stem, found, "one of each for every capture")
+        raise _wrong(stem, found, "one time tag, one start and one frame number for each capture")
     flat = samples.reshape(-1, *samples.shape[-2:])
     write_recording(
         stem,

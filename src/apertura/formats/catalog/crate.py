@@ -114,7 +114,7 @@ class CrateRun:
 # name and hash: a crate must not refer to files above its root, and results are shared without their recordings.
 
 WORKFLOW = "workflow/Snakefile"
-"""Path of the workflow in the crate; its rules are in a subfolder."""
+"""Path of the workflow in the crate; the rules of the workflow are in a subfolder."""
 
 _CRATE_SPEC = "https://w3id.org/ro/crate/1.1"
 _WORKFLOW_CRATE = "https://w3id.org/workflowhub/workflow-ro-crate/1.0"

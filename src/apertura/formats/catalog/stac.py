@@ -313,7 +313,7 @@ class Image:
 
     @property
     def id(self) -> str:
-        """Identifier; it is unique, because the hyphen in the name of a pair is the only one in names."""
+        """Identifier, which is unique because no name contains a hyphen except the hyphen of a pair."""
         return f"{self.flight}-{self.name}"
 
 

@@ -72,7 +72,7 @@ class Export:
     pictured
         True if the workflow report shows the file.
     opened
-        Purpose of opening the file, printed in the summary; empty: the file is not listed in the summary.
+        Hint on opening the file, printed in the summary; empty: the file is not listed in the summary.
     mosaicked
         True if the rasters of all flights are mosaicked; GDAL cannot mosaic complex rasters.
     """

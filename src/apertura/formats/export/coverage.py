@@ -252,7 +252,7 @@ def write_coverage(
         if has_two_maps:
             maps.append(maps[0].beside(part))
         if counts.size > 1:
-            _draw(maps[1], pairs, transform, "YlGnBu", f"pairs that cover a pixel, of {len(covered)}", counts=True)
+            _draw(maps[1], pairs, transform, "YlGnBu", f"pairs per pixel, out of {len(covered)}", counts=True)
         elif small:
             _draw(maps[1], total, transform, "viridis", f"{looks_label}, scene only")
         for number, layout in enumerate(maps):
@@ -266,7 +266,7 @@ def write_coverage(
             samples = [Line2D([], [], color=_COLOURS[number]) for number in flights.values()]
             maps[0].draw_legend(samples, list(flights))
         share = f"{100 * float((pairs > 0).mean()):.1f} % of the scene is covered by {number_of(len(covered), 'pair')}"
-        each = f", every pixel by {counts[0]}" if len(covered) > 1 and counts.size == 1 else ""
+        each = f", every covered pixel by {counts[0]}" if len(covered) > 1 and counts.size == 1 else ""
         thick = ", thick: used for the image" if any(coverage.imaged_m for coverage in covered) else ""
         footprints = "footprints" if len(flights) <= _NAMED else "edge of the covered area"
         lines = f"lines: tracks (dashed: receiver{thick}) and {footprints}"

@@ -93,7 +93,7 @@ class CphdCollection:
 
     @property
     def troposphere_s(self) -> Floats:
-        """Tropospheric part of the reference delay, in excess of vacuum: (pulse,) float64, seconds."""
+        """Tropospheric part of the reference delay, in excess of the delay in vacuum: (pulse,) float64, seconds."""
         return self.reference_delay_s - self._point_path_m / SPEED_OF_LIGHT_M_S
 
     @property

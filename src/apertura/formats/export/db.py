@@ -58,7 +58,7 @@ def write_db(
 def write_mean_db(
     path: Path, power: NorthUpRaster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write 10 log10 of a multilooked power, (y, x) float32; NaN where it is not positive.
+    """Write 10 log10 of a multilooked power, (y, x) float32; NaN where the power is not positive.
 
     Overviews contain the mean power of all pixels, including negative pixels, in dB. Otherwise as `write_db`.
 

@@ -23,7 +23,7 @@ LEFT, RIGHT, TOP, BOTTOM = 1.0, 1.4, 0.85, 1.6  # margins around the image, inch
 LEAST_WIDTH, LEAST_HEIGHT = 4.2, 1.6  # minimum space for text and colour bar of a narrow or flat image, inch
 PART_HEIGHT = 3.2  # minimum height if a part of the map is plotted separately, inch
 LETTER = 0.073  # width of a character in the label of a colour bar, inch
-LONGEST_FLAG = 24  # length of the longest flag name with comma, characters; unused part of the first of two lines
+LONGEST_FLAG = 24  # characters of the longest flag name with comma; maximum unused space at the end of a line
 
 Marker = tuple[float, float, str]
 

@@ -78,7 +78,7 @@ def write_mosaic(path: Path, rasters: Sequence[Path], *, title: str = "") -> Non
 
 
 def _opened(rasters: Sequence[Path]) -> tuple[dict[str, Any], dict[str, Any], list[str]]:
-    """Return the common grid and kind of the rasters, and the radiometry of each."""
+    """Return the common grid and kind of the rasters, and the radiometry of each raster."""
     layouts: list[tuple[dict[str, Any], dict[str, Any], dict[str, str]]] = []
     tags = []
     for path in rasters:

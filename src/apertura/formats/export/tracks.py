@@ -140,12 +140,12 @@ def write_pos(path: Path, log: RefinedLog, *, outcome: str, version: str) -> Non
         Version of apertura.
     """
     unrefined = int((~log.refined).sum())
-    outside = f"; {unrefined} of {len(log.refined)} epochs before or after the pulses have the nearest correction"
+    outside = f"; {unrefined} of {len(log.refined)} epochs are before or after the pulses: nearest correction used"
     remarks = [
         outcome,
         f"logged point of {log.node}, not an antenna{outside if log.refined.any() else ''}",
         "standard deviation 0: unknown; Q 5: single, or solution type not logged",
-        "ns, age, ratio and covariances 0: unknown (positions refined from images); Q as logged; not usable as filters",
+        "ns, age, ratio and covariances 0: unknown (positions refined from images); Q as logged; not for filtering",
     ]
     with replacement(path) as temporary:
         write_rtklib_pos(
@@ -251,7 +251,7 @@ def _draw_logged(figure: Figure, logs: Sequence[RefinedLog]) -> tuple[list[Any],
 
 
 def _draw(column: Sequence[Axes], log: RefinedLog) -> None:
-    """Plot the three axes of a node one below the other, over the refined epochs or, without these, the whole log."""
+    """Plot the three axes of a node one below the other, over the refined epochs or else over the whole log."""
     time_s, refined = log.time_s, log.refined
     epochs = np.flatnonzero(refined) if refined.any() else np.arange(len(time_s))
     margin_s = 0.04 * float(time_s[epochs[-1]] - time_s[epochs[0]])

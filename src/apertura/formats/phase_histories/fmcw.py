@@ -308,7 +308,7 @@ def read_beat_wav(paths: Sequence[Path], *, pair: str, described: Mapping[str, A
     Source: docs/theory/fmcw.md, "Triggers"; G. L. Charvat et al., MIT OpenCourseWare RES.LL-003, 2011.
     """
     if len(paths) != 1:
-        raise _bad(f"{len(paths)} files", paths[1], "one .wav file per node and flight", "Merge them into one file.")
+        raise _bad(f"{len(paths)} files", paths[1], "one .wav file per node and flight", "Merge the files into one.")
     path, recording = next(iter(read_fields(fmcw_fields.read_wav, paths)))
     return joined_sweeps([cut_sweeps(path, recording, described)], pair=pair, described=described)
 

@@ -118,7 +118,7 @@ def _scans(path: Path) -> tuple[NDArray[np.void], NDArray[np.float64], int]:
 
 
 def _messages(content: bytes) -> tuple[NDArray[np.void], bool]:
-    """Return the messages of a file, skipping other bytes, and True if it ends within a message."""
+    """Return the messages of a file, skipping other bytes, and True if the file ends within a message."""
     size, sign = MESSAGE.itemsize, _SCAN_INFO.to_bytes(2, "big")
     at, blocks = min(_CONFIG_BYTES, len(content)), []
     last = at

@@ -25,7 +25,7 @@ _SPARE_BYTES = 4 << 30
 
 
 def read_zarr_history(paths: Sequence[Path], *, pair: str) -> "xr.Dataset":
-    """Read Zarr folders, concatenated in the order of their names, as `echo` stage; `paths` are the files in them.
+    """Read Zarr folders, concatenated in the order of their names, as `echo` stage; `paths`: files in the folders.
 
     Raises
     ------

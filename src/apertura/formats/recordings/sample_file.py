@@ -21,7 +21,7 @@ SETTLING = 63
 """Half length of the filter in samples; at both ends of a capture, this number of samples is invalid."""
 
 EDGE = 0.025
-"""Minimum distance of a band from the edges of its Nyquist zone, per sample rate, for 80 dB of image rejection."""
+"""Minimum distance of a band from the edges of its Nyquist zone for 80 dB image rejection, in sample rates."""
 
 _KAISER = 8.0
 

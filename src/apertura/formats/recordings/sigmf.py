@@ -125,7 +125,7 @@ class StatedCaptures(NamedTuple):
 def read_meta(path: Path) -> tuple[Global, StatedCaptures]:
     """Read the metadata of a recording.
 
-    A long flight has several hundred thousand captures, of which at most a few thousand JSON objects are in memory.
+    A long flight has several hundred thousand captures; at most a few thousand are in memory as JSON objects.
 
     Raises
     ------

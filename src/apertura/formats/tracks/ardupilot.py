@@ -170,7 +170,7 @@ def _parameter(fields: Fields, names: tuple[tuple[str, ...], ...], receiver: int
 
 
 def _utc(week: Floats, milliseconds: Floats) -> NDArray[np.datetime64]:
-    """Convert GPS weeks and milliseconds to UTC; NaT where they are not yet valid."""
+    """Convert GPS weeks and milliseconds to UTC; NaT where week or milliseconds are not yet valid."""
     known = (week > 0) & (week <= _LAST_WEEK) & (milliseconds >= 0) & (milliseconds < _WEEK_MS)
     utc = np.full(week.size, np.datetime64("NaT", "ns"), "datetime64[ns]")
     utc[known] = utc_from_gps(gps_from_weeks(week[known].astype(np.int64), milliseconds[known].astype(np.int64)))

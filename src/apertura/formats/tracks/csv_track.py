@@ -246,7 +246,8 @@ def read_csv_track(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIO
     - the first complete set of latitude_deg, longitude_deg, height_m (WGS 84, ellipsoidal, after height_offset_m);
       x_m, y_m, z_m (ECEF); east_m, north_m, up_m (local frame of the campaign);
     - optionally roll_deg, pitch_deg, yaw_deg; std_north_m, std_east_m, std_up_m (standard deviations); quality
-      (solution type: a name of `FIXES`, or a number as defined by options.quality). Their cells may be empty.
+      (solution type: a name of `FIXES`, or a number as defined by options.quality). Cells of these columns may be
+      empty.
 
     Numbers are multiplied by options.scales. Epochs within a leap second, and epochs whose GGA quality marks a position
     that is not measured, are excluded and counted.
@@ -347,13 +348,13 @@ def _error(found: str, log: _Log, remedy: str) -> CampaignError:
     expected = (
         "columns time_utc (ISO 8601), or time or time_s, latitude_deg, longitude_deg, height_m, or x_m, y_m, z_m, or "
         f"east_m, north_m, up_m; optionally {', '.join(_ATTITUDE)}, {', '.join(_STD)}, quality ({', '.join(FIXES)}, "
-        f"or numbers as defined by nodes.{log.node}.log.quality); or their names in nodes.{log.node}.log.columns"
+        f"or numbers as defined by nodes.{log.node}.log.quality); other names as mapped by nodes.{log.node}.log.columns"
     )
     return CampaignError(found, log.path, expected, remedy)
 
 
 def _missing_column(name: str, table: pd.DataFrame, log: _Log) -> CampaignError:
-    """Return the error for a missing column, with the columns of the log and the setting that maps one of them."""
+    """Return the error for a missing column, with the columns of the log and the setting that maps a column name."""
     key = f"nodes.{log.node}.log.columns"
     remedy = (
         f"If the column has another name, set {key}: {{{name}: NAME}}; to try a name, use --set columns.{name}=NAME."

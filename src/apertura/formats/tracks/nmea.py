@@ -75,8 +75,8 @@ def read_nmea(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -
     """Read an NMEA 0183 log of any talkers as `track` stage.
 
     Positions, solution types and geoid separation are read from GGA: ellipsoidal height is altitude plus separation.
-    The date of a GGA is that of the preceding valid RMC or of the preceding ZDA, otherwise that of options.start_utc,
-    and advances at midnight; logged and configured dates must agree. Standard deviations are read from GST. If several
+    The date of a GGA is the date of the preceding valid RMC or ZDA, otherwise the date in options.start_utc; the date
+    advances at midnight. Logged and configured dates must agree. Standard deviations are read from GST. If several
     talkers report an epoch, the GN sentence is used. A log without any checksum is read with a remark; in other logs,
     truncated sentences and sentences with a wrong or missing checksum are excluded and counted by reason.
 
@@ -168,7 +168,7 @@ def _time_of_day(text: str) -> int | None:
 
 
 def _dated(sentence: Any) -> int | None:
-    """Return date and time of a sentence as nanoseconds since 1970; None if they are missing or invalid."""
+    """Return date and time of a sentence as nanoseconds since 1970; None if either is missing or invalid."""
     data = [*sentence.data, *[""] * 9]
     if sentence.sentence_type == "RMC":
         day, month, year = (data[8][start : start + 2] for start in (0, 2, 4))
@@ -224,7 +224,7 @@ def _nearest(of_day: int, log: _Log) -> int:
 
 
 def _fix(sentence: Any, log: _Log) -> _Fix | None:
-    """Parse the position of a GGA; if it is not a measured position, count it and return None."""
+    """Parse the position of a GGA; if the position is not measured, count the sentence and return None."""
     data = sentence.data
     quality = data[5]
     reason = GGA_NOT_MEASURED.get(quality)

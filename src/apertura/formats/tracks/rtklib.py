@@ -76,7 +76,7 @@ def read_rtklib_pos(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTI
     ------
     CampaignError
         If a header lacks column names, states two time systems or a datum other than WGS 84, heights are above a geoid
-        and options.height_offset_m is not configured, a baseline has no base, or a line cannot be read.
+        and options.height_offset_m is not configured, baselines have no base position, or a line cannot be read.
 
     Notes
     -----
@@ -178,7 +178,7 @@ def _kind(line: str) -> str:
 
 
 def _header(lines: list[str], path: Path, first: int) -> _Header:
-    """Parse the comment lines of a header, of which the first is line `first` of the file."""
+    """Parse the comment lines of a header; `first`: line number of the first comment line in the file."""
     heading = next((line for line in lines if _kind(line)), "")
     if not heading:
         position = f" after line {first - 1}" if first > 1 else ""
@@ -317,7 +317,7 @@ def _utc(time: NDArray[np.datetime64], system: str, path: Path) -> NDArray[np.da
 def _position(
     values: NDArray[np.float64], header: _Header, options: LogOptions, *, node: str, where: Path
 ) -> tuple[NDArray[np.float64], bool]:
-    """Return positions, and True if they are ECEF, False if latitude, longitude and ellipsoidal height."""
+    """Return positions, and True for ECEF positions, False for latitude, longitude and ellipsoidal height."""
     if header.position == "ecef":
         return values, True
     if header.position == "baseline":

@@ -182,7 +182,7 @@ def receivers_remark(kinds: Mapping[str, NDArray[np.int8]], selected: str, node:
     Examples
     --------
     >>> receivers_remark({"0": np.array([5, 5]), "1": np.array([1, 0])}, "0", "uav1")
-    'the log contains receivers 0 (single 2) and 1 (fix 1, no fix 1); 0 is used: select with nodes.uav1.log.body'
+    'the log contains receivers 0 (single 2) and 1 (fix 1, no fix 1); 0 is used; select with nodes.uav1.log.body'
     """
     names = {number: name for name, number in FIXES.items()} | {0: "no fix"}
     listed = []
@@ -190,7 +190,7 @@ def receivers_remark(kinds: Mapping[str, NDArray[np.int8]], selected: str, node:
         counted = {name: int((fix == number).sum()) for number, name in names.items()}
         solutions = ", ".join(f"{name} {count}" for name, count in counted.items() if count)
         listed.append(f"{receiver} ({solutions or 'no epochs'})")
-    return f"the log contains receivers {' and '.join(listed)}; {selected} is used: select with nodes.{node}.log.body"
+    return f"the log contains receivers {' and '.join(listed)}; {selected} is used; select with nodes.{node}.log.body"
 
 
 def _rolled_over(time_utc: NDArray[np.datetime64]) -> list[str]:

@@ -53,7 +53,7 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
 
     data = path.read_bytes()
     second = data.find(_MAGIC, 1)
-    if second > 0:  # its subscriptions would replace those of the first log
+    if second > 0:  # subscriptions of the second log would replace those of the first log
         raise ValueError(f"a second log starts at byte {second}: separate concatenated logs")
     spans, unread = _foreign(data)
     # the parser reads an undamaged file directly, including appended data

@@ -108,8 +108,8 @@ class BenchNode:
         State of the sidelink as measured for the sidelink correction, and stability of its amplitude; None without a
         sidelink.
     link
-        Strongest path: of the echo for the transmitter, of the echo divided by the sidelink for a receiver; None if no
-        path is found.
+        Strongest path: for the transmitter in its own echo, for a receiver in its echo divided by the sidelink; None if
+        no path is found.
     coherence_before
         Γ of the radar channel without sidelink correction.
     flags

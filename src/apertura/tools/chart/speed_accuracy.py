@@ -131,7 +131,7 @@ def _part(
     total_pixels: int,
     beams: Beams | None,
 ) -> Part:
-    """Return the part to measure; its pixels are sampled as for a certificate, by brightness in the planned image."""
+    """Return the part to measure, with pixels sampled by brightness in the planned image, as for a certificate."""
     window = []
     for size in scene.grid.shape:
         first = max(0, size - SIDE_PX) // 2 // 16 * 16

@@ -50,7 +50,8 @@ class ResourceEstimate:
     Attributes
     ----------
     flight_s
-        Flight → flight time including turns, seconds; with take-off, transit and landing if the plan has a home.
+        Flight → flight time including turns, seconds; also including take-off, transit and landing if the plan has a
+        home.
     transfer_s
         Flight → time before the first and after the last pulse, seconds; 0 without a home.
     pulses

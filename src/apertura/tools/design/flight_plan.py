@@ -26,8 +26,8 @@ class _Track(Section):
     height_m: float = Field(description="height above the reference `above`, m")
     above: Above = Field(
         "ground",
-        description="reference of height_m: ground, mean terrain height of the scene; terrain, terrain below each "
-        "point; ellipsoid",
+        description="reference of height_m: ground (mean terrain height of the scene), terrain (terrain below each "
+        "point) or ellipsoid",
     )
 
 
@@ -51,7 +51,7 @@ class LineTrack(_Leg):
 
 
 class RacetrackTrack(_Leg):
-    """Parallel legs in alternating directions; turns between them are flown and not imaged."""
+    """Parallel legs in alternating directions; turns between them are flown but not imaged."""
 
     kind: Literal["racetrack"]
     legs: int = Field(2, ge=1, le=_MOST_LEGS, description="number of legs, alternating in direction")
@@ -78,7 +78,7 @@ class MissionTrack(Section):
     file: str = Field(description="path relative to the plan: .plan, .waypoints, .kml or .csv")
     speed_m_s: Positive | None = Field(None, description="ground speed, m/s; null: speed of the mission")
     image: tuple[int, int] | None = Field(
-        None, description="first and last waypoint of the imaged part, counted from 1; null: all"
+        None, description="first and last waypoint of the imaged part, counted from 1; null: all waypoints"
     )
 
 
@@ -105,7 +105,7 @@ class FormationSettings(Section):
         "stack: above"
     )
     leader: Name = Field(description="node with a track of its own")
-    spacing_m: Positive = Field(description="distance between neighbours, m; for a vee in both axes")
+    spacing_m: Positive = Field(description="distance between neighbouring nodes, m; for a vee, along both axes")
 
     def offsets(self, followers: int) -> list[tuple[float, float, float]]:
         """Return the offsets (ahead, right, up) of each follower from the leader, metres.
@@ -224,7 +224,7 @@ class Bounds(Section):
         for name in type(self).model_fields:
             low, high = getattr(self, name)
             if low >= high:
-                raise ValueError(f"{name}=[{low:g}, {high:g}]: the minimum must be first")
+                raise ValueError(f"{name}=[{low:g}, {high:g}]: the minimum must precede the maximum")
         if self.spacing[0] <= 0:
             raise ValueError(f"spacing={list(self.spacing)}: factors must be positive")
         return self

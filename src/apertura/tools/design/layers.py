@@ -105,7 +105,7 @@ class PlannedImage:
     looks
         Integrated pulses of a pair, for interferograms; None for a sum.
     doppler_hz
-        Doppler spread over the scene, as sampled by the pulses, Hz; NaN for a sum.
+        Doppler spread over the scene, Hz; NaN for a sum.
     """
 
     name: str

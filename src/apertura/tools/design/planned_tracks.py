@@ -62,7 +62,7 @@ _ARC_S = 0.05  # interval between points of a circle
 _MOST_EPOCHS = 2_000_000
 _MOST_PULSES = 5_000_000
 _IMAGED_POINTS = 65  # points per leg that represent a track in the computation of a common displacement
-_RADIAL = 0.25  # tracks surround the scene if |mean position| / mean distance from its centre is below this ratio
+_RADIAL = 0.25  # tracks surround the scene if |mean offset| / mean distance from the scene centre is below this ratio
 _SEED = 31  # seed of the random deviation from the track: the same plan gives the same results
 
 
@@ -355,7 +355,7 @@ def _vertices(track: LineTrack | RacetrackTrack | CircleTrack) -> _Vertices:
 
 
 def _turn(begin: Floats, end: Floats, along: Floats, speed_m_s: float) -> list[Floats]:
-    """Return points of a turn that starts in a direction and ends in the opposite one: a cubic Bézier curve."""
+    """Return points of a turn that starts in a direction and ends in the opposite direction: a cubic Bézier curve."""
     handle = along * max(_TURN_S * speed_m_s, float(np.linalg.norm(end - begin)))
     share = np.linspace(0, 1, _TURN_POINTS)[1:, None]
     corners = begin, begin + handle, end + handle, end
@@ -497,7 +497,7 @@ def _check_separation(name: str, flight: PlannedFlight, courses: Mapping[str, Co
                 f"separation of {first} and {second} falls to {separation_m[nearest]:.2f} m at {nearest_s:.1f} s",
                 f"flights.{name}",
                 f"at least {flight.separation_m:g} m between any two nodes (separation_m)",
-                "Increase their separation, or reduce separation_m.",
+                "Increase the separation of these nodes, or reduce separation_m.",
             )
 
 

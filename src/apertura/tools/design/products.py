@@ -42,7 +42,7 @@ def write_design(design: Design, folder: Path, tried: Sequence[Tried] = ()) -> l
     folder
         Output folder, created if necessary; files of the same names are replaced.
     tried
-        Plans tried by a search; the Pareto-optimal ones are written to design.json.
+        Plans tried by a search; the Pareto-optimal plans are written to design.json.
     """
     folder, grid, written = made_folder(folder), design.opened.scene.grid, list[Path]()
     georeference = {"transform": Affine(*grid.transform), "crs": grid.crs_wkt}

@@ -38,7 +38,7 @@ _LAYERS = {
 """Requirement → layer, and "most" for an upper or "least" for a lower limit of its values."""
 
 LEAST_GAIN_DB = 0.05
-"""Minimum gain of a listed change, dB, as smaller gains are printed as 0; or the whole shortfall, if smaller."""
+"""Minimum gain of a listed change, dB, or the whole shortfall if that is smaller; smaller gains are printed as 0."""
 
 _LEAST = {"snr_db", "point_snr_db", "coverage", "coherence"}
 _IN_DB = {"nesz_db", "snr_db", "point_snr_db", "loss_db"}
@@ -98,11 +98,11 @@ def judge(design: Design, *, every: bool = False) -> list[Verdict]:
         values = layers["coherence"][np.isfinite(layers["coherence"])]
         value = float(np.percentile(values, 100 - SHARE)) if values.size else float("nan")
         first, second = design.opened.campaign.settings.interferometry.pairs[name]
-        cause = f"common spectrum of {first} and {second}, and their noise"
+        cause = f"common spectrum of {first} and {second}, and noise of both"
         predictions.append(("coherence", value, name, cause))
     recording = design.recording
     flight, duration_s = max(recording.flight_s.items(), key=lambda item: item[1])
-    transfer = ", with take-off, transit and landing" if recording.transfer_s[flight] else ""
+    transfer = ", plus take-off, transit and landing" if recording.transfer_s[flight] else ""
     predictions.append(("flight_s", duration_s, flight, f"length of the tracks divided by speed{transfer}"))
     pulses = f"{sum(recording.pulses.values())} pulses of all flights, recorded by each node"
     predictions.append(("recorded_gb", recording.recorded_bytes / 1e9, "all", pulses))
@@ -155,7 +155,7 @@ def _cause(name: str, design: Design, image: PlannedImage, visible: np.ndarray, 
         return (
             "no pixel is visible"
             if not visible.any()
-            else "transmit power, antenna gains, receiver or its noise figure are not configured"
+            else "transmit power, antenna gains, the receiver or its noise figure is not configured"
         )
     if name == "resolution_m":
         return _resolution_cause(image)
@@ -173,7 +173,7 @@ def _cause(name: str, design: Design, image: PlannedImage, visible: np.ndarray, 
 
 
 def refinement_line(design: Design, flight: str) -> str:
-    """Return the decision on the refinement of a flight's tracks, and the bright points that it requires."""
+    """Return the decision on the refinement of a flight's tracks, and the bright points required for the refinement."""
     refinement = design.refinements[flight]
     if refinement.obstacles:
         return f"refinement is not expected to succeed: {', '.join(refinement.obstacles)}"
@@ -411,7 +411,7 @@ class Tried:
         Minimised value, dB: ten times the total shortfall, plus the largest shortfall (or smallest margin, negative),
         plus a hundredth of the mean shortfall, so that the minimum is Pareto-optimal.
     on_front
-        True if the plan is Pareto-optimal among those tried.
+        True if the plan is Pareto-optimal among the plans tried.
     """
 
     moved: Mapping[str, float]
@@ -488,7 +488,7 @@ def search(
 
 
 def tried_report(tried: Sequence[Tried]) -> list[dict[str, Any]]:
-    """Return the Pareto-optimal plans as JSON values, the best one first: displacement and predicted values."""
+    """Return the Pareto-optimal plans as JSON values, the best plan first: displacement and predicted values."""
     front = sorted((trial for trial in tried if trial.on_front), key=lambda trial: trial.objective)
     return [
         {"moved": dict(trial.moved), "found": {v.requirement: v.report["found"] for v in trial.verdicts}}
@@ -497,7 +497,7 @@ def tried_report(tried: Sequence[Tried]) -> list[dict[str, Any]]:
 
 
 def with_front(tried: Sequence[Tried]) -> list[Tried]:
-    """Mark the Pareto-optimal plans: no other is at least as good in all requirements and better in one."""
+    """Mark the Pareto-optimal plans: no other plan is at least as good in all requirements and better in one."""
     short = np.array([[v.short_db for v in trial.verdicts if v.required is not None] for trial in tried])
     front = [not ((short <= row).all(axis=1) & (short < row).any(axis=1)).any() for row in short]
     return [replace(trial, on_front=is_optimal) for trial, is_optimal in zip(tried, front, strict=True)]

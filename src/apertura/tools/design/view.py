@@ -53,7 +53,7 @@ _TITLES = {
     "point_snr": "SNR of a point",
     "loss": "focus loss, tracks as logged",
 }
-_DOTS = 400  # maximum number of pixels of the longer side of a panel
+_DOTS = 400  # maximum number of pixels along the longer side of a panel
 _MOST_CHANGES, _MOST_PLANS = 5, 12
 _JUDGED = ("requirement", "required", "planned", "met", "image", "largest contribution")
 _LISTED = {
@@ -386,7 +386,8 @@ def _draw_layers(path: Path, design: Design) -> None:
             axes.set_xlabel(f"{across}, m")
         for axes in drawn[:, 0]:
             axes.set_ylabel(f"{up}, m")
-        figure.suptitle(f"{image.name}, {across} and {up} from {number(round(west))} m, {number(round(south))} m")
+        origin = f"{number(round(west))} m, {number(round(south))} m"
+        figure.suptitle(f"{image.name}; {across} and {up} relative to {origin}")
 
 
 def _colour_limits(values: NDArray[np.float64]) -> tuple[float, float]:

@@ -416,7 +416,7 @@ class LiveMap:
         }
 
     def begin(self) -> None:
-        """Remove the document of an earlier live view, so that the map server waits for the first image of this one."""
+        """Remove the document of an earlier live view; the map server then waits for the first image of a new view."""
         (self._folder / MAP).unlink(missing_ok=True)
 
     def add(self, pair: PairSoFar, report: Mapping[str, Any]) -> None:

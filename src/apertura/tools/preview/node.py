@@ -21,7 +21,7 @@ from apertura.stages.ingest import captures_of
 from apertura.stages.node_log import shortest_wave
 from apertura.stages.transmitted import Transmitted
 
-_MARGIN_S = 60.0  # margin of the log before and after the pulses of a block; epochs beyond do not affect the spline
+_MARGIN_S = 60.0  # margin of the log around the pulses of a block; epochs farther away do not affect the spline
 _KNOWN_BYTES = 4096  # number of bytes compared at either end of the samples read, to detect a restarted recording
 _EPOCHS = 4  # epochs required after a pulse: end effects of a spline decrease to 0.27⁴ over this number of epochs
 
@@ -74,7 +74,7 @@ class NodeSoFar:
         self.restart = f"{file}: {change}: images of {self._flight} {self.name} are restarted from the new files"
 
     def read(self) -> bool:
-        """Read new data of recording and log; return True if there were any."""
+        """Read new data of recording and log; return True if there were new data."""
         before = len(self.time), self._log_size
         self.waits = ""
         for read in (self._read_recording, self._read_log):

@@ -86,7 +86,7 @@ class Compressed:
     weight: int = 1
 
     def every(self, step: int) -> "Compressed":
-        """Return a copy with every `step`-th pulse, so that the memory of the others can be freed."""
+        """Return a copy with every `step`-th pulse, so that the memory of the other pulses can be freed."""
         selected = self.profiles[::step]
         axes = {name: values[::step] for name, values in self.axes.items()}
         profiles = replace(selected, samples=np.array(selected.samples))
@@ -127,7 +127,7 @@ class ImageSoFar:
         Number of tiles formed in parallel.
     plans
         `share` → plan of the image formation, common to all pairs; a plan is replaced if the measured error exceeds the
-        requested one.
+        requested error.
     """
 
     def __init__(
@@ -187,7 +187,7 @@ class ImageSoFar:
     def add(self, block: "Compressed") -> None:
         """Add a block of `compressed` pulses.
 
-        Settings are planned for the first block, and again if the measured error exceeds the requested one.
+        Settings are planned for the first block, and again if the measured error exceeds the requested error.
         """
         self.pulses += block.pulses
         profiles = block.profiles
@@ -271,7 +271,8 @@ class ImageSoFar:
         joined = Compressed.joined(self._kept)
         profiles, times = joined.profiles, joined.time
         beams = self._beams(profiles.aperture, joined.axes, profiles.centre_frequency_hz)
-        plan = replace(self._plan, beams=beams, integration=None, flags={})  # those of the plan are of its first block
+        # integration and flags of the plan are those of its first block
+        plan = replace(self._plan, beams=beams, integration=None, flags={})
         side = self._campaign.settings.processing.tile_px
         formation = Formation(None, profiles, self.grid, plan, side)
         cell_m = resolution_cell_m(formation)
@@ -343,7 +344,7 @@ class PairSoFar:
     drop_reason: str = ""
     _shift_ns: int = 0
     _blocks: int = 0
-    _raised: dict[str, tuple[int, str]] = field(default_factory=dict)  # blocks that raised a flag, and its last line
+    _raised: dict[str, tuple[int, str]] = field(default_factory=dict)  # flag → number of blocks, last measurement
     _queue: list[Compressed] = field(default_factory=list)
     _fine: bool = True
 
@@ -394,7 +395,7 @@ class PairSoFar:
         return tx_index[new], rx_index[new]
 
     def add_next(self, *, ended: bool, every: int = 1) -> bool:
-        """Read a block of pulses and add every `every`-th to the coarse image; return False if no pulse is ready."""
+        """Add every `every`-th pulse of the next block to the coarse image; return False if no pulse is ready."""
         try:
             tx_index, rx_index = self.ready(ended=ended)
         except CampaignError as error:  # the time tags cannot be associated yet
@@ -508,7 +509,7 @@ class PairSoFar:
 
     @property
     def delay_s(self) -> float | None:
-        """Delay of the last added pulse behind the last recorded one, seconds; None before the first block."""
+        """Delay of the last added pulse behind the last recorded pulse, seconds; None before the first block."""
         if self.until is None or not len(self.time):
             return None
         return round(float((self.time[-1] - self.until) / np.timedelta64(1, "s")), 2)
