@@ -87,8 +87,8 @@ def test_repeated_rows_and_rows_without_satellites_are_dropped(tmp_path):
         (lambda lines: [lines[0].replace("seaLevel", "takeoff"), *lines[1:]], "no column altitude_above_seaLevel"),
         (lambda lines: [lines[0].replace("latitude,", "lat,"), *lines[1:]], "no column latitude"),
         (lambda lines: [*lines[:7], lines[7].replace("48.4", "x"), *lines[8:]], "column latitude: 'x"),
-        (lambda lines: [*lines[:7], lines[7][:40], *lines[8:]], "cells, the heading 11"),
-        (lambda _: logs.airdata(TIMES, PLACES, clock_ms=110 * np.arange(60)).splitlines(), "they differ by "),
+        (lambda lines: [*lines[:7], lines[7][:40], *lines[8:]], "cells, the header 11"),
+        (lambda _: logs.airdata(TIMES, PLACES, clock_ms=110 * np.arange(60)).splitlines(), "a difference of "),
         (lambda lines: [lines[0], *lines[1:5]], "too sparse to determine when the second changes"),
     ],
 )

@@ -120,7 +120,7 @@ def test_several_receivers_are_listed_with_their_solutions(tmp_path, suffix):
         for name, row in dataflash_rows(receivers=(0, 1))
     ]
     track = read(tmp_path, rows, suffix=suffix)
-    remark = "the log contains receivers 0 (single 60) and 1 (fix 60); 0 is used: select with nodes.a.log.body"
+    remark = "the log contains receivers 0 (single 60) and 1 (fix 60); 0 is used; select with nodes.a.log.body"
     assert track.attrs["remarks"] == [remark]
     assert "remarks" not in read(tmp_path, rows, suffix=suffix, options=LogOptions(body="1")).attrs
 

@@ -137,7 +137,7 @@ def test_semicolon_separators_are_reported_with_their_line(tmp_path, comma):
 def test_line_with_extra_cells_is_named(tmp_path):
     rows = [f"{time},{north},{east},{up}" for time, (north, east, up) in zip(TIMES, PLACES, strict=True)]
     rows[6] += ",0"
-    assert "line 8 has 5 cells, the heading 4" in complaint(lambda: read(tmp_path, f"time_utc,{GEODETIC}", rows))
+    assert "line 8 has 5 cells, the header 4" in complaint(lambda: read(tmp_path, f"time_utc,{GEODETIC}", rows))
     assert (
         read(
             tmp_path,
@@ -214,7 +214,7 @@ def test_headings_and_comments_of_programs_are_read(tmp_path, lines):
 def test_second_heading_with_other_columns_is_rejected(tmp_path):
     lines = [*rows_of()[:20], "longitude_deg,latitude_deg,time_utc,height_m", *rows_of()[20:]]
     message = complaint(lambda: read(tmp_path, f"time_utc,{GEODETIC}", lines))
-    assert "line 22 is a second, different heading: concatenated files" in message
+    assert "line 22 is a second, different header: concatenated files" in message
 
 
 @pytest.mark.parametrize(

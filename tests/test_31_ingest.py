@@ -247,7 +247,9 @@ def test_matlab_7_3_files_equal_those_of_version_7(tmp_path):
 def test_stored_corrections_are_applied_if_configured(tmp_path):
     path, fields = gotcha(tmp_path)
     raw = read_phase_history("afrl_mat", [path], pair="a-a")
-    assert "corrections of r0 (0.20 to 0.24 m) and of phases, which are not applied" in raw.attrs["remarks"][0]
+    assert (
+        "corrections of r0 (0.20 to 0.24 m) and of phases; these corrections are not applied" in raw.attrs["remarks"][0]
+    )
     corrected = read_phase_history("afrl_mat", [path], pair="a-a", described={"corrections": "stored"})
     assert "remarks" not in corrected.attrs
     expected = raw.transfer.values * np.exp(1j * fields["af"]["ph_correct"])[:, None]

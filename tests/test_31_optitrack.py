@@ -93,7 +93,7 @@ def test_stationary_body_has_one_position(tmp_path):
         (",Name,Radar", ",Name,Radaa", "missing or repeated"),
         ("X,Y,Z,W", "Y,Y,Z,W", "missing or repeated"),
         ("Radar,Corner Reflector", "Radar,Radar", "missing or repeated"),
-        (",Type,Rigid", ",Typ,Rigid", "heading lines Type"),
+        (",Type,Rigid", ",Typ,Rigid", "header lines Type"),
         ("\r\n5,", "\r\n5,,", "line 13 has"),
         ("\r\n5,0.0", "\r\n5,x", "line 13: 'x"),
         ("\r\n5,0.0", "\r\n5,inf", "line 13: 'inf"),

@@ -199,7 +199,7 @@ def test_datum_other_than_wgs_84_is_rejected(tmp_path, datum, kind):
 
 def test_header_with_two_time_systems_is_rejected(tmp_path):
     text = logs.solution(TIMES, PLACES, LLH, system="GPST", head=["% obs start : 2025/05/14 23:59:57.0 UTC (week2366)"])
-    assert "times are GPST according to the column heading and UTC according to line 2, '% obs start" in complaint(
+    assert "times are GPST according to the column header and UTC according to line 2, '% obs start" in complaint(
         lambda: read(tmp_path, text)
     )
     assert read(tmp_path, text.replace(".0 UTC", ".0 GPST")).sizes["epoch"] == 40

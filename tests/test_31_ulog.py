@@ -131,7 +131,7 @@ def test_several_receivers_are_listed_with_their_solutions(tmp_path):
     track = read(tmp_path, *topics)
     assert track.attrs["remarks"] == [
         "the log contains receivers sensor_gps:0 (single 60) and sensor_gps:1 (fix 59, no fix 1); sensor_gps:0 is "
-        "used: select with nodes.a.log.body"
+        "used; select with nodes.a.log.body"
     ]
     selected = read(tmp_path, *topics, options=LogOptions(body="sensor_gps:1"))
     assert "remarks" not in selected.attrs
@@ -201,7 +201,7 @@ def test_dropouts_of_the_logger_are_reported(tmp_path):
     at = len(data) - 10 * len(_last_message(data))
     path.write_bytes(data[:at] + struct.pack("<HBH", 2, ord("O"), 1500) + data[at:])
     track = read_track(path, node="a")
-    assert track.attrs["remarks"] == ["1 dropouts of the logger, total 1.5 s: their messages are lost"]
+    assert track.attrs["remarks"] == ["1 dropouts of the logger, total 1.5 s: messages during dropouts are lost"]
     assert track.sizes["epoch"] == 60
 
 

@@ -142,7 +142,8 @@ def test_automatic_grid_is_limited_by_the_recorded_samples(tiny):
     grid, _, reasons = settled(campaign, lambda: flown)
     assert np.prod(grid.shape) <= 9 * 100 * 512
     assert (
-        "than the limit of 0.461 Mpx for this flight; for a finer spacing, state scene.bounds_m" in reasons["spacing_m"]
+        "than the limit of 0.461 Mpx for this flight; for a finer spacing, configure scene.bounds_m"
+        in reasons["spacing_m"]
     )
     small = campaign.settings.model_copy(update={"scene": Scene(crs="local", bounds_m=(-200, -200, 200, 200))})
     # configured bounds keep the fine spacing

@@ -155,7 +155,7 @@ def test_legend_is_off_the_data_and_pair_counts_are_integers(monkeypatch, tmp_pa
 def test_uniform_number_of_pairs_is_stated_and_not_drawn(monkeypatch, tmp_path):
     labels, texts, _ = coverage_map(monkeypatch, tmp_path, [covered(), covered("f02")])
     assert [label.replace("\n", " ") for label in labels[2:]] == ["pulses per pixel, all pairs"]
-    assert "80.0 % of the scene is covered by 2 pairs of 2 flights, every pixel by 2" in " ".join(texts)
+    assert "80.0 % of the scene is covered by 2 pairs of 2 flights, every covered pixel by 2" in " ".join(texts)
 
 
 def test_tracks_of_many_flights_have_one_colour_and_a_common_footprint(monkeypatch, tmp_path):

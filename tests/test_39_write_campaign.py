@@ -76,7 +76,7 @@ GULF = {"crs": "EPSG:32631", "bounds_m": [184000, 92000, 184010, 92010], "height
 def test_track_in_radians_is_refused(tmp_path, scene):
     config = CONFIG | ({"scene": scene} if scene else {})
     message = complaint(lambda: write(tmp_path / "c", along(48.0, 10.0, 8.0, np.float64), config=config))
-    assert "apparently in radians, for which the" in message
+    assert "apparently in radians: read as radians, the" in message
     assert "expected degrees" in message
     assert not (tmp_path / "c").exists()
 

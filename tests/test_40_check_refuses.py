@@ -94,7 +94,7 @@ INVALID = {
     "another rate": (metadata("uav2", core_sample_rate=1e9), "recorded with sample_rate_hz"),
     "no pulse in a segment": (segment, "no pulse of flight f01, pair uav1-uav1 within"),
     "a duplicate tag": (lambda root: edit_meta(root, "uav2", tag_twice), "not after the previous capture"),
-    "a DEM not below the track": (dem_not_below_the_track, "below the track, which scene.bounds_m: auto requires"),
+    "a DEM not below the track": (dem_not_below_the_track, "below the track, required for scene.bounds_m: auto"),
 }
 
 

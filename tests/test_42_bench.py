@@ -121,7 +121,7 @@ def test_path_of_a_flagged_link_is_not_written_to_the_config(tmp_path, capsys):
     edit_config(root, lambda config: config["nodes"]["uav2"]["path_offset_m"].update(radar=0.5))
     before = (root / "config/config.yaml").read_text()
     print_bench(Campaign.load(root), write=True)
-    assert "nodes.uav2.path_offset_m: not determined, because the link has link_incoherent" in capsys.readouterr().out
+    assert "nodes.uav2.path_offset_m: not determined; flags of the link: link_incoherent" in capsys.readouterr().out
     assert (root / "config/config.yaml").read_text() == before
 
 

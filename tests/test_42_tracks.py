@@ -57,7 +57,7 @@ def test_pos_file_contains_the_refined_positions(log, tmp_path):
     text = (tmp_path / "uav1.pos").read_text()
     read = read_rtklib_pos(tmp_path / "uav1.pos", node="uav1")
     assert "% refined: as stated" in text.splitlines()
-    assert "5 of 30 epochs lie outside the pulses" in text
+    assert "5 of 30 epochs are before or after the pulses" in text
     assert "ns, age, ratio and covariances 0: unknown" in text  # reported because programs filter by them
     np.testing.assert_array_equal(read.time.values, log.track.time.values)
     np.testing.assert_allclose(read.position.values, log.track.position.values + log.moved_m, atol=1e-4, rtol=0)

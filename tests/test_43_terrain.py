@@ -243,7 +243,7 @@ def test_dem_of_the_scene_suffices_with_configured_bounds(tiny):
         assert not np.isfinite(expected.terrain.dem.heights(pixel_below_track(expected.grid, opened)))
     campaign = edit_scene(tiny, bounds_m="auto")
     message = complaint(lambda: expected_plan(campaign, *PAIR))
-    assert "below the track, which scene.bounds_m: auto requires" in message
+    assert "below the track, required for scene.bounds_m: auto" in message
     assert "% of the scene" not in message
 
 

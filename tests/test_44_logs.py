@@ -217,7 +217,7 @@ def test_log_with_rounded_positions_is_flagged_with_their_error():
 def test_damaged_log_is_flagged():
     time_s = np.arange(400) * 0.1
     position_m = np.stack([5 * time_s, 3 * np.sin(time_s), 5 + np.sin(0.7 * time_s)], -1)
-    damage = "259 of 6873 bytes are not valid messages, from byte 2602 on; their epochs are lost"
+    damage = "259 of 6873 bytes are not valid messages, from byte 2602 on; epochs in these bytes are lost"
     assert logged_flags(position_m, damage=damage) == {"track_log_damaged": f"a: {damage}"}
 
 

@@ -156,7 +156,7 @@ def test_crate_reports_products_of_other_code_or_settings(finished):
     described = {one["@id"]: one["description"] for one in graph if one["@id"].startswith("#job/")}
     description = described["#job/layers/f01/uav1-uav2"]
     installed = result_of(Campaign.load(finished), "layers", "f01", "uav1-uav2").code_sha256
-    assert f"written by code other than the installed one, whose sha256 is {installed}" in description
+    assert f"written by code that differs from the installed code of sha256 {installed}" in description
     assert f"written with other settings, of sha256 {'1' * 64}" in description
     assert "results/f01/uav1-uav2/layers.manifest.json" in described["#job/coverage"]
     assert described["#job/echo/f01/uav1-uav2"] == "Up to date with the current code and settings."

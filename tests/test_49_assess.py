@@ -81,7 +81,7 @@ def test_summary_prints_each_flag_once(finished_sample, capsys, tmp_path):
 
 
 def test_common_part_of_several_flags_is_printed_once():
-    cause = "4.1 of 4.5 dB are explained if the times of the log of uav1 are 0.50 s late"
+    cause = "4.1 of 4.5 dB peak loss are explained if the times of the log of uav1 are 0.50 s late"
     lines = {"defocused": f"4.5 dB lost; {cause}", "pairs_displaced": f"5 points lie 12 cm apart; {cause}"}
     reports = {"f01 a-a": {"flags": lines}, "f01 a-b": {"flags": {"defocused": f"3.2 dB lost; {cause}"}}}
     console = Console(file=StringIO(), width=200)
@@ -162,7 +162,7 @@ def test_random_log_errors_have_no_single_cause(tmp_path):
     reports = reports_of(run_sample(tmp_path, lambda root: edit_track(root, "uav1", noisy)))
     flags = reports["uav1-uav1"]["flags"]
     assert reports["uav1-uav1"]["hypotheses"] == []
-    assert "no single cause explains it" in flags["defocused"]
+    assert "no single cause explains this" in flags["defocused"]
 
 
 def trial(gain_db, kind, *, offset=False):

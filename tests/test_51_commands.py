@@ -189,7 +189,7 @@ def test_commands_read_results_without_recordings(finished_tiny, tmp_path, run_c
 def test_node_that_does_not_transmit_is_not_aligned(run_command, tiny, node):
     status, _, err = run_command("align", tiny, "f01", node)
     assert status == 2
-    assert f"{node} does not transmit and receive in f01" in err
+    assert f"{node} does not both transmit and receive in f01" in err
     assert "--until echo" in run_command("align", tiny, "f01", "uav1")[2]
 
 

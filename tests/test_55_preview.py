@@ -288,7 +288,7 @@ def test_log_replaced_by_a_named_pipe_is_reported_once(tiny, capsys):
     preview._read()
     preview._read()
     (line,) = capsys.readouterr().out.splitlines()
-    assert "uav1 is not readable at present: " in line
+    assert "files of uav1 are not readable at present: " in line
     assert "uav1.track.csv: a named pipe" in line
 
 

@@ -40,7 +40,7 @@ def read_beam_pattern(path: Path) -> tuple[Samples, Samples]:
             str(error).partition("\n")[0],
             where=path,
             expected="columns cut (azimuth, elevation), angle_deg and gain_db, with increasing angles in both cuts",
-            remedy="Correct the table: one line per sample, one cut after the other.",
+            remedy="Correct the table: one line per sample, the samples of each cut in consecutive lines.",
         ) from error
     return azimuth, elevation
 
@@ -50,7 +50,7 @@ def _samples(cut: pd.DataFrame, name: str) -> Samples:
     phase = numbers(cut[[_PHASE]])[:, 0] if _PHASE in cut else None
     limit = np.degrees(LIMITS_RAD[name])
     if len(angle) < 3:
-        raise ValueError(f"{len(angle)} samples in the {name} cut, at least 3 are needed")
+        raise ValueError(f"{len(angle)} samples in the {name} cut, at least 3 are required")
     if not all(np.isfinite(values).all() for values in (angle, gain, phase) if values is not None):
         raise ValueError(f"the {name} cut contains a cell that is not a number")
     if np.abs(gain).max() > _LARGEST_DB:

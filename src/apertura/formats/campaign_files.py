@@ -34,7 +34,7 @@ def new_folder(directory: Path) -> Iterator[Path]:
             "the path already exists and is not an empty folder",
             where=directory,
             expected="a new or empty folder for the campaign",
-            remedy="Remove it or choose another name.",
+            remedy="Remove the existing path or choose another name.",
         )
     with replacement(directory) as root:
         (root / "config").mkdir(parents=True)
@@ -80,10 +80,10 @@ def write_recording(
     stem
         raw/<flight>/<node>; the file name is the node's name.
     blocks
-        (sample, channel, 2), I and Q with a dtype of `DATATYPES`, in order; written one by one.
+        (sample, channel, 2), I and Q with a dtype of `DATATYPES`; blocks in temporal order, written one by one.
     captures
-        First sample, UTC time tag of the node's clock (datetime64, written in its unit) and, if any, transmitted frame
-        number of each trigger.
+        First sample, UTC time tag of the node's clock (datetime64, written in its unit) and, if available, transmitted
+        frame number of each capture.
     frequency_hz
         RF frequency at zero baseband frequency.
     extra

@@ -1,6 +1,6 @@
-"""Isolation of readers that may crash in a child process, with limits of memory and time and a report of failures.
+"""Execution of readers that may crash in a child process, with limits of memory and time; failures are reported.
 
-The child process receives paths and returns arrays as .npy files; none of its output is executed or unpickled.
+The child process receives paths and returns arrays as .npy files. Its output is neither executed nor unpickled.
 """
 
 import json
@@ -66,7 +66,7 @@ def read_isolated(
     paths
         The files.
     seconds, memory_bytes
-        Limits; by default they grow with the files.
+        Limits; by default proportional to the file sizes, plus a constant.
 
     Returns
     -------
@@ -132,7 +132,7 @@ def _read(folder: Path, number: int) -> dict[str, NDArray[Any]]:
 
 
 def _main(function: str, memory_bytes: str, seconds: str, folder: str, *paths: str) -> int:
-    """Read files in this process, within the limits that it sets; write the arrays of each file, then their names."""
+    """Set the limits of this process, and read files; write the arrays of each file, then the names of the arrays."""
     limits = {
         resource.RLIMIT_AS: int(memory_bytes),
         resource.RLIMIT_FSIZE: int(memory_bytes),

@@ -1,7 +1,7 @@
-"""Tables of recorders, flight logs and phase histories: recognition of a file's format, and its reader.
+"""Tables of recorders, flight logs and phase histories: recognition of the format of a file, and its reader.
 
-Rows refer to readers lazily: looking up a file name imports no reader, and the code hash of a result
-(`apertura.workflow.lineage`) covers only the readers that its campaign uses. A new format requires one file with its
+Rows refer to readers lazily: looking up a file name does not import a reader, and the code hash of a result
+(`apertura.workflow.lineage`) covers only the readers used by its campaign. A new format requires one module with its
 reader and one row in this module.
 """
 
@@ -24,7 +24,7 @@ RECORDERS: Mapping[tuple[str, ...], Callable[..., Any]] = {(".sigmf-meta", ".sig
 FINDERS: Mapping[tuple[str, ...], Callable[..., Any]] = {
     (".sigmf-meta", ".sigmf-data"): _RECORDINGS.sigmf.find_sigmf,
 }
-"""Row of `RECORDERS` → finder(folder, node) → files, for formats whose metadata may state other file names than
+"""Row of `RECORDERS` → finder(folder, node) → files, for formats whose metadata may contain file names that differ from
 <node><suffix>."""
 
 GROWING: Mapping[tuple[str, ...], Callable[..., Any]] = {
@@ -41,9 +41,9 @@ class LogFormat(NamedTuple):
     reader: Callable[..., Any]
     """reader(path, node=, options=) → `track`."""
     heading: str = ""
-    """Text in the first 8 KiB that distinguishes the format from others with the same suffix; empty: any."""
+    """Text in the first 8 KiB that distinguishes the format from others with the same suffix; empty: any text."""
     by_lines: bool = False
-    """True if epochs are lines of text: a log that is being written is then valid up to its last complete line."""
+    """True if epochs are lines of text, so that a log that is being written is valid up to its last complete line."""
 
 
 TRACKS: Mapping[str, LogFormat] = {
@@ -71,7 +71,7 @@ class HistoryFormat(NamedTuple):
     For a folder, `paths` are all its files.
     """
     described: bool = False
-    """True if the reader also takes described=, the section `waveform` of the config."""
+    """True if the reader also has the parameter described=, the section `waveform` of the config."""
     frame: str = ""
     """Frame of the positions, local or ecef; empty: stated by the files or a flight log."""
     waveform: str = "phase_history"
@@ -80,7 +80,7 @@ class HistoryFormat(NamedTuple):
     """Ending of a second file <stem><beside> next to <stem><suffix>; empty: none."""
 
     def files_of(self, path: Path) -> list[Path]:
-        """List the files of the phase history that a file or folder belongs to, main file first."""
+        """List the files of the phase history to which a file or folder belongs, main file first."""
         if path.is_dir():
             return sorted(file for file in path.rglob("*") if file.is_file())
         if not self.beside:

@@ -29,7 +29,7 @@ def read_npy(path: Path, *, kinds: str, most: int, expected: str, remedy: str) -
     Raises
     ------
     CampaignError
-        If the file is not a .npy file, has another kind of dtype, is too large or is truncated.
+        If the file is not a .npy file, its dtype is not of an accepted kind, or it is too large or truncated.
     """
     try:
         with path.open("rb") as stream:
@@ -41,7 +41,7 @@ def read_npy(path: Path, *, kinds: str, most: int, expected: str, remedy: str) -
         if mapped.dtype.kind not in kinds or mapped.dtype.names or mapped.size > most:
             found = f"{quoted(mapped.dtype.str, 20)[1:-1]} of shape {mapped.shape}"
         array = None if found else np.array(mapped)
-    except Exception as error:  # numpy evaluates the header; a malformed one may raise any exception
+    except Exception as error:  # numpy evaluates the header; a malformed header may raise any exception
         found, array = f"not readable ({shown(error, 200)})", None
     if array is None:
         raise CampaignError(str(found), where=path, expected=expected, remedy=remedy)

@@ -1,7 +1,7 @@
 """Reading of recordings, flight logs and phase histories as stages `raw`, `track` and `echo`.
 
-Each format has one file and one row in `names`. Readers are imported when they are first used; the code hash of a
-result covers the readers of the campaign's files only.
+Each format has one module and one row in `names`. Readers are imported when they are first used; the code hash of a
+result covers only the readers of the campaign's files.
 """
 
 from collections.abc import Mapping, Sequence

@@ -44,19 +44,20 @@ def check_rates(waveform: SampledWaveform, recorded: Mapping[str, float], *, whe
 
 
 def check_channels(recorded: Sequence[str], needed: Sequence[str], *, where: Path | str) -> None:
-    """Check that the channels named in `needed` were recorded; raise CampaignError for a missing one."""
+    """Check that the channels named in `needed` were recorded; raise CampaignError if a channel is missing."""
     for channel in needed:
         if channel not in recorded:
             raise CampaignError(
                 f"apertura:channels {[*recorded]}",
                 where=where,
                 expected=f"a channel named {channel!r}",
-                remedy="A secondary node needs its sidelink: name the channel, or remove the node from the flight.",
+                remedy="Correct apertura:channels (a secondary node requires its sidelink), or remove the node from "
+                "the flight.",
             )
 
 
 def check_length(samples: int, needed: int, *, where: Path | str) -> None:
-    """Check that captures contain as many samples as an echo requires; raise CampaignError if they are shorter."""
+    """Check that captures contain as many samples as an echo requires; raise CampaignError if captures are shorter."""
     if samples < needed:
         raise CampaignError(
             f"captures of {samples} samples",
@@ -122,8 +123,9 @@ class Captured:
                 raise CampaignError(
                     "no such file",
                     where=self.samples.path,
-                    expected="the recording, from which transfer functions are formed: stage `transfer` keeps none",
-                    remedy=f"Copy it there. With `processing: {{keep: [echo]}}` in {CONFIG}, later runs keep them.",
+                    expected="the recording, because the transfer functions computed from it are not stored",
+                    remedy="Copy the recording there. To store the transfer functions in later runs, set "
+                    f"`processing: {{keep: [echo]}}` in {CONFIG}.",
                 )
             iq = self.samples.captures(start[captures], length)
             iq = np.ascontiguousarray(ordered(iq, self.order))
@@ -141,7 +143,7 @@ class Captured:
     def of(
         cls, raw: xr.Dataset, samples: Path, files: Path, recording: str, sent: Transmitted, *, order: str
     ) -> "Captured":
-        """Return the captures of a sample file; raise CampaignError if carrier or rate differ from the waveform's.
+        """Return the captures of a sample file; raise CampaignError if carrier or rate differ from the waveform.
 
         Parameters
         ----------
@@ -150,7 +152,7 @@ class Captured:
         samples
             Sample file of the recorder.
         files, recording, order
-            As the attributes.
+            As in the attributes.
         sent
             Transmitted waveform.
         """
@@ -172,7 +174,7 @@ def open_acquisition(campaign: Campaign, flight: str, node: str, sent: Transmitt
     Raises
     ------
     CampaignError
-        If the recorded carrier or sample rate differs from the transmitted waveform's.
+        If the recorded carrier or sample rate differs from that of the transmitted waveform.
     """
     raw, track = (open_stage(campaign.stage(stage, flight, node), stage) for stage in ("raw", "track"))
     raw = raw.assign(time=("pulse", campaign.clock(flight, node).utc(raw.time.values)))
@@ -185,8 +187,8 @@ def open_acquisition(campaign: Campaign, flight: str, node: str, sent: Transmitt
         raise CampaignError(
             "the file has changed since it was ingested",
             where=campaign.root / name,
-            expected="the file that the raw stage describes",
-            remedy="Run the workflow again: it ingests the recording first.",
+            expected="the file from which the raw stage was written",
+            remedy="Run the workflow again, so that the recording is ingested again.",
         )
     wave_m = shortest_wave(sent.numerology.frequency_hz)
     own = {field.name: getattr(captured, field.name) for field in fields(captured)}

@@ -29,7 +29,7 @@ from apertura.core.quality.point_targets import BandLimitedPatch, carrier_at
 from apertura.core.scene.grid import SceneGrid
 
 _SPECKLE_PROBABILITY = 2e-3
-"""Probability that speckle has a pixel 10 dB above its mean within a resolution cell of a given pixel."""
+"""Probability that, within a resolution cell of a given pixel, a speckle pixel exceeds the mean by 10 dB."""
 
 _SIGNIFICANCE = 0.01
 """Significance level of the test for the bright points of another image."""
@@ -90,21 +90,21 @@ def averaged(raster: Any, dots: int) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, eq=False)
 class ComparedImage:
-    """Image with the properties that a comparison with other images of the scene needs.
+    """Image with the properties required for a comparison with other images of the scene.
 
     Attributes
     ----------
     raster
         (y, x) complex64.
     points
-        Isolated bright points whose main lobe lies in the image. They exceed their surroundings in the image; unlike
-        points that measure the focus, they need not dominate their range cell in every pulse.
+        Isolated bright points whose main lobe lies in the image. The points exceed their surroundings in the image, but
+        unlike the points used to measure the focus, they need not dominate their range cell in every pulse.
     cell_m, spectrum
         Finest resolution cell, and (2, 2) covariance of a point's spatial spectrum, cycles² per m².
     focus
         Section `focus` of image.json.
     carriers, grid
-        Spatial carriers of points over the image, as `apertura.core.imaging.view.carriers_of` returns them; and the
+        Spatial carriers of points over the image, as returned by `apertura.core.imaging.view.carriers_of`, and the
         image grid.
     """
 
@@ -177,7 +177,7 @@ def bright_points_within(
     cell_m
         Finest resolution cell.
     isolated
-        Return only points that exceed their surroundings by more than speckle does.
+        Return only points that exceed their surroundings by more than speckle would.
     """
     cell_px = cell_m / grid.spacing_m
     shown = near(spectrum, grid.spacing_m, cell_m)
@@ -194,9 +194,10 @@ def bright_points_within(
 def agreement_of(
     first: ComparedImage, second: ComparedImage, grid: SceneGrid, windows: Sequence[Window]
 ) -> Agreement | None:
-    """Compare a second image with a first by bright points, or without common points by distributed clutter.
+    """Compare a second image with a first at bright points, or, without common bright points, by distributed clutter.
 
-    None if neither is possible, or if pixels are wider than a resolution cell and do not resolve a point's position.
+    The result is None if neither is possible, or if pixels are too wide, relative to a resolution cell, to resolve the
+    position of a point.
     """
     if not comparable(first, second, grid):
         return None
@@ -217,7 +218,7 @@ def comparable(first: ComparedImage, second: ComparedImage, grid: SceneGrid) -> 
 
 
 def shows_points_of(first: ComparedImage, second: ComparedImage, grid: SceneGrid) -> bool:
-    """Return True if a second image has bright pixels at significantly many bright points of a first.
+    """Return True if a second image has bright pixels at a significant number of the bright points of a first image.
 
     Notes
     -----

@@ -29,7 +29,7 @@ _LOOKS_WRONG = frozenset(
 )
 """Flags that indicate a wrong geometry; hypotheses are tested if one of them is raised."""
 
-_TIED = "as many pairs contradict this, and the images do not show which pairs are wrong"
+_TIED = "an equal number of pairs contradict this, and the images do not show which pairs are wrong"
 
 _SPREAD = ", by amounts that differ between points by more than a resolution cell"
 
@@ -64,7 +64,7 @@ def assess(campaign: Campaign, flight: str) -> Path:
     refined = track.correction is not None
     coarse = _too_coarse(compared, grid)
     as_formed = choose_fusion(rank, between, hidden=hidden, coarse=coarse, align=False)
-    # Track refinement does not observe a constant path offset of a pair; its phase is removed here.
+    # Track refinement cannot observe a constant path offset of a pair; the phase of that offset is removed here.
     align = refined or campaign.settings.processing.fusion.align_phase
     fusion = choose_fusion(rank, between, hidden=hidden, coarse=coarse, align=True) if align else as_formed
     explained_rad = track.stage.attrs["report"].get("pair_phase_std_rad", {}) if refined else None
@@ -102,7 +102,7 @@ def _too_coarse(compared: Mapping[str, ComparedImage], grid: SceneGrid) -> str:
 
 
 def _hides(first: ComparedImage, second: ComparedImage, grid: SceneGrid) -> bool:
-    """Return True if a second image lacks the bright points of a first although their SNR is high."""
+    """Return True if a second image lacks the bright points of a first image although the SNR of these is high."""
     return (
         any(point["snr_db"] > _VISIBLE_SNR_DB for point in first.focus["points"])
         and comparable(first, second, grid)
@@ -119,11 +119,11 @@ def _flags(
 ) -> dict[str, Flags]:
     """Return pair → flags of disagreement.
 
-    The flags are raised on the pairs outside the largest set that agrees. If an equally large set contradicts that
-    set, as with two pairs that differ, the images do not determine the wrong one, and the pairs of both are flagged.
-    With refined tracks, the phase is corrected before pairs are added, and flagged only if log errors do not explain
-    it. `explained_rad`: pair → standard deviation of its phase difference from the first pair due to log errors; None
-    if the tracks were not refined.
+    The flags are raised on the pairs outside the largest set of pairs that agree. If an equally large set contradicts
+    that set, as with two pairs that differ, the images do not determine which set is wrong, and the pairs of both sets
+    are flagged. With refined tracks, phase differences are corrected before pairs are added, and flagged only if log
+    errors do not explain them. `explained_rad`: pair → standard deviation of its phase difference from the first pair
+    due to log errors; None if the tracks were not refined.
     """
     flags = {pair: Flags() for pair in pairs}
     for pair in pairs:
@@ -172,9 +172,10 @@ def _hypotheses(
         if image.attrs["quality"]["focus"]["verdict"] == "focused" and "pair_unconfirmed" not in flags[pair]
     }
     causes = hypotheses(campaign, flight, brightest=brightest, cell_m=quality["focus"]["cell_m"], focused=sharp)
-    cause = "; no single cause explains it"
+    cause = "; no single cause explains this"
     if causes:
-        cause = f"; {causes[0]['gain_db']:.1f} of {causes[0]['lost_db']:.1f} dB are explained if {causes[0]['what']}"
+        cause = f"; {causes[0]['gain_db']:.1f} of {causes[0]['lost_db']:.1f} dB peak loss are explained if "
+        cause += str(causes[0]["what"])
     for pair, names in suspicious.items():
         for name in names:
             line = flags[pair].get(name) or images[pair].attrs["flags"][name]
@@ -200,14 +201,15 @@ def _rank(focus: Mapping[str, Any]) -> tuple[int, float]:
 
 
 def _disagreement(chosen: CoherentSum, pair: str, blind: Sequence[str]) -> dict[str, str]:
-    """Return the flags of a pair outside the set that agrees.
+    """Return the flags of a pair outside the set of agreeing pairs.
 
     `blind`: members of the set whose bright points are all missing in the image of the pair.
     """
     agreeing, measured = " and ".join(chosen.agreeing), chosen.apart.get(pair)
     if measured is None:
-        line = f"{pair} does not show the bright points of {' and '.join(blind)} more often than speckle explains"
-        return {"pair_unconfirmed": f"{line}: its echo is too weak, or its geometry is wrong"} if blind else {}
+        line = f"bright points of {' and '.join(blind)} are found in {pair} no more often than expected from speckle"
+        line += f": the echo of {pair} is too weak, or the geometry is wrong"
+        return {"pair_unconfirmed": line} if blind else {}
     where = measured.evidence
     if measured.shifted:
         return {
@@ -238,8 +240,9 @@ def _phase_line(measured: Agreement, where: str, pair: str, reference: str) -> s
 def wrong_codes(codes: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str, str]]:
     """Return pair, flag and line for each pair whose sidelink does not contain the configured code.
 
-    If some receivers detect the configured code, the transmitter sent it, and the others recorded another
-    transmitter. If none detects it, the transmitter sent another code, and all its pairs are flagged.
+    If some receivers detect the configured code, the transmitter sent that code, and the other receivers recorded
+    another transmitter. If no receiver detects the configured code, the transmitter sent another code, and all pairs of
+    the transmitter are flagged.
 
     Parameters
     ----------

@@ -36,7 +36,7 @@ def calibrate(campaign: Campaign, flight: str) -> Path:
             "no section calibration",
             where="config/config.yaml",
             expected="calibration.flight and calibration.reflector_m for a flight of kind calibration",
-            remedy="State the position of the reflector.",
+            remedy="Configure the position of the reflector.",
         )
     lineage = result_of(campaign, "calibration", flight).begin(campaign.root)
     report: dict[str, Any] = {"flight": flight, "reflector_m": list(requested.reflector_m), "pairs": {}}
@@ -66,7 +66,7 @@ def calibrated(campaign: Campaign, flight: str, pair: str) -> dict[str, Any] | N
         raise CampaignError(
             f"no offset of pair {pair}",
             where=path,
-            expected=f"all pairs of flight {flight}; flight {requested.flight} calibrated {sorted(offsets)}",
+            expected=f"all pairs of flight {flight}; calibrated in {requested.flight}: {', '.join(sorted(offsets))}",
             remedy="Fly the calibration with the same transmitter and nodes, or remove section calibration.",
         )
     return {"flight": requested.flight, **offsets[pair]}
@@ -87,7 +87,7 @@ def _pair(campaign: Campaign, opened: PairEcho, requested: CalibrationSettings, 
     echo = opened.stage
     reflector = frame_from_map(campaign.settings.scene.crs, *requested.reflector_m)
     path_m = Aperture(echo.tx_position.values, echo.rx_position.values).path(reflector)
-    path_m = path_m * (SPEED_OF_LIGHT_M_S / wave_speed_of(echo))  # electrical, as path offsets are
+    path_m = path_m * (SPEED_OF_LIGHT_M_S / wave_speed_of(echo))  # electrical length, as for path offsets
     transfer, frequency = Rows(echo.transfer), echo.frequency.values
     offset = estimate_path_offset(transfer, frequency, path_m=path_m, search_m=requested.search_m, where=where)
     history = reflector_history(transfer, frequency, path_m=path_m + offset.offset_m)

@@ -23,8 +23,8 @@ from apertura.stages.scene import OpenScene, settled_scene
 from apertura.stages.tags import tags_of
 from apertura.workflow.lineage import result_of
 
-_DOTS = 480  # averaged pixels along the longer side of the scene
-_VERTICES = 400  # vertices of a track
+_DOTS = 480  # maximum number of averaged pixels along the longer side of the scene
+_VERTICES = 400  # number of vertices of a track
 
 
 def coverage(campaign: Campaign) -> Sequence[Path]:

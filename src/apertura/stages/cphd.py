@@ -52,8 +52,8 @@ def _collection(
 ) -> CphdCollection:
     """Return the CPHD metadata of an echo; a local frame is placed at latitude and longitude 0.
 
-    At that point east, north and up are axes of ECEF. Coordinates keep their values; only the height is rounded, to
-    1 nm.
+    At that point, east, north and up are parallel to the axes of ECEF. Coordinates are unchanged, except that the
+    height is rounded to 1 nm.
     """
     frame_origin, frame_axes = np.zeros(3), np.eye(3)
     origin = scene.middle_m

@@ -35,7 +35,7 @@ _TEXTS = np.dtypes.StringDType()
 
 
 Sums = Mapping[str, Mapping[str, Any]]
-"""Flight with several pairs → its coherent sum, as step `assess` chose it."""
+"""Flight with several pairs → its coherent sum, as chosen by step `assess`."""
 
 
 def labels(images: Images, assessed: Mapping[str, Mapping[str, Any]], sums: Sums, pairs: Sequence[str]) -> xr.Dataset:
@@ -82,7 +82,7 @@ def labels(images: Images, assessed: Mapping[str, Mapping[str, Any]], sums: Sums
 
 
 def reference_flights(images: Images, pairs: Sequence[str]) -> dict[str, str]:
-    """Return pair → the first flight with an image of it."""
+    """Return pair → the first flight with an image of that pair."""
     return {pair: next(flight for flight, other in images if other == pair) for pair in pairs}
 
 
@@ -96,7 +96,7 @@ def _middle_time(images: Images, flight: str) -> Any:
 def _quoted_values(image: xr.Dataset, assessed: Mapping[str, Any]) -> dict[str, float | str | None]:
     """Return the quality of an image and its assessment: name of a row of `QUOTED` → value or None."""
     quality = image.attrs["quality"]
-    # a phase history has no counts of pulses
+    # images from phase histories have no pulse counts
     view, focus, pulses = quality["view"], quality["focus"], quality.get("pulses", {})
     flags = {*image.attrs["flags"], *assessed["flags"]}
     return {
@@ -124,14 +124,14 @@ def _quoted_values(image: xr.Dataset, assessed: Mapping[str, Any]) -> dict[str, 
 # ---- Coherence and phase between the images of a cube ---------------------------------------------------------------
 
 _TILES_AT_ONCE = 4
-"""Tiles per side of a block that is read at once, so that tiles share the margin of their windows."""
+"""Number of tiles along each side of a block that is read at once, so that tiles share the margins of their windows."""
 
 Compared = Mapping[str, Mapping[tuple[str, str], tuple[str, str]]]
 """'pair' or 'flight' → flight and pair of an image → flight and pair of its reference image."""
 
 
 def compared(images: Images, references: Mapping[str, str], first_flights: Mapping[str, str]) -> Compared:
-    """Return the images to compare: each with its flight's reference pair, and with its pair's first flight.
+    """Return the images to compare: each with its flight's reference pair, and with its pair in the reference flight.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def compared(images: Images, references: Mapping[str, str], first_flights: Mappi
 
 
 def window_of(images: Images, spacing_m: float) -> int:
-    """Return the side of the coherence window, pixels: it contains at least 16 looks of every image."""
+    """Return the side of the coherence window, which contains at least 16 looks of every image, in pixels."""
     return max(window_px(_spectrum(image), spacing_m) for image in images.values())
 
 
@@ -169,14 +169,14 @@ def write_phase(
     window: int,
     workers: Executor,
 ) -> tuple[float, float]:
-    """Write coherence and phase of two images tile by tile; return looks, and the coherence bias of unrelated images.
+    """Write coherence and phase of two images tile by tile; return looks and coherence bias of unrelated images.
 
     Parameters
     ----------
     images
         An image and its reference image.
     arrays
-        Arrays of coherence and phase, (y, x) float32; tiles that one of the images lacks are not written.
+        Arrays of coherence and phase, (y, x) float32; tiles missing in one of the images are not written.
     grid
         Grid of the images and arrays.
     side, window
@@ -232,7 +232,7 @@ def _widened(window: Window, by: int, shape: tuple[int, int]) -> Window:
 
 
 def _relative_to(window: Window, whole: Window) -> Window:
-    """Return a window with indices relative to the first pixel of another."""
+    """Return a window with indices relative to the first pixel of another window."""
     rows, columns = (slice(part.start - of.start, part.stop - of.start) for part, of in zip(window, whole, strict=True))
     return rows, columns
 
@@ -245,8 +245,8 @@ _PHASE = "coherence", "phase"
 def cube(campaign: Campaign, *, threads: int = 1) -> Path:
     """Write results/cube.zarr: images (flight, pair, y, x), sums of each flight, coherence and phase between images.
 
-    The cube has sums if a flight has two or more pairs; they are NaN for flights with a single pair. Tiles that no
-    pulse of a pair illuminates are not stored and read as NaN, as in the image.
+    The cube has sums if any flight has two or more pairs; the sums are NaN for flights with a single pair. Tiles that
+    no pulse of a pair illuminates are not stored and are read as NaN, as in the image.
     """
     flights, lineage = campaign.image_flights, result_of(campaign, "cube").begin(campaign.root)
     images = {
@@ -364,7 +364,7 @@ def _compare(
     side: int,
     workers: Executor,
 ) -> None:
-    """Write coherence and phase of each image with its flight's reference pair and its pair's first flight."""
+    """Write coherence and phase of each image relative to its two reference images, see `compared`."""
     window = window_of(images, grid.spacing_m)
     for kind, rows in compared(images, references, reference_flights(images, arrays.pairs)).items():
         for reference in dict.fromkeys(rows.values()):
@@ -381,7 +381,7 @@ def _compare(
 def _between_flights(
     references: Mapping[str, xr.Dataset], grid: SceneGrid, windows: Sequence[Window]
 ) -> dict[str, Any]:
-    """Return the displacement of each flight's reference image relative to the first flight's, and its flags."""
+    """Return the displacement of each flight's reference image relative to that of the first flight, and flags."""
     first, *others = references
     images = {name: ComparedImage.of(image, grid, windows) for name, image in references.items()} if others else {}
     between: dict[str, Any] = {}

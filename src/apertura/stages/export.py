@@ -1,4 +1,4 @@
-"""Rules `export` and `export_fused`: rasters, pictures and report of one image, or of the sums of a flight's images."""
+"""Rules `export` and `export_fused`: rasters, plots and report of one image, or of the sums of a flight's images."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -117,7 +117,7 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     sum_flags = Flags.merged(
         _flags_of_choice(assessed["fusion"]), _incoherent(at_points), cube.attrs["flags"].get(flight, {})
     )
-    # Flags of pairs outside the coherent sum do not affect its focus.
+    # Flags of pairs outside the coherent sum do not affect the focus of the sum.
     relevant = {*sum_flags, *(flag for pair in added for flag in pair_flags[pair])}
     worst = _worst(images, assessed["fusion"])
     focuses = [images[pair].attrs["quality"]["focus"] for pair in added]
@@ -146,7 +146,7 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
         "noncoherent": f"non-coherent sum of {' + '.join(pairs)}",
         "magnitude": f"sum of magnitudes of {' + '.join(pairs)}",
     }
-    # The cube depends on every flight, but the products of a flight depend on its own pairs alone.
+    # The cube depends on every flight, but the products of a flight depend only on the pairs of that flight.
     origin = Provenance.of(lineage.modules, images, settings={"fusion": assessed["fusion"]})
     code_sha256 = chained_sha256(lineage.result.code_sha256, [cube.attrs["code_sha256"]])
     tags = tags_of(replace(origin, code_sha256=code_sha256), lineage) | quality_tags(report)
@@ -197,7 +197,7 @@ def _averaged_sum(
 def _noise_of_sum(
     campaign: Campaign, flight: str, source: str, divisors: Mapping[str, float]
 ) -> Callable[[Window], Floats] | None:
-    """Return the mean noise power in multilook cells of a sum; None if it is not subtracted or not known.
+    """Return the mean noise power in multilook cells of a sum; None if the noise is not subtracted or not known.
 
     Source: docs/theory/speckle.md, eq. 6.
     """
@@ -205,7 +205,8 @@ def _noise_of_sum(
     paths = [campaign.result(flight, pair, kept) for pair in divisors]
     if multilook is None or not multilook.subtract_noise or not all(path.is_file() for path in paths):
         return None
-    # Noise is independent between pairs: powers add up, over n² in a mean of amplitudes and over n in one of powers.
+    # Noise is independent between pairs: powers add up, divided by n² in a mean of n amplitudes, by n in a mean of n
+    # powers.
     count = len(divisors) ** (2 if source == "coherent" else 1)
 
     def noise(window: Window) -> Floats:
@@ -286,9 +287,9 @@ def _in_phase(
 ) -> tuple[InPhase | None, bool]:
     """Measure the phase agreement of the summed images at bright points of the noncoherent sum.
 
-    None for a single image. The second value is True if the points are isolated and present in all images. If
-    there are no such points, the brightest pixels are used; in cells with several scatterers, phases of images
-    need not agree.
+    The first value is None for a single image. The second value is True if the points are isolated and present in all
+    images. If there are no such points, the brightest pixels are used; phases of images need not agree in cells with
+    several scatterers.
     """
     added = assessed["fusion"]["phases_rad"]
     compared = {pair: ComparedImage.of(images[pair], grid, windows) for pair in added}
@@ -314,7 +315,7 @@ def _in_phase(
 
 
 def _focus(images: Mapping[str, xr.Dataset], measured: InPhase | None, added: Sequence[str]) -> dict[str, Any]:
-    """Return the focus of the coherent sum, from the peak loss of its images and the loss by phase differences."""
+    """Return the focus of the coherent sum, from the peak loss of its images and the loss due to phase differences."""
     pair_focus = {pair: images[pair].attrs["quality"]["focus"] for pair in added}
     if len(added) == 1:
         focus = pair_focus[added[0]]
@@ -329,7 +330,7 @@ def _focus(images: Mapping[str, xr.Dataset], measured: InPhase | None, added: Se
             else "the focus of no pair was measured"
         )
         return {"verdict": "inconclusive", "reason": missing}
-    # Images are normalised to equal peaks before they are added; in focus, each peak is higher by its loss.
+    # Images are normalised to equal peaks before they are added; if focused, each peak is higher by its loss.
     image_loss_db = -20 * float(np.log10(np.mean([10 ** (-focus["loss_db"] / 20) for focus in focuses])))
     loss_db = image_loss_db + measured.loss_db
     std_db = float(np.hypot(np.mean([focus["std_db"] for focus in focuses]), measured.loss_std_db))

@@ -1,4 +1,4 @@
-"""Hypotheses on errors of a flight, tested on a bright point, and choice of the one that explains the peak loss.
+"""Hypotheses on errors of a flight, tested on a bright point, and choice of the hypothesis that explains the peak loss.
 
 Source: docs/theory/focus.md, "Hypotheses".
 """
@@ -47,9 +47,9 @@ _AXES = ("forward", "right", "down")
 _POINTS = ("radar_tx", "radar_rx", "sidelink")
 
 _OFFSET_RESIDUAL_RAD = 0.5
-"""Largest residual RMS phase over the aperture of a path change that counts as an offset, radians.
+"""Largest RMS phase residual over the aperture for which a path change is classified as an offset, radians.
 
-The residual excludes a constant and a displacement of the point.
+The residual is that of a fit of a constant and a displacement of the point.
 """
 
 _SIDE_PX = 128
@@ -95,7 +95,7 @@ class Hypothesis:
     gain_db
         Gain of the joint peak power at the bright point; NaN before the test.
     is_offset
-        True if it changes the path of each pair by a constant only, apart from a displacement of the point.
+        True if the hypothesis changes the path of each pair by a constant only, apart from a displacement of the point.
     """
 
     what: str
@@ -117,7 +117,7 @@ def hypotheses(
     cell_m: float,
     focused: Collection[str] = (),
 ) -> list[dict[str, Any]]:
-    """Return the hypothesis that alone explains most of the peak loss of a flight; empty if several explain it.
+    """Return the only hypothesis that explains most of the peak loss of a flight; empty if several or none explain it.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def hypotheses(
     cell_m
         Resolution cell.
     focused
-        Pairs whose own image is focused: they have no peak loss of their own.
+        Pairs whose own image is focused, and which therefore have no peak loss of their own.
 
     Returns
     -------
@@ -315,7 +315,7 @@ def _sidelink_m(tx: Acquisition, rx: Acquisition, tx_at: Times, rx_at: Times) ->
 
 
 def _other_geometries(nodes: Mapping[str, Acquisition], geometries: Sequence[PairGeometry]) -> Iterator[Hypothesis]:
-    """Yield hypotheses on logs (if these cover the pulses), lever arms, heights and paths, the likeliest first."""
+    """Yield hypotheses on logs (if these cover the pulses), lever arms, heights and paths, the most likely first."""
     for what, kind, changed, late_s in _other_logs(nodes):
         with suppress(CampaignError):
             moved = with_logs({**nodes, **changed}, geometries, late_s)
@@ -365,7 +365,7 @@ def _other_logs(
 
 
 def _on_track_of(node: Acquisition, other: Acquisition) -> Acquisition:
-    """Return a node with the positions of another and its own attitude."""
+    """Return a node with the positions of another node and its own attitude."""
     at = node.log_seconds(other.track.time.values)
     own = node.log_seconds(node.track.time.values)
     unwrapped = np.unwrap(node.track.attitude.values, axis=0)
@@ -439,17 +439,17 @@ def _random_tracks(
 # ---- Choice of the hypothesis that explains the loss -----------------------------------------------------------------
 
 LEAST_SHARE = 0.7
-"""Smallest share of the loss in dB that a hypothesis must recover to be reported."""
+"""Smallest fraction of the loss in dB that a hypothesis must recover to be reported."""
 
 LEAST_AGAINST_NEXT = 2.0
 """Smallest ratio of a hypothesis's gain in dB to that of the best other cause and of the best random track."""
 
 CLEAR_DB = 10.0
-"""Difference in dB from which a gain exceeds another with certainty, even if the ratio is below the limit."""
+"""Difference in dB from which a gain is regarded as the larger gain, whatever the ratio of the gains is."""
 
 
 def explanation(trials: Sequence[Hypothesis], drawn: Sequence[Hypothesis], lost_db: float) -> list[dict[str, Any]]:
-    """Return the report of the hypothesis that alone explains most of a loss, or of an offset; else an empty list.
+    """Return the report of the only hypothesis, or of an offset, that explains most of a loss; else an empty list.
 
     Parameters
     ----------
@@ -479,11 +479,11 @@ def explanation(trials: Sequence[Hypothesis], drawn: Sequence[Hypothesis], lost_
     what = best.what
     if rivals:  # several causes of a constant path offset per pair explain the loss equally well
         what = (
-            "the path of each pair has a constant offset, from a path offset, lever arm, phase, or position or time of "
-            f"a log, such as: {what}"
+            "the path of each pair has a constant offset, caused by a path offset, lever arm, phase, or position or "
+            f"time of a log, for example: {what}"
         )
         heights = [trial for trial in rivals if trial.kind == causes.HEIGHT.kind]
-        if heights:  # along a straight track a height error has nearly the same effect
+        if heights:  # with a straight track, a height error has nearly the same effect
             what += f"; or {max(heights, key=lambda trial: trial.gain_db).what}"
     report = {"what": what, "kind": "offset" if rivals else best.kind}
     return [report | {"gain_db": round(best.gain_db, 2), "lost_db": round(max(lost_db, best.gain_db), 2)}]

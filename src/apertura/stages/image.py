@@ -59,7 +59,7 @@ _QUOTED = (
 def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Path:
     """Write results/<flight>/<pair>/image.zarr.
 
-    Existing tiles, from a run that was killed or from the jobs of rule `tiles`, are kept.
+    Tiles that exist already, from an interrupted run or from the jobs of rule `tiles`, are kept.
     """
     lineage = result_of(campaign, "image", flight, pair).begin(campaign.root)
     work = _open(campaign, flight, pair, threads=threads)
@@ -95,20 +95,20 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
         stage_flags = work.empty.attrs["flags"], work.track.stage.attrs["flags"]
         quality["flags"] = Flags.merged(*stage_flags, plan.flags, quality["flags"], judged.flags)
         finish(wip, folder, lineage=lineage, quality=quality, flags=quality["flags"])
-    # Removes all receipts, including those of an earlier run with another number of jobs.
+    # Remove all receipts, including those of an earlier run with another number of jobs.
     _receipts(folder).remove()
     return folder
 
 
 def tiles(campaign: Campaign, flight: str, pair: str, share: str, *, threads: int = 1) -> Path:
-    """Form one job's share of the tiles of an image; write results/<flight>/<pair>/tiles/<share>.json.
+    """Form the tiles of an image that are assigned to one job; write results/<flight>/<pair>/tiles/<share>.json.
 
     Parameters
     ----------
     campaign, flight, pair
         Campaign, flight and pair of the image.
     share
-        Share of the tiles, such as '2-of-8': every eighth tile, from the second on.
+        Tiles of the job, such as '2-of-8': every eighth tile, starting with the second.
     threads
         Number of tiles processed in parallel.
 
@@ -164,7 +164,7 @@ class _Work:
         )
 
     def compute(self, windows: list[Window], target: Any) -> None:
-        """Compute the tiles of some windows as planned."""
+        """Compute the tiles of the given windows with the planned setting."""
         line = self.formation.plan.setting.line
         count = number_of(len(self.formation.windows), "tile")
         print(f"forming {len(windows)} of {count} with {line}", flush=True)
@@ -173,7 +173,7 @@ class _Work:
             compute_tiles(image, windows, target, threads=self.threads, scheduler=self.scheduler)
         if variants := self.formation.variant_counts:
             shares = ", ".join(f"{100 * count / variants.total():.3g} % {name}" for name, count in variants.items())
-            print(f"path variants, share of pixels × pulses: {shares}", flush=True)
+            print(f"fraction of pixel-pulse pairs by method of range computation: {shares}", flush=True)
 
 
 def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
@@ -191,7 +191,7 @@ def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
         opened.history, profiles, scene.grid, plan, campaign.settings.processing.tile_px, compression_db
     )
     result = result_of(campaign, "image", flight, pair)
-    # The number of pulse blocks depends on memory, not on the result: jobs with different memory share one image.
+    # The number of pulse blocks depends on the memory of a job and does not affect the image, which jobs may share.
     choices = {name: value for name, value in plan.choices.items() if name != "pulse_blocks"}
     empty = stamped(
         xr.Dataset(

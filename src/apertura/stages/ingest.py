@@ -28,7 +28,7 @@ def checked_recording(campaign: Campaign, flight: str, node: str) -> Recording:
 
 
 def preamble_files(recording: Recording, campaign: Campaign) -> tuple[Path, ...]:
-    """Return the preamble file named by the recorder's metadata, within the campaign; empty for triggered captures."""
+    """Return the preamble file named in the recorder's metadata, in the campaign; empty for triggered captures."""
     if recording.framing is None:
         return ()
     name = recording.framing["preamble"]

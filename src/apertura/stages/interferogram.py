@@ -40,17 +40,17 @@ from apertura.stages.transfer import PairEcho
 from apertura.workflow.lineage import result_of
 from apertura.workflow.rules import INTERFEROMETRY
 
-_BAND_TOLERANCE = 1e-6  # relative difference of two bands' limits that is tolerated
+_BAND_TOLERANCE = 1e-6  # tolerated relative difference between the limits of two bands
 
 
 @dataclass(frozen=True, eq=False)
 class TwoImages:
-    """Two images of an interferogram, and the terrain that both assume.
+    """Two images of an interferogram, and the terrain assumed for both.
 
     Attributes
     ----------
     names
-        flight/pair of each.
+        flight/pair of each image.
     images
         Stages of both images.
     ground
@@ -82,7 +82,7 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
         names = ", ".join(requested.pairs)
         expected = f"one of {names}" if names else "a configured interferogram; none is configured"
         where = f"{CONFIG}: interferometry.pairs"
-        raise CampaignError(f"no interferogram {name!r}", where, expected, "Add it to interferometry.pairs.")
+        raise CampaignError(f"no interferogram {name!r}", where, expected, "Add the key to interferometry.pairs.")
     images = requested.images(name)
     bands, legs, looks, antennas = [], [], [], list[FlownAntenna]()
     began: np.datetime64 | None = None
@@ -99,7 +99,7 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
         measured = " and ".join(f"{low / 1e6:.6g} to {high / 1e6:.6g} MHz" for low, high in bands)
         where = f"{CONFIG}: interferometry.pairs.{name}"
         expected = "two images of the same frequency band"
-        raise CampaignError(f"bands of {measured}", where, expected, "Name two images of the same band.")
+        raise CampaignError(f"bands of {measured}", where, expected, "Specify two images of the same band.")
     first, second = ("/".join(image) for image in images)
     stages = [open_stage(campaign.stage("image", *image), "image") for image in images]
     sensed = sensed_heights(scene, looks[0], legs, bands[0])
@@ -174,7 +174,7 @@ def sensed_heights(
     band_hz: tuple[float, float],
     window: NDArray[np.float64] | None = None,
 ) -> Sensitivity:
-    """Return the sensitivity to height at every pixel: computed at the lattice nodes, bilinear between them.
+    """Return the sensitivity to height at every pixel, interpolated bilinearly between the lattice nodes.
 
     Parameters
     ----------
@@ -210,11 +210,11 @@ def _known_height(
     height_m: NDArray[np.float64],
     shift_px: NDArray[np.float64],
 ) -> KnownHeight | None:
-    """Return the pixel at which a point is imaged, and its topographic phase there; None outside the grid."""
+    """Return the pixel at which a point is imaged, and the topographic phase of the point; None outside the grid."""
     x_m, y_m, z_m = point["position_m"]
     map_pixel = np.array(scene.grid.pixel_of(x_m, y_m))
     pixel = np.round(map_pixel).astype(int)
-    for _ in range(5):  # iterate the displacement by the point's height above the assumed terrain
+    for _ in range(5):  # iterate the displacement due to the point's height above the assumed terrain
         if not ((pixel >= 0) & (pixel < scene.grid.shape)).all():
             return None
         row, column = pixel

@@ -46,7 +46,7 @@ from apertura.workflow.lineage import result_of
 def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> list[Path]:
     """Write incidence, bistatic angle, mask, looks and noise of a pair, and σ⁰ and mean power if configured.
 
-    Returns their paths. Cross-sections of bright points and the noise figure are written to radiometry.json.
+    Returns the paths of the files. Cross-sections of bright points and the noise figure are written to radiometry.json.
     """
     lineage = result_of(campaign, "layers", flight, pair).begin(campaign.root)
     echo = PairEcho.cleaned(campaign, flight, pair).stage
@@ -125,9 +125,9 @@ class GroundPower:
         Scene with grid and terrain, and the image stage.
     calibrated, mask, quantity
         For a calibrated pair: its calibration, the mask file and the coefficient. Pixels with a mask other than 0 are
-        excluded, because their power is not that of their own terrain alone. None: echo power.
+        excluded, because their power is not caused by their own terrain alone. None: echo power.
     is_known
-        False for a pair without a calibration constant in a calibrated campaign: its power is NaN.
+        False for a pair without a calibration constant in a calibrated campaign; the power of that pair is NaN.
     """
 
     scene: OpenScene
@@ -146,7 +146,8 @@ class GroundPower:
         power = self.calibrated.calibration.power(window, self.quantity, normal)
         if flat or self.mask is None:
             return power
-        with opened_raster(self.mask, expected="the mask that this step writes", remedy="Run it again.") as raster:
+        remedy = "Run the workflow again."
+        with opened_raster(self.mask, expected="the mask that this step writes", remedy=remedy) as raster:
             return np.where(raster.read(1, window=rasterio.windows.Window.from_slices(*window)) == 0, power, np.nan)
 
     def amplitude(self, window: Window) -> NDArray[np.complex64]:
@@ -222,7 +223,7 @@ def _no_constant(campaign: Campaign, pair: str) -> dict[str, Any]:
         "constant_db": None,
         "std_db": None,
         "pointing_std_db": 0.0,
-        "flags": Flags({"pair_uncalibrated": f"{line}: its backscattering coefficients are NaN"}),
+        "flags": Flags({"pair_uncalibrated": f"{line}: the backscattering coefficients of the pair are NaN"}),
         "link": None,
         "noise": {"pulse": None, "noise_figure_db": None, "noise_figure_measured_db": None, "std_db": None},
         "points": [],
@@ -238,7 +239,7 @@ def layer_rasters(
     Parameters
     ----------
     scene, looks
-        Scene with grid and terrain; pulses that contribute to each pixel.
+        Scene with grid and terrain, and the pulses that contribute to each pixel.
     noise
         Noise power of one pulse in its range profile; NaN where it is unknown.
     calibrated

@@ -15,10 +15,10 @@ from apertura.workflow.lineage import result_of
 def mosaic(campaign: Campaign) -> Sequence[Path]:
     """Write results/mosaic/<pair>/<product>.vrt and their styles; return their paths.
 
-    Where flights overlap, the last one in config/flights.tsv is on top.
+    Where flights overlap, the flight that is last in config/flights.tsv is on top.
     """
     lineage = result_of(campaign, "mosaic").begin(campaign.root)
-    # product → the manifest that lists it, and its hash in that manifest
+    # product → the manifest that lists the product, and the product's hash in that manifest
     paths = [campaign.root / manifest for manifest in lineage.result.sources]
     listed = {
         path.parent / name: (path, digest) for path in paths for name, digest in read_manifest(path)["files"].items()

@@ -16,7 +16,7 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.looks import BLOCK_PX
 from apertura.formats.export.radiometry import of_multilooked
 
-_FEWEST_CELLS = 64  # multilook cells along a tile, so that the margin which the filter reads is small in comparison
+_FEWEST_CELLS = 64  # multilook cells along a tile; the margin read by the filter is small in comparison
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def multilook_of(
     *,
     noise: Callable[[Window], Floats] | None = None,
 ) -> Multilook:
-    """Return the multilooked power of an image as configured; the mean power `noise` is subtracted unless None."""
+    """Return the multilooked power of an image as configured; the mean noise power is subtracted, if given."""
     filtered = multilook.speckle_filter == "lee"
     return Multilook.of(image, grid.shape, side_of(grid, multilook), noise=noise, filtered=filtered)
 
@@ -88,7 +88,7 @@ def coarse(
 
 
 def mean_power_report(cells: Multilook, means: Mapping[str, Any], *, noise: str) -> dict[str, Any]:
-    """Return the radiometric report of a multilooked raster; `means`: report of its pixels."""
+    """Return the radiometric report of a multilooked raster; `means`: radiometric report of the averaged pixels."""
     return of_multilooked(
         means,
         side_px=cells.side,

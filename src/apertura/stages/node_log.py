@@ -52,7 +52,7 @@ class NodeLog:
     log
         Log file, for messages.
     shortest_wave_m
-        Wavelength of the highest frequency, metres: scale of the tolerated error between epochs.
+        Wavelength of the highest frequency, metres; the tolerated error between epochs is proportional to it.
     """
 
     name: str
@@ -63,7 +63,7 @@ class NodeLog:
 
     @cached_property
     def checked(self) -> CheckedTrack:
-        """Check result of the log's epochs; errors up to λ/16 between epochs are tolerated."""
+        """Result of the checks of the log's epochs; errors up to λ/16 between epochs are tolerated."""
         poor = np.zeros(self.track.sizes["epoch"], bool)
         if "fix" in self.track:
             poor = poorer_fix(self.track.fix.values, self.settings.worst_fix)
@@ -86,7 +86,7 @@ class NodeLog:
         return seconds_since(at, self.track.time.values[0])
 
     def log_time(self, time_s: float) -> str:
-        """Return the UTC time of day of a time in seconds since the log's first epoch, rounded to 10 ms."""
+        """Return the UTC time of day of a time in seconds since the log's first epoch, truncated to 10 ms."""
         time = self.track.time.values[0] + np.timedelta64(round(time_s * 1e9), "ns")
         return f"{np.datetime_as_string(time, 'ms')[11:-1]}Z"
 
@@ -103,7 +103,7 @@ class NodeLog:
 
     @cached_property
     def smoothing_residual_m(self) -> float | None:
-        """RMS change per axis of the valid epochs by smoothing, metres; None without smoothing."""
+        """RMS change of the valid epochs due to smoothing, metres per axis; None without smoothing."""
         if self.settings.log.smoothing_m is None:
             return None
         times, position, _ = self._valid_epochs
@@ -125,7 +125,7 @@ class NodeLog:
         )
 
     def turns(self, name: Literal["radar_tx", "radar_rx"]) -> bool:
-        """Return True if attitude affects this antenna: it has a beam, or the node has a lever arm."""
+        """Return True if attitude affects this antenna, i.e. the antenna has a beam or the node has a lever arm."""
         return getattr(self.settings.antennas, name) is not None or self.settings.lever_arms_m.any()
 
     def body_axes(self, at: Times) -> NDArray[np.float64]:
@@ -168,7 +168,7 @@ def shortest_wave(frequency_hz: NDArray[np.float64]) -> float:
 def poorer_fix(fix: NDArray[np.int8], worst: Literal["auto", "fix", "float", "any"]) -> NDArray[np.bool_]:
     """Return (epoch,) bool, True for solutions poorer than `worst`.
 
-    Epochs without a logged solution are False, and all epochs for 'auto' if the log has no RTK solution.
+    Epochs without a logged solution are False. For 'auto', all epochs are False if the log has no RTK solution.
 
     Examples
     --------

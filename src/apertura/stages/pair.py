@@ -134,7 +134,7 @@ def _raise_unilluminated(
     middle_m: NDArray[np.float64],
     aperture: Aperture,
 ) -> None:
-    """Raise an error with the smallest angle between each boresight and the scene centre over all pulses."""
+    """Raise an error that states, for each antenna, the smallest angle between boresight and scene centre."""
     stated = campaign.antennas(pair)
     keys, lines = [f"nodes.{node}.antennas.{point}" for point, (node, _) in stated.items()], []
     legs = {"radar_tx": (beams.transmit, aperture.tx_m), "radar_rx": (beams.receive, aperture.rx_m)}
@@ -159,7 +159,7 @@ def _raise_unilluminated(
     )
 
 
-# ---- Pair, opened from its echo, or from the flight logs before that is formed ---------------------------------------
+# ---- Pair, opened from its echo, or from the flight logs before the echo is formed -----------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,14 +187,14 @@ class OpenPair:
     beams
         Antenna beams; None if the antennas are isotropic.
     axes
-        Body axes as in `beams_of`, of antennas that attitude affects.
+        Body axes as in `beams_of`, for the antennas that are affected by attitude.
     sidelink_m
         (pulse, 3) float64, metres, from the receiver's sidelink antenna to the transmitter's; None if no sidelink
         length was added to the echo, and before the echo is formed.
     left
         Residual effect of position errors after track refinement; None if the tracks are those of the logs.
     report
-        Attributes of stage echo; empty before it is formed.
+        Attributes of stage echo; empty before the echo is formed.
     wave_speed_m_s
         Wave speed along the paths.
     air
@@ -241,7 +241,8 @@ def open_pair(
 ) -> OpenPair:
     """Open a pair from its stage `echo` if it is formed, else from the flight logs.
 
-    With `recorded`, the time tags of pulses that both nodes recorded, the logs are used even if the stage is formed.
+    If `recorded`, the time tags of pulses recorded by both nodes, is given, the logs are used even if the stage is
+    formed.
     """
     waveform = campaign.settings.waveform
     if echo is None and recorded is None and campaign.is_current(campaign.stage("echo", flight, pair)):
@@ -277,7 +278,7 @@ def open_pair(
 def _expected(
     campaign: Campaign, flight: str, pair: str, waveform: SampledWaveform, recorded: Times | None
 ) -> OpenPair:
-    """Return the pair expected from the logs: the pulses with positions in both logs, without those of hovers."""
+    """Return the pair expected from the logs: the pulses with positions in both logs, without pulses during hovers."""
     frequency = transmitted(campaign, waveform).numerology.frequency_hz
     tx, rx = (raw_log(campaign, flight, node, shortest_wave(frequency)) for node in pair.split("-"))
     first = max(log.track.time.values[0] for log in (tx, rx))
@@ -350,7 +351,7 @@ def expected_pair(
 
 
 def _positions(stated: Mapping[str, Any]) -> NodePositions:
-    """Return the position accuracy of a node from an echo stage, whose standard deviations are north, east, up."""
+    """Return the position accuracy of a node from an echo stage, which lists it in the order north, east, up."""
     std = stated.get("std_m")
     axes = None if std is None else (float(std[1]), float(std[0]), float(std[2]))
     return NodePositions(

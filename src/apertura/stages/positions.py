@@ -50,7 +50,7 @@ def inside_segments(campaign: Campaign, flight: str, pair: str, times: NDArray[n
 
 
 def keep_segments(campaign: Campaign, flight: str, pair: str, echo: xr.Dataset) -> xr.Dataset:
-    """Return an echo without the pulses outside the segments of its pair; attribute `pulses` contains their number."""
+    """Return an echo without the pulses outside the segments of its pair; attribute `pulses` reports both numbers."""
     if not campaign.segments_of(flight, pair):
         return echo
     inside = inside_segments(campaign, flight, pair, echo.time.values)
@@ -78,12 +78,12 @@ class PulsePositions:
     good
         (pulse,) bool, True for pulses with a position of both nodes.
     reasons
-        Cause → number of pulses excluded by it; each pulse is counted once.
+        Cause → number of pulses excluded for this cause; each pulse is counted once.
     flags
         Flags with the measured values.
     report
-        tx, rx → node, std_m, correlation_s, stated_by, interpolation_m; smoothing_residual_m, source and remarks of the
-        log if there are any.
+        tx, rx → node, std_m, correlation_s, stated_by, interpolation_m; also smoothing_residual_m, source and remarks
+        of the log, if they exist.
     """
 
     good: NDArray[np.bool_]
@@ -95,7 +95,7 @@ class PulsePositions:
 def place(tx: NodeLog, rx: NodeLog, at: Times, *, hovers: bool = False) -> PulsePositions:
     """Select the pulses of a pair, at the transmitter's time tags `at`, for which both logs have valid positions.
 
-    Pulses of a hover are excluded unless `hovers` is True, as it is for pairs with configured segments.
+    Pulses of a hover are excluded unless `hovers` is True, which is the case for pairs with configured segments.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def place(tx: NodeLog, rx: NodeLog, at: Times, *, hovers: bool = False) -> Pulse
         time_s = tx.log_seconds(at)
         first, last = max(stretches(stationary), key=lambda edge: time_s[edge[1] - 1] - time_s[edge[0]])
         flags["hover"] = (
-            f"{int(stationary.sum())} of {len(at)} pulses excluded: platform stationary, at most "
+            f"{int(stationary.sum())} of {len(at)} pulses excluded: platform stationary, longest interval "
             f"{time_s[last - 1] - time_s[first]:.0f} s from {tx.log_time(float(time_s[first]))}"
         )
         good &= ~stationary
@@ -255,12 +255,12 @@ def scene_air(campaign: Campaign, position_m: NDArray[np.float64]) -> SceneAir:
     campaign
         Campaign with `scene.atmosphere`.
     position_m
-        (epoch, 3) float64, metres: antenna positions, from which an automatic CRS and scene centre follow.
+        (epoch, 3) float64, metres: antenna positions, from which an automatic CRS and scene centre are derived.
 
     Notes
     -----
-    Source: docs/theory/atmosphere.md. The terrain height is the configured one or the mean of the DEM, rounded to
-    `GROUND_STEP_M`.
+    Source: docs/theory/atmosphere.md. The terrain height is the configured height or the mean of the DEM, rounded to a
+    multiple of `GROUND_STEP_M`.
     """
     stated = campaign.settings.scene
     crs = utm_crs(np.median(position_m, axis=0)) if stated.crs == "auto" else stated.crs
@@ -302,8 +302,8 @@ def stated_air(air: FlightAir) -> dict[str, Any]:
 def in_air(campaign: Campaign, history: xr.Dataset) -> xr.Dataset:
     """Return a recorder's phase history with the atmosphere along its paths, according to `waveform.air`.
 
-    If samples are referred to a point, the reference delay becomes that of its distance in the atmosphere; samples are
-    unchanged.
+    If samples are referred to a point, the reference delay is set to the delay of that point in the atmosphere; the
+    samples are unchanged.
     """
     waveform, reference = campaign.settings.waveform, history.attrs.get("reference", "delay")
     requested: str = waveform.air if isinstance(waveform, PhaseHistoryWaveform) else "auto"

@@ -36,7 +36,7 @@ FILE = "calibration.json"
 """Name of the file of calibration constants, in the campaign folder."""
 
 _TOLERANCE = 1e-3
-"""Relative difference of frequencies and powers that is tolerated; it changes a constant by at most 0.01 dB."""
+"""Tolerated relative difference of frequencies and powers; it changes a constant by at most 0.01 dB."""
 
 _REMEDY = "Measure with `apertura reflectors`, or set processing.radiometric_calibration to null."
 
@@ -57,7 +57,7 @@ class AntennaShape(_Part):
 
 
 class Radar(_Part):
-    """Signal and antennas with which a calibration constant was measured; it is valid only for these.
+    """Signal and antennas with which a calibration constant was measured, and for which alone the constant is valid.
 
     `sent_power` is the mean power of the transmitted signal in the units by which echoes are divided; None for phase
     histories.
@@ -114,7 +114,7 @@ class Radar(_Part):
 class PairConstant(_Part):
     """Calibration constant of a pair, and its phase relative to the file's `reference` pair, rad; None if not measured.
 
-    `profile_noise` is the noise power of a pulse per Σw² of the window; it changes with the receiver gain.
+    `profile_noise` is the noise power of a pulse divided by Σw² of the window; it changes with the receiver gain.
     """
 
     radar: Radar
@@ -161,20 +161,20 @@ def read_constants(path: Path) -> Constants:
     CampaignError
         If the file is missing or invalid.
     """
-    expected, remedy = "a file of `apertura reflectors`", "Copy it from the campaign that measured it."
+    expected, remedy = "a file of `apertura reflectors`", "Copy the file from the campaign with the reflectors."
     return validated(Constants, read_json(path, expected=expected, remedy=remedy), where=path, expected=expected)
 
 
 def constant_of(campaign: Campaign, opened: OpenPair) -> tuple[PairConstant, str] | None:
     """Return the measured calibration constant of an open pair, and its source.
 
-    None if the config names no file, or if the file has constants of other pairs of the campaign only: a reflector
-    for monostatic pairs does not calibrate a bistatic pair.
+    The result is None if the config names no file, or if the file has only constants of other pairs of the campaign,
+    for example because a reflector for monostatic pairs does not calibrate a bistatic pair.
 
     Raises
     ------
     CampaignError
-        If the file contains no pair of the campaign, or was measured with another radar.
+        If the file contains no pair of the campaign, or its constant was measured with another radar.
     """
     path = campaign.calibration_file
     if path is None:
@@ -305,14 +305,14 @@ class CalibratedPair:
         points_m
             (point, 3) float64, in the frame of the aperture.
         amplitude, background
-            (point,) float64: amplitude of the peak; power of its surroundings relative to the peak's.
+            (point,) float64: amplitude of the peak, and power of its surroundings relative to the peak power.
         pulse_noise
             Measured noise power of a pulse.
 
         Returns
         -------
         list of dict
-            rcs_m2, rcs_dbsm, std_db and scatter_db of each; None if a peak does not exceed noise and clutter enough.
+            rcs_m2, rcs_dbsm, std_db and scatter_db of each peak; None if its contrast is below `LEAST_CONTRAST`.
 
         Notes
         -----
@@ -348,7 +348,7 @@ class CalibratedPair:
         pulse_noise
             Measured noise; NaN if it was not measured.
         bound
-            True if it is an upper bound because echoes alias into it.
+            True if the measured noise is an upper bound, because it contains aliased echoes.
 
         Notes
         -----
@@ -374,7 +374,7 @@ class CalibratedPair:
         if self.noise_before and pulse_noise.power > 0 and not self.sidelink_noise:
             std_db = float(np.hypot(2**0.5 * pulse_noise.std_db, _FIGURE_STD_DB))
             since_db = decibels(pulse_noise.power / self.noise_before)
-            differences.append(("the noise of the reflector flights (other receiver gain?)", since_db, std_db))
+            differences.append(("the noise of the reflector flights (receiver gain changed?)", since_db, std_db))
         lines = [
             f"measured noise is {by_db:+.1f} ± {std_db:.1f} dB relative to {reference}"
             for reference, by_db, std_db in differences
@@ -386,7 +386,7 @@ class CalibratedPair:
 def stated_link(campaign: Campaign, pair: str) -> tuple[Link, float | None, float | None] | None:
     """Return the configured radio of a pair, its standard deviation (None: unknown) and its noise figure, dB.
 
-    None if the radio is not configured completely, as is permitted with measured constants.
+    The result is None if the radio is not completely configured, which is permitted with measured constants.
     """
     power, transmit, receive, receiver = radio_of(campaign.settings.nodes, pair).values()
     if not isinstance(receiver, Receiver) or None in (power, transmit, receive):
@@ -481,7 +481,7 @@ def image_weights(campaign: Campaign, opened: OpenPair, scene: OpenScene) -> tup
 
 
 def _attitude_errors(campaign: Campaign, opened: OpenPair, scene: OpenScene) -> list[Turn]:
-    """Return the attitude errors of a pair's nodes about east, north and up, configured or typical of the source."""
+    """Return the attitude errors of a pair's nodes about east, north and up: configured, or typical of the source."""
     legs, turns = opened.name.split("-"), list[Turn]()
     for name in dict.fromkeys(legs):
         node = campaign.settings.nodes[name]
@@ -501,8 +501,8 @@ def _disagreement(measured: PairConstant, configured: float, std_db: float | Non
     if std_db is None or abs(difference_db) <= DRIFT_SIGMAS * both_db:
         return {}
     return {
-        "constant_disagrees": f"constant from the configured radio {difference_db:+.2f} dB relative to the constant "
-        f"measured at reflectors, {abs(difference_db) / both_db:.1f} standard deviations of the difference"
+        "constant_disagrees": f"constant from the configured radio is {difference_db:+.2f} dB relative to the constant "
+        f"measured at reflectors, i.e. {abs(difference_db) / both_db:.1f} standard deviations of the difference"
     }
 
 

@@ -48,7 +48,7 @@ LEAST_STD_M = 1e-3
 """Lower bound of a stated position accuracy, metres: a prior of zero would fix the track."""
 
 ONE_PHASE = "minimum_entropy"
-"""Method of `auto` if one phase per pulse suffices; accepted at least as often as phase_gradient, at equal cost."""
+"""Method of `auto` if one phase per pulse suffices; its results are accepted at least as often as phase_gradient's."""
 
 
 def autofocus_of(campaign: Campaign, pairs: Sequence[OpenPair], scene: OpenScene) -> tuple[Decision, ...]:
@@ -205,7 +205,7 @@ class RefinedTrack:
     def moved_m(self, node: str, at: Times) -> NDArray[np.float64]:
         """Return the correction of a node's logged positions at given times, (time, 3) float64 metres in the frame.
 
-        Before the first and after the last pulse, it is constant.
+        Before the first and after the last pulse, the correction is constant.
         """
         if self.correction is None:
             return np.zeros((len(at), 3))
@@ -217,8 +217,8 @@ class RefinedTrack:
         Returns
         -------
         ndarray
-            (time, 3) float64, metres; NaN where the images do not observe the node: before the first pulse, after the
-            last, and everywhere if no track was corrected.
+            (time, 3) float64, metres; NaN where the node's position is not observable in the images: before the first
+            pulse, after the last pulse, and at all times if no track was corrected.
         """
         residual_m, nodes = np.full((len(at), 3), np.nan), self.stage.attrs["nodes"]
         if self.correction is None or self.correction.extra_path_m or node not in nodes:
@@ -356,7 +356,7 @@ def reference_points(campaign: Campaign) -> tuple[ReferencePoint, ...]:
 
 
 def refine(campaign: Campaign, flight: str) -> Path:
-    """Write results/<flight>/refined_track.zarr; without a correction, it contains the reason and no knots."""
+    """Write results/<flight>/refined_track.zarr; without a correction, the stage contains the reason and no knots."""
     lineage = result_of(campaign, "refined_track", flight).begin(campaign.root)
     names, scene = campaign.flight(flight).pairs, open_scene(campaign)
     requested = campaign.settings.processing.autofocus
@@ -379,7 +379,7 @@ def refine(campaign: Campaign, flight: str) -> Path:
     inherits: dict[str, Any] = {"parents": stages, "inputs": merged(scene.inputs, *patterns)}
     accepted = refinement.accepted
     settings = {**lineage.result.settings, "refined": accepted}
-    # Without a correction, images depend on their own echoes alone, not on the profiles read by this step.
+    # Without a correction, images depend only on their own echoes, not on the profiles read by this step.
     origin: dict[str, Any] = {"modules": lineage.modules, "settings": settings, **(inherits if accepted else {})}
     save_stage(stamped(stage, "refined_track", **origin), folder, lineage=lineage)
     return folder
@@ -405,7 +405,7 @@ def refined_stage(
     refinement, decisions
         Refinement; decisions on it and on its method.
     inputs
-        Inputs of the refinement; None if it was not tried.
+        Inputs of the refinement; None if no refinement was attempted.
     scene
         Scene of the campaign.
     """

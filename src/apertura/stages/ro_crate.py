@@ -30,7 +30,7 @@ def ro_crate(campaign: Campaign) -> Sequence[Path]:
         write_text(campaign.result(name), text)
     results = list(_results(campaign))
     read = {name: sha256 for one in reversed(results) for name, sha256 in one.recorded["sources"].items()}
-    # Hashes of recordings are those at the time they were read, hashes of the config are current.
+    # Recordings: hashes at the time when they were read; config: hashes at present.
     hashes = {**read, **lineage.sources.digests}
     inputs = sorted(name for name in hashes if not name.startswith("results/"))
     catalog, expected = campaign.result("stac", CATALOG), "the catalogue that step stac writes"
@@ -78,7 +78,7 @@ def _results(campaign: Campaign) -> Iterator[_FinishedResult]:
 
 
 def _jobs(campaign: Campaign, results: Sequence[_FinishedResult], hashes: Mapping[str, str]) -> Iterator[CrateJob]:
-    """Yield every job that wrote some of the results; a job may write several.
+    """Yield every job that wrote results; a job may write several results.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def _jobs(campaign: Campaign, results: Sequence[_FinishedResult], hashes: Mappin
     results
         Finished results.
     hashes
-        File of the campaign → SHA-256, of inputs when they were first read, of results at present.
+        File of the campaign → SHA-256: of an input, when the input was first read; of a result, at present.
     """
     jobs = dict[tuple[str, tuple[str, ...]], list[_FinishedResult]]()
     for one in results:
@@ -107,9 +107,9 @@ def _jobs(campaign: Campaign, results: Sequence[_FinishedResult], hashes: Mappin
 
 
 def _differences(recorded: Mapping[str, Any], result: Result, hashes: Mapping[str, str]) -> Iterator[str]:
-    """Yield the differences of a result's code, settings and sources from the current ones."""
+    """Yield the differences of a result's code, settings and sources from the current code, settings and sources."""
     if recorded["code"] != result.code_sha256:
-        yield f"written by code other than the installed one, whose sha256 is {result.code_sha256}"
+        yield f"written by code that differs from the installed code of sha256 {result.code_sha256}"
     if recorded["settings"] != result.settings_sha256:
         yield f"written with other settings, of sha256 {recorded['settings']}"
     for name, sha256 in recorded["sources"].items():

@@ -45,7 +45,7 @@ _BLOCKS = 32
 
 @dataclass(frozen=True)
 class ConfiguredGround:
-    """Configured terrain, flat at a height or a DEM, with the files that it needs.
+    """Configured terrain, flat at a height or from a DEM, with the required files.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class ConfiguredGround:
 
     @property
     def inputs(self) -> dict[str, str]:
-        """Role → SHA-256 of the DEM and of the geoid grid, for those in use."""
+        """Role → SHA-256 of the DEM and of the geoid grid, as far as they are used."""
         files = {"dem": self.dem.path if self.dem else None, "geoid": self.dem.geoid if self.dem else self.geoid}
         return {role: sha256_file(path) for role, path in files.items() if path}
 
@@ -87,10 +87,10 @@ class ConfiguredGround:
             if np.isfinite(height_m):
                 return height_m
             raise CampaignError(
-                f"no height at ({x_m:.1f}, {y_m:.1f}) below the track, which scene.bounds_m: auto requires",
+                f"no height at ({x_m:.1f}, {y_m:.1f}) below the track, required for scene.bounds_m: auto",
                 where=self.dem.path,
                 expected="a DEM that covers this point without a void",
-                remedy="Extend the DEM, fill the void, or state scene.bounds_m.",
+                remedy="Extend the DEM, fill the void, or configure scene.bounds_m.",
             )
         if self.geoid is None:
             return self.flat_m
@@ -269,9 +269,10 @@ def open_scene(campaign: Campaign) -> OpenScene:
 
 
 def expected_scene(campaign: Campaign, flown: Callable[[], Flown]) -> OpenScene:
-    """Return the scene with its terrain, finished or else planned; voids of a DEM raise CampaignError.
+    """Return the scene with its terrain, from finished results or else from the config.
 
-    `flown` returns the apertures of the first image flight; it is called only for `auto` settings.
+    `flown` returns the apertures of the first image flight; it is called only for `auto` settings. Voids of a DEM raise
+    CampaignError when heights are read.
     """
     requested = campaign.settings.scene
     is_automatic = "auto" in {requested.crs, requested.bounds_m, requested.spacing_m}
@@ -321,7 +322,7 @@ def settled(campaign: Campaign, flown: Callable[[], Flown]) -> tuple[SceneGrid, 
             chosen["spacing_m"] = (
                 f"coarser than {finest:g} m, a third of the finest resolution cell: with automatic bounds that spacing "
                 f"requires {megapixels:.3g} Mpx, more than the limit of {most / 1e6:.3g} Mpx for this flight; for a "
-                "finer spacing, state scene.bounds_m"
+                "finer spacing, configure scene.bounds_m"
             )
     if "auto" in {requested.bounds_m, requested.spacing_m}:
         xmin, ymin, xmax, ymax = bounds
@@ -349,7 +350,7 @@ def _middle(flown: Flown) -> NDArray[np.float64]:
 
 
 def scene(campaign: Campaign) -> Path:
-    """Write results/scene.json: the configured grid, its mean terrain height, and the reasons of automatic values."""
+    """Write results/scene.json: the configured grid, its mean terrain height, and the reasons for automatic values."""
     lineage = result_of(campaign, "scene").begin(campaign.root)
     grid, ground, chosen = settled(campaign, cache(lambda: _first_flight(campaign)))
     path, height_m = campaign.result("scene.json"), ground.level(grid).height_m
@@ -391,7 +392,7 @@ def terrain(campaign: Campaign) -> Path:
             "no DEM",
             where="config/config.yaml: scene.dem",
             expected="a GeoTIFF of heights",
-            remedy="State a DEM and its dem_datum; flat terrain does not need this step.",
+            remedy="Configure dem and dem_datum; flat terrain does not require this step.",
         )
     lineage = result_of(campaign, "terrain").begin(campaign.root)
     ground.dem.check_cover(grid)

@@ -43,7 +43,7 @@ def stamped(
     modules
         ``__name__`` of the step's module and of modules named in tables; the code hash covers their imports.
     parents, settings, inputs
-        As `apertura.common.provenance.Provenance.of`.
+        As in `apertura.common.provenance.Provenance.of`.
     """
     origin = Provenance.of(modules, parents, settings=settings, inputs=inputs, software=packages())
     return stamp(dataset, stage, **vars(origin))
@@ -99,7 +99,7 @@ def stamp(
     Raises
     ------
     ContractError
-        As `check`.
+        In the cases of `check`.
     """
     stamped = check(dataset, stage).copy()
     contract = STAGES[stage]
@@ -122,11 +122,11 @@ def stamp(
     return stamped
 
 
-_FIRST_CLOCK = np.datetime64("1980-01-06")  # times of a recording without a clock count from 1970
+_FIRST_CLOCK = np.datetime64("1980-01-06")  # times of a recording without a clock start in 1970
 
 
 def acquisition_tags(campaign: Campaign, views: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-    """Return time, frequency, look side and author of an image as tags; for a sum, of all its pairs together."""
+    """Return time, frequency, look side and author of an image as tags; for a sum, those of all its pairs together."""
     each = list(views.values())
     first, last = min(view["first_utc"] for view in each), max(view["last_utc"] for view in each)
     centres = {view["centre_hz"] for view in each}

@@ -20,11 +20,11 @@ from apertura.workflow.rule_inputs import is_sampled
 
 
 def tracks(campaign: Campaign, flight: str) -> list[Path]:
-    """Write results/<flight>/tracks: per node a .csv and, unless the frame is local, a .pos, and tracks.png.
+    """Write results/<flight>/tracks: tracks.png, and per node a .csv and, unless the frame is local, a .pos.
 
-    Returns their paths. Positions stored with the samples of a phase history are written as phase centres, one epoch
-    per pulse. If the refinement was not tried, not accepted, or did not correct a track, the files contain the
-    unchanged logs.
+    Returns the paths of the files. Positions stored with the samples of a phase history are written as phase centres,
+    one epoch per pulse. If the refinement was not attempted, was not accepted, or did not correct a track, the files
+    contain the unchanged logs.
     """
     lineage = result_of(campaign, "tracks", flight).begin(campaign.root)
     refined = open_refined(campaign, flight)
@@ -53,7 +53,7 @@ def tracks(campaign: Campaign, flight: str) -> list[Path]:
 
 
 def _positions(campaign: Campaign, flight: str, node: str) -> xr.Dataset:
-    """Return positions in the form of stage `track`: those logged, else those of the node's antenna at the pulses."""
+    """Return positions in the form of stage `track`, from the log, or else of the node's antenna at the pulses."""
     if is_sampled(campaign):
         track: xr.Dataset = open_stage(campaign.stage("track", flight, node), "track")
         return track
@@ -98,7 +98,7 @@ def refined_log(refined: RefinedTrack, node: str, track: xr.Dataset, settings: N
 
 
 def _stated_m(track: xr.Dataset, settings: Node) -> Floats:
-    """Return the accuracy of a log's epochs, (epoch, 3) metres east, north, up, from the log, else the config."""
+    """Return the accuracy of a log's epochs, (epoch, 3) metres east, north, up, from the log or else the config."""
     config_m = np.nan if settings.position_std_m is None else settings.position_std_m
     stated_m = np.array(np.broadcast_to(config_m, track.position.shape), np.float64)
     if "position_std" in track:

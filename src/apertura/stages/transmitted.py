@@ -21,7 +21,7 @@ from apertura.formats.recordings.sample_file import SampleFile
 
 
 def check_mixing(samples: SampleFile, numerology: Numerology, *, where: object) -> None:
-    """Check the mixing of real samples: no mirror image within the band, sufficient prefix; else raise CampaignError.
+    """Check the mixing of real samples; raise CampaignError for a mirror image in the band or too short a prefix.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ MOST_LEAD_SAMPLES = 1 << 26
 """Largest number of samples of preamble, counter and guard before a symbol."""
 
 _FEWEST_BINS = 16  # frequency bins of a band
-_LEAST_INSIDE = 0.01  # smallest share of the pulse's energy within the band
+_LEAST_INSIDE = 0.01  # smallest fraction of the pulse's energy within the band
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +93,7 @@ class Transmitted:
 def transmitted(campaign: Campaign, waveform: SampledWaveform) -> Transmitted:
     """Return the transmitted signal, from a waveform and the campaign's file of codes or samples.
 
-    A flight plan without that file assumes codes of equal power, or a linear chirp over the band.
+    For a flight plan without that file, codes of equal power or a linear chirp over the band are assumed.
 
     Raises
     ------
@@ -123,7 +123,7 @@ def symbol_numerology(waveform: OfdmWaveform) -> Numerology:
 
 
 def _chirp(waveform: PulseWaveform) -> NDArray[np.complex128]:
-    """Return a linear chirp over the band of a waveform, or over 0.8 of the sample rate."""
+    """Return a linear chirp over the configured band; without a configured band, over 0.8 of the sample rate."""
     half = 0.4 * waveform.sample_rate_hz
     low, high = waveform.band_hz or (-half, half)
     time = np.arange(round(waveform.pulse_s * waveform.sample_rate_hz)) / waveform.sample_rate_hz
@@ -146,10 +146,10 @@ def _transmitted_pulse(pulse: NDArray[np.complex128], waveform: PulseWaveform, *
     inside = float(power[numbers % length].sum() / power.sum())
     if numbers.size < _FEWEST_BINS or inside < _LEAST_INSIDE:
         raise CampaignError(
-            f"the band contains {inside:.2g} of the pulse's energy in {max(numbers.size, 0)} bins of "
+            f"the band contains a fraction {inside:.2g} of the pulse's energy in {max(numbers.size, 0)} bins of "
             f"{waveform.sample_rate_hz / length:g} Hz",
             where=where,
-            expected=f"at least {_LEAST_INSIDE} of the energy in at least {_FEWEST_BINS} bins of {CONFIG}: "
+            expected=f"at least a fraction {_LEAST_INSIDE} of the energy, in at least {_FEWEST_BINS} bins of {CONFIG}: "
             "waveform.band_hz",
             remedy="Correct band_hz (baseband frequencies, relative to the carrier), or the file.",
         )
@@ -176,7 +176,7 @@ def read_pulse(path: Path, waveform: PulseWaveform) -> NDArray[np.complex128]:
     )
     remedy = "Use the samples that were transmitted, or correct the waveform."
     if not path.is_file():
-        raise CampaignError("no such file", where=path, expected=expected, remedy="Copy it there.")
+        raise CampaignError("no such file", where=path, expected=expected, remedy="Copy the file there.")
     stored = read_npy(path, kinds="ci", most=2 * MOST_PULSE_SAMPLES, expected=expected, remedy=remedy)
     if waveform.capture_samples > MOST_PULSE_SAMPLES:
         raise CampaignError(
@@ -209,7 +209,7 @@ def read_codes(path: Path, subcarriers: int) -> NDArray[np.complex64]:
     expected = f"({subcarriers},) complex64 without zeros, for config/config.yaml: waveform.subcarriers"
     remedy = "Use the codes that were transmitted, or correct the waveform."
     if not path.is_file():
-        raise CampaignError("no such file", where=path, expected=expected, remedy="Copy it there.")
+        raise CampaignError("no such file", where=path, expected=expected, remedy="Copy the file there.")
     stored = read_npy(path, kinds="c", most=MOST_SYMBOLS, expected=expected, remedy=remedy)
     with np.errstate(over="ignore", invalid="ignore"):  # infinite and NaN values are rejected below
         codes = stored.astype(np.complex64)
@@ -249,8 +249,8 @@ def read_framing(path: Path, described: Mapping[str, Any], *, sample_rate_hz: fl
         raise CampaignError(
             "no such file",
             where=path,
-            expected=f"the preamble that {where.name}: apertura:framing names",
-            remedy="Copy it there.",
+            expected=f"the preamble named in {where.name}: apertura:framing",
+            remedy="Copy the file there.",
         )
     expected = f"a one-dimensional array of at most {MOST_CHIPS} chips, +1 or -1"
     remedy = "Save the preamble that was transmitted."

@@ -1,4 +1,4 @@
 """Commands in addition to the workflow: design, bench, reflectors, align, chart, look; access to campaigns from Python.
 
-No module of the workflow's processing steps imports them.
+The processing steps of the workflow import none of these modules.
 """

@@ -1,4 +1,4 @@
-"""`apertura align`: estimate clock offset, drift and path offset of a recorder against its flight log from echoes."""
+"""`apertura align`: estimate clock offset, drift and path offset of a recorder, from its echoes and its flight log."""
 
 from dataclasses import dataclass, replace
 from decimal import Decimal
@@ -38,10 +38,13 @@ from apertura.stages.scene import ConfiguredGround, settled_scene
 from apertura.stages.transfer import PairEcho
 
 NEAR_S = 5.0
-"""Half width of the search for a UTC clock, seconds; for a free-running clock every overlapping offset is searched."""
+"""Half width of the search range for the offset of a UTC clock, seconds.
+
+For a free-running clock, all offsets at which recording and log overlap are searched.
+"""
 
 MOST_PULSES = 8192
-"""Maximum number of evenly spread pulses of a recording that are used; limits memory."""
+"""Maximum number of pulses used, evenly spread over the recording; limits memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,19 +54,20 @@ class Unaligned:
     Attributes
     ----------
     echo, log
-        Inputs of `apertura.methods.alignment`, with times in seconds from the first pulse and the first epoch.
+        Inputs of `apertura.methods.alignment`; times are in seconds, from the first pulse in `echo` and from the first
+        epoch in `log`.
     log_start_ns
         Delay of the log's first epoch relative to the recorder's first pulse, nanoseconds.
     applied_ns
-        Offset of config/clocks.tsv that is included in the recorder's times, nanoseconds.
+        Offset from config/clocks.tsv that is already applied to the recorder's times, nanoseconds.
     stated_ns
         Offset in config/clocks.tsv, nanoseconds; 0 without an entry.
     applied_ppm
-        Drift of config/clocks.tsv that is included in the recorder's times, ppm.
+        Drift from config/clocks.tsv that is already applied to the recorder's times, ppm.
     taken_off_m
         Path offset that was already removed from the echoes, metres.
     own_clock
-        True if the recorder has a free-running clock, of which only differences are meaningful.
+        True if the recorder's clock is free-running, so that only differences between its times are meaningful.
     """
 
     echo: Recorded
@@ -96,15 +100,16 @@ def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
     Raises
     ------
     CampaignError
-        If the node does not transmit and receive in that flight, has no log, or its echoes have not been computed.
+        If the node does not both transmit and receive in that flight, if it has no log, or if its echoes have not been
+        computed.
     """
     flown = campaign.flight(flight)
     if f"{node}-{node}" not in flown.pairs:
         raise CampaignError(
-            f"{node} does not transmit and receive in {flight}",
+            f"{node} does not both transmit and receive in {flight}",
             where=campaign.root / FLIGHTS,
             expected=f"a node of a monostatic pair; pairs of {flight}: {', '.join(flown.pairs)}",
-            remedy="Name such a node, or correct the line of the flight.",
+            remedy="Specify a node of a monostatic pair, or correct the line of the flight.",
         )
     clock = campaign.clock(flight, node)
     applied_ns, applied_ppm = 0, 0.0
@@ -115,7 +120,7 @@ def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
             raise CampaignError(
                 "no echo stage",
                 where=path,
-                expected=f"the echo of the monostatic pair of {node}",
+                expected=f"the echo stage of the monostatic pair of {node}",
                 remedy="Run `apertura run CAMPAIGN --until echo` first.",
             )
         history = _thinned(PairEcho.opened(campaign, flight, f"{node}-{node}").stage)
@@ -140,12 +145,12 @@ def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
 
 
 def _thinned(history: xr.Dataset) -> xr.Dataset:
-    """Reduce the pulses to at most `MOST_PULSES`, evenly spread."""
+    """Reduce a history to at most `MOST_PULSES` evenly spread pulses."""
     return history.isel(pulse=slice(None, None, -(-history.sizes["pulse"] // MOST_PULSES)))
 
 
 def _wave_speed(campaign: Campaign, log: NodeLog) -> float:
-    """Return the wave speed for the whole log, because the recorded part of it is unknown before alignment."""
+    """Return the wave speed for the whole log, because the recorded part of the log is unknown before alignment."""
     times = log.track.time.values[log.checked.kept]
     times = times[:: -(-len(times) // MOST_PULSES)][1:-1]
     aperture = Aperture(log.antenna("radar_tx", times), log.antenna("radar_rx", times))
@@ -174,19 +179,20 @@ def align(
     search_m: float = 10.0,
     drift: bool = False,
 ) -> tuple[Alignment, dict[str, Any]]:
-    """Estimate the alignment of a recorder with its log; return it also as values for the campaign's config.
+    """Estimate the alignment of a recorder with its log; return the alignment, and values for the campaign's config.
 
     Parameters
     ----------
     campaign, flight, node
         Campaign, flight and a node of a monostatic pair.
     point
-        Easting, northing in the scene's CRS and ellipsoidal height (z in a local frame) of a reflector, metres; None
-        maximises the sharpness of the scene instead.
+        Easting and northing in the scene's CRS and ellipsoidal height (z in a local frame) of a reflector, metres.
+        None: the sharpness of the scene is maximised instead.
     search_s
-        Maximum clock offset, seconds; None: `NEAR_S`, or any overlap for a free-running clock.
+        Maximum difference from the configured clock offset, seconds. None: `NEAR_S`, or, for a free-running clock, all
+        offsets at which recording and log overlap.
     search_m
-        Maximum path offset, metres of total path; 0 uses the configured one.
+        Maximum path offset, metres of total path; 0: the configured path offset is used.
     drift
         Estimate the drift of the recorder's clock as well; requires a reflector.
 
@@ -200,7 +206,7 @@ def align(
     Raises
     ------
     CampaignError
-        If nothing can be estimated.
+        If the alignment cannot be estimated.
     """
     if drift and point is None:
         raise CampaignError(
@@ -225,8 +231,8 @@ def align(
         raise CampaignError(
             str(error),
             where=campaign.root / "raw" / flight,
-            expected="a recording within the times of the log of its node",
-            remedy="Check that recording and log belong together, and nodes.<node>.log.",
+            expected="a recording within the time span of its node's log",
+            remedy="Check that recording and log are of the same flight, and check nodes.<node>.log.",
         ) from error
     offset = Decimal(inputs.offset_ns(alignment.offset_s)).scaleb(-9)
     values = {"offset_s": str(offset), "drift_ppm": round(inputs.applied_ppm + alignment.drift_ppm, 4)}
@@ -255,7 +261,7 @@ def write_clock(
 
 
 def print_alignment(campaign: Campaign, flight: str, node: str, *, write: bool, **options: Any) -> None:
-    """Align, print the result and the lines for the config, and with `write` write clocks.tsv."""
+    """Estimate the alignment; print the result and the lines for the config, and write clocks.tsv if `write` is set."""
     alignment, values = align(campaign, flight, node, **options)
     path_text = f"path offset {values['path_offset_m']:.4f} m"
     path_text += f" ± {alignment.path_width_m:.4f} m" if options["search_m"] > 0 else " (configured, not measured)"
@@ -292,7 +298,7 @@ def _search_range(inputs: Unaligned, search_s: float | None) -> tuple[float, flo
 
 
 def _crs(campaign: Campaign, inputs: Unaligned) -> str:
-    """Return the CRS of `point`; for `auto`, that of a finished scene stage, or else the UTM zone of the log."""
+    """Return the CRS of `point`; for `auto`, the CRS of a finished scene stage, or else the UTM zone of the log."""
     if campaign.settings.scene.crs != "auto":
         return campaign.settings.scene.crs
     if manifest_of(campaign.result("scene.json")).is_file():
@@ -309,7 +315,7 @@ def _scene(campaign: Campaign) -> tuple[SceneGrid, FlatGround]:
             "crs, bounds_m or spacing_m is auto",
             where=f"{CONFIG}: scene",
             expected="a configured scene, because automatic settings require an aligned clock",
-            remedy="Configure them, or give the position of a reflector with --point.",
+            remedy="Configure these keys, or give the position of a reflector with --point.",
         )
     bounds_m, spacing_m = settings.bounds_m, settings.spacing_m
     grid = SceneGrid.from_bounds(settings.crs, bounds_m, spacing_m=spacing_m)  # type: ignore[arg-type]

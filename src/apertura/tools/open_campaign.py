@@ -25,7 +25,7 @@ _OF_THE_CAMPAIGN = {"cube", "terrain"}
 
 @dataclass(frozen=True)
 class OpenCampaign:
-    """A validated campaign folder with its results, which are read on first use.
+    """A validated campaign folder with its results, which are read on access.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class OpenCampaign:
         return open_scene(self.campaign)
 
     def stage(self, name: str, *where: str) -> "xr.Dataset":
-        """Open a finished stage lazily; `transfer` of an echo stage is computed from the recording when it is read.
+        """Open a finished stage lazily; `transfer` of an echo stage is computed from the recording on access.
 
         Parameters
         ----------
@@ -66,7 +66,7 @@ class OpenCampaign:
         Raises
         ------
         CampaignError
-            If there is no such stage, flight, node or pair, or the stage is not finished or was modified.
+            If the stage, flight, node or pair does not exist, or the stage is not finished or was modified.
         """
         _check_name(name, "stage", STAGES, where="campaign.stage")
         if name in _OF_THE_CAMPAIGN:

@@ -45,11 +45,14 @@ from apertura.stages.scene import OpenScene, open_scene
 from apertura.workflow.stale import stale_results
 
 REACH_CELLS = 2.0
-"""Search radius about a reflector's position, resolution cells, in addition to three standard deviations of it."""
+"""Search radius about a reflector's position, resolution cells; three standard deviations of the position are added."""
 
 _ODD = {"HH", "VV", "LR", "RL"}
 RETURNED = {"trihedral": _ODD, "sphere": _ODD, "dihedral": {"HH", "VV", "LL", "RR"}}
-"""Polarisations (transmitted, received) returned by each kind: each reflection reverses circular polarisation."""
+"""Polarisations (transmitted, received) in which each kind returns an echo.
+
+Each reflection reverses the sense of circular polarisation.
+"""
 
 _LEAST_CHANCE = 0.0027  # significance level of the test for disagreeing reflectors: three standard deviations
 _CONVERGED_PX = 1e-4  # step in pixels at which the search for the focused position of a reflector stops
@@ -66,13 +69,14 @@ class Measurement:
     flight, pair, reflector
         Names of flight, pair and reflector.
     constant_db, scatter_db, common_db
-        10 lg K, and its standard deviations: independent for each image, and common to all images of the reflector.
+        10 lg K, and two standard deviations: of errors independent in each image, and of errors common to all images of
+        the reflector.
     phase_rad, phase_scatter_rad
         Phase of the peak relative to that expected from the reflector's position, and its standard deviation.
     gradient
         Gradient of the path with respect to position, mean over the pulses, metres per metre.
     profile_noise
-        Noise power of a pulse, per Σw² of the window.
+        Noise power of a pulse, divided by Σw² of the window.
     report
         Values for the file.
     """
@@ -91,7 +95,7 @@ class Measurement:
 
 
 def measured_constants(campaign: Campaign) -> tuple[Constants, list[str]]:
-    """Measure the constants of a finished campaign's pairs; return also a line for each excluded reflector.
+    """Measure the constants of a finished campaign's pairs; also return a line for each excluded reflector.
 
     Raises
     ------
@@ -136,7 +140,7 @@ def measured_constants(campaign: Campaign) -> tuple[Constants, list[str]]:
             where=campaign.root,
             expected=f"a peak {decibels(LEAST_CONTRAST):.0f} dB above its surroundings, within "
             f"{REACH_CELLS:g} resolution cells of a reflector's position",
-            remedy="Check scene.reflectors, or fly closer to them.",
+            remedy="Check scene.reflectors, or fly closer to the reflectors.",
         )
     reference = measurements[0].pair
     pairs = {
@@ -191,7 +195,7 @@ class _View:
         rcs_m2, formula_db = reflector.seen(to_tx, to_rx, part, self.opened.frequency_hz)
         bistatic_deg = float(np.degrees(np.arccos(np.clip((to_tx * to_rx).sum(axis=-1), -1, 1))).max())
         if not np.isfinite(rcs_m2):
-            return f"bistatic angle up to {bistatic_deg:.0f}°, too large for a {stated.kind} of its size"
+            return f"bistatic angle up to {bistatic_deg:.0f}°, too large for a {stated.kind} of this size"
         if not rcs_m2 > 0:
             return "not oriented towards the antennas"
         path_m = pulses.path(position)
@@ -269,7 +273,7 @@ class _View:
     def _focused(
         self, pulses: Aperture, path_m: NDArray[np.float64], part: NDArray[np.float64], start: tuple[Any, Any]
     ) -> tuple[float, float]:
-        """Return the pixel whose path fits the target's path over the pulses best, by Gauss-Newton iteration.
+        """Return the pixel whose path over the pulses best fits the target's path, by Gauss-Newton iteration.
 
         The result is NaN if the iteration leaves the DEM.
         """
@@ -290,7 +294,10 @@ class _View:
     def _response(
         self, pulses: Aperture, path_m: NDArray[np.float64], part: NDArray[np.float64], row: float, column: float
     ) -> complex:
-        """Return the complex pixel amplitude of a target of 1 m² with the given paths, for K = 1: eq. 15."""
+        """Return the complex pixel amplitude of a target of 1 m² with the given paths, for K = 1.
+
+        Source: docs/theory/radiometry.md, eq. 15.
+        """
         k = 2 * np.pi * centre_frequency(self.opened.frequency_hz) / self.opened.wave_speed_m_s
         phasors = np.exp(-1j * k * (path_m - pulses.path(self._pixel_position(row, column))))
         return complex((part * phasors).sum())
@@ -391,7 +398,7 @@ def _flags(mean: Mean, unit: str) -> dict[str, str]:
 
 
 def _with_drift(pairs: Mapping[str, PairConstant], previous: Constants) -> Iterator[tuple[str, PairConstant]]:
-    """Yield the constants of pairs, with a flag if they drifted since those used by the campaign."""
+    """Yield the constants of pairs, flagged if they differ significantly from the constants used by the campaign."""
     for pair, constant in pairs.items():
         earlier = previous.pairs.get(pair)
         if earlier is None or earlier.radar.differs(constant.radar):
@@ -410,7 +417,7 @@ def write_constants(campaign: Campaign, to: Path | None = None) -> Path:
     Raises
     ------
     CampaignError
-        If nothing can be measured, images are out of date, or the file is the one that the campaign itself uses.
+        If no reflector can be measured, images are out of date, or the campaign itself uses the file.
     """
     path = campaign.root / FILE if to is None else to
     used = campaign.calibration_file
@@ -419,7 +426,7 @@ def write_constants(campaign: Campaign, to: Path | None = None) -> Path:
             "the file used by processing.radiometric_calibration",
             where=path,
             expected="a different file, because the measured constants are compared with it",
-            remedy="Name one with --to.",
+            remedy="Specify a different file with --to.",
         )
     images = {
         campaign.manifest("image", flight.name, pair) for flight in campaign.image_flights for pair in flight.pairs

@@ -1,4 +1,4 @@
-"""Creation of a campaign folder from plain arrays and files, with validation before it gets its final name."""
+"""Creation of a campaign folder from plain arrays and files; the folder is validated before it gets its final name."""
 
 import shutil
 from collections.abc import Mapping
@@ -30,12 +30,12 @@ class RecordedNode:
     ----------
     samples
         I and Q, (sample, channel, 2) or (capture, sample, channel, 2) of int8, int16, int32 or float32; or the path of
-        such an array as .npy, or of a file of int16, little-endian, channels interleaved per sample.
+        a .npy file with such an array, or of a file of little-endian int16 samples with interleaved channels.
     time_utc
         (capture,) datetime64 or ISO 8601, UTC: the node's own time tag of the first sample of each capture.
     track
         (epoch, 3) float64: WGS 84 latitude (deg), longitude (deg), ellipsoidal height (m); or the path of a flight log,
-        which is copied with its suffix.
+        whose copy keeps the suffix.
     track_utc
         (epoch,) datetime64 or ISO 8601, UTC; None with a flight log.
     attitude_deg
@@ -67,7 +67,7 @@ class RecordedFlight:
     transmitter
         Name of the transmitting node.
     nodes
-        Node → recording, including the transmitter's.
+        Node → recording, including the transmitting node.
     kind
         image or calibration.
     """
@@ -89,7 +89,7 @@ def write_campaign(
     Parameters
     ----------
     directory
-        Folder to create; it must not exist, or must be empty.
+        Folder to create; an existing folder must be empty.
     config
         Contents of config/config.yaml: campaign, waveform, nodes, scene and all other keys without default values.
     flights
@@ -155,7 +155,7 @@ def _write_node(stem: Path, recorded: RecordedNode, waveform: SampledWaveform) -
     frame = [None] * len(time) if recorded.frame is None else np.asarray(recorded.frame).tolist()
     if not len(time) == len(start) == len(frame):
         found = f"{len(time)} time tags, {len(start)} starts and {len(frame)} frame numbers"
-        raise _wrong(stem, found, "one of each for every capture")
+        raise _wrong(stem, found, "one time tag, one start and one frame number for each capture")
     flat = samples.reshape(-1, *samples.shape[-2:])
     write_recording(
         stem,
@@ -193,9 +193,9 @@ _SLOWEST_M_S, _FASTEST_M_S = 1.0, 120.0  # range of ground speeds of an image fl
 def _check_degrees(stem: Path, recorded: RecordedNode, scene: Scene) -> None:
     """Raise CampaignError if latitude and longitude of a track are in radians.
 
-    Interpreted as degrees, they lie in the Gulf of Guinea, where there is no land, and distances are 57 times too
-    short. A track there is refused if it fits the scene (or, without a georeferenced scene, the speed of a flight) only
-    when interpreted as radians.
+    Radians interpreted as degrees give positions in the Gulf of Guinea, where there is no land, and distances that are
+    57 times too short. A track there is refused if only its interpretation as radians fits the scene (or, without a
+    georeferenced scene, the speed of a flight).
     """
     track = recorded.track
     if isinstance(track, str | Path) or (np.abs(np.asarray(track)[:, :2]) > _LARGEST_RAD).any():
@@ -219,7 +219,8 @@ def _check_degrees(stem: Path, recorded: RecordedNode, scene: Scene) -> None:
         evidence = f"the median speed is {speeds[1]:.3g} m/s instead of {speeds[0]:.2g} m/s"
     if fits == [False, True]:
         latitude, longitude = angles[0, :2]
-        found = f"latitude {latitude:.6g}, longitude {longitude:.6g}, apparently in radians, for which {evidence}"
+        coordinates = f"latitude {latitude:.6g}, longitude {longitude:.6g}"
+        found = f"{coordinates}, apparently in radians: read as radians, {evidence}"
         raise _wrong(stem, found, "degrees (for a flight at this position, configure scene.crs and scene.bounds_m)")
 
 
@@ -274,7 +275,7 @@ def _times(given: ArrayLike | None, stem: Path, name: str) -> NDArray[np.datetim
 
 
 def _check_opens(campaign: Campaign, flights: Mapping[str, RecordedFlight]) -> None:
-    """Raise CampaignError if the written campaign cannot be read, or its time tags differ from the given ones."""
+    """Raise CampaignError if the written campaign cannot be read, or its time tags differ from the given time tags."""
     for flight in campaign.flights:
         for node in flight.participants:
             recording = open_recording(campaign.recording_files(flight.name, node))
@@ -282,7 +283,7 @@ def _check_opens(campaign: Campaign, flights: Mapping[str, RecordedFlight]) -> N
             recording.cut(recording.captures, node=node)
             stem, given = campaign.root / "raw" / flight.name / node, flights[flight.name].nodes[node]
             if not np.array_equal(recording.captures.time, _times(given.time_utc, stem, "time_utc")):
-                raise _wrong(stem, "written time tags that differ from the given ones", "unchanged time tags")
+                raise _wrong(stem, "written time tags that differ from the given time tags", "unchanged time tags")
             read_log(campaign, flight.name, node)
 
 

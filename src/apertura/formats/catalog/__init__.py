@@ -1,4 +1,4 @@
-"""Metadata of the results for other programs: a STAC catalog for search, an RO-Crate for provenance."""
+"""Metadata of the results for other programs: a STAC catalog for searching, and an RO-Crate for provenance."""
 
 CATALOG = "catalog.json"
 """Root file of the STAC catalog, in its folder."""

@@ -52,7 +52,7 @@ class CrateJob:
     settings
         Settings that affect the job.
     sources
-        Names of its sources: results, named by their manifests (``results/…``), and inputs.
+        Names of the job's sources: results, identified by their manifests (``results/…``), and inputs.
     files
         Output files, manifests last.
     doubts
@@ -114,7 +114,7 @@ class CrateRun:
 # name and hash: a crate must not refer to files above its root, and results are shared without their recordings.
 
 WORKFLOW = "workflow/Snakefile"
-"""Path of the workflow in the crate; its rules are in a subfolder."""
+"""Path of the workflow in the crate; the rules of the workflow are in a subfolder."""
 
 _CRATE_SPEC = "https://w3id.org/ro/crate/1.1"
 _WORKFLOW_CRATE = "https://w3id.org/workflowhub/workflow-ro-crate/1.0"
@@ -172,9 +172,9 @@ def input_id(name: str) -> str:
 def _root(run: CrateRun, parts: Sequence[str], actions: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     description = (
         f"Images of the campaign {run.campaign}, with every processing step from its recordings to the images. "
-        "Recordings and config are listed by hash; the files are in the parent folder. Actions have no times, and "
-        "datePublished is the time of the last recorded pulse: the same recordings, settings and code give the same "
-        "crate at any time. Versions are those of the installation that wrote the crate."
+        "Recordings and config are listed with their hashes; the files are in the parent folder. Actions have no "
+        "times, and datePublished is the time of the last recorded pulse, so that the same recordings, settings and "
+        "code always give the same crate. Versions are those of the installation that wrote the crate."
     )
     return {
         "name": run.campaign,
@@ -204,7 +204,7 @@ def _software(run: CrateRun) -> Iterator[dict[str, Any]]:
             "@id": _LICENCE,
             "@type": "CreativeWork",
             "name": "not stated",
-            "description": "No licence is configured (metadata.licence): ask the owner of the recordings.",
+            "description": "No licence is configured (metadata.licence); ask the owner of the recordings.",
         }
     if run.author:
         yield {"@id": _AUTHOR, "@type": "Person", "name": run.author}
@@ -221,7 +221,7 @@ def _software(run: CrateRun) -> Iterator[dict[str, Any]]:
 
 
 def _steps(run: CrateRun) -> Iterator[dict[str, Any]]:
-    """Yield the workflow, its steps and their tools, one tool for each rule and version of executed code."""
+    """Yield the workflow, its steps, and their tools: one tool for each rule and each version of its executed code."""
     tools: dict[str, dict[str, str]] = {}
     for job in run.jobs:
         tools.setdefault(job.rule, {})[_tool(job)] = job.code_sha256
@@ -301,7 +301,7 @@ def _jobs(run: CrateRun) -> Iterator[dict[str, Any]]:
 
 
 def _data(run: CrateRun) -> tuple[list[str], list[dict[str, Any]]]:
-    """Return the identifiers of the entities in the root, and the entities of all files and stages."""
+    """Return the identifiers of the entities in the crate's root, and the entities of all files and stages."""
     stages: dict[str, list[str]] = {}
     tops, entities = [], []
     for listed in [*run.workflow, *(file for job in run.jobs for file in job.files)]:
@@ -342,7 +342,7 @@ def _tool(job: CrateJob) -> str:
 
 
 def _stage(file: Listed) -> str | None:
-    """Return the identifier of the stage that contains a file; None if there is none."""
+    """Return the identifier of the stage that contains a file; None if no stage contains it."""
     name, inner, _ = file.name.partition(".zarr/")
     return quote(f"{name}.zarr/") if inner else None
 
@@ -379,7 +379,7 @@ class CrateFile:
 
 
 def recorded_files(root: Path, *, inputs: bool = True) -> dict[str, CrateFile]:
-    """Return the files whose hashes a crate lists, by their names in the crate; the files are not opened.
+    """Return the files whose hashes are listed in a crate, by their names in the crate; the files are not opened.
 
     Parameters
     ----------

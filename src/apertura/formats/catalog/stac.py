@@ -30,7 +30,7 @@ EXTENSIONS: Mapping[str, str] = {
     "sar": f"{_BASE}/sar/v1.3.0/schema.json",
     "view": f"{_BASE}/view/v1.1.0/schema.json",
 }
-"""Prefix of the fields → URI of the schema, used as identifier only; nothing is downloaded."""
+"""Prefix of the fields → URI of the schema, which is used only as an identifier and is not downloaded."""
 
 _BANDS_GHZ = {
     "P": (0.25, 1.0),
@@ -190,7 +190,7 @@ class FileFacts:
 
 
 def multihash(sha256: str) -> str:
-    """Format a SHA-256 as multihash for the file extension: code of the hash, length in bytes, hash.
+    """Format a SHA-256 as a multihash for the file extension: code of the hash function, length in bytes, hash.
 
     Examples
     --------
@@ -274,7 +274,7 @@ def asset_of(path: Path, href: str, *, sha256: str, facts: FileFacts) -> pystac.
 RECORDED = "apertura:recorded"
 """Field of the catalog: UTC of the first and the last pulse of all images."""
 
-_NO_PLACE = "Local frame, not georeferenced: items have no geometry, and there is no collection, which requires one."
+_NO_PLACE = "Local frame, not georeferenced: items have no geometry, which a STAC collection would require."
 
 
 @dataclass(frozen=True)
@@ -298,7 +298,7 @@ class Image:
     inputs
         File relative to the campaign folder → SHA-256 of its content when it was read.
     made_from
-        Names of the flight's images that are summed in this image.
+        Names of the flight's images of which this image is the sum.
     """
 
     flight: str
@@ -313,7 +313,7 @@ class Image:
 
     @property
     def id(self) -> str:
-        """Identifier, unique because names contain no hyphen except that of a pair."""
+        """Identifier, which is unique because no name contains a hyphen except the hyphen of a pair."""
         return f"{self.flight}-{self.name}"
 
 
@@ -394,7 +394,7 @@ def catalog_files(
 ) -> dict[str, dict[str, Any]]:
     """Return all files of the catalog of images: path in the catalog's folder → JSON.
 
-    Links are relative and there are no self links, so that the folder may be moved or served from any location.
+    Links are relative, and self links are omitted, so that the folder can be moved, or served from any location.
 
     Parameters
     ----------
@@ -429,7 +429,7 @@ def catalog_files(
 
 
 def _layout() -> CustomLayoutStrategy:
-    """Return the file layout: catalog.json and the parent of the items in one folder, images/<flight>/<image>.json."""
+    """Return the file layout: catalog.json and the parent of the items in one folder; images/<flight>/<image>.json."""
 
     def path_of(item: pystac.Item, folder: str) -> str:
         flight, _, name = item.id.partition("-")

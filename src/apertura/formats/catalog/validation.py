@@ -1,4 +1,4 @@
-"""Validation of a static STAC catalog against the schemas of pystac and of this package; nothing is downloaded."""
+"""Validation of a static STAC catalog against the schemas of pystac and of this package, without network access."""
 
 import json
 from collections.abc import Iterator

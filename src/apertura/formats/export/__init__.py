@@ -1,9 +1,9 @@
 """Table of export products for other programs: one module per format, one row per file.
 
-A row states the name of the file, its source raster and the function that writes it. Workflow rules, steps and tests
-are all derived from these rows. To add a product, write a function such as `apertura.formats.export.cog.write_power`
-and add its row to `EXPORTS`; or, from another package, register an `Export` as entry point of group
-``apertura.exports``. Importing this module imports no format.
+A row contains the name of a file, its source raster and the function that writes the file. Workflow rules, steps and
+tests are derived from these rows. To add a product, write a function such as `apertura.formats.export.cog.write_power`
+and add a row to `EXPORTS`; or, from another package, register an `Export` as an entry point of the group
+``apertura.exports``. Importing this module does not import the modules of the formats.
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -46,13 +46,13 @@ SOURCES: Mapping[str, str] = {
 }
 """Source raster of a file → kind of folder that contains the file.
 
-``image`` is the complex image of a pair. ``coherent`` is the complex sum and ``noncoherent`` the power sum of a
-flight's pairs, the latter as complex amplitude without phase; ``magnitude`` is the sum of their magnitudes. Layers are
-real rasters that describe the image of a pair, in the same folder. Rasters of radiometry exist for calibrated pairs, in
-the folder of the layers; they are complex amplitudes whose power is the named coefficient. Rasters of multilook exist
-if requested; they contain the mean power of square blocks of pixels, on a coarser grid. ``multilook_noise`` is the mean
-noise power that is subtracted from the echo power. Rasters of an interferogram belong to two images; ``panels`` is a
-mapping of all of them by name.
+``image`` is the complex image of a pair. ``coherent`` is the complex sum of a flight's pairs, and ``noncoherent`` their
+power sum, stored as complex amplitude without phase. ``magnitude`` is the sum of the magnitudes of the pairs. Layers
+are real rasters that describe the image of a pair, and are stored in the folder of that image. Rasters of radiometry
+exist for calibrated pairs, in the same folder; their values are complex amplitudes whose power is the named
+coefficient. Rasters of multilook exist if requested; their values are the mean power of square blocks of pixels, on a
+coarser grid. ``multilook_noise`` is the mean noise power that is subtracted from the echo power. Rasters of an
+interferogram are computed from two images; ``panels`` is a mapping from their names to these rasters.
 """
 
 
@@ -70,9 +70,9 @@ class Export:
         Function that writes the file, ``write(path, raster, transform=…, crs=…, tags=…, title=…)``; see
         `apertura.formats.export.cog.write_slc`.
     pictured
-        True if the workflow report contains the file as a picture.
+        True if the workflow report shows the file.
     opened
-        Hint for opening the file, shown in the summary; empty: the summary does not list the file.
+        Hint on opening the file, printed in the summary; empty: the file is not listed in the summary.
     mosaicked
         True if the rasters of all flights are mosaicked; GDAL cannot mosaic complex rasters.
     """
@@ -181,19 +181,19 @@ EXPORTS: tuple[Export, ...] = (
 )
 """All products of a pair or of a flight's sums, in the order in which they are written."""
 
-_OPTIONAL = ("radiometry", "multilook", "multilook_fused")  # kinds whose rows are only written if requested
+_OPTIONAL = ("radiometry", "multilook", "multilook_fused")  # kinds whose files are written only if requested
 
 PHASE_HISTORY = "phase_history.cphd"
-"""Product with the transfer functions of a pair; written only if requested, as the file is as large as the echo."""
+"""Product with the transfer functions of a pair; written only if requested, because it is as large as the echo."""
 
 COVERAGE = ("coverage.png", "coverage.geojson")
-"""Files with the coverage of the whole campaign, a plot and GeoJSON."""
+"""Plot and GeoJSON file of the coverage of the whole campaign."""
 
 MOSAICS = "mosaic"
 """Folder of the mosaics of all flights."""
 
 PREVIEW = "preview"
-"""Folder of the images of `apertura preview`, laid out like the results."""
+"""Folder of the images of `apertura preview`, with the layout of the results."""
 
 MAP = "map/map.json"
 """Description of the web map of `apertura map`."""
@@ -227,7 +227,7 @@ def product(source: str, function: str) -> Export:
 
 
 def export_modules(folder: str) -> list[str]:
-    """List the modules that write the files of a kind of folder; the files are out of date if their code changes.
+    """List the modules that write the files of a kind of folder; if their code changes, the files are out of date.
 
     Examples
     --------
@@ -246,7 +246,7 @@ def mosaics(images: Mapping[str, Sequence[str]], coefficients: Sequence[str] = (
     Parameters
     ----------
     images
-        Flight → its images, as in `product_files`; the lowest flight first.
+        Flight → its images, as in `product_files`; the bottom flight of the mosaic first.
     coefficients
         Sources of kinds ``radiometry`` and ``multilook`` that are written.
 
@@ -274,7 +274,7 @@ def mosaic_files(images: Mapping[str, Sequence[str]], coefficients: Sequence[str
 
 
 def _written(image: str, coefficients: Sequence[str]) -> Iterator[Export]:
-    """Yield the rows of the files in the folder of an image; of optional kinds, only the rows of `coefficients`."""
+    """Yield the rows of the files in the folder of an image; for optional kinds, only the rows of `coefficients`."""
     kinds = ("fused", "multilook_fused") if image == "fused" else ("pair", "layers", "radiometry", "multilook")
     rows = (row for kind in kinds for row in exports_in(kind))
     return (row for row in rows if SOURCES[row.source] not in _OPTIONAL or row.source in coefficients)
@@ -323,7 +323,7 @@ def write_exports(
     folder
         Output folder.
     rasters, titles
-        Source → (y, x) raster on the campaign's grid, and its title; of kinds ``radiometry`` and ``multilook``, only
+        Source → (y, x) raster on the campaign's grid, and its title; for kinds ``radiometry`` and ``multilook``, only
         the requested sources.
     tags
         Tags of every file, name → text.
@@ -344,7 +344,7 @@ def write_exports(
 
 
 def remove_outdated(folder: Path, written: Collection[Path]) -> None:
-    """Remove optional rasters and cross-sections in a folder that were written by an earlier run only."""
+    """Remove optional rasters and cross-sections from a folder if they are left from an earlier run."""
     rows = [row.file for kind in _OPTIONAL for row in exports_in(kind)]
     mosaicked = [f"{name.removesuffix('.tif')}.vrt" for name in rows if name.endswith(".tif")]
     for name in (*rows, *mosaicked, CROSS_SECTIONS):

@@ -35,7 +35,7 @@ from apertura.formats.export.writing import (
     gdal_replacement,
 )
 
-BLOCK = 512  # pixels along a side of a COG tile; overviews halve the raster until it fits into one tile
+BLOCK = 512  # pixels along a side of a COG tile; each overview halves the raster, until it fits into one tile
 
 Pixels = NDArray[Any]
 
@@ -86,8 +86,8 @@ def write_slc(
 ) -> None:
     """Write the complex image unchanged, with carrier phase, as a CFloat32 COG.
 
-    Overviews contain the mean magnitude and the phase of the mean: as the carrier phase changes from pixel to pixel,
-    pixels cancel in a complex mean.
+    Overviews contain the mean magnitude and the phase of the complex mean. The magnitude of the complex mean is not
+    used, because the carrier phase changes from pixel to pixel, so that pixels would cancel.
 
     Parameters
     ----------
@@ -131,23 +131,23 @@ def write_slc(
 def write_power(
     path: Path, image: NorthUpRaster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write |image|² as a float32 COG with overviews of averaged power. Parameters and errors as `write_slc`."""
+    """Write |image|² as a float32 COG with overviews of averaged power. Parameters and errors as in `write_slc`."""
     write_cog(path, image, POWER, transform=transform, crs=crs, tags=tags, title=title, value=power)
 
 
 def write_magnitude(
     path: Path, image: NorthUpRaster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write a real raster of magnitudes as a float32 COG. Parameters and errors as `write_slc`."""
+    """Write a real raster of magnitudes as a float32 COG. Parameters and errors as in `write_slc`."""
     write_cog(path, image, MAGNITUDE, transform=transform, crs=crs, tags=tags, title=title)
 
 
 def write_mean_power(
     path: Path, power: NorthUpRaster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write a multilooked power, (y, x) float32, negative where the subtracted noise power exceeds it.
+    """Write a multilooked power, (y, x) float32; negative where the subtracted noise power exceeds the echo power.
 
-    Parameters and errors as `write_slc`.
+    Parameters and errors as in `write_slc`.
     """
     write_cog(path, power, POWER, transform=transform, crs=crs, tags=tags, title=title, value=only("float32"))
 
@@ -221,7 +221,7 @@ def only(dtype: str) -> Callable[[Pixels], Pixels]:
 
 
 def with_radiometry(band: Band, tags: Mapping[str, str]) -> tuple[Band, dict[str, str]]:
-    """Add the meaning of pixel values, from the tag `TAG` of the source raster, to a band and to the tags.
+    """Add the meaning of pixel values, from the tag `TAG` of the source raster, to the band and to the tags.
 
     Parameters
     ----------
@@ -265,10 +265,10 @@ def placed(image: NorthUpRaster, transform: Affine, crs: str) -> dict[str, Any]:
 
 
 def halved(pixels: Pixels, band: Band) -> Pixels:
-    """Resample pixels to half the resolution, from the valid pixels of groups of two by two, fewer at an odd edge.
+    """Resample pixels to half the resolution, from the valid pixels of groups of 2 × 2 pixels (fewer at an odd edge).
 
-    The result is their mean (AVERAGE), their mean magnitude with the phase of their mean (AVERAGE_MAGPHASE), their most
-    frequent value, the first one of equally frequent values (MODE), or the first pixel (NEAREST).
+    The result is the mean (AVERAGE), the mean magnitude with the phase of the mean (AVERAGE_MAGPHASE), the most
+    frequent value, or the first of equally frequent values (MODE), or the first pixel of each group (NEAREST).
 
     Examples
     --------
@@ -292,7 +292,7 @@ def halved(pixels: Pixels, band: Band) -> Pixels:
 
 
 def _mean(four: Sequence[Pixels], nodata: float) -> Pixels:
-    """Return the mean of the valid pixels of each group of four; no data if there are none."""
+    """Return the mean of the valid pixels of each group of four; nodata if the group has no valid pixel."""
     if not np.isnan(nodata):
         valid_mean = _mean([np.where(values == nodata, np.nan, values) for values in four], np.nan)
         return np.asarray(np.where(np.isnan(valid_mean), nodata, valid_mean))
@@ -307,7 +307,7 @@ def _mean(four: Sequence[Pixels], nodata: float) -> Pixels:
 
 
 def _commonest(four: Sequence[Pixels], nodata: float) -> Pixels:
-    """Return the most frequent value of the valid pixels of each group of four; no data if there are none."""
+    """Return the most frequent value of the valid pixels of each group of four; nodata without a valid pixel."""
     if all((values == four[0][0, 0]).all() for values in four):
         return four[0]
     mode, most = np.full_like(four[0], nodata), np.zeros(four[0].shape, np.uint8)
@@ -327,7 +327,7 @@ def _fill(
 ) -> int:
     """Write a tiled GeoTIFF with tags and its overviews block by block; return a checksum of its pixels.
 
-    Overviews are computed from the blocks in memory, because GDAL reads the blocks again and takes several times as
+    Overviews are computed from the blocks in memory. GDAL would read the blocks again, which takes several times as
     long.
     """
     checksum, shape = 0, (georeference["height"], georeference["width"])

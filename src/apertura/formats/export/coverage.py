@@ -26,7 +26,7 @@ MARGIN = 0.04
 
 _NAMED = 8  # largest number of flights that are distinguished by colours
 _HALF_DEG = 180.0  # a larger difference of longitude between neighbours indicates the antimeridian
-_SMALL = 0.25  # size relative to the longer side of the map, below which the scene gets an additional map
+_SMALL = 0.25  # size relative to the longer side of the map below which an additional map of the scene is plotted
 _COLOURS = tuple(colormaps["tab10"](number) for number in range(10))
 
 Ring = NDArray[np.float64]
@@ -103,7 +103,7 @@ def feature_collection(
         Georeference of the looks on the map.
     place
         Function from map coordinates (n, 3), metres, to longitude and latitude (deg, WGS 84) and height (m), (n, 3);
-        None if the map is not georeferenced: geometries are then null.
+        None if the map is not georeferenced; geometries are then null.
     height_m
         Height of the footprints, for `place`.
     """
@@ -149,7 +149,7 @@ def placed_footprint(
     polygons = [[placed(ring) for ring in rings] for rings in footprint(looks, transform)]
     if not any(np.ptp(ring[:, 0]) > _HALF_DEG for rings in polygons for ring in rings):
         return polygons
-    # For each side of the antimeridian, select the pixels that extend into it, and clip their vertices to it.
+    # For each side of the antimeridian, select the pixels that extend into that side, and clip their vertices to it.
     down, right = np.mgrid[: looks.shape[0] + 1, : looks.shape[1] + 1]
     corners = np.stack(transform @ (right.ravel(), down.ravel()), -1)
     offset_deg = (placed(corners)[:, 0] % 360 - _HALF_DEG).reshape(down.shape)
@@ -226,7 +226,7 @@ def write_coverage(
     path
         ``….png``; complete or absent.
     covered
-        Coverage of each pair; their looks have the same shape.
+        Coverage of each pair; the looks of all pairs have the same shape.
     transform
         Georeference of the looks on the map.
     crs_name
@@ -252,7 +252,7 @@ def write_coverage(
         if has_two_maps:
             maps.append(maps[0].beside(part))
         if counts.size > 1:
-            _draw(maps[1], pairs, transform, "YlGnBu", f"pairs that cover a pixel, of {len(covered)}", counts=True)
+            _draw(maps[1], pairs, transform, "YlGnBu", f"pairs per pixel, out of {len(covered)}", counts=True)
         elif small:
             _draw(maps[1], total, transform, "viridis", f"{looks_label}, scene only")
         for number, layout in enumerate(maps):
@@ -266,7 +266,7 @@ def write_coverage(
             samples = [Line2D([], [], color=_COLOURS[number]) for number in flights.values()]
             maps[0].draw_legend(samples, list(flights))
         share = f"{100 * float((pairs > 0).mean()):.1f} % of the scene is covered by {number_of(len(covered), 'pair')}"
-        each = f", every pixel by {counts[0]}" if len(covered) > 1 and counts.size == 1 else ""
+        each = f", every covered pixel by {counts[0]}" if len(covered) > 1 and counts.size == 1 else ""
         thick = ", thick: used for the image" if any(coverage.imaged_m for coverage in covered) else ""
         footprints = "footprints" if len(flights) <= _NAMED else "edge of the covered area"
         lines = f"lines: tracks (dashed: receiver{thick}) and {footprints}"
@@ -325,7 +325,7 @@ def _draw_lines(layout: MapLayout, covered: Sequence[Covered], transform: Affine
 def _draw_overview(
     layout: MapLayout, covered: Sequence[Covered], total: NDArray[np.float32], transform: Affine
 ) -> None:
-    """Draw the tracks of more than `_NAMED` flights in a single colour, and the edge of the area that they cover."""
+    """Draw the tracks of more than `_NAMED` flights in a single colour, and the edge of the area covered by them."""
     line: dict[str, Any] = {"color": "0.45", "alpha": 0.6, "linewidth": 0.7}
     for coverage in covered:
         for style, track_m in zip(("-", "--"), coverage.tracks_m.values(), strict=False):

@@ -19,7 +19,7 @@ from apertura.core.geometry.geodesy import geodetic_from_ecef
 
 
 PATH_LIMIT = "APERTURA_PATH_LIMIT"
-"""Per-vector parameter added to those of the standard: longest total path within the cyclic prefix, m."""
+"""Per-vector parameter in addition to those of the standard: longest total path within the cyclic prefix, m."""
 
 _OVERSAMPLED = 1.25
 """Oversampling of the frequencies relative to the swath; the standard requires 1.2."""
@@ -28,7 +28,7 @@ _RECORD = (
     *(("TxTime", 1), ("TxPos", 3), ("TxVel", 3), ("RcvTime", 1), ("RcvPos", 3), ("RcvVel", 3), ("SRPPos", 3)),
     *((name, 1) for name in ("aFDOP", "aFRR1", "aFRR2", "FX1", "FX2", "TOA1", "TOA2", "TDTropoSRP", "SC0", "SCSS")),
 )
-"""Per-vector parameters with number of components, in the order of the standard: sarkit writes them by position."""
+"""Per-vector parameters with number of components, in the order of the standard, because sarkit writes by position."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +93,7 @@ class CphdCollection:
 
     @property
     def troposphere_s(self) -> Floats:
-        """Tropospheric part of the reference delay, in excess of vacuum: (pulse,) float64, seconds."""
+        """Tropospheric part of the reference delay, in excess of the delay in vacuum: (pulse,) float64, seconds."""
         return self.reference_delay_s - self._point_path_m / SPEED_OF_LIGHT_M_S
 
     @property
@@ -103,7 +103,7 @@ class CphdCollection:
 
     @property
     def swath_s(self) -> tuple[float, float]:
-        """First and last delay of echoes in the samples, relative to that of the reference point, seconds.
+        """First and last delay of echoes in the samples, relative to the delay of the reference point, seconds.
 
         Both are limited by the frequency spacing and by the cyclic prefix.
         """

@@ -1,4 +1,4 @@
-"""Export of images in decibels, the product that most GIS users open first."""
+"""Export of images in decibels, the product for display in a GIS."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -58,9 +58,9 @@ def write_db(
 def write_mean_db(
     path: Path, power: NorthUpRaster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write 10 log10 of a multilooked power, (y, x) float32; NaN where it is not positive.
+    """Write 10 log10 of a multilooked power, (y, x) float32; NaN where the power is not positive.
 
-    Overviews contain the mean of all pixels in dB, including negative pixels. Otherwise as `write_db`.
+    Overviews contain the mean power of all pixels, including negative pixels, in dB. Otherwise as `write_db`.
 
     Examples
     --------
@@ -77,7 +77,7 @@ def write_mean_db(
 
 
 def decibels(linear: Pixels) -> Pixels:
-    """Convert power to decibels, NaN where it is not positive.
+    """Convert power to decibels; NaN where the power is not positive.
 
     Examples
     --------

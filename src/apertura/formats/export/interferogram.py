@@ -17,7 +17,7 @@ from apertura.formats.export.map_layout import DPI, PICTURE_DOTS, MapLayout
 from apertura.formats.export.quicklook import crs_name, footer
 
 PHASE = Band("float32", np.nan, "rad", "wrapped phase of the first image relative to the second", "NEAREST")
-COHERENCE = Band("float32", np.nan, "1", "coherence as estimated: see the tag APERTURA_CHANCE", "AVERAGE")
+COHERENCE = Band("float32", np.nan, "1", "estimated coherence; bias: see the tag APERTURA_CHANCE", "AVERAGE")
 UNWRAPPED = Band("float32", np.nan, "rad", "unwrapped topographic phase: see the tag APERTURA_LEVEL", "AVERAGE")
 HEIGHT = Band("float32", np.nan, "m", "terrain height in the CRS of the scene: see the tag APERTURA_LEVEL", "AVERAGE")
 HEIGHT_STD = Band("float32", np.nan, "m", "standard deviation of the height due to phase noise only", "AVERAGE")
@@ -40,7 +40,7 @@ def write_phase(
 def write_coherence(
     path: Path, magnitude: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write coherence as estimated, (y, x) float32, 0 to 1. Otherwise as `write_height`."""
+    """Write the estimated coherence, (y, x) float32, 0 to 1. Otherwise as `write_height`."""
     write_cog(path, magnitude, COHERENCE, transform=transform, crs=crs, tags=tags, title=title)
 
 
@@ -95,7 +95,7 @@ def write_panels(
         ``….png``; complete or absent.
     panels
         ``coherence``, ``unwrapped``, ``height`` and ``height_std``, (y, x) float32 on the same grid; NaN is white.
-        Panels with more pixels than the plot has dots are subsampled.
+        Panels with more pixels than can be displayed in the plot are subsampled.
     transform, crs, tags, title
         See `apertura.formats.export.quicklook.write_quicklook`.
     """

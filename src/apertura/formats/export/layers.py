@@ -11,7 +11,7 @@ from apertura.formats.export.cog import Band, NorthUpRaster, only, write_cog
 from apertura.formats.export.radiometry import TAG
 
 SHADOW, LAYOVER, OUTSIDE = 1, 2, 255
-"""Bits of the mask, and its value for pixels without pulses; pixels without shadow and layover are 0."""
+"""Bits of the mask, and value of pixels without pulses; pixels with neither shadow nor layover are 0."""
 
 CLASSES = {
     0: ("valid", (255, 255, 255)),

@@ -23,7 +23,7 @@ LEFT, RIGHT, TOP, BOTTOM = 1.0, 1.4, 0.85, 1.6  # margins around the image, inch
 LEAST_WIDTH, LEAST_HEIGHT = 4.2, 1.6  # minimum space for text and colour bar of a narrow or flat image, inch
 PART_HEIGHT = 3.2  # minimum height if a part of the map is plotted separately, inch
 LETTER = 0.073  # width of a character in the label of a colour bar, inch
-LONGEST_FLAG = 24  # longest flag name with comma, characters; by this number the first of two lines may be shorter
+LONGEST_FLAG = 24  # characters of the longest flag name with comma; maximum unused space at the end of a line
 
 Marker = tuple[float, float, str]
 
@@ -62,7 +62,7 @@ class MapLayout:
         part: tuple[float, float, float, float] | None = None,
         local: bool = False,
     ) -> "MapLayout":
-        """Create an empty layout in which the longer side of `bounds` is `LONGER_SIDE`, with space for `maps` maps.
+        """Create an empty layout in which the longer side of `bounds` is `LONGER_SIDE`, with space for all maps.
 
         The last map covers the bounds `part`, if given.
         """
@@ -155,7 +155,7 @@ class MapLayout:
             )
 
     def write_words(self, title: str, subtitle: str, footer: str) -> None:
-        """Write title and subtitle (up to two lines) above the image, and its provenance below."""
+        """Write title and subtitle (up to two lines) above the image, and the provenance of the image below."""
         width, height = self.figure.get_size_inches()
         room = (width - LEFT - 0.1) * 72 / 0.68  # width in points over the relative width of a bold character
         self._write(LEFT, height - 0.4, title, size=min(13, room / max(1, len(title))), weight="bold")
@@ -204,7 +204,7 @@ def flag_words(flags: Sequence[str], most: int) -> str:
 
 
 def round_origin(low_m: float, high_m: float) -> float:
-    """Return a round offset of coordinates at or below `low_m`; 0 if the coordinates have few digits without an offset.
+    """Return a round offset of coordinates at or below `low_m`; 0 for coordinates that are short without an offset.
 
     Examples
     --------

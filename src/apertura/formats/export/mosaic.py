@@ -1,4 +1,4 @@
-"""Mosaics of the same product of several flights as GDAL virtual rasters (VRT), which refer to the flights' files."""
+"""Mosaics of a product of several flights as GDAL virtual rasters (VRT), which refer to the files of the flights."""
 
 import json
 import os
@@ -19,12 +19,12 @@ _TYPES = {"uint8": "Byte", "float32": "Float32"}
 
 
 def write_mosaic(path: Path, rasters: Sequence[Path], *, title: str = "") -> None:
-    """Write a VRT of rasters on the same grid; where several rasters have data, the last of them is used.
+    """Write a VRT of rasters on the same grid; where several rasters have data, the last of these rasters is used.
 
     Parameters
     ----------
     path
-        ``….vrt``; complete or absent. Paths of the rasters are relative to it, so that the folder may be moved.
+        ``….vrt``; complete or absent. Paths of the rasters are relative to this file, so that the folder can be moved.
     rasters
         Real single-band files on the same grid; later files cover earlier ones.
     title
@@ -78,14 +78,15 @@ def write_mosaic(path: Path, rasters: Sequence[Path], *, title: str = "") -> Non
 
 
 def _opened(rasters: Sequence[Path]) -> tuple[dict[str, Any], dict[str, Any], list[str]]:
-    """Return the common grid and kind of the rasters, and the radiometry of each."""
+    """Return the common grid and kind of the rasters, and the radiometry of each raster."""
     layouts: list[tuple[dict[str, Any], dict[str, Any], dict[str, str]]] = []
     tags = []
     for path in rasters:
-        with opened_raster(path, expected="a raster written by the workflow", remedy="Run it again.") as raster:
+        remedy = "Run the workflow again."
+        with opened_raster(path, expected="a raster written by the workflow", remedy=remedy) as raster:
             grid = {"width": raster.width, "height": raster.height, "transform": raster.transform.to_gdal()}
             kind: dict[str, Any] = {"type": _TYPES.get(raster.dtypes[0]), "NoDataValue": f"{raster.nodata:g}"}
-            # descriptions of sums differ in the number of summed images: that of the last raster is used
+            # descriptions of sums differ in the number of summed images: the description of the last raster is used
             description = {"Description": raster.descriptions[0] or "", "UnitType": raster.units[0] or ""}
             has_palette = raster.colorinterp[0] == ColorInterp.palette
             colours = [colour for _, colour in sorted(raster.colormap(1).items())] if has_palette else []

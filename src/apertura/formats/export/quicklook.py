@@ -33,10 +33,10 @@ def write_quicklook(
 ) -> None:
     """Plot power in dB relative to the peak as a PNG for viewing without a GIS.
 
-    An image with more pixels than the plot has dots is reduced by averaging power, so that no target is lost between
-    samples. The colour scale covers `dynamic_range_db` below the peak. If no more than three dots lie within 20 dB of
-    the peak, the scale starts at the power of the fourth brightest dot, rounded up to 5 dB, so that an outlier does not
-    darken the scene.
+    An image with more pixels than can be displayed is reduced by averaging power over groups of pixels, so that no
+    target is lost by subsampling. The colour scale covers `dynamic_range_db` below the peak. If no more than three
+    displayed pixels lie within 20 dB of the peak, the upper limit of the scale is the power of the fourth brightest
+    displayed pixel, rounded up to 5 dB, so that an outlier does not darken the scene.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ def below_peak(mean: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     decibel
         (rows, columns) float64 dB, NaN where power is not positive.
     top_db
-        0, or less if only outliers are brighter.
+        0, or a negative value if only outliers exceed it.
 
     Notes
     -----
@@ -223,5 +223,5 @@ def below_peak(mean: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     if not brightest.size:
         return decibel, 0.0
     decibel -= brightest[-1]
-    fourth = float(brightest[0] - brightest[-1])  # a target covers several dots, an outlier may cover a single dot
+    fourth = float(brightest[0] - brightest[-1])  # a target covers several displayed pixels, an outlier possibly one
     return decibel, 0.0 if fourth > -20 else 5.0 * ceil(fourth / 5)

@@ -27,7 +27,7 @@ class Radiometry:
     divided_by
         Pair → largest amplitude of its image, by which the image was divided before summation.
     phases_removed_rad
-        Pair → constant phase removed before summation; without pairs that are excluded from the coherent sum.
+        Pair → constant phase removed before summation; pairs excluded from the coherent sum are omitted.
     peak_db, noise_floor_re_peak_db
         Power of the brightest target, dB re 1; median power relative to the peak, dB; None: not measured.
     """

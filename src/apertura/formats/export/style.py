@@ -1,7 +1,7 @@
 """QGIS styles: a .qml file with the name and folder of a raster, which QGIS applies when it opens the raster.
 
-The colour scale of an image ranges from its noise floor to its peak. The usual range, 2 to 98 % of the pixels,
-saturates all targets of a scene that consists mostly of noise.
+The colour scale of an image ranges from its noise floor to its peak. With the usual range, the 2nd to 98th percentile
+of the pixels, all targets of a scene that consists mostly of noise would be saturated.
 """
 
 import json
@@ -72,8 +72,8 @@ def write_db_style(path: Path, *_: object, **__: object) -> None:
 def write_linear_style(path: Path, *_: object, **__: object) -> None:
     """Write the style of power or magnitude: black at zero, white from a tenth of the largest value.
 
-    Parameters as `write_db_style`. Without a style, QGIS computes statistics of the raster and writes them into a
-    mosaic or a sidecar file.
+    Parameters as in `write_db_style`. Without a style, QGIS computes statistics of the raster, and writes these into
+    the mosaic or a sidecar file.
     """
     with _opened_raster_of(path) as raster:
         values = _subsampled(raster)
@@ -82,9 +82,9 @@ def write_linear_style(path: Path, *_: object, **__: object) -> None:
 
 
 def write_mask_style(path: Path, *_: object, **__: object) -> None:
-    """Write the style of the mask: a colour and a label for each class, valid pixels transparent.
+    """Write the style of the mask: a colour and a label for each class; valid pixels are transparent.
 
-    Parameters as `write_db_style`.
+    Parameters as in `write_db_style`.
     """
     renderer = _renderer("paletted", band="1")
     palette = ET.SubElement(renderer, "colorPalette")
@@ -101,9 +101,9 @@ def write_mask_style(path: Path, *_: object, **__: object) -> None:
 
 
 def write_layer_style(path: Path, *_: object, **__: object) -> None:
-    """Write the style of a layer: colours from its smallest to its largest value.
+    """Write the style of a layer: a colour scale from its smallest to its largest value.
 
-    Parameters as `write_db_style`.
+    Parameters as in `write_db_style`.
     """
     with _opened_raster_of(path) as raster:
         values, unit = _subsampled(raster), raster.units[0]
@@ -111,9 +111,10 @@ def write_layer_style(path: Path, *_: object, **__: object) -> None:
 
 
 def write_backscatter_style(path: Path, *_: object, **__: object) -> None:
-    """Write the style of a backscattering coefficient: grey scale over multiples of 5 dB, 2 to 99.5 % of the pixels.
+    """Write the style of a backscattering coefficient: grey scale from the 2nd to the 99.5th percentile.
 
-    Parameters as `write_db_style`. The percentiles exclude dark speckle and bright reflectors from the colour scale.
+    The limits are multiples of 5 dB. The percentiles exclude dark speckle and bright reflectors from the grey scale.
+    Parameters as in `write_db_style`.
     """
     with _opened_raster_of(path) as raster:
         values, unit = _subsampled(raster), raster.units[0]
@@ -130,7 +131,7 @@ def _write_ramp(path: Path, low: float, high: float, unit: str, *, ramp: Sequenc
     ends = {"minimumValue": f"{low:g}", "maximumValue": f"{high:g}"}
     shader = ET.SubElement(ET.SubElement(renderer, "rastershader"), "colorrampshader", ends)
     shader.attrib |= {"colorRampType": "INTERPOLATED", "classificationMode": "1", "clip": "0"}
-    # otherwise QGIS draws a legend with the two limits only, without a unit
+    # without these settings, the legend in QGIS has only the two limits and no unit
     ET.SubElement(shader, "rampLegendSettings", useContinuousLegend="0", suffix=f" {unit}")
     for share, colour in zip(np.linspace(0, 1, len(ramp)), ramp, strict=True):
         value = f"{low + share * (high - low):g}"
@@ -142,13 +143,13 @@ def _subsampled(raster: rasterio.DatasetReader) -> NDArray[np.float32]:
     """Read a raster averaged to at most `_DOTS` pixels along the longer side, NaN for no data."""
     factor = max(1.0, max(raster.shape) / _DOTS)
     shape = tuple(ceil(size / factor) for size in raster.shape)
-    # not read as a masked array, for whose mask rasterio reads every pixel of a mosaic
+    # not read as a masked array, because rasterio reads every pixel of a mosaic to compute the mask
     values = raster.read(1, out_shape=shape, resampling=Resampling.average)
     return np.where(values == raster.nodata, np.nan, values).astype(np.float32, copy=False)
 
 
 def _round_limits(values: NDArray[np.float32]) -> tuple[float, float]:
-    """Return minimum and maximum, rounded outwards to a tenth of the largest power of ten below their difference."""
+    """Return minimum and maximum, rounded outwards to a tenth of the largest power of ten within their difference."""
     low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
     step = 10.0 ** floor(log10(high - low)) / 10 if high > low else 1.0
     return floor(low / step) * step, max(ceil(high / step), floor(low / step) + 1) * step
@@ -166,7 +167,7 @@ def _grey(low: float, high: float, *, unit: str = "") -> ET.Element:
 
 @contextmanager
 def _opened_raster_of(path: Path) -> Iterator[rasterio.DatasetReader]:
-    """Open the raster of a style; a mosaic is opened by its absolute path, as its paths of rasters are relative."""
+    """Open the raster of a style; a mosaic by its absolute path, because it contains relative paths of rasters."""
     file = next(file for file in map(path.with_suffix, (".tif", ".vrt")) if file.is_file())
     opened_path = nullcontext(Path(file.absolute())) if file.suffix == ".vrt" else on_disk(file)
     with opened_path as name, rasterio.Env(**ISOLATED), rasterio.open(name) as raster:

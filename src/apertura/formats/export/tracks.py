@@ -43,9 +43,9 @@ class RefinedLog:
     track
         Stage `track`: positions of the logged point, not of an antenna, in the frame of the log.
     moved_m
-        (epoch, 3) float64: correction to be added to the logged point, metres in that frame.
+        (epoch, 3) float64: correction to be added to the logged point, metres in the frame of the log.
     left_m
-        (epoch, 3) float64: standard deviation of the residual error along the axes of that frame, metres; NaN where the
+        (epoch, 3) float64: standard deviation of the residual error along the axes of the frame, metres; NaN where the
         refinement did not estimate the error of the node.
     stated_m
         (epoch, 3) float64: logged or configured standard deviation of the log to east, north and up, metres; NaN if
@@ -140,12 +140,12 @@ def write_pos(path: Path, log: RefinedLog, *, outcome: str, version: str) -> Non
         Version of apertura.
     """
     unrefined = int((~log.refined).sum())
-    outside = f"; {unrefined} of {len(log.refined)} epochs lie outside the pulses; the nearest correction is used"
+    outside = f"; {unrefined} of {len(log.refined)} epochs are before or after the pulses: nearest correction used"
     remarks = [
         outcome,
         f"logged point of {log.node}, not an antenna{outside if log.refined.any() else ''}",
-        "standard deviation 0: unknown; Q 5: also for solution types that are not logged",
-        "ns, age, ratio and covariances 0: unknown (positions refined from images); Q as logged; do not filter by them",
+        "standard deviation 0: unknown; Q 5: single, or solution type not logged",
+        "ns, age, ratio and covariances 0: unknown (positions refined from images); Q as logged; not for filtering",
     ]
     with replacement(path) as temporary:
         write_rtklib_pos(
@@ -229,7 +229,7 @@ def write_picture(path: Path, logs: Sequence[RefinedLog], *, title: str, outcome
 
 
 def _draw_logged(figure: Figure, logs: Sequence[RefinedLog]) -> tuple[list[Any], list[str]]:
-    """Plot horizontal tracks and heights of logs; return lines and names for a legend."""
+    """Plot horizontal tracks and heights of logs; return lines and labels for a legend."""
     ground, height = figure.subplots(1, 2)
     first = logs[0].track.position.values[0]
     axes_m = LOCAL_NED if logs[0].local else ned_axes(first[None])[0]
@@ -243,7 +243,7 @@ def _draw_logged(figure: Figure, logs: Sequence[RefinedLog]) -> tuple[list[Any],
     ground.set_aspect("equal", adjustable="datalim")
     start = np.datetime_as_string(logs[0].track.time.values[0], "s")
     ground.set(xlabel=f"east of the first epoch of {logs[0].node}, m", ylabel="north, m", title="track (dot: end)")
-    height.set(xlabel=f"time after {start}Z, s", ylabel="height above that epoch, m", title="height")
+    height.set(xlabel=f"time after {start}Z, s", ylabel="height above the first epoch, m", title="height")
     for axes in (ground, height):
         axes.grid(visible=True, color="0.9", linewidth=0.6)
     handles, labels = ground.get_legend_handles_labels()
@@ -251,7 +251,7 @@ def _draw_logged(figure: Figure, logs: Sequence[RefinedLog]) -> tuple[list[Any],
 
 
 def _draw(column: Sequence[Axes], log: RefinedLog) -> None:
-    """Plot the three axes of a node one below the other, over the refined epochs or, without these, the whole log."""
+    """Plot the three axes of a node one below the other, over the refined epochs or else over the whole log."""
     time_s, refined = log.time_s, log.refined
     epochs = np.flatnonzero(refined) if refined.any() else np.arange(len(time_s))
     margin_s = 0.04 * float(time_s[epochs[-1]] - time_s[epochs[0]])
@@ -276,5 +276,5 @@ def _draw(column: Sequence[Axes], log: RefinedLog) -> None:
         axes.margins(x=0)
     column[0].set_title(log.node, fontsize=9)
     start = np.datetime_as_string(log.track.time.values[0], "ms")
-    legend = "\n(grey: outside the pulses)" if refined.any() else ""
+    legend = "\n(grey: no pulses)" if refined.any() else ""
     column[-1].set_xlabel(f"time after {start}Z, s{legend}")

@@ -1,4 +1,4 @@
-"""Atomic writing of files by GDAL, with error messages that state the cause."""
+"""Atomic writing of files with GDAL, with error messages that state the cause."""
 
 import errno
 import os
@@ -32,10 +32,10 @@ BlockSlices = tuple[slice, slice]
 
 @contextmanager
 def gdal_replacement(path: Path, *, size: int) -> Iterator[Path]:
-    """Yield the temporary path of a GDAL output that becomes `path`; a failure to write raises `OSError`.
+    """Yield the temporary path of a GDAL output that becomes `path`; raise `OSError` if writing fails.
 
     GDAL does not report all write errors. Small rasters are therefore written in memory and copied to the disk by
-    Python; larger ones are written to the disk and read back by `check_written`.
+    Python; larger rasters are written to the disk and read back by `check_written`.
 
     Parameters
     ----------
@@ -84,12 +84,12 @@ def added(checksum: int, pixels: NDArray[Any]) -> int:
 
 
 def check_written(path: Path, checksum: int, tags: Mapping[str, str]) -> None:
-    """Read a raster with its overviews back, and compare checksum and tags with the values written.
+    """Read a raster and its overviews back, and compare checksum and tags with the values written.
 
     Raises
     ------
     OSError
-        If they differ.
+        If checksum or tags differ.
     """
     with rasterio.open(path) as raster:
         levels = len(raster.overviews(1))

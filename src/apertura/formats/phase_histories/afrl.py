@@ -1,6 +1,6 @@
 """AFRL Gotcha phase history (.mat): frequency-domain samples and antenna positions in the local frame of the scene.
 
-It is read as stage `echo`: there are no raw samples, no clock and no code to remove.
+The data are read as stage `echo`, because they contain no raw samples and no times, and no code is to be removed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -122,8 +122,8 @@ def joined(
         return echo
     r_correct = np.concatenate(stored)
     remark = (
-        f"data.af contains corrections of r0 ({r_correct.min():.2f} to {r_correct.max():.2f} m) and of phases, which "
-        "are not applied; to apply them, set waveform.corrections: stored"
+        f"data.af contains corrections of r0 ({r_correct.min():.2f} to {r_correct.max():.2f} m) and of phases; these "
+        "corrections are not applied; to apply them, set waveform.corrections: stored"
     )
     print_remark(str(paths[0]), remark)
     return echo.assign_attrs(remarks=[remark])

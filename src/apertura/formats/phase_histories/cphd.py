@@ -1,7 +1,7 @@
 """Compensated phase history data (CPHD 1.0.1 and 1.1.0, NGA.STND.0068-1), monostatic and bistatic.
 
-A file states the ECEF positions of both antennas for each pulse, and the reference point to which its samples are
-compensated, which determines their reference delay (docs/formats/phase_history.md, "CPHD").
+A file contains the ECEF positions of both antennas for each pulse, and the reference point to which the samples are
+compensated. This point determines the reference delay of the samples (docs/formats/phase_history.md, "CPHD").
 """
 
 from collections.abc import Mapping, Sequence
@@ -214,7 +214,7 @@ def _check_frequencies(
     if error_cycles.max() > _CYCLES:
         worst = int(error_cycles.argmax())
         raise CampaignError(
-            f"frequencies (SC0, SCSS) of pulse {worst} differ by {difference_hz[worst]:.6g} Hz from those of the first",
+            f"frequencies (SC0, SCSS) of pulse {worst} differ by {difference_hz[worst]:.6g} Hz from the first pulse",
             where=path,
             expected=f"the same frequencies for all pulses, to within {_CYCLES / max(swath_s, 1e-300):.3g} Hz",
             remedy="Resample the pulses to common frequencies.",

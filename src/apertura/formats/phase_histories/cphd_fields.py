@@ -48,7 +48,7 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
     with path.open("rb") as stream:
         first = stream.readline(_LONGEST_KIND).decode("ascii", errors="replace").strip()
         if not first.startswith("CPHD/"):
-            raise ValueError(f"it starts with {first[:20]!r}, not with CPHD/ and a version")
+            raise ValueError(f"the file starts with {first[:20]!r}, not with CPHD/ and a version")
         if not first.startswith("CPHD/1."):
             raise ValueError(f"version {first!r}, not 1.0.1 or 1.1.0")
         stream.seek(0)

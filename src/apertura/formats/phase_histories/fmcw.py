@@ -28,13 +28,16 @@ _LARGEST = 1e15
 """Largest accepted sample; its square is within the range of float32."""
 
 _FARTHEST_S = 2.0**33
-"""Largest time since 1970 that int64 nanoseconds can represent, s."""
+"""Limit of times since 1970, s, within the range of int64 nanoseconds."""
 
 _DATENUM = 723_181, 803_534
 """The years 1980 and 2200 as MATLAB datenum (days)."""
 
 _LEAST_STEP = 0.9
-"""Minimum interval between sweep starts, relative to the sweep duration; float64 seconds since 1970 resolve 0.2 us."""
+"""Minimum interval between sweep starts, relative to the sweep duration.
+
+The value is below 1, because float64 seconds since 1970 have a resolution of 0.2 us.
+"""
 
 _MOST_INTERVALS = 1.05
 """Maximum duration of a row of samples relative to the interval between sweeps."""
@@ -149,8 +152,8 @@ def joined_sweeps(read: Sequence[Sweeps], *, pair: str, described: Mapping[str, 
     Raises
     ------
     CampaignError
-        If sweeps are too short, contradict waveform.iq, contain values that are not finite, or have no increasing
-        times.
+        If sweeps are too short, contradict waveform.iq, or contain values that are not finite, or if times are missing
+        or do not increase.
     """
     sweep, dropped = sweep_of(described), dict[str, int]()
     times, transfers = list[Times](), list[NDArray[np.complex64]]()
@@ -242,7 +245,7 @@ def _regular(file: Sweeps, described: Mapping[str, Any], *, is_single: bool) -> 
 
 
 def beginning(described: Mapping[str, Any], path: Path) -> np.datetime64:
-    """Return waveform.start_utc; the default is 1970, which a configured clock offset relates to the log's times."""
+    """Return waveform.start_utc; with the default, 1970, a configured clock offset relates the times to the log."""
     start_utc = described["start_utc"]
     try:
         first: np.datetime64 = np.datetime64("1970-01-01", "ns") if start_utc is None else utc_times([start_utc])[0]
@@ -285,7 +288,7 @@ def _error(found: str, path: Path, expected: str = _EXPECTED) -> CampaignError:
 # ---- Beat signals of a sound card (.wav): sync channel and beat channel ---------------------------------------------
 
 _EXTREMES = 0.1, 99.9
-"""Percentiles used as levels of the sync channel, which exclude clicks of a sound card."""
+"""Percentiles that are used as levels of the sync channel; clicks of a sound card are thereby excluded."""
 
 _SAME_RATE = 1e-6
 
@@ -305,7 +308,7 @@ def read_beat_wav(paths: Sequence[Path], *, pair: str, described: Mapping[str, A
     Source: docs/theory/fmcw.md, "Triggers"; G. L. Charvat et al., MIT OpenCourseWare RES.LL-003, 2011.
     """
     if len(paths) != 1:
-        raise _bad(f"{len(paths)} files", paths[1], "one .wav file per node and flight", "Merge them into one file.")
+        raise _bad(f"{len(paths)} files", paths[1], "one .wav file per node and flight", "Merge the files into one.")
     path, recording = next(iter(read_fields(fmcw_fields.read_wav, paths)))
     return joined_sweeps([cut_sweeps(path, recording, described)], pair=pair, described=described)
 
@@ -350,7 +353,7 @@ def cut_sweeps(path: Path, recording: Mapping[str, NDArray[Any]], described: Map
 
 
 def trigger_starts(sync: NDArray[np.float64], *, threshold: float) -> NDArray[np.float64]:
-    """Find where a channel rises through the mean of its two levels, in fractional samples.
+    """Find the instants at which a channel rises through the mean of its two levels, in fractional samples.
 
     Parameters
     ----------
@@ -372,7 +375,7 @@ def trigger_starts(sync: NDArray[np.float64], *, threshold: float) -> NDArray[np
     up = sync[marks] > middle
     rises = marks[1:][up[1:] & ~up[:-1]]
     below = np.flatnonzero(sync <= middle)
-    last = below[np.searchsorted(below, rises) - 1]  # last sample below the mean; exists, as a low level precedes
+    last = below[np.searchsorted(below, rises) - 1]  # last sample below the mean; exists because a low level precedes
     at: NDArray[np.float64] = last + (middle - sync[last]) / (sync[last + 1] - sync[last])
     return at
 

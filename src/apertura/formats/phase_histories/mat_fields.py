@@ -48,7 +48,7 @@ def read_variables(path: Path, names: list[str]) -> dict[str, Any]:
     path
         The file.
     names
-        Requested variables; missing ones are omitted.
+        Requested variables; missing variables are omitted.
 
     Raises
     ------

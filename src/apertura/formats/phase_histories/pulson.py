@@ -1,6 +1,6 @@
 """Scans of Time Domain PulsON P4xx radars (.out): real echo samples in messages MRM_SCAN_INFO.
 
-They are read as stage `echo`, because the radar itself correlates the samples. Times are milliseconds since power-on.
+Scans are read as stage `echo`, because the radar itself correlates the samples. Times are milliseconds since power-on.
 """
 
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ _SHARED = ("source", "start_ps", "stop_ps", "step_bins", "kind", "antenna", "tot
 
 
 def read_pulson(paths: Sequence[Path], *, pair: str) -> xr.Dataset:
-    """Read scans as `echo` stage, transfer functions over the band, without positions, which a flight log provides.
+    """Read scans as `echo` stage: transfer functions over the band, without positions, which are in a flight log.
 
     `time` is the time since power-on of the radar, counted from 1970. Scans with missing or damaged messages, and a
     scan truncated by the end of its file, are excluded and counted in flag `scans_incomplete`.
@@ -68,7 +68,8 @@ def read_pulson(paths: Sequence[Path], *, pair: str) -> xr.Dataset:
     backwards = np.flatnonzero(np.diff(time_ms) <= 0)
     if backwards.size:
         at = int(backwards[0]) + 1
-        raise _error(f"scan {at} at {time_ms[at]} ms is not later than the previous, {time_ms[at - 1]} ms", paths[0])
+        found = f"scan {at} at {time_ms[at]} ms is not later than the previous scan at {time_ms[at - 1]} ms"
+        raise _error(found, paths[0])
     frequency = np.arange(total // 2 + 1) * (SAMPLE_RATE_HZ / total)
     band = (frequency >= BAND_HZ[0]) & (frequency <= BAND_HZ[1])
     transfer = np.fft.rfft(samples, axis=1, norm="forward")[:, band].astype(np.complex64)
@@ -117,7 +118,7 @@ def _scans(path: Path) -> tuple[NDArray[np.void], NDArray[np.float64], int]:
 
 
 def _messages(content: bytes) -> tuple[NDArray[np.void], bool]:
-    """Return the messages of a file, skipping other bytes, and True if it ends within a message."""
+    """Return the messages of a file, skipping other bytes, and True if the file ends within a message."""
     size, sign = MESSAGE.itemsize, _SCAN_INFO.to_bytes(2, "big")
     at, blocks = min(_CONFIG_BYTES, len(content)), []
     last = at
@@ -137,7 +138,8 @@ def _check(scans: NDArray[np.void], path: Path) -> None:
     for name in _SHARED:
         other = np.flatnonzero(scans[name] != scans[name][0])
         if other.size:
-            raise _error(f"scan {int(other[0])} has {name} {scans[name][other[0]]}, others {scans[name][0]}", path)
+            found = f"scan {int(other[0])} has {name} {scans[name][other[0]]}, the first scan {scans[name][0]}"
+            raise _error(found, path)
     duration_ps = int(scans["stop_ps"][0]) - int(scans["start_ps"][0])
     if abs(duration_ps * 1e-12 * SAMPLE_RATE_HZ - int(scans["total"][0])) > 2:
         raise _error(f"{scans['total'][0]} samples for {duration_ps} ps", path)

@@ -21,11 +21,11 @@ SUFFIX = ".zarr"
 
 _EXPECTED = f"a Zarr folder (version 3) with {EXPECTED}"
 _SPARE_BYTES = 4 << 30
-"""Additional address space, bytes, for the threads and the event loop of zarr, which reserve more than they use."""
+"""Additional address space, bytes: the threads and the event loop of zarr reserve more memory than they use."""
 
 
 def read_zarr_history(paths: Sequence[Path], *, pair: str) -> "xr.Dataset":
-    """Read Zarr folders, concatenated in the order of their names, as `echo` stage; `paths` are the files in them.
+    """Read Zarr folders, concatenated in the order of their names, as `echo` stage; `paths`: files in the folders.
 
     Raises
     ------

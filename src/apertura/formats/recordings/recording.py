@@ -15,7 +15,7 @@ from apertura.common.provenance import hashes_of_file
 from apertura.formats.recordings.sample_file import SampleFile
 
 _AT_ONCE = 4096
-_FIRST = 16  # samples compared first, to detect empty and repeated captures without reading them whole
+_FIRST = 16  # samples compared first, so that few captures are read completely to detect empty or repeated captures
 
 
 def _sha512(path: Path) -> str:
@@ -94,7 +94,7 @@ class Recording:
             )
 
     def cut(self, captures: Captures, *, node: str) -> xr.Dataset:
-        """Build the `raw` stage of captures of a node: their position in the file, UTC time and frame number.
+        """Build the `raw` stage from captures of a node: positions in the file, UTC times and frame numbers.
 
         Raises
         ------
@@ -123,7 +123,7 @@ class Recording:
         )
 
     def _repeats(self, captures: Captures) -> NDArray[np.bool_]:
-        """Find captures that are bit-identical to an earlier capture, which noise makes impossible; (capture,) bool.
+        """Find captures that are bit-identical to an earlier capture, which noise would prevent; (capture,) bool.
 
         Captures whose first samples are unique are not read further.
 

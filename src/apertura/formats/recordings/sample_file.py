@@ -21,7 +21,7 @@ SETTLING = 63
 """Half length of the filter in samples; at both ends of a capture, this number of samples is invalid."""
 
 EDGE = 0.025
-"""Minimum distance of a band from the ends of its Nyquist zone over the sample rate, for 80 dB of image rejection."""
+"""Minimum distance of a band from the edges of its Nyquist zone for 80 dB image rejection, in sample rates."""
 
 _KAISER = 8.0
 
@@ -112,7 +112,7 @@ class Mixing:
                 f"{EDGE * rate / 1e6:g} MHz of the edge of a Nyquist zone, or crosses it"
             )
         if self.restarts and prefix_samples < SETTLING:
-            return f"a prefix of {prefix_samples} samples; the filter needs {SETTLING} to settle"
+            return f"a prefix of {prefix_samples} samples; the filter requires {SETTLING} samples to settle"
         return None
 
 
@@ -137,7 +137,7 @@ DATATYPES = "ci16_le: c or r (complex, real); i8, u8, or i16, u16, i32, u32, f16
 """Supported datatypes, for messages."""
 
 _EXAMINED_BYTES = 1 << 16
-# plausible floats: least number of non-zero and of distinct values, smallest magnitude, share of usual magnitudes
+# plausible floats: minimum number of non-zero and of distinct values, limit and minimum fraction of usual magnitudes
 _FEWEST, _DISTINCT, _TINIEST, _USUAL = 256, 32, 1e-12, 0.999
 _HALF = 0.45
 
@@ -199,7 +199,7 @@ class SampleLayout:
         Raises
         ------
         ValueError
-            If a float is not finite or exceeds 1e15; the second argument of the error is the index of the first.
+            If a float is not finite or exceeds 1e15; the second argument of the error is the index of the first one.
         """
         stored = data.view(self.stored)
         if stored.dtype.kind == "u":
@@ -238,7 +238,7 @@ class SampleLayout:
 # file crashes the process instead of raising an error.
 
 Spans = Sequence[tuple[int, int]]
-"""First sample of each span, and sample after its last."""
+"""First sample of each span, and the sample after the span."""
 
 
 def _are_samples(numbers: NDArray[np.floating[Any]]) -> bool:
@@ -327,7 +327,7 @@ class SampleFile:
         plausible = [kind for kind in ("<f4", ">f4", "<f8", ">f8") if _are_samples(np.frombuffer(data, kind))]
         if not plausible:
             return None
-        # doubles with few digits resemble floats that alternate with zeros
+        # float64 numbers with few digits resemble float32 numbers that alternate with zeros
         are_doubles = np.mean(np.frombuffer(data, "<u4") == 0) > _HALF
         kind = np.dtype(next((kind for kind in plausible if kind.endswith("8") == bool(are_doubles)), plausible[0]))
         return f"f{8 * kind.itemsize}_{'b' if kind.str.startswith('>') else 'l'}e"

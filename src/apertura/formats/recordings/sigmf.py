@@ -30,7 +30,7 @@ from apertura.formats.times import utc_times
 # opening a recording.
 
 LARGEST_META = 256_000_000
-"""Maximum size of a metadata file, bytes: some 2 million captures."""
+"""Maximum size of a metadata file, bytes: about 2 million captures."""
 
 _EXPECTED = "SigMF metadata with one capture segment per trigger, each with core:datetime in ISO 8601 UTC"
 
@@ -125,7 +125,7 @@ class StatedCaptures(NamedTuple):
 def read_meta(path: Path) -> tuple[Global, StatedCaptures]:
     """Read the metadata of a recording.
 
-    A long flight has some hundred thousand captures; at most a few thousand JSON objects are kept in memory at a time.
+    A long flight has several hundred thousand captures; at most a few thousand are in memory as JSON objects.
 
     Raises
     ------
@@ -191,7 +191,7 @@ def _from_start(stream: BinaryIO) -> BinaryIO:
 
 
 def _read_captures(documents: Iterator[object], path: Path, whole: Global) -> StatedCaptures:
-    """Read the captures; their first samples count from the start of the file (core:offset is subtracted)."""
+    """Read the captures; their first samples are relative to the start of the file (core:offset is subtracted)."""
     parts: list[StatedCaptures] = []
     while batch := list(islice(documents, _AT_ONCE)):
         captures = of_sigmf(_SOME_CAPTURES, batch, path, "captures", first=_AT_ONCE * len(parts))
@@ -212,7 +212,7 @@ def _read_captures(documents: Iterator[object], path: Path, whole: Global) -> St
                 f"capture {_AT_ONCE * len(parts) + before[0]}: core:sample_start {start[before[0]]}",
                 path,
                 f"at least core:offset {whole.offset}, the index of the first sample in the file",
-                "The recording was split: correct core:sample_start, or remove core:offset if they count from 0.",
+                "The recording was split: correct core:sample_start, or remove core:offset if the first index is 0.",
             )
         start -= whole.offset
         parts.append(StatedCaptures(start, time, np.array(frequency_hz), header, frame))
@@ -261,8 +261,8 @@ def find_sigmf(folder: Path, node: str) -> tuple[Path, Path]:
     Raises
     ------
     CampaignError
-        If a collection is invalid or assigns a stream that it does not list, two collections assign a stream to the
-        node, or the recording is a SigMF archive.
+        If a collection is invalid or assigns a stream that is not in its list, if two collections assign a stream to
+        the node, or if the recording is a SigMF archive.
     """
     meta = folder / f"{node}.sigmf-meta"
     archive = folder / f"{node}{ARCHIVE}"
@@ -338,7 +338,7 @@ def open_sigmf(meta_path: Path, data_path: Path) -> Recording:
     Raises
     ------
     CampaignError
-        If the metadata are not SigMF, the data are truncated, a capture lies after their end, or the first samples are
+        If the metadata are not SigMF, the data are truncated or end before a capture, or the first samples are
         floating-point numbers although core:datatype states integers.
 
     Notes
@@ -477,7 +477,7 @@ def _length(captures: StatedCaptures, total: int, path: Path) -> int:
 
 
 def _usable(length: int, layout: SampleLayout, path: Path) -> int:
-    """Return the number of usable samples per capture; the filter for real samples settles at the end of a capture."""
+    """Return the number of usable samples per capture, without the last samples, which the filter makes invalid."""
     if layout.mixing is None or not layout.mixing.restarts:
         return length
     if length <= 2 * SETTLING:
@@ -506,10 +506,10 @@ _KNOWN_BYTES = 256  # bytes before the read position; if unchanged, metadata wer
 
 
 class GrowingSigmf:
-    """SigMF recording that is being written: each read continues at the end of the previous one.
+    """SigMF recording that is being written: each read continues at the end of the previous read.
 
-    The recorder may append to the metadata, whose captures array is not closed yet, or rewrite them each time.
-    Incomplete captures, in metadata or samples, are left for the next read.
+    The recorder may append to the metadata file, so that its captures array is still unterminated, or rewrite the file
+    at each update. Incomplete captures, in metadata or samples, are left for the next read.
 
     Parameters
     ----------
@@ -553,7 +553,7 @@ class GrowingSigmf:
         Raises
         ------
         CampaignError
-            If the content so far is not SigMF.
+            If the content read so far is not SigMF.
         """
         self._read_meta()
         header, captures, (meta, data) = self._header, self._captures, self.files

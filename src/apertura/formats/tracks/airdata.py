@@ -21,11 +21,11 @@ _PLACE = ["latitude", "longitude"]
 _ATTITUDE = ["roll(degrees)", "pitch(degrees)", "compass_heading(degrees)"]
 _HEIGHTS = {"altitude_above_seaLevel(meters)": 1.0, "altitude_above_seaLevel(feet)": 0.3048}
 _SATELLITES = "satellites"
-_FEWEST = 4  # with fewer satellites, positions are dead reckoning
+_FEWEST = 4  # with fewer satellites, positions are obtained by dead reckoning
 
 _APART = 1.5
 """Difference between the increments of UTC and of the clock above which the clock is considered stopped, in units of
-UTC; truncation of UTC explains at most 1."""
+UTC; truncation of UTC causes a difference of at most 1."""
 
 _TOLERANCE_S = 0.1
 """Required accuracy of a segment's clock offset, and tolerated distance of an epoch from its second, s; both equal
@@ -182,7 +182,7 @@ def _utc(
         misfit = max(misfit, (low - high) / 2 if resolved[rows].any() else 0.0)
     if misfit > _TOLERANCE_S or not resolved.any():
         found = (
-            f"they differ by {misfit:.2f} s"
+            f"a difference of {misfit:.2f} s"
             if misfit > _TOLERANCE_S
             else f"the epochs are too sparse to determine when the {unit} changes"
         )

@@ -125,7 +125,7 @@ def _fix(status: Floats) -> NDArray[np.int8]:
 
 
 def _receiver(fields: Fields, options: LogOptions, node: str, where: Path) -> tuple[int, list[int]]:
-    """Return the number of the selected receiver, and those of all receivers."""
+    """Return the number of the selected receiver, and the numbers of all receivers."""
     numbers = fields["GPS/I"]
     known = sorted({int(number) for number in numbers[np.isfinite(numbers)]})
     if not known:
@@ -164,13 +164,13 @@ def _height(
 
 
 def _parameter(fields: Fields, names: tuple[tuple[str, ...], ...], receiver: int, default: float) -> float:
-    """Return a parameter of a receiver, whose name depends on the version of ArduPilot."""
+    """Return a parameter of a receiver; the name of the parameter depends on the version of ArduPilot."""
     candidates = names[min(receiver, len(names) - 1)]
     return next((float(fields[f"PARM/{name}"][0]) for name in candidates if f"PARM/{name}" in fields), default)
 
 
 def _utc(week: Floats, milliseconds: Floats) -> NDArray[np.datetime64]:
-    """Convert GPS weeks and milliseconds to UTC; NaT where they are not yet valid."""
+    """Convert GPS weeks and milliseconds to UTC; NaT where week or milliseconds are not yet valid."""
     known = (week > 0) & (week <= _LAST_WEEK) & (milliseconds >= 0) & (milliseconds < _WEEK_MS)
     utc = np.full(week.size, np.datetime64("NaT", "ns"), "datetime64[ns]")
     utc[known] = utc_from_gps(gps_from_weeks(week[known].astype(np.int64), milliseconds[known].astype(np.int64)))

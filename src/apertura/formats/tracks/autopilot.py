@@ -155,7 +155,7 @@ def contradicted(time_utc: NDArray[np.datetime64], geodetic: Floats, velocity: F
     wrong = np.zeros(len(time_utc), bool)
     if len(wrong) < 3:
         return wrong
-    ends = velocity[:-1], velocity[1:]  # at start and end of each step; an unknown velocity is replaced by the other
+    ends = velocity[:-1], velocity[1:]  # at both ends of each step; an unknown one is replaced by that of the other end
     with np.errstate(invalid="ignore"):  # invalid coordinates are rejected later
         position = ecef_from_geodetic(*geodetic.T)
         steps = np.einsum("eij,ei->ej", ned_axes(position)[:-1], np.diff(position, axis=0))
@@ -305,7 +305,7 @@ def _counted(boot_s: Floats, options: LogOptions, node: str, where: Path) -> NDA
 
 
 def _repeated(epochs: Epochs) -> NDArray[np.bool_]:
-    """Return a mask of the epochs that repeat the previous one."""
+    """Return a mask of the epochs that repeat the previous epoch."""
     same = np.zeros(epochs.boot_s.size, bool)
     same[1:] = (np.diff(epochs.geodetic, axis=0) == 0).all(axis=1) & (epochs.time_utc[1:] == epochs.time_utc[:-1])
     return same
@@ -321,7 +321,7 @@ def _angles_deg(attitude: Attitude, boot_s: Floats) -> Floats | None:
     if time.size < 2:
         return None
     rotations = Rotation.from_quat(attitude.quaternion[good][order])
-    # outlier: it differs from both neighbours by more than these differ from each other
+    # outlier: differs from both neighbours by more than the neighbours differ from each other
     before, after, across = ((rotations[:-n].inv() * rotations[n:]).magnitude() for n in (1, 1, 2))
     is_outlier = np.zeros(time.size, bool)
     is_outlier[1:-1] = np.minimum(before[:-1], after[1:]) > across + _TURN_RAD

@@ -118,7 +118,7 @@ def read_table(
                 low_memory=False,
             )
         except pd.errors.ParserWarning as error:
-            raise ValueError("a line has more cells than the heading") from error
+            raise ValueError("a line has more cells than the header") from error
     missing = [name for name in required if name not in table.columns]
     if missing:
         raise ValueError(f"no column {missing[0]} among {quoted(list(table.columns), 300)}")
@@ -181,9 +181,9 @@ def _checked_cells(path: Path, known: Sequence[str]) -> tuple[list[str], set[int
                 elif row == heading:
                     others.add(index)
                 elif row and row[0].strip().casefold() in titles:
-                    raise ValueError(f"line {rows.line_num} is a second, different heading: concatenated files")
+                    raise ValueError(f"line {rows.line_num} is a second, different header: concatenated files")
                 elif row and len(row) - (row[-1] == "") != len(heading) != len(row):  # a comma may end the line
-                    raise ValueError(f"line {rows.line_num} has {len(row)} cells, the heading {len(heading)}")
+                    raise ValueError(f"line {rows.line_num} has {len(row)} cells, the header {len(heading)}")
         except csv.Error as error:
             raise ValueError(f"line {rows.line_num}: {error}") from error
     return heading, others
@@ -200,7 +200,7 @@ def _without(stream: TextIO, others: set[int]) -> TextIO:
 
 
 def numbers(columns: pd.DataFrame) -> NDArray[np.float64]:
-    """Convert columns to (row, column) float64, NaN for empty cells; ValueError at a cell that is not a number."""
+    """Convert columns to (row, column) float64, NaN for empty cells; ValueError if a cell is not a number."""
     for name in columns.columns:
         if columns[name].dtype.kind in "fiu":
             continue
@@ -246,7 +246,8 @@ def read_csv_track(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIO
     - the first complete set of latitude_deg, longitude_deg, height_m (WGS 84, ellipsoidal, after height_offset_m);
       x_m, y_m, z_m (ECEF); east_m, north_m, up_m (local frame of the campaign);
     - optionally roll_deg, pitch_deg, yaw_deg; std_north_m, std_east_m, std_up_m (standard deviations); quality
-      (solution type: a name of `FIXES`, or a number as defined by options.quality). Their cells may be empty.
+      (solution type: a name of `FIXES`, or a number as defined by options.quality). Cells of these columns may be
+      empty.
 
     Numbers are multiplied by options.scales. Epochs within a leap second, and epochs whose GGA quality marks a position
     that is not measured, are excluded and counted.
@@ -347,13 +348,13 @@ def _error(found: str, log: _Log, remedy: str) -> CampaignError:
     expected = (
         "columns time_utc (ISO 8601), or time or time_s, latitude_deg, longitude_deg, height_m, or x_m, y_m, z_m, or "
         f"east_m, north_m, up_m; optionally {', '.join(_ATTITUDE)}, {', '.join(_STD)}, quality ({', '.join(FIXES)}, "
-        f"or numbers as defined by nodes.{log.node}.log.quality); or their names in nodes.{log.node}.log.columns"
+        f"or numbers as defined by nodes.{log.node}.log.quality); other names as mapped by nodes.{log.node}.log.columns"
     )
     return CampaignError(found, log.path, expected, remedy)
 
 
 def _missing_column(name: str, table: pd.DataFrame, log: _Log) -> CampaignError:
-    """Return the error for a missing column, with the columns of the log and the setting that maps one of them."""
+    """Return the error for a missing column, with the columns of the log and the setting that maps a column name."""
     key = f"nodes.{log.node}.log.columns"
     remedy = (
         f"If the column has another name, set {key}: {{{name}: NAME}}; to try a name, use --set columns.{name}=NAME."
@@ -393,7 +394,7 @@ def _time(table: pd.DataFrame, log: _Log) -> NDArray[np.datetime64]:
 
 
 def _iso(cells: "pd.Series[str]") -> NDArray[np.datetime64]:
-    """Parse times in ISO 8601, with decimal point or comma; ValueError at the first that is not a time."""
+    """Parse times in ISO 8601, with decimal point or comma; ValueError if a cell is not a time."""
     texts = cells.str.strip().str.replace(",", ".", regex=False)
     time = pd.to_datetime(texts, utc=True, format="ISO8601", errors="coerce")
     wrong = cells[time.isna() & cells.notna()]

@@ -95,7 +95,7 @@ def damage_of(spans: NDArray[np.int64], unit: str = "bytes") -> str:
     Examples
     --------
     >>> damage_of(np.array([[5120, 5320], [0, 40000]]))
-    '200 of 40000 bytes are not valid messages, from byte 5120 on; their epochs are lost'
+    '200 of 40000 bytes are not valid messages, from byte 5120 on; epochs in these bytes are lost'
     """
     if len(spans) < 2:
         return ""
@@ -103,5 +103,6 @@ def damage_of(spans: NDArray[np.int64], unit: str = "bytes") -> str:
     blocks = f", in {len(spans) - 1} blocks" if len(spans) > 2 else ""
     first = f"{unit.removesuffix('s')} {int(spans[0, 0])}"
     return (
-        f"{lost} of {int(spans[-1, 1])} {unit} are not valid messages{blocks}, from {first} on; their epochs are lost"
+        f"{lost} of {int(spans[-1, 1])} {unit} are not valid messages{blocks}, from {first} on; "
+        f"epochs in these {unit} are lost"
     )

@@ -19,9 +19,9 @@ COLUMNS = {
 """Message → columns that are read; NaN for columns that the version of ArduPilot does not log."""
 
 NEEDED = tuple(name for name in COLUMNS["GPS"] if name != "I")
-"""GPS columns that every version since 3.3 logs; a missing one indicates a damaged log."""
+"""GPS columns that every version since 3.3 logs; a missing column indicates a damaged log."""
 
-_SECOND = {"GPS2": "GPS", "GPA2": "GPA"}  # second receiver in older versions; newer ones log I = 1 in GPS and GPA
+_SECOND = {"GPS2": "GPS", "GPA2": "GPA"}  # second receiver in older versions; newer versions log it as I = 1
 _BINARY = b"\xa3\x95"
 _FMT, _FMT_BYTES = 128, 89
 DAMAGE = {"bytes": "damage/bytes", "lines": "damage/lines"}
@@ -41,7 +41,7 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
     Raises
     ------
     ValueError
-        If the file is neither kind of log, or its GPS messages lack required columns such as the GPS week.
+        If the file is neither a binary nor a text log, or its GPS messages lack required columns such as the GPS week.
     """
     from pymavlink.DFReader import DFReader_binary, DFReader_text
 
@@ -111,7 +111,7 @@ def _wrong_lines(data: bytes) -> tuple[list[Span], int]:
 
 
 def _row(message: Any, kind: str) -> list[float]:
-    """Return the columns of a message; NaN for columns that its version lacks."""
+    """Return the columns of a message; NaN for columns missing in this version of ArduPilot."""
     fields = set(message.get_fieldnames())
     if len(message.fmt.columns) != len(message.fmt.format):
         raise ValueError(

@@ -40,9 +40,9 @@ class Mission:
     reference
         Height reference.
     speed_m_s
-        (waypoint,) float64: speed on the way to each waypoint; NaN where the mission does not state it.
+        (waypoint,) float64: speed on the way to each waypoint; NaN where not stated in the mission.
     home_deg
-        Latitude and longitude of the take-off point; None: the mission states none, and the first waypoint is used.
+        Latitude and longitude of the take-off point; None: not stated in the mission, the first waypoint is used.
     """
 
     place: Floats
@@ -70,7 +70,7 @@ def read_mission(path: Path) -> Mission:
     if reader is None:
         raise CampaignError(f"suffix {quoted(path.suffix)}", path, expected, _REMEDY)
     if not path.is_file():
-        raise CampaignError("no such file", path, expected, "Copy it to the folder of the plan.")
+        raise CampaignError("no such file", path, expected, "Copy the mission to the folder of the plan.")
     try:
         mission = reader(path)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
@@ -196,7 +196,7 @@ def write_kml(path: Path, name: str, lines: Mapping[str, Floats], areas: Mapping
     lines
         Name → (vertex, 3) float64: longitude, latitude (degrees), height (m).
     areas
-        Name → polygons, each a list of rings (vertex, 3) in these coordinates, outer ring first.
+        Name → polygons, each a list of rings (vertex, 3) in the same coordinates, outer ring first.
     """
 
     def ring(place: Floats) -> str:

@@ -75,8 +75,8 @@ def read_nmea(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -
     """Read an NMEA 0183 log of any talkers as `track` stage.
 
     Positions, solution types and geoid separation are read from GGA: ellipsoidal height is altitude plus separation.
-    The date of a GGA is that of the preceding valid RMC or of the preceding ZDA, otherwise that of options.start_utc,
-    and advances at midnight; logged and configured dates must agree. Standard deviations are read from GST. If several
+    The date of a GGA is the date of the preceding valid RMC or ZDA, otherwise the date in options.start_utc; the date
+    advances at midnight. Logged and configured dates must agree. Standard deviations are read from GST. If several
     talkers report an epoch, the GN sentence is used. A log without any checksum is read with a remark; in other logs,
     truncated sentences and sentences with a wrong or missing checksum are excluded and counted by reason.
 
@@ -84,7 +84,7 @@ def read_nmea(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -
     ------
     CampaignError
         If a date or the geoid separation is neither logged nor configured, the configured date differs from the logged
-        one, or times do not increase.
+        date, or times do not increase.
 
     Notes
     -----
@@ -97,7 +97,7 @@ def read_nmea(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -
     data = path.read_bytes()
     sealed = _SEALED.search(data) is not None
     log = _Log(path, node, options, data, sealed)
-    # first pass up to the first date, which also applies to the epochs before it
+    # first pass up to the first date, which also applies to the preceding epochs
     scanned = _sentences(_Log(path, node, options, data, sealed))
     dates = (_dated(sentence) for sentence in scanned if sentence.sentence_type in _DATED)
     log.now_ns = next((date for date in dates if date is not None), None)
@@ -119,7 +119,7 @@ def _check_day(first_ns: int, log: _Log) -> None:
 
 
 def _sentences(log: _Log) -> Iterator[Any]:
-    """Yield the complete sentences of the types to be read; count damaged ones."""
+    """Yield the complete sentences of the types to be read; count damaged sentences."""
     lines = log.data.splitlines()
     ended = not log.data or log.data[-1:] in b"\r\n"
     for row, line in enumerate(lines, 1):
@@ -133,7 +133,7 @@ def _sentences(log: _Log) -> Iterator[Any]:
 
 
 def _complete(text: str, checksum: bytes | None, log: _Log, *, ended: bool) -> Iterator[Any]:
-    """Yield a sentence if it is complete and of a type to be read; `ended`: a line end follows it."""
+    """Yield a sentence if it is complete and of a type to be read; `ended`: a line end follows the sentence."""
     unsealed = checksum is None and ended and text.count(",") >= _COMMAS.get(text[2:5], 1)
     if unsealed and not log.sealed:
         checksum, text = b"", text.rstrip()
@@ -168,7 +168,7 @@ def _time_of_day(text: str) -> int | None:
 
 
 def _dated(sentence: Any) -> int | None:
-    """Return date and time of a sentence as nanoseconds since 1970; None if they are missing or invalid."""
+    """Return date and time of a sentence as nanoseconds since 1970; None if either is missing or invalid."""
     data = [*sentence.data, *[""] * 9]
     if sentence.sentence_type == "RMC":
         day, month, year = (data[8][start : start + 2] for start in (0, 2, 4))
@@ -224,7 +224,7 @@ def _nearest(of_day: int, log: _Log) -> int:
 
 
 def _fix(sentence: Any, log: _Log) -> _Fix | None:
-    """Parse the position of a GGA; if it is not a measured position, count it and return None."""
+    """Parse the position of a GGA; if the position is not measured, count the sentence and return None."""
     data = sentence.data
     quality = data[5]
     reason = GGA_NOT_MEASURED.get(quality)

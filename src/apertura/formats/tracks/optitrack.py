@@ -24,7 +24,7 @@ _ENU_FROM_MOTIVE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
 """Rows are east, north and up in Motive's x, y (up) and z."""
 
 _NED_FROM_MOTIVE = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""Rows are north, east and down, and forward, right and down of a body, which is level and faces north when defined."""
+"""Rows are north, east and down; also forward, right and down of a body that is level and faces north when defined."""
 
 
 def read_optitrack(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> xr.Dataset:
@@ -50,7 +50,7 @@ def read_optitrack(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIO
     try:
         heading = list(csv.reader(lines[:_HEADING_LINES]))
     except csv.Error as error:
-        raise _error(f"heading: {error}", path) from error
+        raise _error(f"header: {error}", path) from error
     first = next((row for row, cells in enumerate(heading) if cells[:1] == ["Frame"]), None)
     if first is None:
         raise _error("no line that starts with Frame", path)
@@ -95,7 +95,7 @@ def _columns(heading: list[list[str]], body: str | None, *, node: str, where: Pa
     titled = {row[1]: row for row in rows if row[0] == ""}
     kinds, names, quantities, axes = titled.get("Type"), titled.get("Name"), titled.get(""), heading[-1]
     if kinds is None or names is None or quantities is None or axes[1] != "Time (Seconds)":
-        raise _error("heading lines Type, Name, Rotation and Position, or Time (Seconds) missing", where)
+        raise _error("header lines Type, Name, Rotation and Position, or Time (Seconds) missing", where)
     column_of = {
         (name, quantity, axis): column
         for column, (kind, name, quantity, axis) in enumerate(zip(kinds, names, quantities, axes, strict=True))
@@ -125,7 +125,7 @@ def _numbers(
             continue
         cells = text.split(",")
         if len(cells) != width:
-            raise _error(f"line {line} has {len(cells)} cells, the heading {width}", path)
+            raise _error(f"line {line} has {len(cells)} cells, the header {width}", path)
         try:
             rows.append([number(cells[column].strip()) if cells[column].strip() else np.nan for column in columns])
         except ValueError as error:

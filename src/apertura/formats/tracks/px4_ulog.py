@@ -21,13 +21,13 @@ from apertura.formats.tracks.ulog_fields import ATTITUDE, CORRUPT, DAMAGE, DELAY
 Fields = Mapping[str, NDArray[Any]]
 
 _KINDS = {3: FIXES["single"], 4: FIXES["dgps"], 5: FIXES["float"], 6: FIXES["fix"]}
-"""Solution type of each fix_type; below 3 there is no height, 8 is extrapolated."""
+"""fix_type → solution type; values below 3 have no height, and 8 means extrapolated."""
 
 _STATES = {"dead_reckoning": 0, "lat_lon_valid": 1, "alt_valid": 1}
 """State flag of fused positions → its value while GNSS is used; each version of PX4 logs some of the flags."""
 
 _ALWAYS = ("fix_type", "vel_n_m_s", "vel_e_m_s", "vel_d_m_s")
-"""Receiver fields that every version of PX4 logs; a missing one indicates a damaged log."""
+"""Receiver fields that every version of PX4 logs; a missing field indicates a damaged log."""
 
 _DELAY_MS = 110.0
 _FIRST_US, _LAST_US = 3.2e14, 7.2e15  # UTC from 1980 to 2198; 0 means unknown
@@ -43,10 +43,11 @@ def read_px4_ulog(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTION
     """Read a PX4 ULog as `track` stage; its attribute `source` states the topic and instance used.
 
     The topic is vehicle_gps_position if logged, otherwise sensor_gps; both contain the receiver's solution for its
-    antenna, with UTC. If neither is logged, it is vehicle_global_position, whose height follows a barometer and whose
+    antenna, with UTC. If neither is logged, vehicle_global_position is used; its height follows a barometer, and its
     time is derived from the receiver's UTC. ``options.body`` selects a topic, or one of several receivers as
-    ``sensor_gps:1``. Attitude is read from vehicle_attitude. Heights are ellipsoidal; if the driver logs no ellipsoidal
-    heights, or copies of those above sea level, the latter are converted by ``options.height_offset_m``.
+    ``sensor_gps:1``. Attitude is read from vehicle_attitude. Heights are ellipsoidal. If the driver logs no ellipsoidal
+    heights, or copies of the heights above sea level in their place, heights above sea level are converted with
+    ``options.height_offset_m``.
 
     Parameters
     ----------
@@ -114,7 +115,8 @@ def _with_remarks(
     track = damaged(track, damage, where)
     dropouts = fields.get(DROPOUTS, np.zeros(0, np.int64))
     if dropouts.size:
-        remark = f"{dropouts.size} dropouts of the logger, total {dropouts.sum() / 1e3:.1f} s: their messages are lost"
+        duration_s = dropouts.sum() / 1e3
+        remark = f"{dropouts.size} dropouts of the logger, total {duration_s:.1f} s: messages during dropouts are lost"
         track = remarked(track, remark, where)
     receivers = [name for name in _sources(fields) if not name.startswith(FUSED)]
     several = len({name for name in receivers if name.startswith(source.partition(":")[0])}) > 1

@@ -45,7 +45,7 @@ _GEOCENTRIC = re.compile(r"(?:WGS|ITRF|IGS|IGB)[-_ ]?\d*", re.I)
 _INTERVAL = re.compile(
     r"(?:obs|sol|inp) (?:start|end)\b.*?\b(GPST|UTC|JST)\b|out-timesys\s*[=:]\s*(gpst|utc|jst)\b", re.I
 )
-"""Time system in a comment of the header, in addition to the one stated with the column names."""
+"""Time system in a comment of the header, in addition to the time system stated with the column names."""
 
 _STATES = re.compile(rf"ref pos\s*:|{_DATUM.pattern}|{_INTERVAL.pattern}", re.I)
 _EXPECTED = "an RTKLIB solution whose header contains column names and time system (GPST, UTC or JST)"
@@ -76,7 +76,7 @@ def read_rtklib_pos(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTI
     ------
     CampaignError
         If a header lacks column names, states two time systems or a datum other than WGS 84, heights are above a geoid
-        and options.height_offset_m is not configured, a baseline has no base, or a line cannot be read.
+        and options.height_offset_m is not configured, baselines have no base position, or a line cannot be read.
 
     Notes
     -----
@@ -178,7 +178,7 @@ def _kind(line: str) -> str:
 
 
 def _header(lines: list[str], path: Path, first: int) -> _Header:
-    """Parse the comment lines of a header, of which the first is line `first` of the file."""
+    """Parse the comment lines of a header; `first`: line number of the first comment line in the file."""
     heading = next((line for line in lines if _kind(line)), "")
     if not heading:
         position = f" after line {first - 1}" if first > 1 else ""
@@ -206,11 +206,11 @@ def _height_datum(lines: list[str], system: str, path: Path, first: int) -> str:
         other = (interval[1] or interval[2]).upper() if interval else system
         if other != system:
             raise CampaignError(
-                f"times are {system} according to the column heading and {other} according to line {line}, "
+                f"times are {system} according to the column header and {other} according to line {line}, "
                 f"{quoted(text.strip(), 80)}",
                 path,
                 "a single time system",
-                f"Export the solution again. If the heading is correct, remove line {line}.",
+                f"Export the solution again. If the column header is correct, remove line {line}.",
             )
         if datum and datum[1] != "0" and not _GEOCENTRIC.fullmatch(datum[1]):
             raise CampaignError(
@@ -233,7 +233,7 @@ def _check_stated(header: _Header, options: LogOptions, *, node: str, where: Pat
     if header.geodetic_height == "geodetic" and options.height_offset_m is None:
         raise unstated(
             "height_offset_m",
-            "heights are above a geoid (geodetic in RTKLIB)",
+            "heights are orthometric (above a geoid; 'geodetic' in RTKLIB)",
             node=node,
             where=where,
             remedy=", or export ellipsoidal heights",
@@ -317,7 +317,7 @@ def _utc(time: NDArray[np.datetime64], system: str, path: Path) -> NDArray[np.da
 def _position(
     values: NDArray[np.float64], header: _Header, options: LogOptions, *, node: str, where: Path
 ) -> tuple[NDArray[np.float64], bool]:
-    """Return positions, and True if they are ECEF, False if latitude, longitude and ellipsoidal height."""
+    """Return positions, and True for ECEF positions, False for latitude, longitude and ellipsoidal height."""
     if header.position == "ecef":
         return values, True
     if header.position == "baseline":
@@ -349,7 +349,7 @@ def _base(header: _Header, options: LogOptions, *, node: str, where: Path) -> ND
 
 
 def _std(logged: NDArray[np.float64], ecef: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return standard deviations to north, east and up, in ECEF with the logged signed roots of covariances."""
+    """Return standard deviations to north, east and up; those in ECEF are rotated, with the logged covariances."""
     if not logged.shape[1]:
         return None
     if logged.shape[1] == len(_STD):
@@ -408,7 +408,7 @@ def write_rtklib_pos(
     path
         ``….pos``.
     time_utc
-        (epoch,) datetime64, UTC; written in `system` with the milliseconds or finer digits needed.
+        (epoch,) datetime64, UTC; written in `system` with milliseconds, or with more digits if needed.
     geodetic
         (epoch, 3) float64: latitude and longitude (degrees), metres above the ellipsoid; written with a resolution of
         1 µm in arc length and 10 µm in height.

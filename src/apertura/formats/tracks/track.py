@@ -22,7 +22,7 @@ GGA_KINDS = {"1": "single", "2": "dgps", "3": "single", "4": "fix", "5": "float"
 """Quality indicator of NMEA GGA → solution type, a key of `FIXES`; 9 as defined by NovAtel."""
 
 GGA_NOT_MEASURED = {"": "no fix", "0": "no fix", "6": "dead reckoning", "7": "manual input", "8": "simulated"}
-"""Quality indicator of NMEA GGA → reason why the position is not a measured one."""
+"""Quality indicator of NMEA GGA → reason why the position is not measured."""
 
 LOWEST_M, HIGHEST_M = -1000.0, 100_000.0
 """Accepted heights above the ellipsoid, m, of aircraft and balloons."""
@@ -182,7 +182,7 @@ def receivers_remark(kinds: Mapping[str, NDArray[np.int8]], selected: str, node:
     Examples
     --------
     >>> receivers_remark({"0": np.array([5, 5]), "1": np.array([1, 0])}, "0", "uav1")
-    'the log contains receivers 0 (single 2) and 1 (fix 1, no fix 1); 0 is used: select with nodes.uav1.log.body'
+    'the log contains receivers 0 (single 2) and 1 (fix 1, no fix 1); 0 is used; select with nodes.uav1.log.body'
     """
     names = {number: name for name, number in FIXES.items()} | {0: "no fix"}
     listed = []
@@ -190,7 +190,7 @@ def receivers_remark(kinds: Mapping[str, NDArray[np.int8]], selected: str, node:
         counted = {name: int((fix == number).sum()) for number, name in names.items()}
         solutions = ", ".join(f"{name} {count}" for name, count in counted.items() if count)
         listed.append(f"{receiver} ({solutions or 'no epochs'})")
-    return f"the log contains receivers {' and '.join(listed)}; {selected} is used: select with nodes.{node}.log.body"
+    return f"the log contains receivers {' and '.join(listed)}; {selected} is used; select with nodes.{node}.log.body"
 
 
 def _rolled_over(time_utc: NDArray[np.datetime64]) -> list[str]:
@@ -279,7 +279,7 @@ _UNIX = re.compile(r"1970-01-01(?:[T ]00:00(?::00(?:\.0+)?)?)?", re.ASCII)
 
 
 def unstated(key: str, found: str, *, node: str, where: Path, remedy: str = "") -> CampaignError:
-    """Return the error for a log without a value that the config must then state.
+    """Return the error for a log without a value that must then be configured.
 
     Parameters
     ----------

@@ -53,7 +53,7 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
 
     data = path.read_bytes()
     second = data.find(_MAGIC, 1)
-    if second > 0:  # its subscriptions would replace those of the first log
+    if second > 0:  # subscriptions of the second log would replace those of the first log
         raise ValueError(f"a second log starts at byte {second}: separate concatenated logs")
     spans, unread = _foreign(data)
     # the parser reads an undamaged file directly, including appended data
@@ -193,7 +193,7 @@ def _appended(data: bytes) -> list[int]:
 
 
 def _joined(data: bytes) -> bytes:
-    """Remove the offsets of appended data from a ULog: without foreign bytes, these follow the other messages."""
+    """Remove the offsets of appended data from a ULog from which foreign bytes, and thus gaps, are to be removed."""
     if not _appended(data):
         return data
     at = _HEADER + _MESSAGE

@@ -1,1 +1,1 @@
-"""Bench test of a stationary radar: measurement of channels, clocks and links (`measurement`), and its `report`."""
+"""Bench test of a stationary radar: `measurement` of channels, clocks and links, and the `report` on them."""

@@ -1,4 +1,4 @@
-"""Measurement of a flight of kind bench: channels and clocks of its nodes, links of its pairs, verdict lines."""
+"""Measurement of a flight of kind bench: channels and clocks of nodes, links of pairs, and lines of the verdict."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -64,7 +64,7 @@ from apertura.stages.ingest import captures_of, checked_recording
 from apertura.stages.transmitted import Transmitted, transmitted
 
 _CHANNELS = ("radar", "sidelink")
-_STRETCH = 256  # consecutive captures in each of 16 groups of a recording
+_STRETCH = 256  # consecutive captures in each of `GROUPS` groups of a recording
 _EVERY_CAPTURE = 4096
 """Maximum number of captures of a node whose samples are analysed; longer recordings are sampled evenly."""
 
@@ -101,13 +101,15 @@ class BenchNode:
     name
         Name of the node.
     triggers, channels, saturated
-        Recorded pulses; state of each channel; share of saturated samples by channel.
+        Recorded and missed pulses; state of each channel; channel → fraction of saturated samples.
     clock
-        Clock offset to the transmitter; None for the transmitter, and if it cannot be measured.
+        Clock offset relative to the transmitter; None for the transmitter itself, and if the offset cannot be measured.
     sidelink, contact
-        State of the sidelink as measured for the correction, and stability of its amplitude; None without a sidelink.
+        State of the sidelink as measured for the sidelink correction, and stability of its amplitude; None without a
+        sidelink.
     link
-        Strongest path: the transmitter's own echo, else the echo divided by the sidelink; None if no path locks.
+        Strongest path: for the transmitter in its own echo, for a receiver in its echo divided by the sidelink; None if
+        no path is found.
     coherence_before
         Γ of the radar channel without sidelink correction.
     flags
@@ -137,9 +139,9 @@ class Bench:
     nodes
         Recording nodes, the transmitter first.
     offsets
-        Node → path offset of its radar channel, less that of its sidelink, relative to the set-up.
+        Node → path offset of its radar channel minus that of its sidelink channel, relative to the paths of the set-up.
     splits
-        Pair → comparison of its radar channel with the transmitter's, if one signal is split to both.
+        Pair → comparison of its radar channel with that of the transmitter, if one signal is split to both channels.
     carrier_hz, interval_s
         Nominal carrier frequency, and pulse interval.
     """
@@ -164,7 +166,7 @@ class Bench:
 
     @property
     def lines(self) -> list[VerdictLine]:
-        """Lines of the verdict on all nodes."""
+        """Lines of the verdict for all nodes."""
         return [line for node in self.nodes for line in self._lines(node)]
 
     def _lines(self, node: BenchNode) -> Iterator[VerdictLine]:
@@ -212,7 +214,7 @@ class Bench:
             )
 
     def _received(self, node: BenchNode, line: Any) -> Iterator[VerdictLine]:
-        """Yield lines on a receiver's clock and sidelink."""
+        """Yield the lines for a receiver's clock and sidelink."""
         if node.name == self.transmitter:
             return
         if node.clock is not None:
@@ -220,17 +222,17 @@ class Bench:
             sampling = f"{node.clock.sfo_ppm:+.4f} ± {node.clock.sfo_std_ppm:.4f} ppm of the sampling rate"
             yield line(node.name, "carrier frequency offset", f"{ppm:+.4f} ± {std:.4f} ppm", f"{UNLOCKED_PPM:g} ppm",
                        "clock_unlocked", "clock_ambiguous")  # fmt: skip
-            yield line(node.name, "sampling frequency offset", sampling, "equal to that of the carrier")
+            yield line(node.name, "sampling frequency offset", sampling, "equal to the carrier offset in ppm")
             change_ppm = node.clock.cfo_slope_hz * node.triggers.recorded / self.carrier_hz * 1e6
             yield line(node.name, "change of the carrier offset over the recording", f"{change_ppm:+.4f} ppm",
                        f"{DRIFT_PPM:g} ppm", "clock_drifts")  # fmt: skip
         of = f"{node.name} sidelink"
         if node.sidelink is not None:
             state = node.sidelink
-            method = "depends on the correction"
+            method = "depends on the correction method"
             yield line(of, "SNR", f"{state['snr_db']:.1f} dB per subcarrier", method, "sidelink_noisy")
             yield line(of, "lock", f"{100 * state['lock_rate']:.1f} % of the pulses", "100 %", "sidelink_lost")
-            yield line(of, "echoes besides the direct path", f"at most {state['echo_db']:.1f} dB", method,
+            yield line(of, "echoes in addition to the direct path", f"at most {state['echo_db']:.1f} dB", method,
                        "sidelink_echo", "second_arrival", "sidelink_ripple_or_echo")  # fmt: skip
             yield line(of, "ripple over the band", f"{state['ripple_db']:.2f} dB", method,
                        "sidelink_ripple", "sidelink_nulls")  # fmt: skip
@@ -293,7 +295,7 @@ class Bench:
         if (split := self.splits.get(pair)) is not None:
             yield line(
                 pair,
-                f"difference to {self.pair(self.transmitter)} with a split signal",
+                f"difference from {self.pair(self.transmitter)} with a split signal",
                 f"{split.gain_db:+.2f} dB, {split.phase_rad:+.3f} ± {split.phase_std_rad:.3f} rad, path "
                 f"{split.path_m:+.3f} m (receiver: relative to its sidelink); over the band {split.band_db:.2f} dB, "
                 f"{split.band_rad:.3f} rad rms",
@@ -327,7 +329,7 @@ _DOUBTS = frozenset({
     "link_weak", "link_incoherent", "contact_intermittent", "delay_jumps", "wrong_code", "code_unconfirmed",
     "spectrum_inverted", "saturated_radar", "saturated_sidelink", "sidelink_lost", "interference",
 })  # fmt: skip
-"""Flags that exclude the measured path of a node from the config."""
+"""Flags that prevent the measured path offset of a node from being written to the config."""
 
 
 def _link_report(node: BenchNode, interval_s: float) -> dict[str, Any]:
@@ -354,7 +356,7 @@ def _link_report(node: BenchNode, interval_s: float) -> dict[str, Any]:
 
 
 def measure_bench(campaign: Campaign, flight: str) -> Bench:
-    """Measure a flight of kind bench from its recordings; no log is read.
+    """Measure a flight of kind bench from its recordings, without flight logs.
 
     Raises
     ------
@@ -373,7 +375,7 @@ def measure_bench(campaign: Campaign, flight: str) -> Bench:
     names = [name for name in flown.participants if name in flown.nodes]
     nodes = tuple(_node(campaign, flight, name, sent, is_transmitter=name == flown.transmitter) for name in names)
     due = max((node.triggers.due for node in nodes), default=0)
-    # pulses recorded by other nodes before a node started or after it stopped
+    # `beyond`: pulses that other nodes recorded before this node started or after it stopped
     counts = [replace(node.triggers, beyond=due - node.triggers.due) for node in nodes]
     nodes = tuple(
         replace(node, triggers=triggers, flags=Flags.merged(node.flags, triggers.flags))
@@ -425,8 +427,8 @@ def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, is_t
     if _is_inverted(read, sent, "radar" if is_transmitter else "sidelink", len(every)):
         read = _conjugated(read)
         line = (
-            f"{name}: the code matches the complex conjugate of the samples; toggle nodes.{name}.iq, or waveform.iq "
-            "for all nodes"
+            f"{name}: the code matches the complex conjugate of the samples; change nodes.{name}.iq, or waveform.iq "
+            "if all nodes are affected"
         )
         flags.append({"spectrum_inverted": line})
     before, clock, contact, state = None, None, None, None
@@ -452,7 +454,7 @@ def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, is_t
             state = measured.report["sidelink"]
     link = None
     if measured is not None:
-        # the radar is stationary: flags of echo processing on geometry and on phase stability do not apply here
+        # the radar is stationary: the flags of echo processing that assume a flight do not apply
         flags.append({key: line for key, line in measured.flags.items() if key not in _OF_FLIGHTS})
         kept = np.flatnonzero(measured.kept)
         if len(kept) > 1:
@@ -501,7 +503,7 @@ def _conjugated(read: Read) -> Read:
 
 
 def _is_inverted(read: Read, sent: Transmitted, channel: str, count: int) -> bool:
-    """Return True if the code locks to the complex conjugate of a channel's samples, but not to the samples."""
+    """Return True if the code matches the complex conjugate of a channel's samples, but not the samples themselves."""
     pulses = np.concatenate(spread(count, groups=4, each=16))
 
     def locks(reader: Read) -> bool:
@@ -524,6 +526,6 @@ def _clock(read: Read, sent: Transmitted, name: str, count: int) -> tuple[ClockO
 
 
 def series(link: MeasuredLink) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return the plotted series: (pulse,) time, s, phase, rad, delay, ps, and amplitude, dB re median."""
+    """Return the plotted series, (pulse,) each: time in s, phase in rad, delay in ps, amplitude in dB re median."""
     size = np.abs(link.terms)
     return link.time_s, link.phase_rad, link.delay_ps, 20 * np.log10(size / np.median(size))

@@ -1,4 +1,4 @@
-"""Rule `bench` and `apertura bench`: measure a stationary radar; bench.json, bench.html and bench.png."""
+"""Rule `bench` and `apertura bench`: measure a stationary radar; write bench.json, bench.html and bench.png."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -42,7 +42,7 @@ def bench(campaign: Campaign, flight: str) -> Sequence[Path]:
 
 
 def print_bench(campaign: Campaign, *, write: bool = False) -> int:
-    """Measure new or out-of-date flights of kind bench and print all verdicts; return the number of lines with flags.
+    """Measure flights of kind bench without an up-to-date result, print all verdicts, and count the lines with flags.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def print_bench(campaign: Campaign, *, write: bool = False) -> int:
         raise CampaignError(
             f"{number_of(len(campaign.flights), 'flight')}, none of kind bench",
             where=campaign.root / FLIGHTS,
-            expected="a line for a recording of a stationary radar: flight, bench, transmitter, nodes",
+            expected="a line with the columns flight, bench, transmitter, nodes for a recording of a stationary radar",
             remedy="Add the line; no flight log is required.",
         )
     stale, flagged = set(stale_results(campaign)), 0
@@ -117,8 +117,9 @@ def _blocks(title: str, report: Mapping[str, Any], picture: bytes) -> Iterator[B
         yield Table("Flags raised.", ("flag", "measurement", "meaning", "advice"), rows)
     yield Picture(
         picture,
-        "Phase, delay and amplitude of the strongest path of each pair from pulse to pulse, relative to their mean; "
-        "mean range profile; Allan deviation of the delay from its phase, dashed: white noise at the measured SNR.",
+        "From top to bottom: phase, delay and amplitude of the strongest path of each pair against time, relative to "
+        "their mean; mean range profile; Allan deviation of the delay, computed from the phase (dashed: white noise at "
+        "the measured SNR).",
     )
     yield Table("Measurements.", _HEAD, _rows(report))
 
@@ -157,17 +158,17 @@ def draw_bench(path: Path, measured: Bench, *, title: str, tags: Mapping[str, st
             over_time[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), markerscale=4)
 
 
-# ---- Measured paths into the config ---------------------------------------------------------------------------------
+# ---- Measured path offsets in the config ----------------------------------------------------------------------------
 
 
 def _offer(campaign: Campaign, flight: str, offsets: Mapping[str, Any], *, write: bool) -> None:
-    """Print the config keys for the measured paths, or write them; links with excluding flags are skipped."""
+    """Print the measured path offsets as config keys, or write them; links with a flag in `_DOUBTS` are skipped."""
     if not offsets:
         print(f"{CONFIG}: bench.radar_m and bench.sidelink_m are not configured: path offsets cannot be computed")
         return
     for node, offset in offsets.items():
         if offset["doubts"]:
-            print(f"nodes.{node}.path_offset_m: not determined, because the link has {', '.join(offset['doubts'])}")
+            print(f"nodes.{node}.path_offset_m: not determined; flags of the link: {', '.join(offset['doubts'])}")
     differing = {
         node: offset
         for node, offset in offsets.items()
@@ -176,7 +177,7 @@ def _offer(campaign: Campaign, flight: str, offsets: Mapping[str, Any], *, write
     if write:
         write_offsets(campaign, flight, differing)
     elif differing:
-        print(f"measured paths for {CONFIG} (`apertura bench --write` writes them):")
+        print(f"measured path offsets for {CONFIG} (to write them: `apertura bench --write`):")
         transmitter = campaign.flight(flight).transmitter
         for node, offset in differing.items():
             radar_m = _radar_m(campaign, node, offset["offset_m"], is_transmitter=node == transmitter)
@@ -184,12 +185,12 @@ def _offer(campaign: Campaign, flight: str, offsets: Mapping[str, Any], *, write
 
 
 def _radar_m(campaign: Campaign, node: str, offset_m: float, *, is_transmitter: bool) -> float:
-    """Return the path offset of a radar channel; for a receiver, the measured offset is relative to its sidelink."""
+    """Return the path offset of a radar channel, metres; for a receiver, `offset_m` is relative to its sidelink."""
     return round(offset_m if is_transmitter else offset_m + campaign.settings.nodes[node].path_offset_m.sidelink, 4)
 
 
 def write_offsets(campaign: Campaign, flight: str, offsets: Mapping[str, Any]) -> None:
-    """Write measured paths into config/config.yaml; the rest of the file is unchanged."""
+    """Write measured path offsets into config/config.yaml; the rest of the file is unchanged."""
     path, transmitter = campaign.root / CONFIG, campaign.flight(flight).transmitter
     text = path.read_text(encoding="utf-8")
     values = {
@@ -203,7 +204,7 @@ def write_offsets(campaign: Campaign, flight: str, offsets: Mapping[str, Any]) -
         validated(yaml.safe_load(text), where=path)
         write_text(path, text)
     else:
-        print(f"{CONFIG}: unchanged: no measured path to write")
+        print(f"{CONFIG}: unchanged, because there is no measured path offset to write")
 
 
 def with_value(text: str, keys: tuple[str, ...], value: float) -> str:

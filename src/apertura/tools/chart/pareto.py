@@ -23,7 +23,7 @@ _MARKERS = "osD^vP"
 class Point:
     """Time and error of a setting; the time is for the whole image on one thread, extrapolated from the measured part.
 
-    `error_db` is an upper bound with 95 % confidence; None for the exact sum, the reference of all errors.
+    `error_db` is an upper bound with 95 % confidence; None for the exact sum, which is the reference of all errors.
     """
 
     engine: str
@@ -39,7 +39,7 @@ class Point:
 
 
 def with_front(points: Sequence[Point]) -> list[Point]:
-    """Mark the points of the Pareto front in a list sorted by time: no faster point is as accurate."""
+    """Mark the points of the Pareto front, for which no faster point is as accurate, in a list sorted by time."""
     best, marked = float("inf"), []
     for point in points:
         error_db = -np.inf if point.error_db is None else point.error_db
@@ -48,7 +48,7 @@ def with_front(points: Sequence[Point]) -> list[Point]:
     return marked
 
 
-_BESIDE = 3.0  # multiple of the slowest other time, up to which the exact sum is drawn on the axis
+_BESIDE = 3.0  # the exact sum is drawn on the axis if it takes at most this multiple of the slowest other time
 
 
 def draw_points(points: Sequence[Point], path: Path, *, title: str, accuracy_db: float) -> None:
@@ -68,7 +68,7 @@ def draw_points(points: Sequence[Point], path: Path, *, title: str, accuracy_db:
             label = f"{chosen}exact sum, reference of the errors: {point.seconds:.3g} s"
             if point.seconds <= _BESIDE * slowest_s:
                 axes.axvline(point.seconds, color="0.4", linestyle=":", label=label)
-            else:  # not on the axis, which it would stretch
+            else:  # legend only: a mark would stretch the axis
                 axes.plot([], [], color="0.4", linestyle=":", label=f"{label}, beyond the axis")
         elif point.planned:
             presum = f", presum {point.presum}:1" if point.presum > 1 else ""
@@ -76,7 +76,7 @@ def draw_points(points: Sequence[Point], path: Path, *, title: str, accuracy_db:
             axes.plot(point.seconds, point.error_db, "*", color="#d55e00", markersize=17, label=label)
     axes.axhline(accuracy_db, color="#009e73", linestyle="--", label=f"requested: {accuracy_db:g} dB")
     axes.set_xscale("log")
-    axes.set_xlabel("Time of tables and sums for the whole image, one thread, s")
+    axes.set_xlabel("Time to compute tables and sums of the whole image, one thread, s")
     axes.set_ylabel("Error relative to the exact sum, upper bound with 95 % confidence, dB")
     axes.set_title(title, fontsize=11)
     axes.grid(which="both", alpha=0.25)
@@ -101,11 +101,11 @@ td:first-child,th:first-child{text-align:left} tr.planned{background:#fbe5d6} tr
 th{cursor:pointer}
 </style>
 <h1 style="font-size:18px">@TITLE@</h1>
-<p>Each point is an engine with one setting: time of its tables and sums for the whole image on one thread, and error
-relative to the exact sum, an upper bound with 95 % confidence. Solid line: Pareto front. Star: planner's choice. Dashed
-line: requested accuracy. Dotted line: time of the exact sum.</p>
+<p>Each point is one setting of an engine: the time to compute tables and sums of the whole image on one thread, and an
+upper bound, with 95 % confidence, of the error relative to the exact sum. Solid line: Pareto front. Star: planner's
+choice. Dashed line: requested accuracy. Dotted line: time of the exact sum.</p>
 <div id="filters"></div><svg id="chart" viewBox="0 0 960 560" role="img" aria-label="error against time"></svg>
-<p id="tip">Move the pointer to a mark for its values.</p><table id="rows"></table>
+<p id="tip">Move the pointer to a mark to display its values.</p><table id="rows"></table>
 <script>
 const points = @POINTS@, requested = @REQUESTED@;
 const palette = ["#0072b2","#e69f00","#000","#cc79a7","#56b4e9","#009e73"], shown = {};
@@ -142,7 +142,7 @@ function draw() {
   make("line",{x1:box.left,x2:box.right,y1:Y(requested),y2:Y(requested),stroke:"#009e73","stroke-dasharray":"6 4"});
   make("text",{x:box.right-4,y:Y(requested)-5,"text-anchor":"end"},`requested: ${requested} dB`);
   make("text",{x:(box.left+box.right)/2,y:box.bottom+40,"text-anchor":"middle"},
-    "time of tables and sums for the whole image, one thread, s");
+    "time to compute tables and sums of the whole image, one thread, s");
   const selected = points.filter(p=>shown[p.engine]); let best = Infinity, path = "";
   for (const p of selected) if (p.error_db!==null && p.error_db<best) {
     path += path ? `H${X(p.seconds)}V${Y(p.error_db)}` : `M${X(p.seconds)},${Y(p.error_db)}`; best = p.error_db;
@@ -193,7 +193,7 @@ def write_page(points: Sequence[Mapping[str, Any]], path: Path, *, title: str, a
 
 
 def save_png(figure: Figure, path: Path) -> None:
-    """Write a figure as reproducible PNG."""
+    """Write a figure as a reproducible PNG file."""
     FigureCanvasAgg(figure)
     with replacement(path) as temporary:
         figure.savefig(temporary, format="png", dpi=110, metadata={"Software": None})

@@ -31,11 +31,11 @@ from apertura.workflow.rules import STUDY
 
 PULSES, SIDE_PX = 1024, 256
 LEAST_ROWS = 32
-"""Number of window rows that every setting forms; they contain all pixels with exact values."""
+"""Number of rows of the window that are formed with every setting; these rows contain all pixels with exact values."""
 
 _TOLERANCES_RAD = (1.5e-3, 1.5e-4)
 _SLOW_SECONDS = 0.3
-"""Settings with a longer predicted time for the window are timed on fewer of its rows, seconds."""
+"""Predicted time for the window, seconds, above which a setting is timed on only some of the window's rows."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,8 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
 
     Notes
     -----
-    The times are those of the engines; computing pixel positions and storing tiles, common to all, are not included.
+    The times are those of the engines. The computation of pixel positions and the storage of tiles, which are common to
+    all settings, are not included.
     """
     lineage = result_of(campaign, "speed_accuracy").begin(campaign.root)
     logged, track = open_pair(campaign, flight, pair), open_refined(campaign, flight)
@@ -110,7 +111,7 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
         replace(point, predicted_seconds=point.predicted_seconds - search.tile_seconds)
         for point in measure(part, plan, settings, seconds=seconds)
     ]
-    middle_part = "" if len(history) == len(opened.time_s) else f"the middle {len(history)} of "
+    middle_part = "" if len(history) == len(opened.time_s) else f"the central {len(history)} of "
     size = f"{scene.grid.shape[0]} × {scene.grid.shape[1]} pixels, {middle_part}{len(opened.time_s)} pulses"
     title = f"{campaign.settings.campaign}, {flight}/{pair}: {size}"
     paths = [campaign.result(STUDY) / f"speed_accuracy.{suffix}" for suffix in ("csv", "png", "html")]
@@ -130,7 +131,7 @@ def _part(
     total_pixels: int,
     beams: Beams | None,
 ) -> Part:
-    """Return the measured part; its pixels are sampled as for a certificate, by the brightness of the planned image."""
+    """Return the part to measure, with pixels sampled by brightness in the planned image, as for a certificate."""
     window = []
     for size in scene.grid.shape:
         first = max(0, size - SIDE_PX) // 2 // 16 * 16

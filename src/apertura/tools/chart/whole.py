@@ -33,8 +33,8 @@ _FLOOR_DB = -110.0
 _LONGEST_DB = 20.0
 _MARKS = {
     "o": "certified numerical error; bar: range of times",
-    "s": "power spread from peaks, expected by the error budget",
-    "^": "power spread from peaks, measured at bright points, ± σ",
+    "s": "power spread from the peaks, predicted by the error budget",
+    "^": "power spread from the peaks, measured at bright points, ± σ",
 }
 
 
@@ -45,7 +45,8 @@ class Whole:
     Attributes
     ----------
     seconds, least_seconds, most_seconds
-        Mean, minimum and maximum processor time of the repeats, which is less sensitive to other load than wall time.
+        Mean, minimum and maximum processor time of the repeats. Processor time depends less on other load of the
+        machine than wall time.
     wall_seconds
         Mean wall time.
     repeats
@@ -77,7 +78,7 @@ class Whole:
 
 
 def spread_db(loss_db: float) -> float:
-    """Convert a peak loss into the share of the peak's power that is spread around it, dB.
+    """Convert a peak loss into the fraction of the peak power that is spread around the peak, dB.
 
     Examples
     --------
@@ -88,7 +89,7 @@ def spread_db(loss_db: float) -> float:
 
 
 def draw_whole(rows: Sequence[Whole], path: Path, *, title: str, refused: Collection[str]) -> None:
-    """Plot the errors of each setting against its time as PNG; refused settings are listed."""
+    """Plot the errors of each setting against its processing time as PNG; refused settings are listed."""
     figure = Figure(figsize=(13, 7), layout="constrained")
     axes, legend_axes = figure.subplots(1, 2, width_ratios=(3.2, 1))
     ordered = sorted(rows, key=lambda row: row.seconds)
@@ -158,10 +159,10 @@ def whole_chart(campaign: Campaign, *, repeats: int = 3) -> Sequence[Path]:
     Parameters
     ----------
     campaign
-        Campaign whose recordings are processed again, in a folder that is removed afterwards.
+        Campaign whose recordings are reprocessed in a temporary folder.
     repeats
         Number of runs of every setting. Settings alternate, so that other load of the machine affects all of them
-        equally; an additional first run, which is not counted, loads libraries and files.
+        equally. An additional first run, which loads libraries and files, is not counted.
     """
     lineage = result_of(campaign, "whole").begin(campaign.root)
     work = with_inputs(campaign, campaign.result(STUDY) / "whole", link=False)

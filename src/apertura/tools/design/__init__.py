@@ -1,8 +1,8 @@
-"""Prediction of image quality before a flight, with the functions that describe images after processing.
+"""Prediction of image quality before a flight, with the functions that also assess processed images.
 
 `design` returns layers of every image of a plan, the cost of recording and processing, and a verdict on each
 requirement; `requirements` finds the main cause of a shortfall and the most helpful change, and searches for tracks
-within bounds. Quantities that the pipeline reports of images are computed by the pipeline's own functions.
+within bounds. Quantities that the pipeline also reports for images are computed by the pipeline's own functions.
 """
 
 from collections.abc import Mapping
@@ -28,19 +28,20 @@ def design(
     Parameters
     ----------
     plan
-        A YAML file, its document, or a `FlightPlan`: the keys of config/config.yaml, and flights with tracks; see
-        docs/howto/design.md.
+        A YAML file, its parsed contents, or a `FlightPlan`. A plan has the keys of config/config.yaml, and flights with
+        tracks; see docs/howto/design.md.
     root
-        Folder of the files that the plan names; default: folder of the YAML file, else the current folder.
+        Folder of the files named in the plan; default: the folder of the YAML file, or, without a YAML file, the
+        current folder.
     threads
         Number of tiles computed in parallel.
 
     Returns
     -------
     xarray.Dataset
-        Layers of `UNITS` over (image, y, x), float32, on the grid of the later campaign: NaN for a layer that does not
-        apply to an image; `coherence` and `height_ambiguity` over (interferogram, y, x). Attributes: `judgement` of
-        each requirement, `recording`, `budget` and `flags` of each image.
+        Layers of `UNITS` over (image, y, x), float32, on the grid of the later campaign; NaN if a layer does not apply
+        to an image. `coherence` and `height_ambiguity` are over (interferogram, y, x). Attributes: `judgement` of each
+        requirement, `recording`, and `budget` and `flags` of each image.
 
     Raises
     ------
@@ -68,7 +69,7 @@ def design(
 
 
 def as_plan(plan: FlightPlan | Mapping[str, Any] | str | Path, root: Path | None) -> tuple[FlightPlan, Path]:
-    """Return a plan, after reading it if it is a file, and the folder of the files that it names."""
+    """Return a plan, which is read first if given as a file, and the folder of the files named in the plan."""
     if isinstance(plan, str | Path):
         return read_flight_plan(Path(plan)), root or Path(plan).absolute().parent
     if not isinstance(plan, FlightPlan):

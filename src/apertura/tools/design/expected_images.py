@@ -50,7 +50,8 @@ class ResourceEstimate:
     Attributes
     ----------
     flight_s
-        Flight → flight time including turns, seconds; with take-off, transit and landing if the plan has a home.
+        Flight → flight time including turns, seconds; also including take-off, transit and landing if the plan has a
+        home.
     transfer_s
         Flight → time before the first and after the last pulse, seconds; 0 without a home.
     pulses
@@ -60,9 +61,9 @@ class ResourceEstimate:
     recorded_bytes
         Recorded bytes of all nodes and flights.
     processing_s
-        Time of the complete workflow on the machine on which its costs were measured, seconds.
+        Duration of the complete workflow on the machine on which the costs of its steps were measured, seconds.
     memory_bytes
-        Memory of the largest job.
+        Memory of the largest job, bytes.
     """
 
     flight_s: Mapping[str, float]
@@ -160,17 +161,17 @@ def designed(plan: FlightPlan, root: Path, *, threads: int = 1, coarse: int | No
     plan
         The flight plan.
     root
-        Folder of the files that the plan names.
+        Folder of the files named in the plan.
     threads
         Number of tiles computed in parallel.
     coarse
-        Number of pixels along the longer side of a coarser grid, with the integration of the fine grid; None: the grid
-        of the plan.
+        Number of pixels along the longer side of a coarser grid, on which the integration of the fine grid is used;
+        None: the grid of the plan.
 
     Raises
     ------
     CampaignError
-        As `open_plan`, and if the pulse rate is too low for the scene.
+        In the cases of `open_plan`, and if the pulse rate is too low for the scene.
     """
     opened = open_plan(plan, root)
     with errors_of_the_plan():
@@ -212,7 +213,7 @@ def _computed(opened: OpenPlan, *, threads: int, coarse: int | None) -> Design:
 
 
 def _refinement(opened: OpenPlan, pairs: Sequence[OpenPair]) -> PlannedRefinement:
-    """Decide on the refinement of a flight's tracks, and predict the loss by residual position errors."""
+    """Decide on the refinement of a flight's tracks, and predict the loss due to residual position errors."""
     errors = errors_of([replace(pair, positions=tuple(node.assumed for node in pair.positions)) for pair in pairs])
     remainder_db, obstacles = expected_remainder(
         errors.values(),
@@ -234,7 +235,7 @@ def _check_sampled(opened: OpenPlan, pair: OpenPair) -> None:
             f"{pair.flight}/{pair.name}: {sparse}",
             "the plan: waveform.prf_hz",
             f"at least {math.ceil(doppler_hz)} Hz, the Doppler spread over the scene, instead of {prf_hz:g} Hz",
-            "Increase it, fly slower, configure the antenna beams, or make the scene smaller.",
+            "Increase waveform.prf_hz, fly slower, configure the antenna beams, or make the scene smaller.",
         )
 
 
@@ -244,12 +245,12 @@ _BITS = 14
 def rehearse(
     opened: OpenPlan, targets: Sequence[Target], directory: Path, *, seed: int = 1, erring: bool = False
 ) -> Path:
-    """Simulate the flight of a plan into a campaign folder with the config of the later campaign; return the folder.
+    """Simulate the flight of a plan in a campaign folder with the config of the later campaign; return the folder.
 
     Parameters
     ----------
     opened
-        Plan of an OFDM radar in a georeferenced frame.
+        Plan with an OFDM radar and a georeferenced CRS.
     targets
         Point targets, metres from the scene centre; amplitudes are square roots of cross-sections in m².
     directory
@@ -257,12 +258,12 @@ def rehearse(
     seed
         Seed of noise and errors.
     erring
-        True to add errors of nodes.<n>.position_std_m to the logs.
+        True: position errors with the standard deviation nodes.<n>.position_std_m are added to the logs.
 
     Raises
     ------
     CampaignError
-        If the plan has another waveform or a local frame, or the folder is not empty.
+        If the waveform of the plan is not OFDM, its frame is local, or the folder is not empty.
     """
     plan, scene = opened.plan, opened.scene
     if not isinstance(plan.waveform, OfdmWaveform) or scene.grid.crs == LOCAL:
@@ -270,7 +271,7 @@ def rehearse(
             f"waveform {plan.waveform.kind} in scene.crs {scene.grid.crs}",
             "the plan",
             "an OFDM radar in a georeferenced CRS",
-            "Rehearse another plan.",
+            "Use a plan with kind: ofdm and a georeferenced scene.crs.",
         )
     latitude, longitude, height = map(float, geodetic_from_ecef(scene.middle_m))
     origin = Origin(latitude, longitude, height)
@@ -308,7 +309,7 @@ def rehearse(
 
 
 def _simulated(node: Node, *, erring: bool) -> SimulatedNode:
-    """Return the simulated node of a planned node."""
+    """Return the simulated counterpart of a planned node."""
     receiver, antennas = node.receiver, node.antennas
     radio = None
     if receiver is not None:

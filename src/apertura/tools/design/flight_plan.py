@@ -26,8 +26,8 @@ class _Track(Section):
     height_m: float = Field(description="height above the reference `above`, m")
     above: Above = Field(
         "ground",
-        description="reference of height_m: ground, mean terrain height of the scene; terrain, terrain below each "
-        "point; ellipsoid",
+        description="reference of height_m: ground (mean terrain height of the scene), terrain (terrain below each "
+        "point) or ellipsoid",
     )
 
 
@@ -51,14 +51,14 @@ class LineTrack(_Leg):
 
 
 class RacetrackTrack(_Leg):
-    """Parallel legs in alternating directions; turns between them are flown and not imaged."""
+    """Parallel legs in alternating directions; turns between them are flown but not imaged."""
 
     kind: Literal["racetrack"]
     legs: int = Field(2, ge=1, le=_MOST_LEGS, description="number of legs, alternating in direction")
     spacing_m: float = Field(
-        0.0, description="offset of each leg to the right of the previous one, as seen along the first, m"
+        0.0, description="offset of each leg to the right of the previous leg, as seen along the first leg, m"
     )
-    climb_m: float = Field(0.0, description="height of each leg above the previous one, m")
+    climb_m: float = Field(0.0, description="height of each leg above the previous leg, m")
 
 
 class CircleTrack(_Track):
@@ -78,7 +78,7 @@ class MissionTrack(Section):
     file: str = Field(description="path relative to the plan: .plan, .waypoints, .kml or .csv")
     speed_m_s: Positive | None = Field(None, description="ground speed, m/s; null: speed of the mission")
     image: tuple[int, int] | None = Field(
-        None, description="first and last waypoint of the imaged part, counted from 1; null: all"
+        None, description="first and last waypoint of the imaged part, counted from 1; null: all waypoints"
     )
 
 
@@ -86,7 +86,7 @@ class BesideTrack(Section):
     """Track at constant offsets from another node, relative to its course."""
 
     kind: Literal["beside"]
-    of: Name = Field(description="node that it follows")
+    of: Name = Field(description="node that this node follows")
     ahead_m: float = Field(0.0, description="offset ahead of that node, along its course, m")
     right_m: float = Field(0.0, description="offset to the right of that node, m")
     up_m: float = Field(0.0, description="offset above that node, m")
@@ -105,7 +105,7 @@ class FormationSettings(Section):
         "stack: above"
     )
     leader: Name = Field(description="node with a track of its own")
-    spacing_m: Positive = Field(description="distance between neighbours, m; for a vee in both axes")
+    spacing_m: Positive = Field(description="distance between neighbouring nodes, m; for a vee, along both axes")
 
     def offsets(self, followers: int) -> list[tuple[float, float, float]]:
         """Return the offsets (ahead, right, up) of each follower from the leader, metres.
@@ -147,9 +147,9 @@ class PlannedFlight(Section):
     )
     separation_m: float = Field(2.0, ge=0, description="minimum distance between any two nodes, m")
     climb_m_s: Positive = Field(
-        2.0, description="vertical speed of take-off and landing, m/s; included in flight_s of a mission with a home"
+        2.0, description="vertical speed of take-off and landing, m/s, for flight_s of a mission with a home"
     )
-    wobble: WobbleSettings | None = Field(None, description="deviation from the planned track by wind; null: none")
+    wobble: WobbleSettings | None = Field(None, description="deviation from the planned track due to wind; null: none")
     log_rate_hz: Positive = Field(10.0, description="epoch rate of the flight logs, Hz")
     solution: Literal["fix", "float", "single"] = Field(
         "fix",
@@ -164,7 +164,7 @@ class PlannedFlight(Section):
 
 
 class ExpectedScene(Section):
-    """Reference targets of the predicted SNR."""
+    """Reference targets for the predicted SNR."""
 
     sigma0_db: float | None = Field(
         -15.0, description="backscattering coefficient of the terrain, dB; null: not computed"
@@ -184,10 +184,10 @@ class Requirements(Section):
     snr_db: float | None = Field(None, description="minimum SNR of terrain with expect.sigma0_db, dB")
     point_snr_db: float | None = Field(None, description="minimum SNR of a point with expect.rcs_dbsm, dB")
     coverage: Annotated[float, Field(gt=0, le=1)] | None = Field(
-        None, description="minimum visible share of the scene: no shadow or layover, within the recordable path"
+        None, description="minimum visible fraction of the scene: no shadow or layover, within the recordable path"
     )
     loss_db: Annotated[float, Field(ge=0)] | None = Field(
-        None, description="maximum peak loss of a point by all expected errors, dB"
+        None, description="maximum peak loss of a point due to all expected errors, dB"
     )
     ambiguity: Positive | None = Field(
         None, description="maximum power of ambiguous echoes of the scene, relative to the echo of the pixel"
@@ -196,7 +196,7 @@ class Requirements(Section):
         None, description="minimum coherence of the image pairs in interferometry.pairs"
     )
     flight_s: Positive | None = Field(None, description="maximum flight time of a flight, s")
-    recorded_gb: Positive | None = Field(None, description="maximum recorded data of all nodes and flights, GB")
+    recorded_gb: Positive | None = Field(None, description="maximum recorded data volume, all nodes and flights, GB")
 
 
 Range = tuple[float, float]
@@ -224,7 +224,7 @@ class Bounds(Section):
         for name in type(self).model_fields:
             low, high = getattr(self, name)
             if low >= high:
-                raise ValueError(f"{name}=[{low:g}, {high:g}]: the minimum must come first")
+                raise ValueError(f"{name}=[{low:g}, {high:g}]: the minimum must precede the maximum")
         if self.spacing[0] <= 0:
             raise ValueError(f"spacing={list(self.spacing)}: factors must be positive")
         return self
@@ -234,7 +234,7 @@ class FlightPlan(Settings):
     """PLAN.yaml: the keys of config/config.yaml, planned flights, expected targets and requirements."""
 
     flights: dict[Name, PlannedFlight] = Field(min_length=1, description="flights to be imaged")
-    expect: ExpectedScene = Field(default_factory=ExpectedScene, description="reference targets of the predicted SNR")
+    expect: ExpectedScene = Field(default_factory=ExpectedScene, description="reference targets for the predicted SNR")
     require: Requirements = Field(default_factory=Requirements, description="requirements of the images and the flight")
     moved: Moved = Field(default_factory=Moved, description="displacement of the planned tracks")
     bounds: Bounds = Field(default_factory=Bounds, description="bounds of the search by --optimise")
@@ -283,7 +283,7 @@ class FlightPlan(Settings):
             followed["formation.leader"] = flight.formation.leader
         for node, leader in followed.items():
             if leader not in flight.tracks or leader in followed:
-                raise ValueError(f"flights.{name}: {node} follows {leader}, which requires a track of its own")
+                raise ValueError(f"flights.{name}: {node} follows {leader}, but {leader} has no track of its own")
 
 
 def read_flight_plan(path: Path) -> FlightPlan:
@@ -299,7 +299,7 @@ def read_flight_plan(path: Path) -> FlightPlan:
         raise CampaignError(
             "a mission, not a flight plan",
             where=path,
-            expected="a plan in YAML, which also contains radar, nodes and scene",
+            expected="a plan in YAML, which contains radar, nodes and scene in addition to tracks",
             remedy=f"Write a plan with the track {{kind: mission, file: {path.name}}}; {remedy}",
         )
     document = read_yaml(path, expected="a flight plan in YAML", remedy=remedy)

@@ -1,4 +1,4 @@
-"""Predicted images of a flight plan, pixel by pixel, computed with the functions that describe images of a flight."""
+"""Predicted images of a flight plan, pixel by pixel, computed by the functions that also assess processed images."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -31,7 +31,10 @@ from apertura.stages.radiometry import CalibratedPair, calibrated_pair
 from apertura.stages.scene import OpenScene
 
 LOSS_NODES = 3
-"""Number of error budgets along each side of the scene; interpolated bilinearly, as effects vary with range only."""
+"""Number of points along each side of the scene at which the loss is computed from an error budget.
+
+Bilinear interpolation between these points suffices, because the loss varies with range only.
+"""
 
 AMBIGUITY_NODES = 9
 """Number of points along each side of the scene at which ambiguous echoes and path margins are computed."""
@@ -50,10 +53,10 @@ UNITS: Mapping[str, tuple[str, str]] = {
     "snr": ("dB", "SNR of terrain with expect.sigma0_db"),
     "point_snr": ("dB", "SNR of a point with expect.rcs_dbsm"),
     "ambiguity": ("1", "power of ambiguous echoes of the scene, relative to the echo of the pixel"),
-    "path_margin": ("m", "margin of the total path to the end of the prefix or of the recording"),
-    "loss": ("dB", "expected peak loss of a point by all causes of the error budget, with the tracks as logged"),
-    "loss_refined": ("dB", "the same after step refine; NaN if a measured limit of the refinement is exceeded"),
-    "coherence": ("1", "coherence of stationary terrain between two images: common spectrum and noise"),
+    "path_margin": ("m", "margin of the total path to the end of the cyclic prefix or of the recording"),
+    "loss": ("dB", "expected peak loss of a point due to all causes of the error budget, with the tracks as logged"),
+    "loss_refined": ("dB", "loss after step refine; NaN if a measured limit of the refinement is exceeded"),
+    "coherence": ("1", "coherence of stationary terrain between two images, from common spectrum and noise"),
     "height_ambiguity": ("m", "height of ambiguity of two images"),
 }
 """Layer → unit and meaning."""
@@ -68,7 +71,7 @@ class PlannedRefinement:
     decision
         On or off according to the plan's `processing.autofocus`, with the reason.
     remainder_db
-        Expected loss by residual position errors, 0 or less; NaN if an obstacle prevents the refinement.
+        Expected loss due to residual position errors, dB, 0 or less; NaN if an obstacle prevents the refinement.
     obstacles
         Measured limits that the flight exceeds.
     """
@@ -79,7 +82,7 @@ class PlannedRefinement:
 
     @property
     def applied(self) -> bool:
-        """True if requirements apply to refined tracks: requested by the plan, and within the measured limits."""
+        """True if requirements apply to refined tracks: refinement is requested, and no measured limit is exceeded."""
         return self.decision.value == "on" and not self.obstacles
 
 
@@ -102,7 +105,7 @@ class PlannedImage:
     looks
         Integrated pulses of a pair, for interferograms; None for a sum.
     doppler_hz
-        Doppler spread over the scene, as sampled by the pulses, Hz; NaN for a sum.
+        Doppler spread over the scene, Hz; NaN for a sum.
     """
 
     name: str
@@ -129,7 +132,7 @@ def planned_image(
     Parameters
     ----------
     campaign, pair, scene
-        Settings; the planned pair, or the pair according to its logs; grid and terrain.
+        Settings; the planned pair, or the recorded pair with the tracks of its logs; grid and terrain.
     sigma0_db, rcs_dbsm
         Backscattering coefficient of the terrain and cross-section of a point for the predicted SNR; None: not
         computed.
@@ -159,7 +162,7 @@ def planned_image(
         layers["point_snr"] = _point_snr(calibrated, noise, rcs_dbsm, grid.shape)
     contributing = _contributing(pair, beams, scene.middle_m)
     refined = contributing
-    if refinement is not None:  # the residual loss, with the displacements of the logs, which are not observable
+    if refinement is not None:  # residual loss; displacements as without refinement, because they are not observable
         logged = summed(line.effect for line in budget_of(campaign, contributing, scene) if line.cause == "positions")
         refined = replace(contributing, left=replace(logged, loss_db=refinement.remainder_db, loss_std_db=0.0))
     layers |= _coarse_layers(campaign, pair, scene, beams, None if refinement is None else refined.left)
@@ -250,7 +253,7 @@ def resolution_layers(resolution: Resolution, shape: tuple[int, int]) -> dict[st
 
 
 def planned_job(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> tuple[Job, Integration, Beams | None]:
-    """Return the planner's job without its signal, for checks of imaging limits, with integration and weights."""
+    """Return the planner's job with a placeholder signal, for checks of imaging limits, and integration and weights."""
     integration = integration_of(campaign, pair, scene)
     beams = Beams.within(integration.sector, pair.beams)
     grid, frequency_hz = scene.grid, pair.frequency_hz

@@ -61,8 +61,8 @@ _TURN_POINTS = 33
 _ARC_S = 0.05  # interval between points of a circle
 _MOST_EPOCHS = 2_000_000
 _MOST_PULSES = 5_000_000
-_IMAGED_POINTS = 65  # points of each leg when tracks are displaced together
-_RADIAL = 0.25  # tracks surround the scene if |mean position| / mean distance from its centre is below this ratio
+_IMAGED_POINTS = 65  # points per leg that represent a track in the computation of a common displacement
+_RADIAL = 0.25  # tracks surround the scene if |mean offset| / mean distance from the scene centre is below this ratio
 _SEED = 31  # seed of the random deviation from the track: the same plan gives the same results
 
 
@@ -79,7 +79,7 @@ class Course:
     imaged_s
         Start and end of each imaged part, seconds.
     home_m
-        (3,) float64, as `place_m`: take-off and landing point of a mission; None if the plan has none.
+        (3,) float64, coordinates as in `place_m`: take-off and landing point of a mission; None without such a point.
     transit_m_s
         Horizontal speed between home and the track.
     """
@@ -164,7 +164,7 @@ def open_plan(plan: FlightPlan, root: Path) -> OpenPlan:
     plan
         The flight plan.
     root
-        Folder of the files that the plan names.
+        Folder of the files named in the plan.
 
     Raises
     ------
@@ -177,7 +177,7 @@ def open_plan(plan: FlightPlan, root: Path) -> OpenPlan:
 
 @contextmanager
 def errors_of_the_plan() -> Iterator[None]:
-    """Convert errors of campaign checks into errors of the plan, which has the keys of the config."""
+    """Convert errors of campaign checks into errors of the plan, which contains the keys of the config."""
     try:
         yield
     except CampaignError as error:
@@ -355,7 +355,7 @@ def _vertices(track: LineTrack | RacetrackTrack | CircleTrack) -> _Vertices:
 
 
 def _turn(begin: Floats, end: Floats, along: Floats, speed_m_s: float) -> list[Floats]:
-    """Return points of a turn that starts in a direction and ends in the opposite one: a cubic Bézier curve."""
+    """Return points of a turn that starts in a direction and ends in the opposite direction: a cubic Bézier curve."""
     handle = along * max(_TURN_S * speed_m_s, float(np.linalg.norm(end - begin)))
     share = np.linspace(0, 1, _TURN_POINTS)[1:, None]
     corners = begin, begin + handle, end + handle, end
@@ -427,7 +427,8 @@ def _mission(
     time_s = np.concatenate([[0.0], np.cumsum(steps / speed[1:])])
     first, last = track.image or (1, len(waypoints))
     if not 1 <= first < last <= len(waypoints):
-        raise CampaignError(f"image: [{first}, {last}]", where, f"waypoints 1 to {len(waypoints)}", "Correct it.")
+        expected = f"first and last of the waypoints 1 to {len(waypoints)}"
+        raise CampaignError(f"image: [{first}, {last}]", where, expected, "Correct the numbers of the waypoints.")
     imaged = ((float(time_s[first - 1]), float(time_s[last - 1])),)
     course = _sampled(time_s, waypoints, imaged, flight.log_rate_hz, where)
     if mission.reference == "home" and mission.home_deg is not None:
@@ -496,7 +497,7 @@ def _check_separation(name: str, flight: PlannedFlight, courses: Mapping[str, Co
                 f"separation of {first} and {second} falls to {separation_m[nearest]:.2f} m at {nearest_s:.1f} s",
                 f"flights.{name}",
                 f"at least {flight.separation_m:g} m between any two nodes (separation_m)",
-                "Increase their separation, or reduce separation_m.",
+                "Increase the separation of these nodes, or reduce separation_m.",
             )
 
 

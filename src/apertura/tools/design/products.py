@@ -38,11 +38,11 @@ def write_design(design: Design, folder: Path, tried: Sequence[Tried] = ()) -> l
     Parameters
     ----------
     design
-        A design on the full grid.
+        A design on the full-resolution grid.
     folder
         Output folder, created if necessary; files of the same names are replaced.
     tried
-        Plans tried by a search; the Pareto-optimal ones are written to design.json.
+        Plans tried by a search; the Pareto-optimal plans are written to design.json.
     """
     folder, grid, written = made_folder(folder), design.opened.scene.grid, list[Path]()
     georeference = {"transform": Affine(*grid.transform), "crs": grid.crs_wkt}
@@ -67,7 +67,7 @@ def write_design(design: Design, folder: Path, tried: Sequence[Tried] = ()) -> l
 
 
 PICTURE_TAGS = {"APERTURA_VERSION": __version__, "APERTURA_PLANNED": "true"}
-"""Provenance tags of plots of a design; rasters also contain their plan."""
+"""Provenance tags of plots of a design; the tags of rasters also contain the plan."""
 
 
 def tags_of(design: Design) -> dict[str, str]:
@@ -125,7 +125,7 @@ def write_campaign_config(plan: FlightPlan, directory: Path) -> Sequence[Path]:
     Raises
     ------
     CampaignError
-        If a config exists already; nothing is changed then.
+        If a config exists already; the folder then remains unchanged.
     """
     directory = made_folder(directory)
     paths = [directory / "config" / "config.yaml", directory / FLIGHTS]

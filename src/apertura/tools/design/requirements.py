@@ -1,4 +1,4 @@
-"""Verdicts on the requirements of a plan: dominant cause of a shortfall, most helpful changes, search for tracks."""
+"""Verdicts on the requirements of a plan, causes of shortfalls, single changes that help, and search for tracks."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -19,12 +19,12 @@ from apertura.tools.design.flight_plan import BesideTrack, FlightPlan, LineTrack
 from apertura.tools.design.layers import PlannedImage
 
 SHARE = 95.0
-"""Percentage of the visible pixels that must meet a requirement, since edges of a scene are worse than its centre."""
+"""Percentage of the visible pixels that must meet a requirement; image quality is lower at the edges of a scene."""
 
 COARSE_PX = 64
 """Number of pixels along the longer side of the grid on which changes are compared.
 
-The centres of the outermost pixels are 1 % of the side from the edges.
+The centres of the outermost pixels are 1 % of the side length away from the edges.
 """
 
 _LAYERS = {
@@ -38,7 +38,7 @@ _LAYERS = {
 """Requirement → layer, and "most" for an upper or "least" for a lower limit of its values."""
 
 LEAST_GAIN_DB = 0.05
-"""Minimum gain of a listed change, unless the complete shortfall is smaller: smaller gains are printed as zero."""
+"""Minimum gain of a listed change, dB, or the whole shortfall if that is smaller; smaller gains are printed as 0."""
 
 _LEAST = {"snr_db", "point_snr_db", "coverage", "coherence"}
 _IN_DB = {"nesz_db", "snr_db", "point_snr_db", "loss_db"}
@@ -53,7 +53,7 @@ class Verdict:
     requirement
         A key of `require`.
     required, found
-        Required and predicted value, in the unit of the requirement; `found` is NaN if the plan does not determine it.
+        Required and predicted value, in the unit of the requirement; `found` is NaN if not determined by the plan.
     image
         Name of the worst image.
     cause
@@ -98,11 +98,11 @@ def judge(design: Design, *, every: bool = False) -> list[Verdict]:
         values = layers["coherence"][np.isfinite(layers["coherence"])]
         value = float(np.percentile(values, 100 - SHARE)) if values.size else float("nan")
         first, second = design.opened.campaign.settings.interferometry.pairs[name]
-        cause = f"common spectrum of {first} and {second}, and their noise"
+        cause = f"common spectrum of {first} and {second}, and noise of both"
         predictions.append(("coherence", value, name, cause))
     recording = design.recording
     flight, duration_s = max(recording.flight_s.items(), key=lambda item: item[1])
-    transfer = ", with take-off, transit and landing" if recording.transfer_s[flight] else ""
+    transfer = ", plus take-off, transit and landing" if recording.transfer_s[flight] else ""
     predictions.append(("flight_s", duration_s, flight, f"length of the tracks divided by speed{transfer}"))
     pulses = f"{sum(recording.pulses.values())} pulses of all flights, recorded by each node"
     predictions.append(("recorded_gb", recording.recorded_bytes / 1e9, "all", pulses))
@@ -155,7 +155,7 @@ def _cause(name: str, design: Design, image: PlannedImage, visible: np.ndarray, 
         return (
             "no pixel is visible"
             if not visible.any()
-            else "transmit power, antenna gains, receiver or its noise figure are not configured"
+            else "transmit power, antenna gains, the receiver or its noise figure is not configured"
         )
     if name == "resolution_m":
         return _resolution_cause(image)
@@ -169,22 +169,22 @@ def _cause(name: str, design: Design, image: PlannedImage, visible: np.ndarray, 
         spread_hz = max(pair.doppler_hz for pair in design.images.values() if pair.looks is not None)
         return f"Doppler spread of {spread_hz:.0f} Hz over the scene, from speed, range and beams"
     looks = float(np.median(image.layers["looks"][visible]))
-    return f"noise of {looks:.0f} pulses at the far side, from power, gains and range"
+    return f"noise with {looks:.0f} integrated pulses, from transmit power, antenna gains and range"
 
 
 def refinement_line(design: Design, flight: str) -> str:
-    """Return the decision on the refinement of a flight's tracks, and the bright points that it requires."""
+    """Return the decision on the refinement of a flight's tracks, and the bright points required for the refinement."""
     refinement = design.refinements[flight]
     if refinement.obstacles:
         return f"refinement is not expected to succeed: {', '.join(refinement.obstacles)}"
     needs = f"requires {LEAST_POINTS} bright points in the scene, {_least_point(design, flight)}"
     if refinement.applied:
-        return f"tracks refined, which {needs}"
+        return f"tracks refined; the refinement {needs}"
     return f"tracks as logged; refinement (processing.autofocus: on) {needs}"
 
 
 def _least_point(design: Design, flight: str) -> str:
-    """Return the minimum SNR of a point for a refinement, with its cross-section for all pairs of a flight if known."""
+    """Return the minimum SNR of a point for a refinement, and if known the cross-section sufficient for all pairs."""
     minimum = f"{LEAST_SNR_DB:g} dB above the noise of one pulse"
     rcs_dbsm, excess_db = design.opened.plan.expect.rcs_dbsm, list[float]()
     for image in design.images.values():
@@ -241,7 +241,7 @@ class Change:
     found
         Requirement → predicted value with the change.
     breaks
-        Requirements that are met without the change only.
+        Requirements that are met only without the change.
     """
 
     words: str
@@ -257,15 +257,15 @@ def shortfall_db(verdicts: Sequence[Verdict]) -> float:
 
 
 def helpful_changes(plan: FlightPlan, root: Path, before: Sequence[Verdict], *, threads: int = 1) -> list[Change]:
-    """Return single changes that reduce the shortfall, sorted by the number of requirements they break and by gain.
+    """Return single changes that reduce the shortfall, sorted by number of requirements no longer met, then by gain.
 
     Parameters
     ----------
     plan, root
-        As `designed`.
+        As in `designed`.
     before
-        Verdicts of the unchanged plan on the full grid. Changes are evaluated on a coarser grid, and corrected for the
-        difference between both grids for the unchanged plan.
+        Verdicts of the unchanged plan on the full grid. Changes are evaluated on a coarser grid, and the values are
+        corrected by the difference between the two grids for the unchanged plan.
     threads
         Number of tiles computed in parallel.
     """
@@ -409,9 +409,9 @@ class Tried:
         Verdicts on all possible requirements.
     objective
         Minimised value, dB: ten times the total shortfall, plus the largest shortfall (or smallest margin, negative),
-        plus a hundredth of the mean, so that the minimum is Pareto-optimal.
+        plus a hundredth of the mean shortfall, so that the minimum is Pareto-optimal.
     on_front
-        True if the plan is Pareto-optimal among those tried.
+        True if the plan is Pareto-optimal among the plans tried.
     """
 
     moved: Mapping[str, float]
@@ -435,7 +435,7 @@ def search(
     Parameters
     ----------
     plan, root
-        As `designed`.
+        As in `designed`.
     words
         Keys of `AXES`.
     most
@@ -458,7 +458,7 @@ def search(
     unknown = [word for word in words if word not in AXES]
     if unknown or not words:
         found = ",".join(words) or "an empty list"
-        raise CampaignError(found, "--optimise", f"one or more of {','.join(AXES)}", "Correct it.")
+        raise CampaignError(found, "--optimise", f"one or more of {','.join(AXES)}", "Correct the list.")
     if not plan.require.model_fields_set:
         raise CampaignError("no requirement", "the plan: require", "at least one requirement", "Add requirements.")
     keys, tried = [AXES[word] for word in words], list[Tried]()
@@ -480,7 +480,7 @@ def search(
     direct(objective, limits, maxfun=most, locally_biased=True, len_tol=1e-2, vol_tol=0.0)
     if not tried:
         raise CampaignError(
-            "no valid plan within the bounds", "the plan: bounds", "bounds with at least one valid plan", "Widen them."
+            "no valid plan within the bounds", "the plan: bounds", "at least one valid plan", "Widen the bounds."
         )
     best = min(tried, key=lambda trial: trial.objective)
     best_plan = plan.model_copy(update={"moved": plan.moved.model_copy(update=dict(best.moved))})
@@ -488,7 +488,7 @@ def search(
 
 
 def tried_report(tried: Sequence[Tried]) -> list[dict[str, Any]]:
-    """Return the Pareto-optimal plans as JSON values, the best one first: displacement and predicted values."""
+    """Return the Pareto-optimal plans as JSON values, the best plan first: displacement and predicted values."""
     front = sorted((trial for trial in tried if trial.on_front), key=lambda trial: trial.objective)
     return [
         {"moved": dict(trial.moved), "found": {v.requirement: v.report["found"] for v in trial.verdicts}}
@@ -497,7 +497,7 @@ def tried_report(tried: Sequence[Tried]) -> list[dict[str, Any]]:
 
 
 def with_front(tried: Sequence[Tried]) -> list[Tried]:
-    """Mark the Pareto-optimal plans: no other is at least as good in all requirements and better in one."""
+    """Mark the Pareto-optimal plans: no other plan is at least as good in all requirements and better in one."""
     short = np.array([[v.short_db for v in trial.verdicts if v.required is not None] for trial in tried])
     front = [not ((short <= row).all(axis=1) & (short < row).any(axis=1)).any() for row in short]
     return [replace(trial, on_front=is_optimal) for trial, is_optimal in zip(tried, front, strict=True)]

@@ -53,27 +53,27 @@ _TITLES = {
     "point_snr": "SNR of a point",
     "loss": "focus loss, tracks as logged",
 }
-_DOTS = 400  # maximum number of pixels of the longer side of a panel
+_DOTS = 400  # maximum number of pixels along the longer side of a panel
 _MOST_CHANGES, _MOST_PLANS = 5, 12
 _JUDGED = ("requirement", "required", "planned", "met", "image", "largest contribution")
 _LISTED = {
-    "resolution": "coarsest, m",
-    "resolution_fine": "finest, m",
+    "resolution": "resolution, coarsest, m",
+    "resolution_fine": "resolution, finest, m",
     "looks": "pulses",
     "incidence": "incidence, °",
     "bistatic_angle": "bistatic, °",
     "nesz": "NESZ, dB",
     "snr": "SNR, dB",
-    "point_snr": "point's SNR, dB",
+    "point_snr": "point SNR, dB",
     "ambiguity": "ambiguity",
-    "loss": "loss as logged, dB",
-    "loss_refined": "loss refined, dB",
+    "loss": "loss, as logged, dB",
+    "loss_refined": "loss, refined, dB",
 }
 """Layer → column heading; layers that no image has are omitted."""
 
 _LEAST = {"looks", "snr", "point_snr"}
 _SMALLEST = 1e-3  # smaller values are printed as 0
-_CAPTION = "Planned images: median over the visible scene, and the value that 95 % of it meet"
+_CAPTION = "Predicted images: median over the visible scene, and the value met by 95 % of the visible scene"
 
 
 def print_design(path: Path, out: Path | None, *, optimise: str | None = None, threads: int = 1) -> bool:
@@ -86,7 +86,8 @@ def print_design(path: Path, out: Path | None, *, optimise: str | None = None, t
     out
         Folder for layers, tracks, map, report and plan; None writes no files.
     optimise
-        Keys of `AXES`, separated by commas: the displacement of the tracks to optimise first, within the plan's bounds.
+        Keys of `AXES`, separated by commas: components of the track displacement that are optimised first, within the
+        plan's bounds.
     threads
         Number of tiles computed in parallel.
     """
@@ -187,7 +188,7 @@ def _digits(value: float) -> str:
 
 
 def interferogram_lines(design: Design) -> Iterator[str]:
-    """Yield a line with median coherence and height of ambiguity for each interferogram."""
+    """Yield a line with the median coherence and height of ambiguity of each interferogram."""
     for name, layers in design.interferograms.items():
         units = {layer: "" if UNITS[layer][0] == "1" else f" {UNITS[layer][0]}" for layer in layers}
         medians = [f"{layer} {np.nanmedian(values):.3g}{units[layer]}" for layer, values in layers.items()]
@@ -235,25 +236,25 @@ def recording_lines(design: Design) -> Iterator[str]:
         )
     dopplers = {image.name: image.doppler_hz for image in design.images.values() if image.looks is not None}
     prf = float(getattr(opened.plan.waveform, "prf_hz", None) or 0.0)
-    ambiguous = "; above the pulse rate: ambiguous echoes, relative power in ambiguity.tif" * (
+    ambiguous = ", exceeded by the Doppler spread; relative power of ambiguous echoes: ambiguity.tif" * (
         max(dopplers.values()) > prf
     )
     each = ", ".join(f"{name} {hz:.0f}" for name, hz in dopplers.items())
     yield f"Doppler spread over the scene, Hz: {each}; pulse rate {prf:g} Hz{ambiguous}"
     pulses = float(np.median([np.nanmedian(image.layers["looks"]) for image in design.judged]))
     yield (
-        f"A pixel of {opened.scene.grid.spacing_m:g} m integrates {pulses:.0f} pulses; a smaller scene.spacing_m "
-        "integrates more, if the track is long enough"
+        f"{pulses:.0f} pulses are integrated for a pixel of {opened.scene.grid.spacing_m:g} m; with a smaller "
+        "scene.spacing_m, more pulses are integrated if the track is long enough"
     )
     processing = _duration_text(recording.processing_s)
     yield (
-        f"Recorded data {recording.recorded_bytes / 1e9:.3g} GB; processing about {processing}, "
+        f"Recorded data: {recording.recorded_bytes / 1e9:.3g} GB; processing: about {processing} with "
         f"{recording.memory_bytes / 1e9:.2g} GB of memory"
     )
 
 
 def _loss(design: Design, flight: str, layer: str) -> str:
-    """Return the loss not exceeded in 95 % of the visible scene, in the image of a flight with requirements."""
+    """Return the loss that 95 % of the visible scene do not exceed, in the image to which requirements apply."""
     image = next(image for image in design.judged if image.name.startswith(f"{flight}/"))
     values = image.layers[layer][image.layers["mask"] == 0]
     return f"{np.percentile(values, SHARE):.2f} dB" if values.size and np.isfinite(values).all() else "not predicted"
@@ -310,7 +311,7 @@ def _blocks(
         plans = tried_report(tried)[:_MOST_PLANS]
         head = (*(f"moved.{key}" for key in plans[0]["moved"]), *plans[0]["found"])
         rows = [[_value(value) for value in (*trial["moved"].values(), *trial["found"].values())] for trial in plans]
-        yield Table("Pareto-optimal plans, the selected one first; design.json contains all of them.", head, rows)
+        yield Table("Pareto-optimal plans, the selected plan first; complete list: design.json.", head, rows)
     yield Table(f"{_CAPTION}.", *value_table(design))
     yield Paragraph(" ".join(f"{line}." for line in (*interferogram_lines(design), *recording_lines(design))))
     for image in design.images.values():
@@ -327,7 +328,7 @@ def _blocks(
             ]
             total_db = expected(image.budget).loss_db
             caption = f"Error budget of {image.name} at the scene centre; total loss {total_db:.2f} dB."
-            yield Table(caption, ("cause", "size", "loss, dB", "displacement, cm"), budget_lines)
+            yield Table(caption, ("cause", "error", "loss, dB", "displacement, cm"), budget_lines)
             break
     raised = [
         (flag, name, line) for name, image in design.images.items() if image.looks for flag, line in image.flags.items()
@@ -385,7 +386,8 @@ def _draw_layers(path: Path, design: Design) -> None:
             axes.set_xlabel(f"{across}, m")
         for axes in drawn[:, 0]:
             axes.set_ylabel(f"{up}, m")
-        figure.suptitle(f"{image.name}, {across} and {up} from {number(round(west))} m, {number(round(south))} m")
+        origin = f"{number(round(west))} m, {number(round(south))} m"
+        figure.suptitle(f"{image.name}; {across} and {up} relative to {origin}")
 
 
 def _colour_limits(values: NDArray[np.float64]) -> tuple[float, float]:
@@ -441,7 +443,7 @@ def _at(tried: Sequence[Tried], across: str, up: str) -> tuple[list[float], list
 
 
 def print_comparison(path: Path, folder: Path, *, threads: int = 1) -> None:
-    """Print planned values next to those from the logs of the campaign and those measured in its images, if any."""
+    """Print planned values next to values from the logs of the campaign and, if available, measured in its images."""
     from rich.console import Console
 
     plan, campaign = read_flight_plan(path), without_outdated(Campaign.load(folder))
@@ -449,7 +451,7 @@ def print_comparison(path: Path, folder: Path, *, threads: int = 1) -> None:
     rows = comparison_rows(plan, path.absolute().parent, campaign, threads=threads)
     head = ("image", "quantity", "planned", "flown (from the logs)", "measured in the image")
     console = Console(width=max(120, Console().width))
-    title = "Planned and flown; the measured resolution is the width of the brightest point"
+    title = "Planned and flown values; the measured resolution is the width of the brightest point"
     console.print(_table(title, head, rows))
     for line in outdated_lines(campaign):
         console.print(line, highlight=False)
@@ -475,7 +477,7 @@ def comparison_rows(plan: FlightPlan, root: Path, campaign: Campaign, *, threads
     Raises
     ------
     CampaignError
-        If they have no flight and pair in common.
+        If the plan and the campaign have no flight and pair in common.
     """
     design = designed(plan, root, threads=threads)
     scene = expected_scene(campaign, lambda: first_flight(campaign))
@@ -521,7 +523,7 @@ def comparison_rows(plan: FlightPlan, root: Path, campaign: Campaign, *, threads
                 )
     if not rows:
         raise CampaignError(
-            f"images {', '.join(design.images)}, none of which the campaign has",
+            f"images {', '.join(design.images)}, none of which is in the campaign",
             "the plan",
             f"at least one image of campaign {campaign.root.name}",
             "Name flights and nodes as in the campaign.",
@@ -542,7 +544,7 @@ def _numbers(image: PlannedImage) -> dict[str, float]:
 
 
 def _measured(campaign: Campaign, flight: str, pair: str) -> Mapping[str, float]:
-    """Return the same values measured in a finished image; empty if it is not up to date."""
+    """Return the values of `_numbers` measured in a finished image; empty if the image is not up to date."""
     from apertura.common.raster import opened_raster
 
     if not campaign.is_current(campaign.result(flight, pair, "export")):
@@ -558,7 +560,7 @@ def _measured(campaign: Campaign, flight: str, pair: str) -> Mapping[str, float]
         measured["loss, dB"] = -float(report["focus"]["loss_db"])
     for name in ("looks", "incidence", "bistatic_angle", "nesz"):
         with opened_raster(
-            campaign.result(flight, pair, f"{name}.tif"), expected="a layer", remedy="Run again."
+            campaign.result(flight, pair, f"{name}.tif"), expected="a layer", remedy="Run the workflow again."
         ) as raster:
             if name == "nesz" and TAG not in raster.tags():
                 continue  # uncalibrated: dB of image power instead of sigma0
@@ -566,6 +568,7 @@ def _measured(campaign: Campaign, flight: str, pair: str) -> Mapping[str, float]
         values = values[np.isfinite(values)]
         if values.size:
             measured[f"{name}, {UNITS[name][0]}"] = float(np.median(values))
-    with opened_raster(campaign.result(flight, pair, "mask.tif"), expected="a layer", remedy="Run again.") as raster:
+    mask = campaign.result(flight, pair, "mask.tif")
+    with opened_raster(mask, expected="a layer", remedy="Run the workflow again.") as raster:
         measured["coverage, %"] = 100 * float((raster.read(1) == 0).mean())
     return measured

@@ -43,7 +43,7 @@ from apertura.views.quality import explained_flags
 from apertura.views.webmap.document import Layer, Place, crs_of, map_document, stated_places, true_places, url_of
 
 _POLLS = 2  # number of polls of the files per update of the images
-_BEHIND = 3  # a delay of more update intervals than this doubles the decimation of pulses
+_BEHIND = 3  # delay, in update intervals, above which the decimation of pulses is doubled
 _AT_EASE = 0.3  # fraction of busy time below which the decimation is halved
 _MOST_DECIMATED = 64
 
@@ -60,8 +60,8 @@ class Preview:
     every_s
         Interval between updates of the images, seconds.
     end_after_s
-        Time without growth after which the recordings count as finished, seconds; they are also finished when their
-        metadata contain the hash of their samples and all samples are present.
+        Time without new data after which the recordings are considered finished, seconds. Recordings are also finished
+        when their metadata contain the hash of their samples and all samples are present.
     threads
         Number of tiles formed in parallel.
 
@@ -114,7 +114,8 @@ class Preview:
     def _scene(self, block: PulseBlock) -> tuple[SceneGrid, ConfiguredGround]:
         """Return the common grid of all pairs and its terrain; automatic settings are determined once.
 
-        They follow from all data read so far, or with `follow`, which requires configured bounds, from the first block.
+        Automatic settings are derived from all data read so far, or with `follow` from the first block; `follow`
+        requires configured bounds.
         """
         if self._settled is None:
             campaign, history = self.campaign, block.history
@@ -139,7 +140,10 @@ class Preview:
             # before the first data, the status lines of the pairs report the reason for waiting
             if node.waits and self.follow and node.has_read and node.waits not in self._reported:
                 self._reported.add(node.waits)
-                print(f"{datetime.now(UTC):%H:%M:%S}  {node.name} is not readable at present: {node.waits}", flush=True)
+                print(
+                    f"{datetime.now(UTC):%H:%M:%S}  files of {node.name} are not readable at present: {node.waits}",
+                    flush=True,
+                )
             if not node.restart:
                 continue
             print(f"{datetime.now(UTC):%H:%M:%S}  {node.restart}", flush=True)
@@ -278,7 +282,7 @@ def check_bounds(campaign: Campaign, *, follow: bool) -> None:
 
 @contextmanager
 def finished_by_interrupt(preview: Preview) -> Iterator[None]:
-    """Handle the first Ctrl-C as the end of the recordings; a second one stops the command."""
+    """Handle the first Ctrl-C as the end of the recordings; a second Ctrl-C stops the command."""
 
     def finish(_: int, __: FrameType | None) -> None:
         signal.signal(signal.SIGINT, before)
@@ -293,9 +297,9 @@ def finished_by_interrupt(preview: Preview) -> Iterator[None]:
 
 
 def run_preview(campaign: Campaign, *, follow: bool, every_s: float, end_after_s: float, threads: int) -> None:
-    """Show images of a campaign's pulses so far, with `follow` until its recordings end."""
+    """Display images of the pulses recorded so far; with `follow`, update the images until the recordings end."""
     preview = Preview(campaign, follow=follow, every_s=every_s, end_after_s=end_after_s, threads=threads)
-    print(f"shown in {as_typed(campaign.result(PREVIEW, 'index.html'))}", flush=True)
+    print(f"images are shown in {as_typed(campaign.result(PREVIEW, 'index.html'))}", flush=True)
     if not follow:
         preview.run()
         return
@@ -375,11 +379,11 @@ def _page(status: Mapping[str, Any], *, refresh_s: int) -> str:
 
 
 _KEPT = 2
-"""Number of images kept for a pair: a page that has just read the document still finds the previous image."""
+"""Number of images kept for each pair, so that a page with the previous document can still load its image."""
 
 
 class LiveMap:
-    """Live document of the map page, in a folder laid out like the results.
+    """Live document of the map page, in a folder with the layout of the results.
 
     Parameters
     ----------
@@ -412,11 +416,11 @@ class LiveMap:
         }
 
     def begin(self) -> None:
-        """Remove the document of an earlier live view, so that the map server waits for the first image of this one."""
+        """Remove the document of an earlier live view; the map server then waits for the first image of a new view."""
         (self._folder / MAP).unlink(missing_ok=True)
 
     def add(self, pair: PairSoFar, report: Mapping[str, Any]) -> None:
-        """Write the present image of a pair and its report."""
+        """Write the current image of a pair and its report."""
         shown, grid = pair.shown, pair.images[-1].grid
         if shown is None:
             return
@@ -450,7 +454,7 @@ class LiveMap:
         self._places.pop(name, None)
 
     def write(self, *, ended: bool) -> None:
-        """Write the document of the added images; no document before the first image."""
+        """Write the document of the added images; nothing is written before the first image."""
         if self._grid is None:
             return
         document = map_document(

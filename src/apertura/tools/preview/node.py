@@ -21,9 +21,9 @@ from apertura.stages.ingest import captures_of
 from apertura.stages.node_log import shortest_wave
 from apertura.stages.transmitted import Transmitted
 
-_MARGIN_S = 60.0  # margin of the log before and after the pulses of a block: farther epochs do not affect the spline
+_MARGIN_S = 60.0  # margin of the log around the pulses of a block; epochs farther away do not affect the spline
 _KNOWN_BYTES = 4096  # number of bytes compared at either end of the samples read, to detect a restarted recording
-_EPOCHS = 4  # epochs required after a pulse: later ones change the spline there by 0.27⁴ of its error at the end
+_EPOCHS = 4  # epochs required after a pulse: end effects of a spline decrease to 0.27⁴ over this number of epochs
 
 
 class NotFollowedError(CampaignError):
@@ -33,8 +33,9 @@ class NotFollowedError(CampaignError):
 class NodeSoFar:
     """Recording and log of a node so far, complete captures and lines only.
 
-    Data read before are dropped if the files no longer begin with them, which means that the recorder was restarted
-    under the same name. A change between the ends of the samples is not detected; the workflow reads all samples.
+    Data read earlier are discarded if the files no longer begin with these data, which means that the recorder was
+    restarted with the same file names. Only the first and last bytes of the samples are compared: other changes are not
+    detected here, but by the workflow, which reads all samples.
 
     Parameters
     ----------
@@ -43,7 +44,7 @@ class NodeSoFar:
     sent
         The transmitted waveform.
     follow
-        True if the files still grow: formats that cannot be read meanwhile are refused.
+        True if the files still grow; formats that cannot be read during the recording are refused.
     """
 
     def __init__(self, campaign: Campaign, flight: str, node: str, sent: Transmitted, *, follow: bool) -> None:
@@ -67,13 +68,13 @@ class NodeSoFar:
         self._log_size, self._log_bytes, self._log_crc = -1, 0, 0  # file size; size and CRC of its complete lines
 
     def _restart(self, path: Path, change: str) -> None:
-        """Drop the data read, because a file no longer begins with them."""
+        """Discard the data read earlier, because a file no longer begins with these data."""
         self._forget()
         file = path.relative_to(self._campaign.root)
         self.restart = f"{file}: {change}: images of {self._flight} {self.name} are restarted from the new files"
 
     def read(self) -> bool:
-        """Read new data of recording and log; return True if there were any."""
+        """Read new data of recording and log; return True if there were new data."""
         before = len(self.time), self._log_size
         self.waits = ""
         for read in (self._read_recording, self._read_log):
@@ -103,10 +104,10 @@ class NodeSoFar:
             recorded, self.frame = self._found.time.values, self._found.frame.values
         elif self._growing.runs_through:
             raise NotFollowedError(
-                "apertura:framing: a continuous recording, whose pulses are found only in the complete samples",
+                "apertura:framing: a continuous recording, in which pulses are found only after its end",
                 files[0],
                 "one capture segment per trigger for --follow",
-                "Use apertura preview without --follow, or after the end of the recording.",
+                "Use apertura preview without --follow after the end of the recording.",
             )
         else:
             recording = growing if growing or self._follow else open_recording(files)
@@ -189,7 +190,7 @@ class NodeSoFar:
         return "" if self.complete else f"the log of {self.name} ends before its last capture"
 
     def acquisition(self, captures: NDArray[np.int64]) -> Acquisition:
-        """Return paired captures with the log around their times; their frame numbers are consecutive from 0."""
+        """Return paired captures, renumbered with frame numbers from 0, and the part of the log around their times."""
         if self._recording is None or self.track is None:
             raise TypeError("no recording or log has been read yet")
         if self._found is not None:
@@ -221,7 +222,7 @@ class NodeSoFar:
 
 
 def _ends(path: Path, size: int) -> tuple[int, bytes, bytes]:
-    """Return `size` together with the first and last bytes of that leading part of a file."""
+    """Return `size`, and the first and last bytes of the leading `size` bytes of a file."""
     with path.open("rb") as stream:
         head = stream.read(min(size, _KNOWN_BYTES))
         stream.seek(max(0, size - _KNOWN_BYTES))

@@ -47,9 +47,9 @@ Axes = dict[str, NDArray[np.float64]]
 """Body axes of the antennas with beams, as required by `apertura.stages.pair.beams_of`."""
 
 
-_CERTIFIED = 16  # number of pixels that are also summed exactly
-_TOGETHER = 16  # number of neighbouring pulses whose range bounds are computed from one of them
-_CELLS = 8  # number of resolution cells in the shorter side of a scene that an assessment requires
+_CERTIFIED = 16  # number of pixels at which the exact sum is also computed
+_TOGETHER = 16  # number of neighbouring pulses whose range bounds are computed from a single one of these pulses
+_CELLS = 8  # minimum number of resolution cells along the shorter side of a scene for an assessment
 _JUDGED = 1024  # number of evenly spread pulses kept for the assessment
 
 
@@ -60,7 +60,7 @@ class PulseBlock:
     Attributes
     ----------
     history
-        Their phase history.
+        Phase history of the pulses.
     axes
         Body axes, as required by `apertura.stages.pair.beams_of`.
     time
@@ -86,7 +86,7 @@ class Compressed:
     weight: int = 1
 
     def every(self, step: int) -> "Compressed":
-        """Return a copy with every `step`-th pulse, so that the memory of the others can be freed."""
+        """Return a copy with every `step`-th pulse, so that the memory of the other pulses can be freed."""
         selected = self.profiles[::step]
         axes = {name: values[::step] for name, values in self.axes.items()}
         profiles = replace(selected, samples=np.array(selected.samples))
@@ -119,14 +119,15 @@ class ImageSoFar:
     grid, terrain
         Pixels, and their heights.
     share
-        Divisor of bandwidth and of the integration angle: 2 selects the central half of the subcarriers and half the
-        angle, whose resolution cells are twice as wide and require only every second pixel.
+        Divisor of the bandwidth and of the integration angle. With 2, the central half of the subcarriers and half the
+        angle are used; resolution cells are then twice as wide, and every second pixel suffices.
     accuracy_db
         Requested numerical error.
     threads
         Number of tiles formed in parallel.
     plans
-        Share → plan of the image formation, shared by all pairs; replanned if the measured error exceeds the request.
+        `share` → plan of the image formation, common to all pairs; a plan is replaced if the measured error exceeds the
+        requested error.
     """
 
     def __init__(
@@ -152,9 +153,9 @@ class ImageSoFar:
         self._summed, self._every, self._kept = 0, 1, list[Compressed]()
 
     def compressed(self, block: PulseBlock) -> "Compressed":
-        """Return range profiles of a block's contributing pulses, with this image's share of the bandwidth."""
+        """Return range profiles of a block's contributing pulses, in the part of the band used for this image."""
         history, count = block.history, len(block.history.frequency_hz)
-        # the same speed for all blocks: the refractivity changes it by less than 1e-8
+        # the wave speed of the first block is used for all blocks: the refractivity changes it by less than 1e-8
         self._speed_m_s = self._speed_m_s or history.wave_speed_m_s
         kept = -(-count // self.share)
         band = slice((count - kept) // 2, (count - kept) // 2 + kept)
@@ -186,7 +187,7 @@ class ImageSoFar:
     def add(self, block: "Compressed") -> None:
         """Add a block of `compressed` pulses.
 
-        Settings are planned for the first block, and again if the measured error exceeds the requested one.
+        Settings are planned for the first block, and again if the measured error exceeds the requested error.
         """
         self.pulses += block.pulses
         profiles = block.profiles
@@ -235,7 +236,7 @@ class ImageSoFar:
         if requested == "all" or len(aperture) < 2:
             return antennas
         half = sector_half(requested, self._speed_m_s / centre_hz, self.grid.spacing_m)
-        half /= 1 if requested == "auto" else self.share  # with auto, it already follows from the pixel spacing
+        half /= 1 if requested == "auto" else self.share  # with auto, the sector already depends on the pixel spacing
         if half * (1 - TAPER) >= 1:  # the sector contains all directions
             return antennas
         middle_m = self._terrain.positions_at(self.grid, *((size - 1) / 2 for size in self.grid.shape))
@@ -270,7 +271,8 @@ class ImageSoFar:
         joined = Compressed.joined(self._kept)
         profiles, times = joined.profiles, joined.time
         beams = self._beams(profiles.aperture, joined.axes, profiles.centre_frequency_hz)
-        plan = replace(self._plan, beams=beams, integration=None, flags={})  # the plan's refer to its first block
+        # integration and flags of the plan are those of its first block
+        plan = replace(self._plan, beams=beams, integration=None, flags={})
         side = self._campaign.settings.processing.tile_px
         formation = Formation(None, profiles, self.grid, plan, side)
         cell_m = resolution_cell_m(formation)
@@ -288,9 +290,9 @@ class ImageSoFar:
 
 
 AT_ONCE = 2048
-"""Maximum number of pulses of a block; a block takes at least a tenth of a second, whatever its size."""
+"""Maximum number of pulses of a block; the computing time of a block is at least 0.1 s, independent of its size."""
 
-_LEAST = 32  # minimum block size in pulses before the recordings end: each block measures the state of a sidelink
+_LEAST = 32  # minimum pulses per block before the recordings end; the sidelink state is measured in each block
 _OVERLAP = 256  # number of pulses that are associated again, for continuity of the time tags
 _QUEUE_BYTES = 512_000_000  # maximum memory of profiles queued for the fine image
 
@@ -304,7 +306,7 @@ class PairSoFar:
     campaign, flight, name
         Campaign, name of the flight and name of the pair.
     scene
-        Function of the first block that returns the grid and its terrain.
+        Function that returns the grid and its terrain, given the first block.
     echo
         Echo of a recorder that stores transfer functions; tx, rx and sent are then None.
     tx, rx, sent
@@ -318,11 +320,11 @@ class PairSoFar:
     taken
         Number of transmitter captures processed so far.
     dropped
-        Number of processed pulses without a position or sidelink, or excluded by decimation.
+        Number of processed pulses that were excluded: no position, no sidelink, or decimation.
     until
         Time of the last processed pulse.
-    why_dropped
-        Reason for the last dropped block; empty: none.
+    drop_reason
+        Reason for the exclusion of the last excluded block; empty: none.
     """
 
     campaign: Campaign
@@ -342,7 +344,7 @@ class PairSoFar:
     drop_reason: str = ""
     _shift_ns: int = 0
     _blocks: int = 0
-    _raised: dict[str, tuple[int, str]] = field(default_factory=dict)  # blocks that raised a flag, and its last line
+    _raised: dict[str, tuple[int, str]] = field(default_factory=dict)  # flag → number of blocks, last measurement
     _queue: list[Compressed] = field(default_factory=list)
     _fine: bool = True
 
@@ -393,7 +395,7 @@ class PairSoFar:
         return tx_index[new], rx_index[new]
 
     def add_next(self, *, ended: bool, every: int = 1) -> bool:
-        """Read the next block of pulses and add every `every`-th pulse to the coarse image; False if none is ready."""
+        """Add every `every`-th pulse of the next block to the coarse image; return False if no pulse is ready."""
         try:
             tx_index, rx_index = self.ready(ended=ended)
         except CampaignError as error:  # the time tags cannot be associated yet
@@ -486,10 +488,10 @@ class PairSoFar:
         return True
 
     def judged(self) -> dict[str, Any]:
-        """Return the assessment of the fine image, or of the coarse one if that has more than twice as many pulses.
+        """Return the assessment of the fine image, or of the coarse image if its pulses are more than twice as many.
 
-        Only the verdict "focused" of a coarse image is reported: its range cells are twice as deep, so that points in
-        the same cell disturb each other's measurement during the pass.
+        For a coarse image, only the verdict "focused" is reported: its range cells are twice as long, so that points in
+        the same cell disturb each other's measurement.
         """
         coarse, fine = self.images
         image = fine if 2 * fine.pulses >= coarse.pulses else coarse
@@ -507,7 +509,7 @@ class PairSoFar:
 
     @property
     def delay_s(self) -> float | None:
-        """Delay of the last added pulse behind the last recorded one, seconds; None before the first block."""
+        """Delay of the last added pulse behind the last recorded pulse, seconds; None before the first block."""
         if self.until is None or not len(self.time):
             return None
         return round(float((self.time[-1] - self.until) / np.timedelta64(1, "s")), 2)
