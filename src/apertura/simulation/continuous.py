@@ -23,7 +23,7 @@ Chips = NDArray[np.int8]
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Framing:
-    """Framing in front of the symbol, on the middle subcarrier: a PN preamble and a payload with the frame number.
+    """Framing in front of the symbol, on the centre subcarrier: a PN preamble and a payload with the frame number.
 
     Examples
     --------
@@ -66,7 +66,7 @@ class Framing:
         return int(chips * self.chip_samples + self.guard_samples)
 
     def centre_hz(self, waveform: TransmitWaveform) -> float:
-        """Return the baseband frequency of the chips' carrier, the middle subcarrier."""
+        """Return the baseband frequency of the carrier of the chips, the centre subcarrier."""
         return float(waveform.baseband_hz[len(waveform.codes) // 2])
 
     def signal(self, waveform: TransmitWaveform, frame: int, time_s: Floats) -> NDArray[np.complex128]:

@@ -77,7 +77,7 @@ def fly(
 
 
 def physical(channel: Channel, *, transmitter: Radio, receiver: Radio) -> Channel:
-    """Convert a radar channel to root watts at the converter, with the receiver's thermal noise and full scale.
+    """Scale a radar channel to √W at the ADC input, with the thermal noise and the full scale of the receiver.
 
     Parameters
     ----------

@@ -94,7 +94,7 @@ class SimulatedFlight:
     )
     segments: Mapping[str, tuple[tuple[float, float], ...]] = Field(
         default_factory=dict,
-        description="pair → start and end of the segments it is imaged from, s after the first pulse; missing: all",
+        description="pair → start and end of the imaged segments, s after the first pulse; missing: all pulses",
     )
 
     @model_validator(mode="after")

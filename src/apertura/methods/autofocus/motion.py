@@ -14,7 +14,7 @@ PhaseCentres = Callable[[Floats], Aperture]
 """Function of times (time,) inside the log, seconds of its clock, that returns phase centres."""
 
 LEAST_COVERED = 0.5
-"""Least share of the pulses inside the log."""
+"""Least fraction of the pulses inside the log."""
 
 _MARGIN = 8  # pulse intervals added on both sides of the plausible offsets
 _SIGMA = 3.0  # standard deviations below the best correlation beyond which offsets are excluded

@@ -109,7 +109,8 @@ def fix_gauge(
         matrix = np.concatenate([matrix, reference_rows])
         residuals = np.concatenate([residuals, reference_residuals])
         # Normal equations of eq. 15, with the prior |y|². The shift due to previous iterations is added back
-        # to `residuals`; as path offsets are not part of the tracks, the residuals still contain their effect.
+        # to `residuals`; because path offsets are not part of the tracks, the residuals still contain the effect of
+        # path offsets.
         normal = matrix.T @ matrix + np.eye(len(step))
         target = matrix[:, :modes] @ step[:modes] - residuals
         step = np.asarray(np.linalg.solve(normal, matrix.T @ target), np.float64)
@@ -261,8 +262,10 @@ def _distance_sigma(residuals: Floats) -> float:
 
 
 PATH_STD_M = 0.1
-"""Prior standard deviation of path offsets between pairs due to causes other than the tracks, metres. Errors of path
-offsets by fractions of a wavelength must not bend tracks; the constraints between pairs in range are hardly weaker."""
+"""Prior standard deviation of path offsets between pairs due to causes other than the tracks, metres. The prior
+prevents errors of path offsets of fractions of a wavelength from bending tracks, and hardly weakens the range
+constraints between pairs.
+"""
 
 PATH_SIGMAS = 3.0
 """Number of standard deviations above which a path difference between pairs is not attributed to the tracks."""
@@ -277,8 +280,9 @@ _SLIPS = 3  # maximum searches that start from delays while subapertures have cy
 _STAGES = 3  # iterations of caching contributions and maximising sharpness
 
 MOST_ROUNDS = 4
-"""Maximum number of rounds. Each detects bright points in the refined image, also points that errors have hidden so
-far, and refines the tracks with all of them."""
+"""Maximum number of rounds. Each round detects bright points in the refined image, including points that errors have
+hidden so far, and refines the tracks with all these points.
+"""
 
 LEAST_FURTHER_DB = 0.05
 """Least contrast gain of held-out patches over the previous round for another round, dB."""
@@ -564,7 +568,10 @@ class TrackSearch:
         after = self.problem.state(unknowns)
         lost_db = -float(gains_db(state.statistics, after.statistics).mean())
         if self._apart_sigma(after) > max(apart_sigma, 1.0) or lost_db > _LOST_TO_TIES_DB:
-            return state.unknowns, {**report, "ties": "excluded: they blur points or displace them between pairs"}
+            return state.unknowns, {
+                **report,
+                "ties": "excluded: reference points would blur points or displace them between pairs",
+            }
         return unknowns, report
 
     def _apart_sigma(self, state: State) -> float:

@@ -19,7 +19,7 @@ SIGMAS = 5.0
 """Standard deviations above which a measurement is significant: less than one false flag in 10⁴ reports of 12 lines."""
 
 MISSED_SHARE = 0.01
-"""Largest share of missed pulses among the pulses that a node should have recorded."""
+"""Largest fraction of missed pulses among the pulses that a node should have recorded."""
 
 DC_DB = -20.0
 """Largest mean of I and Q relative to the signal, dB; with N = 1000 subcarriers the floor in range is −50 dB."""
