@@ -81,7 +81,7 @@ inline double length_of(const double* v, int64_t step) {
 }
 
 // Term of (4) of integration.md that determines c: the sector's centre s_0, the limit s_1 + S' or s_2 - S' of the flown
-// range, or their middle m; undecided if two terms differ by less than the variation of s between points.
+// range, or their midpoint m; undecided if two terms differ by less than the variation of s between points.
 enum CentreTerm { kUndecided, kOwn, kFirstFlown, kLastFlown, kMiddle };
 
 inline CentreTerm centre_term(const SectorJob& sector, const Flown& flown, double margin) {
