@@ -1,9 +1,9 @@
 """Geolocation of targets with and without atmospheric correction, for flights at heights of 30 m, 300 m and 3 km.
 
 Each one-way path is simulated with the refractivity at the heights of its ends
-(`apertura.simulation.scatterers.TrueAir`); with `--weather`, the atmosphere is 10 °C warmer, 20 hPa denser and wetter
-than the standard atmosphere. The pipeline uses one refractivity N per pair.
-Run: `.venv/bin/python benchmarks/atmosphere.py [--weather] [HEIGHT …]`; prints a table.
+(`apertura.simulation.scatterers.TrueAir`); with `--weather`, the atmosphere is 10 °C warmer, has a pressure higher by
+20 hPa, and is more humid than the standard atmosphere. The pipeline uses one refractivity N per pair. Run:
+`.venv/bin/python benchmarks/atmosphere.py [--weather] [HEIGHT …]`; prints a table.
 """
 
 import argparse

@@ -115,7 +115,7 @@ def build(size: int = 512, pulses: int = 1024, *, bistatic: bool = True, surface
 
 
 def turned(job: Job, degrees: float) -> Job:
-    """Return the job on a grid rotated about its middle."""
+    """Return the job on a grid rotated about its centre."""
     return replace(job, pixels=grid(len(job.pixels), turned_deg=degrees))
 
 

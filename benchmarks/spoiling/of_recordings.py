@@ -47,7 +47,7 @@ def tags(change: Callable[[NDArray[np.int64]], NDArray[np.int64]], *nodes: str) 
 
 
 def kept(choose: Callable[[int], NDArray[np.int_]], *nodes: str, tagged: bool = True) -> FolderChange:
-    """Return a mistake that keeps selected captures (count → numbers); not `tagged`: with the first time tags."""
+    """Return a mistake that keeps selected captures (count → numbers), with their own time tags or the first ones."""
 
     def changed(folder: Folder, node: str) -> None:
         numbers: list[int] = []

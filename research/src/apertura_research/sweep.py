@@ -144,8 +144,8 @@ def with_unit(title: str, unit: str) -> str:
 
     Examples
     --------
-    >>> with_unit("Share of triggers missed", "1"), with_unit("Height", "cm")
-    ('Share of triggers missed', 'Height, cm')
+    >>> with_unit("Fraction of triggers missed", "1"), with_unit("Height", "cm")
+    ('Fraction of triggers missed', 'Height, cm')
     """
     return title if unit == "1" else f"{title}, {unit}"
 

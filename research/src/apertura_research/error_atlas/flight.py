@@ -171,7 +171,7 @@ class TrueFlight:
         return Received(METHODS["divide"](radar, sidelink), measure(sidelink).delay_cells * cell_m)
 
     def paths(self, pair: str) -> PointPaths:
-        """Return the paths of a point in the middle of the scene, for which the budget is computed."""
+        """Return the paths of a point at the scene centre, for which the budget is computed."""
         return PointPaths.of(
             self.apertures()[pair],
             self.time_s,
@@ -264,7 +264,7 @@ class LogErrors:
 
 
 def assumed_from_logs(flown: TrueFlight, generator: Generator, **logs: LogErrors) -> AssumedFlight:
-    """Return the assumptions of a pipeline with erroneous logs; nodes without one have their true positions."""
+    """Return the assumptions of a pipeline with erroneous logs; other nodes have their true positions."""
     places, used, flags = {}, np.ones(len(flown.time_s), bool), dict[str, str]()
     for node, log in logs.items():
         places[node], checked = log.checked(flown, node, generator)

@@ -224,7 +224,7 @@ def _alike(name: str, experiment: Experiment) -> list[Claim]:
     words = "mono- and bistatic recordings of one split receive signal agree" if name == "static" else ""
     note = f"{PRINTED[name][0][0]}, at its true position, electrical paths known"
     rows = [
-        require(f"phase of bistatic less monostatic, {name}", phase, "rad", limit=f"within ±{ALIKE_RAD:g} rad",
+        require(f"phase of bistatic minus monostatic, {name}", phase, "rad", limit=f"within ±{ALIKE_RAD:g} rad",
                 met=abs(phase) <= ALIKE_RAD, words=words, style=".4f", note=note),
         require(f"gain of bistatic over monostatic, {name}", gain_db, "dB", limit=f"within ±{ALIKE_DB:g} dB",
                 met=abs(gain_db) <= ALIKE_DB, words=words, style=".3f", note=note),

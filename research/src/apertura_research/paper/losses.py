@@ -113,8 +113,8 @@ def _timing(scene: PaperScene, still: Profile, moved: Profile, late_s: float) ->
             independent_model=scene.waveform.carrier_hz * late_s % 1.0,
             within=0.005,
             relative=False,
-            note="closed form f_cT modulo one cycle, for a profile referenced to the start of the band; this project "
-            "references profiles to the middle of the band, where it is f_mid·T",
+            note="closed form f_cT modulo one cycle for a profile referenced to the start of the band; this project "
+            "references profiles to the band centre, where the phase change is f_mid·T cycles",
         ),
     ]
 

@@ -17,7 +17,7 @@ from apertura_research.point_response import find_peaks, mean_image
 from apertura_research.stability.sweeps import SWEEPS, ImpairmentSweep
 
 REFUSED_DB = 40.0
-"""Loss recorded if no pulse is imaged; larger losses are clipped to it."""
+"""Loss recorded if no pulse is imaged; larger losses are clipped to this value."""
 
 _REACH_M = (0.16, 1.0)
 
@@ -37,7 +37,7 @@ class StabilityRow:
     floor_db
         RMS error at random pixels of the scene, relative to the mean peak.
     pulses_used
-        Mean share of imaged pulses.
+        Mean fraction of imaged pulses.
     chosen
         Method applied in most draws; `refused` if the sidelink locks in no pulse.
     """
