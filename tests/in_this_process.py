@@ -16,7 +16,7 @@ class Processes:
 
     @staticmethod
     def run(command, **_):
-        """Run ``python … -m module words`` in this process, without the resource limits that it sets itself."""
+        """Run ``python … -m module words`` in this process, without the resource limits that the module sets."""
         words, stderr, status = command[command.index("-m") + 1 :], StringIO(), 0
         with patch.object(sys, "argv", words), patch("resource.setrlimit"), redirect_stderr(stderr):
             try:

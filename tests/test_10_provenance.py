@@ -1,4 +1,4 @@
-"""The code hash follows imports: it changes with the code that a stage can run and with nothing else."""
+"""The code hash follows imports: the hash changes only with the code that a stage can run."""
 
 import ast
 import hashlib
@@ -26,7 +26,7 @@ def copied(tmp_path_factory):
 
 
 def changes(copied, file, *modules):
-    """Return True if the code hash of modules changes with an edit of a file; the edit is undone."""
+    """Return True if the code hash of modules changes with an edit of a file; the edit is reverted."""
     path = copied / file
     before, text = code_sha256(*modules, package=copied), path.read_bytes()
     path.write_bytes(text + b"\nEDITED = 1\n")
@@ -43,7 +43,7 @@ def changes(copied, file, *modules):
         ("core/combination.py", "cube", True),
         ("core/combination.py", "image", False),
         ("core/echo/sidelink.py", "echo", True),
-        ("core/echo/sidelink.py", "image", True),  # the check of its samples recomputes a few
+        ("core/echo/sidelink.py", "image", True),  # the check of its samples recomputes some samples
         ("core/echo/calibration.py", "image", False),
         ("formats/export/__init__.py", "export", True),
         ("formats/export/cog.py", "export", True),

@@ -92,7 +92,7 @@ def test_refractivity_std_covers_10_k_20_hpa_and_any_humidity():
 
 FREQUENCY = 1.2e9 + 2e6 * np.arange(128)
 GRID = ap.SceneGrid("local", -6.0, 6.0, 0.25, (48, 48))
-TARGET = np.array([[1.25, -0.75, 0.0]])  # a corner of pixels; pixel centres are half a spacing away
+TARGET = np.array([[1.25, -0.75, 0.0]])  # corner of a pixel; the pixel centre is half a spacing away
 
 
 def flight(range_m=600.0, pulses=96):
@@ -153,9 +153,9 @@ def test_atmosphere_keyword_sets_the_wave_speed():
 @pytest.mark.quick("numba", "reference")
 @pytest.mark.parametrize("engine", [name for name in ENGINES if name not in {"cuda"}])
 def test_image_in_air_equals_image_of_scaled_geometry_in_vacuum(engine):
-    """docs/theory/atmosphere.md, eq. 4, pixel by pixel, for every engine, and against the double sum.
+    """Equation 4 of docs/theory/atmosphere.md holds at every pixel, for every engine and for the double sum.
 
-    Without a certificate, which would replace an engine whose error is too large.
+    No certificate is computed, because it would replace an engine whose error is too large.
     """
     if not load_engine(engine).available():
         pytest.skip("cannot run here")
@@ -211,8 +211,8 @@ _SIZE = "sizes of cells, searches, windows or grids, and limits of checks: 0.03 
 _POWER = "wavelength of the radar equation: 0.003 dB"
 _DRAWN = "plots and listings"
 _ELECTRICAL = "electrical paths: cables, delays given as c times seconds"
-_DEFAULT = "default for arrays without a speed of their own"
-_FORMAT = "delays that a file gives as a distance, or unconverted delays for in_air"
+_DEFAULT = "default for arrays without a stated speed"
+_FORMAT = "delays that a file states as a distance, or unconverted delays for in_air"
 
 VACUUM = {
     "common/constants.py": "the constant",
@@ -228,7 +228,7 @@ VACUUM = {
     "core/imaging/resolution.py": _SIZE,
     "core/imaging/reflectors.py": "wavelength of a cross-section: 0.003 dB",
     "core/imaging/job.py": f"{_DEFAULT}; {_SIZE}",
-    "core/imaging/judgement.py": "comparison with the speed in vacuum, so that the budget has the effect of air",
+    "core/imaging/judgement.py": "comparison with the speed in vacuum, so that the budget contains the effect of air",
     "core/echo/compression.py": _DEFAULT,
     "core/echo/calibration.py": _ELECTRICAL,
     "core/echo/dechirp.py": _ELECTRICAL,
@@ -248,7 +248,7 @@ VACUUM = {
     "formats/phase_histories/pulson.py": _FORMAT,
     "formats/export/cphd.py": "reference of TDTropoSRP",
     "simulation/scatterers.py": "delay of an optical path",
-    "simulation/fmcw.py": "simulates vacuum, and writes that to its config",
+    "simulation/fmcw.py": "simulates vacuum, and configures vacuum in the campaign",
     "simulation/gridding.py": "same as the plain sum of simulation/scatterers.py, for arrays in vacuum",
     "simulation/observation.py": _POWER,
     "simulation/synthesis.py": "excess path of reflections of the sidelink",

@@ -32,7 +32,7 @@ PROPERTY = tried(60)
 
 
 def read(folder, kind, data):
-    """Return the track of a damaged log, or None if it is rejected."""
+    """Return the track of a damaged log, or None if the log is rejected."""
     name, _, options = LOGS[kind]
     (folder / name).write_bytes(data)
     try:
@@ -83,7 +83,7 @@ def test_log_with_swapped_lines_is_rejected_or_unchanged(tmp_path_factory, kind,
 @PROPERTY
 @given(data=st.data())
 def test_log_with_a_missing_piece_is_rejected_or_lacks_epochs(tmp_path_factory, kind, data):
-    """The remainders of a cut line may form one plausible line; no other epoch changes."""
+    """The remainders of a cut line may form one plausible line; the other epochs remain unchanged."""
     folder, text = tmp_path_factory.mktemp("log"), LOGS[kind][1].encode()
     whole = read(folder, kind, text)
     place = data.draw(st.integers(text.index(b"\n") + 1, len(text) - 1))

@@ -106,7 +106,9 @@ def test_coherence_claims_match_the_paper_and_the_noise_level(campaigns):
     for name, claim in claims.items():
         if name.startswith("lack of coherence"):
             assert float(claim.computed) == pytest.approx(1.0, abs=0.7)
-    pair_claims = [claims[f"{what} monostatic, static"] for what in ("phase of bistatic minus", "gain of bistatic over")]
+    pair_claims = [
+        claims[f"{what} monostatic, static"] for what in ("phase of bistatic minus", "gain of bistatic over")
+    ]
     assert [(claim.about, claim.verdict) for claim in pair_claims] == [
         (PAPER, EXPLAINED)
     ] * 2  # one simulated signal is split

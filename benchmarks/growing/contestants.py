@@ -187,7 +187,7 @@ def share_of(scene: Scene, windows: Iterable[Window]) -> float:
 
 
 def _formed(scene: Scene, predicted_s: float, limit_s: float, *, fields: bool) -> list[Window]:
-    """Return the largest set of windows predicted within the time limit, or the smallest if it is slightly over it."""
+    """Return the largest set of windows within the time limit, or the smallest set if it exceeds the limit slightly."""
     for windows in _samples(scene, fields=fields):
         seconds = predicted_s * share_of(scene, windows)
         if seconds <= limit_s:
