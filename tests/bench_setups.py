@@ -104,7 +104,7 @@ class Setup:
 
 
 def samples_of(root: Path, node: str) -> tuple[Path, Path, dict, NDArray[np.int16]]:
-    """Return both paths, the metadata and the samples (capture, sample, channel, 2) int16 of a node."""
+    """Return the paths of both files, the metadata and the samples (capture, sample, channel, 2) int16 of a node."""
     meta, data = (root / "raw" / FLIGHT / f"{node}.sigmf-{kind}" for kind in ("meta", "data"))
     described = json.loads(meta.read_text(encoding="utf-8"))
     channels = described["global"].get("core:num_channels", 1)

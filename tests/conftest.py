@@ -132,7 +132,7 @@ def finished_sample(shared, all_steps, tmp_path_factory):
 
 
 def pytest_generate_tests(metafunc):
-    """Run tests with `isa` on every instruction set of the compiled engine; only the one selected here is quick."""
+    """Run tests with `isa` on every instruction set of the compiled engine; only the default set is quick."""
     if "isa" in metafunc.fixturenames:
         from apertura.core.backprojection.engines import native, native_binding
 

@@ -49,7 +49,7 @@ def plain():
 
 @pytest.fixture(scope="module")
 def tables(plain):
-    """Tables on the device, shared by all tests: in the simulator they take longer than an image."""
+    """Tables on the device, shared by all tests, because the simulator computes them more slowly than an image."""
     return cuda.prepare(plain[2])
 
 
@@ -292,7 +292,7 @@ def veering(sector, flown, place):
 
 
 def ending_near(sector, scene, place):
-    """Return the same sector, centred by a pulse so near that its s changes more over a patch than that of others."""
+    """Return the same sector, centred on a near pulse, whose s changes more over a patch than s of other pulses."""
     near_position = ecef(np.array([12.0, 0.0, 2.0]))[None]
     along = (ecef(np.array([0.7, 0.7, 0.0])) - ecef(np.zeros(3)))[None] / 2
     end = Sector(along, along, 0.0, sector.half)
@@ -312,7 +312,7 @@ def ending_near(sector, scene, place):
     ],
 )
 def test_excluded_pulses_change_no_bit(long, kind):
-    """Whole chunks and single pulses are excluded, also chunks whose middle is excluded and whose ends are not."""
+    """Whole chunks and single pulses are excluded, also the middle pulses of chunks whose ends contribute."""
     scene, places, tables = long
     flown = Aperture(scene.tx, scene.rx)
     sector = Sector.of(flown, chord_m=1.2, centre=0.0, half=0.03)

@@ -47,7 +47,7 @@ def anywhere(name):
 
 
 def exists(name, document):
-    """A path is relative to the root, src/apertura or the document; a bare name may be anywhere in the code."""
+    """Return True if a path exists below the root, src/apertura or the document's folder, or a bare name anywhere."""
     if any(any(place.glob(name.rstrip("/"))) for place in (*PLACES, document.parent)):
         return True
     return "/" not in name and anywhere(name)

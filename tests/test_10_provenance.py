@@ -158,7 +158,7 @@ def test_code_hash_of_a_parent_changes_that_of_its_child():
 
 @pytest.mark.parametrize("size", [0, 1, 4 << 20, (4 << 20) + 1, 8 << 20, (13 << 20) + 7])
 def test_both_hashes_of_a_file_match_its_bytes(tmp_path, size):
-    """No block, part of a block, several blocks: a buffer is reused only when both hashes have processed it."""
+    """The file has no, part of one or several blocks; a buffer is reused only after both hashes have processed it."""
     content = np.random.default_rng(size).bytes(size)
     (tmp_path / "samples").write_bytes(content)
     expected = {name: hashlib.new(name, content).hexdigest() for name in ("sha256", "sha512")}

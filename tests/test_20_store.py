@@ -77,7 +77,7 @@ def test_changed_document_is_rejected(tmp_path):
 
 
 def test_swapped_chunk_is_rejected_when_read(tmp_path):
-    """Its own checksum is valid; only the hash in the manifest differs. Chunks that are not read are not checked."""
+    """The checksum of the chunk is valid, but the manifest has another hash; chunks that are not read are unchecked."""
     values = np.arange(40.0).reshape(10, 4).astype(np.complex64)
     stage = xr.Dataset({"transfer": (("pulse", "subcarrier"), np.broadcast_to(np.complex64(0), values.shape))})
     for name in ("a", "b"):

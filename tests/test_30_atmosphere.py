@@ -26,7 +26,7 @@ AIR = 1.000282
 
 
 def test_refractivity_matches_itu_r_p453():
-    """Reference values: dry 77.6·1013.25/288.15; e_s = 17.04 hPa at 15 °C from tables, 3.73e5·e/T² of vapour."""
+    """Reference: dry term 77.6·1013.25/288.15; vapour term 3.73e5·e/T², with e_s = 17.04 hPa at 15 °C from tables."""
     assert refractivity(15.0, 1013.25, 0.0) == pytest.approx(77.6 * 1013.25 / 288.15, rel=1e-12)
     wet = refractivity(15.0, 1013.25, 100.0) - refractivity(15.0, 1013.25, 0.0)
     assert wet == pytest.approx(3.73e5 * 17.04 / 288.15**2, rel=0.006)  # 0.4 % is the enhancement factor of moist air
@@ -102,7 +102,7 @@ def flight(range_m=600.0, pulses=96):
 
 
 def history(aperture, index, **changes):
-    """Return the echo of TARGET through air, from the delays of both one-way paths, relative to the origin's delay."""
+    """Return the echo of TARGET through air, from the delays of both one-way paths minus the delay of the origin."""
     origin_s, target_s = (index * aperture.path(place) / SPEED_OF_LIGHT_M_S for place in (0 * TARGET, TARGET))
     delay_s = target_s - origin_s
     echo = np.exp(-2j * np.pi * FREQUENCY * delay_s).astype(np.complex64)

@@ -190,7 +190,7 @@ RADIUS_M = 6_371_000 * np.pi / 180
 @pytest.mark.parametrize("speed", [0.1, 1.0])
 def test_rounded_positions_are_found_with_their_error(grain_deg, expected_m, kind, speed):
     time_s, place = logged(kind, epochs=600, noise_m=0.003, seed=2)
-    rotated = speed * place @ np.array([[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1]])  # aligned with no axis of the grid
+    rotated = speed * place @ np.array([[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1]])  # not aligned with the grid
     latitude, longitude = 48 + rotated[:, 0] / RADIUS_M, 9 + rotated[:, 1] / RADIUS_M / np.cos(np.radians(48))
     rounded = [np.round(angle / grain_deg) * grain_deg for angle in (latitude, longitude)]
     ecef = ecef_from_geodetic(*rounded, 600 + rotated[:, 2])
@@ -333,7 +333,7 @@ def courses(kind, generator):
 
 @pytest.mark.slow
 def test_random_flights_have_no_false_and_few_missed_yaw_faults():
-    """4000 flights; radians detected in 9 of 10 flights with yaw along their turns, in 7 of 10 straight ones."""
+    """Of 4000 flights, radians are detected in 9 of 10 with yaw along their turns and 7 of 10 straight flights."""
     generator, detections = np.random.default_rng(0), {}
     for _ in range(4000):
         kind = generator.choice(["legs", "circle", "lawnmower", "straight", "wandering"])

@@ -41,7 +41,7 @@ def test_fraction_of_a_second_is_estimated_to_half_an_interval(tmp_path_factory,
 
 
 def test_stopped_clock_is_aligned_again(tmp_path):
-    """As in the real log: 74 s pass between rows whose clocks differ by 100 ms; a segment of 0.3 s has no time."""
+    """As in the real log, 74 s pass between rows whose clocks differ by 100 ms; a segment of 0.3 s is not timed."""
     times = TIMES.copy()
     times[30:33] += np.timedelta64(500_000, "ms")
     times[33:] += np.timedelta64(573_900, "ms")

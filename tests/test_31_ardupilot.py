@@ -270,7 +270,7 @@ PLACES = st.integers(0, 10**6)
 
 
 def read_damaged(path, data):
-    """Return the track of a damaged log, or None if it is rejected; in-process version of the isolated reader."""
+    """Return the track of a damaged log, or None if the log is rejected; the reader runs in this process."""
     path.write_bytes(data)
     try:
         fields = read_fields(path)

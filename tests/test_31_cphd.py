@@ -1,4 +1,4 @@
-"""CPHD of other radars: files written field by field after the standard, independent of apertura's own export."""
+"""CPHD of other radars: files written field by field after the standard, without apertura's export."""
 
 import re
 

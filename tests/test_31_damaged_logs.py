@@ -1,4 +1,4 @@
-"""Damaged logs (cut, reordered, flipped bits): epochs are lost or the log is rejected; no other epoch changes."""
+"""Damaged logs (cut, reordered, flipped bits): epochs are lost or the log is rejected; others are unchanged."""
 
 import numpy as np
 import pytest
@@ -97,7 +97,7 @@ def test_log_with_a_missing_piece_is_rejected_or_lacks_epochs(tmp_path_factory, 
 @PROPERTY
 @given(data=st.data())
 def test_flipped_bit_changes_at_most_one_epoch(tmp_path_factory, kind, data):
-    """Without a checksum a changed digit is a valid position; `check_track` finds those that stand out."""
+    """Without a checksum, a changed digit gives a valid position; `check_track` detects the outliers among these."""
     folder, text = tmp_path_factory.mktemp("log"), bytearray(LOGS[kind][1].encode())
     whole = read(folder, kind, bytes(text))
     place = data.draw(st.integers(0, len(text) - 1))

@@ -151,7 +151,7 @@ def test_automatic_grid_is_limited_by_the_recorded_samples(tiny):
 
 
 def test_automatic_bounds_at_the_edge_of_a_utm_zone_are_valid():
-    """Three metres east of 12° E: zone 33, with bounds beyond the edge."""
+    """The scene is three metres east of 12° E, in zone 33, with bounds beyond the edge of the zone."""
     edge_m, north_m, _ = projected_from_ecef("EPSG:32633", ecef_from_geodetic(48.0, 12.0, 600.0))
     east_m, height_m = np.full((2, 41), [[edge_m + 3], [610.0]])
     track = ecef_from_projected("EPSG:32633", east_m, north_m + np.linspace(-20, 20, 41), height_m)
@@ -196,6 +196,6 @@ def test_utm_is_accepted_up_to_3_degrees_beyond_its_zone(longitude, accepted):
 
 
 def test_coordinates_without_an_inverse_projection_are_rejected():
-    """Beyond the edge of the Mercator map, where longitude 181 equals -179."""
+    """The coordinates lie beyond the edge of the Mercator map, where longitude 181 equals -179."""
     with pytest.raises(CampaignError, match="reach longitude"):
         SceneGrid.from_bounds("EPSG:3857", (20037500.0, 0.0, 20037520.0, 10.0), spacing_m=1.0)

@@ -56,7 +56,7 @@ def test_steep_planes_are_in_shadow_or_layover(slope_deg, expected):
 
 
 def test_shadow_on_random_hills_matches_dense_sampling():
-    """The search that skips whole blocks agrees with dense sampling of bilinear terrain."""
+    """The search, which skips whole blocks, agrees with dense sampling of bilinear terrain."""
     from scipy.ndimage import gaussian_filter, map_coordinates
 
     generator = np.random.default_rng(1)
@@ -93,7 +93,7 @@ def test_shadow_needs_most_pulses_of_either_antenna():
 
 
 def test_earth_curvature_hides_distant_terrain():
-    """At 5 km and antenna height, terrain is hidden by the bulge d²/8R of half a metre; not in a plane frame."""
+    """At 5 km, terrain at antenna height is hidden by the bulge d²/8R of half a metre, but not in a plane frame."""
     for crs, west, north, dark in (("local", 0.0, 0.0, 0), ("EPSG:32632", 500000.0, 5400000.0, 1)):
         grid = SceneGrid(crs, west, north, 25.0, (3, 200))
         antenna_position = (west, north - 37.5, 0.3)

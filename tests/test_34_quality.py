@@ -44,7 +44,7 @@ def test_error_bound_holds_with_95_percent_confidence_and_is_tight(kind):
 
 
 def test_errors_of_few_bright_pixels_are_detected():
-    """One target contains almost all power and error: random pixels alone would certify its surroundings."""
+    """One target contains almost all power and error; random pixels alone would certify only its surroundings."""
     generator = np.random.default_rng(5)
     exact = generator.standard_normal((96, 96)) + 0j
     exact[40, 50] = 1e4
@@ -58,7 +58,7 @@ def test_errors_of_few_bright_pixels_are_detected():
 
 
 def test_bound_from_uniform_draws_uses_only_their_power():
-    """Uniform draws without the total power: the bound holds, and is wider if few targets contain the power."""
+    """The bound from uniform draws without the total power holds, and is wider if few targets contain the power."""
     generator, margins_db = np.random.default_rng(6), {}
     for kind in ("speckle", "targets"):
         images = [image_with_errors(generator, kind) for _ in range(200)]

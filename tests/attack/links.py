@@ -276,7 +276,7 @@ FAULTS = (D_CHANGED, HUNG, TRACEBACK, KILLED)
 
 
 def _weight(path: str) -> float:
-    """Return the relative frequency of a path: arrays and Snakemake's folder contain a number of similar paths."""
+    """Return the relative frequency of a path: arrays and Snakemake's folder have many similar paths."""
     return 0.05 if ".zarr/" in path else 0.2 if path.startswith(".snakemake/") else 1.0
 
 

@@ -248,7 +248,7 @@ def quoted_cells(data: bytes, generator: np.random.Generator, tokens: Sequence[b
 def mutated(
     seeds: Sequence[bytes], generator: np.random.Generator, *, tokens: Sequence[bytes], structure: Sequence[Mutator]
 ) -> bytes:
-    """Return one of the seeds after one to four changes, mostly one; half of them are format-specific if available."""
+    """Return one of the seeds after one to four changes, mostly one; half of all changes are format-specific."""
     data = seeds[int(generator.integers(len(seeds)))]
     for _ in range(min(4, int(generator.geometric(0.7)))):
         known = structure and generator.random() < 0.5

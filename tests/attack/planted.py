@@ -136,7 +136,7 @@ def plant(root: Path, *, in_snakemakes_own: bool = False) -> Planted:
 
 
 def _outside_files(planted: Planted) -> None:
-    """Write the files that hostile texts name: grids, lists of CRS, rasters and archives without valid content."""
+    """Write the files named in hostile texts: grids, lists of CRS, rasters and archives without valid content."""
     for name in ("init", "shift.gsb", "geoid.gtx", "raster.tif", "array.zarr", "archive.zip", "config.yaml", "log.csv"):
         (planted.outside / name).write_bytes(b"<9> +proj=utm +zone=32 +datum=WGS84 <>\n")
 

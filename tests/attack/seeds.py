@@ -101,7 +101,7 @@ def scans() -> list[bytes]:
 
 
 def sigmf_meta() -> list[bytes]:
-    """Return metadata of triggered and continuous recordings, with header bytes, and of another vendor."""
+    """Return metadata of recordings: triggered, continuous, with header bytes, and of another vendor."""
     header = {"core:datatype": "ci16_le", "core:version": "1.2.5", "core:sample_rate": 1e6, "core:num_channels": 2}
     captures = [
         {"core:sample_start": 6 * n, "core:frequency": 1.2e9, "core:datetime": f"2025-05-14T09:30:0{n}.25Z"}
@@ -134,7 +134,7 @@ def sigmf_floats() -> list[bytes]:
 
 
 def sigmf_collections() -> list[bytes]:
-    """Return collections that list the first recording of `sigmf_meta`, under the name of a node and its own."""
+    """Return collections that list the first recording of `sigmf_meta`, under two names: of a node, and its own."""
     streams = [{"name": "rx_0", "hash": hashlib.sha512(sigmf_meta()[0]).hexdigest()}]
     body = {"core:version": "1.2.0", "core:streams": streams}
     return [json.dumps({"collection": body | more}).encode() for more in ({"apertura:nodes": {"uav1": "rx_0"}}, {})]

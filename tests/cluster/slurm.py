@@ -76,7 +76,7 @@ def running(root: Path) -> Iterator[None]:
 @contextmanager
 def _at_the_end(end: Callable[[], None]) -> Iterator[None]:
     """Call `end` in a separate process when the body or this process has ended, even if it was killed."""
-    read_end, write_end = os.pipe()  # closes with this process, because programs that it starts inherit no pipe
+    read_end, write_end = os.pipe()  # closed with this process; child processes do not inherit it
     watcher = os.fork()
     if not watcher:
         try:
