@@ -1,4 +1,4 @@
-"""Files of FMCW beat signals: arrays, MATLAB and sound-card recordings contain the same sweeps; faults are named."""
+"""Files of FMCW beat signals: arrays, MATLAB and sound-card recordings give equal sweeps; faults are named."""
 
 import re
 from dataclasses import asdict, replace

@@ -50,7 +50,7 @@ def test_single_date_applies_to_the_whole_log(tmp_path):
 
 @pytest.mark.parametrize("wrong", [1, 3, 10])
 def test_late_date_change_after_midnight_is_corrected(tmp_path, wrong):
-    """Some receivers briefly send the previous date in RMC after midnight; later epochs would be a day early."""
+    """Some receivers briefly send the previous date after midnight; without a correction, epochs are one day early."""
     lines, late = logs.nmea(TIMES, PLACES, every=1).splitlines(), 0
     for place, line in enumerate(lines):
         if "RMC,000" in line and late < wrong:

@@ -238,7 +238,7 @@ def test_backward_filtered_solution_is_reversed(tmp_path, caplog):
     np.testing.assert_allclose(track.position.values, ECEF, atol=1e-5, rtol=0)
     assert "times decrease" in track.remarks[0]
     read_track(tmp_path / "a.track.pos", node="a")
-    assert caplog.text.count("times decrease") == 1  # once, although a command may read the log for each of its checks
+    assert caplog.text.count("times decrease") == 1  # once, although each check of a command may read the log
 
 
 @pytest.mark.parametrize(("weeks", "later"), [(1024, 1024), (2048, 2048), (0, 0)])

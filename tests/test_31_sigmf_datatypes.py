@@ -115,7 +115,7 @@ def test_unit_of_floats_only_scales_the_echo(campaign, plain, unit):
 @pytest.mark.slow
 @pytest.mark.parametrize("datatype", ["ci8", "cu8"])
 def test_eight_bit_samples_add_only_quantisation_noise(campaign, plain, datatype):
-    """A step Δ gives Δ²/12 in I and in Q, which a DFT of N samples spreads over N subcarriers: Δ²/6N on each."""
+    """A step Δ adds Δ²/12 to the variances of I and Q; a DFT of N samples spreads these over N subcarriers: Δ²/6N."""
     counts = counts_of(campaign, "a")
     step = np.abs(counts).max() / 127
     rounded = np.rint(counts / step) + (128 if datatype == "cu8" else 0)

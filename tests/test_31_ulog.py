@@ -296,7 +296,7 @@ def test_leap_second_learnt_during_the_log_is_rejected(tmp_path):
 @pytest.mark.parametrize("epoch", [0, 3, 30, 58, 59])
 @pytest.mark.parametrize(("field", "step"), [("lat", 90), ("lon", -150), ("alt_ellipsoid", 1000)])
 def test_position_that_contradicts_the_velocity_is_dropped(tmp_path, epoch, field, step):
-    """Error of about 1 m, as from a flipped bit; at the ends only velocity reveals it. With epoch 58, 59 is dropped."""
+    """Errors of 1 m, e.g. by flipped bits, are found by velocity even at the ends; 59 is dropped together with 58."""
     displaced = ulog_receiver()[field][1] + step * (np.arange(60) == epoch)
     track = read(tmp_path, (GPS, 0, ulog_receiver(**{field: displaced})))
     assert track.attrs["dropped"] == {"position contradicts the receiver's velocity": 1 + (epoch == 58)}
@@ -312,7 +312,7 @@ def test_velocities_that_contradict_the_whole_log_are_ignored(tmp_path, wrong):
 
 @pytest.mark.usefixtures("reader")
 def test_step_between_solutions_drops_no_epoch(tmp_path):
-    """From float to fix all later positions are displaced; both sides are valid, and steps are checked elsewhere."""
+    """A change to fix displaces all later positions; both parts are valid, and steps are checked elsewhere."""
     displaced = ulog_receiver()["lat"][1] + 180 * (np.arange(60) >= 30)
     assert read(tmp_path, (GPS, 0, ulog_receiver(lat=displaced))).sizes["epoch"] == 60
 

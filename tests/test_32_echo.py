@@ -96,7 +96,7 @@ def test_reference_delay_is_restored():
 
 @pytest.mark.parametrize("count", [16, 49, 64, 400])
 def test_swath_profile_matches_the_complete_sum(count):
-    """Decimation to the swath has an error below -110 dB of the strongest echo, at any position of it."""
+    """Decimation to the swath has an error below -110 dB relative to the strongest echo at any position."""
     frequency, generator = band(), np.random.default_rng(3)
     paths = generator.uniform(0, 749, 40)  # everywhere in the unambiguous range
     transfer = np.repeat(echo_of(paths, frequency) + 10 * echo_of([400.0], frequency), 3, axis=0)
@@ -226,7 +226,7 @@ def test_track_must_cover_the_pulses():
 @tried(50)
 @given(latitude=st.floats(-80, 80), longitude=st.floats(6, 12), height_m=st.floats(-400, 9000))
 def test_ecef_conversion_is_invertible_to_a_micrometre(latitude, longitude, height_m):
-    """Geodetic and UTM zone 32 in both directions; up is the direction of increasing height."""
+    """Geodetic coordinates and UTM zone 32, in both directions; up is the direction of increasing height."""
     place = np.array([latitude, longitude, height_m])
     position = ecef_from_geodetic(*place)
     returned = geodetic_from_ecef(position)

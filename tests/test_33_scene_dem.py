@@ -293,7 +293,7 @@ def test_target_on_a_slope_is_imaged_at_its_position_with_a_dem(tmp_path):
 
 
 def geographic_dem(path, slope):
-    """Write a DEM of a plane in map coordinates, 600 m at (500060, 5400040), with posts every 0.00002°."""
+    """Write a DEM of a plane in map coordinates: height 600 m at (500060, 5400040), posts every 0.00002°."""
     to_map = Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True)
     longitude, latitude = to_map.transform(500060, 5400040, direction="INVERSE")
     step = 2e-5

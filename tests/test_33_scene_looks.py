@@ -172,7 +172,7 @@ def test_illumination_is_exact_at_every_pixel(kind):
 
 @pytest.mark.parametrize("beams", [None, Beams(sector=Sector.of(FLOWN, chord_m=2.0, centre=0.2, half=0.1))])
 def test_aperture_centre_is_the_closest_approach(beams):
-    """Abeam of a straight track, or behind where the sector looks ahead by s = 2 sin(squint)."""
+    """The centre is abeam of a straight track, or behind if the sector is squinted by s = 2 sin(squint)."""
     looks, (rows, columns, points) = Looks.of(GRID, GROUND, FLOWN, beams), some_pixels()
     east = assembled(looks, lambda tile: looks.centre(tile)[0][..., 0])[rows, columns]
     squint = 0.0 if beams is None else np.arcsin(0.2)

@@ -47,7 +47,7 @@ def test_flat_ground_has_no_shadow_or_layover():
 
 @pytest.mark.parametrize(("slope_deg", "expected"), [(-60.0, 1), (-20.0, 0), (20.0, 0), (75.0, 2)])
 def test_steep_planes_are_in_shadow_or_layover(slope_deg, expected):
-    """At about 40° grazing angle: a plane that falls more steeply is in shadow, one that rises above 50° in layover."""
+    """At a grazing angle of about 40°, planes that fall more steeply are in shadow, planes above 50° in layover."""
     middle = STREET.x_m - 30
     heights = np.broadcast_to(np.tan(np.radians(slope_deg)) * middle, STREET.shape)
     antenna = np.array([30.0 - 300.0, 1.375, 300 * np.tan(np.radians(40.0))])

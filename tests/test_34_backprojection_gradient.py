@@ -57,7 +57,7 @@ def entropy(image):
 def displaced(pulse, axis, side, step_m):
     """Return (pulse, point) complex128: contributions with one phase centre or one path length displaced."""
     displacement_m = step_m * np.eye(PULSES)[pulse]
-    if side == "path_m":  # autofocus.md, eq. 3; `moved` rotates float32 samples, too coarse for a small step
+    if side == "path_m":  # autofocus.md, eq. 3; `moved` rotates float32 samples: too inaccurate
         rotation = np.exp(-2j * np.pi * PROFILES.centre_frequency_hz / C * displacement_m)
         return contributions(replace(PROFILES, start_m=PROFILES.start_m + displacement_m)) * rotation[:, None]
     legs = dict(zip(SIDES, PROFILES.aperture.legs, strict=True))

@@ -1,4 +1,4 @@
-"""Tree engine compared with the double sum: use of tree or direct kernel, bit-identical results for any division."""
+"""Tree engine compared with the double sum: choice of tree or direct kernel, bit-identical results."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -130,7 +130,7 @@ def test_presumming_on_a_rough_track_has_the_predicted_error(plain, jitter_m, to
 @pytest.mark.quick("0.05--74-4")
 @pytest.mark.parametrize(("height_m", "nodes_db", "layers"), [(0.02, -50, 3), (0.05, -74, 4), (0.3, -62, 7)])
 def test_rough_terrain_is_interpolated_between_height_layers(height_m, nodes_db, layers):
-    """Eq. 11: relief between pixels is summed by trees on height layers; with one layer less by the direct kernel."""
+    """Eq. 11: relief between pixels is summed by trees on height layers, or by the direct kernel with fewer layers."""
     rough = pixel_grid(70, 90)
     rough[..., 2] += height_m * np.random.default_rng(6).uniform(-1, 1, rough.shape[:2])
     flight = flown(rough, pulses=300)
@@ -389,7 +389,7 @@ def test_images_of_prepared_pulses_sum_to_the_whole(plain, edges):
 
 @pytest.mark.parametrize(("count", "nodes_db"), [(8, -50), (20, -74), (40, -98)])
 def test_table_of_supports_lists_the_widest_band_of_the_nodes(count, nodes_db):
-    """tree_supports.csv: for each number of nodes the band at which eq. 6 has the error `nodes_db`, by bisection."""
+    """tree_supports.csv: the band at which eq. 6 has the error `nodes_db`, for each number of nodes."""
     gauss, share = np.polynomial.legendre.leggauss(160)
     at = nodes(count, nodes_db)
 

@@ -302,7 +302,7 @@ def two_images():
 
 
 def test_bright_points_do_not_depend_on_windows_or_their_order():
-    drawn = [*POINTS, (40.0, 200.0, 0.27), (220.0, 30.0, 0.24), (128.0, 16.0, 0.9)]  # the last on a window edge
+    drawn = [*POINTS, (40.0, 200.0, 0.27), (220.0, 30.0, 0.24), (128.0, 16.0, 0.9)]  # last: on a window edge
     image = lobes(drawn)
     tiles = [
         (slice(row, row + 64), slice(column, column + 64)) for row in range(0, 256, 64) for column in range(0, 256, 64)
@@ -382,7 +382,7 @@ def coarse_range(pulses=512):
 
 
 def test_point_response_follows_from_aperture_and_band():
-    """Along range the band response of the two-way path; across it sin(x)/x beyond the smearing tolerance."""
+    """The response is that of the band along range, and sin(x)/x across, also beyond the smearing tolerance."""
     response = coarse_range()
     behind = np.column_stack([np.zeros(50), np.linspace(0.5, 25, 50), np.zeros(50)])
     np.testing.assert_allclose(response.at(np.zeros(3), behind), np.abs(np.sinc(behind[:, 1] / 6)), atol=5e-3)
@@ -525,7 +525,7 @@ def test_antenna_phase_linear_in_direction_displaces_points():
 
 @pytest.mark.parametrize(("centre_m", "flagged"), [(0.004, False), (0.03, True)])
 def test_angle_dependent_phase_centre_defocuses_as_predicted(centre_m, flagged):
-    """Phase centre displaced by `centre_m` at ±30°, the beam edges; the loss is that of the best peak of the sum."""
+    """The phase centre is displaced by `centre_m` at the beam edges (±30°); the loss is that of the best peak."""
     paths = straight()
     angle = cut_towards(paths)
     in_beam = np.abs(angle) < np.radians(30)
