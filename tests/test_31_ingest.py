@@ -262,7 +262,7 @@ def test_stored_corrections_are_applied_if_configured(tmp_path):
 
 @pytest.mark.slow
 def test_stored_corrections_of_gotcha_keep_trihedrals_focused(shared):
-    """Trihedrals are focused with the signs of eq. (AFRL); the opposite signs cause a loss of at least 18 dB."""
+    """Corrections with the implemented signs keep the peak level; opposite signs would reduce it by 18 dB or more."""
     files = sorted((shared / "gotcha_afrl").glob("*.mat"))
     east, north = np.meshgrid(np.arange(-16.6, -14.6, 0.1), np.arange(20.0, 23.0, 0.1))
     peaks = []

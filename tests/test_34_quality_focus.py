@@ -213,7 +213,7 @@ def test_constant_path_error_offsets_the_phase():
 
 
 def test_unconfigured_position_accuracy_follows_from_the_receiver_solution():
-    """Same effect as if configured, except for the automatic accuracy; a float solution has larger, longer errors."""
+    """The effect is that of a configured accuracy, except on automatic accuracy; a float solution has larger errors."""
     paths = straight()
     (fixed,) = position_lines(paths, [NodePositions(None, 1.0, receiver="fix")], sidelink=False)
     (configured,) = position_lines(paths, [NodePositions((0.01,) * 3, 1.0, "config")], sidelink=False)

@@ -100,7 +100,7 @@ def test_gradient_equals_the_finite_difference_of_the_value():
 
 @pytest.mark.slow
 def test_agreement_reduces_the_path_error_that_blurs_speckle():
-    """Path errors of the monostatic pair, without the part that only displaces the image, fall by eq. 23."""
+    """Path errors of the monostatic pair, without the mere displacement of the image, fall by eq. 23."""
     residual_ratios = []
     for seed in (1, 2):
         records, unknowns = records_of(seed)

@@ -92,7 +92,7 @@ def test_defocused_points_are_found_at_their_positions():
 
 
 def test_subapertures_of_a_longer_flight_contain_no_more_pulses():
-    """Eq. 10b: the aperture of a point is divided, not the flight, so memory does not grow with its length."""
+    """Eq. 10b: the aperture of a point is divided, not the flight; memory is independent of its length."""
     pulses, point = [], np.zeros(3)
     for times in (1, 4):
         time_s = np.arange(0, 60.0 * times, 0.1)

@@ -126,7 +126,7 @@ def test_continuous_recording_is_one_segment_with_framing_metadata(tmp_path):
     recording = sigmf.fromfile(str(root / "raw/f01/b.sigmf-meta"))
     recording.validate()
     (segment,) = recording.get_captures()
-    assert segment["core:datetime"] == "2025-05-14T09:30:00.001000Z"  # 1 ms before the first pulse, 2 ms late
+    assert segment["core:datetime"] == "2025-05-14T09:30:00.001000Z"  # start: 1 ms early; tags: 2 ms late
     framing = recording.get_global_field("apertura:framing")
     chips = np.load(root / framing["preamble"])
     assert set(chips.tolist()) == {-1, 1}

@@ -202,7 +202,7 @@ def test_height_errors_of_a_ramp_match_the_stated_deviation(rise_m):
 
 @pytest.mark.slow
 def test_height_deviation_includes_that_of_the_reference_point():
-    """Common offset of all heights: σ_h² grows by (σ₀/a)²; with four equal points by π/8 of that (median)."""
+    """Common offset of all heights: σ_h² grows by (σ₀/a)², with four equal points by π/8·(σ₀/a)²."""
     first, second, response = two_tracks(1.0)
     free = form_interferogram(first, second, ground_of(response, []), GRID.tiles(64), window=WINDOW)
     row, column = np.argwhere(np.isfinite(free.panels["unwrapped"]))[500]

@@ -182,7 +182,7 @@ def test_missing_pulses_are_refused_and_leave_no_file(tmp_path):
 
 
 def test_swath_ends_where_echoes_exceed_the_prefix(tmp_path):
-    """Without a prefix, the swath is the unambiguous range of the frequency step divided by 1.25."""
+    """Without a prefix, the swath is the unambiguous range of the frequency step, divided by 1.25."""
     first, last = collection(path_limit_m=np.full(6, np.inf)).swath_s
     assert last == -first == pytest.approx(0.5 / 1.25 / 1e5)
     limited = collection(path_limit_m=np.full(6, 900.0))

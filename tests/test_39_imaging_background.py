@@ -130,7 +130,7 @@ def test_no_background_is_detected_without_coupling(seed):
 
 
 def test_predicted_loss_of_a_target_equals_that_of_its_image():
-    """Short passes with little change of range."""
+    """The passes are short, with little change of range."""
     target = np.array([[0.0, 25.0, 0.0]])
     losses = []
     for length_m in (1.5, 3.0, 6.0):
@@ -186,7 +186,7 @@ def test_configured_method_removes_a_circled_target_with_a_flag():
 
 
 def test_coupling_is_kept_and_flagged_if_every_target_would_be_lost():
-    """Hovering platform: 5 cm of track."""
+    """The platform hovers, with 5 cm of track."""
     removal = coupled(recorded(straight(length_m=0.05)), 10).decided()
     assert removal.background is None
     assert removal.loss_db < -10
@@ -233,7 +233,7 @@ def leaking(tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
 def test_image_of_a_campaign_is_formed_without_the_background(leaking, pair):
-    """Profiles, certificate and reports use the same transfer functions; the image contains no coupling."""
+    """Profiles, certificate and reports use the same transfer functions, and the image contains no coupling."""
     images = {name: open_stage(campaign.stage("image", "f01", pair), "image") for name, campaign in leaking.items()}
     quality = images["auto"].attrs["quality"]
     assert quality["background"]["removed"] == "median"
@@ -265,7 +265,7 @@ def test_reflector_of_a_real_flight_is_the_highest_peak_at_its_survey_point(shar
 
 
 def test_each_capture_is_checked_for_saturation_once(finished_tiny, tmp_path, monkeypatch):
-    """Captures that the decisions read before are not counted again in the flags of the profiles."""
+    """Captures that were read for the decisions are not counted again in the flags of the profiles."""
     campaign = Campaign.load(copy_writable(finished_tiny.root, tmp_path / "campaign"))
     pulses = open_stage(campaign.stage("echo", "f01", "uav1-uav1"), "echo").sizes["pulse"]
     counts, count = Counter(), Saturation.count

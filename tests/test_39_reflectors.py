@@ -24,13 +24,13 @@ def rcs(shape, size_m, tx=AHEAD, rx=None):
 
 
 def test_corners_have_textbook_cross_sections_on_the_boresight():
-    """Skolnik; Knott, Shaeffer and Tuley: 4πa⁴/3λ² of triangles, 8πa²b²/λ² of rectangles."""
+    """By Skolnik and by Knott, Shaeffer and Tuley: 4πa⁴/3λ² for triangles, 8πa²b²/λ² for rectangles."""
     assert rcs("trihedral", (0.7,))[0] == pytest.approx(4 * np.pi * 0.7**4 / (3 * WAVELENGTH_M**2))
     assert rcs("dihedral", (0.5, 0.8))[0] == pytest.approx(8 * np.pi * 0.5**2 * 0.8**2 / WAVELENGTH_M**2)
 
 
 def test_trihedral_is_3_db_down_at_20_degrees_and_zero_along_a_plate():
-    """Robertson 1947: half-power width 40° of the triangular corner; no return along a plate."""
+    """By Robertson (1947), the half-power width of the triangular corner is 40°; there is no return along a plate."""
     edges = [
         10 * np.log10(rcs("trihedral", (1.0,), towards(side))[0] / rcs("trihedral", (1.0,))[0]) for side in (-20, 20)
     ]
@@ -70,7 +70,7 @@ def test_trihedral_cross_section_follows_from_its_effective_aperture(cosines):
 
 
 def test_bistatic_trihedral_loss_equals_the_aperture_diffraction_loss():
-    """Second-order model against the diffraction of the hexagonal aperture; undefined beyond 1 dB."""
+    """The second-order model agrees with the diffraction of the hexagonal aperture; it is undefined beyond 1 dB."""
     leg_m, half_deg = 0.6, 2.4
     bistatic, std_db = rcs("trihedral", (leg_m,), towards(-half_deg), towards(half_deg))
     monostatic, monostatic_std_db = rcs("trihedral", (leg_m,))
@@ -107,7 +107,7 @@ def test_bistatic_dihedral_loss_occurs_across_but_not_along_the_seam():
 
 
 def test_sphere_matches_rayleigh_resonance_and_optical_limits():
-    """Relative to πa²: 9(ka)⁴ for small ka, 3.65 at ka = 1, 1 for large ka: Ruck, fig. 3-2."""
+    """Relative to πa², Ruck (fig. 3-2) states 9(ka)⁴ for small ka, 3.65 at ka = 1, and 1 for large ka."""
     radius = np.array([0.05, 1.03, 60.0]) * WAVELENGTH_M / (2 * np.pi)
     shares = [rcs("sphere", (a,))[0] / (np.pi * a**2) for a in radius]
     assert shares[0] == pytest.approx(9 * 0.05**4, rel=0.01)
@@ -139,7 +139,7 @@ def test_cross_section_over_pulses_is_the_mean_amplitude_squared():
 
 
 def test_pulses_of_zero_weight_do_not_exclude_a_reflector():
-    """Outside the beam the bistatic angle is not limited."""
+    """Outside the beam, the bistatic angle is not limited."""
     tx, rx = np.concatenate([AHEAD, towards(-9)]), np.concatenate([AHEAD, towards(9)])
     corner, frequency = Reflector("trihedral", (1.0,), AXES), np.array([1.49896229e9] * 2)
     assert corner.seen(tx, rx, np.array([1.0, 0.0]), frequency)[0] == pytest.approx(rcs("trihedral", (1.0,))[0])
@@ -153,7 +153,7 @@ def test_flights_over_one_reflector_do_not_reduce_its_own_error():
 
 
 def test_several_reflectors_reduce_the_error_unless_they_disagree():
-    """Birge ratio: the deviation grows by the root of chi square per degree of freedom."""
+    """The deviation grows by the Birge ratio, the root of chi square per degree of freedom."""
     names, flights = ["a", "b", "c", "d"], ["f01"] * 4
     agreed = together(np.array([59.7, 60.1, 60.3, 59.9]), np.full(4, 0.3), np.full(4, 0.4), names, flights)
     assert agreed.std == pytest.approx(0.25)
@@ -165,7 +165,7 @@ def test_several_reflectors_reduce_the_error_unless_they_disagree():
 
 
 def test_mean_has_the_stated_deviation():
-    """400 drawn calibrations with three reflectors in two flights: 95 % within 1.96 deviations."""
+    """Of 400 drawn calibrations with three reflectors in two flights, 95 % are within 1.96 deviations."""
     draw, normalised = np.random.default_rng(1), []
     names, flights = ["a", "a", "b", "b", "c", "c"], ["f01", "f02"] * 3
     for _ in range(400):

@@ -94,7 +94,7 @@ def test_log_that_ends_before_the_last_pulse_is_reported(tiny):
 
 
 def test_poor_solutions_at_the_end_of_a_log_are_no_problem(tiny):
-    def single(lines):  # the pulses after its last fixed solution are dropped by the echo, and flagged
+    def single(lines):  # the echo step excludes the pulses after the last fixed solution and raises a flag
         cut = [line for line in lines if line.startswith("%") or line.split()[1] < "09:30:19"]
         return [*cut[:-3], *(line.replace("   1  18", "   5  18") for line in cut[-3:])]
 
@@ -153,7 +153,7 @@ def test_log_without_heights_is_reported(tiny):
 
 def test_supersonic_median_speed_is_reported(tiny):
     edit_config(tiny, lambda document: document["scene"].update(bounds_m="auto"))
-    for stretched, is_reported in ((500, False), (3, True)):  # from half a metre per second
+    for stretched, is_reported in ((500, False), (3, True)):  # the original speed is half a metre per second
         edit_position(tiny, lambda latitude, *rest, by=stretched: (48.4226 + by * (latitude - 48.4226), *rest))
         assert any(line.startswith(f"{TX}: a median speed of") for line in reported(tiny)) is is_reported
 
@@ -465,7 +465,7 @@ def test_disk_must_hold_the_results_still_to_be_written(tiny, monkeypatch):
 
 @pytest.mark.parametrize(("unit", "refused"), [("degrees", False), ("radians", True)])
 def test_attitude_in_radians_is_refused_if_a_lever_arm_needs_it(tiny, unit, refused):
-    """Fly a circle of 10 m: yaw follows the course over 360° only if it is in radians."""
+    """On a circle of 10 m, yaw follows the course over 360° only if the angles are in radians."""
 
     def circle(lines):
         header, *rows = lines

@@ -58,7 +58,7 @@ def test_pos_file_contains_the_refined_positions(log, tmp_path):
     read = read_rtklib_pos(tmp_path / "uav1.pos", node="uav1")
     assert "% refined: as stated" in text.splitlines()
     assert "5 of 30 epochs lie outside the pulses" in text
-    assert "ns, age, ratio and covariances 0: unknown" in text  # reported because programs filter by them
+    assert "ns, age, ratio and covariances 0: unknown" in text  # reported, because programs filter by these values
     np.testing.assert_array_equal(read.time.values, log.track.time.values)
     np.testing.assert_allclose(read.position.values, log.track.position.values + log.moved_m, atol=1e-4, rtol=0)
     np.testing.assert_allclose(read.position_std.values[:, ENU], np.nan_to_num(log.std_m), atol=5.1e-5, rtol=0)
@@ -91,7 +91,7 @@ def test_corrections_and_deviations_are_in_east_north_up(log):
     np.testing.assert_allclose((log.std_m**2).sum(axis=1)[inside], (log.left_m**2).sum(axis=1)[inside])
     np.testing.assert_allclose(
         log.std_m[~inside, :2], np.hypot([0.01, 0.02], log.correction_m[~inside, :2])
-    )  # the held correction belongs to other epochs
+    )  # the constant correction applies to other epochs
     assert np.isnan(log.std_m[~inside, 2]).all()
 
 

@@ -366,7 +366,7 @@ ADD = "const add = (name, with_) => document.body.appendChild(Object.assign(docu
 
 
 class Listener(ThreadingHTTPServer):
-    """Local server of an empty page that records its connections, datagrams and requests."""
+    """Local server of an empty page that records connections, datagrams and requests."""
 
     daemon_threads = True
 
@@ -503,7 +503,7 @@ def test_page_in_the_results_is_not_shown(browser, finished, tmp_path):
 
 
 def test_preview_page_updates_and_keeps_the_selection(browser, tmp_path, monkeypatch):
-    """First half of the pulses, then all: the page updates without being reloaded."""
+    """The page shows the first half of the pulses, then all; it is updated without a reload."""
     monkeypatch.setattr(preview_pair, "AT_ONCE", 60)
     root = simulate(tmp_path / "campaign", preset("demo", pulses=120), seed=1)
     preview = Preview(Campaign.load(root), follow=True, every_s=1.0, end_after_s=1e6)

@@ -1,4 +1,4 @@
-"""`apertura verify`: every change between a product and the raw samples is reported, and nothing else."""
+"""`apertura verify`: exactly the changes between a product and the raw samples are reported."""
 
 import shutil
 import subprocess

@@ -1,4 +1,4 @@
-"""Preview of a flight (`apertura preview`): images of the pulses so far, from incompletely written files."""
+"""Preview of a flight (`apertura preview`): images of the pulses recorded so far, from incompletely written files."""
 
 import hashlib
 import json
@@ -157,7 +157,7 @@ def test_rewritten_metadata_are_read_again(tiny, tmp_path):
         }
         growing.files[0].write_text(json.dumps(partial))
         assert len(growing.read().captures.start) == count
-    growing.files[0].write_text("")  # just truncated by its recorder
+    growing.files[0].write_text("")  # at this moment truncated by its recorder
     assert len(growing.read().captures.start) == captures
 
 
@@ -192,7 +192,7 @@ def test_pulses_beyond_the_log_wait_for_it(tiny):
 
 
 def other_flight(root, node="uav1"):
-    """Overwrite the files of a node with half of a flight of another day, like a restarted recorder."""
+    """Overwrite the files of a node with half of a flight of another day, as by a restarted recorder."""
     meta, data = (root / f"raw/f01/{node}.sigmf-{kind}" for kind in ("meta", "data"))
     document = json.loads(meta.read_text())
     for capture in document["captures"]:
