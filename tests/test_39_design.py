@@ -111,7 +111,7 @@ def test_resolution_of_a_circle_is_equal_in_all_directions():
 
 @pytest.mark.parametrize("rise", [-0.3, 0.3])
 def test_ground_range_resolution_depends_on_the_terrain_slope(rise):
-    """The path grows by 2(sin θ - r cos θ) per metre of the map, r the rise; resolution 0.886 c/B over that."""
+    """With the rise r, the path grows by g = 2(sin θ - r cos θ) per metre of the map; the width is 0.886 c/(B g)."""
     along = np.linspace(-2, 2, 401)
     track = np.stack([along, np.full(401, -30.0), np.full(401, 30.0)], -1)
     band = CARRIER + np.linspace(-1e8, 1e8, 64)
@@ -183,7 +183,7 @@ def test_resolution_of_a_sum_matches_its_response_in_random_geometries():
 
 
 def test_coherence_of_two_heights_is_the_overlap_of_windowed_spectra():
-    """Overlap of spectra shifted by δ of their width: 1 - δ if flat, 1 - (2π²/3) δ² with a Hann window, small δ."""
+    """For spectra shifted by δ widths, the overlap is 1 - δ if flat, 1 - (2π²/3) δ² with a Hann window and small δ."""
     shares, low = [], line(start_m=[-2.0, 0.0], end_m=[2.0, 0.0])
     for window in ("none", "hann"):
         plan = plan_of(processing={"window": window, "integration": "all"}, expect={"sigma0_db": None})
@@ -217,7 +217,7 @@ def design_of(std_m, autofocus, **node):
 
 @pytest.mark.parametrize(("autofocus", "met"), [("auto", True), ("on", True), ("off", False)])
 def test_loss_is_judged_after_refinement_if_the_plan_requests_it(autofocus, met):
-    """At L-band 2 cm cause a loss of 2 to 5 dB, 0.3 dB after refinement (docs/theory/autofocus.md, "Measured")."""
+    """At L-band, 2 cm cause a loss of 2 to 5 dB, 0.3 dB after refinement (docs/theory/autofocus.md, "Measured")."""
     design = design_of(0.02, autofocus)
     (verdict,) = judge(design)
     assert verdict.met == met
@@ -251,7 +251,7 @@ def test_refinement_beyond_its_measured_limits_is_not_assumed(std_m, node, obsta
 
 
 def test_sparse_pulses_are_refused_on_a_coarse_grid_too():
-    """2 × 2 pixels span half of the Doppler of 20 × 20; plans kept by a search must be valid on the full grid."""
+    """2 × 2 pixels span half the Doppler of 20 × 20 pixels; plans found by a search must be valid on the full grid."""
     plan = plan_of()
     plan["waveform"]["prf_hz"] = 8.0
     for coarse in (None, 2):

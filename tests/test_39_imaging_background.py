@@ -88,7 +88,7 @@ def recorded(aperture, targets=TARGETS, *, noise=0.3, seed=1):
 
 
 def coupled(recording, level_db, *, drift=0.0):
-    """Add a response that decays over the ranges of the scene, level_db above one target; its phase drifts, rad."""
+    """Add a response that decays over the ranges of the scene, level_db above one target, with a phase drift (rad)."""
     delays_s = np.arange(20.0, 75.0, 1.5) / C
     amplitude = 10 ** (level_db / 20) * np.exp(-np.arange(len(delays_s)) / 8)
     response = (amplitude[:, None] * np.exp(-2j * np.pi * np.remainder(delays_s[:, None] * FREQUENCY, 1.0))).sum(axis=0)
@@ -216,7 +216,7 @@ def test_bursts_in_a_tenth_of_the_pulses_do_not_change_the_median():
 
 @pytest.fixture(scope="module")
 def leaking(tmp_path_factory):
-    """Process campaigns with coupling 40 dB above the echoes at the delay of the scene: removal auto and off."""
+    """Process campaigns with coupling 40 dB above the echoes at the delay of the scene, with and without removal."""
     plan = replace(preset("demo", pulses=150), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
     leaks = Leakage(level_db=40.0, path_m=20.0)
     nodes = {

@@ -50,7 +50,7 @@ def test_noise_is_measured_below_the_echoes_of_a_recording(noise):
 
 @pytest.mark.parametrize("share", [0.05, 0.2])
 def test_missing_pulses_do_not_leak_echoes_into_the_noise(share):
-    """An echo 40 dB above the noise at the range of all points: pulse numbers without gaps give phase jumps."""
+    """An echo is 40 dB above the noise at the range of all points; contiguous pulse numbers would cause phase jumps."""
     noise, kept = 1e-4, np.flatnonzero(np.random.default_rng(5).random(128) >= share)
     whole, target, middle = profiles(noise, pulses=128), np.array([2.0, 35.0, 0.0]), APERTURE.tx_m[64]
     angle = np.random.default_rng(2).uniform(-0.6, 0.6, 64)

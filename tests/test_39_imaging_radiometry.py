@@ -55,7 +55,7 @@ def pattern(aperture):
 @pytest.mark.parametrize("bistatic", [False, True])
 @pytest.mark.parametrize("point", [(0.0, 20.0, 0.0), (-2.5, 17.5, 0.0), (2.5, 22.5, 0.0)])
 def test_cross_section_of_a_point_follows_from_its_peak(point, bistatic):
-    """Eqs. 3 and 4: spreading loss, both patterns and sector weights, for any normalisation of the image."""
+    """Eqs. 3 and 4 include spreading loss, patterns and sector weights, for any normalisation of the image."""
     aperture = straight_aperture(bistatic=bistatic)
     beams = pattern(aperture)
     echo = history(aperture, point, "hann", beams, amplitude=np.sqrt(7.0 * 0.1))
@@ -225,7 +225,7 @@ def test_beta_sigma_and_gamma_differ_by_the_incidence():
 
 
 def test_link_constant_follows_from_the_radar_equation():
-    """1 W, 10 dBi for transmit and receive, 0.25 m: 1 m² at 1 m returns 3.15 mW; gain 20 dB, full scale 30 dBm."""
+    """With 1 W, two gains of 10 dBi and 0.25 m, 1 m² at 1 m returns 3.15 mW; gain 20 dB, full scale 30 dBm."""
     link = Link(30.0, 10.0, 10.0, 20.0, 30.0, 1000.0)
     received_w = 100 * 0.25**2 / (4 * np.pi) ** 3
     assert link.constant(wavelength_m=0.25, sent_power=64.0) == pytest.approx(received_w * 100 * 1000**2 / 64)

@@ -120,7 +120,7 @@ def test_predicted_error_falls_and_cost_rises_with_accuracy():
 @pytest.mark.quick("609")
 @pytest.mark.parametrize("seed", [609, 625, 636])
 def test_predicted_error_holds_over_all_pixels_for_any_scene(seed):
-    """1 to 24 targets in noise; in a dark quarter of the first scene the relative error is 10 dB larger."""
+    """Scenes have 1 to 24 targets in noise; in a dark quarter of the first, the relative error is 10 dB larger."""
     drawn = draw(np.random.default_rng(seed), pixels=96, pulses=80)
     planned = make_plan(drawn.job, accuracy_db=drawn.accuracy_db)
     image = formed(drawn, planned.setting, planned.inputs(drawn.profiles))

@@ -118,7 +118,7 @@ def test_point_not_passed_is_integrated_at_the_nearest_pulses():
 @pytest.mark.parametrize("east_m", [-60.0, -20.0, 0.0, 35.0])
 @pytest.mark.parametrize("spacing_m", [0.1, 0.4, 1.5])
 def test_point_with_a_sampled_angular_span_uses_all_pulses(east_m, spacing_m):
-    """Short passes, with and without squint: points with a wider span use the sampled part, all others every pulse."""
+    """In short passes, also squinted, points with a wider span use the sampled part, all other points every pulse."""
     short, scene_points = straight(12.0, 200, east_m=east_m), points(30.0).reshape(-1, 3)
     chosen = integrate(short, points(30.0), spacing_m=spacing_m, wavelength_m=WAVELENGTH)
     if chosen.sector is None:
@@ -146,7 +146,7 @@ def test_squinted_antennas_are_integrated_about_their_squint():
 
 
 def test_circle_around_the_scene_is_integrated_entirely_and_flagged():
-    """Every pulse of a circle is at the closest approach, so it exceeds a requested angle and is flagged."""
+    """All pulses of a circle are at the closest approach, so that a requested angle is exceeded and flagged."""
     angle = np.linspace(0, 2 * np.pi, 2000)
     circle = monostatic(np.stack([60 * np.cos(angle), 40 + 60 * np.sin(angle), np.full(2000, 40.0)], -1))
     near = points(2.0) + [0.0, 9.0, 0.0]

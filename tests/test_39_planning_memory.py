@@ -24,7 +24,7 @@ LONG = {"aperture": monostatic(straight_track(20_000, length_m=600)), "subcarrie
 
 @pytest.mark.slow
 def test_tables_that_exceed_memory_are_computed_in_pulse_blocks():
-    """Smallest number of blocks whose tables fit; with too little memory for everything else the job is refused."""
+    """The fewest blocks whose tables fit are used; if memory is insufficient for the rest, the job is refused."""
     single_block = plan(**LONG)
     assert single_block.setting.pulse_blocks == single_block.choices["pulse_blocks"] == 1
     table_bytes = single_block.setting.table_bytes + 3 * 8 * 20_000 * 120  # tables, and samples during reading

@@ -61,7 +61,7 @@ def effective_area(direction, leg_m=1.0, count=400):
 
 @pytest.mark.parametrize("cosines", [(1, 1, 1), (1, 2, 3), (0.5, 1, 4), (1, 1.4, 1.2)])
 def test_trihedral_cross_section_follows_from_its_effective_aperture(cosines):
-    """Both cases of the closed form: aperture and its reflection in the vertex, counted on a lattice."""
+    """Both cases of the closed form equal the area common to aperture and reflection, counted on a lattice."""
     cosines = np.array(cosines) / np.linalg.norm(cosines)
     seams = np.array([[3**0.5, -1, 2**0.5], [-(3**0.5), -1, 2**0.5], [0, 2, 2**0.5]]) / 6**0.5
     sigma_m2, _ = rcs("trihedral", (1.0,), (cosines @ seams)[None])
@@ -86,7 +86,7 @@ def test_bistatic_trihedral_loss_equals_the_aperture_diffraction_loss():
 
 
 def test_dihedral_pattern_is_narrow_along_its_seam_and_wide_across():
-    """First null along the seam at asin(λ/2b); across it the amplitude falls as the sine of 45° minus the angle."""
+    """The first null along the seam is at asin(λ/2b); across, the amplitude falls as sin(45° - angle)."""
     size_m = (0.5, 1.0)
     best, null_deg = rcs("dihedral", size_m)[0], np.degrees(np.arcsin(WAVELENGTH_M / 2))
     assert rcs("dihedral", size_m, towards(null_deg))[0] < 1e-6 * best
@@ -97,7 +97,7 @@ def test_dihedral_pattern_is_narrow_along_its_seam_and_wide_across():
 
 
 def test_bistatic_dihedral_loss_occurs_across_but_not_along_the_seam():
-    """Across: second order of the sinc of its width; along: specular, so no loss for symmetric antennas."""
+    """Across, the loss is that of a sinc to second order; along, it is zero (specular) for symmetric antennas."""
     size_m, best = (0.3, 1.0), rcs("dihedral", (0.3, 1.0))[0]
     shift = np.pi / WAVELENGTH_M * 2 * np.sin(np.radians(3)) * 2 * 0.3 * np.sin(np.pi / 4)
     across, _ = rcs("dihedral", size_m, towards(0, -3), towards(0, 3))
@@ -177,7 +177,7 @@ def test_mean_has_the_stated_deviation():
 
 @pytest.mark.parametrize(("change_db", "drifts"), [(0.59, False), (0.61, True)])
 def test_drift_is_reported_beyond_three_deviations_of_the_scatter(change_db, drifts):
-    """Two reflectors, scatter 0.2 dB: flight differences scatter by 0.2 dB·√2/√2; their own errors of 2 dB cancel."""
+    """With two reflectors, flight differences scatter by 0.2 dB·√2/√2; reflector errors of 2 dB cancel."""
     value = np.array([61.0, 59.0, 61.0, 59.0]) + np.array([0, 0, change_db, change_db])
     mean = together(value, np.full(4, 0.2), np.full(4, 2.0), ["a", "b", "a", "b"], ["f01", "f01", "f02", "f02"])
     assert mean.drift[:2] == ("f01", "f02")

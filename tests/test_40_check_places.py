@@ -309,7 +309,7 @@ def test_track_more_than_30_km_above_the_terrain_is_reported(tiny):
     for height_m, high in ((-29_000.0, False), (-30_000.0, True)):
         state(tiny, "scene", height_m=height_m)
         lines = reported(tiny)
-        assert any("m above the terrain: check the heights in the logs" in line for line in lines)  # no echo comes back
+        assert any("m above the terrain: check the heights in the logs" in line for line in lines)  # no echo arrives
         assert any("expected a node above the terrain, by at most 30 km" in line for line in lines) is high
 
 

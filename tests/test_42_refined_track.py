@@ -281,7 +281,7 @@ def add_noise(root, std_m, stated_m):
 
 @pytest.mark.slow
 def test_errors_of_a_quarter_wavelength_are_corrected_or_flagged(tmp_path):
-    """Limit of the method: a section of the track may be wrong by a wavelength, and is then rejected."""
+    """At the limit of the method, a track section may be wrong by a wavelength; the refinement is rejected."""
     campaign = campaign_to_refine(tmp_path, pulses=600, half_m=6.0, std_m=0.05, stated_m=0.05)
     refine.refine(campaign, "f01")
     stage = open_refined(campaign, "f01").stage

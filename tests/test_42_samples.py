@@ -40,7 +40,7 @@ PULSES = {
 
 @pytest.fixture(scope="module", params=[pytest.param(name, marks=pytest.mark.slow) for name in PULSES])
 def imaged(request, tmp_path_factory):
-    """Image three targets from two nodes with noise, own clocks, missed triggers, random phases and start times."""
+    """Image three targets from two nodes with noise, two clocks, missed triggers, random phases and start times."""
     root = tmp_path_factory.mktemp(request.param) / "campaign"
     simulate(root, preset("demo", pulses=150), waveform=PULSES[request.param], targets=TARGETS)
     return run_steps(root, exports=False)

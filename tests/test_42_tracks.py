@@ -108,7 +108,7 @@ def test_track_in_a_local_frame_is_written_in_its_axes(tmp_path):
 
 
 def stage_of(*, accepted, pairs=()):
-    """Return the stage of a refinement: node uav1 moved by up to 1 m in 2 s, and zero path offsets of pairs."""
+    """Return the stage of a refinement: node uav1 displaced by up to 1 m in 2 s, zero path offsets of pairs."""
     knots = START + np.array([0, 2_000_000_000], "timedelta64[ns]")
     moved_m = np.array([[[0.0, 0, 0], [1.0, 0, 0]]])
     return xr.Dataset(

@@ -211,7 +211,7 @@ def test_missing_dem_is_reported_before_a_run(tiny):
 def test_void_in_the_scene_is_reported_with_count_and_position(tiny):
     write_plane(tiny, void=np.nan)
     campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid")
-    planned = complaint(lambda: expected_plan(campaign, *PAIR))  # before anything ran
+    planned = complaint(lambda: expected_plan(campaign, *PAIR))  # before any step runs
     message = complaint(lambda: settle_ground(campaign))
     assert planned == message
     assert "of 3600 pixels" in message
@@ -319,7 +319,7 @@ def test_platform_below_the_terrain_is_refused_with_its_pulse(hillside, tmp_path
     write_plane(root, slope=-1.5 * SLOPE)
     shutil.rmtree(root / "results")
     campaign = edit_scene(root, bounds_m=bounds)
-    planned = complaint(lambda: expected_plan(campaign, "f01", "uav1-uav1"))  # before anything ran
+    planned = complaint(lambda: expected_plan(campaign, "f01", "uav1-uav1"))  # before any step runs
     assert "flight f01, pair uav1-uav1: at " in planned
     assert "transmitter is at or below the terrain" in planned
     shutil.copytree(str(hillside.results / "f01"), str(root / "results" / "f01"))

@@ -95,7 +95,7 @@ def test_noise_of_a_calibrated_image_agrees_with_the_noise_figure(flown, pair):
 
 @pytest.mark.slow
 def test_receiver_gain_error_of_6_db_is_flagged_from_noise(flown, tmp_path):
-    """Eq. 8b: noise compared with the configured figure, or without one with the physical limit of 0 dB."""
+    """By eq. 8b, noise is compared with the configured noise figure or, if not configured, with 0 dB."""
     assert not any("noise_disagrees" in report_of(flown, pair)["flags"] for pair in PAIRS)
     root = copy_writable(flown.root, tmp_path / "campaign")
     for wrong_db, figure_db, flagged in ((6.0, 6.0, True), (-6.0, 6.0, True), (6.0, None, False), (12.0, None, True)):
@@ -210,7 +210,7 @@ def test_coefficient_no_longer_configured_is_removed(flown, tmp_path):
 
 @pytest.mark.slow
 def test_mean_power_is_on_a_coarser_grid_and_states_its_quantity(flown, tmp_path):
-    """Linear and in dB, for the configured coefficients: mean preserved, noise subtracted, speckle filtered."""
+    """Linear and dB files of all coefficients: mean preserved, noise subtracted, speckle filtered."""
     root = copy_writable(flown.root, tmp_path / "campaign")
     products = {f"multilook_sigma0{end}" for end in ("_power.tif", "_power.qml", "_db.tif", "_db.qml")}
     means = {}
@@ -288,7 +288,7 @@ def test_mean_power_of_sums_subtracts_the_noise_of_their_pairs(finished_tiny, tm
             if subtracted:
                 peaks, n = read(f"fused/{source}_power.tif")[1]["divided_by"], 2
                 for pair, peak in peaks.items():
-                    looks, _, tags = read(f"{pair}/looks.tif")  # every pulse counts, so that they are Σw² and M
+                    looks, _, tags = read(f"{pair}/looks.tif")  # every pulse contributes: Σw² and M
                     noise[source] += float(tags["APERTURA_PULSE_NOISE"]) / looks[5, 9] / peak**2
                 noise[source] /= n**2 if source == "coherent" else n
             assert squares[1, 2] == pytest.approx(pixels[4:8, 8:12].mean() - noise[source], rel=1e-3)

@@ -88,7 +88,7 @@ def ball_m2():
 
 
 def corner_m2():
-    """Return the mean cross-section of the trihedral over f01: a simulated point has the same in all directions."""
+    """Return the mean cross-section of the trihedral over f01: simulated points are isotropic."""
     track = preset("demo", pulses=120).flights[0].tracks["uav1"]
     position_m = np.array(track.start_m) + np.outer(np.arange(120) / 20, track.velocity_m_s)
     away = position_m - CORNER

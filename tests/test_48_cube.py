@@ -62,7 +62,7 @@ def test_images_are_selected_by_name(campaign, opened):
 
 
 def test_cube_has_the_metadata_of_cf(campaign, opened):
-    """Checks of the IOOS compliance-checker for CF-1.11, and dB, which CF allows but the checker does not know."""
+    """The cube passes the IOOS compliance checker for CF-1.11, except for dB, which CF permits."""
     assert opened.attrs["Conventions"] == "CF-1.11"
     assert campaign.settings.campaign in opened.attrs["title"]
     assert opened.attrs["history"]

@@ -174,7 +174,7 @@ def estimated_and_true(campaign, expected, cores=2):
 
 @pytest.mark.parametrize("factor", [0.2, 1.0, 50.0])
 def test_time_left_is_within_a_factor_of_two_or_unknown(finished_tiny, factor):
-    """Expected times of images wrong by a factor (0.2 is the limit), those of other steps half the true ones."""
+    """Expected times are wrong by a factor for images (limit: 0.2), and by one half for other steps."""
     expected = {rule: seconds * (factor if rule == "image" else 0.5) for rule, seconds in SECONDS.items()}
     estimates = estimated_and_true(finished_tiny, expected)
     known = [(left, true) for left, true, _ in estimates if left is not None]
@@ -206,7 +206,7 @@ def test_share_of_tiles_takes_start_up_and_its_part_of_the_work(finished_tiny):
 
 
 def test_time_left_is_unknown_before_the_first_image(finished_tiny):
-    """An image may take 1000 times longer (double sum); also with shares of tiles, and without progress reports."""
+    """An image may take 1000 times longer (double sum), also in several jobs or without progress reports."""
     started = JobRecord("image", ("image", "f01", "uav1-uav1"), "", 40.0)
     for waiting in (
         {"planned": {"scene": 9, "tracks": 9, "image": 1}},
@@ -245,7 +245,7 @@ def test_time_left_is_unknown_while_tiles_are_recomputed(finished_tiny):
 
 
 def test_first_tiles_do_not_determine_the_time_left(finished_tiny):
-    """After 30 s one of 100 tiles is finished, because tables come first; an image took 60 s, not 50 minutes."""
+    """After 30 s, one of 100 tiles is finished, because tables precede; an image takes 60 s, not 50 minutes."""
     done = JobRecord("image", ("image", "f01", "uav1-uav1"), "", 0.0, 60.0)
     run = RunRecord(planned={"image": 2}, jobs={1: done, 2: replace(done, begun_s=60.0, ended_s=None)})
     progress = {2: StepProgress("tiles", 1, 100, 60.0, 90.0)}

@@ -623,7 +623,7 @@ def test_stage_with_pickled_chunks_is_not_opened(finished, kind):
 
 
 def with_checksum(text):
-    """Return a JSON document that ends with its own CRC-32C: white space chosen so that the checksum is four blanks.
+    """Return a JSON document that ends with its own CRC-32C: white space makes the checksum four blanks.
 
     CRC-32C is linear: a tab in place of a blank changes the checksum by a fixed pattern; Gaussian elimination selects
     the tabs.

@@ -228,7 +228,7 @@ def test_edited_address_and_back_button_change_the_view(browser, address):
         until(frame, lambda: "colours=inferno" in window.url)
         window.evaluate("location.hash = location.hash.replace('colours=inferno', 'colours=viridis')")
         until(frame, lambda: frame.input_value("#colours") == "viridis")
-        assert window.evaluate("history.length") == length + 1  # added by the edit, not by messages of the map
+        assert window.evaluate("history.length") == length + 1  # by the edit, not by map messages
         window.go_back()
         until(frame, lambda: frame.input_value("#colours") == "inferno")
         assert window.url == before.replace("colours=grey", "colours=inferno")

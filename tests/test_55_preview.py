@@ -434,7 +434,7 @@ def test_decimation_follows_the_delay(tiny, monkeypatch):
 
 @pytest.mark.slow
 def test_map_of_a_preview_serves_only_the_last_images(tiny, capsys):
-    """It waits for the first image, keeps two per pair, and resamples images to the grid of the scene."""
+    """The preview waits for the first image, keeps two per pair, and resamples to the grid of the scene."""
     preview, waiting = Preview(Campaign.load(tiny), follow=True, every_s=2.0, end_after_s=1e6), threading.Event()
 
     def serve():
