@@ -2,11 +2,11 @@
 
 Jobs are bistatic with flat terrain, on one core; the contestants run alternately. `--other PATH` is a shared library
 with a function `bp_perm2` that takes the same tables (pulse, coefficient, cell), float32, phase centres (3, pulse), a
-plane grid and a polynomial of the carrier phase in (1, u, u², …), alternately cosine and sine. Its input are the tables
-of the engine, computed from profiles that all start at the same path. Image sides must be multiples of 16 pixels,
-pulses of 8. `--kernel PATH` is another build of the engine; repeat the option for more. The clock frequency is measured
-between runs by a chain of dependent multiplications and additions, with a latency of 3 + 1 cycles on x86 cores of the
-last ten years. Times are medians of the process's CPU time.
+plane grid and a polynomial of the carrier phase in (1, u, u², …), alternately cosine and sine. Its input consists of
+the tables of the engine, computed from profiles that all start at the same path. Image sides must be multiples of 16
+pixels, pulses of 8. `--kernel PATH` is another build of the engine; repeat the option for more. The clock frequency is
+measured between runs by a chain of dependent multiplications and additions, with a latency of 3 + 1 cycles on x86 cores
+of the last ten years. Times are medians of the process's CPU time.
 
     python benchmarks/cycles.py --other build/kern3.so --kernel build/before.so
 """

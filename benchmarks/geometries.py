@@ -129,7 +129,7 @@ def _formed(
 
 
 def measure(geometry: Geometry, **options: int) -> Outcome:
-    """Plan and form one geometry, with any given options of the tree, and compare it with the exact sum."""
+    """Plan and form one geometry, with any given options of the tree, and compare the image with the exact sum."""
     generator = np.random.default_rng([16, geometry.seed])
     lines = echo(geometry, generator)
     profiles = profiles_of(geometry, lines)

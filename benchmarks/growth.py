@@ -143,7 +143,7 @@ def machine() -> str:
 
 
 def _contestants(engine_input: EngineInput, effort: Effort) -> Iterator[Contestant]:
-    """Yield the available contestants; print the reasons of the skipped ones."""
+    """Yield the available contestants; print the reasons for skipped contestants."""
     limit_s = effort.limit_s
     entries: list[tuple[str, Callable[[], Contestant]]] = [
         (f"{engine} {aim_db:.0f} dB", partial(engine_input.planned, engine, aim_db, limit_s))

@@ -6,8 +6,8 @@ Without a folder, or with '-', the campaign is a small simulated one: 48 x 48 pi
 receives SIGKILL after a random fraction of the duration of an undisturbed run, together with all processes that the run
 has started. In three of ten cases, these processes are not killed: the steps of the run then continue in parallel with
 the steps of the next run. Resumed runs are also killed until the number of KILLS (16) is reached. When a run finishes,
-its results are compared byte for byte with the undisturbed ones, without logs, timings and hidden files, and the next
-run starts from the beginning. Exits with an error if results differ.
+its results are compared byte for byte with the undisturbed results, without logs, timings and hidden files, and the
+next run starts from the beginning. Exits with an error if results differ.
 """
 
 import contextlib

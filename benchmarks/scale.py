@@ -23,7 +23,7 @@ BATCH = 10
 
 
 def campaign_of(root, flights):
-    """Simulate one flight and link it under the names of all flights."""
+    """Simulate one flight and link its files under the names of all flights."""
     from apertura.simulation import ImageGrid, preset, simulate
 
     if (root / "config").is_dir():

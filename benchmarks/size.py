@@ -64,7 +64,7 @@ def kernel_seconds(tables: Tables, grid: SceneGrid, threads: int) -> float:
 
 
 def image_seconds(profiles: Profiles, grid: SceneGrid, *, blocks: int, threads: int) -> tuple[float, float]:
-    """Return the seconds to form the image into zarr, including tables and positions, and those of the kernel."""
+    """Return the seconds to form the image into zarr, including tables and positions, and the seconds of the kernel."""
     kernel_s = sum(
         kernel_seconds(native.prepare(profiles[part]), grid, threads) for part in profiles.aperture.blocks(blocks)
     )

@@ -125,7 +125,7 @@ def verdict_of(report: dict[str, Any]) -> str:
 
 
 def hypothesis_of(report: dict[str, Any]) -> str:
-    """Return the first hypothesis of an image.json in one line; empty without any."""
+    """Return the first hypothesis of an image.json in one line; empty if there is none."""
     hypotheses = report.get("hypotheses") or []
     first = next(iter(hypotheses.items() if isinstance(hypotheses, dict) else hypotheses), "")
     return first if isinstance(first, str) else json.dumps(first)

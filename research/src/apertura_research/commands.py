@@ -46,7 +46,7 @@ error as argument.
 """
 
 PAPER_READS = {"coherence": ("lab", "static"), "fusion": ("uav",)}
-"""Part → experiments whose campaigns it reads, from the folder `CAMPAIGNS`."""
+"""Part → experiments whose campaigns the part reads from the folder `CAMPAIGNS`."""
 
 CAMPAIGNS = "campaigns"
 
@@ -141,7 +141,7 @@ def sweep(name: StudyName, part: str, folder: StudyFolder = None) -> None:
 
 @app.command()
 def chart(name: StudyName, chart: str, folder: StudyFolder = None) -> None:
-    """Merge the parts of a chart and draw them: CHART.csv and CHART.png."""
+    """Merge the parts of a chart and draw the chart: CHART.csv and CHART.png."""
     study = study_of(name)
     require("chart", chart, study.charts)
     typer.echo(study.chart(chart, _results(name, folder)))

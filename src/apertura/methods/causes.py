@@ -15,11 +15,11 @@ from apertura.common.arrays import Floats
 from apertura.common.leap_seconds import LATEST_S
 
 LEAST_GAIN_DB = 0.5
-"""Least increase of the power of points by the correction of a reported cause, dB; log errors explain smaller
+"""Minimum increase of the power of points by the correction of a reported cause, dB; log errors explain smaller
 losses.
 """
 
-# ---- Times of another time system -----------------------------------------------------------------------------------
+# ---- Times in a different time system -------------------------------------------------------------------------------
 
 _TAI_S = 19  # TAI − GPST
 _TIME_SYSTEMS = {

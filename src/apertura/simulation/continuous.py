@@ -172,7 +172,7 @@ def _frame(
     start, stop = region
     rate, waveform = sampling_rate(channel), channel.waveform
     start_s = start / rate + recording_start_s(channel) - time_s
-    # `samples` restarts the oscillator at each capture; here it started with the recording
+    # `samples` restarts the oscillator at each capture; here, the oscillator started with the recording
     offset_rad = -2 * np.pi * (waveform.carrier_hz * start_s + channel.cfo_hz * start / rate)
     starts, phases = np.full_like(channel.start_s, start_s), channel.phase_rad + offset_rad
     noiseless = replace(channel, start_s=starts, phase_rad=phases, noise_variance=0.0)

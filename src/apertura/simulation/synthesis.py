@@ -1,9 +1,9 @@
 """Synthesis of recordings: paths, impairments of a node, samples on its own clock, and digitisation.
 
-A delay acts on each subcarrier, so all echoes are summed in one spectrum, which is transformed to the receiver's time
-grid by an inverse DFT, or by a chirp-z transform if its sampling rate has an offset. The edges of echoes are exact: an
-echo is absent before its arrival and after its end. Captures of long flights are synthesised faster, with periodic
-echoes that have no edges.
+A delay is a phase of each subcarrier, so that all echoes are summed in one spectrum. The spectrum is transformed to the
+receiver's time grid by an inverse DFT, or by a chirp-z transform if the sampling rate has an offset. The edges of
+echoes are exact: an echo is absent before its arrival and after its end. Captures of long flights are synthesised
+faster, with periodic echoes that have no edges.
 """
 
 from collections.abc import Callable, Mapping
@@ -33,7 +33,7 @@ _DOPPLER_ORDER = 3  # order of the Taylor series of exp(-j2πf·rate·t); the ne
 
 @dataclass(frozen=True)
 class Channel:
-    """Receiving channel over a flight, with all random values drawn: it determines the samples.
+    """Receiving channel over a flight with all drawn random values, which determines the samples.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ def _capture(channel: Channel, pulse: int, count: int) -> Complex:
     capture = np.zeros(count, np.complex128)
     edges = np.unique(np.clip(np.concatenate([first, end]), 0, count))
     for start, stop in pairwise(edges):
-        # The paths present are those that have arrived minus those that have ended, both in the order of delays.
+        # Present paths: paths that have arrived minus paths that have ended, both in the order of delays.
         arrived, ended = np.searchsorted(first, start, "right"), np.searchsorted(end, start, "right")
         if arrived > ended:
             present = spectra[:, groups[arrived]] - spectra[:, groups[ended]]

@@ -292,7 +292,7 @@ PROBES_M[:, 0] += np.tile([0.3, -0.4, 0.0, 0.5, -0.2], 3)
 
 @dataclass(frozen=True, eq=False)
 class AutofocusCase:
-    """Inputs of a refinement, and the true tracks that it is compared with.
+    """Inputs of a refinement, and the true tracks with which the result is compared.
 
     Attributes
     ----------

@@ -99,11 +99,11 @@ def tally(rows: Sequence[AutofocusRow]) -> str:
     Examples
     --------
     >>> tally([AutofocusRow("five", 1.0, seed, 1.2, 0.1, 0.1, ACCEPTED, "", "") for seed in (1, 2)])
-    '2 of 2 accepted, 0 of them worse than the logs'
+    '2 of 2 accepted, 0 of these worse than the logs'
     """
     accepted = [one for one in rows if one.verdict in (ACCEPTED, FLAGGED)]
     worse = [one for one in accepted if one.product_loss_db > one.loss_db]
-    return f"{len(accepted)} of {len(rows)} accepted, {len(worse)} of them worse than the logs"
+    return f"{len(accepted)} of {len(rows)} accepted, {len(worse)} of these worse than the logs"
 
 
 def _scale(axes: Axes, outcomes: Sequence[AutofocusRow]) -> None:

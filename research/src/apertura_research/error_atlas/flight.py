@@ -29,11 +29,11 @@ from apertura.simulation.targets import GaussianBeam, Sampled, Straight, Wobble
 from apertura_research.paper_scene import RX_AHEAD_M, Disturbance, PaperScene, receive_pair, reduced_scene
 
 PAIRS = ("a-a", "a-b")
-"""Monostatic pair of node a, and bistatic pair with the receiver b ahead of it."""
+"""Monostatic pair of node a, and bistatic pair with the receiver b ahead of a."""
 
 LASTING_S, SUBCARRIERS = 10.0, 256
 GRID = SceneGrid("local", -6.0, 27.0, 0.08, (300, 150))
-"""The paper's scene: east along the track, north across it."""
+"""The paper's scene: east is along the track, north across the track."""
 
 _LEVEL = FlatGround(0.0)
 _NOISE = Disturbance(Impairments(radar_snr_db=20.0, sidelink_snr_db=30.0))
@@ -89,7 +89,7 @@ class AssumedFlight:
     flags: Mapping[str, str] = field(default_factory=dict)
 
     def history(self, pair: str, received: Received, frequency_hz: Floats) -> PhaseHistory:
-        """Return the phase history of a pair as the pipeline computes it."""
+        """Return the phase history of a pair as computed by the pipeline."""
         aperture, used = self.apertures[pair], slice(None) if self.used is None else self.used
         longer_m = np.full(len(aperture), self.longer_m.get(pair, 0.0))
         if received.sidelink_m is not None:

@@ -1,4 +1,4 @@
-"""Row of the claims table: the printed value, the computed value, the verdict, and the reference it compares with."""
+"""Row of the claims table: the printed value, the computed value, the verdict, and its reference."""
 
 from dataclasses import dataclass, replace
 from math import isinf

@@ -137,7 +137,7 @@ PRINTED = {
 """Experiment → its targets in order, and their printed coherence factors after correction."""
 
 SILENT_M = np.linspace(45.0, 60.0, 60)
-"""Halves of total paths beyond all echoes of both experiments, metres."""
+"""Half of the total path, at distances beyond all echoes of both experiments, metres."""
 
 ALIKE_RAD, ALIKE_DB = 0.05, 0.2
 """Largest differences between mono- and bistatic recordings of one signal, rad and dB."""

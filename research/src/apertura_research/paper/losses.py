@@ -147,7 +147,7 @@ def _level(profile: Profile) -> float:
 
 
 DESTROYED_DB = -12.0
-"""Loss beyond which no peak is measurable: the largest speckle near the target is reported."""
+"""Loss beyond which no peak is measurable; the search then returns the largest speckle near the target."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ class UncorrectedError:
     Attributes
     ----------
     sweep
-        The impairment, applied without any other.
+        The impairment, applied without any other impairment.
     independent_model_db
         Size → mean peak loss of an independent model, dB; differences up to `within_db` agree.
     pulses

@@ -36,7 +36,8 @@ class Alignment:
     Attributes
     ----------
     offset_s, path_m
-        Offset to add to the recorder's times, seconds; electrical path beyond geometry, metres of total path.
+        Offset to add to the recorder's times, seconds; electrical path in excess of the geometric path, metres of total
+        path.
     offset_width_s, path_width_m
         Errors of offset and path that lower the peak by 1 dB.
     contrast_db
@@ -91,7 +92,7 @@ class PointSharpness:
         return np.asarray(summed * (taper / taper.sum()), np.complex64)
 
     def powers(self, offset_s: float) -> tuple[Floats, Floats]:
-        """Return paths beyond geometry (m) over the unambiguous range, and the power of the point at each path."""
+        """Return path offsets (m) over the unambiguous range, and the power of the point at each path offset."""
         frequency = self.echo.frequency_hz
         length = _OVERSAMPLING * frequency.size
         spacing_hz = float(frequency[-1] - frequency[0]) / (frequency.size - 1)
@@ -225,7 +226,7 @@ def alignment_flags(power: Floats, offsets_s: Floats, best_s: float, width_s: fl
 # ---- Drift of the recorder's clock relative to the log's clock ------------------------------------------------------
 
 MOST_PPM = 200.0
-"""Largest drift searched, parts per million: crystal oscillators drift less."""
+"""Largest drift searched, parts per million: the drift of crystal oscillators is smaller."""
 
 
 def apply_drift(time_s: Floats, drift_ppm: float) -> Floats:

@@ -12,15 +12,15 @@ from apertura.methods.autofocus.solve import Gauge, Problem, prominent_point_sta
 from apertura.methods.causes import ARM, LEAST_GAIN_DB, Cause
 
 NEAR = 10.0
-"""Least difference of the objective that distinguishes two causes, or a cause from random tracks."""
+"""Minimum difference of the objective that distinguishes two causes, or a cause from random tracks."""
 
 LEAST_EVIDENCE = 40.0
-"""Least reduction of the objective by a cause together with errors of the logs, relative to errors of the logs alone.
+"""Minimum reduction of the objective by a cause together with errors of the logs, relative to errors of the logs alone.
 The largest reduction in 54 flights without such a cause was 26, with log errors of 4 cm and three points; lever-arm
 errors of 20 cm give 250 to 1300."""
 
 CHANCES = 6
-"""Number of wrong tracks drawn at random for comparison, each with three unknowns, the same number as a lever arm."""
+"""Number of wrong tracks drawn at random for comparison, each with three unknowns, as a lever arm."""
 
 _STAGES = 2  # iterations of caching contributions and maximising sharpness
 

@@ -99,7 +99,7 @@ def remaining(problem: Problem, state: State) -> Remaining:
 # ---- Acceptance of refined tracks -----------------------------------------------------------------------------------
 
 LEAST_GAIN_DB = 0.1
-"""Least contrast gain of held-out patches, net of its uncertainty, dB; a smaller gain is not visible in an image."""
+"""Minimum contrast gain of held-out patches, net of its uncertainty, dB; a smaller gain is not visible in an image."""
 
 DOUBT = 2.0
 """Standard deviations subtracted from the mean gain."""
@@ -110,8 +110,9 @@ of two patches. The prior dominates with few patches, the measured scatter with 
 """
 
 LEAST_FITTED_DB = 0.3
-"""Least contrast gain of fitted patches with confirmed points, dB; a fit to noise alone gains 0.1 dB at an SNR of 10 dB
-per pulse."""
+"""Minimum contrast gain of fitted patches with confirmed points, dB; a fit to noise alone gains 0.1 dB at an SNR of 10
+dB per pulse.
+"""
 
 MOST_APART_SIGMA = 4.0
 """Largest disagreement of point positions between pairs, in standard deviations; more indicates cycle slips."""
@@ -122,16 +123,16 @@ PARTS = 8
 _BY_CHANCE = 1e-3  # false alarm rate of the test of the configured log errors
 _SLACK = 1.5  # factor on the variance, because the image does not fully determine these modes
 _REACH_CELLS, _STEPS = 3.0, 37  # search line for a point in range: range cells on either side; number of samples
-_SLIP_SIGMA = 4.0  # least shift in range of a cycle slip, standard deviations
+_SLIP_SIGMA = 4.0  # minimum shift in range of a cycle slip, standard deviations
 _NEARER, _NEARER_OF_FEW = 0.6, 0.75
-"""Least shift of a cycle slip, wavelengths, for many and for few points: half a wavelength plus a margin for noise."""
+"""Minimum shift of a cycle slip, wavelengths, for many and for few points: half a wavelength plus a noise margin."""
 _NOTHING = 1e-9  # floor of the contrast ratio, for a patch without echoes
 _SCATTERING_POINTS, _POINT_STD_CELLS = 3, 0.055
-"""Least number of points whose scatter gives the standard deviation of a shift; and, for fewer points, the standard
+"""Minimum number of points whose scatter gives the standard deviation of a shift; and, for fewer points, the standard
 deviation assumed per point, cells c/B of path, which is that of a point 20 dB above the noise of the subaperture.
 """
-_DOMINATES = 4.0  # least peak power of a point in a subaperture image over the median of the search line
-_LEAST_SLOPE = 0.05  # least gradient of the path over ground: a point viewed from all sides has no range direction
+_DOMINATES = 4.0  # minimum peak power of a point in a subaperture image over the median of the search line
+_LEAST_SLOPE = 0.05  # minimum gradient of the path over ground: a point viewed from all sides has no range direction
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +144,7 @@ class Evidence:
     fitted_db, held_out_db
         (pair, patch) float64, contrast gain of the fitted patches and of the held-out patches.
     settled
-        (mode,) float64, unknowns that the image alone determines; they have unit variance if the errors of the logs are
+        (mode,) float64, unknowns that the image alone determines; their variance is 1 if the errors of the logs are
         configured correctly.
     before, after
         Shifts of points in range between subapertures.

@@ -360,18 +360,18 @@ class SpeckleTiles:
 
 
 LEAST_COHERENCE = 0.75
-"""Least coherence of held-out tiles, 0 to 1; tracks with errors of a cycle or more do not reach this coherence."""
+"""Minimum coherence of held-out tiles, 0 to 1; tracks with errors of a cycle or more do not reach this coherence."""
 
 LEAST_GAIN = 0.1
-"""Least increase of the coherence of held-out tiles."""
+"""Minimum increase of the coherence of held-out tiles."""
 
 LEAST_EVEN = 0.25
-"""Least fraction of resolution cells that contribute speckle; sidelobes of few points may be coherent for wrong
+"""Minimum fraction of resolution cells that contribute speckle; sidelobes of few points may be coherent for wrong
 tracks.
 """
 
 LEAST_TILES = 8
-"""Least number of tiles, some of which are held out for validation."""
+"""Minimum number of tiles, some of which are held out for validation."""
 
 _STAGES, _ITERATIONS = 2, 15  # rounds of caching contributions; steps of L-BFGS-B in each round
 _HELD_OUT = 4  # every fourth tile is held out of the fit

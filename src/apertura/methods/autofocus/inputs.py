@@ -76,7 +76,7 @@ class TrackErrors:
     std_m
         Standard deviations east, north and up of the error that varies along the flight, metres.
     correlation_s
-        Correlation time: the autocorrelation of the error falls linearly to zero within it.
+        Correlation time: the autocorrelation of the error falls linearly to zero within this time.
     drift_std_m
         Standard deviation per axis of a slow error over the whole flight: offset, slope and curvature.
     """

@@ -81,7 +81,7 @@ def space_variance(middle: PointPaths, points_m: Floats, errors: Sequence[TrackE
 
 
 def _at(middle: PointPaths, point_m: Floats, errors: Sequence[TrackErrors]) -> tuple[float, float]:
-    """Return the mean square residual phase at a point, rad², and the loss that it causes, dB."""
+    """Return the mean square residual phase at a point, rad², and the loss that this phase causes, dB."""
     point = replace(middle, point_m=point_m)
     gradients = (paths.by_node(same=len(errors) == 1, sidelink=False) for paths in (point, middle))
     residuals: list[tuple[Floats, float]] = []
@@ -100,7 +100,7 @@ Patches = Sequence[NDArray[np.complex64]]
 """Block contributions to the pixels, (pixel, block), one array for each patch."""
 
 _SHRINK = 0.7  # ratio of the window widths of consecutive passes
-_EDGE_DB, _WIDER = 10.0, 1.5  # least window: extent of blurred points at this level, times a factor
+_EDGE_DB, _WIDER = 10.0, 1.5  # minimum window: extent of blurred points at this level, times a factor
 _LEAST_VARIANCE = 0.02  # floor of a line's amplitude variance relative to its squared mean
 _SETTLED_RAD = 0.05  # rms phase change below which the passes stop
 _MOST_PASSES = 30  # maximum passes of phase gradient

@@ -169,19 +169,19 @@ def _spans(place_m: Floats, record: PairRecord, axes: Floats, correlation_s: flo
 # ---- Bright points in images of short subapertures ------------------------------------------------------------------
 
 LEAST_RATIO = 5.0
-"""Least peak-to-background power ratio of a point, summed over subapertures."""
+"""Minimum peak-to-background power ratio of a point, summed over subapertures."""
 
 HELPFUL_RATIO = 3.5
-"""Least ratio of weaker points, which are used as well if the scene has points of `LEAST_RATIO`."""
+"""Minimum ratio of weaker points, which are used as well if the scene has points of `LEAST_RATIO`."""
 
-_SHARE_OF_CLEAREST = 0.05  # least ratio relative to the largest ratio; points below may be sidelobes
-_APART = 0.6  # least distance of patches, in half patch sizes
+_SHARE_OF_CLEAREST = 0.05  # minimum ratio relative to the largest ratio; points below may be sidelobes
+_APART = 0.6  # minimum distance of patches, in half patch sizes
 
 MOST_LOOKS = 128
 """Maximum number of subapertures from which a point is visible; shorter subapertures have coarser images."""
 
 REFINED_LOOKS = 4
-"""Least number of subapertures along refined tracks: long subapertures resolve neighbouring points, and a sum over
+"""Minimum number of subapertures along refined tracks: long subapertures resolve neighbouring points, and a sum over
 several subapertures averages sidelobes.
 """
 
@@ -297,7 +297,7 @@ def looks_of(records: Sequence[PairRecord], errors: Mapping[str, TrackErrors], p
 
 
 def sampled_looks(records: Sequence[PairRecord], grid: SceneGrid, terrain: Terrain) -> int:
-    """Return the least number of subapertures whose image resolution is no finer than the pixels of `bright_places`.
+    """Return the minimum number of subapertures whose image resolution is no finer than the pixels of `bright_places`.
 
     Notes
     -----
@@ -318,7 +318,7 @@ def sampled_looks(records: Sequence[PairRecord], grid: SceneGrid, terrain: Terra
 
 
 def least_ratio(looks: int, cells: int) -> float:
-    """Return the ratio to the mean power that speckle, averaged over looks, exceeds in one of a thousand scenes.
+    """Return the ratio to the mean power that speckle averaged over looks exceeds in one of 1000 scenes.
 
     Examples
     --------

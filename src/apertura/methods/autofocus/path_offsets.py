@@ -20,7 +20,7 @@ from apertura.methods.autofocus.one_phase import METHODS, Patches
 from apertura.methods.autofocus.patches import Candidates, Patch, count_in_memory
 
 _APART_CELLS = 2.0  # range cells c/B of total path within which patches share noise
-_BLOCKS_PER_CORRELATION_TIME = 10  # least number of blocks within a correlation time
+_BLOCKS_PER_CORRELATION_TIME = 10  # minimum number of blocks within a correlation time
 _BETWEEN_BLOCKS_RAD2 = 0.1  # largest growth of the phase-error variance between blocks
 _LINEAR = 1 / 8  # residual fraction of this growth with linear interpolation of offsets between blocks
 _PULSES = 4096  # pulses read at a time
@@ -47,8 +47,8 @@ def refine_one_phase(
     -----
     Source: docs/theory/autofocus.md, "One phase per pulse". Each quarter of the patches is validated with offsets that
     are fitted to the other patches, excluding patches that share a range with this quarter. Of these offsets and those
-    fitted to all patches, the offsets with the sharpest images are returned. Tracks are not corrected: the position
-    errors of a node remain those of its log.
+    fitted to all patches, the offsets with the sharpest images are returned. Tracks are not corrected; the position
+    errors of a node are those of its log.
     """
     if not candidates.patches:
         return candidates.rejected(errors)

@@ -49,8 +49,8 @@ from apertura.methods.causes import Cause
 # ---- Gauge fixed by points common to pairs and by reference points --------------------------------------------------
 
 
-_LEAST_RATIO = 30.0  # least peak-to-background power ratio of a point for a position measurement
-_LEAST_STD_M = 0.01  # least std of positions between pairs, as bistatic scattering centres differ
+_LEAST_RATIO = 30.0  # minimum peak-to-background power ratio of a point for a position measurement
+_LEAST_STD_M = 0.01  # minimum std of positions between pairs, as bistatic scattering centres differ
 _ZOOMS, _SIDE = 3, 9  # search for the position of a point: rounds, samples along a side
 _MEDIAN_OF_TWO = 2 * np.log(2)  # median of the sum of two squared standard normal values
 _ROUNDS = 3  # least-squares iterations in the gauge, each with a new linearisation
@@ -272,8 +272,8 @@ PATH_SIGMAS = 3.0
 
 _DRAWS = 200  # random draws of the prior for the standard deviation of a mean path
 
-_KNOTS_PER_CORRELATION_TIME = 10  # least number of knots of corrections within the shortest correlation time
-_LEAST_KNOTS = 64  # least number of knots of a flight
+_KNOTS_PER_CORRELATION_TIME = 10  # minimum number of knots of corrections within the shortest correlation time
+_LEAST_KNOTS = 64  # minimum number of knots of a flight
 _FEW = 8  # number of patches; with fewer, every quarter of the patches is held out in turn
 _LOST_TO_TIES_DB = 0.1  # largest loss of contrast due to fixing the gauge
 _SLIPS = 3  # maximum searches that start from delays while subapertures have cycle slips
@@ -285,7 +285,7 @@ hidden so far, and refines the tracks with all these points.
 """
 
 LEAST_FURTHER_DB = 0.05
-"""Least contrast gain of held-out patches over the previous round for another round, dB."""
+"""Minimum contrast gain of held-out patches over the previous round for another round, dB."""
 
 _BETWEEN_KNOTS_RAD2 = 0.05
 """Phase variance due to errors between knots, which causes a loss of 0.2 dB."""

@@ -1,7 +1,7 @@
 """Links of stationary or cabled radars: pulse-to-pulse stability and electrical length.
 
-As nothing moves, all changes come from the radar: noise, clocks, cables. The equations are in docs/theory/bench.md; the
-limits and their reasons are below.
+Because nothing moves, all changes are due to the radar: noise, clocks, cables. The equations are in
+docs/theory/bench.md; the limits and their reasons are below.
 """
 
 from collections.abc import Callable
@@ -26,19 +26,21 @@ from apertura.methods.bench.channels import MISSED_SHARE, SIGMAS
 # ---- Limits ---------------------------------------------------------------------------------------------------------
 
 WEAK_DB = 10.0
-"""Least SNR of a compressed pulse, dB; below it Γ is less than 0.91 and phases scatter by 0.22 rad."""
+"""Minimum SNR of a compressed pulse, dB; below it Γ is less than 0.91 and phases scatter by 0.22 rad."""
 
 PHASE_RAD = 0.05
-"""Largest phase scatter beyond noise, rms, and largest phase drift over the recording; each causes 0.01 dB of loss."""
+"""Largest phase scatter in excess of noise, rms, and largest phase drift over the recording; each causes 0.01 dB of
+loss.
+"""
 
 AMPLITUDE_DB = 0.5
-"""Largest amplitude scatter beyond noise, dB rms; tight connectors cause some hundredths of a dB."""
+"""Largest amplitude scatter in excess of noise, dB rms; tight connectors cause some hundredths of a dB."""
 
 DROPOUT_DB, DROPOUT_SHARE = -6.0, 0.01
 """Level of a dropout relative to the median, dB, and largest share of dropouts with tight connectors."""
 
 LEAKAGE_DB, APART_CELLS = -20.0, 3.0
-"""Largest level at the delay of the sidelink relative to the strongest path, dB; least difference of the two delays,
+"""Largest level at the delay of the sidelink relative to the strongest path, dB; minimum difference of the two delays,
 cells.
 """
 
@@ -74,7 +76,7 @@ class Contact:
     name
         Name of the path, for messages.
     scatter_db
-        Amplitude scatter beyond noise, rms; 0 if not significant.
+        Amplitude scatter in excess of noise, rms; 0 if not significant.
     moves_db
         Largest amplitude difference between eighths of the recording; 0 if not significant.
     dropouts, pulses
@@ -120,7 +122,7 @@ class Contact:
     def line(self) -> str:
         """Measured values, one line."""
         return (
-            f"amplitude scatter {self.scatter_db:.2f} dB rms beyond noise, slow change {self.moves_db:.2f} dB, "
+            f"amplitude scatter {self.scatter_db:.2f} dB rms in excess of noise, slow change {self.moves_db:.2f} dB, "
             f"{self.dropouts} of {self.pulses} pulses lost or 6 dB below the median"
         )
 
@@ -337,7 +339,7 @@ class MeasuredLink:
         if excess > PHASE_RAD or is_random:
             flags["link_incoherent"] = (
                 f"{self.name}: Γ {self.coherence:.5f}, {self.coherence_limit:.5f} expected from noise; phase scatter "
-                f"{excess:.2g} rad rms beyond noise"
+                f"{excess:.2g} rad rms in excess of noise"
             )
         drift, std = self.phase_drift_rad
         if abs(drift) > max(PHASE_RAD, SIGMAS * std) and not is_random:
@@ -353,11 +355,11 @@ class MeasuredLink:
         return Flags.merged(flags, self.contact.flags)
 
 
-_FEWEST_DIFFERENCES = 8  # least number of second differences for an Allan deviation
+_FEWEST_DIFFERENCES = 8  # minimum number of second differences for an Allan deviation
 _PARTS = 8  # parts of a recording whose amplitudes are compared
 _SHOWN = 4  # number of reported arrivals
 _HANN_STD = 1.51  # ratio of the standard deviations of a delay fitted with and without a Hann window (measured)
-_STANDS_OUT = 20.0  # least power of an arrival relative to the noise of the mean profile: 13 dB
+_STANDS_OUT = 20.0  # minimum power of an arrival relative to the noise of the mean profile: 13 dB
 
 
 def measure_link(
@@ -616,7 +618,7 @@ _GROUP_NOISE = 0.005  # rad², phase noise of a group of subcarriers, small enou
 
 
 def _over_the_band(first: MeasuredLink, second: MeasuredLink) -> tuple[float, float]:
-    """Return the scatter of phase and amplitude between two links over the band beyond noise, rms, rad and dB.
+    """Return the rms phase (rad) and amplitude (dB) differences of two links over the band in excess of noise.
 
     Subcarriers are averaged in groups whose size depends on the noise; the scatter is 0 for fewer than four groups.
     """

@@ -140,7 +140,7 @@ def interferogram_flags(measured: InterferogramCounts) -> Flags:
 # ---- Interferogram: coherence, phase, and geocoded heights ----------------------------------------------------------
 
 LEAST_LOOKS = 4.0
-"""Least number of looks over which the energy of a window is spread; with fewer, a point outside the centre of the
+"""Minimum number of looks over which the energy of a window is spread; with fewer, a point outside the centre of the
 window dominates.
 """
 
@@ -188,7 +188,7 @@ class Interferogram:
     measured
         Counts for the flags.
     level
-        Reference of the heights, and the constant removed from the phase; None without a valid pixel.
+        Reference of the heights, and the constant removed from the phase; None if there is no valid pixel.
     """
 
     panels: Mapping[str, NDArray[np.float32]]

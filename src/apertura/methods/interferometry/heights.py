@@ -12,7 +12,7 @@ from apertura.methods.interferometry.sensitivity import Sensitivity
 
 # ---- Unwrapping and residues ----------------------------------------------------------------------------------------
 
-_LEAST_SHARE = 0.01  # least fraction of all pixels in a connected component: default of snaphu
+_LEAST_SHARE = 0.01  # minimum fraction of all pixels in a connected component: default of snaphu
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +240,7 @@ BY_CHANCE = 1e-3
 """False alarm rate: fraction of incoherent pixels that are accepted as coherent."""
 
 MARGIN = 1.4
-"""Factor on the Cramér-Rao bound of the phase; the phase scatter of simulated terrain stays below it."""
+"""Factor on the Cramér-Rao bound of the phase; the phase scatter of simulated terrain is below this bound."""
 
 
 _STEPS = 30  # iterations of the fixed-point search for the pixel at which a point is imaged
