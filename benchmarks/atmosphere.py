@@ -44,7 +44,7 @@ _NEAR_M = 2.4
 
 
 def flown(height_m: float, *, weather: bool = False) -> CampaignSpecification:
-    """Specify a flight of four pairs past targets at a slant range of 1.4 heights and an aperture of a third of it."""
+    """Specify a flight of four pairs past targets at a slant range of 1.4 heights; aperture: a third of that range."""
     base, ground_m, side_m = preset("demo"), height_m, 12.0
     range_m = float(np.hypot(height_m, ground_m))
     prefix_s = 1e-6 * np.ceil(2e6 * range_m / 299_792_458 + 0.3)

@@ -88,7 +88,7 @@ def two_flights() -> Path:
 
 
 def figure_of(rows: int, columns: int, height: float, **options: Any) -> tuple[Figure, Any]:
-    """Return a figure as wide as the page shows it, in inches of 100 pixels, and its axes."""
+    """Return a figure with the width of the page, in inches of 100 pixels, and its axes."""
     figure = Figure(figsize=(WIDTHS[0] / 100, height), dpi=100, layout="compressed")
     FigureCanvasAgg(figure)
     return figure, figure.subplots(rows, columns, **options)
@@ -539,7 +539,7 @@ MAKERS: dict[str, Callable[[Path], Made | None]] = {
         xarray, your_own_recording, ci, sample, rail_pass, uav_flight, gotcha, px4_flight,
     )
 }  # fmt: skip
-"""Picture → function that generates it, called in an empty folder of its own."""
+"""Picture → function that generates it, called in a separate empty folder."""
 
 
 def publish(made: Made, name: str) -> None:

@@ -25,7 +25,7 @@ def have_qgis() -> bool:
 
 
 def have_gdal() -> bool:
-    """Return True if GDAL's own programs are installed (another version than rasterio's)."""
+    """Return True if the programs of GDAL are installed (the version differs from that of rasterio)."""
     return shutil.which("gdalinfo") is not None and shutil.which("gdallocationinfo") is not None
 
 

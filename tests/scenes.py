@@ -235,6 +235,6 @@ def swaying_beam(
 
 
 def hard_beam(soft: Beam, half_deg: float) -> Beam:
-    """Return a beam with the same axes and unit gain out to `half_deg`."""
+    """Return a beam with the same axes and unit gain up to `half_deg`."""
     angle = np.radians([-half_deg, 0, half_deg])
     return Beam(soft.axes, angle, np.ones(3), angle, np.ones(3))

@@ -107,7 +107,7 @@ def test_tiles_and_threads_are_bitwise_equal(plain, tables):
 
 
 def test_slices_and_copies_of_tables_sum_their_pulses(plain, tables):
-    """A slice shares the arrays on the device; a copy in another process makes its own."""
+    """A slice shares the arrays on the device; a copy in another process creates new arrays."""
     places = ecef(plain[1])[:, :16]
     whole = cuda.form(tables, places)
     parts = [tables[0:10], tables[2:][8:]]

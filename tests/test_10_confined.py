@@ -1,4 +1,4 @@
-"""Confinement of a campaign folder: nothing is read, written or deleted outside it, whatever links it contains."""
+"""Confinement of a campaign folder: nothing outside is read, written or deleted, whatever links exist."""
 
 import ast
 import os

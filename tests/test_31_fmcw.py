@@ -185,7 +185,7 @@ def test_triggers_of_a_bipolar_channel_of_any_type_are_found(tmp_path, dtype):
 
 def test_click_between_sync_pulses_is_no_trigger():
     sync = np.tile(np.r_[np.zeros(500), np.ones(500)], 5)
-    sync[1200] = 0.6  # above the middle, within the threshold
+    sync[1200] = 0.6  # above the midpoint, within the threshold
     np.testing.assert_allclose(trigger_starts(sync, threshold=0.3), [499.5, 1499.5, 2499.5, 3499.5, 4499.5])
 
 

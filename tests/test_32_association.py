@@ -233,7 +233,7 @@ def test_correct_associations_with_jitter_raise_no_false_alarm():
 
 @pytest.mark.parametrize(("size_m", "found"), [(0.8, False), (1.25, True)])
 def test_slow_displacement_above_the_limit_is_found(size_m, found):
-    """With a jitter of 0.15 m, medians of 15 pulses do not reveal 16 cm, but longer medians do."""
+    """A jitter of 0.15 m hides displacements of 16 cm or more in medians of 15 pulses, but not in longer medians."""
     rng = np.random.default_rng(3)
     time = np.arange(1600) / 20
     displacement_m = size_m * EXPLAINED_M * np.cos(2 * np.pi * time / 40)

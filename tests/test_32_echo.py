@@ -1,4 +1,4 @@
-"""From captured symbols to range profiles: phases match those predicted from delays."""
+"""From captured symbols to range profiles: phases match the predictions from delays."""
 
 import numpy as np
 import pytest

@@ -154,7 +154,7 @@ def limited(iq, share):
     ("share", "every", "flagged"), [(1 / 8, 5, True), (1 / 4, 5, True), (1 / 2, 5, False), (1 / 8, 100, False)]
 )
 def test_limited_captures_are_counted(share, every, flagged):
-    """Limiting at half the peak (2.6 standard deviations), or 1 % of the captures, costs less than 0.1 dB."""
+    """Limiting at half the peak (2.6 standard deviations), or limiting 1 % of the captures, costs less than 0.1 dB."""
     generator, saturation = np.random.default_rng(1), Saturation()
     iq = symbols(generator, 200)
     iq[::every] = limited(iq[::every], share)

@@ -103,7 +103,7 @@ def test_looks_at_an_edge_use_the_sums():
     steep = replace(looks, total=total, squares=squares)
     error = np.abs(assembled(steep, steep.effective) / of_sums(steep) - 1)
     assert error[:, :BLOCK_PX].max() < 1e-6
-    assert 1e-5 < error[:, BLOCK_PX:].max() < 1e-4  # beyond the drop both sums change alike
+    assert 1e-5 < error[:, BLOCK_PX:].max() < 1e-4  # beyond the drop, both sums change equally
     dark = np.arange(total.shape[1]) >= 3
     ends = replace(looks, total=np.where(dark, 0, total), squares=np.where(dark, 0, squares))
     last_lit = assembled(ends, ends.effective)[:, 3 * looks.lattice.pitch_px - 1]  # looks of the last node with pulses

@@ -10,7 +10,7 @@ from apertura.core.scene.grid import SceneGrid
 
 
 def image_with_errors(generator, kind):
-    """Return (image, exact), 96 x 96: speckle or targets 40 dB above it; errors uniform or relative to brightness."""
+    """Return (image, exact), 96 x 96: speckle or targets (40 dB above), with uniform or proportional errors."""
     noise = generator.standard_normal((4, 96, 96))
     exact = noise[0] + 1j * noise[1]
     if kind != "speckle":

@@ -382,7 +382,7 @@ def coarse_range(pulses=512):
 
 
 def test_point_response_follows_from_aperture_and_band():
-    """The response is that of the band along range, and sin(x)/x across, also beyond the smearing tolerance."""
+    """Along range, the response is that of the band; across, it is sin(x)/x beyond the smearing tolerance."""
     response = coarse_range()
     behind = np.column_stack([np.zeros(50), np.linspace(0.5, 25, 50), np.zeros(50)])
     np.testing.assert_allclose(response.at(np.zeros(3), behind), np.abs(np.sinc(behind[:, 1] / 6)), atol=5e-3)
@@ -484,7 +484,7 @@ def test_loss_of_random_attitude_errors_equals_monte_carlo_mean():
 
 
 def test_unconfigured_attitude_accuracy_follows_from_the_attitude_source():
-    """Without a lever arm, there is no such term; an attitude from the course is less accurate than a logged one."""
+    """Without a lever arm, there is no such term; the course is less accurate than a logged attitude."""
     paths, bare = straight(), replace(flying_east(), arms_m=((0.0, 0.0, 0.0),) * 3)
     assert attitude_lines(paths, [bare], sidelink=False) == []
     logged = replace(flying_east(), std_deg=None, arm_std_m=None)

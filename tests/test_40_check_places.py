@@ -314,7 +314,7 @@ def test_track_more_than_30_km_above_the_terrain_is_reported(tiny):
 
 
 def write_dem(root, heights, *, post_m=1.0, east_m=0.0):
-    """Write a DEM centred on the scene and configure it; heights (row, column)."""
+    """Write a DEM with heights (row, column), centred on the scene, and configure it."""
     east, north, _ = projected_from_ecef("EPSG:32632", DEMO_ORIGIN.ecef(np.zeros(3)))
     rows, columns = heights.shape
     transform = from_origin(east + east_m - columns * post_m / 2, north + rows * post_m / 2, post_m, post_m)

@@ -85,7 +85,7 @@ def test_corrections_and_deviations_are_in_east_north_up(log):
     np.testing.assert_allclose(
         np.diff([geodetic_from_ecef(log.track.position.values), lifted.geodetic], axis=0)[0, :, 2], 0.05
     )
-    np.testing.assert_allclose(lifted.std_m, 0.02)  # the same in every direction
+    np.testing.assert_allclose(lifted.std_m, 0.02)  # equal in all directions
     inside = log.refined
     assert inside.tolist() == [True] * 25 + [False] * 5
     np.testing.assert_allclose((log.std_m**2).sum(axis=1)[inside], (log.left_m**2).sum(axis=1)[inside])

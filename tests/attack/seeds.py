@@ -134,7 +134,7 @@ def sigmf_floats() -> list[bytes]:
 
 
 def sigmf_collections() -> list[bytes]:
-    """Return collections that list the first recording of `sigmf_meta`, under two names: of a node, and its own."""
+    """Return collections that list the first recording of `sigmf_meta`, with the name of a node and its own name."""
     streams = [{"name": "rx_0", "hash": hashlib.sha512(sigmf_meta()[0]).hexdigest()}]
     body = {"core:version": "1.2.0", "core:streams": streams}
     return [json.dumps({"collection": body | more}).encode() for more in ({"apertura:nodes": {"uav1": "rx_0"}}, {})]

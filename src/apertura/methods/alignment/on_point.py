@@ -242,7 +242,7 @@ def apply_drift(time_s: Floats, drift_ppm: float) -> Floats:
 
 
 def estimate_drift(alignment: Alignment, echo: Recorded, log: Logged, point_m: Floats) -> Alignment:
-    """Add the drift that maximises the coherent sum at a known point to an alignment, if the recording resolves it.
+    """Add the drift that maximises the coherent sum at a known point to an alignment, if the drift is observable.
 
     Parameters
     ----------
