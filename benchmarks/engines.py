@@ -134,7 +134,7 @@ def numba_contestant(job: Job) -> Contestant:
 
 
 def fastsar_contestants(job: Job, mono: Job) -> list[Contestant]:
-    """Return fastsar's bistatic backprojection of points and its exact monostatic former."""
+    """Return the bistatic backprojection of points and the exact monostatic image formation of fastsar."""
     import fastsar
     from fastsar import bp
 

@@ -173,7 +173,7 @@ def _contestants(engine_input: EngineInput, effort: Effort) -> Iterator[Contesta
 
 
 def _factorized(scene: Scene) -> Iterator[tuple[str, dict[str, int]]]:
-    """Yield fastsar's factorized former with default settings, and with the most accurate settings.
+    """Yield the factorized `ImageFormer` of fastsar with default settings, and with the most accurate settings.
 
     The error decreases with the size of the last patches, which have at least 16 pixels. Finer pixels reduce the
     patches, and large images use one more level than the default of three.

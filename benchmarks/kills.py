@@ -88,7 +88,7 @@ def killed(process, wait_s, root, *, alone):
 
 
 def steps_of(root):
-    """Return the numbers of the processes that work in a campaign folder."""
+    """Return the IDs of the processes that work in a campaign folder."""
     numbers = []
     for path in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):

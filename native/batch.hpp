@@ -55,7 +55,8 @@ alignas(64) constexpr float kLaneY[16] = {-1.5f, -1.5f, -1.5f, -1.5f, -.5f, -.5f
                                           .5f,   .5f,   .5f,   .5f,   1.5f, 1.5f, 1.5f, 1.5f};
 
 // Expands the paths of one pulse about the patch's blocks and sets their look-up windows. Returns the variant of the
-// pulse: a fast one only if every index is inside its window and every window inside the table, otherwise exact paths.
+// pulse: a fast variant only if every index is inside its window and every window inside the table; otherwise, exact
+// paths.
 template <bool kTerrain, bool kCurvature>
 inline Variant expand_paths(const ApertureJob& job, const Patch& patch, const OriginPaths& origin, int64_t pulse,
                             int64_t q, Batch& batch) {

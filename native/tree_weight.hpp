@@ -18,7 +18,7 @@ constexpr int64_t kBetween = 5;          // points along an axis at which the po
 constexpr int64_t kChecked = 8;          // every kChecked-th pulse is checked
 constexpr int64_t kCurve = 6;            // polynomial terms of weights over the pulses of a leaf
 constexpr double kLargest = 3;           // ratio of the largest error and the RMS error
-constexpr double kPlaceError = 2e-6;     // error of s by float32
+constexpr double kPlaceError = 2e-6;     // error of s due to float32
 
 // Geometry of a pulse or virtual pulse over a tile: paths, and axes of the sector.
 struct Look {

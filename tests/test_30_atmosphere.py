@@ -68,7 +68,7 @@ def test_refractivity_of_a_flight_is_weighted_by_path_length():
     assert flown.refractivity_n == pytest.approx(float(exact), rel=1e-12)
     assert flown.left_m == pytest.approx(0, abs=1e-12)
     climbing = air.over(np.linspace(900, 1200, 5), np.linspace(900, 1200, 5), (np.full(5, 1500.0),) * 2)
-    assert 3e-3 < climbing.left_m < 1.5e-2  # of a path of 3 km
+    assert 3e-3 < climbing.left_m < 1.5e-2  # for a path of 3 km
     assert flown.report["vacuum_shift_m"] == pytest.approx(flown.refractivity_n * 1e-6 * 5100 / 2, rel=1e-3)
 
 

@@ -1,4 +1,4 @@
-"""fastsar on a scene: its exact formers and its factorized former, from phase history, in complete calls.
+"""fastsar on a scene: `ExactFormer`, `ImageFormer` (factorized) and its backprojection of points, in complete calls.
 
 Images of fastsar are (column, row) on a plane centred on the origin, and its samples refer to one-way range.
 """
@@ -34,15 +34,15 @@ class Fastsar:
         self.middle = scene.grid.positions_at([scene.size // 2], [scene.size // 2], 0.0)[0]
 
     def factorized(self, name: str, finer: int = 1, **options: Any) -> Contestant:
-        """Return the factorized former with planning, on pixels that are finer by a factor and then decimated.
+        """Return the factorized `ImageFormer` with planning, on pixels that are finer by a factor and then decimated.
 
-        The smallest patches of this former have 16 pixels; only finer pixels reduce their size and the image error.
+        The smallest patches of `ImageFormer` have 16 pixels; only finer pixels reduce their size and the image error.
         """
         scene = self.scene
         if scene.geometry == "bistatic":
-            raise SkippedError("its factorized former supports monostatic geometries only")
+            raise SkippedError("ImageFormer supports monostatic geometries only")
         if not isinstance(scene.ground, FlatGround):
-            raise SkippedError("its factorized former supports planes only")
+            raise SkippedError("ImageFormer supports planes only")
         size, spacing = scene.size * finer, scene.grid.spacing_m / finer
         if size > 16384:
             raise SkippedError(f"{size}² pixels do not fit into memory")
@@ -63,7 +63,7 @@ class Fastsar:
         """Return the exact former of planes, tile by tile; range compression, part of every call, is counted once."""
         scene = self.scene
         if scene.geometry == "bistatic" or not isinstance(scene.ground, FlatGround):
-            raise SkippedError("its exact former supports monostatic geometries and planes only")
+            raise SkippedError("ExactFormer supports monostatic geometries and planes only")
         predicted, every = _EXACT_S * scene.size**2 * len(scene.history), 1
         while predicted / every > limit_s and scene.tiles(2 * every) != scene.tiles(every):
             every *= 2

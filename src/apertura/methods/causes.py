@@ -1,7 +1,7 @@
 """Causes of wrong images: quantities of the logs and the config, the trial errors of each, and their messages.
 
-`apertura check` reports the causes that time tags reveal, rule `assess` tries the causes one by one on a bright point,
-and rule `refine` fits the causes that displace the nodes of a flight to all bright points.
+`apertura check` reports the causes that are observable in time tags, rule `assess` tries the causes one by one on a
+bright point, and rule `refine` fits the causes that displace the nodes of a flight to all bright points.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -56,7 +56,7 @@ class CausePrior(Prior):
         return {node: np.tensordot(unknowns, shape, axes=(-1, 0)) for node, shape in self.shapes_m.items()}
 
     def adjoint(self, gradient: Mapping[str, Floats]) -> Floats:
-        """Return (..., size) derivatives with respect to unknowns, from derivatives by nodes' corrections."""
+        """Convert derivatives with respect to node corrections to (..., size) derivatives with respect to unknowns."""
         return np.asarray(
             sum(np.tensordot(gradient[node], shape, axes=((-2, -1), (1, 2))) for node, shape in self.shapes_m.items())
         )

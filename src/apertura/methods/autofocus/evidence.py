@@ -115,7 +115,7 @@ dB per pulse.
 """
 
 MOST_APART_SIGMA = 4.0
-"""Largest disagreement of point positions between pairs, in standard deviations; more indicates cycle slips."""
+"""Largest disagreement of point positions between pairs, in standard deviations; larger values indicate cycle slips."""
 
 PARTS = 8
 """Number of subapertures whose images of a point are compared in range to detect cycle slips."""

@@ -180,7 +180,7 @@ class NodePrior:
         return np.asarray((smoothed * self.std_m + self.slow @ slow) @ self.axes)
 
     def adjoint(self, gradient: Floats) -> Floats:
-        """Return (..., size) derivatives with respect to unknowns, from derivatives by corrections, (..., knot, 3)."""
+        """Convert (..., knot, 3) derivatives with respect to corrections to (..., size) with respect to unknowns."""
         along_axes = gradient @ self.axes.T
         scaled = along_axes * self.std_m / np.sqrt(self.smooth)
         nothing = np.zeros((*scaled.shape[:-2], self.smooth, 3))
@@ -212,7 +212,7 @@ class Prior:
         return {name: node.tracks(unknowns[..., part]) for (name, node), part in self._parts()}
 
     def adjoint(self, gradient: Mapping[str, Floats]) -> Floats:
-        """Return (..., size) derivatives with respect to unknowns, from derivatives by nodes' corrections."""
+        """Convert derivatives with respect to node corrections to (..., size) derivatives with respect to unknowns."""
         return np.concatenate([node.adjoint(gradient[name]) for name, node in self.nodes.items()], axis=-1)
 
     def _parts(self) -> list[tuple[tuple[str, NodePrior], slice]]:

@@ -426,8 +426,8 @@ def _visible_share(record: PairRecord, place_m: Floats) -> float:
 def _looks(record: PairRecord, looks: int, place_m: Floats) -> Iterator[Callable[[Floats], Floats]]:
     """Yield, for each subaperture of a flight, the function that returns the power at pixels (y, x, 3).
 
-    Subapertures have equal length and overlap by a half; their pulses have Hann weights. The image of a subaperture is
-    multiplied by the mean antenna and sector weight, which changes slowly with position. The tables of a subaperture
+    Subapertures have equal length and overlap by one half; their pulses have Hann weights. The image of a subaperture
+    is multiplied by the mean antenna and sector weight, which changes slowly with position. The tables of a subaperture
     are computed once for all pixels.
     """
     count = max(1, round(looks / _visible_share(record, place_m)))

@@ -276,7 +276,7 @@ _KNOTS_PER_CORRELATION_TIME = 10  # minimum number of knots of corrections withi
 _LEAST_KNOTS = 64  # minimum number of knots of a flight
 _FEW = 8  # number of patches; with fewer, every quarter of the patches is held out in turn
 _LOST_TO_TIES_DB = 0.1  # largest loss of contrast due to fixing the gauge
-_SLIPS = 3  # maximum searches that start from delays while subapertures have cycle slips
+_SLIPS = 3  # maximum number of searches from delays while subapertures have cycle slips
 _STAGES = 3  # iterations of caching contributions and maximising sharpness
 
 MOST_ROUNDS = 4
