@@ -60,7 +60,7 @@ class Fastsar:
         return Contestant(name, " ".join(settings) or "defaults", scene, run, from_echoes=True)
 
     def exact(self, limit_s: float) -> Contestant:
-        """Return the exact former of planes, tile by tile; range compression, part of every call, is counted once."""
+        """Return `ExactFormer` for planes, tile by tile; range compression, part of every call, is counted once."""
         scene = self.scene
         if scene.geometry == "bistatic" or not isinstance(scene.ground, FlatGround):
             raise SkippedError("ExactFormer supports monostatic geometries and planes only")
@@ -88,7 +88,7 @@ class Fastsar:
         return Contestant("fastsar exact", "cubic, 8×", scene, run, share, from_echoes=True)
 
     def points(self, limit_s: float) -> Contestant:
-        """Return the bistatic former of points, for the centres of the fields; the cost grows with their number."""
+        """Return the bistatic backprojection of the centres of the fields; the cost grows with their number."""
         scene, sample = self.scene, scene_points(self.scene)
         predicted = _POINT_S * sample.shape[0] * sample.shape[1] * sample.shape[2] * len(scene.history)
         if predicted > PATIENCE * limit_s:

@@ -161,7 +161,7 @@ def _uncorrected(experiments: Mapping[str, Experiment]) -> Claim:
     terms = {name: terms_at(one.uncorrected("none"), one.places_m[0]) for name, one in experiments.items()}
     factors = {name: coherence_factor(own) for name, own in terms.items()}
     pulses = len(terms["lab"])
-    low, high = (-np.log(1 - share) / pulses for share in (0.025, 0.975))  # of random phases MΓ is exponential
+    low, high = (-np.log(1 - share) / pulses for share in (0.025, 0.975))  # MΓ is exponential for random phases
     note = (
         f"for the cables; {factors['static']:.2g} for the first cylinder: the paper does not state which is printed; "
         f"random phases: mean 1/M = {1 / pulses:g}, median {np.log(2) / pulses:.4f}; 95 % of recordings give "
