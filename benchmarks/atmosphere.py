@@ -1,9 +1,9 @@
 """Geolocation of targets with and without atmospheric correction, for flights at heights of 30 m, 300 m and 3 km.
 
 Each one-way path is simulated with the refractivity at the heights of its ends
-(`apertura.simulation.scatterers.TrueAir`); with `--weather`, the atmosphere is 10 °C warmer, 20 hPa denser and wetter
-than the standard atmosphere. The pipeline uses one refractivity N per pair.
-Run: `.venv/bin/python benchmarks/atmosphere.py [--weather] [HEIGHT …]`; prints a table.
+(`apertura.simulation.scatterers.TrueAir`); with `--weather`, the atmosphere is 10 °C warmer, has a pressure higher by
+20 hPa, and is more humid than the standard atmosphere. The pipeline uses one refractivity N per pair. Run:
+`.venv/bin/python benchmarks/atmosphere.py [--weather] [HEIGHT …]`; prints a table.
 """
 
 import argparse
@@ -44,7 +44,7 @@ _NEAR_M = 2.4
 
 
 def flown(height_m: float, *, weather: bool = False) -> CampaignSpecification:
-    """Specify a flight of four pairs past targets at a slant range of 1.4 heights; the aperture is a third of it."""
+    """Specify a flight of four pairs past targets at a slant range of 1.4 heights; aperture: a third of that range."""
     base, ground_m, side_m = preset("demo"), height_m, 12.0
     range_m = float(np.hypot(height_m, ground_m))
     prefix_s = 1e-6 * np.ceil(2e6 * range_m / 299_792_458 + 0.3)

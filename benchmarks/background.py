@@ -2,8 +2,8 @@
 
 ``python benchmarks/background.py`` simulates transfer functions of three radars (OFDM, FMCW, UWB) on a straight pass, a
 circle and a hover, adds coupling whose response decays over the ranges of the scene, and prints the decision of
-`processing.background: auto`, its predicted and measured loss, and the median pixel relative to that without coupling
-(docs/theory/background.md).
+`processing.background: auto`, its predicted and measured loss, and the median pixel relative to the median without
+coupling (docs/theory/background.md).
 """
 
 from dataclasses import replace

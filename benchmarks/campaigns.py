@@ -34,7 +34,7 @@ class Drawn:
 
 
 def draw(generator: np.random.Generator, *, pixels: int = 80, pulses: int = 160) -> Drawn:
-    """Draw all parameters of a campaign and simulate it."""
+    """Draw all parameters of a campaign and simulate the campaign."""
 
     def between(low: float, high: float) -> float:
         return float(np.exp(generator.uniform(np.log(low), np.log(high))))

@@ -1,8 +1,8 @@
 """Comparison of certified error bounds with the true errors of 200 images, recomputed by the double sum at all pixels.
 
 Counts how often the error over all pixels stays below the bound, and the margin of the bound: for the certificate of
-finished images, and for the bound from Python, which uses only the sampled pixels. The difference of the predicted
-error characterises the planner.
+finished images, and for the bound from Python, which uses only the sampled pixels. The difference between the predicted
+and the true error characterises the planner.
 """
 
 import argparse
@@ -37,7 +37,7 @@ class ImageErrors:
 
 
 def evaluated(seeds: range, *, pixels: int, pulses: int, engine: str | None = None) -> Iterator[ImageErrors]:
-    """Evaluate two images of every campaign: the planned one, and one with a random setting of one or any engine."""
+    """Evaluate two images of every campaign: the planned image, and an image with a random setting of given engines."""
     for seed in seeds:
         generator = np.random.default_rng(seed)
         drawn = draw(generator, pixels=pixels, pulses=pulses)
@@ -93,13 +93,13 @@ def main() -> None:
     images = []
     for one in evaluated(seeds, pixels=options.size, pulses=options.pulses, engine=options.engine):
         images.append(one)
-        missed = "" if one.bound_db >= one.error_db else "  below the error"
+        missed = "" if one.bound_db >= one.error_db else " bound below the error"
         print(f"{one.name:<100}{one.error_db:>8.1f} dB, bound {one.bound_db:>7.1f} dB{missed}", flush=True)
     error = np.array([one.error_db for one in images])
     for name in ("predicted_db", "estimate_db"):
         less = np.array([getattr(one, name) for one in images]) - error
         low, high = np.percentile(less, [2.5, 97.5])
-        print(f"{name} less error: {low:+.1f} to {high:+.1f} dB in 95 % of {len(images)}, minimum {less.min():+.1f} dB")
+        print(f"{name} - error: {low:+.1f} to {high:+.1f} dB in 95 % of {len(images)}, minimum {less.min():+.1f} dB")
     for name in ("bound_db", "drawn_alone_db"):
         above = np.array([getattr(one, name) for one in images]) - error
         print(

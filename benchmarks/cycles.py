@@ -2,11 +2,11 @@
 
 Jobs are bistatic with flat terrain, on one core; the contestants run alternately. `--other PATH` is a shared library
 with a function `bp_perm2` that takes the same tables (pulse, coefficient, cell), float32, phase centres (3, pulse), a
-plane grid and a polynomial of the carrier phase in (1, u, u², …), alternately cosine and sine; it is passed the tables
-of the engine, of profiles that all start at the same path. Image sides must be multiples of 16 pixels, pulses of 8.
-`--kernel PATH` is another build of the engine; repeat the option for more. The clock frequency is measured between
-runs by a chain of dependent multiplications and additions, with a latency of 3 + 1 cycles on x86 cores of the last ten
-years. Times are medians of the process's CPU time.
+plane grid and a polynomial of the carrier phase in (1, u, u², …), alternately cosine and sine. Its input consists of
+the tables of the engine, computed from profiles that all start at the same path. Image sides must be multiples of 16
+pixels, pulses of 8. `--kernel PATH` is another build of the engine; repeat the option for more. The clock frequency is
+measured between runs by a chain of dependent multiplications and additions, with a latency of 3 + 1 cycles on x86 cores
+of the last ten years. Times are medians of the process's CPU time.
 
     python benchmarks/cycles.py --other build/kern3.so --kernel build/before.so
 """
@@ -37,7 +37,7 @@ STEPS, CYCLES_PER_STEP = 2_000_000, 4
 
 @nb.njit
 def chain(steps: int, x: int) -> int:
-    """Return the last of `steps` dependent numbers; squares, so that no compiler merges two steps."""
+    """Return the last of `steps` dependent numbers; each is a square, so that no compiler merges two steps."""
     for _ in range(steps):
         x = x * x + 1442695040888963407
     return x
@@ -84,7 +84,7 @@ def fits(path: Path) -> bool:
 
 
 def other(path: Path, job: Job, tables: Tables) -> Callable[[], np.ndarray]:
-    """Return a call of `bp_perm2` of another library, whose x axis is along the image's rows."""
+    """Return a call of `bp_perm2` of another library; the x axis of that function is along the rows of the image."""
     function = ctypes.CDLL(str(path)).bp_perm2
     function.restype = None
     pulses, _, width = tables.cells.shape
@@ -140,7 +140,7 @@ def compare(size: int, options: argparse.Namespace) -> None:
         median = statistics.median(seconds[1:])
         row = f"{name:<24}{1e3 * median:>9.1f} ms (minimum {1e3 * min(seconds[1:]):.1f}){work / median:>10.3g} pp/s"
         row += f"{median * clock / work:>8.3f} cycles/pp{error_db(job, images[name]):>8.1f} dB"
-        print(f"{row}   rate of native relative to it {median / first:.3f}")
+        print(f"{row}   time relative to native {median / first:.3f}")
 
 
 def main() -> None:

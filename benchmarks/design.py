@@ -51,7 +51,7 @@ def node(**more):
 
 
 def line(length=16.0, away=30.0, height=30.0, speed=1.0, heading=0.0, **more):
-    """Return a track to the east with the scene's middle `away` metres north of it, rotated about it by `heading`."""
+    """Return a track to the east, `away` metres south of the scene centre, rotated about this centre by `heading`."""
     angle = np.radians(heading)
     ends = np.array([[-length / 2, -away], [length / 2, -away]])
     ends = ends @ np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) + [EAST, NORTH]
@@ -142,7 +142,7 @@ LAYERS = ("resolution_fine", "resolution", "nesz", "point_snr")
 
 
 def points(opened, half):
-    """Return easting, northing and height of five points on the terrain, none in the sidelobes of another."""
+    """Return easting, northing and height of five points on the terrain, none in the sidelobes of another point."""
     positions = []
     for east, north in ((0.0, 0.0), (0.6, 0.35), (-0.35, 0.6), (-0.6, -0.35), (0.35, -0.6)):
         pixel = opened.grid.pixel_of(EAST + east * half, NORTH + north * half)
@@ -153,7 +153,7 @@ def points(opened, half):
 
 
 def standing(opened, half):
-    """Return these points as targets of 1 m², in east, north and up from the scene's middle."""
+    """Return these points as targets of 1 m², in east, north and up from the scene centre."""
     latitude, longitude, height = map(float, geodetic_from_ecef(opened.middle_m))
     origin = Origin(latitude, longitude, height)
     placed = [origin.enu(frame_from_map(CRS, *place)) for place in points(opened, half)]

@@ -2,7 +2,7 @@
 
 `python benchmarks/disagreement.py WORKFOLDER [--only height,drift] [--out docs/assets/disagreement]`. Two nodes fly
 past five points; one node has an error of its height, position, time, path or phase, from negligible to ten times the
-smallest observable size. A flag that is raised for a small error must also be raised for a larger one: the last line
+smallest observable size. A flag that is raised for a small error must also be raised for a larger error. The last line
 counts the wrong images (more than 0.15 m or 1 dB, as in mistakes.py) without a flag. Writes <out>.csv and <out>.png.
 """
 
@@ -24,7 +24,7 @@ from apertura.simulation import CampaignSpecification, ImageGrid, SimulatedFligh
 from apertura.simulation.targets import PointTarget
 
 _TARGETS = ((0.0, 0.0), (-3.85, -2.8), (4.2, 3.15), (2.1, -4.34), (-4.2, 4.2))
-"""Metres east and north of the scene's middle, which is 16 m from the track."""
+"""Metres east and north of the scene centre, which is 16 m from the track."""
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,10 @@
 """Run times of all engines on one job, measured in alternating rounds: `make bench`, or `python benchmarks/engines.py`.
 
 Times are medians over rounds of the process's CPU time, because other load extends the wall-clock time; each round runs
-all contestants, so that a slow period affects all of them. For two threads, the CPU time of the busier thread counts,
-which equals the wall-clock time of an idle machine. Tables are a separate row; fastsar compresses within its call, so
-that its compression is timed separately and subtracted. Prints a table and updates its rows in benchmarks/latest.json.
+all contestants, so that a slow period affects all of them. For two threads, the CPU time of the busier thread is
+reported, which equals the wall-clock time of an idle machine. Tables are a separate row; fastsar compresses within its
+call, so that its compression is timed separately and subtracted. Prints a table and updates its rows in
+benchmarks/latest.json.
 """
 
 import os
@@ -52,7 +53,7 @@ class Contestant:
         self.seconds.append(self.clock() - begin)
 
     def median(self) -> float:
-        """Return the median time in seconds, less that of `less`."""
+        """Return the median time in seconds, minus the median time of `less`."""
         return statistics.median(self.seconds) - (self.less.median() if self.less else 0.0)
 
     def error_db(self) -> float | None:
@@ -90,7 +91,7 @@ def compression_contestant(job: Job) -> Contestant:
     profiles, number = job.profiles, np.arange(SUBCARRIERS) - SUBCARRIERS // 2
     frequency, count = CENTRE_HZ + SPACING_HZ * (number + 0.5), profiles.samples.shape[1]
     path = profiles.start_m[:, None] + profiles.step_m * np.arange(count)
-    # The job's profiles are referenced to the band's exact middle, half a subcarrier below f_mid.
+    # The job's profiles are referenced to the exact band centre, half a subcarrier below f_mid.
     exact = profiles.samples * np.exp(-1j * np.pi * SPACING_HZ * path / SPEED_OF_LIGHT_M_S)
     history, options = spectra(job, np.zeros(len(path))), {"weight": window_weights("none", SUBCARRIERS)}
     options |= {"reference_delay_s": np.zeros(len(path)), "start_m": profiles.start_m, "count": count}
@@ -133,7 +134,7 @@ def numba_contestant(job: Job) -> Contestant:
 
 
 def fastsar_contestants(job: Job, mono: Job) -> list[Contestant]:
-    """Return fastsar's bistatic backprojection of points and its exact monostatic former."""
+    """Return the bistatic backprojection of points and the exact monostatic image formation of fastsar."""
     import fastsar
     from fastsar import bp
 
@@ -159,7 +160,7 @@ def fastsar_contestants(job: Job, mono: Job) -> list[Contestant]:
 
 
 def centred(job: Job) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return antenna positions relative to the scene's middle, their mean distance from it, and the middle."""
+    """Return antenna positions relative to the scene centre, their mean distance from the centre, and the centre."""
     middle = job.pixels.mean((0, 1))
     tx, rx = (leg - middle for leg in job.profiles.aperture.legs)
     return tx, rx, (np.linalg.norm(tx, axis=1) + np.linalg.norm(rx, axis=1)) / 2, middle

@@ -51,7 +51,7 @@ def patch(range_m: float, carrier_hz: float, spacing_m: float, *, pulses: int = 
 
 
 def measure(job: Job, **options: float) -> tuple[float, float, list[float]]:
-    """Return the RMS error over all pixels and that of the tables, dB, and the shares of the path variants."""
+    """Return the RMS error over all pixels, the error of the tables (dB), and the fractions of the path variants."""
     tables, counts = native.prepare(job.profiles), np.zeros(4, np.int64)
     image = native.form(tables, job.pixels, counts=counts, **options).ravel()
     truth = exact(job, job.pixels.reshape(-1, 3), carrier_hz=job.profiles.centre_frequency_hz)

@@ -1,7 +1,8 @@
 """False-alarm rates of flags on random error-free campaigns.
 
 `python benchmarks/false_alarms.py WORKFOLDER [--count 100] [--seed 0] [--only 17,18] [--out table.csv]`. A campaign is
-determined by seed and number; its intentional flaws are listed with it, and a flag that reports one of them is true.
+determined by seed and number; its intentional flaws are listed with the campaign, and a flag that reports one of these
+flaws is correct.
 """
 
 import argparse

@@ -3,7 +3,7 @@
 ``python benchmarks/flight_engines.py WORK/flight_10min --engines native tree`` images one pair of a campaign with its
 echo, profile and tracks, as computed by `flight.py WORK --minutes 10 --only ingest echo scene profile refine`; three
 minutes give the same image. With ``--every 8``, one tile in eight is formed, and times, including those of tables, are
-multiplied by eight. Errors are RMS at random pixels relative to the RMS of the imaged tiles; the shares of pixels ×
+multiplied by eight. Errors are RMS at random pixels relative to the RMS of the imaged tiles; the fractions of pixels ×
 pulses by path variant are printed.
 """
 

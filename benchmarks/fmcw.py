@@ -62,7 +62,7 @@ def ofdm(root: Path, _: str) -> np.ndarray:
 
 
 def formed(root: Path, window: str) -> tuple[Campaign, float]:
-    """Process a campaign up to its image; return it, and the CPU seconds of the echo step."""
+    """Process a campaign up to its image; return the campaign and the CPU seconds of the echo step."""
     path = root / "config/config.yaml"
     document = yaml.safe_load(path.read_text())
     document["processing"] = {"autofocus": False, "window": window}
@@ -81,7 +81,7 @@ def formed(root: Path, window: str) -> tuple[Campaign, float]:
 
 
 def measured(campaign: Campaign, truth: np.ndarray) -> list[float]:
-    """Return the largest position error (cm), and widths (cm) and PSLR (dB) of the middle target along and across."""
+    """Return the largest position error (cm), and widths (cm) and PSLR (dB) of the central target along and across."""
     grid = open_scene(campaign).grid
     pixels = open_stage(campaign.stage("image", "f01", "uav1-uav1"), "image").image.values
     errors, cuts = [], []

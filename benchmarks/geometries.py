@@ -3,8 +3,8 @@
 Range 30 m to 10 km, aperture up to the range, spacing from an eighth of a wavelength to 1 m, carrier 0.4 to 10 GHz;
 straight, wobbling and circular tracks with and without jitter, one or two nodes, flat, tilted and rolling terrain. Each
 geometry is planned for -60 dB with a free choice of the engine, then formed by the tree with the planner's settings for
-that accuracy and nodes of -74 dB, in smaller tiles if the first ones are summed directly. Echoes are noise and
-scatterers of a flat band; the reference is their sum in float64 over pulses and frequencies at random pixels.
+that accuracy and nodes of -74 dB, in smaller tiles if the tiles of the planner are summed directly. Echoes are noise
+and scatterers of a flat band; the reference is their sum in float64 over pulses and frequencies at random pixels.
 """
 
 import argparse
@@ -37,7 +37,7 @@ class Outcome:
     nodes_db: int
     side_px: int
     chunk: int
-    by_tree: float  # shares of pixels × pulses
+    by_tree: float  # fractions of pixels × pulses
     directly: float
     predicted_db: float
     measured_db: float
@@ -46,7 +46,7 @@ class Outcome:
     @property
     def failure(self) -> str:
         """Short description of a failure; empty without one."""
-        uncertified = ["certified error exceeds the requested one"] if self.bound_db > AIM_DB else []
+        uncertified = ["certified error exceeds the requested error"] if self.bound_db > AIM_DB else []
         unpredicted = ["error exceeds the prediction"] if self.measured_db > self.predicted_db + 3 else []
         return ", ".join(uncertified + unpredicted)
 
@@ -122,14 +122,14 @@ def _setting(job: Job, options: Mapping[str, int]) -> Setting:
 def _formed(
     geometry: Geometry, profiles: Profiles, setting: Setting
 ) -> tuple[NDArray[np.complex64], NDArray[np.float64]]:
-    """Return the flattened image, and the shares of pixels × pulses summed by tree, directly, or without echo."""
+    """Return the flattened image, and the fractions of pixels × pulses by tree, direct sum, or no echo."""
     counts, trees = np.zeros(3, np.int64), tree.prepare(profiles, **setting.options)
     image = tree.form(trees, geometry.pixels, counts=counts, **setting.form_options)
     return image.ravel(), counts / counts.sum()
 
 
 def measure(geometry: Geometry, **options: int) -> Outcome:
-    """Plan and form one geometry, with any given options of the tree, and compare it with the exact sum."""
+    """Plan and form one geometry, with any given options of the tree, and compare the image with the exact sum."""
     generator = np.random.default_rng([16, geometry.seed])
     lines = echo(geometry, generator)
     profiles = profiles_of(geometry, lines)

@@ -56,7 +56,7 @@ class Row:
 
 
 def weights(job: Job) -> dict[str, Beams]:
-    """Return a sector of a tenth of the flight, beams of 40° by 60° directed at the scene's middle, and both."""
+    """Return a sector of a tenth of the flight, beams of 40° by 60° directed at the scene centre, and both."""
     flown = job.profiles.aperture
     sector, middle = Sector.of(flown, chord_m=1.5, centre=0.0, half=0.08), job.pixels.reshape(-1, 3).mean(axis=0)
     cuts = gaussian_cut(40.0, cutoff_db=-20, limit_rad=np.pi), gaussian_cut(60.0, cutoff_db=-20, limit_rad=np.pi / 2)
@@ -90,7 +90,7 @@ def rows(size: int, pulses: int) -> list[Row]:
 
 
 def share(row: Row) -> float:
-    """Return the share of pixels × pulses with a non-zero weight, to which the rate refers."""
+    """Return the fraction of pixels × pulses with a non-zero weight, to which the rate refers."""
     if row.beams is None:
         return 1.0
     coarse = row.job.pixels[:: max(1, row.job.pixels.shape[0] // 9), :: max(1, row.job.pixels.shape[1] // 9)]

@@ -36,7 +36,7 @@ from apertura.core.backprojection.engines import instruction_set
 CHART = Path(__file__).parents[1] / "docs" / "assets" / "growth.png"
 AIMS_DB = (-40.0, -60.0, -80.0)
 SLOW = 0.05
-"""Share of the image below which a contestant runs one round in quick mode."""
+"""Fraction of the image below which a contestant runs one round in quick mode."""
 
 _KEY = ("group", "name", "aim_db", "geometry", "surface", "size", "pulses")
 
@@ -143,7 +143,7 @@ def machine() -> str:
 
 
 def _contestants(engine_input: EngineInput, effort: Effort) -> Iterator[Contestant]:
-    """Yield the available contestants; print the reasons of the skipped ones."""
+    """Yield the available contestants; print the reasons for skipped contestants."""
     limit_s = effort.limit_s
     entries: list[tuple[str, Callable[[], Contestant]]] = [
         (f"{engine} {aim_db:.0f} dB", partial(engine_input.planned, engine, aim_db, limit_s))
@@ -173,10 +173,10 @@ def _contestants(engine_input: EngineInput, effort: Effort) -> Iterator[Contesta
 
 
 def _factorized(scene: Scene) -> Iterator[tuple[str, dict[str, int]]]:
-    """Yield fastsar's factorized former with default settings, and with the most accurate settings.
+    """Yield the factorized `ImageFormer` of fastsar with default settings, and with the most accurate settings.
 
-    Its error decreases with the size of its last patches, which have at least 16 pixels: finer pixels reduce them, and
-    large images use one more level than the default of three.
+    The error decreases with the size of the last patches, which have at least 16 pixels. Finer pixels reduce the
+    patches, and large images use one more level than the default of three.
     """
     deep = {"levels": 4} if scene.size >= 2048 else {}
     yield "fastsar FFBP", {}

@@ -1,7 +1,7 @@
 """Job of the engine benchmarks: a low, wobbling bistatic flight over point scatterers, with its exact image.
 
 512 × 512 pixels of 5 cm, imaged from 10 m height at 5 to 30 m ground range, 1024 pulses over 30 m, 409.6 MHz at
-1.2 GHz. This is the geometry of the source paper, and the most demanding one for series about a patch, because
+1.2 GHz. This is the geometry of the source paper, and the most demanding geometry for series about a patch, because
 aperture, range and scene have the same size.
 """
 
@@ -115,7 +115,7 @@ def build(size: int = 512, pulses: int = 1024, *, bistatic: bool = True, surface
 
 
 def turned(job: Job, degrees: float) -> Job:
-    """Return the job on a grid rotated about its middle."""
+    """Return the job on a grid rotated about its centre."""
     return replace(job, pixels=grid(len(job.pixels), turned_deg=degrees))
 
 

@@ -3,11 +3,11 @@
     python benchmarks/kills.py [CAMPAIGN] [KILLS] [SEED]
 
 Without a folder, or with '-', the campaign is a small simulated one: 48 x 48 pixels in nine tiles, two pairs. A run
-receives SIGKILL after a random share of the duration of an undisturbed run, together with all processes that it has
-started or, in three of ten cases, without them: its steps then continue in parallel with those of the next run. Resumed
-runs are killed, too, until the number of KILLS (16) is reached. When a run finishes, its results are compared byte for
-byte with the undisturbed ones, without logs, timings and hidden files, and the next run starts from the beginning.
-Exits with an error if results differ.
+receives SIGKILL after a random fraction of the duration of an undisturbed run, together with all processes that the run
+has started. In three of ten cases, these processes are not killed: the steps of the run then continue in parallel with
+the steps of the next run. Resumed runs are also killed until the number of KILLS (16) is reached. When a run finishes,
+its results are compared byte for byte with the undisturbed results, without logs, timings and hidden files, and the
+next run starts from the beginning. Exits with an error if results differ.
 """
 
 import contextlib
@@ -88,7 +88,7 @@ def killed(process, wait_s, root, *, alone):
 
 
 def steps_of(root):
-    """Return the numbers of the processes that work in a campaign folder."""
+    """Return the IDs of the processes that work in a campaign folder."""
     numbers = []
     for path in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):

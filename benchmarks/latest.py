@@ -1,4 +1,4 @@
-"""Reading and writing of benchmarks/latest.json, a list of rows of several benchmarks; each replaces its own rows."""
+"""Reading and writing of benchmarks/latest.json, a list of rows; each benchmark replaces its own rows."""
 
 import json
 from collections.abc import Callable

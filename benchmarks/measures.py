@@ -1,7 +1,8 @@
 """Run time of the image quality checks: `python benchmarks/measures.py [--size 2048] [--pulses 4096] [--repeats 3]`.
 
-Five targets and noise are imaged tile by tile into zarr, as planned by the workflow; this time is compared with those
-of the certificate, the brightest target, the focus check and the agreement with another image. All are repeated.
+Five targets and noise are imaged tile by tile into zarr, as planned by the workflow; the time of image formation is
+compared with those of the certificate, the brightest target, the focus check and the agreement with another image. All
+measurements are repeated.
 """
 
 import os
@@ -84,7 +85,7 @@ def main() -> None:
             rows.append(_round(formed, target))
     seconds = np.array(rows)
     table = Table(title=f"{formed.plan.setting.line}, load {os.getloadavg()[0]:.1f}")
-    for heading in ("check", "CPU seconds", "spread", "share of imaging"):
+    for heading in ("check", "CPU seconds", "spread", "fraction of imaging"):
         table.add_column(heading)
     names = ("image", "certificate", "brightest target", "focus", "agreement")
     for name, column in zip(names, seconds.T, strict=True):

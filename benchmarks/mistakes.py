@@ -39,7 +39,8 @@ class Row:
     Attributes
     ----------
     wrong, silent
-        True if the image is wrong; and if it has no flag in addition to those of the error-free campaign.
+        `wrong`: True if the image is wrong; `silent`: True if, in addition, the image has only flags of the error-free
+        campaign.
     control
         True for a change without effect on the image.
     alike

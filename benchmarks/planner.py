@@ -2,7 +2,7 @@
 
 A setting is valid if its measured error meets the requested accuracy. Each campaign's plan, including presumming, and
 the five fastest valid settings are then timed alternately; the ratio is that of the median CPU seconds. If the plan's
-setting misses the accuracy, the times of the next better settings are added until one meets it.
+setting misses the accuracy, the times of the next more accurate settings are added until a setting meets the accuracy.
 """
 
 import argparse
@@ -50,7 +50,7 @@ class Runner:
 
 
 def compare(drawn: Drawn) -> tuple[str, list[float], float, str]:
-    """Return the plan's setting, its errors at first and after recomputation, its time ratio, and the best setting."""
+    """Return the plan's setting, its errors before and after recomputation, its time ratio, and the best setting."""
     plan = make_plan(drawn.job, accuracy_db=drawn.accuracy_db)
     picked = np.random.default_rng(1).integers(0, drawn.grid.shape, (200, 2)).T
     exact = reference.form(drawn.history, drawn.grid.positions(0.0)[*picked])

@@ -43,7 +43,7 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=1.0, help="speed of the replay relative to the recording")
     parser.add_argument("--every", type=float, default=5.0, help="interval between images, s")
     parser.add_argument("--cores", type=int, default=1)
-    parser.add_argument("--no-run", action="store_true", help="run look only, without workflow and comparison")
+    parser.add_argument("--no-run", action="store_true", help="run the preview only, without workflow and comparison")
     options = parser.parse_args()
     flown = options.campaign or options.work / f"flown_{options.seconds:g}s_{options.half_width:g}m"
     if not flown.exists():
@@ -108,7 +108,7 @@ def begin(flown: Path, replayed: Path) -> None:
 
 
 def replay(flown: Path, replayed: Path, rate: float = 1.0) -> None:
-    """Write recordings and logs like a recorder: at each time, all data known by then, with incomplete ends."""
+    """Write recordings and logs like a recorder: at each time, all data available by then, with incomplete ends."""
     campaign = Campaign.load(flown)
     writers = []
     for one in campaign.image_flights:
@@ -149,7 +149,7 @@ class RecordingWriter:
             stream.write(text)
 
     def write(self, now: np.datetime64) -> None:
-        """Write the pulses recorded by `now`; the last one may be incomplete."""
+        """Write the pulses recorded by `now`; the last pulse may be incomplete."""
         pulses = int(np.searchsorted(self.times, now, "right"))
         captures = [json.dumps(one) for one in self.document["captures"][self.captures_written : pulses]]
         if captures:
@@ -208,7 +208,7 @@ def _read(looking: subprocess.Popen, lines: list[str]) -> None:
 
 
 def report(lines: list[str], share: float, lasted_s: float) -> None:
-    """Print the delay, the share of a core and the number of images during the recording."""
+    """Print the delay, the load as a fraction of one core, and the number of images during the recording."""
     delays = [float(match[1]) for line in lines if (match := re.search(r"([\d.]+) s behind", line))]
     print(
         f"recorded for {lasted_s:.0f} s; {share:.2f} of one core; {len(delays)} images; load {os.getloadavg()[0]:.1f}"

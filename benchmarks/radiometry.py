@@ -2,9 +2,9 @@
 
 `python benchmarks/radiometry.py [PART …]` prints: `points`: 0.1, 1 and 10 m² at five ranges and three squints, mono-
 and bistatic, with beams, without noise and in 100 noisy draws each; `clutter`: terrain of constant σ⁰ at incidence
-angles of 30° to 70°, level, on slopes and across the edge of a beam; `looks`: number of looks of its mean power, and
-after the speckle filter; `noise`: noise figure estimated from the noise of simulated recordings. Echoes are those of
-`apertura.simulation` with a `Radio`.
+angles of 30° to 70°, level, on slopes and across the edge of a beam; `looks`: number of looks of multilooked terrain,
+and after the speckle filter; `noise`: noise figure estimated from the noise of simulated recordings. Echoes are those
+of `apertura.simulation` with a `Radio`.
 """
 
 import argparse
@@ -59,7 +59,7 @@ def weights(window: str = "hann") -> NDArray[np.float64]:
 
 
 def flown(*, bistatic: bool, length_m: float = 8.0, pulses: int = 160, height_m: float = HEIGHT_M) -> Aperture:
-    """Return a straight pass to the east at north 0; a bistatic receiver is ahead of, beside and above it."""
+    """Return a straight pass to the east at north 0; a bistatic receiver is ahead, beside and above."""
     along = np.linspace(-length_m / 2, length_m / 2, pulses)
     track = np.stack([along, 0 * along, np.full(pulses, height_m)], -1)
     return Aperture(track, track + ([5.0, -1.5, 1.0] if bistatic else 0.0))
@@ -127,7 +127,7 @@ def cross_section(
         pulse = LINK.pulse_noise(6.0, spacing_hz=WAVE.subcarrier_spacing_hz, squares=float((weights() ** 2).sum()))
     noise = float(share[0]) * pulse
     measured_m2 = max(point.amplitude**2 - noise, 1e-30) / per_m2[0]
-    # Without noise, the ring around a point contains only its own sidelobes, which are not an error.
+    # Without noise, the ring around a point contains only sidelobes of this point, which are not an error.
     inverse = 0.0 if generator is None else max(noise / point.amplitude**2, point.background)
     scatter_db = 10 / np.log(10) * np.sqrt(2 * inverse + inverse**2)
     return 10 * float(np.log10(measured_m2 / rcs_m2)), float(scatter_db)
@@ -167,7 +167,7 @@ SCATTERERS_M = 0.2
 """Side of the square of terrain that a scatterer represents."""
 
 SLOPES = {"level": (0.0, 0.0), "20 % up": (0.0, 0.2), "20 % down": (0.0, -0.2), "20 % along": (0.2, 0.0)}
-"""Gradients to the east, along the track, and to the north, away from it."""
+"""Gradients to the east (along the track) and to the north (away from the track)."""
 
 
 def clutter_power(
@@ -187,7 +187,8 @@ def clutter_power(
     grid = CLUTTER
     aperture = flown(bistatic=bistatic, length_m=10.0, pulses=220, height_m=CLUTTER_HEIGHT_M)
     generator = np.random.default_rng(seed)
-    # One random scatterer per square: with positions uniform over the area, their density would add to the speckle.
+    # One random scatterer per square: with positions uniform over the area, variations of the density would add to the
+    # speckle.
     east, north = np.meshgrid(np.arange(-45.0, 45.0, SCATTERERS_M), np.arange(6.0, 85.0, SCATTERERS_M))
     x, y = ((low + SCATTERERS_M * generator.uniform(size=low.shape)).ravel() for low in (east, north))
     place = np.column_stack([x, y, slope[0] * x + slope[1] * (y - SLOPED_M)])
@@ -283,7 +284,7 @@ SIDELINK_DB, MISSED = 30.0, 0.05
 
 
 def noise(draws: int = 8) -> None:
-    """Print the noise figure estimated from profiles with echoes and thermal noise, for a simulated one of 6 dB.
+    """Print the noise figure estimated from profiles with echoes and thermal noise, simulated as 6 dB.
 
     Some pulses are missing; the echo of a bistatic pair is divided by a noisy sidelink, whose noise is subtracted.
     """
@@ -313,7 +314,7 @@ def noise(draws: int = 8) -> None:
         print(
             f"{'bistatic' if bistatic else 'monostatic'}: noise figure of 6 dB, estimated {min(estimates_db):.2f} to "
             f"{max(estimates_db):.2f} dB, mean {np.mean(estimates_db):.2f} dB in {draws} draws, reported standard "
-            f"deviation {np.mean(stated):.2f} dB; the sidelink's noise raised it by {np.mean(share):.1f} dB",
+            f"deviation {np.mean(stated):.2f} dB; sidelink noise increased it by {np.mean(share):.1f} dB",
             flush=True,
         )
 

@@ -3,9 +3,9 @@
     python benchmarks/scale.py [FOLDER] [FLIGHTS ...]
 
 For each number of FLIGHTS (default: 10, 100, 1000), FOLDER (default: temporary) receives a campaign folder: two nodes
-with 24 pulses, the same ones in every flight (hard links). Each line is a command on that folder, with its wall-clock
-and CPU seconds and the peak resident memory of its largest process. The commands run first without results, then with
-all results, as placeholders with valid manifests.
+with 24 pulses, with the same files in every flight (hard links). Each line is a command on that folder, with its
+wall-clock and CPU seconds and the peak resident memory of its largest process. The commands run first without results,
+then with all results, as placeholders with valid manifests.
 """
 
 import os
@@ -23,7 +23,7 @@ BATCH = 10
 
 
 def campaign_of(root, flights):
-    """Simulate one flight and link it under the names of all flights."""
+    """Simulate one flight and link its files under the names of all flights."""
     from apertura.simulation import ImageGrid, preset, simulate
 
     if (root / "config").is_dir():

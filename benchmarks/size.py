@@ -1,8 +1,8 @@
 """Rate and peak memory of a large image: 8192 × 8192 UTM pixels from 4096 pulses: `python benchmarks/size.py`.
 
-The image is formed tile by tile into zarr. Peak memory is that of the process; the rate is compared with that of the
-kernel on tiles spread over the same image, on the same number of threads, for each block of pulses. Samples are random,
-because time and memory do not depend on them. Prints the results and writes benchmarks/size.json.
+The image is formed tile by tile into zarr. The peak memory is that of the process. The rate is compared with the rate
+of the kernel on tiles spread over the same image, with the same number of threads, for each block of pulses. Samples
+are random, because time and memory do not depend on the samples. Prints the results and writes benchmarks/size.json.
 """
 
 import os
@@ -35,7 +35,7 @@ BANDWIDTH_HZ, CENTRE_HZ, SPACING_M, TILE = 409.6e6, 1.2e9, 0.1, 512
 
 
 def profiles(grid: SceneGrid, pulses: int, height_m: float = 400.0) -> Profiles:
-    """Return random samples over the swath of a straight flight next to the grid, with an aperture of its side."""
+    """Return random samples over the swath of a straight flight along one side of the grid."""
     generator = np.random.default_rng(1)
     west, south, east, north = grid.bounds_m
     along = np.linspace(south, north, pulses)
@@ -64,7 +64,7 @@ def kernel_seconds(tables: Tables, grid: SceneGrid, threads: int) -> float:
 
 
 def image_seconds(profiles: Profiles, grid: SceneGrid, *, blocks: int, threads: int) -> tuple[float, float]:
-    """Return the seconds to form the image into zarr, including tables and positions, and those of the kernel."""
+    """Return the seconds to form the image into zarr, including tables and positions, and the seconds of the kernel."""
     kernel_s = sum(
         kernel_seconds(native.prepare(profiles[part]), grid, threads) for part in profiles.aperture.blocks(blocks)
     )

@@ -2,9 +2,10 @@
 
     python benchmarks/startup.py [CAMPAIGN]
 
-CAMPAIGN, a folder simulated by `apertura simulate`, is copied; without it, the demo is simulated. The steps are the
-commands printed by snakemake, repeated on the finished campaign: each time includes start, imports, opening of files
-and the demo's small computation. Times are user and system time of a command and its children, the minimum of three.
+CAMPAIGN, a folder simulated by `apertura simulate`, is copied; if it is omitted, the demo is simulated. The steps are
+the commands printed by snakemake, repeated on the finished campaign: each time includes start, imports, opening of
+files and the demo's small computation. Times are user and system time of a command and its children, the minimum of
+three.
 """
 
 import re

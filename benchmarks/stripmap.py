@@ -6,8 +6,8 @@
 The first command images a strip of constant width from flights of 0.25 to 2 km with a pulse every 2 cm, and a small
 scene from the longest flight; it prints CPU seconds of planning and of tiles, and the error relative to the double sum
 over pulses and subcarriers at random pixels, all with the same integration. The second command writes echo and profiles
-of a flight to disk, then images, certifies and measures it like the step, in a separate process, and prints its peak
-memory.
+of a flight to disk, then forms, certifies and measures the image in the same way as the step, in a separate process,
+and prints its peak memory.
 """
 
 import argparse
@@ -150,7 +150,7 @@ def lengths() -> None:
 
 
 def long_flight(pulses: int, pixels: int, folder: Path) -> None:
-    """Write echo and profiles of a flight along the middle of a square scene, with antenna beams limiting the swath."""
+    """Write echo and profiles of a flight over the centre line of a square scene; antenna beams limit the swath."""
     grid, flight, beams = _long(pulses, pixels)
     history = flight.history
     inputs = flight.aperture, flight.frequency_hz, history.weight
@@ -188,7 +188,7 @@ def _long(pulses: int, pixels: int) -> tuple[SceneGrid, Flight, Beams]:
 
 
 def imaged(pulses: int, pixels: int, folder: Path) -> None:
-    """Image, certify and measure the flight written by `long_flight`, like the step."""
+    """Form, certify and measure the image of the flight written by `long_flight`, in the same way as the step."""
     import zarr
 
     start_s, wall_start_s = time.process_time(), time.perf_counter()

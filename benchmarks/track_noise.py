@@ -1,4 +1,4 @@
-"""Peak loss by track noise: predicted by the budget, measured against truth, and estimated from the image.
+"""Peak loss due to track noise: predicted by the budget, measured against the truth, and estimated from the image.
 
 `python benchmarks/track_noise.py WORKFOLDER [--base sample|curved] [--draws 20]`. White noise after a moving average of
 one second, σ per axis, is added to both logs, and σ is configured as the position accuracy.

@@ -40,7 +40,7 @@ PULSES = 200
 
 
 def run(waveform, targets, snr_db: float | None) -> tuple[Campaign, float]:
-    """Simulate a campaign and process it up to its images; return it, and the CPU seconds of the echo step."""
+    """Simulate a campaign and process it up to its images; return the campaign and the CPU seconds of the echo step."""
     root = Path(tempfile.mkdtemp()) / "campaign"
     own = Impairments(radar_snr_db=snr_db)
     quiet = {"uav1": own, "uav2": own}

@@ -1,7 +1,7 @@
-"""A QGIS project of all images in dB of a campaign: python3 qgis_project.py CAMPAIGN, with the Python that QGIS brings.
+"""Create a QGIS project of all dB images of a campaign: python3 qgis_project.py CAMPAIGN, with the Python of QGIS.
 
-Coherent sums are on top; QGIS draws each as the .qml beside it says. Writes CAMPAIGN/campaign.qgz,
-and never over one that is there.
+Coherent sums are the topmost layers. QGIS applies the style file (.qml) next to each image. The project is written to
+CAMPAIGN/campaign.qgz; an existing project is not overwritten.
 """
 
 import os
@@ -13,7 +13,7 @@ from qgis.core import QgsApplication, QgsProject, QgsRasterLayer
 
 campaign = Path(sys.argv[1]).resolve()
 if (campaign / "campaign.qgz").exists():
-    sys.exit(f"{campaign / 'campaign.qgz'} is there already: move it away")
+    sys.exit(f"{campaign / 'campaign.qgz'} exists already: move or rename it")
 qgis = QgsApplication([], False)
 qgis.initQgis()
 project = QgsProject.instance()

@@ -48,7 +48,7 @@ struct Isa {
   void (*form_tree)(TreeJob*);
 };
 
-// Fastest first.
+// In descending order of speed.
 const Isa* find(const char* name) {
 #ifdef APERTURA_X86
   static const bool has_avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
@@ -74,8 +74,8 @@ const Isa* find(const char* name) {
   return nullptr;
 }
 
-constexpr int64_t kPulses = 64;   // per pass; together with kRegion, sized for the second-level cache
-constexpr int64_t kRegion = 256;  // pixels along a side of a region; regions are formed one after the other
+constexpr int64_t kPulses = 64;   // pulses per pass; together with kRegion, sized for the second-level cache
+constexpr int64_t kRegion = 256;  // pixels along a side of a region; regions are formed sequentially
 constexpr int64_t kSum = 2 * kPixels;
 
 // Writes the sums of one patch to its pixels.

@@ -7,19 +7,20 @@
 
 namespace {
 
-// Variant of the path computation for one pulse over a patch, cheapest first. Curvature is the second-order part of the
-// path inside a block, (5a). Windows are the 16 cells of the table that a look-up can reach: narrow ones serve a group
-// of four blocks with 16 lanes, one block (8 cells) with 8 lanes, and are not used with 4; wide ones serve one block.
+// Variant of the path computation for one pulse over a patch, in order of increasing cost. Curvature is the
+// second-order part of the path inside a block, (5a). Windows are the 16 cells of the table that a look-up can reach:
+// narrow ones serve a group of four blocks with 16 lanes, one block (8 cells) with 8 lanes, and are not used with 4;
+// wide ones serve one block.
 enum Variant {
   kSharedCurvature,  // narrow window, all blocks have the curvature of the origin
-  kLinearHeights,    // the same, for heights inside a block that need no second-order term
+  kLinearHeights,    // shared curvature, heights inside a block need no second-order term
   kWideWindow,       // shared curvature, wide windows
   kOwnCurvature,     // wide windows, each block has its own curvature
-  kWeighted,         // kOwnCurvature, weighted by the antennas' beams: with beams, the fast variant except at an edge
+  kWeighted,         // kOwnCurvature, weighted by antenna beams: the fast variant of a job with beams
   kAtEdge,           // kOwnCurvature, weighted by the edge of a sector
-  kWeightedAtEdge,   // kOwnCurvature, weighted by both
+  kWeightedAtEdge,   // kOwnCurvature, weighted by antenna beams and the edge of a sector
   kExactPath,        // each pixel in float64 (exact.hpp)
-  kSkipped,          // no echo, or no beam, reaches the patch
+  kSkipped,          // the patch is outside the profile or the beams
   kVariants
 };
 constexpr bool kGrouped = kLanes == 16;  // narrow windows serve groups of four blocks
@@ -28,19 +29,19 @@ constexpr bool kGrouped = kLanes == 16;  // narrow windows serve groups of four 
 // used for flat terrain are adjacent.
 struct Batch {
   alignas(64) float path[kBatch][kBlocks];  // at the block's centre, in cells from the window's first cell
-  alignas(64) float x[kBatch][kBlocks], y[kBatch][kBlocks];  // its derivatives
-  alignas(64) int32_t window[kBatch][kBlocks];               // first cell, from `row`
+  alignas(64) float x[kBatch][kBlocks], y[kBatch][kBlocks];  // derivatives of `path`
+  alignas(64) int32_t window[kBatch][kBlocks];               // first cell of the window, relative to `row`
   alignas(64) float shared_curvature[kBatch][16];            // x'^2 xx + x'y' xy + y'^2 yy at the pixels of any block
-  const float* row[kBatch];          // of the table: the cell of the pulse's path to the patch's origin
-  int64_t order[kVariants][kBatch];  // the pulses of each variant
+  const float* row[kBatch];                                  // table entry of the cell of the path to the patch origin
+  int64_t order[kVariants][kBatch];                          // numbers of the pulses of each variant
   int64_t count[kVariants];
-  alignas(64) float h[kBatch][kBlocks];          // derivative along the height
+  alignas(64) float h[kBatch][kBlocks];          // derivative with respect to height
   alignas(64) float shared_slope_h[kBatch][16];  // x' xh + y' yh at the pixels of any block
   float shared_hh[kBatch];
-  // Own curvature: its second-order coefficients, (5a).
+  // Own curvature of each block: second-order coefficients, (5a).
   alignas(64) float xx[kBatch][kBlocks], xy[kBatch][kBlocks], yy[kBatch][kBlocks];
   alignas(64) float xh[kBatch][kBlocks], yh[kBatch][kBlocks], hh[kBatch][kBlocks];
-  alignas(64) float weight[kBatch][kBlocks], weight_x[kBatch][kBlocks], weight_y[kBatch][kBlocks];  // (7)
+  alignas(64) float weight[kBatch][kBlocks], weight_x[kBatch][kBlocks], weight_y[kBatch][kBlocks];  // of (7)
   float weight_h[kBatch];
   // Depth inside the sector, in widths of its edge: integration.md, (5).
   alignas(64) float depth[kBatch][kBlocks], depth_x[kBatch][kBlocks], depth_y[kBatch][kBlocks];
@@ -54,7 +55,8 @@ alignas(64) constexpr float kLaneY[16] = {-1.5f, -1.5f, -1.5f, -1.5f, -.5f, -.5f
                                           .5f,   .5f,   .5f,   .5f,   1.5f, 1.5f, 1.5f, 1.5f};
 
 // Expands the paths of one pulse about the patch's blocks and sets their look-up windows. Returns the variant of the
-// pulse: a fast one only if every index is inside its window and every window inside the table, otherwise exact paths.
+// pulse: a fast variant only if every index is inside its window and every window inside the table; otherwise, exact
+// paths.
 template <bool kTerrain, bool kCurvature>
 inline Variant expand_paths(const ApertureJob& job, const Patch& patch, const OriginPaths& origin, int64_t pulse,
                             int64_t q, Batch& batch) {
@@ -103,7 +105,8 @@ inline Variant expand_paths(const ApertureJob& job, const Patch& patch, const Or
   }
   batch.row[q] = job.cells + (pulse + q) * 2 * (job.degree + 1) * job.width + int64_t(origin.whole[q]);
   if constexpr (kCurvature) return kOwnCurvature;
-  // Shared curvature depends only on the pixel's position in its block: computed once per pulse for all blocks.
+  // Shared curvature depends only on the position of a pixel in its block; it is computed once per pulse for all
+  // blocks.
   for (int64_t lane = 0; lane < 16; lane += kLanes) {
     const Lanes x = load(kLaneX + lane), y = load(kLaneY + lane);
     store(batch.shared_curvature[q] + lane, x * (x * origin.xx[q] + y * origin.xy[q]) + y * y * origin.yy[q]);
@@ -175,8 +178,8 @@ inline void add_pulses(const ApertureJob& job, const Patch& patch, const Batch& 
   if (count == 0) return;
   const Phase phase(job.phase_coefficients);
   // Path t of each pixel by (5b); its cell i = round(t) is in the low bits of t + 1.5 2^23, and u = t - i is the
-  // position in the cell. They are computed early to hide latency: with enough registers one pulse ahead, otherwise for
-  // all vectors of a pulse before its first look-up.
+  // position in the cell. Both are computed early to hide latency: one pulse ahead if there are enough registers,
+  // otherwise for all vectors of a pulse before its first look-up.
   Lanes place[kVectors];
   IntLanes index[kVectors];
   const auto find_place = [&](int64_t q, int64_t group, int64_t v) {
@@ -209,7 +212,7 @@ inline void add_pulses(const ApertureJob& job, const Patch& patch, const Batch& 
         const Lanes u = place[v];
         const IntLanes cell = index[v];
         if constexpr (kAhead) find_place(next, next_group, v);
-        // (2): the echo at the pixel's path, a_0 + a_1 u + a_2 u^2, including the carrier at the middle of the cell.
+        // (2): the echo at the pixel's path, a_0 + a_1 u + a_2 u^2, including the carrier at the centre of the cell.
         Lanes vr = re1[cell], vi = im1[cell], cosine, sine;
         if constexpr (kDegree == 2) vr += u * re2[cell], vi += u * im2[cell];
         vr = re0[cell] + u * vr, vi = im0[cell] + u * vi;

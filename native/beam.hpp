@@ -9,17 +9,17 @@
 namespace {
 
 constexpr int64_t kPlaneNodes = 9;  // 3 x 3 over the plane of a patch, row by row
-constexpr int64_t kNodes = 11;      // with heights: additionally the lowered and the raised middle
+constexpr int64_t kNodes = 11;      // with heights: also the lowered and the raised centre
 
 // Computation of a pulse's weight over a patch: pixel by pixel, by polynomials of its blocks, or zero.
 enum Weighing { kPixelwise, kSmooth, kDark };
 
 // Gains at the nodes of a patch and classification of the patch, for eight pulses.
 struct NodeGains {
-  alignas(64) float gain[kNodes][kBatch];             // of all antennas so far
+  alignas(64) float gain[kNodes][kBatch];             // product over the antennas processed so far
   alignas(64) float low[2][kBatch], high[2][kBatch];  // smallest, largest position in this antenna's two cuts
   alignas(64) float ahead[kBatch];                    // largest distance of the patch in front of this antenna
-  alignas(64) int32_t dark[kBatch], smooth[kBatch];   // true: no gain in the patch; true: all of it inside both cuts
+  alignas(64) int32_t dark[kBatch], smooth[kBatch];   // patch without gain; patch inside both cuts
 };
 
 // Vectors from antennas to a patch along the antenna axes, in cells: to its origin, and from node to node.
@@ -66,7 +66,7 @@ inline void mark_outside_cone(const BeamJob& beam, const BeamFrame& to, int32_t*
 // Multiplies (6) of one antenna into the gains at the nodes, and records the range of its cuts that they span.
 inline void sample_nodes(const BeamJob& beam, const Patch& patch, const BeamFrame& to, NodeGains& out) {
   for (int64_t node = 0; node < (patch.terrain ? kNodes : kPlaneNodes); node++) {
-    // Node (x, y) of the plane in half widths of the patch, or the lowered (h = -1) or raised (1) middle.
+    // Node (x, y) of the plane in half widths of the patch, or the lowered (h = -1) or raised (1) centre.
     const bool plane = node < kPlaneNodes;
     const float x = plane ? float(node % 3 - 1) : 0, y = plane ? float(node / 3 - 1) : 0;
     const float h = plane ? 0 : float(2 * (node - kPlaneNodes) - 1);
@@ -83,7 +83,7 @@ inline void sample_nodes(const BeamJob& beam, const Patch& patch, const BeamFram
       for (int64_t q = 0; q < kBatch; q++) {
         const float at = place[cut][q];
         out.gain[node][q] *= look_up(beam, cut, at);
-        out.low[cut][q] = node && !(at < out.low[cut][q]) ? out.low[cut][q] : at;  // a NaN at the origin stays
+        out.low[cut][q] = node && !(at < out.low[cut][q]) ? out.low[cut][q] : at;  // keeps a NaN at the origin
         out.high[cut][q] = node && !(at > out.high[cut][q]) ? out.high[cut][q] : at;
       }
   }
@@ -114,7 +114,7 @@ inline bool fit_weights(const Patch& patch, const float* g, float peak, int64_t 
     const float first = magnitude(c - a), second = magnitude(a - 2 * b + c);
     change = first <= change ? change : first, curvature = second <= curvature ? curvature : second;
   };
-  // Along each row of nodes: middle value, slope and curvature.
+  // Along each row of nodes: centre value, slope and curvature.
   for (int64_t i = 0; i < 3; i++) {
     compare(g[3 * i], g[3 * i + 1], g[3 * i + 2]), compare(g[i], g[3 + i], g[6 + i]);
     middle[i] = g[3 * i + 1], d_x[i] = 0.5f * (g[3 * i + 2] - g[3 * i]);

@@ -11,7 +11,7 @@ constexpr int64_t kBatch = 8;       // pulses whose paths are computed together
 constexpr int64_t kTaps = 16;       // taps of a table's filters
 constexpr int64_t kWindow = 16;     // table cells within reach of one look-up
 constexpr int64_t kEchoTaps = 8;    // samples that interpolate the echo at a single point
-constexpr int64_t kEchoDegree = 4;  // degree of the polynomials of their weights
+constexpr int64_t kEchoDegree = 4;  // degree of the polynomials of interpolation weights
 constexpr int64_t kTermTaps = 24;   // samples that interpolate an echo in float64
 // A path may be half a cell from the cell it is rounded to; the remainder covers errors of float32.
 constexpr float kWindowMargin = 0.51f;
@@ -22,7 +22,7 @@ constexpr float kWindowMargin = 0.51f;
 constexpr float kFifthOrder = 0.14f;            // D^5/R^4, with room for higher orders; the gradient adds delta D^4/R^4
 constexpr float kThirdOrder = 0.19f;            // delta^3/R^2
 constexpr float kSharedCurvatureError = 0.58f;  // D delta^2/R^2: three such terms, 1/sqrt 3
-constexpr float kOwnCurvatureError = 0.075f;    // D^2 delta^2/R^3: of six terms of 1/8 all but a tenth is in (5a)
+constexpr float kOwnCurvatureError = 0.075f;    // D^2 delta^2/R^3: a tenth of six terms of 1/8; (5a) contains the rest
 
 // Second-order terms change the path of a pixel in a block by at most 1.5^2 times their coefficients; those of the
 // origin bound those of the whole patch with a factor of two.

@@ -23,8 +23,8 @@ inline float total(Taps value) {
 
 // Position of a point in the samples of up to kRun pulses.
 struct Looks {
-  alignas(64) float u[kRun];                   // offset from the middle between the two nearest samples, in samples
-  alignas(64) float cosine[kRun], sine[kRun];  // of the carrier's phase, times the pulse's weight
+  alignas(64) float u[kRun];                   // offset from the midpoint between the two nearest samples, in samples
+  alignas(64) float cosine[kRun], sine[kRun];  // of the carrier phase, times the weight of the pulse
   alignas(64) int32_t first[kRun];             // first sample of the interpolation
 };
 
@@ -58,7 +58,7 @@ inline void look(const EchoJob& job, int64_t pixel, int64_t begin, int64_t count
     const double whole = (at - 0.5 + kWhole) - kWhole;
     looks.first[i] = int32_t(whole) - int32_t(kEchoTaps / 2 - 1);
     looks.u[i] = float(at - 0.5 - whole);
-    // Integer cycles are removed in float64; the phase of the rest follows from the half angle.
+    // Integer cycles are removed in float64; the phase of the remainder follows from the half angle.
     const double turns = path * job.turns_per_metre;
     float cosine, sine;
     half_turns(float(turns - ((turns + kWhole) - kWhole)), cosine, sine);

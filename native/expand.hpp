@@ -40,7 +40,7 @@ inline void filter(const TableJob& job, int64_t pulse, int64_t position, int64_t
         im[k] += taps[k * kTaps + tap] * y;
       }
     }
-    // exp(j k R_i) at the middle of the cell: the carrier of the pulse's first cell times that of the cell number.
+    // exp(j k R_i) at the centre of the cell: the carrier of the pulse's first cell times that of the cell number.
     const Lanes base_re = load(carrier + m), base_im = load(carrier + job.steps + m);
     const Lanes c = base_re * turn_re - base_im * turn_im, s = base_re * turn_im + base_im * turn_re;
     for (int64_t k = 0; k < kCoefficients; k++) {

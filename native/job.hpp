@@ -17,7 +17,7 @@ struct BeamJob {
 // Integration sector of the pixels, docs/theory/integration.md (1), (3) and (4).
 struct SectorJob {
   const double* axis[2];               // of transmitter and receiver, (3, padded)
-  double centre, inner, outer;         // of s; from `inner` to `outer` from the centre, the weight falls from 1 to 0
+  double centre, inner, outer;         // of s; the weight is 1 up to `inner` from the centre and 0 from `outer` on
   const double *end[2], *end_axis[2];  // (ends, 3): phase centres at the ends of the flight, and their axes
   int64_t ends;                        // 0: the sector of every pixel is centred on `centre`
 };
@@ -27,7 +27,7 @@ struct ApertureJob {
   const float* cells;         // (pulse, 2 (degree + 1), width): re, im of each polynomial coefficient
   const double* transmitter;  // (3, padded): pulses padded to a multiple of kBatch by repeating the last
   const double* receiver;     // (3, padded)
-  const double* first_path;   // (padded): total path at the middle of cell 0
+  const double* first_path;   // (padded): total path at the centre of cell 0
   const double* pixels;       // (rows, columns, 3)
   float* image;               // (rows, columns, 2): re, im
   int64_t* counts;            // pulses x patches by path variant: shared curvature, own curvature, exact path, none

@@ -125,7 +125,7 @@ struct WindowCells {
 };
 
 inline Lanes larger(Lanes a, Lanes b) { return a > b ? a : b; }   // b if a is NaN
-inline Lanes smaller(Lanes a, Lanes b) { return a < b ? a : b; }  // the same
+inline Lanes smaller(Lanes a, Lanes b) { return a < b ? a : b; }  // b if a is NaN
 inline Lanes nearest(Lanes value) { return (value + kRounder) - kRounder; }
 
 // 1 / value, with an error of a few units in the last place.

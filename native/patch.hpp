@@ -21,14 +21,14 @@ static constexpr int64_t pixel_column(int64_t slot) { return block_column(slot /
 static constexpr float half_span(int64_t count) { return count > 1 ? 0.5f * float(count - 1) : 0.5f; }
 
 // Lengths are in cells, except `origin` in metres. Pixel (i, j) is at origin + j step_x + i step_y + height up, with i
-// and j counted from the patch's middle; pixels are stored block by block, and row by row in a block.
+// and j counted from the centre of the patch; pixels are stored block by block, and row by row in a block.
 struct alignas(64) Patch {
   float along_x[kBlocks], along_y[kBlocks], height[kBlocks];   // centre of each block: pixels, pixels, cells
-  float square[kBlocks];                                       // |d|^2: squared distance of that centre from the origin
+  float square[kBlocks];                                       // |d|^2: squared distance of the centre from the origin
   float dot_x[kBlocks], dot_y[kBlocks], dot_h[kBlocks];        // d . step_x, d . step_y and d . up
   float rise[kPixels];                                         // h': height of each pixel above its block
-  float moved[kPixels];                                        // sector centre of each pixel less that of the job
-  float moved_b[kBlocks], moved_x[kBlocks], moved_y[kBlocks];  // the same at each block's centre, and its slopes
+  float moved[kPixels];                                        // sector centre of each pixel minus that of the job
+  float moved_b[kBlocks], moved_x[kBlocks], moved_y[kBlocks];  // `moved` at each block's centre, and its slopes
   float moved_mean, moved_reach, moved_bend;  // mean over the patch; largest deviations from it and from block slopes
   double origin[3], step_x[3], step_y[3], up[3];
   float xx, xy, yy, xh, yh;         // products of step_x, step_y and up

@@ -23,13 +23,13 @@ struct Leg {
 struct OriginPaths {
   Leg leg[2];
   alignas(64) double path[kBatch];     // in cells of the table
-  alignas(64) double whole[kBatch];    // its integer part
-  alignas(64) float fraction[kBatch];  // its fractional part
+  alignas(64) double whole[kBatch];    // integer part of `path`
+  alignas(64) float fraction[kBatch];  // fractional part of `path`
   alignas(64) float xx[kBatch], xy[kBatch], yy[kBatch], xh[kBatch], yh[kBatch], hh[kBatch];
   alignas(64) float curvature_bound[kBatch];                    // bound of the second-order terms inside a block
-  alignas(64) float first_window[kBatch], last_window[kBatch];  // limits of a window's first cell, from `whole`
-  alignas(64) float shared_error[kBatch];                       // largest, cells, with one curvature for all blocks
-  alignas(64) float own_error[kBatch];                          // largest, cells, with a curvature per block
+  alignas(64) float first_window[kBatch], last_window[kBatch];  // limits of a window's first cell, relative to `whole`
+  alignas(64) float shared_error[kBatch];                       // error bound with a common curvature, cells
+  alignas(64) float own_error[kBatch];                          // error bound with a curvature per block, cells
   alignas(64) int32_t linear_heights[kBatch];                   // 1: heights inside a block need no second-order terms
   alignas(64) int32_t holds[kBatch];                            // 2: shared curvature, 1: own curvature, 0: neither
 };

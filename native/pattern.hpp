@@ -22,7 +22,7 @@ inline float place_of(const BeamJob& beam, int64_t cut, float radians) {
   return (radians - float(beam.first_rad[cut])) * float(beam.samples_per_rad[cut]);
 }
 
-// The same for the direction (v0, v1, v2) along the antenna's axes: azimuth = atan2(v1, v0), elevation above it.
+// Positions in the cuts of the direction (v0, v1, v2) along the antenna axes: azimuth atan2(v1, v0), and elevation.
 inline float azimuth_place(const BeamJob& beam, float v0, float v1) { return place_of(beam, 0, angle(v1, v0)); }
 inline float elevation_place(const BeamJob& beam, float v0, float v1, float v2) {
   return place_of(beam, 1, angle(v2, __builtin_sqrtf(v0 * v0 + v1 * v1)));

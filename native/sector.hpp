@@ -13,7 +13,7 @@ enum Zone { kInside, kEdge, kEdgePixelwise, kOutside };
 struct SectorPlaces {
   alignas(64) float along[2][kBatch];    // w . a, in cells
   alignas(64) float inverse[2][kBatch];  // 1 / R, per cell
-  alignas(64) float place[kBatch];       // s of (1) at the origin, less the centre
+  alignas(64) float place[kBatch];       // s of (1) at the origin, minus the centre
   Zone zone[kBatch];
 };
 

@@ -1,5 +1,5 @@
 // Contribution of each pulse at each point in float64, by a long windowed sinc: the reference for certificates of the
-// engines, docs/theory.md (6). Without a compiled library, numpy computes the same.
+// engines, docs/theory.md (6). Without a compiled library, numpy computes the same values.
 #pragma once
 #include "bounds.hpp"
 #include "job.hpp"

@@ -36,16 +36,17 @@ struct TreeTile {
   float* weight;          // (pulse, kTreeWeights): gain of both antennas over the tile, set by the plan; null: no beams
   uint8_t* variant;       // (group): TreeVariant; groups that are not kByTree on entry are unchanged
   uint8_t* nodes;         // (subaperture, 2), level after level: nodes along ξ and η
-  // (leaf): virtual pulses that replace those of a leaf; 0: each pulse is summed itself. Between apertura_weigh_tree
-  // and the plan, 1 marks weights that jump from pulse to pulse, which exclude virtual pulses; zero on entry.
+  // (leaf): virtual pulses that replace those of a leaf; 0: each pulse is summed individually. Between
+  // apertura_weigh_tree and the plan, 1 marks weights that jump from pulse to pulse, which exclude virtual pulses; zero
+  // on entry.
   uint8_t* n_virtual_pulses;
   uint8_t* edge;  // (leaf): 1 if the edge of the sector crosses the tile; zero on entry
-  float* slope;   // (leaf, 3): for these leaves, change of depth along ξ, η and the pulses, per half of each
+  float* slope;   // (leaf, 3): for leaves at an edge, change of depth over half a tile along ξ and η, and half a leaf
   float* band;    // (subaperture, 2), level after level: (4b) along ξ and η, rad per half tile; by apertura_view_tree
   float* turn;    // (leaf, 2): carrier phase over half a leaf, rad, and (8b) in rad per metre; by apertura_view_tree
   double centre[3];
   double rest;        // mean square of the pixels' distances from the surface; set by apertura_rest_tree
-  double first_path;  // path of the first sample less that of the centre; set by the plan
+  double first_path;  // path of the first sample minus that of the centre; set by the plan
   double span,
       slope_rms;  // total path across the tile, and RMS of its slope, metres per half tile; by apertura_view_tree
   int64_t degree, rows, columns, row_slot, column_slot;
@@ -68,13 +69,13 @@ struct TreeJob {
   const double* supports;       // (kTreeNodes + 1): band supported by a number of nodes, rad per half tile
   const double* const* places;  // (kTreeSlots): nodes or pixels along an axis, -1 … 1
   const float* const* spread;   // (kTreeNodes + 1, kTreeSlots): (node, 2 padded): weights, each twice
-  const float* const* mix;      // (kTreeNodes + 1, kTreeSlots): (target, node): the same weights
+  const float* const* mix;      // (kTreeNodes + 1, kTreeSlots): (target, node): weights of `spread`
   TreeTile* tiles;
   int64_t pulses, length, up, lead, stride, count, levels, mono, phase_polynomial;
   int64_t taps_count, delay_terms;
   int64_t sizes[apertura::kTreeLevels];  // pulses of a subaperture
   int64_t curve_degrees[apertura::kTreeCurves];
-  double step, wavenumber, band;  // metres; 2 pi f / c; half the band in the same unit
+  double step, wavenumber, band;  // metres; 2 pi f / c, rad/m; half the band, rad/m
   double presum_error;            // tolerated (8b), rad RMS
   double node_error;              // tolerated relative RMS error of one interpolation between nodes
   const BeamJob* beam[2];         // as in ApertureJob, with axes of stride `pulses`

@@ -137,7 +137,7 @@ inline Slopes slopes_at(const Legs& legs, const Lattice& lattice) {
   return out;
 }
 
-// Paths of one pulse to the points of a tile, less the path to its centre.
+// Paths of one pulse to the points of a tile, minus the path to its centre.
 struct Reach {
   alignas(64) float extra_path[kLattice];
   double low, high;  // bounds over the tile, relative to the centre

@@ -147,7 +147,7 @@ inline void merge(const TreeJob& job, TileState& state, const Nodes& from, int64
   });
 }
 
-constexpr int64_t kStrip = 16;  // rows of pixels per strip; strips are formed one after the other
+constexpr int64_t kStrip = 16;  // rows of pixels per strip; strips are formed sequentially
 
 // Restores the mixed part m of (3) at the pixels of a row, and adds `pairs` to the image.
 inline void add_row(const TreeJob& job, const TileState& state, const Legs& shared, const float* along_xi,

@@ -62,7 +62,7 @@ inline Lanes leg_path(const float* w, float square, float range, Lanes x, Lanes 
   return extra_path(x * w[0] + (y * w[1] + (z * w[2] + d2)), square, range);
 }
 
-// Path to a point less that to the centre, metres.
+// Path to a point minus the path to the centre, metres.
 template <bool kMono = false>
 inline Lanes path(const Legs& legs, Lanes x, Lanes y, Lanes z, Lanes d2) {
   const Lanes out = leg_path(legs.transmitter, legs.squares[0], legs.ranges[0], x, y, z, d2);

@@ -195,7 +195,7 @@ inline Leaves leaves_of(const TreeJob& job, const TreeTile& tile, const Lattice&
   return leaves;
 }
 
-// Slopes of m of (3): those of the chunk's middle pulse less their values on the axes.
+// Slopes of m of (3): slopes at the middle pulse of the chunk minus their values on the axes.
 inline Slopes mixed_slopes(const TreeJob& job, const TreeTile& tile, const Lattice& lattice) {
   Slopes mixed = slopes_at(shared_legs(job, tile), lattice);
   for (int64_t n = 0; n < lattice.count; n++)
@@ -249,7 +249,7 @@ inline bool plan_level(const TreeJob& job, TreeTile& tile, const Lattice& lattic
     if (edge) wide_xi += widened(job, slope_xi, wide_xi), wide_eta += widened(job, slope_eta, wide_eta);
     const int64_t xi = nodes_for(job, wide_xi), eta = nodes_for(job, wide_eta);
     if (level == 0 && edge && (xi > kTreeNodes || eta > kTreeNodes)) {
-      tile.variant[begin / kTreeGroup] = kDirectly;  // only this leaf: the edge is too steep
+      tile.variant[begin / kTreeGroup] = kDirectly;  // the edge is too steep in this leaf only
       continue;
     }
     holds &= xi <= kTreeNodes && eta <= kTreeNodes;

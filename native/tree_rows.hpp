@@ -10,7 +10,7 @@ constexpr int64_t kRows = 16;  // pulses expanded at once, so that the second-le
 struct Rows {
   int64_t first[kRows], samples = 0;
   Floats held, cells, gain, cosines, sines;
-  int64_t low = 0, high = 0;  // sample range of the carrier; it is counted from sample 0, so that tiles do not matter
+  int64_t low = 0, high = 0;  // sample range of the carrier from sample 0, which is independent of tiles
 };
 
 // Computes the carrier exp(j k r), with r from sample 0 of a profile, at the samples of all rows.

@@ -18,7 +18,7 @@ constexpr int64_t kBetween = 5;          // points along an axis at which the po
 constexpr int64_t kChecked = 8;          // every kChecked-th pulse is checked
 constexpr int64_t kCurve = 6;            // polynomial terms of weights over the pulses of a leaf
 constexpr double kLargest = 3;           // ratio of the largest error and the RMS error
-constexpr double kPlaceError = 2e-6;     // error of s by float32
+constexpr double kPlaceError = 2e-6;     // error of s due to float32
 
 // Geometry of a pulse or virtual pulse over a tile: paths, and axes of the sector.
 struct Look {
@@ -81,7 +81,7 @@ inline double length_of(const double* v, int64_t step) {
 }
 
 // Term of (4) of integration.md that determines c: the sector's centre s_0, the limit s_1 + S' or s_2 - S' of the flown
-// range, or their middle m; undecided if two terms differ by less than the variation of s between points.
+// range, or their midpoint m; undecided if two terms differ by less than the variation of s between points.
 enum CentreTerm { kUndecided, kOwn, kFirstFlown, kLastFlown, kMiddle };
 
 inline CentreTerm centre_term(const SectorJob& sector, const Flown& flown, double margin) {

@@ -1,4 +1,4 @@
-"""Logs in the formats of autopilots, from the public descriptions of ULog and DataFlash, of a known flight."""
+"""Logs of a known flight in the formats of autopilots, after the public descriptions of ULog and DataFlash."""
 
 import struct
 
@@ -69,7 +69,7 @@ def boot_us(time_s, late_s=LAG_S):
 
 
 def ulog_receiver(*, old=True, epochs=60, **changes):
-    """Return fields of a receiver's topic as in PX4 until 1.13, or since; a change to None removes a field."""
+    """Return the fields of a receiver's topic in PX4 up to 1.13, or later; a change to None removes a field."""
     time, geodetic, _ = flight(epochs)
     names = ("lat", "lon", "alt", "alt_ellipsoid")
     scales, kind = (1e-7, 1e-7, 1e-3, 1e-3), "int32_t"
@@ -123,7 +123,7 @@ def ulog_fused(epochs=60, **changes):
     return fields | {name: (fields[name][0], np.asarray(values)) for name, values in changes.items()}
 
 
-# DataFlash: FMT messages name the columns; binary messages begin with a3 95 and their type
+# DataFlash: FMT messages define the columns; binary messages begin with a3 95 and the message type
 
 _FMT = ("BBnNZ", "Type,Length,Name,Format,Columns")
 _FORMS = {

@@ -46,7 +46,7 @@ RECEIVED = Impairments(
     radar_snr_db=10.0,
     sidelink_snr_db=30.0,
 )
-"""Impairments of the receiver's channels per subcarrier; 37 dB for a compressed pulse."""
+"""Impairments of the receiver's channels; SNR per subcarrier, which corresponds to 37 dB for a compressed pulse."""
 
 
 def cabled(
@@ -86,7 +86,7 @@ class Setup:
     Attributes
     ----------
     flags
-        At least one of these must be raised; an empty set: no flag at all.
+        Flags of which at least one must be raised; if the set is empty, no flag may be raised.
     """
 
     flags: frozenset[str]
@@ -94,7 +94,7 @@ class Setup:
     spoil: Callable[[Path], None] = lambda _: None
 
     def write(self, folder: Path, seed: int) -> Path:
-        """Simulate the set-up into a new folder, without flight logs."""
+        """Write a simulation of the set-up to a new folder, without flight logs."""
         root = write_campaign(folder, self.specification, np.random.default_rng(seed))
         for log in (root / "raw" / FLIGHT).glob("*.track.*"):
             log.unlink()
@@ -104,7 +104,7 @@ class Setup:
 
 
 def samples_of(root: Path, node: str) -> tuple[Path, Path, dict, NDArray[np.int16]]:
-    """Return both paths, the metadata and the samples (capture, sample, channel, 2) int16 of a node."""
+    """Return the paths of both files, the metadata and the samples (capture, sample, channel, 2) int16 of a node."""
     meta, data = (root / "raw" / FLIGHT / f"{node}.sigmf-{kind}" for kind in ("meta", "data"))
     described = json.loads(meta.read_text(encoding="utf-8"))
     channels = described["global"].get("core:num_channels", 1)
@@ -299,4 +299,4 @@ SPOILT = {
     "another transmitter": Setup(frozenset({"interference"}), spoil=channel(RECEIVER, 0, _tone)),
     "split unequal": Setup(frozenset({"splitter_channels_differ"}), spoil=_split),
 }
-"""Fault → a set-up with it, and the flags that report it."""
+"""Fault → a set-up with this fault, and the flags that report the fault."""

@@ -1,6 +1,6 @@
-"""Shared campaigns (real ones next to the repository, simulated ones generated once per run) and slow-test markers.
+"""Shared campaigns (real campaigns next to the repository, simulated campaigns) and markers of slow tests.
 
-Nothing of apertura is imported before a test needs it: the process that only distributes tests reads this file, too.
+Nothing of apertura is imported before a test needs it: the process that only distributes tests also reads this file.
 """
 
 import fcntl
@@ -14,12 +14,12 @@ import pytest
 # Arrays in tests are small, and a test has one core: idle BLAS threads took a third of the total time.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-# These files run in other environments: that of roc-validator, that of QGIS.
+# These files run in the environments of roc-validator and of QGIS.
 collect_ignore = ["crate/contexts.py", "crate/profile", "in_qgis.py"]
 
 
 COMPILING = {"apertura.core.imaging.backproject.backproject", "apertura.core.imaging.judgement.judge"}
-"""Doctests marked slow, because they start the compiler of numba."""
+"""Doctests that are marked slow because they start the compiler of numba."""
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -127,12 +127,12 @@ def finished_sample(shared, all_steps, tmp_path_factory):
     from folders import copy_writable, state
 
     campaign = copy_writable(shared / "campaign-sample", tmp_path_factory.mktemp("sample") / "campaign")
-    state(campaign, "scene", atmosphere={"refractivity_n": 0.0})  # the model that generated it assumes vacuum
+    state(campaign, "scene", atmosphere={"refractivity_n": 0.0})  # the generating model assumes vacuum
     return all_steps("sample", campaign)
 
 
 def pytest_generate_tests(metafunc):
-    """Run tests with `isa` on every instruction set of the compiled engine; only the one selected here is quick."""
+    """Run tests with `isa` on every instruction set of the compiled engine; only the default set is quick."""
     if "isa" in metafunc.fixturenames:
         from apertura.core.backprojection.engines import native, native_binding
 
@@ -162,7 +162,7 @@ def toy(monkeypatch):
 
 @pytest.fixture(params=["here", pytest.param("isolated", marks=pytest.mark.slow)])
 def reader(request, monkeypatch):
-    """Run readers that may crash in this process (fast); in `make test-slow` also in a process of their own."""
+    """Run readers that may crash in this process (fast); in `make test-slow`, also in a separate process."""
     if request.param == "here":
         from in_this_process import Processes
 

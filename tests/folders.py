@@ -114,7 +114,7 @@ def make_images(campaign: Campaign, flight: str) -> None:
 
 
 STAND_ON_ALL = frozenset({"mosaic", "map", "stac", "ro_crate"})
-"""Results that depend on every image of a campaign."""
+"""Results that depend on all images of a campaign."""
 
 
 def export_flight(campaign: Campaign, flight: str) -> None:
@@ -189,7 +189,7 @@ def edit_meta(root: Path, node: str, change: Callable[[dict[str, Any]], object])
 
 
 def edit_data(root: Path, node: str, change: Callable[[np.ndarray], object]) -> None:
-    """Rewrite the samples and their hash, so that only the content reveals the damage."""
+    """Rewrite the samples and their hash, so that the damage is observable only in the content."""
     path = root / "raw" / "f01" / f"{node}.sigmf-data"
     samples = np.fromfile(path, "<i2")
     change(samples)
@@ -219,7 +219,7 @@ def small_simulation(
     pulses: int = 6,
     **flight: Any,
 ) -> CampaignSpecification:
-    """Return a specification of two nodes: low sampling rate and 2 ms pulse interval keep recordings small."""
+    """Return a specification of two nodes: a low sampling rate and pulses every 2 ms keep recordings small."""
     waveform = WaveformSpecification(64, 1.2e9 + 4567e3, 250e3, 5e-6, 2e-6, 32e6, 500.0)
     tracks = {"a": Straight((-2.0, -11.0, 5.0), (5.0, 0.0, 0.0)), "b": Straight((2.7, -11.0, 5.0), (5.0, 0.0, 0.0))}
     targets = (PointTarget((0.0, 0.0, 0.0)), PointTarget((1.0, 2.0, 0.5), 0.5))
@@ -286,6 +286,6 @@ def finished(process: subprocess.Popen[str], timeout: float = 600) -> tuple[int,
 
 
 def apertura(*words: object, **popen: Any) -> subprocess.Popen[str]:
-    """Start the command line in a process of its own."""
+    """Start the command line in a separate process."""
     command = [str(Path(sys.executable).parent / "apertura"), *map(str, words)]
     return subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **popen)

@@ -1,4 +1,4 @@
-"""Script for a Python with QGIS, never imported: report how QGIS reads rasters, sample and draw them.
+"""Script for a Python with QGIS, never imported: report how QGIS reads rasters; sample and draw the rasters.
 
 Requests come as JSON on stdin: {"tell": [raster], "sample": {raster: [[x, y]]}, "draw": {raster: [png, width]}}.
 """
@@ -42,7 +42,7 @@ def described(path: str) -> dict[str, object]:
     }
     root = QgsProject.instance().layerTreeRoot()
     QgsProject.instance().addMapLayer(layer)
-    model = QgsLayerTreeModel(root)  # must outlive its nodes
+    model = QgsLayerTreeModel(root)  # must exist longer than its nodes
     nodes = model.layerLegendNodes(root.findLayer(layer.id()))
     properties["legend"] = [node.data(Qt.DisplayRole) for node in nodes if isinstance(node, QgsRasterSymbolLegendNode)]
     ramps = [node.settings() for node in nodes if isinstance(node, QgsColorRampLegendNode)]
@@ -61,7 +61,7 @@ def described(path: str) -> dict[str, object]:
 
 def sampled(path: str, places: list[tuple[float, float]]) -> list[float | None]:
     """Return the values of the pixels at points (x, y) in the raster's own CRS; None without a value."""
-    layer = QgsRasterLayer(path, "raster")  # must outlive its provider
+    layer = QgsRasterLayer(path, "raster")  # must exist longer than its provider
     provider = layer.dataProvider()
     samples = [provider.sample(QgsPointXY(x, y), 1) for x, y in places]
     return [value if valid else None for value, valid in samples]

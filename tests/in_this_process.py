@@ -16,11 +16,11 @@ class Processes:
 
     @staticmethod
     def run(command, **_):
-        """Run ``python … -m module words`` in this process, without the resource limits that it sets itself."""
+        """Run ``python … -m module words`` in this process, without the resource limits that the module sets."""
         words, stderr, status = command[command.index("-m") + 1 :], StringIO(), 0
         with patch.object(sys, "argv", words), patch("resource.setrlimit"), redirect_stderr(stderr):
             try:
-                with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # it is imported already
+                with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # already imported
                     runpy.run_module(words[0], run_name="__main__")
             except SystemExit as end:
                 status = int(end.code or 0)

@@ -1,4 +1,4 @@
-"""Programs that open a raster: the georeferencing that each reports, and its value of a pixel at a point."""
+"""Programs that open a raster: the georeferencing and the pixel value at a point that each program reports."""
 
 import functools
 import json
@@ -13,7 +13,7 @@ import numpy as np
 import rasterio
 
 QGIS = Path("/usr/bin/python3")
-"""A Python that may have QGIS: the system's, since that of the tests has no system modules."""
+"""Python interpreter that may have QGIS: that of the system, because the tests run without system modules."""
 
 Place = tuple[float, float]
 
@@ -25,12 +25,12 @@ def have_qgis() -> bool:
 
 
 def have_gdal() -> bool:
-    """Return True if GDAL's own programs are installed (another version than rasterio's)."""
+    """Return True if the programs of GDAL are installed (the version differs from that of rasterio)."""
     return shutil.which("gdalinfo") is not None and shutil.which("gdallocationinfo") is not None
 
 
 def _outside(*command: str | Path, given: str = "") -> "subprocess.CompletedProcess[str]":
-    """Run a system program in the system's environment, not in that of the tests."""
+    """Run a system program in the environment of the system instead of that of the tests."""
     kept = {name: os.environ[name] for name in ("PATH", "HOME", "LANG", "TMPDIR") if name in os.environ}
     # PAM off: statistics are not written next to the file.
     return subprocess.run(
@@ -58,7 +58,7 @@ def by_rasterio(path: Path) -> dict[str, Any]:
 
 
 def by_rioxarray(path: Path) -> dict[str, Any]:
-    """Return the same; the transform follows from the coordinates of the pixel centres."""
+    """Return the values of `by_rasterio`; the transform follows from the coordinates of the pixel centres."""
     import rioxarray
 
     with rioxarray.open_rasterio(str(path)) as raster:
@@ -74,7 +74,7 @@ def by_rioxarray(path: Path) -> dict[str, Any]:
 
 
 def by_gdal(path: Path) -> dict[str, Any]:
-    """Return the same as reported by ``gdalinfo``."""
+    """Return the values of `by_rasterio` as reported by ``gdalinfo``."""
     report = json.loads(_outside("gdalinfo", "-json", path).stdout)
     west, right, _, north, _, down = report["geoTransform"]
     return {
@@ -116,7 +116,7 @@ def sampled_by_gdal(paths: Mapping[Path, Sequence[Place]]) -> dict[Path, list[co
 
 
 def sampled_by_qgis(paths: Mapping[Path, Sequence[Place]]) -> dict[Path, list[complex]]:
-    """Return the values of pixels at points, of real rasters only: QGIS returns none of complex ones."""
+    """Return the values of pixels at points, of real rasters only: QGIS returns no values of complex rasters."""
     real = {str(path): places for path, places in paths.items() if not path.stem.endswith("slc")}
     answer = ask_qgis(sample=real)["sampled"]
     return {Path(path): [np.nan if value is None else value for value in values] for path, values in answer.items()}

@@ -35,7 +35,7 @@ def without_library(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def ground_points(size_m: float = 10.0, *, north_m: float = 20.0, count: int = 5) -> NDArray[np.float64]:
-    """Return (count, count, 3) points on flat ground north of the track, rows from north to south."""
+    """Return (count, count, 3) points on flat ground north of the track, in rows from north to south."""
     east, north = np.meshgrid(np.linspace(-size_m / 2, size_m / 2, count), north_m + np.linspace(size_m, 0, count))
     return np.stack([east, north, 0 * east], -1)
 
@@ -53,7 +53,7 @@ def monostatic(track_m: NDArray[np.float64]) -> Aperture:
 
 
 def planning_job(**changes: Any) -> Job:
-    """Return the planner's job for that flight, 400 MHz at 1.2 GHz."""
+    """Return the planner's job for the straight flight, with 400 MHz at 1.2 GHz."""
     signal = Signal(1.2e9, 2.0, C / 800e6, 120)
     plain = Job(
         monostatic(straight_track()), ground_points(), (200, 200), 0.05, 1.2e9, 400e6, 512, signal, frame="local"
@@ -62,7 +62,7 @@ def planning_job(**changes: Any) -> Job:
 
 
 def plan(accuracy_db: float = -60.0, *, overrides: Mapping[str, Any] | None = None, **changes: Any) -> Plan:
-    """Return the plan of that flight."""
+    """Return the plan of the straight flight."""
     return make_plan(planning_job(**changes), accuracy_db=accuracy_db, overrides=overrides)
 
 
@@ -77,7 +77,7 @@ TARGET_GRID = SceneGrid("local", -4.0, 4.0, 0.05, (160, 160))
 
 
 def point_history(pulses: int = 96) -> PhaseHistory:
-    """Return echoes of `TARGET` from a straight track 20 m south of the middle of `TARGET_GRID`."""
+    """Return echoes of `TARGET` from a straight track 20 m south of the centre of `TARGET_GRID`."""
     frequency = 1.2e9 + 2e6 * np.arange(200)
     along = np.linspace(-4, 4, pulses)
     track = np.stack([along, np.full(pulses, -20.0), np.full(pulses, 10.0)], -1)
@@ -87,7 +87,7 @@ def point_history(pulses: int = 96) -> PhaseHistory:
 
 
 def strip_history(aperture: Aperture, targets_m: NDArray[np.float64], subcarriers: int = 64) -> PhaseHistory:
-    """Return echoes of targets (target, 3) recorded on any flight, 96 MHz about 1.25 GHz."""
+    """Return echoes of targets (target, 3) along any aperture, with a band of 96 MHz about 1.25 GHz."""
     frequency = 1.2e9 + 1.5e6 * np.arange(subcarriers)
     echo = transfer(Scatterers(targets_m, np.ones(len(targets_m))), aperture, frequency, spreading=False)
     weight = np.full(subcarriers, 1 / subcarriers)
@@ -150,7 +150,7 @@ def fly(
     carrier_hz: float = 1.2e9,
     range_m: float = 12.0,
 ) -> Scene:
-    """Return echoes of targets (local metres, around x = range_m) from height range_m, aperture equal to the range."""
+    """Return echoes of targets (local metres, around x = range_m) from a height and with an aperture of range_m."""
     along = np.linspace(-0.5, 0.5, pulses)[:, None] * range_m
     bend = np.sin(np.linspace(0, 7, pulses))[:, None]
     tx = ecef(np.hstack([0.03 * bend, along, range_m + 0.05 * bend]))
@@ -207,7 +207,7 @@ def side_beam(
     pulses: int = 300,
     cutoff_db: float = -20.0,
 ) -> Beam:
-    """Return a beam to the left of a body that flies east: northward."""
+    """Return a beam to the left (north) of a body that flies east."""
     body = np.broadcast_to(np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), (pulses, 3, 3))
     cuts = (
         gaussian_cut(w, cutoff_db=cutoff_db, limit_rad=x) for w, x in zip(width_deg, (np.pi, np.pi / 2), strict=True)
@@ -235,6 +235,6 @@ def swaying_beam(
 
 
 def hard_beam(soft: Beam, half_deg: float) -> Beam:
-    """Return a beam with the same axes and unit gain out to `half_deg`."""
+    """Return a beam with the same axes and unit gain up to `half_deg`."""
     angle = np.radians([-half_deg, 0, half_deg])
     return Beam(soft.axes, angle, np.ones(3), angle, np.ones(3))

@@ -1,4 +1,4 @@
-"""The GPU engine in numba's simulator against the double sum: run by a test in a process of its own.
+"""The GPU engine in numba's simulator against the double sum: run by a test in a separate process.
 
 The simulator must be requested before numba is imported, and would affect other tests. To run it manually:
 NUMBA_ENABLE_CUDASIM=1 python -m pytest -n0 tests/simulated_device.py
@@ -49,7 +49,7 @@ def plain():
 
 @pytest.fixture(scope="module")
 def tables(plain):
-    """Tables on the device, shared by all tests: in the simulator they take longer than an image."""
+    """Tables on the device, shared by all tests, because the simulator computes them more slowly than an image."""
     return cuda.prepare(plain[2])
 
 
@@ -67,7 +67,7 @@ def predicted_db(scene, pixels, profiles, beams=None, **requested):
 
 @pytest.mark.parametrize(("bistatic", "rough_m"), [(True, 0.3), (False, 0.0)])
 def test_error_stays_within_prediction(bistatic, rough_m):
-    """On any surface: pixels need not lie on or near a plane."""
+    """The prediction holds for any surface; pixels need not lie near a plane."""
     pixels = pixel_grid(16, 18)
     pixels[..., 2] = rough_m * np.random.default_rng(6).standard_normal((16, 18))
     scene = fly(scatter(pixels), pulses=PULSES, bistatic=bistatic)
@@ -80,7 +80,7 @@ def test_error_stays_within_prediction(bistatic, rough_m):
 
 @pytest.mark.parametrize(("range_m", "tolerance_rad"), [(4.0, 1.5e-3), (4.0, 1e-9), (0.6, 1.5e-3)])
 def test_near_ranges_and_small_tolerances_use_exact_paths(range_m, tolerance_rad):
-    """At 4 m by the series or in float64 alone; at 0.6 m the series does not converge."""
+    """At 4 m, paths are computed by the series or in float64 only; at 0.6 m, the series does not converge."""
     pixels = pixel_grid(16, 16, range_m=range_m)
     scene = fly(scatter(pixels), range_m=range_m, pulses=6)
     profiles = scene.profiles(ecef(pixels))
@@ -107,7 +107,7 @@ def test_tiles_and_threads_are_bitwise_equal(plain, tables):
 
 
 def test_slices_and_copies_of_tables_sum_their_pulses(plain, tables):
-    """A slice shares the arrays on the device; a copy in another process makes its own."""
+    """A slice shares the arrays on the device; a copy in another process creates new arrays."""
     places = ecef(plain[1])[:, :16]
     whole = cuda.form(tables, places)
     parts = [tables[0:10], tables[2:][8:]]
@@ -142,7 +142,7 @@ def test_pixel_without_position_is_nan_and_affects_no_other(plain, tables, nowhe
 
 
 def test_pixels_beyond_the_profiles_are_zero_and_others_unchanged(plain, tables):
-    """Beyond all profiles; and where truncated profiles end inside the patch."""
+    """Pixels beyond all profiles, and pixels behind the end of truncated profiles inside a patch."""
     scene, pixels, profiles = plain
     far = ecef(pixels)
     far[:, 16:] += 1000.0
@@ -199,7 +199,7 @@ def weights_of(scene, places, kind):
     ],
 )
 def test_weighted_pulses_match_the_double_sum(kind, bistatic, rough_m, tolerance_rad):
-    """By series with weights in float32, and by exact paths with weights in float64; on any surface."""
+    """Paths by series with weights in float32, and exact paths with weights in float64, on any surface."""
     pixels = pixel_grid(16, 18)
     pixels[..., 2] = rough_m * np.random.default_rng(6).standard_normal((16, 18))
     places = ecef(pixels)
@@ -218,14 +218,14 @@ def test_weighted_pulses_match_the_double_sum(kind, bistatic, rough_m, tolerance
     predicted_error_db = predicted_db(scene, pixels, profiles, beams, oversampling=6, tolerance_rad=tolerance_rad)
     assert -80 < predicted_error_db < -70
     assert decibels(image - truth, truth) <= predicted_error_db + 3
-    assert decibels(reference.form(scene.history(), places) - truth, truth) > -20  # the weights matter
+    assert decibels(reference.form(scene.history(), places) - truth, truth) > -20  # the weights have an effect
     summed = counts[0] if tolerance_rad > 1e-6 else counts[1]
     assert counts.sum() == weight.size
     assert (weight != 0).sum() <= summed == counts[:2].sum()
 
 
 def test_sector_finer_than_float32_is_weighted_exactly():
-    """An edge 4e-5 wide across a patch at 28 km: s is computed from its change over the patch, not as a whole."""
+    """An edge 4e-5 wide across a patch at 28 km: s is computed relative to its value at the patch origin."""
     pixels = pixel_grid(16, 16, range_m=20e3)
     scene = fly(scatter(pixels), range_m=20e3, pulses=8)
     places, profiles = ecef(pixels), scene.profiles(ecef(pixels))
@@ -283,7 +283,7 @@ def steady(scene, turn_deg, width_deg=8.0):
 
 
 def veering(sector, flown, place):
-    """Return the same sector for a flight that heads for its middle for some pulses at the end of each 64."""
+    """Return the same sector for a flight that heads for the scene for some pulses at the end of each group of 64."""
     axes = []
     for leg, axis in zip(flown.legs, (sector.tx_axis, sector.rx_axis), strict=True):
         toward = (place - leg) / np.linalg.norm(place - leg, axis=1, keepdims=True)
@@ -292,7 +292,7 @@ def veering(sector, flown, place):
 
 
 def ending_near(sector, scene, place):
-    """Return the same sector, centred by a pulse so near that its s changes more over a patch than that of others."""
+    """Return the same sector, centred on a near pulse, whose s changes more over a patch than s of other pulses."""
     near_position = ecef(np.array([12.0, 0.0, 2.0]))[None]
     along = (ecef(np.array([0.7, 0.7, 0.0])) - ecef(np.zeros(3)))[None] / 2
     end = Sector(along, along, 0.0, sector.half)
@@ -312,7 +312,7 @@ def ending_near(sector, scene, place):
     ],
 )
 def test_excluded_pulses_change_no_bit(long, kind):
-    """Whole chunks and single pulses are excluded, also chunks whose middle is excluded and whose ends are not."""
+    """Whole chunks and single pulses are excluded, also the middle pulses of chunks whose ends contribute."""
     scene, places, tables = long
     flown = Aperture(scene.tx, scene.rx)
     sector = Sector.of(flown, chord_m=1.2, centre=0.0, half=0.03)
@@ -362,7 +362,7 @@ def test_more_chunks_than_threads_are_checked_in_groups(long):
 
 @compiled
 def test_unilluminated_pixels_match_the_compiled_engine(plain, tables):
-    """Their value is zero, which the steps write as no data."""
+    """Pixels that no pulse illuminates are zero; the steps write these as no data."""
     scene, pixels, profiles = plain
     places, flown = ecef(pixels), Aperture(scene.tx, scene.rx)
     beams = Beams(None, hard_beam(swaying_beam(scene.rx, (11.8, 0, 0), sway_deg=1), 0.8))
@@ -428,7 +428,7 @@ def test_simulator_is_used_only_on_request():
 
 
 def test_device_error_is_one_message(plain, monkeypatch):
-    """A device without memory, or one that fails: numba.cuda's own error, as raised by drivers."""
+    """The device has no memory or fails: numba.cuda raises its own error, as with real drivers."""
     from numba import cuda as numba_cuda
     from numba.cuda.cudadrv.driver import CudaAPIError
 

@@ -1,6 +1,6 @@
 """`python tests/snakemake_jobs.py OPTIONS`: snakemake, printing every planned job as a line of JSON.
 
-With a message Snakemake prints that instead of a job's inputs and outputs; a logger plugin receives all of them.
+For a rule with a message, Snakemake prints the message instead of inputs and outputs; a logger plugin receives all.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Atomic writes: a file or folder is complete or absent, with several writers and with killed ones."""
+"""Atomic writes: a file or folder is complete or absent, also with several writers and with killed writers."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""Model of the config, its generated files, and the values that it rejects."""
+"""Model of the config: generated files and rejected values."""
 
 import json
 import re
@@ -119,7 +119,7 @@ def test_iq_order_of_a_node_overrides_that_of_sampled_waveforms():
 
 
 def test_stage_depends_only_on_its_own_settings(finished_tiny):
-    """A step that depended on the complete config would rerun without need."""
+    """A step that depends on the complete config would be rerun unnecessarily."""
     everything = {*Settings.model_json_schema()["properties"], *Processing.model_json_schema()["properties"]}
     of = {"scene": ()}
     stages = {

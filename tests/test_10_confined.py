@@ -1,4 +1,4 @@
-"""Confinement of a campaign folder: nothing is read, written or deleted outside it, whatever links it contains."""
+"""Confinement of a campaign folder: nothing outside is read, written or deleted, whatever links exist."""
 
 import ast
 import os
@@ -119,7 +119,7 @@ def test_clearing_a_work_folder_removes_links_but_not_targets(root, outside):
 
 
 def test_folder_swapped_for_a_link_during_a_write_is_safe(root, outside):
-    """The write goes to the descriptor of the folder that was created, wherever its name leads meanwhile."""
+    """The write uses the descriptor of the created folder, even if the name of the folder leads elsewhere."""
     folder, before = Path(root) / "results" / "f01", state_of(outside)
 
     def written():

@@ -47,14 +47,14 @@ def anywhere(name):
 
 
 def exists(name, document):
-    """A path is relative to the root, src/apertura or the document; a bare name may be anywhere in the code."""
+    """Return True if a path exists below the root, src/apertura or the document's folder, or a bare name anywhere."""
     if any(any(place.glob(name.rstrip("/"))) for place in (*PLACES, document.parent)):
         return True
     return "/" not in name and anywhere(name)
 
 
 def missing(lacking_in, documents=DOCUMENTS):
-    """Return the missing references of documents that have any."""
+    """Return document → missing references, for documents with missing references."""
     assert len(documents) > 20
     lacking = {document.relative_to(ROOT).as_posix(): sorted(lacking_in(document)) for document in documents}
     return {document: names for document, names in lacking.items() if names}
@@ -145,7 +145,7 @@ def test_config_keys_in_documents_exist():
     keys = {key for part in parts for key in part.get("properties", {})} | {"native", "numba", "cuda", "reference"}
 
     def lacking(document):
-        config, *_ = text_of(document).split("\n## image.json")  # without image.json, whose keys are those of results
+        config, *_ = text_of(document).split("\n## image.json")  # without image.json, whose keys are not config keys
         named = {word for key in _KEY.findall(config) for word in key.split(".")}
         return {word for word in named if not word.startswith("<")} - keys
 

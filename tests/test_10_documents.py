@@ -1,4 +1,4 @@
-"""Reading of YAML and JSON files: any content is read within limits or rejected in one short message."""
+"""Reading of YAML and JSON files: any content is read within limits or rejected with one short message."""
 
 import pickle
 import time

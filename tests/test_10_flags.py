@@ -1,4 +1,4 @@
-"""Table of flags: only flags of the table can be raised, and each is raised where the table states."""
+"""Table of flags: only flags of the table can be raised, and each flag is raised in the file that the table states."""
 
 import pickle
 import re
@@ -15,7 +15,7 @@ SOURCES = {path.relative_to(ROOT / "src/apertura").as_posix(): path for path in 
 
 
 def test_flag_outside_the_table_cannot_be_raised():
-    """By any method of setting it: every flag in a product has an explanation."""
+    """The check applies to all ways of setting a flag, so that every flag in a product has an explanation."""
     flags = Flags(dict.fromkeys(FLAGS, "measured"))
     for raise_it in (
         lambda: Flags({"clipped": "3 %"}),
@@ -61,7 +61,7 @@ def test_generated_pages_are_up_to_date():
 
 
 def test_texts_of_a_flag_raised_twice_are_merged():
-    """The union of dicts keeps the last text and silently drops the other."""
+    """The union of two dicts would keep only the last text."""
     merged = Flags.merged(
         {"saturated_radar": "tx: 3 %"}, {"fix_quality_low": "9 pulses"}, {"saturated_radar": "rx: 40 %"}
     )

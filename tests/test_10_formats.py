@@ -1,4 +1,4 @@
-"""docs/formats.md against the code: it lists every key, column, format and kind that is read, and no other."""
+"""docs/formats.md against the code: the page lists exactly the keys, columns, formats and kinds that are read."""
 
 import json
 import re

@@ -29,7 +29,7 @@ def test_picture_is_small_and_not_empty(name):
 
 @pytest.mark.parametrize(("cell", "mode"), [(66, "RGB"), (12, "P")])
 def test_picture_keeps_full_colour_below_the_limit(monkeypatch, tmp_path, cell, mode):
-    """Cells of random colours: 60 of them fit into 60 kB in full colour, 1815 do not."""
+    """Cells of random colours: 60 cells fit into 60 kB in full colour, 1815 cells do not."""
     monkeypatch.setattr(gallery, "PICTURES", tmp_path)
     colours = np.random.default_rng(1).integers(0, 256, (396 // cell, 660 // cell, 3), np.uint8)
     drawn = Image.fromarray(colours).resize((1320, 792), Image.Resampling.NEAREST)

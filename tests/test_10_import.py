@@ -37,7 +37,7 @@ def test_reading_a_config_loads_no_arrays():
 
 @pytest.mark.slow
 def test_step_over_level_terrain_loads_no_compiler_or_transforms():
-    """Each costs a tenth of a second per job."""
+    """Importing either library takes a tenth of a second per job."""
     heavy = {"numba", "scipy.fft", "scipy.ndimage", "scipy.special"}
     loaded_by(f"import sys, apertura.stages.layers\nassert not {heavy} & set(sys.modules)")
 
@@ -56,7 +56,7 @@ def test_unknown_public_name_is_an_attribute_error():
 
 
 def test_public_names_do_not_enter_the_code_hash_of_a_stage():
-    """Stages import the version from the package; that must not tie their hash to every public module."""
+    """Stages import the version from the package; their hash must nevertheless not depend on every public module."""
     assert code_sha256("apertura") == code_sha256()
     assert code_sha256("apertura.common.contracts") != code_sha256()
 

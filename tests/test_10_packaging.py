@@ -70,7 +70,7 @@ def test_catalogue_campaign_matches_its_specification(tmp_path):
         if path.suffix == ".sigmf-data":  # sine functions of other machines round differently
             difference = np.fromfile(kept, "<i2").astype(int) - np.fromfile(path, "<i2")
             assert np.abs(difference).max() <= 1
-        elif path.suffix not in {".sigmf-meta", ".npy"} and path.name != "truth.json":  # with hashes of samples
+        elif path.suffix not in {".sigmf-meta", ".npy"} and path.name != "truth.json":  # contains hashes of samples
             assert kept.read_bytes() == path.read_bytes(), path.name
         else:
             assert kept.is_file()

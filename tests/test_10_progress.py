@@ -59,7 +59,7 @@ def test_failing_step_removes_its_progress(tmp_path):
 
 
 def test_progress_of_tiles_counts_their_parts(tmp_path, monkeypatch):
-    """A tile of a long flight is complete with the last block of pulses: parts are counted, not tiles."""
+    """Parts are counted, not tiles, because a tile of a long flight is complete only with the last block of pulses."""
     from dask.array import ones
 
     from apertura.core.backprojection.tiles import compute_tiles

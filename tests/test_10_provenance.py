@@ -1,4 +1,4 @@
-"""The code hash follows imports: it changes with the code that a stage can run and with nothing else."""
+"""The code hash follows imports: the hash changes only with the code that a stage can run."""
 
 import ast
 import hashlib
@@ -26,7 +26,7 @@ def copied(tmp_path_factory):
 
 
 def changes(copied, file, *modules):
-    """Return True if the code hash of modules changes with an edit of a file; the edit is undone."""
+    """Return True if the code hash of modules changes with an edit of a file; the edit is reverted."""
     path = copied / file
     before, text = code_sha256(*modules, package=copied), path.read_bytes()
     path.write_bytes(text + b"\nEDITED = 1\n")
@@ -43,7 +43,7 @@ def changes(copied, file, *modules):
         ("core/combination.py", "cube", True),
         ("core/combination.py", "image", False),
         ("core/echo/sidelink.py", "echo", True),
-        ("core/echo/sidelink.py", "image", True),  # the check of its samples recomputes a few
+        ("core/echo/sidelink.py", "image", True),  # the check of its samples recomputes some samples
         ("core/echo/calibration.py", "image", False),
         ("formats/export/__init__.py", "export", True),
         ("formats/export/cog.py", "export", True),
@@ -158,7 +158,7 @@ def test_code_hash_of_a_parent_changes_that_of_its_child():
 
 @pytest.mark.parametrize("size", [0, 1, 4 << 20, (4 << 20) + 1, 8 << 20, (13 << 20) + 7])
 def test_both_hashes_of_a_file_match_its_bytes(tmp_path, size):
-    """No block, part of a block, several blocks: a buffer is reused only when both hashes have processed it."""
+    """The file has no, part of one or several blocks; a buffer is reused only after both hashes have processed it."""
     content = np.random.default_rng(size).bytes(size)
     (tmp_path / "samples").write_bytes(content)
     expected = {name: hashlib.new(name, content).hexdigest() for name in ("sha256", "sha512")}

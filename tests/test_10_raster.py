@@ -156,7 +156,7 @@ def test_dem_with_a_billion_declared_rows_is_rejected(tmp_path):
 
 
 def test_dem_with_too_many_posts_is_rejected_before_reading(tmp_path):
-    """Half a micrometre between posts: 120 m of scene would be 10^16 of them."""
+    """With half a micrometre between posts, 120 m of scene contain 10^16 posts."""
     side = 1 << 20
     path = tmp_path / "dem.tif"
     shape = {"height": side, "width": side, "count": 1, "dtype": "float32", "SPARSE_OK": True}
@@ -207,7 +207,7 @@ def test_implausible_undulation_is_rejected(tmp_path):
     [((6.75, 51.25, 0.5, 0.5), (9, 9)), ((-180, 90, 10, 7.5), (24, 36)), ((0, 90, 10, 7.5), (24, 36))],
 )
 def test_tif_grid_matches_proj(tmp_path, place, shape):
-    """Regional, and global, with a post beyond the last column."""
+    """A regional and a global grid, also with a post beyond the last column."""
     values = np.random.default_rng(1).uniform(-50, 50, shape).astype(np.float32)
     path = write_dem(tmp_path / "egm96.tif", values, place, "EPSG:4326", nodata=-999)
     west, south = (-179.9, -80) if shape[1] > 9 else (7.1, 47.1)
@@ -223,7 +223,7 @@ def test_tif_grid_matches_proj(tmp_path, place, shape):
 
 
 def test_tif_without_rows_per_strip_is_read(tmp_path):
-    """The tag for the rows of a strip is missing: PROJ's own reader divides by zero and ends the process."""
+    """The tag RowsPerStrip is missing; the reader of PROJ divides by zero and ends the process."""
     path = write_dem(tmp_path / "egm96.tif", np.full((9, 9), 45, np.float32), (6.75, 51.25, 0.5, 0.5), "EPSG:4326")
     rows_of_a_strip, unknown = (struct.pack("<HHI", tag, 3, 1) for tag in (278, 30000))
     path.write_bytes(path.read_bytes().replace(rows_of_a_strip, unknown))

@@ -1,4 +1,4 @@
-"""Lint of wording: what it reports, and what it leaves alone."""
+"""Lint of wording: reported and unreported phrases."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Store of stages: a stage is complete or absent, and any difference from what was written is detected."""
+"""Store of stages: a stage is complete or absent, and any difference from the written data is detected."""
 
 import fcntl
 import json
@@ -67,7 +67,7 @@ def test_changed_file_is_reported_with_the_manifest_to_delete(tmp_path):
 
 
 def test_changed_document_is_rejected(tmp_path):
-    """Also if it is still a valid document: it is read only if its hash equals that in its manifest."""
+    """A document is read only if its hash equals the hash in its manifest, even if the document is still valid."""
     path = tmp_path / "scene.json"
     save_document(path, {"height_m": 1.0})
     assert open_document(path) == {"height_m": 1.0}
@@ -77,7 +77,7 @@ def test_changed_document_is_rejected(tmp_path):
 
 
 def test_swapped_chunk_is_rejected_when_read(tmp_path):
-    """Its own checksum is valid; only the hash in the manifest differs. Chunks that are not read are not checked."""
+    """The checksum of the chunk is valid, but the manifest has another hash; chunks that are not read are unchecked."""
     values = np.arange(40.0).reshape(10, 4).astype(np.complex64)
     stage = xr.Dataset({"transfer": (("pulse", "subcarrier"), np.broadcast_to(np.complex64(0), values.shape))})
     for name in ("a", "b"):
@@ -103,7 +103,7 @@ def test_stored_array_does_not_depend_on_its_blocks(tmp_path, monkeypatch):
         np.testing.assert_array_equal(zarr.open_array(tmp_path / "x.wip", path="profile")[:], values)
         trees.append(sha256_tree(tmp_path / "x.wip"))
     assert trees[0] == trees[1] == trees[2]
-    assert len(trees[0]) == 2 + 6  # two rows a chunk
+    assert len(trees[0]) == 2 + 6  # two rows per chunk
 
 
 def test_rows_of_zeros_take_no_space(tmp_path):
@@ -239,7 +239,7 @@ def test_partial_chunk_of_a_killed_writer_is_removed(tmp_path):
 
 
 def test_chunks_being_rewritten_are_recomputed_after_a_kill(tmp_path):
-    """Tiles are formed again to measure their error: a run killed meanwhile must reach the same certificate."""
+    """Tiles are recomputed to measure their error; a run killed at that time must reach the same certificate."""
     folder = tmp_path / "image.zarr"
     with writing(folder) as wip:
         resume(wip, empty_image(), "image", WINDOWS)
@@ -387,7 +387,7 @@ def test_chunk_damaged_after_opening_is_reported_with_the_manifest(tmp_path):
 
 
 def test_chunk_deleted_after_opening_is_reported(tmp_path):
-    """zarr reads an absent chunk as the fill value, NaN, the value of pixels that were never formed."""
+    """zarr reads an absent chunk as the fill value NaN, which is also the value of pixels that were not formed."""
     finished_image(tmp_path / "image.zarr")
     opened = open_stage(tmp_path / "image.zarr", "image")
     (tmp_path / "image.zarr" / "image" / "c" / "1" / "1").unlink()

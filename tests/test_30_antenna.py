@@ -121,7 +121,7 @@ def test_high_accuracy_needs_exact_weights():
 
 
 def aimed(position_m, middle_m, width_deg):
-    """Return the beam of a level body that flies along the track, aimed at the scene centre from mid-track."""
+    """Return the beam of a level body that flies along the track; at mid-track, it points at the scene centre."""
     ahead = (position_m[-1] - position_m[0]) * [1, 1, 0]
     ahead /= np.linalg.norm(ahead)
     body = np.stack([ahead, np.cross(ahead, [0, 0, 1.0]), [0, 0, -1.0]], 1)

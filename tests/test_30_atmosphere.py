@@ -26,7 +26,7 @@ AIR = 1.000282
 
 
 def test_refractivity_matches_itu_r_p453():
-    """Reference values: dry 77.6·1013.25/288.15; e_s = 17.04 hPa at 15 °C from tables, 3.73e5·e/T² of vapour."""
+    """Reference: dry term 77.6·1013.25/288.15; vapour term 3.73e5·e/T², with e_s = 17.04 hPa at 15 °C from tables."""
     assert refractivity(15.0, 1013.25, 0.0) == pytest.approx(77.6 * 1013.25 / 288.15, rel=1e-12)
     wet = refractivity(15.0, 1013.25, 100.0) - refractivity(15.0, 1013.25, 0.0)
     assert wet == pytest.approx(3.73e5 * 17.04 / 288.15**2, rel=0.006)  # 0.4 % is the enhancement factor of moist air
@@ -68,7 +68,7 @@ def test_refractivity_of_a_flight_is_weighted_by_path_length():
     assert flown.refractivity_n == pytest.approx(float(exact), rel=1e-12)
     assert flown.left_m == pytest.approx(0, abs=1e-12)
     climbing = air.over(np.linspace(900, 1200, 5), np.linspace(900, 1200, 5), (np.full(5, 1500.0),) * 2)
-    assert 3e-3 < climbing.left_m < 1.5e-2  # of a path of 3 km
+    assert 3e-3 < climbing.left_m < 1.5e-2  # for a path of 3 km
     assert flown.report["vacuum_shift_m"] == pytest.approx(flown.refractivity_n * 1e-6 * 5100 / 2, rel=1e-3)
 
 
@@ -92,7 +92,7 @@ def test_refractivity_std_covers_10_k_20_hpa_and_any_humidity():
 
 FREQUENCY = 1.2e9 + 2e6 * np.arange(128)
 GRID = ap.SceneGrid("local", -6.0, 6.0, 0.25, (48, 48))
-TARGET = np.array([[1.25, -0.75, 0.0]])  # a corner of pixels; pixel centres are half a spacing away
+TARGET = np.array([[1.25, -0.75, 0.0]])  # corner of a pixel; the pixel centre is half a spacing away
 
 
 def flight(range_m=600.0, pulses=96):
@@ -102,7 +102,7 @@ def flight(range_m=600.0, pulses=96):
 
 
 def history(aperture, index, **changes):
-    """Return the echo of TARGET through air, from the delays of both one-way paths, relative to the origin's delay."""
+    """Return the echo of TARGET through air, from the delays of both one-way paths minus the delay of the origin."""
     origin_s, target_s = (index * aperture.path(place) / SPEED_OF_LIGHT_M_S for place in (0 * TARGET, TARGET))
     delay_s = target_s - origin_s
     echo = np.exp(-2j * np.pi * FREQUENCY * delay_s).astype(np.complex64)
@@ -153,9 +153,9 @@ def test_atmosphere_keyword_sets_the_wave_speed():
 @pytest.mark.quick("numba", "reference")
 @pytest.mark.parametrize("engine", [name for name in ENGINES if name not in {"cuda"}])
 def test_image_in_air_equals_image_of_scaled_geometry_in_vacuum(engine):
-    """docs/theory/atmosphere.md, eq. 4, pixel by pixel, for every engine, and against the double sum.
+    """Equation 4 of docs/theory/atmosphere.md holds at every pixel, for every engine and for the double sum.
 
-    Without a certificate, which would replace an engine whose error is too large.
+    No certificate is computed, because it would replace an engine whose error is too large.
     """
     if not load_engine(engine).available():
         pytest.skip("cannot run here")
@@ -211,8 +211,8 @@ _SIZE = "sizes of cells, searches, windows or grids, and limits of checks: 0.03 
 _POWER = "wavelength of the radar equation: 0.003 dB"
 _DRAWN = "plots and listings"
 _ELECTRICAL = "electrical paths: cables, delays given as c times seconds"
-_DEFAULT = "default for arrays without a speed of their own"
-_FORMAT = "delays that a file gives as a distance, or unconverted delays for in_air"
+_DEFAULT = "default for arrays without a stated speed"
+_FORMAT = "delays that a file states as a distance, or unconverted delays for in_air"
 
 VACUUM = {
     "common/constants.py": "the constant",
@@ -228,7 +228,7 @@ VACUUM = {
     "core/imaging/resolution.py": _SIZE,
     "core/imaging/reflectors.py": "wavelength of a cross-section: 0.003 dB",
     "core/imaging/job.py": f"{_DEFAULT}; {_SIZE}",
-    "core/imaging/judgement.py": "comparison with the speed in vacuum, so that the budget has the effect of air",
+    "core/imaging/judgement.py": "comparison with the speed in vacuum, so that the budget contains the effect of air",
     "core/echo/compression.py": _DEFAULT,
     "core/echo/calibration.py": _ELECTRICAL,
     "core/echo/dechirp.py": _ELECTRICAL,
@@ -248,7 +248,7 @@ VACUUM = {
     "formats/phase_histories/pulson.py": _FORMAT,
     "formats/export/cphd.py": "reference of TDTropoSRP",
     "simulation/scatterers.py": "delay of an optical path",
-    "simulation/fmcw.py": "simulates vacuum, and writes that to its config",
+    "simulation/fmcw.py": "simulates vacuum, and configures vacuum in the campaign",
     "simulation/gridding.py": "same as the plain sum of simulation/scatterers.py, for arrays in vacuum",
     "simulation/observation.py": _POWER,
     "simulation/synthesis.py": "excess path of reflections of the sidelink",

@@ -122,7 +122,7 @@ def test_subaperture_has_the_paths_of_its_pulses():
 
 
 def test_phase_rates_match_a_passing_antenna():
-    """Rates of points at ±θ from abeam differ by 2·2·sin θ·step/λ cycles per pulse."""
+    """The rates of two points at ±θ from broadside differ by 2·2·sin θ·step/λ cycles per pulse."""
     step, angle = 0.02, np.radians(20)
     antenna = np.array([[-step / 2, 0.0, 0.0], [step / 2, 0.0, 0.0]])
     places = 50 * np.array([[np.sin(a), np.cos(a), 0] for a in (-angle, 0, angle)])
@@ -145,7 +145,7 @@ def test_fastest_part_determines_the_rate_spread(fast):
 
 @pytest.mark.parametrize("jump", [0, 100, 255, 256, 257, 598])
 def test_largest_rate_is_found_anywhere_in_a_long_aperture(jump):
-    """A jump between any two pulses, also at the boundary between blocks of pulses."""
+    """The track has a jump between any two pulses, also at the boundary between blocks of pulses."""
     track = straight_track(600)
     track[jump + 1 :, 0] += 1.0
     points = ground_points().reshape(-1, 3)
@@ -160,7 +160,7 @@ def test_largest_rate_is_found_anywhere_in_a_long_aperture(jump):
 
 @pytest.mark.parametrize("apart_m", [0.0, 2.0])
 def test_azimuth_resolution_follows_the_integration_angle(apart_m):
-    """δ = λ/(4 sin(θ/2)) with sin(θ/2) = (L/2)/√((L/2)² + R²); antennas in a line have nearly the same angle."""
+    """δ = λ/(4 sin(θ/2)) with sin(θ/2) = (L/2)/√((L/2)² + R²); antennas in a line have nearly equal angles."""
     length, height, north = 6.0, 10.0, 20.0
     track = straight_track(64, length_m=length, height_m=height)
     ground = ground_points(1e-3, north_m=north)
@@ -171,7 +171,7 @@ def test_azimuth_resolution_follows_the_integration_angle(apart_m):
 
 
 def test_resolution_of_a_stationary_antenna_is_its_ground_range_cell():
-    """δ = c/(2B)·R/r_g."""
+    """The resolution is δ = c/(2B)·R/r_g."""
     track = np.tile([0.0, 0.0, 10.0], (64, 1))
     ground = ground_points(1e-3, north_m=20.0)
     cell = monostatic(track).resolution_cell_m(ground, band_hz=(1.0e9, 1.4e9))
@@ -198,7 +198,7 @@ def test_straight_flight_has_no_wobble(start, heading, climb):
 
 
 def test_wobble_is_that_of_the_midpoints():
-    """Antennas that move in opposite directions leave their midpoint on its line."""
+    """If the antennas move in opposite directions, their midpoint remains on the line."""
     track, sway = straight_track(100), np.zeros((100, 3))
     sway[:, 1] = np.sin(np.arange(100))
     assert Aperture(track + sway, track - sway).wobble_m == pytest.approx(0, abs=1e-12)

@@ -1,4 +1,4 @@
-"""Phase centres between the epochs of a log: smoothing, and local frames without a position on Earth."""
+"""Phase centres between the epochs of a log: smoothing, and local frames that are not georeferenced."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_smoothing_spline_removes_the_given_noise():
 
 @pytest.mark.parametrize(("yaw_deg", "expected"), [(0, (0, 1, 0)), (90, (1, 0, 0)), (180, (0, -1, 0))])
 def test_yaw_in_a_local_frame_is_clockwise_from_north(yaw_deg, expected):
-    """Axes are east, north, up; a lever arm with a positive third component points down."""
+    """Axes are east, north and up; a lever arm with a positive third component points down."""
     position = np.array([[0.0, 0, 2], [0, 0, 2], [0, 0, 2]])
     attitude = np.radians([[0.0, 0.0, yaw_deg]] * 3)
     placed = phase_centres(

@@ -1,4 +1,4 @@
-"""Checks of a flight log by its own epochs: faults are found, and good logs have none."""
+"""Checks of a flight log by its epochs: faults are found, and correct logs raise none."""
 
 import numpy as np
 import pytest
@@ -56,7 +56,7 @@ def checked(time_s, place, *, poor=None, tolerated_m=X_BAND_M):
 @pytest.mark.parametrize("kind", ["hover", "straight", "circle", "legs"])
 @pytest.mark.parametrize("rate_hz", [1.0, 2.0, 5.0, 10.0, 50.0, 100.0])
 def test_good_log_has_no_fault_and_no_hole(kind, rate_hz):
-    """For any noise, resolution and jitter; at 100 Hz coarse positions repeat legitimately."""
+    """No fault is raised for any noise, resolution and jitter; coarse positions at 100 Hz repeat legitimately."""
     for seed, noise_m in enumerate((0.0, 0.001, 0.01, 0.03)):
         for grain_m, unequal in ((0.0, 0.0), (1e-4, 0.2), (0.01, 0.0), (0.01, 0.2)):
             parameters = {"rate_hz": rate_hz, "noise_m": noise_m, "grain_m": grain_m, "unequal": unequal, "seed": seed}
@@ -79,7 +79,7 @@ def test_outlying_epochs_are_found_and_excluded(kind, epochs):
 
 @pytest.mark.parametrize(("size_m", "found"), [(0.02, False), (0.08, True)])
 def test_outlier_threshold_is_ten_times_the_scatter_of_the_log(size_m, found):
-    """3 mm per axis is a misfit scatter of 4.2 mm."""
+    """Noise of 3 mm per axis causes a misfit scatter of 4.2 mm."""
     time_s, place = logged("straight", noise_m=0.003)
     assert scatter_m(misfits(time_s, place)) == pytest.approx(0.0042, rel=0.1)
     place[200, 2] += size_m
@@ -108,7 +108,7 @@ def test_step_of_positions_is_located(kind, size_m, found):
 
 
 def test_braking_within_an_epoch_is_no_outlier():
-    """5 m/s to 0 at once, in a log of 1 Hz: the spline has an error, but every epoch is correct."""
+    """The speed drops from 5 m/s to 0 in a log of 1 Hz: the spline has an error, but every epoch is correct."""
     time_s = np.arange(120.0)
     for when in np.arange(60.0, 61.0, 0.1):
         place = np.stack([5 * np.minimum(time_s, when), 0 * time_s, 0 * time_s], -1)
@@ -118,7 +118,7 @@ def test_braking_within_an_epoch_is_no_outlier():
 
 @pytest.mark.parametrize(("missing", "excluded"), [(2, False), (30, True)])
 def test_gap_excludes_pulses_where_the_spline_is_inaccurate(missing, excluded):
-    """Legs of a mission: gaps of 0.3 s are interpolated accurately, gaps of 3.1 s are not."""
+    """On the legs of a mission, gaps of 0.3 s are interpolated accurately, and gaps of 3.1 s are not."""
     time_s, place = logged("legs", seed=4, noise_m=0.001)
     rest = np.delete(np.arange(400), np.arange(200, 200 + missing))
     result = checked(time_s[rest], place[rest])
@@ -132,7 +132,7 @@ def test_gap_excludes_pulses_where_the_spline_is_inaccurate(missing, excluded):
 
 
 def test_long_gap_of_a_straight_flight_excludes_nothing():
-    """On a line at constant speed, where the spline error is below λ/16 of 1 GHz."""
+    """On a line at constant speed, the spline error is below λ/16 at 1 GHz."""
     time_s, place = logged("straight", noise_m=0.0)
     rest = np.delete(np.arange(400), np.arange(200, 210))
     assert checked(time_s[rest], place[rest], tolerated_m=0.019).holes == ()
@@ -167,7 +167,7 @@ def test_repeated_positions_are_used_once():
 
 @pytest.mark.parametrize(("grain_s", "found"), [(0.1, True), (0.001, False)])
 def test_rounded_times_are_found_with_their_position_error(grain_s, found):
-    """8 m/s · 0.1 s/√12 = 0.23 m."""
+    """The expected position error is 8 m/s · 0.1 s/√12 = 0.23 m."""
     true_s, place = np.arange(300) * 0.137, logged("straight", rate_hz=1 / 0.137, epochs=300)[1]
     size_m = rounded_time_m(np.round(true_s / grain_s) * grain_s, place)
     assert size_m == pytest.approx(0.23 if found else 0.0, abs=0.01)
@@ -181,7 +181,7 @@ RADIUS_M = 6_371_000 * np.pi / 180
     ("grain_deg", "expected_m"),
     [
         (1e-4 / 60, 0.0644),  # four decimals of an arc minute: 0.185 m and 0.124 m, over √12
-        (1e-5 / 60, 0.00535),  # 1.9 cm of latitude; 1.2 cm of longitude are fine enough
+        (1e-5 / 60, 0.00535),  # 1.9 cm of latitude; the 1.2 cm of longitude are negligible
         (1e-4, 3.87),  # six significant digits, as in a spreadsheet
         (1e-9, 0.0),
     ],
@@ -190,7 +190,7 @@ RADIUS_M = 6_371_000 * np.pi / 180
 @pytest.mark.parametrize("speed", [0.1, 1.0])
 def test_rounded_positions_are_found_with_their_error(grain_deg, expected_m, kind, speed):
     time_s, place = logged(kind, epochs=600, noise_m=0.003, seed=2)
-    rotated = speed * place @ np.array([[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1]])  # aligned with no axis of the grid
+    rotated = speed * place @ np.array([[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1]])  # not aligned with the grid
     latitude, longitude = 48 + rotated[:, 0] / RADIUS_M, 9 + rotated[:, 1] / RADIUS_M / np.cos(np.radians(48))
     rounded = [np.round(angle / grain_deg) * grain_deg for angle in (latitude, longitude)]
     ecef = ecef_from_geodetic(*rounded, 600 + rotated[:, 2])
@@ -202,7 +202,7 @@ def test_rounded_positions_are_found_with_their_error(grain_deg, expected_m, kin
 
 
 def test_degrees_in_single_precision_are_a_grid():
-    """Steps of 4·10⁻⁶° of latitude (0.42 m) and 10⁻⁶° of longitude (0.07 m), beyond 48° north and 9° east."""
+    """The grid has steps of 4·10⁻⁶° of latitude (0.42 m) and 10⁻⁶° of longitude (0.07 m) at 48° north and 9° east."""
     time_s, place = logged("circle", epochs=600, noise_m=0.003, seed=2)
     latitude, longitude = 48.4 + place[:, 0] / RADIUS_M, 9.9 + place[:, 1] / RADIUS_M / np.cos(np.radians(48.4))
     single = [angle.astype(np.float32).astype(np.float64) for angle in (latitude, longitude)]
@@ -211,14 +211,14 @@ def test_degrees_in_single_precision_are_a_grid():
 
 
 def test_positions_of_uniform_motion_are_no_grid():
-    """5 m/s at 10 Hz is a displacement of 0.5 m per epoch."""
+    """A speed of 5 m/s at 10 Hz displaces the positions by 0.5 m per epoch."""
     time_s, place = logged("straight", epochs=300)
     assert rounded_position_m(time_s, place, least_m=X_BAND_M) == 0.0
     assert rounded_position_m(time_s, place + [4e6, 1e6, 4e6], least_m=X_BAND_M) == 0.0
 
 
 def test_spline_error_between_epochs_is_estimated():
-    """A wave of 1 m and 1 s, at 5 and 10 Hz: never below the true error, and closer to it at the higher rate."""
+    """For a wave of 1 m and 1 s, the estimate is never below the true error, and closer to it at 10 Hz than at 5 Hz."""
     for rate_hz, most in ((5.0, 4.0), (10.0, 2.5)):
         time_s = np.arange(0, 40, 1 / rate_hz)
         wave = np.stack([np.sin(2 * np.pi * time_s), 0 * time_s, 0 * time_s], -1)
@@ -257,7 +257,7 @@ def attitude(place_m, policy, generator):
 
 
 def mapped(course_deg, seconds=10.0):
-    """Return positions of legs at 7 m/s and ten epochs a second, one for each course; north, east, down."""
+    """Return positions (north, east, down) at ten epochs per second along legs at 7 m/s, one leg for each course."""
     course = np.radians(np.repeat(course_deg, round(10 * seconds)))
     return np.cumsum(0.1 * AIR_M_S * np.column_stack([np.cos(course), np.sin(course), 0 * course]), axis=0)
 
@@ -301,7 +301,7 @@ def test_yaw_in_radians_is_detected(flown, policy, certain):
 
 
 def test_anticlockwise_yaw_is_detected_on_a_round_course():
-    """From north or from east; a single corner is ambiguous, as the node may turn towards the scene."""
+    """Yaw counts from north or from east; a single corner is ambiguous, because the node may turn towards the scene."""
     degrees = attitude(ROUND, "ahead", np.random.default_rng(1))
     for zero in (0.0, 90.0):
         anticlockwise = np.radians(degrees * [1, 1, -1] + [0, 0, zero])
@@ -312,7 +312,7 @@ def test_anticlockwise_yaw_is_detected_on_a_round_course():
 
 
 def test_angle_above_2_pi_rules_out_radians():
-    """On both sides of the limit: one epoch of a lawnmower flight at 2π or at 6.5."""
+    """Both sides of the limit are tested: one epoch of a lawnmower flight has a yaw of 2π or of 6.5."""
     radians = np.radians(attitude(FLOWN["lawnmower"], "ahead", np.random.default_rng(1)))
     for largest, found in ((2 * np.pi, True), (6.5, False)):
         radians[7, 2] = largest
@@ -333,7 +333,7 @@ def courses(kind, generator):
 
 @pytest.mark.slow
 def test_random_flights_have_no_false_and_few_missed_yaw_faults():
-    """4000 flights; radians detected in 9 of 10 flights with yaw along their turns, in 7 of 10 straight ones."""
+    """Of 4000 flights, radians are detected in 9 of 10 with yaw along their turns and 7 of 10 straight flights."""
     generator, detections = np.random.default_rng(0), {}
     for _ in range(4000):
         kind = generator.choice(["legs", "circle", "lawnmower", "straight", "wandering"])
@@ -354,7 +354,7 @@ def test_random_flights_have_no_false_and_few_missed_yaw_faults():
 
 
 def _flown(*parts: tuple[float, float], interval_s: float = 0.05):
-    """Return times and positions for parts of a flight (duration, speed), with 1 cm of noise in the log."""
+    """Return times and positions for flight parts (duration, speed), with log noise of 1 cm."""
     speed = np.concatenate([np.full(round(duration_s / interval_s), speed) for duration_s, speed in parts])
     east = np.cumsum(speed) * interval_s
     noise = 0.01 * np.random.default_rng(1).standard_normal((len(east), 3))

@@ -41,7 +41,7 @@ def test_fraction_of_a_second_is_estimated_to_half_an_interval(tmp_path_factory,
 
 
 def test_stopped_clock_is_aligned_again(tmp_path):
-    """As in the real log: 74 s pass between rows whose clocks differ by 100 ms; a segment of 0.3 s has no time."""
+    """As in the real log, 74 s pass between rows whose clocks differ by 100 ms; a segment of 0.3 s is not timed."""
     times = TIMES.copy()
     times[30:33] += np.timedelta64(500_000, "ms")
     times[33:] += np.timedelta64(573_900, "ms")
@@ -118,7 +118,7 @@ FORMATS = {
 @pytest.mark.parametrize("form", FORMATS.values(), ids=FORMATS)
 @pytest.mark.parametrize("back_days", [0, 9], ids=["14 May", "5 May"])
 def test_every_date_format_of_an_account_is_read(tmp_path, form, back_days):
-    """The flight passes midnight, and the change of the day (5/5 to 5/6 or 6/5) identifies which number it is."""
+    """The flight passes midnight, and the change of date (5/5 to 5/6 or 6/5) identifies the number of the day."""
     times = TIMES - np.timedelta64(back_days, "D")
     track = read(tmp_path, dated(form, times))
     assert (np.abs(track.time.values - times) <= np.timedelta64(50, "ms")).all()
@@ -134,7 +134,7 @@ def test_ambiguous_date_is_reported_with_the_account_setting(tmp_path):
 
 
 def test_times_in_minutes_are_read_if_the_minute_changes(tmp_path):
-    """As saved by a spreadsheet: 5/14/2025 23:59."""
+    """A spreadsheet saves such times, e.g. 5/14/2025 23:59."""
     track = read(tmp_path, dated(lambda t: f"{t.month}/{t.day}/{t.year} {t:%H:%M}"))
     assert (np.abs(track.time.values - TIMES) <= np.timedelta64(50, "ms")).all()
     assert "datetime(utc) contains whole minutes" in track.remarks[0]
@@ -169,7 +169,7 @@ def test_real_flight_has_the_epochs_and_positions_of_its_rows(flight, table):
 
 
 def test_epochs_of_a_real_flight_lie_in_their_utc_second(flight, table):
-    """Although the millisecond clock stopped twice, for 74.5 s and 12.3 s, while motors were off."""
+    """This holds although the millisecond clock stopped twice, for 74.5 s and 12.3 s, while the motors were off."""
     second = table["datetime(utc)"].to_numpy("datetime64[ns]")
     within = (flight.time.values - second) / np.timedelta64(1, "s")
     assert within.min() >= -0.051

@@ -42,7 +42,7 @@ def position_error_m(track):
 def test_track_has_the_values_of_the_receiver(tmp_path, suffix):
     track = read(tmp_path, dataflash_rows(), suffix=suffix)
     time, geodetic, yaw = flight()
-    np.testing.assert_array_equal(track.time.values, utc_of(time))  # the log's own weeks are 18 s ahead
+    np.testing.assert_array_equal(track.time.values, utc_of(time))  # the GPS weeks of the log are 18 s ahead
     np.testing.assert_allclose(geodetic_from_ecef(track.position.values), geodetic, atol=6e-3)
     np.testing.assert_allclose(geodetic_from_ecef(track.position.values)[:, :2], geodetic[:, :2], atol=6e-8)
     np.testing.assert_allclose(track.position_std.values, np.tile([0.02, 0.02, 0.03], (60, 1)))
@@ -55,7 +55,7 @@ def test_track_has_the_values_of_the_receiver(tmp_path, suffix):
 
 
 def test_generated_log_is_readable_by_pymavlink(tmp_path):
-    """The epochs equal those of pymavlink message by message, at the times that it computes from weeks."""
+    """All epochs equal those of pymavlink, at the times that pymavlink computes from GPS weeks."""
     from pymavlink.DFReader import DFReader_binary
 
     path = tmp_path / "a.track.bin"
@@ -73,7 +73,7 @@ def test_generated_log_is_readable_by_pymavlink(tmp_path):
 
 @pytest.mark.usefixtures("reader")
 def test_attitude_is_read_at_the_time_of_validity(tmp_path):
-    """GPS1_DELAY_MS is the delay of the receiver; 0 means the driver's default, 120 ms in this log."""
+    """GPS1_DELAY_MS is the delay of the receiver; 0 selects the default of the driver, 120 ms in this log."""
     configured = read(tmp_path, dataflash_rows(parameters={"GPS1_DELAY_MS": 220.0}))
     default = read(tmp_path, dataflash_rows(parameters={"GPS1_DELAY_MS": 0.0}))
     difference_deg = np.degrees(default.attitude.values[:, 2] - configured.attitude.values[:, 2])
@@ -99,7 +99,7 @@ def test_ellipsoidal_heights_of_the_novatel_driver_are_not_used(tmp_path):
 
 @pytest.mark.usefixtures("reader")
 def test_receiver_is_selected_by_number(tmp_path):
-    """The second receiver is 1e-5 degrees, 1.11 m, to the north."""
+    """The second receiver is displaced by 1e-5 degrees (1.11 m) to the north."""
     rows = dataflash_rows(receivers=(0, 1))
     first = read(tmp_path, rows)
     assert first.attrs["source"] == "GPS 0 of 0, 1"
@@ -151,7 +151,7 @@ def test_epochs_after_foreign_bytes_are_read_and_bytes_counted(tmp_path, foreign
 
 
 def _counts(track):
-    """Return the number of bytes that are no messages, and the total."""
+    """Return the number of bytes that do not belong to messages, and the total."""
     lost, total = track.attrs["damage"].split(" bytes")[0].split(" of ")
     return int(lost), int(total)
 
@@ -212,7 +212,7 @@ def test_epochs_without_gps_week_are_counted(tmp_path):
 
 @pytest.mark.usefixtures("reader")
 def test_earlier_flight_has_fewer_leap_seconds(tmp_path):
-    """In week 1850, June 2015, GPS time was 16 s ahead of UTC; ten years later, 18 s."""
+    """In week 1850 (June 2015), GPS time was 16 s ahead of UTC; ten years later, the difference is 18 s."""
     track = read(tmp_path, dataflash_rows(GWk=np.full(60, 1850)))
     assert (track.time.values[0] - START) / SECOND == (1850 - 2366) * 7 * 86400 + 2
 
@@ -229,7 +229,7 @@ def test_position_that_contradicts_the_velocity_is_dropped(tmp_path):
 
 
 def numbered(rows):
-    """Yield messages with the number of earlier messages of the same name."""
+    """Yield each message with the number of earlier messages of the same name."""
     counts = Counter()
     for name, values in rows:
         yield counts[name], (name, values)
@@ -270,7 +270,7 @@ PLACES = st.integers(0, 10**6)
 
 
 def read_damaged(path, data):
-    """Return the track of a damaged log, or None if it is rejected; in-process version of the isolated reader."""
+    """Return the track of a damaged log, or None if the log is rejected; the reader runs in this process."""
     path.write_bytes(data)
     try:
         fields = read_fields(path)
@@ -323,7 +323,7 @@ def test_reordered_messages_are_rejected_or_harmless(log, random, swaps):
 
 
 def assert_no_position_is_silently_wrong(track):
-    """Check that every epoch is at the true position or is found by the check applied to every track."""
+    """Assert that every epoch is at the true position or is detected by the check of all tracks."""
     time_s = (track.time.values - track.time.values[0]) / SECOND
     checked = check_track(time_s, track.position.values, poor_fix=np.zeros(time_s.size, bool), tolerated_m=0.01)
     inside = np.minimum(np.arange(time_s.size), np.arange(time_s.size)[::-1]) >= 6

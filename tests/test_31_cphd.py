@@ -1,4 +1,4 @@
-"""CPHD of other radars: files written field by field after the standard, independent of apertura's own export."""
+"""CPHD of other radars: files written field by field after the standard, without apertura's export."""
 
 import re
 
@@ -49,7 +49,7 @@ def collected(sign=-1, srp=SRP):
 def write(
     path, pvp, signals, *, kind="CF8", sign=-1, version="1.1.0", domain="FX", collect="BISTATIC", channels=("A",)
 ):
-    """Write the parts of the standard that a reader needs; a parameter may be one number for all pulses."""
+    """Write the parts of the standard that a reader needs; a parameter may be a single number for all pulses."""
     names = [name for name in (*FIELDS, "AmpSF", "SIGNAL") if name in pvp]
     table = np.zeros(
         PULSES, [(name, "i8" if name == "SIGNAL" else "f8", (3,) if name.endswith("Pos") else ()) for name in names]
@@ -136,7 +136,7 @@ def test_integer_samples_are_scaled_per_pulse(tmp_path, kind, full):
 def test_pulses_without_a_normal_signal_are_dropped_and_counted(tmp_path):
     pvp, signal = collected()
     pvp["SIGNAL"] = np.where(np.arange(PULSES) == 3, 0, np.where(np.arange(PULSES) == 7, 2, 1))
-    pvp["TxPos"][3] = np.nan  # noise was recorded without a transmission
+    pvp["TxPos"][3] = np.nan  # this pulse contains only noise, without a transmission
     signal[5] = 0
     echo = read(write(tmp_path / "rx.cphd", pvp, signal))
     assert echo.attrs["pulses"] == {
@@ -256,7 +256,7 @@ def test_truncated_file_is_rejected(tmp_path):
 
 
 def test_external_xml_entity_is_not_read(tmp_path):
-    """An entity of the XML may name any file, whose contents must not be disclosed."""
+    """An XML entity may name any file; the contents of that file must not be disclosed."""
     secret = tmp_path / "secret"
     secret.write_text("BISTATIC")
     path = write(tmp_path / "rx.cphd", *collected())

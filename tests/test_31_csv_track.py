@@ -59,7 +59,7 @@ def test_complete_frame_is_used_if_another_lacks_a_column(tmp_path):
     ],
 )
 def test_seconds_count_from_the_configured_time_zero(tmp_path, start, options):
-    """From the start of the log, from the Unix epoch, in GPS time with 18 leap seconds."""
+    """The time zero is the start of the log or the Unix epoch, in UTC or in GPS time with 18 leap seconds."""
     seconds = (TIMES - np.datetime64(start, "ns")) / np.timedelta64(1, "s") + (18 if "time_system" in options else 0)
     track = read(tmp_path, f"time_s,{GEODETIC}", [f"{second:.6f}" for second in seconds], *PLACES.T, **options)
     assert (np.abs(track.time.values - TIMES) <= np.timedelta64(500, "ns")).all()
@@ -149,7 +149,7 @@ def test_line_with_extra_cells_is_named(tmp_path):
 
 
 def test_columns_in_other_units_are_scaled(tmp_path):
-    """As written by ulog2csv: µs, 1e-7 degrees, millimetres."""
+    """ulog2csv writes µs, 1e-7 degrees and millimetres."""
     elapsed = (TIMES - np.datetime64("1970-01-01", "ns")).astype("timedelta64[us]").astype(int)
     whole = np.rint(PLACES / [1e-7, 1e-7, 1e-3]).astype(int)
     scales = {"time_s": 1e-6, "latitude_deg": 1e-7, "longitude_deg": 1e-7, "height_m": 1e-3}
@@ -162,7 +162,7 @@ def test_columns_in_other_units_are_scaled(tmp_path):
 
 @pytest.mark.parametrize("numbers", [[1], [5], [4, 5], [1, 2, 5], [2, 9]])
 def test_numeric_solution_types_need_a_numbering(tmp_path, numbers):
-    """4 is a fixed solution in GGA and DGPS in RTKLIB; 1 is a single solution in GGA and fixed in RTKLIB."""
+    """Type 4 is a fixed solution in GGA and DGPS in RTKLIB; type 1 is a single solution in GGA and a fix in RTKLIB."""
     columns = TIMES, *PLACES.T, np.resize(numbers, 40)
     message = complaint(lambda: read(tmp_path, f"time_utc,{GEODETIC},quality", *columns))
     assert f"solution types {', '.join(map(str, numbers))} in column 'quality'" in message

@@ -1,4 +1,4 @@
-"""Damaged logs (cut, reordered, flipped bits): epochs are lost or the log is rejected; no other epoch changes."""
+"""Damaged logs (cut, reordered, flipped bits): epochs are lost or the log is rejected; others are unchanged."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ PROPERTY = tried(60)
 
 
 def read(folder, kind, data):
-    """Return the track of a damaged log, or None if it is rejected."""
+    """Return the track of a damaged log, or None if the log is rejected."""
     name, _, options = LOGS[kind]
     (folder / name).write_bytes(data)
     try:
@@ -83,7 +83,7 @@ def test_log_with_swapped_lines_is_rejected_or_unchanged(tmp_path_factory, kind,
 @PROPERTY
 @given(data=st.data())
 def test_log_with_a_missing_piece_is_rejected_or_lacks_epochs(tmp_path_factory, kind, data):
-    """The remainders of a cut line may form one plausible line; no other epoch changes."""
+    """The remainders of a cut line may form one plausible line; the other epochs remain unchanged."""
     folder, text = tmp_path_factory.mktemp("log"), LOGS[kind][1].encode()
     whole = read(folder, kind, text)
     place = data.draw(st.integers(text.index(b"\n") + 1, len(text) - 1))
@@ -97,7 +97,7 @@ def test_log_with_a_missing_piece_is_rejected_or_lacks_epochs(tmp_path_factory, 
 @PROPERTY
 @given(data=st.data())
 def test_flipped_bit_changes_at_most_one_epoch(tmp_path_factory, kind, data):
-    """Without a checksum a changed digit is a valid position; `check_track` finds those that stand out."""
+    """Without a checksum, a changed digit gives a valid position; `check_track` detects the outliers among these."""
     folder, text = tmp_path_factory.mktemp("log"), bytearray(LOGS[kind][1].encode())
     whole = read(folder, kind, bytes(text))
     place = data.draw(st.integers(0, len(text) - 1))

@@ -1,4 +1,4 @@
-"""Files of FMCW beat signals: arrays, MATLAB and sound-card recordings contain the same sweeps; faults are named."""
+"""Files of FMCW beat signals: arrays, MATLAB and sound-card recordings give equal sweeps; faults are named."""
 
 import re
 from dataclasses import asdict, replace
@@ -32,7 +32,7 @@ def echo(form, *paths, **changes):
 
 
 def beats(start_s, sweep=COFFEE):
-    """Return beats of a stationary target 30 m away and of an approaching one."""
+    """Return beats of a stationary target at 30 m and of an approaching target."""
     paths = [lambda time: np.full_like(time, 60.0), lambda time: 90.0 - 2 * time]
     return beat_signal(sweep, np.asarray(start_s), paths, [1.0, 0.5])
 
@@ -70,7 +70,7 @@ STARTS_S = 0.05 + 0.040004 * np.arange(8)
 @pytest.mark.parametrize("stated", ["times", "prf", "none"])
 @pytest.mark.parametrize("form", ["beat_npy", "beat_mat"])
 def test_array_with_a_sweep_per_column_is_rejected(tmp_path, form, stated, count):
-    """Sweeps of 882 samples: fewer sweeps than samples, about as many, and more."""
+    """Sweeps have 882 samples; tested are fewer, a similar number of, and more sweeps than samples."""
     beat = np.random.default_rng(1).normal(size=(count, 882)).astype(np.float32)
     time = BEGAN + np.arange(count) * np.timedelta64(40, "ms")
     changes = {"prf_hz": 25.0} if stated != "times" else {}
@@ -136,7 +136,7 @@ def test_sweep_starts_between_sound_samples_are_found(tmp_path):
     assert stage.attrs["dropped"] == {}
     starts_utc = BEGAN + np.round((STARTS_S + 0.00001) * 1e9).astype("timedelta64[ns]")
     middle = np.timedelta64(round(COFFEE.middle_s * 1e9), "ns")
-    # resolution of a sync edge without intermediate samples
+    # the resolution of a sync edge without intermediate samples is one sample
     within = np.timedelta64(round(0.51e9 / COFFEE.sample_rate_hz), "ns")
     assert np.abs(stage.time.values - middle - starts_utc).max() <= within
 
@@ -185,7 +185,7 @@ def test_triggers_of_a_bipolar_channel_of_any_type_are_found(tmp_path, dtype):
 
 def test_click_between_sync_pulses_is_no_trigger():
     sync = np.tile(np.r_[np.zeros(500), np.ones(500)], 5)
-    sync[1200] = 0.6  # above the middle, within the threshold
+    sync[1200] = 0.6  # above the midpoint, within the threshold
     np.testing.assert_allclose(trigger_starts(sync, threshold=0.3), [499.5, 1499.5, 2499.5, 3499.5, 4499.5])
 
 

@@ -1,4 +1,4 @@
-"""Ingest of recorders and flight logs: the stages have the arrays that their contracts define."""
+"""Ingest of recorders and flight logs: the stages contain the arrays that their contracts define."""
 
 import hashlib
 import json
@@ -191,7 +191,7 @@ def test_real_recording_of_another_recorder_is_read(shared):
 
 @pytest.mark.usefixtures("reader")
 def test_gotcha_delays_refer_to_the_scene_centre(shared):
-    """The antenna's distance to the scene centre is r0, so that an echo from there has zero phase."""
+    """The distance of the antenna from the scene centre is r0, so that an echo from the centre has zero phase."""
     files = sorted((shared / "gotcha_afrl").glob("*.mat"))
     echo = check(read_phase_history("afrl_mat", files, pair="a-a"), "echo")
     assert echo.transfer.shape == (234, 424)
@@ -264,7 +264,7 @@ def test_stored_corrections_are_applied_if_configured(tmp_path):
 
 @pytest.mark.slow
 def test_stored_corrections_of_gotcha_keep_trihedrals_focused(shared):
-    """With the signs above; the opposite signs lose at least 18 dB."""
+    """Corrections with the implemented signs keep the peak level; opposite signs would reduce it by 18 dB or more."""
     files = sorted((shared / "gotcha_afrl").glob("*.mat"))
     east, north = np.meshgrid(np.arange(-16.6, -14.6, 0.1), np.arange(20.0, 23.0, 0.1))
     peaks = []
@@ -308,7 +308,7 @@ def test_unreadable_antenna_pattern_is_named(tmp_path, rows, expected):
 
 
 def epochs_of(logged, start="2025-05-14T09:30:00", grain_ns=1):
-    """Return geodetic positions rounded to the nine decimals that are written, and times."""
+    """Return geodetic positions, rounded to the nine decimals of the log, and times."""
     values = np.array([epoch[:3] for epoch in logged]).round(9)
     elapsed = np.cumsum([epoch[3] for epoch in logged]) * grain_ns
     return values, np.datetime64(start, "ns") + elapsed.astype("timedelta64[ns]")
@@ -350,10 +350,10 @@ def test_any_rtklib_log_is_read_back_unchanged(tmp_path_factory, logged, weeks):
 @QUICK
 @given(gaps=st.lists(st.integers(0, 3), min_size=1, max_size=9), channels=st.integers(1, 3), data=st.data())
 def test_captures_have_their_own_samples_despite_gaps(tmp_path_factory, gaps, channels, data):
-    """Every capture has the median length; samples recorded beyond it belong to no capture."""
+    """Every capture has the median length; further samples do not belong to any capture."""
     length = 6
     gaps = sorted(gaps)[: (len(gaps) + 1) // 2] if np.median(gaps) else gaps
-    gaps = [0] * (len(gaps) + 1) + gaps  # most captures follow each other
+    gaps = [0] * (len(gaps) + 1) + gaps  # most captures are contiguous
     order = data.draw(st.permutations(gaps))
     starts = np.cumsum([0, *(length + gap for gap in order)])
     samples = np.arange(1, starts[-1] * channels * 2 + 1).reshape(starts[-1], channels, 2) % 30_000 + 1

@@ -94,7 +94,7 @@ def test_crash_of_a_reader_is_one_message_with_the_signal(tmp_path, monkeypatch)
 
 @pytest.mark.slow
 def test_matlab_file_that_crashes_scipy_is_rejected(tmp_path):
-    """Found by the fuzzer; versions of scipy that no longer crash report an error, or the fields are invalid."""
+    """The file was found by the fuzzer; versions of scipy that do not crash report an error or invalid fields."""
     for path in sorted((ROOT / "tests/attack/regressions/afrl.mat").glob("segv-*")):
         (tmp_path / "a.mat").write_bytes(path.read_bytes())
         assert complaint(lambda: read(tmp_path / "a.mat")).startswith(f"{tmp_path / 'a.mat'}: ")
@@ -133,7 +133,7 @@ def test_modules_in_the_campaign_are_not_imported(tmp_path, monkeypatch):
 
 
 def test_reader_process_imports_no_heavy_libraries():
-    """The imports take half a second of a step."""
+    """The imports would add half a second to a step."""
     code = "import sys, apertura.formats.isolated, scipy.io"
     code += "\nimport apertura.formats.phase_histories.mat_fields; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-P", "-c", code], check=True, capture_output=True, text=True).stdout

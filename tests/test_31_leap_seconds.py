@@ -38,7 +38,7 @@ def listed():
 
 
 def test_table_of_leap_seconds_matches_tzdata():
-    """A failure with a newer tzdata means a new leap second or a later expiry: copy its list."""
+    """A failure with a newer tzdata indicates a new leap second or a later expiry: copy the list of tzdata."""
     since, expires = listed()
     assert len(since) == LATEST_S
     np.testing.assert_array_equal(gps_ahead_s(since), np.arange(1, LATEST_S + 1))

@@ -50,7 +50,7 @@ def test_single_date_applies_to_the_whole_log(tmp_path):
 
 @pytest.mark.parametrize("wrong", [1, 3, 10])
 def test_late_date_change_after_midnight_is_corrected(tmp_path, wrong):
-    """Some receivers briefly send the previous date in RMC after midnight; later epochs would be a day early."""
+    """Some receivers briefly send the previous date after midnight; without a correction, epochs are one day early."""
     lines, late = logs.nmea(TIMES, PLACES, every=1).splitlines(), 0
     for place, line in enumerate(lines):
         if "RMC,000" in line and late < wrong:
@@ -146,7 +146,7 @@ def test_sentence_with_wrong_or_missing_checksum_is_dropped(tmp_path):
 
 @pytest.mark.parametrize("end", ["\r\n", "\n", " \r\n"])
 def test_log_without_checksums_is_read_with_a_remark(tmp_path, end):
-    """A truncated sentence is still dropped, even if only the last digits at the end of the log are missing."""
+    """A truncated sentence is dropped, even if only the last digits at the end of the log are missing."""
     lines = [line.partition("*")[0] for line in logs.nmea(TIMES, PLACES).splitlines()]
     at = next(place for place, line in enumerate(lines) if "GGA,235957.30" in line)
     lines[at] = lines[at][:40]
@@ -192,7 +192,7 @@ def test_invalid_sentence_is_one_message(tmp_path, old, new):
 @tried(200)
 @given(data=st.data())
 def test_flipped_bit_changes_no_epoch(tmp_path_factory, data):
-    """One flipped bit removes a sentence or a date; it never changes a position or time."""
+    """A flipped bit removes a sentence or a date, but never changes a position or a time."""
     whole = logs.nmea(TIMES, PLACES).encode()
     place, bit = data.draw(st.integers(0, len(whole) - 1)), data.draw(st.integers(0, 7))
     damaged = bytearray(whole)

@@ -36,7 +36,7 @@ def test_axes_are_x_east_minus_z_north_y_up(tmp_path):
 
 
 def test_rotation_about_y_is_counter_clockwise(tmp_path):
-    """Counter-clockwise seen from above, so that yaw, clockwise from north, decreases."""
+    """The rotation is counter-clockwise seen from above, so that yaw (clockwise from north) decreases."""
     np.testing.assert_allclose(np.degrees(read(take(tmp_path)).attitude.values[-1]), [0, 0, -57.2958], atol=1e-3)
 
 
@@ -119,7 +119,7 @@ def test_incomplete_pose_and_non_unit_quaternion_are_rejected(tmp_path):
 
 
 def test_real_rail_pass_is_read(shared):
-    """10928 frames at 360 Hz in the heading, five without the radar; the rail is 3.42 m long, straight and level."""
+    """The take has 10928 frames at 360 Hz, five without the radar; the rail is 3.42 m long, straight and level."""
     path = shared / "bwsi_rail_passA" / "Rail SAR 2.csv"
     track = read(path)
     assert track.sizes["epoch"] + track.dropped["body not tracked"] == 10928

@@ -93,7 +93,7 @@ def test_lines_without_a_solution_are_dropped(tmp_path):
 
 
 def test_ecef_standard_deviations_are_rotated_to_north_east_up(tmp_path):
-    """From a diagonal covariance in north, east and up (5, 2 and 1 cm): some covariances in ECEF are negative."""
+    """The covariance is diagonal in north, east and up (5, 2 and 1 cm); some covariances in ECEF are negative."""
     axes = ned_axes(ECEF)
     covariance = axes @ np.diag([0.05, 0.02, 0.01]) ** 2 @ np.swapaxes(axes, 1, 2)
     parts = covariance[:, [0, 1, 2, 0, 1, 2], [0, 1, 2, 1, 2, 0]]
@@ -157,14 +157,14 @@ def restarted(first, second, **written):
     ],
 )
 def test_each_part_is_read_with_its_own_header(tmp_path, first, second):
-    """As written by rtkrcv after a restart, and as joined by `cat`."""
+    """Such logs are written by rtkrcv after a restart or joined by `cat`."""
     track = read(tmp_path, restarted(first, second))
     np.testing.assert_array_equal(track.time.values, TIMES)
     np.testing.assert_allclose(track.position.values, ECEF, atol=1e-5, rtol=0)
 
 
 def test_columns_and_time_format_may_change_with_a_header(tmp_path):
-    """The second header has weeks and seconds and reordered standard deviations; the first has none."""
+    """The second header has weeks, seconds and reordered standard deviations; the first has no standard deviations."""
     columns = np.hstack([PLACES[20:], np.tile([0.02, 0.01, 0.05], (20, 1))])
     second = logs.solution(TIMES[20:], columns, f"{LLH} sde(m) sdn(m) sdu(m)")
     for time in TIMES[20:]:
@@ -238,7 +238,7 @@ def test_backward_filtered_solution_is_reversed(tmp_path, caplog):
     np.testing.assert_allclose(track.position.values, ECEF, atol=1e-5, rtol=0)
     assert "times decrease" in track.remarks[0]
     read_track(tmp_path / "a.track.pos", node="a")
-    assert caplog.text.count("times decrease") == 1  # once, although a command may read the log for each of its checks
+    assert caplog.text.count("times decrease") == 1  # once, although each check of a command may read the log
 
 
 @pytest.mark.parametrize(("weeks", "later"), [(1024, 1024), (2048, 2048), (0, 0)])

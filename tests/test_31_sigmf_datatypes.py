@@ -32,7 +32,7 @@ NODES = {"a": 1, "b": 2}
 
 @pytest.fixture(scope="module")
 def _recorded(tmp_path_factory):
-    """Band of 0 to 16 MHz sampled at 64 MHz, 448 samples per capture, negligible noise."""
+    """Simulated recordings: band of 0 to 16 MHz sampled at 64 MHz, 448 samples per capture, negligible noise."""
     plan = small_simulation(pulses=20)
     nodes = {
         name: replace(node, impairments=replace(node.impairments, radar_snr_db=90.0, sidelink_snr_db=90.0))
@@ -104,7 +104,7 @@ def test_lossless_datatype_gives_bitwise_equal_echoes(campaign, plain, datatype)
 @pytest.mark.slow
 @pytest.mark.parametrize("unit", [2.0**-40, 2.0**15])
 def test_unit_of_floats_only_scales_the_echo(campaign, plain, unit):
-    """Volts or counts: scaled by powers of two, bitwise equal for a node's own echoes."""
+    """Volts or counts: scaling by powers of two gives bitwise equal echoes of the monostatic pairs."""
     for node in NODES:
         rewrite(campaign, node, (counts_of(campaign, node) * unit).astype("<f4"), "cf32_le")
     scaled = transfers(campaign)
@@ -115,7 +115,7 @@ def test_unit_of_floats_only_scales_the_echo(campaign, plain, unit):
 @pytest.mark.slow
 @pytest.mark.parametrize("datatype", ["ci8", "cu8"])
 def test_eight_bit_samples_add_only_quantisation_noise(campaign, plain, datatype):
-    """A step Δ gives Δ²/12 in I and in Q, which a DFT of N samples spreads over N subcarriers: Δ²/6N on each."""
+    """A step Δ adds Δ²/12 to the variances of I and Q; a DFT of N samples spreads these over N subcarriers: Δ²/6N."""
     counts = counts_of(campaign, "a")
     step = np.abs(counts).max() / 127
     rounded = np.rint(counts / step) + (128 if datatype == "cu8" else 0)
@@ -135,7 +135,7 @@ def as_real(counts, if_hz):
 @pytest.mark.quick("-24000000.0")
 @pytest.mark.parametrize("if_hz", [8e6, 8e6 + 5 * RATE_HZ, -24e6])
 def test_real_samples_at_an_intermediate_frequency_give_the_same_echo(campaign, plain, if_hz):
-    """In any Nyquist zone, upright or mirrored, within the filter's -80 dB."""
+    """The echoes agree within the -80 dB of the filter, in any Nyquist zone, upright or mirrored."""
     for node in NODES:
         real = as_real(counts_of(campaign, node), if_hz)
         rewrite(campaign, node, real.astype("<f4"), "rf32_le", **{"apertura:if_hz": if_hz})
@@ -147,7 +147,7 @@ def test_real_samples_at_an_intermediate_frequency_give_the_same_echo(campaign, 
 @pytest.mark.slow
 @pytest.mark.parametrize("datatype", ["ri16_le", "ri16_be", "rf16_le"])
 def test_real_samples_add_only_quantisation_noise(campaign, plain, datatype):
-    """Rounding gives Δ²/12 in the real sample; the Hilbert filter gives the same to the quadrature, within the band."""
+    """Rounding adds a variance of Δ²/12 to the real sample; the Hilbert filter adds the same to Q within the band."""
     real = np.rint(as_real(counts_of(campaign, "a"), 8e6) / 16)  # 11 bits, exact in float16
     rewrite(campaign, "a", real.astype(SampleLayout(datatype).stored), datatype, **{"apertura:if_hz": 8e6})
     transfer = transfers(campaign)["a-a"]
@@ -182,7 +182,7 @@ def test_invalid_datatype_or_mixing_is_named(campaign, datatype, if_hz, expected
 
 
 def test_mirror_image_is_80_db_down_across_the_band():
-    """A tone anywhere inside the band comes out as exp(j2πft), for any phase."""
+    """A tone at any frequency inside the band and of any phase is converted to exp(j2πft)."""
     n = np.arange(600)
     inner = slice(SETTLING, -SETTLING)
     for cycles in np.linspace(EDGE, 0.5 - EDGE, 23):
@@ -287,7 +287,7 @@ def test_header_and_trailing_bytes_are_skipped(campaign, plain):
         files = recording_files(campaign / "raw/f01", node)
         opened = open_recording(files)
         np.testing.assert_array_equal(opened.samples.captures(opened.captures.start[3:7], 448), recorded[node][3:7])
-        # sigmf's own reading adds a header twice
+        # the reader of the package sigmf counts a header twice
         begin, end = sigmf.fromfile(str(files[0])).get_capture_byte_boundaries(5)
         assert files[1].read_bytes()[begin:end] == recorded[node][5].tobytes()
         across = opened.samples.read(440, 460)  # the end of a capture and the start of the next

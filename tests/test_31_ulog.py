@@ -45,7 +45,7 @@ def read(tmp_path, *topics, options=DEFAULT_OPTIONS, **more):
 
 
 def position_error_m(track, time_s=None):
-    """Return the distance of each epoch from the true position, at its time or at a given one."""
+    """Return the distance of each epoch from the true position at its time or at given times."""
     time_s = (track.time.values - START) / SECOND if time_s is None else time_s
     exact, geodetic, _ = flight(4000, 400.0)
     fine = ecef_from_geodetic(*geodetic.T)
@@ -70,7 +70,7 @@ def test_track_has_the_values_of_the_receiver(tmp_path, topic, old):
 
 @pytest.mark.usefixtures("reader")
 def test_attitude_is_read_at_the_time_of_validity(tmp_path):
-    """The autopilot receives an epoch 110 ms late; ignoring this gives a yaw error of 1.0° in this turn."""
+    """The autopilot receives an epoch 110 ms late; neglecting this delay causes a yaw error of 1.0° in this turn."""
     track = read(tmp_path, (GPS, 0, ulog_receiver()), (ATTITUDE, 0, ulog_attitude()))
     expected = np.stack([np.full(60, 10.0), np.full(60, 3.0), flight()[2]], -1)
     np.testing.assert_allclose(np.degrees(track.attitude.values), expected, atol=2e-3)
@@ -97,7 +97,7 @@ def test_attitude_is_not_extrapolated(tmp_path):
 
 @pytest.mark.usefixtures("reader")
 def test_fused_positions_are_timed_by_the_receiver(tmp_path):
-    """The estimator assumes that the receiver is late by EKF2_GPS_DELAY, and so does the inverse conversion."""
+    """The estimator and the inverse conversion both assume that the receiver is late by EKF2_GPS_DELAY."""
     topics = (GPS, 0, ulog_receiver()), (ATTITUDE, 0, ulog_attitude()), (FUSED, 0, ulog_fused())
     track = read(tmp_path, *topics, options=LogOptions(body=FUSED))
     assert track.attrs["source"] == f"{FUSED}:0"
@@ -158,7 +158,7 @@ SYNC = struct.pack("<HB", 8, ord("S")) + bytes([0x2F, 0x73, 0x13, 0x20, 0x25, 0x
 def test_epochs_after_foreign_bytes_are_read_and_bytes_counted(tmp_path, foreign, inside):
     data = ulog((GPS, 0, ulog_receiver(epochs=98)))
     size = len(_last_message(data))
-    at = len(data) - 58 * size + inside  # after epoch 40
+    at = len(data) - 58 * size + inside  # position after epoch 40
     path = tmp_path / "a.track.ulg"
     path.write_bytes(data[:at] + foreign + data[at:])
     track = read_track(path, node="a")
@@ -275,13 +275,13 @@ def test_clock_drift_is_followed_and_late_messages_are_harmless(tmp_path):
     track = read(tmp_path, (GPS, 0, receiver), (ATTITUDE, 0, attitude))
     np.testing.assert_array_equal(track.time.values, utc_of(time))
     error_deg = (np.degrees(track.attitude.values[:, 2]) - flight(600)[2] + 180) % 360 - 180
-    # 4 ms from the late messages at 9.2°/s, 3 ms from a drift that attitude does not share
+    # 4 ms due to late messages at 9.2°/s, 3 ms due to a drift that does not affect the attitude
     assert np.abs(error_deg).max() < 0.06
 
 
 @pytest.mark.usefixtures("reader")
 def test_leap_second_learnt_during_the_log_is_rejected(tmp_path):
-    """The first times are 2 s early; the log alone cannot determine which half is right."""
+    """The first times are 2 s early; the correct half cannot be determined from the log alone."""
     times = ulog_receiver()["time_utc_usec"][1] - np.where(np.arange(60) < 25, 2_000_000, 0)
     message = complaint(lambda: read(tmp_path, (GPS, 0, ulog_receiver(time_utc_usec=times))))
     assert "25 of 60 times of the receiver disagree with the autopilot's clock" in message
@@ -296,7 +296,7 @@ def test_leap_second_learnt_during_the_log_is_rejected(tmp_path):
 @pytest.mark.parametrize("epoch", [0, 3, 30, 58, 59])
 @pytest.mark.parametrize(("field", "step"), [("lat", 90), ("lon", -150), ("alt_ellipsoid", 1000)])
 def test_position_that_contradicts_the_velocity_is_dropped(tmp_path, epoch, field, step):
-    """Error of about 1 m, as from a flipped bit; at the ends only velocity reveals it. With epoch 58, 59 is dropped."""
+    """Errors of 1 m, e.g. by flipped bits, are found by velocity even at the ends; 59 is dropped together with 58."""
     displaced = ulog_receiver()[field][1] + step * (np.arange(60) == epoch)
     track = read(tmp_path, (GPS, 0, ulog_receiver(**{field: displaced})))
     assert track.attrs["dropped"] == {"position contradicts the receiver's velocity": 1 + (epoch == 58)}
@@ -312,7 +312,7 @@ def test_velocities_that_contradict_the_whole_log_are_ignored(tmp_path, wrong):
 
 @pytest.mark.usefixtures("reader")
 def test_step_between_solutions_drops_no_epoch(tmp_path):
-    """From float to fix all later positions are displaced; both sides are valid, and steps are checked elsewhere."""
+    """A change to fix displaces all later positions; both parts are valid, and steps are checked elsewhere."""
     displaced = ulog_receiver()["lat"][1] + 180 * (np.arange(60) >= 30)
     assert read(tmp_path, (GPS, 0, ulog_receiver(lat=displaced))).sizes["epoch"] == 60
 
@@ -337,7 +337,7 @@ def test_invalid_log_is_rejected(tmp_path, data, found):
     assert found in complaint(lambda: read_track(path, node="a"))
 
 
-# Damaged logs: ULog has no checksums, so that changes are detected only by contradictions within the log
+# Damaged logs: ULog has no checksums; therefore, changes are detected only by contradictions within the log
 
 MESSAGES = ulog((GPS, 0, ulog_receiver()), (ATTITUDE, 0, ulog_attitude(rate_hz=10.0)))
 DAMAGED = tried(300)
@@ -354,7 +354,7 @@ def split(data):
 
 
 def read_damaged(path, data):
-    """Return the track of a damaged log, or None if it is rejected; in-process version of the isolated reader."""
+    """Return the track of a damaged log, or None if the log is rejected; the reader runs in this process."""
     path.write_bytes(data)
     try:
         fields = read_fields(path)
@@ -367,7 +367,7 @@ def read_damaged(path, data):
 
 
 def assert_no_position_is_silently_wrong(track):
-    """Check that every epoch is at the true position or is found by the check applied to every track."""
+    """Assert that every epoch is at the true position or is detected by the check of all tracks."""
     time_s = (track.time.values - track.time.values[0]) / SECOND
     checked = check_track(time_s, track.position.values, poor_fix=np.zeros(time_s.size, bool), tolerated_m=0.01)
     inside = np.minimum(np.arange(time_s.size), np.arange(time_s.size)[::-1]) >= 6
@@ -448,7 +448,7 @@ def test_real_log_is_undamaged(flown):
 
 @pytest.mark.slow
 def test_foreign_bytes_anywhere_in_a_real_log_are_found(tmp_path):
-    """At 40 positions; the other epochs of the log stay unchanged."""
+    """Foreign bytes are inserted at 40 positions; the other epochs of the log remain unchanged."""
     if not REAL.is_file():
         pytest.skip(f"{REAL} does not exist")
     data, generator = REAL.read_bytes(), np.random.default_rng(4)
@@ -465,7 +465,7 @@ def test_foreign_bytes_anywhere_in_a_real_log_are_found(tmp_path):
 
 
 def test_real_flight_has_the_epochs_and_positions_of_its_messages(flown):
-    """px4_real_flight, a PX4 1.9 multicopter over Zurich; fields are unpacked by their offsets in the message."""
+    """The log is px4_real_flight, a PX4 1.9 multicopter over Zurich; fields are unpacked by their byte offsets."""
     names, payloads = raw_messages(GPS)
     sizes = {"uint64_t": 8, "int32_t": 4, "float": 4, "uint8_t": 1, "bool": 1}
     offsets, at = {}, 0

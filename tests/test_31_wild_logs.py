@@ -1,4 +1,4 @@
-"""Flight logs with implausible values: each is one short, printable message; Windows line ends are accepted."""
+"""Flight logs with implausible values: each causes one short, printable message; Windows line ends are accepted."""
 
 import pytest
 from folders import complaint, edit_track

@@ -1,4 +1,4 @@
-"""Association of the pulses of two nodes: correct pairs, and flags or errors for ambiguous cases."""
+"""Association of the pulses of two nodes: pairs are correct, and ambiguous cases raise flags or errors."""
 
 import numpy as np
 import pytest
@@ -219,7 +219,7 @@ def test_outliers_of_the_sidelink_are_no_wrong_association():
 
 @pytest.mark.slow
 def test_correct_associations_with_jitter_raise_no_false_alarm():
-    """Trigger jitter from 1 mm to 3 m, Gaussian and uniform, 30 to 800 pulses: at most one false alarm in 500."""
+    """Gaussian or uniform trigger jitter of 1 mm to 3 m, 30 to 800 pulses: at most one false alarm in 500 draws."""
     alarms = 0
     for seed in range(500):
         rng = np.random.default_rng(seed)
@@ -233,7 +233,7 @@ def test_correct_associations_with_jitter_raise_no_false_alarm():
 
 @pytest.mark.parametrize(("size_m", "found"), [(0.8, False), (1.25, True)])
 def test_slow_displacement_above_the_limit_is_found(size_m, found):
-    """Jitter of 0.15 m hides at least 16 cm from a median of 15 pulses, but not from a longer one."""
+    """A jitter of 0.15 m hides displacements of 16 cm or more in medians of 15 pulses, but not in longer medians."""
     rng = np.random.default_rng(3)
     time = np.arange(1600) / 20
     displacement_m = size_m * EXPLAINED_M * np.cos(2 * np.pi * time / 40)
@@ -246,7 +246,7 @@ def test_slow_displacement_above_the_limit_is_found(size_m, found):
 
 
 def test_pulses_at_the_ends_are_counted_once():
-    """An outlier at the very end of a flight is no displacement."""
+    """An outlier in the last pulse of a flight is not reported as a displacement."""
     measured = 5 + np.random.default_rng(5).normal(0, 0.02, 60)
     measured[[0, -1]] += 1.0
     assert detect_wrong_association(baseline_residual(measured, np.full(60, 5.0))) is None
@@ -261,7 +261,7 @@ def test_pulses_at_the_ends_are_counted_once():
     drift_ppm=st.floats(-100, 100),
 )
 def test_jitter_below_half_an_interval_keeps_pairs_correct(seed, offset, reach, lost, drift_ppm):
-    """Time tags with a relative jitter of up to 0.4 of an interval, about an offset of up to 0.4."""
+    """Time tags with a relative jitter of up to 0.4 of an interval, about an offset of up to 0.4 of an interval."""
     rng, interval_ns = np.random.default_rng(seed), 50_000_000
     numbers = [np.flatnonzero(rng.random(150) >= share) for share in lost]
     tags = [n * interval_ns + (rng.uniform(-reach, reach, n.size) * interval_ns).astype(np.int64) for n in numbers]

@@ -1,4 +1,4 @@
-"""Path offset from a reflector at a known position, and the cases in which none is determined."""
+"""Path offset from a reflector at a known position, and the cases in which no offset is determined."""
 
 import numpy as np
 import pytest
@@ -52,7 +52,7 @@ def test_reported_std_matches_the_errors_of_many_flights(snr_db, clutter, wobble
     ]
     errors = np.array([flight.offset_m - 1.374 for flight in flights])
     reported_m = np.sqrt(np.mean([flight.std_m**2 for flight in flights]))
-    # clutter has errors of both signs: the reported deviation is too large
+    # errors due to clutter have both signs; therefore, the reported deviation is too large
     assert reported_m / 4 < np.sqrt(np.mean(errors**2)) < reported_m * 2
 
 
@@ -120,7 +120,7 @@ def test_single_pulse_gives_an_offset_without_std():
 
 @pytest.mark.parametrize("offset_m", [0.0, 0.4])
 def test_phase_of_a_static_recording_equals_the_clock_phase(offset_m):
-    """200 stationary pulses: the random phase of each is recovered, and the corrected pulses are coherent."""
+    """The random phases of 200 stationary pulses are recovered, and the corrected pulses are coherent."""
     rng = np.random.default_rng(9)
     phase = rng.uniform(-np.pi, np.pi, 200)
     still = np.exp(-2j * np.pi * FREQUENCY * (31.0 + offset_m) / C)

@@ -1,4 +1,4 @@
-"""Clock offset of a receiver: measured on its sidelink, corrected in its samples, ignored where harmless."""
+"""Clock offset of a receiver: measured on the sidelink, corrected in the samples, and neglected where harmless."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from apertura.core.echo.demodulate import Numerology
 
 NUMBERS = np.arange(512)
 NUMEROLOGY = Numerology(1.2e9, 102.4e6, NUMBERS, prefix_samples=320, dft_samples=1024)  # Δf = 100 kHz, B = 51.2 MHz
-SYMBOL = 1600  # T = 1.25/Δf, with the prefix before it
+SYMBOL = 1600  # T = 1.25/Δf plus prefix
 CODES = np.exp(2j * np.pi * np.random.default_rng(0).random(512))
 ECHOES_S = np.array([0.2e-6, 0.53e-6, 1.4e-6])
 
@@ -30,13 +30,13 @@ def record(delays_s, *, cfo_hz=0.0, sfo_hz=0.0, pulses=1, snr_db=None, rng=None,
 
 
 def transfer(samples, waveform=NUMEROLOGY):
-    """Return the symbols for R/S: DFT after the prefix, code removed."""
+    """Return the transfer functions for the ratio R/S: DFT after the prefix, with the code removed."""
     window = samples[:, waveform.prefix_samples : waveform.prefix_samples + waveform.dft_samples]
     return (np.fft.fft(window, axis=1) / waveform.dft_samples)[:, waveform.numbers] / CODES
 
 
 def floor_db(radar, sidelink):
-    """Return the RMS error of the divided range profile against the ideal one, relative to its peak."""
+    """Return the RMS error of the divided range profile, relative to the peak of the ideal profile."""
     ratio = (transfer(radar) / transfer(sidelink))[0]
     frequency = NUMEROLOGY.carrier_hz + NUMBERS * NUMEROLOGY.spacing_hz
     ideal = np.exp(-2j * np.pi * np.outer(ECHOES_S - 0.1e-6, frequency)).sum(0)
@@ -76,7 +76,8 @@ def test_clock_accuracy_in_noise_matches_theory(ppm):
     rng = np.random.default_rng(1)
     captures = record(0.7e-6, cfo_hz=1200 * ppm, sfo_hz=102.4 * ppm, pulses=64, snr_db=0, rng=rng)
     offset = estimate_clock(captures, NUMEROLOGY)
-    # 64 pulses, two copies 10 µs apart of 128 in-band samples at 3 dB: variance of the phase 1/SNR + 1/(2·SNR²)
+    # 64 pulses, two copies, separated by 10 µs, of 128 in-band samples at 3 dB: variance of the phase 1/SNR +
+    # 1/(2·SNR²)
     theory_hz = np.sqrt((1 / 2 + 1 / 8) / (64 * 128)) / (2 * np.pi * 10e-6)
     assert offset.one_clock
     assert abs(offset.cfo_hz - 1200 * ppm) < 4 * theory_hz
@@ -105,7 +106,8 @@ def test_blocked_pulses_do_not_bias_the_clock():
 @pytest.mark.parametrize(("cfo_hz", "sfo_hz"), [(10e3, 0.0), (2e3, 0.0), (0.0, 200 * 102.4), (9600.0, 819.2)])
 def test_predicted_floor_matches_the_measured_floor(cfo_hz, sfo_hz):
     predicted = interference_floor_db(cfo_hz, sfo_hz / 102.4, NUMEROLOGY)
-    # components common to echo and sidelink cancel in the ratio; the rest grows with the delay between them
+    # components common to echo and sidelink cancel in the ratio; the residual grows with the delay between echo and
+    # sidelink
     phase_rad = 2 * np.pi * 100e3 * (ECHOES_S - 0.1e-6)
     excess = ((np.pi * phase_rad / 2 - phase_rad**2 / 4) / (np.pi**2 / 6)).sum()
     assert floor_db(*both(cfo_hz=cfo_hz, sfo_hz=sfo_hz)) == pytest.approx(predicted + 10 * np.log10(excess), abs=1)
@@ -127,7 +129,7 @@ def test_clock_is_corrected_only_if_the_accuracy_needs_it(ppm, accuracy_db, corr
 
 
 def test_insignificant_clock_offset_is_not_corrected():
-    """2400 Hz: not corrected below three standard deviations, and both values are reported."""
+    """An offset of 2400 Hz, below three standard deviations, is not corrected; both values are reported."""
     assert not decision(2.0, std_hz=820.0).correct
     assert decision(2.0, std_hz=820.0).reason.startswith("clock +2.00 ± 0.68 ppm (CFO")
     assert decision(2.0, std_hz=820.0).reason.endswith("not corrected: below 3 σ")
@@ -189,7 +191,7 @@ def test_captures_without_a_repetition_are_rejected():
 
 
 def test_late_captures_give_the_same_clock():
-    """A chirp-like code whose end has one edge of the band: 8 samples of silence there are no clock offset."""
+    """The end of a chirp-like code has one edge of the band; 8 samples of silence there are not taken for an offset."""
     chirp = np.exp(1j * np.pi * NUMBERS**2 / NUMBERS.size)  # Newman's phases
     rng = np.random.default_rng(3)
     captures = np.zeros((400, SYMBOL), np.complex64)

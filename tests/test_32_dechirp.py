@@ -18,14 +18,14 @@ def beats(sweep, path_m, start_s=(0.0,)):
 
 
 def against_truth(sweep, path_m, **options):
-    """Return the transfer function of one echo divided by the exact one."""
+    """Return the transfer function of one echo divided by the exact transfer function."""
     transfer = transfer_of(beats(sweep, path_m), sweep, **options)[0]
     delay_s = path_m / SPEED_OF_LIGHT_M_S - sweep.reference_delay_s
     return transfer * np.exp(2j * np.pi * sweep.frequency_hz * delay_s)
 
 
 def gathered(ratio):
-    """Return the value of a Hann-weighted profile at the echo's own delay."""
+    """Return the value of a Hann-weighted profile at the delay of the echo."""
     return complex((ratio * window_weights("hann", len(ratio))).sum())
 
 
@@ -36,7 +36,7 @@ def gathered(ratio):
 def test_echo_has_the_phase_of_its_delay_at_every_frequency(path_m, bandwidth_hz, iq, options):
     sweep = replace(FAST, start_hz=2.4e9 - bandwidth_hz / 2, bandwidth_hz=bandwidth_hz, iq=iq, **options)
     ratio = against_truth(sweep, path_m)
-    inside = ratio[60:-60]  # the echo is absent for its delay, 12 samples at most, and its edges ring
+    inside = ratio[60:-60]  # the echo is absent before its delay, at most 12 samples, and its edges ring
     assert np.abs(inside / abs(inside) - 1).max() < 0.05
     assert gathered(ratio) == pytest.approx(1, abs=2e-3)
 
@@ -107,7 +107,7 @@ def test_sidelobes_are_those_of_the_window():
 
 @pytest.mark.parametrize(("sweep_s", "flagged"), [(2e-3, False), (4e-3, True)])
 def test_motion_within_a_sweep_is_flagged_above_wavelength_16(sweep_s, flagged):
-    """At 3 m/s and 2.4 GHz, λ/16 = 7.8 mm takes 2.6 ms."""
+    """At 3 m/s and 2.4 GHz, a path change of λ/16 = 7.8 mm takes 2.6 ms."""
     time = np.datetime64("2025-05-14T09:30", "ns") + np.arange(50) * np.timedelta64(10, "ms")
     flown = np.arange(50)[:, None] * np.array([0.03, 0, 0])
     frequency = np.linspace(2.2e9, 2.6e9, 100)

@@ -1,4 +1,4 @@
-"""From captured symbols to range profiles: phases match those predicted from delays."""
+"""From captured symbols to range profiles: phases match the predictions from delays."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ RATE, SPACING, COUNT, PREFIX = 64e6, 1e6, 32, 16
 
 
 def symbol(delay_s, codes, numbers, carrier=1e9):
-    """Return a delayed symbol as sampled by the receiver, from its definition (theory eq. 1)."""
+    """Return the samples of a delayed symbol at the receiver from the definition (eq. 1 of the theory)."""
     time = np.arange(PREFIX + 80) / RATE - delay_s
     inside = (time >= 0) & (time < PREFIX / RATE + 1.25 / SPACING)
     waves = np.exp(2j * np.pi * numbers * SPACING * (time[:, None] - PREFIX / RATE))
@@ -96,7 +96,7 @@ def test_reference_delay_is_restored():
 
 @pytest.mark.parametrize("count", [16, 49, 64, 400])
 def test_swath_profile_matches_the_complete_sum(count):
-    """Decimation to the swath has an error below -110 dB of the strongest echo, at any position of it."""
+    """Decimation to the swath has an error below -110 dB relative to the strongest echo at any position."""
     frequency, generator = band(), np.random.default_rng(3)
     paths = generator.uniform(0, 749, 40)  # everywhere in the unambiguous range
     transfer = np.repeat(echo_of(paths, frequency) + 10 * echo_of([400.0], frequency), 3, axis=0)
@@ -132,7 +132,7 @@ def test_hann_window_lowers_the_sidelobes():
 
 @pytest.mark.parametrize("count", [3, 64, 1023, 1024])
 def test_hann_window_is_symmetric(count):
-    """Profiles of other programs and closed formulas are compared with this definition only."""
+    """Only this definition agrees with profiles of other programs and closed formulas."""
     expected = hann(count, sym=True)
     np.testing.assert_allclose(window_weights("hann", count), expected / expected.sum(), atol=1e-15)
     periodic = hann(count, sym=False)
@@ -226,7 +226,7 @@ def test_track_must_cover_the_pulses():
 @tried(50)
 @given(latitude=st.floats(-80, 80), longitude=st.floats(6, 12), height_m=st.floats(-400, 9000))
 def test_ecef_conversion_is_invertible_to_a_micrometre(latitude, longitude, height_m):
-    """Geodetic and UTM zone 32 in both directions; up is the direction of increasing height."""
+    """Geodetic coordinates and UTM zone 32, in both directions; up is the direction of increasing height."""
     place = np.array([latitude, longitude, height_m])
     position = ecef_from_geodetic(*place)
     returned = geodetic_from_ecef(position)
@@ -239,7 +239,7 @@ def test_ecef_conversion_is_invertible_to_a_micrometre(latitude, longitude, heig
 
 @pytest.mark.parametrize("overrun", [0.02, 0.1, 0.3])
 def test_echo_beyond_the_prefix_loses_power_to_noise(overrun):
-    """docs/theory/focus.md, eq. 5a, for 512 subcarriers: 20 random codes, one echo of amplitude 1, no window."""
+    """Eq. 5a of docs/theory/focus.md for 512 subcarriers, 20 random codes, one echo of amplitude 1 and no window."""
     count, length, prefix = 512, 1024, 64
     numerology = Numerology(1e9, 1024e6, np.arange(count), prefix_samples=prefix, dft_samples=length)
     codes = np.exp(2j * np.pi * np.random.default_rng(1).random((20, count)))

@@ -1,4 +1,4 @@
-"""Transfer functions formed on reading: equal to those stored in a stage, for any reader and any order."""
+"""Transfer functions computed on reading are equal to those stored in a stage, for any reader and any order."""
 
 from dataclasses import replace
 
@@ -87,7 +87,7 @@ def test_stored_pulse_parameters_give_the_measured_transfer(drifting, tmp_path, 
 
 @pytest.mark.slow
 def test_images_from_stored_transfer_equal_those_of_recordings(drifting, tmp_path):
-    """With another window than in the first run, as if the recordings had been deleted since."""
+    """The window differs from that of the first run, and the recordings are not available."""
     results = []
     for lost in (False, True):
         campaign = formed(drifting, tmp_path, f"lost {lost}", window="none")
@@ -142,7 +142,7 @@ def test_missing_or_changed_recording_is_reported_on_reading(drifting, tmp_path,
 
 @pytest.mark.parametrize(("wrong_m", "least_db", "most_db"), [(0.0, -300, -120), (0.5, -30, 0)])
 def test_compression_error_reveals_wrong_paths(wrong_m, least_db, most_db):
-    """Half a metre is a fifth of a resolution cell c/B."""
+    """A path error of half a metre is a fifth of a resolution cell c/B."""
     rng = np.random.default_rng(2)
     frequency = 1.2e9 + 1e6 * np.arange(128)
     track = np.stack([np.linspace(-1, 1, 64), np.full(64, -20.0), np.full(64, 10.0)], -1)

@@ -9,7 +9,7 @@ SENT = np.arange(600) * 50_000_000
 
 
 def response(kept):
-    """Return the azimuth response of the used pulses, normalised by their number, from one cell outwards."""
+    """Return the azimuth response of the used pulses, normalised by their number, at distances of one cell or more."""
     return np.abs(np.fft.rfft(kept, 4 * kept.size))[4:] / kept.sum()
 
 

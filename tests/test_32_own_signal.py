@@ -83,7 +83,7 @@ def test_random_phase_is_detected_on_points_and_clutter(targets, phase_rad, flag
     for seed in range(4):
         found = stability(echoes(np.random.default_rng(seed), targets, phase_rad=phase_rad))
         assert ("phase_unstable" in found.flags) is flagged
-        if phase_rad == 0.3:  # the standard deviation of a second difference of white phase noise is √6 times its own
+        if phase_rad == 0.3:  # second differences of white phase noise have √6 times its deviation
             assert found.rms_rad == pytest.approx(np.sqrt(6) * 0.3, rel=0.2)
 
 

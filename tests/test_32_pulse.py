@@ -1,4 +1,4 @@
-"""Single-pulse waveforms: captures are linear convolutions, inverted by one DFT of the capture length."""
+"""Single-pulse waveforms: captures are linear convolutions, which one DFT of the capture length inverts."""
 
 import numpy as np
 import pytest
@@ -93,7 +93,7 @@ def test_simulated_captures_are_delayed_pulses(name):
     carried = samples(
         Channel(wave, paths.at(slice(None)), np.ones(len(wave.codes)), np.zeros(1), np.zeros(1), sfo_hz=1e-6), None
     )
-    assert np.abs(carried[0] - expected).max() < 0.01  # through the simulation path for clock offsets
+    assert np.abs(carried[0] - expected).max() < 0.01  # simulated by the method for clock offsets
 
 
 @pytest.mark.parametrize(("name", "widest"), [("chirp", 0.26), ("pn", 0.48), ("golay", 0.48)])
@@ -108,7 +108,7 @@ def test_default_band_is_that_of_the_pulse(name, widest):
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("requested", ["inverse", "matched"])
 def test_snr_loss_of_the_filter_is_as_reported(name, requested):
-    """Noise through the filter, against N·SNR of the matched filter."""
+    """SNR after the filter relative to N·SNR of the matched filter."""
     pulse = pulse_samples(name, **SIZES)
     spectrum = pulse_spectrum(pulse, lead=0, length=LENGTH)[middle_band() % LENGTH]
     chosen = pulse_filter(spectrum, requested=requested)
@@ -157,7 +157,7 @@ def test_auto_filter_depends_on_the_pulse_spectrum():
 
 @pytest.mark.parametrize("cfo_hz", [0.0, 3e4])
 def test_division_needs_no_clock_for_a_single_pulse(cfo_hz):
-    """A carrier offset displaces both spectra alike; their ratio keeps only 2π·CFO·(delay difference)."""
+    """A carrier offset displaces both spectra equally; their ratio retains only 2π·CFO·(delay difference)."""
     pulse = pulse_samples("pn", **SIZES)
     numbers = middle_band()
     rotation = np.exp(-2j * np.pi * cfo_hz / RATE * np.arange(LENGTH))

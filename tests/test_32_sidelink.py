@@ -1,4 +1,4 @@
-"""Sidelink corrections: remaining image quality, failure of each method, and the selection by `auto`."""
+"""Sidelink corrections: resulting image quality, failure of each method, and selection by `auto`."""
 
 import re
 
@@ -14,7 +14,7 @@ TARGETS = np.array([(0, 5, 0), (-2, 8, 0), (0, 11, 0), (2, 14, 0), (0, 18, 0)], 
 
 
 class Tandem:
-    """Two UAVs in line past five points, 409.6 MHz around 1.4 GHz; each method gets the same random draws."""
+    """Two UAVs in line past five points, 409.6 MHz around 1.4 GHz; all methods use the same random draws."""
 
     def __init__(self, subcarriers=512, pulses=48):
         self.shape = pulses, subcarriers
@@ -82,7 +82,7 @@ def test_corrected_targets_have_the_phase_of_their_paths(method):
 
 @pytest.mark.parametrize("snr_db", [10, 6, 3, 0, -5, -10])
 def test_division_loss_matches_theory(snr_db):
-    """E[1/(1+n)] = 1 - exp(-SNR): -4 dB at 0 dB, -20 dB at -10 dB."""
+    """The expected amplitude is E[1/(1+n)] = 1 - exp(-SNR): -4 dB at 0 dB SNR, -20 dB at -10 dB."""
     losses = [SCENE.loss_db(divide(*SCENE.record(np.random.default_rng(seed), snr_db))) for seed in range(4)]
     expected = 20 * np.log10(1 - np.exp(-(10 ** (snr_db / 10))))
     assert np.mean(losses) == pytest.approx(expected, abs=0.6 if snr_db < -5 else 0.2)
@@ -106,7 +106,7 @@ def test_auto_is_within_0_2_db_of_the_best_method(snr_db, flaw):
     state = measure(sidelink)
     kept = state.locked[:, None] / state.locked.mean()
     levels = {method: scene.loss_db(correct(radar, sidelink) * kept) for method, correct in METHODS.items()}
-    # a gain is as wrong as a loss
+    # a gain is an error, too
     errors = {method: abs(level) for method, level in levels.items()}
     assert errors[choose(state)[0]] <= min(errors.values()) + 0.2
 

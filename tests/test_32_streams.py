@@ -59,7 +59,7 @@ def test_transfer_functions_do_not_depend_on_block_size(method):
 
 
 def test_random_phase_and_start_of_captures_are_removed():
-    """After division the echo is 0.45 µs after the sidelink, and 10 ps more with every pulse."""
+    """After division, the echo is delayed by 0.45 µs relative to the sidelink, increasing by 10 ps per pulse."""
     _, whole = formed(recorded(40))
     delay_s = 0.45e-6 + 1e-11 * np.arange(40)
     straight = remove_path(whole, NUMEROLOGY.frequency_hz, delay_s=delay_s)
@@ -81,7 +81,7 @@ def test_sidelink_state_does_not_depend_on_block_size():
 
 
 def test_wrong_code_is_detected_across_blocks():
-    """Neighbouring pulses agree, also across the boundary between blocks."""
+    """Neighbouring pulses agree, also across block boundaries."""
     rng = np.random.default_rng(4)
     wrong_code = np.exp(2j * np.pi * rng.random(128))
     sidelink = (20 * wrong_code + rng.normal(size=(9, 128)) + 1j * rng.normal(size=(9, 128))).astype(np.complex64)
@@ -91,7 +91,7 @@ def test_wrong_code_is_detected_across_blocks():
 
 
 def test_direct_path_delay_maximises_the_likelihood():
-    """The power |Σ S_n exp(j2πn·delay/N)|² decreases on both sides, with noise, ripple and an echo."""
+    """The power |Σ S_n exp(j2πn·delay/N)|² decreases on both sides of the delay, with noise, ripple and an echo."""
     rng = np.random.default_rng(5)
     number = np.arange(300) - 149.5
     delay = rng.uniform(-140, 140, 50)
@@ -109,7 +109,7 @@ def test_direct_path_delay_maximises_the_likelihood():
 
 
 def test_clock_is_measured_on_groups_of_a_long_flight():
-    """8 ppm, from 16 groups of 8 of 640 pulses: consistent with the estimate from all, and near the truth."""
+    """From 16 groups of 8 of 640 pulses, 8 ppm are estimated consistently with all pulses and with the truth."""
     iq = recorded(640, ppm=8.0)["sidelink"]
     samples = transfer.as_complex(iq)
     groups = spread(640, groups=16, each=8)
@@ -124,7 +124,7 @@ def test_clock_is_measured_on_groups_of_a_long_flight():
 @pytest.mark.slow
 @pytest.mark.parametrize("displacement_m", [0.0, 9.0])
 def test_jitter_of_a_long_flight_is_no_wrong_association(displacement_m):
-    """The largest of 300 000 medians exceeds that of a thousand; a larger displacement is still detected."""
+    """The largest of 300 000 medians exceeds the largest of a thousand; larger displacements are still detected."""
     rng = np.random.default_rng(3)
     delay_m = 12 + rng.uniform(-12, 12, 300_000)
     delay_m[100_000:100_300] += displacement_m
@@ -133,7 +133,7 @@ def test_jitter_of_a_long_flight_is_no_wrong_association(displacement_m):
 
 
 def test_saturation_counts_all_blocks():
-    """Extremes reached only by a later block replace those of earlier blocks."""
+    """Extreme values in a later block replace the extreme values of earlier blocks."""
     saturation = Saturation()
     for values in ([1, 5, 5, -3], [7, 7, 7, -3], [7, 0, 0, -9]):
         saturation.count({"radar": np.array(values, np.int16).reshape(1, 2, 2)})
@@ -146,7 +146,7 @@ def symbols(generator, captures):
 
 
 def limited(iq, share):
-    """Limit each component to a share of its maximum."""
+    """Limit each component to a fraction of its maximum."""
     return iq.clip(-share * np.abs(iq).max(), share * np.abs(iq).max())
 
 
@@ -154,7 +154,7 @@ def limited(iq, share):
     ("share", "every", "flagged"), [(1 / 8, 5, True), (1 / 4, 5, True), (1 / 2, 5, False), (1 / 8, 100, False)]
 )
 def test_limited_captures_are_counted(share, every, flagged):
-    """Limiting at half of the peak, 2.6 standard deviations, costs under 0.1 dB, as does limiting 1 % of captures."""
+    """Limiting at half the peak (2.6 standard deviations), or limiting 1 % of the captures, costs less than 0.1 dB."""
     generator, saturation = np.random.default_rng(1), Saturation()
     iq = symbols(generator, 200)
     iq[::every] = limited(iq[::every], share)
@@ -178,7 +178,7 @@ def test_weak_captures_and_tones_are_not_counted_as_limited():
 
 
 def test_memory_does_not_grow_with_the_length_of_a_flight(monkeypatch):
-    """Ten times the pulses with the same peak except a few numbers per pulse; captures are generated on reading."""
+    """With ten times the pulses, peak memory grows by a few numbers per pulse; captures are generated on reading."""
     monkeypatch.setattr(transfer, "_STRETCH", 8)
     captures = recorded(64)["radar"]
     peaks = []

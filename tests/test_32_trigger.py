@@ -75,7 +75,7 @@ def test_noise_triggers_at_the_configured_rate_at_any_level(sigma):
     alarms_per_s = 2e-5 * RATE_HZ  # one in 50 000 samples, so that 80 are expected
     detections = find(record([], 0, samples, rng, sigma=sigma), false_alarms_per_s=alarms_per_s)
     expected = alarms_per_s * samples / RATE_HZ
-    # neighbouring samples alarm together and a frame of dead time follows: fewer than configured, never more
+    # neighbouring samples alarm together and a frame of dead time follows: the rate is below the configured rate
     assert 0.6 * expected < len(detections) < expected + 2 * np.sqrt(expected)
 
 

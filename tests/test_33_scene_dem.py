@@ -46,7 +46,7 @@ def test_plane_is_interpolated_exactly(tmp_path):
 
 
 def test_geoid_undulation_is_added_to_heights(tmp_path):
-    """A geoid that slopes to the east, 40 m above the ellipsoid at 8° and 48 m at 10°; the scene is at 9°."""
+    """The geoid slopes to the east, from 40 m above the ellipsoid at 8° to 48 m at 10°; the scene is at 9°."""
     gtx = tmp_path / "sloping.gtx"
     posts = np.broadcast_to([40.0, 44.0, 48.0], (3, 3)).astype(">f4")
     gtx.write_bytes(struct.pack(">4d2i", 47.0, 8.0, 1.0, 1.0, *posts.shape) + posts.tobytes())
@@ -57,7 +57,7 @@ def test_geoid_undulation_is_added_to_heights(tmp_path):
 
 
 def test_dem_in_another_crs_keeps_post_heights(shared):
-    """The height at each post's own position in UTM equals that of the post of the isce3 DEM."""
+    """The height at the UTM position of each post equals the height of this post in the isce3 DEM."""
     path = shared / "dem_isce3" / "SanAnd_dem.tif"
     with rasterio.open(path) as raster:
         posts, transform = raster.read(1), raster.transform
@@ -70,7 +70,7 @@ def test_dem_in_another_crs_keeps_post_heights(shared):
 
 
 def test_egm96_heights_are_converted_by_the_grid_file(shared):
-    """Compared with the .gtx read directly, without PROJ."""
+    """Heights are compared with the .gtx file, read directly without PROJ."""
     path, gtx = shared / "dem_isce3" / "SanAnd_dem.tif", shared / "dem_isce3" / "egm96_15.gtx"
     grid = SceneGrid("EPSG:32611", 368000.0, 3783000.0, 40.0, (60, 50))
     raised = open_dem(path, grid.crs, datum="egm96", geoid=gtx).heights(grid)
@@ -118,7 +118,7 @@ def test_geoid_grid_is_found_in_the_proj_search_path(shared, monkeypatch, tmp_pa
 
 
 def test_geoid_grid_in_the_working_folder_is_opened(shared, monkeypatch):
-    """As named by the workflow, from inside the campaign folder."""
+    """The workflow names the grid relative to the campaign folder, in which it runs."""
     monkeypatch.chdir(shared / "dem_isce3")
     terrain = open_dem(Path("SanAnd_dem.tif"), "EPSG:32611", datum="egm96", geoid=Path("egm96_15.gtx"))
     assert np.isfinite(terrain.heights(SceneGrid("EPSG:32611", 368000.0, 3783000.0, 40.0, (3, 3)))).all()
@@ -175,7 +175,7 @@ def test_void_affects_only_pixels_around_its_post(tmp_path, void):
 
 @pytest.mark.parametrize("wild", [-9999.0, -32768.0, 3.4e38, 29029.0])
 def test_implausible_heights_are_rejected_within_the_scene(tmp_path, wild):
-    """Posts 20 and 21 of row 30 are in the scene, row 2 is not; in a local frame any height is accepted."""
+    """Posts 20 and 21 of row 30 are in the scene, row 2 is outside; in a local frame, any height is accepted."""
     heights = np.full((60, 60), 600.0)
     heights[2] = wild
     path, corner = tmp_path / "dem.tif", from_origin(500000, 5400100, 2, 2)
@@ -193,7 +193,7 @@ def test_implausible_heights_are_rejected_within_the_scene(tmp_path, wild):
 @pytest.mark.parametrize("crs", ["EPSG:31467", "EPSG:31287", "EPSG:25832", "EPSG:32632"])
 @pytest.mark.parametrize("dem_crs", ["EPSG:31467", "EPSG:32632", "EPSG:4326"])
 def test_heights_refer_to_wgs_84_for_any_crs(tmp_path, crs, dem_crs):
-    """Bessel's ellipsoid is 47 m below WGS 84 there; a DEM and flat ground, both 620 m above WGS 84, must agree."""
+    """The Bessel ellipsoid is 47 m below WGS 84 here; a DEM and flat ground, both 620 m above WGS 84, must agree."""
     x, y = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(9.955, 48.42)
     grid = SceneGrid(crs, x, y, 1.0, (8, 8))
     west, north = Transformer.from_crs("EPSG:4326", dem_crs, always_xy=True).transform(9.954, 48.421)
@@ -210,7 +210,7 @@ def test_heights_refer_to_wgs_84_for_any_crs(tmp_path, crs, dem_crs):
 @pytest.mark.parametrize("fill", [0, -1, 1, 255, 999])
 @pytest.mark.parametrize("side", [1, 2, 12])
 def test_void_filled_with_a_constant_is_rejected_in_the_scene(tmp_path, fill, side):
-    """In hilly terrain near 400 m; the same block outside the scene is accepted."""
+    """The terrain is hilly, near 400 m; the same block outside the scene is accepted."""
     heights = 400 + np.random.default_rng(5).normal(0, 3, (60, 60)).astype(np.float32)
     heights[2 : 2 + side, 50 - side : 50] = fill
     path, corner = tmp_path / "dem.tif", from_origin(500000, 5400100, 2, 2)
@@ -274,7 +274,7 @@ def test_invalid_dem_file_is_rejected(tmp_path):
 
 @pytest.mark.slow
 def test_target_on_a_slope_is_imaged_at_its_position_with_a_dem(tmp_path):
-    """Flat ground 1.8 m lower displaces it; the raster is in geographic coordinates, the scene in UTM."""
+    """Flat ground 1.8 m lower displaces the target; the raster is in geographic coordinates, the scene in UTM."""
     grid = ap.SceneGrid("EPSG:32632", 500059.0, 5400041.0, 0.1, (40, 40))
     path = geographic_dem(tmp_path / "dem.tif", slope=(0.3, -0.2))
     terrain = ap.open_dem(str(path), grid, datum="ellipsoid")
@@ -293,7 +293,7 @@ def test_target_on_a_slope_is_imaged_at_its_position_with_a_dem(tmp_path):
 
 
 def geographic_dem(path, slope):
-    """Write a DEM of a plane in map coordinates, 600 m at (500060, 5400040), with posts every 0.00002°."""
+    """Write a DEM of a plane in map coordinates: height 600 m at (500060, 5400040), posts every 0.00002°."""
     to_map = Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True)
     longitude, latitude = to_map.transform(500060, 5400040, direction="INVERSE")
     step = 2e-5

@@ -74,7 +74,7 @@ def test_coordinate_conversions_are_invertible_in_any_window(crs, spacing_m, sha
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:2056", "EPSG:3413", "EPSG:3857"])
 @pytest.mark.parametrize("spacing_m", [0.002, 1.0, 30.0, 300.0])
 def test_pixel_positions_match_proj_on_any_terrain(crs, spacing_m):
-    """To 10 nm, far below the wavelength: between nodes, across blocks, on and high above the ellipsoid."""
+    """Positions agree to 10 nm, between nodes, across blocks, on and high above the ellipsoid."""
     west_m, north_m = {"EPSG:32632": (330e3, 9.2e6), "EPSG:2056": (2.6e6, 1.2e6)}.get(crs, (1e6, -2e6))
     grid = SceneGrid(crs, west_m, north_m, spacing_m, (300, 270))[3:, 5:]
     height = np.random.default_rng(1).uniform(-400, 4000, grid.shape)
@@ -131,7 +131,7 @@ def test_automatic_bounds_extend_to_both_sides_of_the_track():
 
 
 def test_automatic_grid_is_limited_by_the_recorded_samples(tiny):
-    """A circle of 5 m at 30 m height resolves 6 cm; limit: 9 pixels per sample, 100 pulses × 512 subcarriers."""
+    """A circle of 5 m at 30 m height resolves 6 cm; at most 9 pixels per sample of 100 × 512 samples are permitted."""
     angle = np.linspace(0, 2 * np.pi, 100)
     circle = np.stack([5 * np.sin(angle), 5 * np.cos(angle), np.full(100, 30.0)], -1)
     frequency = 1.2e9 + 4e5 * np.arange(512)
@@ -152,7 +152,7 @@ def test_automatic_grid_is_limited_by_the_recorded_samples(tiny):
 
 
 def test_automatic_bounds_at_the_edge_of_a_utm_zone_are_valid():
-    """Three metres east of 12° E: zone 33, with bounds beyond the edge."""
+    """The scene is three metres east of 12° E, in zone 33, with bounds beyond the edge of the zone."""
     edge_m, north_m, _ = projected_from_ecef("EPSG:32633", ecef_from_geodetic(48.0, 12.0, 600.0))
     east_m, height_m = np.full((2, 41), [[edge_m + 3], [610.0]])
     track = ecef_from_projected("EPSG:32633", east_m, north_m + np.linspace(-20, 20, 41), height_m)
@@ -197,6 +197,6 @@ def test_utm_is_accepted_up_to_3_degrees_beyond_its_zone(longitude, accepted):
 
 
 def test_coordinates_without_an_inverse_projection_are_rejected():
-    """Beyond the edge of the Mercator map, where longitude 181 equals -179."""
+    """The coordinates lie beyond the edge of the Mercator map, where longitude 181 equals -179."""
     with pytest.raises(CampaignError, match="reach longitude"):
         SceneGrid.from_bounds("EPSG:3857", (20037500.0, 0.0, 20037520.0, 10.0), spacing_m=1.0)

@@ -50,7 +50,7 @@ def test_constant_dem_equals_a_lowered_track():
 
 
 def test_raised_target_is_displaced_on_flat_ground_but_not_on_its_dem():
-    """On flat ground a target of height h appears at the point of equal range: √(y² − 2Hh + h²)."""
+    """On flat ground, a target of height h appears at the point of equal range, √(y² − 2Hh + h²)."""
     spectra = history(track_at(8.0), [0.5, 12.0, 1.2])
     y = np.broadcast_to(LOCAL.y_m[:, None], LOCAL.shape)
     for heights, expected_y_m in ((0.0, np.sqrt(12.0**2 - 2 * 8 * 1.2 + 1.2**2)), (np.where(y > 10.5, 1.2, 0.0), 12.0)):
@@ -94,7 +94,7 @@ def test_swath_contains_the_path_of_every_pixel_on_terrain():
 
 
 def test_bounds_of_windows_do_not_depend_on_joint_reading():
-    """Strips of 1200 × 1800 pixels are read in two parts, windows that are not neighbours one by one."""
+    """Strips of 1200 × 1800 pixels are read in two parts; windows that are not adjacent are read individually."""
     grid = SceneGrid("local", 0.0, 120.0, 0.1, (1200, 1800))
     terrain = GridHeights(grid, np.random.default_rng(5).standard_normal(grid.shape))
     tiles = list(grid.tiles(600))

@@ -21,7 +21,7 @@ FLOWN = monostatic(straight_track(6000, length_m=150.0))
 
 
 def sideways(pulses, *, beamwidth_deg=(30.0, 8.0)):
-    """Return a beam that looks north and 30° down and ends at -20 dB."""
+    """Return a beam directed to the north and 30° downwards that ends at -20 dB."""
     down = np.radians(30)
     axes = np.array([[0, np.cos(down), -np.sin(down)], [1, 0, 0], [0, np.sin(down), np.cos(down)]])
     cuts = [gaussian_cut(width, cutoff_db=-20.0, limit_rad=np.pi / 2) for width in beamwidth_deg]
@@ -95,7 +95,7 @@ def test_looks_are_bilinear_only_where_both_sums_change_alike(step, growth):
 
 
 def test_looks_at_an_edge_use_the_sums():
-    """A sum that falls to less than half between nodes, or to zero, is not interpolated bilinearly."""
+    """Looks are not interpolated bilinearly if a sum decreases by more than half between nodes, or to zero."""
     looks = Looks.of(GRID, GROUND, FLOWN, None)
     total = np.full(looks.lattice.shape, 1e3, np.float32)
     total[:, 3:] *= 0.45
@@ -103,7 +103,7 @@ def test_looks_at_an_edge_use_the_sums():
     steep = replace(looks, total=total, squares=squares)
     error = np.abs(assembled(steep, steep.effective) / of_sums(steep) - 1)
     assert error[:, :BLOCK_PX].max() < 1e-6
-    assert 1e-5 < error[:, BLOCK_PX:].max() < 1e-4  # beyond the drop both sums change alike
+    assert 1e-5 < error[:, BLOCK_PX:].max() < 1e-4  # beyond the drop, both sums change equally
     dark = np.arange(total.shape[1]) >= 3
     ends = replace(looks, total=np.where(dark, 0, total), squares=np.where(dark, 0, squares))
     last_lit = assembled(ends, ends.effective)[:, 3 * looks.lattice.pitch_px - 1]  # looks of the last node with pulses
@@ -172,7 +172,7 @@ def test_illumination_is_exact_at_every_pixel(kind):
 
 @pytest.mark.parametrize("beams", [None, Beams(sector=Sector.of(FLOWN, chord_m=2.0, centre=0.2, half=0.1))])
 def test_aperture_centre_is_the_closest_approach(beams):
-    """Abeam of a straight track, or behind where the sector looks ahead by s = 2 sin(squint)."""
+    """The centre is abeam of a straight track, or behind if the sector is squinted by s = 2 sin(squint)."""
     looks, (rows, columns, points) = Looks.of(GRID, GROUND, FLOWN, beams), some_pixels()
     east = assembled(looks, lambda tile: looks.centre(tile)[0][..., 0])[rows, columns]
     squint = 0.0 if beams is None else np.arcsin(0.2)
@@ -184,7 +184,7 @@ def test_aperture_centre_is_the_closest_approach(beams):
 
 @pytest.mark.parametrize("passes", [1, 2])
 def test_interpolated_angles_over_level_terrain_are_accurate(passes):
-    """Within 0.006° between nodes spaced by 1/48 of the range; computed per pixel where the nearest pass changes."""
+    """Errors are within 0.006° between nodes at 1/48 of the range; where the nearest pass changes, pixels are exact."""
     along = np.linspace(-80, 80, 600)
     tx = np.concatenate([np.stack([along, 0 * along + y, 0 * along + 200], -1) for y in (0.0, 860.0)[:passes]])
     grid = SceneGrid("local", -60.0, 470.0, 0.25, (300, 300))

@@ -47,7 +47,7 @@ def test_flat_ground_has_no_shadow_or_layover():
 
 @pytest.mark.parametrize(("slope_deg", "expected"), [(-60.0, 1), (-20.0, 0), (20.0, 0), (75.0, 2)])
 def test_steep_planes_are_in_shadow_or_layover(slope_deg, expected):
-    """At about 40° grazing angle: a plane that falls more steeply is in shadow, one that rises above 50° in layover."""
+    """At a grazing angle of about 40°, planes that fall more steeply are in shadow, planes above 50° in layover."""
     middle = STREET.x_m - 30
     heights = np.broadcast_to(np.tan(np.radians(slope_deg)) * middle, STREET.shape)
     antenna = np.array([30.0 - 300.0, 1.375, 300 * np.tan(np.radians(40.0))])
@@ -56,7 +56,7 @@ def test_steep_planes_are_in_shadow_or_layover(slope_deg, expected):
 
 
 def test_shadow_on_random_hills_matches_dense_sampling():
-    """The search that skips whole blocks agrees with dense sampling of bilinear terrain."""
+    """The search, which skips whole blocks, agrees with dense sampling of bilinear terrain."""
     from scipy.ndimage import gaussian_filter, map_coordinates
 
     generator = np.random.default_rng(1)
@@ -93,7 +93,7 @@ def test_shadow_needs_most_pulses_of_either_antenna():
 
 
 def test_earth_curvature_hides_distant_terrain():
-    """At 5 km and antenna height, terrain is hidden by the bulge d²/8R of half a metre; not in a plane frame."""
+    """At 5 km, terrain at antenna height is hidden by the bulge d²/8R of half a metre, but not in a plane frame."""
     for crs, west, north, dark in (("local", 0.0, 0.0, 0), ("EPSG:32632", 500000.0, 5400000.0, 1)):
         grid = SceneGrid(crs, west, north, 25.0, (3, 200))
         antenna_position = (west, north - 37.5, 0.3)

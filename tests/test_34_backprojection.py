@@ -85,7 +85,7 @@ def test_coincident_platforms_give_the_monostatic_image(name):
 
 
 def test_raised_target_is_laid_over_as_geometry_predicts():
-    """Layover: the target appears where flat terrain has the same path length at the middle of the aperture."""
+    """Layover: the target appears where flat terrain has the same path length at the aperture centre."""
     _, profiles = history((0.0, 10.0, 0.5))
     image = formed("numba", profiles)
     peak = find_peak(image, *np.unravel_index(np.abs(image).argmax(), image.shape))

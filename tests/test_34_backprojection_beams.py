@@ -34,7 +34,7 @@ def test_engines_apply_the_same_weights(isa, plain):
     assert decibels(image - truth, truth) <= -65
     assert decibels(other - truth, truth) <= -65
     assert counts[1] == counts.sum()  # no pulse is weighted pixel by pixel
-    assert decibels(exact(scene, pixels, Beams()) - truth, truth) > -20  # the weight matters
+    assert decibels(exact(scene, pixels, Beams()) - truth, truth) > -20  # the weight has an effect
 
 
 def test_rough_surface_is_weighted_at_its_height(isa, plain):

@@ -84,7 +84,7 @@ def test_float64_terms_equal_those_of_the_double_sum():
 @compiled
 @pytest.mark.usefixtures("isa")
 def test_every_instruction_set_gives_the_terms_of_numpy(monkeypatch):
-    """Points inside the samples, across both ends, beyond them, and one undefined point."""
+    """Points inside the samples, near both ends, beyond the ends, and one undefined point."""
     line = np.stack([np.linspace(-200, 200, 401), np.zeros(401), np.zeros(401)], -1)
     points = ecef(np.concatenate([line, [[np.nan, 0, 0]]]))
     fast = band_limited_terms(PROFILES, points)

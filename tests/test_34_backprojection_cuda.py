@@ -50,7 +50,7 @@ def test_simulated_device_passes_its_tests():
 
 
 def test_series_error_stays_below_its_bound():
-    """Eq. 8 in float32 as in the kernel, random pixels of near and far patches: rounding and truncated orders."""
+    """Eq. 8 in float32, as in the kernel, at random pixels of near and far patches: rounding and truncation errors."""
     draw = np.random.default_rng(0)
     for reach, distance in ((0.5, 2.3), (0.5, 4.0), (0.5, 20.0), (5.0, 500.0), (0.5, 1e4)):
         w, d = draw.standard_normal((2, 20000, 3))
@@ -72,7 +72,7 @@ def test_series_error_stays_below_its_bound():
 
 
 def test_weight_error_stays_below_its_bound():
-    """Eq. 8a and the angles about the beam axes, in float32 as in the kernel."""
+    """Eq. 8a and the angles about the beam axes are computed in float32, as in the kernel."""
     draw = np.random.default_rng(0)
     for reach, distance in ((0.5, 20.0), (5.0, 500.0), (0.5, 1e4)):
         w, d = draw.standard_normal((2, 20000, 3))
@@ -124,7 +124,7 @@ def test_invalid_input_is_refused(plain):
 
 
 def test_weights_add_to_predicted_time_and_error():
-    """Estimated time: longer with each beam, and proportional to the number of pulses in a sector."""
+    """The predicted time increases with each beam and is proportional to the number of pulses in a sector."""
     sector = Sector.of(planning_job().aperture, chord_m=1.0, centre=0.0, half=0.05)
     search = {"pulses": 300, "requested": {"oversampling": 16, "tolerance_rad": 1.5e-5}}
 
@@ -158,7 +158,7 @@ def test_weighted_image_uses_cuda_only_if_requested(monkeypatch):
 
 @pytest.mark.slow
 def test_engine_without_measured_cost_is_used_only_if_requested(monkeypatch):
-    """Independent of image size and predicted time; the engine is no fallback either."""
+    """This is independent of image size and predicted time; the engine is not a fallback either."""
     monkeypatch.setattr(cuda, "available", lambda: True)
     large = plan(shape=(20000, 20000))
     assert "cuda" not in {large.engine, *(setting.engine for setting in large.fallbacks)}
@@ -172,7 +172,7 @@ def test_engine_without_measured_cost_is_used_only_if_requested(monkeypatch):
 
 
 def test_simulator_slower_than_the_double_sum_is_no_fallback(monkeypatch):
-    """Even if no other engine meets the accuracy: an engine that costs more than the double sum is useless."""
+    """An engine that costs more than the double sum is not used, even if no other engine meets the accuracy."""
     monkeypatch.setenv("NUMBA_ENABLE_CUDASIM", "1")
     without_library(monkeypatch)
     monkeypatch.setattr(cuda, "available", lambda: True)

@@ -1,4 +1,4 @@
-"""Exact gradient of an image objective, compared with finite differences of that image."""
+"""Exact gradient of an objective of an image, compared with finite differences."""
 
 from dataclasses import replace
 
@@ -57,7 +57,7 @@ def entropy(image):
 def displaced(pulse, axis, side, step_m):
     """Return (pulse, point) complex128: contributions with one phase centre or one path length displaced."""
     displacement_m = step_m * np.eye(PULSES)[pulse]
-    if side == "path_m":  # autofocus.md, eq. 3; `moved` rotates float32 samples, too coarse for a small step
+    if side == "path_m":  # autofocus.md, eq. 3; `moved` rotates float32 samples: too inaccurate
         rotation = np.exp(-2j * np.pi * PROFILES.centre_frequency_hz / C * displacement_m)
         return contributions(replace(PROFILES, start_m=PROFILES.start_m + displacement_m)) * rotation[:, None]
     legs = dict(zip(SIDES, PROFILES.aperture.legs, strict=True))
@@ -136,7 +136,7 @@ def test_gradient_scales_with_the_unit_of_the_objective():
 
 @pytest.mark.slow
 def test_gradient_predicts_the_change_of_the_exact_image():
-    """The double sum over pulses and subcarriers, all phase centres displaced at once."""
+    """The image is the double sum over pulses and subcarriers; all phase centres are displaced simultaneously."""
     history, patch = point_history(), TARGET_GRID[40:120, 40:120]
     rng = np.random.default_rng(6)
     displacements = {side: rng.standard_normal((len(history), 3)) for side in SIDES}
@@ -152,7 +152,7 @@ def test_gradient_predicts_the_change_of_the_exact_image():
         )
         return peaks(image.values.astype(complex))
 
-    offset_m = 5e-3  # with exact tracks the objective is stationary and its derivative zero
+    offset_m = 5e-3  # with exact tracks, the objective is stationary and its derivative is zero
     legs = {side: leg + offset_m * displacements[side] for side, leg in zip(SIDES, history.aperture.legs, strict=True)}
     profiles = ap.range_compress(history, TARGET_GRID, ap.FlatGround(0.0))
     profiles = profiles.moved(ap.Aperture(**legs), offset_m * extra_paths)

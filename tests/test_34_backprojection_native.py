@@ -143,7 +143,7 @@ def test_irregular_surface_uses_the_exact_path(isa):
     assert error_db(scene, pixels, image) <= -70
 
 
-@pytest.mark.parametrize(("range_m", "rough_m"), [(12, 3.0), (2000, 1.5)])  # beyond the series; beyond the window only
+@pytest.mark.parametrize(("range_m", "rough_m"), [(12, 3.0), (2000, 1.5)])  # outside the series; outside the window
 def test_heights_beyond_the_windows_use_the_exact_path(isa, range_m, rough_m):
     pixels = pixel_grid(33, 21, range_m=range_m)
     pixels[..., 2] = rough_m * np.random.default_rng(6).standard_normal((33, 21))

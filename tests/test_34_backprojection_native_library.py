@@ -89,7 +89,7 @@ def test_kernel_passes_under_sanitizers(tmp_path):
     root = Path(__file__).parents[1]
     subprocess.run([cmake, "-S", root, "-B", tmp_path, "-DAPERTURA_SANITIZE=ON"], check=True, capture_output=True)
     subprocess.run([cmake, "--build", tmp_path, "--parallel", "2"], check=True, capture_output=True)
-    runtimes = [  # libstdc++ too: the sanitizer otherwise misses exceptions of libraries that Python loads later
+    runtimes = [  # with libstdc++; otherwise, the sanitizer misses exceptions of libraries that Python loads later
         subprocess.run(
             [compiler, f"-print-file-name={name}"], check=True, capture_output=True, text=True
         ).stdout.strip()
@@ -99,7 +99,7 @@ def test_kernel_passes_under_sanitizers(tmp_path):
         **os.environ,
         "APERTURA_KERNEL": str(tmp_path / "_backprojection.so"),
         "LD_PRELOAD": " ".join(runtimes),
-        "ASAN_OPTIONS": "detect_leaks=0",  # leaks of Python itself
+        "ASAN_OPTIONS": "detect_leaks=0",  # ignores leaks of Python
     }
     command = [
         sys.executable,

@@ -1,4 +1,4 @@
-"""Integrated sector: equal weights in every engine, smooth over the scene, no cost for pulses outside."""
+"""Integration sector: equal weights in all engines, smooth over the scene; pulses outside cost no time."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -55,7 +55,7 @@ def strip(pulses: int = 3000, length_m: float = 150.0) -> tuple[Aperture, SceneG
 
 
 def test_weight_is_largest_at_the_shortest_total_path():
-    """Also for antennas of different speeds."""
+    """This also holds for antennas with different speeds."""
     along = np.linspace(-40, 40, 801)[:, None] * [1.0, 0.0, 0.0]
     aperture = Aperture(along + [0, 0, 10.0], 0.4 * along + [-6.0, -3.0, 12.0])
     points = np.array([[-5.0, 30.0, 0.0], [0.0, 20.0, 0.0], [9.0, 40.0, 2.0]])
@@ -73,7 +73,7 @@ def test_weight_is_largest_at_the_shortest_total_path():
 @pytest.mark.parametrize("half", [0.04, 0.1, 0.25])
 @pytest.mark.parametrize("antenna", [False, True])
 def test_engines_agree_on_both_sides_of_the_edge(isa, flight, half, antenna):
-    """Pulses inside, at the edge and outside; the sector ends within the last, incomplete batch."""
+    """Pulses are inside, at the edge and outside; the sector ends within the last, incomplete batch."""
     beam = swaying_beam(flight.scene.tx, (12, 0, 0)) if antenna else None
     beams, points = Beams(beam, None, sector_of(flight.aperture, half)), ecef(flight.pixels)
     weight = beams.sector.weight(flight.aperture, points.reshape(-1, 3))
@@ -84,7 +84,7 @@ def test_engines_agree_on_both_sides_of_the_edge(isa, flight, half, antenna):
     assert decibels(image - truth, truth) <= -70
     assert decibels(other - truth, truth) <= -70
     whole = reference.form(flight.scene.history(), points, beams=beams.antennas)
-    assert decibels(whole - truth, truth) > -25  # the sector matters
+    assert decibels(whole - truth, truth) > -25  # the sector has an effect
     assert counts[3] > 0 or half == 0.25
 
 
@@ -93,7 +93,7 @@ def test_engines_agree_on_both_sides_of_the_edge(isa, flight, half, antenna):
 @pytest.mark.parametrize("half", [0.04, 0.1, 0.25])
 @pytest.mark.parametrize("rough", [False, True])
 def test_engines_agree_if_the_sector_centre_follows_the_flight(isa, flight, half, rough):
-    """Sector far ahead of the flight: each pixel has its own centre, which varies within patches and blocks."""
+    """The sector is far ahead of the flight, so that each pixel has a separate centre, which varies within blocks."""
     pixels = flight.pixels.copy()
     if rough:
         pixels[..., 2] = 0.05 * np.sin(2 * pixels[..., 0])
@@ -123,7 +123,7 @@ def test_rough_surface_is_weighted_at_its_height_at_the_edge(isa, flight):
 
 @compiled
 def test_pulses_inside_a_sector_use_the_unweighted_path(isa, flight):
-    """The whole scene is inside: same path variants, bit-identical images."""
+    """If the whole scene is inside, path variants are unchanged and images are bit-identical."""
     tables, points = native.prepare(flight.profiles), ecef(flight.pixels)
     counts = np.zeros((2, 4), np.int64)
     plain = native.form(tables, points, counts=counts[0])
@@ -180,12 +180,12 @@ def test_excluded_pulses_have_zero_weight(antenna, centre):
     weight = beams.weight(aperture, inside.reshape(-1, 3)).reshape(1000, 60, 40) != 0
     needed = np.add.reduceat(weight.any(axis=1), np.arange(0, 1000, PULSES), axis=0) > 0
     assert not (needed & ~lit).any()
-    assert lit.mean() < 0.7  # a large share of the blocks is excluded
+    assert lit.mean() < 0.7  # a large fraction of the blocks is excluded
 
 
 @compiled
 def test_tiles_beyond_the_swath_are_not_formed():
-    """A lazily read flight, with and without pulse blocks, gives the same image from only the rows it needs."""
+    """A lazily read flight, with and without pulse blocks, gives the same image, and only required rows are read."""
     aperture, grid = strip()
     history = strip_history(aperture, np.array([[x, 36.0, 0.0] for x in (-60.0, -20.0, 0.0, 40.0)]))
     beams = Beams(sector=Sector.of(aperture, chord_m=4.0, centre=0.0, half=0.1))
@@ -247,7 +247,7 @@ def test_range_window_is_limited_by_the_sector():
 
 
 def test_range_window_from_sampled_pulses_covers_all_pulses():
-    """Of 40 000 pulses every third is evaluated; the window still covers the paths of all pulses."""
+    """Every third of 40 000 pulses is evaluated; the window nevertheless covers the paths of all pulses."""
     aperture, grid = strip(40_000, 150.0)
     near, far = swath(grid, FLAT, aperture)
     sampled, points = slice(5, None, 1999), FLAT.positions(grid)[::8, ::10].reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Tiles and pulse blocks: same image for any division, tables of one block in memory at a time."""
+"""Tiles and pulse blocks: the image is the same for any division, and only the tables of one block are in memory."""
 
 import os
 import signal
@@ -21,7 +21,7 @@ from apertura.core.scene.terrain import FlatGround
     ("engine", "form_options"), [("native", {"accumulate": "complex128", "tolerance_rad": 1e-5}), ("numba", {})]
 )
 def test_image_from_pulse_blocks_equals_that_of_all_pulses(engine, form_options):
-    """Blocks are added in complex64: below -130 dB, far below the error of any table."""
+    """Blocks are added in complex64; the error is below -130 dB, far below the error of any table."""
     if not load_engine(engine).available():
         pytest.skip("apertura was installed without a compiler")
     drawn = draw(np.random.default_rng(2), pixels=48, pulses=90)
@@ -36,7 +36,7 @@ def test_image_from_pulse_blocks_equals_that_of_all_pulses(engine, form_options)
 
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # raised by fork in a process with threads
 def test_child_forked_after_image_formation_forms_the_image(toy):
-    """Threads of Dask do not exist in a forked child, which would wait for them; the alarm ends it after 10 s."""
+    """A forked child has no Dask threads and must not wait for these; an alarm would end the child after 10 s."""
     drawn = draw(np.random.default_rng(2), pixels=40, pulses=64)
     setting = Setting("toy", {"refine": 1}, {}, -20.0, 1.0)
     image = image_array(drawn.profiles, setting, drawn.grid, FlatGround(0.0), side_px=16)
@@ -49,7 +49,7 @@ def test_child_forked_after_image_formation_forms_the_image(toy):
 
 
 def test_pulse_blocks_are_prepared_one_after_the_other(toy):
-    """Tables of the next block wait for every tile of the previous one: memory holds tables of one block."""
+    """Tables of the next block are computed after all tiles of the previous block, so that one block is in memory."""
     drawn = draw(np.random.default_rng(2), pixels=40, pulses=64)
     setting = Setting("toy", {"refine": 1}, {}, -20.0, 1.0, pulse_blocks=3)
     toy_engine.CALLS.clear()

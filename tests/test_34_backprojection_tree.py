@@ -1,4 +1,4 @@
-"""Tree engine compared with the double sum: use of tree or direct kernel, bit-identical results for any division."""
+"""Tree engine compared with the double sum: choice of tree or direct kernel, bit-identical results."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -77,7 +77,7 @@ def test_pixels_without_position_are_nan_and_others_unchanged(plain):
 
 
 def test_tiles_at_the_end_of_profiles_use_the_direct_kernel():
-    """Profiles end in the middle of the scene: the step there is not band-limited and needs the direct kernel."""
+    """Profiles end inside the scene; the step at this end is not band-limited and requires the direct kernel."""
     flight = flown(pixel_grid(130, 200, spacing_m=0.15), pulses=128)
     whole, _ = formed(flight)
     flight.profiles = replace(flight.profiles, samples=flight.profiles.samples[:, :100])
@@ -100,7 +100,7 @@ def test_tiles_beyond_all_profiles_are_skipped(plain):
 @pytest.mark.slow
 @pytest.mark.parametrize("jitter_m", [0.0, 1e-3, 1e-2])
 def test_pulses_off_a_smooth_track_are_not_presummed(plain, jitter_m):
-    """64 pulses of a smooth track are presummed; with white noise of 1 mm at 12 m range they are not."""
+    """64 pulses of a smooth track are presummed; with white noise of 1 mm at 12 m range, pulses are not presummed."""
     white = jitter_m * np.random.default_rng(8).standard_normal((2, 300, 3))
     true = plain.scene
     scene = observed(scatter(plain.pixels), true.tx + white[0], true.rx + white[1], true.carrier_hz)
@@ -116,7 +116,7 @@ def test_pulses_off_a_smooth_track_are_not_presummed(plain, jitter_m):
 @pytest.mark.parametrize("together", [True, False])
 @pytest.mark.parametrize("jitter_m", [3e-4, 3e-3])
 def test_presumming_on_a_rough_track_has_the_predicted_error(plain, jitter_m, together):
-    """Profiles of noise are the worst case: no correlation between pulses."""
+    """Profiles of noise, without correlation between pulses, are the worst case."""
     flight = heard(shaken(plain, jitter_m, together=together))
     images = [formed(flight, nodes_db=-86, presum_db=presum_db)[0] for presum_db in (-100, -40)]
     predictions = [
@@ -130,7 +130,7 @@ def test_presumming_on_a_rough_track_has_the_predicted_error(plain, jitter_m, to
 @pytest.mark.quick("0.05--74-4")
 @pytest.mark.parametrize(("height_m", "nodes_db", "layers"), [(0.02, -50, 3), (0.05, -74, 4), (0.3, -62, 7)])
 def test_rough_terrain_is_interpolated_between_height_layers(height_m, nodes_db, layers):
-    """Eq. 11: relief between pixels is summed by trees on height layers; with one layer less by the direct kernel."""
+    """Eq. 11: relief between pixels is summed by trees on height layers, or by the direct kernel with fewer layers."""
     rough = pixel_grid(70, 90)
     rough[..., 2] += height_m * np.random.default_rng(6).uniform(-1, 1, rough.shape[:2])
     flight = flown(rough, pulses=300)
@@ -183,7 +183,7 @@ def test_pixels_off_their_surface_have_the_predicted_error(carrier_hz, spacing_m
 @pytest.mark.quick("3.0-0.15-0")
 @pytest.mark.parametrize(("range_m", "spacing_m", "levels"), [(12.0, 0.05, 2), (5.0, 0.08, 1), (3.0, 0.15, 0)])
 def test_near_tile_uses_smaller_subapertures_or_the_direct_kernel(range_m, spacing_m, levels):
-    """Near tiles need more nodes per subaperture: above 128 nodes the tree has fewer levels, or is not used."""
+    """Near tiles need more nodes per subaperture: above 128 nodes, the tree has fewer levels or is not used."""
     pixels = pixel_grid(100, 100, spacing_m=spacing_m, range_m=range_m)
     flight = flown(pixels, pulses=256, carrier_hz=4e9, range_m=range_m)
     image, share = formed(flight, side_px=128)
@@ -200,16 +200,16 @@ def weighted_error_db(flight, image, beams):
 
 @pytest.mark.parametrize("sway_deg", [0.0, 3.0])
 def test_smooth_weights_are_applied_at_the_leaves(isa, plain, sway_deg):
-    """Also if they jump between pulses, which are then not presummed."""
+    """This also holds if weights jump between pulses, which are then not presummed."""
     beams = Beams(swaying_beam(plain.scene.tx, (12, 1, 0), 30, sway_deg=sway_deg))
     image, share = formed(plain, beams=beams)
     assert share.tolist() == [1, 0, 0]
     assert weighted_error_db(plain, image, beams) <= -64
-    assert decibels(image - formed(plain)[0], image) > -30  # the weight matters
+    assert decibels(image - formed(plain)[0], image) > -30  # the weight has an effect
 
 
 def sector_of(flight, half, centre=0.02):
-    """Return beams of a sector; one far ahead of the flight is centred on the nearest pulse of each point."""
+    """Return beams of a sector; a sector far ahead of the flight is centred on the nearest pulse of each point."""
     sector = Sector.of(flight.aperture, chord_m=1.2, centre=centre, half=half)
     if centre < 0.3:
         return Beams(None, None, sector)
@@ -220,7 +220,7 @@ def sector_of(flight, half, centre=0.02):
 @pytest.mark.parametrize("nodes_db", [-50, -74])
 @pytest.mark.parametrize(("centre", "half"), [(0.02, 0.25), (0.02, 0.1), (0.7, 0.2), (0.7, 0.05)])
 def test_sector_edges_use_the_tree(isa, plain, centre, half, nodes_db):
-    """Also with a separate centre for each point; pulses beyond the edges are skipped."""
+    """This also holds with a separate centre for each point; pulses beyond the edges are skipped."""
     beams = sector_of(plain, half, centre)
     assert (beams.sector.ends is None) == (centre < 0.3)
     image, share = formed(plain, beams=beams, nodes_db=nodes_db)
@@ -228,14 +228,14 @@ def test_sector_edges_use_the_tree(isa, plain, centre, half, nodes_db):
     assert share[0] > 0.2
     assert share[2] > 0.2 or half >= 0.2
     assert weighted_error_db(plain, image, beams) <= setting(plain, nodes_db=nodes_db).error_db
-    assert decibels(image - formed(plain, nodes_db=nodes_db)[0], image) > -25  # the sector matters
+    assert decibels(image - formed(plain, nodes_db=nodes_db)[0], image) > -25  # the sector has an effect
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("relief_m", [0.0, 0.4])
 @pytest.mark.parametrize("antenna", [False, True])
 def test_weights_of_a_whole_tile_hold_at_every_pixel(antenna, relief_m):
-    """Eq. 12, random tiles of a swaying flight: weight 1 inside a sector, weight 0 of skipped pulses."""
+    """Eq. 12 for random tiles of a swaying flight: the weight is 1 inside a sector and 0 for skipped pulses."""
     generator, along = np.random.default_rng(3), np.linspace(-60, 60, 3200)
     sway = np.stack([along, 2 * np.sin(along / 9), 20 + np.cos(along / 5)], -1)
     aperture = Aperture(sway, sway + [3.0, 0.5, 1.0])
@@ -263,7 +263,7 @@ def test_weights_of_a_whole_tile_hold_at_every_pixel(antenna, relief_m):
 
 @pytest.mark.parametrize(("half", "nodes_db"), [(0.04, -74), (0.01, -50)])
 def test_edges_too_steep_for_the_nodes_use_the_direct_kernel(plain, half, nodes_db):
-    """Eq. 13: they need more than 128 nodes along a tile; pulses beyond the edges are still skipped."""
+    """By eq. 13, such edges require more than 128 nodes along a tile; pulses beyond the edges are still skipped."""
     beams = sector_of(plain, half)
     image, share = formed(plain, beams=beams, nodes_db=nodes_db)
     assert share[0] == 0
@@ -272,7 +272,7 @@ def test_edges_too_steep_for_the_nodes_use_the_direct_kernel(plain, half, nodes_
 
 
 def test_edges_with_a_kinked_sector_centre_use_the_direct_kernel(plain):
-    """The centre has a kink, not representable by nodes, where the flight starts to cover the whole sector."""
+    """The centre has a kink where the flight starts to cover the whole sector; nodes cannot represent this kink."""
     beams = sector_of(plain, 0.25, 0.6)
     image, share = formed(plain, beams=beams)
     assert (share[:2] > 0.2).all()
@@ -282,7 +282,7 @@ def test_edges_with_a_kinked_sector_centre_use_the_direct_kernel(plain):
 @pytest.mark.parametrize("nodes_db", [-50, -74, -98])
 @pytest.mark.parametrize("slope", [0.3, 0.8])
 def test_sector_edge_widens_the_band_as_predicted(slope, nodes_db):
-    """Eq. 13: the second derivative of the edge jumps; nodes of the widened band meet their design error."""
+    """Eq. 13: the second derivative of the edge jumps; nodes for the widened band meet their design error."""
     at, generator, band_rad = np.linspace(-1, 1, 1001), np.random.default_rng(5), 15.0
     waves, kinks, tops = (generator.uniform(low, high, 150) for low, high in ((-15.0, 15.0), (-1, 1), (0, 1)))
 
@@ -315,7 +315,7 @@ def test_pulses_unsuited_to_a_tile_are_passed_to_its_quarters(monkeypatch):
 
 
 def test_weighted_tiles_and_threads_give_bit_identical_images(isa, plain):
-    """Antenna pattern and sector together: tiles are bit-identical to the whole in any thread."""
+    """With an antenna pattern and a sector, tiles are bit-identical to the whole image in any thread."""
     sector = Sector.of(plain.aperture, chord_m=1.2, centre=0.02, half=0.15)
     beams = Beams(swaying_beam(plain.scene.tx, (12, 1, 0), 30, sway_deg=0.0), None, sector)
     chosen, points = setting(plain, nodes_db=-74), ecef(plain.pixels)
@@ -331,7 +331,7 @@ def test_weighted_tiles_and_threads_give_bit_identical_images(isa, plain):
 
 @pytest.mark.parametrize("pulses", [65, 68, 129, 130, 193])
 def test_last_pulses_of_a_flight_are_weighted_like_all_others(plain, pulses):
-    """Also if fewer pulses remain than the interval between sampled pulses: the beam ends among the last four."""
+    """This also holds if the beam ends among the last four pulses, fewer than the interval between sampled pulses."""
     flight, tilt = flown(pixel_grid(70, 90), pulses=pulses), np.radians(30)
     axes = swaying_beam(flight.scene.tx, (12, 0, 0), sway_deg=0).axes
     axes[-4:] = [[np.cos(tilt), np.sin(tilt), 0], [-np.sin(tilt), np.cos(tilt), 0], [0, 0, 1]] @ axes[-4:]
@@ -345,7 +345,7 @@ def test_last_pulses_of_a_flight_are_weighted_like_all_others(plain, pulses):
 def test_profile_with_a_different_start_is_detected_at_any_pulse(first):
     flight = flown(pixel_grid(70, 90), pulses=128)
     start_m, samples = flight.profiles.start_m.copy(), flight.profiles.samples.copy()
-    start_m[first] += 35 * flight.profiles.step_m  # in the middle of the scene
+    start_m[first] += 35 * flight.profiles.step_m  # inside the scene
     flight.profiles = replace(flight.profiles, start_m=start_m, samples=samples)
     image, share = formed(flight)
     assert share[1] > 0.2
@@ -389,7 +389,7 @@ def test_images_of_prepared_pulses_sum_to_the_whole(plain, edges):
 
 @pytest.mark.parametrize(("count", "nodes_db"), [(8, -50), (20, -74), (40, -98)])
 def test_table_of_supports_lists_the_widest_band_of_the_nodes(count, nodes_db):
-    """tree_supports.csv: for each number of nodes the band at which eq. 6 has the error `nodes_db`, by bisection."""
+    """tree_supports.csv: the band at which eq. 6 has the error `nodes_db`, for each number of nodes."""
     gauss, share = np.polynomial.legendre.leggauss(160)
     at = nodes(count, nodes_db)
 
@@ -408,7 +408,7 @@ def test_table_of_supports_lists_the_widest_band_of_the_nodes(count, nodes_db):
 
 
 def test_phase_slope_peaking_in_a_tile_needs_nodes_for_its_airy_tail():
-    """Eq. 4b: if the phase slope peaks inside the tile, the spectrum extends beyond that slope."""
+    """Eq. 4b: if the phase slope has a peak inside the tile, the spectrum extends beyond this slope."""
     at, error_db = np.linspace(-1, 1, 4001), -74
     highest_rad, bend_rad = 60.0, 40.0
 
@@ -424,7 +424,7 @@ def test_phase_slope_peaking_in_a_tile_needs_nodes_for_its_airy_tail():
 
 
 def test_tile_band_is_the_largest_phase_slope_plus_an_airy_tail():
-    """Eq. 4 and 4b for a tile below the track, with a slope peak inside, against finite differences of paths."""
+    """Eq. 4 and 4b for a tile below the track, with a slope peak inside, agree with finite differences of paths."""
     along = np.linspace(-2, 2, 128)
     track = np.stack([along, np.full(128, -1.0), np.full(128, 3.0)], -1)
     pixels = pixel_grid(64, 64, spacing_m=0.08, range_m=0.0)

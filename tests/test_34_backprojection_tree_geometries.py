@@ -11,7 +11,7 @@ pytestmark = compiled
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [5, 9, 50, 58])
 def test_random_geometry_meets_the_requested_error(seed):
-    """With tiles inside a circular flight, tiles as large as the range (9), a track that bends within a leaf (58)."""
+    """Seeds include tiles inside a circular flight, tiles as large as the range (9), and a bend within a leaf (58)."""
     outcome = measure(draw(seed), nodes_db=-74)
     assert not outcome.failure, outcome
     assert outcome.by_tree == 1

@@ -10,7 +10,7 @@ from apertura.core.scene.grid import SceneGrid
 
 
 def image_with_errors(generator, kind):
-    """Return (image, exact), 96 x 96: speckle or targets 40 dB above it; errors uniform or relative to brightness."""
+    """Return (image, exact), 96 x 96: speckle or targets (40 dB above), with uniform or proportional errors."""
     noise = generator.standard_normal((4, 96, 96))
     exact = noise[0] + 1j * noise[1]
     if kind != "speckle":
@@ -44,7 +44,7 @@ def test_error_bound_holds_with_95_percent_confidence_and_is_tight(kind):
 
 
 def test_errors_of_few_bright_pixels_are_detected():
-    """One target contains almost all power and error: random pixels alone would certify its surroundings."""
+    """One target contains almost all power and error; random pixels alone would certify only its surroundings."""
     generator = np.random.default_rng(5)
     exact = generator.standard_normal((96, 96)) + 0j
     exact[40, 50] = 1e4
@@ -58,7 +58,7 @@ def test_errors_of_few_bright_pixels_are_detected():
 
 
 def test_bound_from_uniform_draws_uses_only_their_power():
-    """Uniform draws without the total power: the bound holds, and is wider if few targets contain the power."""
+    """The bound from uniform draws without the total power holds, and is wider if few targets contain the power."""
     generator, margins_db = np.random.default_rng(6), {}
     for kind in ("speckle", "targets"):
         images = [image_with_errors(generator, kind) for _ in range(200)]
@@ -92,7 +92,7 @@ def test_patch_interpolation_is_exact_for_an_aliased_carrier():
 
 
 def test_pslr_and_islr_of_an_unweighted_aperture():
-    """Sinc response: PSLR −13.26 dB, −3 dB width 0.886 cells, ISLR about −9.7 dB within ten cells."""
+    """A sinc response has a PSLR of −13.26 dB, a width of 0.886 cells and an ISLR of −9.7 dB within ten cells."""
     x = np.arange(128) - 64.0
     image = np.outer(np.ones(128), np.sinc(x / 4)).astype(np.complex64)
     cut = cut_through(image, find_peak(image, 64, 64), direction=(1, 0), spacing_m=1.0, reach_m=31.0)
@@ -137,7 +137,7 @@ def test_only_tiles_that_miss_the_accuracy_are_listed():
 
 
 def test_tile_with_a_single_bright_pixel_is_judged_relative_to_that_pixel():
-    """Pixel 36 dB above the mean of a dark image: its error counts relative to its own power, not to the mean."""
+    """The error of a pixel 36 dB above the mean is relative to the power of this pixel, not to the mean power."""
     image = np.full((64, 64), 1e-3, np.complex64)
     image[5, 5] = 1.0
     windows, pixels = list(SceneGrid("local", 0, 0, 1, (64, 64)).tiles(32)), np.array([[5, 5], [40, 40]])
@@ -157,7 +157,7 @@ def test_random_pixels_cover_every_tile_if_there_are_enough(count, covered_tiles
 
 @pytest.mark.slow
 def test_draws_have_the_stated_density():
-    """Half by power, half by magnitude, plus random pixels: the frequency of each pixel equals the stated density."""
+    """Pixels are drawn half by power, half by magnitude, plus uniformly; frequencies equal the stated density."""
     generator = np.random.default_rng(8)
     image = (generator.standard_normal((6, 7)) + 1j * generator.standard_normal((6, 7))).astype(np.complex64)
     image[2, 3] *= 8

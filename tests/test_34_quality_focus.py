@@ -91,7 +91,7 @@ def test_snr_of_a_point_follows_from_its_even_and_odd_pulses():
 
 @pytest.mark.parametrize(("cycles", "evidence"), [(0.4, True), (1.5, False), (6.5, False)])
 def test_sidelobe_of_a_distant_echo_is_no_evidence_of_focus(cycles, evidence):
-    """Its contributions have constant amplitude and a phase ramp: they are in phase at another point."""
+    """The contributions have constant amplitude and a phase ramp; they are in phase at another point."""
     assert (point_focus(np.exp(2j * np.pi * cycles * np.arange(400) / 400)) is not None) == evidence
 
 
@@ -130,7 +130,7 @@ def test_large_numerical_error_prevents_verdict_focused(error_db, verdict):
 @pytest.mark.parametrize("std_cm", [0.5, 1.0, 2.0, 4.0])
 @pytest.mark.parametrize("separation_m", [0.0, 4.7])
 def test_predicted_loss_of_random_errors_equals_monte_carlo_mean(std_cm, separation_m):
-    """Mean over 60 draws of the tracks of both nodes, best peak within a few cells; within 15 % in dB."""
+    """The mean over 60 draws of both tracks, with the best peak within a few cells, agrees within 15 % in dB."""
     paths, generator = straight(separation_m=separation_m), np.random.default_rng(5)
     same = separation_m == 0
     slopes = paths.by_node(same=same, sidelink=not same)
@@ -163,7 +163,7 @@ def test_height_error_displaces_a_point_with_little_loss():
 
 
 def bent(radius_m=12.0, offset_m=6.0):
-    """Return the paths of a circular flight about a centre off the point, with varying elevation angle."""
+    """Return the paths of a circular flight about a centre displaced from the point, with varying elevation angle."""
     angle = np.linspace(0, 2 * np.pi, 300, endpoint=False)
     track = np.stack([offset_m + radius_m * np.sin(angle), radius_m * np.cos(angle), np.full(300, 8.0)], -1)
     return replace(straight(), aperture=Aperture(track, track), time_s=np.linspace(0, 30, 300))
@@ -171,7 +171,7 @@ def bent(radius_m=12.0, offset_m=6.0):
 
 @pytest.mark.parametrize("separation_m", [0.0, 4.7])
 def test_height_error_is_not_observable_on_a_straight_track(separation_m):
-    """Path lengths from a line depend only on the distance from it: eq. 2a, exactly, for one and two nodes."""
+    """Path lengths from a line depend only on the distance from it, so that eq. 2a is exact, for one and two nodes."""
     paths = straight(separation_m=separation_m)
     line = height_line(paths, None)
     assert line.counts
@@ -213,7 +213,7 @@ def test_constant_path_error_offsets_the_phase():
 
 
 def test_unconfigured_position_accuracy_follows_from_the_receiver_solution():
-    """Same effect as if configured, except for the automatic accuracy; a float solution has larger, longer errors."""
+    """The effect is that of a configured accuracy, except on automatic accuracy; a float solution has larger errors."""
     paths = straight()
     (fixed,) = position_lines(paths, [NodePositions(None, 1.0, receiver="fix")], sidelink=False)
     (configured,) = position_lines(paths, [NodePositions((0.01,) * 3, 1.0, "config")], sidelink=False)
@@ -229,7 +229,7 @@ def test_unconfigured_position_accuracy_follows_from_the_receiver_solution():
 
 
 def test_predicted_scatter_of_the_loss_equals_monte_carlo_scatter():
-    """Standard deviation of the loss over 200 draws with 5 mm per axis."""
+    """The scatter is the standard deviation of the loss over 200 draws with 5 mm per axis."""
     paths, generator = straight(), np.random.default_rng(8)
     (slope,), count, losses = paths.by_node(same=True, sidelink=False), len(paths.time_s), []
     gradient = paths.gradient[:, :2]
@@ -289,7 +289,7 @@ def sinc_response(peak, others):
 
 POINTS = [(60.0, 70.0, 1.0), (150.3, 90.2, 0.8), (200.7, 190.1, 0.5)]
 SHIFT_PX = (0.8, -0.6)
-WIDE = np.diag([0.52, 0.52])  # square band, 2.5 cycles per metre wide
+WIDE = np.diag([0.52, 0.52])  # square band with a width of 2.5 cycles per metre
 
 
 @pytest.fixture
@@ -302,7 +302,7 @@ def two_images():
 
 
 def test_bright_points_do_not_depend_on_windows_or_their_order():
-    drawn = [*POINTS, (40.0, 200.0, 0.27), (220.0, 30.0, 0.24), (128.0, 16.0, 0.9)]  # the last on a window edge
+    drawn = [*POINTS, (40.0, 200.0, 0.27), (220.0, 30.0, 0.24), (128.0, 16.0, 0.9)]  # last: on a window edge
     image = lobes(drawn)
     tiles = [
         (slice(row, row + 64), slice(column, column + 64)) for row in range(0, 256, 64) for column in range(0, 256, 64)
@@ -382,7 +382,7 @@ def coarse_range(pulses=512):
 
 
 def test_point_response_follows_from_aperture_and_band():
-    """Along range the band response of the two-way path; across it sin(x)/x beyond the smearing tolerance."""
+    """Along range, the response is that of the band; across, it is sin(x)/x beyond the smearing tolerance."""
     response = coarse_range()
     behind = np.column_stack([np.zeros(50), np.linspace(0.5, 25, 50), np.zeros(50)])
     np.testing.assert_allclose(response.at(np.zeros(3), behind), np.abs(np.sinc(behind[:, 1] / 6)), atol=5e-3)
@@ -398,7 +398,7 @@ def test_smeared_main_lobe_is_not_a_separate_point(cells):
 
 
 def test_undersampled_response_has_no_false_lobes():
-    """Pulse sampling would alias the phase of far points: 512 of 8192 pulses give a repeated peak at 100 cells."""
+    """Sampling of 512 of 8192 pulses would alias the phase of far points and repeat the peak at 100 cells."""
     sampled, complete = coarse_range(512), coarse_range(8192)
     aside = np.column_stack([np.linspace(60, 1500, 400), np.zeros(400), np.zeros(400)])
     for response in (sampled, complete):
@@ -428,7 +428,7 @@ def test_drift_between_subapertures_is_detected():
 
 @pytest.mark.parametrize("carrier_cycles", [0.3, 0.7, 2.3, -1.6])
 def test_phase_between_pixels_needs_the_unaliased_carrier(carrier_cycles):
-    """Two images of a point with carriers aliased differently: in phase at the point, which lies between pixels."""
+    """Two images of a point between pixels, with differently aliased carriers, are in phase at this point."""
     y, x = np.mgrid[:64, :64]
     row, column = 31.4, 30.2
     envelope = np.sinc((y - row) / 4) * np.sinc((x - column) / 4)
@@ -454,7 +454,7 @@ def flying_east(**accuracies):
 
 
 def test_constant_attitude_error_displaces_points_by_the_lever_arm_error():
-    """2° of each angle displace the image like the displaced track, without defocusing."""
+    """Errors of 2° of each angle displace the image like the displaced track, without defocusing."""
     paths = straight()
     attitude, _ = attitude_lines(paths, [flying_east()], sidelink=False)
     (slope,), squares = paths.by_node(same=True, sidelink=False), 0.0
@@ -467,7 +467,7 @@ def test_constant_attitude_error_displaces_points_by_the_lever_arm_error():
 
 
 def test_loss_of_random_attitude_errors_equals_monte_carlo_mean():
-    """Mean loss in dB of 100 draws of three angles, correlation time 1 s, lever arm 0.4 m."""
+    """The mean is that of the loss in dB over 100 draws of three angles; correlation time 1 s, lever arm 0.4 m."""
     paths, generator = straight(), np.random.default_rng(3)
     node = replace(flying_east(std_deg=(2.0, 3.0), correlation_s=1.0), arms_m=((0.4, 0.0, 0.0),) * 2 + ((0.0,) * 3,))
     attitude, _ = attitude_lines(paths, [node], sidelink=False)
@@ -484,7 +484,7 @@ def test_loss_of_random_attitude_errors_equals_monte_carlo_mean():
 
 
 def test_unconfigured_attitude_accuracy_follows_from_the_attitude_source():
-    """Without lever arm there is no term; the course is less accurate than a log of attitude."""
+    """Without a lever arm, there is no such term; the course is less accurate than a logged attitude."""
     paths, bare = straight(), replace(flying_east(), arms_m=((0.0, 0.0, 0.0),) * 3)
     assert attitude_lines(paths, [bare], sidelink=False) == []
     logged = replace(flying_east(), std_deg=None, arm_std_m=None)
@@ -498,7 +498,7 @@ def test_unconfigured_attitude_accuracy_follows_from_the_attitude_source():
 
 
 def test_attitude_error_changes_the_sidelink_path_through_its_lever_arm():
-    """Only the sidelink antenna has a lever arm, across the line between the nodes."""
+    """Only the sidelink antenna has a lever arm, which is perpendicular to the line between the nodes."""
     paths = straight(separation_m=4.7)
     node = replace(flying_east(), arms_m=((0.0,) * 3, (0.0,) * 3, (0.0, 0.5, 0.0)), std_deg=(1e-6, 2.0))
     (attitude, _) = attitude_lines(paths, [node, None], sidelink=True)
@@ -525,7 +525,7 @@ def test_antenna_phase_linear_in_direction_displaces_points():
 
 @pytest.mark.parametrize(("centre_m", "flagged"), [(0.004, False), (0.03, True)])
 def test_angle_dependent_phase_centre_defocuses_as_predicted(centre_m, flagged):
-    """Phase centre displaced by `centre_m` at ±30°, the beam edges; the loss is that of the best peak of the sum."""
+    """The phase centre is displaced by `centre_m` at the beam edges (±30°); the loss is that of the best peak."""
     paths = straight()
     angle = cut_towards(paths)
     in_beam = np.abs(angle) < np.radians(30)

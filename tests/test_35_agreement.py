@@ -33,7 +33,7 @@ def track(ahead_m):
 
 
 def speckle(generator):
-    """Draw about one scatterer per resolution cell, on an area larger than the grid."""
+    """Draw about one scatterer per resolution cell over an area larger than the grid."""
     points = np.concatenate([generator.uniform((-14, 2), (14, 32), (30_000, 2)), np.zeros((30_000, 1))], axis=1)
     amplitude = generator.standard_normal((2, 30_000)).T @ [1, 1j]
     return Scatterers(points, amplitude)
@@ -100,7 +100,7 @@ def test_gradient_equals_the_finite_difference_of_the_value():
 
 @pytest.mark.slow
 def test_agreement_reduces_the_path_error_that_blurs_speckle():
-    """Path errors of the monostatic pair, without the part that only displaces the image, fall by eq. 23."""
+    """Path errors of the monostatic pair, without the mere displacement of the image, fall by eq. 23."""
     residual_ratios = []
     for seed in (1, 2):
         records, unknowns = records_of(seed)
@@ -113,7 +113,7 @@ def test_agreement_reduces_the_path_error_that_blurs_speckle():
 
 
 def blur_m(error_m):
-    """Return the RMS path error at the scene centre that does not merely displace the image."""
+    """Return the RMS path error at the scene centre, without the component that only displaces the image."""
     centre = np.array([0.0, 15, 0])
     along = np.stack([np.interp(KNOTS_S, TIME_S, axis) for axis in track(0.0).T], -1) - centre
     unit = along / np.linalg.norm(along, axis=1, keepdims=True)

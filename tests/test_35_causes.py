@@ -39,7 +39,7 @@ def test_higher_terrain_is_equivalent_to_lower_tracks():
 
 @pytest.mark.slow
 def test_wrong_lever_arm_is_found_within_3_cm():
-    """In addition to track errors of 3 mm, on a pass of 7.5 s."""
+    """The lever-arm error is added to track errors of 3 mm on a pass of 7.5 s."""
     case, causes, (node, arm_m) = wrong_case("lever arm", "points-5", "short", 0.003, 2)
     search = TrackSearch.begin(case.records, GRID, GROUND, case.errors)
     fit = explained(search.problem, causes, search.axes, np.random.default_rng(0))
@@ -54,7 +54,7 @@ def test_wrong_lever_arm_is_found_within_3_cm():
     ("kind", "seeds", "tolerance"), [("time", (5,), 0.005), ("lever arm", (6,), 0.03), ("height", (0, 6), 0.1)]
 )
 def test_single_wrong_constant_is_identified_and_corrected(kind, seeds, tolerance):
-    """Within 5 ms, 3 cm, 10 cm: the residual of a height error of 40 cm costs 0.2 dB."""
+    """Residuals are within 5 ms, 3 cm and 10 cm; that of a height error of 40 cm causes a loss of 0.2 dB."""
     for seed in seeds:
         case, causes, (node, values) = wrong_case(kind, "points-5", "wobble", 0.003, seed)
         refined = refine(case.records, GRID, GROUND, case.errors, causes=causes)
@@ -70,7 +70,7 @@ def test_single_wrong_constant_is_identified_and_corrected(kind, seeds, toleranc
 
 @pytest.mark.slow
 def test_random_track_errors_are_not_attributed_to_a_constant():
-    """Track errors of 4 cm over 7.5 s, which a lever arm would explain well by peak gain alone."""
+    """Track errors of 4 cm over 7.5 s would be explained well by a lever arm if only the peak gain were considered."""
     for seed in (0, 1, 3):
         case, causes, _ = wrong_case("nothing", "points-6", "short", 0.04, seed)
         refined = refine(case.records, GRID, GROUND, case.errors, causes=causes)

@@ -1,4 +1,4 @@
-"""Clock offset and path offset of a recorder from its echoes: estimated if the speed changes, else flagged."""
+"""Clock offset and path offset of a recorder from its echoes: estimated if the speed changes, otherwise flagged."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ POINTS = np.array([[0.3, 4.0, 0.0], [-0.9, 4.6, 0.0], [1.1, 3.5, 0.0]])
 
 
 def start_and_stop(time_s):
-    """Return the positions along a track: stationary until 5 s, 3 m in 8 s with varying speed, stationary."""
+    """Return the positions along a track: stationary until 5 s, then 3 m in 8 s with varying speed, then stationary."""
     along = np.clip((time_s - 5.0) / 8.0, 0.0, 1.0)
     return 3.0 * (along + 0.04 * np.sin(4 * np.pi * along)) - 1.5
 
@@ -80,7 +80,7 @@ def test_known_path_offset_is_kept():
 
 
 def test_clock_drift_is_estimated_on_a_long_recording():
-    """Oscillation over ten minutes: 40 ppm are 24 ms and 4 cm of path, more than half a wavelength."""
+    """Over ten minutes of oscillation, 40 ppm cause 24 ms and 4 cm of path, more than half a wavelength."""
 
     def to_and_fro(time_s):
         return 2.0 * np.sin(0.6 * time_s + 0.4 * np.sin(0.05 * time_s))

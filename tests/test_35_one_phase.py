@@ -66,7 +66,7 @@ def test_constant_track_offset_causes_no_loss():
 
 @pytest.mark.parametrize("behind_m", [0.0, 4.7])
 def test_predicted_residual_of_one_phase_equals_monte_carlo_residual(behind_m):
-    """Near scene, errors of 1 cm: path errors of the corners relative to the centre, without displacement."""
+    """For a near scene and errors of 1 cm: path errors of the corners relative to the centre, without displacement."""
     generator, errors = np.random.default_rng(3), TrackErrors((0.01, 0.01, 0.01))
     paths = paths_of(NEAR, behind_m=behind_m)
     corners = CORNERS_M * [9, 10, 0]
@@ -101,7 +101,7 @@ def test_gradient_of_entropy_equals_its_finite_difference():
 
 
 def record_of(flight, points_m, *, pair="a-a", seed=1, snr_db=None):
-    """Return the record of a pair from tracks with errors of 2 cm, sidelink corrected, and its true profiles."""
+    """Return the sidelink-corrected record of a pair whose tracks have errors of 2 cm, and its true profiles."""
     time_s, track = flight
     generator = np.random.default_rng(seed)
     logged = Aperture(track, track - [4.7 * (pair != "a-a"), 0, 0])
@@ -146,7 +146,7 @@ def losses(profiles, true, points_m, cell_m):
 
 
 def expected_shifts(record, true, points_m):
-    """Return (point, 2) displacement east and north of points of a far scene by the track errors, metres."""
+    """Return (point, 2) displacement of points of a far scene to the east and north due to track errors, metres."""
     logged = record.profiles.aperture
     path_errors = (
         true.aperture.path(points_m) - logged.path(points_m) - (true.start_m - record.profiles.start_m)[:, None]
@@ -200,7 +200,7 @@ def test_one_phase_leaves_a_near_scene_defocused():
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_phases_fitted_to_noise_are_rejected(method):
-    """Three points per range share their noise: a phase that sharpens one of them sharpens the others."""
+    """Three points at the same range share their noise: a phase that sharpens one point sharpens the others."""
     points = np.array([(east, north, 0.0) for north in (-12, -4, 4, 12) for east in (-12, 0, 12)])
     gains_db = []
     for seed in (0, 2):

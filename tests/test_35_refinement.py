@@ -38,7 +38,7 @@ def track(ahead_m=0.0):
 
 
 def echo(true, logged, sidelink):
-    """Return the echo of the target on the true track, with the sidelink length of the logged one."""
+    """Return the echo of the target on the true track, with the sidelink length of the logged track."""
     path = true.path(TARGET_M)
     if sidelink:
         length = [np.linalg.norm(aperture.tx_m - aperture.rx_m, axis=1)[:, None] for aperture in (true, logged)]
@@ -92,7 +92,7 @@ def test_defocused_points_are_found_at_their_positions():
 
 
 def test_subapertures_of_a_longer_flight_contain_no_more_pulses():
-    """Eq. 10b: the aperture of a point is divided, not the flight, so memory does not grow with its length."""
+    """Eq. 10b: the aperture of a point is divided, not the flight; memory is independent of its length."""
     pulses, point = [], np.zeros(3)
     for times in (1, 4):
         time_s = np.arange(0, 60.0 * times, 0.1)
@@ -119,7 +119,7 @@ def test_blocks_contribute_the_sum_of_their_pulses(search):
     no_motion = blocks.moves({node: np.zeros((len(search.problem.knots_s), 3)) for node in ("uav1", "uav2")})
     summed = blocks.contribution(echo, no_motion).values
     whole = block_contributions(blocks.record.profiles, echo.patch.pixels_m, edges=blocks.edges)
-    # Blocks keep the carrier of each pulse at the patch centre, elsewhere that of their mean position.
+    # Blocks have the exact carrier of each pulse at the patch centre, and elsewhere the carrier of their mean position.
     phase = np.exp(1j * np.angle((summed.conj() * whole).sum(axis=0)))
     error = np.linalg.norm(summed * phase - whole) / np.linalg.norm(whole)
     assert error < 0.03
@@ -142,7 +142,7 @@ def test_prior_has_the_stated_variance_and_correlation_time():
 
 
 def test_description_of_position_correlation_s_matches_its_use():
-    """The description converts a correlation time at 1/e to the configured one: factor 1/0.63."""
+    """The description states the factor 1/0.63 from a correlation time at 1/e to the configured correlation time."""
     description = Node.model_fields["position_correlation_s"].description
     share = 1 - 1 / np.e
     assert float(re.search(r"to zero there, and to 1/e at ([0-9.]+) of it", description)[1]) == pytest.approx(
@@ -203,7 +203,8 @@ def test_track_errors_of_2_cm_are_corrected_at_points_not_fitted(two_centimetres
 def test_refinement_does_not_displace_the_image(two_centimetres, refined, search):
     before, after = judge(two_centimetres), judge(two_centimetres, refined.correction)
     assert after.target_shift_cm < before.target_shift_cm + 0.3
-    # The constrained modes displace the image without a measurable loss of focus: apply all to the true tracks.
+    # All constrained modes, which displace the image without a measurable loss of focus, are applied to the true
+    # tracks.
     problem = search.problem
     truth = {node: two_centimetres.truth.at(node, problem.knots_s) for node in ("uav1", "uav2")}
     constrained = problem.prior.tracks(problem.gauge.modes[-3:].sum(axis=0))
@@ -232,14 +233,14 @@ def test_overstated_position_error_is_flagged(two_centimetres, refined):
     result = refine(two_centimetres.records, GRID, FlatGround(0.0), stated)
     assert "position_error_overstated" in result.flags
     assert not {"position_error_overstated", "position_error_understated"} & refined.flags.keys()
-    assert judge(two_centimetres, result.correction).probe_loss_db > -0.5  # focused nevertheless
+    assert judge(two_centimetres, result.correction).probe_loss_db > -0.5  # the image is nevertheless focused
 
 
 def test_path_slip_over_part_of_the_aperture_is_detected(two_centimetres, search):
     problem, wavelength_m = search.problem, search.wavelength_m
     truth = {node: two_centimetres.truth.at(node, problem.knots_s) for node in ("uav1", "uav2")}
     slip = np.zeros((len(problem.knots_s), 3))
-    slip[75:115, 1] = -0.8 * wavelength_m  # away from the scene, slightly more than half a wavelength of two-way path
+    slip[75:115, 1] = -0.8 * wavelength_m  # away from the scene; slightly more than half a wavelength of two-way path
 
     def slipped(tracks):
         state = problem.at(tracks)
@@ -266,7 +267,7 @@ def test_refinement_of_speckle_is_rejected(two_centimetres):
 @pytest.mark.slow
 @pytest.mark.parametrize(("points", "pairs", "sigma_m"), [(1, "mono", 0.02), (2, "bi", 0.02), (3, "joint", 0.04)])
 def test_short_flight_past_few_points_is_corrected(points, pairs, sigma_m):
-    """150 pulses in 7.5 s: points are judged by the other points or, without others, by steady amplitudes."""
+    """With 150 pulses in 7.5 s, points are validated by other points or, without others, by steady amplitudes."""
     simulated = case(f"points-{points}", "short", pairs, sigma_m, 10.0, 0)
     result = refine(simulated.records, GRID, FlatGround(0.0), simulated.errors)
     before, after = judge(simulated), judge(simulated, result.correction)
@@ -280,12 +281,12 @@ def test_exact_tracks_are_left_unchanged():
     simulated = case("points-4", "short", "mono", 0.0, 10.0, 3, stated_m=0.02)
     result = refine(simulated.records, GRID, FlatGround(0.0), simulated.errors)
     assert not result.accepted
-    assert not result.flags.keys() - {"position_error_overstated"}  # correct for tracks without error and 2 cm stated
+    assert not result.flags.keys() - {"position_error_overstated"}  # correct, because 2 cm are stated for exact tracks
     assert "no improvement over the logs" in result.reason
 
 
 def test_track_slip_is_found_by_delays_and_corrected():
-    """4 cm in 7.5 s: the sharpest tracks have one-wavelength slips in parts of the flight until delays are compared."""
+    """For 4 cm in 7.5 s, the sharpest tracks have one-wavelength slips, which are resolved by comparison of delays."""
     simulated = case("points-4", "short", "mono", 0.04, 10.0, 13)
     result = refine(simulated.records, GRID, FlatGround(0.0), simulated.errors)
     assert result.accepted, result.reason

@@ -54,7 +54,8 @@ def test_true_tracks_have_no_loss_and_logged_tracks_the_predicted_one(pairs):
     measured = peaks(simulated.probes, simulated.truth, PROBES_M, simulated.reach_m)
     assert np.abs(measured.place_m - PROBES_M).max() < 0.02
     losses = [judge(case("five", "straight", pairs, 0.01, None, seed)).probe_loss_db for seed in range(3, 6)]
-    # 1 cm per axis gives an rms phase of k·|g|·σ, |g| about 2: loss exp(-(2kσ)²), slightly less at the best peak
+    # 1 cm per axis causes an rms phase of k·|g|·σ with |g| ≈ 2; the loss is exp(-(2kσ)²), slightly less at the best
+    # peak
     assert -2.2 < np.mean(losses) < -0.8
 
 

@@ -1,4 +1,4 @@
-"""Simulated folders, checked against the input contract, the sample campaign and independent packages."""
+"""Simulated folders, compared with the input contract, the sample campaign and independent packages."""
 
 import csv
 import json
@@ -110,7 +110,7 @@ def test_non_empty_folder_is_left_unchanged(tmp_path):
 
 @pytest.mark.parametrize(("atmosphere", "index"), [("vacuum", 1.0), (320.0, 1.00032)])
 def test_recorded_samples_have_the_phase_of_the_logged_geometry(tmp_path, atmosphere, index):
-    """Computed from the files: DFT, code, CSV log, true target; 1e-3 rad. The refractive index applies to air only."""
+    """The phase is computed from DFT, code, CSV log and true target; the refractive index applies to air only."""
     simulation = small_simulation()
     single = replace(simulation, targets=(PointTarget((0.5, 1.0, 0.3)),), atmosphere=atmosphere)
     offset = {"radar": 1.374}
@@ -184,7 +184,7 @@ def test_lever_arms_rotate_with_the_node():
 
 
 def test_echo_amplitude_includes_both_antenna_patterns():
-    """Level antennas that look left of an eastward flight, so that bearing and elevation follow from the map."""
+    """Level antennas on the left of an eastward flight; bearing and elevation follow from map coordinates."""
     omnidirectional = small_simulation()
     beams = {
         "a": {"radar_tx": GaussianBeam((-90.0, 0.0), (30.0, 40.0))},

@@ -65,7 +65,7 @@ def test_preamble_starts_at_the_true_sample_and_payload_counts_frames():
 
 
 def test_continuous_recording_equals_the_definition_on_the_node_clock():
-    """One continuous oscillator and sampling clock; frames arrive at arbitrary sample phases."""
+    """Oscillator and sampling clock run continuously; frames arrive at arbitrary sample phases."""
     impairments = Impairments(clock=Clock(cfo_hz=1234.0, sfo_hz=345.0), timing=Timing(offset_s=7.3e-6))
     simulation = small_simulation(framing=FRAMING, continuous=True, secondary=impairments, first_frame=5)
     stream, channels, time_s, _ = stream_of(simulation, "b")
@@ -126,7 +126,7 @@ def test_continuous_recording_is_one_segment_with_framing_metadata(tmp_path):
     recording = sigmf.fromfile(str(root / "raw/f01/b.sigmf-meta"))
     recording.validate()
     (segment,) = recording.get_captures()
-    assert segment["core:datetime"] == "2025-05-14T09:30:00.001000Z"  # 1 ms before the first pulse, 2 ms late
+    assert segment["core:datetime"] == "2025-05-14T09:30:00.001000Z"  # start: 1 ms early; tags: 2 ms late
     framing = recording.get_global_field("apertura:framing")
     chips = np.load(root / framing["preamble"])
     assert set(chips.tolist()) == {-1, 1}

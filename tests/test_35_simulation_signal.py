@@ -45,7 +45,7 @@ def small_waveform(carrier_is="band_start", subcarriers=200):
 
 
 def two_uavs(pulses=6):
-    """Return two targets and the geometry of a transmitter and a receiver 4.7 m ahead of it, metres, local frame."""
+    """Return two targets and the geometry of a transmitter and a receiver 4.7 m ahead, metres in the local frame."""
     along = np.linspace(-1.0, 1.0, pulses)
     sender = np.column_stack([along, np.zeros(pulses), np.full(pulses, 5.0)])
     receiver = sender + np.array([4.7, 0.3, 0.1])
@@ -130,7 +130,7 @@ def test_fast_transfer_functions_equal_the_dft_of_samples():
 
 @pytest.mark.parametrize("carrier_is", ["band_start", "band_centre"])
 def test_periodic_samples_are_exact_where_all_echoes_overlap(carrier_is):
-    """From the last arrival to the first end; an echo not entirely inside the window is omitted."""
+    """Samples are exact from the last arrival to the first end; echoes not entirely inside the window are omitted."""
     waveform = small_waveform(carrier_is)
     impairments = Impairments(
         carrier_phase=UniformPhase(), timing=Timing(half_width_s=20e-9), clock=Clock(cfo_hz=3e4), doppler=False

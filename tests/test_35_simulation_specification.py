@@ -28,7 +28,7 @@ from apertura.simulation.waveform import WaveformSpecification
 @pytest.mark.quick("demo", "paper", "swarm", "continuous", "flight", "paper-lab")
 @pytest.mark.parametrize("name", list(PRESETS))
 def test_preset_has_echoes_inside_the_prefix_and_targets_on_the_grid(name):
-    """Triggered recordings; a continuous recording is cut at its pulses."""
+    """Recordings are triggered; a continuous recording is cut at its pulses."""
     specification = preset(name, pulses=30)
     recordings, campaign = recordings_of(specification)
     waveform = campaign.waveform

@@ -32,7 +32,7 @@ def band_mask(carrier):
 
 
 def simulated_pair(number, *, phase_rad=0.0, shift_px=(0.0, 0.0), code=True, carrier=None, clutter=0.08, draw=0):
-    """Simulate image and bright points of pair `number`: four targets in clutter, in a band of its own."""
+    """Simulate image and bright points of pair `number`: four targets in clutter, in a separate band."""
     generator = np.random.default_rng((draw, number))
     carrier = carrier or (0.1 + 0.05 * number, 0.3 - 0.04 * number)
     row, column = np.mgrid[:SIDE, :SIDE]
@@ -95,7 +95,7 @@ def test_one_or_two_wrong_pairs_of_six_are_excluded_from_the_sum(error, wrong):
 
 
 def test_two_pairs_in_phase_of_four_are_summed_whichever_is_focused_best():
-    """Phase offsets of the others: 90° and 180°; the latter pair is focused best."""
+    """The other pairs have phase offsets of 90° and 180°; the latter pair has the best focus."""
     images = dict(
         zip(
             PAIRS[:4],
@@ -140,7 +140,7 @@ def test_two_pairs_with_the_same_error_do_not_outvote_four():
 
 
 def measured_agreement(phase_rad, *, std_rad=0.05, shift_m=0.0, cycles=0.0):
-    """Return the agreement measured between two pairs, resolution cells of 0.4 m."""
+    """Return a measured agreement between two pairs with resolution cells of 0.4 m."""
     units = shift_m / 0.22
     return Agreement("bright points", 4, shift_m, 0.0, 0.01, units, 0.045, cycles, 0.1, phase_rad, std_rad, 0.99)
 
@@ -168,7 +168,7 @@ def test_aligning_phases_are_the_least_squares_solution():
     }
     fusion = choose_fusion(rank, between, align=True)
     assert fusion.phases_rad["c"] == pytest.approx(2.1, abs=0.01)
-    assert fusion.phases_rad["b"] == pytest.approx(1.1, abs=0.01)  # the path through c is ten times as accurate
+    assert fusion.phases_rad["b"] == pytest.approx(1.1, abs=0.01)  # the path via c is ten times more accurate
 
 
 def test_unmeasured_pair_is_summed_unless_it_lacks_points_of_others():
@@ -222,12 +222,12 @@ def test_wrong_pair_is_excluded_from_many_pairs_without_exhaustive_search():
 
 
 def test_path_error_of_one_wavelength_is_detected_by_the_displacement():
-    """A displacement of 0.16 cells is not significant by itself, but indicates another carrier cycle."""
+    """A displacement of 0.16 cells alone is not significant, but indicates a different carrier cycle."""
     same_cycle = measured_agreement(0.0, shift_m=0.065, cycles=0.4)
     other_cycle = measured_agreement(0.0, shift_m=0.065, cycles=0.9)
     assert not same_cycle.shifted
     assert other_cycle.shifted
-    assert not measured_agreement(0.0, shift_m=0.03, cycles=0.9).shifted  # below a tenth of a cell: tolerated
+    assert not measured_agreement(0.0, shift_m=0.03, cycles=0.9).shifted  # tolerated, below a tenth of a cell
 
 
 @pytest.mark.slow
@@ -271,7 +271,7 @@ def test_clutter_of_different_scenes_is_not_coherent():
 
 
 def displaced_points(generator, count, side_m, shift_m):
-    """Return the points of two images, each with its own displacement in the second, metres."""
+    """Return the points of two images, each with a separate displacement in the second image, metres."""
     positions = generator.uniform(0, side_m, (count, 2))
     first, second = (
         [BrightPoint(y / SPACING_M, x / SPACING_M, 1.0) for x, y in image_positions]
@@ -282,7 +282,7 @@ def displaced_points(generator, count, side_m, shift_m):
 
 @pytest.mark.parametrize("displacement_m", [0.0, 0.3, 0.6, 1.0, 1.5])
 def test_unequal_displacements_of_points_are_detected(displacement_m):
-    """A height error displaces points by look angle: in opposite directions on opposite sides."""
+    """The displacement due to a height error depends on the look angle and is opposite on opposite sides."""
     generator = np.random.default_rng(3)
     direction = generator.uniform(0.5, 1.5, (5, 2)) * [1.0, 0.3]
     image = np.ones((400, 400), np.complex64)
@@ -293,7 +293,7 @@ def test_unequal_displacements_of_points_are_detected(displacement_m):
 
 
 def test_points_of_different_scenes_are_not_matched():
-    """At most three false matches in 1000 draws."""
+    """At most three false matches occur in 1000 draws."""
     generator, image = np.random.default_rng(4), np.ones((400, 400), np.complex64)
     matches = 0
     for _ in range(1000):

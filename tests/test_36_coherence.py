@@ -26,9 +26,9 @@ def test_images_with_different_carriers_have_a_uniform_phase():
     scene = random_scene(1)
     first, second = imaged(scene, middle=(0.1, 0.3)), imaged(scene, middle=(0.1, 0.4))
     magnitude, phase, _ = coherence(1j * first, second, window=9)
-    assert magnitude[INSIDE].mean() == pytest.approx(0.8, abs=0.02)  # of 0.5 cycles per pixel, 0.4 are common
+    assert magnitude[INSIDE].mean() == pytest.approx(0.8, abs=0.02)  # 0.4 of 0.5 cycles per pixel
     assert np.mean(np.exp(1j * phase[INSIDE])) == pytest.approx(1j, abs=0.05)
-    slope = np.exp(-2j * np.pi * 0.1 * np.arange(SIDE))  # with k₂ − k₁ removed there is no common band
+    slope = np.exp(-2j * np.pi * 0.1 * np.arange(SIDE))  # without the slope k₂ − k₁, there is no common band
     without_overlap, _, looks = coherence(1j * first * slope.astype(np.complex64), second, window=9)
     assert without_overlap[INSIDE].mean() < 1.3 * chance(looks)
 

@@ -88,7 +88,7 @@ def ramp_m(east, north):
 
 @cache
 def two_tracks(rise_m, along_m=0.0, common=1.0, marked=False):
-    """Form two images of a ramp of scatterers, focused on flat terrain; `common` 1: unchanged between them."""
+    """Form two images of a ramp of scatterers, focused on flat terrain; with `common` 1, terrain is unchanged."""
     generator = np.random.default_rng(3)
     count = round((2 * HALF_M + 4) ** 2 * 25)
     east, north = generator.uniform(-HALF_M - 2, HALF_M + 2, (2, count))
@@ -149,7 +149,7 @@ def test_height_sensitivity_is_the_baseline_over_range_and_sine(height_m):
 
 def test_height_error_rotates_points_about_the_track():
     response = at_middle(track(25.0), track(25.001))
-    # At 45° a height of 1 m displaces the point by 1 m away from the track.
+    # At 45°, a height of 1 m displaces the point by 1 m away from the track.
     assert response.shift[0] == pytest.approx([0.0, 1.0], abs=1e-3)
     assert at_middle(track(25.0), track(25.0, along_m=2.0)).shift[0, 0] == pytest.approx(0.0, abs=0.05)
 
@@ -202,7 +202,7 @@ def test_height_errors_of_a_ramp_match_the_stated_deviation(rise_m):
 
 @pytest.mark.slow
 def test_height_deviation_includes_that_of_the_reference_point():
-    """Common offset of all heights: σ_h² grows by (σ₀/a)²; with four equal points by π/8 of that (median)."""
+    """Common offset of all heights: σ_h² grows by (σ₀/a)², with four equal points by π/8·(σ₀/a)²."""
     first, second, response = two_tracks(1.0)
     free = form_interferogram(first, second, ground_of(response, []), GRID.tiles(64), window=WINDOW)
     row, column = np.argwhere(np.isfinite(free.panels["unwrapped"]))[500]
@@ -230,7 +230,7 @@ def test_temporal_decorrelation_lowers_coherence_and_widens_the_deviation():
     assert changed.measured.coherence == pytest.approx(0.6 * unchanged.measured.coherence, abs=0.05)
     assert np.nanmedian(changed.panels["height_std"]) > 3 * np.nanmedian(unchanged.panels["height_std"])
     error = (changed.panels["height"] - ramp_m(*np.meshgrid(GRID.x_m, GRID.y_m)))[INSIDE]
-    error -= np.nanmedian(error)  # there is no point of known height
+    error -= np.nanmedian(error)  # no point of known height exists
     assert np.sqrt(np.nanmean((error / changed.panels["height_std"][INSIDE]) ** 2)) < 1.2
     assert list(interferogram_flags(changed.measured)) == ["height_relative"]
 
@@ -239,7 +239,7 @@ def test_temporal_decorrelation_lowers_coherence_and_widens_the_deviation():
 @pytest.mark.parametrize("same", [False, True])
 @pytest.mark.parametrize("correlation_s", [0.5, 4.0, 1e4])
 def test_phase_deviation_of_track_errors_equals_monte_carlo_deviation(same, correlation_s):
-    """Eq. 8a compared with drawn errors: two flights, and one flight whose receivers share a transmitter."""
+    """Eq. 8a agrees with drawn errors of two flights, and of one flight whose receivers share a transmitter."""
     generator, time_s, std_m = np.random.default_rng(5), np.linspace(0, 30, 301), np.array([0.01, 0.02, 0.015])
     points = np.array([[x, y, 0.0] for x in (-20.0, 0.0, 25.0) for y in (20.0, 60.0)])
     along = np.stack([np.linspace(-15, 15, 301), np.zeros(301), np.full(301, 20.0)], -1)
@@ -401,7 +401,7 @@ def test_known_point_takes_the_cycle_of_its_neighbours():
 
 def test_heights_are_placed_at_their_ground_positions():
     row, column = np.mgrid[:60, :80].astype(float)
-    truth = 0.05 * column - 0.02 * row  # terrain height at its own position
+    truth = 0.05 * column - 0.02 * row  # true terrain height at each position
     shift = np.full((60, 80, 2), [-3.0, 2.0])
     imaged = truth / (1 - (0.05 * 2.0 - 0.02 * -3.0))  # h(p) = truth(p + s h(p))
     imaged[20:25, 30:35] = np.nan

@@ -109,7 +109,7 @@ def test_every_raster_is_a_strictly_valid_cog(tmp_path, name, shape):
 @pytest.mark.quick("MODE-255")
 @pytest.mark.parametrize("band", [POWER, SLC, MASK, LOOKS, PHASE], ids=lambda band: f"{band.overviews}-{band.nodata}")
 def test_overviews_equal_those_of_gdal(tmp_path, band):
-    """Also across the blocks read at once, and next to undefined pixels."""
+    """This also holds across block boundaries and next to undefined pixels."""
     rng, shape = np.random.default_rng(5), (READ + 256, 1040)
     image = {"complex64": speckle(*shape), "uint8": rng.integers(0, 4, shape, np.uint8)}.get(band.dtype)
     image = np.abs(speckle(*shape)) if image is None else image
@@ -352,7 +352,7 @@ def test_single_outlier_does_not_darken_the_quicklook():
 
 
 def framed_dots(path: Path, shape: tuple[int, int]) -> np.ndarray:
-    """Return brightness of the dots inside the frame, `LEFT` and `TOP` inches from the upper left corner."""
+    """Return the brightness of the pixels inside the frame, `LEFT` and `TOP` inches from the upper left corner."""
     with rasterio.open(path) as png:
         dots = png.read([1, 2, 3]).sum(axis=0)
     scale = 6.4 * DPI / max(shape)

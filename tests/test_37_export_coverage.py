@@ -55,7 +55,7 @@ def near_the_antimeridian(at_m):
 
 
 def test_footprint_and_track_are_split_at_the_antimeridian():
-    """RFC 7946, 3.1.9 and 5.2: the same area in two polygons, a line in two parts, bounds from west to east."""
+    """As in RFC 7946 (3.1.9 and 5.2), areas have two polygons, lines two parts, and bounds extend from west to east."""
     east, north, _ = map_from_frame("EPSG:32660", ecef_from_geodetic(np.array(48.0), np.array(180.0), np.array(0.0)))
     transform = Affine(2.0, 0, east - 9, 0, -2.0, north + 8)
     track = np.stack([np.linspace(east - 20, east + 20, 9), np.full(9, north - 30), np.full(9, 30.0)], -1)
@@ -98,7 +98,7 @@ def test_coverage_map_is_reproducible_and_depends_on_its_input(tmp_path):
 
 
 def coverage_map(monkeypatch, tmp_path, several, **options):
-    """Return axis and colour bar labels, texts of the figure, and the figure of a coverage map."""
+    """Return the axis and colour bar labels, the texts, and the figure of a coverage map."""
     figures = []
     monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: figures.append(self) or Path(path).write_bytes(b""))
     tags = {"APERTURA_VERSION": "0.1.0"}
@@ -120,7 +120,7 @@ def test_single_pair_has_one_panel_and_a_distant_scene_a_second(monkeypatch, tmp
     assert figure.axes[2].get_xlim() == (100, 120)
     figure.canvas.draw()
     wide, high = (figure.axes[2].bbox.size / figure.dpi).tolist()
-    assert max(wide, high) > 3  # inches: large enough to read
+    assert max(wide, high) > 3  # inches, large enough to be readable
     canvas = figure.bbox
     for axes in figure.axes:  # nothing is cut at the edge of the figure
         box = axes.get_tightbbox()

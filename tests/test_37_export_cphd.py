@@ -69,7 +69,7 @@ def difference_db(first, second):
 
 @pytest.fixture(scope="module")
 def gotcha(shared, tmp_path_factory):
-    """Process two degrees of Gotcha at the accuracy of the comparison."""
+    """Process two degrees of the Gotcha data at the accuracy of the comparison."""
     root = tmp_path_factory.mktemp("gotcha") / "campaign"
     (root / "config").mkdir(parents=True)
     (root / "raw/pass1").mkdir(parents=True)
@@ -108,7 +108,7 @@ def test_gotcha_image_through_cphd_differs_by_less_than_minus_80_db(gotcha, tmp_
     assert echoes[1].attrs["frame"] == "local"
     np.testing.assert_allclose(echoes[1].tx_position.values, echoes[0].tx_position.values, atol=2e-9)
     np.testing.assert_array_equal(echoes[1].time.values, echoes[0].time.values)
-    # Samples are referred to the scene centre instead of the origin, so they differ.
+    # Samples differ, because they are referred to the scene centre instead of the origin.
     assert np.abs(np.diff([stage.reference_delay.values for stage in echoes], axis=0)).min() > 1e-8
 
 
@@ -182,7 +182,7 @@ def test_missing_pulses_are_refused_and_leave_no_file(tmp_path):
 
 
 def test_swath_ends_where_echoes_exceed_the_prefix(tmp_path):
-    """Without a prefix, the swath is the unambiguous range of the frequency step divided by 1.25."""
+    """Without a prefix, the swath is the unambiguous range of the frequency step, divided by 1.25."""
     first, last = collection(path_limit_m=np.full(6, np.inf)).swath_s
     assert last == -first == pytest.approx(0.5 / 1.25 / 1e5)
     limited = collection(path_limit_m=np.full(6, 900.0))

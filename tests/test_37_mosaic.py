@@ -1,4 +1,4 @@
-"""Mosaics of the rasters of all flights: last flight on top, georeference kept, relative paths."""
+"""Mosaics of the rasters of all flights: the last flight is on top, the georeference is kept, paths are relative."""
 
 import json
 import shutil

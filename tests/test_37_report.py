@@ -114,12 +114,12 @@ def test_plot_has_page_width_clips_nothing_and_is_reproducible(draw, tmp_path):
     drawn = imread(io.BytesIO(data), format="png")[..., :3]
     assert drawn.shape[1] / 220 == pytest.approx(6.7, abs=0.01)  # inches between the margins of A4
     edge = np.concatenate([drawn[0], drawn[-1], drawn[:, 0], drawn[:, -1]])
-    assert (edge == 1).all()  # clipped content would colour the edge
+    assert (edge == 1).all()  # clipped content would change the colour of the edge
     assert (drawn < 0.5).any()
 
 
 def figure_of(draw, path, monkeypatch):
-    """Return the figure drawn, without writing a file."""
+    """Return the drawn figure without writing a file."""
     figures = []
     monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: figures.append(self) or Path(path).write_bytes(b""))
     draw(path)
@@ -127,7 +127,7 @@ def figure_of(draw, path, monkeypatch):
 
 
 def test_budget_legend_shows_each_kind_of_bar(monkeypatch, tmp_path):
-    """Also a kind that no line of the image has, as in the first of the three panels."""
+    """The legend also shows a kind of bar that is absent from the first of the three panels."""
     stated = [{"cause": "positions", "stated": "1 cm", "loss_db": -0.2, "shift_m": 0.01, "phase_rad": 0.1}]
     (legend,) = figure_of(
         lambda path: draw_budget(path, stated, Measured(), **SHARED), tmp_path / "first.png", monkeypatch

@@ -196,7 +196,7 @@ def test_local_campaign_has_items_without_geometry_and_no_collection(slc, tmp_pa
     ("ghz", "band"), [(0.15, None), (0.25, "P"), (0.7, "P"), (1.0, "L"), (39.9, "Ka"), (77.0, None)]
 )
 def test_frequency_band_letter_follows_the_table_of_the_extension(slc, ghz, band):
-    """Bands of the extension: P from 0.25 to 1 GHz; the letter is optional."""
+    """The bands are those of the extension, with P from 0.25 to 1 GHz; the letter is optional."""
     document = item(slc, acquisition=AcquisitionTime(START, START, 1e9 * ghz, 1e8))
     assert document["properties"]["sar:center_frequency"] == ghz
     assert document["properties"].get("sar:frequency_band") == band

@@ -1,4 +1,4 @@
-"""Default QGIS styles: decibels from noise floor to peak, classes with their names."""
+"""Default QGIS styles: decibels from the noise floor to the peak, and classes with their names."""
 
 from xml.etree import ElementTree as ET
 

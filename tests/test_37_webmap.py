@@ -1,4 +1,4 @@
-"""Map server: serves its page and listed files to the local machine only; the page inserts no text as HTML."""
+"""Map server: it serves its page and listed files to the local machine only, and the page inserts no text as HTML."""
 
 import http.client
 import json

@@ -68,13 +68,13 @@ def test_refused_case_counts_as_neither_harmful_nor_harmless(monkeypatch):
 
 @pytest.mark.parametrize("name", sorted(CAUSES.keys() - {"track_noise_time"}))  # never negligible
 def test_assumed_geometry_at_negligible_error_is_the_true_one(name):
-    """Within 1 cm: logs have noise, and a time tag late by 1 ms displaces by 1 mm."""
+    """Positions agree within 1 cm: logs have noise, and a time tag that is 1 ms late displaces a node by 1 mm."""
     cause = CAUSES[name]
     steps = np.diff(cause.sizes)
     assert (steps > 0).all() or (steps < 0).all()
     simulated = cause.flight()
     assumed = cause.assume(simulated, cause.sizes[0], np.random.default_rng(0))
-    tolerance_m = 0.04 if name == "association" else 0.01  # one pulse interval is 3.3 cm of flight
+    tolerance_m = 0.04 if name == "association" else 0.01  # one pulse interval corresponds to 3.3 cm of flight
     for pair in PAIRS:
         for leg, true in zip(assumed.apertures[pair].legs, simulated.truth.apertures[pair].legs, strict=True):
             assert np.abs(leg - true).max() < tolerance_m

@@ -63,7 +63,7 @@ def test_target_peaks_at_its_range_in_the_profile(campaigns, name, pair):
     true_m = float(history.aperture.path(experiment.places_m[:1]).mean()) / 2
     slant_m = true_m + np.linspace(-0.6, 0.6, 601)
     peak_m = slant_m[np.abs(profiles_at(history, slant_m)).mean(axis=0).argmax()]
-    assert peak_m == pytest.approx(true_m, abs=0.08)  # clutter displaces it by a fraction of a cell of 37 cm
+    assert peak_m == pytest.approx(true_m, abs=0.08)  # clutter displaces the peak by a fraction of a cell of 37 cm
 
 
 def test_lab_experiment_has_10_m_radar_and_5_m_sidelink_cables():
@@ -106,7 +106,9 @@ def test_coherence_claims_match_the_paper_and_the_noise_level(campaigns):
     for name, claim in claims.items():
         if name.startswith("lack of coherence"):
             assert float(claim.computed) == pytest.approx(1.0, abs=0.7)
-    pair_claims = [claims[f"{what} monostatic, static"] for what in ("phase of bistatic less", "gain of bistatic over")]
+    pair_claims = [
+        claims[f"{what} monostatic, static"] for what in ("phase of bistatic minus", "gain of bistatic over")
+    ]
     assert [(claim.about, claim.verdict) for claim in pair_claims] == [
         (PAPER, EXPLAINED)
     ] * 2  # one simulated signal is split
@@ -152,7 +154,7 @@ def test_flight_segments_have_the_stated_length_and_gap():
     assert (later - end) * speed_m_s + ahead_m == pytest.approx(GAP_M)
     assert last <= (flight.pulses - 1) / specification.waveform.prf_hz
     middle_m = tx[0] + (start + last) / 2 * speed_m_s + ahead_m / 2
-    assert middle_m == pytest.approx(0.0)  # the scene centre is abeam of the middle of both segments
+    assert middle_m == pytest.approx(0.0)  # the scene centre is abeam of the midpoint of both segments
 
 
 def test_adjacent_segments_have_one_aperture_sidelobe_raised_by_a_gap():
@@ -186,4 +188,4 @@ def test_processed_flight_gives_the_predicted_fusion_results(tmp_path):
     assert (relative_width.about, relative_width.verdict) == (PAPER, AGREES)
     assert {claim.verdict for name, claim in claims.items() if "coherent sum" not in name} == {AGREES}
     width = float(claims["UAV experiment: cross-range width, coherent sum"].computed)
-    assert 10 < width < 14  # a third of that of one segment
+    assert 10 < width < 14  # a third of the width of one segment

@@ -130,13 +130,13 @@ def test_chart_distinguishes_the_verdicts(monkeypatch, tmp_path):
     marked = [marks(five, label).tolist() for label in (*VERDICTS, "refused estimate")]
     assert marked == [[[1.0, 0.2]], [[2.0, 0.2]], [[3.0, 6.0]], [[5.0, 10.0]], [[3.0, 0.2]]]
     assert marks(dense, TOO_FEW)[:, 0].tolist() == [1.0, 2.0, 3.0, 5.0]
-    assert "2 of 4 accepted, 0 of them worse" in five.get_title()
+    assert "2 of 4 accepted, 0 of these worse" in five.get_title()
     assert "0 of 4 accepted" in dense.get_title()
 
 
 def test_tally_counts_accepted_and_harmful_refinements():
     rows = [row(1.0, ACCEPTED, product_db=2.5), row(2.0, REFUSED, product_db=9.0)]
-    assert charts.tally(rows) == "1 of 2 accepted, 1 of them worse than the logs"
+    assert charts.tally(rows) == "1 of 2 accepted, 1 of these worse than the logs"
 
 
 def test_sweep_and_chart_are_one_command_each(monkeypatch, tmp_path):

@@ -117,7 +117,7 @@ def test_contradictions_of_the_paper_are_noted():
 
 
 def test_frequency_offset_limits_follow_from_orthogonality():
-    # At the limit the sampling clock slips by one cycle of the last subcarrier over the symbol.
+    # At the limit, the sampling clock slips by one cycle of the last subcarrier over the symbol.
     limit_hz = parameters.sfo_limit_hz(1.024e9, 409.6e6, 12.5e-6)
     slip_s = 12.5e-6 * limit_hz / (1.024e9 - limit_hz)
     assert slip_s * 409.6e6 == pytest.approx(1, rel=1e-9)
@@ -145,7 +145,7 @@ def test_uav_flight_widths_match_the_paper():
     for name, width_cm in (("cross-range", 11), ("ground-range", 49)):
         row = rows[f"UAV flight: {name} width, fused, fitted segments"]
         assert float(row.computed) == pytest.approx(width_cm, rel=0.05)
-        assert row.verdict == EXPLAINED  # no evidence, as three values were fitted
+        assert row.verdict == EXPLAINED  # no confirmation, because three values were fitted
         assert "by construction" in row.note
     assert rows["UAV flight: ground-range width, Hann, mono"].verdict == AGREES
 
@@ -162,7 +162,7 @@ def test_timing_error_shifts_a_profile_and_carrier_phase_does_not():
 def test_errors_along_the_sidelink_cancel_only_if_common_to_both_nodes():
     claim = position_claims(draws=1)[-1]
     assert (claim.about, claim.verdict) == (PAPER, AGREES)
-    alone_cm = 1 - 2.35 / np.hypot(2.35, np.hypot(15, 10))  # the sidelink grows by 1 cm, the echo path by less
+    alone_cm = 1 - 2.35 / np.hypot(2.35, np.hypot(15, 10))  # the sidelink path increases by 1 cm, the echo path by less
     assert f"of a single node, which the paper does not discuss, leaves {alone_cm:.2f} cm" in claim.note
 
 

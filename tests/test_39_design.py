@@ -65,14 +65,14 @@ def line(**changes):
 
 
 def with_tracks(plan, **tracks):
-    """Return a plan with other tracks in its flight."""
+    """Return a plan with the tracks of its flight replaced."""
     changed = copy.deepcopy(plan)
     changed["flights"]["f01"]["tracks"] = tracks
     return changed
 
 
 def with_second(shape="column", spacing_m=4.0, **flight):
-    """Return a plan of two nodes in formation, the second receiving alone."""
+    """Return a plan of two nodes in formation, of which the second only receives."""
     plan = plan_of()
     plan["nodes"]["uav2"] = {"antennas": {"radar_rx_gain_dbi": 3.0}, "receiver": RECEIVER, "attitude": "log"}
     formation = {"shape": shape, "leader": "uav1", "spacing_m": spacing_m}
@@ -85,7 +85,7 @@ def at_centre(design, name, image=0):
 
 
 def test_resolution_of_a_line_follows_from_wavelength_and_angle():
-    """0.886 λ/(4 sin(Θ/2)) across and 0.886 c/(2B sin θ) along range, for flat spectra."""
+    """For flat spectra, the widths are 0.886 λ/(4 sin(Θ/2)) across and 0.886 c/(2B sin θ) along range."""
     design = ap.design(with_tracks(plan_of(), uav1=line(start_m=[-5.0, 0.0], end_m=[5.0, 0.0])))
     x, y = (float(design[axis][design.sizes[axis] // 2]) for axis in "xy")
     ends = [np.array([end - x, y, 30.0]) for end in (-5, 5)]
@@ -100,7 +100,7 @@ def test_resolution_of_a_line_follows_from_wavelength_and_angle():
 
 
 def test_resolution_of_a_circle_is_equal_in_all_directions():
-    """|p|² = J₀²(4π r sin θ/λ) is 1/2 at an argument of 1.126, so the full width is 2.252."""
+    """|p|² = J₀²(4π r sin θ/λ) is 1/2 at an argument of 1.126, so that the full width is 2.252."""
     circle = {"kind": "circle", "centre_m": [0.0, 30.0], "radius_m": 30.0, "height_m": 30.0, "speed_m_s": 3.0}
     scene = plan_of()["scene"] | {"bounds_m": [-0.5, 29.5, 0.5, 30.5]}
     design = ap.design(with_tracks(plan_of(scene=scene), uav1=circle))
@@ -111,7 +111,7 @@ def test_resolution_of_a_circle_is_equal_in_all_directions():
 
 @pytest.mark.parametrize("rise", [-0.3, 0.3])
 def test_ground_range_resolution_depends_on_the_terrain_slope(rise):
-    """The path grows by 2(sin θ - r cos θ) per metre of the map, r the rise; resolution 0.886 c/B over that."""
+    """With the rise r, the path grows by g = 2(sin θ - r cos θ) per metre of the map; the width is 0.886 c/(B g)."""
     along = np.linspace(-2, 2, 401)
     track = np.stack([along, np.full(401, -30.0), np.full(401, 30.0)], -1)
     band = CARRIER + np.linspace(-1e8, 1e8, 64)
@@ -125,7 +125,7 @@ def test_ground_range_resolution_depends_on_the_terrain_slope(rise):
 
 
 def test_noise_and_point_snr_follow_from_the_radar_equation():
-    """SNR of M pulses of duration T: P G² λ² σ T M / ((4π)³ R⁴ kT₀F), R nearly constant on a short track."""
+    """The SNR of M pulses of duration T is P G² λ² σ T M / ((4π)³ R⁴ kT₀F), with R nearly constant on a short track."""
     design = ap.design(with_tracks(plan_of(), uav1=line(start_m=[-1.0, 0.0], end_m=[1.0, 0.0])))
     pulses = at_centre(design, "looks")
     distance = np.sqrt(30.25**2 + 30**2)
@@ -146,7 +146,7 @@ def test_sum_of_two_pairs_has_finer_resolution_and_their_mean_noise():
 
 
 def drawn_tracks(generator, pulses=32):
-    """Draw straight tracks of two antennas, 20 to 60 m from the origin, 15 to 60 m high, in any direction."""
+    """Draw straight tracks of two antennas in any direction, 20 to 60 m from the origin and 15 to 60 m high."""
     for _ in range(2):
         azimuth, heading = generator.uniform(0, 2 * np.pi, 2)
         distance, height, length = generator.uniform((20, 15, 8), (60, 60, 40))
@@ -157,7 +157,7 @@ def drawn_tracks(generator, pulses=32):
 
 @pytest.mark.slow
 def test_resolution_of_a_sum_matches_its_response_in_random_geometries():
-    """The series of eq. 1 assumes one lobe; for separate spectra of pairs its widths have errors up to 15 %."""
+    """The series of eq. 1 assumes one lobe; for separate spectra of the pairs, the widths have errors of up to 15 %."""
     generator, count = np.random.default_rng(3), 16
     band = CARRIER + 12.8e6 * (np.arange(count) - (count - 1) / 2)
     weight = np.hanning(count + 2)[1:-1] / np.hanning(count + 2).sum()
@@ -183,7 +183,7 @@ def test_resolution_of_a_sum_matches_its_response_in_random_geometries():
 
 
 def test_coherence_of_two_heights_is_the_overlap_of_windowed_spectra():
-    """Overlap of spectra shifted by δ of their width: 1 - δ if flat, 1 - (2π²/3) δ² with a Hann window, small δ."""
+    """For spectra shifted by δ widths, the overlap is 1 - δ if flat, 1 - (2π²/3) δ² with a Hann window and small δ."""
     shares, low = [], line(start_m=[-2.0, 0.0], end_m=[2.0, 0.0])
     for window in ("none", "hann"):
         plan = plan_of(processing={"window": window, "integration": "all"}, expect={"sigma0_db": None})
@@ -217,7 +217,7 @@ def design_of(std_m, autofocus, **node):
 
 @pytest.mark.parametrize(("autofocus", "met"), [("auto", True), ("on", True), ("off", False)])
 def test_loss_is_judged_after_refinement_if_the_plan_requests_it(autofocus, met):
-    """At L-band 2 cm cause a loss of 2 to 5 dB, 0.3 dB after refinement (docs/theory/autofocus.md, "Measured")."""
+    """At L-band, 2 cm cause a loss of 2 to 5 dB, 0.3 dB after refinement (docs/theory/autofocus.md, "Measured")."""
     design = design_of(0.02, autofocus)
     (verdict,) = judge(design)
     assert verdict.met == met
@@ -251,7 +251,7 @@ def test_refinement_beyond_its_measured_limits_is_not_assumed(std_m, node, obsta
 
 
 def test_sparse_pulses_are_refused_on_a_coarse_grid_too():
-    """2 × 2 pixels span half of the Doppler of 20 × 20; plans kept by a search must be valid on the full grid."""
+    """2 × 2 pixels span half the Doppler of 20 × 20 pixels; plans found by a search must be valid on the full grid."""
     plan = plan_of()
     plan["waveform"]["prf_hz"] = 8.0
     for coarse in (None, 2):
@@ -261,7 +261,7 @@ def test_sparse_pulses_are_refused_on_a_coarse_grid_too():
 
 @pytest.mark.slow
 def test_ambiguous_echoes_are_reported_as_cause_and_more_pulses_help(tmp_path):
-    """At 5 m/s the Doppler spread over 60 m of scene is between 50 and 100 Hz."""
+    """At 5 m/s, the Doppler spread over 60 m of scene is between 50 and 100 Hz."""
     plan = plan_of(require={"ambiguity": 0.02})
     plan["waveform"]["prf_hz"] = 50.0
     plan["scene"] |= {"bounds_m": [-30.0, 20.0, 30.0, 80.0], "spacing_m": 1.0}
@@ -280,7 +280,7 @@ def changes_of(plan, root):
 
 @pytest.mark.slow
 def test_requirement_missed_by_little_on_the_fine_grid_gets_changes(tmp_path):
-    """A coarser grid omits 0.1 to 1 % of the far side: gains are relative to the unchanged plan on the same grid."""
+    """A coarser grid omits 0.1 to 1 % of the far side; therefore, gains are relative to the plan on the same grid."""
     plan = plan_of(scene=plan_of()["scene"] | {"spacing_m": 0.05})
     (verdict,) = judge(designed(FlightPlan.model_validate(plan | {"require": {"nesz_db": 0.0}}), tmp_path))
     missed = plan | {"require": {"nesz_db": verdict.found - 0.002}}
@@ -352,7 +352,7 @@ def test_tracks_are_moved_relative_to_the_scene_centre():
     moved = {"height_m": 5.0, "offset_m": 10.0, "heading_deg": 90.0}
     opened = open_plan(FlightPlan.model_validate(plan_of(moved=moved)), HERE)
     positions = opened.pairs[0].aperture.tx_m
-    # Shifted 10 m south to 40 m from the centre (0, 30), then rotated clockwise: west of it, north to south.
+    # Shifted 10 m south to 40 m from the centre (0, 30), then rotated clockwise: west of the centre, north to south.
     assert positions[:, 0] == pytest.approx(-40.0)
     assert positions[[0, -1], 1] == pytest.approx([50.0, 10.0])
     assert positions[:, 2] == pytest.approx(35.0)
@@ -406,7 +406,7 @@ def test_mission_file_instead_of_a_plan_is_refused_with_a_remedy(tmp_path, name)
 
 
 def test_unknown_key_named_like_a_kind_of_track_is_reported(tmp_path):
-    """`mission` is not a key of a plan, but a kind of track."""
+    """The key `mission` is a kind of track, not a key of a plan."""
     (tmp_path / "plan.yaml").write_text("mission: dike.plan\n")
     with pytest.raises(CampaignError, match="mission: unknown key"):
         read_flight_plan(tmp_path / "plan.yaml")

@@ -1,4 +1,4 @@
-"""Python function `backproject`: lazy, planned and certified images, identical on every scheduler."""
+"""Python function `backproject`: images are lazy, planned and certified, and identical on every scheduler."""
 
 import json
 from dataclasses import replace
@@ -37,7 +37,7 @@ def test_target_focuses_at_its_position_with_its_echo_amplitude(image):
 
 
 def test_certified_error_matches_a_comparison_with_the_double_sum():
-    """On speckle, where no pixel dominates the power; the certified error is an upper bound."""
+    """The image is speckle, in which no pixel dominates the power; the certified error is an upper bound."""
     drawn = draw(np.random.default_rng(4), pixels=80, pulses=60)
     noise = np.random.default_rng(6).standard_normal((2, *drawn.history.transfer.shape))
     history = replace(drawn.history, transfer=(noise[0] + 1j * noise[1]).astype(np.complex64))
@@ -55,7 +55,7 @@ def test_certified_error_matches_a_comparison_with_the_double_sum():
 @compiled
 @pytest.mark.parametrize("seed", [860, 863, 871])
 def test_bound_from_few_pixels_is_not_below_the_predicted_error(seed):
-    """Four pixels miss the bright ones; the bound from them alone is up to 9 dB below the error."""
+    """Four pixels miss the bright pixels; the bound from these four alone is up to 9 dB below the error."""
     drawn = draw(np.random.default_rng(seed), pixels=48, pulses=60)
     image = ap.backproject(
         drawn.history, drawn.grid, -40, engine="tree", integration="all", certified_pixels=4, judge=False
@@ -64,7 +64,7 @@ def test_bound_from_few_pixels_is_not_below_the_predicted_error(seed):
 
 
 def test_profiles_give_the_same_image_and_their_own_certificate(image):
-    """Their error is relative to band-limited interpolation; the error of range compression is -130 dB."""
+    """The error is relative to band-limited interpolation of the profiles; that of range compression is -130 dB."""
     profiles = ap.range_compress(point_history(), TARGET_GRID, ap.FlatGround(0.0))
     alone = ap.backproject(profiles, TARGET_GRID, tile_px=64)
     assert alone.attrs["numerical_error_db"] < -60
@@ -119,7 +119,7 @@ def test_toy_engine_is_used_if_accurate_enough(toy):
 
 
 def test_setting_that_misses_the_accuracy_is_replaced_by_the_next(toy):
-    """The toy engine takes the nearest sample of a profile and predicts too small an error."""
+    """The toy engine uses the nearest sample of a profile and underestimates the error in its prediction."""
     requested = {"engine": "toy", "engine_options": {"toy": {"refine": 2}}}
     image = ap.backproject(point_history(), TARGET_GRID, accuracy_db=-60.0, **requested)
     assert not image.attrs["setting"].startswith("toy")
@@ -131,7 +131,7 @@ def test_setting_that_misses_the_accuracy_is_replaced_by_the_next(toy):
 
 
 def test_accuracy_met_by_no_setting_is_flagged():
-    """Profiles do not permit the double sum as a fallback."""
+    """With profiles as input, the double sum is not available as a fallback."""
     profiles = ap.range_compress(point_history(), TARGET_GRID, ap.FlatGround(0.0))
     flags = json.loads(ap.backproject(profiles, TARGET_GRID, accuracy_db=-120.0).attrs["flags"])
     assert "-120 dB requested" in flags["accuracy_not_met"]

@@ -88,7 +88,7 @@ def recorded(aperture, targets=TARGETS, *, noise=0.3, seed=1):
 
 
 def coupled(recording, level_db, *, drift=0.0):
-    """Add a response that decays over the ranges of the scene, level_db above one target; its phase drifts, rad."""
+    """Add a response that decays over the ranges of the scene, level_db above one target, with a phase drift (rad)."""
     delays_s = np.arange(20.0, 75.0, 1.5) / C
     amplitude = 10 ** (level_db / 20) * np.exp(-np.arange(len(delays_s)) / 8)
     response = (amplitude[:, None] * np.exp(-2j * np.pi * np.remainder(delays_s[:, None] * FREQUENCY, 1.0))).sum(axis=0)
@@ -130,7 +130,7 @@ def test_no_background_is_detected_without_coupling(seed):
 
 
 def test_predicted_loss_of_a_target_equals_that_of_its_image():
-    """Short passes with little change of range."""
+    """The passes are short, with little change of range."""
     target = np.array([[0.0, 25.0, 0.0]])
     losses = []
     for length_m in (1.5, 3.0, 6.0):
@@ -186,7 +186,7 @@ def test_configured_method_removes_a_circled_target_with_a_flag():
 
 
 def test_coupling_is_kept_and_flagged_if_every_target_would_be_lost():
-    """Hovering platform: 5 cm of track."""
+    """The platform hovers, with 5 cm of track."""
     removal = coupled(recorded(straight(length_m=0.05)), 10).decided()
     assert removal.background is None
     assert removal.loss_db < -10
@@ -216,7 +216,7 @@ def test_bursts_in_a_tenth_of_the_pulses_do_not_change_the_median():
 
 @pytest.fixture(scope="module")
 def leaking(tmp_path_factory):
-    """Process campaigns with coupling 40 dB above the echoes at the delay of the scene: removal auto and off."""
+    """Process campaigns with coupling 40 dB above the echoes at the delay of the scene, with and without removal."""
     plan = replace(preset("demo", pulses=150), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
     leaks = Leakage(level_db=40.0, path_m=20.0)
     nodes = {
@@ -233,7 +233,7 @@ def leaking(tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
 def test_image_of_a_campaign_is_formed_without_the_background(leaking, pair):
-    """Profiles, certificate and reports use the same transfer functions; the image contains no coupling."""
+    """Profiles, certificate and reports use the same transfer functions, and the image contains no coupling."""
     images = {name: open_stage(campaign.stage("image", "f01", pair), "image") for name, campaign in leaking.items()}
     quality = images["auto"].attrs["quality"]
     assert quality["background"]["removed"] == "median"
@@ -265,7 +265,7 @@ def test_reflector_of_a_real_flight_is_the_highest_peak_at_its_survey_point(shar
 
 
 def test_each_capture_is_checked_for_saturation_once(finished_tiny, tmp_path, monkeypatch):
-    """Captures that the decisions read before are not counted again in the flags of the profiles."""
+    """Captures that were read for the decisions are not counted again in the flags of the profiles."""
     campaign = Campaign.load(copy_writable(finished_tiny.root, tmp_path / "campaign"))
     pulses = open_stage(campaign.stage("echo", "f01", "uav1-uav1"), "echo").sizes["pulse"]
     counts, count = Counter(), Saturation.count

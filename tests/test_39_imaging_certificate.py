@@ -1,4 +1,4 @@
-"""Certificate of an image: tiles that miss the accuracy are recomputed, a remaining excess is flagged."""
+"""Certificate of an image: tiles that do not meet the accuracy are recomputed, and a residual excess is flagged."""
 
 from dataclasses import replace
 
@@ -70,7 +70,7 @@ def test_only_a_tile_that_misses_is_recomputed_with_the_first_fallback(speckle):
 
 
 def test_tiles_fall_back_until_accurate_and_the_rest_is_flagged(speckle):
-    """-125 dB requires the float64 double sum, stored as complex64; -200 dB is not met by any engine."""
+    """An accuracy of -125 dB requires the float64 double sum, stored as complex64; no engine meets -200 dB."""
     target = speckle.image.compute()
     report = certify(speckle, target, accuracy_db=-125.0)
     assert report["recomputed"][-1]["with"] == "reference, every pulse"
@@ -82,7 +82,7 @@ def test_tiles_fall_back_until_accurate_and_the_rest_is_flagged(speckle):
 
 
 def test_all_tiles_are_recomputed_if_only_the_bound_misses(speckle):
-    """Uniform error slightly below the requested one: the confidence bound exceeds it."""
+    """The uniform error is slightly below the requested error; the confidence bound exceeds the requested error."""
     exact = speckle.exact(np.argwhere(np.ones(speckle.grid.shape, bool))).reshape(speckle.grid.shape)
     phasors = np.exp(2j * np.pi * np.random.default_rng(3).random(exact.shape))
     target = (exact + 1e-3 * np.sqrt(np.mean(np.abs(exact) ** 2)) * phasors).astype(np.complex64)

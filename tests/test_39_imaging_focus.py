@@ -47,13 +47,13 @@ def test_echo_beyond_the_ranges_of_the_scene_is_reported():
 
 
 def test_strong_echo_not_focused_in_the_image_is_reported():
-    """Called without bright points, so the echo of a point within the ranges of the scene counts as unfocused."""
+    """The check is called without bright points, so that the echo of a point within the scene counts as unfocused."""
     line = echo_outside_scene(echo_of(np.zeros((1, 3))), GRID, GROUND)
     assert "no pixel of the image focuses it" in line
 
 
 def test_points_in_one_range_cell_are_not_an_outside_echo():
-    """Three equal points, 2.6 m spacing, in one range cell of 0.6 m: each has a third of the echo."""
+    """Three equal points, spaced by 2.6 m, lie in one range cell of 0.6 m; each has a third of the echo."""
     east = np.array([-2.6, 0.0, 2.6])
     points = np.column_stack([east, np.sqrt(400 - east**2) - 20, 0 * east])
     history = echo_of(points)
@@ -101,7 +101,7 @@ def test_subaperture_images_sum_to_the_image():
 
 
 def test_joint_peak_power_is_largest_on_the_true_track():
-    """Measure for comparing hypotheses: random track errors of 2 cm reduce it."""
+    """Random track errors of 2 cm reduce the measure by which hypotheses are compared."""
     history = echo_of(np.zeros((1, 3)))
     erroneous = TRACK + 0.02 * np.random.default_rng(4).standard_normal(TRACK.shape)
     displaced = PhaseHistory(
@@ -115,7 +115,7 @@ def test_joint_peak_power_is_largest_on_the_true_track():
 # Focus of points with coarse range cells
 
 COARSE_HZ = 1.2e9 + 100e6 / 256 * np.arange(256)
-"""Resolution 3 m along the line of sight, 0.16 m across it from 50 m of track at a range of 67 m."""
+"""Resolution of 3 m along the line of sight; across, 0.16 m with 50 m of track at a range of 67 m."""
 
 
 ALONG = np.linspace(-1, 1, 512)
@@ -158,7 +158,7 @@ def test_sidelobes_along_a_coarse_range_cell_are_not_points(targets, seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("targets", [5, 12])
 def test_loss_of_points_with_coarse_range_cells_is_measured(targets):
-    """True loss: from paths of the true track to a target minus paths of the log to its imaged position."""
+    """The true loss follows from the paths of the true track to a target minus the paths of the log to its image."""
     report, true_points, aperture = coarse_report(targets, seed=3, bow_m=0.018)
     wavenumber, losses = 2 * np.pi * COARSE_HZ.mean() / SPEED_OF_LIGHT_M_S, []
     for point in report["points"]:

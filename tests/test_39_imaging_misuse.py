@@ -222,7 +222,7 @@ def test_conjugated_samples_are_identified():
 
 
 def test_ambiguous_spectrum_gives_no_verdict():
-    """Swapped halves of the spectrum give two peaks in range, not distinguishable from two targets."""
+    """Swapped halves of the spectrum give two peaks in range, which cannot be distinguished from two targets."""
     swapped = replace(HISTORY, transfer=np.fft.fftshift(ECHO, axes=1))
     assert ap.backproject(swapped, TARGET_GRID).attrs["verdict"] == "inconclusive"
 
@@ -234,7 +234,7 @@ def test_correct_image_is_focused_without_a_flag():
 
 
 def test_outside_echo_is_not_flagged_if_the_scene_has_points():
-    """A house 30 dB brighter than the target, 40 m farther, whose sidelobes are weaker than the target."""
+    """The sidelobes of a house that is 30 dB brighter and 40 m farther than the target are weaker than the target."""
     window = np.hanning(202)[1:-1]
     house = 30 * np.exp(-2j * np.pi * FREQUENCY * (PATH_M + 40)[:, None] / SPEED_OF_LIGHT_M_S)
     with_target = replace(HISTORY, transfer=(ECHO + house).astype(np.complex64), weight=window / window.sum())
@@ -376,7 +376,7 @@ def test_xarray_and_dask_arrays_are_accepted():
 
 
 def test_image_without_samples_is_not_called_focused():
-    """Profile starts in km: no pixel lies within the samples."""
+    """The profile starts are in km, so that no pixel lies within the samples."""
     image = ap.backproject(replace(PROFILES, start_m=PROFILES.start_m / 1e3), TARGET_GRID, judge=True)
     assert image.attrs["verdict"] == "inconclusive"
 

@@ -50,7 +50,7 @@ def test_noise_is_measured_below_the_echoes_of_a_recording(noise):
 
 @pytest.mark.parametrize("share", [0.05, 0.2])
 def test_missing_pulses_do_not_leak_echoes_into_the_noise(share):
-    """An echo 40 dB above the noise at the range of all points: pulse numbers without gaps give phase jumps."""
+    """An echo is 40 dB above the noise at the range of all points; contiguous pulse numbers would cause phase jumps."""
     noise, kept = 1e-4, np.flatnonzero(np.random.default_rng(5).random(128) >= share)
     whole, target, middle = profiles(noise, pulses=128), np.array([2.0, 35.0, 0.0]), APERTURE.tx_m[64]
     angle = np.random.default_rng(2).uniform(-0.6, 0.6, 64)
@@ -63,7 +63,7 @@ def test_missing_pulses_do_not_leak_echoes_into_the_noise(share):
 
 @pytest.mark.parametrize(("every", "sparse"), [(1, False), (2, True)])
 def test_deviation_for_sparse_pulses_includes_leaked_echoes(every, sparse):
-    """With pulses at twice the Doppler of the scene little band remains: outside echoes raise the estimate."""
+    """With pulses at twice the Doppler of the scene, little band remains, and outside echoes raise the estimate."""
     noise, whole = 1e-2, profiles(1e-2)
     decimated = replace(
         whole, samples=whole.samples[::every], start_m=whole.start_m[::every], aperture=APERTURE[::every]
@@ -75,7 +75,7 @@ def test_deviation_for_sparse_pulses_includes_leaked_echoes(every, sparse):
 
 @pytest.mark.slow
 def test_reported_deviation_equals_the_scatter_of_many_recordings():
-    """Also if 64 points lie in a few resolution cells and are hardly independent."""
+    """This also holds if 64 points lie in a few resolution cells and are hardly independent."""
     drawn = [profiles(1.0, echo=0.0, seed=seed, pulses=128) for seed in range(24)]
     for points in (POINTS, 0.05 * POINTS + [0, 30, 0]):
         measured = [noise_power(recording, points) for recording in drawn]
@@ -118,7 +118,7 @@ def test_sidelink_noise_is_added_to_the_echoes_by_the_correction(method):
     )
     added = sidelink_noise(history, grid, FlatGround(0.0), POINTS, method=method, snr_db=snr_db)
     thermal, measured = 0.02**2 / subcarriers, noise_power(range_compress(history, grid, FlatGround(0.0)), POINTS).power
-    # Noise kept only on the echoes affects few points, and the median differs from that of a sum.
+    # Noise that is kept only on the echoes affects few points, so that the median differs from that of a sum.
     least_db = 1.5 if method == "two_parameter" else 0.5
     assert 10 * np.log10(measured / (thermal + added)) == pytest.approx(0, abs=least_db)
     if method in DIVIDING:

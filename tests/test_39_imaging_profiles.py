@@ -64,7 +64,7 @@ def test_range_window_covers_every_pixel_with_guard_samples(shape, relief_m, mid
 
 
 def test_scene_deeper_than_the_unambiguous_range_is_refused():
-    """2 MHz between subcarriers: the total path repeats every 150 m, in 400 samples."""
+    """With 2 MHz between subcarriers, the total path repeats every 150 m or 400 samples."""
     deep = SceneGrid("local", -50.0, 100.0, 1.0, (150, 100))
     with pytest.raises(CampaignError, match=r"spans \d+ range samples; expected at most 400"):
         range_compress(point_history(4), deep, FLAT)

@@ -55,7 +55,7 @@ def pattern(aperture):
 @pytest.mark.parametrize("bistatic", [False, True])
 @pytest.mark.parametrize("point", [(0.0, 20.0, 0.0), (-2.5, 17.5, 0.0), (2.5, 22.5, 0.0)])
 def test_cross_section_of_a_point_follows_from_its_peak(point, bistatic):
-    """Eqs. 3 and 4: spreading loss, both patterns and sector weights, for any normalisation of the image."""
+    """Eqs. 3 and 4 include spreading loss, patterns and sector weights, for any normalisation of the image."""
     aperture = straight_aperture(bistatic=bistatic)
     beams = pattern(aperture)
     echo = history(aperture, point, "hann", beams, amplitude=np.sqrt(7.0 * 0.1))
@@ -118,7 +118,7 @@ def clutter(aperture, slope, beams, seed, side_m=0.35):
     ("slope", "beam"), [((0.0, 0.0), False), ((0.0, 0.2), False), ((0.0, -0.2), False), ((0.0, 0.0), True)]
 )
 def test_simulated_clutter_has_its_sigma0_over_the_swath(slope, beam, bistatic):
-    """Within 0.2 dB over incidences of 30° to 70°, on slopes of 20 %, and at the far beam edge, 3 to 24 dB down.
+    """Errors are within 0.2 dB for incidences of 30° to 70°, slopes of 20 %, and the far beam edge, 3 to 24 dB down.
 
     At the beam edge, without a window, sidelobes of the brighter near terrain would add 1 dB.
     """
@@ -209,14 +209,14 @@ def test_gain_and_area_are_accurate_between_lattice_nodes():
 
 
 def test_track_flown_twice_has_the_same_resolution():
-    """The azimuths repeat: a plain sum over pulses in eq. 5 would halve the cell."""
+    """The azimuths repeat; a plain sum over pulses in eq. 5 would halve the cell."""
     once = straight_aperture(200)
     twice = Aperture(np.concatenate([once.tx_m, once.tx_m[::-1]]), np.concatenate([once.rx_m, once.rx_m[::-1]]))
     assert calibrated(twice).cell(MIDDLE)[0, 0] == pytest.approx(calibrated(once).cell(MIDDLE)[0, 0], rel=0.01)
 
 
 def test_beta_sigma_and_gamma_differ_by_the_incidence():
-    """Level terrain, monostatic, broadside: σ⁰ = β⁰ sin θ and γ⁰ = σ⁰/cos θ."""
+    """For level terrain in a monostatic broadside image, σ⁰ = β⁰ sin θ and γ⁰ = σ⁰/cos θ."""
     calibration, window = calibrated(straight_aperture()), MIDDLE
     incidence = np.arctan2(20.0, 12.0 + 10.0)
     power = {name: calibration.power(window, name)[0, 0] for name in ("sigma0", "beta0", "gamma0")}
@@ -225,7 +225,7 @@ def test_beta_sigma_and_gamma_differ_by_the_incidence():
 
 
 def test_link_constant_follows_from_the_radar_equation():
-    """1 W, 10 dBi for transmit and receive, 0.25 m: 1 m² at 1 m returns 3.15 mW; gain 20 dB, full scale 30 dBm."""
+    """With 1 W, two gains of 10 dBi and 0.25 m, 1 m² at 1 m returns 3.15 mW; gain 20 dB, full scale 30 dBm."""
     link = Link(30.0, 10.0, 10.0, 20.0, 30.0, 1000.0)
     received_w = 100 * 0.25**2 / (4 * np.pi) ** 3
     assert link.constant(wavelength_m=0.25, sent_power=64.0) == pytest.approx(received_w * 100 * 1000**2 / 64)
@@ -236,7 +236,7 @@ def test_link_constant_follows_from_the_radar_equation():
 @pytest.mark.quick("terrain1")
 @pytest.mark.parametrize("terrain", [LEVEL, Plane(0.0, 20.0, 0.0, 0.0, -0.3)])
 def test_calibrated_image_has_sigma0_and_cross_section(terrain):
-    """A point of 0.1 m² at the corner of four pixels, K = 7; σ⁰ is the cross-section over the cell area."""
+    """A point of 0.1 m² lies at the corner of four pixels, with K = 7; σ⁰ is the cross-section over the cell area."""
     aperture = straight_aperture()
     height = float(terrain.heights_at(GRID, np.array([23.5]), np.array([23.5]))[0])
     x, y = GRID.map_at(np.array([23]), np.array([23]))[0]
@@ -265,7 +265,7 @@ def test_calibration_requires_a_positive_constant_and_the_band():
 
 
 def test_attitude_error_changes_the_power_by_the_slope_of_the_pattern():
-    """Eq. 9: a point 15° below the axis of a Gaussian beam of 40° in elevation, 2° of roll: 24·θ·δθ/w² per antenna."""
+    """Eq. 9: for a point 15° below the axis of a Gaussian beam of 40° and 2° of roll, 24·θ·δθ/w² per antenna."""
     aperture = Aperture(*2 * [np.tile([0.0, 0.0, 12.0], (8, 1))])
     beam = side_beam((50.0, 40.0), pulses=8)
     boresight = beam.axes[0, 0]
@@ -283,7 +283,7 @@ def test_attitude_error_changes_the_power_by_the_slope_of_the_pattern():
     assert pointing_std_db(None, aperture, point, [(roll, both_antennas)]) == 0
     level = np.array([0.0, 12.0 / np.tan(below - np.radians(15.0)), 0.0])
     flat_db = pointing_std_db(Beams(beam, beam), aperture, level, [(roll, both_antennas)])
-    # On the axis only the quadratic term remains.
+    # On the axis, only the quadratic term remains.
     assert flat_db == pytest.approx(2 * 12.04 * (2.0 / 40.0) ** 2, rel=0.02)
 
 
@@ -311,7 +311,7 @@ def test_terrain_outside_every_beam_has_no_calibration():
 
 
 def test_sigma0_of_level_terrain_near_nadir_is_undefined():
-    """The cell area diverges below the track: its error reaches 3 dB within 5°, where σ⁰ is NaN."""
+    """The cell area diverges below the track; its error reaches 3 dB within 5°, where σ⁰ is NaN."""
     track = straight_track(96, length_m=14.0)
     aperture = Aperture(track + [0.0, 0.0, 12.0], track + [0.0, 0.0, 12.0])
     grid = SceneGrid("local", -3.0, float(track[0, 1]) + 12.0, 0.25, (96, 24))

@@ -1,4 +1,4 @@
-"""Number of looks by speckle correlation and as measured, and a speckle filter that keeps means, edges and points."""
+"""Number of looks, by speckle correlation and measured, and a speckle filter that keeps means, edges and points."""
 
 from dataclasses import replace
 from itertools import product
@@ -43,7 +43,7 @@ def test_correlated_pixels_follow_from_the_band(window, squares):
 
 @pytest.mark.parametrize("side", [2, 4, 8])
 def test_looks_by_correlation_equal_those_of_the_mean_power(side):
-    """Eq. 3: neither the number of pixels nor that of cells per square."""
+    """By eq. 3, the looks equal neither the number of pixels nor the number of cells per square."""
     image = speckle(0.4)
     measured = Multilook.of(image.__getitem__, image.shape, side)
     scatter = np.sqrt(2 / (SIZE / side) ** 2 * measured.looks + 4 / (SIZE / 2.5) ** 2)
@@ -86,7 +86,7 @@ def test_filter_keeps_the_mean_of_speckle_and_raises_its_looks():
 
 
 def test_filter_keeps_an_edge_and_a_point():
-    """Next to a step of 10 dB a plain window mean would be 7 dB too high."""
+    """Next to a step of 10 dB, a plain window mean would be 7 dB too high."""
     generator = np.random.default_rng(2)
     ground = np.where(np.arange(200) < 100, 1.0, 10.0) * np.ones((200, 1))
     power = ground * generator.gamma(10.0, 0.1, ground.shape)
@@ -98,7 +98,7 @@ def test_filter_keeps_an_edge_and_a_point():
 
 
 def test_noise_subtraction_leaves_the_mean_power_of_the_terrain():
-    """For noise as strong as the terrain echo, and for noise only, where half of the squares are negative."""
+    """The noise is as strong as the terrain echo; with noise only, half of the squares are negative."""
     noise = 1.0
     ground = np.where(np.arange(SIZE) < SIZE // 2, 1.0, 0.0) * np.ones((SIZE, 1))
     image = speckle(0.4, sigma0=ground + noise)
@@ -147,7 +147,7 @@ def test_mostly_undefined_image_has_no_looks_and_no_filter():
 
 
 def test_pixels_without_power_stay_zero_and_are_excluded_from_looks():
-    """As in simulations without noise, next to their targets."""
+    """Such pixels occur next to targets in simulations without noise."""
     image = speckle(0.4) * (np.arange(SIZE) < SIZE // 2)
     multilook = Multilook.of(image.__getitem__, image.shape, SIDE, filtered=True)
     assert (whole(multilook)[:, -20:] == 0).all()

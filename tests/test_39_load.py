@@ -114,7 +114,7 @@ def test_planned_grid_equals_the_grid_of_the_workflow(tiny):
 @pytest.mark.quick("uav1-uav2")
 @pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
 def test_path_limit_of_the_prefix_equals_the_planned_one(tiny, pair):
-    """The prefix may limit automatic bounds: path offsets and sidelink length are included before the echo exists."""
+    """The prefix may limit automatic bounds: path offsets and sidelink length are included even without an echo."""
     campaign = Campaign.load(tiny)
     expected_m = open_pair(campaign, "f01", pair).path_limit_m
     ingest_all(campaign)

@@ -1,4 +1,4 @@
-"""Planner: decision rules on both sides of their limits, predicted against certified errors, and cost."""
+"""Planner: decision rules on both sides of their limits, predicted and certified errors, and cost."""
 
 import re
 from dataclasses import replace
@@ -20,7 +20,7 @@ from apertura.core.quality.measures import numerical_error_db
 
 
 def error_db(drawn, image, window=(...,)):
-    """Return the error over all pixels or those of a window, eq. 6a, dB."""
+    """Return the error (eq. 6a) over all pixels or the pixels of a window, dB."""
     exact = reference.form(drawn.history, drawn.grid.positions(0.0)[window])
     return numerical_error_db(image[window].astype(np.complex64), exact)
 
@@ -55,7 +55,7 @@ SETTINGS = (
 @pytest.mark.parametrize("window", ["none", "hann"])
 @pytest.mark.parametrize("seed", [1, 3, 9])
 def test_measured_errors_are_within_minus_3_5_and_1_5_db_of_the_prediction(seed, window):
-    """White echoes with both windows: Hann lowers the error of a table by up to 17 dB, as predicted."""
+    """Echoes are white; a Hann window lowers the error of a table by up to 17 dB, as predicted."""
     generator = np.random.default_rng(seed)
     draws = [white(seed, window, generator) for _ in range(12)]  # a small scene contains only a few speckle cells
     job, points = draws[0].job, draws[0].grid.positions(0.0)
@@ -120,7 +120,7 @@ def test_predicted_error_falls_and_cost_rises_with_accuracy():
 @pytest.mark.quick("609")
 @pytest.mark.parametrize("seed", [609, 625, 636])
 def test_predicted_error_holds_over_all_pixels_for_any_scene(seed):
-    """1 to 24 targets in noise; in a dark quarter of the first scene the relative error is 10 dB larger."""
+    """Scenes have 1 to 24 targets in noise; in a dark quarter of the first, the relative error is 10 dB larger."""
     drawn = draw(np.random.default_rng(seed), pixels=96, pulses=80)
     planned = make_plan(drawn.job, accuracy_db=drawn.accuracy_db)
     image = formed(drawn, planned.setting, planned.inputs(drawn.profiles))
@@ -228,7 +228,7 @@ def test_path_variants_of_native_are_predicted(spacing_m, range_m, variant, monk
     shares, _ = path_variants(view, cell_m=step / 3, wavenumber_rad_m=2 * np.pi / WAVELENGTH, tolerance_rad=1.5e-3)
     assert shares[2] == pytest.approx(tally[2] / tally.sum(), abs=0.15)
     assert (shares[2] > 0.5) == (variant == 2)
-    if spacing_m < 0.1:  # narrow windows: only the curvature decides between the first two variants
+    if spacing_m < 0.1:  # with narrow windows, only the curvature decides between the first two variants
         assert shares[1] == pytest.approx(tally[1] / tally.sum(), abs=0.15)
         assert (shares[1] > 0.5) == (variant == 1)
 
@@ -245,7 +245,7 @@ def test_coarse_pixels_get_a_coarser_table():
 
 
 def test_most_accurate_setting_of_equal_cost_is_chosen():
-    """Most accurate of the settings within 5 % of the shortest time."""
+    """The plan has the most accurate of the settings within 5 % of the shortest time."""
     planned = plan(-50.0)
     within = [s for s in SettingSearch(planning_job()).settings(300) if s.seconds <= planned.setting.seconds]
     assert planned.setting.error_db == min(setting.error_db for setting in within)

@@ -43,9 +43,9 @@ def test_missing_pulses_and_undefined_positions_are_refused():
     ("spread", "bandwidth_hz", "flagged"),
     [
         (0.97, 400e6, False),
-        (1.15, 400e6, False),  # the edges are aliased in a part of the pulses, ambiguities at -34 dB
+        (1.15, 400e6, False),  # the edges are aliased in some pulses, with ambiguities at -34 dB
         (1.03, 2e6, False),  # ambiguities as bright as the points, in the outermost corners
-        (1.4, 2e6, True),  # ambiguities of a third of the scene
+        (1.4, 2e6, True),  # a third of the scene has ambiguities
         (2.5, 400e6, True),  # weak ambiguities, but their sum equals the signal at each pixel
     ],
 )
@@ -61,7 +61,7 @@ def test_aperture_is_flagged_if_its_ambiguities_are_significant(spread, bandwidt
 
 @pytest.mark.slow
 def test_azimuth_ambiguity_of_a_point_migrates_through_range_cells():
-    """150 of 300 required pulses: the highest ambiguity, half a scene away, is 2f/BM of the peak."""
+    """With 150 of 300 required pulses, the highest ambiguity, half a scene away, is 2f/BM of the peak."""
     track, half = straight_track(150, length_m=30.0), 8.0
     frequency = 1.2e9 + 400e6 * (np.arange(256) / 256 - 0.5)
     window = np.hanning(258)[1:-1] / np.hanning(258).sum()
@@ -76,7 +76,7 @@ def test_azimuth_ambiguity_of_a_point_migrates_through_range_cells():
 
 
 def test_missed_pulses_and_gaps_do_not_undersample_an_aperture():
-    """20 % random losses and a gap of 10 % in an aperture oversampled seven times."""
+    """The aperture is oversampled seven times and has 20 % random losses and a gap of 10 %."""
     points = ground_points().reshape(-1, 3)
     whole, _ = monostatic(straight_track(3000)).phase_rates(points, wavelength_m=C / 1.4e9)
     kept = np.random.default_rng(1).random(3000) > 0.2

@@ -36,7 +36,7 @@ def integration_of(aperture, *, spacing_m=0.05, requested="auto", antennas=None)
 
 
 def test_pulses_within_the_pixel_bandwidth_are_all_integrated():
-    """The automatic spacing, a third of the finest cell, samples the whole flight."""
+    """The automatic spacing, a third of the finest cell, permits the integration of the whole flight."""
     aperture = straight()
     cell_m = aperture.resolution_cell_m(points(), band_hz=(1.25e9, 1.25e9))
     whole = integration_of(aperture, spacing_m=cell_m / 3)
@@ -70,7 +70,7 @@ def test_degrees_are_the_angle_over_a_straight_pass():
 @compiled
 @pytest.mark.parametrize("fixed", [False, True])
 def test_width_of_a_target_is_the_requested_resolution(fixed):
-    """With moving antennas and with one stationary: -3 dB width 0.88 of the resolution, near and far."""
+    """The -3 dB width is 0.88 of the resolution, near and far, with moving antennas and with one stationary antenna."""
     aperture = straight(240.0, 2400)
     if fixed:
         aperture = Aperture(np.broadcast_to([10.0, -5.0, 15.0], aperture.rx_m.shape).copy(), aperture.rx_m)
@@ -89,7 +89,7 @@ def test_width_of_a_target_is_the_requested_resolution(fixed):
 @pytest.mark.slow
 @compiled
 def test_target_inside_the_swath_has_its_echo_amplitude():
-    """The error bound holds with a sector too: engine and double sum use equal weights."""
+    """The error bound also holds with a sector: engine and double sum use equal weights."""
     aperture, grid = straight(), SceneGrid("local", -10.0, 50.0, 0.25, (80, 80))
     history = strip_history(aperture, np.array([[1.0, 49.0, 0.0]]))
     image = backproject(history, grid, integration={"degrees": 20.0})
@@ -118,7 +118,7 @@ def test_point_not_passed_is_integrated_at_the_nearest_pulses():
 @pytest.mark.parametrize("east_m", [-60.0, -20.0, 0.0, 35.0])
 @pytest.mark.parametrize("spacing_m", [0.1, 0.4, 1.5])
 def test_point_with_a_sampled_angular_span_uses_all_pulses(east_m, spacing_m):
-    """Short passes, with and without squint: points with a wider span use the sampled part, all others every pulse."""
+    """In short passes, also squinted, points with a wider span use the sampled part, all other points every pulse."""
     short, scene_points = straight(12.0, 200, east_m=east_m), points(30.0).reshape(-1, 3)
     chosen = integrate(short, points(30.0), spacing_m=spacing_m, wavelength_m=WAVELENGTH)
     if chosen.sector is None:
@@ -146,7 +146,7 @@ def test_squinted_antennas_are_integrated_about_their_squint():
 
 
 def test_circle_around_the_scene_is_integrated_entirely_and_flagged():
-    """Every pulse of a circle is at the closest approach, so it exceeds a requested angle and is flagged."""
+    """All pulses of a circle are at the closest approach, so that a requested angle is exceeded and flagged."""
     angle = np.linspace(0, 2 * np.pi, 2000)
     circle = monostatic(np.stack([60 * np.cos(angle), 40 + 60 * np.sin(angle), np.full(2000, 40.0)], -1))
     near = points(2.0) + [0.0, 9.0, 0.0]

@@ -24,7 +24,7 @@ LONG = {"aperture": monostatic(straight_track(20_000, length_m=600)), "subcarrie
 
 @pytest.mark.slow
 def test_tables_that_exceed_memory_are_computed_in_pulse_blocks():
-    """Smallest number of blocks whose tables fit; with too little memory for everything else the job is refused."""
+    """The fewest blocks whose tables fit are used; if memory is insufficient for the rest, the job is refused."""
     single_block = plan(**LONG)
     assert single_block.setting.pulse_blocks == single_block.choices["pulse_blocks"] == 1
     table_bytes = single_block.setting.table_bytes + 3 * 8 * 20_000 * 120  # tables, and samples during reading
@@ -40,7 +40,7 @@ def test_tables_that_exceed_memory_are_computed_in_pulse_blocks():
         replace(split.setting, pulse_blocks=1, form_seconds=single_block.setting.form_seconds) == single_block.setting
     )
     assert len(split.fallbacks) > 1
-    assert all(setting.pulse_blocks > 1 for setting in split.fallbacks[:-1])  # finer tables exceed memory too
+    assert all(setting.pulse_blocks > 1 for setting in split.fallbacks[:-1])  # finer tables also exceed memory
     assert split.fallbacks[-1].pulse_blocks == 1
     check_fits(split, free_disk=None, where="f01/a-b", memory=split.memory_bytes)
     short = plan(**LONG, memory_bytes=other_bytes // 2)
@@ -50,7 +50,7 @@ def test_tables_that_exceed_memory_are_computed_in_pulse_blocks():
 
 @pytest.mark.slow
 def test_long_flight_is_summed_in_blocks_for_any_memory():
-    """Samples and tables are never in memory as a whole, so a flight three times as long needs no more."""
+    """Samples and tables are never in memory as a whole; a flight of three times the length requires no more memory."""
     flights = [
         {**LONG, "aperture": monostatic(straight_track(count, length_m=count / 33))} for count in (10**5, 3 * 10**5)
     ]

@@ -20,7 +20,7 @@ def terrain(height_m: float, *, slope: float = 0.0, wobble_m: float = 0.1, spaci
 
 
 def test_flat_terrain_is_assumed_within_the_focus_limit():
-    """4πd·Δθ/(√2λ) < 0.4 with wobble amplitude d = 0.1 m and Δθ = δh/20 m: δh < 2.25 m."""
+    """The limit 4πd·Δθ/(√2λ) < 0.4, with a wobble amplitude d = 0.1 m and Δθ = δh/20 m, gives δh < 2.25 m."""
     limit_m = 0.4 * np.sqrt(2) * WAVELENGTH * 20 / (4 * np.pi * 0.1)
     assert terrain(0.97 * limit_m) == "plane"
     assert terrain(1.1 * limit_m) == "dem"
@@ -28,7 +28,7 @@ def test_flat_terrain_is_assumed_within_the_focus_limit():
 
 
 def test_flat_terrain_is_assumed_within_the_displacement_limit():
-    """Half a pixel of 0.2 m at height 10 m over ground range 20 m: δh < 0.2 m."""
+    """The limit of half a pixel of 0.2 m, at 10 m height and 20 m ground range, gives δh < 0.2 m."""
     assert terrain(0.15, wobble_m=0.0, spacing_m=0.2) == "plane"
     assert terrain(0.25, wobble_m=0.0, spacing_m=0.2) == "dem"
 
@@ -39,7 +39,7 @@ def test_a_slope_is_a_tilted_plane():
 
 
 def test_tilted_plane_is_fitted_to_the_dem():
-    """1 cm per row and 5 cm per column of pixels; pixel (0, 0) is 7 m below the level surface."""
+    """The plane rises by 1 cm per row and 5 cm per column of pixels; pixel (0, 0) is 7 m below the level surface."""
     row, column = np.indices((200, 200))
     heights = 0.01 * row + 0.05 * column - 2.0
     sloped = plan(terrain=ground_of(heights, level_m=5.0))

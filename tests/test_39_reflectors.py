@@ -24,13 +24,13 @@ def rcs(shape, size_m, tx=AHEAD, rx=None):
 
 
 def test_corners_have_textbook_cross_sections_on_the_boresight():
-    """Skolnik; Knott, Shaeffer and Tuley: 4πa⁴/3λ² of triangles, 8πa²b²/λ² of rectangles."""
+    """By Skolnik and by Knott, Shaeffer and Tuley: 4πa⁴/3λ² for triangles, 8πa²b²/λ² for rectangles."""
     assert rcs("trihedral", (0.7,))[0] == pytest.approx(4 * np.pi * 0.7**4 / (3 * WAVELENGTH_M**2))
     assert rcs("dihedral", (0.5, 0.8))[0] == pytest.approx(8 * np.pi * 0.5**2 * 0.8**2 / WAVELENGTH_M**2)
 
 
 def test_trihedral_is_3_db_down_at_20_degrees_and_zero_along_a_plate():
-    """Robertson 1947: half-power width 40° of the triangular corner; no return along a plate."""
+    """By Robertson (1947), the half-power width of the triangular corner is 40°; there is no return along a plate."""
     edges = [
         10 * np.log10(rcs("trihedral", (1.0,), towards(side))[0] / rcs("trihedral", (1.0,))[0]) for side in (-20, 20)
     ]
@@ -61,7 +61,7 @@ def effective_area(direction, leg_m=1.0, count=400):
 
 @pytest.mark.parametrize("cosines", [(1, 1, 1), (1, 2, 3), (0.5, 1, 4), (1, 1.4, 1.2)])
 def test_trihedral_cross_section_follows_from_its_effective_aperture(cosines):
-    """Both cases of the closed form: aperture and its reflection in the vertex, counted on a lattice."""
+    """Both cases of the closed form equal the area common to aperture and reflection, counted on a lattice."""
     cosines = np.array(cosines) / np.linalg.norm(cosines)
     seams = np.array([[3**0.5, -1, 2**0.5], [-(3**0.5), -1, 2**0.5], [0, 2, 2**0.5]]) / 6**0.5
     sigma_m2, _ = rcs("trihedral", (1.0,), (cosines @ seams)[None])
@@ -70,7 +70,7 @@ def test_trihedral_cross_section_follows_from_its_effective_aperture(cosines):
 
 
 def test_bistatic_trihedral_loss_equals_the_aperture_diffraction_loss():
-    """Second-order model against the diffraction of the hexagonal aperture; undefined beyond 1 dB."""
+    """The second-order model agrees with the diffraction of the hexagonal aperture; it is undefined beyond 1 dB."""
     leg_m, half_deg = 0.6, 2.4
     bistatic, std_db = rcs("trihedral", (leg_m,), towards(-half_deg), towards(half_deg))
     monostatic, monostatic_std_db = rcs("trihedral", (leg_m,))
@@ -86,7 +86,7 @@ def test_bistatic_trihedral_loss_equals_the_aperture_diffraction_loss():
 
 
 def test_dihedral_pattern_is_narrow_along_its_seam_and_wide_across():
-    """First null along the seam at asin(λ/2b); across it the amplitude falls as the sine of 45° minus the angle."""
+    """The first null along the seam is at asin(λ/2b); across, the amplitude falls as sin(45° - angle)."""
     size_m = (0.5, 1.0)
     best, null_deg = rcs("dihedral", size_m)[0], np.degrees(np.arcsin(WAVELENGTH_M / 2))
     assert rcs("dihedral", size_m, towards(null_deg))[0] < 1e-6 * best
@@ -97,7 +97,7 @@ def test_dihedral_pattern_is_narrow_along_its_seam_and_wide_across():
 
 
 def test_bistatic_dihedral_loss_occurs_across_but_not_along_the_seam():
-    """Across: second order of the sinc of its width; along: specular, so no loss for symmetric antennas."""
+    """Across, the loss is that of a sinc to second order; along, it is zero (specular) for symmetric antennas."""
     size_m, best = (0.3, 1.0), rcs("dihedral", (0.3, 1.0))[0]
     shift = np.pi / WAVELENGTH_M * 2 * np.sin(np.radians(3)) * 2 * 0.3 * np.sin(np.pi / 4)
     across, _ = rcs("dihedral", size_m, towards(0, -3), towards(0, 3))
@@ -107,7 +107,7 @@ def test_bistatic_dihedral_loss_occurs_across_but_not_along_the_seam():
 
 
 def test_sphere_matches_rayleigh_resonance_and_optical_limits():
-    """Relative to πa²: 9(ka)⁴ for small ka, 3.65 at ka = 1, 1 for large ka: Ruck, fig. 3-2."""
+    """Relative to πa², Ruck (fig. 3-2) states 9(ka)⁴ for small ka, 3.65 at ka = 1, and 1 for large ka."""
     radius = np.array([0.05, 1.03, 60.0]) * WAVELENGTH_M / (2 * np.pi)
     shares = [rcs("sphere", (a,))[0] / (np.pi * a**2) for a in radius]
     assert shares[0] == pytest.approx(9 * 0.05**4, rel=0.01)
@@ -139,7 +139,7 @@ def test_cross_section_over_pulses_is_the_mean_amplitude_squared():
 
 
 def test_pulses_of_zero_weight_do_not_exclude_a_reflector():
-    """Outside the beam the bistatic angle is not limited."""
+    """Outside the beam, the bistatic angle is not limited."""
     tx, rx = np.concatenate([AHEAD, towards(-9)]), np.concatenate([AHEAD, towards(9)])
     corner, frequency = Reflector("trihedral", (1.0,), AXES), np.array([1.49896229e9] * 2)
     assert corner.seen(tx, rx, np.array([1.0, 0.0]), frequency)[0] == pytest.approx(rcs("trihedral", (1.0,))[0])
@@ -153,7 +153,7 @@ def test_flights_over_one_reflector_do_not_reduce_its_own_error():
 
 
 def test_several_reflectors_reduce_the_error_unless_they_disagree():
-    """Birge ratio: the deviation grows by the root of chi square per degree of freedom."""
+    """The deviation grows by the Birge ratio, the root of chi square per degree of freedom."""
     names, flights = ["a", "b", "c", "d"], ["f01"] * 4
     agreed = together(np.array([59.7, 60.1, 60.3, 59.9]), np.full(4, 0.3), np.full(4, 0.4), names, flights)
     assert agreed.std == pytest.approx(0.25)
@@ -165,7 +165,7 @@ def test_several_reflectors_reduce_the_error_unless_they_disagree():
 
 
 def test_mean_has_the_stated_deviation():
-    """400 drawn calibrations with three reflectors in two flights: 95 % within 1.96 deviations."""
+    """Of 400 drawn calibrations with three reflectors in two flights, 95 % are within 1.96 deviations."""
     draw, normalised = np.random.default_rng(1), []
     names, flights = ["a", "a", "b", "b", "c", "c"], ["f01", "f02"] * 3
     for _ in range(400):
@@ -177,7 +177,7 @@ def test_mean_has_the_stated_deviation():
 
 @pytest.mark.parametrize(("change_db", "drifts"), [(0.59, False), (0.61, True)])
 def test_drift_is_reported_beyond_three_deviations_of_the_scatter(change_db, drifts):
-    """Two reflectors, scatter 0.2 dB: flight differences scatter by 0.2 dB·√2/√2; their own errors of 2 dB cancel."""
+    """With two reflectors, flight differences scatter by 0.2 dB·√2/√2; reflector errors of 2 dB cancel."""
     value = np.array([61.0, 59.0, 61.0, 59.0]) + np.array([0, 0, change_db, change_db])
     mean = together(value, np.full(4, 0.2), np.full(4, 2.0), ["a", "b", "a", "b"], ["f01", "f01", "f02", "f02"])
     assert mean.drift[:2] == ("f01", "f02")

@@ -1,4 +1,4 @@
-"""ap.write_campaign: data read back unchanged, errors are reported, and no partial files remain."""
+"""ap.write_campaign: data are read back unchanged, errors are reported, and no partial files remain."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Check of a campaign folder before a run: reports every problem at once, from headers alone."""
+"""Check of a campaign folder before a run: all problems are reported at once, from headers alone."""
 
 import io
 import os

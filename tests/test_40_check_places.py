@@ -94,7 +94,7 @@ def test_log_that_ends_before_the_last_pulse_is_reported(tiny):
 
 
 def test_poor_solutions_at_the_end_of_a_log_are_no_problem(tiny):
-    def single(lines):  # the pulses after its last fixed solution are dropped by the echo, and flagged
+    def single(lines):  # the echo step excludes the pulses after the last fixed solution and raises a flag
         cut = [line for line in lines if line.startswith("%") or line.split()[1] < "09:30:19"]
         return [*cut[:-3], *(line.replace("   1  18", "   5  18") for line in cut[-3:])]
 
@@ -153,7 +153,7 @@ def test_log_without_heights_is_reported(tiny):
 
 def test_supersonic_median_speed_is_reported(tiny):
     edit_config(tiny, lambda document: document["scene"].update(bounds_m="auto"))
-    for stretched, is_reported in ((500, False), (3, True)):  # from half a metre per second
+    for stretched, is_reported in ((500, False), (3, True)):  # the original speed is half a metre per second
         edit_position(tiny, lambda latitude, *rest, by=stretched: (48.4226 + by * (latitude - 48.4226), *rest))
         assert any(line.startswith(f"{TX}: a median speed of") for line in reported(tiny)) is is_reported
 
@@ -309,12 +309,12 @@ def test_track_more_than_30_km_above_the_terrain_is_reported(tiny):
     for height_m, high in ((-29_000.0, False), (-30_000.0, True)):
         state(tiny, "scene", height_m=height_m)
         lines = reported(tiny)
-        assert any("m above the terrain: check the heights in the logs" in line for line in lines)  # no echo comes back
+        assert any("m above the terrain: check the heights in the logs" in line for line in lines)  # no echo arrives
         assert any("expected a node above the terrain, by at most 30 km" in line for line in lines) is high
 
 
 def write_dem(root, heights, *, post_m=1.0, east_m=0.0):
-    """Write a DEM centred on the scene and configure it; heights (row, column)."""
+    """Write a DEM with heights (row, column), centred on the scene, and configure it."""
     east, north, _ = projected_from_ecef("EPSG:32632", DEMO_ORIGIN.ecef(np.zeros(3)))
     rows, columns = heights.shape
     transform = from_origin(east + east_m - columns * post_m / 2, north + rows * post_m / 2, post_m, post_m)
@@ -465,7 +465,7 @@ def test_disk_must_hold_the_results_still_to_be_written(tiny, monkeypatch):
 
 @pytest.mark.parametrize(("unit", "refused"), [("degrees", False), ("radians", True)])
 def test_attitude_in_radians_is_refused_if_a_lever_arm_needs_it(tiny, unit, refused):
-    """Fly a circle of 10 m: yaw follows the course over 360° only if it is in radians."""
+    """On a circle of 10 m, yaw follows the course over 360° only if the angles are in radians."""
 
     def circle(lines):
         header, *rows = lines

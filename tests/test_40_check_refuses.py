@@ -62,7 +62,7 @@ def tag_twice(meta):
 
 
 def dem_not_below_the_track(root):
-    """Write a DEM that covers the scene but not the track, which automatic bounds require."""
+    """Write a DEM that covers the scene but not the track; automatic bounds require both."""
     west, _, _, north = Campaign.load(root).settings.scene.bounds_m
     place = from_origin(west + 400, north + 400, 1.0, 1.0)
     kind = {"width": 20, "height": 20, "count": 1, "dtype": "float64", "crs": "EPSG:32632"}

@@ -1,4 +1,4 @@
-"""The job graph of `workflow/*.smk` is that of `apertura.workflow.rules`, from which lineage is derived."""
+"""The job graph of `workflow/*.smk` equals that of `apertura.workflow.rules`, from which lineage is derived."""
 
 import json
 import subprocess
@@ -48,7 +48,7 @@ def check(root, *targets):
         files |= {result.manifest for result in results}
         if rule == "tiles":
             assert [Path(file).parent.name for file in outputs] == ["tiles"]
-        elif rule in {"mosaic", "pictures", "page"}:  # which also write files that depend on the campaign
+        elif rule in {"mosaic", "pictures", "page"}:  # these rules also write files that depend on the campaign
             assert files <= outputs, (rule, where)
         else:
             assert files == outputs, (rule, where)

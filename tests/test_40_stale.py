@@ -1,4 +1,4 @@
-"""Out-of-date results: manifests record inputs, and a changed file, setting or code is found by its hash."""
+"""Out-of-date results: manifests record inputs, and changed files, settings or code are found by hashes."""
 
 import json
 import os
@@ -357,7 +357,7 @@ def planned_spacing_m(campaign):
 
 @pytest.mark.slow
 def test_plan_follows_the_config_and_not_outdated_results(tiny, capsys):
-    """Automatic CRS with a finished grid: after a change of the spacing the plan uses and reports the new one."""
+    """With an automatic CRS and a finished grid, the plan uses and reports a changed spacing."""
     campaign = state(tiny, "scene", crs="auto")
     for node in ("uav1", "uav2"):
         ingest.ingest(campaign, "f01", node)

@@ -1,4 +1,4 @@
-"""Invalid campaign folders: each error is one message with finding, location, expectation and remedy."""
+"""Invalid campaign folders: each error is one message with cause, location, expected value and remedy."""
 
 import hashlib
 import json
@@ -357,7 +357,7 @@ def test_segments_without_pulses_are_reported_with_recorded_times(tiny):
 
 
 def test_recording_changed_since_ingestion_is_refused(tiny):
-    """The raw stage refers to the recorder's file under its hash; samples are not copied."""
+    """The raw stage refers to the file of the recorder by its hash; samples are not copied."""
     campaign = Campaign.load(tiny)
     ingest_all(campaign)
     stage = tiny / "results/f01/uav1/raw.zarr"

@@ -158,7 +158,7 @@ def test_codes_that_are_no_complex_symbols_are_refused(tmp_path, content, expect
 
 
 def test_oversized_codes_are_refused_by_their_header(tmp_path):
-    """Sparse file of the size in its header: reading it would allocate 2 TiB."""
+    """The file is sparse and has the size stated in its header; reading it would allocate 2 TiB."""
     read = codes(tmp_path, header((1 << 38,)))
     os.truncate(tmp_path / "codes.npy", 128 + (8 << 38))
     assert "<c8 of shape (274877906944,)" in complaint(read)
@@ -281,7 +281,7 @@ def csv_log(*lines, heading=CSV):
 
 
 def west(longitude):
-    """Return the geodetic positions of the flight, moved by a longitude in degrees."""
+    """Return the geodetic positions of the flight, displaced by a longitude in degrees."""
     return GEODETIC * [1, 0, 1] + [0, longitude, 0]
 
 
@@ -442,7 +442,7 @@ def of_24_bits(wav):
 
 
 def gotcha(**changes):
-    """Return AFRL's structure of 8 frequencies and 5 pulses, as MATLAB saves it."""
+    """Return AFRL's structure of 8 frequencies and 5 pulses in the format of MATLAB."""
     pulses = np.arange(5.0)
     fields = {
         "fp": np.exp(1j * np.arange(40.0)).reshape(8, 5), "freq": 9.3e9 + 1e6 * np.arange(8.0),
@@ -517,7 +517,7 @@ def test_recordings_of_other_programs_are_read_or_refused_with_one_message(tmp_p
 
 
 RASTER = {"count": 1, "dtype": "float32", "crs": "EPSG:32632", "transform": from_origin(500000, 5400100, 2, 2)}
-GROUND = 600 + np.add.outer(0.2 * np.arange(60), 0.3 * np.arange(60))  # by rows and columns of 2 m
+GROUND = 600 + np.add.outer(0.2 * np.arange(60), 0.3 * np.arange(60))  # slopes by rows and columns of 2 m
 GRID = SceneGrid("EPSG:32632", 500030.0, 5400070.0, 1.0, (30, 30))
 
 

@@ -1,4 +1,4 @@
-"""Bench measurement of a radar: a correct set-up raises no flag, each defect raises its own."""
+"""Bench measurement of a radar: a correct set-up raises no flag, and each defect raises its own flag."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -35,7 +35,7 @@ def measured(setup: Setup, folder: Path, seed: int = 3) -> Bench:
 
 
 def with_snr(snr_db: float) -> Setup:
-    """Return a correct set-up with a signal-to-noise ratio of the compressed pulses, by noise of the radar channels."""
+    """Return a correct set-up with noise in the radar channels that gives an SNR of the compressed pulses."""
     per_subcarrier_db = snr_db - 10 * np.log10(512)
     own = Impairments(radar_snr_db=per_subcarrier_db)
     return replace(RIGHT, specification=cabled(own, replace(RECEIVED, radar_snr_db=per_subcarrier_db)))
@@ -59,7 +59,7 @@ def test_correct_set_up_raises_no_flag(seed: int, tmp_path):
 @pytest.mark.quick("18.5-0.986")
 @pytest.mark.parametrize(("snr_db", "printed"), [(18.5, 0.986), (33.0, 0.9995), (40.0, 0.9999)])
 def test_coherence_over_a_cable_is_limited_by_its_snr(snr_db: float, printed: float, tmp_path):
-    """Γ of both pairs equals that of the paper for its three recordings, within 4σ and the rounding in print."""
+    """Γ of both pairs equals the three printed values of the paper within 4σ and rounding."""
     for node in measured(with_snr(snr_db), tmp_path / "bench").nodes:
         digit = 10.0 ** -len(str(printed).partition(".")[2])
         assert abs(node.link.coherence - printed) < 4 * node.link.coherence_std + digit / 2
@@ -105,7 +105,7 @@ def test_bench_needs_no_log_and_forms_no_image(tmp_path, capsys, monkeypatch):
 
 
 def test_common_signal_of_two_channels_agrees_despite_noise(tmp_path):
-    """Noise of 20 pulses at 18.5 dB scatters phases over the band by 0.3 rad or more, which is no disagreement."""
+    """In 20 pulses at 18.5 dB, noise scatters phases over the band by 0.3 rad or more, which is not a disagreement."""
     noisy = with_snr(18.5)
     short = replace(
         noisy, specification=replace(noisy.specification, flights=(replace(noisy.specification.flights[0], pulses=20),))
@@ -154,7 +154,7 @@ def test_stationary_radar_is_refused_as_an_image_flight(tmp_path):
 
 @pytest.mark.parametrize(("length_m", "flagged"), [(0.3, True), (2.0, False)])
 def test_aperture_too_short_for_its_scene_is_flagged(length_m: float, flagged: bool):
-    """Resolution λR/2L in a scene of 6 m: 4.2 m for a track of 0.3 m at a range of 10 m, 0.6 m for 2 m."""
+    """The resolution λR/2L at 10 m range in a scene of 6 m is 4.2 m for a track of 0.3 m, and 0.6 m for 2 m."""
     track = np.stack([np.linspace(0, length_m, 50) - length_m / 2, np.full(50, -10.0), np.full(50, 1.0)], -1)
     ground = np.stack(np.meshgrid(np.linspace(-3, 3, 5), np.linspace(3, -3, 5), indexing="xy"), -1)
     ground = np.concatenate([ground, np.zeros((5, 5, 1))], -1)
@@ -190,7 +190,7 @@ def test_hover_is_excluded_unless_segments_are_configured(tmp_path):
 
 @pytest.mark.slow
 def test_image_without_aperture_is_inconclusive_about_focus():
-    """Stationary antennas: the echo resolves range only, and no_aperture is the only flag of its focus."""
+    """With stationary antennas, the echo resolves only range, and no_aperture is the only flag that concerns focus."""
     frequency, still = 1.2e9 + 1e6 * np.arange(128), np.tile([0.0, -20.0, 10.0], (64, 1))
     aperture, grid = Aperture(still, still), ap.SceneGrid("local", -5.0, 5.0, 0.1, (100, 100))
     echo = np.exp(-2j * np.pi * frequency * aperture.path(np.zeros((1, 3))) / 299792458.0).astype(np.complex64)

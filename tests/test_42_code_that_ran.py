@@ -1,4 +1,4 @@
-"""Code hash of a result: it covers every module whose functions the step calls, and no other."""
+"""Code hash of a result: the hash covers exactly the modules whose functions the step calls."""
 
 import pkgutil
 import shutil
@@ -65,7 +65,7 @@ READ = FOCUSED | {"pictures", "raw", "track", "echo", "transfer", "profile", "la
 
 
 CHANGES = [
-    ("formats/tracks/px4_ulog.py", "code", set()),  # no log of the campaign has that format
+    ("formats/tracks/px4_ulog.py", "code", set()),  # no log of the campaign has this format
     ("formats/tracks/csv_track.py", "comment", set()),
     ("formats/tracks/csv_track.py", "code", READ - {"raw", "transfer"} | {"pictures_fused"}),
     ("formats/recordings/sigmf.py", "code", READ - {"track", "tracks"} | {"cphd", "pictures_fused"}),

@@ -21,7 +21,7 @@ from apertura.stages.scene import open_scene
 from apertura.stages.transfer import recorded_echo
 
 FAST = FrequencySweep(2.2e9, 400e6, 20e-6, 25e6)
-"""400 MHz centred on 2.4 GHz in 20 µs: chirp rate 2e13 Hz/s, beat frequencies to 12.5 MHz, 187 m of path."""
+"""Sweep of 400 MHz about 2.4 GHz in 20 µs: chirp rate 2e13 Hz/s, beat frequencies up to 12.5 MHz, 187 m of path."""
 
 NEAR = ((0.0, 0.0, 0.0), (-2.0, 2.0, 0.0), (2.5, -1.5, 0.0))
 FLIGHT = FmcwFlight(FAST, 100.0, 200, {"uav1": (0.0, -20.0, 10.0)}, NEAR, spacing_m=0.0625, half_width_m=3.5)
@@ -118,7 +118,7 @@ def test_second_node_on_the_same_clock_images_the_same_targets(tmp_path):
 
 @pytest.mark.slow
 def test_residual_video_phase_displaces_a_far_target_as_predicted(tmp_path, monkeypatch):
-    """Its phase has a frequency lower by γτ, which reduces its along-track distance in the same proportion."""
+    """The frequency of the phase is lower by γτ, which reduces the along-track distance in the same proportion."""
     east = 12.0
     flight = replace(
         FLIGHT,

@@ -1,4 +1,4 @@
-"""Phase history with positions in a flight log whose clock differs from the recorder's."""
+"""Phase history with positions in a flight log whose clock differs from the clock of the recorder."""
 
 import json
 
@@ -23,7 +23,7 @@ EAST, NORTH = 570_000.0, 5_363_000.0
 FREQUENCY = 1.2e9 + 2e6 * np.arange(200)
 START = np.datetime64("2025-05-14T09:30", "ns")
 CLOCK_OFFSET_S = 4.44
-"""Delay of the recorder's clock relative to the log's, in seconds."""
+"""Delay of the recorder's clock relative to the clock of the log, seconds."""
 
 
 def position_ecef(east, north, up):
@@ -159,7 +159,7 @@ def test_check_reports_pulses_outside_the_log(campaign):
 
 
 def test_track_at_terrain_height_is_refused_before_the_run(campaign):
-    """Planar rail: the log alone determines that the antenna is at the terrain surface."""
+    """The rail lies in the terrain plane; the log alone shows that the antenna is at the terrain surface."""
     edit_config(campaign, lambda document: document["scene"].update(height_m=510.0))
     lines = [str(problem) for problem in problems(campaign)]
     heights = [f"uav1: median height above the terrain {height} m" for height in ("0.0", "-0.0")]

@@ -1,4 +1,4 @@
-"""Campaign far from its scene: autofocus estimates one phase per pulse, and images are formed with it."""
+"""Campaign far from its scene: autofocus estimates one phase per pulse, and images are formed with these phases."""
 
 from dataclasses import replace
 from typing import get_args
@@ -30,7 +30,7 @@ POINTS_M = ((-9, -8.5), (0, -10), (8, -6), (-5, -3), (4, -1), (-10, 2), (10, 4),
 
 
 def far_away():
-    """Return a specification: ten points on 24 m × 24 m at 300 m from a track of 60 m, flown in 15 s."""
+    """Return a specification: ten points on 24 m × 24 m at 300 m distance from a track of 60 m, flown in 15 s."""
     demo, pulses, speed_m_s = preset("demo"), 300, 4.0
     half_m = speed_m_s * (pulses - 1) / demo.waveform.prf_hz / 2
     tracks = {

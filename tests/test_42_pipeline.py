@@ -48,7 +48,7 @@ def test_coherent_fusion_is_narrower_than_either_pair(finished_sample):
 
 
 def test_mono_and_bistatic_phases_agree_at_the_targets(finished_sample):
-    """Condition of the coherent sum; the generating model of the sample agrees within 0.06 rad."""
+    """Equal phases are required by the coherent sum; the generating model of the sample agrees within 0.06 rad."""
     cube = open_stage(finished_sample.stage("cube"), "cube").image.values[0]
     grid = open_scene(finished_sample).grid
     truth = json.loads((finished_sample.root / "truth.json").read_text())["targets"]
@@ -61,7 +61,7 @@ def test_mono_and_bistatic_phases_agree_at_the_targets(finished_sample):
 
 @pytest.mark.slow
 def test_bistatic_image_requires_the_sidelink(finished_sample, monkeypatch, tmp_path):
-    """Without sidelink correction, at equal RMS of the phase histories, the peak drops by at least 15 dB."""
+    """Without sidelink correction, and at equal RMS of the phase histories, the peak is lower by at least 15 dB."""
     pair = ("f01", "uav1-uav2")
     scene = open_scene(finished_sample)
     grid, ground = scene.grid, scene.terrain
@@ -98,7 +98,7 @@ def test_bistatic_image_requires_the_sidelink(finished_sample, monkeypatch, tmp_
 
 @pytest.mark.slow
 def test_gotcha_trihedrals_focus_within_30_cm(shared, tmp_path):
-    """Two degrees of the airborne circular X-band aperture, by the same steps, in a local frame."""
+    """Two degrees of the airborne circular X-band aperture are processed by the same steps in a local frame."""
     root = tmp_path / "gotcha"
     (root / "config").mkdir(parents=True)
     (root / "raw" / "pass1").mkdir(parents=True)
@@ -147,7 +147,7 @@ def test_table_engine_meets_its_error_bound(finished_sample, window, pair):
 
 
 def test_stated_numerical_error_is_confirmed(finished_tiny):
-    """Recomputed at other pixels than those of the certificate."""
+    """The error is recomputed at pixels other than those of the certificate."""
     pair = ("f01", "uav1-uav2")
     report = json.loads((finished_tiny.results / "f01" / "uav1-uav2" / "image.json").read_text())
     dataset = PairEcho.opened(finished_tiny, *pair).stage

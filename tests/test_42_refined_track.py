@@ -1,4 +1,4 @@
-"""Track refinement from images: the decision, image formation with refined tracks, and the reports."""
+"""Track refinement from images: decision, image formation with refined tracks, and reports."""
 
 import csv
 import json
@@ -152,7 +152,7 @@ def test_corrected_track_gives_the_images_of_the_true_track(erroneous, finished_
 
 @pytest.mark.slow
 def test_delivered_refined_logs_give_the_same_images(erroneous, tmp_path):
-    """Images are formed from the delivered tracks: a CSV table with attitude, and a .pos solution without."""
+    """Images are formed from the delivered tracks: a CSV table with attitude and a .pos solution without attitude."""
     campaign, (start, correction) = erroneous
     wave_m = 0.02 * np.sin(correction.time_s[:, None] / np.array([0.4, 0.5, 0.3]))
     both = TrackCorrection(correction.time_s, {"uav1": correction.moved_m["uav1"], "uav2": wave_m})
@@ -281,7 +281,7 @@ def add_noise(root, std_m, stated_m):
 
 @pytest.mark.slow
 def test_errors_of_a_quarter_wavelength_are_corrected_or_flagged(tmp_path):
-    """Limit of the method: a section of the track may be wrong by a wavelength, and is then rejected."""
+    """At the limit of the method, a track section may be wrong by a wavelength; the refinement is rejected."""
     campaign = campaign_to_refine(tmp_path, pulses=600, half_m=6.0, std_m=0.05, stated_m=0.05)
     refine.refine(campaign, "f01")
     stage = open_refined(campaign, "f01").stage
@@ -316,7 +316,7 @@ def test_log_errors_of_2_cm_are_refined_automatically(tmp_path):
     report = json.loads((campaign.results / "f01" / "uav1-uav1" / "image.json").read_text())
     assert report["autofocus"]["gain_held_out_db"] > 0.3
     runspec = json.loads(open_stage(campaign.stage("image", "f01", "uav1-uav1"), "image").attrs["runspec"])
-    assert runspec["uav1-uav2"]["nodes"].keys() == {"uav1", "uav2"}  # the image depends on the other pair, too
+    assert runspec["uav1-uav2"]["nodes"].keys() == {"uav1", "uav2"}  # the image also depends on the other pair
     assert runspec["refined"] is True
     for node in ("uav1", "uav2"):
         check_delivered(campaign, node, right)
@@ -361,7 +361,7 @@ def test_refined_track_applies_to_a_pair_without_sidelink(erroneous):
 
 @pytest.mark.slow
 def test_delayed_log_is_identified_and_corrected(tmp_path):
-    """From raw samples: on curves at varying speed 0.1 s costs 6 dB and displaces targets by 40 cm."""
+    """From raw samples on curves at varying speed, a delay of 0.1 s costs 6 dB and displaces targets by 40 cm."""
     campaign = Campaign.load(curved(tmp_path / "campaign"))
     path = campaign.root / "raw" / "f01" / "uav1.track.csv"
     write_log(path, late(0.1)(read_log(path)))

@@ -40,7 +40,7 @@ PULSES = {
 
 @pytest.fixture(scope="module", params=[pytest.param(name, marks=pytest.mark.slow) for name in PULSES])
 def imaged(request, tmp_path_factory):
-    """Image three targets from two nodes with noise, own clocks, missed triggers, random phases and start times."""
+    """Image three targets from two nodes with noise, two clocks, missed triggers, random phases and start times."""
     root = tmp_path_factory.mktemp(request.param) / "campaign"
     simulate(root, preset("demo", pulses=150), waveform=PULSES[request.param], targets=TARGETS)
     return run_steps(root, exports=False)
@@ -132,7 +132,7 @@ def test_planned_pair_agrees_with_the_formed_echo(tiny):
 
 
 def test_stop_and_go_error_is_that_of_the_pulse_duration(imaged):
-    """Half of the pulse of 1 µs at a path rate of a few decimetres per second."""
+    """The error is that of half the pulse of 1 µs at a path rate of a few decimetres per second."""
     lines = {line.cause: line for line in budget_of(imaged, open_pair(imaged, "f01", PAIRS[0]), open_scene(imaged))}
     assert 0 < lines["stop and go"].effect.shift_m < 1e-6
 
@@ -174,7 +174,7 @@ def test_waveform_inconsistent_with_the_recording_is_reported_by_check(tiny, cha
 @pytest.mark.quick("2.5e-07-True")
 @pytest.mark.parametrize(("late_s", "cut"), [(0.05e-6, False), (0.25e-6, True), (-0.6e-6, True)])
 def test_captures_that_truncate_the_direct_pulse_are_flagged(tmp_path, late_s, cut):
-    """A capture begins 0.1 µs before the pulse, less the delay of the recorder, and ends 0.5 µs after it."""
+    """A capture begins 0.1 µs minus the recorder delay before the pulse, and ends 0.5 µs after the pulse."""
     root, timing = tmp_path / "campaign", {"uav2": Impairments(timing=Timing(offset_s=late_s))}
     simulate(root, preset("demo", pulses=20), waveform=PULSES["pn"], targets=TARGETS, impairments=timing)
     campaign = Campaign.load(root)
@@ -193,7 +193,7 @@ def test_too_short_captures_are_refused_by_the_echo_step(tiny):
 
 
 def test_lead_is_refused_for_a_continuous_recording(tmp_path):
-    """Captures start at the trigger; a lead would be taken as a part of the delay."""
+    """Captures start at the trigger; a lead would be interpreted as part of the delay."""
     root = simulate(tmp_path / "campaign", preset("continuous", pulses=2))
     waveform = {"kind": "samples", "carrier_hz": 1.2e9, "sample_rate_hz": 64e6, "prf_hz": 1000.0}
     waveform |= {"pulse_s": 4e-6, "listen_s": 2e-6, "lead_s": 1e-6}

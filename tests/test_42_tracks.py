@@ -85,13 +85,13 @@ def test_corrections_and_deviations_are_in_east_north_up(log):
     np.testing.assert_allclose(
         np.diff([geodetic_from_ecef(log.track.position.values), lifted.geodetic], axis=0)[0, :, 2], 0.05
     )
-    np.testing.assert_allclose(lifted.std_m, 0.02)  # the same in every direction
+    np.testing.assert_allclose(lifted.std_m, 0.02)  # equal in all directions
     inside = log.refined
     assert inside.tolist() == [True] * 25 + [False] * 5
     np.testing.assert_allclose((log.std_m**2).sum(axis=1)[inside], (log.left_m**2).sum(axis=1)[inside])
     np.testing.assert_allclose(
         log.std_m[~inside, :2], np.hypot([0.01, 0.02], log.correction_m[~inside, :2])
-    )  # the held correction belongs to other epochs
+    )  # the constant correction applies to other epochs
     assert np.isnan(log.std_m[~inside, 2]).all()
 
 
@@ -108,7 +108,7 @@ def test_track_in_a_local_frame_is_written_in_its_axes(tmp_path):
 
 
 def stage_of(*, accepted, pairs=()):
-    """Return the stage of a refinement: node uav1 moved by up to 1 m in 2 s, and zero path offsets of pairs."""
+    """Return the stage of a refinement: node uav1 displaced by up to 1 m in 2 s, zero path offsets of pairs."""
     knots = START + np.array([0, 2_000_000_000], "timedelta64[ns]")
     moved_m = np.array([[[0.0, 0, 0], [1.0, 0, 0]]])
     return xr.Dataset(

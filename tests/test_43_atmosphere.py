@@ -51,7 +51,7 @@ def positions(campaign):
 
 
 def test_atmosphere_is_that_of_the_config_at_terrain_height(tiny):
-    """Terrain height 620 m, antennas 4.8 m above it: N is smaller along the path by the factor exp(−2.4/7350)."""
+    """For terrain at 620 m and antennas 4.8 m above, N is smaller along the path by the factor exp(−2.4/7350)."""
     weather = {"temperature_c": 25.0, "pressure_hpa": 930.0, "relative_humidity": 70.0}
     for configured, expected in (
         ("auto", Atmosphere.standard(620.0)),
@@ -149,7 +149,7 @@ HEIGHT_M = 300.0
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
-    """Write a flight at 300 m height past a target at 300 m, 10 K and 20 hPa above the standard atmosphere."""
+    """Write a flight at 300 m height past a target at 300 m, in air 10 K and 20 hPa above the standard atmosphere."""
     base = preset("demo")
     range_m, pulses = HEIGHT_M * np.sqrt(2), 120
     waveform = WaveformSpecification(200, 1.3e9, 1e6, 1e-6, 4e-6, 256e6, 20.0)
@@ -184,7 +184,7 @@ def north_error_m(campaign, pair):
 
 @pytest.mark.slow
 def test_configured_atmosphere_puts_targets_at_their_positions(flown, tmp_path):
-    """Errors: configured air 1 cm of 75 cm; `auto` within its budget; vacuum by eq. 5; pairs in phase in each case."""
+    """Errors are 1 cm (cells of 75 cm) in configured air, within the budget for `auto`, and as in eq. 5 for vacuum."""
     root, warm = flown
     pairs, expected_m = ("uav1-uav1", "uav1-uav2"), 1e-6 * warm * HEIGHT_M * np.sqrt(2) * np.sqrt(2)
     results = {}

@@ -57,7 +57,7 @@ def test_planned_setting_and_reference_are_always_measured(charted):
 
 
 def test_measured_errors_are_no_worse_than_predicted(charted):
-    """Predictions hold for white echoes, and bounds exceed the actual errors; these echoes are of single targets."""
+    """Predictions apply to white echoes, and bounds exceed actual errors; these echoes are from single targets."""
     for row in charted[1]:
         if row["engine"] != "reference":
             assert float(row["error_db"]) <= float(row["predicted_error_db"]) + 9
@@ -128,7 +128,7 @@ def test_slow_engine_is_timed_on_fewer_rows(part, toy, monkeypatch, seconds, row
         return form(prepared, pixels)
 
     monkeypatch.setattr(toy_engine, "form", recorded)
-    assert measured_by_toy(part, seconds).error_db < -10  # the part contains little but sidelobes
+    assert measured_by_toy(part, seconds).error_db < -10  # the part contains mainly sidelobes
     assert shapes == {(rows, 160, 3)}
 
 

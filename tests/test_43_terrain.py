@@ -163,7 +163,7 @@ def test_undulation_is_added_to_geoid_heights(shared, tiny):
 @pytest.mark.slow
 @pytest.mark.parametrize("has_stage", [True, False])
 def test_plan_predicts_the_profiles_of_a_hillside(hillside, has_stage, tmp_path):
-    """Numbers of samples and table bytes are those of the terrain, from the stage or from the DEM alone."""
+    """The numbers of samples and table bytes are those for the terrain, from the stage or from the DEM alone."""
     root = copy_writable(hillside.root, tmp_path / "campaign")
     if not has_stage:
         (root / "results" / "terrain.manifest.json").unlink()
@@ -211,13 +211,13 @@ def test_missing_dem_is_reported_before_a_run(tiny):
 def test_void_in_the_scene_is_reported_with_count_and_position(tiny):
     write_plane(tiny, void=np.nan)
     campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid")
-    planned = complaint(lambda: expected_plan(campaign, *PAIR))  # before anything ran
+    planned = complaint(lambda: expected_plan(campaign, *PAIR))  # before any step runs
     message = complaint(lambda: settle_ground(campaign))
     assert planned == message
     assert "of 3600 pixels" in message
     assert "first at x " in message
     assert not (tiny / "results" / "terrain.zarr").exists()
-    write_plane(tiny)  # corrected DEM: unfinished work with the old one is discarded
+    write_plane(tiny)  # with the corrected DEM, unfinished work with the old DEM is discarded
     settle_ground(campaign)
     assert np.isfinite(open_stage(campaign.stage("terrain"), "terrain").height.values).all()
 
@@ -248,7 +248,7 @@ def test_dem_of_the_scene_suffices_with_configured_bounds(tiny):
 
 
 def pixel_below_track(grid, opened):
-    """Return the grid of one pixel below the middle of the track."""
+    """Return the grid of one pixel below the midpoint of the track."""
     x, y, _ = projected_from_ecef(grid.crs, np.median(np.concatenate(opened.aperture.legs), axis=0))
     return SceneGrid(grid.crs, x - 0.5, y + 0.5, 1.0, (1, 1))
 
@@ -287,7 +287,7 @@ def test_undeclared_void_is_an_impossible_height(tiny):
 
 @pytest.mark.slow
 def test_dem_above_the_antennas_is_flagged_and_flat_terrain_refused(tiny):
-    """A radar next to a hill may look up, so that a DEM above it is no error; 620 m are 2034 ft."""
+    """A radar next to a hill may be directed upwards, so that a higher DEM is not an error; 620 m are 2034 ft."""
     write_plane(tiny, height_m=620.0 / 0.3048)
     campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid")
     message = complaint(lambda: expected_plan(campaign, *PAIR))  # out of range of the echoes
@@ -319,7 +319,7 @@ def test_platform_below_the_terrain_is_refused_with_its_pulse(hillside, tmp_path
     write_plane(root, slope=-1.5 * SLOPE)
     shutil.rmtree(root / "results")
     campaign = edit_scene(root, bounds_m=bounds)
-    planned = complaint(lambda: expected_plan(campaign, "f01", "uav1-uav1"))  # before anything ran
+    planned = complaint(lambda: expected_plan(campaign, "f01", "uav1-uav1"))  # before any step runs
     assert "flight f01, pair uav1-uav1: at " in planned
     assert "transmitter is at or below the terrain" in planned
     shutil.copytree(str(hillside.results / "f01"), str(root / "results" / "f01"))

@@ -1,4 +1,4 @@
-"""Flags of signal impairments: each is raised beyond its threshold and not below, one impairment per recording."""
+"""Flags of signal impairments: each is raised only beyond its threshold; each recording has one impairment."""
 
 from dataclasses import replace
 

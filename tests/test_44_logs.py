@@ -47,7 +47,7 @@ def echo_of(campaign, pair="a-b"):
 
 
 def flags_of(dataset):
-    """Return the flags except those of saturated converters, which the small campaign drives hard."""
+    """Return the flags except those of saturated converters, which occur in the small campaign."""
     return {name: line for name, line in dataset.attrs["flags"].items() if not name.startswith("saturated")}
 
 
@@ -181,7 +181,7 @@ def test_repeated_positions_of_a_log_are_skipped(tmp_path):
 @pytest.mark.quick("0.2-True")
 @pytest.mark.parametrize(("grain_s", "flagged"), [(0.1, False), (0.2, True)])
 def test_log_with_rounded_times_is_flagged_with_the_position_error(tmp_path, grain_s, flagged):
-    """Position error with times rounded to 0.2 s at 5 m/s: 5 m/s · 0.2 s/√12 = 0.29 m."""
+    """Times rounded to 0.2 s at 5 m/s cause a position error of 5 m/s · 0.2 s/√12 = 0.29 m."""
     campaign = small_campaign(tmp_path)
 
     def rounded(table):
@@ -198,7 +198,7 @@ def test_log_with_rounded_times_is_flagged_with_the_position_error(tmp_path, gra
 
 
 def logged_flags(position, *, damage=""):
-    """Return the flags of a 10 Hz log for pulses between its epochs at 1.2 GHz."""
+    """Return the flags of a 10 Hz log for pulses at 1.2 GHz between its epochs."""
     times = np.datetime64("2025-05-14T09:30", "ns") + np.arange(len(position)) * np.timedelta64(100, "ms")
     where = Path("a.track.ulg")
     track = damaged(make_track(times, position, frame="local", node="a", where=where), damage, where)
@@ -224,9 +224,9 @@ def test_damaged_log_is_flagged():
 @pytest.mark.slow
 @pytest.mark.parametrize("offset_s", [0.0, 1e-3, -4e-3])
 def test_tag_offset_between_nodes_does_not_change_the_bistatic_phase(tmp_path, offset_s):
-    """Positions of both nodes are taken at the transmitter's tag: the target has the same phase in both pairs.
+    """Positions of both nodes are those at the transmitter's tag, so that the target has the same phase in both pairs.
 
-    At 12 m/s and 9.5 GHz, the receiver's own tag, 1 ms late, would cause an error of R_sl of 1.2 cm, -2.27 rad.
+    At 12 m/s and 9.5 GHz, a receiver tag that is 1 ms late would cause an error of R_sl of 1.2 cm (-2.27 rad).
     """
     speed = (12.0, 0.0, 0.0)
     tracks = {"a": Straight((-2.0, -11.0, 5.0), speed), "b": Straight((2.7, -11.0, 5.0), speed)}
@@ -254,7 +254,7 @@ def test_tag_offset_between_nodes_does_not_change_the_bistatic_phase(tmp_path, o
 @pytest.mark.quick("b")
 @pytest.mark.parametrize("node", ["a", "b"])
 def test_repeated_captures_are_excluded(tmp_path, node):
-    """Eight captures contain the samples of the eight before them, from other positions, and would form a ghost."""
+    """Eight captures repeat the samples of the preceding eight, from other positions, and would form a ghost."""
     campaign = small_campaign(tmp_path)
 
     def repeat(samples):
@@ -285,7 +285,7 @@ def test_single_wrong_tag_is_excluded(tmp_path):
 
 @pytest.mark.parametrize(("arm_m", "flagged"), [(0.3, True), (0.0, False)])
 def test_attitude_in_radians_is_flagged_with_a_lever_arm(arm_m, flagged):
-    """Track of 40 m to the east with a logged yaw of π/2."""
+    """The track is 40 m to the east, with a logged yaw of π/2."""
     time = np.datetime64("2026-05-14T09:30", "ns") + np.arange(80) * np.timedelta64(100, "ms")
     position_m = np.column_stack([0.5 * np.arange(80), np.zeros(80), np.full(80, 20.0)])
     angles = np.column_stack([0.02 * np.sin(np.arange(80)), np.full(80, -0.07), np.full(80, np.pi / 2)])
@@ -301,13 +301,13 @@ def test_attitude_in_radians_is_flagged_with_a_lever_arm(arm_m, flagged):
 
 @pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
 def test_budget_predicts_the_phase_error_of_a_yaw_offset(tiny, pair):
-    """Yaw offset of 3° in the log of uav1 displaces its antennas, and the paths change as the budget predicts."""
+    """A yaw offset of 3° in the log of uav1 displaces its antennas; the paths change as predicted by the budget."""
 
     def nodes(document):
         document["nodes"]["uav1"].update(attitude_std_deg=[1e-6, 3.0], attitude_correlation_s=1e9, lever_arm_std_m=1e-6)
 
     def paths():
-        """Return total paths to the scene centre, less the sidelink length of a bistatic pair."""
+        """Return total paths to the scene centre, minus the sidelink length of a bistatic pair."""
         opened = open_pair(Campaign.load(tiny), "f01", pair)
         tx, rx = (raw_log(campaign, "f01", name, 0.2) for name in pair.split("-"))
         at = opened.began + (1e9 * opened.time_s).round().astype("timedelta64[ns]")

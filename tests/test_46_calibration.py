@@ -19,7 +19,7 @@ PAIRS = ("uav1-uav1", "uav1-uav2")
 
 
 def simulated(folder, *, reflector=True):
-    """Return a campaign with configured offsets wrong by decimetres, a calibration and an imaging flight."""
+    """Return a campaign with a calibration and an imaging flight, whose configured offsets are wrong by decimetres."""
     plan = replace(preset("demo", pulses=60), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
     stated = {"radar": 1.0, "sidelink": 0.5}
     nodes = {name: replace(node, stated_path_offset_m=stated) for name, node in plan.nodes.items()}

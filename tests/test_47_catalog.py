@@ -272,7 +272,7 @@ def test_frequency_is_equal_in_all_products(finished_tiny):
 
 @pytest.mark.slow
 def test_verdict_is_equal_in_all_products(finished, monkeypatch):
-    """A focused pair with a wrong code: no product reports its image, or a sum with it, as focused."""
+    """For a focused pair with a wrong code, no product reports the image, or a sum that contains it, as focused."""
     line = [("uav1-uav2", "wrong_code", "another code")]
     monkeypatch.setattr("apertura.stages.assess.wrong_codes", lambda _: line)
     campaign = Campaign.load(finished)

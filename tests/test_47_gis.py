@@ -76,7 +76,7 @@ def test_qgis_agrees_with_rasterio_and_uses_every_style(finished_tiny, tmp_path)
             radiometry = json.loads(rasterio.open(path).tags()["APERTURA_RADIOMETRY"])
             top = radiometry["peak_db"]
             assert report["stretch"] == pytest.approx([top + radiometry["noise_floor_re_peak_db"], top], abs=0.01)
-            assert report["legend"] == [" dB"]  # suffix of both ends of the ramp
+            assert report["legend"] == [" dB"]  # suffix at both ends of the ramp
         if name.endswith("nesz.tif"):
             assert len(report["legend"]) == 5
             assert all(label.endswith(" dB") for label in report["legend"])
@@ -85,7 +85,7 @@ def test_qgis_agrees_with_rasterio_and_uses_every_style(finished_tiny, tmp_path)
             assert report["classes"]["0"] == ["valid", 0]
         if path.with_suffix(".qml").name in {"incidence.qml", "looks.qml"}:
             assert report["renderer"] == "singlebandpseudocolor"
-    assert len(STYLED) == (2 * 7 + 5) * 2  # per pair 2 + 5 layers, sums 5; in the flight and in the mosaic
+    assert len(STYLED) == (2 * 7 + 5) * 2  # 2 + 5 layers per pair, 5 of the sums; in the flight and in the mosaic
 
 
 def known_rasters():
@@ -171,7 +171,7 @@ def test_qgis_renders_peak_white_and_noise_floor_black(finished_tiny, tmp_path):
     with rasterio.open(db) as raster:
         decibel, radiometry = raster.read(1), json.loads(raster.tags()["APERTURA_RADIOMETRY"])
     with pytest.warns(rasterio.errors.NotGeoreferencedWarning), rasterio.open(picture) as png:
-        grey = png.read(1)[2::4, 2::4].astype(float)  # 60 pixels of 4 × 4 dots
+        grey = png.read(1)[2::4, 2::4].astype(float)  # 60 pixels, each drawn as 4 × 4 screen pixels
     floor_db = radiometry["peak_db"] + radiometry["noise_floor_re_peak_db"]
     expected = np.clip((decibel - floor_db) / -radiometry["noise_floor_re_peak_db"], 0, 1) * 255
     assert np.abs(grey - expected).max() < 3

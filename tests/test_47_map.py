@@ -1,4 +1,4 @@
-"""Map of a finished campaign: its document agrees with the files, and the server serves nothing else."""
+"""Map of a finished campaign: its document agrees with the files, and the server serves only these files."""
 
 import json
 import re

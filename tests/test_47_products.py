@@ -176,7 +176,7 @@ def test_noise_layer_lies_below_its_image(finished_tiny):
         rasterio.open(str(folder / f"{name}.tif")).read(1) for name in ("db", "nesz", "looks", "mask")
     )
     assert np.nanmax(nesz) < np.nanpercentile(db, 20)
-    assert len(np.unique(looks)) == 1  # every pulse counts for every pixel
+    assert len(np.unique(looks)) == 1  # every pulse contributes to every pixel
     assert not mask.any()
 
 

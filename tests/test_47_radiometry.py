@@ -67,7 +67,7 @@ def report_of(campaign, pair, name="radiometry.json"):
 @pytest.mark.slow
 @pytest.mark.parametrize("pair", PAIRS)
 def test_measured_cross_sections_are_those_of_the_targets(flown, pair):
-    """Samples of a 14-bit converter, two beams, and configured power, gains and receiver."""
+    """The flight has samples of a 14-bit converter, two beams, and configured power, gains and receiver."""
     findings = [finding for finding in score(flown) if finding.image == pair]
     assert [finding.rcs_put_dbsm for finding in findings] == pytest.approx([-10, 0, 10])
     for finding in findings:
@@ -95,7 +95,7 @@ def test_noise_of_a_calibrated_image_agrees_with_the_noise_figure(flown, pair):
 
 @pytest.mark.slow
 def test_receiver_gain_error_of_6_db_is_flagged_from_noise(flown, tmp_path):
-    """Eq. 8b: noise compared with the configured figure, or without one with the physical limit of 0 dB."""
+    """By eq. 8b, noise is compared with the configured noise figure or, if not configured, with 0 dB."""
     assert not any("noise_disagrees" in report_of(flown, pair)["flags"] for pair in PAIRS)
     root = copy_writable(flown.root, tmp_path / "campaign")
     for wrong_db, figure_db, flagged in ((6.0, 6.0, True), (-6.0, 6.0, True), (6.0, None, False), (12.0, None, True)):
@@ -120,7 +120,7 @@ def test_sigma0_states_its_quantity_and_scales_with_the_image(flown):
     assert means["calibration_std_db"] == 0.5
     with rasterio.open(str(flown.result("f01", "uav1-uav1", "db.tif"))) as raster:
         ratio_db = sigma0_db - raster.read(1)
-    assert np.nanmax(ratio_db) - np.nanmin(ratio_db) < 10  # spreading and beams over six metres, and no speckle
+    assert np.nanmax(ratio_db) - np.nanmin(ratio_db) < 10  # spreading loss and beams over six metres, without speckle
     assert flown.result("f01", "uav1-uav1", "sigma0_db.qml").is_file()
     assert not flown.result("f01", "uav1-uav1", "gamma0_db.tif").exists()
 
@@ -210,7 +210,7 @@ def test_coefficient_no_longer_configured_is_removed(flown, tmp_path):
 
 @pytest.mark.slow
 def test_mean_power_is_on_a_coarser_grid_and_states_its_quantity(flown, tmp_path):
-    """Linear and in dB, for the configured coefficients: mean preserved, noise subtracted, speckle filtered."""
+    """Linear and dB files of all coefficients: mean preserved, noise subtracted, speckle filtered."""
     root = copy_writable(flown.root, tmp_path / "campaign")
     products = {f"multilook_sigma0{end}" for end in ("_power.tif", "_power.qml", "_db.tif", "_db.qml")}
     means = {}
@@ -240,7 +240,7 @@ def test_mean_power_is_on_a_coarser_grid_and_states_its_quantity(flown, tmp_path
         sigma0 = 10 ** (raster.read(1) / 10)
     with rasterio.open(str(folder / "nesz.tif")) as raster:
         noise = (10 ** (raster.read(1).astype(np.float64) / 10)).reshape(20, 6, 20, 6).mean(axis=(1, 3))
-    dim = means[False] < np.median(means[False])  # in bright pixels it is below the precision of float32
+    dim = means[False] < np.median(means[False])  # in bright pixels, the noise is below the precision of float32
     np.testing.assert_allclose((means[False] - means[True])[dim], noise[dim], rtol=0.01)
     assert means[False].mean() == pytest.approx(np.nanmean(sigma0), rel=0.05)
     edit_config(root, lambda document: document["processing"].pop("multilook"))
@@ -249,7 +249,7 @@ def test_mean_power_is_on_a_coarser_grid_and_states_its_quantity(flown, tmp_path
 
 
 def test_mean_power_of_a_relative_image_is_its_pixel_mean(finished_tiny, tmp_path):
-    """Mean of the pixels of power.tif, also in blocks at the edge; the image stays up to date."""
+    """The mean is that of the pixels of power.tif, also in blocks at the edge; the image remains up to date."""
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     campaign = state(root, "processing", multilook={"spacing_m": 0.4})
     settings = [result_of(which, "image", "f01", "uav1-uav1").settings for which in (finished_tiny, campaign)]
@@ -288,7 +288,7 @@ def test_mean_power_of_sums_subtracts_the_noise_of_their_pairs(finished_tiny, tm
             if subtracted:
                 peaks, n = read(f"fused/{source}_power.tif")[1]["divided_by"], 2
                 for pair, peak in peaks.items():
-                    looks, _, tags = read(f"{pair}/looks.tif")  # every pulse counts, so that they are Σw² and M
+                    looks, _, tags = read(f"{pair}/looks.tif")  # every pulse contributes: Σw² and M
                     noise[source] += float(tags["APERTURA_PULSE_NOISE"]) / looks[5, 9] / peak**2
                 noise[source] /= n**2 if source == "coherent" else n
             assert squares[1, 2] == pytest.approx(pixels[4:8, 8:12].mean() - noise[source], rel=1e-3)
@@ -323,7 +323,7 @@ def test_mean_power_is_in_the_mosaic_and_the_catalog(finished_tiny, tmp_path):
 
 @pytest.mark.slow
 def test_sigma0_is_nan_in_layover_and_shadow(flown, tmp_path):
-    """Ridge with layover in front of it and shadow behind it: eq. 10."""
+    """A ridge causes layover in front of it and shadow behind it (eq. 10)."""
     root = copy_writable(flown.root, tmp_path / "campaign")
     east, north, _ = projected_from_ecef("EPSG:32632", DEMO_ORIGIN.ecef(np.zeros(3)))
     west, top = np.floor(east) - 10, np.ceil(north) + 10
@@ -345,6 +345,6 @@ def test_sigma0_is_nan_in_layover_and_shadow(flown, tmp_path):
     assert np.isnan(beta0[mask != 0]).all()
     assert np.isfinite(beta0[mask == 0]).all()
     assert np.isfinite(sigma0[mask == 0]).mean() > 0.95  # except slopes close to layover
-    nesz = rasterio.open(str(folder / "nesz.tif")).read(1)  # per facet, like σ⁰
+    nesz = rasterio.open(str(folder / "nesz.tif")).read(1)  # per facet, as for σ⁰
     assert np.array_equal(np.isfinite(nesz)[mask == 0], np.isfinite(sigma0)[mask == 0])
     assert np.isnan(squares[(np.isnan(sigma0).reshape(30, 4, 30, 4).sum(axis=(1, 3)) > 8)]).all()

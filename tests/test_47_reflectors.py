@@ -88,7 +88,7 @@ def ball_m2():
 
 
 def corner_m2():
-    """Return the mean cross-section of the trihedral over f01: a simulated point has the same in all directions."""
+    """Return the mean cross-section of the trihedral over f01: simulated points are isotropic."""
     track = preset("demo", pulses=120).flights[0].tracks["uav1"]
     position_m = np.array(track.start_m) + np.outer(np.arange(120) / 20, track.velocity_m_s)
     away = position_m - CORNER
@@ -182,7 +182,7 @@ def test_constant_is_within_its_deviation(measured, pair):
 
 @pytest.mark.slow
 def test_cross_sections_of_another_flight_are_calibrated(later):
-    """Another track and other targets without a configured radio: calibrated by the file alone."""
+    """A flight with another track and other targets, without a configured radio, is calibrated by the file alone."""
     findings = [finding for finding in score(later) if finding.image in PAIRS]
     assert len(findings) == 4
     for finding in findings:
@@ -220,7 +220,7 @@ def test_changed_calibration_file_outdates_the_layers(later, tmp_path):
 
 @pytest.mark.slow
 def test_wrongly_configured_radio_is_flagged_and_not_used(later, tmp_path):
-    """Receiver gain wrong by 4 dB, eight of the configured standard deviations."""
+    """The receiver gain is wrong by 4 dB, eight configured standard deviations."""
     root = copy_writable(later.root, tmp_path / "campaign")
     pair, scene = open_pair(later, "f01", "uav1-uav1"), open_scene(later)
     by_gain = {}
@@ -239,7 +239,7 @@ def test_wrongly_configured_radio_is_flagged_and_not_used(later, tmp_path):
 
 @pytest.mark.slow
 def test_gain_loss_between_flights_is_flagged_in_its_pair(measured, tmp_path):
-    """Samples of uav1 are lower by a fifth (1.94 dB) in f02; those of uav2 are unchanged."""
+    """Samples of uav1 are lower by a fifth (1.94 dB) in f02; samples of uav2 are unchanged."""
     root = copy_writable(measured.root, tmp_path / "campaign")
     shutil.rmtree(root / "results")
     path = root / "raw/f02/uav1.sigmf-data"
@@ -282,7 +282,7 @@ def test_outdated_images_are_refused_for_calibration(measured, tmp_path):
 
 @pytest.mark.slow
 def test_reflectors_outside_the_image_are_excluded_with_a_dem(measured, tmp_path):
-    """Terrain 0.5 m below both reflectors: they are measured where they are imaged, with the loss of focus."""
+    """The terrain is 0.5 m below both reflectors; each is measured at its imaged position, with the loss of focus."""
     root = copy_writable(measured.root, tmp_path / "campaign")
     shutil.rmtree(root / "results")
     scene = measured.settings.scene
@@ -318,7 +318,7 @@ def test_reflectors_outside_the_image_are_excluded_with_a_dem(measured, tmp_path
 
 @pytest.mark.slow
 def test_phase_history_is_calibrated_from_its_images(measured, tmp_path):
-    """CPHD without amplitude scale and beams: the constant includes the gain towards the reflectors."""
+    """The CPHD has neither amplitude scale nor beams; the constant includes the gain towards the reflectors."""
     (tmp_path / "config").mkdir()
     scene = measured.values["scene"]
     waveform = {"kind": "phase_history", "format": "cphd"}
@@ -476,7 +476,7 @@ def test_calibration_without_configured_reflectors_is_refused(tiny):
 
 @pytest.mark.slow
 def test_reflector_is_refused_for_a_polarisation_it_does_not_return(measured, tmp_path):
-    """Trihedrals and spheres return H as H: HV contains only leakage, which yields no constant."""
+    """Trihedrals and spheres return H as H; HV contains only leakage, from which no constant is derived."""
     root = copy_writable(measured.root, tmp_path / "campaign")
 
     def with_receive_polarisation(letter):
@@ -497,7 +497,7 @@ def test_reflector_is_refused_for_a_polarisation_it_does_not_return(measured, tm
 
 @pytest.mark.slow
 def test_receiver_gain_change_is_flagged_from_noise(later, tmp_path):
-    """The file is of a gain higher or lower by 6 dB, which makes all cross-sections wrong by 6 dB."""
+    """The file was measured with a gain higher or lower by 6 dB, so that all cross-sections are wrong by 6 dB."""
     for factor, flagged in ((1.0, False), (4.0, True), (0.25, True)):
         root = copy_writable(later.root, tmp_path / f"{factor:g}")
         change_file(

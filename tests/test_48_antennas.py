@@ -36,7 +36,7 @@ BEAM = {"boresight_deg": [90.0, -DEPRESSION_DEG], "beamwidth_deg": [15.0, 60.0]}
 
 
 def simulated(folder, antennas, snr_db):
-    """Simulate a straight track along azimuth 40° with one target abeam of its middle."""
+    """Simulate a straight track along azimuth 40° with one target abeam of the midpoint."""
     plan = preset("demo", pulses=PULSES)
     speed = STEP_M * plan.waveform.prf_hz
     start = -RIGHT * BACK_M - AHEAD * STEP_M * (PULSES - 1) / 2 + [0, 0, UP_M]
@@ -189,7 +189,7 @@ def test_sampled_gaussian_pattern_equals_the_analytic_beam(beamed):
 
 
 def test_beam_rotates_with_the_logged_yaw(beamed):
-    """With yaw reversed, the beam points to the other side; the off-boresight angle is smallest at the track ends."""
+    """With reversed yaw, the beam points to the other side; the off-boresight angle is smallest at the track ends."""
     log = beamed / "raw" / "f01" / "uav1.track.csv"
     head, *lines = log.read_text().splitlines()
     reversed_yaw = [",".join([*line.split(",")[:-1], str(float(line.split(",")[-1]) - 180)]) for line in lines]
@@ -269,7 +269,7 @@ def test_presumming_is_refused_with_beams(beamed):
 
 @pytest.mark.slow
 def test_phase_of_a_pattern_is_in_the_budget_and_flagged(beamed):
-    """Quadratic phase of 120° at 10° off boresight in each antenna, compared with zero phase."""
+    """Each antenna has a quadratic phase of 120° at 10° off boresight, compared with zero phase."""
     azimuth = [(angle, -12.04 * (angle / 15) ** 2) for angle in range(-20, 21, 2)]
     for phase_deg, flagged in ((0.0, False), (120.0, True)):
         antenna = pattern(beamed, azimuth, phase_deg=lambda angle, at_10_deg=phase_deg: at_10_deg * (angle / 10) ** 2)

@@ -22,7 +22,7 @@ HEIGHT_OFFSET_M = 0.1
 
 
 def run_two_flights(root):
-    """Run two flights, the second of one node, higher by 0.1 m and a day later; tiles of 16 of 60 pixels."""
+    """Run two flights, the second with one node, 0.1 m higher and a day later; tiles are 16 of 60 pixels wide."""
     plan = preset("demo", pulses=120)
     first, grid = plan.flights[0], ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1)
     track = first.tracks["uav1"]
@@ -62,7 +62,7 @@ def test_images_are_selected_by_name(campaign, opened):
 
 
 def test_cube_has_the_metadata_of_cf(campaign, opened):
-    """Checks of the IOOS compliance-checker for CF-1.11, and dB, which CF allows but the checker does not know."""
+    """The cube passes the IOOS compliance checker for CF-1.11, except for dB, which CF permits."""
     assert opened.attrs["Conventions"] == "CF-1.11"
     assert campaign.settings.campaign in opened.attrs["title"]
     assert opened.attrs["history"]

@@ -66,7 +66,7 @@ def test_side_of_a_straight_track_is_stated_but_not_observable():
 
 @pytest.mark.slow
 def test_side_is_observable_with_lateral_but_not_vertical_motion():
-    """Phase error of a mirrored point for a lateral rms deviation w: 4π/λ·2w sin θ."""
+    """The phase error of a mirrored point for a lateral rms deviation w is 4π/λ·2w sin θ."""
     bend = 0.05 * np.sin(np.linspace(-9, 9, 101))
     view = view_of(straight_track(bend))
     wavelength = SPEED_OF_LIGHT_M_S / (1.2e9 + 32e6)

@@ -102,7 +102,7 @@ def flip_right_arm(document):
 
 @pytest.mark.slow
 def test_sign_error_of_a_lever_arm_is_identified(tmp_path):
-    """Both images are sharp but displaced by 33 and 26 cm: only the comparison of pairs detects the error."""
+    """Both images are sharp but displaced by 33 and 26 cm; only the comparison of pairs detects the error."""
     campaign = run_sample(tmp_path, lambda root: edit_config(root, flip_right_arm))
     reports = reports_of(campaign)
     for pair in PAIRS:
@@ -146,7 +146,7 @@ def test_log_late_by_half_a_second_is_identified(tmp_path):
 
 @pytest.mark.slow
 def test_random_log_errors_have_no_single_cause(tmp_path):
-    """Errors of 2 cm: several hypotheses regain 2 dB of the loss of 7 dB, and so do random tracks."""
+    """With errors of 2 cm, several hypotheses and random tracks all regain 2 dB of the loss of 7 dB."""
     generator = np.random.default_rng(5)
 
     def noisy(lines):
@@ -195,7 +195,7 @@ def test_hypothesis_is_reported_if_it_alone_explains_the_loss(trials, drawn, los
     [
         (-1.35, 0.3, 1.6, True),
         (-1.35, 0.3, 0.0, False),  # the cause is in another pair
-        (-1.35, 0.6, 1.6, False),  # chance
+        (-1.35, 0.6, 1.6, False),  # not significant
         (-3.0, 0.3, 1.6, False),  # most of the loss has another cause
         (-0.1, 0.01, 0.3, False),
     ],
@@ -278,7 +278,7 @@ def papers_flight(tmp_path_factory):
     ("spacing_m", "reason"), [(0.1, ""), (0.11, "pixels of 0.11 m do not sample resolution cells of 0.0997 m")]
 )
 def test_pixels_much_wider_than_a_resolution_cell_are_not_compared(spacing_m, reason):
-    """Resolution cell 9.97 cm, pixels 10 cm: the band is sampled at the Nyquist rate up to 1.13 cells."""
+    """The resolution cell is 9.97 cm; pixels of up to 1.13 cells sample the band at the Nyquist rate."""
     images = {pair: SimpleNamespace(cell_m=0.0997) for pair in PAIRS}
     grid = SceneGrid("local", 0.0, 10.0, spacing_m, (100, 100))
     assert assess._too_coarse(images, grid).partition(":")[0] == reason
@@ -286,7 +286,7 @@ def test_pixels_much_wider_than_a_resolution_cell_are_not_compared(spacing_m, re
 
 @pytest.mark.slow
 def test_flight_of_the_paper_is_added_in_phase(papers_flight):
-    """Resolution 12 cm × 54 cm; the paper states 11 cm × 49 cm for segments that it does not specify."""
+    """The resolution is 12 cm × 54 cm; the paper states 11 cm × 49 cm for unspecified segments."""
     report = json.loads((papers_flight.results / "f01" / "fused" / "image.json").read_text())
     assert report["flags"] == {}
     assert report["focus"]["verdict"] == "focused"
@@ -316,7 +316,7 @@ def test_path_error_of_the_papers_flight_is_flagged(papers_flight, tmp_path, wav
 
 @pytest.mark.parametrize("height_m", [-3.0, 0.5, 3.0])
 def test_height_hypothesis_moves_its_point(monkeypatch, height_m):
-    """Terrain lower by 3 m displaces points by several metres, at a constant mean path."""
+    """Terrain that is 3 m lower displaces points by several metres, at a constant mean path."""
     track = np.stack([np.linspace(-5, 5, 64), np.full(64, -30.0), np.full(64, 25.0)], -1)
     pairs = [SimpleNamespace(history=SimpleNamespace(aperture=Aperture(track, track + [0.0, 4.0, 2.0])))]
     point_m = np.array([1.0, 2.0, 0.0])

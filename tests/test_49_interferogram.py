@@ -35,7 +35,7 @@ FILES = {export.file for export in exports_in("interferogram")} | {"interferogra
 
 
 def two_flights(*, half_width_m, density_per_m2, pulses=60, rise_m=1.0):
-    """Return a specification: two passes over a ramp at two heights; the config has flat terrain and two points."""
+    """Return a specification: two passes over a ramp at two heights; the config states flat terrain and two points."""
     step_m, velocity = 12.0 / pulses, (120.0 / pulses, 0.0, 0.0)
     edge = half_width_m + 1.5
 

@@ -1,4 +1,4 @@
-"""Tiles formed by workers of a dask scheduler: identical bytes, results stay up to date, errors are one message."""
+"""Tiles formed by workers of a dask scheduler: bytes are identical, results stay up to date, errors are one message."""
 
 import time
 

@@ -1,4 +1,4 @@
-"""Campaign of the Snakemake workflow catalogue in `.test/`: it runs and gives a focused image."""
+"""Campaign of the Snakemake workflow catalogue in `.test/`: the workflow runs and gives a focused image."""
 
 import json
 import shutil

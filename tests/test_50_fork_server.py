@@ -1,4 +1,4 @@
-"""Fork server of steps: the executor sends it exactly the jobs that are plain step commands."""
+"""Fork server of steps: the executor sends exactly the jobs that are plain step commands to the server."""
 
 import csv
 import json
@@ -18,7 +18,7 @@ STEP = "apertura step image f01 uav1-uav2 --threads 2 > results/logs/f01/uav1-ua
 
 
 class Workflow(SimpleNamespace):
-    """Stub of Snakemake's workflow as an executor uses it; records the ends of jobs."""
+    """Stub of Snakemake's workflow for an executor, which records the ends of jobs."""
 
     def __init__(self, requests):
         self.ends = queue.Queue()

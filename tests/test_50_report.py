@@ -1,4 +1,4 @@
-"""`apertura report` end to end, and its file in a browser without network access."""
+"""`apertura report` from end to end, and its page in a browser without network access."""
 
 import os
 import subprocess

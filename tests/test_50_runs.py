@@ -145,16 +145,18 @@ SECONDS = {
     "image": 110.0,
     "export": 8.0,
 }
-"""Times of steps of a long flight: scene and tracks are mostly start-up, layers and export write rasters."""
+"""Times of steps of a long flight: those of scene and tracks are mainly start-up, those of layers and export are
+writing of rasters.
+"""
 
 
 def estimated_and_true(campaign, expected, cores=2):
-    """Return at each step end of a scripted run: estimated (or None) and true seconds left, and timed rules."""
+    """Return the estimated (or None) and true seconds left at each step end of a scripted run, and the timed rules."""
     time_left, run = TimeLeft(campaign, cores), RunRecord(planned=dict.fromkeys(SECONDS, 6))
     time_left._expected = lambda rule, _: expected[rule]
     waiting = [rule for rule in SECONDS for _ in range(6)]
     ends = [0.0] * cores
-    for number, rule in enumerate(waiting):  # each on the first free core
+    for number, rule in enumerate(waiting):  # each step runs on the first free core
         core = ends.index(min(ends))
         run.jobs[number] = JobRecord(rule, (rule, "f01", f"p{number}"), "", ends[core])
         ends[core] += SECONDS[rule]
@@ -172,7 +174,7 @@ def estimated_and_true(campaign, expected, cores=2):
 
 @pytest.mark.parametrize("factor", [0.2, 1.0, 50.0])
 def test_time_left_is_within_a_factor_of_two_or_unknown(finished_tiny, factor):
-    """Expected times of images wrong by a factor (0.2 is the limit), those of other steps half the true ones."""
+    """Expected times are wrong by a factor for images (limit: 0.2), and by one half for other steps."""
     expected = {rule: seconds * (factor if rule == "image" else 0.5) for rule, seconds in SECONDS.items()}
     estimates = estimated_and_true(finished_tiny, expected)
     known = [(left, true) for left, true, _ in estimates if left is not None]
@@ -204,7 +206,7 @@ def test_share_of_tiles_takes_start_up_and_its_part_of_the_work(finished_tiny):
 
 
 def test_time_left_is_unknown_before_the_first_image(finished_tiny):
-    """An image may take 1000 times longer (double sum); also with shares of tiles, and without progress reports."""
+    """An image may take 1000 times longer (double sum), also in several jobs or without progress reports."""
     started = JobRecord("image", ("image", "f01", "uav1-uav1"), "", 40.0)
     for waiting in (
         {"planned": {"scene": 9, "tracks": 9, "image": 1}},
@@ -233,7 +235,7 @@ def test_shares_of_tiles_yield_the_time_left_of_the_image(finished_tiny):
 
 
 def test_time_left_is_unknown_while_tiles_are_recomputed(finished_tiny):
-    """Images took 60 s; one has run for 95 s, and its tiles are being recomputed in parts."""
+    """Images took 60 s; one image has taken 95 s so far, and its tiles are being recomputed in parts."""
     done = JobRecord("image", ("image", "f01", "uav1-uav1"), "", 0.0, 60.0)
     run = RunRecord(planned={"image": 2}, jobs={1: done, 2: replace(done, begun_s=60.0, ended_s=None)})
     for parts, is_known in ((0, False), (1, False), (4, True)):
@@ -243,7 +245,7 @@ def test_time_left_is_unknown_while_tiles_are_recomputed(finished_tiny):
 
 
 def test_first_tiles_do_not_determine_the_time_left(finished_tiny):
-    """After 30 s one of 100 tiles is finished, because tables come first; an image took 60 s, not 50 minutes."""
+    """After 30 s, one of 100 tiles is finished, because tables precede; an image takes 60 s, not 50 minutes."""
     done = JobRecord("image", ("image", "f01", "uav1-uav1"), "", 0.0, 60.0)
     run = RunRecord(planned={"image": 2}, jobs={1: done, 2: replace(done, begun_s=60.0, ended_s=None)})
     progress = {2: StepProgress("tiles", 1, 100, 60.0, 90.0)}
@@ -302,7 +304,7 @@ def test_progress_outside_the_results_is_not_read(finished_tiny):
 
 
 class Terminal(io.StringIO):
-    """A stream that reports to be a terminal."""
+    """A stream that is reported as a terminal."""
 
     def isatty(self):
         return True

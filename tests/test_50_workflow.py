@@ -28,7 +28,7 @@ def contents(root):
 
 
 TO_IMAGES = ("--until", "image")
-"""Option for runs that are killed and resumed: later products follow from the images."""
+"""Option for runs that are killed and resumed; later products are derived from the images."""
 
 
 def configure_many_tiles(root):
@@ -139,7 +139,7 @@ def test_killed_run_with_scattered_tiles_gives_identical_results(tiny, uninterru
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     process.stdout.close()
-    receipt = tiny / "results/f01/uav1-uav1/tiles/1-of-3.json"  # receipt of a share finished before the kill
+    receipt = tiny / "results/f01/uav1-uav1/tiles/1-of-3.json"  # receipt of a group of tiles finished before the kill
     receipt.parent.mkdir(exist_ok=True)
     receipt.write_text("{}")
     code, output = finished(apertura("run", tiny, *TO_IMAGES, "--set-scatter", "tiles=4"))
@@ -200,7 +200,7 @@ def append_keeping_times(path):
 @pytest.mark.slow
 @pytest.mark.parametrize("program", ["snakemake", "apertura"])
 def test_changed_input_with_kept_time_reruns_dependent_steps(finished_tiny, tmp_path, program):
-    """Results without Snakemake's records: out-of-date results are found by hashes alone.
+    """Without Snakemake's records, out-of-date results are found by hashes alone.
 
     Images of a flight depend on all its pairs, through track refinement; profiles do not.
     """
@@ -291,7 +291,7 @@ def test_steps_end_with_the_run_whichever_process_is_killed(tiny, uninterrupted,
     assert steps
     for number in (snakemake_itself, *steps):
         with contextlib.suppress(OSError):  # a step may have finished
-            assert state_and_parent(number)[1] == fork_server  # no process of Snakemake in between
+            assert state_and_parent(number)[1] == fork_server  # there is no process of Snakemake in between
     os.kill({"the run": run.pid, "snakemake": snakemake_itself}.get(killed, fork_server), signal.SIGKILL)
     code, output = finished(run, timeout=60)
     assert code == (-signal.SIGKILL if killed == "the run" else 1)

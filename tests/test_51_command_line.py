@@ -40,7 +40,7 @@ def test_every_problem_is_a_separate_line(tiny):
 
 @pytest.mark.slow
 def test_closed_output_pipe_ends_a_command_silently(finished_tiny):
-    """Exit status of `apertura summary | true`: 128 plus the number of SIGPIPE."""
+    """The exit status of `apertura summary | true` is 128 plus the number of SIGPIPE."""
     reading, writing = os.pipe()
     os.close(reading)
     with os.fdopen(writing, "w") as closed:
@@ -91,7 +91,7 @@ def test_out_of_memory_is_one_message():
 @pytest.mark.quick("words0")
 @pytest.mark.parametrize("words", [(), ("paper-part", "effects"), ("sweep", "stability", "--folder", "x"), ("--help",)])
 def test_missing_study_distribution_is_one_message(words):
-    """Installation of apertura alone: no other distribution has commands."""
+    """Only apertura is installed, and no other distribution provides commands."""
     code = (
         "import importlib.metadata as metadata, sys\n"
         "metadata.entry_points = lambda **_: ()\n"

@@ -160,7 +160,7 @@ def test_partial_run_reports_finished_and_missing_results(finished_tiny, tmp_pat
 
 def test_outdated_image_with_a_report_is_not_finished(finished_tiny, tmp_path, run_command):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
-    (root / "results/f01/uav1-uav2/export.manifest.json").unlink()  # like a run that did not reach this step
+    (root / "results/f01/uav1-uav2/export.manifest.json").unlink()  # as after a run that did not reach this step
     assert not is_finished(Campaign.load(root))
     status, out, _ = run_command("summary", root)
     assert status == 0
@@ -176,7 +176,7 @@ def test_commands_read_results_without_recordings(finished_tiny, tmp_path, run_c
         path.unlink()
     command, *options = words.split()
     status, out, err = run_command(command, root, *options)
-    needs_raw = missing == "all" and command in {"check", "run"}  # which read logs and codes
+    needs_raw = missing == "all" and command in {"check", "run"}  # these commands read logs and codes
     assert status == (1 if command == "verify" else 2 if needs_raw else 0), out + err
     if command == "verify":
         assert re.findall(r"^(\w+) +(\S+sigmf-data):", out, re.MULTILINE) == [("missing", name) for name in SAMPLES]

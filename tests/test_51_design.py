@@ -90,7 +90,7 @@ def run_command(monkeypatch, capsys, *words):
 
 
 def test_flight_time_includes_take_off_transit_and_landing(folder):
-    """Climb and descent of 30 m at 2 m/s and 15.6 m back home at 1 m/s, in addition to the mission of 15.6 s."""
+    """The flight adds climb and descent of 30 m at 2 m/s and a return of 15.6 m at 1 m/s to the mission of 15.6 s."""
     design = designed(read_flight_plan(folder / "plan.yaml"), folder)
     back_m = np.radians(WAYPOINTS[1][1] - WAYPOINTS[0][1]) * 6.378e6 * np.cos(np.radians(WAYPOINTS[0][0]))
     assert design.recording.transfer_s["f01"] == pytest.approx(2 * 30 / 2 + back_m, rel=0.01)
@@ -103,7 +103,7 @@ def test_mission_yields_report_layers_and_config(folder, monkeypatch, capsys):
     assert (status, err) == (0, "")
     table = [line.split() for line in out.splitlines()]
     assert ["coverage", "0.95", "1", "yes"] in [words[:4] for words in table]
-    assert any("uav1" in line and "100.0" in line for line in out.splitlines())  # share of the scene, %
+    assert any("uav1" in line and "100.0" in line for line in out.splitlines())  # fraction of the scene, %
     page = (folder / "out" / "design.html").read_text()
     assert page.count("data:image/png") == 2
     assert "GO: all requirements met (1 of 1)" in page
@@ -154,7 +154,7 @@ def test_comparison_contains_the_nesz_of_calibrated_images_only(finished_tiny, t
         values, tags, profile = raster.read(1), raster.tags(), raster.profile
     measured = _measured(campaign, "f01", "uav1-uav1")
     assert measured.pop("nesz, dB") == pytest.approx(np.nanmedian(values))
-    del tags["APERTURA_RADIOMETRY"]  # like an image without a configured radio: relative dB
+    del tags["APERTURA_RADIOMETRY"]  # as for an image without a configured radio: relative dB
     with rasterio.open(str(path), "w", **profile) as raster:
         raster.write(values, 1)
         raster.update_tags(**tags)
@@ -163,7 +163,7 @@ def test_comparison_contains_the_nesz_of_calibrated_images_only(finished_tiny, t
 
 @pytest.mark.slow
 def test_predicted_image_quality_is_measured_in_the_simulated_flight(tmp_path, monkeypatch, capsys):
-    """Widths within 5 %, NESZ and RCS within 1 dB: the noise of 256 pulses is measured to 0.4 dB."""
+    """Widths agree within 5 %, NESZ and RCS within 1 dB; the noise of 256 pulses is measured to 0.4 dB."""
     document = copy.deepcopy(PLAN) | {"flights": {"f01": PLAN["flights"]["f01"] | {"tracks": {"uav1": LINE}}}}
     design = designed(FlightPlan.model_validate(document), tmp_path)
     campaign = run_steps(rehearse(design.opened, [PointTarget((0.0, 0.0, 0.0))], tmp_path / "flown"), exports=False)

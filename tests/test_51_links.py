@@ -63,7 +63,7 @@ def test_read_only_command_writes_only_hashes(finished_tiny, tmp_path, words):
 
 @pytest.mark.parametrize("while_running", [False, True], ids=["before", "while it runs"])
 def test_links_and_pipes_in_results_change_nothing_outside(tmp_path, while_running):
-    """A selection of the trials of `python -m tests.attack.links`."""
+    """The trials are a selection of those of `python -m tests.attack.links`."""
     names = ["list", "clean", "preview", "step scene"]
     outcomes = trials_of(tmp_path, names, kinds=list(KINDS), seed=1, most=2, while_running=while_running)
     assert len(outcomes) >= 2 * len(names)

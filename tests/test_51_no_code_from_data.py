@@ -84,7 +84,7 @@ TYPED = {
 """Command → command line in the campaign folder, if it has arguments."""
 
 MAY_REFUSE = {"align", "bench", "step bench", "reflectors", "step calibrate", "step interferogram", "step page"}
-"""Commands whose requirements such a campaign does not meet."""
+"""Commands whose requirements the tested campaign does not meet."""
 
 WORKFLOW_COMMANDS = {
     "apertura, in the campaign": ("{bin}/apertura run . --cores 2", "{campaign}"),
@@ -191,7 +191,7 @@ def finished(_finished, tmp_path):
 
 @pytest.mark.slow
 def test_executed_or_opened_marker_is_detected(unfinished, monkeypatch):
-    """Check of the detection: Python started in the folder, and a file outside the folder that is read."""
+    """The detection is checked with Python started in the folder, and with a file read outside the folder."""
     monkeypatch.delenv(SAFE_PATH, raising=False)  # set by earlier tests in this process
     planted = plant(unfinished)
     with planted.fires() as fired:
@@ -470,7 +470,9 @@ ANY_TEXT = {
     ("nodes", "*", "log", "body"),
     ("processing", "scheduler"),
 }
-"""Keys that accept any text: titles, options of other log formats, and settings that need an environment variable."""
+"""Keys that accept any text: titles, options of other log formats, and settings that require an environment
+variable.
+"""
 
 IN_ONE_PROCESS = """
 import sys, traceback, yaml
@@ -598,7 +600,7 @@ def test_code_in_the_config_is_refused(unfinished, start_from, line):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["version 2", "codec"])
 def test_stage_with_pickled_chunks_is_not_opened(finished, kind):
-    """A forged stage with valid checksums: zarr version 2 stores objects as pickles, and codecs may execute code."""
+    """The forged stage has valid checksums; zarr version 2 stores objects as pickles, and codecs may execute code."""
     planted, folder = plant(finished), finished / "results/f01/uav1-uav1/image.zarr"
     chunk = pickle.dumps(Code(planted.code("pickle")))
     if kind == "codec":
@@ -621,9 +623,10 @@ def test_stage_with_pickled_chunks_is_not_opened(finished, kind):
 
 
 def with_checksum(text):
-    """Return a JSON document that ends with its own CRC-32C: white space chosen so that the checksum is four blanks.
+    """Return a JSON document that ends with its own CRC-32C: white space makes the checksum four blanks.
 
-    CRC-32C is linear: a tab in place of a blank changes it by a fixed pattern; Gaussian elimination selects the tabs.
+    CRC-32C is linear: a tab in place of a blank changes the checksum by a fixed pattern; Gaussian elimination selects
+    the tabs.
     """
     blanks, whole = 64, int.from_bytes(b"    ", "little")
     plain = text.encode() + b" " * blanks
@@ -665,7 +668,7 @@ HARMLESS = {
     "TZ": ["nosuch/zone"],
     "ZARR_ARRAY__ORDER": ["F", "Q"],
 }
-"""Environment variables → values that do not affect a step, all set at once."""
+"""Environment variables → values that do not affect a step; all are set at once."""
 
 REFUSED = {
     "step pictures f01 uav1-uav2": {
@@ -676,7 +679,7 @@ REFUSED = {
     "run . -n": {"PATH": ["", "/nowhere"], "SNAKEMAKE_PROFILE": ["nosuch"]},
     "plan .": {"APERTURA_KERNEL": ["_backprojection.so"]},
 }
-"""Command → environment variables that it needs → values that it refuses."""
+"""Command → environment variables that the command needs → values that the command refuses."""
 
 
 @pytest.mark.slow

@@ -64,7 +64,7 @@ def test_facts_of_a_csv_log_agree_with_its_columns(shared):
 
 
 def test_attitude_in_radians_is_reported_without_a_campaign(tmp_path):
-    """Track of 40 m to the east with a yaw of π/2, and of 90."""
+    """The track is 40 m to the east, with a yaw of π/2 or of 90."""
     for yaw, is_radians in ((1.5708, True), (90.0, False)):
         time = np.datetime64("2026-05-14T09:30:00.0", "ms") + 100 * np.arange(80)
         rows = [
@@ -78,7 +78,7 @@ def test_attitude_in_radians_is_reported_without_a_campaign(tmp_path):
 
 
 def test_preview_of_a_log_labels_the_axes_of_its_frame(shared, tmp_path):
-    """Axes: east and north for positions on Earth, x, y and z in a local frame."""
+    """The axes are east and north for positions on Earth, and x, y and z in a local frame."""
     path = tmp_path / "uav1.track.csv"
     rows = [f"2026-05-14T09:30:0{second}Z,{second},0,20" for second in range(9)]
     path.write_text("\n".join(["time_utc,east_m,north_m,up_m", *rows, ""]))

@@ -1,4 +1,4 @@
-"""`apertura diff`: differences between two products are reported per section, and nothing else."""
+"""`apertura diff`: exactly the differences between two products are reported, per section."""
 
 import json
 

@@ -228,7 +228,7 @@ def test_edited_address_and_back_button_change_the_view(browser, address):
         until(frame, lambda: "colours=inferno" in window.url)
         window.evaluate("location.hash = location.hash.replace('colours=inferno', 'colours=viridis')")
         until(frame, lambda: frame.input_value("#colours") == "viridis")
-        assert window.evaluate("history.length") == length + 1  # added by the edit, not by messages of the map
+        assert window.evaluate("history.length") == length + 1  # by the edit, not by map messages
         window.go_back()
         until(frame, lambda: frame.input_value("#colours") == "inferno")
         assert window.url == before.replace("colours=grey", "colours=inferno")
@@ -366,7 +366,7 @@ ADD = "const add = (name, with_) => document.body.appendChild(Object.assign(docu
 
 
 class Listener(ThreadingHTTPServer):
-    """Local server of an empty page that records its connections, datagrams and requests."""
+    """Local server of an empty page that records connections, datagrams and requests."""
 
     daemon_threads = True
 
@@ -503,7 +503,7 @@ def test_page_in_the_results_is_not_shown(browser, finished, tmp_path):
 
 
 def test_preview_page_updates_and_keeps_the_selection(browser, tmp_path, monkeypatch):
-    """First half of the pulses, then all: the page updates without being reloaded."""
+    """The page shows the first half of the pulses, then all; it is updated without a reload."""
     monkeypatch.setattr(preview_pair, "AT_ONCE", 60)
     root = simulate(tmp_path / "campaign", preset("demo", pulses=120), seed=1)
     preview = Preview(Campaign.load(root), follow=True, every_s=1.0, end_after_s=1e6)

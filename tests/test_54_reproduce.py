@@ -48,7 +48,7 @@ def result_files(root):
 
 @pytest.mark.slow
 def test_products_are_reproduced_in_another_folder_with_other_cores(root, tmp_path, capsys):
-    """The original results are of one process with two threads; the workflow recomputes them on one core."""
+    """The original results were computed by one process with two threads; the workflow recomputes them on one core."""
     before = contents(root)
     assert print_reproduced(root, cores=1, keep=tmp_path / "another folder") == 0
     same, kept = capsys.readouterr().out.splitlines()[-2:]
@@ -69,7 +69,7 @@ def test_deleted_results_are_recomputed_with_identical_bytes(root):
 
 @pytest.mark.slow
 def test_product_of_changed_inputs_differs(root, capsys):
-    """Only the results that the product depends on are recomputed."""
+    """Only the results on which the product depends are recomputed."""
     path = root / "raw/f01/uav1.track.csv"
     text = path.read_text()
     path.write_text(text.replace(",620.", ",621.") if ",620." in text else text.replace("5,", "6,", 1))

@@ -1,4 +1,4 @@
-"""`apertura verify`: every change between a product and the raw samples is reported, and nothing else."""
+"""`apertura verify`: exactly the changes between a product and the raw samples are reported."""
 
 import shutil
 import subprocess
@@ -66,7 +66,7 @@ def test_changed_byte_of_a_stage_is_reported_at_the_stage(root, file):
 
 @pytest.mark.slow
 def test_any_changed_byte_of_the_last_manifest_is_reported(root):
-    """No other file contains its hash: its content and its formatting are compared with what it lists."""
+    """No other file contains the hash of this manifest; its content is compared with the files that it lists."""
     whole = (root / EXPORT).read_bytes()
     for at in range(0, len(whole), 97):
         flip(root / EXPORT, at)

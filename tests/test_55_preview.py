@@ -1,4 +1,4 @@
-"""Preview of a flight (`apertura preview`): images of the pulses so far, from incompletely written files."""
+"""Preview of a flight (`apertura preview`): images of the pulses recorded so far, from incompletely written files."""
 
 import hashlib
 import json
@@ -157,7 +157,7 @@ def test_rewritten_metadata_are_read_again(tiny, tmp_path):
         }
         growing.files[0].write_text(json.dumps(partial))
         assert len(growing.read().captures.start) == count
-    growing.files[0].write_text("")  # just truncated by its recorder
+    growing.files[0].write_text("")  # at this moment truncated by its recorder
     assert len(growing.read().captures.start) == captures
 
 
@@ -192,7 +192,7 @@ def test_pulses_beyond_the_log_wait_for_it(tiny):
 
 
 def other_flight(root, node="uav1"):
-    """Overwrite the files of a node with half of a flight of another day, like a restarted recorder."""
+    """Overwrite the files of a node with half of a flight of another day, as by a restarted recorder."""
     meta, data = (root / f"raw/f01/{node}.sigmf-{kind}" for kind in ("meta", "data"))
     document = json.loads(meta.read_text())
     for capture in document["captures"]:
@@ -434,7 +434,7 @@ def test_decimation_follows_the_delay(tiny, monkeypatch):
 
 @pytest.mark.slow
 def test_map_of_a_preview_serves_only_the_last_images(tiny, capsys):
-    """It waits for the first image, keeps two per pair, and resamples images to the grid of the scene."""
+    """The preview waits for the first image, keeps two per pair, and resamples to the grid of the scene."""
     preview, waiting = Preview(Campaign.load(tiny), follow=True, every_s=2.0, end_after_s=1e6), threading.Event()
 
     def serve():

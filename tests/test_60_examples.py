@@ -1,4 +1,4 @@
-"""Example campaigns of examples/: alignment, image formation and target positions with their measured data."""
+"""Campaigns of examples/ with measured data: alignment, image formation and target positions."""
 
 import runpy
 import shutil
@@ -71,7 +71,7 @@ def test_rail_pass_alignment_agrees_with_its_config(rail_pass):
 
 @pytest.mark.slow
 def test_alignment_with_fixed_path_offset_estimates_the_clock(rail_pass):
-    """Case of a further pass of the same radar."""
+    """This is the case of another pass of the same radar."""
     (rail_pass / "config/clocks.tsv").unlink()
     campaign = Campaign.load(rail_pass)
     alignment, stated = align(campaign, "passA", "radar", point=tuple(reflector(rail_pass)), search_m=0.0)

@@ -1,4 +1,4 @@
-"""How-tos with their own data: every code block runs and prints the output shown."""
+"""How-tos that create their own data: every code block runs and prints the output shown."""
 
 from pathlib import Path
 

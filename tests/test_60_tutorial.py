@@ -46,7 +46,7 @@ def test_qgis_project_of_the_tutorial_contains_every_image(finished_tiny, tmp_pa
     assert done.stdout.splitlines()[-1:] == ["4 images, EPSG:32632"], done.stderr
     again = subprocess.run([python, PROJECT, campaign], capture_output=True, text=True, check=False)
     assert again.returncode == 1
-    assert "there already" in again.stderr
+    assert "exists already" in again.stderr
     with zipfile.ZipFile(campaign / "campaign.qgz") as project:
         text = project.read("campaign.qgs").decode()
     layers = re.findall(r"<maplayer .*?</maplayer>", text, re.S)

@@ -72,7 +72,7 @@ def test_code_blocks_of_the_how_to_run_and_image_the_target(tmp_path, monkeypatc
 
 
 def test_written_campaign_equals_the_recorded_files(tmp_path, monkeypatch):
-    """Samples and time tags exactly, attitude to 1e-4°."""
+    """Samples and time tags are exactly equal, attitude to 1e-4°."""
     plain_files(tmp_path)
     monkeypatch.chdir(tmp_path)
     names, text = {}, HOWTO.read_text(encoding="utf-8")

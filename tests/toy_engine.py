@@ -1,4 +1,4 @@
-"""An engine outside the package: one file and one row of the engine table. Nearest sample, no interpolation."""
+"""An engine outside the package: one file and one row of the engine table. It uses the nearest sample."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -25,7 +25,7 @@ def available() -> bool:
 
 
 def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterator[Setting]:
-    """Yield a setting per refinement, so cheap that the planner selects it wherever -20 dB suffice."""
+    """Yield a setting per refinement, at a cost so low that the planner selects it wherever -20 dB suffices."""
     for refine in (requested.get("refine"),) if requested.get("refine") else (1, 4):
         yield Setting(
             "toy",

@@ -1,4 +1,4 @@
-"""Flights imaged by the tree engine: its predictions, its images, and the share of each summation method."""
+"""Flights imaged by the tree engine: predictions, images, and the fraction of each summation method."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -19,7 +19,7 @@ WAVENUMBERS = {"wavenumber_rad_m": 2 * np.pi * 1.2e9 / C, "band_rad_m": np.pi * 
 
 
 def seen(scene, pixels):
-    """Return a flight with profiles that extend beyond its pixels: filters of trees are long."""
+    """Return a flight with profiles that extend beyond its pixels, because the filters of trees are long."""
     around = [pixels[::9, ::9].reshape(-1, 3) + [east, north, 0] for east in (-5, 5) for north in (-5, 5)]
     wide = scene.profiles(ecef(np.concatenate(around)))
     return SimpleNamespace(scene=scene, pixels=pixels, profiles=wide, aperture=Aperture(scene.tx, scene.rx))
@@ -58,7 +58,7 @@ def heard(flight):
 
 
 def formed(flight, pixels=None, *, beams=None, **requested):
-    """Return the image, and the shares of it summed by tree, directly and not at all."""
+    """Return the image, and the fractions summed by tree, summed directly, and skipped."""
     chosen, counts = setting(flight, **{"nodes_db": -74} | requested), np.zeros(3, np.int64)
     places = ecef(flight.pixels if pixels is None else pixels)
     trees = tree.prepare(flight.profiles, **chosen.options)

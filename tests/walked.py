@@ -1,4 +1,4 @@
-"""Pages of docs/ that are executed: their blocks, and the output shown below each."""
+"""Executed pages of docs/: their blocks, and the output shown below each block."""
 
 import os
 import re
@@ -23,7 +23,7 @@ def blocks(page: Path):
 def walk(page: Path) -> dict[str, object]:
     """Run a page's blocks in the working folder and return the names that they define.
 
-    Printed words and integers must equal those shown; numbers with a decimal point may differ by 5 %.
+    Printed words and integers must equal the words and integers shown; numbers with a decimal point may differ by 5 %.
     """
     names: dict[str, object] = {}
     for line, kind, block, shown in blocks(page):
@@ -49,5 +49,5 @@ def run_commands(block: str) -> None:
 
 
 def _parts(text: str) -> tuple[list[str], list[float]]:
-    """Return the words of a text, with a mark for every number that has a decimal point, and these numbers."""
+    """Return the words of a text, with a marker for every number with a decimal point, and these numbers."""
     return _NUMBER.sub("#", text).split(), [float(number) for number in _NUMBER.findall(text)]

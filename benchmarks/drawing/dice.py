@@ -15,11 +15,11 @@ class Dice:
         self.generator = np.random.default_rng([seed, number])
 
     def between(self, low: float, high: float) -> float:
-        """Draw a number with a uniform logarithm."""
+        """Draw a log-uniformly distributed number."""
         return float(np.exp(self.generator.uniform(np.log(low), np.log(high))))
 
     def uniform(self, low: float, high: float) -> float:
-        """Draw a uniform number."""
+        """Draw a uniformly distributed number."""
         return float(self.generator.uniform(low, high))
 
     def one_of(self, *choices: Any) -> Any:

@@ -32,7 +32,7 @@ class Geometry:
 
     @property
     def ground_range_m(self) -> float:
-        """Horizontal distance of the track's middle from the scene's middle."""
+        """Horizontal distance of the track midpoint from the scene centre."""
         return float(np.sqrt(self.range_m**2 - self.up_m**2))
 
     @property
@@ -42,7 +42,7 @@ class Geometry:
 
 
 def draw_geometry(dice: Dice, highest_hz: float, bandwidth_hz: float, true: dict[str, str]) -> Geometry:
-    """Draw a track that samples its scene without ambiguity, or, as an intentional flaw, one that undersamples it."""
+    """Draw a track that samples its scene without ambiguity or, as an intentional flaw, undersamples the scene."""
     kind, pulses = dice.one_of(*KINDS), int(dice.between(80, 200))
     farthest_m = (MOST_SUBCARRIERS * C / bandwidth_hz - 8.0) / 4.0
     range_m = dice.between(max(8.0, 10 * C / bandwidth_hz), min(300.0, farthest_m))
@@ -74,7 +74,7 @@ def draw_geometry(dice: Dice, highest_hz: float, bandwidth_hz: float, true: dict
 
 
 def track(geometry: Geometry, behind_rad: float, farther: float) -> Track:
-    """Return a track about the origin, rotated by an angle against the transmitter's and at another range."""
+    """Return a track about the origin, rotated relative to the transmitter's track and at a different range."""
     ground, up = geometry.ground_range_m * farther, geometry.up_m * farther
     duration_s = (geometry.pulses - 1) / geometry.prf_hz
     middle = geometry.heading_rad + behind_rad + (np.radians(30) if geometry.kind == "squinted" else 0.0)

@@ -63,7 +63,7 @@ def _accuracy(axis: Any, rows: list[Row]) -> None:
     for row in rows:
         place = (row["seconds_from_echoes"], row["error_db"])
         axis.plot(*place, marker=_marker(row), color=_style(row)["color"])
-        below = row["name"] == "native"  # keeps its label apart from that of the tree at -80 dB
+        below = row["name"] == "native"  # separates the label from that of the tree at -80 dB
         axis.annotate(label(row), place, xytext=(6, -11 if below else 4), textcoords="offset points", fontsize=8)
     axis.set(xscale="log", xlabel=_SECONDS, ylabel="RMS error, dB (more accurate upwards)")
     geometry, surface, size, pulses = _SHOWN

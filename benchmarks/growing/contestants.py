@@ -36,13 +36,13 @@ class Contestant:
     run
         Returns the image at the checks, the CPU seconds common to all pixels, and the CPU seconds of the pixels.
     share
-        Share of the image's pixels that `run` forms; the CPU seconds of the pixels are divided by it.
+        Fraction of the image pixels that `run` forms; the CPU seconds of the pixels are divided by this fraction.
     aim_db
         Requested accuracy; None if the program has no such setting.
     from_echoes
         True if `run` includes range compression.
     ways
-        Path variant of an engine with several → number of pixels × pulses in the last run.
+        Path variant, for an engine with several variants → number of pixels × pulses in the last run.
     planning_s
         CPU seconds of apertura's planner, not included in other times; fastsar plans inside `run`.
     """
@@ -182,12 +182,12 @@ class EngineInput:
 
 
 def share_of(scene: Scene, windows: Iterable[Window]) -> float:
-    """Return the share of the image's pixels within the given windows."""
+    """Return the fraction of the image pixels within the given windows."""
     return sum((rows.stop - rows.start) * (columns.stop - columns.start) for rows, columns in windows) / scene.size**2
 
 
 def _formed(scene: Scene, predicted_s: float, limit_s: float, *, fields: bool) -> list[Window]:
-    """Return the largest set of windows predicted within the time limit, or the smallest if it is slightly over it."""
+    """Return the largest set of windows within the time limit, or the smallest set if it exceeds the limit slightly."""
     for windows in _samples(scene, fields=fields):
         seconds = predicted_s * share_of(scene, windows)
         if seconds <= limit_s:
@@ -198,7 +198,7 @@ def _formed(scene: Scene, predicted_s: float, limit_s: float, *, fields: bool) -
 
 
 def _samples(scene: Scene, *, fields: bool) -> Iterator[list[Window]]:
-    """Yield smaller and smaller sets of windows of the image, each with all compared pixels."""
+    """Yield sets of windows of the image in descending order of size, each with all compared pixels."""
     every, most = 1, -(-scene.size // TILE_PX)
     while every <= most:
         yield scene.tiles(every)

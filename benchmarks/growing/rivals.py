@@ -1,6 +1,6 @@
-"""fastsar on a scene: its exact formers and its factorized former, from phase history, in complete calls.
+"""fastsar on a scene: `ExactFormer`, `ImageFormer` (factorized) and its backprojection of points, in complete calls.
 
-Its images are (column, row), of a plane centred on the origin, and its samples refer to one-way range.
+Images of fastsar are (column, row) on a plane centred on the origin, and its samples refer to one-way range.
 """
 
 import time
@@ -34,22 +34,22 @@ class Fastsar:
         self.middle = scene.grid.positions_at([scene.size // 2], [scene.size // 2], 0.0)[0]
 
     def factorized(self, name: str, finer: int = 1, **options: Any) -> Contestant:
-        """Return its factorized former with planning, on pixels finer by a factor and then decimated.
+        """Return the factorized `ImageFormer` with planning, on pixels that are finer by a factor and then decimated.
 
-        Its smallest patches have 16 pixels: only finer pixels reduce their size, and the error of the image.
+        The smallest patches of `ImageFormer` have 16 pixels; only finer pixels reduce their size and the image error.
         """
         scene = self.scene
         if scene.geometry == "bistatic":
-            raise SkippedError("its factorized former supports monostatic geometries only")
+            raise SkippedError("ImageFormer supports monostatic geometries only")
         if not isinstance(scene.ground, FlatGround):
-            raise SkippedError("its factorized former supports planes only")
+            raise SkippedError("ImageFormer supports planes only")
         size, spacing = scene.size * finer, scene.grid.spacing_m / finer
         if size > 16384:
             raise SkippedError(f"{size}² pixels do not fit into memory")
 
         def run() -> tuple[Image, float, float]:
             begin = time.process_time()
-            with warnings.catch_warnings(action="ignore"):  # warns of its accuracy, which is measured below
+            with warnings.catch_warnings(action="ignore"):  # warns of the accuracy, which is measured below
                 former = self.package.ImageFormer(*self._grid(size, spacing), **self._options, **options)
             planned = time.process_time()
             image = former(scene.history.transfer)
@@ -60,10 +60,10 @@ class Fastsar:
         return Contestant(name, " ".join(settings) or "defaults", scene, run, from_echoes=True)
 
     def exact(self, limit_s: float) -> Contestant:
-        """Return its exact former of planes, tile by tile; range compression, part of every call, is counted once."""
+        """Return `ExactFormer` for planes, tile by tile; range compression, part of every call, is counted once."""
         scene = self.scene
         if scene.geometry == "bistatic" or not isinstance(scene.ground, FlatGround):
-            raise SkippedError("its exact former supports monostatic geometries and planes only")
+            raise SkippedError("ExactFormer supports monostatic geometries and planes only")
         predicted, every = _EXACT_S * scene.size**2 * len(scene.history), 1
         while predicted / every > limit_s and scene.tiles(2 * every) != scene.tiles(every):
             every *= 2
@@ -88,7 +88,7 @@ class Fastsar:
         return Contestant("fastsar exact", "cubic, 8×", scene, run, share, from_echoes=True)
 
     def points(self, limit_s: float) -> Contestant:
-        """Return its bistatic former of points, for the middles of the fields; its cost grows with their number."""
+        """Return the bistatic backprojection of the centres of the fields; the cost grows with their number."""
         scene, sample = self.scene, scene_points(self.scene)
         predicted = _POINT_S * sample.shape[0] * sample.shape[1] * sample.shape[2] * len(scene.history)
         if predicted > PATIENCE * limit_s:
@@ -119,7 +119,7 @@ class Fastsar:
         return {"backend": "cpu", "window": False, "ref": self.one_way_m}
 
     def _compression(self, upsample: int) -> float:
-        """Return CPU seconds of its range compression with its chunk size."""
+        """Return CPU seconds of the range compression of fastsar with its chunk size."""
         history = self.scene.history.transfer
         begin = time.process_time()
         for first in range(0, len(history), 256):
@@ -128,5 +128,5 @@ class Fastsar:
 
 
 def scene_points(scene: Scene) -> NDArray[np.float64]:
-    """Return positions of the pixels in the middles of fields, (field, row, column, 3) metres."""
+    """Return positions of the pixels at the centres of fields, (field, row, column, 3) metres."""
     return np.stack([scene.ground.positions(scene.grid[window]) for window in scene.inner])

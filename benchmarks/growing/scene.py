@@ -1,8 +1,8 @@
 """Scenes of clutter and noise whose aperture grows with the image.
 
-The flight goes back and forth next to the image over its full width; its height and distance, 10 m and 5 m at 512
-pixels of 5 cm, grow with the image, except for geometry `low`, where they are constant. Geometry `spotlight` is a
-straight flight at 10 km.
+The flight goes back and forth next to the image over the full width of the image; its height and distance, 10 m and 5 m
+at 512 pixels of 5 cm, grow with the image, except for geometry `low`, where they are constant. Geometry `spotlight` is
+a straight flight at 10 km.
 
 Fields of clutter are spread over the tiles of the image, one per row and column of tiles; every sample contains noise
 of equal power, so that errors of single pulses are as large as the planner predicts. Compared pixels are in the fields,
@@ -43,7 +43,7 @@ class Scene:
     geometry, surface
         Kinds of flight and terrain.
     history
-        Transfer functions, with the delay of the scene's middle removed.
+        Transfer functions, with the delay of the scene centre removed.
     grid, ground
         Grid and terrain of the image, in a local frame.
     fields
@@ -64,7 +64,7 @@ class Scene:
 
     @property
     def inner(self) -> list[Window]:
-        """Windows of the compared pixels, the middle of each field."""
+        """Windows of the compared pixels, at the centre of each field."""
         return [_inner(field) for field in self.fields]
 
     @property

@@ -1,4 +1,4 @@
-"""Error-free base campaigns into which mistakes are introduced: the sample, and one with a strongly curved track."""
+"""Error-free base campaigns into which mistakes are introduced: sample and strongly curved track."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -44,7 +44,7 @@ def curved_specification() -> CampaignSpecification:
 
 
 def bow(first_deg: float, up_m: float) -> Waypoints:
-    """Return an arc of 36° about the origin in 7 s, as flown manually with varying speed, distance and height.
+    """Return an arc of 36° about the origin in 7 s, typical of manual control, with varying speed, distance and height.
 
     On a uniform circle, a time offset only rotates the image; on this arc it distorts the image.
     """

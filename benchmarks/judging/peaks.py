@@ -54,7 +54,7 @@ def true_places(root: Path) -> NDArray[np.float64]:
 
 
 def find_targets(image: NDArray[np.complex64], grid: SceneGrid, places_m: NDArray[np.float64]) -> Peaks:
-    """Find the brightest point near each target, closer to it than to any other target.
+    """Find the brightest point near each target that is closer to this target than to any other.
 
     Parameters
     ----------

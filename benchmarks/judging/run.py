@@ -69,7 +69,7 @@ def run_campaign(root: Path) -> Outcome:
             _steps(campaign, flight)
     except CampaignError as error:
         return Outcome(str(error).splitlines()[0].replace(f"{root}/", ""), time.perf_counter() - start_s)
-    except Exception as error:  # a crash is a result, too; the other campaigns must still be processed
+    except Exception as error:  # a crash is also a result; the other campaigns are still processed
         text = f"crash: {type(error).__name__}: {error}"
         return Outcome(text.splitlines()[0], time.perf_counter() - start_s)
     seconds = time.perf_counter() - start_s
@@ -125,7 +125,7 @@ def verdict_of(report: dict[str, Any]) -> str:
 
 
 def hypothesis_of(report: dict[str, Any]) -> str:
-    """Return the first hypothesis of an image.json in one line; empty without any."""
+    """Return the first hypothesis of an image.json in one line; empty if there is none."""
     hypotheses = report.get("hypotheses") or []
     first = next(iter(hypotheses.items() if isinstance(hypotheses, dict) else hypotheses), "")
     return first if isinstance(first, str) else json.dumps(first)

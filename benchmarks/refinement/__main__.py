@@ -35,7 +35,7 @@ def refined(one: AutofocusCase) -> Refinement:
 
 
 def by_speckle(one: AutofocusCase) -> Refinement:
-    """Refine a case by its speckle only, without bright points."""
+    """Refine a case by speckle only, without bright points."""
     correlation_s = min(errors.correlation_s for errors in one.errors.values())
     time_s = one.records[0].time_s
     knots_s = np.arange(time_s[0] + correlation_s / 20, time_s[-1], correlation_s / 10)

@@ -38,7 +38,7 @@ OTHERS = {
 
 
 def erroneous_case(flight_name: str, arm_m: float, height_m: float, drift_m: float, seed: int) -> AutofocusCase:
-    """Return a case with a lever arm error of the first node to its right, and terrain above its assumed height."""
+    """Return a case with a lever-arm error to the right of the first node, and terrain above the assumed height."""
     of_tracks, of_scene, of_noise = np.random.default_rng(seed).spawn(3)
     flight, scatterers = FLIGHTS[flight_name](), SCENES["forty"](of_scene)
     errors = TrackErrors((SIGMA_M,) * 3)

@@ -1,9 +1,9 @@
-"""Limits of the track refinement on a short flight: share of successful draws against error, points and SNR.
+"""Limits of the track refinement on a short flight: fraction of successful draws against error, points and SNR.
 
 `python -m benchmarks.refinement.edges --out FOLDER`: 150 pulses in 7.5 s past a few points, mono- and bistatic pair
-together and separately; one of error, correlation time, number of points and SNR is varied at a time. Writes edges.csv,
-which is continued if it exists, and edges.png. A draw succeeds if the refinement is accepted and the targets lose at
-most 1 dB.
+together and separately; one quantity (error, correlation time, number of points or SNR) is varied at a time. Writes
+edges.csv, which is continued if it exists, and edges.png. A draw succeeds if the refinement is accepted and the targets
+lose at most 1 dB.
 """
 
 import argparse
@@ -66,7 +66,7 @@ def row(at: Setting, pairs: str, seed: int) -> dict[str, object]:
 
 
 def draw(rows: Sequence[dict[str, str]], path: Path, *, draws: int) -> None:
-    """Draw the shares of successful draws, and of accepted but unsuccessful draws, in a panel per varied quantity."""
+    """Draw the fractions of successful and of accepted but unsuccessful draws, in a panel per varied quantity."""
     figure = Figure(figsize=(13, 3.9), layout="constrained")
     for axes, label in zip(figure.subplots(1, len(OVER), sharey=True), OVER, strict=True):
         for number, (pairs, pairs_label) in enumerate(PAIRS.items()):
@@ -88,7 +88,7 @@ def draw(rows: Sequence[dict[str, str]], path: Path, *, draws: int) -> None:
             axes.set_xticks(OVER[label][1], [f"{value:g}" for value in OVER[label][1]])
             axes.minorticks_off()
         axes.set_ylim(-0.04, 1.04)
-    figure.axes[0].set_ylabel(f"share of {draws} draws")
+    figure.axes[0].set_ylabel(f"fraction of {draws} draws")
     figure.axes[0].plot([], [], "x:", color="0.3", label="accepted, but residual loss above 1 dB")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     figure.suptitle(

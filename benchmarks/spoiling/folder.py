@@ -89,7 +89,7 @@ class Mistake:
     cause
         Cause of the expected hypothesis: one of `CAUSES`, or empty if no tested hypothesis applies.
     control
-        True for a change without effect on the image: a flag on it is a false alarm.
+        True for a change without effect on the image: a flag raised for the change is a false alarm.
     alike
         Bases in which the mistake displaces the whole scene, which is not observable within the campaign.
     """

@@ -26,7 +26,7 @@ class Log:
     attitude_deg
         (epoch, 3) float64: roll, pitch, yaw; None in RTKLIB solutions.
     header, quality
-        Header lines of an RTKLIB solution, and the columns behind the position of each line.
+        Header lines of an RTKLIB solution, and the columns after the position in each line.
     begun
         UTC of the first epoch of the log when it was read.
     """

@@ -58,7 +58,7 @@ def noisy(sigma_m: float, *, seed: int = 0) -> Change:
 
 
 def wandering(sigma_m: float) -> Change:
-    """Return a change that adds slow noise, correlated over two seconds, like that of a float solution."""
+    """Return a change that adds slow noise, correlated over two seconds, typical of a float solution."""
 
     def change(log: Log) -> Log:
         from scipy.ndimage import gaussian_filter1d
@@ -230,7 +230,7 @@ MISTAKES = {
     "logs_1hz_cut_times": Mistake(
         "one epoch per second, with times truncated to whole seconds",
         logs(lambda log: retimed(np.floor)(every(10)(log.picked(slice(5, None)))), TX),
-        "time",  # all epochs by the same half second
+        "time",  # all epochs are displaced by the same half second
     ),
     "tx_times_rounded_1s": Mistake("times of a 10 Hz log rounded to 1 s", logs(retimed(np.round), TX)),
     "tx_times_jitter": Mistake(

@@ -47,7 +47,7 @@ def tags(change: Callable[[NDArray[np.int64]], NDArray[np.int64]], *nodes: str) 
 
 
 def kept(choose: Callable[[int], NDArray[np.int_]], *nodes: str, tagged: bool = True) -> FolderChange:
-    """Return a mistake that keeps selected captures (count → numbers); not `tagged`: with the first time tags."""
+    """Return a mistake that keeps selected captures (count → numbers), with their own time tags or the first ones."""
 
     def changed(folder: Folder, node: str) -> None:
         numbers: list[int] = []
@@ -120,7 +120,7 @@ def _limited(values: Complex) -> Complex:
 
 
 def _repeated(captures: Captures) -> Captures:
-    """Replace captures 80 to 119 by the 40 before them."""
+    """Replace captures 80 to 119 by the 40 preceding captures."""
     captures[80:120] = captures[40:80]
     return captures
 
@@ -180,11 +180,11 @@ MISTAKES = {
     "rx_pulse_doubled": Mistake("one capture of the receiver duplicated", kept(lambda n: np.sort(np.r_[:n, 60]), RX)),
     "rx_pulses_dropped": Mistake("a quarter of the receiver's captures lost", kept(lambda n: np.r_[:50, 84:n], RX)),
     "tx_pulses_dropped_unremarked": Mistake(
-        "five captures of the transmitter lost, the following ones have their time tags",
+        "five captures of the transmitter lost, their time tags assigned to the following captures",
         kept(lambda n: np.r_[:60, 65:n], TX, tagged=False),
     ),
     "rx_pulses_dropped_unremarked": Mistake(
-        "five captures of the receiver lost, the following ones have their time tags",
+        "five captures of the receiver lost, their time tags assigned to the following captures",
         kept(lambda n: np.r_[:60, 65:n], RX, tagged=False),
     ),
     "half_missing": Mistake("second half of the recordings missing", kept(lambda n: np.r_[: n // 2], TX, RX)),

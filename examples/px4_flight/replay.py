@@ -1,4 +1,4 @@
-"""Make a campaign of a radar flown along a PX4 log: samples are simulated, the flight log is the real one.
+"""Write a campaign of a radar flown along a PX4 log, with simulated samples and the real flight log.
 
 python examples/px4_flight/replay.py LOG.ulg CAMPAIGN
 """
@@ -22,32 +22,32 @@ from apertura.simulation.targets import Origin, PointTarget, Waypoints
 from apertura.simulation.waveform import WaveformSpecification
 
 FIRST_S, LAST_S = 5.6, 11.6
-"""The leg of the flight that is imaged, from the log's first epoch."""
+"""Start and end of the imaged part of the flight, seconds after the first epoch of the log."""
 
-BESIDE_M = -8.0, -14.0, -8.0
-"""From the middle of the flight to the middle of the scene: north, east, up."""
+SCENE_OFFSET_M = -8.0, -14.0, -8.0
+"""Offset of the scene centre from the mean position of the flight, metres north, east and up."""
 
 
 def replay(log: Path, campaign: Path) -> None:
-    """Write the campaign."""
+    """Write a campaign with the real flight log and simulated samples."""
     track = read_track(log, node="uav1")
     position, time = track.position.values, track.time.values
-    began = time[0] + np.timedelta64(round(FIRST_S * 1e9), "ns")
-    middle = position.mean(axis=0)
-    north, east, up = BESIDE_M
-    origin = Origin(*geodetic_from_ecef(middle + ned_axes(middle) @ [north, east, -up]))
+    start = time[0] + np.timedelta64(round(FIRST_S * 1e9), "ns")
+    mean = position.mean(axis=0)
+    north, east, up = SCENE_OFFSET_M
+    origin = Origin(*geodetic_from_ecef(mean + ned_axes(mean) @ [north, east, -up]))
     centre = origin.ecef(np.zeros(3))
     north, east, down = ((position - centre) @ ned_axes(centre)).T
-    places = tuple(map(tuple, np.stack([east, north, -down], axis=-1).tolist()))
-    flown = Waypoints(tuple(((time - began) / np.timedelta64(1, "s")).tolist()), places)
+    positions = tuple(map(tuple, np.stack([east, north, -down], axis=-1).tolist()))
+    trajectory = Waypoints(tuple(((time - start) / np.timedelta64(1, "s")).tolist()), positions)
     waveform = WaveformSpecification(512, 1.2e9, 400e3, 3.125e-6, 0.625e-6, 409.6e6, 100.0)
     pulses = round((LAST_S - FIRST_S) * waveform.prf_hz)
-    flight = SimulatedFlight("f01", "uav1", {"uav1": flown}, pulses, start_utc=str(began))
-    targets = tuple(PointTarget(place) for place in ((0.0, 0.0, 0.0), (-2.0, 3.0, 0.0), (3.0, -2.0, 0.0)))
+    flight = SimulatedFlight("f01", "uav1", {"uav1": trajectory}, pulses, start_utc=str(start))
+    targets = tuple(PointTarget(position) for position in ((0.0, 0.0, 0.0), (-2.0, 3.0, 0.0), (3.0, -2.0, 0.0)))
     grid = ImageGrid("EPSG:32632", half_width_m=5.0, spacing_m=0.05)
     node = {"uav1": SimulatedNode(attitude="none")}
-    made = CampaignSpecification("px4 flight, replayed", origin, waveform, targets, node, (flight,), grid)
-    simulate(campaign, made, seed=1)
+    specification = CampaignSpecification("px4 flight, replayed", origin, waveform, targets, node, (flight,), grid)
+    simulate(campaign, specification, seed=1)
     (campaign / "raw/f01/uav1.track.csv").unlink()
     shutil.copyfile(log, campaign / "raw/f01/uav1.track.ulg")
 

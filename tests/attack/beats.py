@@ -94,5 +94,5 @@ def read_sound(path: Path) -> Any:
 def _fields(read: Any, path: Path) -> Any:
     try:
         return read(path)
-    except Exception as error:  # of any type: the isolated reader reports it as its last line
+    except Exception as error:  # of any type: the isolated reader prints the exception as its last line
         raise CampaignError(str(error), path, "beat signals", "Copy it again.") from error

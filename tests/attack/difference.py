@@ -11,7 +11,7 @@ from pydantic import BaseModel
 
 
 def leaves(value: object, path: str = "") -> Iterator[tuple[str, object]]:
-    """Yield the leaves of a parsed value with their paths: numbers, texts, and arrays as shape and bytes."""
+    """Yield the leaves of a parsed value with their paths: numbers, texts, and arrays (as shape and bytes)."""
     if isinstance(value, np.memmap | np.ndarray):
         array = np.asarray(value)
         yield f"{path} (shape)", array.shape
@@ -35,7 +35,7 @@ def leaves(value: object, path: str = "") -> Iterator[tuple[str, object]]:
 
 
 def same(one: object, other: object) -> bool:
-    """Return True if two leaves are equal, where NaN equals NaN."""
+    """Return True if two leaves are equal; NaN is equal to NaN."""
     return type(one) is type(other) and (one == other or (one != one and other != other))  # noqa: PLR0124
 
 

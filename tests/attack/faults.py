@@ -2,8 +2,8 @@
 
     python -m tests.attack.faults --kills 300 --errors 50 --full 10
 
-Kills are spread evenly over the calls that a step makes below results/; errors are EIO, ENOSPC, EDQUOT, EROFS and
-partial writes; full disks are small file systems in memory. Prints a table; exits with an error if a file is
+Kills are distributed evenly over the calls that a step makes below results/. Errors are EIO, ENOSPC, EDQUOT, EROFS and
+partial writes. Full disks are small file systems in memory. Prints a table; exits with an error if a file is
 incomplete, a step prints no message or more than one, or the bytes of the next run differ.
 """
 
@@ -132,7 +132,7 @@ def _fail(bench: Bench, step: str, count: int, table: "Table") -> None:
 
 
 def _earlier_calls(share: float, calls: int) -> Iterator[int]:
-    """Yield the number of a call and then of earlier ones, because a step makes few calls of some kinds."""
+    """Yield the number of a call and then of earlier calls, because a step makes few calls of some kinds."""
     at = max(1, int(share * calls))
     while at > 1:
         yield at

@@ -34,7 +34,7 @@ def compiler():
 
 
 def build(folder: Path) -> dict[str, str]:
-    """Compile the library and write the page; return the environment of a process that uses them."""
+    """Compile the library and write the page; return the environment for processes that use both."""
     library, page = folder / "faults.so", folder / "page"
     source = Path(__file__).with_name("faults.c")
     subprocess.run([compiler(), "-shared", "-fPIC", "-O2", "-o", library, source, "-ldl"], check=True)

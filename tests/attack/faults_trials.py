@@ -18,7 +18,7 @@ ROOM = 1 << 30
 PAGE = 4096
 
 LIMIT_S = 30
-"""Time limit of a step in seconds: steps take about 1 s."""
+"""Time limit of a step, seconds; a step takes about 1 s."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Ended:
 
     @property
     def faults(self) -> list[str]:
-        """Deviations from a single message with exit status 2."""
+        """Deviations from the required end: a single message and exit status 2."""
         errors = re.findall(r"^error: .*", self.output, re.MULTILINE)
         wrong = [] if self.status == 2 else [f"exit status {self.status}"]
         wrong += [] if len(errors) == 1 else [f"{len(errors)} messages"]
@@ -48,7 +48,7 @@ class Bench:
     page
         Settings of fault injection.
     before, after, calls
-        Per step: folder with the results before it, files after it, and its number of calls.
+        Per step: folder with the results before the step, files after the step, and number of calls of the step.
     """
 
     root: Path
@@ -112,14 +112,14 @@ class Bench:
         ]
 
     def killed(self, step: str, at: int) -> tuple[bool, list[str]]:
-        """Kill a step at a call and rerun it; return True if it was killed, and the failures."""
+        """Kill a step at a call and rerun the step; return True if it was killed, and the failures."""
         self.reset(step)
         arm(self.page, self.results, KILL, at=at)
         ended = self.run(step)
         return ended.status == -9, self.half_written(step) + self.again(step)
 
     def failed(self, step: str, at: int, action: int, *, error: int, kinds: int) -> tuple[str, list[str]]:
-        """Let a call of a step fail and rerun it; return the outcome and the failures."""
+        """Let a call of a step fail and rerun the step; return the outcome and the failures."""
         self.reset(step)
         arm(self.page, self.results, action, at=at, error=error, kinds=kinds)
         ended = self.run(step)
@@ -131,7 +131,7 @@ class Bench:
         return outcome, wrong + self.half_written(step) + self.again(step)
 
     def full(self, step: str, share: float) -> tuple[int, list[str]]:
-        """Run a step on a disk with space for a share of its output, and rerun it with enough space.
+        """Run a step on a disk with space for a fraction of its output, and rerun the step with enough space.
 
         Returns the free space in bytes and the failures.
         """
@@ -163,8 +163,8 @@ class Bench:
 def files(folder: Path) -> dict[str, bytes]:
     """Return the contents of all files by path, except hidden files and folders.
 
-    Excluded are receipts of tile shares, which contain the number of tiles formed, smaller after a kill; and partial
-    files of a killed writer in unfinished stages, which are removed when the stage is finished.
+    Two kinds of files are also excluded: receipts of tile jobs, which contain the number of tiles formed (smaller after
+    a kill), and partial files of a killed writer in unfinished stages, which are removed when the stage is finished.
     """
     contents = {}
     for path in folder.rglob("*"):

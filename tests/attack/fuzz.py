@@ -32,7 +32,7 @@ SECONDS = 5.0
 """Time limit per file, in seconds."""
 
 MEMORY_BYTES = 2 << 30
-"""Memory limit for reading a file, in addition to that of the libraries, in bytes."""
+"""Memory limit for reading a file, in addition to the memory of the libraries, bytes."""
 
 LONGEST_MESSAGE = 3000
 
@@ -42,7 +42,7 @@ REGRESSIONS = Path(__file__).parent / "regressions"
 """Inputs that were harmful in the past: <parser>/<name>."""
 
 HARM = ("traceback", "hang", "crash", "memory", "message")
-"""Kinds of harm; `message`: too long or with control characters."""
+"""Kinds of harm; `message`: the message is too long or contains control characters."""
 
 
 @dataclass
@@ -65,7 +65,7 @@ class Tally:
 
 def inputs_of(name: str, seed: int) -> "Inputs":
     """Return the unlimited inputs of a parser, each generated from the seed and its number."""
-    row = zlib.crc32(name.encode())  # from the name, so that a new parser does not change other inputs
+    row = zlib.crc32(name.encode())  # from the name, so that a new parser does not change the inputs of others
     return Inputs(PARSERS[name], PARSERS[name].seeds(), seed, row)
 
 
@@ -133,7 +133,7 @@ def _count(tally: Tally, result: dict, parser: Parser) -> None:
 
 
 def _child(parser: Parser, numbers: range, source, seeds: Sequence[bytes], folder: Path) -> Iterator[str]:
-    """Yield one line per input read in a child process, and one for the input that ended it."""
+    """Yield one line per input read in a child process, and one line for the input that ended the process."""
     receiver, sender = os.pipe()
     sys.stdout.flush()
     child = os.fork()
@@ -221,7 +221,7 @@ def _arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--seconds", type=float, help="time per parser instead of a number of inputs")
     parser.add_argument("--parser", action="append", choices=sorted(PARSERS), help="one parser, or several")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--save", type=Path, default=Path("build/fuzz"), help="folder of harmful inputs")
+    parser.add_argument("--save", type=Path, default=Path("build/fuzz"), help="folder for harmful inputs")
     return parser.parse_args(words)
 
 

@@ -15,7 +15,9 @@ from typing import Any
 # ---- Commands -------------------------------------------------------------------------------------------------------
 
 SAMPLE, PAIR, BENCH = "sample", "pair", "bench"
-"""Campaigns: with every step; with two flights, an interferogram and a reflector; with a bench measurement."""
+"""Campaigns: one with every step; one with two flights, an interferogram and a reflector; and one with a bench
+recording.
+"""
 
 
 @dataclass(frozen=True)
@@ -129,14 +131,14 @@ def make_campaign(folder: Path, name: str) -> None:
     else:
         lab = preset("paper-lab", pulses=60)
         simulate(root, replace(lab, flights=(replace(lab.flights[0], name="b01", kind="bench"),)))
-        _edit(root, "bench", sidelink_m=1.0)  # so that the measured path differs and `--write` changes the config
+        _edit(root, "bench", sidelink_m=1.0)  # The measured path then differs, so that `--write` changes the config.
     finished = copy(root, folder / f"{name}-finished")
     words = [program(), "run", str(finished), "--cores", "2", "--quiet"]
     subprocess.run(words, check=name != BENCH, capture_output=True, env=environment(folder))
 
 
 def _plan(root: Path) -> dict[str, Any]:
-    """Return a flight plan with the radar and the scene of a campaign."""
+    """Return a flight plan for the radar and the scene of a campaign."""
     import yaml
 
     config = yaml.safe_load((root / "config" / "config.yaml").read_text())

@@ -32,7 +32,7 @@ def _limit() -> None:
 
 
 def serve() -> None:
-    """Fork a process for each line of standard input, a JSON object; print its process ID and its exit status.
+    """Fork a process for each line (JSON object) of standard input; print the process ID and the exit status.
 
     Runs in a separate interpreter, which has imported the package and has no threads.
     """
@@ -196,7 +196,7 @@ _CHUNK = re.compile(r"(.*\.zarr/.*?)/c(/.*)?$|(.*\.snakemake/metadata)/[^/]*$|(.
 
 
 class Watch:
-    """Watch of the events below a folder, including new subfolders.
+    """Watch for file events below a folder, including new subfolders.
 
     Parameters
     ----------
@@ -257,9 +257,9 @@ class Recording:
     written
         Paths created, written, renamed or deleted, even temporarily, with their parent folders.
     opened
-        Files that are only read, except inputs.
+        Files that are only read; inputs are excluded.
     folders
-        Folders among both.
+        Folders among the written and opened paths.
     random
         Number of names with a random part, which cannot be planted in advance.
     seconds, status

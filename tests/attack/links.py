@@ -3,7 +3,7 @@
 The paths are recorded: every command runs once on a copy of a small campaign while the kernel (inotify) reports which
 files and folders it creates, writes, renames, deletes and opens. Then one or several of these paths are replaced before
 the command starts, or while it runs. A folder D of the user outside the campaign and the inputs of the campaign must
-remain unchanged, and the command must end in time, with one message or successfully::
+remain unchanged, and the command must end within the time limit, successfully or with one message::
 
     python -m tests.attack.links --commands list,status --most 20 --seed 3
     python -m tests.attack.links --while-running
@@ -168,7 +168,7 @@ class Replacing:
         self.replaced: list[str] = []
 
     def work(self) -> None:
-        """Replace a path that has just appeared, or any path whose folder exists."""
+        """Replace a newly created path, or any path whose folder exists."""
         events = [path for path, mask in self._watch.read() if mask & (CREATE | MOVED_TO)]
         self._first_call_s = self._first_call_s or time.monotonic()
         if time.monotonic() - self._first_call_s < self._start_s or len(self.replaced) >= 40:
@@ -221,7 +221,7 @@ REVIEW: tuple[Trial, ...] = (
     Trial("step bench", "link to file", ("results/b01/bench.json",)),
     *(Trial("clean", "link to folder", (f"results/{name}",)) for name in (".run", "logs", "benchmarks", "preview")),
     Trial("clean", "link to file", ("results/.run.lock",)),
-    # Findings in addition to the 56 links, or not about links.
+    # Findings in addition to the 56 links, and findings that do not concern links.
     Trial("preview", "link to folder", ("results/preview/.status.json.wip",)),
     Trial("preview", "link to folder", ("results/preview/.index.html.wip",)),
     Trial("preview", "link to folder", ("results/preview/f01/uav1-uav1/.db.0.tif.wip",)),
@@ -276,7 +276,7 @@ FAULTS = (D_CHANGED, HUNG, TRACEBACK, KILLED)
 
 
 def _weight(path: str) -> float:
-    """Return the relative frequency of a path: arrays and Snakemake's folder contain a number of similar paths."""
+    """Return the relative frequency of a path: arrays and Snakemake's folder have many similar paths."""
     return 0.05 if ".zarr/" in path else 0.2 if path.startswith(".snakemake/") else 1.0
 
 
@@ -336,7 +336,7 @@ class Harness:
         return self._used
 
     def trials(self, name: str, most: int, kinds: Sequence[str], rng: random.Random) -> list[Trial]:
-        """Return the trials of the review for a command and random ones, preferably of its own paths."""
+        """Return the trials of the review for a command and random trials, preferably with the paths of the command."""
         own = self.recordings[name]
         campaign = COMMANDS[name].campaign
         same = [self.recordings[other] for other in self.recordings if COMMANDS[other].campaign == campaign]
@@ -388,7 +388,7 @@ class Harness:
     def _compared(
         self, name: str, root: Path, outside: Path, planted: Sequence[str], meanwhile: Callable[[], object] | None
     ) -> tuple[Ended, str]:
-        """Run a command; return its end and the changes of D and of the inputs."""
+        """Run a command; return its end, and the changes of D and of the inputs."""
         command = COMMANDS[name]
         watched = [outside, *(root / top for top in INPUTS)]
         before = fingerprint(*watched)

@@ -78,7 +78,7 @@ AIRDATA = (
 
 
 def airdata(times: np.ndarray, geodetic: np.ndarray, *, clock_ms: np.ndarray | None = None, satellites=17) -> str:
-    """Return an Airdata export with times from the first epoch and a message that contains a comma."""
+    """Return an AirData export with times since the first epoch, and with a message that contains a comma."""
     clock = (times - times[0]).astype("timedelta64[ms]").astype(int) + 100 if clock_ms is None else clock_ms
     lines = [AIRDATA]
     for number, (time, (latitude, longitude, height)) in enumerate(zip(times, geodetic, strict=True)):
@@ -111,7 +111,7 @@ def capture(
 
 
 def poses(count: int = 12) -> dict[str, np.ndarray]:
-    """Return the poses of a body on a rail and of a stationary one."""
+    """Return the poses of a body on a rail and of a stationary body."""
     along = np.linspace(0, 1, count)
     turned = np.stack([0 * along, np.sin(along / 2), 0 * along, np.cos(along / 2)], -1)
     rail = np.stack([along - 5, 0 * along + 1.8, -3 * along], -1)

@@ -1,4 +1,4 @@
-"""Mutators of valid files: changes of bytes in the manner of AFL, and changes of parts of known formats."""
+"""Mutators of valid files: changes of bytes as in the fuzzer AFL, and changes of parts of known formats."""
 
 import csv
 import functools
@@ -45,7 +45,7 @@ LEAVES += [[], {}, [[]], [1, 2, 3], {"a": 1}, [None] * 300, {"": {"": {}}}, "000
 
 
 def _offset(data: bytes, generator: np.random.Generator) -> int:
-    """Return a random offset; half of them are among the first bytes, which are the header of binary formats."""
+    """Return a random offset, with probability 1/2 among the first bytes, which are the header of binary formats."""
     size = len(data)
     return int(generator.integers(0, min(size, 256) if generator.random() < 0.5 else size)) if size else 0
 
@@ -97,7 +97,7 @@ def token(data: bytes, generator: np.random.Generator, tokens: Sequence[bytes]) 
 
 
 def noise(data: bytes, generator: np.random.Generator, tokens: Sequence[bytes]) -> bytes:
-    """Overwrite some bytes with random ones."""
+    """Overwrite some bytes with random bytes."""
     size = int(generator.integers(1, 40))
     place = _offset(data, generator)
     return data[:place] + generator.bytes(size) + data[place + size :]
@@ -163,9 +163,9 @@ def json_tree(data: bytes, generator: np.random.Generator, tokens: Sequence[byte
 
 
 def yaml_tree(data: bytes, generator: np.random.Generator, tokens: Sequence[bytes]) -> bytes:
-    """Change a part of a YAML document, or repeat it with an alias; bytes if the data are not valid YAML."""
+    """Change a part of a YAML document or repeat it by an alias; change bytes if the data are not valid YAML."""
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    if b"&b" in data or data.count(b"[") > 200 or len(data) > 100_000:  # parsing would expand it
+    if b"&b" in data or data.count(b"[") > 200 or len(data) > 100_000:  # parsing would expand the aliases
         return token(data, generator, tokens)
     try:
         document = yaml.load(data, Loader=loader)
@@ -248,7 +248,7 @@ def quoted_cells(data: bytes, generator: np.random.Generator, tokens: Sequence[b
 def mutated(
     seeds: Sequence[bytes], generator: np.random.Generator, *, tokens: Sequence[bytes], structure: Sequence[Mutator]
 ) -> bytes:
-    """Return one of the seeds after one to four changes, mostly one; half of them are format-specific if available."""
+    """Return one of the seeds after one to four changes, mostly one; half of all changes are format-specific."""
     data = seeds[int(generator.integers(len(seeds)))]
     for _ in range(min(4, int(generator.geometric(0.7)))):
         known = structure and generator.random() < 0.5

@@ -143,7 +143,7 @@ def _alone(read: Callable[[Path], Any], path: Path) -> Any:
     """Read like `read_isolated`, but in this process, which may crash."""
     try:
         return read(path)
-    except Exception as error:  # of any type: the isolated reader reports it as its last line
+    except Exception as error:  # of any type: the isolated reader prints the exception as its last line
         raise CampaignError(shown(str(error), 300), path, "a file of its format", "Copy it again.") from error
 
 

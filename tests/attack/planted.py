@@ -66,7 +66,7 @@ class Planted:
     root
         Campaign folder.
     outside
-        Folder next to it, in which no file may be opened.
+        Folder next to the campaign, in which no file may be opened.
     ran
         Folder in which executed markers create files.
     watched
@@ -108,14 +108,14 @@ class Code:
 
 
 def plant(root: Path, *, in_snakemakes_own: bool = False) -> Planted:
-    """Place markers in a campaign folder, at all paths that a tool which trusts the folder reads.
+    """Place markers in a campaign folder, at all paths from which a tool may read code or settings.
 
     Parameters
     ----------
     root
         Campaign folder, unfinished or finished.
     in_snakemakes_own
-        Place markers also in the folder of Snakemake, which `apertura check` reports.
+        Also place markers in the folder of Snakemake, which `apertura check` reports.
     """
     outside, ran = root.parent / "outside", root.parent / "ran"
     for folder in (outside, ran):
@@ -136,13 +136,13 @@ def plant(root: Path, *, in_snakemakes_own: bool = False) -> Planted:
 
 
 def _outside_files(planted: Planted) -> None:
-    """Write the files that hostile texts name: grids, lists of CRS, rasters and archives without valid content."""
+    """Write the files named in hostile texts: grids, lists of CRS, rasters and archives without valid content."""
     for name in ("init", "shift.gsb", "geoid.gtx", "raster.tif", "array.zarr", "archive.zip", "config.yaml", "log.csv"):
         (planted.outside / name).write_bytes(b"<9> +proj=utm +zone=32 +datum=WGS84 <>\n")
 
 
 def _modules(planted: Planted, *, in_snakemakes_own: bool) -> Mapping[str, str]:
-    """Return a module for every name that Python or an installed package may import."""
+    """Return modules for all names that Python or an installed package may import."""
     installed = {name for name in packages_distributions() if name.isidentifier()}
     names = {
         *sys.stdlib_module_names,
@@ -191,7 +191,7 @@ def _workflows(planted: Planted) -> Mapping[str, str]:
 
 
 def _sidecars(planted: Planted) -> Mapping[str, str]:
-    """Return sidecar files that GDAL reads with a raster, each naming a file outside."""
+    """Return sidecar files that GDAL reads with a raster; each names a file outside the campaign."""
     rasters = [path.relative_to(planted.root).as_posix() for path in planted.root.rglob("*.tif")]
     text = (
         f"<PAMDataset><SRS>LOCAL_CS[x]</SRS><VRTRasterBand><SourceFilename>{planted.outside / 'raster.tif'}"
@@ -210,7 +210,7 @@ def _pickles(planted: Planted) -> Mapping[str, bytes]:
 
 
 def hostile_texts(planted: Planted) -> Mapping[str, str]:
-    """Return texts that a library may interpret, by the library and its interpretation."""
+    """Return texts that a library may interpret, by library and interpretation."""
     outside = planted.outside
     shifted = f"+proj=utm +zone=32 +ellps=bessel +nadgrids={outside}/shift.gsb +units=m"
     return {
@@ -245,7 +245,7 @@ def hostile_texts(planted: Planted) -> Mapping[str, str]:
 
 @contextmanager
 def opened(paths: list[Path]) -> Iterator[set[Path]]:
-    """Yield the set of files and folders that any process opens during the block; it is filled at the end."""
+    """Yield the set of files and folders that any process opens during the block; the set is filled at the end."""
     watching = _LIBC.inotify_init1(_IN_NONBLOCK)
     if watching < 0:
         raise OSError(ctypes.get_errno(), "inotify_init1")

@@ -49,7 +49,7 @@ def pictures() -> list[bytes]:
 
 
 def read_tag_text(path: Path) -> Any:
-    """Return the content of a tag whose text is that of a file."""
+    """Return the content of a tag whose text is the content of a file."""
     tags = {"APERTURA_SOURCES": path.read_bytes().decode("utf-8", "replace")}
     return document(tags, "SOURCES", path), hashes(tags, "SOURCES", path)
 

@@ -58,7 +58,7 @@ def real(name: str, *, lines: int = 0, most: int = 40_000) -> list[bytes]:
 
 
 def configs() -> list[bytes]:
-    """Return configs: with all keys commented, with a calibration and a DEM, and a real one."""
+    """Return configs: one with all keys commented, one with a calibration and a DEM, and a real config."""
     rest = "\n".join(line for line in config_template().splitlines() if not line.startswith("calibration"))
     rest = rest.replace("crs: auto", "crs: EPSG:32632").replace("dem: null", "dem: config/dem.tif")
     rest = rest.replace("dem_datum: null", "dem_datum: ellipsoid")
@@ -101,7 +101,7 @@ def scans() -> list[bytes]:
 
 
 def sigmf_meta() -> list[bytes]:
-    """Return metadata of triggered and continuous recordings, with header bytes, and of another vendor."""
+    """Return metadata of recordings: triggered, continuous, with header bytes, and of another vendor."""
     header = {"core:datatype": "ci16_le", "core:version": "1.2.5", "core:sample_rate": 1e6, "core:num_channels": 2}
     captures = [
         {"core:sample_start": 6 * n, "core:frequency": 1.2e9, "core:datetime": f"2025-05-14T09:30:0{n}.25Z"}
@@ -134,7 +134,7 @@ def sigmf_floats() -> list[bytes]:
 
 
 def sigmf_collections() -> list[bytes]:
-    """Return collections that list the first recording of `sigmf_meta`, under the name of a node and its own."""
+    """Return collections that list the first recording of `sigmf_meta`, with the name of a node and its own name."""
     streams = [{"name": "rx_0", "hash": hashlib.sha512(sigmf_meta()[0]).hexdigest()}]
     body = {"core:version": "1.2.0", "core:streams": streams}
     return [json.dumps({"collection": body | more}).encode() for more in ({"apertura:nodes": {"uav1": "rx_0"}}, {})]
@@ -194,7 +194,7 @@ def nmea() -> list[bytes]:
 
 
 def airdata() -> list[bytes]:
-    """Return Airdata exports of DJI flights, one with a constant clock, and the head of a real one."""
+    """Return AirData exports of DJI flights, one with a constant clock, and the head of a real export."""
     times, places = logs.circle(24)
     late = times + np.where(np.arange(24) < 12, 0, 74_000).astype("timedelta64[ms]")
     texts = [logs.airdata(times, places), logs.airdata(late, places, clock_ms=100 + 100 * np.arange(24))]
@@ -203,7 +203,7 @@ def airdata() -> list[bytes]:
 
 
 def captures() -> list[bytes]:
-    """Return Motive takes of two bodies and the head of a real one."""
+    """Return Motive takes of two bodies and the head of a real take."""
     text = logs.capture(np.arange(12) / 360, logs.poses(), lost=[5])
     return [text.encode(), *real("bwsi_rail_passA/Rail SAR 2.csv", lines=30)]
 
@@ -219,7 +219,7 @@ def ulogs() -> list[bytes]:
 
 
 def dataflash_logs() -> list[bytes]:
-    """Return binary ArduPilot logs with one receiver and with two."""
+    """Return binary ArduPilot logs with one and with two receivers."""
     return [dataflash(dataflash_rows(epochs=12)), dataflash(dataflash_rows(epochs=8, receivers=(0, 1)))]
 
 
@@ -229,7 +229,7 @@ def dataflash_texts() -> list[bytes]:
 
 
 def patterns() -> list[bytes]:
-    """Return sampled beam patterns without and with phase."""
+    """Return sampled beam patterns with and without phase."""
     rows = [f"{cut},{angle},{-(angle**2) / 100}" for cut in ("azimuth", "elevation") for angle in range(-60, 61, 20)]
     with_phase = ["cut,angle_deg,gain_db,phase_deg", *(f"{row},-3.5" for row in rows), ""]
     return ["\n".join(["cut,angle_deg,gain_db", *rows, ""]).encode(), "\n".join(with_phase).encode()]

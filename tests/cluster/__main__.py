@@ -4,8 +4,8 @@
 
 Simulates the campaign, runs one copy locally and one on the cluster with ``profiles/slurm`` and disturbances, and
 compares every product byte for byte. The copy on the cluster contains markers of every kind (`tests.attack.planted`),
-and the run starts in it: no marker may fire. Without Slurm it prints what is missing and does nothing. Exits with an
-error if the run fails, a marker fires or bytes differ.
+and the run starts in it: no marker may fire. Without Slurm, the program prints the missing requirement and stops. Exits
+with an error if the run fails, a marker fires or bytes differ.
 """
 
 import importlib.util

@@ -17,7 +17,7 @@ _PACKAGES = "slurmctld slurmd slurm-client munge"
 
 
 def missing() -> str | None:
-    """Return why Slurm cannot run on this machine and the remedy; None if it can."""
+    """Return the reason that prevents Slurm from running on this machine, and the remedy; None if there is none."""
     if any(shutil.which(program) is None for program in _PROGRAMS):
         return f"Slurm is not installed: apt-get install --no-install-recommends {_PACKAGES}"
     if os.geteuid():
@@ -76,11 +76,11 @@ def running(root: Path) -> Iterator[None]:
 @contextmanager
 def _at_the_end(end: Callable[[], None]) -> Iterator[None]:
     """Call `end` in a separate process when the body or this process has ended, even if it was killed."""
-    read_end, write_end = os.pipe()  # closes with this process, because programs that it starts inherit no pipe
+    read_end, write_end = os.pipe()  # closed with this process; child processes do not inherit it
     watcher = os.fork()
     if not watcher:
         try:
-            os.setsid()  # not reached by Ctrl-C and by `make`
+            os.setsid()  # not terminated by Ctrl-C or `make`
             for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
                 signal.signal(number, signal.SIG_IGN)
             os.close(write_end)
@@ -97,7 +97,7 @@ def _at_the_end(end: Callable[[], None]) -> Iterator[None]:
 
 
 def _munge() -> bool:
-    """Start munge if it does not run; return True if it was started."""
+    """Start munge if it is not running; return True if it was started."""
 
     def works() -> bool:
         return subprocess.run("munge -n | unmunge", shell=True, capture_output=True, check=False).returncode == 0
@@ -143,7 +143,7 @@ def resume(node: str) -> None:
 
 
 def jobs(rule: str) -> dict[str, str]:
-    """Return the nodes of running jobs of a rule or a group of rules, by job."""
+    """Return job → node of the running jobs of a rule or a group of rules."""
     lines = output_of("squeue", "-h", "-t", "running", "-o", "%A %N %k").splitlines()
     rows = (line.split(" ", 2) for line in lines)
     return {job: node for job, node, comment in rows if comment.startswith((f"rule_{rule}", f"group_{rule}"))}

@@ -41,10 +41,12 @@ PAPER_PARTS = {
     "clock": "corrections:clock_claims",
     "swarm": "corrections:swarm_claims",
 }
-"""Part of claims.csv, in the order of its rows → function that computes it; `loss_…` passes its error as argument."""
+"""Part of claims.csv, in the order of its rows → function that computes it; a part `loss_…` passes the name of its
+error as argument.
+"""
 
 PAPER_READS = {"coherence": ("lab", "static"), "fusion": ("uav",)}
-"""Part → experiments whose campaigns it reads, from the folder `CAMPAIGNS`."""
+"""Part → experiments whose campaigns the part reads from the folder `CAMPAIGNS`."""
 
 CAMPAIGNS = "campaigns"
 
@@ -54,7 +56,7 @@ PAPER_FIGURES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("static_profile", "static_phase"), ("static",)),
     **dict.fromkeys(("uav_geometry", "uav_images", "uav_cuts"), ("uav",)),
 }
-"""The paper's figures with data, in its order → experiments whose campaigns they show."""
+"""The paper's figures with data, in the order of the paper → experiments whose campaigns they show."""
 
 Folder = Annotated[Path, typer.Option("--folder", callback=given, help="output folder")]
 StudyName = Annotated[str, typer.Argument(metavar="study", help=f"one of {', '.join(STUDIES)}")]
@@ -139,7 +141,7 @@ def sweep(name: StudyName, part: str, folder: StudyFolder = None) -> None:
 
 @app.command()
 def chart(name: StudyName, chart: str, folder: StudyFolder = None) -> None:
-    """Merge the parts of a chart and draw them: CHART.csv and CHART.png."""
+    """Merge the parts of a chart and draw the chart: CHART.csv and CHART.png."""
     study = study_of(name)
     require("chart", chart, study.charts)
     typer.echo(study.chart(chart, _results(name, folder)))

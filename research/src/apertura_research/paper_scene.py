@@ -152,7 +152,8 @@ def window_samples(channel: Channel, generator: Generator | None) -> NDArray[np.
     """Simulate the samples of every capture in the DFT window, (pulse, sample) complex128.
 
     Equal to `apertura.simulation.synthesis.samples` from the end of the prefix on if every path arrives within the
-    prefix; twenty times faster, because the edges of paths are not computed. Without a generator, no noise is added.
+    prefix; this function is twenty times faster, because the edges of paths are not computed. Without a generator, no
+    noise is added.
 
     Notes
     -----

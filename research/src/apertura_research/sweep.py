@@ -36,7 +36,7 @@ class Study(Generic[Row]):
     cases
         Part → its cases, in order.
     run
-        Part and one of its cases → rows; parts depend on the code of the module of this function.
+        Part and one case of the part → rows; parts depend on the code of the module of this function.
     draw
         Draws a chart: its name, its rows and the path of the PNG.
     summaries
@@ -92,7 +92,7 @@ class Study(Generic[Row]):
         return [row for part in parts for row in read_table(part_path(folder, part), self.row)]
 
     def chart(self, name: str, folder: Path) -> Path:
-        """Merge the parts of a chart, NAME.csv, and draw them, NAME.png."""
+        """Merge the parts of a chart, NAME.csv, and draw the chart, NAME.png."""
         rows = self.read(folder, self.charts[name])
         write_table(folder / f"{name}.csv", rows)
         self.draw(name, rows, folder / f"{name}.png")
@@ -144,8 +144,8 @@ def with_unit(title: str, unit: str) -> str:
 
     Examples
     --------
-    >>> with_unit("Share of triggers missed", "1"), with_unit("Height", "cm")
-    ('Share of triggers missed', 'Height, cm')
+    >>> with_unit("Fraction of triggers missed", "1"), with_unit("Height", "cm")
+    ('Fraction of triggers missed', 'Height, cm')
     """
     return title if unit == "1" else f"{title}, {unit}"
 
@@ -163,7 +163,7 @@ def panels(path: Path, size: tuple[float, float], shape: tuple[int, int], **opti
     shape
         Rows and columns.
     **options
-        title, legend_columns (4 by default), and those of `Figure.subplots`.
+        title, legend_columns (4 by default), and the options of `Figure.subplots`.
     """
     title, columns = options.pop("title"), options.pop("legend_columns", 4)
     figure = Figure(figsize=size, layout="constrained")

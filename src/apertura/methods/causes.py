@@ -1,7 +1,7 @@
 """Causes of wrong images: quantities of the logs and the config, the trial errors of each, and their messages.
 
-`apertura check` reports the causes that time tags reveal, rule `assess` tries the causes one by one on a bright point,
-and rule `refine` fits the causes that displace the nodes of a flight to all bright points.
+`apertura check` reports the causes that are observable in time tags, rule `assess` tries the causes one by one on a
+bright point, and rule `refine` fits the causes that displace the nodes of a flight to all bright points.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,9 +15,11 @@ from apertura.common.arrays import Floats
 from apertura.common.leap_seconds import LATEST_S
 
 LEAST_GAIN_DB = 0.5
-"""Least power of points that the correction of a reported cause recovers, dB; log errors explain smaller losses."""
+"""Minimum increase of the power of points by the correction of a reported cause, dB; log errors explain smaller
+losses.
+"""
 
-# ---- Times of another time system -----------------------------------------------------------------------------------
+# ---- Times in a different time system -------------------------------------------------------------------------------
 
 _TAI_S = 19  # TAI − GPST
 _TIME_SYSTEMS = {
@@ -66,7 +68,7 @@ class Quantity:
     directions
         Words that describe a positive and a negative error.
     sizes
-        Magnitudes of the trial errors, applied with both signs, the likeliest first.
+        Magnitudes of the trial errors, applied with both signs, the most probable first.
     std
         Prior standard deviation of a fitted error: as large as configuration mistakes, so that the estimate depends on
         the images rather than on the prior.
@@ -88,7 +90,7 @@ class Quantity:
 
     @property
     def errors(self) -> list[Any]:
-        """Trial errors, the likeliest first."""
+        """Trial errors, the most probable first."""
         return [sign * size for size in self.sizes for sign in (1, -1)]
 
     def line(self, *error: float, digits: int = 2, **words: str) -> str:
@@ -128,7 +130,9 @@ PREFIX = Quantity(
     sizes=(1, 2, 3, 5, 10, 20, 50),
 )
 RANGE = Quantity(
-    "range", "paths of {pair} are wrong by {0:+.2f} m: path offset?", sizes=(0.05, 0.1, 0.15, 0.3, 0.5, 1.0, 2.0, 4.0)
+    "range",
+    "paths of {pair} are wrong by {0:+.2f} m: wrong path offset?",
+    sizes=(0.05, 0.1, 0.15, 0.3, 0.5, 1.0, 2.0, 4.0),
 )
 CARRIER = Quantity("carrier_is", "waveform.carrier_is is {other}")
 CHANNELS = Quantity("channels", "the channels of {node} are swapped")

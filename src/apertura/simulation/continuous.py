@@ -23,7 +23,7 @@ Chips = NDArray[np.int8]
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Framing:
-    """Framing in front of the symbol, on the middle subcarrier: a PN preamble and a payload with the frame number.
+    """Framing in front of the symbol, on the centre subcarrier: a PN preamble and a payload with the frame number.
 
     Examples
     --------
@@ -66,7 +66,7 @@ class Framing:
         return int(chips * self.chip_samples + self.guard_samples)
 
     def centre_hz(self, waveform: TransmitWaveform) -> float:
-        """Return the baseband frequency of the chips' carrier, the middle subcarrier."""
+        """Return the baseband frequency of the carrier of the chips, the centre subcarrier."""
         return float(waveform.baseband_hz[len(waveform.codes) // 2])
 
     def signal(self, waveform: TransmitWaveform, frame: int, time_s: Floats) -> NDArray[np.complex128]:
@@ -179,7 +179,7 @@ def _frame(
     start, stop = region
     rate, waveform = sampling_rate(channel), channel.waveform
     start_s = start / rate + recording_start_s(channel) - time_s
-    # `samples` restarts the oscillator at each capture; here it started with the recording
+    # `samples` restarts the oscillator at each capture; here, the oscillator started with the recording
     offset_rad = -2 * np.pi * (waveform.carrier_hz * start_s + channel.cfo_hz * start / rate)
     starts, phases = np.full_like(channel.start_s, start_s), channel.phase_rad + offset_rad
     noiseless = replace(channel, start_s=starts, phase_rad=phases, noise_variance=0.0)

@@ -100,7 +100,7 @@ def write_fmcw_campaign(root: Path, flight: FmcwFlight, *, waveform: Mapping[str
     flight
         Flight and sweep.
     waveform
-        Keys of the section `waveform` that replace the correct ones.
+        Keys of the section `waveform` that replace the correct keys.
     """
     import yaml
 

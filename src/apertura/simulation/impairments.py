@@ -100,7 +100,7 @@ class Blockage:
     Source: E. N. Gilbert, "Capacity of a burst-noise channel", Bell Syst. Tech. J. 39 (1960): two-state Markov chain.
     """
 
-    fraction: float = Field(ge=0, lt=1, description="share of shadowed pulses")
+    fraction: float = Field(ge=0, lt=1, description="fraction of shadowed pulses")
     mean_pulses: float = Field(default=10.0, ge=1, description="mean length of a burst, pulses")
     attenuation_db: float = Field(default=60.0, ge=0, description="loss while shadowed, dB")
 
@@ -129,7 +129,7 @@ class Interferer:
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Ripple:
-    """Ripple by an internal reflection: response 1 + ρ·exp(-j2πf·delay).
+    """Ripple due to an internal reflection: response 1 + ρ·exp(-j2πf·delay).
 
     Examples
     --------
@@ -170,7 +170,7 @@ class Radio:
         default=None, ge=0, description="noise figure of the receiver, dB; null: no noise"
     )
     amplitude_std_db: float | None = Field(
-        default=None, ge=0, description="configured standard deviation of all of these, dB; null: not configured"
+        default=None, ge=0, description="configured standard deviation of all these values, dB; null: not configured"
     )
 
 
@@ -198,7 +198,7 @@ class Impairments:
         default=None, description="carrier phase per pulse: uniform or walk; null: coherent"
     )
     timing: Timing = Field(default=Timing(), description="error of the start of each capture")
-    missed_fraction: float = Field(default=0.0, ge=0, lt=1, description="share of the pulses without a capture")
+    missed_fraction: float = Field(default=0.0, ge=0, lt=1, description="fraction of the pulses without a capture")
     time_tag: TimeTag = Field(default=TimeTag(), description="error of the UTC tags")
     radar_snr_db: float | None = Field(default=None, description="SNR of the radar channel, dB; null: no noise")
     sidelink_snr_db: float | None = Field(default=None, description="SNR of the sidelink, dB; null: no noise")

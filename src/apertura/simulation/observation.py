@@ -77,7 +77,7 @@ def fly(
 
 
 def physical(channel: Channel, *, transmitter: Radio, receiver: Radio) -> Channel:
-    """Convert a radar channel to root watts at the converter, with the receiver's thermal noise and full scale.
+    """Scale a radar channel to √W at the ADC input, with the thermal noise and the full scale of the receiver.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ def observe(
 
 
 def _true(logged: Geometry, sender: _Node, receiver: _Node) -> Geometry:
-    """Return the true antenna positions: the logged ones minus the localization error of each node."""
+    """Return the true antenna positions: the logged positions minus the localization error of each node."""
 
     def true(logged_m: Floats, point: AntennaPoint, node: _Node) -> Floats:
         localization, error_m = node[0].localization, node[1].position_error_m

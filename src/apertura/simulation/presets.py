@@ -1,7 +1,7 @@
 """Presets of simulations: the demo, the scene of the reference paper and its three experiments.
 
-The docstring of an experiment lists the parameters published in the paper, and the assumptions made for unpublished
-ones. Assumptions are not tuned to reproduce results of the paper; docs/theory/study.md, "Experiments".
+The docstring of an experiment lists the parameters published in the paper, and the values assumed for unpublished
+parameters. Assumptions are not tuned to reproduce results of the paper; docs/theory/study.md, "Experiments".
 """
 
 from collections.abc import Callable, Mapping

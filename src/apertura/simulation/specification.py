@@ -94,7 +94,7 @@ class SimulatedFlight:
     )
     segments: Mapping[str, tuple[tuple[float, float], ...]] = Field(
         default_factory=dict,
-        description="pair → start and end of the segments it is imaged from, s after the first pulse; missing: all",
+        description="pair → start and end of the imaged segments, s after the first pulse; missing: all pulses",
     )
 
     @model_validator(mode="after")
@@ -214,7 +214,7 @@ def read_specification(path: Path) -> CampaignSpecification:
     Raises
     ------
     CampaignError
-        If the file is missing or invalid; the error lists all wrong keys and the nearest valid ones.
+        If the file is missing or invalid; the error lists all wrong keys and the nearest valid keys.
     """
     remedy = "Start from the output of `apertura simulate --print-spec demo`."
     document = read_yaml(path, expected="a YAML specification of a simulation", remedy=remedy)

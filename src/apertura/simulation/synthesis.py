@@ -1,9 +1,9 @@
 """Synthesis of recordings: paths, impairments of a node, samples on its own clock, and digitisation.
 
-A delay acts on each subcarrier, so all echoes are summed in one spectrum, which is transformed to the receiver's time
-grid by an inverse DFT, or by a chirp-z transform if its sampling rate has an offset. The edges of echoes are exact: an
-echo is absent before its arrival and after its end. Captures of long flights are synthesised faster, with periodic
-echoes that have no edges.
+A delay is a phase of each subcarrier, so that all echoes are summed in one spectrum. The spectrum is transformed to the
+receiver's time grid by an inverse DFT, or by a chirp-z transform if the sampling rate has an offset. The edges of
+echoes are exact: an echo is absent before its arrival and after its end. Captures of long flights are synthesised
+faster, with periodic echoes that have no edges.
 """
 
 from collections.abc import Callable, Mapping
@@ -27,13 +27,13 @@ from apertura.simulation.waveform import TransmitWaveform
 
 Complex = NDArray[np.complex128]
 
-_SHORT = 64  # longest interval that is summed directly, samples; longer intervals are taken from a transform
+_SHORT = 64  # longest interval that is summed directly, samples; longer intervals are computed by a transform
 _DOPPLER_ORDER = 3  # order of the Taylor series of exp(-j2πf·rate·t); the next term is below -150 dB (100 m/s, 1.6 GHz)
 
 
 @dataclass(frozen=True)
 class Channel:
-    """Receiving channel over a flight, with all random values drawn: it determines the samples.
+    """Receiving channel over a flight with all drawn random values, which determines the samples.
 
     Attributes
     ----------
@@ -133,7 +133,7 @@ def _capture(channel: Channel, pulse: int, count: int) -> Complex:
     capture = np.zeros(count, np.complex128)
     edges = np.unique(np.clip(np.concatenate([first, end]), 0, count))
     for start, stop in pairwise(edges):
-        # The paths present are those that have arrived minus those that have ended, both in the order of delays.
+        # Present paths: paths that have arrived minus paths that have ended, both in the order of delays.
         arrived, ended = np.searchsorted(first, start, "right"), np.searchsorted(end, start, "right")
         if arrived > ended:
             present = spectra[:, groups[arrived]] - spectra[:, groups[ended]]
@@ -147,7 +147,7 @@ def _cumulative_spectra(channel: Channel, pulse: int, order: NDArray[np.intp], s
     delay, rate = paths.delay_s[pulse, order], paths.delay_rate[pulse, order]
     middle_s = waveform.duration_s / 2
     terms = _DOPPLER_ORDER + 1 if rate.any() else 1
-    # delays at the middle of the pulse relative to the start of the capture; they also determine the carrier phase
+    # delays at the midpoint of the pulse relative to the start of the capture; these also determine the carrier phase
     late = delay + rate * middle_s - channel.start_s[pulse]
     level = paths.amplitude[pulse, order]
     factor = waveform.codes * channel.response * np.exp(-2j * np.pi * waveform.baseband_hz * waveform.cyclic_prefix_s)
@@ -162,7 +162,7 @@ def _cumulative_spectra(channel: Channel, pulse: int, order: NDArray[np.intp], s
 
 
 def _interval(channel: Channel, pulse: int, spectra: Complex, start: int, stop: int, count: int) -> Complex:
-    """Evaluate Σ_q t^q Σ_n S_qn exp(j2πnΔf·m/f_s') for start ≤ m < stop; t is relative to the middle of the pulse."""
+    """Evaluate Σ_q t^q Σ_n S_qn exp(j2πnΔf·m/f_s') for start ≤ m < stop; t is relative to the midpoint of the pulse."""
     waveform = channel.waveform
     cycles = waveform.subcarrier_spacing_hz / sampling_rate(channel)  # per sample and subcarrier
     index = np.arange(start, stop)
@@ -416,7 +416,7 @@ def _response(waveform: TransmitWaveform, ripple: Ripple | None) -> Complex:
 
 
 def spectral_power(waveform: TransmitWaveform, paths: Paths, response: Complex | float = 1.0) -> float:
-    """Return the mean of |Σ a·exp(-j2πfτ)|² over subcarriers and pulses (evenly spaced ones of a long flight)."""
+    """Return the mean of |Σ a·exp(-j2πfτ)|² over subcarriers and pulses (of a long flight, evenly spaced pulses)."""
     every = -(-len(paths.delay_s) // _MOST_PULSES)
     paths = paths.at(slice(None, None, every))
     starts = range(0, len(paths.delay_s), _PULSES_AT_ONCE)

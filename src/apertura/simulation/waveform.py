@@ -199,7 +199,7 @@ class TransmitPulse(TransmitWaveform):
     pulse
         (sample,) complex128.
     lead_s, listen_s
-        Time of the capture before the pulse, and longest delay whose echo is complete in the capture, seconds.
+        Duration of the capture before the pulse, and longest delay whose echo is complete in the capture, seconds.
     band_hz
         Band of demodulation at baseband.
 
@@ -260,7 +260,7 @@ class TransmitPulse(TransmitWaveform):
         return "pulse.npy", self.pulse.astype(np.complex64)
 
     def presence(self, arrival: Floats, rate_hz: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return the first and last sample of each path: the whole capture, or none of it if outside the capture.
+        """Return the first and last sample of each path: the whole capture, or no sample if outside the capture.
 
         The tones contain the edges of a pulse, including the ringing of a fractional delay beyond them.
         """
@@ -317,7 +317,9 @@ class PulseSpecification:
     """Specification of a pulse that is sent once per trigger; docs/theory/waveforms.md, "Simulated"."""
 
     pulse: PulseName = Field(description="chirp, pn (maximum-length sequence) or golay")
-    carrier_hz: float = Field(gt=0, description="RF frequency of baseband zero, the middle of the pulse's band, Hz")
+    carrier_hz: float = Field(
+        gt=0, description="RF frequency of baseband zero, the centre of the band of the pulse, Hz"
+    )
     bandwidth_hz: float = Field(gt=0, description="bandwidth of the chirp, or chip rate, Hz")
     pulse_s: float = Field(gt=0, description="longest duration of the pulse, s")
     listen_s: float = Field(gt=0, description="longest delay whose echo is complete in a capture, s")

@@ -80,7 +80,7 @@ def _points_over_clutter(above_db: float) -> Callable[[np.random.Generator], Tar
 
 
 def _field(generator: np.random.Generator) -> TargetScene:
-    """Return speckle that extends beyond the scene on all sides, so that the image contains no edge of it."""
+    """Return speckle that extends beyond the scene on all sides, so that the image contains no edge of the speckle."""
     return _clutter(60_000, generator, (-18.0, 1.0, 18.0, 37.0))
 
 
@@ -179,7 +179,7 @@ def _straight() -> LoggedFlight:
 
 
 def _short() -> LoggedFlight:
-    """Return a short flight, as of a first test: 20 m in 7.5 s, 150 pulses."""
+    """Return a short flight, typical of a first test: 20 m in 7.5 s, 150 pulses."""
     time_s = np.arange(150) / 20
     first = np.stack([20 / 7.5 * (time_s - 3.725), 0 * time_s, np.full(150, 10.0)], -1)
     return LoggedFlight(time_s, dict(zip(NODES, (first, first + [_NODE_SPACING_M, 0, 0]), strict=True)))
@@ -196,7 +196,7 @@ def _wobble() -> LoggedFlight:
 
 
 def _circle() -> LoggedFlight:
-    """Return one full circle about the middle of the scene with a radius of 14 m."""
+    """Return one full circle about the scene centre with a radius of 14 m."""
     radius = 14.0
     time_s = np.arange(int(2 * np.pi * radius * PULSES_HZ)) / PULSES_HZ
 
@@ -209,7 +209,7 @@ def _circle() -> LoggedFlight:
 
 
 def _far() -> LoggedFlight:
-    """Return a pass at a distance of 1 km and ten times the speed: a track error has one phase for the whole scene."""
+    """Return a pass at 1 km and ten times the speed: a track error has the same phase at all points of the scene."""
     time_s = np.arange(3000) / PULSES_HZ
     first = np.stack([10 * (time_s - 15), np.full(3000, -985.0), np.full(3000, 300.0)], -1)
     return LoggedFlight(time_s, dict(zip(NODES, (first, first + [_NODE_SPACING_M, 0, 0]), strict=True)), (1.2, 0.6))
@@ -238,7 +238,7 @@ _STEP_NOISE_M = 0.005
 
 
 def _step(time_s: Floats, errors: TrackErrors, generator: np.random.Generator) -> Floats:
-    """Draw position errors, (pulse, 3) metres: noise of 0.5 cm and a step of `std_m`, as at a change of the fix."""
+    """Draw position errors, (pulse, 3) metres: noise of 0.5 cm and a step of `std_m`, typical of a change of fix."""
     noise = drawn_errors(time_s, replace(errors, std_m=(_STEP_NOISE_M,) * 3), generator)
     at_s = time_s[0] + generator.uniform(0.35, 0.65) * (time_s[-1] - time_s[0])
     direction = generator.standard_normal(3)
@@ -292,7 +292,7 @@ PROBES_M[:, 0] += np.tile([0.3, -0.4, 0.0, 0.5, -0.2], 3)
 
 @dataclass(frozen=True, eq=False)
 class AutofocusCase:
-    """Inputs of a refinement, and the true tracks that it is compared with.
+    """Inputs of a refinement, and the true tracks with which the result is compared.
 
     Attributes
     ----------
@@ -334,7 +334,7 @@ def case(
     kind: str = "smooth",
     stated_m: float | None = None,
 ) -> AutofocusCase:
-    """Return a case; tracks, scene and noise have separate random streams, so that each stays when another changes.
+    """Return a case; tracks, scene and noise have separate random streams, so that they change independently.
 
     Parameters
     ----------
@@ -343,8 +343,8 @@ def case(
     sigma_m, drift_m
         Standard deviations of the logs' errors in each axis.
     snr_db
-        Range-compressed, per pulse, of the rms target, or of the mean range cell if the scene has no target;
-        None: no noise.
+        SNR of a range-compressed pulse, dB, of a target with the rms amplitude, or of the mean range cell if the scene
+        has no target; None: no noise.
     seed
         Seed of all random streams.
     correlation_s
@@ -352,7 +352,7 @@ def case(
     kind
         Name in `ERRORS`.
     stated_m
-        Standard deviation that the refinement is given instead of `sigma_m`.
+        Standard deviation that is stated to the refinement instead of `sigma_m`.
     """
     of_tracks, of_scene, of_noise, of_probes = np.random.default_rng(seed).spawn(4)
     flight, scatterers = FLIGHTS[geometry](), SCENES[scene](of_scene)

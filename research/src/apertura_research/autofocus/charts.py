@@ -94,16 +94,16 @@ def _mark_verdicts(axes: Axes, rows: Sequence[AutofocusRow]) -> None:
 
 
 def tally(rows: Sequence[AutofocusRow]) -> str:
-    """Count the accepted refinements, and those of them with more loss than the logged tracks.
+    """Count the accepted refinements, and the accepted refinements with a larger loss than the logged tracks.
 
     Examples
     --------
     >>> tally([AutofocusRow("five", 1.0, seed, 1.2, 0.1, 0.1, ACCEPTED, "", "") for seed in (1, 2)])
-    '2 of 2 accepted, 0 of them worse than the logs'
+    '2 of 2 accepted, 0 of these worse than the logs'
     """
     accepted = [one for one in rows if one.verdict in (ACCEPTED, FLAGGED)]
     worse = [one for one in accepted if one.product_loss_db > one.loss_db]
-    return f"{len(accepted)} of {len(rows)} accepted, {len(worse)} of them worse than the logs"
+    return f"{len(accepted)} of {len(rows)} accepted, {len(worse)} of these worse than the logs"
 
 
 def _scale(axes: Axes, outcomes: Sequence[AutofocusRow]) -> None:
@@ -179,7 +179,7 @@ def _title(one: AutofocusCase, result: Refinement) -> str:
 def _draw_images(
     figure: Figure, panels: Mapping[str, Axes], one: AutofocusCase, tracks: Mapping[str, TrackCorrection]
 ) -> Floats:
-    """Draw the first pair's image from each set of tracks (the last: true), and return the enlarged point."""
+    """Draw the first pair's image from each set of tracks, the last being true, and return the enlarged point."""
     true = image(one, one.truth, GRID)
     place_m = _brightest(true)
     for view, grid in (("whole", GRID), ("close", _about(place_m))):
@@ -188,7 +188,7 @@ def _draw_images(
         row = [panels[f"{view} {number}"] for number in range(len(images))]
         for axes, (name, values) in zip(row, images.items(), strict=True):
             shown = _draw_image(axes, values / peak, grid)
-            # Pixels of the whole scene sample peaks with an error of tenths of a decibel.
+            # The pixel spacing of the whole scene causes errors of tenths of a decibel in sampled peaks.
             peak_text = f", peak {20 * np.log10(values.max() / peak):+.1f} dB" if view == "close" else ""
             axes.set_title(name + peak_text, fontsize=10)
         row[0].set_ylabel("North, m")
@@ -229,17 +229,17 @@ def _draw_errors(axes: Axes, one: AutofocusCase, used: TrackCorrection, number: 
 
 
 def _draw_paths(axes: Axes, one: AutofocusCase, used: TrackCorrection, place_m: Floats) -> None:
-    """Draw the errors of paths to a point less their means: the part that defocuses the point."""
+    """Draw the errors of paths to a point minus their means: the component that defocuses the point."""
     for record, colour in zip(one.records, _COLOURS, strict=False):
         true, logged, now = (_path(record, tracks, place_m) for tracks in (one.truth, UNCORRECTED, used))
         errors = tuple(error - error.mean() for error in (true - logged, true - now))
         _draw_pair(axes, record.time_s, errors, (record.pair, colour))
     axes.set_title(f"path to the enlarged point at {place_m[0]:.1f} m east, {place_m[1]:.1f} m north", fontsize=10)
-    axes.set_ylabel("Path error less its mean, cm")
+    axes.set_ylabel("Path error minus its mean, cm")
 
 
 def _path(record: PairRecord, tracks: TrackCorrection, place_m: Floats) -> Floats:
-    """Return the path of a point's echo that tracks predict, (pulse,) metres (docs/theory/autofocus.md, eq. 1)."""
+    """Return the echo path of a point along given tracks, (pulse,) metres (docs/theory/autofocus.md, eq. 1)."""
     aperture = tracks.aperture(record.profiles.aperture, record.pair, record.time_s)
     longer_m = tracks.longer_m(record.pair, record.time_s, record.sidelink_m)
     return np.asarray(aperture.path(place_m[None])[:, 0] - longer_m)

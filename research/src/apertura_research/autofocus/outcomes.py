@@ -128,7 +128,7 @@ SEEDS = (1, 2, 3)
 SNR_DB = 10.0
 
 LEAST_STATED_M = 0.005
-"""Smallest stated standard deviation: with less, the refinement is not requested."""
+"""Smallest stated standard deviation: for smaller values, no refinement is requested."""
 
 ACCEPTED, FLAGGED, REFUSED, TOO_FEW = "accepted", "accepted with a flag", "refused", "refused: no bright point"
 VERDICTS = (ACCEPTED, FLAGGED, REFUSED, TOO_FEW)
@@ -142,7 +142,8 @@ class AutofocusRow:
     ----------
     loss_db, product_loss_db, estimate_loss_db
         Mean peak loss of the probes, which no refinement uses, relative to the true tracks; positive if peaks are too
-        low: with the logs, with the tracks that the product uses, and with its estimate, accepted or not.
+        low. The losses are those with the logged tracks, with the tracks used by the product, and with the estimated
+        tracks, accepted or not.
     verdict
         One of `VERDICTS`.
     flags, why

@@ -29,11 +29,11 @@ from apertura.simulation.targets import GaussianBeam, Sampled, Straight, Wobble
 from apertura_research.paper_scene import RX_AHEAD_M, Disturbance, PaperScene, receive_pair, reduced_scene
 
 PAIRS = ("a-a", "a-b")
-"""Monostatic pair of node a, and bistatic pair with the receiver b ahead of it."""
+"""Monostatic pair of node a, and bistatic pair with the receiver b ahead of a."""
 
 LASTING_S, SUBCARRIERS = 10.0, 256
 GRID = SceneGrid("local", -6.0, 27.0, 0.08, (300, 150))
-"""The paper's scene: east along the track, north across it."""
+"""The paper's scene: east is along the track, north across the track."""
 
 _LEVEL = FlatGround(0.0)
 _NOISE = Disturbance(Impairments(radar_snr_db=20.0, sidelink_snr_db=30.0))
@@ -89,7 +89,7 @@ class AssumedFlight:
     flags: Mapping[str, str] = field(default_factory=dict)
 
     def history(self, pair: str, received: Received, frequency_hz: Floats) -> PhaseHistory:
-        """Return the phase history of a pair as the pipeline computes it."""
+        """Return the phase history of a pair as computed by the pipeline."""
         aperture, used = self.apertures[pair], slice(None) if self.used is None else self.used
         longer_m = np.full(len(aperture), self.longer_m.get(pair, 0.0))
         if received.sidelink_m is not None:
@@ -171,7 +171,7 @@ class TrueFlight:
         return Received(METHODS["divide"](radar, sidelink), measure(sidelink).delay_cells * cell_m)
 
     def paths(self, pair: str) -> PointPaths:
-        """Return the paths of a point in the middle of the scene, for which the budget is computed."""
+        """Return the paths of a point at the scene centre, for which the budget is computed."""
         return PointPaths.of(
             self.apertures()[pair],
             self.time_s,
@@ -264,7 +264,7 @@ class LogErrors:
 
 
 def assumed_from_logs(flown: TrueFlight, generator: Generator, **logs: LogErrors) -> AssumedFlight:
-    """Return the assumptions of a pipeline with erroneous logs; nodes without one have their true positions."""
+    """Return the assumptions of a pipeline with erroneous logs; other nodes have their true positions."""
     places, used, flags = {}, np.ones(len(flown.time_s), bool), dict[str, str]()
     for node, log in logs.items():
         places[node], checked = log.checked(flown, node, generator)

@@ -110,7 +110,7 @@ def _formation(assumed: AssumedFlight, pair: str, history: Any) -> Formation:
 
 
 def _interpolator(formation: Formation) -> Callable[[Floats, Floats], NDArray[np.complex64]]:
-    """Return a function that forms the planned image at any point: a raster locates a peak to a centimetre only."""
+    """Return a function that forms the planned image at any point; raster pixels locate a peak only to a centimetre."""
     setting, inputs = formation.plan.setting, formation.plan.inputs(formation.profiles)
     engine = load_engine(setting.engine)
     tables = engine.prepare(inputs, **setting.options)
@@ -162,7 +162,8 @@ class ErrorAtlasRow:
     Attributes
     ----------
     pair
-        Pair of the losses and displacements: that with the larger expected effect, or the monostatic one without any.
+        Pair of the losses and displacements: the pair with the larger expected effect, or the monostatic pair if no
+        effect is expected.
     loss_db, shift_m
         Mean over the five targets, relative to the same draw without the error.
     phase_rad

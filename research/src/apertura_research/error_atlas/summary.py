@@ -14,10 +14,10 @@ from apertura_research.error_atlas.outcomes import ErrorAtlasRow, draws_of, run_
 from apertura_research.sweep import Study, crossing, draw_table, order_sizes, panels, with_unit
 
 HARMFUL_DB, HARMFUL_CELLS = 1.0, 0.5
-"""Peak loss or displacement above which an image is wrong: without a flag, it counts as a missed alarm."""
+"""Peak loss or displacement above which an image is wrong; a wrong image without a flag counts as a missed alarm."""
 
 HARMLESS_DB, HARMLESS_CELLS, HARMLESS_RAD, HARMLESS_GHOST_DB = 0.3, 0.1, 0.3, 3.0
-"""Limits below all of which an image is right: with a flag, it counts as a false alarm."""
+"""An image below all these limits is right; a right image with a flag counts as a false alarm."""
 
 _MEASURABLE_DB = 0.5
 """Smallest loss for which the ratio of expected to measured loss is computed."""
@@ -36,14 +36,14 @@ class CauseSummary:
     size_of_flag
         The first size at which most draws have a flag.
     expected_over_measured
-        Ratio of losses in dB, averaged over the sizes that cost more than 0.5 dB; without any, ratio of displacements,
-        over those of more than a tenth of a resolution cell.
+        Ratio of losses in dB, averaged over the sizes with a loss above 0.5 dB; if there are none, ratio of
+        displacements, averaged over displacements of more than a tenth of a resolution cell.
     ratio_of
         Quantity of the ratio: loss, shift or nothing.
     wrong, missed
-        Number of wrong draws, and the share of them without a flag.
+        Number of wrong draws, and the fraction of wrong draws without a flag.
     right, false
-        Number of right draws, and the share of them with a flag.
+        Number of right draws, and the fraction of right draws with a flag.
     flags
         Flags raised at any size, separated by blanks.
     """
@@ -73,11 +73,12 @@ class Alarm:
     raised
         Number of draws of all causes with the flag.
     wrong, missed
-        Number of wrong draws of the causes that raise the flag at any size, and the share of them without it.
+        Number of wrong draws of the causes that raise the flag at any size, and the fraction of these draws without the
+        flag.
     unflagged
-        Share of these wrong draws without any flag.
+        Fraction of these wrong draws without any flag.
     right, false
-        Number of right draws of all causes, and the share of them with the flag.
+        Number of right draws of all causes, and the fraction of these draws with the flag.
     """
 
     flag: str
@@ -111,7 +112,7 @@ def by_size(outcomes: Sequence[ErrorAtlasRow]) -> dict[float, list[ErrorAtlasRow
 
 
 def mean_of(rows: Sequence[ErrorAtlasRow], name: str) -> float:
-    """Return the mean of one column over the draws that were not refused; NaN without any."""
+    """Return the mean of one column over the draws that were not refused; NaN if all were refused."""
     values = [value for row in rows if np.isfinite(value := getattr(row, name))]
     return float(np.mean(values)) if values else float("nan")
 
@@ -173,7 +174,7 @@ def alarms(outcomes: Sequence[ErrorAtlasRow]) -> list[Alarm]:
 
 
 def share(rows: Sequence[ErrorAtlasRow], condition: Callable[[ErrorAtlasRow], bool]) -> float:
-    """Return the share of draws that meet a condition; NaN without any draw."""
+    """Return the fraction of draws that meet a condition; NaN if there are no draws."""
     return _rounded(np.mean([condition(row) for row in rows])) if rows else float("nan")
 
 
@@ -204,7 +205,7 @@ def _raises(flag: str, one: ErrorAtlasRow) -> bool:
 
 
 def _first(groups: dict[float, list[ErrorAtlasRow]], condition: Callable[[ErrorAtlasRow], bool]) -> float:
-    """Return the first size at which most draws meet a condition; NaN without any."""
+    """Return the first size at which most draws meet a condition; NaN if there is none."""
     return next(
         (size for size, rows in groups.items() if np.mean([condition(row) for row in rows]) > 0.5), float("nan")
     )

@@ -1,4 +1,4 @@
-"""Row of the claims table: the printed value, the computed value, the verdict, and the reference it compares with."""
+"""Row of the claims table: the printed value, the computed value, the verdict, and its reference."""
 
 from dataclasses import dataclass, replace
 from math import isinf
@@ -19,7 +19,7 @@ class Claim:
     Attributes
     ----------
     paper
-        Number printed in the source paper, digit by digit; empty if it prints none.
+        Number printed in the source paper, digit by digit; empty if the paper prints no number.
     independent_model
         Value of a model that shares no code with this project, or of a closed form; empty if there is none.
     about
@@ -60,7 +60,7 @@ def compare(
     claim, computed, unit, paper, independent_model, note
         Columns of `Claim`; at least one of `paper`, as printed, and `independent_model`.
     within
-        Largest difference that still agrees: a share of the expected value, or in `unit` if not `relative`; None:
+        Largest difference that still agrees: a fraction of the expected value, or in `unit` if not `relative`; None:
         values that round to the printed digits agree.
     style
         Format of `computed`.
@@ -148,7 +148,7 @@ def require(
 
 
 def fitted_to(row: Claim) -> Claim:
-    """Mark an agreeing row as explained if its parameters were fitted to the printed value: it is no confirmation.
+    """Mark an agreeing row as explained if its parameters were fitted to the printed value: no confirmation.
 
     Examples
     --------

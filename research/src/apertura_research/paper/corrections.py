@@ -141,7 +141,7 @@ def position_claims(*, draws: int = DRAWS, seed: int = 3) -> list[Claim]:
     bistatic_db = float(np.mean([peak_losses_db(ERRORS["localization"], SIGMA_CM, drawn()) for drawn in generators]))
     return [
         compare("largest range error λ/10", tenth_cm, "cm", paper="2", style=".3g",
-                note="at the middle of the band; the requirement rows use δR = 2 cm one way"),
+                note="at the band centre; the requirement rows use δR = 2 cm one way"),
         require(f"loss at range errors of at most λ/10, {draws} draws", bounded_db, "dB",
                 limit=f"at most {TOLERATED_DB:g} dB", met=bounded_db >= -TOLERATED_DB, style=".2f",
                 words="positions with a range error of at most λ/10 suffice",
@@ -228,7 +228,7 @@ def _along_the_sidelink() -> Claim:
     return require(
         "residual path of an offset of 1 cm of both nodes along the sidelink", both_cm, "cm",
         limit="less than 0.1 cm", met=both_cm < 0.1, words="offsets of both nodes cancel", style=".3f",
-        note="R_tx + R_rx − R_sl, target abreast of the middle, 15 m away and 10 m below; the image is displaced "
+        note="R_tx + R_rx − R_sl, target abreast of the pair, 15 m away and 10 m below; the image is displaced "
         f"along track; an offset of a single node, which the paper does not discuss, leaves {single_cm:.2f} cm",
     )  # fmt: skip
 

@@ -137,7 +137,7 @@ PRINTED = {
 """Experiment → its targets in order, and their printed coherence factors after correction."""
 
 SILENT_M = np.linspace(45.0, 60.0, 60)
-"""Halves of total paths beyond all echoes of both experiments, metres."""
+"""Half of the total path, at distances beyond all echoes of both experiments, metres."""
 
 ALIKE_RAD, ALIKE_DB = 0.05, 0.2
 """Largest differences between mono- and bistatic recordings of one signal, rad and dB."""
@@ -161,7 +161,7 @@ def _uncorrected(experiments: Mapping[str, Experiment]) -> Claim:
     terms = {name: terms_at(one.uncorrected("none"), one.places_m[0]) for name, one in experiments.items()}
     factors = {name: coherence_factor(own) for name, own in terms.items()}
     pulses = len(terms["lab"])
-    low, high = (-np.log(1 - share) / pulses for share in (0.025, 0.975))  # of random phases MΓ is exponential
+    low, high = (-np.log(1 - share) / pulses for share in (0.025, 0.975))  # MΓ is exponential for random phases
     note = (
         f"for the cables; {factors['static']:.2g} for the first cylinder: the paper does not state which is printed; "
         f"random phases: mean 1/M = {1 / pulses:g}, median {np.log(2) / pulses:.4f}; 95 % of recordings give "
@@ -224,7 +224,7 @@ def _alike(name: str, experiment: Experiment) -> list[Claim]:
     words = "mono- and bistatic recordings of one split receive signal agree" if name == "static" else ""
     note = f"{PRINTED[name][0][0]}, at its true position, electrical paths known"
     rows = [
-        require(f"phase of bistatic less monostatic, {name}", phase, "rad", limit=f"within ±{ALIKE_RAD:g} rad",
+        require(f"phase of bistatic minus monostatic, {name}", phase, "rad", limit=f"within ±{ALIKE_RAD:g} rad",
                 met=abs(phase) <= ALIKE_RAD, words=words, style=".4f", note=note),
         require(f"gain of bistatic over monostatic, {name}", gain_db, "dB", limit=f"within ±{ALIKE_DB:g} dB",
                 met=abs(gain_db) <= ALIKE_DB, words=words, style=".3f", note=note),

@@ -135,7 +135,7 @@ BLUE, ORANGE, GREEN, BLACK = "#0072B2", "#D55E00", "#009E73", "black"
 
 DEPTH_DB = 40.0
 SPANS_M = {"lab": (-6.0, 10.0), "static": (0.0, 12.0)}
-"""Range axes: halves of total paths beyond the cables, metres."""
+"""Range axes: half of the total path in excess of the cables, metres."""
 
 TITLES = ("(a) Monostatic", "(b) Bistatic, code only", "(c) Bistatic, divided by the sidelink")
 
@@ -154,7 +154,7 @@ def draw_profile(name: str, folder: Path, path: Path) -> Path:
         axes.plot([], [], color=BLUE, label=f"all {len(level)} pulses")
         for place, words, colour in zip(experiment.places_m, _names(name), (ORANGE, GREEN), strict=False):
             axes.axvline(_half_path_m(history, place), color=colour, linestyle="--", linewidth=1, label=words)
-        axes.set(xlabel="Half of the total path beyond cables, m", xlim=SPANS_M[name], ylim=(-60, 3))
+        axes.set(xlabel="Half of the total path without cables, m", xlim=SPANS_M[name], ylim=(-60, 3))
         axes.set_title(title, loc="left", fontsize=10)
         axes.grid(alpha=0.3)
     panels[0].set_ylabel("Magnitude, dB re peak of all pulses")

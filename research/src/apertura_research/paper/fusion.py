@@ -88,7 +88,7 @@ def _phase(experiment: Experiment) -> Claim:
     )
     worst = float(np.abs(np.angle(np.divide(bistatic, mono))).max())
     return require(
-        "absolute coherence: phase of bistatic less monostatic image, UAV flight",
+        "absolute coherence: phase of bistatic minus monostatic image, UAV flight",
         worst,
         "rad",
         limit=f"within ±{LARGEST_PHASE_RAD:g} rad",

@@ -113,8 +113,8 @@ def _timing(scene: PaperScene, still: Profile, moved: Profile, late_s: float) ->
             independent_model=scene.waveform.carrier_hz * late_s % 1.0,
             within=0.005,
             relative=False,
-            note="closed form f_cT modulo one cycle, for a profile referenced to the start of the band; this project "
-            "references profiles to the middle of the band, where it is f_mid·T",
+            note="closed form f_cT modulo one cycle for a profile referenced to the start of the band; this project "
+            "references profiles to the band centre, where the phase change is f_mid·T cycles",
         ),
     ]
 
@@ -147,7 +147,7 @@ def _level(profile: Profile) -> float:
 
 
 DESTROYED_DB = -12.0
-"""Loss beyond which no peak is measurable: the largest speckle near the target is reported."""
+"""Loss beyond which no peak is measurable; the search then returns the largest speckle near the target."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ class UncorrectedError:
     Attributes
     ----------
     sweep
-        The impairment, applied without any other.
+        The impairment, applied without any other impairment.
     independent_model_db
         Size → mean peak loss of an independent model, dB; differences up to `within_db` agree.
     pulses

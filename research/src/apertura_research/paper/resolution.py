@@ -53,7 +53,7 @@ def simulated_table(*, pulses: int = 600) -> list[Claim]:
         closed = 100 * ground_range_resolution_m(_bandwidth_hz(scene), peak[1], height_m)
         closed_cm.append(closed)
         crosses_cm.append(cross)
-        note = f"closed form 0.886·c/2B·R/r_g {closed:.1f} cm: a long aperture is finer because it adds look angles"
+        note = f"closed form 0.886·c/2B·R/r_g {closed:.1f} cm: longer apertures resolve more finely"
         name = f"{title}: ground-range width"
         rows.append(compare(name, ground, "cm", independent_model=ground_cm, within=WITHIN, note=note))
         closed = 100 * cross_range_resolution_m(middle_hz, float(np.hypot(peak[1], height_m)), aperture_m)

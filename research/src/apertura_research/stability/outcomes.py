@@ -17,7 +17,7 @@ from apertura_research.point_response import find_peaks, mean_image
 from apertura_research.stability.sweeps import SWEEPS, ImpairmentSweep
 
 REFUSED_DB = 40.0
-"""Loss recorded if no pulse is imaged; larger losses are clipped to it."""
+"""Loss recorded if no pulse is imaged; larger losses are clipped to this value."""
 
 _REACH_M = (0.16, 1.0)
 
@@ -33,11 +33,11 @@ class StabilityRow:
     coherence_factor
         Mean over the targets and draws.
     ground_width_m, cross_width_m
-        −3 dB widths of the third target, median over the draws; NaN if it has no main lobe.
+        −3 dB widths of the third target, median over the draws; NaN if the target has no main lobe.
     floor_db
         RMS error at random pixels of the scene, relative to the mean peak.
     pulses_used
-        Mean share of imaged pulses.
+        Mean fraction of imaged pulses.
     chosen
         Method applied in most draws; `refused` if the sidelink locks in no pulse.
     """
@@ -66,7 +66,7 @@ def sizes_of(part: str) -> tuple[float, ...]:
 def run_size(part: str, size: float, *, seed: int = 1) -> list[StabilityRow]:
     """Simulate one size of an impairment of `SWEEPS` under a correction of `CHOICES`.
 
-    Draws depend only on the seed and their number: every method and size gets the same random numbers.
+    Draws depend only on the seed and their number: the random numbers are the same for every method and size.
     """
     impairment, _, method = part.partition(".")
     sweep = SWEEPS[impairment]

@@ -148,7 +148,7 @@ def draw_impairment(impairment: str, outcomes: Sequence[StabilityRow], path: Pat
 
 def _draw_line(axis: Axes, method: str, sizes: list[float], values: list[float]) -> None:
     colour, marker, style = _STYLES[method]
-    below = method == "auto"  # drawn as a broad line below that of the method it selects
+    below = method == "auto"  # drawn as a broad line below the line of the selected method
     axis.plot(
         sizes,
         values,
@@ -172,7 +172,7 @@ def _mark_losses(axis: Axes) -> None:
 
 
 def _draw_tolerances(tolerances: Sequence[Tolerance], path: Path) -> None:
-    """Draw the table of sizes with 1 dB and 3 dB of peak error, coloured by the share of the sweep below 1 dB."""
+    """Draw the table of sizes with 1 dB and 3 dB of peak error, coloured by the fraction of the sweep below 1 dB."""
     table = [tolerances[first : first + len(CHOICES)] for first in range(0, len(tolerances), len(CHOICES))]
     draw_table(
         path,
@@ -180,12 +180,12 @@ def _draw_tolerances(tolerances: Sequence[Tolerance], path: Path) -> None:
         [[_share(one) for one in row] for row in table],
         ([with_unit(sweep.title, sweep.unit) for sweep in SWEEPS.values()], CHOICES),
         title="Size at which the peak error reaches 1 dB | 3 dB (> or <: not within the sweep)",
-        scale="Share of the sweep below 1 dB",
+        scale="Fraction of the sweep below 1 dB",
     )
 
 
 def _share(tolerance: Tolerance) -> float:
-    """Return the share of the sweep with a loss below 1 dB, 0…1."""
+    """Return the fraction of the sweep with a loss below 1 dB, 0…1."""
     if np.isnan(tolerance.size_at_1_db):
         return 1.0
     sweep = SWEEPS[tolerance.impairment]

@@ -150,7 +150,7 @@ SWEEPS: Mapping[str, ImpairmentSweep] = {
         _reflection, logarithmic=False, draws=1,
     ),
     "sidelink_blockage": ImpairmentSweep(
-        "Share of pulses with the sidelink blocked by 60 dB", "1", (0.01, 0.03, 0.1, 0.2, 0.4, 0.7),
+        "Fraction of pulses with the sidelink blocked by 60 dB", "1", (0.01, 0.03, 0.1, 0.2, 0.4, 0.7),
         lambda size: {"sidelink_blockage": Blockage(size)}, logarithmic=False, draws=4,
     ),
     "leakage": ImpairmentSweep(
@@ -187,7 +187,7 @@ SWEEPS: Mapping[str, ImpairmentSweep] = {
         tagged=True,
     ),
     "missed_triggers": ImpairmentSweep(
-        "Share of triggers missed", "1", (0.02, 0.05, 0.1, 0.3, 0.5, 0.8, 0.95),
+        "Fraction of triggers missed", "1", (0.02, 0.05, 0.1, 0.3, 0.5, 0.8, 0.95),
         lambda size: {"missed_fraction": size}, logarithmic=False, draws=4,
     ),
     "doppler": ImpairmentSweep(

@@ -1,4 +1,4 @@
-"""Clock offset and path of a recorder without a known point, by maximum sharpness of the image of the terrain."""
+"""Clock offset and path offset of a recorder without a known point, by maximum sharpness of the terrain image."""
 
 from dataclasses import dataclass, replace
 
@@ -53,7 +53,7 @@ class SceneSharpness:
 
     @classmethod
     def of(cls, echo: Recorded, log: Logged, places_m: Floats) -> "SceneSharpness":
-        """Return the sharpness function of echoes, whose pulses are compressed once."""
+        """Return the sharpness function of echoes; the pulses are range compressed once."""
         frequency = echo.frequency_hz
         speed = echo.wave_speed_m_s
         step_m, length = range_step(frequency, oversampling=_OVERSAMPLING, wave_speed_m_s=speed)
@@ -116,7 +116,7 @@ def align_on_scene(
     within_s
         Smallest and largest offset to search, seconds.
     search_m
-        Limit of the searched paths of either sign, metres; 0 keeps the path fixed.
+        Largest magnitude of the searched path offsets, metres; 0 keeps the path offset fixed.
 
     Raises
     ------
@@ -125,8 +125,9 @@ def align_on_scene(
 
     Notes
     -----
-    Source: docs/theory/tracks.md, "Clock of the recorder". Only the curvature of a point's phase history separates
-    path, offset and position of the point: the aperture must not be short compared with the distance.
+    Source: docs/theory/tracks.md, "Clock of the recorder". Only the curvature of a point's phase history separates the
+    path offset, the clock offset and the position of the point; therefore, the aperture must not be short compared with
+    the distance.
     """
     pulses = echo.moving()[:: -(-len(echo) // MOST_PULSES)]
     low, high = plausible_offsets(echo, log, within_s)
@@ -157,7 +158,7 @@ def align_on_scene(
 
 
 def _coarse(grid: SceneGrid, terrain: Terrain, cell_m: float) -> Floats:
-    """Return pixels (y, x, 3) spaced by a range cell, or more if the scene exceeds `MOST_PIXELS` on a side."""
+    """Return pixels (y, x, 3) spaced by at least one range cell, at most `MOST_PIXELS` on a side."""
     step = max(1, round(cell_m / grid.spacing_m), -(-max(grid.shape) // MOST_PIXELS))
     rows, columns = (np.arange(step // 2, size, step) for size in grid.shape)
     return terrain.positions_at(grid, *np.meshgrid(rows, columns, indexing="ij"))

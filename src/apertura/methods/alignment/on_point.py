@@ -22,9 +22,9 @@ AMBIGUITY_DB = -1.0
 """Level of the second-best offset relative to the best, dB, above which the best is ambiguous."""
 
 LEAST_CONTRAST_DB = 6.0
-"""Least significant peak power relative to the median of all offsets, dB."""
+"""Minimum ratio of the peak power to the median over all offsets for a significant peak, dB."""
 
-_STEPS_PER_WAVE = 8  # offset steps while the fastest path changes by a wavelength
+_STEPS_PER_WAVE = 8  # offset steps per wavelength of the fastest-changing path
 _OVERSAMPLING = 8  # oversampling of paths
 _WIDTH_DB = -1.0  # level below the peak at which widths are measured
 
@@ -36,7 +36,8 @@ class Alignment:
     Attributes
     ----------
     offset_s, path_m
-        Offset to add to the recorder's times, seconds; electrical path beyond geometry, metres of total path.
+        Offset to add to the recorder's times, seconds; electrical path in excess of the geometric path, metres of total
+        path.
     offset_width_s, path_width_m
         Errors of offset and path that lower the peak by 1 dB.
     contrast_db
@@ -44,7 +45,7 @@ class Alignment:
     report
         Method and search, as JSON values.
     drift_ppm
-        Microseconds to be added, in addition to the offset, for every second since the first pulse.
+        Microseconds to add for every second since the first pulse, in addition to the offset.
     flags
         Flag → measured values, one line.
     """
@@ -76,7 +77,7 @@ class PointSharpness:
     point_m: Floats
 
     def spectrum(self, offset_s: float) -> Complexes:
-        """Return (subcarrier,) complex64, sum of pulses referred to the point's path, weighted by distance flown."""
+        """Return (subcarrier,) complex64: sum of pulses with the path to the point compensated, weighted by speed."""
         at_s = self.echo.time_s + offset_s
         kept = self.log.inside(at_s)
         pulses, speed = self.echo[kept], self.log.speeds_m_s(at_s)[kept]
@@ -91,7 +92,7 @@ class PointSharpness:
         return np.asarray(summed * (taper / taper.sum()), np.complex64)
 
     def powers(self, offset_s: float) -> tuple[Floats, Floats]:
-        """Return paths beyond geometry (m) over the unambiguous range, and the power of the point at each path."""
+        """Return path offsets (m) over the unambiguous range, and the power of the point at each path offset."""
         frequency = self.echo.frequency_hz
         length = _OVERSAMPLING * frequency.size
         spacing_hz = float(frequency[-1] - frequency[0]) / (frequency.size - 1)
@@ -120,7 +121,7 @@ def align_on_point(
     within_s
         Smallest and largest offset to search, seconds.
     search_m
-        Limit of the searched paths of either sign, metres; 0 keeps the path fixed.
+        Largest magnitude of the searched path offsets, metres; 0 keeps the path offset fixed.
 
     Raises
     ------
@@ -152,7 +153,7 @@ def align_on_point(
 
 
 def offset_steps(echo: Recorded, log: Logged, low: float, high: float) -> Floats:
-    """Return offsets in steps during which no path changes by more than an eighth of a wavelength."""
+    """Return offsets at intervals in which no path changes by more than an eighth of a wavelength."""
     step_s = offset_step_s(echo, log)
     return np.arange(low, high + step_s, step_s)
 
@@ -188,7 +189,7 @@ def refine_maximum(
 def peak_widths(
     power: Callable[[float, float], float], offset_s: float, path_m: float, steps: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return the error of the offset, and that of the path, which alone lowers the peak by 1 dB."""
+    """Return the error of the offset and the error of the path that each lower the peak by 1 dB."""
     least = power(offset_s, path_m) * 10 ** (_WIDTH_DB / 10)
 
     def width(step: float, at: Callable[[float], float]) -> float:
@@ -225,7 +226,7 @@ def alignment_flags(power: Floats, offsets_s: Floats, best_s: float, width_s: fl
 # ---- Drift of the recorder's clock relative to the log's clock ------------------------------------------------------
 
 MOST_PPM = 200.0
-"""Largest drift searched, parts per million: crystal oscillators drift less."""
+"""Largest drift searched, parts per million: the drift of crystal oscillators is smaller."""
 
 
 def apply_drift(time_s: Floats, drift_ppm: float) -> Floats:
@@ -241,7 +242,7 @@ def apply_drift(time_s: Floats, drift_ppm: float) -> Floats:
 
 
 def estimate_drift(alignment: Alignment, echo: Recorded, log: Logged, point_m: Floats) -> Alignment:
-    """Add the drift that maximises the coherent sum at a known point to an alignment, if the recording resolves it.
+    """Add the drift that maximises the coherent sum at a known point to an alignment, if the drift is observable.
 
     Parameters
     ----------
@@ -255,8 +256,9 @@ def estimate_drift(alignment: Alignment, echo: Recorded, log: Logged, point_m: F
     Notes
     -----
     Source: docs/theory/tracks.md, "Clock of the recorder". The drift is fitted about the mid-time of the recording,
-    where it is independent of the offset; the returned drift counts from the first pulse, as in config/clocks.tsv. A
-    drift that changes no path by an eighth of a wavelength over half of the recording is not estimated.
+    where its estimate is independent of the offset; the returned drift counts from the first pulse, as in
+    config/clocks.tsv. A drift that changes no path by an eighth of a wavelength over half of the recording is not
+    estimated.
     """
     from scipy.optimize import minimize  # slow to import
 

@@ -1,4 +1,4 @@
-"""Fit of one wrong quantity to all bright points, and comparison with the explanation by errors of the logs."""
+"""Fit of the error of one quantity to all bright points, and comparison with the explanation by errors of the logs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,15 +12,15 @@ from apertura.methods.autofocus.solve import Gauge, Problem, prominent_point_sta
 from apertura.methods.causes import ARM, LEAST_GAIN_DB, Cause
 
 NEAR = 10.0
-"""Least difference of the objective that distinguishes two causes, or a cause from random tracks."""
+"""Minimum difference of the objective that distinguishes two causes, or a cause from random tracks."""
 
 LEAST_EVIDENCE = 40.0
-"""Least reduction of the objective by a cause together with errors of the logs, relative to errors of the logs alone.
-The largest of 54 flights without a cause was 26, with log errors of 4 cm and three points; lever-arm errors of 20 cm
-give 250 to 1300."""
+"""Minimum reduction of the objective by a cause together with errors of the logs, relative to errors of the logs alone.
+The largest reduction in 54 flights without such a cause was 26, with log errors of 4 cm and three points; lever-arm
+errors of 20 cm give 250 to 1300."""
 
 CHANCES = 6
-"""Number of wrong tracks drawn at random for comparison, each with three unknowns, the same number as a lever arm."""
+"""Number of wrong tracks drawn at random for comparison, each with three unknowns, as a lever arm."""
 
 _STAGES = 2  # iterations of caching contributions and maximising sharpness
 
@@ -56,7 +56,7 @@ class CausePrior(Prior):
         return {node: np.tensordot(unknowns, shape, axes=(-1, 0)) for node, shape in self.shapes_m.items()}
 
     def adjoint(self, gradient: Mapping[str, Floats]) -> Floats:
-        """Return (..., size) derivatives with respect to unknowns, from those with respect to nodes' corrections."""
+        """Convert derivatives with respect to node corrections to (..., size) derivatives with respect to unknowns."""
         return np.asarray(
             sum(np.tensordot(gradient[node], shape, axes=((-2, -1), (1, 2))) for node, shape in self.shapes_m.items())
         )
@@ -69,7 +69,7 @@ class CauseFit:
     Attributes
     ----------
     cause, values
-        The wrong quantity, and its error: (unknown,) in its unit.
+        The wrong quantity; and its error, (unknown,) float64, in the unit of the quantity.
     correction
         Correction of the tracks.
     objective
@@ -99,7 +99,7 @@ class CauseFit:
         values = [alone.value(state, all_used, start.statistics) for state in states]
         best = int(np.argmin(values))
         state = states[best]
-        # Gain of points in dB, from √(Σ|I|⁴); the floor is for patches from which the points are displaced.
+        # Gain of points in dB, from √(Σ|I|⁴); the floor applies where points are displaced out of their patches.
         before, after = (
             np.array([np.sqrt(image.contrast) * image.energy for images in each.statistics for image in images])
             for each in (start, state)
@@ -119,7 +119,7 @@ class CauseFit:
         return 0.5 * float(((self.values / self.cause.std) ** 2).sum())
 
     def more(self, problem: Problem, axes: Floats) -> "CauseFit":
-        """Return the fit plus the residual error, which is fitted to a problem with logs corrected for this cause."""
+        """Return this fit plus a fit of the residual error to a problem whose logs are corrected for this cause."""
         residual = CauseFit.of(problem, self.cause, axes)
         if residual.gain_db <= 0:
             return self
@@ -127,7 +127,7 @@ class CauseFit:
         return replace(self, values=self.values + residual.values, correction=correction, gain_db=gain_db)
 
     def with_rest(self, rest: Refinement, evidence: float) -> Refinement:
-        """Return the refinement by this cause, followed by the refinement of the corrected logs if that is accepted.
+        """Return the refinement by this cause, followed by the refinement of the corrected logs if accepted.
 
         Parameters
         ----------
@@ -153,14 +153,14 @@ class CauseFit:
 def explained(
     problem: Problem, causes: Sequence[Cause], axes: Floats, generator: np.random.Generator
 ) -> CauseFit | None:
-    """Return the cause that explains the images best; of equally good causes, that with the fewest unknowns.
+    """Return the cause that explains the images best; among equally good causes, the cause with the fewest unknowns.
 
-    The result is None if no cause gains `LEAST_GAIN_DB`, or random tracks explain the images equally well.
+    The result is None if no cause gains `LEAST_GAIN_DB`, or if random tracks explain the images equally well.
 
     Parameters
     ----------
     problem
-        Bright points of all pairs along the logs, with the prior of the logs' errors.
+        Bright points of all pairs, imaged along the logged tracks, with the prior of the log errors.
     causes
         Candidate causes.
     axes

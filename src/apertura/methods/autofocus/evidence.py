@@ -21,10 +21,12 @@ from apertura.methods.autofocus.solve import Problem, State
 
 
 MOST_RATIO = 1e3
-"""Peak-to-background power ratio above which neighbours of a point, instead of noise, limit its phase accuracy."""
+"""Peak-to-background power ratio above which the phase accuracy of a point is limited by neighbouring points instead of
+noise.
+"""
 
 FOLDS = 4
-"""Number of folds of the cross-validation: a quarter of the patches is held out of each fit and validates it."""
+"""Number of folds of the cross-validation: each fit excludes a quarter of the patches, which then validate the fit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,37 +99,40 @@ def remaining(problem: Problem, state: State) -> Remaining:
 # ---- Acceptance of refined tracks -----------------------------------------------------------------------------------
 
 LEAST_GAIN_DB = 0.1
-"""Least contrast gain of held-out patches, net of its uncertainty, dB; a smaller gain is not visible in an image."""
+"""Minimum contrast gain of held-out patches, net of its uncertainty, dB; a smaller gain is not visible in an image."""
 
 DOUBT = 2.0
 """Standard deviations subtracted from the mean gain."""
 
 _SCATTER, _SCATTER_DB, _DEGREES = 0.5, 0.5, 2
-"""Prior scatter of the gains: half of their mean, and 0.5 dB, with the weight of two patches. The prior dominates with
-few patches, the measured scatter with many."""
+"""Prior standard deviation of the gains: half of their mean and 0.5 dB, added in quadrature; the prior has the weight
+of two patches. The prior dominates with few patches, the measured scatter with many.
+"""
 
 LEAST_FITTED_DB = 0.3
-"""Least contrast gain of fitted patches that are confirmed points, dB; a fit to noise gains 0.1 dB at an SNR of 10 dB
-per pulse."""
+"""Minimum contrast gain of fitted patches with confirmed points, dB; a fit to noise alone gains 0.1 dB at an SNR of 10
+dB per pulse.
+"""
 
 MOST_APART_SIGMA = 4.0
-"""Largest disagreement of point positions between pairs, in standard deviations; more indicates cycle slips."""
+"""Largest disagreement of point positions between pairs, in standard deviations; larger values indicate cycle slips."""
 
 PARTS = 8
 """Number of subapertures whose images of a point are compared in range to detect cycle slips."""
 
 _BY_CHANCE = 1e-3  # false alarm rate of the test of the configured log errors
-_SLACK = 1.5  # factor on the variance, because the image does not fully determine its modes
+_SLACK = 1.5  # factor on the variance, because the image does not fully determine these modes
 _REACH_CELLS, _STEPS = 3.0, 37  # search line for a point in range: range cells on either side; number of samples
-_SLIP_SIGMA = 4.0  # least shift in range of a cycle slip, standard deviations
+_SLIP_SIGMA = 4.0  # minimum shift in range of a cycle slip, standard deviations
 _NEARER, _NEARER_OF_FEW = 0.6, 0.75
-"""Least shift of a cycle slip, wavelengths, for many and for few points: half a wavelength plus a margin for noise."""
+"""Minimum shift of a cycle slip, wavelengths, for many and for few points: half a wavelength plus a noise margin."""
 _NOTHING = 1e-9  # floor of the contrast ratio, for a patch without echoes
 _SCATTERING_POINTS, _POINT_STD_CELLS = 3, 0.055
-"""Least number of points for estimating the standard deviation of a shift from their scatter; and the standard
-deviation assumed per point for fewer points, cells c/B of path: that of a point 20 dB above the subaperture's noise."""
-_DOMINATES = 4.0  # least peak power of a point in a subaperture image over the median of the search line
-_LEAST_SLOPE = 0.05  # least gradient of the path over ground: a point viewed from all sides has no range direction
+"""Minimum number of points whose scatter gives the standard deviation of a shift; and, for fewer points, the standard
+deviation assumed per point, cells c/B of path, which is that of a point 20 dB above the noise of the subaperture.
+"""
+_DOMINATES = 4.0  # minimum peak power of a point in a subaperture image over the median of the search line
+_LEAST_SLOPE = 0.05  # minimum gradient of the path over ground: a point viewed from all sides has no range direction
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,15 +144,16 @@ class Evidence:
     fitted_db, held_out_db
         (pair, patch) float64, contrast gain of the fitted patches and of the held-out patches.
     settled
-        (mode,) float64, unknowns that the image alone determines; they have unit variance if the errors of the logs are
+        (mode,) float64, unknowns that the image alone determines; their variance is 1 if the errors of the logs are
         configured correctly.
     before, after
         Shifts of points in range between subapertures.
     wavelength_m
         Wavelength at the band centre.
     steady
-        Variance of the log-amplitude along the aperture: maximum over patches of the minimum over pairs. It is that of
-        the noise for a point that dominates its cell, and 0.4 for speckle; infinite if there are too few blocks.
+        Variance of the log-amplitude along the aperture: maximum over patches of the minimum over pairs. It equals the
+        noise variance for a point that dominates its cell, and 0.4 for speckle; it is infinite if there are too few
+        blocks.
     apart_sigma
         Rms disagreement of point positions between pairs, in standard deviations, that remains for all tracks within
         the errors of the logs.
@@ -180,7 +186,7 @@ class Evidence:
 
     @property
     def promising(self) -> bool:
-        """True if fitted patches gained contrast or a cycle slip was found; otherwise the logs are as good."""
+        """True if fitted patches gained contrast or a cycle slip was found; otherwise the logs are equally good."""
         return bool(self.slip) or float(self.fitted_db.mean()) > LEAST_GAIN_DB
 
     @property
@@ -209,7 +215,7 @@ class Evidence:
         if self.apart_sigma > MOST_APART_SIGMA:
             return (
                 f"point positions differ between pairs by {self.apart_sigma:.1f} standard deviations: the tracks are "
-                "wrong by more than the errors of their logs"
+                "wrong by more than the configured errors of the logs"
             )
         slipped = self.after.slipped(self.wavelength_m)
         if not slipped.any():
@@ -309,7 +315,7 @@ def mean_gain(held_out_db: Floats) -> MeanGain:
 
 
 def unsteady(initial: State, state: State) -> float:
-    """Return the log-amplitude variance along the aperture at the patches' peaks: least of pairs, largest of patches.
+    """Return the log-amplitude variance along the aperture at patch peaks: minimum over pairs, maximum over patches.
 
     Parameters
     ----------
@@ -438,7 +444,7 @@ def range_shifts(problem: Problem, state: State, axes: Floats, *, parts: int = P
 def _of_most(shifts_m: Floats, within_m: float) -> Floats:
     """Return (pair, patch, 1), the mean shift of the largest set of subapertures that agree within `within_m`.
 
-    This is the offset of the delay from the brightest pixel, which is common to all subapertures.
+    This mean is the delay offset relative to the brightest pixel; it is common to all subapertures.
     """
     near = np.abs(shifts_m[..., None] - shifts_m[..., None, :]) < within_m
     most = np.take_along_axis(near, near.sum(axis=-1).argmax(axis=-1)[..., None, None], axis=-2)[..., 0, :]

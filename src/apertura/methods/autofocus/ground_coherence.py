@@ -28,7 +28,9 @@ MOST_TILES = 64
 """Maximum number of tiles; if a scene has more, the tiles about its centre are used."""
 
 SAMPLING = 0.85
-"""Pixel density relative to the Nyquist rate of the image; less than 1 suffices, as products of images are summed."""
+"""Pixel density relative to the Nyquist rate of the image; less than 1 suffices, because products of images are
+summed.
+"""
 
 _CELLS_WIDE = 2.5  # width of a tile, in cross-range cells of the aperture flown within a correlation time
 _STEPS = 64  # pulses sampled for the size and pixels of a tile
@@ -164,12 +166,12 @@ class TileCoherence:
         (block of the first pair, block of the second pair) sparse complex64: Σ conj(B)·B' over the tile, divided by the
         energy of the two images of the tile and weighted by the spatial frequencies that both blocks share.
     cells
-        Effective number of resolution cells: all cells of a tile with speckle; few if a point dominates the tile, as
-        the spatial frequencies of a point are not independent.
+        Effective number of resolution cells: all cells of a tile with speckle; few if a point dominates the tile,
+        because the spatial frequencies of a point are not independent.
     brightness
         Mean power of both images.
     contributions
-        Blocks of each pair that illuminate the tile, and their path gradients; the values are omitted.
+        Blocks of each pair that illuminate the tile, and their path gradients, without the values.
     """
 
     product: "csr_array"
@@ -194,7 +196,7 @@ class TileCoherence:
         )
 
     def coherence(self, moved: Sequence[Tracks]) -> tuple[complex, list[NDArray[np.complex64]]]:
-        """Return the coherence Σ conj(I)·I', normalised by the energies, and the share of each block of both pairs.
+        """Return the coherence Σ conj(I)·I', normalised by the energies, and the contributions of both pairs' blocks.
 
         `moved` contains the displacements of the nodes of each pair, node → (block, 3) metres.
         """
@@ -315,7 +317,7 @@ class SpeckleTiles:
         return cls(pairs, tiles, [blocks.echoes([tile.patch for tile in tiles]) for blocks in pairs])
 
     def agreements(self, tracks: Tracks, used: NDArray[np.bool_] | None = None) -> list[SpeckleAgreement]:
-        """Return the coherence objective of every two pairs on the used tiles; corrections are node → (knot, 3)."""
+        """Return the coherence objectives of all combinations of two pairs on the used tiles, at given corrections."""
         moved = [blocks.moves(tracks) for blocks in self.pairs]
         coherences: dict[tuple[int, int], list[TileCoherence]]
         coherences = {pairs: [] for pairs in combinations(range(len(self.pairs)), 2)}
@@ -337,7 +339,7 @@ class SpeckleTiles:
     def _weighted_by_brightness(
         self, coherences: Sequence[TileCoherence], pair: int, used: NDArray[np.bool_] | None
     ) -> list[TileCoherence]:
-        """Return the tiles with fewer cells for dark tiles, in which sidelobes of brighter tiles may dominate.
+        """Return the tiles with reduced cell numbers of dark tiles, in which sidelobes of brighter tiles may dominate.
 
         Brightness is corrected for the decrease of echo power with the squares of both distances.
         """
@@ -358,16 +360,18 @@ class SpeckleTiles:
 
 
 LEAST_COHERENCE = 0.75
-"""Least coherence of held-out tiles, 0 to 1; tracks with errors of a cycle or more do not reach it."""
+"""Minimum coherence of held-out tiles, 0 to 1; tracks with errors of a cycle or more do not reach this coherence."""
 
 LEAST_GAIN = 0.1
-"""Least increase of the coherence of held-out tiles."""
+"""Minimum increase of the coherence of held-out tiles."""
 
 LEAST_EVEN = 0.25
-"""Least share of resolution cells that contribute speckle; sidelobes of few points may be coherent for wrong tracks."""
+"""Minimum fraction of resolution cells that contribute speckle; sidelobes of few points may be coherent for wrong
+tracks.
+"""
 
 LEAST_TILES = 8
-"""Least number of tiles, some of which are held out for validation."""
+"""Minimum number of tiles, some of which are held out for validation."""
 
 _STAGES, _ITERATIONS = 2, 15  # rounds of caching contributions; steps of L-BFGS-B in each round
 _HELD_OUT = 4  # every fourth tile is held out of the fit
@@ -384,7 +388,7 @@ class SpeckleEvidence:
     tiles
         Number of tiles.
     even
-        Effective share of resolution cells that contribute speckle.
+        Effective fraction of resolution cells that contribute speckle.
     """
 
     before: float
@@ -426,7 +430,7 @@ def refined_by_speckle(ground: SpeckleTiles, prior: Prior, knots_s: Floats) -> R
     Notes
     -----
     Source: docs/theory/autofocus.md, "Speckle". The returned standard deviations are those of the logs; eq. 23 would
-    reduce them by at most a half.
+    reduce them by at most half.
     """
     unrefined, count = np.zeros(prior.size), len(ground.tiles)
     std_m = {
@@ -472,7 +476,7 @@ def _solved(ground: SpeckleTiles, prior: Prior, used: Bools) -> Floats:
 
 
 def _coherence(ground: SpeckleTiles, prior: Prior, unknowns: Floats, used: Bools) -> tuple[float, float]:
-    """Return the mean coherence of the used tiles, and the effective share of their cells."""
+    """Return the mean coherence of the used tiles, and the effective fraction of their cells."""
     tracks = prior.tracks(unknowns)
     agreements = ground.agreements(tracks, used)
     weights = np.concatenate([[tile.cells for tile in one.tiles] for one in agreements])

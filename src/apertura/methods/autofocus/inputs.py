@@ -48,7 +48,7 @@ class PairRecord:
         return tx, rx
 
     def extreme_errors(self, errors: Mapping[str, "TrackErrors"]) -> tuple[float, float]:
-        """Return the shortest correlation time of the nodes' errors, s, and the rms phase of the largest, rad."""
+        """Return the shortest correlation time of the nodes' errors, s, and the rms phase of the largest error, rad."""
         of_nodes = [errors[node] for node in self.nodes]
         largest_m = max(max(error.std_m) for error in of_nodes)
         return min(error.correlation_s for error in of_nodes), 2 * self.profiles.wavenumber_rad_m * largest_m
@@ -76,7 +76,7 @@ class TrackErrors:
     std_m
         Standard deviations east, north and up of the error that varies along the flight, metres.
     correlation_s
-        Correlation time: the autocorrelation of the error falls linearly to zero within it.
+        Correlation time: the autocorrelation of the error falls linearly to zero within this time.
     drift_std_m
         Standard deviation per axis of a slow error over the whole flight: offset, slope and curvature.
     """
@@ -180,7 +180,7 @@ class NodePrior:
         return np.asarray((smoothed * self.std_m + self.slow @ slow) @ self.axes)
 
     def adjoint(self, gradient: Floats) -> Floats:
-        """Return (..., size) derivatives with respect to unknowns, from those by corrections, (..., knot, 3)."""
+        """Convert (..., knot, 3) derivatives with respect to corrections to (..., size) with respect to unknowns."""
         along_axes = gradient @ self.axes.T
         scaled = along_axes * self.std_m / np.sqrt(self.smooth)
         nothing = np.zeros((*scaled.shape[:-2], self.smooth, 3))
@@ -212,7 +212,7 @@ class Prior:
         return {name: node.tracks(unknowns[..., part]) for (name, node), part in self._parts()}
 
     def adjoint(self, gradient: Mapping[str, Floats]) -> Floats:
-        """Return (..., size) derivatives with respect to unknowns, from those with respect to nodes' corrections."""
+        """Convert derivatives with respect to node corrections to (..., size) derivatives with respect to unknowns."""
         return np.concatenate([node.adjoint(gradient[name]) for name, node in self.nodes.items()], axis=-1)
 
     def _parts(self) -> list[tuple[tuple[str, NodePrior], slice]]:

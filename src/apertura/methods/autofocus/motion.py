@@ -14,7 +14,7 @@ PhaseCentres = Callable[[Floats], Aperture]
 """Function of times (time,) inside the log, seconds of its clock, that returns phase centres."""
 
 LEAST_COVERED = 0.5
-"""Least share of the pulses inside the log."""
+"""Minimum fraction of the pulses inside the log."""
 
 _MARGIN = 8  # pulse intervals added on both sides of the plausible offsets
 _SIGMA = 3.0  # standard deviations below the best correlation beyond which offsets are excluded
@@ -109,8 +109,8 @@ def plausible_offsets(echo: Recorded, log: Logged, within_s: tuple[float, float]
     Notes
     -----
     Source: docs/theory/tracks.md, "Clock of the recorder". The difference between consecutive pulses is correlated with
-    the logged displacement between them, limited to the distance beyond which pulses are uncorrelated. If the motion is
-    uniform, no offset is excluded.
+    the logged displacement between these pulses, limited to the distance beyond which pulses are uncorrelated. If the
+    motion is uniform, no offset is excluded.
     """
     # |H_p − H_{p−1}|/|H_p|, between pulses, and the node's speed on a grid of the log's times.
     change = np.linalg.norm(np.diff(echo.transfer, axis=0), axis=1) / np.linalg.norm(echo.transfer[1:], axis=1)

@@ -332,7 +332,7 @@ def _patch(patch: Contribution, cached: PatchImage, moved: Tracks) -> tuple[floa
     fourth = float((power**2).sum())
     if not fourth:
         return 0.0, np.zeros(len(rotation))
-    # G and ∂J/∂θ of eq. 12; J of eq. 11, with S² as cached.
+    # G and ∂J/∂θ of eq. 12; J of eq. 11, with the cached S².
     by_image = (-cached.weight * power / fourth * image).astype(np.complex64)
     by_phase = -2 * (rotation * (by_image.conj() @ patch.values)).imag
     return -0.5 * cached.weight * float(np.log(fourth / cached.energy**2)), by_phase.astype(np.float64)

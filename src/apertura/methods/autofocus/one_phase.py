@@ -44,7 +44,7 @@ class SpaceVariance:
         """Reason of the choice, one line."""
         return (
             f"one phase per pulse leaves {self.residual_rad:.2g} rad rms and a loss of {-self.loss_db:.2g} dB at the "
-            f"scene's edges; {MOST_LOSS_DB:g} dB are tolerated"
+            f"scene edges; {MOST_LOSS_DB:g} dB is tolerated"
         )
 
 
@@ -58,7 +58,7 @@ def space_variance(middle: PointPaths, points_m: Floats, errors: Sequence[TrackE
     points_m
         (point, 3) float64, corners of the scene, metres in the frame of the phase centres.
     errors
-        Error statistics of the logs: one for a monostatic pair, otherwise those of transmitter and receiver.
+        Error statistics of the logs: of a single log for a monostatic pair, otherwise of transmitter and receiver.
 
     Notes
     -----
@@ -81,7 +81,7 @@ def space_variance(middle: PointPaths, points_m: Floats, errors: Sequence[TrackE
 
 
 def _at(middle: PointPaths, point_m: Floats, errors: Sequence[TrackErrors]) -> tuple[float, float]:
-    """Return the mean square residual phase at a point, rad², and the loss that it causes, dB."""
+    """Return the mean square residual phase at a point, rad², and the loss that this phase causes, dB."""
     point = replace(middle, point_m=point_m)
     gradients = (paths.by_node(same=len(errors) == 1, sidelink=False) for paths in (point, middle))
     residuals: list[tuple[Floats, float]] = []
@@ -100,7 +100,7 @@ Patches = Sequence[NDArray[np.complex64]]
 """Block contributions to the pixels, (pixel, block), one array for each patch."""
 
 _SHRINK = 0.7  # ratio of the window widths of consecutive passes
-_EDGE_DB, _WIDER = 10.0, 1.5  # least window: extent of the blurred points down to this level, and factor applied to it
+_EDGE_DB, _WIDER = 10.0, 1.5  # minimum window: extent of blurred points at this level, times a factor
 _LEAST_VARIANCE = 0.02  # floor of a line's amplitude variance relative to its squared mean
 _SETTLED_RAD = 0.05  # rms phase change below which the passes stop
 _MOST_PASSES = 30  # maximum passes of phase gradient
@@ -155,7 +155,7 @@ def phase_gradient(patches: Patches) -> Floats:
 def minimum_entropy(patches: Patches) -> Floats:
     """Estimate the correction phases of the blocks by minimum entropy of the lines through the brightest pixels.
 
-    Parameters and result as for `phase_gradient`.
+    The parameters and the result are those of `phase_gradient`.
 
     Notes
     -----

@@ -24,19 +24,21 @@ from apertura.methods.autofocus.inputs import PairRecord, Refinement, TrackError
 
 
 MOST_PATCHES, CLEAR = 32, 20.0
-"""Maximum number of patches; and peak-to-background power ratio of a clear point: a dozen such points suffice."""
+"""Maximum number of patches; and peak-to-background power ratio of a clearly visible point. A dozen such points
+suffice.
+"""
 
 MOST_VALUES = 2**27
 """Maximum number of complex values of block contributions (1 GB), which limits the number of patches."""
 
 _ENOUGH = 12 * CLEAR  # sum of the ratios at which the selection of patches stops
-_SAMPLING = 0.7  # pixel spacing in resolution cells: 0.5 is no better, and at 0.85 positions are less accurate
+_SAMPLING = 0.7  # pixel spacing, resolution cells; 0.5 gives no improvement, 0.85 less accurate positions
 _RANGE_CELLS = 1.5  # half the size of a patch along the line of sight
 _LEAST_CELLS, _MOST_CELLS = 6.0, 24.0  # half the size of a patch across the line of sight
 _BANDWIDTH = 0.66  # bandwidth of errors with correlation time τ, in 1/τ; the patch must contain their sidelobes
 _MOST_PIXELS = 1000  # maximum pixels of a patch
 _PULSES = 256  # number of pulses sampled for the directions and cells of a patch
-_SHARE = 0.4  # largest share of all patches in one ninth of the scene
+_SHARE = 0.4  # largest fraction of all patches in one ninth of the scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,12 +58,12 @@ class Patch:
 
 
 def separated(places_m: Floats, ratio: Floats, axes: Floats, *, apart_m: float) -> Floats:
-    """Select a sufficient number of points, clearest first, that are separated and spread over the scene.
+    """Select a sufficient number of separated points over the scene, in descending order of power ratio.
 
     Parameters
     ----------
     places_m
-        (point, 3) float64, metres in the frame, clearest first.
+        (point, 3) float64, metres in the frame, in descending order of `ratio`.
     ratio
         (point,) float64, peak-to-background power ratio of each point.
     axes
@@ -82,7 +84,7 @@ def separated(places_m: Floats, ratio: Floats, axes: Floats, *, apart_m: float) 
     """
     level = (places_m - places_m.mean(axis=0)) @ axes[:2].T
     low, extent = level.min(axis=0), np.maximum(np.ptp(level, axis=0), 1e-9)
-    # The scene in nine parts, each of which contributes no more than its share of the points.
+    # The scene is divided into nine parts, each of which contributes at most the fraction `_SHARE` of the points.
     ninth = np.minimum((level - low) / extent * 3, 2.999).astype(int) @ np.array([3, 1])
     selected: list[int] = []
     for number in range(len(places_m)):
@@ -97,7 +99,7 @@ def separated(places_m: Floats, ratio: Floats, axes: Floats, *, apart_m: float) 
 
 
 def patch_at(place_m: Floats, records: Sequence[PairRecord], axes: Floats, *, correlation_s: float) -> Patch:
-    """Return the patch about a point: as fine as the sharpest pair requires, as wide as errors spread the energy.
+    """Return the patch about a point, with the pixel spacing of the sharpest pair and the width of the blurred point.
 
     Parameters
     ----------
@@ -167,19 +169,21 @@ def _spans(place_m: Floats, record: PairRecord, axes: Floats, correlation_s: flo
 # ---- Bright points in images of short subapertures ------------------------------------------------------------------
 
 LEAST_RATIO = 5.0
-"""Least peak-to-background power ratio of a point, summed over subapertures."""
+"""Minimum peak-to-background power ratio of a point, summed over subapertures."""
 
 HELPFUL_RATIO = 3.5
-"""Least ratio of weaker points, which are used as well if the scene has points of `LEAST_RATIO`."""
+"""Minimum ratio of weaker points, which are used as well if the scene has points of `LEAST_RATIO`."""
 
-_SHARE_OF_CLEAREST = 0.05  # least ratio relative to the clearest point; fainter points may be sidelobes of it
-_APART = 0.6  # least distance of patches, in half patch sizes
+_SHARE_OF_CLEAREST = 0.05  # minimum ratio relative to the largest ratio; points below may be sidelobes
+_APART = 0.6  # minimum distance of patches, in half patch sizes
 
 MOST_LOOKS = 128
 """Maximum number of subapertures from which a point is visible; shorter subapertures have coarser images."""
 
 REFINED_LOOKS = 4
-"""Least number of subapertures along refined tracks: long ones resolve neighbours, several average sidelobes."""
+"""Minimum number of subapertures along refined tracks: long subapertures resolve neighbouring points, and a sum over
+several subapertures averages sidelobes.
+"""
 
 _BLURRED_RAD2 = 3.0  # growth of the phase-error variance up to which an image keeps most of a point's power
 _BY_CHANCE = 1e-3  # false alarm rate of points from speckle, per scene
@@ -198,7 +202,8 @@ class Candidates:
     Attributes
     ----------
     patches
-        Patches about separated bright points, clearest first; empty if the scene has no point.
+        Patches about separated bright points, in descending order of power ratio; empty if the scene has no bright
+        point.
     points
         Number of points above the detection threshold.
     axes
@@ -230,8 +235,9 @@ class Candidates:
         errors
             Node → error statistics of its log.
         looks
-            Least number of subapertures; the pixel spacing may require more. By default, of the subaperture lengths
-            that the errors of the logs may require, the shortest with at least half as many bright points as any other.
+            Least number of subapertures; the pixel spacing may require more. The default is determined from the
+            subaperture lengths that the errors of the logs may require: the shortest length at which at least half as
+            many bright points are detected as at any other length.
         """
         correlation_s = min(one.correlation_s for one in errors.values())
         if looks:
@@ -258,7 +264,7 @@ class Candidates:
         return cls([patch_at(place, records, axes, correlation_s=correlation_s) for place in chosen], points, axes)
 
     def rejected(self, errors: Mapping[str, TrackErrors], by_speckle: Refinement | None = None) -> Refinement:
-        """Return a rejected refinement without corrections: reasons are no bright point, and those against speckle."""
+        """Return a rejected refinement, whose reason states that bright points and speckle are insufficient."""
         line = f"no point of the scene exceeds its background by {decibels(LEAST_RATIO):.0f} dB"
         report: dict[str, Any] = {"patches": self.points}
         if by_speckle is not None:
@@ -269,7 +275,7 @@ class Candidates:
 
 
 def looks_of(records: Sequence[PairRecord], errors: Mapping[str, TrackErrors], place_m: Floats) -> list[int]:
-    """Return candidate numbers of subapertures of the time for which a point is visible, shortest subapertures first.
+    """Return candidate numbers of subapertures within the time for which a point is visible, in descending order.
 
     Notes
     -----
@@ -291,7 +297,7 @@ def looks_of(records: Sequence[PairRecord], errors: Mapping[str, TrackErrors], p
 
 
 def sampled_looks(records: Sequence[PairRecord], grid: SceneGrid, terrain: Terrain) -> int:
-    """Return the least number of subapertures whose image resolution is no finer than the pixels of `bright_places`.
+    """Return the minimum number of subapertures whose image resolution is no finer than the pixels of `bright_places`.
 
     Notes
     -----
@@ -312,7 +318,7 @@ def sampled_looks(records: Sequence[PairRecord], grid: SceneGrid, terrain: Terra
 
 
 def least_ratio(looks: int, cells: int) -> float:
-    """Return the ratio to the mean power that speckle, averaged over looks, exceeds in one of a thousand scenes.
+    """Return the ratio to the mean power that speckle averaged over looks exceeds in one of 1000 scenes.
 
     Examples
     --------
@@ -409,7 +415,7 @@ def _middle(grid: SceneGrid, terrain: Terrain) -> Floats:
 
 
 def _visible_share(record: PairRecord, place_m: Floats) -> float:
-    """Return the fraction of pulses for which a point is within beams and sector; 1 also if there is no such pulse."""
+    """Return the fraction of pulses for which a point is within beams and sector, or 1 if there is no such pulse."""
     if record.beams is None:
         return 1.0
     pulses = record.profiles.aperture.sample(_PULSES)
@@ -420,8 +426,8 @@ def _visible_share(record: PairRecord, place_m: Floats) -> float:
 def _looks(record: PairRecord, looks: int, place_m: Floats) -> Iterator[Callable[[Floats], Floats]]:
     """Yield, for each subaperture of a flight, the function that returns the power at pixels (y, x, 3).
 
-    Subapertures have equal length and overlap by a half; their pulses have Hann weights. The image of a subaperture is
-    multiplied by the mean antenna and sector weight, which changes slowly with position. The tables of a subaperture
+    Subapertures have equal length and overlap by one half; their pulses have Hann weights. The image of a subaperture
+    is multiplied by the mean antenna and sector weight, which changes slowly with position. The tables of a subaperture
     are computed once for all pixels.
     """
     count = max(1, round(looks / _visible_share(record, place_m)))

@@ -20,9 +20,9 @@ from apertura.methods.autofocus.one_phase import METHODS, Patches
 from apertura.methods.autofocus.patches import Candidates, Patch, count_in_memory
 
 _APART_CELLS = 2.0  # range cells c/B of total path within which patches share noise
-_BLOCKS_PER_CORRELATION_TIME = 10  # least number of blocks within a correlation time
+_BLOCKS_PER_CORRELATION_TIME = 10  # minimum number of blocks within a correlation time
 _BETWEEN_BLOCKS_RAD2 = 0.1  # largest growth of the phase-error variance between blocks
-_LINEAR = 1 / 8  # share of this growth that remains with offsets interpolated linearly between blocks
+_LINEAR = 1 / 8  # residual fraction of this growth with linear interpolation of offsets between blocks
 _PULSES = 4096  # pulses read at a time
 _SHIFTS = 0.5  # variation of the path gradient in directions of image shifts, relative to the largest
 
@@ -46,9 +46,9 @@ def refine_one_phase(
     Notes
     -----
     Source: docs/theory/autofocus.md, "One phase per pulse". Each quarter of the patches is validated with offsets that
-    are fitted to the other patches, without those that share a range with it. Of these offsets and those fitted to all
-    patches, the offsets with the sharpest images are returned. Tracks are not corrected: the position errors of a node
-    remain those of its log.
+    are fitted to the other patches, excluding patches that share a range with this quarter. Of these offsets and those
+    fitted to all patches, the offsets with the sharpest images are returned. Tracks are not corrected; the position
+    errors of a node are those of its log.
     """
     if not candidates.patches:
         return candidates.rejected(errors)
@@ -58,7 +58,8 @@ def refine_one_phase(
     reason = (
         f"{gain_db.size} held-out images of bright points gained {gain.mean_db:.2f} ± {gain.std_db:.2f} dB of contrast"
     )
-    knots_s = np.unique(np.concatenate([fit.time_s for fit in fits]))  # union of all knots, to smooth no offset
+    # Union of all knots, so that no offset is smoothed.
+    knots_s = np.unique(np.concatenate([fit.time_s for fit in fits]))
     correction = TrackCorrection(
         knots_s,
         {node: np.zeros((len(knots_s), 3)) for node in errors},
@@ -214,7 +215,7 @@ def _log_effect(record: PairRecord, candidates: Candidates, errors: Mapping[str,
 def _residuals(fits: Sequence[_Fit], log_effects: Sequence[Effect]) -> dict[str, float]:
     """Return the residual errors at the scene centre.
 
-    Shift and mean phase are those due to log errors, as the path offsets contain neither.
+    Shift and mean phase are those due to log errors, because the path offsets contain neither.
     """
     residual_rad2 = float(np.mean([fit.residual_rad2 for fit in fits]))
     mean_rad2 = float(np.mean([effect.phase_rad**2 for effect in log_effects]))

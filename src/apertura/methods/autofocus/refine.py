@@ -49,8 +49,8 @@ from apertura.methods.causes import Cause
 # ---- Gauge fixed by points common to pairs and by reference points --------------------------------------------------
 
 
-_LEAST_RATIO = 30.0  # least peak-to-background power ratio of a point for a position measurement
-_LEAST_STD_M = 0.01  # least std of positions between pairs, as bistatic scattering centres differ
+_LEAST_RATIO = 30.0  # minimum peak-to-background power ratio of a point for a position measurement
+_LEAST_STD_M = 0.01  # minimum std of positions between pairs, as bistatic scattering centres differ
 _ZOOMS, _SIDE = 3, 9  # search for the position of a point: rounds, samples along a side
 _MEDIAN_OF_TWO = 2 * np.log(2)  # median of the sum of two squared standard normal values
 _ROUNDS = 3  # least-squares iterations in the gauge, each with a new linearisation
@@ -109,7 +109,8 @@ def fix_gauge(
         matrix = np.concatenate([matrix, reference_rows])
         residuals = np.concatenate([residuals, reference_residuals])
         # Normal equations of eq. 15, with the prior |y|². The shift due to previous iterations is added back
-        # to `residuals`; as path offsets are not part of the tracks, the residuals still contain their effect.
+        # to `residuals`; because path offsets are not part of the tracks, the residuals still contain the effect of
+        # path offsets.
         normal = matrix.T @ matrix + np.eye(len(step))
         target = matrix[:, :modes] @ step[:modes] - residuals
         step = np.asarray(np.linalg.solve(normal, matrix.T @ target), np.float64)
@@ -261,27 +262,30 @@ def _distance_sigma(residuals: Floats) -> float:
 
 
 PATH_STD_M = 0.1
-"""Prior standard deviation of path offsets between pairs due to causes other than the tracks, metres. Errors of path
-offsets by fractions of a wavelength must not bend tracks; the constraints between pairs in range are hardly weaker."""
+"""Prior standard deviation of path offsets between pairs due to causes other than the tracks, metres. The prior
+prevents errors of path offsets of fractions of a wavelength from bending tracks, and hardly weakens the range
+constraints between pairs.
+"""
 
 PATH_SIGMAS = 3.0
 """Number of standard deviations above which a path difference between pairs is not attributed to the tracks."""
 
 _DRAWS = 200  # random draws of the prior for the standard deviation of a mean path
 
-_KNOTS_PER_CORRELATION_TIME = 10  # least number of knots of corrections within the shortest correlation time
-_LEAST_KNOTS = 64  # least number of knots of a flight
+_KNOTS_PER_CORRELATION_TIME = 10  # minimum number of knots of corrections within the shortest correlation time
+_LEAST_KNOTS = 64  # minimum number of knots of a flight
 _FEW = 8  # number of patches; with fewer, every quarter of the patches is held out in turn
 _LOST_TO_TIES_DB = 0.1  # largest loss of contrast due to fixing the gauge
-_SLIPS = 3  # maximum searches that start from delays while subapertures have cycle slips
+_SLIPS = 3  # maximum number of searches from delays while subapertures have cycle slips
 _STAGES = 3  # iterations of caching contributions and maximising sharpness
 
 MOST_ROUNDS = 4
-"""Maximum number of rounds. Each detects bright points in the refined image, also points that errors have hidden so
-far, and refines the tracks with all of them."""
+"""Maximum number of rounds. Each round detects bright points in the refined image, including points that errors have
+hidden so far, and refines the tracks with all these points.
+"""
 
 LEAST_FURTHER_DB = 0.05
-"""Least contrast gain of held-out patches over the previous round for another round, dB."""
+"""Minimum contrast gain of held-out patches over the previous round for another round, dB."""
 
 _BETWEEN_KNOTS_RAD2 = 0.05
 """Phase variance due to errors between knots, which causes a loss of 0.2 dB."""
@@ -564,7 +568,10 @@ class TrackSearch:
         after = self.problem.state(unknowns)
         lost_db = -float(gains_db(state.statistics, after.statistics).mean())
         if self._apart_sigma(after) > max(apart_sigma, 1.0) or lost_db > _LOST_TO_TIES_DB:
-            return state.unknowns, {**report, "ties": "excluded: they blur points or displace them between pairs"}
+            return state.unknowns, {
+                **report,
+                "ties": "excluded: reference points would blur points or displace them between pairs",
+            }
         return unknowns, report
 
     def _apart_sigma(self, state: State) -> float:

@@ -20,10 +20,10 @@ LEAST_PHASE_RAD = 0.03
 """Radians rms over the aperture, per standard deviation of the log, below which a mode does not affect the focus."""
 
 LEAST_SHIFT_M = 3e-4
-"""Least shift of patches by a gauge mode, metres per standard deviation of the log."""
+"""Minimum shift of patches by a gauge mode, metres per standard deviation of the log."""
 
 LEAST_INFORMATION = 10.0
-"""Least information that the image provides on a mode that it alone determines, relative to that of the log (1)."""
+"""Minimum information that the image provides on a mode that it alone determines, relative to that of the log (1)."""
 
 _MODES = 32  # number of smooth motions evaluated at once
 _PIECES = 5  # number of cubic pieces of a smooth mode within the illumination time of a patch
@@ -213,7 +213,7 @@ def effects(patch: Contribution, moved: Mapping[str, Floats], axes: Floats) -> t
     Notes
     -----
     Source: docs/theory/autofocus.md, eq. 13: a constant phase does not blur; over the band, however, the path change
-    including its mean blurs unless a shift explains it.
+    including its mean blurs the point unless a shift explains the change.
     """
     return effects_of_paths(patch, longer_paths(patch, moved), axes)
 

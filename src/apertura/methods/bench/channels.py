@@ -19,7 +19,7 @@ SIGMAS = 5.0
 """Standard deviations above which a measurement is significant: less than one false flag in 10⁴ reports of 12 lines."""
 
 MISSED_SHARE = 0.01
-"""Largest share of missed pulses among the pulses that a node should have recorded."""
+"""Largest fraction of missed pulses among the pulses that a node should have recorded."""
 
 DC_DB = -20.0
 """Largest mean of I and Q relative to the signal, dB; with N = 1000 subcarriers the floor in range is −50 dB."""
@@ -29,7 +29,7 @@ IMAGE_DB = -25.0
 subcarrier."""
 
 FEWEST_COUNTS = 4.0
-"""Least level of a channel with integer samples, counts rms; quantisation noise is 22 dB below it."""
+"""Minimum level of a channel with integer samples, counts rms; quantisation noise is 22 dB below it."""
 
 
 # ---- Triggers: recorded, missed and false ---------------------------------------------------------------------------
@@ -62,7 +62,7 @@ class Triggers:
         """Flag → measured values for exceeded limits."""
         flags, due, lost = {}, self.due + self.beyond, self.missed + self.beyond
         if lost > MISSED_SHARE * due:
-            ends = f", {self.beyond} of them before its first capture or after its last" if self.beyond else ""
+            ends = f", {self.beyond} of these before the first or after the last capture" if self.beyond else ""
             flags["triggers_missed"] = f"{lost} of {due} pulses were not recorded{ends}"
         if self.false > 0:
             flags["triggers_false"] = f"{self.false} of {self.recorded} captures lie between two pulses"

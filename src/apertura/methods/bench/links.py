@@ -1,7 +1,7 @@
 """Links of stationary or cabled radars: pulse-to-pulse stability and electrical length.
 
-As nothing moves, all changes come from the radar: noise, clocks, cables. The equations are in docs/theory/bench.md; the
-limits and their reasons are below.
+Because nothing moves, all changes are due to the radar: noise, clocks, cables. The equations are in
+docs/theory/bench.md; the limits and their reasons are below.
 """
 
 from collections.abc import Callable
@@ -26,25 +26,31 @@ from apertura.methods.bench.channels import MISSED_SHARE, SIGMAS
 # ---- Limits ---------------------------------------------------------------------------------------------------------
 
 WEAK_DB = 10.0
-"""Least SNR of a compressed pulse, dB; below it Γ is less than 0.91 and phases scatter by 0.22 rad."""
+"""Minimum SNR of a compressed pulse, dB; below it Γ is less than 0.91 and phases scatter by 0.22 rad."""
 
 PHASE_RAD = 0.05
-"""Largest phase scatter beyond noise, rms, and largest phase drift over the recording; each causes 0.01 dB of loss."""
+"""Largest phase scatter in excess of noise, rms, and largest phase drift over the recording; each causes 0.01 dB of
+loss.
+"""
 
 AMPLITUDE_DB = 0.5
-"""Largest amplitude scatter beyond noise, dB rms; tight connectors cause some hundredths of a dB."""
+"""Largest amplitude scatter in excess of noise, dB rms; tight connectors cause some hundredths of a dB."""
 
 DROPOUT_DB, DROPOUT_SHARE = -6.0, 0.01
 """Level of a dropout relative to the median, dB, and largest share of dropouts with tight connectors."""
 
 LEAKAGE_DB, APART_CELLS = -20.0, 3.0
-"""Largest level at the sidelink's delay relative to the strongest path, dB; least distance between both, cells."""
+"""Largest level at the delay of the sidelink relative to the strongest path, dB; minimum difference of the two delays,
+cells.
+"""
 
 TONE_DB = 13.0
 """Largest pulse-to-pulse change of a subcarrier relative to the median, dB; with 20 pulses, noise reaches 5 dB."""
 
 UNLOCKED_PPM = 0.3
-"""Largest offset between locked oscillators; the offset of disciplined ones (GNSS, 10 MHz cable) is below 0.1 ppm."""
+"""Largest offset between locked oscillators; the offset of disciplined oscillators (GNSS, 10 MHz cable) is below 0.1
+ppm.
+"""
 
 DRIFT_PPM = 0.02
 """Largest clock drift over the recording; a carrier of 1.2 GHz then drifts by 24 Hz."""
@@ -53,7 +59,9 @@ PATH_CELLS = 0.1
 """Largest difference between measured and configured path, cells c/B; a wrong constant displaces the whole image."""
 
 SPLIT_DB, SPLIT_RAD = 1.0, 0.3
-"""Largest differences between two channels fed by one signal: of gain, and of phase beyond the path difference."""
+"""Largest differences between two channels fed by one signal: gain, and phase in excess of that of the path
+difference.
+"""
 
 
 # ---- Links: one path from pulse to pulse ----------------------------------------------------------------------------
@@ -68,7 +76,7 @@ class Contact:
     name
         Name of the path, for messages.
     scatter_db
-        Amplitude scatter beyond noise, rms; 0 if not significant.
+        Amplitude scatter in excess of noise, rms; 0 if not significant.
     moves_db
         Largest amplitude difference between eighths of the recording; 0 if not significant.
     dropouts, pulses
@@ -114,7 +122,7 @@ class Contact:
     def line(self) -> str:
         """Measured values, one line."""
         return (
-            f"amplitude scatter {self.scatter_db:.2f} dB rms beyond noise, slow change {self.moves_db:.2f} dB, "
+            f"amplitude scatter {self.scatter_db:.2f} dB rms in excess of noise, slow change {self.moves_db:.2f} dB, "
             f"{self.dropouts} of {self.pulses} pulses lost or 6 dB below the median"
         )
 
@@ -143,7 +151,7 @@ def measure_contact(name: str, form: Callable[[Pulses], Complexes], pulses: int)
 
 @dataclass(frozen=True)
 class Arrival:
-    """Further arrival: path beyond the strongest path in metres, and level relative to the strongest path in dB."""
+    """Arrival in addition to the strongest path: path (metres) and level (dB) relative to the strongest path."""
 
     later_m: float
     level_db: float
@@ -175,12 +183,12 @@ class MeasuredLink:
     arrivals
         Further arrivals, strongest first.
     direct_db
-        Level at the sidelink's delay relative to the path, dB; None if the path has that delay or the level is not
-        significant.
+        Level at the delay of the sidelink relative to the strongest path, dB; None if the strongest path has that delay
+        or the level is not significant.
     mean
         (subcarrier,) complex128, mean of the pulses.
     jumped, jump_m
-        Number of pulses locked at another delay, and median difference of their path, metres.
+        Number of pulses locked at a different delay, and median path difference of these pulses, metres.
     tone_hz, tone_db
         Frequency of the largest pulse-to-pulse change, and its level relative to the median of the band, dB.
     delay_ps
@@ -207,7 +215,7 @@ class MeasuredLink:
 
     @property
     def profile(self) -> tuple[Floats, Floats]:
-        """(cell,) total path about the strongest, ascending, metres; level of the mean profile relative to it, dB."""
+        """(cell,) total paths about the strongest path, ascending, metres; levels of the mean profile there, dB."""
         cells = self.mean.size
         later = np.arange(cells) - cells // 2
         start = -(cells - 1) / 2 * self.path_m / self.cell_m / cells
@@ -319,19 +327,19 @@ class MeasuredLink:
             flags["link_weak"] = f"{self.name}: SNR {snr_db:.1f} dB in a compressed pulse"
         if self.jumped > MISSED_SHARE * self.pulses and snr_db > WEAK_DB:
             flags["delay_jumps"] = (
-                f"{self.name}: {self.jumped} of {self.pulses} pulses arrive {self.jump_m:+.2f} m from the others; "
-                "all other measurements exclude them"
+                f"{self.name}: the path of {self.jumped} of {self.pulses} pulses differs by {self.jump_m:+.2f} m from "
+                "the path of the other pulses; these pulses are excluded from all other measurements"
             )
         if self.tone_db > TONE_DB:
             flags["interference"] = (
-                f"{self.name}: {self.tone_db:.0f} dB above the median subcarrier at {self.tone_hz / 1e6:.2f} MHz"
+                f"{self.name}: {self.tone_db:.0f} dB above the median of subcarriers at {self.tone_hz / 1e6:.2f} MHz"
             )
         excess = self.phase_excess_rad
         is_random = 1 - self.coherence > 0.5 > 1 - self.coherence_limit
         if excess > PHASE_RAD or is_random:
             flags["link_incoherent"] = (
                 f"{self.name}: Γ {self.coherence:.5f}, {self.coherence_limit:.5f} expected from noise; phase scatter "
-                f"{excess:.2g} rad rms beyond noise"
+                f"{excess:.2g} rad rms in excess of noise"
             )
         drift, std = self.phase_drift_rad
         if abs(drift) > max(PHASE_RAD, SIGMAS * std) and not is_random:
@@ -347,11 +355,11 @@ class MeasuredLink:
         return Flags.merged(flags, self.contact.flags)
 
 
-_FEWEST_DIFFERENCES = 8  # least number of second differences for an Allan deviation
+_FEWEST_DIFFERENCES = 8  # minimum number of second differences for an Allan deviation
 _PARTS = 8  # parts of a recording whose amplitudes are compared
 _SHOWN = 4  # number of reported arrivals
-_HANN_STD = 1.51  # standard deviation of a delay fitted under a Hann window over that without (measured)
-_STANDS_OUT = 20.0  # least power of an arrival relative to the noise of the mean profile: 13 dB
+_HANN_STD = 1.51  # ratio of the standard deviations of a delay fitted with and without a Hann window (measured)
+_STANDS_OUT = 20.0  # minimum power of an arrival relative to the noise of the mean profile: 13 dB
 
 
 def measure_link(
@@ -404,7 +412,7 @@ def measure_link(
     # 2. One delay for all pulses: the median of delays relative to the first, modulo the length of the profile.
     first = float(paths.delay_cells[locked][0])
     relative = (paths.delay_cells - first + subcarriers / 2) % subcarriers - subcarriers / 2
-    #    With several delays, the most frequent: a median might lie between them.
+    #    If pulses lock at several delays, the most frequent delay is used, because a median might lie between them.
     ordered = np.sort(relative[locked])
     in_cell = np.searchsorted(ordered, ordered + 1.0, side="right") - np.arange(ordered.size)  # pulses within a cell
     most = int(in_cell.argmax())
@@ -475,7 +483,7 @@ def _arrivals(mean: NDArray[np.complex128], noise: float, cell_m: float) -> tupl
 
 
 def _at_sidelink(mean: NDArray[np.complex128], delay_cells: float, noise: float) -> float | None:
-    """Return the level at zero delay relative to the path, dB; None if the path is near or the level is noise."""
+    """Return the level at zero delay relative to the path, dB; None if the delays are similar or the level is noise."""
     if abs(delay_cells) < APART_CELLS:
         return None
     near = np.abs(mean[(round(-delay_cells) + np.arange(-1, 2)) % mean.size]) ** 2
@@ -506,7 +514,7 @@ def clock_flags(name: str, clock: ClockOffset, numerology: Numerology, pulses: i
 
 @dataclass(frozen=True)
 class BenchPathOffset:
-    """Electrical path of a link beyond the geometry of the set-up, metres of total path.
+    """Electrical path of a link in excess of the geometric path of the set-up, metres of total path.
 
     Attributes
     ----------
@@ -529,7 +537,7 @@ class BenchPathOffset:
         if abs(difference_m) <= max(PATH_CELLS * self.cell_m, SIGMAS * self.std_m):
             return {}
         return {
-            "path_offset_disagrees": f"{name}: {self.offset_m:+.3f} ± {self.std_m:.3f} m beyond the set-up, "
+            "path_offset_disagrees": f"{name}: path offset {self.offset_m:+.3f} ± {self.std_m:.3f} m measured, "
             f"{self.stated_m:+.3f} m configured"
         }
 
@@ -553,7 +561,7 @@ class SplitAgreement:
     path_m
         Difference of electrical paths, metres.
     phase_rad, phase_std_rad
-        Phase difference at the band centre beyond that of the path difference, and its standard deviation.
+        Phase difference at the band centre in excess of that of the path difference, and its standard deviation.
     band_rad, band_db
         Rms phase and amplitude differences over the band in excess of the path difference and noise.
     """
@@ -610,7 +618,7 @@ _GROUP_NOISE = 0.005  # rad², phase noise of a group of subcarriers, small enou
 
 
 def _over_the_band(first: MeasuredLink, second: MeasuredLink) -> tuple[float, float]:
-    """Return the scatter of phase and amplitude between two links over the band beyond noise, rms, rad and dB.
+    """Return the rms phase (rad) and amplitude (dB) differences of two links over the band in excess of noise.
 
     Subcarriers are averaged in groups whose size depends on the noise; the scatter is 0 for fewer than four groups.
     """

@@ -79,7 +79,7 @@ def coherence(
     """Return coherence and phase of two images over a window about each pixel, and the number of looks of the window.
 
     Both images are backprojected to the same terrain: their phase difference contains neither the flat-earth nor the
-    terrain phase, nor the carrier that each image has. No slope is removed.
+    terrain phase, nor the carrier of either image. No slope is removed.
 
     Parameters
     ----------
@@ -92,8 +92,8 @@ def coherence(
     Returns
     -------
     magnitude
-        (y, x) float32, 0 to 1, biased estimate: its mean for independent images is `chance(looks)`, which `unbiased`
-        removes. NaN where either image is NaN or zero within the window.
+        (y, x) float32, 0 to 1, biased estimate: its mean for independent images is `chance(looks)`. The bias is removed
+        by `unbiased`. NaN where either image is NaN or zero within the window.
     phase
         (y, x) float32, phase of the first image minus that of the second, rad; NaN where the magnitude is NaN.
     looks
@@ -161,7 +161,7 @@ def unbiased(magnitude: NDArray[np.float32], looks: float) -> NDArray[np.float32
     Raises
     ------
     ValueError
-        If `looks` is 1 or less, as any two single samples are coherent.
+        If `looks` is 1 or less, because any two single samples are coherent.
 
     Examples
     --------
@@ -203,7 +203,7 @@ def _correlation(image: NDArray[np.complex128], window: int) -> NDArray[np.compl
     padded = [scipy.fft.next_fast_len(size + window - 1) for size in image.shape]
     lags = np.arange(1 - window, window)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # Single precision suffices, as the image is complex64; a peak of 1 avoids overflow of the power.
+        # Single precision suffices, because the image is complex64; a peak of 1 avoids overflow of the power.
         spectrum = scipy.fft.fft2((image / np.abs(image).max()).astype(np.complex64), padded)
         correlation = spectrum.real**2 + spectrum.imag**2
         for axis in (0, 1):
@@ -233,7 +233,7 @@ def map_coherence(
     magnitude, phase, looks
         As returned by `coherence`; looks are the median over tiles, NaN without a finite value.
     shared
-        (y, x) float32, effective share of a window's pixels that contribute its energy: about 1/2 for terrain,
+        (y, x) float32, effective fraction of the pixels of a window that contribute its energy: about 1/2 for terrain,
         1/`looks` for a point (docs/theory/interferometry.md, eq. 6).
 
     Examples

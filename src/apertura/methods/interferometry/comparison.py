@@ -40,16 +40,17 @@ class InterferogramCounts:
     common
         Number of pixels visible in both images, without shadow or layover.
     coherent
-        Number of common pixels with significant coherence; `sensitive` counts those with sufficient sensitivity to
-        height.
+        Number of common pixels with significant coherence; `sensitive` counts the common pixels with sufficient
+        sensitivity to height.
     coherence, chance
         Median estimated coherence of the common pixels, and its expected value for independent images.
     overlap
-        Median share of the image spectrum that both images sample.
+        Median fraction of the image spectrum that both images sample.
     ambiguity_m
         Median height of ambiguity, metres.
     unwrapped
-        Number of pixels with unwrapped phase; `apart` counts those in components without a reference level.
+        Number of pixels with unwrapped phase; `apart` counts the unwrapped pixels in components without a reference
+        level.
     residues, loops, jumps, by
         As in `apertura.methods.interferometry.heights.Unwrapped`.
     folded
@@ -76,7 +77,7 @@ class InterferogramCounts:
 
 
 MOST_INCOHERENT = 0.5
-"""Largest share of common pixels without significant coherence."""
+"""Largest fraction of common pixels without significant coherence."""
 
 MOST_RESIDUES = 1e-3
 """Largest number of residues per loop of four pixels."""
@@ -109,8 +110,8 @@ def interferogram_flags(measured: InterferogramCounts) -> Flags:
     ambiguous = []
     if counts.apart:
         ambiguous.append(
-            f"{counts.apart} of {counts.unwrapped} unwrapped pixels lie in other components, "
-            "with unknown multiples of 2π: excluded"
+            f"{counts.apart} of {counts.unwrapped} unwrapped pixels are excluded: they lie in components without a "
+            "reference level, with unknown multiples of 2π"
         )
     if counts.jumps and not counts.by:
         ambiguous.append(
@@ -123,7 +124,7 @@ def interferogram_flags(measured: InterferogramCounts) -> Flags:
     if counts.residues > MOST_RESIDUES * counts.loops:
         inconsistent.append(f"{counts.residues} phase residues in {counts.loops} loops of four pixels")
     if counts.folded > MOST_FOLDED * counts.unwrapped:
-        inconsistent.append(f"{number_of(counts.folded, 'point')} imaged by several pixels, excluded")
+        inconsistent.append(f"{number_of(counts.folded, 'point')} imaged at several pixels and excluded")
     if inconsistent:
         flags["unwrapping_inconsistent"] = (
             f"{'; '.join(inconsistent)}: heights may have errors of multiples of {counts.ambiguity_m:.3g} m"
@@ -139,7 +140,9 @@ def interferogram_flags(measured: InterferogramCounts) -> Flags:
 # ---- Interferogram: coherence, phase, and geocoded heights ----------------------------------------------------------
 
 LEAST_LOOKS = 4.0
-"""Least number of looks over which the energy of a window is spread; with fewer, a point off its centre dominates."""
+"""Minimum number of looks over which the energy of a window is spread; with fewer, a point outside the centre of the
+window dominates.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +188,7 @@ class Interferogram:
     measured
         Counts for the flags.
     level
-        Reference of the heights, and the constant removed from the phase; None without a valid pixel.
+        Reference of the heights, and the constant removed from the phase; None if there is no valid pixel.
     """
 
     panels: Mapping[str, NDArray[np.float32]]

@@ -12,7 +12,7 @@ from apertura.methods.interferometry.sensitivity import Sensitivity
 
 # ---- Unwrapping and residues ----------------------------------------------------------------------------------------
 
-_LEAST_SHARE = 0.01  # least size of a connected component as a share of all pixels: snaphu's default
+_LEAST_SHARE = 0.01  # minimum fraction of all pixels in a connected component: default of snaphu
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ def unwrap(phase: NDArray[np.float32], coherence: NDArray[np.float32], *, looks:
         wrapped, weight, max(1.0, looks), cost="smooth", mask=valid, min_conncomp_frac=_LEAST_SHARE
     )
     known = valid & (part > 0)
-    # as snaphu rounds its phase, only the multiples of 2π are used and added to the measured phase
+    # because snaphu rounds its phase, only the multiples of 2π are used and added to the measured phase
     cycles = np.round((np.where(known, whole, 0) - np.where(known, phase, 0)) / (2 * np.pi))
     return Unwrapped(
         np.where(known, phase + 2 * np.pi * cycles, np.nan).astype(np.float32),
@@ -205,7 +205,7 @@ def level(phase: Unwrapped, known: Sequence[KnownHeight]) -> Level | None:
 
 
 def _level_std(constants: Sequence[float], stds: Sequence[float]) -> float:
-    """Return the standard deviation of the median of constants, from their standard deviations or, if larger, scatter.
+    """Return the standard deviation of the median of constants: from their standard deviations or scatter, if larger.
 
     Source: docs/theory/interferometry.md, eq. 15a.
     """
@@ -223,7 +223,7 @@ def _unwrapped(point: KnownHeight, phase: Unwrapped, valid: NDArray[np.int64]) -
 
 
 def remove_level(phase: Unwrapped, reference: Level) -> NDArray[np.float32]:
-    """Return the phase due to height in the reference component, (y, x) float32 rad; wrapped without unwrapping.
+    """Return the phase due to height in the reference component, (y, x) float32 rad; wrapped if not unwrapped before.
 
     Examples
     --------
@@ -237,10 +237,10 @@ def remove_level(phase: Unwrapped, reference: Level) -> NDArray[np.float32]:
 
 # ---- Valid pixels, accuracy, and geocoding of the heights -----------------------------------------------------------
 BY_CHANCE = 1e-3
-"""False alarm rate: share of incoherent pixels that are accepted as coherent."""
+"""False alarm rate: fraction of incoherent pixels that are accepted as coherent."""
 
 MARGIN = 1.4
-"""Factor on the Cramér-Rao bound of the phase; the phase scatter of simulated terrain stays below it."""
+"""Factor on the Cramér-Rao bound of the phase; the phase scatter of simulated terrain is below this bound."""
 
 
 _STEPS = 30  # iterations of the fixed-point search for the pixel at which a point is imaged

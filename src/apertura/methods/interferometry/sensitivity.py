@@ -13,7 +13,9 @@ Legs = tuple[Floats, Floats]
 """Phase centres of transmitter and receiver for the pulses that illuminate a point, (point, pulse, 3) metres each."""
 
 PROBE = 0.02
-"""Height step of the finite difference relative to the range: large against rounding, small against the range."""
+"""Height step of the finite difference relative to the range: large compared with rounding errors, small compared with
+the range.
+"""
 
 _STEPS = 4  # Gauss-Newton steps; the first is accurate to first order in PROBE, and each further step squares the error
 
@@ -25,7 +27,8 @@ class Sensitivity:
     Attributes
     ----------
     slope, bend
-        (...) float64, phase = slope · h + bend · h², rad for h in metres; phase of the first image minus the second's.
+        (...) float64, phase = slope · h + bend · h², rad for h in metres; phase of the first image minus that of the
+        second.
     shift
         (..., 2) float64, displacement of the imaged terrain from the pixel, metres east and north per metre of height.
     overlap
@@ -122,9 +125,9 @@ def sensitivity(
 def _moved(places_m: Floats, axes: Floats, images: tuple[Legs, Legs], paths: list[Floats], height_m: Floats) -> Floats:
     """Locate the terrain that is `height_m` higher and imaged at `places_m` in both images.
 
-    The path difference of this terrain is constant over the pulses, otherwise it would be focused elsewhere along the
-    track, and has a mean of zero over both images, otherwise it would be imaged elsewhere in range
-    (docs/theory/interferometry.md, eq. 10).
+    The path difference of this terrain is constant over the pulses; otherwise the terrain would be focused at another
+    position along the track. The path difference has a mean of zero over both images; otherwise the terrain would be
+    imaged at another range (docs/theory/interferometry.md, eq. 10).
     """
     east_north, moved = axes[:2], places_m + height_m[:, None] * axes[2]
     for _ in range(_STEPS):
@@ -198,7 +201,7 @@ def _correlated(one: Floats, other: Floats, window: Floats) -> Floats:
 # ---- Track errors ---------------------------------------------------------------------------------------------------
 
 _BINS = 128  # time bins, in each of which the error of a track is constant
-_FINER = 8  # interpolated samples of the aperture per given pulse
+_FINER = 8  # interpolated samples of the aperture per sampled pulse
 _WITHIN = 33  # number of lags over which the correlation of two bins is averaged, odd
 _NODES = 1024  # points processed at once
 _REFERENCES = 256  # points whose mean phase represents the mean phase of all points
