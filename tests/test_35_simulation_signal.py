@@ -12,6 +12,7 @@ from apertura.simulation.impairments import (
     Blockage,
     Clock,
     Impairments,
+    Interferer,
     Leakage,
     Localization,
     PhaseWalk,
@@ -163,6 +164,45 @@ def test_noise_of_periodic_samples_has_the_requested_variance():
     channel = Channel(small_waveform(), paths, np.ones(200), np.zeros(40), np.zeros(40), noise_variance=9.0)
     noise = periodic_samples(channel, np.random.default_rng(1), np.arange(40))
     assert np.mean(np.abs(noise) ** 2) == pytest.approx(9.0, rel=0.03)
+
+
+INTERFERERS = {
+    "tone": Interferer(1.25e9, 10.0),
+    "pulses": Interferer(1.25e9, 10.0, duration_s=1e-6, rate_hz=2e5),
+    "hann pulses": Interferer(1.25e9, 10.0, duration_s=1e-6, rate_hz=2e5, envelope="hann"),
+    "noise": Interferer(1.25e9, 10.0, bandwidth_hz=20e6),
+}
+
+
+@pytest.mark.parametrize("name", INTERFERERS)
+@pytest.mark.parametrize("synthesis", [samples, periodic_samples])
+def test_interference_has_the_specified_power_and_frequency(name, synthesis):
+    source, count = INTERFERERS[name], 400
+    paths = Paths(np.full((count, 1), 1e-7), np.zeros((count, 1), complex), np.zeros((count, 1)))
+    channel = Channel(small_waveform(), paths, np.ones(200), np.zeros(count), np.zeros(count), noise_variance=1.0)
+    disturbed = replace(channel, interference=((source, 50.0),))
+    pulses = np.arange(count)
+    added = synthesis(disturbed, np.random.default_rng(3), pulses) - synthesis(
+        channel, np.random.default_rng(3), pulses
+    )
+    # pulses overlap a sample at a rate·duration on average; a Hann envelope has 3/8 of the power
+    share = (source.rate_hz * source.duration_s if source.duration_s else 1) * (
+        3 / 8 if source.envelope == "hann" else 1
+    )
+    assert np.mean(np.abs(added) ** 2) == pytest.approx(50.0 * share, rel=0.2)
+    rate = channel.waveform.sample_rate_hz
+    power = (np.abs(np.fft.fft(added, axis=1)) ** 2).sum(axis=0)
+    offset_hz = np.fft.fftfreq(added.shape[1], 1 / rate) - (source.frequency_hz - channel.waveform.carrier_hz)
+    near = np.abs(offset_hz) <= (source.bandwidth_hz / 2 or 3e6)
+    assert power[near].sum() > 0.85 * power.sum()
+
+
+def test_interference_does_not_change_the_noise():
+    paths = Paths(np.full((4, 1), 1e-7), np.zeros((4, 1), complex), np.zeros((4, 1)))
+    channel = Channel(small_waveform(), paths, np.ones(200), np.zeros(4), np.zeros(4), noise_variance=9.0)
+    weak = replace(channel, interference=((Interferer(1.25e9, 0.0), 1e-20),))
+    first, second = (samples(either, np.random.default_rng(1)) for either in (channel, weak))
+    assert_allclose(first, second, atol=1e-9)
 
 
 def test_sidelink_division_removes_phase_start_and_transmit_ripple_exactly():

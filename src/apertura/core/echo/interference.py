@@ -168,23 +168,33 @@ class Interference:
         return {
             "subcarriers": int(self.excluded.sum()),
             "frequencies_hz": self.frequency_hz[self.excluded][:_LISTED].tolist(),
-            "excess_db": round(decibels(float(self.excess.max())), 1),
+            "excess_db": round(self.strongest[1], 1),
             "excluded": self.is_removed,
             "gain_db": round(self.gain_db, 2),
             "sidelobe_db": round(self.sidelobe_db, 1),
         }
 
     @property
+    def strongest(self) -> tuple[float, float]:
+        """Frequency (Hz) and excess (dB) of the subcarrier with the largest excess."""
+        return float(self.frequency_hz[self.excess.argmax()]), decibels(float(self.excess.max()))
+
+    @property
+    def description(self) -> str:
+        """Number, frequency and excess of the subcarriers with interference; empty without any."""
+        if not self.excluded.any():
+            return ""
+        frequency_hz, excess_db = self.strongest
+        number = number_of(int(self.excluded.sum()), "subcarrier")
+        at = f"{1e-6 * frequency_hz:.2f} MHz ({service_at(frequency_hz)})"
+        where = f"{number} at {at}" if self.excluded.sum() == 1 else f"{number}, the strongest at {at}"
+        return f"{where}: noise {excess_db:.1f} dB above the neighbours"
+
+    @property
     def flags(self) -> Flags:
         """Flag `interference` if any subcarrier has interference."""
-        if not self.excluded.any():
-            return Flags()
-        excess, strongest = decibels(float(self.excess.max())), float(self.frequency_hz[self.excess.argmax()])
         done = "excluded" if self.is_removed else "not excluded, as that gains nothing"
-        number = number_of(int(self.excluded.sum()), "subcarrier")
-        at = f"{1e-6 * strongest:.2f} MHz ({service_at(strongest)})"
-        where = f"{number} at {at}" if self.excluded.sum() == 1 else f"{number}, the strongest at {at}"
-        return Flags({"interference": f"{where}: noise {excess:.1f} dB above the neighbours; {done}"})
+        return Flags({"interference": f"{self.description}; {done}"} if self.description else {})
 
 
 def _usual(values: Floats) -> Floats:

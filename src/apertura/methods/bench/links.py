@@ -15,10 +15,11 @@ from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.flags import Flags
 from apertura.common.units import decibels
-from apertura.core.echo.captures import Pulses, blocks_of
+from apertura.core.echo.captures import Pulses, blocks_of, sampled_pulses
 from apertura.core.echo.clock import ClockOffset
 from apertura.core.echo.compression import phasors
 from apertura.core.echo.demodulate import Numerology
+from apertura.core.echo.interference import Interference
 from apertura.core.echo.line_of_sight import LineOfSight, fit_block, joined
 from apertura.core.quality.measures import coherence_factor
 from apertura.methods.bench.channels import MISSED_SHARE, SIGMAS
@@ -43,9 +44,6 @@ LEAKAGE_DB, APART_CELLS = -20.0, 3.0
 """Largest level at the delay of the sidelink relative to the strongest path, dB; minimum difference of the two delays,
 cells.
 """
-
-TONE_DB = 13.0
-"""Largest pulse-to-pulse change of a subcarrier relative to the median, dB; with 20 pulses, noise reaches 5 dB."""
 
 UNLOCKED_PPM = 0.3
 """Largest offset between locked oscillators; the offset of disciplined oscillators (GNSS, 10 MHz cable) is below 0.1
@@ -189,8 +187,8 @@ class MeasuredLink:
         (subcarrier,) complex128, mean of the pulses.
     jumped, jump_m
         Number of pulses locked at a different delay, and median path difference of these pulses, metres.
-    tone_hz, tone_db
-        Frequency of the largest pulse-to-pulse change, and its level relative to the median of the band, dB.
+    interference
+        Noise of the subcarriers relative to their neighbours.
     delay_ps
         (pulse,) float64, delay relative to the median, ps.
     """
@@ -209,8 +207,7 @@ class MeasuredLink:
     mean: NDArray[np.complex128]
     jumped: int
     jump_m: float
-    tone_hz: float
-    tone_db: float
+    interference: Interference
     delay_ps: Floats = field(repr=False)
 
     @property
@@ -330,10 +327,8 @@ class MeasuredLink:
                 f"{self.name}: the path of {self.jumped} of {self.pulses} pulses differs by {self.jump_m:+.2f} m from "
                 "the path of the other pulses; these pulses are excluded from all other measurements"
             )
-        if self.tone_db > TONE_DB:
-            flags["interference"] = (
-                f"{self.name}: {self.tone_db:.0f} dB above the median of subcarriers at {self.tone_hz / 1e6:.2f} MHz"
-            )
+        if self.interference.description:
+            flags["interference"] = f"{self.name}: {self.interference.description}"
         excess = self.phase_excess_rad
         is_random = 1 - self.coherence > 0.5 > 1 - self.coherence_limit
         if excess > PHASE_RAD or is_random:
@@ -428,13 +423,10 @@ def measure_link(
     # 3. Value of every pulse at this delay, its contribution to an image; noise from pulse-to-pulse changes of cells.
     align = phasors(np.array([delay / subcarriers]), subcarriers, first=-(subcarriers - 1) / 2)
     power, total = np.zeros(subcarriers), np.zeros(subcarriers, np.complex128)
-    band, band_total = np.zeros(subcarriers), np.zeros(subcarriers, np.complex128)
     terms = np.zeros(count, np.complex128)
     for block in blocks_of(numbers[locked]):
         aligned = form(block) * align
         profile = fft.ifft(aligned, axis=1).astype(np.complex128)
-        band += (np.abs(aligned) ** 2).sum(axis=0)
-        band_total += aligned.sum(axis=0)
         terms[block] = profile[:, 0]
         power += (np.abs(profile) ** 2).sum(axis=0)
         total += profile.sum(axis=0)
@@ -444,8 +436,8 @@ def measure_link(
     noise = float(np.median(changes)) / (1 - 1 / (9 * (used - 1))) ** 3
     mean = total / used
     scatter = float(np.std(relative[locked]))
-    changing = np.maximum(band - np.abs(band_total) ** 2 / used, 1e-30)
-    tone = int(changing.argmax())
+    sampled = [form(numbers[locked][group]) for group in sampled_pulses(used)]
+    interference = Interference.measured(sampled, numerology.frequency_hz, np.full(subcarriers, 1 / subcarriers))
     direct = _at_sidelink(mean, delay, noise / used) if divided else None
     # 4. Path from the mean under a Hann window; otherwise sidelobes of other arrivals displace the path by millimetres.
     windowed = (fft.fft(mean) * np.hanning(subcarriers)).astype(np.complex64)
@@ -465,8 +457,7 @@ def measure_link(
         fft.fft(mean) * np.conj(align[0]),
         int(jumped.sum()),
         jump_m,
-        float(numerology.frequency_hz[tone]),
-        decibels(changing[tone] / float(np.median(changing))),
+        interference,
         (relative[locked] - middle) * cell_m / SPEED_OF_LIGHT_M_S * 1e12,
     )
 

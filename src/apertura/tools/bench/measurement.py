@@ -25,6 +25,7 @@ from apertura.core.echo.captures import (
 )
 from apertura.core.echo.clock import GROUPS, ClockOffset, clock_of
 from apertura.core.echo.demodulate import demodulate
+from apertura.core.echo.interference import EXCESS_DB
 from apertura.core.echo.transfer import Transfer, as_complex, transfer_by_code, transfer_by_sidelink
 from apertura.core.quality.budget import strictest_accuracy_db
 from apertura.methods.bench.channels import (
@@ -46,7 +47,6 @@ from apertura.methods.bench.links import (
     PHASE_RAD,
     SPLIT_DB,
     SPLIT_RAD,
-    TONE_DB,
     UNLOCKED_PPM,
     WEAK_DB,
     BenchPathOffset,
@@ -276,8 +276,14 @@ class Bench:
         yield self._steady(link.contact, pair)
         path = f"{link.path_m:+.4f} ± {link.path_std_m:.4f} m"
         yield line(pair, "path", path, "equal for all pulses", "channels_swapped", "delay_jumps")
-        yield line(pair, "strongest tone", f"{link.tone_db:.1f} dB at {link.tone_hz / 1e6:.2f} MHz",
-                   f"{TONE_DB:g} dB re noise", "interference")  # fmt: skip
+        frequency_hz, excess_db = link.interference.strongest
+        yield line(
+            pair,
+            "strongest interference",
+            f"{excess_db:.1f} dB at {frequency_hz / 1e6:.2f} MHz",
+            f"{EXCESS_DB:g} dB re neighbours",
+            "interference",
+        )
         if (offset := self.offsets.get(node.name)) is not None:
             yield line(
                 pair,
