@@ -1,4 +1,4 @@
-"""Prediction of a refinement before a flight, from measured limits of docs/theory/autofocus.md, "Limits of the method"."""
+"""Prediction of a refinement before a flight, from the measured "Limits of the method" in docs/theory/autofocus.md."""
 
 import math
 from collections.abc import Iterable
