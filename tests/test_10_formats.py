@@ -50,7 +50,7 @@ def test_documented_sigmf_keys_match_those_read(model, after):
 
 
 def test_every_framing_key_is_documented():
-    assert names("A frame is preamble") == list(SigmfFraming.model_fields)
+    assert names("A frame consists of preamble") == list(SigmfFraming.model_fields)
 
 
 def test_documented_datatypes_match_those_read():
@@ -109,7 +109,7 @@ PLACES = {
 @pytest.mark.parametrize("time", TIMES)
 @pytest.mark.parametrize("place", PLACES)
 def test_csv_log_columns_are_documented_and_need_time_and_position(tmp_path, time, place):
-    documented = names("Columns of CSV")
+    documented = names("The columns of a CSV log")
     assert set(documented) >= {*TIMES, *(name for group in PLACES for name in group)}
     optional = [name for name in documented if name not in TIMES and not any(name in group for group in PLACES)]
     cells = TIMES | dict(zip(place, PLACES[place], strict=True)) | dict.fromkeys(optional, "1.5") | {"quality": "fix"}

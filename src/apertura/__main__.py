@@ -1,4 +1,4 @@
-"""The command `apertura`: out of the working folder first, everything else after that."""
+"""Entry point of the command `apertura`: leave the working folder before all other imports."""
 
 import os
 import sys
@@ -18,7 +18,7 @@ def _refuse(message: str) -> NoReturn:
 
 
 def main() -> None:
-    """Leave the working folder, which may be a stranger's, and run the command line."""
+    """Leave the working folder, which may be untrusted, and run the command line."""
     try:
         leave_working_folder()
     except OSError as error:
@@ -27,12 +27,12 @@ def main() -> None:
         folders = list(filter(None, os.environ.get(name, "").split(os.pathsep)))
         if folders and not any(Path(folder, "proj.db").is_file() for folder in folders):
             _refuse(f"environment variable {name}: no proj.db in {os.pathsep.join(folders)}. Unset it.")
-    # What a terminal cannot show is escaped, here and in every step: names and signs of others are no reason to fail.
+    # Characters that the terminal cannot display are escaped, here and in every step, so that printing does not fail.
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     os.environ[_ENCODING] = f"{os.environ.get(_ENCODING, '').partition(':')[0]}:backslashreplace"
     os.environ[ALGEBRA_THREADS] = "1"
-    os.environ[_BACKEND] = "agg"  # pictures are files; a backend of the caller's may be none that is here
+    os.environ[_BACKEND] = "agg"  # plots are files; a backend configured by the user may not be installed
     from apertura.cli import main as run
 
     run()

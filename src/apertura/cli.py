@@ -1,6 +1,6 @@
-"""Command line: the workflow of a campaign, one subcommand per step, and the tools around them.
+"""Command line: the workflow of a campaign, one subcommand per step, and further tools.
 
-Commands import their modules when they run: help texts and usage errors load no library.
+Commands import their modules on execution; help texts and usage errors therefore load no library.
 """
 
 import os
@@ -40,7 +40,7 @@ PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
 
 
 class Commands(TyperGroup):
-    """Commands of apertura and of installed plugins; plugins are searched only for names that apertura lacks."""
+    """Commands of apertura and of installed plugins; plugins are searched only for names unknown to apertura."""
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return a command by its name, None if there is none."""
@@ -61,7 +61,7 @@ class Commands(TyperGroup):
         return super().list_commands(ctx)
 
     def _add_installed(self) -> None:
-        from importlib.metadata import entry_points  # costs 20 ms, which jobs of a run save
+        from importlib.metadata import entry_points  # takes 20 ms, which the jobs of a run avoid
 
         for point in entry_points(group="apertura.commands"):
             if point.name not in self.commands:
@@ -71,7 +71,7 @@ class Commands(TyperGroup):
 
 # ---- apertura step: one command per row of RULES ---------------------------------------------------------------------
 
-step = typer.Typer(no_args_is_help=True, help="Run one step of the pipeline as the workflow runs it.")
+step = typer.Typer(no_args_is_help=True, help="Run a single step in the same way as the workflow.")
 
 Directory = Annotated[Path, typer.Option("--campaign", help="campaign folder")]
 Threads = Annotated[int, typer.Option(min=1, help="number of tiles processed in parallel")]
@@ -124,7 +124,7 @@ app.add_typer(step, name="step", hidden=True)  # for the rules, and to repeat a 
 CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder, default: current directory", show_default=False)]
 Cores = Annotated[int, typer.Option(min=1, help="number of CPU cores")]
 Paranoid = Annotated[
-    bool, typer.Option("--paranoid", help="compute the checksum of every input, even if its modification time is old")
+    bool, typer.Option("--paranoid", help="recompute the hash of every input, even if the file times are unchanged")
 ]
 HERE = Path()
 ALL_CORES = os.cpu_count() or 1
@@ -136,8 +136,8 @@ class _PassesOn(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse arguments after separating short options from their values and repeating `--until` for each step.
 
-        In `-sFILE`, click reads each letter that is an option of apertura as that option. snakemake accepts several
-        step names after one `--until`; click accepts one value.
+        Otherwise click would interpret the letters of a value, as in `-sFILE`, as options of apertura. snakemake
+        accepts several step names after one `--until`; click accepts a single value.
         """
         from apertura.run.driver import UNTIL, apart
         from apertura.workflow.rules import RULES
@@ -192,7 +192,7 @@ def main() -> None:
 
 
 def _flush() -> None:
-    """Flush the output; if its reader has gone or its disk is full, discard it so that the exit does not fail."""
+    """Flush the output; if the pipe is closed or the disk is full, discard the output, so that the exit succeeds."""
     try:
         sys.stdout.flush()
     except OSError:
@@ -228,12 +228,14 @@ def inspect(
     *,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="setting that a log does not contain; keys of nodes.<n>.log"),
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help="setting that the log does not contain; a key of nodes.<n>.log"
+        ),
     ] = None,
-    plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="draw a preview")] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="also write a plot")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
-    """Describe a file or folder: type, times, rates, gaps, position fix, bounds, and what an image still requires."""
+    """Describe a file or folder: type, times, rates, gaps, fix, bounds, and information missing for an image."""
     picture = None if plot is None else given(plot)
     from apertura.views.inspect.path import inspect_path
 
@@ -246,23 +248,27 @@ def align(
         list[str],
         typer.Argument(
             metavar="[CAMPAIGN] FLIGHT NODE",
-            help="campaign folder, default: current directory; flight; node that transmits and receives",
+            help="campaign folder (default: current directory), flight, and node that transmits and receives",
         ),
     ],
     *,
     point: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(help="reflector: easting, northing in scene.crs, ellipsoidal height (z in a local frame), m"),
+        typer.Option(
+            help="position of a reflector: easting, northing in scene.crs, ellipsoidal height (local frame: z), m"
+        ),
     ] = None,
-    search_s: Annotated[float | None, typer.Option(min=0, help="half width of the search for the clock, s")] = None,
+    search_s: Annotated[
+        float | None, typer.Option(min=0, help="half width of the search range of the clock offset, s")
+    ] = None,
     search_m: Annotated[
-        float, typer.Option(min=0, help="half width of the search for the path offset, m of total path")
+        float, typer.Option(min=0, help="half width of the search range of the path offset, m of total path")
     ] = 10.0,
     drift: Annotated[bool, typer.Option("--drift", help="estimate the clock drift as well")] = False,
     keep_path: Annotated[bool, typer.Option("--keep-path", help="keep the configured path offset")] = False,
-    write: Annotated[bool, typer.Option("--write", help="write config/clocks.tsv")] = False,
+    write: Annotated[bool, typer.Option("--write", help="write the result to config/clocks.tsv")] = False,
 ) -> None:
-    """Estimate clock and path offset of a recorder relative to its flight log, at which echoes focus best."""
+    """Estimate the clock offset (recorder to flight log) and the path offset by maximising the focus of echoes."""
     if len(words) not in {2, 3}:
         raise CampaignError(" ".join(words), "align", "[CAMPAIGN] FLIGHT NODE", "Name flight and node.")
     *folder, flight, node = words
@@ -280,19 +286,22 @@ def run(
     cores: Cores = ALL_CORES,
     *,
     paranoid: Paranoid = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="print errors and the paths of products only")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="print only errors and the paths of products")] = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="print the whole output of snakemake")] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", "-n", help="dry run: list the steps without running them")
     ] = False,
     until: Annotated[
-        list[str] | None, typer.Option("--until", "-U", metavar="STEP …", help="last steps: image, export, cube, …")
+        list[str] | None,
+        typer.Option("--until", "-U", metavar="STEP …", help="stop after these steps: image, export, cube, …"),
     ] = None,
     profile: Annotated[
-        str | None, typer.Option(metavar="PROFILE", help="snakemake profile: profiles/slurm, or your own folder")
+        str | None,
+        typer.Option(metavar="PROFILE", help="snakemake profile: profiles/slurm, or the folder of another profile"),
     ] = None,
     set_scatter: Annotated[
-        list[str] | None, typer.Option("--set-scatter", metavar="tiles=N", help="divide each image among N jobs")
+        list[str] | None,
+        typer.Option("--set-scatter", metavar="tiles=N", help="distribute the tiles of each image over N jobs"),
     ] = None,
 ) -> None:
     """Run the workflow on a campaign folder; other options and targets are passed to snakemake."""
@@ -330,13 +339,13 @@ def preview(
     ] = False,
     every: Annotated[float, typer.Option(min=1, help="interval between updates, s")] = 5.0,
     end_after: Annotated[
-        float, typer.Option(min=1, help="time without growth after which recordings count as finished, s")
+        float, typer.Option(min=1, help="time without growth after which a recording is considered finished, s")
     ] = 10.0,
     run_after: Annotated[
         bool, typer.Option("--run/--no-run", help="run the workflow when the recordings are finished")
     ] = True,
 ) -> None:
-    """Show preview images of the pulses so far; with --follow, Ctrl-C ends following and starts the workflow."""
+    """Form images from the pulses recorded so far; with --follow, Ctrl-C stops the updates and starts the workflow."""
     opened = _opened(campaign)
     from apertura.tools.preview.follow import run_preview
 
@@ -347,7 +356,7 @@ def preview(
 
 @app.command()
 def status(campaign: CampaignFolder = HERE) -> None:
-    """Print the progress of a run from another terminal: steps done, running and left, time left, the last error."""
+    """Print the progress of a run in another terminal: finished, running and pending steps, time left, last error."""
     opened = _opened(campaign)
     from apertura.run.screen import print_status
 
@@ -356,7 +365,7 @@ def status(campaign: CampaignFolder = HERE) -> None:
 
 @app.command("list")
 def list_results(campaign: CampaignFolder = HERE) -> None:
-    """List flights and pairs, which of their results are finished, out of date or missing, and their sizes."""
+    """List flights and pairs, with state (finished, out of date or missing) and size of the results."""
     opened = _opened(campaign)
     from apertura.run.results import print_list
 
@@ -369,7 +378,7 @@ def clean(
     wip: Annotated[bool, typer.Option("--wip", help="remove only unfinished files of a run that was killed")] = False,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="do not ask for confirmation")] = False,
 ) -> None:
-    """Remove the files that the workflow has written, and no others; refused while the campaign is being run."""
+    """Remove all files written by the workflow, and no others; refused during a run of the campaign."""
     opened = _opened(campaign)
     from apertura.run.results import clean as remove_results
 
@@ -379,10 +388,12 @@ def clean(
 @app.command()
 def check(
     campaign: CampaignFolder = HERE,
-    products: Annotated[bool, typer.Option("--products", help="read every byte of the results")] = False,
+    products: Annotated[
+        bool, typer.Option("--products", help="also read every byte of the results, to detect damage")
+    ] = False,
     paranoid: Paranoid = False,
 ) -> None:
-    """Print every error in a campaign folder, one per line, and the results that are out of date; run nothing."""
+    """List all errors in a campaign folder, one per line, and all results that are out of date; run no step."""
     from apertura.check import print_findings
 
     raise SystemExit(2 if print_findings(given(campaign), products=products, paranoid=paranoid) else 0)
@@ -390,7 +401,7 @@ def check(
 
 @app.command()
 def plan(campaign: CampaignFolder = HERE, threads: Threads = 1) -> None:
-    """Print engine, settings, reasons, predicted accuracy and cost of each pair's image; run nothing."""
+    """Print engine, settings, reasons, predicted accuracy and cost of the image of each pair; run no step."""
     opened = _opened(campaign)
     from apertura.views.plan import print_plan
 
@@ -410,12 +421,12 @@ def design(
         str | None,
         typer.Option(
             metavar="QUANTITIES",
-            help="first optimise the tracks within the plan's bounds; any of height,offset,spacing,heading",
+            help="first optimise the tracks within the bounds of the plan; any of height,offset,spacing,heading",
         ),
     ] = None,
     threads: Threads = 1,
 ) -> None:
-    """Predict resolution, noise, coverage and data volume of a planned flight, and compare with the requirements."""
+    """Predict resolution, noise, coverage and data volume of a planned flight, and compare them with requirements."""
     path, folder = given(plan), None if out is None else given(out)
     from apertura.tools.design.view import print_design
 
@@ -428,7 +439,7 @@ def compare(
     campaign: CampaignFolder = HERE,
     threads: Threads = 1,
 ) -> None:
-    """Compare the flight plan with the campaign's logs and, once they are formed, its images."""
+    """Compare a flight plan with the logs of a campaign and, if available, with its images."""
     path, folder = given(plan), given(campaign)
     from apertura.tools.design.view import print_comparison
 
@@ -437,7 +448,7 @@ def compare(
 
 @app.command(context_settings=PASS_ON)
 def chart(context: typer.Context, campaign: CampaignFolder = HERE, cores: Cores = ALL_CORES) -> None:
-    """Measure run time and accuracy of every engine and setting: results/study/speed_accuracy.{png,html,csv}."""
+    """Measure speed and accuracy of all engines and settings; write results/study/speed_accuracy.{png,html,csv}."""
     from apertura.run.driver import run_workflow
 
     status = run_workflow(given(campaign), cores, *context.args, "speed_accuracy")
@@ -463,7 +474,7 @@ def score(
     ] = HERE,
     paths: Annotated[bool, typer.Option("--paths", help="list the files of all products as well")] = False,
 ) -> None:
-    """Compare the measured positions of point targets with the true ones."""
+    """Compare the measured positions of point targets with their true positions."""
     opened = _opened(campaign)
     from apertura.views.score import print_findings
     from apertura.views.summary import print_stale
@@ -475,9 +486,11 @@ def score(
 @app.command()
 def bench(
     campaign: CampaignFolder = HERE,
-    write: Annotated[bool, typer.Option("--write", help="write the measured paths into config/config.yaml")] = False,
+    write: Annotated[
+        bool, typer.Option("--write", help="write the measured path offsets to config/config.yaml")
+    ] = False,
 ) -> None:
-    """Measure channels, clocks, coherence and path lengths of a stationary or cabled radar, each with a verdict.
+    """Check channels, clocks, coherence and path lengths of a stationary or cabled radar against limits.
 
     The exit code is 2 if a measurement exceeds its limit.
     """
@@ -494,7 +507,7 @@ def reflectors(
         Path | None, typer.Option(metavar="FILE", help="output file, default: calibration.json in the campaign folder")
     ] = None,
 ) -> None:
-    """Measure each pair's calibration constant at reflectors of known cross-section, for use in later campaigns."""
+    """Measure the calibration constant of each pair at reflectors of known cross-section, for later campaigns."""
     opened, path = _opened(campaign), None if to is None else given(to)
     from apertura.tools.reflectors import write_constants
 
@@ -515,11 +528,11 @@ def verify(
         Path | None, typer.Option(metavar="FOLDER", help="campaign folder of a file that was copied elsewhere")
     ] = None,
     crate: Annotated[
-        bool, typer.Option("--crate", help="verify a copy of results/ by its RO-Crate and catalogue")
+        bool, typer.Option("--crate", help="verify a copy of results/ against its RO-Crate and STAC catalog")
     ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="print differences only")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="print only differences")] = False,
 ) -> None:
-    """Verify a product back to the raw samples: report for each file if it is unchanged, changed or missing."""
+    """Verify the provenance of a product down to the raw samples: list each file as unchanged, changed or missing."""
     if crate:
         from apertura.views.verify.chain import print_checked
 
@@ -544,7 +557,8 @@ def reproduce(
     keep: Annotated[
         Path | None,
         typer.Option(
-            metavar="FOLDER", help="new folder for the reproduced files, which is kept; default: temporary, in TMPDIR"
+            metavar="FOLDER",
+            help="new folder in which the reproduced files are kept; default: temporary folder in TMPDIR",
         ),
     ] = None,
 ) -> None:
@@ -558,7 +572,9 @@ def reproduce(
 @app.command()
 def diff(
     first: Annotated[Path, typer.Argument(help="raster, picture, stage or report")],
-    second: Annotated[Path, typer.Argument(help="product to compare it with, of the same or another campaign")],
+    second: Annotated[
+        Path, typer.Argument(help="product to compare with the first, from the same or another campaign")
+    ],
     *,
     whole: Annotated[bool, typer.Option("--all", help="print every line of long sections")] = False,
 ) -> None:
@@ -573,7 +589,7 @@ def report(
     campaign: CampaignFolder = HERE,
     cores: Cores = ALL_CORES,
 ) -> None:
-    """Write results/report.html: configuration, decisions, image quality, pictures; readable without a network."""
+    """Write results/report.html: configuration, decisions, image quality and figures; readable offline."""
     from apertura.campaign.folder import Campaign
     from apertura.run.driver import run_workflow
     from apertura.views.report import PAGE
@@ -601,7 +617,7 @@ def map_page(
     preview_: Annotated[bool, typer.Option("--preview", help="show the live images of `apertura preview`")] = False,
     open_: Annotated[bool, typer.Option("--open", help="open the map in the browser")] = False,
 ) -> None:
-    """Show a campaign as a map in a browser; the server accepts this machine only and runs until Ctrl-C."""
+    """Show a campaign on a map in a browser; the server is accessible only from this machine and runs until Ctrl-C."""
     opened = _opened(campaign)
     opened.check_images()
     from apertura.views.summary import print_stale
@@ -653,7 +669,7 @@ def _next_after_init(directory: Path) -> str:
 @app.command()
 def simulate(
     paths: Annotated[
-        list[Path] | None, typer.Argument(metavar="[SPEC.yaml] DIR", help="specification, and folder to create")
+        list[Path] | None, typer.Argument(metavar="[SPEC.yaml] DIR", help="YAML specification, and folder to create")
     ] = None,
     preset: Annotated[
         str | None,
@@ -667,7 +683,7 @@ def simulate(
         str | None, typer.Option(metavar="PRESET", help="print the specification of a preset")
     ] = None,
 ) -> None:
-    """Write a simulated campaign folder of raw IQ, with truth.json, from a YAML specification or a preset."""
+    """Write a campaign folder with simulated raw samples and truth.json, from a YAML specification or a preset."""
     from apertura import simulation
 
     if print_spec is not None:

@@ -122,7 +122,7 @@ def pulse_filter(spectrum: NDArray[np.complexfloating], *, requested: str) -> Pu
 
     Notes
     -----
-    Source: docs/theory/waveforms.md, "Which filter".
+    Source: docs/theory/waveforms.md, "Selection of the filter".
 
     Examples
     --------

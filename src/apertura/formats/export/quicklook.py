@@ -211,7 +211,7 @@ def below_peak(mean: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
 
     Notes
     -----
-    Source: docs/theory/export.md, "Where the colours of a quicklook end".
+    Source: docs/theory/export.md, "Colour range of a quicklook".
 
     Examples
     --------

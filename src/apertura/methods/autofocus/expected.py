@@ -1,4 +1,4 @@
-"""Prediction of a refinement before a flight, from measured limits of docs/theory/autofocus.md, "Where it ends"."""
+"""Prediction of a refinement before a flight by measured limits: docs/theory/autofocus.md, "Limits of the method"."""
 
 import math
 from collections.abc import Iterable

@@ -43,7 +43,7 @@ def sidelink_error_rad(
 
     Notes
     -----
-    Source: docs/theory/echo_methods.md, "What the sidelink takes out".
+    Source: docs/theory/echo_methods.md, "Errors removed by the sidelink".
 
     Examples
     --------
