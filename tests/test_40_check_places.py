@@ -170,7 +170,7 @@ def test_missing_attitude_is_reported_if_a_lever_arm_needs_it(tiny):
 def test_nodes_without_line_of_sight_are_reported(tiny):
     edit_position(tiny, lambda latitude, longitude, up: (longitude, latitude, up), node="uav2")
     lines = reported(tiny)
-    assert f"{RX}: the log is 5393 km from that of uav1: latitude 9.95" in "\n".join(lines)
+    assert f"{RX}: the track is 5393 km from the track of uav1: latitude 9.95" in "\n".join(lines)
     assert "expected nodes in line of sight" in "\n".join(lines)
 
 

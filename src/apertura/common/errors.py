@@ -21,7 +21,7 @@ _REMEDIES = {
     errno.EMFILE: "Raise the limit on open files (ulimit -n)",
     errno.ENFILE: "Close other programs",
     errno.ENOMEM: "Give the job more memory",
-    errno.ENOENT: "Check the path (for output: a path in a writable folder)",
+    errno.ENOENT: "Check the path (an output path must be in a writable folder)",
     errno.EEXIST: "Move the existing file or folder, or use another path,",
     errno.ENOTDIR: "Move the file that occupies the path of a folder",
     errno.EISDIR: "Move the folder that occupies the path of a file",
@@ -111,7 +111,7 @@ class CampaignError(ValueError):
     found
         The fault, with the value found.
     where
-        File, and key, line or pulse within it.
+        File, and key, line or pulse within the file.
     expected
         Description of a valid value.
     remedy
@@ -181,11 +181,11 @@ def explained(error: BaseException) -> str | None:
 
 _OF_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _OF_PLACE = {errno.ENOENT, errno.EEXIST}
-"""Errors that are internal, i.e. not to be corrected by the user, unless they contain the name of a file."""
+"""Error numbers that indicate an internal error, which the user cannot correct, unless the error names a file."""
 
 
 def _error_number(error: BaseException) -> int | None:
-    """Return the errno of an exception; for GDAL errors, the errno of the system message that they quote."""
+    """Return the errno of an exception; for a GDAL error, the errno of the system message that the error quotes."""
     if isinstance(error, OSError) and error.errno is not None:
         known = error.errno in _REMEDIES and (error.filename is not None or error.errno not in _OF_PLACE)
         return error.errno if known else None
