@@ -152,8 +152,8 @@ def test_partial_run_reports_finished_and_missing_results(finished_tiny, tmp_pat
     state(root, "processing", engine="numba")
     status, out, err = run_command("run", root, "--cores", 1, "--until", "image")
     assert status == 0, err
-    message = r"^\d+ results finished, \d+ results out of date, \d+ results missing: `apertura run` computes the rest$"
-    assert re.search(message, out, re.MULTILINE)
+    counts = r"^\d+ results finished, \d+ results out of date, \d+ results missing"
+    assert re.search(f"{counts}: `apertura run` computes the remaining results$", out, re.MULTILINE)
     assert "error" not in err
     assert run_command("summary", root)[0] == 2  # no image exists
 
@@ -235,8 +235,8 @@ def test_summary_without_results_names_the_command_to_run(tiny, run_command):
 
 def test_plan_states_its_inputs(tiny, finished_tiny, run_command):
     before, after = (run_command("plan", root)[1] for root in (tiny, finished_tiny.root))
-    assert "Planned from the flight logs alone" in before
-    assert "Planned from the flight logs alone" not in after
+    assert "This plan is based on the flight logs alone" in before
+    assert "This plan is based on the flight logs alone" not in after
 
 
 @pytest.mark.parametrize(

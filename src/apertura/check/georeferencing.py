@@ -171,8 +171,8 @@ def check_spikes(examined: Examination) -> Iterator[CampaignError]:
     row, column = np.argwhere(spikes)[0]
     x, y = window.map_at(row, column)
     yield CampaignError(
-        f"{heights[row, column]:.0f} m at x {x:.1f}, y {y:.1f}, where the surrounding terrain has "
-        f"{np.nanmedian(heights[max(row - 6, 0) : row + 7, max(column - 6, 0) : column + 7]):.0f} m; "
+        f"a height of {heights[row, column]:.0f} m at x {x:.1f}, y {y:.1f}, where the median height of the "
+        f"surroundings is {np.nanmedian(heights[max(row - 6, 0) : row + 7, max(column - 6, 0) : column + 7]):.0f} m; "
         f"{int(spikes.sum())} of {spikes.size} samples are such spikes",
         where=dem.path,
         expected=f"no post more than {TALLEST_M:.0f} m and ten post widths above or below all its neighbours",
