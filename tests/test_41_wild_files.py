@@ -40,7 +40,7 @@ def test_folder_name_that_is_not_utf_8_is_refused(tiny):
     tiny.rename(latin_1_path)
     for root in (latin_1_path, f"{latin_1_path}/."):
         message = complaint(lambda root=root: Campaign.load(root))
-        assert "the path is not UTF-8 text; expected names in UTF-8 of the folder and its parent folders" in message
+        assert "the path is not UTF-8 text; expected UTF-8 names of the folder and its parent folders" in message
         assert "LC_ALL=C.UTF-8" in message
         assert [str(problem) for problem in problems(root)] == [message]
         assert message.isprintable()

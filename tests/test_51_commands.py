@@ -113,7 +113,7 @@ INVALID_RUNS = {
     "--set-scatter tiles=0": "tiles=N, N >= 1",
     "--set-scat=tiles=0": "tiles=N, N >= 1",
     "--until imag": "ingest, bench, echo",
-    "cphd": "cphd: a step that runs only if its result is requested",
+    "cphd": "cphd: a step that only runs if its result is requested",
     "results/f01/uav2-uav2/echo.manifest.json": "one of fused, tracks, uav1, uav1-uav1, uav1-uav2, uav2",
     "results/f01/uav9/track.manifest.json": "f01 has no uav9",
     "results/f09/uav1-uav1/echo.manifest.json": "no flight 'f09'",
@@ -182,7 +182,7 @@ def test_commands_read_results_without_recordings(finished_tiny, tmp_path, run_c
         assert re.findall(r"^(\w+) +(\S+sigmf-data):", out, re.MULTILINE) == [("missing", name) for name in SAMPLES]
         assert "changed" not in out
     elif command in {"check", "summary", "list"} and not needs_raw:
-        assert "missing recordings, not compared with results: raw/f01/uav1.sigmf-" in out
+        assert "recordings are missing and not compared with results: raw/f01/uav1.sigmf-" in out
 
 
 @pytest.mark.parametrize("node", ["uav2", "uav9"])

@@ -95,7 +95,7 @@ def _elsewhere(examined: Examination, crs: str) -> Iterator[CampaignError]:
                 problem
                 if not hint
                 else CampaignError(
-                    f"the bounds {list(bounds)} lie outside the area of use of {crs}",
+                    f"bounds_m {list(bounds)} lie outside the area of use of {crs}",
                     where=f"{CONFIG}: scene.bounds_m",
                     expected=f"[xmin, ymin, xmax, ymax], metres in {crs}",
                     remedy=hint,
