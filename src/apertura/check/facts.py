@@ -192,7 +192,7 @@ class RecordingFacts:
     samples
         Number of samples of each channel.
     captures, capture_samples
-        Number of captures, and samples of each.
+        Number of captures, and number of samples per capture.
     span
         Times of the first and last capture, or time span of a continuous recording.
     times
@@ -361,7 +361,7 @@ def dem_facts(path: Path) -> DemFacts:
     """
     from apertura.common.raster import opened_raster
 
-    with opened_raster(path, expected="a GeoTIFF of heights", remedy="Convert it to GeoTIFF.") as raster:
+    with opened_raster(path, expected="a GeoTIFF of heights", remedy="Convert the file to GeoTIFF.") as raster:
         bounds, crs = raster.bounds, raster.crs
         return DemFacts(
             tags={str(name): str(value) for name, value in raster.tags().items()},

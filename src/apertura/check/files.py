@@ -35,7 +35,7 @@ def check_flights(examined: "Examination") -> Iterator[CampaignError]:
     """Yield a problem if no flight is of kind image or bench."""
     if {flight.kind for flight in examined.campaign.flights} <= {"calibration"}:
         yield CampaignError(
-            f"{number_of(len(examined.campaign.flights), 'flight')}, but none of kind image",
+            f"{number_of(len(examined.campaign.flights), 'flight')}, none of kind image",
             where=examined.campaign.root / FLIGHTS,
             expected="at least one flight of kind image or bench",
             remedy="Add such a flight, or correct the kind of a flight.",

@@ -89,7 +89,8 @@ def check_histories(examined: Examination) -> Iterator[CampaignError]:
 def check_intervals(examined: Examination) -> Iterator[CampaignError]:
     """Yield problems of recordings whose time tag interval differs from 1/prf_hz for a reason other than missed pulses.
 
-    A receiver may record only every second or third pulse, because the transmitter records a match for each of these.
+    A receiver that records only every second or third pulse is accepted, because each of its pulses has a match at the
+    transmitter.
     """
     waveform = examined.waveform
     transmitters = {(flight.name, flight.transmitter) for flight in examined.campaign.flights}

@@ -38,7 +38,10 @@ _WRITES = os.O_WRONLY | os.O_RDWR
 _KINDS = {stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket", stat.S_IFBLK: "a device", stat.S_IFCHR: "a device"}
 _DESCRIPTORS = Path("/proc/self/fd")
 _EXPECTED = "a regular file or folder: nothing in a campaign folder is read, written or deleted through a link"
-_REMEDY = "Remove it. The campaign folder itself may be a link, and `raw_root` in the config may name another raw/."
+_REMEDY = (
+    "Remove this entry. The campaign folder itself may be a link; `raw_root` in the config may name a folder elsewhere "
+    "that replaces raw/."
+)
 
 
 class ConfinedPath(PosixPath):

@@ -25,7 +25,12 @@ STANDARD_NAMES = {"incidence": "angle_of_incidence", "centre_frequency": "sensor
 Row = tuple[tuple[str, ...], str, str, str]
 
 RASTERS: dict[str, Row] = {
-    "image": (_RASTERS, "complex64", "1", "echo amplitude of every image; NaN: the pair did not fly, or no image"),
+    "image": (
+        _RASTERS,
+        "complex64",
+        "1",
+        "echo amplitude of every image; NaN: no flight of the pair, or no image formed",
+    ),
     "coherent": (_SUMS, "complex64", "1", "mean of the peak-normalised images"),
     "noncoherent": (_SUMS, "float32", "1", "mean power of the peak-normalised images"),
     "magnitude": (_SUMS, "float32", "1", "mean magnitude of the peak-normalised images"),
@@ -49,7 +54,12 @@ MEASURED: dict[str, Row] = {
         for name, meaning in _OF_COHERENCE.items()
     },
     "coherent_noise_floor": (_FLIGHTS, "float64", "dB", "median power of the coherent sum relative to its peak"),
-    "clutter_reduction": (_FLIGHTS, "float64", "dB", "clutter of the images relative to that of their coherent sum"),
+    "clutter_reduction": (
+        _FLIGHTS,
+        "float64",
+        "dB",
+        "clutter of the images relative to the clutter of their coherent sum",
+    ),
 }
 """Quantities measured while the rasters are written."""
 
@@ -147,8 +157,8 @@ STAGES: Mapping[str, Stage] = {
         {
             "start": Variable(("pulse",), "int64", "1", "first sample of the capture in the recorder's file"),
             "time": Variable(("pulse",), "datetime64[ns]", "", "UTC time tag of the capture, clock of the node"),
-            "frame": Variable(("pulse",), "int64", "1", "frame number sent in the payload; -1: none"),
-            "repeats": Variable(("pulse",), "bool", "1", "True if the capture is bit-identical to an earlier one"),
+            "frame": Variable(("pulse",), "int64", "1", "frame number transmitted in the payload; -1 if there is none"),
+            "repeats": Variable(("pulse",), "bool", "1", "True if the capture is bit-identical to an earlier capture"),
         },
         {
             "node": "node name",
@@ -205,7 +215,7 @@ STAGES: Mapping[str, Stage] = {
                 ("pulse",), "float64", "Hz", "carrier offset of the receiver, already removed from its samples"
             ),
             "sidelink_delay": Variable(
-                ("pulse",), "float64", "m", "measured sidelink delay × c, with an arbitrary constant; NaN: no lock"
+                ("pulse",), "float64", "m", "measured sidelink delay × c, plus an arbitrary constant; NaN: no lock"
             ),
             "sidelink_snr": Variable(("pulse",), "float64", "dB", "sidelink SNR per subcarrier; NaN: no lock"),
             "sidelink_phase": Variable(("pulse",), "float64", "rad", "sidelink phase at mid-band; NaN: no lock"),
@@ -228,7 +238,10 @@ STAGES: Mapping[str, Stage] = {
         {
             **_PULSE_GEOMETRY,
             "profile": Variable(
-                ("pulse", "range"), "complex64", "1", "range profile; × exp(+j2πf_mid·path/c) aligns pulses in phase"
+                ("pulse", "range"),
+                "complex64",
+                "1",
+                "range profile; the factor exp(+j2πf_mid·path/c) aligns pulses in phase",
             ),
             "start": Variable(("pulse",), "float64", "m", "total path (tx → scene → rx) of range sample 0"),
         },

@@ -205,7 +205,7 @@ def undamaged(path: Path, *, expected: str, remedy: str) -> Iterator[None]:
     Raises
     ------
     CampaignError
-        For every error that a missing key, a wrong type or a number out of range causes in the block.
+        For all errors that a missing key, a wrong type or a number out of range causes in the context.
     """
     try:
         yield

@@ -9,12 +9,12 @@ from pathlib import Path
 
 _LOG = logging.getLogger(__name__)
 _REMEDIES = {
-    errno.ENOSPC: "Free disk space there",
-    errno.EDQUOT: "Free disk space there, or request a larger quota",
+    errno.ENOSPC: "Free disk space",
+    errno.EDQUOT: "Free disk space, or request a larger quota,",
     errno.EFBIG: "Raise the file size limit (ulimit -f), or write to another file system",
     errno.EROFS: "Copy the campaign to a writable file system",
-    errno.EACCES: "Make it readable and its folder writable",
-    errno.EPERM: "Make it readable and its folder writable",
+    errno.EACCES: "Make the file readable and its folder writable",
+    errno.EPERM: "Make the file readable and its folder writable",
     errno.EIO: "Check the disk (dmesg)",
     errno.ESTALE: "Remount the network file system",
     errno.ETIMEDOUT: "Remount the network file system",
@@ -63,7 +63,7 @@ def shown(text: object, longest: int = 80) -> str:
 
 @lru_cache(maxsize=1000)
 def print_remark(where: str, remark: str) -> None:
-    """Log a remark about a file, once per process: a command may read the same file for several checks.
+    """Log a remark about a file once per process, because a command may read the same file for several checks.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def quoted(value: object, longest: int = 80) -> str:
 class CampaignError(ValueError):
     """Error in the campaign folder that the user has to correct.
 
-    The message may quote an untrusted file. It is one line of bounded length, without control characters.
+    The message, which may quote an untrusted file, is a single line of bounded length without control characters.
 
     Parameters
     ----------
@@ -198,4 +198,4 @@ def _error_number(error: BaseException) -> int | None:
 def _free(path: Path) -> str:
     path = Path(path.absolute())
     existing_folder = next(folder for folder in (path, *path.parents) if folder.exists())
-    return f"{shutil.disk_usage(existing_folder).free / 1e6:.1f} MB free there"
+    return f"{shutil.disk_usage(existing_folder).free / 1e6:.1f} MB free on the file system"

@@ -79,7 +79,7 @@ _OF_RECORDINGS = {
         "stages/positions.py",
     ),
     "alignment_ambiguous": Flag(
-        "the other clock offset, and its contrast relative to the best, dB",
+        "the other clock offset; its contrast relative to that of the best clock offset, dB",
         "another clock offset, or every clock offset, focuses the image nearly as well",
         "alignment on a reflector (apertura align --point); a track with changes of speed",
         "methods/alignment/on_point.py",
@@ -214,7 +214,7 @@ _OF_RECORDINGS = {
     "phase_unstable": Flag(
         "second differences of phase, rad rms; stability of the magnitude",
         "echoes have a stable magnitude but no stable phase: the image is speckle",
-        "oscillator of the node; which node transmits",
+        "oscillator of the node; assignment of the transmitter",
         "core/echo/own_pulses.py",
     ),
     "wrong_code": Flag(
@@ -243,7 +243,7 @@ _OF_RECORDINGS = {
         "core/echo/sidelink_state.py",
     ),
     "second_arrival": Flag(
-        "second path relative to the direct one, dB; its delay",
+        "level of the second path relative to the direct path, dB; delay of the second path",
         "a second path is nearly as strong as the direct one",
         "a second transmitter; reflections",
         "core/echo/sidelink_state.py",
@@ -255,13 +255,13 @@ _OF_RECORDINGS = {
         "core/echo/sidelink_state.py",
     ),
     "sidelink_noisy": Flag(
-        "SNR of the sidelink, SNR required",
+        "SNR of the sidelink and required SNR",
         "the SNR is below the minimum that the correction requires",
         "processing.sidelink: auto selects another correction",
         "core/echo/sidelink.py",
     ),
     "sidelink_echo": Flag(
-        "echo relative to the direct path, dB",
+        "level of the echo relative to the direct path, dB",
         "an echo in the sidelink causes ghosts",
         "processing.sidelink",
         "core/echo/sidelink.py",
@@ -273,7 +273,7 @@ _OF_RECORDINGS = {
         "core/echo/sidelink.py",
     ),
     "sidelink_ripple_or_echo": Flag(
-        "second arrival relative to the direct path, dB and m",
+        "level and path of the second arrival relative to the direct path, dB and m",
         "the second arrival may be an echo, which causes errors of path and phase",
         "reflections at the sidelink antenna",
         "core/echo/sidelink_state.py",
@@ -327,7 +327,7 @@ _OF_RECORDINGS = {
         "core/echo/calibration.py",
     ),
     "calibration_ambiguous": Flag(
-        "second reflector relative to the first, dB; its path offset",
+        "level of the second reflector relative to the first, dB; path offset of the second reflector",
         "a second reflector is nearly as strong",
         "calibration.search_m",
         "core/echo/calibration.py",
@@ -352,7 +352,7 @@ _OF_IMAGES = {
         "core/scene/clearance.py",
     ),
     "terrain_step": Flag(
-        "height of the step and its width on the ground, m; its position",
+        "height and horizontal width of the step, m; position of the step",
         "the DEM has a step steeper than 79 degrees",
         "voids filled with a constant; seams of the DEM; no action is needed for a real cliff",
         "stages/scene.py",
@@ -425,7 +425,7 @@ _OF_IMAGES = {
         "methods/autofocus/evidence.py",
     ),
     "refinement_no_bright_point": Flag(
-        "contrast required of a bright point",
+        "minimum contrast of a bright point",
         "no bright point for track refinement: the unrefined tracks are used",
         "reflectors in the scene; processing.autofocus: off",
         "methods/autofocus/patches.py",
@@ -451,8 +451,8 @@ _OF_IMAGES = {
     ),
     "position_error_overstated": Flag(
         "estimated track errors relative to the configured position accuracy",
-        "estimated track errors are much smaller than the configured position accuracy: the refinement is less "
-        "constrained than it could be",
+        "estimated track errors are much smaller than the configured position accuracy: a smaller configured value "
+        "would constrain the refinement better",
         "position_std_m, position_correlation_s",
         "methods/autofocus/evidence.py",
     ),
@@ -534,7 +534,7 @@ _OF_IMAGES = {
         "stages/layers.py",
     ),
     "constant_drifts": Flag(
-        "difference between flights or calibrations, dB or rad; its standard deviation",
+        "difference between flights or calibrations and its standard deviation, dB or rad",
         "the calibration constant or phase changed by more than three standard deviations",
         "cables, gains, temperature; pointing of the antennas",
         "tools/reflectors.py",
@@ -600,7 +600,7 @@ _OF_IMAGES = {
         "methods/interferometry/comparison.py",
     ),
     "height_relative": Flag(
-        "missing points of known height in the image",
+        "absence of points of known height in the image",
         "heights are relative to the terrain model; the offset of the heights varies over the scene",
         "scene.reference_points",
         "methods/interferometry/comparison.py",
@@ -662,7 +662,7 @@ _OF_BENCHES = {
     ),
     "link_incoherent": Flag(
         "coherence factor Γ, its value if limited only by noise, excess phase noise",
-        "the phase scatter of the path exceeds the scatter caused by noise: images have the same loss",
+        "the phase scatter of the path exceeds the scatter caused by noise: images suffer the corresponding loss",
         "clock of both channels; sidelink; connectors",
         "methods/bench/links.py",
     ),
@@ -679,7 +679,7 @@ _OF_BENCHES = {
         "methods/bench/links.py",
     ),
     "interference": Flag(
-        "noise of a subcarrier relative to its neighbours, dB; its frequency and usual service",
+        "noise of a subcarrier relative to adjacent subcarriers, dB; frequency of the subcarrier and its usual service",
         "a narrow-band signal in the band adds noise at every range; excluded subcarriers cause sidelobes",
         "other transmitters; spurious signals of the node's clocks; processing.interference",
         "methods/bench/links.py, core/echo/interference.py",
@@ -691,7 +691,7 @@ _OF_BENCHES = {
         "methods/bench/links.py",
     ),
     "channel_crosstalk": Flag(
-        "sidelink relative to the strongest path, dB",
+        "level of the sidelink relative to the strongest path, dB",
         "the sidelink leaks into the radar channel, which causes a false echo at short range",
         "shielding, parallel cables, isolation of the channels",
         "methods/bench/links.py",

@@ -218,11 +218,11 @@ def check_size(path: Path, size: int) -> None:
     largest = LARGEST_DOCUMENT if path.suffix == ".json" else LARGEST_RESULT
     if size > largest:
         expected = f"a result file of at most {largest} bytes"
-        raise CampaignError(f"{size} bytes", path, expected, "Remove it and run the workflow again.")
+        raise CampaignError(f"{size} bytes", path, expected, "Remove the file and run the workflow again.")
 
 
 def hashes_of_file(path: Path, algorithms: Sequence[str]) -> dict[str, str]:
-    """Return algorithm → hash of a file, hex; the file is read once, and each hash is computed in its own thread."""
+    """Return algorithm → hash of a file, hex; the file is read once, and each hash is computed in a separate thread."""
     digests = {name: hashlib.new(name) for name in algorithms}
     updates = list[Future[None]]()
     with path.open("rb", buffering=0) as stream, ThreadPoolExecutor(len(digests)) as pool:

@@ -66,7 +66,7 @@ def read_table(path: Path, kind: type[Row]) -> list[Row]:
     [Loss(cause='timing', loss_db=1.5)]
     """
     if not path.is_file():
-        raise CampaignError("no such file", path, "a table of a study", "Run the command that writes it first.")
+        raise CampaignError("no such file", path, "a table of a study", "First run the command that writes the table.")
     types = get_type_hints(kind)
     convert = {field.name: types[field.name] for field in fields(kind)}  # type: ignore[arg-type]
     with path.open(encoding="utf-8", newline="") as stream:

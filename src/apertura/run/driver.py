@@ -104,7 +104,7 @@ class _Files:
         return {**os.environ, "PATH": path, **files, **({CONFINED: self.confined} if self.confined else {})}
 
     def status_of(self, status: int) -> int:
-        """Return the exit status: 1 after a signal, 2 if steps failed without internal error, else as of Snakemake."""
+        """Return the exit status: 1 after a signal, 2 if steps failed without internal error, otherwise Snakemake's."""
         if _ended_by(status):
             return 1
         reported = self.status.read_text(encoding="utf-8").split() if self.status.is_file() else []
@@ -408,7 +408,7 @@ def _without_inner_steps(campaign: Campaign, options: Sequence[str]) -> list[str
         return {result.manifest for name, result in results if name == RULES[step].result}
 
     def needed(step: str) -> set[str]:
-        visited = set() if RULES[step].shares else outputs(step)  # a step that shares a result does not complete it
+        visited = set() if RULES[step].shares else outputs(step)  # a step for part of a result does not complete it
         pending = [source for manifest in outputs(step) for source in sources[manifest]]
         while pending:
             manifest = pending.pop()

@@ -219,7 +219,7 @@ class TimeLeft:
                 chain += 0.0 if _cost(rule).last else each
         return max(work, chain)
 
-    @cache  # noqa: B019 - one per run
+    @cache  # noqa: B019 - one instance per run
     def _places(self, rule: str) -> Sequence[tuple[str, ...]]:
         """Return the flights, pairs or nodes processed by the jobs of a rule; one empty entry if there are none."""
         return (places(self._campaign, RULES[rule]) if rule in RULES else []) or [()]

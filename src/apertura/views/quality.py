@@ -278,7 +278,7 @@ class RaisedFlag:
 
 
 def raised_flags(reports: Mapping[str, Report], *, quotes: bool = True) -> list[RaisedFlag]:
-    """Return each raised flag once.
+    """Return the raised flags without repetition.
 
     Parameters
     ----------

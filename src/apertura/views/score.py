@@ -1,4 +1,4 @@
-"""`apertura score`: compare target positions measured in the exported GeoTIFFs with the true ones in truth.json."""
+"""`apertura score`: compare target positions measured in exported GeoTIFFs with the true positions in truth.json."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -108,7 +108,7 @@ def _flight(campaign: Campaign, flight: Flight, targets: list[dict[str, float]])
 def _cross_sections(
     campaign: Campaign, flight: str, pair: str
 ) -> Callable[[BrightPoint, float | None], dict[str, Any]] | None:
-    """Return a function that measures the cross-section of a point in a pair's image; None if it is not calibrated.
+    """Return a function that measures the cross-section of a point in a pair's image; None if not calibrated.
 
     The arguments of the function are the point and its true cross-section.
     """

@@ -53,7 +53,7 @@ def print_summary(campaign: Campaign) -> None:
     campaign.check_images()
     names = [(flight.name, name) for flight in campaign.image_flights for name in flight.images]
     current = [image for image in names if campaign.is_current(campaign.result(*image, "export"))]
-    # if no image is up to date, reading the first one raises the error
+    # if no image is up to date, reading the first image raises the error
     reports = {" ".join(image): read_report(campaign, *image) for image in current or names[:1]}
     values = {name: ImageValues.of(report) for name, report in reports.items()}
     console = Console(highlight=False)

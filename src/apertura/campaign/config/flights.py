@@ -265,7 +265,7 @@ def read_clocks(path: Path, *, flights: Sequence[Flight]) -> Iterator[ClockRow]:
     Parameters
     ----------
     path
-        Tab-separated table with columns flight, node, offset_s, drift_ppm, std_s; the last two may be empty.
+        Tab-separated table with columns flight, node, offset_s, drift_ppm, std_s; cells of the last two may be empty.
     flights
         Flights of flights.tsv.
 

@@ -50,7 +50,7 @@ class Log(Section):
         None,
         description="base station of a log of baselines: latitude, longitude (deg), ellipsoidal height (m), WGS 84",
     )
-    body: str | None = Field(None, description="name of the rigid body or device, if the log contains several")
+    body: str | None = Field(None, description="name of the rigid body or device, for logs of several bodies")
     height_offset_m: float | None = Field(
         None, description="offset added to logged heights to obtain ellipsoidal heights, m"
     )

@@ -79,7 +79,8 @@ class OfdmWaveform(SampledWaveform):
     codes: str = Field("raw/codes.npy", description="transmitted code symbols, complex64 (subcarriers,)")
     carrier_is: Literal["band_start", "band_centre"] = Field(
         "band_start",
-        description="position of the carrier: subcarrier numbers n = 0…N-1 (band_start) or -N/2…N/2-1 (band_centre)",
+        description="position of the carrier in the band: subcarrier numbers n are 0…N-1 (band_start) or -N/2…N/2-1 "
+        "(band_centre)",
     )
     subcarriers: int = Field(gt=1, description="number of subcarriers N", examples=[4096])
     subcarrier_spacing_hz: float = Field(gt=0, description="subcarrier spacing Δf, Hz", examples=[100e3])

@@ -187,8 +187,8 @@ def skeleton(
     Parameters
     ----------
     stage
-        Stage with provenance. Only dims, dtype, fill value and attributes of the arrays in `chunks` are used, so they
-        may be broadcast.
+        Stage with provenance. Only dims, dtype, fill value and attributes of the arrays in `chunks` are used, so that
+        these arrays may be broadcast.
     chunks
         Array that is written chunk by chunk → shape of its chunks.
     packed

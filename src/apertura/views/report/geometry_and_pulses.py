@@ -243,7 +243,7 @@ def draw_pulses(path: Path, record: PulseRecord, *, title: str, tags: Mapping[st
 def _draw_counts(axes: Axes, record: PulseRecord) -> None:
     last = float(record.sent_s.max()) if record.sent_s.size else 0.0
     interval = float(np.median(np.diff(record.sent_s))) if last else 1.0
-    # bins of an integer number of pulse intervals, because the number of pulses would alternate between other bins
+    # bin width: integer number of pulse intervals; for other widths, the number of pulses per bin would alternate
     width = interval * _pulses_per_bin(round(last / interval) + 1)
     edges = np.arange(-interval / 2, last + width, width)
     kept, excluded = (np.histogram(record.sent_s[selected], edges)[0] for selected in (record.kept, ~record.kept))

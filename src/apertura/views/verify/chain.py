@@ -393,9 +393,9 @@ def other_versions(tags: Mapping[str, str], made_with: Mapping[str, Any], name: 
             for package in packages[:_VERSIONS_NAMED]
         )
         more = f" and {len(packages) - _VERSIONS_NAMED} more" if len(packages) > _VERSIONS_NAMED else ""
-        yield f"made with {listed}{more}: bytes may differ when products are recomputed"
+        yield f"products were made with {listed}{more}: bytes may differ after recomputation"
     if tags.get("APERTURA_LOCK_SHA256", lock_sha256()) != lock_sha256():
-        yield "made with a different requirements/all.txt"
+        yield "products were made with a different requirements/all.txt"
 
 
 def verify(path: Path, campaign: Path | None = None) -> Chain:
