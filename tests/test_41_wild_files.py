@@ -84,7 +84,7 @@ def test_comments_and_blank_lines_of_a_table_are_skipped(tiny, line, first):
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        ("f02\timage\tuav1\tuav1\tmore", "5 cells, the last 'more'"),
+        ("f02\timage\tuav1\tuav1\tmore", "5 cells, the last of which is 'more'"),
         ('f02\timage\tuav1\t"uav1', "not readable as a table"),
         ("f02\timage\tuav1\t" + "x" * 200_000, "field larger than field limit"),
         ("f02\t\x1b[31mred\tuav1\tuav1", r"unknown kind '\x1b[31mred', not one of"),

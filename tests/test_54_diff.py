@@ -166,7 +166,7 @@ def test_deeply_nested_document_is_flattened():
 def test_products_that_cannot_be_compared_are_one_message(root, tmp_path):
     db = root / PAIR / "db.tif"
     assert "no such file" in complaint(lambda: differences(db, tmp_path / "none.tif"))
-    assert "a different kind than db.tif" in complaint(lambda: differences(db, root / PAIR / "image.json"))
+    assert "not of the same kind as db.tif" in complaint(lambda: differences(db, root / PAIR / "image.json"))
     assert "is not a stage" in complaint(lambda: differences(root, root / "results"))
     (tmp_path / "b.json").write_text("[")
     assert "damaged" in complaint(lambda: differences(tmp_path / "b.json", tmp_path / "b.json"))
