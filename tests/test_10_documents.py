@@ -134,7 +134,7 @@ def test_damaged_result_message_has_remedy(tmp_path, text):
     path.write_text(text, encoding="latin-1")
     message = complaint(lambda: read_json(path, expected="a grid", remedy="Run."))
     assert message.startswith(str(path))
-    assert "Delete it and run" in message or "UTF-8" in message
+    assert "Delete the file and run" in message or "UTF-8" in message
 
 
 def test_any_error_in_a_document_names_its_file(tmp_path):

@@ -391,7 +391,10 @@ class ConfinedPath(PosixPath):
             size = os.fstat(stream.fileno()).st_size
             if size > largest:
                 raise CampaignError(
-                    f"{size} bytes", self, f"a file of at most {largest} bytes", "Remove it if it is the wrong file."
+                    f"{size} bytes",
+                    self,
+                    f"a file of at most {largest} bytes",
+                    "Remove the file if it is the wrong file.",
                 )
             return stream.read()  # type: ignore[no-any-return]
 

@@ -30,7 +30,7 @@ MOST_NODES = 100_000
 LARGEST_JSON = 64_000_000
 """Maximum size of a JSON file, bytes."""
 
-DAMAGED = "Delete it and run the workflow again."
+DAMAGED = "Delete the file and run the workflow again."
 """Remedy for a damaged result."""
 
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)

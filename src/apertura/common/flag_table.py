@@ -79,7 +79,7 @@ _OF_RECORDINGS = {
         "stages/positions.py",
     ),
     "alignment_ambiguous": Flag(
-        "the other clock offset; its contrast relative to that of the best clock offset, dB",
+        "the other clock offset; contrast of this clock offset relative to that of the best clock offset, dB",
         "another clock offset, or every clock offset, focuses the image nearly as well",
         "alignment on a reflector (apertura align --point); a track with changes of speed",
         "methods/alignment/on_point.py",
@@ -188,7 +188,7 @@ _OF_RECORDINGS = {
         "stages/echo.py",
     ),
     "captures_limited": Flag(
-        "captures affected, of the total number; their crest factor and that of the other captures, dB",
+        "captures affected, of the total number; crest factors of these and of the other captures, dB",
         "some captures are limited below full scale: their echoes are attenuated and distorted",
         "limiter, gain control and gain of the receiver",
         "core/echo/captures.py",
@@ -244,7 +244,7 @@ _OF_RECORDINGS = {
     ),
     "second_arrival": Flag(
         "level of the second path relative to the direct path, dB; delay of the second path",
-        "a second path is nearly as strong as the direct one",
+        "a second path is nearly as strong as the direct path",
         "a second transmitter; reflections",
         "core/echo/sidelink_state.py",
     ),
@@ -321,14 +321,14 @@ _OF_RECORDINGS = {
         "core/echo/transfer.py",
     ),
     "calibration_uncertain": Flag(
-        "path offset, its scatter, tolerated scatter",
+        "path offset, measured scatter, tolerated scatter",
         "the scatter of the path offset exceeds the tolerance of an image",
         "the reflector; the track",
         "core/echo/calibration.py",
     ),
     "calibration_ambiguous": Flag(
         "level of the second reflector relative to the first, dB; path offset of the second reflector",
-        "a second reflector is nearly as strong",
+        "a second reflector is nearly as strong as the first",
         "calibration.search_m",
         "core/echo/calibration.py",
     ),
@@ -382,13 +382,13 @@ _OF_IMAGES = {
         "core/planning/plan.py",
     ),
     "azimuth_undersampled": Flag(
-        "Doppler spread, cycles per pulse; aliased fraction of the scene and its level, dB",
+        "Doppler spread, cycles per pulse; aliased fraction of the scene; level of the ambiguities, dB",
         "the aperture is undersampled: azimuth ambiguities are visible",
         "scene.bounds_m; flight speed and waveform.prf_hz",
         "core/planning/plan.py",
     ),
     "pulses_missing": Flag(
-        "number of missing pulses; level of the sidelobes that they cause, dB",
+        "number of missing pulses; level of the sidelobes caused by missing pulses, dB",
         "missing pulses cause sidelobes along the track above −20 dB",
         "section pulses of image.json: pulses dropped, with reasons",
         "core/echo/association.py",
@@ -661,7 +661,7 @@ _OF_BENCHES = {
         "methods/bench/links.py",
     ),
     "link_incoherent": Flag(
-        "coherence factor Γ, its value if limited only by noise, excess phase noise",
+        "coherence factor Γ, coherence factor if limited only by noise, excess phase noise",
         "the phase scatter of the path exceeds the scatter caused by noise: images suffer the corresponding loss",
         "clock of both channels; sidelink; connectors",
         "methods/bench/links.py",

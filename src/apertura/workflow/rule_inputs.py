@@ -87,7 +87,7 @@ SettingSpec = str | Callable[[JobScope], Mapping[str, Any]]
 
 
 def charted(campaign: "Campaign") -> tuple[str, str]:
-    """Return flight and pair of `apertura chart`: the last pair of the first flight, which is usually bistatic.
+    """Return flight and pair of `apertura chart`: the last pair of the first image flight.
 
     Raises
     ------

@@ -119,7 +119,7 @@ class Shown:
 
     @cached_property
     def time_s(self) -> Floats:
-        """(pulse,) times of the pulses used in the image, seconds since the first of them."""
+        """(pulse,) times of the pulses used in the image, seconds since the first of these pulses."""
         return seconds_since(self.echo.time.values, self.echo.time.values[0])
 
     @cached_property
