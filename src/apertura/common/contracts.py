@@ -290,7 +290,7 @@ STAGES: Mapping[str, Stage] = {
             "nodes": "names along `node`",
             "pairs": "names along `pair`: pairs with a separate path offset; may be empty",
             "decisions": "autofocus, and autofocus_method if enabled: value and reason",
-            "accepted": "True if images are formed with the correction; why: reason; report: measured values",
+            "accepted": "True if images are formed with the correction, see also attributes `reason` and `report`",
             "left": "effect of the residual position errors on an image: loss_db, shift_m, phase_rad",
         },
     ),
