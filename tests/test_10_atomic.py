@@ -155,7 +155,7 @@ def test_removing_a_link_keeps_its_target(tmp_path):
 @pytest.mark.parametrize(
     ("number", "remedy"),
     [
-        (errno.ENOSPC, "MB free there. Free disk space there"),
+        (errno.ENOSPC, "MB free on the file system. Free disk space and run again"),
         (errno.EDQUOT, "a larger quota"),
         (errno.EFBIG, "ulimit -f"),
         (errno.EROFS, "to a writable file system"),

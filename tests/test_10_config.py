@@ -96,7 +96,7 @@ def test_requirements_are_locked_by_hash_without_a_registry():
     ("change", "expected"),
     [
         ({"symbol_s": 1e-6}, "shorter than the DFT window"),
-        ({"subcarriers": 20000}, "exceed the DFT length"),
+        ({"subcarriers": 20000}, "exceeds the DFT length"),
         ({"subcarrier_spacing_hz": 99e3}, "must be an integer"),
         ({"kind": "chirp"}, "ofdm"),
     ],

@@ -118,7 +118,7 @@ def test_rows_of_zeros_take_no_space(tmp_path):
 @pytest.mark.parametrize("rows", [10, 12])
 def test_blocks_that_do_not_fill_the_array_are_rejected(tmp_path, rows):
     stage = xr.Dataset({"profile": (("pulse", "range"), np.broadcast_to(0.0, (11, 4)))})
-    with pytest.raises(ValueError, match="of profile: must be 11"):
+    with pytest.raises(ValueError, match="of profile were supplied; the array has 11 rows"):
         write_blocks(tmp_path / "x.wip", stage, "profile", [np.zeros((rows, 4))])
 
 

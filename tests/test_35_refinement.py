@@ -145,9 +145,8 @@ def test_description_of_position_correlation_s_matches_its_use():
     """The description states the factor 1/0.63 from a correlation time at 1/e to the configured correlation time."""
     description = Node.model_fields["position_correlation_s"].description
     share = 1 - 1 / np.e
-    assert float(re.search(r"to zero there, and to 1/e at ([0-9.]+) of it", description)[1]) == pytest.approx(
-        share, abs=0.005
-    )
+    stated = re.search(r"to zero at this time, and to 1/e at ([0-9.]+) times this time", description)[1]
+    assert float(stated) == pytest.approx(share, abs=0.005)
     assert autocorrelation(np.array([share, 1.0]), 1.0) == pytest.approx([1 / np.e, 0.0])
 
 

@@ -140,8 +140,8 @@ def test_budget_legend_shows_each_kind_of_bar(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("counted", "labels"),
     [
-        (True, ["pulses per 2 transmitted", "pulses from the first pulse sent (no times recorded)"]),
-        (False, ["pulses in 2 s", "time from the first pulse sent, s"]),
+        (True, ["pulses per 2 transmitted", "pulses since the first transmitted pulse (no times recorded)"]),
+        (False, ["pulses per 2 s", "time since the first transmitted pulse, s"]),
     ],
 )
 def test_pulses_without_times_are_counted_instead_of_drawn_over_time(counted, labels, monkeypatch, tmp_path):

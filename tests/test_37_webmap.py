@@ -218,7 +218,8 @@ def test_file_with_another_hash_is_not_served(server, results):
         f"/{IMAGE}",
     ):
         response, body = request(server, target)
-        assert (response.status, body) == (409, b"changed since the map was made: run the workflow again\n")
+        message = b"the file was changed after the map was made: run the workflow again\n"
+        assert (response.status, body) == (409, message)
 
 
 def test_connection_reset_leaves_the_server_running_without_output(server, capfd):
@@ -255,7 +256,7 @@ def test_only_hashed_files_of_the_current_format_are_listed():
 
 
 def test_missing_map_page_is_reported_with_a_remedy(tmp_path):
-    with pytest.raises(CampaignError, match=r"no map page, because pip install does not build it.*make webmap"):
+    with pytest.raises(CampaignError, match=r"no map page, because pip install does not build the page.*make webmap"):
         page_files(tmp_path)
     for name in PAGE:
         (tmp_path / name).write_text(name)

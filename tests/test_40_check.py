@@ -303,7 +303,8 @@ def test_file_dated_in_the_future_is_reported_with_remedy(tiny):
         os.utime(path, (time.time() + ahead_s,) * 2)
         lines = reported(tiny)
         assert len(lines) == count
-    assert "dated 2.0 h in the future; expected a modification time in the past, by this machine's clock" in lines[0]
+    found = "the modification time is 2.0 h in the future"
+    assert f"{found}; expected a modification time in the past, according to the clock of this machine" in lines[0]
     assert "run `touch raw/f01/uav1.sigmf-meta`" in lines[0]
 
 

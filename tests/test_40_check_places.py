@@ -170,7 +170,7 @@ def test_missing_attitude_is_reported_if_a_lever_arm_needs_it(tiny):
 def test_nodes_without_line_of_sight_are_reported(tiny):
     edit_position(tiny, lambda latitude, longitude, up: (longitude, latitude, up), node="uav2")
     lines = reported(tiny)
-    assert f"{RX}: the log is 5393 km from that of uav1: latitude 9.95" in "\n".join(lines)
+    assert f"{RX}: the track is 5393 km from the track of uav1: latitude 9.95" in "\n".join(lines)
     assert "expected nodes in line of sight" in "\n".join(lines)
 
 
@@ -309,8 +309,8 @@ def test_track_more_than_30_km_above_the_terrain_is_reported(tiny):
     for height_m, high in ((-29_000.0, False), (-30_000.0, True)):
         state(tiny, "scene", height_m=height_m)
         lines = reported(tiny)
-        assert any("m above the terrain: check the heights in the logs" in line for line in lines)  # no echo arrives
-        assert any("expected a node above the terrain, by at most 30 km" in line for line in lines) is high
+        assert any("m above the terrain: check the heights in the logs" in line for line in lines)  # no echo comes back
+        assert any("expected a node at most 30 km above the terrain" in line for line in lines) is high
 
 
 def write_dem(root, heights, *, post_m=1.0, east_m=0.0):
@@ -349,7 +349,10 @@ def test_dem_spike_of_kilometres_is_reported_and_a_cliff_is_not(tiny, heights, s
     write_dem(tiny, heights)
     lines = [line for line in reported(tiny) if "are such spikes" in line]
     assert bool(lines) is spike
-    assert all(line.startswith("dem.tif: ") and "where the surrounding terrain has 600 m" in line for line in lines)
+    assert all(
+        line.startswith("dem.tif: ") and "where the median height of the surroundings is 600 m" in line
+        for line in lines
+    )
 
 
 def test_needles_are_narrow_and_taller_than_the_threshold():

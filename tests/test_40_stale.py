@@ -90,7 +90,7 @@ def test_changed_log_with_kept_time_outdates_all_dependent_results(finished):
     assert "results/f01/uav1-uav1/export.manifest.json" in outdated  # through the assessment
     assert list(stale_lines(outdated)) == [
         f"results/f01/uav2/track.manifest.json: out of date, {LOG} has changed",
-        f"{len(outdated) - 1} dependent results out of date as well",
+        f"{len(outdated) - 1} dependent results also out of date",
     ]
     replace_keeping_times(path, data)
     assert stale_results(campaign) == {}
@@ -168,7 +168,7 @@ def test_changed_code_outdates_its_results(finished, monkeypatch):
 
     monkeypatch.setattr("apertura.workflow.lineage.modules_of", other)
     outdated = stale_results(Campaign.load(finished))
-    assert outdated["results/f01/uav1-uav1/profile.manifest.json"] == "its code has changed"
+    assert outdated["results/f01/uav1-uav1/profile.manifest.json"] == "the code has changed"
     assert not {"raw", "track", "echo", "scene"} & names(outdated)
 
 
@@ -178,7 +178,7 @@ def test_missing_source_or_damaged_manifest_outdates_a_result(finished):
     (finished / "results/cube.manifest.json").write_text("{")
     outdated = stale_results(campaign)
     assert "results/f01/uav1/track.manifest.json is missing" in outdated["results/f01/uav1-uav1/echo.manifest.json"]
-    assert outdated["results/cube.manifest.json"].startswith("its manifest is damaged")
+    assert outdated["results/cube.manifest.json"].startswith("the manifest is damaged")
 
 
 @pytest.mark.quick("f01/uav1-uav1/db.tif*", "cube*")
@@ -269,7 +269,7 @@ def test_damaged_document_is_refused(finished, file):
     from apertura.stages.scene import settled_scene
 
     campaign = Campaign.load(finished)
-    with pytest.raises(CampaignError, match=r"1 file differs from the manifest, first .*Delete .*manifest\.json"):
+    with pytest.raises(CampaignError, match=r"1 file differs from the manifest; the first .*Delete .*manifest\.json"):
         (settled_scene(campaign), assessment_of(campaign, "f01"))
 
 
@@ -300,7 +300,8 @@ def test_archived_recordings_leave_results_up_to_date(finished):
     campaign = archive(finished)
     assert stale_results(campaign) == {}
     assert (absent_files(campaign), wanted_files(campaign, {})) == (SAMPLES, {})
-    assert list(absent_lines(campaign)) == [f"missing recordings, not compared with results: {SAMPLES[0]} and 1 more"]
+    line = f"recordings are missing and not compared with results: {SAMPLES[0]} and 1 more"
+    assert list(absent_lines(campaign)) == [line]
     assert problems(finished, without=["memory"]) == []
     assert Resources(campaign).work("f01", None, "uav1").pulses == 40
 
@@ -371,5 +372,5 @@ def test_plan_follows_the_config_and_not_outdated_results(tiny, capsys):
     assert planned_spacing_m(edited) == 0.2
     print_plan(edited)
     printed = capsys.readouterr().out
-    assert "1 result out of date (results/scene.manifest.json): plan from the config" in printed
+    assert "1 result out of date (results/scene.manifest.json): the plan is based on the config" in printed
     assert "pixels of 0.2 m" in " ".join(printed.split())

@@ -145,7 +145,7 @@ def with_antenna(antenna, node="uav1"):
 def test_beam_without_attitude_is_refused(tiny):
     edit_config(tiny, with_antenna(BEAM, "uav2"))
     message = complaint(lambda: Campaign.load(tiny))
-    assert "nodes.uav2: antennas has a beam but attitude is none" in message
+    assert "nodes.uav2: antennas has a beam, but attitude is none" in message
     assert "set attitude to log or course" in message
 
 
@@ -315,7 +315,7 @@ def test_node_with_another_sample_rate_is_refused(tiny):
         ("fused\timage\tuav1\tuav1", "reserved for files in the results folder"),
         ("f02\tphoto\tuav1\tuav1", "not one of bench, calibration, image"),
         ("f02\timage\tuav9\tuav1", "'uav9' is not in"),
-        ("f01\timage\tuav1\tuav1", "second line of flight f01"),
+        ("f01\timage\tuav1\tuav1", "a second line for flight f01"),
     ],
 )
 def test_invalid_line_of_flights_is_reported(tiny, line, expected):

@@ -40,7 +40,7 @@ def test_folder_name_that_is_not_utf_8_is_refused(tiny):
     tiny.rename(latin_1_path)
     for root in (latin_1_path, f"{latin_1_path}/."):
         message = complaint(lambda root=root: Campaign.load(root))
-        assert "the path is not UTF-8 text; expected names in UTF-8 of the folder and its parent folders" in message
+        assert "the path is not UTF-8 text; expected UTF-8 names of the folder and its parent folders" in message
         assert "LC_ALL=C.UTF-8" in message
         assert [str(problem) for problem in problems(root)] == [message]
         assert message.isprintable()
@@ -84,7 +84,7 @@ def test_comments_and_blank_lines_of_a_table_are_skipped(tiny, line, first):
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        ("f02\timage\tuav1\tuav1\tmore", "5 cells, the last 'more'"),
+        ("f02\timage\tuav1\tuav1\tmore", "5 cells, the last of which is 'more'"),
         ('f02\timage\tuav1\t"uav1', "not readable as a table"),
         ("f02\timage\tuav1\t" + "x" * 200_000, "field larger than field limit"),
         ("f02\t\x1b[31mred\tuav1\tuav1", r"unknown kind '\x1b[31mred', not one of"),

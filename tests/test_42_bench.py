@@ -149,7 +149,7 @@ def test_stationary_radar_is_refused_as_an_image_flight(tmp_path):
     flight = replace(specification.flights[0], kind="image")
     root = write_campaign(tmp_path / "c", replace(specification, flights=(flight,)), np.random.default_rng(1))
     (first, *_) = [problem for problem in problems(root) if "bench" in str(problem)]
-    assert "no aperture, the nodes moved only 0 cm" in str(first)
+    assert "no aperture, because the nodes moved by only 0 cm" in str(first)
 
 
 @pytest.mark.parametrize(("length_m", "flagged"), [(0.3, True), (2.0, False)])

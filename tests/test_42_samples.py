@@ -162,7 +162,7 @@ def test_campaign_of_a_pulse_passes_the_checks_with_little_memory(tiny):
         ({"pulse": "raw/other.npy"}, "no such file"),
         ({"band_hz": [400e6, 500e6]}, "of the pulse's energy"),
         ({"carrier_hz": 1.2e9}, "waveform.carrier_hz"),
-        ({"listen_s": 0.02e-6}, "the limit by waveform.listen_s"),
+        ({"listen_s": 0.02e-6}, "the limit set by waveform.listen_s"),
     ],
 )
 def test_waveform_inconsistent_with_the_recording_is_reported_by_check(tiny, changed, message):

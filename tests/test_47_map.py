@@ -232,7 +232,8 @@ def test_server_follows_a_concurrent_run_and_refuses_changed_files(finished):
     as_written = manifest.read_bytes()
     with serving(finished) as ask:
         tamper(finished)
-        assert ask("map/map.json") == (409, b"changed since the map was made: run the workflow again\n")
+        message = b"the file was changed after the map was made: run the workflow again\n"
+        assert ask("map/map.json") == (409, message)
         manifest.unlink()
         status, body = ask("map/map.json")
         assert (status, body.count(b"\n")) == (409, 1)

@@ -97,7 +97,7 @@ def test_sidelink_correction_makes_the_brightest_target_coherent(reported):
     before, after = (steadiness(phasors) for phasors in phasors_of.values())
     assert before[1] < 0.4
     assert after[1] > 0.9
-    assert list(Shown(reported, "f01", "uav1-uav1").phasors()) == ["as recorded, tracks from the logs"]
+    assert list(Shown(reported, "f01", "uav1-uav1").phasors()) == ["as recorded, with the logged tracks"]
 
 
 @pytest.mark.slow

@@ -72,5 +72,5 @@ def test_score_summary_and_report_list_the_pair(alone, tmp_path, capsys):
     campaign = Campaign.load(copy_writable(alone.root, tmp_path / "campaign"))
     pictures(campaign, "f01", PAIR)
     assert page(campaign, "f01") == [campaign.result("f01", "report.html")]
-    assert "Pairs and their sums" not in campaign.result("f01", "report.html").read_text()
+    assert "Pairs and sums" not in campaign.result("f01", "report.html").read_text()
     assert landing(campaign)["sentences"] == []

@@ -76,7 +76,7 @@ def test_summary_prints_each_flag_once(finished_sample, capsys, tmp_path):
     print_summary(Campaign.load(root))
     printed = capsys.readouterr().out
     assert printed.count("a line [with brackets]") == 1
-    assert "not in the error budget, because no uncertainty is configured" in printed
+    assert "not in the error budget, because their uncertainty is not configured" in printed
     assert re.search(r"geolocation uncertainty \d\.\d+ m, dominated by heights \(not configured; assumed 3 m", printed)
 
 

@@ -397,10 +397,10 @@ def test_common_message_of_failed_steps_is_printed_once(tmp_path):
 
 
 def test_internal_error_and_killed_step_are_distinguished(tmp_path):
-    assert "internal error, please report it" in failed(
+    assert "internal error, please report this error" in failed(
         tmp_path, "Traceback (most recent call last):\nZeroDivisionError: by zero\n"
     )
-    assert "it was killed, possibly out of memory" in failed(tmp_path, "forming 10 of 20 tiles\n")
+    assert "the step was killed, possibly out of memory" in failed(tmp_path, "forming 10 of 20 tiles\n")
 
 
 @pytest.mark.parametrize(("log", "killed"), [("forming 10 of 20 tiles\n", True), ("error: codes.npy: gone\n", False)])
@@ -472,7 +472,8 @@ def test_clean_keeps_and_reports_other_files(finished, capsys):
         "f01/uav1-uav1/db.qgz",
         "f01/uav1-uav1/image.zarr/mine",
     }
-    assert "kept files not written by the workflow: results/f01/uav1-uav1/db.qgz and 2 more" in capsys.readouterr().out
+    line = "kept files that the workflow did not write: results/f01/uav1-uav1/db.qgz and 2 more"
+    assert line in capsys.readouterr().out
 
 
 def test_clean_of_unfinished_work_keeps_results(finished, capsys):

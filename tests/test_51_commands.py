@@ -113,7 +113,7 @@ INVALID_RUNS = {
     "--set-scatter tiles=0": "tiles=N, N >= 1",
     "--set-scat=tiles=0": "tiles=N, N >= 1",
     "--until imag": "ingest, bench, echo",
-    "cphd": "cphd: a step that runs only if its result is requested",
+    "cphd": "cphd: a step that only runs if its result is requested",
     "results/f01/uav2-uav2/echo.manifest.json": "one of fused, tracks, uav1, uav1-uav1, uav1-uav2, uav2",
     "results/f01/uav9/track.manifest.json": "f01 has no uav9",
     "results/f09/uav1-uav1/echo.manifest.json": "no flight 'f09'",
@@ -152,8 +152,8 @@ def test_partial_run_reports_finished_and_missing_results(finished_tiny, tmp_pat
     state(root, "processing", engine="numba")
     status, out, err = run_command("run", root, "--cores", 1, "--until", "image")
     assert status == 0, err
-    message = r"^\d+ results finished, \d+ results out of date, \d+ results missing: `apertura run` computes the rest$"
-    assert re.search(message, out, re.MULTILINE)
+    counts = r"^\d+ results finished, \d+ results out of date, \d+ results missing"
+    assert re.search(f"{counts}: `apertura run` computes the remaining results$", out, re.MULTILINE)
     assert "error" not in err
     assert run_command("summary", root)[0] == 2  # no image exists
 
@@ -182,7 +182,7 @@ def test_commands_read_results_without_recordings(finished_tiny, tmp_path, run_c
         assert re.findall(r"^(\w+) +(\S+sigmf-data):", out, re.MULTILINE) == [("missing", name) for name in SAMPLES]
         assert "changed" not in out
     elif command in {"check", "summary", "list"} and not needs_raw:
-        assert "missing recordings, not compared with results: raw/f01/uav1.sigmf-" in out
+        assert "recordings are missing and not compared with results: raw/f01/uav1.sigmf-" in out
 
 
 @pytest.mark.parametrize("node", ["uav2", "uav9"])
@@ -235,8 +235,8 @@ def test_summary_without_results_names_the_command_to_run(tiny, run_command):
 
 def test_plan_states_its_inputs(tiny, finished_tiny, run_command):
     before, after = (run_command("plan", root)[1] for root in (tiny, finished_tiny.root))
-    assert "Planned from the flight logs alone" in before
-    assert "Planned from the flight logs alone" not in after
+    assert "This plan is based on the flight logs alone" in before
+    assert "This plan is based on the flight logs alone" not in after
 
 
 @pytest.mark.parametrize(

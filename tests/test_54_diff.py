@@ -72,7 +72,7 @@ def test_pixels_finite_in_one_product_only_are_counted(tmp_path, scene):
     scene[:2, :5] = np.nan
     write_slc(tmp_path / "b.tif", scene, tags={}, **GEOREFERENCE)
     assert differing(tmp_path / "a.tif", tmp_path / "b.tif")["pixels"] == [
-        "10 values are finite in the first only, 0 in the second only"
+        "10 values are finite only in the first product, 0 only in the second"
     ]
 
 
@@ -81,7 +81,7 @@ def test_overlap_of_two_grids_is_compared(tmp_path, scene):
     part = Affine(0.5, 0, 500002.5, 0, -0.5, 5399998)
     write_slc(tmp_path / "b.tif", scene[4:, 5:25], tags={}, transform=part, crs="EPSG:32632")
     sections = differing(tmp_path / "a.tif", tmp_path / "b.tif")
-    assert sections["pixels"] == ["compared in the overlap: 20 × 36 pixels"]
+    assert sections["pixels"] == ["compared in the overlap of the grids, 20 × 36 pixels"]
     assert [line.split(":")[0] for line in sections["geometry"]] == ["size", "transform"]
     assert differing(tmp_path / "b.tif", tmp_path / "a.tif")["pixels"] == sections["pixels"]
 
@@ -92,14 +92,14 @@ def test_overlap_of_two_grids_is_compared(tmp_path, scene):
         (
             Affine(0.5, 0, 500000.2, 0, -0.5, 5400000),
             "EPSG:32632",
-            "CRS or pixel spacing differ, or the offset is not an integer",
+            "CRS or pixel spacing differ, or the grid offset is not an integer",
         ),
         (
             Affine(0.25, 0, 500000, 0, -0.25, 5400000),
             "EPSG:32632",
-            "CRS or pixel spacing differ, or the offset is not an integer",
+            "CRS or pixel spacing differ, or the grid offset is not an integer",
         ),
-        (GEOREFERENCE["transform"], "EPSG:32633", "CRS or pixel spacing differ, or the offset is not an integer"),
+        (GEOREFERENCE["transform"], "EPSG:32633", "CRS or pixel spacing differ, or the grid offset is not an integer"),
         (Affine(0.5, 0, 500100, 0, -0.5, 5400000), "EPSG:32632", "do not overlap"),
     ],
 )
@@ -166,7 +166,7 @@ def test_deeply_nested_document_is_flattened():
 def test_products_that_cannot_be_compared_are_one_message(root, tmp_path):
     db = root / PAIR / "db.tif"
     assert "no such file" in complaint(lambda: differences(db, tmp_path / "none.tif"))
-    assert "a different kind than db.tif" in complaint(lambda: differences(db, root / PAIR / "image.json"))
+    assert "not of the same kind as db.tif" in complaint(lambda: differences(db, root / PAIR / "image.json"))
     assert "is not a stage" in complaint(lambda: differences(root, root / "results"))
     (tmp_path / "b.json").write_text("[")
     assert "damaged" in complaint(lambda: differences(tmp_path / "b.json", tmp_path / "b.json"))

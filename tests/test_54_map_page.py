@@ -317,7 +317,7 @@ def test_image_changed_after_the_map_is_not_shown(browser, finished, tmp_path):
     path = root / "results" / "f01" / "fused" / "coherent_db.tif"
     path.with_name("noncoherent_db.tif").replace(path)
     with serving(root) as address, shown(browser, address, drawn=False) as (frame, _):
-        frame.locator("#notices", has_text="changed since the map was made").wait_for(timeout=10_000)
+        frame.locator("#notices", has_text="changed after the map was made").wait_for(timeout=10_000)
 
 
 def test_page_without_webgl_still_displays_values(tool, address):

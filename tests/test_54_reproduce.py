@@ -87,7 +87,8 @@ def test_only_sources_of_the_product_are_requested(root, fake_run, capsys):
     assert (cores, targets) == (3, (f"{PAIR}/export.manifest.json",))
     assert not folder.exists()
     count = len(json.loads((root / PAIR / "export.manifest.json").read_text())["files"])
-    assert capsys.readouterr().out == f"same     {count} files, byte for byte, of {PAIR}/export.manifest.json\n"
+    expected = f"same     {count} files of {PAIR}/export.manifest.json, identical byte for byte\n"
+    assert capsys.readouterr().out == expected
     assert print_reproduced(root, cores=1) == 0
     assert fake_run[1][2] == ("all",)
 
@@ -104,7 +105,7 @@ def test_edited_file_differs(root, fake_run, capsys, name):
     assert print_reproduced(root / PAIR / name, cores=1) == 1
     first, *_, last = capsys.readouterr().out.splitlines()
     assert first == f"changed  {PAIR}/{name}: first difference at byte {len(data) - 2}"
-    assert "changed after it was made" in last
+    assert "changed after the run" in last
 
 
 def test_edited_chunk_of_a_stage_is_reported(root, fake_run, capsys):

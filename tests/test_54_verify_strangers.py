@@ -68,7 +68,7 @@ def test_other_software_versions_are_noted_without_failure(root, capsys):
     version, numpy, lock = capsys.readouterr().out.splitlines()
     assert version.startswith(f"apertura 0.0.9 made products such as {DB}, ")
     assert "numpy 1.0 (installed: " in numpy
-    assert lock == "made with a different requirements/all.txt"
+    assert lock == "products were made with a different requirements/all.txt"
 
 
 def test_invalid_config_does_not_hide_other_links(root):

@@ -1,6 +1,5 @@
-// Bundles the map's page and the window around it into the package: index.html, app.js, app.css and shell.*, which name
-// no other host.
-// `node build.mjs [folder]`; without a folder, into src/apertura/views/webmap/page.
+// Bundle the map page and the window around it (index.html, app.js, app.css and shell.*, which refer to no other host).
+// `node build.mjs [folder]`; the default folder is src/apertura/views/webmap/page.
 import { build } from 'esbuild';
 import { copyFile, mkdir, rename, rm } from 'node:fs/promises';
 import { dirname, join, resolve } from 'node:path';
@@ -21,7 +20,7 @@ await build({
   format: 'iife',
   target: 'es2022',
   charset: 'utf8',
-  legalComments: 'inline', // the licences of what is bundled go with it
+  legalComments: 'inline', // include the licences of the bundled packages
   logLevel: 'warning',
 });
 for (const page of ['index.html', 'shell.html']) await copyFile(join(here, 'src', page), join(beside, page));

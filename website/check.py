@@ -1,4 +1,4 @@
-"""Check a built site: every link has a target, and no page loads resources from another host.
+"""Check a built site: all links must have a target, and no page may load resources from another host.
 
 `python -m website.check build/site`
 """
@@ -10,11 +10,11 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 _LOADED = {"script": "src", "img": "src", "iframe": "src", "source": "src", "link": "href"}
-"""HTML element that a browser loads automatically → attribute with its URL."""
+"""HTML element whose resource a browser loads automatically → attribute that contains the URL."""
 
 
 class Page(HTMLParser):
-    """Links, anchors and loaded resources of one page."""
+    """Links, anchors and loaded resources of a page."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -33,7 +33,7 @@ class Page(HTMLParser):
 
 
 def faults(site: Path) -> list[str]:
-    """Return one line per broken link or external resource of a built site."""
+    """Return a line for each broken link or external resource of a built site."""
     pages = {path: Page() for path in site.resolve().rglob("*.html")}
     for path, page in pages.items():
         page.feed(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Page docs/cli.md, generated from the commands."""
+"""Page docs/cli.md, generated from the help texts of the commands."""
 
 import re
 from typing import Any
@@ -10,18 +10,18 @@ from apertura.cli import app
 
 _HEADER = """# Command line
 
-`apertura COMMAND --help` shows the same text. `[campaign]` is a campaign folder (default: current directory). Generated
-by `make pages` from the commands.
+`apertura COMMAND --help` prints the text of a section. `[campaign]` is a campaign folder (default: current directory).
+This page is generated from the commands by `make pages`.
 
 | exit code | meaning |
 |---|---|
 | 0 | success |
 | 1 | `verify`, `diff` or `reproduce` found a difference, or an internal error occurred |
-| 2 | an error in the input, described by one message |
-| 130 | stopped by a signal |
+| 2 | error in the input, described by a message |
+| 130 | termination by a signal |
 """
 _DESCRIBED_IN_HEADER = {"campaign folder, default: current folder", "campaign folder, default: current directory"}
-"""Help texts that the header of the page gives once for all commands."""
+"""Help texts that are stated in the header of the page instead of for each command."""
 
 
 def cli_page() -> str:
@@ -48,9 +48,9 @@ def _section(command: Any, context: typer.Context) -> str:
 
 def _line(parameter: Any, context: typer.Context) -> str:
     names, description = parameter.get_help_record(context) or ("", "")
-    if parameter.name == "cores":  # the default depends on the machine, not on the command
+    if parameter.name == "cores":  # the default value depends on the machine
         description = re.sub(r"\[default: \d+", "[default: all of the machine", description)
-    names = re.sub(r" <(?:path|str|int|(?:int|float) range)>", "", names)  # types follow from the description
+    names = re.sub(r" <(?:path|str|int|(?:int|float) range)>", "", names)  # types are clear from the description
     return f"- `{_one_line(names)}`: {_escaped(description)}\n"
 
 
@@ -59,11 +59,11 @@ def _one_line(text: str) -> str:
 
 
 def _escaped(text: str) -> str:
-    """Return a text with characters escaped that Markdown interprets as markup."""
+    """Escape the characters of a text that Markdown interprets as markup."""
     return _one_line(text).replace("<", "&lt;").replace("[", "\\[")
 
 
 def _description(text: str | None) -> str:
-    """Return a docstring as Markdown, without its sections on parameters, exceptions, results and examples."""
+    """Return a docstring as Markdown, without the sections on parameters, exceptions, results and examples."""
     prose = re.split(r"\n\s*(?:Parameters|Raises|Returns|Examples)\n\s*-{3}", text or "")[0]
     return "\n\n".join(" ".join(paragraph.split()).replace("<", "&lt;") for paragraph in prose.split("\n\n"))

@@ -1,4 +1,4 @@
-"""Hook of mkdocs: typeset indices and powers of the Unicode equations in pages of the theory."""
+"""Hook of mkdocs: typeset indices and powers in the Unicode equations of theory pages."""
 
 import re
 from typing import Any
@@ -20,12 +20,12 @@ _POWER = re.compile(
 
 
 def on_page_content(html: str, *, page: Any, **_: Any) -> str:
-    """Return the HTML of a page, with typeset equations if it is a page of the theory or the glossary."""
+    """Return the HTML of a page, with typeset equations for pages of the theory and the glossary."""
     return set_equations(html) if page.file.src_uri.startswith(("theory", "glossary")) else html
 
 
 def set_equations(html: str) -> str:
-    """Return HTML with x_n and x^n typeset as index and power, in indented blocks and in prose but not in code.
+    """Return HTML with x_n and x^n typeset as index and power, in indented blocks and running text but not in code.
 
     Examples
     --------

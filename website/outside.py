@@ -1,4 +1,4 @@
-"""Hook of mkdocs: add documents outside docs/ to the site as pages, and redirect links to them."""
+"""Hook of mkdocs: add documents outside docs/ to the site as pages, and redirect links to these documents."""
 
 import posixpath
 import re
@@ -20,7 +20,7 @@ _LINK = re.compile(r"\]\(([\w./-]+\.\w+)(#[\w-]+)?\)")
 
 
 def on_files(files: Files, *, config: Any) -> Files:
-    """Add the documents outside docs/."""
+    """Add the documents outside docs/ to the files of the site."""
     for source, page in OUTSIDE.items():
         text = (_ROOT / source).read_text(encoding="utf-8")
         files.append(File.generated(config, page, content=_with_links_of(text, source, page)))
@@ -28,12 +28,12 @@ def on_files(files: Files, *, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
-    """Return a page of docs/ with its links to documents outside docs/ redirected."""
+    """Return a page of docs/ with redirected links to documents outside docs/."""
     return _with_links_of(markdown, f"docs/{page.file.src_uri}", page.file.src_uri)
 
 
 def _with_links_of(text: str, source: str, page: str) -> str:
-    """Return the text of a repository file with its relative links adapted to the location of its page."""
+    """Return the text of a repository file with relative links adapted to the location of the page on the site."""
 
     def adapted(link: re.Match[str]) -> str:
         target = posixpath.normpath(posixpath.join(posixpath.dirname(source), link[1]))

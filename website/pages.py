@@ -22,7 +22,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "docs/howto/sizing.md": sizing_page,
     "docs/theory/tests.md": theory_tests_page,
 }
-"""File → function that returns its content."""
+"""File → function that returns the content of the file."""
 
 if __name__ == "__main__":
     for name, page in PAGES.items():

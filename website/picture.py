@@ -1,4 +1,4 @@
-"""Image of the first page: `python -m website.picture` writes docs/assets/image.png from simulated echoes."""
+"""Image on the first page: `python -m website.picture` forms docs/assets/image.png from simulated echoes."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ PICTURE = Path(__file__).parents[1] / "docs" / "assets" / "image.png"
 
 
 def example_history() -> ap.PhaseHistory:
-    """Return echoes of nine posts in two rows and of rough ground, from a flight of 40 m, 60 m south of them."""
+    """Return echoes of nine posts in two rows and of rough terrain, for a flight of 40 m at 60 m south of the posts."""
     generator, frequency = np.random.default_rng(29), 1.2e9 + 1.6e6 * np.arange(256)
     posts = np.array([[x, y, 0.0] for y, count in ((-4.0, 5), (5.0, 4)) for x in np.linspace(-9, 9, count)])
     rough = np.column_stack([generator.uniform(-15, 15, (900, 2)), np.zeros(900)])
@@ -34,7 +34,7 @@ def main() -> None:
     tags = {"APERTURA_VERSION": ap.__version__, "APERTURA_ERROR_DB": f"{image.numerical_error_db:.0f}"}
     title = f"nine posts on rough ground: {image.verdict}"
     write_quicklook(PICTURE, image.values, transform=Affine(*grid.transform), crs=grid.crs_wkt, tags=tags, title=title)
-    with Image.open(PICTURE) as drawn:  # reduced from 400 kB, too large for a web page
+    with Image.open(PICTURE) as drawn:  # reduce the size of 400 kB, which is too large for a web page
         small = drawn.convert("RGB").resize((drawn.width // 2, drawn.height // 2), Image.Resampling.LANCZOS)
     small.quantize(64).save(PICTURE, optimize=True)
 

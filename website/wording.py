@@ -1,7 +1,7 @@
 """Lint of wording: first lines of docstrings, and words that are not standard terms, in code and documents.
 
-`python -m website.wording` prints the places to rewrite and fails if there is one. It finds openings and single words
-alone: whether a sentence is clear takes a reader.
+`python -m website.wording` prints the locations to be rewritten, and fails if there are any. Only first words and
+single words are checked; the clarity of a sentence requires a reader.
 """
 
 import ast
@@ -17,7 +17,7 @@ _SOURCES = ("src", "research", "benchmarks", "website", "workflow")
 _DOCUMENTS = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "config/README.md", "docs", "examples")
 
 OPENINGS = re.compile(r"(What|Whether|Who|How|Where|Return (how|what|whether|which|where|who|why))\b")
-"""First words of a docstring that name no object of the field."""
+"""First words of a docstring that do not denote an object of the field."""
 
 WORDS = {
     "nobody": "not configured",
@@ -37,17 +37,17 @@ WORDS = {
     "unlike chance": "statistically significant",
     "of ours": "internal",
 }
-"""Word → the standard terms for what it is used for."""
+"""Word → standard terms that replace it."""
 
 NAMES = frozenset({"told", "untold", "asked", "nobody", "vague", "said", "wanted"})
-"""Names of variables that describe no value."""
+"""Variable names that do not describe a value."""
 
 _CODE = re.compile(r"`[^`]*`")
 _WORD = re.compile(rf"(?<![\w-])({'|'.join(map(re.escape, WORDS))})(?![\w-])", re.IGNORECASE)
 
 
 def faults_of_code(text: str) -> Iterator[tuple[int, str]]:
-    """Check a module: yield line and fault of its docstrings, strings, comments and names.
+    """Check a module: yield line number and fault for docstrings, strings, comments and names.
 
     Examples
     --------
@@ -73,7 +73,7 @@ def faults_of_code(text: str) -> Iterator[tuple[int, str]]:
 
 
 def faults_of_document(text: str) -> Iterator[tuple[int, str]]:
-    """Check a document in Markdown: yield line and fault, outside code.
+    """Check a document in Markdown, except code: yield line number and fault.
 
     Examples
     --------
@@ -93,7 +93,7 @@ def _words(line: str) -> Iterator[str]:
 
 
 def main() -> None:
-    """Print every place as file:line: fault."""
+    """Print all faults as file:line: fault."""
     code = [path for folder in _SOURCES for path in sorted((ROOT / folder).rglob("*.py")) if path != Path(__file__)]
     documents = [path for name in _DOCUMENTS for path in [ROOT / name, *sorted((ROOT / name).rglob("*.md"))]]
     found = [
@@ -103,7 +103,7 @@ def main() -> None:
         if path.is_file()
         for line, fault in check(path.read_text(encoding="utf-8"))
     ]
-    sys.exit("\n".join([*found, f"{len(found)} places to rewrite"]) if found else 0)
+    sys.exit("\n".join([*found, f"{len(found)} locations to be rewritten"]) if found else 0)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import { Targets } from './targets.js';
 
 const FORMAT = 1;
 const OVER = { mask: 'mask: shadow and layover', tracks: 'tracks', footprints: 'footprints', targets: 'targets' };
-const BEYOND = 0.5; // travel of the sliders beyond the value range of the layer, as a share of that range
+const BEYOND = 0.5; // travel of the sliders beyond the value range of the layer, as a fraction of that range
 
 class Page {
   constructor(data) {
@@ -33,12 +33,12 @@ class Page {
     else this.untracked();
   }
 
-  /** Disable tracks and footprints: for a local frame they are not exported as GeoJSON. */
+  /** Disable tracks and footprints, which are not exported as GeoJSON for a local frame. */
   untracked() {
     for (const control of [this.boxes.tracks, this.boxes.footprints, byId('fit-tracks')]) control.disabled = true;
   }
 
-  /** Fill in the constant texts about the campaign. */
+  /** Fill in the texts about the campaign that do not change. */
   describe() {
     const { campaign, crs } = this.data;
     document.title = `${campaign} · apertura map`;
@@ -105,7 +105,7 @@ class Page {
     addEventListener('hashchange', () => this.restore(permalink.read(location.hash)));
   }
 
-  /** Show the state given by a permalink, as far as the campaign has its images and layers. */
+  /** Show the state given by a permalink, as far as its images and layers exist in the campaign. */
   restore(state) {
     if (state.over) for (const [name, box] of Object.entries(this.boxes)) box.checked = state.over.includes(name);
     if (state.view) {
@@ -116,7 +116,7 @@ class Page {
     this.section.set(state.line);
   }
 
-  /** Select an image and one of its layers by name; unknown names select the first. */
+  /** Select an image and one of its layers by name; for unknown names, select the first image or layer. */
   choose(image, file, { stretch = null, colours = null } = {}) {
     this.image = this.data.images.find((entry) => `${entry.flight}/${entry.image}` === image) ?? this.data.images[0];
     const layers = this.image.layers.filter((layer) => layer.kind !== 'classes');
@@ -158,7 +158,7 @@ class Page {
     this.stretch(low, high);
   }
 
-  /** Set both ends of the colour scale; the end that was moved pushes the other. */
+  /** Set both ends of the colour scale; if the ends would cross, the end that was not moved is adjusted. */
   stretch(low, high, moved = 'low') {
     const gap = Number(byId('low').step) || 1e-6;
     this.low = moved === 'high' ? Math.min(low, high - gap) : low;
@@ -216,7 +216,7 @@ class Page {
     let before = JSON.stringify(this.data);
     while (this.data.again_s) {
       await new Promise((done) => setTimeout(done, 1000 * this.data.again_s));
-      const data = await read().catch(() => this.data); // not readable at present: retried after the next interval
+      const data = await read().catch(() => this.data); // if not readable now, retry after the next interval
       const now = JSON.stringify(data);
       if (now !== before) this.update(data);
       before = now;
@@ -250,12 +250,12 @@ async function read() {
   const answer = await fetch('map.json');
   if (!answer.ok) throw new Error(`map.json: ${(await answer.text()).trim()}`);
   const data = await answer.json();
-  if (data.format !== FORMAT) throw new Error('map.json has a different format version than this page: run the workflow again');
+  if (data.format !== FORMAT) throw new Error('the format version of map.json differs from that of this page: run the workflow again');
   return data;
 }
 
 async function start() {
-  if (!canDraw()) notice('This browser has no WebGL, so that images are not displayed; values, targets and tracks are available.');
+  if (!canDraw()) notice('This browser has no WebGL. Therefore images are not displayed, but values, targets and tracks are available.');
   const page = new Page(await read());
   page.follow().catch((error) => notice(error.message));
   page.chart.map.on('rendercomplete', () => {

@@ -1,4 +1,4 @@
-// The map: one raster, mask overlay, tracks, footprints, targets, and the line of the cross-section.
+// The map: a raster, mask overlay, tracks, footprints, targets, and the line of the cross-section.
 import Map from 'ol/Map.js';
 import View from 'ol/View.js';
 import { extend } from 'ol/extent.js';
@@ -19,7 +19,7 @@ import { byId, notice } from './dom.js';
 const FLIGHTS = ['#22d3ee', '#f472b6', '#a3e635', '#facc15', '#c084fc', '#fb7185'];
 const HALO = new Stroke({ color: '#0b1220cc', width: 4 });
 
-/** True if the browser supports WebGL, which drawing rasters requires. */
+/** Return true if the browser supports WebGL, which is required to draw rasters. */
 export function canDraw() {
   const canvas = document.createElement('canvas');
   return Boolean(canvas.getContext('webgl') || canvas.getContext('experimental-webgl'));
@@ -61,7 +61,7 @@ export class Chart {
     return this.map.getView();
   }
 
-  /** Draw a scale bar of a round length on the ground. */
+  /** Draw a scale bar that represents a round length. */
   scale() {
     const metres = getPointResolution(this.places.projection, this.view.getResolution(), this.view.getCenter(), 'm');
     const most = 140 * metres;
@@ -72,12 +72,12 @@ export class Chart {
     byId('scale').textContent = `${Number((length / metre).toPrecision(2))} ${unit}`;
   }
 
-  /** Replace the raster on display, with its colour scale. */
+  /** Replace the displayed raster and its colour scale. */
   show(layer, colours, low, high) {
     this.raster = this.replaced(this.raster, layer, () => rampStyle(colours, low, high), 0);
   }
 
-  /** Show a mask over the raster; null removes it. */
+  /** Show a mask over the raster; null removes the mask. */
   mask(layer) {
     this.overlay = this.replaced(this.overlay, layer, maskStyle, 1);
     this.overlay?.setOpacity(0.55);
@@ -95,20 +95,20 @@ export class Chart {
     const source = new GeoTIFF({
       sources: [{ url: layer.url }],
       normalize: false,
-      interpolate: false, // dB values must not be interpolated linearly
+      interpolate: false, // values in dB must not be interpolated linearly
       projection: this.places.projection,
       transition: 0,
     });
     source.on('change', () => {
-      if (source.getState() === 'error') explain(layer); // returns nothing: false would stop the event's propagation
+      if (source.getState() === 'error') explain(layer); // the handler returns nothing, because false would stop the propagation of the event
     });
     const added = new TileLayer({ source, style: style(), zIndex });
     this.map.addLayer(added);
-    this.map.once('rendercomplete', removeBefore); // removing it earlier would make the map flash
+    this.map.once('rendercomplete', removeBefore); // earlier removal would make the map flicker
     return added;
   }
 
-  /** True if the file of the raster has been opened. */
+  /** True if there is no raster, or if the file of the raster has been opened. */
   get drawn() {
     return !this.raster || this.raster.getSource()?.getState() === 'ready';
   }
@@ -131,7 +131,7 @@ export class Chart {
     }
   }
 
-  /** True if a layer has lines and all of them are outside the view. */
+  /** Return true if a layer has lines and all its lines are outside the view. */
   isOutside(name) {
     const lines = this[name].getSource().getFeatures().map((feature) => feature.getGeometry()).filter(Boolean);
     const view = this.view.calculateExtent(this.map.getSize());

@@ -8,7 +8,7 @@ export const MASK = { 1: '#3b82f6', 2: '#f59e0b', 3: '#d946ef' };
 
 const CLEAR = ['color', 0, 0, 0, 0];
 
-/** Style of a layer between the variables `low` and `high`; pixels without a value are transparent. */
+/** Style of a layer: colour ramp between the variables `low` and `high`; pixels without a value are transparent. */
 export function rampStyle(name, low, high) {
   const share = ['clamp', ['/', ['-', ['band', 1], ['var', 'low']], ['-', ['var', 'high'], ['var', 'low']]], 0, 1];
   const ramp = RAMPS[name];
@@ -17,13 +17,13 @@ export function rampStyle(name, low, high) {
   return { variables: { low, high }, color: ['case', ['==', ['band', 2], 0], CLEAR, colour] };
 }
 
-/** Style of the mask: visible pixels are transparent. */
+/** Style of the mask; pixels of class 'visible' are transparent. */
 export function maskStyle() {
   const cases = Object.entries(MASK).flatMap(([value, colour]) => [['==', ['band', 1], Number(value)], colour]);
   return { color: ['case', ['==', ['band', 2], 0], CLEAR, ...cases, CLEAR] };
 }
 
-/** Draw a ramp from left to right. */
+/** Draw a colour ramp from left to right. */
 export function drawRamp(canvas, name) {
   const pen = canvas.getContext('2d');
   const fill = pen.createLinearGradient(0, 0, canvas.width, 0);

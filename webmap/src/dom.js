@@ -1,10 +1,10 @@
-// Creation of elements. Text is inserted as text only, never as markup: names come from untrusted files.
+// Creation of elements. Text is inserted as text only, never as markup, because names come from untrusted files.
 const SVG = 'http://www.w3.org/2000/svg';
 
 /** Return the element with an id. */
 export const byId = (id) => document.getElementById(id);
 
-/** Create an element with properties and children; strings become text. */
+/** Create an element with properties and children; strings become text nodes. */
 export function element(name, properties = {}, ...children) {
   const created = Object.assign(document.createElement(name), properties);
   created.append(...children);
@@ -19,7 +19,7 @@ export function drawn(name, attributes, text) {
   return created;
 }
 
-/** Show a problem of the map to the user; each message once. */
+/** Show a problem of the map to the user; a message that is already displayed is not repeated. */
 export function notice(message) {
   const box = byId('notices');
   if ([...box.children].every((child) => child.textContent !== message)) box.append(element('p', { textContent: message }));

@@ -3,7 +3,7 @@ const REACH = 3; // pixels; a resolution cell is about three pixels wide
 const WITHIN_DB = 3;
 const TERMS = (y, x) => [1, y, x, y * y, x * x, x * y];
 
-/** Return the offset [down, right] of the peak from the highest pixel; `at(down, right)` returns the dB value there. */
+/** Return the offset [down, right] of the peak from the highest pixel; `at(down, right)` returns the value in dB at an offset. */
 export function top(at) {
   const around = [];
   for (let y = -REACH; y <= REACH; y++) for (let x = -REACH; x <= REACH; x++) around.push([y, x, at(y, x) - at(0, 0)]);
@@ -16,7 +16,7 @@ export function top(at) {
   return Math.max(...offset.map(Math.abs)) <= 2 ? offset : [0, 0];
 }
 
-/** Return the least-squares coefficients of `TERMS`: normal equations, solved by elimination with pivoting. */
+/** Return the least-squares coefficients of `TERMS` from the normal equations, solved by elimination with pivoting. */
 function leastSquares(samples) {
   const count = TERMS(0, 0).length;
   const rows = Array.from({ length: count }, () => new Array(count + 1).fill(0));

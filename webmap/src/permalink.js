@@ -4,7 +4,7 @@ const numbers = (text, count) => {
   return text && values.length === count && values.every(Number.isFinite) ? values : null;
 };
 
-/** Parse a fragment; null for missing and invalid values. */
+/** Parse a fragment; missing and invalid values are null. */
 export function read(hash) {
   const parameters = new URLSearchParams(hash.slice(1));
   const line = numbers(parameters.get('line'), 4);
@@ -20,7 +20,7 @@ export function read(hash) {
   };
 }
 
-/** Write the state into the URL and post it to the window around the map, without a new entry in the history. */
+/** Write the state to the URL, without a new entry in the history, and post the state to the window around the map. */
 export function write({ image, layer, colours, stretch, over, view, line }, decimals) {
   const fixed = (values, more = 0) => values.map((value) => Number(value.toFixed(decimals + more))).join(',');
   const parameters = new URLSearchParams({ image, layer, colours, stretch: stretch.join(','), over: over.join(',') });

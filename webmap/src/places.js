@@ -1,4 +1,4 @@
-// The campaign's CRS: projection for OpenLayers, and geographic coordinates checked against PROJ at control points.
+// CRS of the campaign: projection for OpenLayers, and geographic coordinates, checked against PROJ at control points.
 import proj4 from 'proj4';
 import Projection from 'ol/proj/Projection.js';
 import { addProjection } from 'ol/proj.js';
@@ -6,7 +6,7 @@ import { register } from 'ol/proj/proj4.js';
 import { notice, number } from './dom.js';
 
 const CODE = 'CAMPAIGN';
-const WORST_M = 0.01; // tolerated difference from PROJ, metres on the ground
+const WORST_M = 0.01; // tolerated position difference from PROJ, metres
 const DEGREE_M = 111320;
 
 export class Places {
@@ -17,7 +17,7 @@ export class Places {
     this.decimals = Math.min(4, Math.max(0, 1 + Math.ceil(-Math.log10(grid.spacing_m))));
     this.toGeographic = crs.local || !crs.proj4 ? null : proj4(crs.proj4, 'WGS84').forward;
     if (this.toGeographic && !(this.errorM() <= WORST_M)) {
-      notice(`WGS 84 coordinates are not displayed: this page's projection differs from PROJ by ${number(this.errorM(), 3)} m in ${crs.name}.`);
+      notice(`WGS 84 coordinates are not displayed, because the projection of this page differs from PROJ by ${number(this.errorM(), 3)} m in ${crs.name}.`);
       this.toGeographic = null;
     }
     if (this.toGeographic) {
@@ -73,7 +73,7 @@ export class Places {
     return [(north - y) / this.grid.spacing_m - 0.5, (x - west) / this.grid.spacing_m - 0.5];
   }
 
-  /** Return easting and northing of a row and a column. */
+  /** Return easting and northing of a point given as row and column. */
   placeOf([row, column]) {
     const [west, , , north] = this.grid.bounds_m;
     return [west + (column + 0.5) * this.grid.spacing_m, north - (row + 0.5) * this.grid.spacing_m];

@@ -28,7 +28,7 @@ export function plot(samples, unit, width, height) {
   return svg;
 }
 
-/** Return path data that are interrupted at samples without a value. */
+/** Return path data of a line that is interrupted at samples without a value. */
 function path(samples, x, y) {
   let pen = 'M';
   return samples
@@ -51,7 +51,7 @@ function span(values) {
   return [low - margin, high + margin];
 }
 
-/** Return about `about` round tick values between two limits, each with its number of decimals. */
+/** Return approximately `about` round tick values between two limits, each with its number of decimals. */
 export function ticks(low, high, about) {
   const raw = (high - low) / about;
   const power = 10 ** Math.floor(Math.log10(raw));

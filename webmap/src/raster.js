@@ -10,7 +10,7 @@ export class Raster {
     this.layer = layer;
     this.places = places;
     this.opened = this.open();
-    this.opened.catch(() => {}); // reported by the functions that await it
+    this.opened.catch(() => {}); // the functions that await the promise report its error
   }
 
   async open() {
@@ -18,12 +18,12 @@ export class Raster {
     const { bounds_m: bounds, spacing_m: spacing, shape } = this.places.grid;
     const offsets = image.getBoundingBox().map((edge, side) => Math.abs(edge - bounds[side]));
     if (image.getHeight() !== shape[0] || image.getWidth() !== shape[1] || Math.max(...offsets) > spacing / 1000)
-      throw new Error(`${this.layer.file} is not on the campaign's grid`);
+      throw new Error(`${this.layer.file} is not on the grid of the campaign`);
     this.nodata = image.getGDALNoData();
     return image;
   }
 
-  /** Read a window, `bottom` and `right` excluded; NaN for pixels without a value, null outside the grid. */
+  /** Read a window, excluding `bottom` and `right`; NaN for pixels without a value; null if outside the grid. */
   async window(top, left, bottom, right) {
     const [rows, columns] = this.places.grid.shape;
     const [row, column] = [Math.max(0, top), Math.max(0, left)];
@@ -40,17 +40,17 @@ export class Raster {
     return { row, column, end, last, at };
   }
 
-  /** Return the value of the pixel at a point; NaN if it has none. */
+  /** Return the value of the pixel at a point; NaN if the pixel has no value. */
   async value(place) {
     const [row, column] = this.places.pixelOf(place).map(Math.round);
     const window = await this.window(row, column, row + 1, column + 1);
     return window ? window.at(row, column) : NaN;
   }
 
-  /** Return the highest pixel around a point, and its subpixel peak position. */
+  /** Return value and subpixel position of the highest peak around a point. */
   async peak(place, reach) {
     const [row, column] = this.places.pixelOf(place).map(Math.round);
-    const wide = reach + 3; // `top` also uses the neighbours of the highest pixel
+    const wide = reach + 3; // `top` also uses pixels around the highest pixel
     const window = await this.window(row - wide, column - wide, row + wide + 1, column + wide + 1);
     if (!window) return null;
     let best = null;
@@ -65,7 +65,7 @@ export class Raster {
     return { place: this.places.placeOf([y + down, x + right]), value };
   }
 
-  /** Return distance (m), point and value of samples along a line, every half pixel and at most `MOST_SAMPLES`. */
+  /** Return distance (m), point and value of samples along a line, spaced by half a pixel; at most `MOST_SAMPLES`. */
   async along(from, to) {
     const length = Math.hypot(to[0] - from[0], to[1] - from[1]);
     const count = Math.min(MOST_SAMPLES, Math.max(2, Math.ceil((2 * length) / this.places.grid.spacing_m) + 1));
@@ -93,7 +93,7 @@ export class Raster {
 
 const nearest = (at, [row, column]) => at(Math.round(row), Math.round(column));
 
-/** Interpolate bilinearly in linear power between four pixels; returns dB. */
+/** Interpolate linear power bilinearly between four pixels, and return dB. */
 function bilinearPower(at, [row, column]) {
   const [y, x] = [Math.floor(row), Math.floor(column)];
   const [down, right] = [row - y, column - x];

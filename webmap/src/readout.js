@@ -1,10 +1,10 @@
-// Position of the pointer in map and geographic coordinates, and value of the pixel there.
+// Position of the pointer in map and geographic coordinates, and value of the pixel at that position.
 import { byId, number } from './dom.js';
 
 const PAUSE_MS = 40;
 
 export class Readout {
-  /** `raster` and `mask` are functions that return the rasters to read, or null. */
+  /** `raster` and `mask` are functions that return the rasters to be read, or null. */
   constructor(chart, places, raster, mask, classes) {
     Object.assign(this, { chart, places, raster, mask, classes, request: 0 });
     const { map } = chart;
@@ -26,7 +26,7 @@ export class Readout {
     map.getViewport().addEventListener('pointerleave', () => this.place && this.at(this.place));
   }
 
-  /** Show the coordinates of a point at once, and its value after a pause. */
+  /** Show the coordinates of a point immediately, and the value of the pixel after a pause. */
   at(place) {
     this.place = place;
     byId('place').textContent = this.places.words(place);

@@ -1,4 +1,4 @@
-// Cross-section tool: a line on the map, with a plot of its values and a CSV export.
+// Cross-section tool: a line on the map, with a plot of the values along the line and a CSV export.
 import Draw from 'ol/interaction/Draw.js';
 import { byId, element, number } from './dom.js';
 import { plot, width3dB } from './plot.js';
@@ -7,7 +7,7 @@ const NAMES = { earth: ['from E', 'from N', 'to E', 'to N'], local: ['from x', '
 const HEIGHT = 190;
 
 export class Section {
-  /** `raster` is a function that returns the raster on display; `changed` is called after a change of the line. */
+  /** `raster` is a function that returns the displayed raster; `changed` is called after a change of the line. */
   constructor(chart, places, raster, changed) {
     Object.assign(this, { chart, places, raster, changed, ends: null, request: 0 });
     this.inputs = NAMES[places.toGeographic ? 'earth' : 'local'].map((name) => {
@@ -28,7 +28,7 @@ export class Section {
     this.tool = new Draw({ type: 'LineString', maxPoints: 2, source: undefined });
     this.tool.on('drawend', ({ feature }) => {
       const ends = feature.getGeometry().getCoordinates();
-      setTimeout(() => this.stop()); // the tool must not be removed inside its own event
+      setTimeout(() => this.stop()); // the tool must not be removed while its event is handled
       this.set(ends);
     });
     this.chart.map.addInteraction(this.tool);

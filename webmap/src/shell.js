@@ -1,5 +1,6 @@
-// The window around the map. The map is a frame of another origin: this window's policy limits the navigation of the
-// frame, which can neither navigate this window nor open another. The window receives only permalink and title from it.
+// The window around the map. The map is a frame of a different origin. The policy of this window restricts the navigation
+// of the frame, which can neither navigate this window nor open a new window. The window receives only permalink and
+// title from the frame.
 import './shell.css';
 
 const origin = `${location.protocol}//127.0.0.1:${location.port}`;

@@ -1,22 +1,22 @@
-// Target list: known positions of points, and positions of the image peaks near them.
+// Target list: known positions of points, and positions of the image peaks near these points.
 import { byId, element, number } from './dom.js';
 
 const SOURCES = { truth: 'true position', stated: 'from the config', found: 'detected in the image' };
-const REACH_M = 0.3; // search radius around a target, at least `REACH_PX` pixels
+const REACH_M = 0.3; // search radius around a target; the minimum radius is `REACH_PX` pixels
 const REACH_PX = 4;
 
 export class Targets {
-  /** `raster` is a function that returns the image in dB in which peaks are searched, or null. */
+  /** `raster` is a function that returns the image in dB in which to search for peaks, or null. */
   constructor(all, chart, places, raster) {
     Object.assign(this, { all, chart, places, raster });
   }
 
-  /** List the targets of an image: those of the campaign, and those detected in the image. */
+  /** List the targets for an image: targets of the campaign, and targets detected in the image. */
   list(image) {
     const shown = this.all.filter((target) => target.image === null || target.image === image);
     this.chart.mark(shown);
     byId('targets-note').textContent = shown.length
-      ? 'Select a target to zoom to it and to measure the image peak near it.'
+      ? 'Select a target to zoom to the target and to measure the image peak nearby.'
       : 'No targets: the campaign has neither truth.json nor reference points.';
     byId('targets').replaceChildren(...shown.map((target) => this.row(target)));
   }
@@ -46,7 +46,7 @@ export class Targets {
     try {
       const peak = await raster.peak(at, Math.min(reach, 64));
       if (!peak) {
-        output.textContent = 'outside the image, or no value there';
+        output.textContent = 'the target is outside the image, or the image has no value there';
         return;
       }
       const [east, north] = peak.place.map((value, axis) => value - at[axis]);

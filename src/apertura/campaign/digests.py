@@ -22,22 +22,22 @@ from apertura.common.provenance import canonical_json, check_size, code_sha256, 
 _KEPT = Path("results/.hashes")
 _SMALL = 1 << 16  # bytes; smaller files are hashed faster than their cached state is read
 _SETTLED_S = 2.0
-"""Smallest age of a file whose hash is cached, seconds: a newer one may change again within the same clock tick."""
+"""Minimum age of a file whose hash is cached, seconds: a newer file may change again within the same clock tick."""
 
 
 def digest_of(
     root: Path, name: str, *, algorithm: Literal["sha256", "sha512"] = "sha256", paranoid: bool = False
 ) -> str:
-    """Return the hash of a campaign's file, hex, from `results/.hashes` if its state is unchanged.
+    """Return the hash of a file in a campaign, hex, from `results/.hashes` if the state of the file is unchanged.
 
     Parameters
     ----------
     root
         Campaign folder.
     name
-        File relative to the folder.
+        Path of the file relative to the folder.
     algorithm
-        sha256 or sha512; with sha512, both are computed in one pass, because recordings need both.
+        sha256 or sha512; with sha512, both hashes are computed in one pass, because recordings need both.
     paranoid
         True to read the file even if its state is unchanged.
 
@@ -78,7 +78,7 @@ class Sources:
     root
         Campaign folder.
     digests
-        File relative to the folder → SHA-256.
+        Path of each file relative to the folder → SHA-256.
     """
 
     root: Path
@@ -87,7 +87,7 @@ class Sources:
 
     @classmethod
     def of(cls, root: Path, names: Iterable[str]) -> "Sources":
-        """Hash files; raise CampaignError if one is missing."""
+        """Hash the given files; raise CampaignError if a file is missing."""
         root = ConfinedPath.at(root)
         states = {name: _state(root.named(name, where=root)) for name in sorted(set(names))}
         return cls(root, {name: digest_of(root, name) for name in states}, states)
@@ -119,7 +119,7 @@ def _state(path: Path) -> dict[str, int]:
         state = path.stat()
     except OSError as error:
         problem = "no such file" if isinstance(error, FileNotFoundError) else f"not readable ({error.strerror})"
-        raise CampaignError(problem, path, "a source file of a result", "Copy it there.") from error
+        raise CampaignError(problem, path, "a source file of a result", "Copy the file there.") from error
     return {
         "size": state.st_size,
         "inode": state.st_ino,
@@ -134,7 +134,7 @@ def _changed(path: Path) -> CampaignError:
         "the file changed while it was read",
         where=path,
         expected="a file that is not being modified",
-        remedy="Wait until it is completely written, then run the workflow again.",
+        remedy="Wait until the file is completely written, then run the workflow again.",
     )
 
 
@@ -145,7 +145,7 @@ def _code_sha256(modules: tuple[str, ...]) -> str:
 
 @dataclass(frozen=True)
 class Result:
-    """Result of a rule with its lineage.
+    """Result of a rule and its lineage.
 
     Attributes
     ----------
@@ -156,7 +156,7 @@ class Result:
     settings
         Settings that affect the result.
     modules
-        Modules whose import closure is the code of the result, as `apertura.workflow.lineage.result_of` returns them.
+        Modules whose import closure is the code of the result, as returned by `apertura.workflow.lineage.result_of`.
     """
 
     manifest: str
@@ -175,7 +175,7 @@ class Result:
         return _code_sha256(self.modules)
 
     def begin(self, root: Path, *, others: Sequence[str] = ()) -> "Lineage":
-        """Hash the sources, and `others` to which the sources refer."""
+        """Hash the sources, and the files `others` to which the sources refer."""
         return Lineage(self, Sources.of(root, (*self.sources, *others)))
 
 

@@ -51,13 +51,13 @@ class RawFolder:
     settings: Settings
 
     def __post_init__(self) -> None:
-        """Confine paths to the folder, and to the configured raw_root for raw/."""
+        """Confine paths to the campaign folder, and paths in raw/ to the configured raw_root."""
         elsewhere = getattr(self.settings, "raw_root", None)
         root = ConfinedPath.at(self.root)
         object.__setattr__(self, "root", root.with_elsewhere({"raw": Path(elsewhere)}) if elsewhere else root)
 
     def raw_files(self, flight: str, node: str) -> dict[str, ConfinedPath]:
-        """Return role → file of all recorded files of `node` in `flight`, existing or not."""
+        """Return role → path of all recorded files of `node` in `flight`, existing or not."""
         if isinstance(self.settings.waveform, SampledWaveform):
             recorded = {path.suffix: path for path in self.promised_files(flight, node)}
             return {**recorded, "track": self.track_file(flight, node)}
@@ -67,15 +67,15 @@ class RawFolder:
         return {**history, **({"track": self.track_file(flight, node)} if self.logged(flight, node) else {})}
 
     def promised_files(self, flight: str, node: str) -> tuple[ConfinedPath, ...]:
-        """Return the files of `recording_files`, existing or not."""
+        """Return the paths returned by `recording_files`, also of files that do not exist."""
         return tuple(self._recorded(flight, path.name) for path in recording_files(self.flight_folder(flight), node))
 
     def recording_files(self, flight: str, node: str) -> tuple[ConfinedPath, ...]:
-        """Return the files of the recording of `node` in `flight`, in the order of their row of `RECORDERS`."""
+        """Return the files of the recording of `node` in `flight`, in the order of the format's row of `RECORDERS`."""
         return tuple(self._raw_file(flight, node, path) for path in self.promised_files(flight, node))
 
     def history_files(self, flight: str, node: str) -> list[ConfinedPath]:
-        """Return the files of a node's phase history in the order of their names; for a folder, all its files."""
+        """Return the files of a node's phase history, sorted by name; for a folder, all files in the folder."""
         suffix = PHASE_HISTORIES[self.settings.waveform.format].suffix  # type: ignore[union-attr]
         folder = self.flight_folder(flight)
         paths = [path for path in sorted(folder.glob(f"{node}*{suffix}")) if path.name[len(node)] == "."]
@@ -87,7 +87,7 @@ class RawFolder:
                 "no such file",
                 where=folder / f"{node}.*{suffix}",
                 expected=f"the phase history of node {node} in flight {flight}",
-                remedy=f"Copy the {suffix} files there, named <node>{suffix} or <node>.<anything>{suffix}.",
+                remedy=f"Copy the {suffix} files there with the names <node>{suffix} or <node>.<anything>{suffix}.",
             )
         return [self._recorded(flight, name) for name in own]
 
@@ -104,7 +104,7 @@ class RawFolder:
             f"{number_of(len(logs), 'flight log')} {logs}" if logs else "no flight log",
             where=self.flight_folder(flight) / f"{node}.track.*",
             expected=f"exactly one flight log of node {node}",
-            remedy=f"Copy the log there, named <node>.track.<{'|'.join(log_suffixes())}>.",
+            remedy=f"Copy the log there with the name <node>.track.<{'|'.join(log_suffixes())}>.",
         )
 
     def _logs(self, flight: str, node: str) -> list[str]:
@@ -112,7 +112,7 @@ class RawFolder:
         return existing or [name for name in self._recorded_sources(flight, node) if _is_log(Path(name), node)]
 
     def _recorded_sources(self, flight: str, node: str) -> list[str]:
-        """Return a node's files listed in manifests of results if raw/ contains none, as in a copy without raw/."""
+        """Return a node's files listed in manifests of results, for a campaign whose raw/ contains no such files."""
         from apertura.campaign.store import read_manifest  # loads zarr, which reading the config does not need
 
         sources, folder = set[str](), f"raw/{flight}/"
@@ -138,7 +138,7 @@ class RawFolder:
                 "no such file",
                 where=path,
                 expected=f"the recording of node {node} in flight {flight}",
-                remedy=f"Copy it there, or remove {node} from the nodes of {flight} in {FLIGHTS}.",
+                remedy=f"Copy the file there, or remove {node} from the nodes of {flight} in {FLIGHTS}.",
             )
         return path
 
@@ -153,13 +153,13 @@ def _is_log(path: Path, node: str) -> bool:
 
 
 def _files(path: ConfinedPath) -> list[ConfinedPath]:
-    """Return the files of a folder, or a file itself; raise CampaignError for a link."""
+    """Return the files at any depth of a folder, or the file itself; raise CampaignError for a link."""
     paths = list(path.rglob("*")) if path.is_dir() else [path]
     return [file for file in paths if not file.is_dir()]
 
 
 def check_name(root: Path) -> None:
-    """Check that the absolute path of a folder is UTF-8 text, which tags, JSON and GDAL require.
+    """Check that the absolute path of a folder is UTF-8 text, as required by tags, JSON and GDAL.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def check_name(root: Path) -> None:
         raise CampaignError(
             "the path is not UTF-8 text",
             root.name or root,
-            "names in UTF-8 of the folder and its parent folders",
+            "UTF-8 names of the folder and its parent folders",
             "Rename the folder (convmv -f latin1 -t utf8), or set a UTF-8 locale: LC_ALL=C.UTF-8.",
         ) from None
 
@@ -187,9 +187,9 @@ class Campaign(RawFolder):
     flights, segments, clocks
         Lines of the tables in config/.
     planned
-        True for a flight plan, without recordings and possibly without the file of the transmitted signal.
+        True for a flight plan, which has no recordings and possibly no file of the transmitted signal.
     outdated
-        Manifests of results that are out of date, and not used for plans.
+        Manifests of results that are out of date and therefore not used for plans.
 
     Examples
     --------
@@ -227,23 +227,23 @@ class Campaign(RawFolder):
 
     @property
     def images(self) -> dict[str, tuple[str, ...]]:
-        """Image flight → names of its images: its pairs, and their sums if there are several pairs."""
+        """Image flight → names of its images: the pairs, and the sums if there are several pairs."""
         return {flight.name: flight.images for flight in self.image_flights}
 
     def check_images(self) -> None:
-        """Check that the campaign has an image flight; raise CampaignError if not."""
+        """Raise CampaignError if the campaign has no image flight."""
         if not self.image_flights:
             kinds = ", ".join(dict.fromkeys(flight.kind for flight in self.flights))
             raise CampaignError(
                 f"only flights of kind {kinds}",
                 where=self.root / FLIGHTS,
                 expected="a flight of kind image",
-                remedy="Add a flight of kind image; `apertura bench` measures a stationary radar.",
+                remedy="Add a flight of kind image, or use `apertura bench` for a stationary radar.",
             )
 
     @cached_property
     def calibrated(self) -> bool:
-        """True if images are calibrated, by the configured radio of the pairs or by measured constants."""
+        """True if images are calibrated, either by the configured radio of the pairs or by measured constants."""
         if self.settings.processing.radiometric_calibration:
             return True
         radios = (radio_of(self.settings.nodes, pair) for pair in self._pairs)
@@ -251,7 +251,7 @@ class Campaign(RawFolder):
 
     @property
     def coefficients(self) -> tuple[str, ...]:
-        """Names of multilooked powers and of backscattering coefficients to write (none for relative images)."""
+        """Names of the backscattering coefficients (none for relative images) and multilooked powers to be written."""
         processing = self.settings.processing
         written = processing.radiometry if self.calibrated else ()
         if processing.multilook is None:
@@ -273,12 +273,12 @@ class Campaign(RawFolder):
 
     @cached_property
     def values(self) -> dict[str, Any]:
-        """Settings as JSON values, without scheduler and raw_root, which do not affect results."""
+        """Settings as JSON values, except scheduler and raw_root, which do not affect results."""
         return self.settings.model_dump(mode="json", exclude={"raw_root": True, "processing": {"scheduler"}})
 
     @property
     def results(self) -> ConfinedPath:
-        """Folder of the pipeline's output."""
+        """Folder of the results."""
         return self.root / "results"
 
     def stage(self, stage: str, *where: str) -> ConfinedPath:
@@ -301,7 +301,7 @@ class Campaign(RawFolder):
 
     def is_current(self, result: ConfinedPath) -> bool:
         """Return True if a stage or document is finished and not `outdated`."""
-        from apertura.campaign.store.manifest import manifest_of  # callers have loaded zarr already
+        from apertura.campaign.store.manifest import manifest_of  # callers have already loaded zarr
 
         manifest = manifest_of(result)
         return manifest.is_file() and self.relative(manifest) not in self.outdated
@@ -318,7 +318,7 @@ class Campaign(RawFolder):
 
     @property
     def calibration_file(self) -> ConfinedPath | None:
-        """File of the constants measured at reflectors; None if the config names none."""
+        """File of the constants measured at reflectors; None if not configured."""
         named = self.settings.processing.radiometric_calibration
         return self.file(named, "processing.radiometric_calibration") if named else None
 
@@ -327,7 +327,7 @@ class Campaign(RawFolder):
         return path.relative_to(self.root).as_posix()
 
     def height_files(self) -> dict[str, ConfinedPath]:
-        """Return role → file of the DEM and of the geoid grid, for those that the config names."""
+        """Return role → file of the DEM and of the geoid grid, as far as configured."""
         scene = self.settings.scene
         named = {"dem": scene.dem, "geoid": scene.geoid}
         return {role: self.file(name, f"scene.{role}") for role, name in named.items() if name}
@@ -348,7 +348,7 @@ class Campaign(RawFolder):
         return {key: self.file(name, key) for key, name in named.items()}
 
     def segments_of(self, flight: str, pair: str) -> list[tuple[str, str]]:
-        """Return start and end (UTC) of the track segments that image a pair; empty: the whole track."""
+        """Return start and end (UTC) of the track segments from which a pair is imaged; empty for the whole track."""
         return self._segments.get((flight, pair), [])
 
     @cached_property
@@ -359,11 +359,11 @@ class Campaign(RawFolder):
         return own
 
     def clock(self, flight: str, node: str) -> ClockRow:
-        """Return the clock of a node's recorder relative to its log in a flight."""
+        """Return the clock of a node's recorder relative to the node's log in a flight."""
         return self._clocks.get((flight, node), ClockRow(flight, node))
 
     def node(self, flight: str, node: str) -> Node:
-        """Return the settings of a node in a flight; clocks.tsv overrides its configured time tag accuracy."""
+        """Return the settings of a node in a flight; clocks.tsv overrides the configured time tag accuracy."""
         stated, std_s = self.settings.nodes[node], self.clock(flight, node).std_s
         return stated if std_s is None else stated.model_copy(update={"time_tag_std_s": std_s})
 
@@ -372,7 +372,7 @@ class Campaign(RawFolder):
         return {(clock.flight, clock.node): clock for clock in self.clocks}
 
     def flight(self, name: str) -> Flight:
-        """Return the flight called `name`; raise CampaignError with the existing names if there is none."""
+        """Return the flight called `name`; raise CampaignError, which lists all names, if there is no such flight."""
         if name not in self._flights:
             raise CampaignError(
                 f"no flight {name!r}",

@@ -1,7 +1,7 @@
 """Check of a campaign folder before a run: configuration, headers, logs and DEM, without reading samples.
 
-All problems are reported at once. A problem prevents imaging; a condition that only degrades images is measured by a
-step, which raises a flag.
+All problems are reported at once. A problem prevents imaging. A condition that only degrades images is not reported
+here: a step measures the condition and raises a flag.
 """
 
 import shlex
@@ -72,10 +72,10 @@ CHECKS: Mapping[str, Check] = {
     "imaging": _CHECKS_OF.reach.check_imaging,
     "plan": _CHECKS_OF.reach.check_plan,
 }
-"""Name of each check → function of an `Examination` that yields problems, or raises one."""
+"""Name of each check → function that takes an `Examination` and yields problems, or raises a problem."""
 
 LAST = frozenset({"imaging", "plan"})
-"""Checks that run only if there are no problems so far: they open pairs, and would repeat these problems."""
+"""Checks that run only if the other checks find no problems: they open pairs, which would repeat these problems."""
 
 
 def problems(root: str | Path, *, without: Collection[str] = ()) -> list[CampaignError]:
@@ -102,7 +102,7 @@ def problems(root: str | Path, *, without: Collection[str] = ()) -> list[Campaig
 
 
 def problems_of(examined: "Examination", *, without: Collection[str] = ()) -> list[CampaignError]:
-    """Check an opened campaign and return its problems; `without` as for `problems`."""
+    """Check an opened campaign and return its problems; for `without`, see `problems`."""
     wrong: list[CampaignError] = []
     for name, function in CHECKS.items():
         if name not in without and not (name in LAST and wrong):
@@ -135,7 +135,7 @@ def _print_problems(
 
 
 def assumptions(examined: "Examination") -> Iterator[str]:
-    """Yield notes on uncertain assumptions that replace missing configuration."""
+    """Yield notes on uncertain assumptions that are made where a setting is not configured."""
     from apertura.core.geometry.geodesy import LOCAL, geodetic_from_ecef
 
     scene = examined.campaign.settings.scene
@@ -155,7 +155,7 @@ def print_findings(root: str | Path, *, products: bool = False, paranoid: bool =
     root
         The campaign folder.
     products
-        Read all results, too, and report damaged files.
+        Also read all results, and report damaged files.
     paranoid
         Hash all inputs again, including those with an unchanged size and modification time.
     """
@@ -172,7 +172,7 @@ def print_findings(root: str | Path, *, products: bool = False, paranoid: bool =
     if products:
         damaged = damaged_results(campaign).items()
         lines += [
-            f"{manifest}: damaged, {reason}. Delete this file and run the workflow again."
+            f"{manifest}: the result is damaged: {reason}. Delete this file and run the workflow again."
             for manifest, reason in damaged
         ]
     for line in lines:
@@ -197,7 +197,7 @@ def as_line(problem: CampaignError) -> str:
 
 
 def _problems_of_check(check: Check, examined: "Examination") -> Iterator[CampaignError]:
-    """Yield the problems that a check yields, and the one that it raises, if any."""
+    """Yield the problems that a check yields, and the problem that it raises, if any."""
     try:
         yield from check(examined)
     except CampaignError as problem:
@@ -212,7 +212,9 @@ class _AnyNode(frozenset[str]):
 
 
 def load(root: Path) -> tuple[Campaign | None, list[CampaignError]]:
-    """Load a campaign; return it, or None, with the problems of config.yaml and of its tables, each read independently.
+    """Load a campaign; return the campaign, or None, and the problems of config.yaml and of the tables.
+
+    Each file is read even if another file is invalid.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Recordings, logs, terrain and grid of a campaign, each opened once on first use."""
+"""Recordings, logs, terrain and grid of a campaign, each opened on first use."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -34,7 +34,7 @@ Key = tuple[str, str]
 """Flight and node."""
 
 _SMALL_BYTES = 64 << 20  # largest phase history that is read by the check
-_NODES = 128  # pixels along the shorter side of a grid with automatic spacing
+_NODES = 128  # pixels along the shorter side of the grid that is used if the pixel spacing is automatic
 
 
 @dataclass(frozen=True)
@@ -54,18 +54,18 @@ class Examination:
 
     @cached_property
     def stale(self) -> dict[str, str]:
-        """Manifest of each result that is out of date → reason, as in `stale_results`."""
+        """Manifest of each out-of-date result → reason, see `stale_results`."""
         return stale_results(self.campaign, paranoid=self.paranoid)
 
     @property
     def waveform(self) -> SampledWaveform | None:
-        """Transmitted waveform of a campaign recorded as samples; None: phase history."""
+        """Transmitted waveform if the campaign was recorded as samples; None for phase histories."""
         waveform = self.campaign.settings.waveform
         return waveform if isinstance(waveform, SampledWaveform) else None
 
     @property
     def transmitted(self) -> "Transmitted | None":
-        """Transmitted signal; None without samples, or if the file contradicts the waveform settings."""
+        """Transmitted signal; None for phase histories, or if the file contradicts the waveform settings."""
         return self._transmitted[0]
 
     @property
@@ -84,14 +84,14 @@ class Examination:
 
     @property
     def keys(self) -> tuple[Key, ...]:
-        """Flights and nodes with a recording, or with a log that is required."""
+        """Flights and nodes with a recording, or with a required log."""
         every = [(flight, node) for flight in self.campaign.flights for node in flight.recorded]
         return tuple(
             (flight.name, node) for flight, node in every if self.waveform or self.campaign.logged(flight.name, node)
         )
 
     def needs_log(self, key: Key) -> bool:
-        """Return True if a flight requires the logs of its nodes: all kinds except bench."""
+        """Return True if the flight of a key requires logs, i.e. for all kinds except bench."""
         return self.campaign.flight(key[0]).kind != "bench"
 
     @property
@@ -125,7 +125,7 @@ class Examination:
         return self._tracks[1]
 
     def opens(self, flight: str, pair: str) -> bool:
-        """Return True if the logs and headers of a pair were opened, or its phase history is small."""
+        """Return True if the logs and headers of a pair could be opened, or if its phase history is small."""
         if self.waveform is not None:
             keys = {(flight, node) for node in pair.split("-")}
             return keys <= self.tracks.keys() & self.recordings.keys()
@@ -134,7 +134,7 @@ class Examination:
 
     @cached_property
     def history_problems(self) -> list[CampaignError]:
-        """Problems of phase histories: of all pairs with small files, and of one pair if needed for the frame."""
+        """Problems of phase histories: those of all small files, and of the first file if it determines the frame."""
         if self.waveform is not None:
             return []
         from apertura.stages.transfer import recorded_echo
@@ -160,7 +160,7 @@ class Examination:
         return self._each(self.campaign.recording_files, self._opened)
 
     def _opened(self, files: tuple[Path, ...], key: Key) -> "Recording":
-        """Open a recording and convert its times to UTC by the clock of its node."""
+        """Open a recording and convert its times to UTC with the clock settings of its node."""
         recording = open_recording(files)
         captures = recording.captures
         return replace(recording, captures=replace(captures, time=self.campaign.clock(*key).utc(captures.time)))
@@ -181,7 +181,7 @@ class Examination:
         open_files: Callable[[tuple[ConfinedPath, ...], Key], T],
         needed: Callable[[Key], bool] = lambda _: True,
     ) -> tuple[dict[Key, T], list[CampaignError]]:
-        """Open files that exist and are not empty; all others are reported by check 'files'."""
+        """Open the files that exist and are not empty; check 'files' reports all other files."""
         opened: dict[Key, T] = {}
         problems: list[CampaignError] = []
         for flight, node in filter(needed, self.keys):
@@ -199,7 +199,7 @@ class Examination:
 
     @property
     def frame(self) -> str:
-        """Frame of the positions, ecef or local; empty if only the phase history determines it."""
+        """Frame of the positions, ecef or local; empty if only the content of a phase history determines the frame."""
         frames = [track.attrs["frame"] for track in self.tracks.values()]
         if frames or self.waveform:
             return next(iter(frames), "ecef")
@@ -207,7 +207,7 @@ class Examination:
 
     @cached_property
     def crs(self) -> str | None:
-        """CRS of the scene; `auto` is the UTM zone of the first image flight; None if unknown or not in metres."""
+        """CRS of the scene; for `auto`, the UTM zone of the first image flight; None if unknown or not in metres."""
         requested = self.campaign.settings.scene.crs
         if requested != "auto":
             return requested if requested == LOCAL or in_metres(requested) else None
@@ -218,7 +218,7 @@ class Examination:
 
     @property
     def other_frame(self) -> bool:
-        """True if the scene's CRS and the positions have different frames, ecef and local."""
+        """True if the CRS of the scene and the positions refer to different frames (ecef and local)."""
         return bool(self.frame) and (self.campaign.settings.scene.crs == LOCAL) is not (self.frame == LOCAL)
 
     @cached_property
@@ -234,7 +234,7 @@ class Examination:
 
     @cached_property
     def grid(self) -> "SceneGrid | None":
-        """Grid of the scene, coarser with automatic spacing; None with automatic bounds or an invalid CRS."""
+        """Grid of the scene, coarser if the spacing is automatic; None if bounds are automatic or the CRS invalid."""
         from apertura.core.scene.grid import SceneGrid
 
         requested = self.campaign.settings.scene
@@ -259,7 +259,7 @@ class Examination:
 
     @property
     def level_m(self) -> float:
-        """Height of flat terrain under the grid, metres above the ellipsoid; with a DEM, the height of the track."""
+        """Height of flat terrain below the grid, metres above the ellipsoid; with a DEM, the height of the track."""
         return self._ground[2]
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Contents of input files as plain values: flight log, recording, phase history, DEM."""
+"""Contents of input files as plain values: flight logs, recordings, phase histories and DEMs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ METRES = frozenset({"", "m", "metre", "meter", "metres", "meters"})
 """Unit names of heights in metres; an empty name is interpreted as metres."""
 
 WAVE_M = 0.25
-"""Wavelength for the tolerance of errors between epochs of a log without a campaign, metres: L-band."""
+"""Wavelength assumed for the tolerance of errors in a log that is read without a campaign, metres (L-band)."""
 
 _FIX_NAMES = {number: name for name, number in FIXES.items()}
 _ACROSS = 512  # largest number of DEM posts read along a side
@@ -56,7 +56,7 @@ class LogFacts:
     fixes
         Solution class → number of epochs; None if the log contains no solution class.
     attitude_share
-        Share of epochs with roll, pitch and yaw.
+        Fraction of epochs with roll, pitch and yaw.
     has_attitude
         True if any angle is logged at any epoch.
     frame
@@ -68,12 +68,12 @@ class LogFacts:
     middle_geodetic
         (3,) float64: median of latitude, longitude (deg) and ellipsoidal height (m); None in a local frame.
     length_m
-        Length of the track, straight between epochs, metres.
+        Length of the track, along straight lines between epochs, metres.
     median_speed_m_s, largest_speed_m_s
-        Speed between epochs, metres per second.
+        Median and largest speed between epochs, metres per second.
     stated_std_m
-        Median standard deviations north, east and up in the log, metres; None for an axis without values, or if no axis
-        has any.
+        Median of the logged standard deviations in north, east and up, metres; None for an axis without values; None
+        instead of the tuple if no axis has values.
     remarks
         Remarks of the reader for the user.
     """
@@ -127,7 +127,7 @@ def _stated_std_m(track: "xr.Dataset") -> tuple[float | None, ...] | None:
 
 
 def log_faults(track: "xr.Dataset") -> CheckedTrack:
-    """Check a log with a tolerance of 1/16 of `WAVE_M`, and return its usable part."""
+    """Check a log with a position tolerance of 1/16 of `WAVE_M`, and return the result with the usable epochs."""
     from apertura.stages.node_log import poorer_fix
 
     poor = poorer_fix(track.fix.values, "auto") if "fix" in track else np.zeros(track.sizes["epoch"], bool)
@@ -142,7 +142,8 @@ def log_faults(track: "xr.Dataset") -> CheckedTrack:
 def bounds_of(position_m: NDArray[np.float64], frame: str) -> dict[str, Range]:
     """Return minimum and maximum of each coordinate of (n, 3) positions; geodetic coordinates for frame ecef.
 
-    Longitudes are those of the western and the eastern end: the first is larger across the antimeridian.
+    Longitudes are those of the western and the eastern end. If the positions cross the antimeridian, the first
+    longitude is larger.
 
     Examples
     --------
@@ -160,7 +161,7 @@ def _bounds(places: NDArray[np.float64], frame: str) -> dict[str, Range]:
 
 
 def _middle(places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the median of latitude, longitude and height, also across the antimeridian."""
+    """Return the medians of latitude, longitude and height, also for positions across the antimeridian."""
     latitude, longitude, height = places.T
     middle = np.median(longitudes_about(longitude, longitude[0]))
     return np.array([np.median(latitude), (middle + 180) % 360 - 180, np.median(height)])
@@ -187,17 +188,17 @@ class RecordingFacts:
     sample_rate_hz
         Complex samples per second.
     carrier_hz
-        RF frequency at baseband zero; None if not stated.
+        RF frequency that corresponds to zero frequency at baseband; None if not stated.
     samples
         Number of samples of each channel.
     captures, capture_samples
-        Number of captures, and samples of each.
+        Number of captures, and number of samples per capture.
     span
-        First and last capture, or the time span of a continuous recording.
+        Times of the first and last capture, or time span of a continuous recording.
     times
         Times of captures; a gap is longer than `LOST_CAPTURE` intervals. None for a continuous recording.
     frames
-        Frame counter of captures; None without a counter.
+        First and last frame number, and numbers of missing frames and restarts; None without a frame counter.
     """
 
     channels: tuple[str, ...]
@@ -212,12 +213,12 @@ class RecordingFacts:
 
     @property
     def runs_through(self) -> bool:
-        """True for a continuous recording, not triggered by pulses."""
+        """True for a continuous recording, i.e. one that is not triggered by pulses."""
         return self.times is None
 
 
 def recording_facts(recording: Recording) -> RecordingFacts:
-    """Summarise the header of a recording; no sample is read."""
+    """Summarise the header of a recording; samples are not read."""
     captures, triggered = recording.captures, recording.framing is None
     return RecordingFacts(
         channels=tuple(recording.channels),
@@ -261,7 +262,7 @@ class HistoryFacts:
     frame
         Frame of the positions, ecef or local; None without positions.
     bistatic
-        True if the antennas are separated.
+        True if transmit and receive antenna have different positions.
     bounds
         tx and rx → result of `bounds_of`.
     dropped
@@ -316,9 +317,9 @@ class DemFacts:
     Attributes
     ----------
     tags
-        Tags of the file, with `PRODUCT_TAG` for a product of apertura.
+        Tags of the file; they include `PRODUCT_TAG` for a product of apertura.
     description, values_unit
-        Description and unit of the first band; empty if not stated. With a compound CRS the unit is that of the
+        Description and unit of the first band; empty if not stated. For a compound CRS, the unit is that of the
         vertical axis.
     posts
         Rows and columns.
@@ -329,12 +330,12 @@ class DemFacts:
     bounds
         Left, bottom, right, top.
     spacing
-        Post spacing, east and north.
+        Post spacing to the east and north.
     bands, dtype
-        Number of bands, and data type of the first.
+        Number of bands, and data type of the first band.
     heights
-        (row, column) float32 in `values_unit`, scale and offset applied, at most 512 posts along a side, NaN for
-        nodata; None if the raster is too large or complex.
+        (row, column) float32 in `values_unit`, with scale and offset applied, reduced to at most 512 posts along a
+        side, NaN for nodata; None if the raster is too large or has complex values.
     """
 
     tags: Mapping[str, str]
@@ -360,7 +361,7 @@ def dem_facts(path: Path) -> DemFacts:
     """
     from apertura.common.raster import opened_raster
 
-    with opened_raster(path, expected="a GeoTIFF of heights", remedy="Convert it to GeoTIFF.") as raster:
+    with opened_raster(path, expected="a GeoTIFF of heights", remedy="Convert the file to GeoTIFF.") as raster:
         bounds, crs = raster.bounds, raster.crs
         return DemFacts(
             tags={str(name): str(value) for name, value in raster.tags().items()},
@@ -378,7 +379,7 @@ def dem_facts(path: Path) -> DemFacts:
 
 
 def _values_unit(raster: "DatasetReader") -> str:
-    """Return the unit of the first band: that of the vertical axis of a compound CRS, else that stated for the band."""
+    """Return the unit of the vertical axis of a compound CRS; for other CRSs, the unit stated for the first band."""
     from pyproj import CRS
     from pyproj.exceptions import ProjError
 

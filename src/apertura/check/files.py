@@ -22,7 +22,10 @@ _AHEAD_S = 5.0
 _IMPORTED = ".snakemake/pip-deployments"
 """Folder for plugins installed by jobs, relative to the working folder (Snakemake 9, `PIP_DEPLOYMENTS_PATH`)."""
 
-_KEPT = "If the settings of the echo are unchanged, transfer functions kept by `processing: {keep: [echo]}` replace it."
+_KEPT = (
+    "If the settings of the echo are unchanged, transfer functions kept by `processing: {keep: [echo]}` replace the "
+    "recording."
+)
 
 _RECORDS = ("metadata", "incomplete")
 """Folders of Snakemake's records, which are not needed and can be removed if damaged."""
@@ -66,9 +69,9 @@ def check_files(examined: "Examination") -> Iterator[CampaignError]:
 
 
 def _wanted(examined: Examination) -> Callable[[str], str | None]:
-    """Return a function from the name of an absent recording file to the result that a run would compute from it.
+    """Return a function that maps the name of an absent recording file to the result that a run would compute from it.
 
-    The result is empty if the file is not needed by a run, and None if it never was an input or this is unknown.
+    The function returns '' if no run needs the file, and None if the file was never an input, or if this is unknown.
     """
 
     @cache
@@ -86,7 +89,7 @@ def _wanted(examined: Examination) -> Callable[[str], str | None]:
 
 
 def _recorded(campaign: Campaign, flight: Flight, required_by: Callable[[str], str | None]) -> Iterator[CampaignError]:
-    """Yield problems of the files of a flight: samples and logs, or phase history."""
+    """Yield problems of the files of a flight: samples and logs, or phase histories."""
     if not isinstance(campaign.settings.waveform, SampledWaveform):
         for node in flight.nodes:
             yield from _looked_up(lambda node=node: list(campaign.raw_files(flight.name, node).values()))  # type: ignore[misc]
@@ -114,7 +117,7 @@ def _recorded(campaign: Campaign, flight: Flight, required_by: Callable[[str], s
 
 
 def _looked_up(files: Callable[[], list[ConfinedPath]]) -> Iterator[CampaignError]:
-    """Yield the error of looking up files, or the problems of the files found."""
+    """Yield the error raised by the lookup of files, or the problems of the files found."""
     try:
         paths = files()
     except CampaignError as problem:
@@ -134,9 +137,9 @@ def _readable(path: ConfinedPath, expected: str, remedy: str) -> Iterator[Campai
         yield CampaignError("no such file", where=path, expected=expected, remedy=remedy)
     elif state.st_mtime > time.time() + _AHEAD_S:
         yield CampaignError(
-            f"dated {(state.st_mtime - time.time()) / 3600:.1f} h in the future",
+            f"the modification time is {(state.st_mtime - time.time()) / 3600:.1f} h in the future",
             where=path,
-            expected="a modification time in the past, by this machine's clock",
+            expected="a modification time in the past, according to the clock of this machine",
             remedy=f"Set the clock, or run `touch {path}`: Snakemake rejects inputs dated in the future.",
         )
     elif state.st_size == 0:
@@ -155,7 +158,7 @@ def check_raw_root(examined: "Examination") -> Iterator[CampaignError]:
             f"{stated} is not a folder",
             where="raw_root",
             expected="the folder that contains <flight>/<node>.*",
-            remedy="Mount the folder or correct raw_root; or copy the recordings to raw/ and remove raw_root.",
+            remedy="Mount the folder, or correct raw_root, or copy the recordings to raw/ and remove raw_root.",
         )
     own = ConfinedPath.at(Path(campaign.root)) / "raw"
     if any(files for _, _, files in own.walk()):
@@ -168,7 +171,7 @@ def check_raw_root(examined: "Examination") -> Iterator[CampaignError]:
 
 
 def check_links(examined: "Examination") -> Iterator[CampaignError]:
-    """Yield a problem for each symbolic link that replaces, or lies in, the folders results and .snakemake."""
+    """Yield a problem for each symbolic link inside, or in place of, the folders results and .snakemake."""
     root = examined.campaign.root
     for top in (root / "results", root / ".snakemake"):
         below = () if top.is_symlink() else (folder / name for folder, _, names in top.walk() for name in names)
@@ -177,8 +180,8 @@ def check_links(examined: "Examination") -> Iterator[CampaignError]:
                 yield CampaignError(
                     "a symbolic link",
                     where=path,
-                    expected="a folder or a file: Snakemake would write and delete through a link",
-                    remedy="Remove the link; to store results elsewhere, move the whole campaign folder.",
+                    expected="a folder or a file, because Snakemake writes and deletes files through links",
+                    remedy="Remove the link. To store results elsewhere, move the whole campaign folder.",
                 )
 
 
@@ -189,15 +192,15 @@ def check_modules(examined: "Examination") -> Iterator[CampaignError]:
         yield CampaignError(
             "Python modules in a folder of Snakemake",
             where=folder,
-            expected="a campaign folder without code: every job would import these modules",
-            remedy="Remove the folder; install Snakemake plugins in the environment of apertura.",
+            expected="a campaign folder without code, because every job would import these modules",
+            remedy="Remove the folder, and install Snakemake plugins in the environment of apertura.",
         )
 
 
 def drop_damaged_records(root: ConfinedPath) -> int:
     """Remove the records of earlier runs that Snakemake cannot read; return their number.
 
-    Out-of-date results are detected by hashes, not by these records: only run times of earlier jobs are lost.
+    Out-of-date results are detected by hashes, not by these records. Only the run times of earlier jobs are lost.
     """
     records = root / ".snakemake"
     damaged = [path for folder in _RECORDS for path in (records / folder).rglob("*") if _is_damaged(path)]
@@ -219,10 +222,10 @@ def _is_damaged(path: ConfinedPath) -> bool:
 
 
 _BASE_BYTES = 120_000_000  # the interpreter and its libraries
-_CAPTURE_BYTES = 1100  # memory per capture for its metadata while they are read; samples are read in blocks
-_RAW_BYTES = 10  # per capture in the stage raw, compressed
-_ECHO_SHARE = 0.95  # least fraction of the pulses that is not excluded; 8 bytes per pulse and subcarrier
-PIXEL_BYTES = 36  # per pixel and pair: image, its share of the cube, three rasters, compressed; 76 uncompressed
+_CAPTURE_BYTES = 1100  # memory for the metadata of a capture during reading; samples are read in blocks
+_RAW_BYTES = 10  # disk space per capture in the stage raw, compressed
+_ECHO_SHARE = 0.95  # assumed fraction of the pulses that are not excluded; 8 bytes per pulse and subcarrier
+PIXEL_BYTES = 36  # disk space per pixel and pair for image, cube and three rasters, compressed; 76 uncompressed
 MEMINFO = Path("/proc/meminfo")
 
 
@@ -257,7 +260,7 @@ def check_memory(examined: Examination) -> Iterator[CampaignError]:
 
 
 def free_memory(meminfo: Path = MEMINFO) -> int:
-    """Return the free memory of this process, bytes: that of the machine, or the limit of its control group.
+    """Return the memory available to this process, bytes: free memory of the machine, or limit of the control group.
 
     Examples
     --------
@@ -283,12 +286,12 @@ def check_disk(examined: Examination) -> Iterator[CampaignError]:
             f"remaining results need at least {needed / 1e6:.0f} MB ({parts})",
             where=folder,
             expected=f"at most {free / 1e6:.0f} MB, the free disk space",
-            remedy="Free some space, copy the campaign to a larger disk, or make the scene smaller.",
+            remedy="Free disk space, copy the campaign to a larger disk, or make the scene smaller.",
         )
 
 
 def disk_bytes(examined: Examination) -> dict[str, int]:
-    """Return stage → lower bound of the bytes to be written; stages with a manifest exist already."""
+    """Return stage → lower bound of the bytes still to be written; stages with a manifest are already complete."""
     campaign, transmitted = examined.campaign, examined.transmitted
     raw = sum(
         _RAW_BYTES * recording.captures
@@ -315,7 +318,7 @@ def _has_result(examined: Examination, stage: str, *where: str) -> bool:
 
 
 def check_scheduler(examined: Examination) -> Iterable[CampaignError]:
-    """Raise CampaignError for a scheduler that the user has not enabled."""
+    """Raise CampaignError if the user has not enabled the configured scheduler."""
     scheduler = examined.campaign.settings.processing.scheduler
     if scheduler != "threads":
         from apertura.core.backprojection.tiles import check_named

@@ -19,18 +19,19 @@ from apertura.core.scene.map_crs import check_crs, horizontal_crs
 _WHERE = f"{CONFIG}: scene.crs"
 _FAR_UP_M = 1000.0  # largest height of a reference point above or below the terrain
 TALLEST_M = 500.0
-"""Largest height by which a real feature narrower than two posts rises above its surroundings, metres; at least
-`_STEEPEST_POSTS` post widths."""
+"""Largest height above its surroundings of a real feature narrower than two posts, metres. The limit is raised to
+`_STEEPEST_POSTS` post widths if these are larger."""
 
 _NEAR_M = 20e3
-"""Largest distance of scene and track, after correction of a mistake, at which the mistake is reported, metres."""
+"""Largest distance between scene and track, after correction of a mistake, for which the mistake is reported, metres.
+"""
 
 _STEEPEST_POSTS = 10.0
 _PER_POST = 2  # samples per post
-_WINDOW = 7  # samples: three and a half posts
+_WINDOW = 7  # window width in samples, i.e. three and a half posts
 _MOST_SAMPLES = 1_000_000
 _COARSE = 256
-_MARGIN = _WINDOW - 1  # samples around the scene, which are not evaluated
+_MARGIN = _WINDOW - 1  # width of the margin around the scene in samples, in which no spikes are reported
 
 Place = tuple[float, float]
 """Latitude and longitude, degrees."""
@@ -39,7 +40,7 @@ _NOWHERE = (np.nan, np.nan)
 
 
 def check_scene_crs(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a problem if the CRS is not in metres, does not fit the positions' frame, or is unsuitable for the area."""
+    """Yield a problem if the CRS is not in metres, contradicts the positions' frame, or is not valid in the area."""
     crs = examined.campaign.settings.scene.crs
     if examined.other_frame:
         local = crs == LOCAL
@@ -55,7 +56,7 @@ def check_scene_crs(examined: Examination) -> Iterator[CampaignError]:
 
 
 def check_reference_points(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a problem for each reference point or reflector outside the scene, or far above or below its terrain."""
+    """Yield a problem for each reference point or reflector outside the scene, or far above or below the terrain."""
     grid = examined.grid
     if grid is None:
         return
@@ -71,7 +72,7 @@ def check_reference_points(examined: Examination) -> Iterator[CampaignError]:
                 f"{point.name} at {x:.2f}, {y:.2f} lies outside the scene",
                 where=where,
                 expected=f"easting {west:.2f} to {east:.2f}, northing {south:.2f} to {north:.2f} in {grid.crs}",
-                remedy="Easting comes before northing." if swapped else remedy,
+                remedy="State easting before northing." if swapped else remedy,
             )
         elif examined.ground is not None and abs(height_m - examined.level_m) > _FAR_UP_M:
             yield CampaignError(
@@ -83,7 +84,7 @@ def check_reference_points(examined: Examination) -> Iterator[CampaignError]:
 
 
 def _elsewhere(examined: Examination, crs: str) -> Iterator[CampaignError]:
-    """Yield a problem if the bounds, or with automatic bounds the track, lie outside the area of use of the CRS."""
+    """Yield a problem if the bounds, or the track if bounds are automatic, lie outside the area of use of the CRS."""
     bounds = examined.campaign.settings.scene.bounds_m
     if bounds != "auto":
         try:
@@ -115,7 +116,7 @@ def _elsewhere(examined: Examination, crs: str) -> Iterator[CampaignError]:
 
 
 def _not_in_metres(examined: Examination, crs: str) -> CampaignError:
-    """Return the problem of a CRS that is not in metres, with the suitable UTM zone."""
+    """Return the problem of a CRS that is not in metres; the remedy names the suitable UTM zone."""
     try:
         system = horizontal_crs(crs)
     except CampaignError as problem:
@@ -143,7 +144,7 @@ def _zone(examined: Examination, *, degrees: bool) -> str:
 
 
 def check_dem(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a problem if a DEM or geoid grid cannot be read, does not cover the scene, or has invalid heights."""
+    """Yield a problem if the DEM or geoid grid cannot be read, or if heights of the scene are missing or invalid."""
     yield from examined.ground_problems
     dem, grid = examined.ground and examined.ground.dem, examined.grid
     if dem and grid:
@@ -155,8 +156,8 @@ def check_spikes(examined: Examination) -> Iterator[CampaignError]:
 
     Heights are sampled twice per post. A morphological opening with a window of seven samples removes peaks narrower
     than the window and preserves slopes, ridges and cliffs of any height; a closing does the same for pits. A removed
-    height is a spike if it exceeds 500 m and the width of ten posts: steeper than 80° on all sides. If the scene has
-    more than a million samples, this number about its centre is tested.
+    height is a spike if it exceeds both 500 m and the width of ten posts, i.e. if the slope exceeds 80° on all sides.
+    If the scene has more than a million samples, only a million samples around its centre are tested.
     """
     dem, grid = examined.ground and examined.ground.dem, examined.grid
     if not dem or not grid:
@@ -170,17 +171,17 @@ def check_spikes(examined: Examination) -> Iterator[CampaignError]:
     row, column = np.argwhere(spikes)[0]
     x, y = window.map_at(row, column)
     yield CampaignError(
-        f"{heights[row, column]:.0f} m at x {x:.1f}, y {y:.1f}, where the surrounding terrain has "
-        f"{np.nanmedian(heights[max(row - 6, 0) : row + 7, max(column - 6, 0) : column + 7]):.0f} m; "
+        f"a height of {heights[row, column]:.0f} m at x {x:.1f}, y {y:.1f}, where the median height of the "
+        f"surroundings is {np.nanmedian(heights[max(row - 6, 0) : row + 7, max(column - 6, 0) : column + 7]):.0f} m; "
         f"{int(spikes.sum())} of {spikes.size} samples are such spikes",
         where=dem.path,
-        expected=f"no post above or below all its neighbours by more than {TALLEST_M:.0f} m, or ten post widths",
-        remedy="Set these posts to nodata and fill them with a GIS.",
+        expected=f"no post more than {TALLEST_M:.0f} m and ten post widths above or below all its neighbours",
+        remedy="Set these posts to nodata and fill the voids with a GIS.",
     )
 
 
 def _heights(dem: Dem, grid: SceneGrid, window: SceneGrid) -> NDArray[np.float64]:
-    """Return the heights of a window; NaN if posts outside the scene have invalid heights."""
+    """Return the heights in a window; all NaN if posts of the window outside the scene have invalid heights."""
     try:
         return dem.heights(window)
     except CampaignError:
@@ -189,7 +190,7 @@ def _heights(dem: Dem, grid: SceneGrid, window: SceneGrid) -> NDArray[np.float64
 
 
 def post_width_m(dem: Dem, grid: SceneGrid) -> float:
-    """Return the post spacing of a DEM at the centre of a grid, metres, along the finer axis."""
+    """Return the post spacing of a DEM at the centre of a grid along the axis with the finer spacing, metres."""
     xmin, ymin, xmax, ymax = grid.bounds_m
     x, y = (xmin + xmax) / 2 + np.array([0.0, 1.0, 0.0]), (ymin + ymax) / 2 + np.array([0.0, 0.0, 1.0])
     if grid.crs != LOCAL:
@@ -201,7 +202,7 @@ def post_width_m(dem: Dem, grid: SceneGrid) -> float:
 
 
 def sampled_about(grid: SceneGrid, spacing_m: float) -> SceneGrid:
-    """Return a sampling grid with a given spacing over a grid and a margin, limited to a million samples."""
+    """Return a sampling grid with a given spacing that covers a grid with a margin, limited to a million samples."""
     (xmin, ymin, xmax, ymax), most = grid.bounds_m, int(np.sqrt(_MOST_SAMPLES))
     sides = [min(round(side / spacing_m) + 2 * _MARGIN, most) for side in (xmax - xmin, ymax - ymin)]
     west, north = (xmin + xmax - sides[0] * spacing_m) / 2, (ymin + ymax + sides[1] * spacing_m) / 2
@@ -209,9 +210,10 @@ def sampled_about(grid: SceneGrid, spacing_m: float) -> SceneGrid:
 
 
 def needles(heights: NDArray[np.float64], *, taller_than_m: float) -> NDArray[np.bool_]:
-    """Return (row, column) bool, True at spikes of a surface, upward or downward, narrower than seven samples.
+    """Return (row, column) bool, True at upward or downward spikes of a surface that are narrower than seven samples.
 
-    Samples within two half widths of the window from a void or the edge are excluded: their surroundings are unknown.
+    Samples closer to a void or the edge than twice the half width of the window are excluded, because their
+    surroundings are unknown.
 
     Examples
     --------
@@ -224,12 +226,12 @@ def needles(heights: NDArray[np.float64], *, taller_than_m: float) -> NDArray[np
     with np.errstate(invalid="ignore"):
         up = heights - _over_windows(_over_windows(heights, np.fmin), np.fmax)
         down = _over_windows(_over_windows(heights, np.fmax), np.fmin) - heights
-        near = _over_windows(_over_windows(heights, np.maximum), np.maximum)  # NaN next to voids and edges
+        near = _over_windows(_over_windows(heights, np.maximum), np.maximum)  # NaN near voids and edges
         return np.asarray(((up > taller_than_m) | (down > taller_than_m)) & np.isfinite(near))
 
 
 def _over_windows(heights: NDArray[np.float64], by: np.ufunc) -> NDArray[np.float64]:
-    """Return the extreme value in the window about each sample; samples outside are NaN, like voids."""
+    """Return the extreme value in the window around each sample; samples outside the array are NaN, like voids."""
     half = _WINDOW // 2
     for axis in (0, 1):
         padded = np.pad(
@@ -241,7 +243,7 @@ def _over_windows(heights: NDArray[np.float64], by: np.ufunc) -> NDArray[np.floa
 
 
 def likely_place(examined: Examination) -> str:
-    """Return a remedy for a scene far from the track: the mistake whose correction brings them together; '' if none."""
+    """Return a remedy for a scene far from the track: the correction that brings both together; '' if none does."""
     bounds = examined.campaign.settings.scene.bounds_m
     if bounds == "auto" or examined.middle_m is None or examined.crs is None:
         return ""
@@ -250,7 +252,7 @@ def likely_place(examined: Examination) -> str:
     zone, crs = utm_crs(examined.middle_m), str(examined.crs)
     scene, track = _place(crs, x, y), (latitude, longitude)
     degrees = f"The bounds appear to be in degrees: set scene.bounds_m in metres in {crs}."
-    mistakes = [  # each with the locations of scene and track after its correction
+    mistakes = [  # remedy of each mistake, and the locations of scene and track after its correction
         (degrees, (y, x), track),
         (degrees, (x, y), track),
         ("Set scene.bounds_m with easting before northing: [xmin, ymin, xmax, ymax].", _place(crs, y, x), track),
@@ -276,7 +278,7 @@ def _place(crs: str, x: float, y: float) -> Place:
 
 
 def _distance_m(*places: Place) -> float:
-    """Return the straight-line distance between two locations; inf if one of them is not on Earth."""
+    """Return the straight-line distance between two locations, metres; inf if a location is not on Earth."""
     if not all(abs(latitude) <= 90 and abs(longitude) <= 180 for latitude, longitude in places):
         return np.inf
     first, second = (ecef_from_geodetic(*(np.array(value) for value in (*place, 0.0))) for place in places)

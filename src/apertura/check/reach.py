@@ -1,4 +1,4 @@
-"""Check that nodes, scene and reflector are within range and in the beams, and that images can be planned."""
+"""Check that nodes, scene and reflector are within range and in the antenna beams, and that images can be planned."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -33,29 +33,31 @@ if TYPE_CHECKING:
 
 _TAGS = 256  # largest number of time tags of a pair at which distances are computed
 _POINTS = 9  # points along each side of the scene
-_CURVATURE = 0.99  # factor on the straight path: the curved terrain of a scene of unknown height recedes from the track
-_LEAST_M = 1e-3  # least height above the terrain: an antenna at terrain height is below it at half of the pulses
-_MOSTLY = 0.9  # share of the distance above which a height difference is its cause
+_CURVATURE = 0.99  # factor on path lengths: on the curved Earth, terrain below the track's height may be closer
+_LEAST_M = (
+    1e-3  # minimum height above the terrain; an antenna at terrain height is below the terrain at half the pulses
+)
+_MOSTLY = 0.9  # fraction of the distance from which a height difference is reported as the cause of the distance
 _CHECK = (
     "Check scene.crs and scene.bounds_m (easting before northing), the positions in the logs, waveform.{key} and "
     "nodes.<node>.path_offset_m."
 )
 _HORIZON_M = 4.12e3
-"""Radio horizon over a smooth Earth with refraction, metres per square root of the height in metres."""
+"""Distance to the radio horizon over a smooth Earth with refraction, metres per square root of the height in metres."""
 
-_LEAST_HEIGHT_M = 1000.0  # least height assumed for the horizon: heights refer to the ellipsoid, not to the terrain
+_LEAST_HEIGHT_M = 1000.0  # minimum height for the horizon, because heights refer to the ellipsoid, not to the terrain
 
 HIGHEST_M = 30e3
 """Largest accepted height of a node above the terrain, metres."""
 
-_STILL_M = 0.05  # scatter of the logged positions of a stationary node
-_SOME_TIME = np.timedelta64(1, "s")  # shortest recording in which motion of a node is detectable
+_STILL_M = 0.05  # largest scatter of the logged positions of a stationary node
+_SOME_TIME = np.timedelta64(1, "s")  # duration of the shortest recording in which motion of a node is detectable
 
 _CALIBRATION = f"{CONFIG}: calibration"
 
 
 def check_nodes_apart(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a problem for nodes of one flight beyond the radio horizon of each other, according to their logs."""
+    """Yield a problem for nodes of one flight that are beyond each other's radio horizon, according to their logs."""
     for flight in examined.campaign.flights if examined.waveform else ():
         for node in flight.nodes:
             key, other = (flight.name, flight.transmitter), (flight.name, node)
@@ -70,17 +72,17 @@ def check_nodes_apart(examined: Examination) -> Iterator[CampaignError]:
             if distance_m > horizon_m:
                 (a, b, _), (c, d, _) = middles
                 yield CampaignError(
-                    f"the log is {distance_m / 1e3:.0f} km from that of {flight.transmitter}: latitude {c:.4f}, "
+                    f"the track is {distance_m / 1e3:.0f} km from the track of {flight.transmitter}: latitude {c:.4f}, "
                     f"longitude {d:.4f} and latitude {a:.4f}, longitude {b:.4f}",
                     where=examined.campaign.track_file(*other),
                     expected=f"nodes in line of sight, within a distance of {horizon_m / 1e3:.0f} km",
-                    remedy="Check latitude and longitude in both logs (order, signs, degrees), and that both belong to "
-                    "the same flight.",
+                    remedy="Check latitude and longitude in both logs (order, signs, unit), and check that both logs "
+                    "belong to the same flight.",
                 )
 
 
 def check_distance(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a problem for image flights where all echoes of the scene arrive after the cyclic prefix."""
+    """Yield a problem for each image flight in which all echoes of the scene arrive after the cyclic prefix."""
     waveform = examined.waveform
     if waveform is None or examined.grid is None:
         return
@@ -94,7 +96,7 @@ def check_distance(examined: Examination) -> Iterator[CampaignError]:
             f"the scene is {_length(distance_m)} from the track of {flight.name} {', '.join(row[0] for row in far)}: "
             f"the shortest total path is {_length(path_m)}",
             where=f"{CONFIG}: scene",
-            expected=f"a total path of at most {_length(limit_m)}, the limit by waveform.{waveform.delay_key}",
+            expected=f"a total path of at most {_length(limit_m)}, the limit set by waveform.{waveform.delay_key}",
             remedy=_height_remedy(examined, distance_m)
             or likely_place(examined)
             or _CHECK.format(key=waveform.delay_key),
@@ -102,7 +104,7 @@ def check_distance(examined: Examination) -> Iterator[CampaignError]:
 
 
 def _height_remedy(examined: Examination, distance_m: float) -> str:
-    """Return the remedy if the distance between scene and track is mainly a height difference; else ''."""
+    """Return the remedy if the distance between scene and track is mainly a height difference; '' otherwise."""
     if examined.middle_m is None or examined.ground is None or examined.ground.dem:
         return ""
     above_m = float(geodetic_from_ecef(examined.middle_m)[2]) - examined.level_m
@@ -120,7 +122,7 @@ def _reach(
 ) -> tuple[float, float, float] | None:
     """Return distance from track to scene, shortest total path, and longest total path within the prefix, metres.
 
-    The first two are lower bounds over all pulses, the last is an upper bound.
+    The first two values are lower bounds over all pulses; the last value is an upper bound.
     """
     aperture, grid = pair_aperture(examined, flight, node, waveform), examined.grid
     if aperture is None or grid is None:
@@ -160,9 +162,9 @@ def _positions(examined: Examination, key: Key, times: Times) -> NDArray[np.floa
 
 
 def scene_points(examined: Examination) -> tuple[NDArray[np.float64], float]:
-    """Return (point, 3) float64 positions (m) on the scene, and the radius (m) about them that covers all its pixels.
+    """Return points of the scene, (point, 3) float64 m, and the radius (m) around each point that covers all pixels.
 
-    With a DEM the points have the height of the track, so that their distance is a lower bound for any terrain.
+    With a DEM, the points have the height of the track, so that their distance is a lower bound for any terrain.
     """
     grid = examined.grid
     if grid is None:
@@ -177,7 +179,7 @@ def _length(metres: float) -> str:
 
 
 def check_aperture(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a problem for each pair within range of the scene if the logs contain no motion of its nodes."""
+    """Yield a problem for each pair within range of the scene whose nodes, according to the logs, do not move."""
     waveform, transmitted = examined.waveform, examined.transmitted
     if waveform is None or transmitted is None:
         return
@@ -193,8 +195,8 @@ def check_aperture(examined: Examination) -> Iterator[CampaignError]:
             moved_m = max(float(np.linalg.norm(leg - leg[0], axis=1).max()) for leg in aperture.legs)
             if moved_m < max(wavelength_m, _STILL_M):
                 yield CampaignError(
-                    f"flight {flight.name}, pair {flight.transmitter}-{node}: no aperture, the nodes moved only "
-                    f"{100 * moved_m:.2g} cm (a bench recording?)",
+                    f"flight {flight.name}, pair {flight.transmitter}-{node}: no aperture, because the nodes moved by "
+                    f"only {100 * moved_m:.2g} cm (possibly a bench recording)",
                     where=examined.campaign.root / FLIGHTS,
                     expected=f"a flight past the scene, longer than a wavelength ({100 * wavelength_m:.0f} cm)",
                     remedy="Set the kind of the flight to bench and run `apertura bench`, or check its flight logs.",
@@ -202,7 +204,7 @@ def check_aperture(examined: Examination) -> Iterator[CampaignError]:
 
 
 def check_ground(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a problem for image flights in which a node is mostly at or below the terrain, or over 30 km above it."""
+    """Yield a problem for each image flight with a node mostly below the terrain, or more than 30 km above it."""
     waveform, grid, ground = examined.waveform, examined.grid, examined.ground
     if grid is None or ground is None:
         return
@@ -210,7 +212,7 @@ def check_ground(examined: Examination) -> Iterator[CampaignError]:
     for flight in examined.campaign.image_flights:
         positions_of: dict[str, NDArray[np.float64]] = {}
         for node in flight.nodes:
-            if waveform is None:  # pulse times are in phase histories, which are not read here: use all epochs
+            if waveform is None:  # use all epochs, because phase histories, which contain the pulse times, are not read
                 track = examined.tracks.get((flight.name, node))
                 positions_of |= {} if track is None else {node: track.position.values}
                 continue
@@ -236,13 +238,13 @@ def _height_problem(flight: str, wrong: dict[str, tuple[float, float]], *, dem: 
         f"flight {flight}, {', '.join(wrong)}: median height above the terrain {above_m:.1f} m (log "
         f"{above_m + ground_m:.1f} m, {source} {ground_m:.1f} m)",
         where=f"{CONFIG}: {key}",
-        expected=f"a node above the terrain, by at most {HIGHEST_M / 1e3:.0f} km",
+        expected=f"a node at most {HIGHEST_M / 1e3:.0f} km above the terrain, and not below the terrain",
         remedy=f"Check {check}, and the heights in the flight log (which may refer to the geoid).",
     )
 
 
 def check_calibration(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a problem if the calibration flight is invalid, lacks required pairs, or cannot reach the reflector."""
+    """Yield a problem if the calibration flight is invalid, lacks required pairs, or has the reflector out of range."""
     campaign = examined.campaign
     settings, flights = campaign.settings.calibration, {flight.name: flight for flight in campaign.flights}
     calibrating = [flight.name for flight in campaign.flights if flight.kind == "calibration"]
@@ -270,7 +272,7 @@ def check_calibration(examined: Examination) -> Iterator[CampaignError]:
             yield CampaignError(
                 f"flight {image.name} has pairs {', '.join(missing)}, which are not calibrated by {flight.name}",
                 where=f"{_CALIBRATION}.flight",
-                expected=f"only pairs of {flight.name}: {', '.join(flight.pairs)}",
+                expected=f"only pairs that occur in {flight.name}: {', '.join(flight.pairs)}",
                 remedy="Repeat the calibration with the same transmitter and nodes, or remove section calibration.",
             )
     yield from _reflector(examined, flight, settings)
@@ -322,8 +324,8 @@ def check_constants(examined: Examination) -> Iterable[CampaignError]:
     return ()
 
 
-_MOST_PAIRS = 16  # pairs opened, 0.2 s each; problems of others are reported by their steps
-_MOST_PIXELS = 1_000_000  # largest scene whose DEM heights are read here, 0.5 s; a larger one is read by step `terrain`
+_MOST_PAIRS = 16  # number of pairs opened, which takes 0.2 s each; steps report the problems of the other pairs
+_MOST_PIXELS = 1_000_000  # pixels of the largest scene whose DEM heights are read here, which takes 0.5 s
 
 
 def check_imaging(examined: Examination) -> Iterator[CampaignError]:
@@ -347,7 +349,7 @@ def check_imaging(examined: Examination) -> Iterator[CampaignError]:
 
 
 def check_plan(examined: Examination) -> Iterator[CampaignError]:
-    """Yield the problems of configured overrides that the planner cannot meet: engine, terrain model, presumming."""
+    """Yield the problems of configured engine, terrain model or presumming that the planner cannot comply with."""
     from apertura.stages.planning import accuracy_of, job_of, plan_job
 
     campaign, problems = examined.campaign, list[CampaignError]()
@@ -361,10 +363,10 @@ def check_plan(examined: Examination) -> Iterator[CampaignError]:
 
 
 def _opened(examined: Examination, problems: list[CampaignError]) -> tuple[list["OpenPair"], "OpenScene | None"]:
-    """Open the first pairs, from logs and headers, and the scene; append the problems of pairs that do not open.
+    """Open the first pairs, from logs and headers, and the scene; append the problems of pairs that cannot be opened.
 
-    Large phase histories are omitted. The scene is None if no pair of the first image flight opens, or the grid is too
-    large for reading the DEM.
+    Large phase histories are omitted. The scene is None if no pair of the first image flight can be opened, or if the
+    grid is too large for reading the DEM.
     """
     from apertura.core.scene.terrain import GridHeights
     from apertura.stages.pair import open_pair
@@ -392,7 +394,7 @@ def _opened(examined: Examination, problems: list[CampaignError]) -> tuple[list[
 
 
 def _recorded(examined: Examination, flight: Flight, pair: str) -> Times | None:
-    """Return the time tags of pulses recorded by both nodes; None for phase history, which contains its pulse times."""
+    """Return time tags of the pulses recorded by both nodes; None for phase histories, which contain their times."""
     if examined.waveform is None:
         return None
     tx, rx = (examined.recordings[flight.name, node] for node in pair.split("-"))

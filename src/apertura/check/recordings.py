@@ -26,13 +26,14 @@ from apertura.stages.positions import inside_segments
 from apertura.stages.transmitted import check_mixing
 
 _OFF = 0.2
-"""Tolerated relative deviation of intervals from 1/prf_hz: time tags have errors of a few ms, or 1 ms resolution."""
+"""Tolerated relative deviation of intervals from 1/prf_hz: time tags have errors of a few ms, or a resolution of 1 ms.
+"""
 
-_SOME = 0.1  # share of intervals of 1/prf_hz from which the longer intervals are attributed to missed pulses
+_SOME = 0.1  # least fraction of intervals equal to 1/prf_hz for which longer intervals are attributed to missed pulses
 
 
 def check_codes(examined: Examination) -> Iterator[CampaignError]:
-    """Yield the problems of the file with the codes, or with the transmitted pulse."""
+    """Yield the problems of the file that contains the codes or the transmitted pulse."""
     waveform = examined.waveform
     if waveform is None:
         return
@@ -42,7 +43,7 @@ def check_codes(examined: Examination) -> Iterator[CampaignError]:
 
 
 def check_recordings(examined: Examination) -> Iterator[CampaignError]:
-    """Yield problems of recordings that cannot be opened, or whose carrier or sample rate differs from the waveform."""
+    """Yield problems of recordings that cannot be opened, or contradict the waveform in carrier or sample rate."""
     yield from examined.recording_problems
     waveform = examined.waveform
     if waveform is None:
@@ -61,7 +62,7 @@ def check_recordings(examined: Examination) -> Iterator[CampaignError]:
 
 
 def check_receivers(examined: Examination) -> Iterator[CampaignError]:
-    """Yield problems of receivers that lack a required channel, or have captures shorter than prefix and DFT window."""
+    """Yield problems of recordings that lack a required channel, or whose captures are shorter than required."""
     waveform = examined.waveform
     if waveform is None:
         return
@@ -86,9 +87,10 @@ def check_histories(examined: Examination) -> Iterator[CampaignError]:
 
 
 def check_intervals(examined: Examination) -> Iterator[CampaignError]:
-    """Yield problems of recordings whose time tag interval differs from 1/prf_hz, other than by missed pulses.
+    """Yield problems of recordings whose time tag interval differs from 1/prf_hz for a reason other than missed pulses.
 
-    A receiver may record only every second or third pulse: each of these pulses has a match at the transmitter.
+    A receiver that records only every second or third pulse is accepted, because each of its pulses has a match at the
+    transmitter.
     """
     waveform = examined.waveform
     transmitters = {(flight.name, flight.transmitter) for flight in examined.campaign.flights}
@@ -101,7 +103,7 @@ def check_intervals(examined: Examination) -> Iterator[CampaignError]:
         if whole and key not in transmitters:
             continue
         ordinal = {2: "second", 3: "third"}.get(whole, f"{whole}th")
-        reason = f": only every {ordinal} pulse was recorded, or waveform.prf_hz is {whole} times the true one"
+        reason = f": only every {ordinal} pulse was recorded, or waveform.prf_hz is {whole} times the true rate"
         yield CampaignError(
             f"time tag interval {interval_s:.6g} s ({1 / interval_s:.6g} Hz){reason if whole else ''}",
             where=recording.files[0],
@@ -111,7 +113,7 @@ def check_intervals(examined: Examination) -> Iterator[CampaignError]:
 
 
 def odd_interval_s(times: Times, prf_hz: float) -> float | None:
-    """Return the interval of time tags if it differs from 1/prf_hz, singly and averaged over 16; None if it agrees.
+    """Return the interval of time tags if single intervals and means over 16 intervals differ from 1/prf_hz, else None.
 
     Examples
     --------
@@ -133,7 +135,7 @@ def odd_interval_s(times: Times, prf_hz: float) -> float | None:
 
 
 def check_overlap(examined: Examination) -> Iterator[CampaignError]:
-    """Yield problems of pairs of nodes without a common pulse, by frame numbers if available, else by time tags."""
+    """Yield problems of pairs of nodes without common pulses, judged by frame numbers if available, else by times."""
     waveform = examined.waveform
     for flight in examined.campaign.flights if waveform else ():
         tx = examined.recordings.get((flight.name, flight.transmitter))
@@ -157,7 +159,7 @@ def _nothing_in_common(tx: Recording, rx: Recording, prf_hz: float) -> CampaignE
             f"frame numbers {first} and {second}, without a common number",
             where=where,
             expected="recordings of the same pulses",
-            remedy="Check that both recordings are of the same flight, and check apertura:frame of their captures.",
+            remedy="Check that both recordings belong to the same flight, and check apertura:frame of their captures.",
         )
     if seconds_between(recorded_span(tx), recorded_span(rx)) <= 1 / prf_hz:
         return None
@@ -167,12 +169,12 @@ def _nothing_in_common(tx: Recording, rx: Recording, prf_hz: float) -> CampaignE
         f"recorded {first} and {second}, a difference of {abs(shift):.1f} s{mistaken_time(shift)}",
         where=where,
         expected="time tags of the same pulses",
-        remedy="Check that both recordings are of the same flight, and check their core:datetime.",
+        remedy="Check that both recordings belong to the same flight, and check core:datetime of their captures.",
     )
 
 
 def check_segments(examined: Examination) -> Iterator[CampaignError]:
-    """Yield problems of pairs without a pulse inside their segments in segments.tsv."""
+    """Yield problems of pairs that have no pulse inside the segments given in segments.tsv."""
     campaign, waveform = examined.campaign, examined.waveform
     for flight in campaign.image_flights:
         tx = examined.recordings.get((flight.name, flight.transmitter))

@@ -1,4 +1,4 @@
-"""Times of recordings and logs: span, rate, gaps, and the overlap of two of them."""
+"""Times of recordings and logs: span, rate, gaps, and the overlap of two recordings or logs."""
 
 from dataclasses import dataclass
 from math import fsum
@@ -15,10 +15,10 @@ Span = tuple[np.datetime64, np.datetime64]
 """First and last time."""
 
 LOST_CAPTURE = 1.5
-"""Separation of captures, in intervals, above which a capture is missing between them."""
+"""Separation of two captures, in intervals, above which a capture between them is missing."""
 
 LAG = 16
-"""Number of intervals over which a rate is also measured, to average the rounding of single times."""
+"""Number of intervals over which a rate is additionally averaged, to reduce the effect of rounded times."""
 
 _UNIX_DAYS = np.timedelta64(3650, "D")
 
@@ -34,13 +34,13 @@ class TimeFacts:
     span
         First and last time.
     clock
-        'UTC'; 'its own' for a clock that was not set; 'none' for times that only count pulses.
+        'UTC'; 'its own' for a clock that was never set; 'none' if the times only count pulses.
     interval_s
         Typical interval, seconds; inf for a single time.
     gap_at
-        (gap,) intp: indices of the first time after each gap.
+        (gap,) intp: index of the first time after each gap.
     after_s, gap_s
-        (gap,) float64: start of each gap, seconds since the first time, and its duration.
+        (gap,) float64: start of each gap, in seconds since the first time, and duration of each gap, seconds.
     """
 
     count: int
@@ -58,7 +58,7 @@ class TimeFacts:
 
     @property
     def rate_hz(self) -> float | None:
-        """Rate outside gaps, Hz; None for a single time."""
+        """Rate of times outside gaps, Hz; None for a single time."""
         return 1 / self.interval_s if 0 < self.interval_s < np.inf else None
 
     @property
@@ -73,9 +73,9 @@ def time_facts(times: Times, *, longer: float) -> TimeFacts:
     Parameters
     ----------
     times
-        (time,) datetime64[ns], ascending, at least one.
+        (time,) datetime64[ns], ascending, at least one time.
     longer
-        Least duration of a gap, in typical intervals.
+        Minimum duration of a gap, in typical intervals.
 
     Examples
     --------
@@ -126,8 +126,8 @@ def steps_s(times: Times, *, over: int = 1) -> NDArray[np.float64]:
 def interval_s(times: Times) -> float:
     """Return the typical interval, seconds; inf for a single time.
 
-    The median of single intervals selects stretches without losses; the mean over these is not limited by the
-    resolution of the times.
+    The median of single intervals selects the stretches without losses. The mean over these stretches is not limited by
+    the resolution of the times.
 
     Examples
     --------
@@ -158,7 +158,7 @@ def gaps(times: Times, longer: float) -> NDArray[np.intp]:
 
 
 def own_clock(times: Times) -> bool:
-    """Return True if times are within ten years of the Unix epoch, as from a clock that was never set.
+    """Return True if times are within ten years of the Unix epoch, which indicates a clock that was never set.
 
     Examples
     --------
@@ -169,7 +169,7 @@ def own_clock(times: Times) -> bool:
 
 
 def counted(times: Times) -> bool:
-    """Return True if times count pulses, one per second from the Unix epoch, as without a clock.
+    """Return True if times only count pulses, one per second from the Unix epoch, which indicates a missing clock.
 
     Examples
     --------
@@ -180,7 +180,7 @@ def counted(times: Times) -> bool:
 
 
 def recorded_span(recording: Recording) -> Span:
-    """Return the times of the first and the last capture; of the first and the last sample if continuous."""
+    """Return the times of the first and last capture; for a continuous recording, of the first and last sample."""
     first, last = recording.captures.time[0], recording.captures.time[-1]
     if recording.framing is not None:
         last = last + np.timedelta64(round(len(recording.samples) / recording.sample_rate_hz * 1e9), "ns")
@@ -188,7 +188,7 @@ def recorded_span(recording: Recording) -> Span:
 
 
 def frame_numbers(recording: Recording) -> NDArray[np.int64]:
-    """Return (n,) int64, the frame numbers of the captures that have one."""
+    """Return the frame numbers of the captures that have a frame number, (n,) int64."""
     frame = recording.captures.frame
     return np.asarray(frame[frame >= 0])
 
@@ -196,14 +196,14 @@ def frame_numbers(recording: Recording) -> NDArray[np.int64]:
 def common_pulses(tx: Recording, rx: Recording, prf_hz: float) -> Times:
     """Return the transmitter's time tags of pulses that certainly have a match in the receiver's recording.
 
-    Pulses are matched by frame numbers if both nodes record them, else by the time span, reduced by one interval at
-    either end. The result is empty if a counter wraps or a recording is continuous: headers then do not contain the
-    pulses.
+    Pulses are matched by frame numbers if both nodes record frame numbers; otherwise by the receiver's time span,
+    reduced by one interval at either end. The result is empty if a frame counter wraps or a recording is continuous,
+    because the pulses then cannot be identified from the headers.
 
     Parameters
     ----------
     tx, rx
-        Recordings of the transmitting and of the receiving node, which may be the same.
+        Recordings of the transmitting and of the receiving node, which may be the same node.
     prf_hz
         Pulses per second.
     """
@@ -222,7 +222,7 @@ def common_pulses(tx: Recording, rx: Recording, prf_hz: float) -> Times:
 
 
 def expected_pulses(tx: Recording, rx: Recording, prf_hz: float) -> Times:
-    """Return time tags as `common_pulses`; if they are unknown, a regular series over the transmitter's recording."""
+    """Return the result of `common_pulses`, or, if that is empty, a regular series over the transmitter's recording."""
     times = common_pulses(tx, rx, prf_hz)
     if times.size:
         return times
@@ -232,7 +232,7 @@ def expected_pulses(tx: Recording, rx: Recording, prf_hz: float) -> Times:
 
 
 def inside(times: Times, span: Span) -> NDArray[np.bool_]:
-    """Return (time,) bool, True for times inside a span, both ends included.
+    """Return (time,) bool, True for times inside a span, including both ends.
 
     Examples
     --------
@@ -260,6 +260,6 @@ def seconds_between(first: Span, second: Span) -> float:
 
 
 def shift_s(first: Span, second: Span) -> float:
-    """Return the delay of the second span's midpoint relative to the first span's, seconds."""
+    """Return the delay of the midpoint of the second span relative to the midpoint of the first, seconds."""
     one_second = np.timedelta64(1, "s")
     return float(((second[0] - first[0]) / one_second + (second[1] - first[1]) / one_second) / 2)

@@ -1,4 +1,4 @@
-"""Check that flight logs can be read, belong to their flight, and cover the pulses of their nodes."""
+"""Check that flight logs can be read, belong to the flight, and cover the pulses of the nodes."""
 
 from collections.abc import Iterator
 
@@ -14,17 +14,17 @@ from apertura.formats.tracks.track import FIXES
 from apertura.methods.causes import mistaken_time
 
 FASTEST_M_S = 340.0
-"""Largest median speed of a node: above the speed of sound, times or positions have another unit."""
+"""Largest accepted median speed of a node, m/s: a supersonic speed indicates a wrong unit of times or positions."""
 
 
 def check_tracks(examined: Examination) -> Iterator[CampaignError]:
-    """Yield problems of logs that cannot be read, have different frames, no heights, or a supersonic speed."""
+    """Yield problems of logs that cannot be read, have different frames, lack heights, or have a supersonic speed."""
     yield from examined.track_problems
     for key, log in examined.logs.items():
         found = expected = remedy = ""
         if log.frame != examined.frame:
-            found, expected = f"positions in frame {log.frame}", f"frame {examined.frame}, like the other logs"
-            remedy = "Provide logs in one frame."
+            found, expected = f"positions in frame {log.frame}", f"frame {examined.frame}, as in the other logs"
+            remedy = "Provide all logs in the same frame."
         elif log.frame == "ecef" and np.abs(log.bounds["height_m"]).max() < 1e-3:
             found, expected = "height 0 at every epoch", "metres above the ellipsoid"
             remedy = "Export the log with heights."
@@ -36,9 +36,10 @@ def check_tracks(examined: Examination) -> Iterator[CampaignError]:
 
 
 def check_attitude(examined: Examination) -> Iterator[CampaignError]:
-    """Yield problems of nodes whose log lacks the required attitude, or has it in radians or anticlockwise.
+    """Yield problems of nodes whose log lacks the required attitude, or has an attitude in radians or anticlockwise.
 
-    A wrong unit or sense of rotation is certain only with courses in most directions; else step `echo` raises a flag.
+    A wrong unit or sense of rotation is only certain if the courses cover most directions; otherwise, step `echo`
+    raises a flag.
     """
     from apertura.stages.node_log import yaw_fault_of
 
@@ -58,9 +59,9 @@ def check_attitude(examined: Examination) -> Iterator[CampaignError]:
             yield CampaignError(
                 "no roll, pitch and yaw",
                 where=campaign.track_file(flight, node),
-                expected=f"an attitude at every epoch, since {CONFIG}: nodes.{node}.attitude is log",
-                remedy="Log the attitude, set the node's attitude to course, or its lever arms to zero and antennas to "
-                "null.",
+                expected=f"an attitude at every epoch, because {CONFIG}: nodes.{node}.attitude is log",
+                remedy="Log the attitude; or set the node's attitude to course; or set its lever arms to zero and its "
+                "antennas to null.",
             )
 
 
@@ -78,10 +79,10 @@ def _uses_attitude(campaign: Campaign, flight: str, node: str) -> bool:
 
 
 def check_coverage(examined: Examination) -> Iterator[CampaignError]:
-    """Yield problems of logs that do not cover their pulses, or have only poor solutions.
+    """Yield problems of logs that do not cover the pulses of their nodes, or have only poor solutions.
 
-    Both nodes have their positions at the transmitter's time tags. Pulses beyond an end of the log whose solution is
-    poorer than fixed may be excluded by the configuration, and are not reported here.
+    The positions of both nodes are evaluated at the transmitter's time tags. Pulses beyond an end of the log are not
+    reported here if the solution at that end is poorer than fixed, because the configuration may exclude these pulses.
     """
     waveform = examined.waveform
     reported: set[Key] = set()
@@ -106,7 +107,7 @@ def check_coverage(examined: Examination) -> Iterator[CampaignError]:
 
 
 def _no_overlap(examined: Examination, key: Key) -> CampaignError | None:
-    """Return the problem of a log without overlap with a continuous recording, whose pulse times are unknown."""
+    """Return the problem of a log that does not overlap a continuous recording (with unknown pulse times)."""
     log, recorded = examined.logs[key].times.span, recorded_span(examined.recordings[key])
     shift = shift_s(recorded, log)
     found = f"the times of log and recording differ by {abs(shift):.1f} s{mistaken_time(shift)}"
@@ -137,7 +138,7 @@ def _uncovered(examined: Examination, key: Key, pulses: Times) -> CampaignError 
 
 
 def _all_poor(examined: Examination, key: Key, pulses: Times) -> CampaignError | None:
-    """Return the problem of a log whose epochs during the pulses all have a poorer solution than configured."""
+    """Return the problem of a log whose epochs during the pulses all have a solution poorer than the configured one."""
     track, node = examined.tracks[key], examined.campaign.settings.nodes[key[1]]
     worst = node.worst_fix
     if "fix" not in track or not pulses.size or worst == "any":
@@ -154,7 +155,7 @@ def _all_poor(examined: Examination, key: Key, pulses: Times) -> CampaignError |
         f"all {int(during.sum())} epochs during the pulses have a solution poorer than {node.poorest_fix}",
         where=examined.campaign.track_file(*key),
         expected=f"solutions allowed by {CONFIG}: nodes.{key[1]}.worst_fix",
-        remedy="Process the log again, or allow poorer solutions by this key.",
+        remedy="Process the log again, or set this key to allow poorer solutions.",
     )
 
 

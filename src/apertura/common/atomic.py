@@ -16,8 +16,8 @@ from apertura.common.confined import ConfinedPath
 def replacement(path: Path) -> Iterator[Path]:
     """Yield a temporary path for a file or folder that becomes `path` when the body finishes without an error.
 
-    A second writer of the same path waits for a kernel lock, which is released when its process exits. Files left by a
-    killed writer are removed by the next writer.
+    A second writer of the same path waits for a kernel lock, which is released when the first writer's process exits.
+    Files left by a killed writer are removed by the next writer.
 
     Parameters
     ----------
@@ -80,10 +80,10 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
 
 
 def write_beside(path: Path, content: bytes) -> None:
-    """Write a file with a single writer under a temporary name, flush it to disk and rename it; create its folder.
+    """Write a file under a temporary name, flush it to disk and rename it; create its folder; a single writer only.
 
     After a power failure the file is complete or absent. A killed writer leaves a file ``<name>.….partial``, which the
-    owner of the folder has to remove. `replacement` is slower but removes such files.
+    owner of the folder has to remove. `replacement` is slower, but removes such files and permits several writers.
 
     Examples
     --------
@@ -116,7 +116,7 @@ def rename(source: Path, target: Path) -> None:
 
 
 def date(paths: Iterable[ConfinedPath], *, earliest_ns: int, latest_ns: int) -> None:
-    """Clip the modification times of files to an interval, if permitted."""
+    """Clip the modification times of files to an interval; files of other users remain unchanged."""
     for path in paths:
         with suppress(OSError):
             state = path.stat()
@@ -132,7 +132,7 @@ def remove(path: Path) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Add the path to an `OSError` raised in the body, because errors of write calls contain no path.
+    """Add the path to an `OSError` raised in the context, because errors of write calls contain no path.
 
     Examples
     --------
@@ -165,7 +165,7 @@ def made_folder(path: Path) -> ConfinedPath:
 
 @contextmanager
 def _naming_target(folder: Path, path: Path) -> Iterator[None]:
-    """Replace the path in an `OSError` of the body by the target, if it is missing or inside the work folder."""
+    """Set the path in an `OSError` raised in the context to the target, if it is missing or in the work folder."""
     try:
         yield
     except OSError as error:
@@ -176,7 +176,7 @@ def _naming_target(folder: Path, path: Path) -> Iterator[None]:
 
 @contextmanager
 def _locked(work: ConfinedPath) -> Iterator[None]:
-    """Hold ``work/.lock``; on leaving, remove both."""
+    """Hold the lock ``work/.lock``; on exit, remove the lock file and the work folder."""
     name = work / ".lock"
     while True:
         work.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Import closure of a module, and the source of these modules without comments and docstrings, for code hashes.
+"""Import closure of modules, and the source of all modules in the closure, for code hashes.
 
 Imports inside functions are included. Comments, docstrings and modules that affect no value of a result
 (`WITHOUT_EFFECT`) are excluded.
@@ -25,7 +25,7 @@ WITHOUT_EFFECT = (
     "apertura.common.progress",  # progress reports
     "apertura.common.processes",  # module search path and exit of a process
     "apertura.workflow.lineage",  # sources, settings and code of a result: each is recorded in the manifest
-    "apertura.workflow.rules",  # the rule table behind lineage
+    "apertura.workflow.rules",  # the rule table that lineage evaluates
     "apertura.workflow.rule_inputs",
     "apertura.campaign.digests",  # hashes of the sources
 )
@@ -36,7 +36,7 @@ _TEXT_OR_COMMENT = re.compile(
     re.DOTALL,
 )
 _GOES_ON = frozenset("([{,=+-*/%|&<>\\")
-"""Last characters of a line whose statement continues; a string on the next line is a value, not a docstring."""
+"""Characters after which a statement continues on the next line; a string on that line is a value, not a docstring."""
 
 
 def import_closure(modules: Iterable[str], *, package: Path = PACKAGE) -> dict[str, Path]:
@@ -97,7 +97,7 @@ def _source(name: str, package: Path) -> Path | None:
 
 
 def _source_outside(name: str) -> Path | None:
-    """Find the source of a module of another distribution: a plug-in for exports or engines, or a module it imports."""
+    """Find the source of a module of another distribution: an export or engine plug-in, or a module that it imports."""
     spec = importlib.util.find_spec(_top(name))
     if spec is None or spec.origin is None:
         return None
@@ -128,7 +128,7 @@ def _parsed_imports(name: str, path: Path) -> list[str]:
             above = package.split(".")[: len(package.split(".")) - statement.level + 1] if statement.level else []
             module = ".".join(filter(None, [*above, statement.module or ""]))
             names += [module, *(f"{module}.{alias.name}" for alias in statement.names)]
-        elif isinstance(statement, ast.If) and ast.unparse(statement.test) == "TYPE_CHECKING":  # never run
+        elif isinstance(statement, ast.If) and ast.unparse(statement.test) == "TYPE_CHECKING":  # never executed
             waiting += statement.orelse
         else:
             bodies = (getattr(statement, field, []) for field in ("body", "orelse", "finalbody"))
@@ -143,7 +143,7 @@ _KEPT = PACKAGE / "__pycache__" / "imports.json"
 
 @functools.cache
 def _kept() -> dict[str, list[Any]]:
-    """Return the imports cached by earlier processes, to which this process adds its own."""
+    """Return the imports cached by earlier processes; this process adds the imports of the modules that it parses."""
     with suppress(OSError, ValueError):
         kept: dict[str, list[Any]] = json.loads(_KEPT.read_text(encoding="utf-8"))
         return kept
@@ -166,7 +166,7 @@ def _keep_at_exit() -> None:
 
 @functools.cache
 def without_description(source: str) -> str:
-    r"""Strip comments and empty lines from a Python source and replace docstrings by ellipses.
+    r"""Remove comments and empty lines from a Python source, and replace docstrings by ellipses.
 
     Examples
     --------

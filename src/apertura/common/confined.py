@@ -1,9 +1,9 @@
 """Confined paths of a campaign folder: access below the folder is relative to a descriptor and follows no link.
 
-A campaign folder is untrusted, and other processes may write to it at any time. Files in it are therefore never opened
-by their full path, in which the kernel follows links: each component is opened with ``O_NOFOLLOW`` relative to the
-descriptor of its parent (openat(2)), and only regular files and folders are accepted. The path of the campaign folder
-itself is trusted and may contain links.
+A campaign folder is untrusted, and other processes may write to it at any time. Files in the folder are therefore never
+opened by full path, in which the kernel follows links. Instead, each component is opened with ``O_NOFOLLOW`` relative
+to the descriptor of its parent (openat(2)), and only regular files and folders are accepted. The path of the campaign
+folder itself is trusted and may contain links.
 """
 
 import errno
@@ -21,7 +21,7 @@ from typing import IO, Any, NoReturn
 from apertura.common.errors import CampaignError, quoted
 
 LARGEST_READ = 1 << 30
-"""Maximum size of a file that is read at once, such as an array chunk, bytes; documents have lower limits."""
+"""Maximum size of a file that is read as a whole, such as an array chunk, bytes; documents have lower limits."""
 
 _FOLDER = os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC
 _BELOW = _FOLDER | os.O_NOFOLLOW
@@ -38,16 +38,19 @@ _WRITES = os.O_WRONLY | os.O_RDWR
 _KINDS = {stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket", stat.S_IFBLK: "a device", stat.S_IFCHR: "a device"}
 _DESCRIPTORS = Path("/proc/self/fd")
 _EXPECTED = "a regular file or folder: nothing in a campaign folder is read, written or deleted through a link"
-_REMEDY = "Remove it. The campaign folder itself may be a link, and `raw_root` in the config may name another raw/."
+_REMEDY = (
+    "Remove this entry. The campaign folder itself may be a link; `raw_root` in the config may name a folder elsewhere "
+    "that replaces raw/."
+)
 
 
 class ConfinedPath(PosixPath):
     """Path in a campaign folder, through which no file outside the folder can be accessed.
 
-    The class has the methods of `pathlib.Path` that apertura uses. Reading and writing through a symbolic link, and
-    opening anything but a regular file or folder, raise `CampaignError`; removing a link does not affect its target.
-    Paths derived from a confined path are confined, too. The class is not an `os.PathLike`: for libraries that open
-    files by name, use `on_disk`.
+    The class has the methods of `pathlib.Path` that apertura uses. `CampaignError` is raised on reading and writing
+    through a symbolic link, and on opening anything other than a regular file or folder. Removing a link does not
+    affect its target. Paths derived from a confined path are confined, too. The class does not implement `os.PathLike`:
+    for libraries that open files by name, use `on_disk`.
 
     Examples
     --------
@@ -73,7 +76,7 @@ class ConfinedPath(PosixPath):
         folder
             The root folder; its path may be or contain a link.
         elsewhere
-            Name of a subfolder → folder outside the root that replaces the subfolder, accessed under the same rules.
+            Name of a subfolder → folder outside the root that replaces the subfolder; access to it is confined, too.
         """
         if isinstance(folder, ConfinedPath):
             return folder
@@ -98,7 +101,7 @@ class ConfinedPath(PosixPath):
         name
             Path relative to this folder, with slashes.
         where
-            Document and key that contain the name, for the message.
+            Document and key that contain the name, for the error message.
 
         Raises
         ------
@@ -174,7 +177,7 @@ class ConfinedPath(PosixPath):
 
     @property
     def location(self) -> Path:
-        """Actual path, with replaced subfolders; for display only, not for opening."""
+        """Actual path, with subfolders replaced as stated in `at`; for display only, not for opening."""
         first, *rest = self.parts[len(self._top.parts) :] or ("",)
         return self._elsewhere[first].joinpath(*rest) if first in self._elsewhere else Path(self)
 
@@ -210,7 +213,7 @@ class ConfinedPath(PosixPath):
 
     @contextmanager
     def _within(self, *, make: bool = False) -> Iterator[tuple[int, str]]:
-        """Yield a descriptor of the parent folder, and the name in it; create missing folders if `make`."""
+        """Yield a descriptor of the parent folder, and the name of the entry; create missing folders if `make`."""
         top, parts = self._components()
         try:
             folder = os.open(top, _FOLDER)
@@ -226,7 +229,7 @@ class ConfinedPath(PosixPath):
             finally:
                 os.close(folder)
         except OSError as error:
-            if not str(error.filename or "").startswith(os.sep):  # a name relative to its folder
+            if not str(error.filename or "").startswith(os.sep):  # a name relative to the parent folder
                 error.filename = str(self)
             raise
 
@@ -240,13 +243,13 @@ class ConfinedPath(PosixPath):
             raise
 
     def descriptor(self, flags: int) -> int:
-        """Open a regular file as `os.open` does, and return its descriptor.
+        """Open a regular file with the flags of `os.open`, and return its descriptor.
 
         Raises
         ------
         CampaignError
-            If the path is or contains a symbolic link, is not a regular file, or is opened for writing and has further
-            hard links, through which a file outside the folder would be changed.
+            If the path is or contains a symbolic link, or is not a regular file; also if a file with further hard links
+            is opened for writing, because this would change a file outside the folder.
         """
         with self._within() as (folder, name):
             try:
@@ -285,9 +288,12 @@ class ConfinedPath(PosixPath):
             os.close(entered)
 
     def copy_to(self, target: Path, *, link: bool = False) -> None:
-        """Copy a file; if `link`, as a hard link where possible."""
+        """Copy a file; with `link`, create a hard link instead where possible."""
         if link:
-            with suppress(OSError), self._within() as (folder, name):  # not on another disk, or for another user's file
+            with (
+                suppress(OSError),
+                self._within() as (folder, name),
+            ):  # fails on another disk, or for other users' files
                 os.link(name, target, src_dir_fd=folder, follow_symlinks=False)
                 return
         with self.open("rb") as source, target.open("wb") as copy:
@@ -307,8 +313,8 @@ class ConfinedPath(PosixPath):
     def on_disk(self) -> Iterator[Path]:
         """Yield an ordinary path to this file or folder, for libraries that open files by name.
 
-        The path is valid in this process and its forks until the context exits. As the access of a library to the
-        content of a folder is not confined, apertura only passes files, and folders that it has just created.
+        The path is valid in this process and its forks until the context exits. The access of a library to the content
+        of a folder is not confined. Therefore apertura only passes files, and folders that it has just created.
         """
         if self.is_dir():
             with self.folder() as opened:
@@ -323,7 +329,7 @@ class ConfinedPath(PosixPath):
     # ---- Reading ----------------------------------------------------------------------------------------------------
 
     def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:
-        """Override `pathlib.Path.stat`; raise CampaignError for a link that would be followed."""
+        """Override `pathlib.Path.stat`; raise CampaignError for a link if links are to be followed."""
         with self._within() as (folder, name):
             state = os.stat(name, dir_fd=folder, follow_symlinks=False)
         if follow_symlinks and stat.S_ISLNK(state.st_mode):
@@ -385,7 +391,10 @@ class ConfinedPath(PosixPath):
             size = os.fstat(stream.fileno()).st_size
             if size > largest:
                 raise CampaignError(
-                    f"{size} bytes", self, f"a file of at most {largest} bytes", "Remove it if it is the wrong file."
+                    f"{size} bytes",
+                    self,
+                    f"a file of at most {largest} bytes",
+                    "Remove the file if it is the wrong file.",
                 )
             return stream.read()  # type: ignore[no-any-return]
 
@@ -400,7 +409,7 @@ class ConfinedPath(PosixPath):
             return os.open(name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=folder)
 
     def _entries(self) -> list[tuple[str, bool]]:
-        """List the entries of a folder: sorted names, and True for folders; empty if the folder does not exist."""
+        """List the sorted entries of a folder: name, and True if a folder; empty if the folder does not exist."""
         try:
             opened = self._opened_folder()
         except (FileNotFoundError, NotADirectoryError):
@@ -430,7 +439,7 @@ class ConfinedPath(PosixPath):
             yield from (self / name).walk()
 
     def rglob(self, pattern: str, **_: Any) -> Iterator["ConfinedPath"]:  # type: ignore[override]
-        """Yield the entries below a folder whose name matches, sorted folder by folder; links are not followed."""
+        """Yield entries at any depth whose name matches a pattern, sorted in each folder; links are not followed."""
         for folder, folders, files in self.walk():
             yield from (folder / name for name in sorted((*folders, *files)) if fnmatchcase(name, pattern))
 
@@ -465,11 +474,11 @@ class ConfinedPath(PosixPath):
             except FileExistsError:
                 if not exist_ok:
                     raise
-                with suppress(FileNotFoundError):  # another process has removed it meanwhile
+                with suppress(FileNotFoundError):  # another process has removed the folder meanwhile
                     os.close(self._entered(folder, name))
 
     def unlink(self, missing_ok: bool = False) -> None:
-        """Override `pathlib.Path.unlink`: a link is removed, its target remains."""
+        """Override `pathlib.Path.unlink`: a link is removed, but its target remains."""
         try:
             with self._within() as (folder, name):
                 os.unlink(name, dir_fd=folder)
@@ -491,7 +500,7 @@ class ConfinedPath(PosixPath):
                 os.unlink(name, dir_fd=folder)
 
     def rename(self, target: Any) -> "ConfinedPath":
-        """Rename a file or folder within the campaign; an existing file or empty folder of that name is replaced."""
+        """Rename a file or folder within the campaign; an existing file or empty folder at `target` is replaced."""
         renamed = ConfinedPath.of(target)
         with self._within() as (folder, name), renamed._within() as (other, new):
             os.rename(name, new, src_dir_fd=folder, dst_dir_fd=other)
@@ -529,7 +538,7 @@ class ConfinedPath(PosixPath):
 
 
 def on_disk(path: Path) -> AbstractContextManager[Path]:
-    """Return `ConfinedPath.on_disk` of a confined path; a context with the path itself otherwise."""
+    """Return `ConfinedPath.on_disk` of a confined path; for other paths, a context with the path itself."""
     return path.on_disk() if isinstance(path, ConfinedPath) else nullcontext(path)
 
 

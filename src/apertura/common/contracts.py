@@ -25,7 +25,12 @@ STANDARD_NAMES = {"incidence": "angle_of_incidence", "centre_frequency": "sensor
 Row = tuple[tuple[str, ...], str, str, str]
 
 RASTERS: dict[str, Row] = {
-    "image": (_RASTERS, "complex64", "1", "echo amplitude of every image; NaN: no flight or no image formed"),
+    "image": (
+        _RASTERS,
+        "complex64",
+        "1",
+        "echo amplitude of every image; NaN: no flight of the pair, or no image formed",
+    ),
     "coherent": (_SUMS, "complex64", "1", "mean of the peak-normalised images"),
     "noncoherent": (_SUMS, "float32", "1", "mean power of the peak-normalised images"),
     "magnitude": (_SUMS, "float32", "1", "mean magnitude of the peak-normalised images"),
@@ -38,8 +43,8 @@ RASTERS: dict[str, Row] = {
 
 _OF_COHERENCE = {
     "looks": "independent samples in the window of",
-    "chance": "expected value for unrelated images of",
-    "common_band": "upper limit for unchanged terrain, set by the common band, of",
+    "chance": "expected value, for unrelated images, of",
+    "common_band": "upper limit, set by the common band for unchanged terrain, of",
 }
 
 MEASURED: dict[str, Row] = {
@@ -49,7 +54,12 @@ MEASURED: dict[str, Row] = {
         for name, meaning in _OF_COHERENCE.items()
     },
     "coherent_noise_floor": (_FLIGHTS, "float64", "dB", "median power of the coherent sum relative to its peak"),
-    "clutter_reduction": (_FLIGHTS, "float64", "dB", "clutter of the images relative to that of their coherent sum"),
+    "clutter_reduction": (
+        _FLIGHTS,
+        "float64",
+        "dB",
+        "clutter of the images relative to the clutter of their coherent sum",
+    ),
 }
 """Quantities measured while the rasters are written."""
 
@@ -60,8 +70,13 @@ QUOTED: dict[str, Row] = {
     "heading": (_IMAGES, "float64", "degree", "direction of flight, clockwise from grid north"),
     "look_direction": (_IMAGES, "float64", "degree", "direction to the scene centre, clockwise from grid north"),
     "incidence": (_IMAGES, "float64", "degree", "incidence angle of the transmitter at the scene centre"),
-    "bistatic_angle": (_IMAGES, "float64", "degree", "angle between the directions to both antennas"),
-    "range": (_IMAGES, "float64", "m", "half the total path to the scene centre, at closest approach"),
+    "bistatic_angle": (
+        _IMAGES,
+        "float64",
+        "degree",
+        "angle at the scene centre between the directions to both antennas",
+    ),
+    "range": (_IMAGES, "float64", "m", "half the total path via the scene centre, at closest approach"),
     "height": (_IMAGES, "float64", "m", "height of the antennas' midpoint above the scene centre"),
     "centre_frequency": (_IMAGES, "float64", "Hz", "centre frequency of the band"),
     "bandwidth": (_IMAGES, "float64", "Hz", "bandwidth of the echo"),
@@ -70,10 +85,10 @@ QUOTED: dict[str, Row] = {
     "numerical_error": (_IMAGES, "float64", "dB", "upper limit of the numerical error relative to the image's rms"),
     "entropy": (_IMAGES, "float64", "1", "entropy of the image's power, nats"),
     "noise_floor": (_IMAGES, "float64", "dB", "median power of the image relative to its peak"),
-    "pulses_used": (_IMAGES, "float64", "1", "pulses in the image"),
-    "pulses_dropped": (_IMAGES, "float64", "1", "pulses excluded from the image"),
-    "peak": (_IMAGES, "float64", "1", "largest magnitude; divisor of the image in sums"),
-    "phase_removed": (_IMAGES, "float64", "rad", "phase removed before the coherent sum; NaN: not in the sum"),
+    "pulses_used": (_IMAGES, "float64", "1", "number of pulses that form the image"),
+    "pulses_dropped": (_IMAGES, "float64", "1", "number of pulses excluded from the image"),
+    "peak": (_IMAGES, "float64", "1", "largest magnitude, by which the image is divided in sums"),
+    "phase_removed": (_IMAGES, "float64", "rad", "phase removed before the coherent sum; NaN: pair not in the sum"),
     "verdict": (_IMAGES, "T", "", "focus: focused, defocused or inconclusive; empty: no flight"),
     "flags": (_IMAGES, "T", "", "comma-separated names of the image's flags"),
 }
@@ -83,8 +98,8 @@ COORDINATES: dict[str, Row] = {
     "flight": (("flight",), "T", "", "name of the flight"),
     "pair": (("pair",), "T", "", "transmitter-receiver"),
     "time": (("flight",), "datetime64[ns]", "", "mid-time of the flight, UTC"),
-    "reference_pair": (("flight",), "T", "", "reference for the other pairs of the flight"),
-    "reference_flight": (("pair",), "T", "", "reference for the other flights of the pair"),
+    "reference_pair": (("flight",), "T", "", "pair to which the other pairs of the flight are compared"),
+    "reference_flight": (("pair",), "T", "", "flight to which the other flights of the pair are compared"),
 }
 """Coordinates of the cube."""
 
@@ -142,8 +157,8 @@ STAGES: Mapping[str, Stage] = {
         {
             "start": Variable(("pulse",), "int64", "1", "first sample of the capture in the recorder's file"),
             "time": Variable(("pulse",), "datetime64[ns]", "", "UTC time tag of the capture, clock of the node"),
-            "frame": Variable(("pulse",), "int64", "1", "frame number sent in the payload; -1: none"),
-            "repeats": Variable(("pulse",), "bool", "1", "True if the capture is bit-identical to an earlier one"),
+            "frame": Variable(("pulse",), "int64", "1", "frame number transmitted in the payload; -1 if there is none"),
+            "repeats": Variable(("pulse",), "bool", "1", "True if the capture is bit-identical to an earlier capture"),
         },
         {
             "node": "node name",
@@ -153,11 +168,11 @@ STAGES: Mapping[str, Stage] = {
             "sample_rate_hz": "complex samples per second",
             "datatype": "SigMF datatype of the samples in the file",
             "trailing_bytes": "bytes at the end of the file that are not samples",
-            "mixing": "down-conversion of real samples: if_hz, sample_rate_hz, restarts; null: complex samples",
+            "mixing": "down-conversion of real samples (if_hz, sample_rate_hz, restarts); null for complex samples",
         },
         {
             "segment_start": Variable(("segment",), "int64", "1", "first sample after bytes that are not samples"),
-            "segment_skipped": Variable(("segment",), "int64", "1", "number of such bytes before the segment"),
+            "segment_skipped": Variable(("segment",), "int64", "1", "number of these bytes before the segment"),
         },
     ),
     "track": Stage(
@@ -177,7 +192,9 @@ STAGES: Mapping[str, Stage] = {
             "position_std": Variable(
                 ("epoch", "axis"), "float64", "m", "logged standard deviation: north, east, up; NaN where not logged"
             ),
-            "fix": Variable(("epoch",), "int8", "1", "solution type, RTKLIB's Q: 1 fix, 2 float …; 0 where not logged"),
+            "fix": Variable(
+                ("epoch",), "int8", "1", "solution type as Q of RTKLIB (1 fix, 2 float, …); 0 if not logged"
+            ),
         },
     ),
     "echo": Stage(
@@ -190,7 +207,7 @@ STAGES: Mapping[str, Stage] = {
         _FRAME | _WAVE,
         {
             **_TRANSFER,
-            "capture": Variable(("pulse",), "int64", "1", "source of `transfer`: capture in the receiver's recording"),
+            "capture": Variable(("pulse",), "int64", "1", "index of the pulse's capture in the receiver's recording"),
             "path_removed": Variable(
                 ("pulse",), "float64", "m", "electrical path outside the scene, already removed from `transfer`"
             ),
@@ -198,7 +215,7 @@ STAGES: Mapping[str, Stage] = {
                 ("pulse",), "float64", "Hz", "carrier offset of the receiver, already removed from its samples"
             ),
             "sidelink_delay": Variable(
-                ("pulse",), "float64", "m", "measured sidelink delay × c, with an arbitrary constant; NaN: no lock"
+                ("pulse",), "float64", "m", "measured sidelink delay × c, plus an arbitrary constant; NaN: no lock"
             ),
             "sidelink_snr": Variable(("pulse",), "float64", "dB", "sidelink SNR per subcarrier; NaN: no lock"),
             "sidelink_phase": Variable(("pulse",), "float64", "rad", "sidelink phase at mid-band; NaN: no lock"),
@@ -206,7 +223,7 @@ STAGES: Mapping[str, Stage] = {
                 ("pulse",), "float64", "1", "sidelink amplitude per subcarrier, ADC counts; NaN: no lock"
             ),
             "sidelink_vector": Variable(
-                ("pulse", "axis"), "float64", "m", "vector between sidelink antennas, receiver to transmitter"
+                ("pulse", "axis"), "float64", "m", "vector from the receiver's to the transmitter's sidelink antenna"
             ),
         }
         | {
@@ -221,44 +238,55 @@ STAGES: Mapping[str, Stage] = {
         {
             **_PULSE_GEOMETRY,
             "profile": Variable(
-                ("pulse", "range"), "complex64", "1", "range profile; in phase after × exp(+j2πf_mid·path/c)"
+                ("pulse", "range"),
+                "complex64",
+                "1",
+                "range profile; the factor exp(+j2πf_mid·path/c) aligns pulses in phase",
             ),
             "start": Variable(("pulse",), "float64", "m", "total path (tx → scene → rx) of range sample 0"),
         },
         {
             **_FRAME,
             **_WAVE,
-            "background": "echoes at constant delay: method requested, removed, and why",
-            "interference": "subcarriers and pulses with interference: how many, where, excluded or not",
+            "background": "echoes at constant delay: requested method, applied method, and reason",
+            "interference": "subcarriers and pulses with interference: number, frequencies, and whether they are excluded",
             "step_m": "total path between range samples, m",
             "centre_frequency_hz": "f_mid, reference frequency of the profile, Hz",
             "oversampling": "samples per resolution cell c/B of total path",
             "window": "weighting over the subcarriers",
-            "compression_error_db": "RMS error relative to the exact sum over subcarriers, at test samples, dB",
+            "compression_error_db": "rms error at test samples relative to the exact sum over subcarriers, dB",
         },
         {
             "background": Variable(
                 ("background_knot", "subcarrier"),
                 "complex64",
                 "1",
-                "removed, in delays of the recorder",
+                "removed background, with delays referred to the recorder's time base",
             ),
             "subcarrier_gain": Variable(
-                ("subcarrier",), "float32", "1", "factor of `transfer`: 0 where interference is excluded"
+                ("subcarrier",),
+                "float32",
+                "1",
+                "factor applied to `transfer`; 0 for subcarriers excluded for interference",
+            ),
+            "background_time": Variable(
+                ("background_knot",), "float64", "s", "times of the knots of `background`, since the first pulse"
             ),
             "interference_level": Variable(
-                ("subcarrier",), "float32", "1", "median power of `transfer`; limit of pulsed interference"
+                ("subcarrier",),
+                "float32",
+                "1",
+                "median power of `transfer`, reference for interference of single pulses",
             ),
-            "background_time": Variable(("background_knot",), "float64", "s", "of its knots, from the first pulse"),
         },
     ),
     "refined_track": Stage(
         {
             "time": Variable(("knot",), "datetime64[ns]", "", "UTC, transmitter's clock; linear between knots"),
             "further": Variable(
-                ("pair", "knot"), "float64", "m", "extra total path of all echoes of the pair, to be added"
+                ("pair", "knot"), "float64", "m", "extra total path, to be added to the path of all echoes of the pair"
             ),
-            "correction": Variable(_KNOTS, "float64", "m", "to be added to every position of the node, in `frame`"),
+            "correction": Variable(_KNOTS, "float64", "m", "vector to be added to positions of the node, in `frame`"),
             "std": Variable(_KNOTS, "float64", "m", "standard deviation of the residual error, per axis of `frame`"),
             "position": Variable(_KNOTS, "float64", "m", "radar phase centre according to the log, in `frame`"),
         },
@@ -266,20 +294,20 @@ STAGES: Mapping[str, Stage] = {
             "frame": _FRAME["frame"],
             "flags": "flags raised by the refinement: flag name → measured text, one line",
             "nodes": "names along `node`",
-            "pairs": "names along `pair`: pairs with an offset of their own; may be empty",
+            "pairs": "names along `pair`: pairs with a separate path offset; may be empty",
             "decisions": "autofocus, and autofocus_method if enabled: value and reason",
-            "accepted": "True if images are formed with the correction; why: reason; report: measured values",
-            "left": "effect of residual position errors on an image: loss_db, shift_m, phase_rad",
+            "accepted": "True if images are formed with the correction, see also attributes `reason` and `report`",
+            "left": "effect of the residual position errors on an image: loss_db, shift_m, phase_rad",
         },
     ),
     "terrain": Stage(
-        {"height": Variable(("y", "x"), "float64", "m", "terrain height: above the ellipsoid, or z of the frame")},
-        {"frame": _FRAME["frame"], "terrain": "the DEM: file, datum, geoid grid, lowest and highest terrain"},
+        {"height": Variable(("y", "x"), "float64", "m", "terrain height above the ellipsoid, or z in a local frame")},
+        {"frame": _FRAME["frame"], "terrain": "DEM file, datum, geoid grid, lowest and highest terrain"},
     ),
     "image": Stage(
         {
             "image": Variable(
-                ("y", "x"), "complex64", "1", "focused image with carrier phase; 1: echo amplitude; NaN: not formed"
+                ("y", "x"), "complex64", "1", "focused image with carrier phase, as echo amplitude; NaN: not formed"
             )
         },
         {**_FRAME, "quality": "engine, models, errors and measures, as in image.json"},
@@ -287,8 +315,8 @@ STAGES: Mapping[str, Stage] = {
     "cube": Stage(
         {name: row for name, row in _CUBE.items() if name not in SUMMED},
         {
-            "fusion": "flight → pairs of the coherent sum with the phase removed from each; excluded pairs, reasons",
-            "coherence_window": "side length in pixels of the window for coherence estimation",
+            "fusion": "flight → pairs of the coherent sum, phase removed from each; excluded pairs with reasons",
+            "coherence_window": "side length of the window for coherence estimation, pixels",
         },
         {name: row for name, row in _CUBE.items() if name in SUMMED},
     ),
@@ -301,7 +329,7 @@ def check(dataset: "xr.Dataset", stage: str) -> "xr.Dataset":
     Parameters
     ----------
     dataset
-        Dataset to check; dask arrays are not computed.
+        Dataset to be checked; dask arrays are not computed.
     stage
         A key of `STAGES`.
 

@@ -1,4 +1,4 @@
-"""Reading and validation of untrusted text, YAML and JSON files; every error is reported as a single message."""
+"""Reading and validation of untrusted text, YAML and JSON files; each error is converted to a single message."""
 
 import difflib
 import json
@@ -30,7 +30,7 @@ MOST_NODES = 100_000
 LARGEST_JSON = 64_000_000
 """Maximum size of a JSON file, bytes."""
 
-DAMAGED = "Delete it and run the workflow again."
+DAMAGED = "Delete the file and run the workflow again."
 """Remedy for a damaged result."""
 
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -126,7 +126,7 @@ def _count_nodes(text: str) -> None:
             size, name = sizes.pop(), names.pop()
         elif isinstance(event, yaml.AliasEvent):
             if event.anchor not in anchors:
-                raise _wrong(f"alias {quoted(event.anchor)} refers to no complete node before it", event)
+                raise _wrong(f"alias {quoted(event.anchor)} does not refer to a complete preceding node", event)
             size, name = anchors[event.anchor], ""
         elif isinstance(event, yaml.ScalarEvent):
             size, name = 1, event.anchor or ""
@@ -136,11 +136,11 @@ def _count_nodes(text: str) -> None:
             anchors[name] = size
         sizes[-1] += size
         if sizes[-1] > MOST_NODES:
-            raise _wrong(f"more than {MOST_NODES} values with aliases expanded", event)
+            raise _wrong(f"more than {MOST_NODES} values after expansion of aliases", event)
 
 
 def _check_nodes(root: yaml.Node) -> None:
-    """Raise YAMLError at a repeated key, a tag beyond plain values, or an integer of too many digits."""
+    """Raise YAMLError at a repeated key, a tag that is not a plain value, or an integer with too many digits."""
     visited, waiting = set[int](), [root]
     while waiting:
         node = waiting.pop()
@@ -193,19 +193,19 @@ def read_json(path: Path, *, expected: str, remedy: str, largest: int = LARGEST_
 
 @contextmanager
 def undamaged(path: Path, *, expected: str, remedy: str) -> Iterator[None]:
-    """Convert errors that are raised while a document is parsed into a single message about the file.
+    """Convert errors raised while a document is parsed to a single message about the file.
 
     Parameters
     ----------
     path
-        The file that the document was read from.
+        File of the document.
     expected, remedy
-        Parts of the message; the remedy for a damaged result is to delete it and run again.
+        Parts of the message; `remedy` is `DAMAGED` for a damaged result.
 
     Raises
     ------
     CampaignError
-        For every error that a missing key, a wrong type or a number out of range causes in the block.
+        For all errors that a missing key, a wrong type or a number out of range causes in the context.
     """
     try:
         yield
@@ -221,11 +221,11 @@ def _refuse_constant(name: str) -> float:
 
 
 CODECS = frozenset({"bytes", "transpose", "zstd", "gzip", "blosc", "crc32c", "sharding_indexed", "vlen-utf8"})
-"""Permitted codecs of zarr chunks. Others may be unsafe: the pickle codec of numcodecs executes code from the chunk."""
+"""Permitted codecs of Zarr chunks; others may be unsafe, such as the pickle codec, which executes code in a chunk."""
 
 
 def other_codec(metadata: object) -> str | None:
-    """Find a codec outside `CODECS` in Zarr version 3 metadata, at any depth.
+    """Find a codec that is not in `CODECS` in Zarr version 3 metadata, at any depth.
 
     Parameters
     ----------
@@ -256,7 +256,7 @@ def other_codec(metadata: object) -> str | None:
 T = TypeVar("T")
 
 _TYPE = r"(constrained-\w+|literal\[.*|function-.*|tuple\[.*|bool|int|float|str)$"
-"""Components that pydantic adds to the location of a key that accepts several types."""
+"""Components that pydantic adds to the location of a key if the key accepts several types."""
 
 _MOST_COMPLAINTS = 12
 
@@ -265,7 +265,7 @@ LARGEST_NUMBER = 1e15
 
 
 def validated(model: type[T], document: object, *, where: object, expected: str) -> T:
-    """Validate `document` as a `model`; a single message lists every invalid key with the most similar valid key.
+    """Validate `document` as a `model`; a single message lists all invalid keys, each with the most similar valid key.
 
     Parameters
     ----------
@@ -279,7 +279,7 @@ def validated(model: type[T], document: object, *, where: object, expected: str)
     Raises
     ------
     CampaignError
-        If keys or values are invalid; the message states file, key, value found and valid value.
+        If keys or values are invalid; the message states file, key, invalid value and valid values.
     """
     adapter = TypeAdapter(model)
     try:
@@ -319,11 +319,11 @@ def _complaints(error: ValidationError, schema: dict[str, Any]) -> str:
     lines = [f"{key}: {' or '.join(complaints[:_MOST_COMPLAINTS])}" for key, complaints in wrong.items()]
     lines.sort(key=lambda line: "unknown key" not in line)
     more = len(lines) > _MOST_COMPLAINTS or error.error_count() > 10 * _MOST_COMPLAINTS
-    return "; ".join(lines[:_MOST_COMPLAINTS]) + (f"; and more, {error.error_count()} in all" if more else "")
+    return "; ".join(lines[:_MOST_COMPLAINTS]) + (f"; and more, {error.error_count()} in total" if more else "")
 
 
 def _complaint(item: dict[str, Any], schema: dict[str, Any]) -> tuple[str, str]:
-    """Return a key and its error; names of alternative types are removed from the location of the key."""
+    """Return a key and its error; the location of the key is stripped of the names of alternative types."""
     tags = _collected(schema, lambda part: part.get("discriminator", {}).get("mapping", {}))
     parts, unknown = [*map(str, item["loc"])], item["type"] in {"extra_forbidden", "unexpected_keyword_argument"}
     own = parts[-1:] if unknown else []  # always a key, even if it has the name of an alternative type
@@ -346,7 +346,7 @@ def _properties(part: dict[str, Any]) -> Any:
 
 
 def _collected(schema: object, names: Any) -> set[str]:
-    """Return the `names` of every part of a JSON schema."""
+    """Return the union of `names`, a function, over all parts of a JSON schema."""
     if isinstance(schema, list):
         return set().union(*(_collected(part, names) for part in schema))
     if not isinstance(schema, dict):

@@ -9,19 +9,19 @@ from pathlib import Path
 
 _LOG = logging.getLogger(__name__)
 _REMEDIES = {
-    errno.ENOSPC: "Free disk space there",
-    errno.EDQUOT: "Free disk space there, or request a larger quota",
+    errno.ENOSPC: "Free disk space",
+    errno.EDQUOT: "Free disk space, or request a larger quota,",
     errno.EFBIG: "Raise the file size limit (ulimit -f), or write to another file system",
     errno.EROFS: "Copy the campaign to a writable file system",
-    errno.EACCES: "Make it readable and its folder writable",
-    errno.EPERM: "Make it readable and its folder writable",
+    errno.EACCES: "Make the file readable and its folder writable",
+    errno.EPERM: "Make the file readable and its folder writable",
     errno.EIO: "Check the disk (dmesg)",
     errno.ESTALE: "Remount the network file system",
     errno.ETIMEDOUT: "Remount the network file system",
     errno.EMFILE: "Raise the limit on open files (ulimit -n)",
     errno.ENFILE: "Close other programs",
     errno.ENOMEM: "Give the job more memory",
-    errno.ENOENT: "Check the path (for output: a path in a writable folder)",
+    errno.ENOENT: "Check the path (an output path must be in a writable folder)",
     errno.EEXIST: "Move the existing file or folder, or use another path,",
     errno.ENOTDIR: "Move the file that occupies the path of a folder",
     errno.EISDIR: "Move the folder that occupies the path of a file",
@@ -63,7 +63,7 @@ def shown(text: object, longest: int = 80) -> str:
 
 @lru_cache(maxsize=1000)
 def print_remark(where: str, remark: str) -> None:
-    """Log a remark about a file, once per process: a command may read the same file for several checks.
+    """Log a remark about a file once per process, because a command may read the same file for several checks.
 
     Parameters
     ----------
@@ -104,14 +104,14 @@ def quoted(value: object, longest: int = 80) -> str:
 class CampaignError(ValueError):
     """Error in the campaign folder that the user has to correct.
 
-    The message may quote an untrusted file. It is one line of bounded length, without control characters.
+    The message, which may quote an untrusted file, is a single line of bounded length without control characters.
 
     Parameters
     ----------
     found
         The fault, with the value found.
     where
-        File, and key, line or pulse within it.
+        File, and key, line or pulse within the file.
     expected
         Description of a valid value.
     remedy
@@ -181,11 +181,11 @@ def explained(error: BaseException) -> str | None:
 
 _OF_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _OF_PLACE = {errno.ENOENT, errno.EEXIST}
-"""Errors that are internal, i.e. not to be corrected by the user, unless they contain the name of a file."""
+"""Error numbers that indicate an internal error, which the user cannot correct, unless the error names a file."""
 
 
 def _error_number(error: BaseException) -> int | None:
-    """Return the errno of an exception; for GDAL errors, the errno of the system message that they quote."""
+    """Return the errno of an exception; for a GDAL error, the errno of the system message that the error quotes."""
     if isinstance(error, OSError) and error.errno is not None:
         known = error.errno in _REMEDIES and (error.filename is not None or error.errno not in _OF_PLACE)
         return error.errno if known else None
@@ -198,4 +198,4 @@ def _error_number(error: BaseException) -> int | None:
 def _free(path: Path) -> str:
     path = Path(path.absolute())
     existing_folder = next(folder for folder in (path, *path.parents) if folder.exists())
-    return f"{shutil.disk_usage(existing_folder).free / 1e6:.1f} MB free there"
+    return f"{shutil.disk_usage(existing_folder).free / 1e6:.1f} MB free on the file system"

@@ -1,6 +1,6 @@
 """Flags of an image: quantity measured, meaning, advice, module. docs/flags.md is generated from this table.
 
-Rows are in processing order, from recording to image. `Flags` reads the names alone.
+Rows are in processing order, from recording to image. `Flags` uses only the names.
 """
 
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Flag:
-    """Limit of a method that an image may exceed.
+    """Row of the flag table: a flag is raised if a limit of a method is exceeded.
 
     Parameters
     ----------
@@ -17,13 +17,13 @@ class Flag:
     meaning
         Consequence for the image.
     advice
-        What to check first, or the remedy.
+        Item to check first, or remedy.
     raised
-        Module that raises it, relative to src/apertura; several are separated by commas.
+        Module that raises the flag, relative to src/apertura; several modules are separated by commas.
 
     Examples
     --------
-    >>> Flag("share of samples", "samples at full scale", "gain", "core/echo/captures.py").advice
+    >>> Flag("fraction of the samples", "samples at full scale", "gain", "core/echo/captures.py").advice
     'gain'
     """
 
@@ -37,13 +37,13 @@ class Flag:
 
 _OF_RECORDINGS = {
     "association_ambiguous": Flag(
-        "time offset of the nodes' tags, s and pulse intervals",
-        "the time offset is close to half a pulse interval: pulses may be paired with a neighbour",
+        "time offset between the nodes' time tags, in s and in pulse intervals",
+        "the time offset is close to half a pulse interval: pulses may be paired with an adjacent pulse",
         "frame counters; clocks of the nodes",
         "core/echo/association.py",
     ),
     "association_sparse": Flag(
-        "share of the pulses of the shorter recording that were paired",
+        "paired fraction of the pulses of the shorter recording",
         "less than half of the pulses of the shorter recording were paired",
         "flights and nodes in flights.tsv; missed triggers",
         "core/echo/association.py",
@@ -55,21 +55,21 @@ _OF_RECORDINGS = {
         "core/echo/association.py",
     ),
     "time_tag_offset": Flag(
-        "time offset of the nodes' tags, s, and distance flown in it, m",
-        "time tags of the nodes differ by more than 20 ms: positions belong to another moment",
+        "time offset between the nodes' time tags, s, and distance flown in that time, m",
+        "time tags of the nodes differ by more than 20 ms: positions are evaluated at the wrong time",
         "time system of each node",
         "core/echo/association.py",
     ),
     "time_tag_outlier": Flag(
-        "pulses dropped, deviation of their tags",
-        "single time tags deviate from the line fitted to all tags",
+        "pulses dropped, deviation of their time tags",
+        "single time tags deviate from the line fitted to all time tags",
         "triggers of both nodes",
         "core/echo/association.py",
     ),
     "pulses_unpaired": Flag(
         "unpaired pulses before and after the other recording",
         "more than 5 % of the transmitted pulses lie outside the other recording",
-        "start and end of the recordings; time tags late by a number of pulse intervals",
+        "start and end of the recordings; time tags delayed by an integer number of pulse intervals",
         "core/echo/association.py",
     ),
     "fix_quality_low": Flag(
@@ -79,8 +79,8 @@ _OF_RECORDINGS = {
         "stages/positions.py",
     ),
     "alignment_ambiguous": Flag(
-        "the other clock offset, and its contrast relative to the best, dB",
-        "another clock offset, or every one, focuses nearly as well",
+        "the other clock offset; contrast of this clock offset relative to that of the best clock offset, dB",
+        "another clock offset, or every clock offset, focuses the image nearly as well",
         "alignment on a reflector (apertura align --point); a track with changes of speed",
         "methods/alignment/on_point.py",
     ),
@@ -91,9 +91,9 @@ _OF_RECORDINGS = {
         "methods/alignment/on_point.py",
     ),
     "alignment_uncertain": Flag(
-        "contrast of the best clock offset above the others, dB",
-        "the best clock offset is hardly better than the others",
-        "position of the point; path offset; whether the flight log belongs to the recording",
+        "contrast of the best clock offset relative to the others, dB",
+        "the contrast of the best clock offset is hardly higher than that of the others",
+        "position of the point; path offset; correspondence of flight log and recording",
         "methods/alignment/on_point.py",
     ),
     "scans_incomplete": Flag(
@@ -104,14 +104,14 @@ _OF_RECORDINGS = {
     ),
     "sweep_motion": Flag(
         "path change per sweep, wavelengths; displacement of echoes, m",
-        "the antennas move within a sweep: envelope and phase of echoes disagree",
+        "the antennas move during a sweep: envelope and phase of an echo correspond to different ranges",
         "waveform.sweep_s; a slower flight, or stops while sweeping",
         "core/echo/dechirp.py",
     ),
     "track_epochs_dropped": Flag(
         "epochs excluded, by reason",
-        "epochs without a fix, damaged or duplicated",
-        "the flight log, if track_gap is raised too; otherwise nothing",
+        "epochs that have no fix, are damaged or are duplicates were excluded",
+        "the flight log, if track_gap is also raised; otherwise no action is needed",
         "stages/positions.py",
     ),
     "track_log_damaged": Flag(
@@ -123,7 +123,7 @@ _OF_RECORDINGS = {
     "track_gap": Flag(
         "pulses dropped, longest gap",
         "a gap of the flight log is too long for interpolation by the spline",
-        "rate and losses of the flight log",
+        "rate of the flight log; missing epochs",
         "stages/positions.py",
     ),
     "track_outlier": Flag(
@@ -134,26 +134,26 @@ _OF_RECORDINGS = {
     ),
     "hover": Flag(
         "pulses dropped, duration",
-        "platform stationary: these pulses would add weight to a single aspect",
-        "config/segments.tsv, which takes precedence for the pairs that it lists",
+        "platform stationary: these pulses would increase the weight of a single aspect angle",
+        "config/segments.tsv, which takes precedence for the pairs listed in it",
         "stages/positions.py",
     ),
     "track_frozen": Flag(
         "pulses dropped, epochs, largest deviation",
         "epochs repeat the previous position",
-        "output rate of the receiver compared with that of the log",
+        "output rate of the GNSS receiver compared with the rate of the log",
         "stages/positions.py",
     ),
     "track_positions": Flag(
         "position error, m",
         "coordinates of the flight log are rounded too coarsely",
-        "decimals of the log's coordinates: 8 in degrees, 6 in minutes (NMEA)",
+        "number of decimals of the log's coordinates: 8 for degrees, 6 for minutes (NMEA)",
         "stages/positions.py",
     ),
     "track_times": Flag(
         "position error along the track, m",
         "times of the flight log are rounded too coarsely",
-        "decimals of the log's times",
+        "number of decimals of the log's times",
         "stages/positions.py",
     ),
     "attitude_suspect": Flag(
@@ -164,48 +164,49 @@ _OF_RECORDINGS = {
     ),
     "time_tag_jitter": Flag(
         "scatter of the time tags, s rms; pulse repetition interval",
-        "single pulses may be paired with a neighbour",
+        "single pulses may be paired with an adjacent pulse",
         "frame counters",
         "core/echo/association.py",
     ),
     "association_suspect": Flag(
-        "difference between the sidelink path and the geometry, m",
+        "difference between the measured sidelink path and that computed from the geometry, m",
         "the sidelink contradicts the geometry: pulses are paired wrongly, or positions are wrong",
         "time tags, flight logs, lever arms",
         "core/echo/transfer.py",
     ),
     "reference_point": Flag(
-        "largest difference between reception and reference point, s and m of path",
+        "largest difference between the stated delay of the reference point and that computed from the positions, in s "
+        "and in m of path",
         "CPHD: positions and times of the pulses contradict each other",
-        "the software that wrote the file; whether the image is focused",
+        "the software that wrote the file; focus of the image",
         "formats/phase_histories/cphd.py",
     ),
     "captures_repeated": Flag(
-        "captures excluded, of how many; number of the first",
-        "captures are bit-identical to earlier ones: the recorder wrote old samples again, which would image as ghosts",
+        "captures excluded, of the total number; number of the first",
+        "captures are bit-identical to earlier ones: the recorder wrote old samples again, which would cause ghosts",
         "buffers of the recorder; the copy of the recording",
         "stages/echo.py",
     ),
     "captures_limited": Flag(
-        "captures affected, of how many; their crest factor and that of the others, dB",
-        "some captures are limited below full scale: their echoes are weaker and distorted",
+        "captures affected, of the total number; crest factors of these and of the other captures, dB",
+        "some captures are limited below full scale: their echoes are attenuated and distorted",
         "limiter, gain control and gain of the receiver",
         "core/echo/captures.py",
     ),
     "saturated_radar": Flag(
-        "share of the samples",
-        "samples at full scale of the converter",
+        "fraction of the samples",
+        "samples are at full scale of the converter",
         "gain",
         "core/echo/captures.py",
     ),
     "saturated_sidelink": Flag(
-        "share of the samples",
-        "samples at full scale of the converter",
+        "fraction of the samples",
+        "samples are at full scale of the converter",
         "gain",
         "core/echo/captures.py",
     ),
     "code_unconfirmed": Flag(
-        "strongest echo above the level beyond the prefix, dB",
+        "strongest echo relative to the level beyond the prefix, dB",
         "echoes repeat from pulse to pulse but do not lie within the prefix or listening time",
         "waveform.codes, waveform.pulse; another transmitter",
         "core/echo/own_pulses.py",
@@ -213,25 +214,25 @@ _OF_RECORDINGS = {
     "phase_unstable": Flag(
         "second differences of phase, rad rms; stability of the magnitude",
         "echoes have a stable magnitude but no stable phase: the image is speckle",
-        "oscillator of the node; which node transmits",
+        "oscillator of the node; assignment of the transmitter",
         "core/echo/own_pulses.py",
     ),
     "wrong_code": Flag(
         "SNR of the sidelink",
-        "the sidelink contains another code: that of the transmitter if all of its pairs have this flag, "
-        "otherwise that of another transmitter",
+        "the sidelink does not contain the configured code: the configured code is wrong if all pairs of the "
+        "transmitter have this flag; otherwise the sidelink received another transmitter",
         "waveform.codes, waveform.carrier_is, waveform.iq, nodes.<n>.iq; the recording",
         "core/echo/sidelink_state.py",
     ),
     "background": Flag(
-        "image noise with arcs of the background, dB above that without; why it is not removed",
+        "increase of the image noise by arcs of the background, dB; reason why the background is not removed",
         "echoes at constant delay, such as antenna coupling, cause arcs at constant range",
         "processing.background; isolation of the antennas",
         "core/imaging/background.py",
     ),
     "background_loss": Flag(
         "largest peak loss of a target, dB",
-        "the removed background contains part of targets whose range hardly changes",
+        "the removed background contains part of the echoes of targets whose range hardly changes",
         "processing.background: none; a longer track",
         "core/imaging/background.py",
     ),
@@ -242,25 +243,25 @@ _OF_RECORDINGS = {
         "core/echo/sidelink_state.py",
     ),
     "second_arrival": Flag(
-        "second path relative to the direct one, dB; its delay",
-        "a second path is nearly as strong as the direct one",
+        "level of the second path relative to the direct path, dB; delay of the second path",
+        "a second path is nearly as strong as the direct path",
         "a second transmitter; reflections",
         "core/echo/sidelink_state.py",
     ),
     "sidelink_nulls": Flag(
-        "share of subcarriers far below the mean",
-        "parts of the band are attenuated instead of corrected",
+        "fraction of subcarriers far below the mean level",
+        "parts of the band are down-weighted instead of being corrected",
         "reflections at the sidelink antenna",
         "core/echo/sidelink_state.py",
     ),
     "sidelink_noisy": Flag(
-        "SNR of the sidelink, SNR required",
-        "the SNR is below the minimum of the correction",
+        "SNR of the sidelink and required SNR",
+        "the SNR is below the minimum that the correction requires",
         "processing.sidelink: auto selects another correction",
         "core/echo/sidelink.py",
     ),
     "sidelink_echo": Flag(
-        "echo relative to the direct path, dB",
+        "level of the echo relative to the direct path, dB",
         "an echo in the sidelink causes ghosts",
         "processing.sidelink",
         "core/echo/sidelink.py",
@@ -272,37 +273,37 @@ _OF_RECORDINGS = {
         "core/echo/sidelink.py",
     ),
     "sidelink_ripple_or_echo": Flag(
-        "arrival relative to the direct path, dB and m",
-        "the arrival may be an echo: path and phase may have this error",
+        "level and path of the second arrival relative to the direct path, dB and m",
+        "the second arrival may be an echo, which causes errors of path and phase",
         "reflections at the sidelink antenna",
         "core/echo/sidelink_state.py",
     ),
     "sidelink_code": Flag(
         "correction requested",
-        "the sidelink lacks the code that the correction requires",
+        "the sidelink does not contain the code that the correction requires",
         "waveform.codes",
         "core/echo/sidelink.py",
     ),
     "waveform_sidelobes": Flag(
         "range sidelobes of every point, dB",
-        "the pulse's filter leaves an uneven spectrum: range sidelobes",
+        "the spectrum of the filtered pulse is uneven, which causes range sidelobes",
         "waveform.filter, waveform.band_hz",
         "core/echo/pulse_filter.py",
     ),
     "waveform_noise": Flag(
-        "SNR loss, dB; share of the band with little energy",
+        "SNR loss, dB; fraction of the band with little energy",
         "division by the pulse's spectrum amplifies noise where the pulse has little energy",
         "waveform.band_hz; waveform.filter",
         "core/echo/pulse_filter.py",
     ),
     "pulse_truncated": Flag(
         "pulses whose direct path is truncated by the capture",
-        "captures truncate the direct pulse: division leaves sidelobes and loses energy",
+        "captures truncate the direct pulse: division by its spectrum causes sidelobes and loses energy",
         "waveform.lead_s; trigger of the receiver",
         "core/echo/pulse_filter.py",
     ),
     "clock_ambiguous": Flag(
-        "carrier frequency offset, half the subcarrier spacing, Hz",
+        "carrier frequency offset and half the subcarrier spacing, Hz",
         "the carrier frequency offset is close to half the subcarrier spacing",
         "oscillator of the receiver",
         "core/echo/clock.py",
@@ -315,19 +316,19 @@ _OF_RECORDINGS = {
     ),
     "clock_unmeasured": Flag(
         "reason",
-        "captures are too short, or the pulse neither repeats nor is divided out",
+        "the clock offset is not measured: captures are too short, or the pulse is neither repeated nor divided out",
         "length of the captures; processing.sidelink",
         "core/echo/transfer.py",
     ),
     "calibration_uncertain": Flag(
-        "path offset, its scatter, scatter allowed",
-        "the path offset scatters more than an image allows",
+        "path offset, measured scatter, tolerated scatter",
+        "the scatter of the path offset exceeds the tolerance of an image",
         "the reflector; the track",
         "core/echo/calibration.py",
     ),
     "calibration_ambiguous": Flag(
-        "second reflector relative to the first, dB; its path offset",
-        "a second reflector is nearly as strong",
+        "level of the second reflector relative to the first, dB; path offset of the second reflector",
+        "a second reflector is nearly as strong as the first",
         "calibration.search_m",
         "core/echo/calibration.py",
     ),
@@ -340,261 +341,267 @@ _OF_RECORDINGS = {
 _OF_IMAGES = {
     "platform_inside_scene": Flag(
         "pulses above the scene",
-        "the track crosses the scene: echoes of both sides overlap",
+        "the track crosses the scene: echoes from both sides of the track overlap",
         "scene.bounds_m",
         "core/planning/plan.py",
     ),
     "platform_below_scene": Flag(
         "height of the antenna below the lowest terrain of the scene, m",
-        "an antenna is below the whole DEM near it",
+        "an antenna is below all DEM heights in its surroundings",
         "unit and vertical datum of scene.dem",
         "core/scene/clearance.py",
     ),
     "terrain_step": Flag(
-        "height of the step and its width on the ground, m; its position",
+        "height and horizontal width of the step, m; position of the step",
         "the DEM has a step steeper than 79 degrees",
-        "voids filled with a constant, seams of the DEM; nothing, if it is a cliff",
+        "voids filled with a constant; seams of the DEM; no action is needed for a real cliff",
         "stages/scene.py",
     ),
     "outside_swath": Flag(
-        "share of the scene, integration angle",
-        "part of the scene is not seen by any pulse within the integration angle: no data there",
+        "fraction of the scene; integration angle",
+        "no pulse illuminates part of the scene within the integration angle: these pixels are nodata",
         "scene.bounds_m; processing.integration",
         "core/planning/decisions.py",
     ),
     "track_turns": Flag(
-        "range of aspect angles, integration angle",
-        "the track turns or returns: resolution is finer in some directions",
+        "range of aspect angles; integration angle",
+        "the track turns or reverses: the resolution differs between directions",
         "config/segments.tsv, to image the passes separately",
         "core/planning/decisions.py",
     ),
     "no_aperture": Flag(
         "length of the antennas' track, m",
-        "the aperture is too short, as seen from the scene, to form an image",
+        "the angle subtended by the aperture at the scene is too small for image formation",
         "kind bench in flights.tsv; the flight log; config/segments.tsv",
         "core/planning/plan.py",
     ),
     "spacing_coarse": Flag(
-        "pixel spacing, finest resolution cell",
+        "pixel spacing and size of the finest resolution cell",
         "the pixel spacing exceeds the finest resolution cell by more than 5 %",
         "scene.spacing_m",
         "core/planning/plan.py",
     ),
     "azimuth_undersampled": Flag(
-        "Doppler spread, cycles per pulse; aliased fraction of the scene and its level, dB",
+        "Doppler spread, cycles per pulse; aliased fraction of the scene; level of the ambiguities, dB",
         "the aperture is undersampled: azimuth ambiguities are visible",
         "scene.bounds_m; flight speed and waveform.prf_hz",
         "core/planning/plan.py",
     ),
     "pulses_missing": Flag(
-        "missing pulses, level of their sidelobes, dB",
-        "sidelobes along the track, caused by missing pulses, exceed −20 dB",
-        "pulses section of image.json: pulses dropped, with reasons",
+        "number of missing pulses; level of the sidelobes caused by missing pulses, dB",
+        "missing pulses cause sidelobes along the track above −20 dB",
+        "section pulses of image.json: pulses dropped, with reasons",
         "core/echo/association.py",
     ),
     "beyond_cyclic_prefix": Flag(
-        "share of the scene whose echoes are too late",
-        "echoes of part of the scene arrive after the cyclic prefix, or the listening time, in every pulse",
+        "fraction of the scene whose echoes arrive too late",
+        "in every pulse, echoes of part of the scene arrive after the cyclic prefix or the listening time",
         "scene.bounds_m",
         "core/planning/plan.py",
     ),
     "scene_beyond_samples": Flag(
-        "share of the total paths of the scene",
-        "from Python: range profiles do not cover the scene",
+        "fraction of the scene's interval of total paths",
+        "range profiles do not cover the scene (only in calls from Python)",
         "the range window to which the profiles were cropped",
         "core/imaging/job.py",
     ),
     "outside_beam": Flag(
-        "share of the scene",
-        "part of the scene lies outside every antenna beam",
+        "fraction of the scene",
+        "part of the scene lies outside the antenna beams at every pulse",
         "boresights; scene.bounds_m",
         "core/antenna/illumination.py",
     ),
     "antenna_phase": Flag(
-        "peak loss of a point, dB; its displacement, cm",
-        "the phase of antenna patterns changes over the aperture",
+        "peak loss and displacement of a point, dB and cm",
+        "the phase of the antenna patterns changes over the aperture",
         "lever_arms_m, which must end at the phase centre; phase_deg of the pattern",
         "core/quality/budget.py",
     ),
     "refinement_rejected": Flag(
-        "gain of contrast on held-out points, dB; gain required",
-        "contrast on held-out points did not improve significantly, or a track is displaced by a wavelength: the "
-        "unrefined tracks are used",
+        "increase of the contrast of held-out points and required increase, dB",
+        "the contrast of held-out points did not increase significantly, or the refinement displaced a track by a "
+        "wavelength: the unrefined tracks are used",
         "position_std_m of the nodes; SNR; docs/howto/refine_tracks.md",
         "methods/autofocus/evidence.py",
     ),
     "refinement_no_bright_point": Flag(
-        "contrast required of a bright point",
+        "minimum contrast of a bright point",
         "no bright point for track refinement: the unrefined tracks are used",
         "reflectors in the scene; processing.autofocus: off",
         "methods/autofocus/patches.py",
     ),
     "cause_corrected": Flag(
-        "cause, its size, loss explained, dB",
-        "a wrong constant explains the loss better than track errors: the images are formed with it corrected",
-        "the constant named: lever_arms_m or attitude, config/clocks.tsv, scene.height_m",
+        "cause, magnitude of the error, explained loss, dB",
+        "the error of a configured constant explains the loss better than track errors: images are formed with the "
+        "corrected constant",
+        "the constant named in the flag: lever_arms_m or attitude, config/clocks.tsv, scene.height_m",
         "methods/autofocus/cause_fit.py",
     ),
     "path_offsets_differ": Flag(
-        "difference of path, cm, and its standard deviation",
-        "after refinement, bright points of the pairs differ by a constant path",
+        "path difference and its standard deviation, cm",
+        "after refinement, the paths of bright points differ by a constant between the pairs",
         "nodes.<n>.path_offset_m of the pair's receiver; lever arms",
         "methods/autofocus/refine.py",
     ),
     "position_error_understated": Flag(
-        "estimated track errors relative to the configured ones",
-        "estimated track errors are much larger than configured",
+        "estimated track errors relative to the configured position accuracy",
+        "estimated track errors are much larger than the configured position accuracy",
         "position_std_m, position_correlation_s; lever arms, heights, times",
         "methods/autofocus/evidence.py",
     ),
     "position_error_overstated": Flag(
-        "estimated track errors relative to the configured ones",
-        "estimated track errors are much smaller than configured: the refinement has more freedom than needed",
+        "estimated track errors relative to the configured position accuracy",
+        "estimated track errors are much smaller than the configured position accuracy: a smaller configured value "
+        "would constrain the refinement better",
         "position_std_m, position_correlation_s",
         "methods/autofocus/evidence.py",
     ),
     "cycle_slip_suspected": Flag(
-        "sections of the track, their displacement",
+        "sections of the track and their displacement",
         "sections of the refined track may be displaced by a wavelength",
         "position_std_m; more bright points",
         "methods/autofocus/evidence.py",
     ),
     "defocused": Flag(
-        "peak loss of bright points, dB; peak loss expected by the error budget, dB",
+        "peak loss of bright points, dB; peak loss predicted by the error budget, dB",
         "phase errors reduced the peaks of bright points by more than 1 dB",
-        "the hypothesis, where one is named; positions, lever arms, heights, times",
+        "the hypothesis, if the flag states one; positions, lever arms, heights, times",
         "core/imaging/focus_check.py",
     ),
     "loss_unexpected": Flag(
-        "peak loss of bright points and expected loss, dB, with standard deviations",
-        "the peak loss is 1 dB at most, but exceeds the error budget by three standard deviations, or is removed "
-        "by the cause identified in another image",
-        "nodes.<n>.position_std_m, scene.height_std_m, time_tag_std_s: are they realistic?",
+        "measured and predicted peak loss of bright points, dB, with standard deviations",
+        "the peak loss is at most 1 dB, but it exceeds the error budget by three standard deviations, or correction of "
+        "the cause identified in another image removes it",
+        "nodes.<n>.position_std_m, scene.height_std_m and time_tag_std_s, which may be too optimistic",
         "core/imaging/focus_check.py",
     ),
     "echo_outside_scene": Flag(
         "position of the strong echo",
-        "the pulses contain a strong echo at ranges outside the scene, or one that does not focus at any position",
-        "heights and vertical datum of log and scene; scene.bounds_m; path offsets; I and Q swapped: waveform.iq; "
-        "from Python: conjugate the samples",
+        "the pulses contain a strong echo at ranges outside the scene, or a strong echo that does not focus at any "
+        "position",
+        "heights and vertical datum of log and scene; scene.bounds_m; path offsets; swapped I and Q: waveform.iq, or "
+        "conjugated samples in calls from Python",
         "core/imaging/focus_check.py",
     ),
     "pairs_displaced": Flag(
-        "displacement of the points, cm, east and north",
+        "displacement of the points to the east and north, cm",
         "bright points of a pair are displaced relative to the other pairs, or no majority of the pairs agrees on "
-        "their position",
-        "the hypothesis, where one is named; path offsets, lever arms, scene.height_m",
+        "the position of the points",
+        "the hypothesis, if the flag states one; path offsets, lever arms, scene.height_m",
         "stages/assess.py",
     ),
     "pairs_out_of_phase": Flag(
         "phase relative to the pairs that agree",
-        "bright points of a pair differ in phase from the other pairs, or no majority of the pairs agrees: "
+        "bright points of a pair differ in phase from the other pairs, or no majority of the pairs agrees: the pair is "
         "excluded from the coherent sum",
         "path offsets; processing.fusion.align_phase",
         "stages/assess.py",
     ),
     "pair_excluded": Flag(
-        "pair, reason, phase that would align it",
+        "pair, reason, phase correction that would align the pair",
         "a pair is excluded from the coherent sum",
         "flags of that pair; processing.fusion.align_phase",
         "stages/export.py",
     ),
     "phase_unobservable": Flag(
         "pair, reason, peak loss caused by a wrong phase, dB",
-        "the phase offset of a pair in the coherent sum is not observable: if it is wrong, targets split",
-        "as stated in the flag: a finer scene.spacing_m, or a reflector in the scene, or a calibration flight",
+        "the phase offset of a pair in the coherent sum is not observable; a wrong phase splits targets",
+        "the remedy stated in the flag: a finer scene.spacing_m, a reflector in the scene, or a calibration flight",
         "stages/export.py",
     ),
     "sum_incoherent": Flag(
-        "share of the power in phase at bright points; peak loss, dB",
-        "pairs of the coherent sum are not in phase: its peaks are reduced",
+        "fraction of the power at bright points that adds in phase; peak loss, dB",
+        "pairs of the coherent sum are not in phase: the peaks of the sum are reduced",
         "pairs_out_of_phase, phase_unobservable; positions; processing.fusion.align_phase",
         "stages/export.py",
     ),
     "flights_displaced": Flag(
-        "displacement of the points, cm, east and north",
+        "displacement of the points to the east and north, cm",
         "bright points of two flights are displaced relative to each other",
         "base station, datum, time system of one flight",
         "stages/cube.py",
     ),
     "pair_unconfirmed": Flag(
-        "bright points in common",
-        "a pair has no more bright points in common with another pair than expected by chance",
-        "SNR of its echo; names of its channels",
+        "number of common bright points",
+        "the number of bright points that a pair has in common with other pairs is not statistically significant",
+        "SNR of the pair's echo; names of the pair's channels",
         "stages/assess.py",
     ),
     "pair_uncalibrated": Flag(
         "file of calibration constants, pair",
-        "no calibration constant is known for the pair: backscattering coefficients have no values",
-        "a reflector that serves the pair; transmit_power_dbm and receivers of its nodes",
+        "no calibration constant is available for the pair: backscattering coefficients have no values",
+        "a reflector within the beams of the pair; transmit_power_dbm and receivers of the pair's nodes",
         "stages/layers.py",
     ),
     "constant_drifts": Flag(
-        "difference between flights or calibrations, dB or rad; its standard deviation",
+        "difference between flights or calibrations and its standard deviation, dB or rad",
         "the calibration constant or phase changed by more than three standard deviations",
         "cables, gains, temperature; pointing of the antennas",
         "tools/reflectors.py",
     ),
     "reflectors_disagree": Flag(
-        "reflectors, sum of squared residuals, its probability",
-        "reflectors disagree: the standard deviation of the calibration constant was increased",
+        "reflectors; sum of squared residuals and its probability",
+        "calibration constants of the reflectors disagree: the standard deviation of the constant was increased",
         "positions, sizes and orientations of the reflectors; other echoes; antenna patterns",
         "tools/reflectors.py",
     ),
     "constant_disagrees": Flag(
-        "difference between configured radio and measured constant, dB, in standard deviations",
-        "the config contradicts the reflectors; their constant was used",
+        "difference between the calibration constant computed from the config and the constant measured on "
+        "reflectors, dB, and in standard deviations",
+        "the config contradicts the reflectors; the constant measured on the reflectors was used",
         "transmit_power_dbm, antenna gains, receiver",
         "stages/radiometry.py",
     ),
     "noise_disagrees": Flag(
-        "measured noise relative to the configured noise figure, dB, or to that at the reflectors",
-        "noise too high: interference, too little gain, a wrong gain or full scale; noise too low: a wrong gain "
-        "or full scale, and all cross-sections have the same error",
+        "measured noise relative to the configured noise figure, or relative to the noise at the measurement of the "
+        "reflectors, dB",
+        "possible causes of excessive noise are interference, too little gain, and a wrong gain or full scale; a noise "
+        "that is too low indicates a wrong gain or full scale, and all cross-sections have the same error",
         "nodes.<n>.receiver: gain_db, full_scale_dbm or full_scale_v, full_scale_counts, noise_figure_db",
         "stages/radiometry.py",
     ),
     "engine_replaced": Flag(
-        "tiles, engine requested and engine used, accuracy",
-        "the requested engine does not meet the requested accuracy: another engine formed the image, or some of "
-        "its tiles",
+        "tiles; requested engine and engine used; accuracy",
+        "the requested engine does not meet the requested accuracy: another engine formed the image, or some tiles of "
+        "the image",
         "processing.engine: auto, or a coarser processing.accuracy_db",
         "core/planning/plan.py",
     ),
     "accuracy_not_met": Flag(
-        "upper bound of the error, requested accuracy, dB",
+        "upper bound of the error and requested accuracy, dB",
         "the 95 % upper bound of the numerical error exceeds the requested accuracy",
         "processing.accuracy_db, processing.engine",
         "core/imaging/certify.py, core/imaging/backproject.py",
     ),
     "interferogram_decorrelated": Flag(
-        "share of pixels with significant coherence; coherence, coherence by chance, coherence allowed by the geometry",
+        "fraction of pixels with significant coherence; measured coherence, expected coherence of unrelated images, "
+        "upper limit set by the geometry",
         "the two images have little coherence: neither phase nor height is usable",
         "baseline of the tracks; changes between the flights; focus of both images",
         "methods/interferometry/comparison.py",
     ),
     "height_insensitive": Flag(
-        "share of pixels where the height of ambiguity exceeds the height range",
+        "fraction of pixels where the height of ambiguity exceeds the height range",
         "the baseline is too short to measure heights",
         "a longer baseline",
         "methods/interferometry/comparison.py",
     ),
     "height_ambiguous": Flag(
-        "pixels in unconnected regions, or phase jumps where the phase is not unwrapped; height of ambiguity",
-        "heights are ambiguous by multiples of the height of ambiguity, or missing where regions do not connect",
+        "pixels in unconnected regions, or phase jumps if the phase is not unwrapped; height of ambiguity",
+        "heights are ambiguous by multiples of the height of ambiguity, or missing in regions that are not connected",
         "the optional dependency unwrap; a shorter baseline; a wider interferometry.window_px",
         "methods/interferometry/comparison.py",
     ),
     "unwrapping_inconsistent": Flag(
-        "loops of four pixels with a phase residue; pixels in layover",
-        "the phase changes by more than half a cycle per pixel, or is noisy: heights may have errors of multiples "
-        "of the height of ambiguity",
+        "phase residues (loops of four pixels); pixels in layover",
+        "the phase changes by more than half a cycle per pixel, or is noisy: heights may have errors of integer "
+        "multiples of the height of ambiguity",
         "a shorter baseline; a DEM; interferometry.window_px",
         "methods/interferometry/comparison.py",
     ),
     "height_relative": Flag(
-        "no point of known height lies in the image",
-        "heights are relative to the terrain model; their offset varies over the scene",
+        "absence of points of known height in the image",
+        "heights are relative to the terrain model; the offset of the heights varies over the scene",
         "scene.reference_points",
         "methods/interferometry/comparison.py",
     ),
@@ -606,7 +613,7 @@ _OF_IMAGES = {
 
 _OF_BENCHES = {
     "triggers_missed": Flag(
-        "pulses not recorded, of those expected",
+        "pulses not recorded, of the expected number",
         "more than 1 % of the pulses triggered no capture",
         "trigger level and cable; disk of the recorder",
         "methods/bench/channels.py",
@@ -619,7 +626,7 @@ _OF_BENCHES = {
     ),
     "channel_weak": Flag(
         "level of a channel, counts rms",
-        "the signal covers few quantisation levels of the converter: quantisation adds noise",
+        "the signal uses only a few quantisation levels of the converter, which adds quantisation noise",
         "gain, attenuators, cable of the channel",
         "methods/bench/channels.py",
     ),
@@ -631,7 +638,7 @@ _OF_BENCHES = {
     ),
     "channel_image": Flag(
         "level of the image frequency, dB",
-        "I/Q imbalance: subcarriers leak into their image frequencies",
+        "I/Q imbalance: each subcarrier leaks into its image frequency",
         "balance of the mixer; clipping of I or Q",
         "methods/bench/channels.py",
     ),
@@ -649,30 +656,30 @@ _OF_BENCHES = {
     ),
     "link_weak": Flag(
         "level of a compressed pulse above the noise, dB",
-        "the path is hardly above the noise",
+        "the level of the path is hardly above the noise",
         "attenuators, cables, gain; assignment of the channels",
         "methods/bench/links.py",
     ),
     "link_incoherent": Flag(
-        "coherence factor Γ, its value with noise alone, phase noise in excess",
-        "the phase of the path scatters more than noise explains: images have the same loss",
+        "coherence factor Γ, coherence factor if limited only by noise, excess phase noise",
+        "the phase scatter of the path exceeds the scatter caused by noise: images suffer the corresponding loss",
         "clock of both channels; sidelink; connectors",
         "methods/bench/links.py",
     ),
     "link_drifts": Flag(
         "phase and delay drift over the recording",
-        "path or delay changes with a stationary set-up",
+        "phase or delay changes with a stationary set-up",
         "warm-up of cables, amplifiers and filters: wait, or calibrate again",
         "methods/bench/links.py",
     ),
     "delay_jumps": Flag(
-        "pulses at another delay, its difference",
-        "delays jump with a stationary set-up: captures start elsewhere, or the strongest path changes",
+        "number of pulses with a different delay; difference from the common delay",
+        "delays jump with a stationary set-up: captures start at a different delay, or the strongest path changes",
         "trigger of the transmitter; cables; two reflectors of equal strength",
         "methods/bench/links.py",
     ),
     "interference": Flag(
-        "noise of a subcarrier relative to its neighbours, dB; its frequency and usual service",
+        "noise of a subcarrier relative to adjacent subcarriers, dB; frequency of the subcarrier and its usual service",
         "a narrow-band signal in the band adds noise at every range; excluded subcarriers cause sidelobes",
         "other transmitters; spurious signals of the node's clocks; processing.interference",
         "methods/bench/links.py, core/echo/interference.py",
@@ -700,26 +707,26 @@ _OF_BENCHES = {
         "core/echo/interference.py",
     ),
     "contact_intermittent": Flag(
-        "change of amplitude in excess of noise; pulses lost or 6 dB low",
+        "amplitude change in excess of noise; number of pulses lost or attenuated by 6 dB",
         "the amplitude is unstable with a stationary set-up",
         "connectors of that channel; supply of the amplifiers",
         "methods/bench/links.py",
     ),
     "channel_crosstalk": Flag(
-        "sidelink relative to the strongest path, dB",
-        "the sidelink leaks into the radar channel: a false echo at short range",
+        "level of the sidelink relative to the strongest path, dB",
+        "the sidelink leaks into the radar channel, which causes a false echo at short range",
         "shielding, parallel cables, isolation of the channels",
         "methods/bench/links.py",
     ),
     "channels_swapped": Flag(
-        "lead of the echo over the sidelink, m",
+        "path difference by which the echo arrives before the sidelink, m",
         "the strongest echo arrives before the direct path",
         "order of the channels; bench.radar_m, bench.sidelink_m",
         "methods/bench/links.py",
     ),
     "clock_unlocked": Flag(
         "frequency offset from the transmitter's clock, ppm",
-        "the clocks have no common reference: samples are corrected by the measured offset",
+        "the clocks have no common reference: samples are corrected for the measured offset",
         "lock of the node's reference (GNSS, 10 MHz)",
         "methods/bench/links.py",
     ),
@@ -730,8 +737,8 @@ _OF_BENCHES = {
         "methods/bench/links.py",
     ),
     "path_offset_disagrees": Flag(
-        "path offset measured on the set-up, path offset configured",
-        "the configured path offset differs from the measured one",
+        "path offset measured on the set-up and configured path offset",
+        "the configured path offset differs from the measured path offset",
         "nodes.<n>.path_offset_m; bench.radar_m, bench.sidelink_m",
         "methods/bench/links.py",
     ),
@@ -745,4 +752,4 @@ _OF_BENCHES = {
 """Flags of bench recordings: name → row."""
 
 FLAGS = _OF_BENCHES | _OF_RECORDINGS | _OF_IMAGES
-"""All flags: name → row, those of a bench first."""
+"""All flags: name → row; flags of bench recordings are listed first."""

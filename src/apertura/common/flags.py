@@ -16,7 +16,7 @@ class Flags(dict[str, str]):
     Raises
     ------
     KeyError
-        If a name is not in this table.
+        If a name is not in the flag table.
 
     Examples
     --------
@@ -50,9 +50,9 @@ class Flags(dict[str, str]):
 
     @classmethod
     def merged(cls, *several: Mapping[str, str]) -> Self:
-        """Merge flags from several sources, in order; a flag raised by several sources has the lines of each.
+        """Merge flags from several sources, in order; a flag raised by several sources has the lines of each source.
 
-        A line that is contained whole in another line, followed by "; ", " (" or the end, is omitted.
+        A line is omitted if another line contains the whole line, followed by "; ", " (" or the end of the text.
         """
         merged = cls()
         for flags in several:
@@ -66,5 +66,5 @@ class Flags(dict[str, str]):
 
 
 def _repeats(line: str, part: str) -> bool:
-    """Return True if a line equals `part` or contains it whole, delimited by "; "."""
+    """Return True if a line equals `part`, or contains the whole of `part`, delimited by "; " or " ("."""
     return re.search(rf"(?:^|; ){re.escape(part)}(?:$|; | \()", line) is not None

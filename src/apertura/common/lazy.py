@@ -1,4 +1,4 @@
-"""Lazy references to functions: the module of a table's function is imported only when the function is called."""
+"""Lazy references to functions of a table: the module of a function is imported only when the function is called."""
 
 import pkgutil
 from collections.abc import Callable
@@ -8,7 +8,9 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Lazy:
-    """Reference to a package, module or function by dotted path; attributes are references, a call imports the module.
+    """Reference to a package, module or function by dotted path.
+
+    Attributes are references, too. A call imports the module and calls the function.
 
     Examples
     --------

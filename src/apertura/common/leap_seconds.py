@@ -1,4 +1,4 @@
-"""Leap seconds: offset between GPS time and UTC, and conversions between both."""
+"""Leap seconds: offset between GPS time and UTC, and conversions between GPS time and UTC."""
 
 import logging
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Times
 
 GPS_EPOCH = np.datetime64("1980-01-06T00:00:00", "ns")
-"""Epoch of GPS time, where its offset from UTC is zero."""
+"""Epoch of GPS time, at which GPS time equals UTC."""
 
 KNOWN_UNTIL = np.datetime64("2027-06-28T00:00:00", "ns")
 """Date until which the table of leap seconds is complete (IERS Bulletin C, as listed in tzdata 2026.6)."""
@@ -40,7 +40,7 @@ def gps_ahead_s(time_utc: Times | np.datetime64) -> NDArray[np.int64]:
     Returns
     -------
     ndarray
-        Offset in s, int64, of the same shape. The offset is constant after `KNOWN_UNTIL`, with a warning.
+        Offset in s, int64, of the same shape. After `KNOWN_UNTIL` the offset is assumed to be constant, with a warning.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def gps_ahead_s(time_utc: Times | np.datetime64) -> NDArray[np.int64]:
 
     Notes
     -----
-    Source: IERS Bulletin C (https://hpiers.obspm.fr/iers/bul/bulc/); GPS time is 19 s behind TAI (IS-GPS-200, 3.3.4).
+    Source: IERS Bulletin C (https://hpiers.obspm.fr/iers/bul/bulc/). GPS time is 19 s behind TAI (IS-GPS-200, 3.3.4).
     """
     _check(time_utc)
     return np.asarray(np.searchsorted(_SINCE_UTC, time_utc, side="right"), np.int64)
@@ -129,4 +129,8 @@ def _check(time: Times | np.datetime64) -> None:
     if np.any(~(time >= GPS_EPOCH)):
         raise ValueError("a time before 1980-01-06, the epoch of GPS time")
     if np.any(time >= KNOWN_UNTIL):
-        _LOG.warning("leap seconds are known until %s: %d s are assumed after it", str(KNOWN_UNTIL)[:10], LATEST_S)
+        _LOG.warning(
+            "leap seconds are known until %s: an offset of %d s is assumed after this date",
+            str(KNOWN_UNTIL)[:10],
+            LATEST_S,
+        )

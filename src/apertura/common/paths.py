@@ -6,9 +6,9 @@ from apertura.common.errors import CampaignError
 
 
 def check_shell_name(root: Path) -> None:
-    """Raise CampaignError if the path of a campaign contains characters that a shell interprets in double quotes.
+    """Raise CampaignError if the path of a campaign contains characters that a shell interprets within double quotes.
 
-    Snakemake executors pass commands with that path to a shell, for example the Slurm executor as
+    Snakemake executors pass commands that contain this path to a shell; for example, the Slurm executor calls
     ``sbatch --wrap="…"``.
 
     Examples
@@ -30,7 +30,7 @@ def check_shell_name(root: Path) -> None:
 
 
 def shipped() -> Path:
-    """Return the folder of the root Snakefile, profiles and tables: in the installed package or in the source tree.
+    """Return the folder of the root Snakefile, profiles and tables, in the installed package or in the source tree.
 
     Examples
     --------

@@ -34,10 +34,10 @@ ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 """Signals that terminate a run."""
 
 ALGEBRA_THREADS = "OPENBLAS_NUM_THREADS"
-"""Environment variable for the number of OpenBLAS threads, read when numpy is imported; 1 in every command. As OpenBLAS
-only multiplies small matrices, its threads wait for each other longer than they compute (simulation of the demo: 6.8
-CPU seconds with two threads, 1.9 with one). With one thread, results are bit-identical for any number of cores. Engines
-have their own threads."""
+"""Environment variable for the number of OpenBLAS threads, read when numpy is imported; 1 in every command. Because
+OpenBLAS only multiplies small matrices here, its threads wait for each other longer than they compute: the simulation
+of the demo takes 6.8 CPU seconds with two threads and 1.9 with one. With one thread, results are bit-identical for any
+number of cores. Engines create separate threads."""
 
 _PR_SET_PDEATHSIG = 1  # of prctl(2)
 
@@ -47,7 +47,7 @@ class Interrupted(SystemExit):
 
 
 def leave_status(status: int) -> None:
-    """Report the exit status of a step to its run, if any."""
+    """Report the exit status of a step to its run, if the step is part of a run."""
     if STATUS_FILE in os.environ and status:
         file = ConfinedPath.referenced(os.environ[STATUS_FILE])
         with suppress(OSError, CampaignError), file.open("a", encoding="utf-8") as stream:  # absent on another node
@@ -99,7 +99,7 @@ _left: list[Path] = []
 
 
 def leave_working_folder() -> None:
-    """Change the working folder to the package folder, and call `isolate`; `given` resolves paths of the command line.
+    """Change the working folder to the package folder and call `isolate`; `given` then resolves command-line paths.
 
     Raises
     ------
@@ -114,8 +114,8 @@ def leave_working_folder() -> None:
 def isolate() -> None:
     """Prevent imports and commands from the working folder, in this process and its child processes.
 
-    Removes empty and relative entries of PATH, PYTHONPATH and ``sys.path``, which refer to the working folder;
-    Snakemake itself adds ``.snakemake/pip-deployments``.
+    Empty and relative entries of PATH, PYTHONPATH and ``sys.path``, which refer to the working folder, are removed.
+    Snakemake itself adds such an entry, ``.snakemake/pip-deployments``.
 
     Examples
     --------
@@ -164,7 +164,7 @@ def _is_writable(folder: Path | None) -> bool:
 
 
 def _private_folder() -> Path:
-    """Return this user's folder in the temporary folder; a new folder if the standard name belongs to another user."""
+    """Return this user's folder in the temporary folder; a new folder if another user owns the standard name."""
     folder = Path(tempfile.gettempdir()) / f"apertura-cache-{os.getuid()}"
     with suppress(FileExistsError):
         folder.mkdir(mode=0o700)
@@ -207,20 +207,20 @@ def as_typed(text: object) -> str:
 
 # ---- Confinement of Snakemake ---------------------------------------------------------------------------------------
 #
-# Snakemake and the shells of its jobs write and delete files by full path, in which the kernel follows links: records
-# in .snakemake, logs, benchmarks, outputs of failed jobs. Landlock (Linux 5.19 and newer, landlock(7)) prevents a
+# Snakemake and the shells of its jobs write and delete files (records in .snakemake, logs, benchmarks, outputs of
+# failed jobs) by full path, in which the kernel follows links. Landlock (Linux 5.19 and newer, landlock(7)) prevents a
 # process and its child processes from changing anything outside a list of folders, also through links.
 
 CONFINED = "APERTURA_CONFINED"
-"""Environment variable: the campaign folder to which Snakemake's changes are confined."""
+"""Environment variable: campaign folder to which changes by Snakemake are confined."""
 
 TEMPORARY = ("TMPDIR", "TMP", "TEMP", "TEMPDIR")
-"""Environment variables of the folder for temporary files; Snakemake sets all of them for its jobs."""
+"""Environment variables for the folder of temporary files; Snakemake sets all of these variables for its jobs."""
 
 _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446  # system calls, the same on every architecture
 _VERSION, _PATH_BENEATH, _PR_SET_NO_NEW_PRIVS = 1, 1, 38
 _CHANGES = sum(1 << right for right in (1, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13))
-"""Landlock rights: write a file; remove and create folders and files of every kind; move between folders."""
+"""Landlock rights: write files; remove and create folders and files of every type; move files between folders."""
 _TRUNCATE, _MOVES, _TRUNCATES = 1 << 14, 2, 3
 """Landlock right to truncate files; Landlock ABI versions that support moves and truncation."""
 
@@ -228,8 +228,9 @@ _TRUNCATE, _MOVES, _TRUNCATES = 1 << 14, 2, 3
 def confine_changes(root: Path, *others: Path) -> bool:
     """Prevent this process and its child processes from changing files outside results and caches.
 
-    Writable are ``results`` and ``.snakemake`` of the campaign (the latter also for temporary files), the user's cache,
-    the package folder with its compiled code, and devices. Recordings and config are read-only.
+    The following folders remain writable: ``results`` and ``.snakemake`` of the campaign (the latter also for temporary
+    files), the user's cache, the package folder with its compiled code, and the folders of devices and processes.
+    Recordings and config are read-only.
 
     Parameters
     ----------
@@ -241,8 +242,8 @@ def confine_changes(root: Path, *others: Path) -> bool:
     Returns
     -------
     bool
-        True if confined; False if the kernel has no Landlock or an older version of it. In this case, links are only
-        detected by the check before a run.
+        True if confined; False if the kernel has no Landlock or only an older version. In this case, only the check
+        before a run detects links.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     version = libc.syscall(_CREATE_RULESET, None, ctypes.c_size_t(0), _VERSION)
@@ -270,14 +271,14 @@ def confine_changes(root: Path, *others: Path) -> bool:
     return confined
 
 
-# ---- Lock of a campaign: one run at a time, released when its process exits -----------------------------------------
+# ---- Lock of a campaign: one run at a time; the lock is released when its process exits -----------------------------
 
 _LOCK = Path("results/.run.lock")
 _TRIES, _BETWEEN_S = 20, 0.02
 
 
 def hold(root: Path) -> IO[str]:
-    """Lock a campaign folder until the returned file is closed or its process exits.
+    """Lock a campaign folder until the returned file is closed or this process exits.
 
     Raises
     ------
@@ -335,7 +336,7 @@ def holder(root: Path) -> str | None:
 
 
 def _take(lock: IO[str]) -> None:
-    """Acquire the lock; retry, because `holder` acquires it for an instant."""
+    """Acquire the lock; retry, because `holder` acquires the lock for an instant."""
     for attempt in range(_TRIES):
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -348,4 +349,4 @@ def _take(lock: IO[str]) -> None:
 
 def _read_holder(lock: IO[str]) -> str:
     lock.seek(0)
-    return shown(lock.read(200).strip() or "process unknown, just started", 200)
+    return shown(lock.read(200).strip() or "a process that has just started", 200)

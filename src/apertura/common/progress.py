@@ -1,4 +1,4 @@
-"""Progress reports of a step: a small file in the campaign folder, read by the run and by `apertura status`."""
+"""Progress reports of a step: a small file in the campaign folder, which the run and `apertura status` read."""
 
 import json
 import threading
@@ -48,7 +48,7 @@ def reporting_to(file: Path) -> Iterator[None]:
 
 @contextmanager
 def progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Report the progress of a step at most once a second; without effect outside `reporting_to`.
+    """Report the progress of a step at most once a second; outside `reporting_to`, nothing is written.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
     Yields
     ------
     callable
-        Function that adds a number of finished units; may be called from any thread.
+        Function that adds a number of finished units; it may be called from any thread.
 
     Examples
     --------

@@ -25,7 +25,7 @@ _NAME = re.compile(r"[\w.-]+")
 
 
 def packages() -> dict[str, str]:
-    """Return name → version of apertura, Python and each distribution that apertura requires, sorted by name.
+    """Return name → version of apertura, of Python and of each distribution that apertura requires, sorted by name.
 
     The distributions are not imported. Optional dependencies (`extra`) are excluded, because they affect no result.
 
@@ -51,9 +51,9 @@ def _packages() -> tuple[tuple[str, str], ...]:
 
 
 def software() -> dict[str, str]:
-    """Return `packages` with the versions of GDAL (of rasterio) and PROJ (of pyproj).
+    """Return `packages` with the versions of GDAL (in rasterio) and PROJ (in pyproj).
 
-    ``proj`` is the library of pyproj, which computes pixel coordinates; rasterio may contain another version.
+    ``proj`` is the library in pyproj, which computes pixel coordinates; rasterio may contain another version of PROJ.
 
     Examples
     --------
@@ -68,7 +68,7 @@ def software() -> dict[str, str]:
 
 
 def lock_sha256() -> str:
-    """Return the SHA-256 of requirements/all.txt, the distributions of the tested environment with their hashes.
+    """Return the SHA-256 of requirements/all.txt, which lists the distributions of the tested environment.
 
     Examples
     --------
@@ -78,7 +78,7 @@ def lock_sha256() -> str:
     return sha256_file(shipped() / "requirements" / "all.txt")
 
 
-# ---- Settings, inputs and code of a result and of the stages before it ----------------------------------------------
+# ---- Settings, inputs and code of a result and of its upstream stages -----------------------------------------------
 
 _READ_BYTES = 1 << 22
 
@@ -103,7 +103,7 @@ class Provenance:
     code_sha256
         Chained code hash of the stage and its upstream stages.
     software
-        Name → version of the software of this stage and the upstream stages; several versions if these differ.
+        Name → version of the software of this stage and the upstream stages; several versions if the stages differ.
     """
 
     runspec: Mapping[str, Any]
@@ -131,7 +131,7 @@ class Provenance:
             Upstream stages of a single chain, whose settings agree; or name → stage for several chains, such as the
             pairs of a flight, whose settings are stored separately under these names.
         settings, inputs
-            Settings, and role → SHA-256 of the input files, of the new stage alone.
+            Settings of the new stage alone, and role → SHA-256 of its input files.
         software
             Name → version of the running software.
 
@@ -193,7 +193,7 @@ def sha256_text(text: str) -> str:
 
 
 LARGEST_DOCUMENT = 1_000_000_000
-"""Maximum size of a JSON document to be hashed, bytes; an RO-Crate has about 300 bytes for every chunk."""
+"""Maximum size of a JSON document to be hashed, bytes; an RO-Crate contains about 300 bytes per chunk."""
 
 LARGEST_RESULT = 1 << 36
 """Maximum size of a result file to be hashed, bytes; results of the largest stages occupy several GB, stored in chunks
@@ -218,17 +218,17 @@ def check_size(path: Path, size: int) -> None:
     largest = LARGEST_DOCUMENT if path.suffix == ".json" else LARGEST_RESULT
     if size > largest:
         expected = f"a result file of at most {largest} bytes"
-        raise CampaignError(f"{size} bytes", path, expected, "Remove it and run the workflow again.")
+        raise CampaignError(f"{size} bytes", path, expected, "Remove the file and run the workflow again.")
 
 
 def hashes_of_file(path: Path, algorithms: Sequence[str]) -> dict[str, str]:
-    """Return algorithm → hash of a file, hex; the file is read once, and each hash is computed in its own thread."""
+    """Return algorithm → hash of a file, hex; the file is read once, and each hash is computed in a separate thread."""
     digests = {name: hashlib.new(name) for name in algorithms}
     updates = list[Future[None]]()
     with path.open("rb", buffering=0) as stream, ThreadPoolExecutor(len(digests)) as pool:
         block_bytes = min(_READ_BYTES, max(os.fstat(stream.fileno()).st_size, 1))
         blocks = cycle([memoryview(bytearray(block_bytes)) for _ in range(2)])
-        while size := stream.readinto(block := next(blocks)):  # the previous block is being hashed meanwhile
+        while size := stream.readinto(block := next(blocks)):  # meanwhile, the previous block is being hashed
             wait(updates)
             updates = [pool.submit(digest.update, block[:size]) for digest in digests.values()]
     return {name: digest.hexdigest() for name, digest in digests.items()}
@@ -272,7 +272,7 @@ def code_sha256(*modules: str, package: Path = PACKAGE) -> str:
 
 @cache
 def _as_run(source: str) -> str:
-    """Return the executable lines of a source."""
+    """Return the executable lines of a source text."""
     return "".join(f"{line}\n" for line in without_description(source).split("\n") if line.strip() != "...")
 
 

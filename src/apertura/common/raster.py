@@ -1,7 +1,7 @@
 """Opening of untrusted rasters as GeoTIFF only, without sidecar files.
 
-GDAL otherwise selects a driver by file content: a VRT or WMS document named .tif can read other files and the network,
-and a sidecar file can change the heights or the georeference of a raster.
+By default, GDAL selects a driver by file content: a VRT or WMS document named .tif can access other files and the
+network, and a sidecar file can change the heights or the georeference of a raster.
 """
 
 import re
@@ -26,7 +26,7 @@ ISOLATED = {
 """GDAL configuration options for opening and reading an untrusted raster."""
 
 LARGEST_BLOCK = 100_000_000
-"""Maximum number of values in a block or strip of a raster, which GDAL allocates whole before decompression."""
+"""Maximum number of values in a block or strip of a raster; GDAL allocates the whole block before decompression."""
 
 LARGEST_SIDE = 1 << 30
 """Maximum number of rows or columns."""
@@ -34,14 +34,14 @@ LARGEST_SIDE = 1 << 30
 
 @contextmanager
 def opened_raster(path: Path, *, expected: str, remedy: str) -> Iterator[Any]:
-    """Open a GeoTIFF for reading; errors on opening and in the context are reported as a single message.
+    """Open a GeoTIFF for reading; errors during opening and within the context are converted to a single message.
 
     Parameters
     ----------
     path
         The file; sidecar files are ignored.
     expected, remedy
-        Parts of the message.
+        Parts of the error message.
 
     Yields
     ------

@@ -1,6 +1,6 @@
 """CSV tables of the studies: one dataclass instance per row, one file per table; a file that exists is complete.
 
-The csv module is used instead of pandas: importing pandas takes one second, a large part of a job of a few seconds, and
+The csv module is used instead of pandas, because importing pandas takes one second of jobs that last a few seconds, and
 pandas converts text columns that resemble numbers.
 """
 
@@ -17,16 +17,16 @@ Row = TypeVar("Row")
 
 
 def write_table(path: Path, rows: Iterable[Any], *, digits: int | None = None) -> None:
-    """Write rows as CSV, one line each; an interrupted process leaves a complete file or no file.
+    """Write rows as CSV, one line per row; an interrupted process leaves a complete file or no file.
 
     Parameters
     ----------
     path
         The file; missing parent folders are created.
     rows
-        At least one dataclass instance or mapping, all with the columns of the first.
+        At least one dataclass instance or mapping; all rows have the columns of the first row.
     digits
-        Significant digits of floats; None: the shortest exact representation.
+        Significant digits of floats; None for the shortest exact representation.
     """
     records = [_record(row, digits) for row in rows]
     with replacement(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
@@ -43,7 +43,9 @@ def _record(row: Any, digits: int | None) -> Mapping[str, object]:
 
 
 def read_table(path: Path, kind: type[Row]) -> list[Row]:
-    """Read a file of `write_table`; each row becomes an instance of dataclass `kind` with str, int and float fields.
+    """Read a file written by `write_table`; each row becomes an instance of dataclass `kind`.
+
+    The fields of `kind` have the types str, int or float.
 
     Raises
     ------
@@ -64,7 +66,7 @@ def read_table(path: Path, kind: type[Row]) -> list[Row]:
     [Loss(cause='timing', loss_db=1.5)]
     """
     if not path.is_file():
-        raise CampaignError("no such file", path, "a table of a study", "Run the command that writes it first.")
+        raise CampaignError("no such file", path, "a table of a study", "First run the command that writes the table.")
     types = get_type_hints(kind)
     convert = {field.name: types[field.name] for field in fields(kind)}  # type: ignore[arg-type]
     with path.open(encoding="utf-8", newline="") as stream:

@@ -1,4 +1,4 @@
-"""Driver of the workflow: check a campaign folder, run Snakemake in one process group, stop it with all its steps."""
+"""Driver of the workflow: check a campaign folder, run Snakemake in a process group, and stop it with all its steps."""
 
 import os
 import re
@@ -44,28 +44,28 @@ from apertura.workflow.stale import absent_lines, any_is_missing, forms_results,
 Show = Literal["errors", "steps", "snakemake"]
 
 _GRACE_S = 3.0
-_LOOK_S, _REST = 0.2, 20  # polling interval, and least ratio of idle to polling time: polling 10^5 jobs takes long
+_LOOK_S, _REST = 0.2, 20  # polling interval; minimum ratio of idle to polling time, because 10^5 jobs take long to poll
 _COUNTERS = Path("/proc/vmstat")
 _ELSEWHERE = ("memory", "plan")
-"""Checks of this machine, omitted if steps run on other machines."""
+"""Checks that concern this machine, omitted if steps run on other machines."""
 _HOLDS_CODE = ("--profile", "--workflow-profile", "--configfiles", "--snakefile", "--jobscript", "--js")
-"""Options of Snakemake whose values are files from which it executes code; abbreviations of them are accepted."""
+"""Options whose values are files from which Snakemake executes code; Snakemake accepts abbreviations of options."""
 _HOLDS_NONE = ("--config", "--jobs")
 _PICKLED = "--trust-io-cache"
-"""Option of Snakemake: read the state of files from a pickle in the working folder."""
+"""Option with which Snakemake reads the state of files from a pickle in the working folder."""
 _SHORT = re.compile(r"(-[hntkfFlSDvpa]*s)(.*)")
-"""Short options without a value, then `-s` (`--snakefile`), and its value if attached without a space."""
+"""Short options without values, followed by `-s` (`--snakefile`) and its value if there is no space between them."""
 _PROFILE = "SNAKEMAKE_PROFILE"
 """Environment variable: default profile of Snakemake."""
 _DRY_RUN = re.compile(r"-n|-np|--dry-?run")
 _SCATTER = "--set-scatter"
 _DEPLOYS = ("--sd", "--so", "--use-c", "--use-s", "--use-a", "--conda")
-"""Prefixes of options with which Snakemake installs software in any folder: its file access is then not confined."""
+"""Prefixes of options with which Snakemake installs software in any folder; its file access is then not confined."""
 _BY_SHELL = (*_DEPLOYS, "--cac", "--be")
 """Prefixes of options that apply to shell commands: software deployment, caching, extended benchmarks."""
 UNTIL = ("--until", "-U")
 _TARGETS = ("all", "pages", "phase_history")
-"""Rules of the workflow that only collect results of other rules."""
+"""Rules of the workflow that only collect the results of other rules."""
 _LOG = "snakemake.log"
 
 
@@ -77,7 +77,7 @@ class _Files:
     status: ConfinedPath
     log: ConfinedPath
     confined: str = ""
-    """Campaign folder to which file changes of Snakemake are confined; empty: not confined."""
+    """Campaign folder to which file changes by Snakemake are confined; empty if changes are not confined."""
 
     @classmethod
     def of(cls, campaign: Campaign, *, confined: bool) -> "_Files":
@@ -97,14 +97,14 @@ class _Files:
 
     @property
     def environment(self) -> dict[str, str]:
-        """Environment of Snakemake and its steps, with `apertura`, which the rules call, on the PATH."""
+        """Environment of Snakemake and its steps; PATH includes the command `apertura`, which the rules call."""
         isolate()
         path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
         files = {STATUS_FILE: self.status.reference(), JOURNAL: self.journal.reference()}
         return {**os.environ, "PATH": path, **files, **({CONFINED: self.confined} if self.confined else {})}
 
     def status_of(self, status: int) -> int:
-        """Return the exit status: 1 after a signal, 2 if steps failed without internal error, else Snakemake's."""
+        """Return the exit status: 1 after a signal, 2 if steps failed without internal error, otherwise Snakemake's."""
         if _ended_by(status):
             return 1
         reported = self.status.read_text(encoding="utf-8").split() if self.status.is_file() else []
@@ -125,7 +125,8 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
     paranoid
         Hash all sources again, including those with an unchanged size and modification time.
     show
-        'errors'; 'steps': a line per step, with progress bars on a terminal; or 'snakemake': its full output.
+        'errors': only errors; 'steps': a line per step, with progress bars on a terminal; 'snakemake': full output of
+        Snakemake.
 
     Returns
     -------
@@ -179,7 +180,7 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
 
 @contextmanager
 def _ahead(root: Path) -> Iterator["subprocess.Popen[bytes]"]:
-    """Start the fork server, which imports modules during the check of the campaign; stop it in any case."""
+    """Start the fork server, which imports modules during the check of the campaign; stop the server on exit."""
     isolate()
     at_once = []
     with suppress(CampaignError):  # reported by the check
@@ -188,7 +189,7 @@ def _ahead(root: Path) -> Iterator["subprocess.Popen[bytes]"]:
     try:
         yield process
     finally:
-        with process:  # closes its standard input, if still open
+        with process:  # closes the standard input of the process if it is still open
             process.kill()
 
 
@@ -201,7 +202,7 @@ def _formed(
     *,
     verbose: bool,
 ) -> int:
-    """Run Snakemake, in the waiting fork server if any, and display the progress in its journal."""
+    """Run Snakemake, in the waiting fork server if there is one, and display the progress recorded in the journal."""
     reader, killed, status, ended = JournalReader(files.journal), _killed_for_memory(), INTERRUPTED, 0
     try:
         with files.log.open("wb") as output, files.log.open("rb") as log, screen:
@@ -234,7 +235,7 @@ def _formed(
 
 
 def _examined(root: Path, words: Sequence[str], files: "_Files", *, report: bool) -> int:
-    """Run Snakemake without computing results, and if `report` is set print a summary of the planned steps."""
+    """Run Snakemake without computing results; with `report`, print a summary of the planned steps."""
     with files.log.open("wb") as output:
         status = files.status_of(_watched(_started([RECORDER, *words], files.environment, output=output)))
     run = JournalReader(files.journal).news()
@@ -258,13 +259,16 @@ def _words(root: Path, cores: int, arguments: Sequence[str]) -> list[str]:
 
 
 def _ended_by(status: int) -> str:
-    """Return the signal that terminated a process, from its or a shell's exit status; empty after exit or SIGINT."""
+    """Return the signal that terminated a process, given the exit status of the process or a shell.
+
+    The name is empty if the process exited, or was interrupted by SIGINT.
+    """
     number = -status if status < 0 else status - SIGNALLED
     return signal.Signals(number).name if status != INTERRUPTED and number in set(signal.Signals) else ""
 
 
 def _killed_for_memory() -> int:
-    """Return the number of processes killed by the kernel out of memory since boot; 0 if not available."""
+    """Return the number of processes that the kernel has killed for lack of memory since boot; 0 if not available."""
     try:
         counters = dict(line.split() for line in _COUNTERS.read_text(encoding="ascii").splitlines())
         return int(counters.get("oom_kill", 0))
@@ -273,9 +277,9 @@ def _killed_for_memory() -> int:
 
 
 def code_from_outside(root: Path, arguments: Sequence[str]) -> list[str]:
-    """Make paths of files with code for Snakemake absolute, and refuse files in the campaign folder.
+    """Make paths of files that contain code for Snakemake absolute, and reject files in the campaign folder.
 
-    Snakemake is started in a different folder than the caller's. Profiles and configurations may contain Python (YTE).
+    Snakemake is started in a different folder than the caller. Profiles and configurations may contain Python (YTE).
 
     Parameters
     ----------
@@ -287,7 +291,7 @@ def code_from_outside(root: Path, arguments: Sequence[str]) -> list[str]:
     Raises
     ------
     CampaignError
-        If such a file lies in the campaign folder, or is reached through it.
+        If such a file lies in the campaign folder, or is reached through the campaign folder.
 
     Examples
     --------
@@ -307,7 +311,7 @@ def code_from_outside(root: Path, arguments: Sequence[str]) -> list[str]:
 
 
 def apart(argument: str) -> list[str]:
-    """Split an option and its value that are written as one word.
+    """Split an option and its value if both are written as one word.
 
     Examples
     --------
@@ -321,7 +325,7 @@ def apart(argument: str) -> list[str]:
 
 
 def _values(options: Sequence[str], *names: str) -> Iterator[int]:
-    """Yield the indices of the values of an option, also in its abbreviated forms."""
+    """Yield the indices of the values of an option, which may be abbreviated."""
     option = ""
     for at, word in enumerate(options):
         if word.startswith("-"):
@@ -331,7 +335,7 @@ def _values(options: Sequence[str], *names: str) -> Iterator[int]:
 
 
 def _steps_as_until(options: Sequence[str]) -> list[str]:
-    """Convert steps named as targets to options --until, since Snakemake accepts no target rules with wildcards.
+    """Convert steps named as targets to options --until, because Snakemake accepts no target rules with wildcards.
 
     Examples
     --------
@@ -343,10 +347,10 @@ def _steps_as_until(options: Sequence[str]) -> list[str]:
     for step in steps:
         if RULES[step].on_demand:
             raise CampaignError(
-                f"{step}: a step that runs only if its result is requested",
+                f"{step}: a step that only runs if its result is requested",
                 "apertura run",
                 f"a target ({', '.join(_TARGETS)}), or a file of the results",
-                "Name the file, or the target that collects it.",
+                "Request the file, or the target that collects the file.",
             )
     others = [word for word in options[:leading] if word not in steps]
     rest = list(options[leading:])
@@ -359,7 +363,7 @@ def _steps_as_until(options: Sequence[str]) -> list[str]:
 
 
 def _check_values(options: Sequence[str]) -> None:
-    """Raise CampaignError for invalid shares or step names that Snakemake ignores, or reports incomprehensibly."""
+    """Raise CampaignError for invalid numbers of jobs or step names, which Snakemake ignores or reports unclearly."""
     for shares in (options[at] for at in _values(options, _SCATTER)):
         if not re.fullmatch(r"tiles=0*[1-9][0-9]*", shares):
             raise CampaignError(
@@ -376,7 +380,7 @@ def _check_values(options: Sequence[str]) -> None:
 
 
 def _check_targets(campaign: Campaign, options: Sequence[str]) -> None:
-    """Raise CampaignError for result files of an unknown flight, pair or node, even if they match a rule."""
+    """Raise CampaignError for result files of an unknown flight, pair or node, even if the files match a rule."""
     requested = [path for path in map(PurePosixPath, options) if path.parts[:1] == ("results",) and len(path.parts) > 3]
     requested = [path for path in requested if path.parts[1] not in RESERVED_NAMES]
     known = [PurePosixPath(result.manifest).parts for _, result in results_of(campaign)] if requested else []
@@ -390,7 +394,10 @@ def _check_targets(campaign: Campaign, options: Sequence[str]) -> None:
 
 
 def _without_inner_steps(campaign: Campaign, options: Sequence[str]) -> list[str]:
-    """Return the options without --until steps that are inputs of others: Snakemake fails if both are given."""
+    """Return the options without --until steps on which other --until steps depend.
+
+    Snakemake fails if both steps are given.
+    """
     indices = [at for at in _values(options, *UNTIL) if options[at] in RULES]
     if len(indices) < 2:
         return list(options)
@@ -401,7 +408,7 @@ def _without_inner_steps(campaign: Campaign, options: Sequence[str]) -> list[str
         return {result.manifest for name, result in results if name == RULES[step].result}
 
     def needed(step: str) -> set[str]:
-        visited = set() if RULES[step].shares else outputs(step)  # a share alone does not complete its result
+        visited = set() if RULES[step].shares else outputs(step)  # a step for part of a result does not complete it
         pending = [source for manifest in outputs(step) for source in sources[manifest]]
         while pending:
             manifest = pending.pop()
@@ -419,7 +426,7 @@ def _without_inner_steps(campaign: Campaign, options: Sequence[str]) -> list[str
 
 
 def _holds_code(option: str) -> bool:
-    """Return True if the value of an option, also abbreviated, is a file from which Snakemake executes code."""
+    """Return True if the value of an option (which may be abbreviated) is a file from which Snakemake executes code."""
     if not option.startswith("--"):
         return _SHORT.fullmatch(option) is not None
     return option not in ("--", *_HOLDS_NONE) and any(name.startswith(option) for name in _HOLDS_CODE)
@@ -430,27 +437,26 @@ def _refuse_pickled(option: str) -> None:
         raise CampaignError(
             f"{option}: Snakemake would read a pickle in the campaign folder, which may execute code",
             "apertura run",
-            "options with which the campaign folder is read as data only",
+            "options for which the campaign folder is only read as data",
             "Omit this option.",
         )
 
 
 def _absolute(root: Path, option: str, name: str) -> str:
-    """Return the absolute path of a shipped profile or a file of the caller; any other name unchanged."""
+    """Return the absolute path of a shipped profile or a file of the caller; return any other name unchanged."""
     ours, theirs = shipped() / name, given(Path(name))
     if name.startswith("profiles/") and ours.exists():
         return str(ours)
     if not theirs.exists():
         return name
-    typed = Path(
-        os.path.normpath(theirs)
-    )  # also refused: a link in the campaign folder, whose creator controls the target
+    # A link in the campaign folder is also rejected, because the creator of the folder controls its target.
+    typed = Path(os.path.normpath(theirs))
     if any(path.resolve().is_relative_to(root.resolve()) for path in (theirs, typed, *typed.parents)):
         raise CampaignError(
             f"{option} {name} lies in the campaign folder",
             "apertura run",
-            "a file outside the campaign folder: Snakemake executes its code, but campaign folders are data",
-            "Inspect the file, and copy it out of the campaign folder if you trust it.",
+            "a file outside the campaign folder, because Snakemake executes its code, but campaign folders are data",
+            "Inspect the file. If you trust the file, copy it to a folder outside the campaign folder.",
         )
     return str(theirs)
 
@@ -464,7 +470,7 @@ def _runs_elsewhere(arguments: Sequence[str]) -> bool:
 def _started(
     words: Sequence[str], environment: Mapping[str, str], *, stdin: int | None = None, output: IO[bytes] | None = None
 ) -> "subprocess.Popen[bytes]":
-    """Start a module with its arguments in a new process group, which includes all its descendants."""
+    """Start a module with its arguments in a new process group, which includes all descendants of the process."""
     return subprocess.Popen(
         [sys.executable, "-P", "-m", *words],
         cwd=PACKAGE,  # never the campaign folder: see `apertura.common.processes`
@@ -495,5 +501,5 @@ def _end(process: "subprocess.Popen[bytes]") -> None:
     with suppress(subprocess.TimeoutExpired):
         process.wait(_GRACE_S)
     with suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)  # also steps that outlive Snakemake; their completed work is kept
+        os.killpg(process.pid, signal.SIGKILL)  # also kills steps that outlive Snakemake; completed work is kept
     process.wait()

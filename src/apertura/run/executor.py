@@ -1,4 +1,4 @@
-"""Snakemake executor plugin `apertura`: requests steps from `apertura.run.fork_server`, which forks them.
+"""Snakemake executor plugin `apertura`: requests steps from `apertura.run.fork_server`, which forks a process per step.
 
 Jobs that are not steps are passed to Snakemake's local executor.
 """
@@ -28,7 +28,7 @@ _THREADS = (
     "VECLIB_MAXIMUM_THREADS",
     "NUMEXPR_NUM_THREADS",
 )
-"""Environment variables with the number of threads of a job, as Snakemake sets them for a shell."""
+"""Environment variables for the number of threads of a job, which Snakemake sets for shell commands."""
 
 
 @dataclass
@@ -36,7 +36,7 @@ class ExecutorSettings(ExecutorSettingsBase):  # type: ignore[misc]  # the inter
     """Options of the executor."""
 
     requests: int | None = field(
-        default=None, metadata={"help": "file descriptor of the socket for requests of steps", "type": int}
+        default=None, metadata={"help": "file descriptor of the socket for step requests", "type": int}
     )
 
 
@@ -64,7 +64,7 @@ class Executor(AbstractExecutor):  # type: ignore[misc]
             return
         self.workflow.async_run(job.prepare())
         self._running[job.jobid] = info = SubmittedJobInfo(job)
-        self._local.report_job_submission(info)  # marks its results as incomplete
+        self._local.report_job_submission(info)  # marks the results of the job as incomplete
         request = {
             "job": job.jobid,
             "words": step[1].split(),
@@ -86,12 +86,12 @@ class Executor(AbstractExecutor):  # type: ignore[misc]
                 self.report_job_success(info)
 
     def shutdown(self) -> None:
-        """Wait for the jobs that are not steps; steps are terminated with Snakemake's process."""
+        """Wait for jobs that are not steps; steps are terminated together with the Snakemake process."""
         self._local.shutdown()
 
     cancel = shutdown
 
     def handle_job_success(self, job: Any) -> None:
-        """Do nothing: the job has been reported to Snakemake."""
+        """Do nothing, because the job has already been reported to Snakemake."""
 
     handle_job_error = handle_job_success

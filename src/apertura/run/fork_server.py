@@ -1,8 +1,8 @@
-"""Fork server of `apertura run`: steps are forks of one process that has imported their modules.
+"""Fork server of `apertura run`: steps are forks of a single process that has imported their modules.
 
-``python -m apertura.run.fork_server`` reads an order, forks Snakemake with a journal, and then forks a process for
-each step requested by its executor; it has no threads. Log, benchmark, variables, signals and exit status of a step are
-those of the shell command in its rule, which plain Snakemake and other machines run directly.
+``python -m apertura.run.fork_server`` reads an order, forks Snakemake with a journal, and then forks a process for each
+step requested by the executor of Snakemake. The fork server has no threads. Log, benchmark, variables, signals and exit
+status of a step are those of the shell command in its rule, which plain Snakemake and other machines run directly.
 """
 
 import gc
@@ -34,7 +34,7 @@ from apertura.workflow.rules import RULES
 NAME = "apertura.run.fork_server"
 """Name of this module."""
 AT_ONCE = "--at-once"
-"""Argument: import the modules of steps immediately, since steps will be requested."""
+"""Argument with which the modules of steps are imported immediately, because steps will be requested."""
 
 _BOTH = ("apertura.check", "apertura.workflow.jobs", "apertura.workflow.stale")
 """Modules that are also imported in the process of Snakemake."""
@@ -56,7 +56,7 @@ _LIBRARIES = (
 )
 """Modules that most steps import within functions."""
 
-_LONGEST = 1 << 16  # largest size of a request, bytes
+_LONGEST = 1 << 16  # maximum size of a request, bytes
 _GRACE_S = 2.0
 _fork = multiprocessing.get_context("fork").Process
 
@@ -70,9 +70,9 @@ class Order:
     arguments
         Arguments of Snakemake.
     environment
-        Variables in addition to those of this process.
+        Environment variables in addition to those of this process.
     output
-        File for all output, as a reference of `ConfinedPath`.
+        File for all output, given as `ConfinedPath.reference`.
     """
 
     arguments: Sequence[str]
@@ -86,9 +86,9 @@ class Order:
 
 
 def main() -> int:
-    """Run Snakemake as ordered, and its steps; return its exit status."""
-    os.environ[ALGEBRA_THREADS] = "1"  # otherwise numpy starts threads on import, and forks are unsafe
-    for number in ENDING:  # signals reach the whole group: this process exits after the others
+    """Run Snakemake as ordered, and its steps; return the exit status of Snakemake."""
+    os.environ[ALGEBRA_THREADS] = "1"  # otherwise numpy starts threads on import, which makes forks unsafe
+    for number in ENDING:  # signals are sent to the whole group: this process exits after the other processes
         signal.signal(number, signal.SIG_IGN)
     own_end, snakemake_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     for module in _BOTH:
@@ -120,7 +120,7 @@ def _start_snakemake(requests: socket.socket) -> BaseProcess:
 
 
 def _serve(requests: socket.socket, snakemake: BaseProcess) -> None:
-    """Fork a process for each request until Snakemake has exited, and report the exit status of each."""
+    """Fork a process for each request until Snakemake has exited, and report the exit status of each process."""
     running: dict[int, tuple[BaseProcess, int]] = {}
     while snakemake.is_alive():
         for ready in wait([requests, snakemake.sentinel, *running]):
@@ -142,7 +142,7 @@ def _serve(requests: socket.socket, snakemake: BaseProcess) -> None:
 
 
 def _status(process: BaseProcess) -> int:
-    """Return the exit status of a process by the convention of shells."""
+    """Return the exit status of a process according to the convention of shells."""
     process.join()
     code = process.exitcode or 0
     return code if code >= 0 else SIGNALLED - code
@@ -165,7 +165,7 @@ def _import() -> None:
     from apertura.core.backprojection.engines.reference import polynomial
 
     zero = np.zeros((1, 1), np.complex128)
-    polynomial(zero, zero)  # the first call of a compiled function initialises numba's tables, 0.2 s
+    polynomial(zero, zero)  # the first call of a compiled function initialises tables of numba, which takes 0.2 s
     software()
     code_sha256(*(rule.module for rule in RULES.values()))
     gc.collect()
@@ -181,18 +181,18 @@ def _redirect(file: ConfinedPath) -> None:
 
 
 def _child(parent: int, work: Callable[..., None], *arguments: Any) -> None:
-    """Run a function in a process that is terminated with its parent, and by signals."""
+    """Run a function in a process that is terminated by signals, and when its parent exits."""
     die_with_parent(parent)
     for number in ENDING:
         signal.signal(number, signal.SIG_DFL)
     work(*arguments)
 
 
-# ---- In the process of snakemake ------------------------------------------------------------------------------------
+# ---- In the process of Snakemake ------------------------------------------------------------------------------------
 
 
 def _snakemake(requests: socket.socket, arguments: Sequence[str]) -> None:
-    """Run Snakemake with a journal in this process, with the executor that requests steps."""
+    """Run Snakemake in this process, with a journal and with the executor that requests steps."""
     from snakemake_interface_executor_plugins.registry import ExecutorPluginRegistry
 
     executor = importlib.import_module("apertura.run.executor")
@@ -205,7 +205,7 @@ def _snakemake(requests: socket.socket, arguments: Sequence[str]) -> None:
 
 
 def _step(request: Mapping[str, Any]) -> None:
-    """Run the command of a step in this process as a shell would; write its benchmark if it succeeds."""
+    """Run the command of a step in this process like a shell; write the benchmark if the command succeeds."""
     start_s = time.monotonic()
     os.environ.update(request["environment"])
     os.environ.pop(CONFINED, None)  # applies to Snakemake only

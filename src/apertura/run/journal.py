@@ -1,4 +1,4 @@
-"""Journal of a run in the campaign folder: writing, reading the state of the run, and the messages of a failed run."""
+"""Journal of a run in the campaign folder: writing, reading the state of a run, and messages of a failed run."""
 
 import json
 import re
@@ -16,13 +16,13 @@ JOURNAL = "APERTURA_JOURNAL"
 """Environment variable: path of the journal of a run."""
 
 RECORDER, NAME = "apertura.run.recorder", "apertura"
-"""Module that runs Snakemake with a journal, and the name of its logger plugin."""
+"""Module that runs Snakemake with a journal, and name of the logger plugin."""
 
 _STEP = re.compile(r"\bapertura step ((?:[\w.-]+ ?)+)")
 LAST_S = float(1 << 33)
 """Upper limit of valid times, seconds since the epoch: year 2242."""
 
-_LONGEST = 1 << 26  # largest journal that is read, bytes; 10^5 jobs write 3·10^7
+_LONGEST = 1 << 26  # maximum number of bytes read from a journal; 10^5 jobs write 3·10^7 bytes
 _NO_STEPS = {"all", "total"}
 
 
@@ -49,9 +49,9 @@ class JobRecord:
     Attributes
     ----------
     rule, step
-        Rule, and step name and arguments.
+        Name of the rule; step name and arguments.
     log
-        Log of the step, relative to the campaign folder; empty if it has none.
+        Log of the step, relative to the campaign folder; empty if the step has no log.
     begun_s, ended_s
         Start and end, seconds since the epoch; `ended_s` is None while the job runs.
     failed
@@ -76,20 +76,20 @@ class JobRecord:
         return self.ended_s is None
 
     def seconds(self, now_s: float | None = None) -> float:
-        """Return the duration of the job, so far if it is running, seconds."""
+        """Return the duration of the job, or its duration so far if it is running, seconds."""
         return (self.ended_s or now_s or time.time()) - self.begun_s
 
 
 @dataclass
 class RunRecord:
-    """State of a run from its journal.
+    """State of a run according to its journal.
 
     Attributes
     ----------
     planned
         Rule → number of jobs, as planned before the first job.
     jobs
-        Number of a job → the job, for jobs that have started.
+        Job number → job, for jobs that have started.
     errors
         Error messages of Snakemake.
     cores
@@ -115,7 +115,7 @@ class RunRecord:
 
     @property
     def running(self) -> list[JobRecord]:
-        """Running jobs, the oldest first."""
+        """Running jobs, in the order of their start."""
         return [job for job in self.jobs.values() if job.running]
 
     @property
@@ -162,7 +162,7 @@ class JournalReader:
     Parameters
     ----------
     path
-        The journal; it need not exist yet.
+        Path of the journal, which need not exist yet.
     """
 
     def __init__(self, path: Path) -> None:
@@ -183,7 +183,7 @@ class JournalReader:
 
 
 def note(path: Path, event: str, **values: Any) -> None:
-    """Write a line of the journal."""
+    """Append a line to the journal."""
     with path.open("a", encoding="utf-8") as journal:
         journal.write(json.dumps({"at": round(time.time(), 2), "event": event, **values}) + "\n")
 
@@ -194,7 +194,7 @@ _ERROR_PREFIX = "error: "
 
 
 def failures(root: Path, run: RunRecord, log: Path) -> Iterator[str]:
-    """Yield the error report of a failed run: messages of steps, or of Snakemake, and the logs.
+    """Yield the error report of a failed run: messages of steps or of Snakemake, and paths of the logs.
 
     Parameters
     ----------
@@ -220,11 +220,11 @@ def failures(root: Path, run: RunRecord, log: Path) -> Iterator[str]:
 
 
 def a_step_was_killed(root: Path, run: RunRecord) -> bool:
-    """Return True if a failed step of a run has left no message in its log."""
+    """Return True if the log of a failed step of a run contains no message."""
     return any(_message(root / job.log) == _KILLED for job in run.failed if job.log)
 
 
-_KILLED = "a step exited without a message: it was killed, possibly out of memory, or its machine failed"
+_KILLED = "a step exited without a message: the step was killed, possibly out of memory, or its machine failed"
 _NO_EXECUTOR = re.compile(r"argument --executor/-e: invalid choice: '([\w-]+)'")
 
 
@@ -248,7 +248,7 @@ def _message(log: Path | None) -> str:
         if line.startswith(_ERROR_PREFIX):
             return shown(line, 2000)
     if any(line.startswith("Traceback") for line in lines):
-        return f"internal error, please report it with the log: {shown(lines[-1], 2000)}"
+        return f"internal error, please report this error with the log: {shown(lines[-1], 2000)}"
     return _KILLED
 
 

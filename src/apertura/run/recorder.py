@@ -1,7 +1,7 @@
 """Snakemake with a journal: each start, end or failure of a job is recorded as a line of JSON.
 
-``python -m apertura.run.recorder`` is Snakemake with an additional logger plugin. Snakemake finds plugins only in
-installed top-level packages, not in editable ones; here the plugin is registered explicitly.
+``python -m apertura.run.recorder`` runs Snakemake with an additional logger plugin. The plugin is registered
+explicitly, because Snakemake finds plugins only in installed top-level packages, not in editable installations.
 """
 
 import os
@@ -21,7 +21,7 @@ from apertura.run.journal import JOURNAL, NAME, note, step_of
 
 
 class LogHandler(LogHandlerBase):
-    """Log handler that writes job events of Snakemake to the journal; its output is unchanged."""
+    """Log handler that writes job events of Snakemake to the journal; the output of Snakemake is unchanged."""
 
     writes_to_stream = False
     writes_to_file = False
@@ -38,7 +38,7 @@ class LogHandler(LogHandlerBase):
 
 
 def _line(event: LogEvent | None, record: dict[str, Any]) -> tuple[str, dict[str, Any]] | None:
-    """Convert an event of Snakemake to name and values of a journal line; None if it is not recorded."""
+    """Convert an event of Snakemake to name and values of a journal line; None if the event is not recorded."""
     if event == LogEvent.RUN_INFO:
         return "planned", {"jobs": record["stats"]}
     if event == LogEvent.JOB_INFO:
@@ -58,7 +58,7 @@ def _line(event: LogEvent | None, record: dict[str, Any]) -> tuple[str, dict[str
 def record() -> None:
     """Run Snakemake with the arguments of this process."""
     LoggerPluginRegistry().register_plugin(f"snakemake_logger_plugin_{NAME}", sys.modules[__name__])
-    sys.argv[0] = "snakemake"  # prefix of its messages
+    sys.argv[0] = "snakemake"  # prefix of Snakemake's messages
     if CONFINED in os.environ:
         journal = ConfinedPath.referenced(os.environ[JOURNAL])
         confine_changes(Path(os.environ.pop(CONFINED)), journal.parent.real())

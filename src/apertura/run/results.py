@@ -29,11 +29,11 @@ _OWN: Mapping[str, str | tuple[str, ...]] = {
     RUN: "",
     "preview": (".png", ".json", ".html", ".tif"),
 }
-"""Folder of the results → suffixes of files written there by a run or by `apertura preview`."""
+"""Folder in the results → suffixes of the files that a run or `apertura preview` writes there."""
 
 
 def print_list(campaign: Campaign) -> None:
-    """Print a row for each folder of the results: finished, stale and missing results, and size."""
+    """Print a row for each folder of the results: finished, out-of-date and missing results, and size."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -64,7 +64,7 @@ def print_list(campaign: Campaign) -> None:
 
 
 def states(campaign: Campaign) -> dict[tuple[str, ...], dict[str, list[str]]]:
-    """Return folder below the results → state (finished, stale, missing) → names of results."""
+    """Return folder relative to the results → state (finished, stale, missing) → names of results."""
     stale = stale_results(campaign)
     states_of: dict[tuple[str, ...], dict[str, list[str]]] = defaultdict(lambda: {state: [] for state in _COLOURS})
     for name, result in results_of(campaign):
@@ -77,7 +77,7 @@ def states(campaign: Campaign) -> dict[tuple[str, ...], dict[str, list[str]]]:
 
 
 def counted(found: Mapping[tuple[str, ...], Mapping[str, list[str]]]) -> str:
-    """Return a summary of the number of results in each state, from the result of `states`.
+    """Return a summary of the number of results in each state, given the return value of `states`.
 
     Examples
     --------
@@ -89,7 +89,7 @@ def counted(found: Mapping[tuple[str, ...], Mapping[str, list[str]]]) -> str:
 
 
 def _sizes(results: ConfinedPath, places: set[tuple[str, ...]]) -> dict[tuple[str, ...], int]:
-    """Return the size of each folder, bytes; files in no other folder are attributed to the campaign."""
+    """Return the size of each folder, bytes; files outside the given folders are attributed to the campaign."""
     sizes = dict.fromkeys({*places, ()}, 0)
     for folder, _, names in results.walk():
         parts = folder.relative_to(results).parts
@@ -106,14 +106,14 @@ def clean(campaign: Campaign, *, unfinished_only: bool, agreed: bool) -> None:
     campaign
         The campaign; its recordings and configuration are never changed.
     unfinished_only
-        Remove only incomplete results.
+        Remove incomplete results only.
     agreed
         Do not ask for confirmation.
 
     Raises
     ------
     CampaignError
-        If the campaign is locked by a run, a step still writes, or confirmation is required without a terminal.
+        If a run locks the campaign, a step is still writing, or confirmation is required but there is no terminal.
     """
     if not campaign.results.is_dir():
         print(f"nothing to remove: {campaign.results} does not exist")
@@ -135,9 +135,9 @@ def clean(campaign: Campaign, *, unfinished_only: bool, agreed: bool) -> None:
         kept = [] if unfinished_only else _files(campaign.results)
         if kept:
             more = f" and {len(kept) - 1} more" if len(kept) > 1 else ""
-            print(f"kept files not written by the workflow: {shown(campaign.relative(kept[0]), 400)}{more}")
+            print(f"kept files that the workflow did not write: {shown(campaign.relative(kept[0]), 400)}{more}")
         elif not unfinished_only:
-            campaign.results.remove()  # contains only the lock
+            campaign.results.remove()  # the folder only contains the lock
 
 
 def in_bytes(size: int) -> str:
@@ -173,7 +173,10 @@ def _is_confirmed(question: str, root: Path) -> bool:
 
     if not sys.stdin.isatty():
         raise CampaignError(
-            "confirmation required, but no terminal", root, "a terminal, or --yes", "Use --yes to skip confirmation."
+            "confirmation is required, but there is no terminal",
+            root,
+            "a terminal, or --yes",
+            "Use --yes to skip the confirmation.",
         )
     return typer.confirm(question)
 
@@ -183,7 +186,7 @@ def _made(results: ConfinedPath) -> Iterator[ConfinedPath]:
     yield from _unfinished(results)
     for path in _files(results):
         if path.name.endswith(".manifest.json"):
-            with suppress(CampaignError):  # a damaged manifest: its files are not removed
+            with suppress(CampaignError):  # files listed in a damaged manifest are not removed
                 yield from _listed(path, read_manifest(path)["files"], below=path.parent)
                 yield path
         elif path.name.startswith(".") and path.name.endswith(_LOCK):
@@ -196,7 +199,7 @@ def _made(results: ConfinedPath) -> Iterator[ConfinedPath]:
 
 
 def _listed(where: ConfinedPath, names: dict[str, object], *, below: ConfinedPath) -> Iterator[ConfinedPath]:
-    """Yield the existing files listed in a manifest or lock, inside the folder and not through links."""
+    """Yield the existing files listed in a manifest or lock that are inside the folder; links are not followed."""
     for name in names:
         with suppress(CampaignError):
             path = below.named(name, where=where)
@@ -211,7 +214,7 @@ def _unfinished(results: ConfinedPath) -> Iterator[ConfinedPath]:
 
 
 def _files(top: ConfinedPath) -> list[ConfinedPath]:
-    """Return all files below a folder, sorted; links are not followed."""
+    """Return all files at any depth of a folder, sorted; links are not followed."""
     return sorted(folder / name for folder, _, names in top.walk() for name in names if name != ".run.lock")
 
 

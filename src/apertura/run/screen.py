@@ -1,4 +1,4 @@
-"""Console output of a run and of `apertura status`: a line per finished step, progress bars for running steps."""
+"""Console output of a run and of `apertura status`: lines for finished steps, and progress bars for running steps."""
 
 import sys
 import time
@@ -22,7 +22,7 @@ UNKNOWN = "time left unknown"
 NOTHING = "Nothing to be done: all results are up to date."
 
 _MOST_BARS = 12
-_MARGIN = 3  # columns left free at the end of a line for ^C
+_MARGIN = 3  # number of empty columns at the end of a line, in which the terminal may print ^C
 
 
 def span(seconds: float) -> str:
@@ -56,7 +56,7 @@ def about(seconds: float) -> str:
 
 @dataclass(frozen=True)
 class Bar:
-    """Progress bar: name, progress in words, completed fraction, and time left in seconds (None: unknown)."""
+    """Progress bar: name, progress as text, completed fraction, and time left in seconds (None if unknown)."""
 
     name: str
     counts: str
@@ -70,7 +70,7 @@ class Bar:
 
 
 def bars(campaign: Campaign, run: RunRecord, time_left: TimeLeft) -> list[Bar]:
-    """Return a progress bar for each running job, the oldest first, and a final bar for the whole run."""
+    """Return a progress bar for each running job, in the order of their start, and a final bar for the whole run."""
     now_s = time.time()
     progress = {number: StepProgress.of(campaign, job) for number, job in list(_running(run).items())[:_MOST_BARS]}
     left, whole_s = time_left.left(run, now_s, progress)
@@ -93,7 +93,7 @@ def _bar(job: JobRecord, progress: StepProgress | None, left_s: float | None, no
 
 
 def table(rows: list[Bar]) -> "Table":
-    """Return progress bars as a table of the width of the terminal."""
+    """Return progress bars as a table that is as wide as the terminal."""
     from rich.progress_bar import ProgressBar
     from rich.table import Table
     from rich.text import Text
@@ -113,16 +113,16 @@ def table(rows: list[Bar]) -> "Table":
 
 
 class Screen:
-    """Progress display of a run; as a context manager it restores the terminal on exit, also after an error.
+    """Progress display of a run; the context manager restores the terminal on exit, also after an error.
 
     Parameters
     ----------
     campaign, time_left
-        Campaign of the run, and its predicted time left.
+        Campaign of the run, and prediction of the time left.
     quiet
         Print nothing.
     stream
-        Output stream: progress bars on a terminal, plain lines otherwise.
+        Output stream; progress bars are displayed on a terminal, and plain lines are written otherwise.
     """
 
     def __init__(
@@ -149,7 +149,7 @@ class Screen:
 
     def update(self, run: RunRecord) -> None:
         """Display new events in chronological order."""
-        news: list[tuple[float, bool, JobRecord]] = []  # time, True for an end, job
+        news: list[tuple[float, bool, JobRecord]] = []  # time, True for the end of a job, job
         for number, job in [] if self._quiet else run.jobs.items():
             end_shown = self._shown.get((number, job.begun_s))  # a restarted job has a new start time
             if end_shown is None:
@@ -219,7 +219,7 @@ def _clock(at_s: float) -> str:
 
 
 def print_status(campaign: Campaign) -> None:
-    """Print the state of a run in progress: owner, steps and time left; or the outcome of the last run."""
+    """Print the state of a run in progress (owner, steps, time left), or the outcome of the last run."""
     run = JournalReader(campaign.result(RUN, "journal.jsonl")).news()
     held = holder(campaign.root)
     if held:
@@ -227,7 +227,7 @@ def print_status(campaign: Campaign) -> None:
         if run.planned and run.status is None:
             _print_steps(campaign, run)
         else:
-            print("steps unknown: the run is being planned, or was started without `apertura run`")
+            print("the steps are unknown: the run is being planned, or was not started by `apertura run`")
     else:
         print(_outcome(run))
     if run.status != INTERRUPTED and (run.failed or run.status):
@@ -253,7 +253,7 @@ def _print_steps(campaign: Campaign, run: RunRecord) -> None:
 
 def _outcome(run: RunRecord) -> str:
     if not run.begun_s:
-        return "no run in progress, and no earlier run recorded"
+        return "no run is in progress, and no earlier run is recorded"
     start = time.strftime("%Y-%m-%d %H:%M", time.localtime(run.begun_s))
     done = (
         f"{len(run.finished)} of {run.total} steps done"
@@ -263,10 +263,11 @@ def _outcome(run: RunRecord) -> str:
         else NOTHING
     )
     if run.ended_s is None:
-        return f"no run in progress; the last run, started {start}, was killed: {done}. Run again to resume."
+        return f"no run is in progress; the last run, started {start}, was killed: {done}. Run again to resume."
     outcome = {0: "succeeded", INTERRUPTED: "was interrupted"}.get(
         run.status or 0, f"failed with exit status {run.status}"
     )
     return (
-        f"no run in progress; the last run, started {start}, {outcome} after {span(run.ended_s - run.begun_s)}: {done}"
+        f"no run is in progress; the last run, started {start}, {outcome} after "
+        f"{span(run.ended_s - run.begun_s)}: {done}"
     )

@@ -1,19 +1,21 @@
-"""Prediction of the time left of a run, from the durations of its finished and reporting steps.
+"""Prediction of the time left of a run, from the durations of finished steps and of steps that report their progress.
 
-The cost of rule r predicts b + w seconds for a job: start-up b and work w. With ratios ρ of measured to predicted
-durations in this run, the job is expected to take
+The cost of rule r predicts a duration of b + w seconds for a job, with start-up b and work w. Given the ratios ρ of
+measured to predicted durations in this run, the expected duration of the job is
 
     ρ_r (b + w)       if a job of the same rule has finished, or reports its progress;
-    ρ_p (b + w)       for raster jobs, or imaging jobs (sums of pulses over pixels), if a job of the same kind has;
+    ρ_p (b + w)       for raster jobs and imaging jobs (sums of pulses at pixels), if such a job was measured;
     ρ_b b + ρ_w w     otherwise, with ρ_b from jobs dominated by start-up and ρ_w from the other jobs.
 
-The third prediction is displayed only for jobs dominated by start-up, w ≤ b, after such jobs of two rules were
-measured: start-up times are similar, but the first jobs of a run wait for common imports. The time left of the run is
-displayed while at most a fifth of it is due to jobs without a displayed prediction: if these took no time, the
-displayed value would be 1.25 times the true one; if they took six times as long, half of it. It is not displayed
-before an imaging job was measured, since engine and accuracy change its duration a thousandfold; nor for an imaging job
-that takes 1.5 times as long as expected, since its tiles are being recomputed. Any other overdue job is expected to run
-on for as long as it is overdue.
+The third prediction is only displayed for jobs dominated by start-up, w ≤ b, after such jobs of two rules were
+measured. Start-up times of jobs are similar, except that the first jobs of a run wait for common imports.
+
+The time left of the run is displayed while jobs without a displayed prediction contribute at most a fifth. If these
+jobs took no time, the displayed value would be 1.25 times the true value; if they took six times as long as expected,
+the displayed value would be half the true value. The time left of the run is not displayed before an imaging job was
+measured, because engine and accuracy change the duration of imaging jobs by up to a factor of a thousand. The time left
+is also not displayed for an imaging job that takes 1.5 times as long as expected, because tiles of its image are then
+being recomputed. Any other overdue job is expected to continue for the time by which it is overdue.
 """
 
 import json
@@ -35,13 +37,13 @@ from apertura.workflow.rules import RULES, Cost
 
 _MOST_TIMED = 500
 _LEAST_S = 0.1
-_TELLS = 0.05  # least completed share of a step, and at least two parts, before its pace is used for other jobs
-_SURE = 0.8  # least share of the time left that is due to jobs with a reliable prediction
+_TELLS = 0.05  # minimum completed fraction of a step (and at least two units) before its pace is used for other jobs
+_SURE = 0.8  # minimum fraction of the time left that is due to jobs with a reliable prediction
 
 
 @dataclass(frozen=True)
 class StepProgress:
-    """Progress reported by a step: `done` of `total`, start and time of the report, seconds since the epoch."""
+    """Progress reported by a step: `done` of `total` units; start, and time of the report, seconds since the epoch."""
 
     what: str
     done: int
@@ -51,7 +53,7 @@ class StepProgress:
 
     @classmethod
     def of(cls, campaign: Campaign, job: JobRecord) -> "StepProgress | None":
-        """Read the progress report of a job; None if there is no valid one."""
+        """Read the progress report of a job; None if there is no valid report."""
         with suppress(CampaignError, OSError, ValueError, KeyError, TypeError):
             file = json.loads(campaign.result(*progress_path(job.step)).read_text("utf-8"))
             report = cls(shown(file["what"]), int(file["done"]), int(file["total"]), file["since"], file["at"])
@@ -62,12 +64,12 @@ class StepProgress:
 
     @property
     def tells(self) -> bool:
-        """True if enough is done for a reliable pace, which includes preparations such as tables."""
+        """True if enough units are done for a reliable pace, which also includes preparations such as tables."""
         return self.done >= max(_TELLS * self.total, 2)
 
     @property
     def left_s(self) -> float | None:
-        """Time left at the present pace, seconds; None before the first part is done."""
+        """Time left at the current pace, seconds; None before the first unit is done."""
         passed = self.at_s - self.since_s
         return passed * (self.total - self.done) / self.done if self.done and passed > 0 else None
 
@@ -81,11 +83,11 @@ class Measure:
     of_rule
         Rule → ratio, for rules with measured jobs.
     of_rasters, of_imaging
-        Ratio of raster jobs, and of imaging jobs (sums of pulses over pixels); None if none was measured.
+        Ratio for raster jobs, and for imaging jobs (sums of pulses at pixels); None if no such job was measured.
     of_start, of_work
-        Ratio of the start-up of jobs, and of their work; None if no job was measured.
+        Ratio for the start-up of jobs, and for their work; None if no job was measured.
     starts
-        True if jobs of two rules dominated by start-up were measured.
+        True if jobs of at least two rules dominated by start-up were measured.
     """
 
     of_rule: dict[str, float]
@@ -97,7 +99,7 @@ class Measure:
 
     @classmethod
     def of(cls, timed: Sequence[tuple[str, float, float, float]]) -> "Measure":
-        """Compute the ratios from jobs: rule, duration, and predicted durations of start-up and work, seconds."""
+        """Compute the ratios from jobs: rule, measured duration, predicted durations of start-up and work, seconds."""
         ratios: dict[str, list[float]] = defaultdict(list)
         grows: dict[str, list[bool]] = defaultdict(list)
         for rule, seconds, start_s, work_s in timed:
@@ -119,7 +121,7 @@ class Measure:
         )
 
     def seconds(self, rule: str, start_s: float, work_s: float) -> tuple[float, bool]:
-        """Return the expected duration of a job, seconds, and True if it is reliable."""
+        """Return the expected duration of a job, seconds, and True if this value is reliable."""
         if rule in self.of_rule:
             return self.of_rule[rule] * (start_s + work_s), True
         cost = _cost(rule)
@@ -139,7 +141,7 @@ class TimeLeft:
     campaign
         The campaign.
     cores
-        Number of cores; 0: the number of running jobs, on a cluster.
+        Number of cores; 0 on a cluster, where the number of running jobs is used instead.
     """
 
     def __init__(self, campaign: Campaign, cores: int) -> None:
@@ -148,7 +150,7 @@ class TimeLeft:
         self._expected = cache(lambda rule, where: sizes.expected_seconds(rule, *where))
 
     def _expects(self, run: RunRecord, rule: str, where: tuple[str, ...]) -> tuple[float, float]:
-        """Return the predicted start-up and work of a job, seconds; jobs may share the work of a pair."""
+        """Return the predicted start-up and work of a job, seconds; the work of a pair may be divided among jobs."""
         shared = rule in RULES and RULES[rule].shares
         shares = max(run.planned.get(rule, 0) / max(len(self._places(rule)), 1) if shared else 1.0, 1.0)
         start_s = _cost(rule).begin_s
@@ -157,16 +159,16 @@ class TimeLeft:
     def left(
         self, run: RunRecord, now_s: float, progress: dict[int, StepProgress | None]
     ) -> tuple[dict[int, float | None], float | None]:
-        """Return number of a job → its time left, and the time left of the run, seconds; None: unknown.
+        """Return job number → time left of the job, and the time left of the run, seconds; None if unknown.
 
         Parameters
         ----------
         run
             State of the run.
         now_s
-            Present time, seconds since the epoch.
+            Current time, seconds since the epoch.
         progress
-            Number of a job → its progress report.
+            Job number → progress report of the job.
         """
         running = {number: job for number, job in run.jobs.items() if job.running}
         paced = {number: report.left_s for number in running if (report := progress.get(number))}
@@ -183,7 +185,7 @@ class TimeLeft:
             early = job.rule in measure.of_rule and report and not report.tells
             if pace is None or early:
                 over_s = job.seconds(now_s) - whole
-                # Tiles that missed the accuracy are recomputed with a finer setting, for an unknown time.
+                # Tiles that do not meet the accuracy are recomputed with a finer setting, which takes an unknown time.
                 left[number] = abs(over_s), sure and not (_cost(job.rule).of_imaging and over_s > whole / 2)
             else:
                 left[number] = pace, True
@@ -206,7 +208,7 @@ class TimeLeft:
         *,
         all_of_it: bool,
     ) -> float:
-        """Return the duration of all work on all cores, at least that of a sequential chain of steps, seconds."""
+        """Return the duration of all work on all cores, but at least the duration of a sequential chain of steps, s."""
         running = [seconds for seconds, sure in left.values() if sure or all_of_it]
         at_once = self._cores or max(1, len(left))
         work, chain = sum(running) / at_once, max(running, default=0.0)
@@ -217,9 +219,9 @@ class TimeLeft:
                 chain += 0.0 if _cost(rule).last else each
         return max(work, chain)
 
-    @cache  # noqa: B019 - one per run
+    @cache  # noqa: B019 - one instance per run
     def _places(self, rule: str) -> Sequence[tuple[str, ...]]:
-        """Return the flights, pairs or nodes on which the jobs of a rule run; one empty entry if there are none."""
+        """Return the flights, pairs or nodes processed by the jobs of a rule; one empty entry if there are none."""
         return (places(self._campaign, RULES[rule]) if rule in RULES else []) or [()]
 
 

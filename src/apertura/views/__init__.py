@@ -1,4 +1,5 @@
-"""User interface: the command line, the report, the map, inspection of files, verification of products.
+"""User interface: plan, summary, report, map, inspection of files, and verification of products.
 
-The package imports every layer of the product; only the command `apertura` and the workflow's Snakefile import it.
+The package imports all layers of the product. Only the command `apertura` and the workflow's Snakefile import the
+package.
 """

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def first_flight(campaign: Campaign) -> Flown:
-    """Return the joint geometry of the first image flight, which determines the common grid of all images."""
+    """Return the geometry of all pairs of the first image flight, which determines the common grid of all images."""
     flight = campaign.image_flights[0]
     return Flown.together([open_pair(campaign, flight.name, pair).flown for pair in flight.pairs])
 
@@ -51,9 +51,9 @@ def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
             console.print(_table(plan, f"{flight.name}/{opened.name}"), budget)
             if opened.history is None:
                 console.print(
-                    "Planned from the flight logs alone, because step echo has not run. The recorded samples and the "
-                    "number of usable pulses may change models, errors and engine: repeat `apertura plan` after step "
-                    "echo."
+                    "This plan is based on the flight logs alone, because step echo has not run. The recorded samples "
+                    "and the number of usable pulses may change models, errors and engine. Repeat `apertura plan` "
+                    "after step echo."
                 )
             for name, line in plan.flags.items():
                 console.print(f"[yellow]{name}[/yellow]: {line}")
@@ -67,7 +67,7 @@ def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
         raise CampaignError(
             f"the results of all pairs need {decimal(disk)} on disk",
             where=campaign.root,
-            expected=f"at most the {decimal(free)} of free space",
+            expected=f"at most {decimal(free)}, the free disk space",
             remedy="Free disk space, or make the scene smaller.",
         )
 
@@ -97,7 +97,7 @@ def _budget_table(lines: list[BudgetLine]) -> "Table":
         table.add_column(heading, overflow="fold")
     for line in lines:
         report = line.report
-        stated = "; ".join(dict.fromkeys(report["stated"].split("; ")))  # identical text of several nodes only once
+        stated = "; ".join(dict.fromkeys(report["stated"].split("; ")))  # text that is identical for several nodes
         table.add_row(report["cause"], stated, *_effect(line.effect))
     table.add_section()
     table.add_row("sum of expected effects", "", *_effect(expected(lines)))
@@ -110,7 +110,7 @@ def _effect(effect: Effect) -> tuple[str, str, str]:
 
 
 def _length(metres: float) -> str:
-    """Format a length in centimetres, or in metres from 1 m.
+    """Format a length in centimetres, or in metres for lengths of at least 1 m.
 
     Examples
     --------

@@ -30,22 +30,22 @@ class ImageValues:
 
     Attributes
     ----------
-    verdict, why
-        Focus verdict, and its reason.
+    verdict, reason
+        Focus verdict, and the reason for the verdict.
     loss_db, expected_db
-        Peak loss measured at bright points, and expected by the error budget, dB, 0 or less.
+        Peak loss measured at bright points, and peak loss predicted by the error budget, dB, 0 or less.
     worst_cause
-        Cause with the largest expected peak loss, among those with a stated or assumed size.
+        Cause with the largest predicted peak loss, among the causes of stated or assumed size.
     not_stated
-        Causes of the budget whose size is neither stated nor assumed.
+        Causes in the error budget whose size is neither stated nor assumed.
     place_m, place_cause
-        Expected displacement of points, metres, and the cause that contributes most.
+        Expected displacement of points, metres, and the cause with the largest contribution.
     error_db
         Upper bound of the numerical error, dB.
     used, recorded
-        Numbers of pulses used in the image, and recorded.
+        Numbers of pulses used in the image, and of pulses recorded.
     coherence, excluded
-        Coherence of the pairs of a sum, and number of pairs excluded from it.
+        Coherence of the pairs of a sum, and number of pairs excluded from the sum.
     flags
         Flag → measurement.
     """
@@ -67,7 +67,7 @@ class ImageValues:
 
     @classmethod
     def of(cls, report: Report) -> "ImageValues":
-        """Return the values in an image.json."""
+        """Return the values in the contents of an image.json."""
         focus, pulses, coherence, fusion = (report.get(key) or {} for key in ("focus", "pulses", "coherence", "fusion"))
         budget = report.get("budget", ())
         counted = [line for line in budget if is_counted(line)]
@@ -98,7 +98,7 @@ def read_report(campaign: Campaign, flight: str, image: str) -> dict[str, Any]:
     Raises
     ------
     CampaignError
-        If it is missing, was modified, or lacks a value that every view requires.
+        If the file is missing, was modified, or lacks a value that all views require.
     """
     report = report_of(campaign, flight, image)
     with undamaged(
@@ -147,14 +147,14 @@ def decibels(loss_db: float | None, digits: int) -> str:
 
 
 def sentences(name: str, report: Report) -> Iterator[str]:
-    """Yield sentences on an image for a results section: focus, certificate, agreement.
+    """Yield sentences on an image for a results section: focus, numerical error, agreement with other images.
 
     Parameters
     ----------
     name
         Name of the image.
     report
-        Its image.json.
+        Contents of the image's image.json.
     """
     focus = report.get("focus") or {}
     if focus:
@@ -173,24 +173,24 @@ def sentences(name: str, report: Report) -> Iterator[str]:
         yield f"Coherence of the pairs: {coherence['mean']:.3f} (for random phases: {coherence['chance']:.2f})."
     if gain := report.get("gain"):
         over_db, noise_db = gain["over_best_pair_db"], gain["allowed_db"]
-        sidelobes = " The additional reduction comes from sidelobes of the pairs that cancel in the sum."
+        sidelobes = " The additional reduction is caused by sidelobes of the pairs, which cancel in the sum."
         yield (
             f"The background between targets, relative to the peak, is {abs(over_db):.1f} dB "
-            f"{'lower' if over_db >= 0 else 'higher'} than in {gain['best_pair']}, the best pair; averaging of "
+            f"{'lower' if over_db >= 0 else 'higher'} than in {gain['best_pair']}, the best pair. Averaging of "
             f"uncorrelated noise accounts for up to {noise_db:.1f} dB.{sidelobes * (over_db > noise_db)}"
         )
         yield _cut_sentence(report["brightest"])
 
 
 def _cut_sentence(brightest: Mapping[str, Any]) -> str:
-    """Return a sentence with the −3 dB widths and sidelobe ratios of a target, for those that its cuts contain."""
+    """Return a sentence with the −3 dB widths and sidelobe ratios of a target, as far as its cuts contain them."""
     parts = []
     for name, direction in (("cross_range", "in cross-range"), ("ground_range", "in ground range")):
         width, pslr = brightest.get(f"{name}_width_m"), brightest.get(f"{name}_pslr_db")
         if width is not None:
             sidelobe = "" if pslr is None else f" (PSLR {_signed(pslr, 1)} dB)"
             parts.append(f"{100 * width:.1f} cm {direction}{sidelobe}")
-    return f"−3 dB width of the brightest target: {', '.join(parts) or 'beyond the length of the cuts'}."
+    return f"−3 dB width of the brightest target: {', '.join(parts) or 'larger than the length of the cuts'}."
 
 
 def certificate(report: Report) -> str:
@@ -199,10 +199,10 @@ def certificate(report: Report) -> str:
     Examples
     --------
     >>> certificate({"numerical_error_db": -67.8, "numerical_error_confidence": 0.95, "certified_pixels": 272})
-    'Numerical error below −67.8 dB (95 % confidence), measured at 272 pixels against the exact sum in float64.'
+    'Numerical error below −67.8 dB (95 % confidence), relative to the exact sum in float64 at 272 pixels.'
     """
     pixels = report.get("certified_pixels")
-    source = f"measured at {pixels} pixels against the exact sum in float64" if pixels else "that of the worst pair"
+    source = f"relative to the exact sum in float64 at {pixels} pixels" if pixels else "the bound of the worst pair"
     confidence = f"{100 * report['numerical_error_confidence']:.0f} % confidence"
     return f"Numerical error below {_signed(report['numerical_error_db'], 1)} dB ({confidence}), {source}."
 
@@ -223,7 +223,7 @@ def decision_rows(report: Report) -> list[Cells]:
 
 
 def shared_rows(reports: Mapping[str, Report]) -> list[Cells]:
-    """Return table rows of the decisions of several images, each decision once with the names of its images.
+    """Return table rows of the decisions of several images; each decision is listed once with the names of the images.
 
     Examples
     --------
@@ -238,7 +238,7 @@ def shared_rows(reports: Mapping[str, Report]) -> list[Cells]:
 
 
 def budget_rows(lines: Sequence[Report]) -> list[Cells]:
-    """Return table rows of an error budget, with the columns `BUDGET`; effects that are not summed are in brackets.
+    """Return table rows of an error budget, with the columns `BUDGET`; effects not in the sum are in brackets.
 
     Examples
     --------
@@ -266,9 +266,9 @@ class RaisedFlag:
     name
         Name of the flag.
     measured
-        Measurement → names of its images.
+        Measurement → names of the images for which the flag reports it.
     meaning, advice
-        Meaning of the flag and advice; empty for a flag of another version of apertura.
+        Meaning of the flag and advice; empty for a flag that this version of apertura does not define.
     """
 
     name: str
@@ -278,14 +278,14 @@ class RaisedFlag:
 
 
 def raised_flags(reports: Mapping[str, Report], *, quotes: bool = True) -> list[RaisedFlag]:
-    """Return each raised flag once.
+    """Return the raised flags without repetition.
 
     Parameters
     ----------
     reports
-        Name of an image → its image.json, sums after their pairs.
+        Name of an image → contents of its image.json; sums follow their pairs.
     quotes
-        Include measurements of sums that only repeat those of their pairs.
+        Include measurements of sums that only repeat measurements of the pairs.
     """
     raised: dict[str, dict[str, list[str]]] = {}
     for image, report in reports.items():
@@ -302,7 +302,7 @@ def flag_rows(reports: Mapping[str, Report]) -> list[Cells]:
     Parameters
     ----------
     reports
-        Name of an image → its image.json.
+        Name of an image → contents of its image.json.
 
     Examples
     --------
@@ -338,7 +338,7 @@ def explained_flags(flags: Mapping[str, str]) -> dict[str, str]:
 
 
 def _explained(flag: str) -> tuple[str, str]:
-    definition = FLAGS.get(flag)  # an image of another version may have a flag that this version does not define
+    definition = FLAGS.get(flag)  # an image made by another version may have a flag that this version does not define
     return (definition.meaning, definition.advice) if definition else ("", "")
 
 

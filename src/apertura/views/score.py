@@ -1,4 +1,4 @@
-"""`apertura score`: compare measured target positions in the exported GeoTIFFs with those of truth.json."""
+"""`apertura score`: compare target positions measured in exported GeoTIFFs with the true positions in truth.json."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -25,12 +25,12 @@ from apertura.stages.scene import open_scene, settled_scene
 from apertura.views.summary import print_summary
 
 REACH_M = 1.0
-"""Half length of the cuts through a target, metres; a quarter of it is the search radius about the true position."""
+"""Half length of the cuts through a target, metres; the search radius around the true position is a quarter of it."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Measurement of a target in an image: lengths in metres, radar cross-section in calibrated images."""
+    """Measurement of a target in an image: position error and widths; in calibrated images, radar cross-section."""
 
     flight: str
     image: str
@@ -58,7 +58,7 @@ def score(campaign: Campaign) -> list[Finding]:
         If the campaign has no truth.json or no results.
     """
     path = campaign.root.named("truth.json", where=campaign.root)
-    expected, remedy = "true target positions", "Only simulated campaigns have them."
+    expected, remedy = "true target positions", "Use a simulated campaign: only these contain true positions."
     document = read_json(path, expected=expected, remedy=remedy)
     with undamaged(path, expected=expected, remedy=remedy):
         keys = ("x", "y", "rcs_m2")
@@ -108,7 +108,10 @@ def _flight(campaign: Campaign, flight: Flight, targets: list[dict[str, float]])
 def _cross_sections(
     campaign: Campaign, flight: str, pair: str
 ) -> Callable[[BrightPoint, float | None], dict[str, Any]] | None:
-    """Return a function of a point and its true cross-section that measures it in a pair's image, if calibrated."""
+    """Return a function that measures the cross-section of a point in a pair's image; None if not calibrated.
+
+    The arguments of the function are the point and its true cross-section.
+    """
     if not campaign.calibrated or pair == FUSED:
         return None
     scene, path = open_scene(campaign), campaign.result(flight, pair, CROSS_SECTIONS)
@@ -126,7 +129,7 @@ def _cross_sections(
 
 
 def print_findings(campaign: Campaign, *, paths: bool) -> None:
-    """Print a table of the findings of `score`; with `paths` also the files of all products."""
+    """Print a table of the findings of `score`; with `paths`, also print the files of all products."""
     campaign.check_images()
     console = Console(width=120)
     table = Table(title=f"{campaign.settings.campaign}: measured and true positions", title_justify="left")

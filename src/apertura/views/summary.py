@@ -31,7 +31,7 @@ _HEADINGS = ("image", "verdict", "focus loss", "expected loss", "coherence", "nu
 _WHOLE = {"image", "verdict", "focus loss", "pulses"}
 _WIDE = 120
 _MOST_FLIGHTS = 3
-_SENTENCE = 40  # characters: shorter parts of a line are measurements, which may be the same for two flags
+_SENTENCE = 40  # minimum length in characters; shorter parts are measurements, which may be equal for two flags
 
 
 def is_finished(campaign: Campaign) -> bool:
@@ -41,7 +41,7 @@ def is_finished(campaign: Campaign) -> bool:
 
 
 def print_summary(campaign: Campaign) -> None:
-    """Print a row for each image, each raised flag with meaning and advice, and the files to open.
+    """Print a table row for each image, each raised flag with meaning and advice, and the main files.
 
     Raises
     ------
@@ -53,14 +53,14 @@ def print_summary(campaign: Campaign) -> None:
     campaign.check_images()
     names = [(flight.name, name) for flight in campaign.image_flights for name in flight.images]
     current = [image for image in names if campaign.is_current(campaign.result(*image, "export"))]
-    # without a current image, reading the first raises the error
+    # if no image is up to date, reading the first image raises the error
     reports = {" ".join(image): read_report(campaign, *image) for image in current or names[:1]}
     values = {name: ImageValues.of(report) for name, report in reports.items()}
     console = Console(highlight=False)
     if not console.is_terminal:
         console = Console(highlight=False, width=max(_WIDE, console.width))
     console.print(_table(values))
-    undecided = dict[str, list[str]]()  # reason → images whose verdict is not `focused` although no flag explains it
+    undecided = dict[str, list[str]]()  # reason → images without flags whose verdict is not `focused`
     for name, image_values in values.items():
         if image_values.verdict not in ("", "focused") and not image_values.flags:
             undecided.setdefault(f"{image_values.verdict}: {image_values.reason}", []).append(name)
@@ -74,7 +74,8 @@ def print_summary(campaign: Campaign) -> None:
     not_stated = dict.fromkeys(cause for image_values in values.values() for cause in image_values.not_stated)
     if not_stated:
         console.print(
-            f"not in the error budget, because no uncertainty is configured: {', '.join(not_stated)}; see image.json"
+            f"not in the error budget, because their uncertainty is not configured: {', '.join(not_stated)}; see "
+            "image.json"
         )
     interferograms = dict(_interferograms(campaign))
     for name, report in interferograms.items():
@@ -86,9 +87,9 @@ def print_summary(campaign: Campaign) -> None:
 
 
 def print_stale(campaign: Campaign) -> None:
-    """Print the number of results that are out of date, except those made on demand.
+    """Print the number of out-of-date results, except results that are only made on demand.
 
-    Missing recordings, which cannot be compared, are reported in another line.
+    Missing recordings, which cannot be compared, are reported in a separate line.
     """
     print(*(f"{line}\n" for line in absent_lines(campaign)), sep="", end="")
     if stale := [manifest for manifest in stale_results(campaign) if not on_demand(campaign, manifest)]:
@@ -97,17 +98,17 @@ def print_stale(campaign: Campaign) -> None:
 
 
 def print_unfinished(campaign: Campaign) -> None:
-    """Print the numbers of finished, missing and out-of-date results, except those made on demand."""
-    print(f"{counted(states(campaign))}: `apertura run` computes the rest")
+    """Print the numbers of finished, missing and out-of-date results, except results that are only made on demand."""
+    print(f"{counted(states(campaign))}: `apertura run` computes the remaining results")
 
 
 def print_benches(campaign: Campaign) -> None:
-    """Print a line with the raised flags and the report page for each measured flight of kind bench."""
+    """Print the raised flags and the report page of each measured flight of kind bench, one line per flight."""
     for flight in campaign.flights:
         report, page = (campaign.result(flight.name, name) for name in ("bench.json", "bench.html"))
         if flight.kind == "bench" and campaign.is_current(campaign.result(flight.name, "bench")):
             flags = open_listed(report, report.with_name("bench.manifest.json"))["flags"]
-            verdict = f"flags {', '.join(printable(flags))}" if flags else "all measurements within their limits"
+            verdict = f"flags {', '.join(printable(flags))}" if flags else "all measurements are within their limits"
             print(f"bench {flight.name}: {verdict}: {campaign.relative(page)}")
 
 
@@ -126,13 +127,13 @@ def print_products(campaign: Campaign) -> None:
             if row.opened and path.is_file():
                 print(f"  {campaign.relative(path)}  {row.opened}")
     if len(flights) > _MOST_FLIGHTS:
-        print(f"  and those of {number_of(len(flights) - _MOST_FLIGHTS, 'flight')} more")
+        print(f"  and the files of {number_of(len(flights) - _MOST_FLIGHTS, 'further flight')}")
     if campaign.result(MAP).is_file():
         print(f"  map of all images: apertura map {shlex.quote(str(campaign.root))}")
 
 
 def _interferograms(campaign: Campaign) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the summary of each interferogram."""
+    """Yield name and summary of each up-to-date interferogram."""
     for name in campaign.settings.interferometry.pairs:
         path = campaign.result(INTERFEROMETRY, name, "interferogram.json")
         if campaign.is_current(campaign.result(INTERFEROMETRY, name, "interferogram")):
@@ -147,14 +148,14 @@ def _abbreviated(names: Sequence[str], most: int = 3) -> str:
 
 
 def _print_flags(console: "Console", reports: Mapping[str, Report]) -> None:
-    """Print each flag with meaning, measurements by image, and advice.
+    """Print each flag with meaning, measurement in each image, and advice.
 
-    A sentence that was printed before is replaced by a reference to its flag.
+    A sentence that was already printed for another flag is replaced by a reference to that flag.
     """
     from rich.padding import Padding
     from rich.text import Text
 
-    printed = dict[str, str]()  # sentence → its flag
+    printed = dict[str, str]()  # sentence → flag for which the sentence was printed
     for flag in raised_flags(reports, quotes=False):
         console.print(Text.assemble((flag.name, "yellow"), f": {flag.meaning}" if flag.meaning else ""))
         measured = []

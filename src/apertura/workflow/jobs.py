@@ -1,7 +1,7 @@
-"""Inputs, resources and parameters of the rules in `workflow/`, from the campaign's flights and settings.
+"""Inputs, resources and parameters of the rules in `workflow/`, computed from flights and settings of the campaign.
 
-The rules contain their file names literally. `apertura.workflow.rules` has the same graph for lineage and for the
-check of outdated results; a test compares the two.
+The rules in `workflow/` contain file names literally. `apertura.workflow.rules` defines the same graph for lineage and
+for the detection of out-of-date results. A test compares both graphs.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -22,7 +22,7 @@ FilesOfJob = Callable[[Any], list[str]]
 
 @dataclass(frozen=True)
 class Job:
-    """Resources and parameters of a rule's jobs for Snakemake, as functions of a job's wildcards."""
+    """Resources and parameters of the jobs of a rule for Snakemake, as functions of the wildcards of a job."""
 
     threads: Callable[..., int]
     resources: Mapping[str, Callable[..., int]]
@@ -31,7 +31,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Jobs:
-    """Jobs of a campaign's rules."""
+    """Jobs of the rules for a campaign."""
 
     campaign: Campaign
 
@@ -40,7 +40,7 @@ class Jobs:
         return Resources(self.campaign)
 
     def __getitem__(self, rule: str) -> Job:
-        """Return resources and parameters of a rule's jobs; parameters are the settings and code that affect them."""
+        """Return resources and parameters (settings and code of the results) of the jobs of a rule."""
         resources, row = self._resources[rule], RULES[rule]
         rows = [other for other in RESULTS.values() if other.name == rule] or [RESULTS[row.result]]
 
@@ -55,26 +55,26 @@ class Jobs:
         return Job(resources.threads, {"mem_mb": resources.mem_mb, "runtime": resources.runtime}, params)
 
     def each(self, manifest: str, of: Scope | None = None) -> FilesOfJob:
-        """Return the input function of a manifest with wildcards: one manifest per node, pair or flight of the job.
+        """Return the input function for a manifest with wildcards: one manifest per node, pair or flight of the job.
 
-        Results that the campaign does not have are omitted, such as the terrain of a campaign without a DEM.
+        Results that do not exist in the campaign are omitted, such as the terrain of a campaign without a DEM.
         """
         row = next(row for row in RESULTS.values() if f"results/{row.manifest}.manifest.json" == manifest)
         return lambda wildcards: manifests_below(self._scope(wildcards, of), row)
 
     def files(self, source: Callable[[JobScope], Iterable[str]], of: Scope | None = None) -> FilesOfJob:
-        """Return an input function with the files that a function of `apertura.workflow.rule_inputs` returns."""
+        """Return an input function for the files returned by a function of `apertura.workflow.rule_inputs`."""
         root = self.campaign.root
         return lambda wildcards: [str((root / name).location) for name in source(self._scope(wildcards, of))]
 
     def _scope(self, wildcards: Any, of: Scope | None) -> JobScope:
-        """Return the scope of a job: of the given kind, or of the kind that its wildcards imply."""
+        """Return the scope of a job: of the given kind, or of the kind implied by the wildcards of the job."""
         named = {name for name in ("flight", "node", "pair", "two") if hasattr(wildcards, name)}
         of = of or next(of for of in Scope if set(of.wildcards) == named)
         return JobScope(self.campaign, of, tuple(getattr(wildcards, word) for word in of.wildcards))
 
 
 def added_files(rule: str) -> list[str]:
-    """Return the files that other packages add to a rule by entry points of group ``apertura.exports``."""
+    """Return the files that other packages add to a rule through entry points of group ``apertura.exports``."""
     row: Rule = RULES[rule]
     return [f"results/{row.folder}/{one.file}" for one in added_exports(row.exports)]

@@ -1,8 +1,8 @@
-"""Lineage of every result: source files, other results, settings and code, for rules, steps and checks.
+"""Lineage of each result: source files, other results, settings and code, for rules, steps and checks.
 
-A result is the output of one rule. Its manifest is written last; it lists the files and states their lineage. A changed
-source, setting or code makes the result out of date, independent of file times. The lineage follows from
-`apertura.workflow.rules`.
+A result is the output of a single rule. Its manifest, which is written last, contains the files and their lineage. A
+result is out of date if a source, a setting or the code has changed, independent of file times. The lineage follows
+from `apertura.workflow.rules`.
 """
 
 from collections.abc import Iterable, Iterator
@@ -24,7 +24,7 @@ from apertura.workflow.rule_inputs import JobScope, Scope, SettingSpec, SourceSp
 from apertura.workflow.rules import EVERY, RESULTS, Rule
 
 _READS = "apertura.formats.reading"
-"""Module that calls the readers of recordings and logs; a step that imports it depends on their code."""
+"""Module that calls the readers of recordings and logs; a step that imports it depends on the code of the readers."""
 
 _FOCUSES = frozenset(
     {
@@ -33,13 +33,13 @@ _FOCUSES = frozenset(
         "apertura.methods.alignment.on_ground",
     }
 )
-"""Modules that call engines; a step that imports one of them depends on the code of all engines."""
+"""Modules that call engines; a step that imports one of these modules depends on the code of all engines."""
 
 _KEPT = {"transfer": "echo"}
-"""Result that is written on demand → value of `processing.keep` with which every run writes it."""
+"""Result that is written on demand → value of `processing.keep` with which every run writes the result."""
 
 _INPUTS = ("config", "raw")
-"""Folders of a campaign that are inputs with all their files."""
+"""Folders of a campaign whose files are all inputs."""
 
 
 def result_of(campaign: Campaign, result: str, *where: str) -> Result:
@@ -52,12 +52,12 @@ def result_of(campaign: Campaign, result: str, *where: str) -> Result:
     result
         A key of `apertura.workflow.rules.RESULTS`.
     *where
-        Values of the wildcards of its row, such as flight and pair.
+        Values of the wildcards in the row of the result, such as flight and pair.
 
     Raises
     ------
     CampaignError
-        If the campaign does not have the result, such as sums of a flight with one pair.
+        If the result does not exist in the campaign, such as the sums of a flight with a single pair.
     """
     rule = RESULTS[result]
     scope = JobScope(campaign, rule.of, where)
@@ -66,7 +66,7 @@ def result_of(campaign: Campaign, result: str, *where: str) -> Result:
             f"no {result} of {' '.join(where) or 'this campaign'}",
             where=campaign.root,
             expected="a result that follows from the campaign's flights and config",
-            remedy="`apertura list` lists them.",
+            remedy="Choose a result listed by `apertura list`.",
         )
     sources = tuple(dict.fromkeys(source for one in rule.sources for source in _read(scope, one)))
     settings = {name: value for one in rule.settings for name, value in _stated(scope, one).items()}
@@ -74,27 +74,27 @@ def result_of(campaign: Campaign, result: str, *where: str) -> Result:
 
 
 def results_of(campaign: Campaign) -> Iterator[tuple[str, Result]]:
-    """Yield every result of a campaign with its name, each after the results that it depends on."""
+    """Yield name and result for all results of a campaign; each result follows the results on which it depends."""
     for name, _, result in places_of(campaign):
         yield name, result
 
 
 def places_of(campaign: Campaign) -> Iterator[tuple[str, tuple[str, ...], Result]]:
-    """Yield name, wildcard values and result for every result, in the order of `results_of`."""
+    """Yield name, wildcard values and result for all results, in the order of `results_of`."""
     for rule, where in _jobs(campaign):
         yield rule.result, where, result_of(campaign, rule.result, *where)
 
 
 def on_demand(campaign: Campaign, manifest: str) -> bool:
-    """Return True if a manifest belongs to a result that is written on demand, and not by every run."""
+    """Return True if a manifest belongs to a result that is only written on demand, not by every run."""
     rule = RESULTS.get(manifest.rpartition("/")[2].removesuffix(".manifest.json"))
     return rule is not None and _on_demand(campaign, rule)
 
 
 def reads_kept(campaign: Campaign, flight: str, pair: str) -> bool:
-    """Return True if a pair's transfer functions are read from stage `transfer`, not formed from the recording.
+    """Return True if the transfer functions of a pair are read from stage `transfer` instead of the recording.
 
-    This is the case if the recording is missing and the stage belongs to the present echo.
+    This is the case if the recording is missing and the stage was computed from the current stage `echo`.
     """
     from apertura.campaign.store import read_manifest, sha256_present  # loads zarr, which delays the start of a run
 
@@ -105,7 +105,7 @@ def reads_kept(campaign: Campaign, flight: str, pair: str) -> bool:
 
 
 def files_read(campaign: Campaign, result: str, *where: str) -> Iterator[str]:
-    """Yield the sources of a result, and the recordings from which its step forms transfer functions."""
+    """Yield the sources of a result, and the recordings from which its step computes transfer functions."""
     rule = RESULTS[result]
     yield from result_of(campaign, result, *where).sources
     if rule.forms and is_sampled(campaign):
@@ -115,24 +115,24 @@ def files_read(campaign: Campaign, result: str, *where: str) -> Iterator[str]:
 
 
 def places(campaign: Campaign, rule: Rule) -> list[tuple[str, ...]]:
-    """Return the wildcard values of each job of a rule; flights in the order of `KINDS`."""
+    """Return the wildcard values of each job of a rule, with flights in the order of `KINDS`."""
     return [where for kind in KINDS for where in _places(campaign, rule, kind)]
 
 
 def products_of(rule: Rule) -> list[str]:
-    """Return the products of a rule for users: the files next to its manifest."""
+    """Return the products of a rule that are intended for users, i.e. the files next to its manifest."""
     return [*rule.products, *(row.file for row in (exports_in(rule.exports) if rule.exports else ()))]
 
 
 def _jobs(campaign: Campaign) -> Iterator[tuple[Rule, tuple[str, ...]]]:
-    """Yield rule and wildcard values of every result; calibration flights come first, because others depend on them."""
+    """Yield rule and wildcard values of all results; calibration flights precede the flights that depend on them."""
     for kind in KINDS:
         for rule in RESULTS.values():
             yield from ((rule, where) for where in _places(campaign, rule, kind))
 
 
 def _places(campaign: Campaign, rule: Rule, kind: str) -> list[tuple[str, ...]]:
-    """Return the wildcard values of a rule's jobs for flights of a kind; campaign-wide jobs belong to image flights."""
+    """Return the wildcard values of a rule's jobs for flights of a kind; campaign-wide jobs belong to kind image."""
     return _needed(rule, campaign, _candidates(campaign, rule, kind)) if kind in rule.kinds else []
 
 
@@ -158,18 +158,18 @@ def _manifest(rule: Rule, where: Iterable[str]) -> str:
 
 
 def manifests_below(scope: JobScope, rule: Rule) -> list[str]:
-    """Return the manifests of a rule's results within the scope of a job; results not in the campaign are omitted."""
+    """Return the manifests of a rule's results within the scope of a job, except results that the campaign lacks."""
     return [_manifest(rule, where) for where in _needed(rule, scope.campaign, scope.below(rule.of))]
 
 
 def every_result(scope: JobScope) -> list[str]:
-    """Return the manifests of all results except those written on demand and those that describe all results."""
+    """Return the manifests of all results except results written on demand and results that describe all results."""
     every = _jobs(scope.campaign)
     return [_manifest(rule, where) for rule, where in every if not _describes_all(scope.campaign, rule)]
 
 
 def _read(scope: JobScope, source: SourceSpec) -> Iterable[str]:
-    """Return the files and manifests of a row's source for a job."""
+    """Return the files and manifests of a source in a rule's row for a job."""
     if callable(source):
         return source(scope)
     if source == EVERY:
@@ -186,7 +186,7 @@ def _describes_all(campaign: Campaign, rule: Rule) -> bool:
 
 
 def _stated(scope: JobScope, setting: SettingSpec) -> dict[str, Any]:
-    """Return the values of a row's setting for a job, by the last part of the key."""
+    """Return the values of a setting in a rule's row for a job: last part of the key → value."""
     if callable(setting):
         return dict(setting(scope))
     value: Any = scope.campaign.values
@@ -203,7 +203,7 @@ def modules_of(campaign: Campaign, result: str, *where: str) -> tuple[str, ...]:
     Parameters
     ----------
     campaign, result, *where
-        As `result_of`.
+        See `result_of`.
     """
     rule = RESULTS[result]
     step = (rule.module, *_written(rule, measured=bool(campaign.coefficients)))
@@ -246,7 +246,7 @@ def _readers(campaign: Campaign, rule: Rule, where: tuple[str, ...]) -> Iterator
 
 
 def _log_reader(campaign: Campaign, flight: str, node: str) -> str:
-    """Return the module that reads a log; for a missing log, the module of that suffix with which it was read."""
+    """Return the module that reads a log; for a missing log, the module of its suffix with which the log was read."""
     path, options = campaign.track_file(flight, node), campaign.settings.nodes[node].log.options
     manifest = campaign.root / campaign.manifest("track", flight, node)
     readers = [module_of(row.reader) for row in TRACKS.values() if path.suffix.lower() in row.suffixes]
@@ -261,20 +261,19 @@ def _log_reader(campaign: Campaign, flight: str, node: str) -> str:
 def with_inputs(campaign: Campaign, target: Path, *, link: bool) -> Path:
     """Copy the inputs of a campaign's results to a folder; return the folder.
 
-    Without `link`, recordings are copied, so that later edits of the copy do not change the campaign.
-
     Parameters
     ----------
     campaign
-        Campaign with the files: those of config/ and raw/, and others that its config names.
+        Campaign whose inputs are copied: config/, raw/, and other files named in the config.
     target
         Folder, which is created if it is missing.
     link
-        Create hard links to recordings where possible.
+        Create hard links to recordings where possible. Without `link`, recordings are copied, so that later edits of
+        the copy do not change the campaign.
     """
     sources = {source for _, result in results_of(campaign) for source in result.sources}
     named = [campaign.root / source for source in sources if source.partition("/")[0] not in {"results", *_INPUTS}]
-    inputs = ["config", *([] if campaign.settings.raw_root else ["raw"])]  # raw_root is absolute, valid in the copy
+    inputs = ["config", *([] if campaign.settings.raw_root else ["raw"])]  # raw_root is absolute: valid in the copy
     for path in sorted({*named, *(path for folder in inputs for path in (campaign.root / folder).rglob("*"))}):
         if path.is_file(follow_symlinks=False):
             relative = path.relative_to(campaign.root)

@@ -1,7 +1,8 @@
 """Cluster resources and run time of the jobs of each rule, estimated from file sizes and the config.
 
-No recording is opened, because Snakemake calls this for each job of up to a thousand flights when it builds the
-workflow. The resources are upper bounds; a job killed at its memory or time limit requests twice as much.
+No recording is opened, because Snakemake calls these functions for each job of up to a thousand flights when it builds
+the workflow. The resources are upper bounds. A job that is killed at its memory or time limit is restarted with twice
+the resources.
 """
 
 import math
@@ -18,11 +19,11 @@ from apertura.common.documents import DAMAGED, read_json
 from apertura.common.errors import CampaignError
 from apertura.workflow.rules import RULES, Cost, Demand
 
-_CAPTURE_BYTES = 64  # smallest size of a capture's metadata
-_UNKNOWN_PIXELS = 4096**2  # pixels assumed in resources for a grid that is derived from the first flight
-_USUAL_MPX = 0.25  # megapixels assumed in run times for such a grid
-_AT_ONCE_PIXELS = 4096**2  # pixels in memory at once; larger rasters are processed in blocks
-_AT_ONCE_BYTES = 1_000_000_000  # range profiles in memory at once; larger ones are processed in blocks of pulses
+_CAPTURE_BYTES = 64  # minimum size of the metadata of a capture
+_UNKNOWN_PIXELS = 4096**2  # pixels assumed for resources if the grid is still to be derived from the first flight
+_USUAL_MPX = 0.25  # megapixels assumed for run times in this case
+_AT_ONCE_PIXELS = 4096**2  # maximum number of pixels in memory at a time; larger rasters are processed in blocks
+_AT_ONCE_BYTES = 1_000_000_000  # maximum size of range profiles in memory at a time; pulses are processed in blocks
 _OVERSAMPLING = 2  # oversampling of range profiles
 
 
@@ -33,15 +34,15 @@ class Work:
     Attributes
     ----------
     recorded_bytes
-        Size of its nodes' recordings.
+        Size of the recordings of the job's nodes.
     pulses
         Largest number of pulses of a pair.
     profile_bytes
-        Size of a pair's range profiles.
+        Size of the range profiles of a pair.
     pixels
-        Pixels of the grid.
+        Number of pixels of the grid.
     tiles
-        Tiles of an image, or of the job's share of an image.
+        Number of tiles of an image, or of the part of the image that the job forms.
     images
         Number of images.
     """
@@ -54,21 +55,21 @@ class Work:
     images: int = 1
 
 
-_SNAKEMAKE_MB = 300  # two Snakemake processes, which a batch system counts as part of the job
-_LEAST_MINUTES = 10  # allows for a start on a busy node, and for slow file systems
-_SLOWER = 3  # assumed factor relative to run times on the machine where the constants were measured
+_SNAKEMAKE_MB = 300  # memory of two Snakemake processes, which a batch system counts as part of the job
+_LEAST_MINUTES = 10  # allowance for the start on a busy machine and for slow file systems
+_SLOWER = 3  # assumed ratio of run times to those on the machine on which the constants were measured
 
 
 @dataclass(frozen=True)
 class Resources:
-    """Resources of the jobs of a campaign's rules.
+    """Resources of the jobs of all rules for a campaign.
 
     Attributes
     ----------
     campaign
         Campaign with settings and flights.
     planned
-        Flight and node → bytes and pulses of planned recordings; None: recordings are in raw/.
+        Flight and node → bytes and pulses of planned recordings; None if recordings are in raw/.
 
     Examples
     --------
@@ -89,14 +90,14 @@ class Resources:
         return RuleResources(demand, self)
 
     def expected_seconds(self, rule: str, *where: str) -> float:
-        """Return the expected time of a job of a rule on this machine, seconds.
+        """Return the expected run time of a job of a rule on this machine, seconds.
 
         Parameters
         ----------
         rule
             Name of the rule; for an unknown name, the default cost is returned.
         *where
-            Arguments of the job, first the values of its wildcards; names that the campaign does not have are ignored.
+            Arguments of the job, beginning with the values of its wildcards; names unknown in the campaign are ignored.
         """
         row = RULES.get(rule)
         cost = row.cost if row else Cost()
@@ -108,7 +109,7 @@ class Resources:
         return cost.begin_s + cost.mb_s * recorded_mb + cost.mpx_s * mpx + cost.mb_mpx_s * recorded_mb * mpx
 
     def _recorded_mb(self, stated: dict[str, str]) -> float:
-        """Return the size of the recordings of a job's nodes, MB; 0 for names that the campaign does not have."""
+        """Return the size of the recordings of a job's nodes, MB; 0 for names that are unknown in the campaign."""
         flight, pair, node = (stated.get(word) for word in ("flight", "pair", "node"))
         named = [name for name in (node, *(pair or "").split("-")) if name]
         known = flight in {each.name for each in self.campaign.flights} and {*named} <= {*self.campaign.settings.nodes}
@@ -122,9 +123,9 @@ class Resources:
         Parameters
         ----------
         flight, pair, node
-            Wildcards of the job; None for wildcards that it does not have.
+            Wildcards of the job; None for wildcards that the job does not have.
         jobs
-            Number of jobs that share the tiles of an image.
+            Number of jobs among which the tiles of an image are divided.
         """
         campaign = self.campaign
         flights = [campaign.flight(flight)] if flight else list(campaign.image_flights or campaign.flights)
@@ -152,7 +153,7 @@ class Resources:
         return cache(self._bytes_and_pulses)
 
     def _bytes_and_pulses(self, flight: str, node: str) -> tuple[int, int]:
-        """Return the size of a recording in bytes, and the largest possible number of its pulses."""
+        """Return the size of a recording in bytes, and an upper bound of its number of pulses."""
         if self.planned is not None:
             return self.planned[flight, node]
         waveform = self.campaign.settings.waveform
@@ -168,7 +169,7 @@ class Resources:
         return sum(files), math.ceil(min(samples / waveform.needed_samples, max(files[0] / _CAPTURE_BYTES, continuous)))
 
     def _captures(self, flight: str, node: str) -> int:
-        """Return the number of captures in stage `raw` of a missing recording; 0 if it is unknown."""
+        """Return the number of captures in stage `raw` of a missing recording; 0 if the number is unknown."""
         with suppress(CampaignError, LookupError, TypeError, ValueError):
             path = self.campaign.stage("raw", flight, node) / "start" / "zarr.json"
             return int(read_json(path, expected="an array of stage raw", remedy=DAMAGED)["shape"][0])
@@ -176,7 +177,7 @@ class Resources:
 
     @cached_property
     def _shape(self) -> tuple[int, int] | None:
-        """Rows and columns from scene.json or the config; None if they are not known yet."""
+        """Rows and columns of the grid from scene.json or the config; None if not yet known."""
         scene = self.campaign.settings.scene
         with suppress(CampaignError, LookupError, TypeError, ValueError):  # scene.json missing or damaged
             document = read_json(self.campaign.result("scene.json"), expected="the campaign's grid", remedy=DAMAGED)
@@ -189,7 +190,7 @@ class Resources:
 
     @cached_property
     def _range_samples(self) -> int:
-        """Largest number of samples of a range profile: of the unambiguous range, or of the scene's depth."""
+        """Maximum number of samples in a range profile, limited by the unambiguous range or the depth of the scene."""
         waveform, scene = self.campaign.settings.waveform, self.campaign.settings.scene
         if not isinstance(waveform, SampledWaveform):
             return 1000
@@ -204,17 +205,17 @@ class Resources:
 
 @dataclass(frozen=True)
 class RuleResources:
-    """Resources of the jobs of a rule, as functions of a job's wildcards for Snakemake."""
+    """Resources of the jobs of a rule for Snakemake, as functions of the wildcards of a job."""
 
     demand: Demand
     of: Resources
 
     def threads(self, wildcards: Any) -> int:
-        """Return the number of threads of a job, at most its number of tiles."""
+        """Return the number of threads of a job, which does not exceed the number of tiles."""
         return max(1, min(self.demand.threads, self._work(wildcards).tiles))
 
     def mem_mb(self, wildcards: Any, attempt: int) -> int:
-        """Return the memory of a job, MB of 1e6 bytes; it doubles with each attempt."""
+        """Return the memory of a job, MB of 1e6 bytes; the value doubles with each attempt."""
         work, demand = self._work(wildcards), self.demand
         grows = demand.pulse_bytes * work.pulses
         grows += demand.pixel_bytes * min(work.pixels, _AT_ONCE_PIXELS)
@@ -223,7 +224,7 @@ class RuleResources:
         return math.ceil(_SNAKEMAKE_MB + demand.base_mb + grows / 1e6) << attempt - 1
 
     def runtime(self, wildcards: Any, attempt: int) -> int:
-        """Return the time limit of a job, minutes; it doubles with each attempt."""
+        """Return the time limit of a job, minutes; the value doubles with each attempt."""
         work, demand = self._work(wildcards), self.demand
         seconds = demand.recorded_s * work.recorded_bytes / 1e9 + demand.pixel_s * work.images * work.pixels / 1e6
         seconds += demand.sum_s * work.images * work.pixels * work.pulses / 1e9

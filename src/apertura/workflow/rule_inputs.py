@@ -1,6 +1,6 @@
-"""Scope of a job, and functions of rule rows that return source files and settings.
+"""Scope of a job, and functions in the rows of rules that return source files and settings.
 
-Functions import what they need when they are called, because the command line imports the rows.
+The functions import modules only when they are called, because the command line also imports the rows.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Scope(Enum):
-    """Scope of a rule, with the Snakemake wildcards of its jobs."""
+    """Scope of a rule, and the Snakemake wildcards of the jobs of the rule."""
 
     NODE = "node", ("flight", "node")
     PAIR = "pair", ("flight", "pair")
@@ -29,7 +29,7 @@ class Scope(Enum):
 
 @dataclass(frozen=True)
 class JobScope:
-    """Scope of a job with the values of its wildcards.
+    """Scope of a job and the values of its wildcards.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class JobScope:
 
     @property
     def pairs(self) -> list[tuple[str, str]]:
-        """Flight and pair of every image within the scope."""
+        """Flight and pair of each image within the scope."""
         campaign = self.campaign
         if self.of is Scope.PAIR:
             return [(self.where[0], self.where[1])]
@@ -60,7 +60,7 @@ class JobScope:
         return [(flight.name, pair) for flight in campaign.image_flights for pair in flight.pairs]
 
     def below(self, of: Scope) -> list[tuple[str, ...]]:
-        """Return the wildcard values of all jobs of another kind of scope that are related to this job.
+        """Return the wildcard values of all jobs with another kind of scope that belong to this job.
 
         Examples
         --------
@@ -82,11 +82,12 @@ class JobScope:
 
 SourceSpec = str | Callable[[JobScope], Iterable[str]]
 SettingSpec = str | Callable[[JobScope], Mapping[str, Any]]
-"""Source or setting in the row of a result: a name, or a function of the job's scope that returns names or values."""
+"""Source or setting in the row of a result: a name, or a function that returns names or values for the scope of a job.
+"""
 
 
 def charted(campaign: "Campaign") -> tuple[str, str]:
-    """Return flight and pair of `apertura chart`: the last pair of the first flight, bistatic if there is one.
+    """Return flight and pair of `apertura chart`: the last pair of the first image flight.
 
     Raises
     ------
@@ -98,19 +99,19 @@ def charted(campaign: "Campaign") -> tuple[str, str]:
 
 
 def is_sampled(campaign: "Campaign") -> bool:
-    """Return True if samples were recorded, not phase histories."""
+    """Return True if samples were recorded; False for phase histories."""
     from apertura.campaign.config import SampledWaveform
 
     return isinstance(campaign.settings.waveform, SampledWaveform)
 
 
 def of_samples(scope: JobScope) -> bool:
-    """Return True if samples were recorded, not phase histories."""
+    """Return True if samples were recorded; False for phase histories."""
     return is_sampled(scope.campaign)
 
 
 def adds_up(scope: JobScope) -> bool:
-    """Return True if a flight has several pairs, and thus sums."""
+    """Return True if a flight has several pairs and therefore sums."""
     from apertura.campaign.config import FUSED
 
     return FUSED in scope.campaign.flight(scope.where[0]).images
@@ -137,19 +138,19 @@ def stated_paths(scope: JobScope) -> Mapping[str, Any]:
 
 
 def sample_orders(scope: JobScope) -> Mapping[str, Any]:
-    """Return the configured order of I and Q of each node that does not use that of the waveform."""
+    """Return the configured order of I and Q for nodes that override the order in the section `waveform`."""
     nodes = scope.campaign.settings.nodes
     orders = {node: nodes[node].iq for (_, node) in scope.below(Scope.NODE) if nodes[node].iq is not None}
     return {"iq": orders} if orders else {}
 
 
 def log(scope: JobScope) -> Iterable[str]:
-    """Return a node's flight log."""
+    """Return the flight log of a node."""
     return [scope.campaign.relative(scope.campaign.track_file(*scope.where))]
 
 
 def transmitted_and_received(scope: JobScope) -> Iterable[str]:
-    """Return the files from which an echo is formed, and the calibration applied to it."""
+    """Return the files from which stage `echo` is computed, and the calibration applied to the stage."""
     campaign, (flight, pair) = scope.campaign, scope.where
     nodes = list(dict.fromkeys(pair.split("-")))
     if not is_sampled(campaign):
@@ -164,7 +165,7 @@ def transmitted_and_received(scope: JobScope) -> Iterable[str]:
 
 
 def received(scope: JobScope) -> Iterable[str]:
-    """Return the files from which the pairs' transfer functions are formed, in addition to stage `echo`."""
+    """Return the files from which transfer functions of the pairs are computed, in addition to stage `echo`."""
     campaign = scope.campaign
     samples = (campaign.promised_files(flight, pair.split("-")[1])[-1] for flight, pair in scope.pairs)
     return map(campaign.relative, (campaign.sent_file, *samples))
@@ -179,7 +180,7 @@ def echoes_that_bound_the_scene(scope: JobScope) -> Iterable[str]:
 
 
 def unstaged_positions(scope: JobScope) -> Iterable[str]:
-    """Return the sources of positions for phase histories, which have no stage `track`: flight logs, else echoes."""
+    """Return the sources of positions for phase histories, which have no stage `track`: flight logs or echoes."""
     campaign = scope.campaign
     if is_sampled(campaign):
         return []
@@ -194,7 +195,7 @@ def heights(scope: JobScope) -> Iterable[str]:
 
 
 def ground_under_air(scope: JobScope) -> Iterable[str]:
-    """Return the files of terrain heights if the refractivity depends on them."""
+    """Return the files of terrain heights if the refractivity depends on the terrain."""
     return [] if scope.campaign.settings.scene.atmosphere == "vacuum" else heights(scope)
 
 
@@ -211,13 +212,13 @@ def air(scope: JobScope) -> Mapping[str, Any]:
 
 
 def patterns(scope: JobScope) -> Iterable[str]:
-    """Return the files of the sampled patterns of the pairs' antennas."""
+    """Return the files of the antenna patterns of the pairs."""
     files = (path for _, pair in scope.pairs for path in scope.campaign.pattern_files(pair).values())
     return map(scope.campaign.relative, files)
 
 
 def autofocused(scope: JobScope) -> Iterable[str]:
-    """Return the sources of autofocus; empty if it is off."""
+    """Return the sources of autofocus; empty if autofocus is off."""
     if scope.campaign.settings.processing.autofocus == "off":
         return []
     stages = [scope.campaign.manifest(stage, *pair) for pair in scope.pairs for stage in ("echo", "profile")]
@@ -262,7 +263,7 @@ def log_settings(scope: JobScope) -> Mapping[str, Any]:
 
 
 def unstaged_log_settings(scope: JobScope) -> Mapping[str, Any]:
-    """Return the settings for reading the logs of a flight, if there is no stage `track`."""
+    """Return the settings for reading the logs of a flight; empty if there are stages `track`."""
     if is_sampled(scope.campaign):
         return {}
     nodes = {at[1]: at for at in scope.below(Scope.NODE) if scope.campaign.logged(*at)}
@@ -270,7 +271,7 @@ def unstaged_log_settings(scope: JobScope) -> Mapping[str, Any]:
 
 
 def polarisations(scope: JobScope) -> Mapping[str, Any]:
-    """Return the stated polarisations of the pairs."""
+    """Return the configured polarisations of the pairs."""
     from apertura.campaign.config import polarisation_of
 
     names = sorted({pair for _, pair in scope.pairs})
@@ -285,7 +286,7 @@ def stated_errors(scope: JobScope) -> Mapping[str, Any]:
 
 
 def antennas(scope: JobScope) -> Mapping[str, Any]:
-    """Return the beams of the pairs' antennas."""
+    """Return the antenna beams of the pairs."""
     beams = {point: beam.model_dump(mode="json") for point, (_, beam) in _beams(scope).items()}
     return {"antennas": beams} if beams else {}
 
@@ -319,26 +320,26 @@ def radio(scope: JobScope) -> Mapping[str, Any]:
 
 
 def coefficients(scope: JobScope) -> Mapping[str, Any]:
-    """Return the backscattering coefficients and mean powers to write; empty if there are none."""
+    """Return the names of the backscattering coefficients and mean powers to be written; empty if there are none."""
     written = scope.campaign.coefficients
     return {"radiometry": list(written)} if written else {}
 
 
 def multilook(scope: JobScope) -> Mapping[str, Any]:
-    """Return the settings of multilooking; empty if it is off."""
+    """Return the settings of multilooking; empty if multilooking is off."""
     stated = scope.campaign.values["processing"]["multilook"]
     return {"multilook": stated} if stated else {}
 
 
 def noise_of_sums(scope: JobScope) -> Iterable[str]:
-    """Return the manifests with the noise of a flight's images if it is subtracted from their sums."""
+    """Return the manifests with the noise of a flight's images; empty unless noise is subtracted from the sums."""
     multilooking = scope.campaign.settings.processing.multilook
     subtracted = multilooking is not None and multilooking.subtract_noise
     return [scope.campaign.manifest("layers", *pair) for pair in scope.pairs] if subtracted else []
 
 
 def measured_image(scope: JobScope) -> Iterable[str]:
-    """Return the image if it is calibrated or multilooked, with the transmitted signal and the file of constants."""
+    """Return the image, transmitted signal and file of constants, as far as calibration or multilooking need these."""
     campaign, files = scope.campaign, list[Path]()
     if campaign.calibrated:
         files += [campaign.sent_file] if is_sampled(campaign) else []
@@ -348,13 +349,13 @@ def measured_image(scope: JobScope) -> Iterable[str]:
 
 
 def calibration_of_images(scope: JobScope) -> Iterable[str]:
-    """Return the manifests with the radiometry of images; empty if images are relative."""
+    """Return the manifests with the radiometric calibration of images; empty if images are relative."""
     campaign = scope.campaign
     return [campaign.manifest("layers", *pair) for pair in scope.pairs] if campaign.calibrated else []
 
 
 def pair_settings(scope: JobScope) -> Mapping[str, Any]:
-    """Return the settings of a pair's echo: its nodes, and the presence of beams but not their shapes."""
+    """Return the settings that affect the echo of a pair: those of its nodes, and the presence (not shape) of beams."""
     campaign, (flight, pair) = scope.campaign, scope.where
     nodes = {
         node: {key: value for key, value in campaign.values["nodes"][node].items() if key not in _RADIO}
@@ -385,13 +386,13 @@ _AFTER_THE_IMAGE = frozenset({"fusion", "radiometry", "radiometric_calibration",
 
 
 def imaging(scope: JobScope) -> Mapping[str, Any]:
-    """Return all settings of section `processing` except those of other rules; new keys count as image settings."""
+    """Return the settings of section `processing` except those of other rules; new keys count as image settings."""
     processing = scope.campaign.values["processing"]
     return {name: value for name, value in processing.items() if name not in _BEFORE_THE_IMAGE | _AFTER_THE_IMAGE}
 
 
 def two_images(scope: JobScope) -> Mapping[str, Any]:
-    """Return the images compared, as flight/pair."""
+    """Return the compared images, as flight/pair."""
     return {"images": ["/".join(pair) for pair in scope.pairs]}
 
 

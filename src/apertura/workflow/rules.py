@@ -1,7 +1,7 @@
-"""Rules of the workflow, one row each: result, sources, settings, function, resources and cost.
+"""Rules of the workflow, one row per rule: result, sources, settings, function, resources and cost.
 
-Lineage, resources, the remaining time and `apertura step` follow from the rows; a test compares them with the rules in
-`workflow/`. Rows refer to functions by `Lazy`, because the command line imports the rows as well.
+Lineage, resources, the remaining time and `apertura step` are derived from the rows. A test compares the rows with the
+rules in `workflow/`. Rows refer to functions by `Lazy`, because the command line also imports the rows.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -16,7 +16,7 @@ INTERFEROMETRY = "interferometry"
 """Results folder of interferograms."""
 
 STUDY = "study"
-"""Results folder of benchmark measurements, which are made on demand."""
+"""Results folder of benchmark measurements, which are only made on demand."""
 
 EVERY = "*"
 """Source of a result that describes all results except those written on demand."""
@@ -24,24 +24,24 @@ EVERY = "*"
 
 @dataclass(frozen=True)
 class Demand:
-    """Cluster resources of a job: a constant, and terms proportional to its work, from measured runs.
+    """Cluster resources of a job: a constant and terms proportional to the work, derived from measured runs.
 
     Attributes
     ----------
     base_mb
-        Resident memory independent of the work: 1.5 times the memory measured for little work.
+        Resident memory independent of the work: 1.5 times the memory measured for a small amount of work.
     pulse_bytes, pixel_bytes, tile_bytes, image_bytes
-        Memory per pulse, per pixel in memory at once, per tile to be formed, and per image that is described.
+        Memory per pulse, per pixel held in memory at a time, per tile to be formed, and per described image.
     profile_share
-        Memory per byte of range profiles in memory at once.
+        Memory per byte of range profiles held in memory at a time.
     threads
         Largest useful number of threads.
     recorded_s
-        Seconds per GB recorded.
+        Seconds per recorded GB.
     pixel_s
         Seconds per million pixels and image.
     sum_s
-        Seconds of one thread per 1e9 pixels times pulses.
+        Seconds of a single thread per 1e9 contributions (pixels × pulses).
     """
 
     base_mb: float
@@ -58,18 +58,20 @@ class Demand:
 
 @dataclass(frozen=True)
 class Cost:
-    """Expected run time of a job on two CPU cores of 2025, started by a fork; a run scales it by its measured times.
+    """Expected run time of a job, started by a fork, on two CPU cores of 2025.
+
+    During a run, the expected run times are scaled by the measured run times.
 
     Attributes
     ----------
     begin_s
         Seconds independent of the work.
     mb_s, mpx_s, mb_mpx_s
-        Seconds per MB recorded, per million pixels, and per product of both.
+        Seconds per recorded MB, per million pixels, and per product of both numbers.
     all_cores
         True if a job uses all cores.
     last
-        True if no other rule, or hardly any, depends on it.
+        True if no other rule, or hardly any other rule, depends on the rule.
     """
 
     begin_s: float = 0.4
@@ -81,12 +83,12 @@ class Cost:
 
     @property
     def of_imaging(self) -> bool:
-        """True if a job sums pulses over pixels; its run time depends on the plan by orders of magnitude."""
+        """True if a job sums pulses at all pixels, so that its run time varies with the plan by orders of magnitude."""
         return bool(self.mb_mpx_s)
 
     @property
     def of_rasters(self) -> bool:
-        """True if a job mainly reads and writes rasters; predictions for such jobs have similar errors."""
+        """True if a job mainly reads and writes rasters; predicted run times of such jobs have similar errors."""
         return bool(self.mpx_s) and not self.mb_s and not self.mb_mpx_s
 
 
@@ -99,50 +101,52 @@ class Rule:
     name
         Name in the workflow.
     of
-        Scope of its jobs.
+        Scope of the jobs of the rule.
     help
-        Description in one sentence, shown by `apertura step`.
+        One-sentence description, printed by `apertura step`.
     step
-        Function of a campaign and the values of the wildcards that writes the result; it returns the written paths.
+        Function that writes the result and returns the written paths; its arguments are a campaign and the values of
+        the wildcards.
     sources
-        Names of results, within the scope of the job, and functions of the scope that return further manifests and
+        Names of results within the scope of the job, and functions of the scope that return further manifests and
         files, relative to the campaign folder.
     settings
         Settings that affect the result: dotted keys, and functions of the scope that return further values by name.
     demand
-        Cluster resources of a job; None if Snakemake itself does the work.
+        Cluster resources of a job; None if Snakemake itself computes the result.
     cost
         Expected run time of a job.
     result
-        Name of the result; empty: the name of the rule.
+        Name of the result; empty for the name of the rule.
     products
-        Files next to the manifest for users.
+        Files next to the manifest that are intended for users.
     documents
-        Files next to the manifest for other rules.
+        Files next to the manifest that are intended for other rules.
     exports
-        Kind of the rows of `apertura.formats.export` that it writes.
+        Kind of the rows of `apertura.formats.export` that the rule writes.
     styles
-        True if it writes the styles of all rows.
+        True if the rule writes the styles of all rows.
     manifest
-        Path below the results, without ``.manifest.json``; empty: from the scope and the name of the result.
+        Path relative to the results, without ``.manifest.json``; empty to derive the path from the scope and the name
+        of the result.
     kinds
-        Kinds of flights to which it applies.
+        Kinds of flights to which the rule applies.
     needed
         Function that returns True if the result exists in a scope.
     on_demand
-        True if it is written on request only, and not by every run.
+        True if the result is only written on request, not by every run.
     shares
-        True if it computes a share of `result`, which another rule completes.
+        True if the rule computes part of `result`, which another rule completes.
     forms
-        True if its step reads transfer functions of its pairs, which are formed from the recordings of receivers.
+        True if the step reads transfer functions of its pairs, which are computed from the recordings of receivers.
     reads
-        Readers (of recordings, of logs) whose code affects the result, if its step reads recorded files.
+        Readers (of recordings, of logs) whose code affects the result, if the step reads recorded files.
     command
-        Name of its `apertura step` command; empty: the name of the rule.
+        Name of the `apertura step` command; empty for the name of the rule.
     arguments, options
-        Arguments and options of that command; no arguments: the wildcards.
+        Arguments and options of that command; empty arguments for the wildcards.
     last_words
-        Arguments after the wildcards, for a command that serves several rules.
+        Arguments after the wildcards, for a command that is used by several rules.
     """
 
     name: str
@@ -185,17 +189,17 @@ class Rule:
 
     @property
     def module(self) -> str:
-        """Dotted name of the module of its step."""
+        """Dotted name of the module that contains the step function."""
         return module_of(self.step)
 
     @property
     def folder(self) -> str:
-        """Folder of the result below the results folder, with wildcards in braces."""
+        """Folder of the result relative to the results folder, with wildcards in braces."""
         return self.manifest.rpartition("/")[0]
 
     @property
     def log(self) -> str:
-        """Path of its log and benchmark files below their folders, without suffix.
+        """Path of the rule's log and benchmark files relative to their folders, without file extension.
 
         Examples
         --------
@@ -254,7 +258,7 @@ _INGEST = Rule(
 _IMAGE = Rule(
     "image",
     Scope.PAIR,
-    "Focus a pair's image, image.zarr.",
+    "Form the image of a pair, image.zarr.",
     _STAGES.image.image,
     sources=(*_FORMED, "refined_track"),
     settings=_IMAGE_SETTINGS,
@@ -282,7 +286,7 @@ _ROWS = (
     Rule(
         "bench",
         Scope.FLIGHT,
-        "Measure channels, clocks and links of a stationary radar, bench.json, bench.html and bench.png.",
+        "Measure channels, clocks and links of a stationary radar; write bench.json, bench.html and bench.png.",
         _TOOLS.bench.report.bench,
         sources=(inputs.recorded_on_the_bench,),
         settings=("campaign", "waveform", "bench", "processing.sidelink", inputs.stated_paths, inputs.sample_orders),
@@ -295,7 +299,7 @@ _ROWS = (
     Rule(
         "echo",
         Scope.PAIR,
-        "Measure pulses, phase centres, clock and sidelink of a pair, echo.zarr.",
+        "Determine pulses, phase centres, clock and sidelink of a pair, echo.zarr.",
         _STAGES.echo.echo,
         sources=("raw", "track", inputs.transmitted_and_received, inputs.ground_under_air),
         settings=(
@@ -338,7 +342,7 @@ _ROWS = (
     Rule(
         "scene",
         Scope.CAMPAIGN,
-        "Choose the campaign's grid, scene.json.",
+        "Choose the output grid of the campaign, scene.json.",
         _STAGES.scene.scene,
         sources=(inputs.echoes_that_bound_the_scene, inputs.heights),
         settings=("campaign", inputs.grid),
@@ -349,7 +353,7 @@ _ROWS = (
     Rule(
         "terrain",
         Scope.CAMPAIGN,
-        "Resample the DEM to the campaign's grid, terrain.zarr.",
+        "Resample the DEM to the output grid, terrain.zarr.",
         _STAGES.scene.terrain,
         sources=("scene", inputs.heights),
         settings=("scene.dem", "scene.dem_datum", "scene.geoid"),
@@ -359,7 +363,7 @@ _ROWS = (
     Rule(
         "profile",
         Scope.PAIR,
-        "Compress a pair in range over the scene, profile.zarr.",
+        "Compute the range profiles of a pair over the scene, profile.zarr.",
         _STAGES.profile.profile,
         sources=("echo", *_GROUND, inputs.patterns),
         settings=(
@@ -376,7 +380,7 @@ _ROWS = (
     Rule(
         "refine",
         Scope.FLIGHT,
-        "Estimate errors of a flight's tracks from its images if autofocus is on, refined_track.zarr.",
+        "Estimate track errors of a flight from its images if autofocus is enabled, refined_track.zarr.",
         _STAGES.refine.refine,
         result="refined_track",
         sources=(inputs.autofocused, *_GROUND),
@@ -387,7 +391,7 @@ _ROWS = (
     Rule(
         "tracks",
         Scope.FLIGHT,
-        "Write the refined tracks of a flight, tracks/<node>.pos and .csv, and plot the corrections, tracks.png.",
+        "Write the refined tracks of a flight (tracks/<node>.pos, .csv), and plot the corrections (tracks.png).",
         _STAGES.tracks.tracks,
         sources=("refined_track", "track", inputs.unstaged_positions),
         settings=("campaign", inputs.stated_errors, inputs.unstaged_log_settings),
@@ -400,7 +404,7 @@ _ROWS = (
     replace(
         _IMAGE,
         name="tiles",
-        help="Form one job's share of an image's tiles, such as '2-of-8'; step image completes the image.",
+        help="Form a share of an image's tiles in one job, such as '2-of-8'; step image completes the image.",
         step=_STAGES.image.tiles,
         result="image",
         command="tiles",
@@ -412,7 +416,7 @@ _ROWS = (
     Rule(
         "layers",
         Scope.PAIR,
-        "Write incidence, bistatic angle, mask, looks and noise of a pair as GeoTIFFs, and sigma0 if calibrated.",
+        "Write incidence, bistatic angle, mask, looks, noise and, if calibrated, sigma0 of a pair as GeoTIFFs.",
         _STAGES.layers.layers,
         sources=(*_FORMED, inputs.measured_image),
         settings=("campaign", "processing.integration", inputs.antennas, inputs.radio, inputs.multilook),
@@ -437,7 +441,7 @@ _ROWS = (
     Rule(
         "export",
         Scope.PAIR,
-        "Write GeoTIFFs and the quicklook of a pair, or of 'fused'.",
+        "Write GeoTIFFs and the quicklook of a pair, or of the sums ('fused').",
         _STAGES.export.export,
         sources=("image", "assessment", "scene", inputs.calibration_of_images),
         settings=("campaign", "metadata", inputs.polarisations),
@@ -464,7 +468,7 @@ _ROWS = (
     Rule(
         "coverage",
         Scope.CAMPAIGN,
-        "Draw the coverage of every flight and pair, coverage.png and coverage.geojson.",
+        "Draw the coverage of all flights and pairs, coverage.png and coverage.geojson.",
         _STAGES.coverage.coverage,
         sources=("echo", "layers", "scene"),
         settings=("campaign",),
@@ -485,7 +489,7 @@ _ROWS = (
     Rule(
         "export_fused",
         Scope.FLIGHT,
-        "Write GeoTIFFs and the quicklook of the sums of a flight's pairs.",
+        "Write GeoTIFFs and the quicklook of the sums of the pairs of a flight.",
         _STAGES.export.export,
         result="fused",
         sources=("image", "assessment", "cube", "scene", inputs.noise_of_sums),
@@ -503,7 +507,7 @@ _ROWS = (
     Rule(
         "interferogram",
         Scope.TWO,
-        "Compute coherence, unwrapped phase and heights from two images, by a name of interferometry.pairs.",
+        "Compute coherence, unwrapped phase and heights from two images, a pair named in interferometry.pairs.",
         _STAGES.interferogram.interferogram,
         sources=(*_FORMED, "image", "layers"),
         settings=(
@@ -523,7 +527,7 @@ _ROWS = (
     Rule(
         "mosaic",
         Scope.CAMPAIGN,
-        "Write a mosaic of each product over all flights, mosaic/<pair>/<product>.vrt.",
+        "Write a mosaic of each product from all flights, mosaic/<pair>/<product>.vrt.",
         _STAGES.mosaic.mosaic,
         sources=("layers", "export", "fused"),
         settings=("campaign", inputs.coefficients),
@@ -535,7 +539,7 @@ _ROWS = (
     Rule(
         "stac",
         Scope.CAMPAIGN,
-        "Describe every image in a static STAC catalogue, stac/catalog.json.",
+        "Describe all images in a static STAC catalogue, stac/catalog.json.",
         _STAGES.stac.stac,
         sources=("echo", "layers", "export", "fused", "scene"),
         settings=("campaign", "metadata", inputs.polarisations),
@@ -556,7 +560,7 @@ _ROWS = (
     Rule(
         "pictures_fused",
         Scope.FLIGHT,
-        "Draw the figures of a flight's sums for the report: comparison with the pairs, and cuts.",
+        "Draw the figures of a flight's sums for the report: comparison with the pairs, and cuts through a target.",
         _VIEWS.report.pictures.pictures_fused,
         sources=("export", "image", "cube", "fused", "scene"),
         settings=("campaign",),
@@ -602,7 +606,7 @@ _ROWS = (
     Rule(
         "speed_accuracy",
         Scope.CHARTED,
-        "Measure run time and accuracy of every engine and setting on a pair, within a time limit in seconds.",
+        "Measure run time and accuracy of all engines and settings for a pair, within a time limit in seconds.",
         _TOOLS.chart.speed_accuracy.speed_accuracy,
         sources=(*_FORMED, "refined_track"),
         settings=(inputs.charted_pair, *_IMAGE_SETTINGS),
@@ -618,7 +622,7 @@ _ROWS = (
     Rule(
         "whole_chart",
         Scope.CAMPAIGN,
-        "Measure run time and accuracy from raw samples to GeoTIFFs with several settings, whole.csv and .png.",
+        "Measure run time and accuracy from raw samples to GeoTIFFs for several settings, whole.csv and whole.png.",
         _TOOLS.chart.whole.whole_chart,
         result="whole",
         sources=(inputs.everything_recorded, inputs.heights),
@@ -632,7 +636,7 @@ _ROWS = (
     Rule(
         "ro_crate",
         Scope.CAMPAIGN,
-        "Describe the whole run, with every file and command, as an RO-Crate, ro-crate-metadata.json.",
+        "Describe the whole run with all files and commands as an RO-Crate, ro-crate-metadata.json.",
         _STAGES.ro_crate.ro_crate,
         sources=(inputs.config_files, EVERY),
         settings=("campaign", "metadata", _workflow),
@@ -642,7 +646,7 @@ _ROWS = (
 )
 
 RULES: Mapping[str, Rule] = dict(reversed({row.name: row for row in reversed(_ROWS) if row.demand}.items()))
-"""Rule of the workflow → its row; for a rule with several results, the row of the first result."""
+"""Name of a rule → row; for a rule with several results, the row of the first result."""
 
 RESULTS: Mapping[str, Rule] = {row.result: row for row in _ROWS if not row.shares}
-"""Result → row of its rule, each after the results on which it depends."""
+"""Name of a result → row of its rule; each result follows the results on which it depends."""

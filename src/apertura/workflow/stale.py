@@ -1,6 +1,6 @@
-"""Detection of results that are out of date, because a source, a setting or the code changed; file times are ignored.
+"""Detection of out-of-date results, for which a source, a setting or the code has changed.
 
-The comparison uses the hashes in the manifests of results.
+Current hashes are compared with those in the manifests of results. File times are ignored.
 """
 
 import re
@@ -24,7 +24,7 @@ _ONLY_LOOKS = (
     r"-[a-zA-Z]*[nlSD][a-zA-Z]*|--(dry-?run|lint|list.*|lt|lc|lp|summary|detailed-summary|dag|d3dag|rulegraph|filegraph|"
     r"report.*|unlock|cleanup.*|containerize|export-cwl|archive|compilation|print-compilation|delete-.*|help|version)"
 )
-"""Options with which snakemake reads a workflow without running it."""
+"""Options with which Snakemake reads a workflow without running it."""
 
 _RAW = "raw/"
 _SOURCE = {"missing": "is missing", "altered": "has changed", "added": "is a new source"}
@@ -33,42 +33,45 @@ _SOURCE = {"missing": "is missing", "altered": "has changed", "added": "is a new
 def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, str]:
     """Return manifest → reason for each existing result that is out of date, in the order of dependencies.
 
-    The reason is empty if a result only depends on another one that is out of date. A missing file of raw/ is no
-    reason, because recordings may be stored elsewhere, see `absent_files`.
+    The reason is empty for a result that is only out of date because it depends on another out-of-date result. A
+    missing file of raw/ is not a reason, because recordings may be stored elsewhere (see `absent_files`).
 
     Parameters
     ----------
     campaign
         Campaign with settings and flights.
     paranoid
-        Compute the hash of every file, even if its size and times are those of a stored hash.
+        Compute the hashes of all files, including those whose size and times agree with those of a cached hash.
     """
     stale: dict[str, str] = {}
     for name, result in results_of(campaign):
         path = campaign.root.named(result.manifest, where=campaign.root)
         if not path.is_file():
             if any((path.parent / file).is_file() for file in products_of(RESULTS[name])):
-                stale[result.manifest] = "its manifest, which states its lineage, is missing"
+                stale[result.manifest] = "the manifest, which contains the lineage, is missing"
             continue
         try:
             reasons = list(_reasons(campaign.root, result, read_manifest(path), paranoid=paranoid))
         except CampaignError:
-            reasons = ["its manifest is damaged"]
+            reasons = ["the manifest is damaged"]
         if reasons or not stale.keys().isdisjoint(result.sources):
             stale[result.manifest] = "; ".join(reasons)
     return stale
 
 
 def without_outdated(campaign: Campaign) -> Campaign:
-    """Return the campaign with its outdated results marked, so that plans follow from config and files instead."""
+    """Return the campaign with its out-of-date results marked, so that plans are based on config and files instead."""
     return replace(campaign, outdated=frozenset(stale_results(campaign)))
 
 
 def outdated_lines(campaign: Campaign) -> Iterator[str]:
-    """Yield a line on the results that `without_outdated` has marked."""
+    """Yield a line on the results marked by `without_outdated`."""
     if campaign.outdated:
         count = number_of(len(campaign.outdated), "result")
-        yield f"{count} out of date ({min(campaign.outdated)}): plan from the config; `apertura run` updates them"
+        yield (
+            f"{count} out of date ({min(campaign.outdated)}): the plan is based on the config; `apertura run` updates "
+            "the results"
+        )
 
 
 def absent_files(campaign: Campaign) -> list[str]:
@@ -79,9 +82,9 @@ def absent_files(campaign: Campaign) -> list[str]:
 
 
 def wanted_files(campaign: Campaign, stale: Collection[str]) -> dict[str, str]:
-    """Return missing file of raw/ that a run needs → manifest of the first result that needs it.
+    """Return missing file of raw/ that a run needs → manifest of the first result that needs the file.
 
-    `stale`: manifests of `stale_results`.
+    `stale` contains the manifests returned by `stale_results`.
     """
     missing = dict[str, str]()
     for name, where, result in places_of(campaign):
@@ -94,12 +97,12 @@ def wanted_files(campaign: Campaign, stale: Collection[str]) -> dict[str, str]:
 
 
 def absent_lines(campaign: Campaign) -> Iterator[str]:
-    """Yield a line if raw/ is stored elsewhere, and a line if files of raw/ are missing and thus not compared."""
+    """Yield a line if raw/ is stored elsewhere, and a line if files of raw/ are missing and therefore not compared."""
     if campaign.settings.raw_root:
         yield f"recordings are read from {shown(campaign.settings.raw_root, 400)} (raw_root in the config)"
     if absent := absent_files(campaign):
         more = f" and {len(absent) - 1} more" if len(absent) > 1 else ""
-        yield f"missing recordings, not compared with results: {shown(absent[0])}{more}"
+        yield f"recordings are missing and not compared with results: {shown(absent[0])}{more}"
 
 
 def any_is_missing(campaign: Campaign) -> bool:
@@ -109,10 +112,10 @@ def any_is_missing(campaign: Campaign) -> bool:
 
 
 def settle_times(campaign: Campaign, stale: Collection[str]) -> None:
-    """Set the file times of current results: not older than their sources, and not later than now.
+    """Set the file times of up-to-date results: not older than their sources, and not in the future.
 
-    Snakemake recomputes results that are older than their input, even if a copy lost the file times, and rejects
-    inputs with times in the future, which occur after a clock was set back.
+    Snakemake recomputes results that are older than their inputs, even if the times were lost when copying the files.
+    Snakemake also rejects inputs with times in the future, which occur after a clock was set back.
     """
     results, now_ns = [result for _, result in results_of(campaign)], time.time_ns()
     inputs = {source for result in results for source in result.sources if not source.startswith("results/")}
@@ -123,7 +126,7 @@ def settle_times(campaign: Campaign, stale: Collection[str]) -> None:
         if result.manifest not in stale and path.is_file():
             files = [path.parent / file for file in read_manifest(path)["files"] if ".zarr/" not in file]
             date([path, *files], earliest_ns=newest_ns, latest_ns=now_ns)
-    # Benchmark files are outputs of the rules, too: Snakemake compares the oldest output.
+    # Benchmark files are also outputs of the rules, and Snakemake compares the oldest output.
     benchmarks = (campaign.root / "results" / "benchmarks").rglob("*.tsv")
     date(benchmarks, earliest_ns=newest_ns, latest_ns=now_ns)
 
@@ -133,20 +136,23 @@ def _newest_ns(root: ConfinedPath, names: Iterable[str]) -> int:
 
 
 def make_again(campaign: Campaign, stale: Mapping[str, str], *, remove: bool) -> None:
-    """Print the results that will be recomputed, and `remove` their manifests, so that they count as unfinished."""
+    """Print the results to be recomputed; with `remove`, delete their manifests, so that they count as unfinished."""
     for line in stale_lines(stale):
         print(line, file=sys.stderr, flush=True)
-    # Dependent results first, so that after a kill no finished result depends on an unfinished one.
+    # Start with dependent results, so that no finished result depends on an unfinished result after a kill.
     for manifest in reversed(list(stale)) if remove else ():
         for kept in _set_aside(campaign.root, manifest):
             print(f"a manually edited file is kept as {kept}", file=sys.stderr, flush=True)
         (campaign.root / manifest).unlink(missing_ok=True)
     if stale and not remove:
-        print("a dry run of snakemake alone does not include them; `apertura run CAMPAIGN -n` does", file=sys.stderr)
+        print(
+            "a dry run of snakemake does not include these results; use `apertura run CAMPAIGN -n` instead",
+            file=sys.stderr,
+        )
 
 
 def _set_aside(root: ConfinedPath, manifest: str) -> Iterator[str]:
-    """Rename manually edited files of a result, so that the workflow does not overwrite them; yield their new names."""
+    """Rename manually edited files of a result, so that the workflow does not overwrite the edits; yield new names."""
     path = root / manifest
     try:
         files = read_manifest(path)["files"]
@@ -163,12 +169,12 @@ def _set_aside(root: ConfinedPath, manifest: str) -> Iterator[str]:
 
 
 def stale_lines(stale: Mapping[str, str]) -> Iterator[str]:
-    """Yield a line for each reason with the results that are out of date, and one for dependent results.
+    """Yield a line for each reason, with the out-of-date results, and a line for dependent results.
 
     Examples
     --------
-    >>> list(stale_lines({"a.json": "its code has changed", "b.json": "its code has changed", "c.json": ""}))
-    ['a.json and 1 more: out of date, its code has changed', '1 dependent result out of date as well']
+    >>> list(stale_lines({"a.json": "the code has changed", "b.json": "the code has changed", "c.json": ""}))
+    ['a.json and 1 more: out of date, the code has changed', '1 dependent result also out of date']
     """
     by_reason: dict[str, list[str]] = {}
     for manifest, reason in stale.items():
@@ -178,11 +184,11 @@ def stale_lines(stale: Mapping[str, str]) -> Iterator[str]:
         more = f" and {len(manifests) - 1} more" if len(manifests) > 1 else ""
         yield f"{manifests[0]}{more}: out of date, {reason}"
     if dependent:
-        yield f"{number_of(dependent, 'dependent result')} out of date as well"
+        yield f"{number_of(dependent, 'dependent result')} also out of date"
 
 
 def forms_results(arguments: Sequence[str]) -> bool:
-    """Return True if a command line of snakemake runs jobs; the workflow has no other way to detect a dry run.
+    """Return True if a command line of Snakemake runs jobs; the workflow has no other means of detecting a dry run.
 
     Examples
     --------
@@ -193,7 +199,7 @@ def forms_results(arguments: Sequence[str]) -> bool:
 
 
 def damaged_results(campaign: Campaign) -> dict[str, str]:
-    """Return manifest → files that have changed since they were written, for all existing results; reads every byte."""
+    """Return manifest → description of damage for each damaged result; all bytes of all existing results are read."""
     damaged = {}
     for _, result in results_of(campaign):
         path = campaign.root.named(result.manifest, where=campaign.root)
@@ -201,17 +207,17 @@ def damaged_results(campaign: Campaign) -> dict[str, str]:
             try:
                 files = damaged_files(path)
             except CampaignError:
-                damaged[result.manifest] = "its manifest is damaged"
+                damaged[result.manifest] = "the manifest is damaged"
                 continue
             if files:
                 others = f", and {len(files) - 1} more" if len(files) > 1 else ""
-                damaged[result.manifest] = f"changed since it was written: {files[0]}{others}"
+                damaged[result.manifest] = f"changed since the result was written: {files[0]}{others}"
     return damaged
 
 
 def _reasons(root: ConfinedPath, result: Result, recorded: Mapping[str, Any], *, paranoid: bool) -> Iterator[str]:
     if not states_origin(recorded):
-        yield "its manifest does not state its lineage"
+        yield "the manifest does not contain the lineage"
         return
     folder = (root / result.manifest).parent
 
@@ -236,4 +242,4 @@ def _reasons(root: ConfinedPath, result: Result, recorded: Mapping[str, Any], *,
             if not elsewhere or difference.name not in result.sources:
                 yield f"{difference.name} {_SOURCE[difference.state]}"
         else:
-            yield {"settings": "its settings have changed", "code": "its code has changed"}[difference.part]
+            yield {"settings": "the settings have changed", "code": "the code has changed"}[difference.part]

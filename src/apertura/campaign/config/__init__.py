@@ -1,6 +1,6 @@
-"""Config of a campaign folder: one model generates the defaults, the JSON schema and the validation.
+"""Config of a campaign folder: a single model provides the defaults, the JSON schema and the validation.
 
-Layers from `campaign` up use these objects; lower layers receive arrays and numbers.
+`campaign` and higher layers use these objects; lower layers receive arrays and numbers.
 """
 
 from apertura.campaign.config.config import CONFIG, Settings, located, read_settings, validated

@@ -1,4 +1,4 @@
-"""Validation of config/config.yaml as `Settings`; one message lists all errors."""
+"""Validation of config/config.yaml as `Settings`; a single message lists all errors."""
 
 from pathlib import Path
 from typing import Self
@@ -40,9 +40,9 @@ class Settings(Section):
     waveform: Waveform = Field(description="transmitted waveform")
     raw_root: RawRoot | None = Field(
         None,
-        description="absolute path of a folder that replaces raw/, such as on another disk; null: raw/",
+        description="absolute path of a folder that replaces raw/, for example on another disk; null: raw/",
     )
-    nodes: dict[Name, Node] = Field(min_length=1, description="one section per node, named as in flights.tsv")
+    nodes: dict[Name, Node] = Field(min_length=1, description="one section per node, with the name in flights.tsv")
     scene: Scene = Field(default_factory=Scene, description="output grid of the campaign")
     processing: Processing = Field(default_factory=Processing, description="processing settings")
     calibration: CalibrationSettings | None = Field(
@@ -69,13 +69,13 @@ class Settings(Section):
         nodes = [name for name, node in self.nodes.items() if node.iq is not None]
         if nodes and not isinstance(self.waveform, SampledWaveform):
             raise ValueError(
-                f"nodes.{nodes[0]}.iq applies to recorded samples only (kinds ofdm and samples): set it to null and "
-                "use waveform.iq"
+                f"nodes.{nodes[0]}.iq applies to recorded samples only (kinds ofdm and samples): set this key to null "
+                "and use waveform.iq"
             )
         return self
 
     def iq_of(self, node: str) -> str:
-        """Return the order of I and Q in recordings of a node: `nodes.<n>.iq`, else `waveform.iq`."""
+        """Return the order of I and Q in recordings of a node: `nodes.<n>.iq` if configured, else `waveform.iq`."""
         return self.nodes[node].iq or self.waveform.iq
 
     @model_validator(mode="after")
@@ -83,7 +83,7 @@ class Settings(Section):
         nodes = [name for name, node in self.nodes.items() if node.antennas.any()]
         if nodes and isinstance(self.waveform, PhaseHistoryWaveform):
             raise ValueError(
-                f"nodes.{nodes[0]}.antennas has a beam, but phase histories contain no attitude: set it to null"
+                f"nodes.{nodes[0]}.antennas has a beam, but phase histories contain no attitude: set the beam to null"
             )
         return self
 
@@ -96,7 +96,7 @@ def read_settings(path: Path) -> Settings:
     CampaignError
         If the file is missing, is not YAML, or is not valid.
     """
-    remedy = "`apertura init` writes a commented config."
+    remedy = "Create a commented config with `apertura init`."
     return validated(read_yaml(path, expected="a campaign folder", remedy=remedy), where=path)
 
 
@@ -115,7 +115,7 @@ def located(message: str) -> str:
 
 
 def validated(document: object, *, where: object) -> Settings:
-    """Return `document` as Settings; one message names every invalid key and the nearest valid one.
+    """Return `document` as Settings; a single message lists all invalid keys, each with the most similar valid key.
 
     Raises
     ------
@@ -129,5 +129,5 @@ def validated(document: object, *, where: object) -> Settings:
     ...
     apertura.common.errors.CampaignError: config.yaml: campaing: unknown key (did you mean 'campaign'?); ...
     """
-    expected = f"keys and values as in the {CONFIG} of `apertura init`"
+    expected = f"keys and values as in the {CONFIG} written by `apertura init`"
     return documents.validated(Settings, document, where=where, expected=expected)

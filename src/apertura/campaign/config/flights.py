@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 FLIGHTS = Path("config/flights.tsv")
 _COLUMNS = ["flight", "kind", "transmitter", "nodes"]
 KINDS = ("bench", "calibration", "image")
-"""Kinds of flights: stationary radar; calibration flight past a reflector; imaging flight."""
+"""Kinds of flights: recording of a stationary radar; calibration flight past a reflector; imaging flight."""
 _NAME: TypeAdapter[str] = TypeAdapter(Name)
 
 FUSED = "fused"
-"""Name of the sums of a flight's pairs, used as image name and as folder name."""
+"""Name of the sums of the pairs of a flight, used as image name and as folder name."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Flight:
 
     @property
     def participants(self) -> tuple[str, ...]:
-        """Transmitter and receivers, each once.
+        """Transmitter and receivers, without repetition.
 
         Examples
         --------
@@ -68,7 +68,7 @@ class Flight:
 
     @property
     def images(self) -> tuple[str, ...]:
-        """Names of the images of the flight: its pairs, and 'fused' if there are several pairs.
+        """Names of the images of the flight: the pairs, and 'fused' if there are several pairs.
 
         Examples
         --------
@@ -104,10 +104,10 @@ def read_flights(path: Path, *, nodes: Collection[str]) -> Iterator[Flight]:
         flight = _flight(cells, nodes, where=where)
         if flight.name in names:
             raise CampaignError(
-                f"second line of flight {flight.name}",
+                f"a second line for flight {flight.name}",
                 where=where,
                 expected="one line per flight",
-                remedy="Join the lines or rename one flight.",
+                remedy="Join the lines, or rename one of the flights.",
             )
         names.add(flight.name)
         yield flight
@@ -128,12 +128,12 @@ def _flight(cells: dict[str, str], known: Collection[str], *, where: str) -> Fli
     if unknown:
         problem = f"node {quoted(unknown[0])} is not in {CONFIG}: nodes"
     if not nodes or len(set(nodes)) != len(nodes):
-        problem = f"nodes {quoted(cells['nodes'])} are empty or contain duplicates"
+        problem = f"the list of nodes {quoted(cells['nodes'])} is empty or contains duplicates"
     if problem:
         raise CampaignError(
             problem,
             where=where,
-            expected=f"flight, {'|'.join(KINDS)}, a transmitter and nodes among {sorted(known)}",
+            expected=f"flight, {'|'.join(KINDS)}, and a transmitter and nodes from {sorted(known)}",
             remedy="Correct the line.",
         )
     return Flight(cells["flight"], cells["kind"], cells["transmitter"], nodes)
@@ -148,12 +148,12 @@ _SEGMENT_COLUMNS = ["flight", "pair", "start", "end"]
 
 @dataclass(frozen=True)
 class Segment:
-    """Line of segments.tsv: the pair is imaged with the pulses from start to end, both included.
+    """Line of segments.tsv: the image of the pair is formed from the pulses from start to end, inclusive.
 
     Attributes
     ----------
     start, end
-        UTC, ISO 8601 without time zone, on the transmitter's time tags.
+        UTC, ISO 8601 without time zone; compared with the transmitter's time tags.
     """
 
     flight: str
@@ -163,7 +163,7 @@ class Segment:
 
 
 def read_segments(path: Path, *, flights: Sequence[Flight]) -> Iterator[Segment]:
-    """Yield the lines of segments.tsv; nothing if the file is missing.
+    """Yield the lines of segments.tsv; yield nothing if the file is missing.
 
     Parameters
     ----------
@@ -192,14 +192,14 @@ def read_segments(path: Path, *, flights: Sequence[Flight]) -> Iterator[Segment]
             if not problem and time is None:
                 problem = f"{name} {quoted(cells[name])} is not a valid time"
         if not problem and start is not None and end is not None and start >= end:
-            problem, expected = f"start {cells['start']} is not before end {cells['end']}", "a start before its end"
+            problem, expected = f"start {cells['start']} is not before end {cells['end']}", "a start before the end"
         if problem or start is None or end is None:
             raise CampaignError(str(problem), where=where, expected=expected, remedy="Correct the line.")
         yield Segment(cells["flight"], cells["pair"], start.isoformat(), end.isoformat())
 
 
 def _utc(text: str) -> datetime | None:
-    """Parse a time as UTC, also if it has no time zone; return None if it is not valid."""
+    """Parse a time; a time without time zone is interpreted as UTC; return None if the time is not valid."""
     try:
         time = datetime.fromisoformat(text)
         time = time.astimezone(UTC).replace(tzinfo=None) if time.tzinfo else time
@@ -223,9 +223,9 @@ class ClockRow:
     Attributes
     ----------
     offset_ns
-        Offset that is added to the recorder's times, at its first pulse.
+        Offset at the first pulse, to be added to the recorder's times.
     drift_ppm
-        Increase of the offset per elapsed time since the first pulse.
+        Rate of change of the offset after the first pulse.
     std_s
         Standard deviation of the offset; None: unknown.
     """
@@ -237,12 +237,12 @@ class ClockRow:
     std_s: float | None = None
 
     def utc(self, times: "NDArray[np.datetime64]") -> "NDArray[np.datetime64]":
-        """Convert times of a recorder to the log's clock.
+        """Convert times of a recorder to the clock of the log.
 
         Parameters
         ----------
         times
-            (pulse,) datetime64[ns], ascending, from the first pulse of the recording.
+            (pulse,) datetime64[ns], ascending, beginning with the first pulse of the recording.
 
         Examples
         --------
@@ -260,12 +260,12 @@ class ClockRow:
 
 
 def read_clocks(path: Path, *, flights: Sequence[Flight]) -> Iterator[ClockRow]:
-    """Yield the lines of clocks.tsv; nothing if the file is missing.
+    """Yield the lines of clocks.tsv; yield nothing if the file is missing.
 
     Parameters
     ----------
     path
-        Tab-separated table with columns flight, node, offset_s, drift_ppm, std_s; the last two may be empty.
+        Tab-separated table with columns flight, node, offset_s, drift_ppm, std_s; cells of the last two may be empty.
     flights
         Flights of flights.tsv.
 
@@ -286,7 +286,7 @@ def read_clocks(path: Path, *, flights: Sequence[Flight]) -> Iterator[ClockRow]:
         elif node not in nodes[flight]:
             problem = f"flight {flight} has no node {quoted(node)}"
         elif (flight, node) in stated:
-            problem = f"second line of flight {flight}, node {node}"
+            problem = f"a second line for flight {flight}, node {node}"
         if problem:
             raise CampaignError(problem, where=where, expected=_EXPECTED, remedy="Correct the line.")
         stated.add((flight, node))
@@ -298,7 +298,7 @@ def read_clocks(path: Path, *, flights: Sequence[Flight]) -> Iterator[ClockRow]:
 
 
 def _number(cells: dict[str, str], name: str, where: str, *, most: Decimal) -> Decimal | None:
-    """Return the exact decimal number of a cell; None if it is empty."""
+    """Return the exact decimal number in a cell; None if the cell is empty."""
     if not cells[name]:
         return None
     try:
@@ -311,5 +311,5 @@ def _number(cells: dict[str, str], name: str, where: str, *, most: Decimal) -> D
         f"{name} {quoted(cells[name])}",
         where=where,
         expected=f"a number between -{most} and {most}, or an empty cell",
-        remedy="Correct the line; `apertura align` writes it.",
+        remedy="Correct the line, or let `apertura align` write it.",
     )

@@ -20,14 +20,14 @@ RESERVED_NAMES = frozenset(
         *("tracks", "workflow", "preview"),
     }
 )
-"""Names of files and folders in the results folder, which flights and nodes must not use."""
+"""Names of files and folders in the results folder, which flights and nodes must not have."""
 
 _RESERVED_ENDS = (".json", ".geojson", ".zarr", ".wip", ".lock", ".tif", ".png", ".html", ".vrt", ".qml")
 """Suffixes of files in the results folder: scene.json, cube.manifest.json, cube.zarr …"""
 
 WAVEFORM_KINDS = (
     "ofdm, samples (a pulse given by its samples), fmcw (beat signals of sweeps) or phase_history "
-    "(frequency-domain samples); `apertura init --kind` writes the keys of each"
+    "(frequency-domain samples); `apertura init --kind` writes the keys of a kind"
 )
 """Description of the key waveform.kind."""
 
@@ -51,7 +51,7 @@ def _plain_name(name: str) -> str:
     if len(name) > _LONGEST:
         raise ValueError(f"name of {len(name)} characters: at most {_LONGEST} may be used")
     if name.lower() in RESERVED_NAMES or name.lower().endswith(_RESERVED_ENDS):
-        raise ValueError(f"name {name!r} is reserved for files in the results folder; choose another")
+        raise ValueError(f"name {name!r} is reserved for files in the results folder; choose another name")
     return name
 
 
@@ -59,7 +59,7 @@ def _title(text: str) -> str:
     invalid = next((char for char in text if not char.isprintable() or char in '"<>&\\'), None)
     if invalid is not None:
         raise ValueError(
-            f"{quoted(text)}: {quoted(invalid)} may not be used, because WKT, HTML and file tags contain the text"
+            f"{quoted(text)}: {quoted(invalid)} may not be used, because the text is written to WKT, HTML and file tags"
         )
     if not 1 <= len(text.strip()) <= _LONGEST_TITLE:
         raise ValueError(f"{len(text.strip())} characters: 1 to {_LONGEST_TITLE} may be used")
@@ -82,8 +82,8 @@ def plain_crs(crs: str) -> str:
     """
     if not re.fullmatch(rf"auto|local|{_CODE}(\+({_AUTHORITY}:)?[0-9]+)?", crs):
         raise ValueError(
-            f"{quoted(crs)}: must be authority and code such as EPSG:32632, auto or local; PROJ strings and WKT are "
-            "not accepted, because they may refer to files"
+            f"{quoted(crs)}: must be authority and code such as EPSG:32632, or auto, or local; PROJ strings and WKT "
+            "are not accepted, because they may refer to files"
         )
     return crs
 
@@ -92,7 +92,7 @@ Name = Annotated[str, AfterValidator(_plain_name)]
 """Name of a flight or a node."""
 
 CrsName = Annotated[str, AfterValidator(plain_crs)]
-"""Coordinate reference system: authority and code (two joined by ``+`` if compound), 'auto' or 'local'."""
+"""Coordinate reference system: authority and code (two codes joined by ``+`` if compound), 'auto' or 'local'."""
 
 RawRoot = Annotated[str, AfterValidator(_absolute)]
 """Path of a folder outside the campaign."""
@@ -110,11 +110,11 @@ Title = Annotated[str, AfterValidator(_title)]
 # ---- Tab-separated tables of the config: a header line, then one line per row ----------------------------------------
 
 LARGEST_TABLE = 1_000_000
-"""Largest size of a config table, bytes."""
+"""Maximum size of a config table, bytes."""
 
 
 def table_rows(path: Path, columns: Sequence[str], *, remedy: str) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield file and line of each row, for messages, and its stripped cells by column.
+    """Yield, for each row, file and line number (for messages) and the stripped cells by column.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def table_rows(path: Path, columns: Sequence[str], *, remedy: str) -> Iterator[t
                 if cells != list(columns):
                     raise CampaignError(f"columns {quoted(cells, 300)}", path, listed, "Correct the header line.")
             elif len(cells) > len(columns):
-                problem = f"{len(cells)} cells, the last {quoted(cells[-1])}"
+                problem = f"{len(cells)} cells, the last of which is {quoted(cells[-1])}"
                 raise CampaignError(problem, f"{path}: line {rows.line_num}", listed, "Correct the line.")
             else:
                 yield f"{path}: line {rows.line_num}", dict(zip(columns, cells + [""] * len(columns), strict=False))

@@ -19,15 +19,15 @@ from apertura.core.backprojection.engines import ENGINES, load_engine
 WAVEFORMS: dict[str, type[BaseModel]] = {
     get_args(section.model_fields["kind"].annotation)[0]: section for section in get_args(get_args(Waveform)[0])
 }
-"""waveform.kind → class of its section."""
+"""waveform.kind → class of the section `waveform`."""
 
 _FLIGHTS = "flight\tkind\ttransmitter\tnodes\nf01\timage\tuav1\t{nodes}\n"
 _NODES = {"fmcw": ("uav1",), "phase_history": ("uav1",)}
-"""Kind of waveform with a single node in the example; other kinds have two nodes."""
+"""Kinds of waveform whose example has a single node; the examples of other kinds have two nodes."""
 
 
 def config_template(kind: str = "ofdm") -> str:
-    """Return config/config.yaml with every key, its meaning as a comment, and its default or an example.
+    """Return config/config.yaml with all keys; each key has its meaning as a comment, and its default or an example.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def config_template(kind: str = "ofdm") -> str:
             f"kind {quoted(kind)}",
             where="apertura init",
             expected=f"one of {', '.join(WAVEFORMS)}",
-            remedy="Choose one of them.",
+            remedy="Choose one of these kinds.",
         )
     examples = {"waveform": WAVEFORMS[kind], "nodes": dict.fromkeys(_nodes(kind), Node)}
     header = "# Generated from the settings model by `apertura init`; see config/README.md.\n\n"
@@ -57,7 +57,7 @@ def config_template(kind: str = "ofdm") -> str:
 
 
 def flights_template(kind: str = "ofdm") -> str:
-    """Return config/flights.tsv with one example flight, for a kind of waveform."""
+    """Return config/flights.tsv with an example flight for a kind of waveform."""
     return _FLIGHTS.format(nodes=",".join(_nodes(kind)))
 
 
@@ -105,11 +105,11 @@ def _value(field: FieldInfo) -> Any:
         return field.default
     if field.default_factory is dict:
         return {}
-    return get_args(field.annotation)[0]  # a Literal without default: its first choice
+    return get_args(field.annotation)[0]  # first choice of a Literal without default
 
 
 def _choices(field: FieldInfo) -> str:
-    """Return the allowed values or the range of a field in parentheses, unless its description lists them."""
+    """Return the allowed values or the range of a field in parentheses, unless the description lists the values."""
     kinds = (
         get_args(field.annotation) if get_origin(field.annotation) in (Union, types.UnionType) else (field.annotation,)
     )

@@ -1,4 +1,4 @@
-"""Section `waveform`: the transmitted signal and the kind of recording, samples or transfer functions."""
+"""Section `waveform`: the transmitted signal, and the kind of recording (samples or transfer functions)."""
 
 from abc import abstractmethod
 from typing import Annotated, ClassVar, Literal, Self
@@ -14,8 +14,8 @@ from apertura.formats.names import PHASE_HISTORIES
 class SampledWaveform(Section):
     """Waveform with one pulse per trigger, recorded as samples: interface from captures to transfer functions.
 
-    `file_key` is the key with the file of the transmitted signal; `delay_key` and `limit_name` are key and name of the
-    interval in which echoes must arrive.
+    `file_key` is the key that names the file of the transmitted signal. `delay_key` and `limit_name` are the key and
+    the name of the interval in which echoes must arrive.
     """
 
     file_key: ClassVar[str]
@@ -23,7 +23,9 @@ class SampledWaveform(Section):
     limit_name: ClassVar[str]
 
     kind: str = Field(description=WAVEFORM_KINDS)
-    carrier_hz: float = Field(gt=0, description="RF carrier, the frequency at baseband zero, Hz", examples=[1.2e9])
+    carrier_hz: float = Field(
+        gt=0, description="RF carrier, the RF frequency that corresponds to zero at baseband, Hz", examples=[1.2e9]
+    )
     sample_rate_hz: float = Field(gt=0, description="complex sample rate f_s, Hz", examples=[1.024e9])
     prf_hz: float = Field(gt=0, description="pulse repetition frequency, Hz", examples=[100.0])
     iq: Literal["complex", "swapped", "conjugate"] = Field(
@@ -35,36 +37,36 @@ class SampledWaveform(Section):
     @property
     @abstractmethod
     def longest_delay_s(self) -> float:
-        """Longest delay of an echo that is recorded completely, seconds."""
+        """Longest delay for which an echo is recorded completely, seconds."""
 
     @property
     @abstractmethod
     def middle_s(self) -> float:
-        """Mid-time of the measured part of the pulse, seconds after its start."""
+        """Mid-time of the measured part of the pulse, seconds after the start of the pulse."""
 
     @property
     @abstractmethod
     def capture_s(self) -> float:
-        """Duration of a capture, seconds; later samples are not used."""
+        """Used duration of a capture, seconds; later samples are not used."""
 
     @property
     @abstractmethod
     def needed_samples(self) -> int:
-        """Smallest number of samples of a capture."""
+        """Minimum number of samples in a capture."""
 
     @property
     @abstractmethod
     def most_subcarriers(self) -> int:
-        """Largest number of frequencies at which an echo is measured."""
+        """Maximum number of frequencies at which an echo is measured."""
 
     @property
     @abstractmethod
     def widest_band_hz(self) -> float:
-        """Largest bandwidth, Hz."""
+        """Maximum bandwidth, Hz."""
 
     @property
     def capture_samples(self) -> int:
-        """Number of samples of a capture."""
+        """Number of samples in the used duration of a capture."""
         return round(self.capture_s * self.sample_rate_hz)
 
 
@@ -77,12 +79,15 @@ class OfdmWaveform(SampledWaveform):
     codes: str = Field("raw/codes.npy", description="transmitted code symbols, complex64 (subcarriers,)")
     carrier_is: Literal["band_start", "band_centre"] = Field(
         "band_start",
-        description="subcarrier numbers relative to the carrier: n = 0…N-1 (band_start) or -N/2…N/2-1 (band_centre)",
+        description="position of the carrier in the band: subcarrier numbers n are 0…N-1 (band_start) or -N/2…N/2-1 "
+        "(band_centre)",
     )
     subcarriers: int = Field(gt=1, description="number of subcarriers N", examples=[4096])
     subcarrier_spacing_hz: float = Field(gt=0, description="subcarrier spacing Δf, Hz", examples=[100e3])
-    symbol_s: float = Field(gt=0, description="transmitted symbol T without prefix, s", examples=[12.5e-6])
-    cyclic_prefix_s: float = Field(ge=0, description="cyclic prefix T_cp, s", examples=[3.125e-6])
+    symbol_s: float = Field(
+        gt=0, description="duration T of the transmitted symbol without prefix, s", examples=[12.5e-6]
+    )
+    cyclic_prefix_s: float = Field(ge=0, description="duration T_cp of the cyclic prefix, s", examples=[3.125e-6])
 
     @property
     def longest_delay_s(self) -> float:
@@ -101,36 +106,36 @@ class OfdmWaveform(SampledWaveform):
 
     @property
     def prefix_samples(self) -> int:
-        """T_cp·f_s."""
+        """Number of samples of the cyclic prefix, T_cp·f_s."""
         return round(self.cyclic_prefix_s * self.sample_rate_hz)
 
     @property
     def dft_samples(self) -> int:
-        """f_s/Δf."""
+        """DFT length, f_s/Δf."""
         return round(self.sample_rate_hz / self.subcarrier_spacing_hz)
 
     @property
     def needed_samples(self) -> int:
-        """Samples of the prefix and one period 1/Δf."""
+        """Number of samples of the prefix and of one period 1/Δf."""
         return self.prefix_samples + self.dft_samples
 
     @property
     def most_subcarriers(self) -> int:
-        """N."""
+        """Number of subcarriers, N."""
         return self.subcarriers
 
     @property
     def widest_band_hz(self) -> float:
-        """NΔf."""
+        """Bandwidth of all subcarriers, NΔf."""
         return self.subcarriers * self.subcarrier_spacing_hz
 
     @model_validator(mode="after")
     def _dft_fits(self) -> Self:
         length = self.sample_rate_hz / self.subcarrier_spacing_hz
         if abs(length - round(length)) > 1e-6 * length:
-            raise ValueError(f"sample_rate_hz/subcarrier_spacing_hz = {length:.6f} must be an integer, the DFT length")
+            raise ValueError(f"the DFT length sample_rate_hz/subcarrier_spacing_hz = {length:.6f} must be an integer")
         if self.subcarriers > round(length):
-            raise ValueError(f"subcarriers={self.subcarriers} exceed the DFT length {round(length)}")
+            raise ValueError(f"subcarriers={self.subcarriers} exceeds the DFT length {round(length)}")
         if self.symbol_s < (1 - 1e-9) / self.subcarrier_spacing_hz:
             raise ValueError(
                 f"symbol_s={self.symbol_s:g} is shorter than the DFT window 1/subcarrier_spacing_hz = "
@@ -146,22 +151,23 @@ class PulseWaveform(SampledWaveform):
 
     kind: Literal["samples"] = Field(description=WAVEFORM_KINDS)
     pulse: str = Field(
-        "raw/pulse.npy", description="the pulse at sample_rate_hz: .npy of (sample,) complex, or (sample, 2) integers"
+        "raw/pulse.npy",
+        description=".npy file of the pulse sampled at sample_rate_hz: (sample,) complex, or (sample, 2) integers",
     )
-    pulse_s: float = Field(gt=0, description="pulse duration: that of the whole file, s", examples=[1e-6])
+    pulse_s: float = Field(gt=0, description="pulse duration, equal to that of the whole file, s", examples=[1e-6])
     lead_s: float = Field(0.0, ge=0, description="time from the start of a capture to the pulse, s")
     listen_s: float = Field(
-        gt=0, description="longest delay of an echo that a capture contains completely, s", examples=[2e-6]
+        gt=0, description="longest delay for which a capture contains the complete echo, s", examples=[2e-6]
     )
     band_hz: tuple[float, float] | None = Field(
         None,
-        description="baseband frequencies used for imaging, [lowest, highest], Hz; null: where the pulse has its "
-        "energy",
+        description="baseband frequencies used for imaging, [lowest, highest], Hz; null: the band that contains the "
+        "energy of the pulse",
     )
     filter: Literal["auto", "inverse", "matched"] = Field(
         "auto",
-        description="range filter: inverse (sidelobes of the window alone) or matched (least noise); auto: inverse, "
-        "unless the spectrum is flat or has too many gaps",
+        description="range filter: inverse (only the sidelobes of the window) or matched (minimum noise); auto: "
+        "inverse, unless the spectrum is flat or has too many gaps",
     )
 
     @property
@@ -181,17 +187,17 @@ class PulseWaveform(SampledWaveform):
 
     @property
     def needed_samples(self) -> int:
-        """Samples of a whole capture, which ends with the end of the last echo."""
+        """Number of samples of a whole capture, which ends with the end of the last echo."""
         return self.capture_samples
 
     @property
     def most_subcarriers(self) -> int:
-        """Largest number of DFT frequencies within the band."""
+        """Maximum number of DFT frequencies within the band."""
         return min(self.capture_samples, int(self.widest_band_hz / self.sample_rate_hz * self.capture_samples) + 1)
 
     @property
     def widest_band_hz(self) -> float:
-        """Configured bandwidth, else the sample rate."""
+        """Configured bandwidth; the sample rate if no band is configured."""
         return self.sample_rate_hz if self.band_hz is None else self.band_hz[1] - self.band_hz[0]
 
     @model_validator(mode="after")
@@ -214,7 +220,7 @@ class PulseWaveform(SampledWaveform):
 # ---- Waveforms as transfer functions: phase histories, beat signals of FMCW -----------------------------------------
 
 _MOST_SAMPLES = 1_000_000
-"""Largest number of samples of a sweep; ramps of real radars have 100 to 100 000."""
+"""Maximum number of samples in a sweep; sweeps of real radars have 100 to 100 000 samples."""
 
 _LONGEST_REFERENCE_M = 1e6
 
@@ -230,7 +236,7 @@ def _known(name: str, kind: str) -> str:
 
 
 class PhaseHistoryWaveform(Section):
-    """Frequency-domain samples with antenna positions, recorded by another radar."""
+    """Phase history: frequency-domain samples with antenna positions, recorded by another radar."""
 
     kind: Literal["phase_history"] = Field(description=WAVEFORM_KINDS)
     format: str = Field(
@@ -242,17 +248,18 @@ class PhaseHistoryWaveform(Section):
     air: Literal["auto", "measured", "point", "corrected"] = Field(
         "auto",
         description="atmospheric delay in the files: measured (delays as recorded), point (samples are referred to "
-        "a point at a stated distance; only the excess path is delayed), corrected (removed before); "
+        "a point at a stated distance; only the excess path is delayed), corrected (delay already removed); "
         "auto: point for afrl_mat and cphd, otherwise measured",
     )
-    channel: str | None = Field(None, description="channel to image, for CPHD files with several channels")
+    channel: str | None = Field(None, description="channel to be imaged, for CPHD files with several channels")
     corrections: Literal["none", "stored"] = Field(
-        "none", description="phase corrections contained in afrl_mat files (data.af): none, or stored to apply them"
+        "none",
+        description="phase corrections contained in afrl_mat files (data.af): none (not applied) or stored (applied)",
     )
     iq: Literal["complex", "conjugate"] = Field(
         "complex",
-        description="complex: samples as recorded; conjugate: their complex conjugates, for files with the opposite "
-        "sign of phase",
+        description="complex: samples as recorded; conjugate: complex conjugates of the samples, for files with the "
+        "opposite sign of phase",
     )
 
     @field_validator("format")
@@ -279,13 +286,13 @@ class Trigger(Section):
         0.3,
         gt=0,
         lt=1,
-        description="trigger level of the sync signal above the mean of its two levels, as a fraction of half their "
-        "difference",
+        description="trigger level of the sync signal relative to the mean of its two levels, as a fraction of half "
+        "the difference between the levels",
     )
 
 
 class FmcwWaveform(Section):
-    """FMCW waveform: linear sweeps, whose beat signals with their echoes were recorded."""
+    """FMCW waveform: linear sweeps; the beat signals of sweeps and echoes were recorded."""
 
     kind: Literal["fmcw"] = Field(description=WAVEFORM_KINDS)
     format: str = Field(
@@ -294,7 +301,7 @@ class FmcwWaveform(Section):
         json_schema_extra={"enum": [*_formats("fmcw")]},
     )
     start_hz: float = Field(
-        gt=0, description="RF frequency at the first sample of a sweep, or at its trigger, Hz", examples=[2.2e9]
+        gt=0, description="RF frequency at the first sample, or at the trigger, of a sweep, Hz", examples=[2.2e9]
     )
     bandwidth_hz: float = Field(
         description="frequency change during sweep_s, Hz; negative for falling sweeps", examples=[400e6]
@@ -303,18 +310,20 @@ class FmcwWaveform(Section):
     sample_rate_hz: float = Field(gt=0, description="sample rate of the beat signal, Hz", examples=[25e6])
     iq: Literal["real", "complex", "conjugate"] = Field(
         "real",
-        description="real: a single mixer; complex: I+jQ of the echo times the conjugate sweep, with negative beat "
-        "frequencies for rising sweeps; conjugate: the opposite sign",
+        description="real: samples of a single mixer; complex: I+jQ of the echo times the conjugate sweep, with "
+        "negative beat frequencies for rising sweeps; conjugate: I+jQ with the opposite sign of frequency",
     )
-    settle_s: float = Field(0.0, ge=0, description="settling time excluded at the start of every sweep, s")
-    reference_path_m: float = Field(0.0, ge=0, description="path of the sweep to the mixer inside the radar, m")
+    settle_s: float = Field(0.0, ge=0, description="settling time excluded at the start of each sweep, s")
+    reference_path_m: float = Field(
+        0.0, ge=0, description="length of the internal local-oscillator path to the mixer, m"
+    )
     prf_hz: float | None = Field(
         None, ge=1e-3, description="sweep repetition frequency, Hz; null: the files contain times or triggers"
     )
     start_utc: str | None = Field(
         None,
-        description="start of recordings without times, by the recorder's clock, ISO 8601 in UTC; null: 1970, "
-        "corrected by config/clocks.tsv",
+        description="start of recordings without times according to the recorder's clock, ISO 8601 in UTC; null: "
+        "1970-01-01, corrected by config/clocks.tsv",
     )
     trigger: Trigger = Field(default_factory=Trigger, description="sweep trigger in a .wav file")
 
@@ -332,10 +341,10 @@ class FmcwWaveform(Section):
         if not 8 <= (self.sweep_s - self.settle_s) * self.sample_rate_hz <= _MOST_SAMPLES:
             raise ValueError(
                 f"(sweep_s - settle_s)*sample_rate_hz = {(self.sweep_s - self.settle_s) * self.sample_rate_hz:g} "
-                f"samples per sweep; must be 8 to {_MOST_SAMPLES}"
+                f"samples per sweep; must be between 8 and {_MOST_SAMPLES}"
             )
         if self.reference_path_m > _LONGEST_REFERENCE_M:
-            raise ValueError(f"reference_path_m={self.reference_path_m:g}: at most {_LONGEST_REFERENCE_M:g}")
+            raise ValueError(f"reference_path_m={self.reference_path_m:g} must be at most {_LONGEST_REFERENCE_M:g}")
         if self.prf_hz is not None and self.prf_hz * self.sweep_s > 1 + 1e-9:
             raise ValueError(f"sweep_s={self.sweep_s:g} is longer than 1/prf_hz = {1 / self.prf_hz:g} s")
         return self

@@ -1,8 +1,8 @@
-"""Stages on disk: zarr folders that are complete or absent, each with a manifest of hashes.
+"""Stages on disk: Zarr folders that are complete or absent, each with a manifest of hashes.
 
-A stage is written as ``<stage>.zarr.wip`` under a kernel lock and finished by a rename. ``<stage>.manifest.json`` is
-written last: if the manifest exists, the folder is complete. Documents and products have manifests of the same form,
-which list their files with hashes and state their lineage.
+A stage is written as ``<stage>.zarr.wip`` under a kernel lock and finished by renaming the folder.
+``<stage>.manifest.json`` is written last, so that the folder is complete if the manifest exists. Documents and products
+have manifests of the same format, which contain the hashes of their files and their lineage.
 """
 
 from apertura.campaign.store.manifest import (

@@ -1,4 +1,4 @@
-"""Chunks on disk: synchronised to disk before they are renamed, verified by their checksum when they are read."""
+"""Chunks on disk: flushed to disk before they are renamed, and verified by their checksums when they are read."""
 
 import asyncio
 import hashlib
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-# Override the user's zarr settings (ZARR_…, ~/.config/zarr), so that the written bytes do not depend on them.
+# Override the user's Zarr settings (ZARR_…, ~/.config/zarr), so that the written bytes do not depend on these settings.
 zarr.config.update(zarr.config.defaults[0], priority="new")
-zarr.config.set({"array.write_empty_chunks": True})  # a missing chunk means not computed, so zeros are written as well
+zarr.config.set({"array.write_empty_chunks": True})  # write zeros, too, because a missing chunk means 'not computed'
 
 CODECS = (ZstdCodec(), Crc32cCodec())
 """Codecs of a chunk; the checksum is last, so that it covers the bytes on disk."""
@@ -40,17 +40,18 @@ _METADATA = "zarr.json"
 class StageStore(LocalStore):
     """Zarr store of a stage folder that verifies chunks.
 
-    A file is complete or absent, even after a power failure. Every chunk is verified by its checksum on reading, and
-    chunks of a finished stage also by their hash in the manifest, if it is given, when they are first read.
+    A file is complete or absent, even after a power failure. Each chunk is verified by its checksum on reading. Chunks
+    of a finished stage are also verified by their hashes in the manifest, if given, when they are first read.
 
     Parameters
     ----------
     folder, read_only
-        As in `zarr.storage.LocalStore`.
+        See `zarr.storage.LocalStore`.
     sha256
-        File of the folder → hash.
+        File in the folder → hash.
     finished_later
-        Leave the synchronisation of all files to `finish`; after a kill, the stage is recomputed from the start.
+        True if files are not flushed to disk before `finish`; a stage whose writer is killed is recomputed from the
+        start.
     """
 
     root: ConfinedPath
@@ -76,7 +77,7 @@ class StageStore(LocalStore):
     def get_sync(
         self, key: str, *, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
-        """Return the content of a file, as `get` does."""
+        """Return the content of a file; synchronous version of `get`."""
         return self._checked(key, super().get_sync(key, prototype=prototype, byte_range=byte_range), byte_range)
 
     async def set(self, key: str, value: Buffer) -> None:
@@ -84,7 +85,7 @@ class StageStore(LocalStore):
         await asyncio.to_thread(self.set_sync, key, value)
 
     def set_sync(self, key: str, value: Buffer) -> None:
-        """Write a file of the folder, as `set` does."""
+        """Write a file of the folder; synchronous version of `set`."""
         self._check_writable()
         path = self.root / key
         if self._finished_later:
@@ -94,7 +95,7 @@ class StageStore(LocalStore):
             write_beside(path, value.to_bytes())
 
     async def set_if_not_exists(self, key: str, value: Buffer) -> None:
-        """Write a file unless it exists; each file of a stage has one writer."""
+        """Write a file unless it exists; each file of a stage has only one writer."""
         if not await self.exists(key):
             await self.set(key, value)
 
@@ -109,11 +110,11 @@ class StageStore(LocalStore):
 
     def _checked(self, key: str, value: Buffer | None, byte_range: ByteRequest | None) -> Buffer | None:
         name = key.rpartition("/")[2]
-        if name.startswith(".z"):  # metadata of zarr version 2, not used here; its filters may contain a pickle
+        if name.startswith(".z"):  # metadata of Zarr version 2 are not used, because filters may contain a pickle
             return None
         if name == _METADATA and value is not None and other_codec(_json(value)) is not None:
             raise damaged(self.root, key)
-        if value is None and key in self._unchecked:  # zarr reads a missing chunk as an empty one
+        if value is None and key in self._unchecked:  # Zarr interprets a missing chunk as an empty chunk
             raise damaged(self.root, key)
         if value is None or byte_range is not None or name == _METADATA:
             return value
@@ -130,7 +131,7 @@ def _json(value: Buffer) -> object:
     try:
         return json.loads(value.to_bytes())
     except (ValueError, RecursionError):
-        return None  # zarr raises its own error
+        return None  # Zarr then raises an error
 
 
 def array_of(folder: Path, name: str, mode: str) -> Any:
@@ -186,14 +187,14 @@ def skeleton(
     Parameters
     ----------
     stage
-        Stage with provenance. Only dims, dtype, fill value and attributes of the arrays in `chunks` are used, so they
-        may be broadcast.
+        Stage with provenance. Only dims, dtype, fill value and attributes of the arrays in `chunks` are used, so that
+        these arrays may be broadcast.
     chunks
         Array that is written chunk by chunk → shape of its chunks.
     packed
-        True if those arrays are compressed, which does not reduce the size of noise.
+        True if these arrays are compressed, which does not reduce the size of noise.
     consolidated
-        True if the metadata of the stage repeat those of its arrays, for readers that open several of them.
+        True if the metadata of the stage contain those of all arrays, for readers that open several arrays.
     """
     files: dict[str, Buffer] = {}
     whole, store = stage.drop_vars(list(chunks)), MemoryStore(files)
@@ -213,6 +214,6 @@ def skeleton(
         )
     if consolidated:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ZarrUserWarning)  # not in the zarr version 3 standard yet
+            warnings.simplefilter("ignore", ZarrUserWarning)  # not yet part of the Zarr version 3 standard
             zarr.consolidate_metadata(store)
     return {path: content.to_bytes() for path, content in files.items()}

@@ -1,4 +1,4 @@
-"""Manifest of a result: hashes of its files and its lineage; written last, and verified when the result is opened."""
+"""Manifest of a result: hashes of the files, and lineage; written last, and checked when the result is opened."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ def remake(result: Path) -> str:
 
 
 def remake_from(manifest: Path) -> str:
-    """Return the remedy for a result whose files contradict their manifest, or whose manifest is damaged."""
+    """Return the remedy for a result whose files contradict the manifest, or whose manifest is damaged."""
     return f"Delete {manifest} and run the workflow again."
 
 
@@ -43,7 +43,7 @@ class ResultOrigin(Protocol):
     """Lineage of a result that is being computed, `apertura.campaign.digests.Lineage`."""
 
     def record(self) -> dict[str, Any]:
-        """Return sources (file → SHA-256), settings and code for the manifest; check that the files are unchanged."""
+        """Return sources (file → SHA-256), settings and code for the manifest; check that the sources are unchanged."""
 
 
 def write_manifest(manifest: Path, files: Mapping[str, str], lineage: ResultOrigin | None = None) -> None:
@@ -54,15 +54,15 @@ def write_manifest(manifest: Path, files: Mapping[str, str], lineage: ResultOrig
     manifest
         ``….manifest.json``.
     files
-        File relative to the manifest's folder → SHA-256.
+        File relative to the folder of the manifest → SHA-256.
     lineage
-        Lineage of the result; None: not stated.
+        Lineage of the result; None to omit the lineage.
     """
     write_json(manifest, {"files": files, **(lineage.record() if lineage else {})})
 
 
 def record_files(manifest: Path, files: Sequence[Path], lineage: ResultOrigin | None = None) -> None:
-    """Hash files in or below the manifest's folder, and write their manifest."""
+    """Hash files in the folder of the manifest, at any depth, and write the manifest."""
     write_manifest(
         manifest, {path.relative_to(manifest.parent).as_posix(): sha256_file(path) for path in sorted(files)}, lineage
     )
@@ -87,18 +87,18 @@ def read_manifest(manifest: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Difference:
-    """Difference from a manifest.
+    """Difference between the current state of a result and its manifest.
 
     Attributes
     ----------
     part
         Part of the manifest: a file of the result, a source, the settings or the code.
     name
-        Recorded name of the file or source; empty for settings and code.
+        Name of the file or source; empty for settings and code.
     state
-        missing: recorded, but absent; altered: with another hash; added: present, but not recorded.
+        missing: recorded, but absent; altered: hash differs; added: present, but not recorded.
     recorded, present
-        SHA-256, hex; empty for added and missing files, respectively.
+        Recorded and current SHA-256, hex; `recorded` is empty for added files, `present` for missing files.
     """
 
     part: Literal["file", "source", "settings", "code"]
@@ -180,17 +180,17 @@ def compare_origin(
 
 
 def states_origin(document: Mapping[str, Any]) -> bool:
-    """Return True if a manifest states the lineage of its result; manifests before 0.1.0 do not."""
+    """Return True if a manifest contains the lineage of the result; manifests before version 0.1.0 do not."""
     return {"sources", "settings", "code"} <= document.keys()
 
 
 def sha256_present(path: Path) -> str:
-    """Return the SHA-256 of a file, reading every byte; empty if the file is missing."""
+    """Return the SHA-256 of a file, reading all bytes; empty if the file is missing."""
     return sha256_file(path) if path.is_file() else ""
 
 
 def damaged_files(manifest: Path) -> list[str]:
-    """Return the files of a result that have changed since they were written or are missing; reads every byte."""
+    """Return the files of a result that are missing or have changed since they were written; all bytes are read."""
 
     def present(name: str) -> str:
         return sha256_present(ConfinedPath.of(manifest).parent.named(name, where=manifest))
@@ -204,7 +204,7 @@ def check_document(path: Path) -> None:
     Raises
     ------
     CampaignError
-        If it is missing, or differs from its manifest.
+        If the document is missing, or differs from its manifest.
     """
     _check(manifest_of(path), _files_of(path), {path.name: sha256_file(path)})
 
@@ -215,18 +215,18 @@ def check_stage(folder: Path) -> dict[str, str]:
     Returns
     -------
     dict
-        File of the folder → SHA-256, for the verification of chunks when they are read; opening a stage does not read
+        File of the folder → SHA-256, for the verification of chunks on reading, because opening a stage does not read
         its chunks.
 
     Raises
     ------
     CampaignError
-        If it is missing, or differs from its manifest.
+        If the stage is missing, or differs from its manifest.
     """
     recorded, inside = _files_of(folder), f"{folder.name}/"
     names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
     present = {
-        # zarr version 3 stores chunks below a folder `c`
+        # Zarr version 3 stores chunks below a folder `c`
         f"{inside}{name}": recorded.get(f"{inside}{name}", "")
         if "c" in name.split("/")[1:]
         else sha256_file(folder / name)
@@ -237,7 +237,7 @@ def check_stage(folder: Path) -> dict[str, str]:
 
 
 def _files_of(result: Path) -> dict[str, str]:
-    """Return the files of a finished result and their hashes; raise CampaignError if it is not finished."""
+    """Return the files of a finished result and their hashes; raise CampaignError if the result is not finished."""
     manifest = manifest_of(result)
     if not manifest.is_file() or not result.exists():
         raise CampaignError(
@@ -250,12 +250,12 @@ def _files_of(result: Path) -> dict[str, str]:
 
 
 def _check(manifest: Path, recorded: Mapping[str, str], present: Mapping[str, str]) -> None:
-    """Check that the present files are those recorded; raise CampaignError if not."""
+    """Raise CampaignError if the current files of a result differ from those recorded in the manifest."""
     differing = list(compare(recorded, lambda name: present.get(name, ""), added=present))
     if differing:
         count = f"{number_of(len(differing), 'file')} {'differs' if len(differing) == 1 else 'differ'}"
         raise CampaignError(
-            f"{count} from the manifest, first {differing[0].name}",
+            f"{count} from the manifest; the first is {differing[0].name}",
             where=manifest.parent,
             expected=f"the files listed in {manifest.name}",
             remedy=remake_from(manifest),
@@ -268,7 +268,7 @@ def check_listed(path: Path, manifest: Path, *, present: Callable[[Path], str] =
     Parameters
     ----------
     path
-        File in the manifest's folder or below.
+        File in the folder of the manifest, at any depth.
     manifest
         Manifest that lists the file.
     present
@@ -288,31 +288,31 @@ def check_listed(path: Path, manifest: Path, *, present: Callable[[Path], str] =
 
 
 def save_document(path: Path, document: Mapping[str, Any], lineage: ResultOrigin | None = None) -> None:
-    """Write a result that consists of one JSON document, and its manifest."""
+    """Write a result that consists of a single JSON document, and write its manifest."""
     manifest_of(path).unlink(missing_ok=True)
     write_json(path, document)
     record_files(manifest_of(path), [path], lineage)
 
 
 def open_document(path: Path) -> dict[str, Any]:
-    """Read a result that consists of one JSON document, after checking it against its manifest.
+    """Read a result that consists of a single JSON document, after checking the document against its manifest.
 
     Raises
     ------
     CampaignError
-        If it is missing, or differs from its manifest.
+        If the document is missing, or differs from its manifest.
     """
     check_document(path)
     return read_json(path, expected="a result of the workflow", remedy=remake(path))
 
 
 def open_listed(path: Path, manifest: Path) -> dict[str, Any]:
-    """Read a JSON document that is a file of a result, after checking it against the manifest.
+    """Read a JSON document that is a file of a result, and check the document against the manifest.
 
     Raises
     ------
     CampaignError
-        If it or the manifest is missing, or it has changed since it was written.
+        If the document or the manifest is missing, or if the document has changed since it was written.
     """
     document = read_json(path, expected="a finished campaign", remedy="Run the workflow first.")
     check_listed(path, manifest)

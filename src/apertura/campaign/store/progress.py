@@ -1,4 +1,4 @@
-"""Writing, reading and resuming of stages: blocks of arrays, the lock on work in progress, the finishing rename."""
+"""Writing, reading and resuming of stages: blocks of arrays, lock on work in progress, and renaming when finished."""
 
 import errno
 import fcntl
@@ -28,21 +28,21 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-# ---- Lock of a stage, and the rename that finishes it ---------------------------------------------------------------
+# ---- Lock of a stage, and renaming of the finished stage ------------------------------------------------------------
 
 
 @contextmanager
 def writing(folder: Path) -> Iterator[ConfinedPath]:
     """Lock `folder` for writing and yield the folder of work in progress.
 
-    A kernel lock, which is released when its process ends, excludes a second writer: a new step waits for a step
-    that is still running after its snakemake was killed. A finished folder with unchanged files becomes work in
+    A kernel lock, which is released when its process exits, excludes a second writer: a new step waits for a step that
+    is still running after its Snakemake process was killed. A finished folder with unchanged files becomes work in
     progress again, so that its chunks are not recomputed.
 
     Yields
     ------
     apertura.common.confined.ConfinedPath
-        ``<folder>.wip``; kept if the body fails, so that finished chunks are used again.
+        ``<folder>.wip``; the folder is kept if an error is raised in the context, so that finished chunks are reused.
     """
     folder = confined_target(folder)
     with _opened(folder) as (wip, lock):
@@ -54,18 +54,20 @@ def writing(folder: Path) -> Iterator[ConfinedPath]:
 def sharing(
     folder: Path, stage: "xr.Dataset", name: str, windows: Sequence[Window]
 ) -> Iterator[tuple[ConfinedPath, list[Window]]]:
-    """Lock a stage for several jobs that write different chunks at the same time; its finishing step waits for them.
+    """Lock a stage for several jobs that write different chunks at the same time.
+
+    The step that finishes the stage waits for these jobs.
 
     Parameters
     ----------
     folder, stage, name, windows
-        As in `writing` and `resume`.
+        See `writing` and `resume`.
 
     Yields
     ------
     tuple
-        ``<folder>.wip``, and the windows that it lacks: empty if another job meanwhile finished the stage, or started
-        it with other settings.
+        ``<folder>.wip``, and the windows that are missing in this folder; empty if another job has meanwhile finished
+        the stage, or started the stage with other settings.
     """
     folder = confined_target(folder)
     with _opened(folder) as (wip, lock):
@@ -96,7 +98,7 @@ def _acquire(lock: IO[str], folder: ConfinedPath, wip: ConfinedPath) -> None:
 
 
 def _lock_of(folder: ConfinedPath) -> ConfinedPath:
-    """Return the lock file of a stage, which also contains the hashes of its files, as snakemake removes manifests."""
+    """Return the lock file of a stage, which also contains file hashes, because Snakemake removes manifests."""
     return folder.with_name(f".{folder.name}.lock")
 
 
@@ -110,7 +112,7 @@ def finish(wip: Path, folder: Path, *, lineage: ResultOrigin | None = None, **at
     lineage
         Lineage of the stage, for `write_manifest`.
     **attributes
-        Attributes of the stage that are known only at the end, such as measurements on it.
+        Attributes of the stage that are known only at the end, such as measurements on the finished arrays.
     """
     wip, folder = ConfinedPath.of(wip), ConfinedPath.of(folder)
     if attributes:
@@ -137,7 +139,7 @@ _PROVENANCE = ("runspec", "inputs", "code_sha256")
 
 
 def resume(wip: Path, stage: "xr.Dataset", name: str, windows: Sequence[Window]) -> list[Window]:
-    """Return the windows of array `name` that `wip` lacks; create `wip` if it is absent or has another provenance.
+    """Return the windows of array `name` that are missing in `wip`; create `wip` if absent or of another provenance.
 
     All files of `wip` are verified; damaged chunks are recomputed, with a warning.
 
@@ -146,11 +148,12 @@ def resume(wip: Path, stage: "xr.Dataset", name: str, windows: Sequence[Window])
     wip
         Work in progress, from `writing`.
     stage
-        Stage with provenance. Only shape, dtype and fill value of array `name` are used, so it may be a broadcast zero.
+        Stage with provenance. Only shape, dtype and fill value of array `name` are used, so that the array may be a
+        broadcast zero.
     name
         Array that is written tile by tile.
     windows
-        All tiles, square except at the edges; the shape of the first is the chunk shape.
+        All tiles, square except at the edges; the shape of the first tile is the chunk shape.
 
     Notes
     -----
@@ -168,9 +171,9 @@ def resume(wip: Path, stage: "xr.Dataset", name: str, windows: Sequence[Window])
 
 
 def mark_rewritten(wip: Path, name: str, windows: Sequence[Window], rewritten: Sequence[Window]) -> None:
-    """Record the windows that are rewritten with other settings than at first: `resume` recomputes them.
+    """Record windows that are rewritten with settings other than the initial ones; `resume` recomputes these windows.
 
-    A run that resumes after a kill, or from a finished stage, thus produces the same bytes.
+    A run that resumes after a kill, or from a finished stage, therefore produces the same bytes.
     """
     from apertura.campaign.store.chunks import update_attributes
 
@@ -224,19 +227,19 @@ def _is_whole(path: ConfinedPath, array: Any, window: Window) -> bool:
 
 
 def _warn_damaged(path: Path, error: BaseException, consequence: str) -> None:
-    """Log a warning on a damaged file of work in progress; it appears on stderr if no handler is configured."""
+    """Log a warning on a damaged file of work in progress; printed to stderr if no log handler is configured."""
     _LOG.warning("%s is damaged (%s): %s", path, f"{error}".split(";")[0] or type(error).__name__, consequence)
 
 
 def skeleton_of(stage: "xr.Dataset", name: str, windows: Sequence[Window]) -> dict[str, bytes]:
-    """Return metadata and coordinates of a stage whose array `name` is written by `windows`: path → bytes."""
+    """Return metadata and coordinates of a stage whose array `name` is written window by window: path → bytes."""
     from apertura.campaign.store.chunks import skeleton
 
     return skeleton(stage, {name: _chunk(windows)})
 
 
 def _begin(wip: ConfinedPath, files: Mapping[str, bytes]) -> None:
-    """Write metadata and coordinates of a stage; zarr.json, which identifies the stage, is last."""
+    """Write metadata and coordinates of a stage; zarr.json, which identifies the stage, is written last."""
     remove(wip)
     for name, content in files.items():
         if name != "zarr.json":
@@ -247,13 +250,13 @@ def _begin(wip: ConfinedPath, files: Mapping[str, bytes]) -> None:
 
 
 def is_intact(wip: ConfinedPath, files: Mapping[str, bytes]) -> bool:
-    """Return True if metadata and coordinates of work in progress are unchanged, apart from attributes of the stage."""
+    """Return True if metadata and coordinates of work in progress are unchanged; attributes of the stage may differ."""
     paths = ((wip / name, content) for name, content in files.items() if name != "zarr.json")
     return all(path.is_file(follow_symlinks=False) and path.read_bytes() == content for path, content in paths)
 
 
 def _repair(wip: ConfinedPath, files: Mapping[str, bytes], chunks: Collection[str]) -> None:
-    """Restore metadata and coordinates of work in progress; remove files that do not belong to it."""
+    """Restore metadata and coordinates of work in progress; remove files that do not belong to the stage."""
     for path in [path for path in wip.rglob("*") if not path.is_dir(follow_symlinks=False)]:
         if (name := path.relative_to(wip).as_posix()) not in files and name not in chunks:
             path.unlink()
@@ -261,7 +264,7 @@ def _repair(wip: ConfinedPath, files: Mapping[str, bytes], chunks: Collection[st
         path = wip / name
         if not path.is_file(follow_symlinks=False) or path.read_bytes() != content:
             if name != "zarr.json":  # zarr.json of a finished stage also contains measured attributes
-                _warn_damaged(path, ValueError("it has changed since it was written"), "restoring it")
+                _warn_damaged(path, ValueError("changed since it was written"), "restoring it")
             remove(path)
             write_beside(path, content)
 
@@ -290,14 +293,14 @@ def create(
     wip
         Work in progress, from `writing`; existing files are removed.
     stage
-        Stage with provenance. Only dims, dtype, fill value and attributes of the arrays in `chunks` are used, so they
-        may be broadcast.
+        Stage with provenance. Only dims, dtype, fill value and attributes of the arrays in `chunks` are used, so that
+        these arrays may be broadcast.
     chunks
-        Array name → shape of its chunks. Each chunk must be written by one process at a time.
+        Array name → shape of the array's chunks. Only one process at a time may write a chunk.
     packed
         True if chunks are compressed.
     consolidated
-        As in `apertura.campaign.store.chunks.skeleton`.
+        See `apertura.campaign.store.chunks.skeleton`.
     """
     from apertura.campaign.store.chunks import skeleton
 
@@ -305,7 +308,7 @@ def create(
 
 
 def open_array(folder: Path, name: str, mode: str = "r+") -> Any:
-    """Open an array of a stage as a `zarr.Array`; arrays of work in progress may be written."""
+    """Open an array of a stage as a `zarr.Array`, which may be written if the stage is work in progress."""
     from apertura.campaign.store.chunks import array_of
 
     return array_of(folder, name, mode)
@@ -318,7 +321,7 @@ def save_stage(
     chunks: Mapping[str, int] | None = None,
     lineage: ResultOrigin | None = None,
 ) -> None:
-    """Write a stage at once: `folder`.wip, rename, manifest.
+    """Write a stage as a whole: write `folder`.wip, rename the folder, write the manifest.
 
     Parameters
     ----------
@@ -343,15 +346,15 @@ def save_stage(
 
 
 def open_stage(folder: Path, stage: str) -> "xr.Dataset":
-    """Open a finished stage lazily, after checking its metadata and coordinates against the manifest and the contract.
+    """Open a finished stage lazily; check metadata and coordinates against the manifest and the contract.
 
     Chunks are checked against the manifest when they are read.
 
     Raises
     ------
     CampaignError
-        If the folder is missing, differs from its manifest, or was written by another version that does not satisfy
-        the contract; on reading, if a chunk is damaged.
+        If the folder is missing, differs from its manifest, or violates the contract because another version wrote it;
+        on reading, if a chunk is damaged.
     """
     import xarray as xr
 
@@ -365,7 +368,7 @@ def open_stage(folder: Path, stage: str) -> "xr.Dataset":
             f"written by another version of apertura: {error}",
             where=folder,
             expected=f"stage {stage} of this version",
-            remedy="Run the workflow again: it recomputes results of other versions.",
+            remedy="Run the workflow again, which recomputes results of other versions.",
         ) from error
 
 
@@ -383,13 +386,13 @@ def write_blocks(wip: Path, stage: "xr.Dataset", name: str, blocks: Iterable[NDA
     wip
         Work in progress, from `writing`.
     stage
-        Stage with provenance. Only dims, shape, dtype and attributes of array `name` are used, so it may be a broadcast
-        zero.
+        Stage with provenance. Only dims, shape, dtype and attributes of array `name` are used, so that the array may be
+        a broadcast zero.
     name
         Name of the array.
     blocks
-        Consecutive blocks of rows of the array. Chunks on disk have about 8 MB, independent of the blocks. They are not
-        compressed, because echoes are mostly noise. Chunks of zeros are not written.
+        Consecutive blocks of rows of the array. Chunks on disk have a size of about 8 MB, independent of the blocks.
+        Chunks are not compressed, because echoes are mostly noise. Chunks of zeros are not written.
 
     Raises
     ------
@@ -412,7 +415,7 @@ def write_blocks(wip: Path, stage: "xr.Dataset", name: str, blocks: Iterable[NDA
                     array[written : written + filled] = buffer[:filled]
                 written, filled = written + filled, 0
     if written + filled != rows:
-        raise ValueError(f"{written + filled} rows of {name}: must be {rows}")
+        raise ValueError(f"{written + filled} rows of {name} were supplied; the array has {rows} rows")
 
 
 def _counted(blocks: Iterable[NDArray[Any]], array: "xr.DataArray") -> Iterator[NDArray[Any]]:
@@ -424,7 +427,7 @@ def _counted(blocks: Iterable[NDArray[Any]], array: "xr.DataArray") -> Iterator[
 
 
 def blocks_of_rows(stage: "xr.Dataset", name: str) -> Iterator[slice]:
-    """Yield slices of the rows of a stage's array, with the chunk length of the array on disk."""
+    """Yield slices of the rows of an array of a stage; the length of a slice is the chunk length on disk."""
     array, rows = stage[name], len(stage[name])
     default = rows_of_chunk(array.dtype.itemsize * int(np.prod(array.shape[1:], dtype=int)))
     size = int(array.encoding.get("chunks", (default,))[0]) or default
@@ -433,7 +436,7 @@ def blocks_of_rows(stage: "xr.Dataset", name: str) -> Iterator[slice]:
 
 
 def rows_of_chunk(row_bytes: int) -> int:
-    """Return the number of rows of a chunk, a power of two.
+    """Return the number of rows in a chunk, which is a power of two.
 
     Examples
     --------

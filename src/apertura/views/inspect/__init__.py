@@ -1,1 +1,1 @@
-"""`apertura inspect`: kind and contents of a file or folder, and the data missing to form an image from it."""
+"""`apertura inspect`: kind and contents of a file or folder, and the data that are missing for image formation."""

@@ -1,4 +1,4 @@
-"""Reports of single files: flight log, recording, phase history, DEM or array, read with the campaign's settings."""
+"""Reports of single files (flight log, recording, phase history, DEM, array), read with settings of the campaign."""
 
 import json
 import re
@@ -65,19 +65,19 @@ class Surroundings:
     Attributes
     ----------
     node
-        Node name, taken from the file name.
+        Node name, derived from the file name.
     options
         Options for reading the node's flight log.
     waveform
         Section `waveform` of the campaign's config; empty outside a campaign.
     problem
-        Error in reading that config; None if it was read.
+        Error raised on reading the config; None if the config was read.
     typed
-        Options of the log given with --set.
+        Options of the log specified with --set.
     logged
         True if the folder contains a flight log of the node.
     aligned
-        True if the campaign contains clock offsets between recordings and logs.
+        True if the campaign has a table of clock offsets between recordings and logs.
     """
 
     node: str
@@ -90,15 +90,15 @@ class Surroundings:
 
 
 def surroundings(path: Path, settings: Sequence[str]) -> Surroundings:
-    """Return the settings for reading a file: options given with --set override the config of its campaign.
+    """Return the settings for reading a file; options specified with --set override the config of the campaign.
 
     Parameters
     ----------
     path
         Absolute path of the file.
     settings
-        KEY=VALUE with keys of `LogOptions`: columns.NAME for a column, scales.NAME for its factor; a base consists of
-        three numbers separated by commas.
+        Settings KEY=VALUE with keys of `LogOptions`: columns.NAME for a column, scales.NAME for the factor of a column.
+        A base consists of three numbers separated by commas.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def _parsed(settings: Sequence[str]) -> dict[str, Any]:
         key, equals, value = setting.partition("=")
         table, dot, column = key.partition(".")
         if not equals or table not in (_TABLES if dot else _OPTIONS):
-            raise CampaignError(setting, "--set", _EXPECTED, "Correct it.")
+            raise CampaignError(setting, "--set", _EXPECTED, "Correct the setting.")
         if dot:
             parsed.setdefault(table, {})[column] = value
         else:
@@ -145,7 +145,7 @@ def _parsed(settings: Sequence[str]) -> dict[str, Any]:
 
 
 def retries(problem: CampaignError) -> list[str]:
-    """Suggest --set options for a log that was refused because a key is not configured.
+    """Suggest options --set for a log that was refused because a key is not configured.
 
     Examples
     --------
@@ -164,13 +164,13 @@ ARRAY, DEM = (".npy",), (".tif", ".tiff")
 """File name suffixes."""
 
 FIRST = 128
-"""Number of leading captures whose samples are read."""
+"""Number of captures, from the first, whose samples are read."""
 
 LISTED = 10
-"""Number of gaps that are listed individually, longest first."""
+"""Maximum number of gaps that are listed individually; the longest gaps are selected."""
 
 PHASE_HISTORY = "phase_history"
-"""`waveform.kind` of formats that describe the transmitted waveform themselves."""
+"""`waveform.kind` of formats that contain a description of the transmitted waveform."""
 
 _MOST_SAMPLES = 1 << 21
 _MOST_NUMBERS = 1 << 28
@@ -199,7 +199,7 @@ def log_report(path: Path, context: Surroundings) -> Report:
     Raises
     ------
     CampaignError
-        If the file is not a flight log, or lacks information that `LogOptions` must supply.
+        If the file is not a flight log, or if it lacks information that is not given in `LogOptions` either.
     """
     track = read_track(path, node=context.node, options=context.options)
     facts = log_facts(track)
@@ -249,20 +249,20 @@ def _missing_of_log(path: Path, log: LogFacts, context: Surroundings) -> list[st
         extension = suffix if suffix in suffixes else suffixes[0]
         lacks.append(f"name of the node: copy the log to raw/<flight>/{NODE}.track.{extension}")
     lacks += [
-        f"config of the option given with --set: add nodes.{NODE}.log.{key} to config/config.yaml"
+        f"configuration of the option specified with --set: add nodes.{NODE}.log.{key} to config/config.yaml"
         for key in context.typed
     ]
     if not log.has_attitude:
-        lacks.append(f"attitude: set nodes.{NODE}.attitude to course, or lever arms to zero and antennas to null")
+        lacks.append(f"attitude: set nodes.{NODE}.attitude to course, or set lever arms to zero and antennas to null")
     if log.times.gap_at.size:
         lacks.append(f"epochs in {number_of(log.times.gap_at.size, 'gap')}: pulses in gaps may be excluded")
     kinds = log.fixes or {}
     if kinds and not {"fix", "float"} & kinds.keys():
-        lacks.append("a carrier-phase solution (RTK or PPK): position errors are many wavelengths")
+        lacks.append("a carrier-phase solution (RTK or PPK): position errors amount to many wavelengths")
     elif kinds.get("float") or any(name not in {"fix", "float", "not stated"} for name in kinds):
-        lacks.append(f"a fixed solution throughout: pulses at other epochs are excluded, see nodes.{NODE}.worst_fix")
+        lacks.append(f"a fixed solution at all epochs: pulses at other epochs are excluded, see nodes.{NODE}.worst_fix")
     if log.fixes is None and log.stated_std_m is None:
-        lacks.append(f"position accuracy: not contained in the log; set nodes.{NODE}.position_std_m")
+        lacks.append(f"position accuracy: the log does not contain it; set nodes.{NODE}.position_std_m")
     return lacks
 
 
@@ -272,9 +272,9 @@ def recording_report(files: Sequence[Path], context: Surroundings) -> Report:
     Parameters
     ----------
     files
-        In the order of a row of `apertura.formats.names.RECORDERS`.
+        Files of the recording, in the order of a row of `apertura.formats.names.RECORDERS`.
     context
-        Settings for reading them.
+        Settings for reading the files.
 
     Raises
     ------
@@ -301,7 +301,7 @@ def recording_report(files: Sequence[Path], context: Surroundings) -> Report:
         covered, left_out = _against_log(recording, node, logs[0], context)
         rows, lacks = rows | covered, lacks + left_out
     else:
-        lacks.append(f"antenna positions: the folder has no flight log {node}.track.<{'|'.join(log_suffixes())}>")
+        lacks.append(f"antenna positions: the folder contains no flight log {node}.track.<{'|'.join(log_suffixes())}>")
     return Report(
         files[0],
         "recording",
@@ -345,15 +345,15 @@ def _missing_of_recording(recording: "Recording", facts: RecordingFacts, context
         settings = ", ".join(f"{key}: {value:.9g}" for key, value in stated.items() if value)
         suffixes = "|".join(file.suffix for file in recording.files)
         lacks.append(
-            f"transmitted waveform: section waveform of config/config.yaml, with {settings} as in the recording"
+            f"transmitted waveform: section waveform of config/config.yaml, with {settings}, as in the recording"
         )
         lacks.append(f"a campaign: copy the recording to raw/<flight>/{NODE}{suffixes} of a campaign folder")
     if not facts.carrier_hz:
-        lacks.append("the carrier frequency: not in the recording; the configured value is used")
+        lacks.append("the carrier frequency: the recording does not contain it; the configured value is used")
     if facts.captures == 1 and not facts.runs_through:
         lacks.append(
-            "pulses: the recording is a single capture; write one capture per trigger, or apertura:framing if the "
-            "recording is continuous"
+            "pulses: the recording consists of a single capture; write one capture per trigger, or set "
+            "apertura:framing if the recording is continuous"
         )
     if own_clock(recording.captures.time):
         lacks.append("UTC times: the recorder has a free-running clock; `apertura align` estimates its offset to UTC")
@@ -363,7 +363,7 @@ def _missing_of_recording(recording: "Recording", facts: RecordingFacts, context
 def _against_log(
     recording: "Recording", node: str, log: Path, context: Surroundings
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the share of a recording that its flight log covers, and a message on captures outside the log."""
+    """Return the fraction of a recording covered by the flight log, and a message on captures outside the log."""
     if not log.is_file():  # reading a named pipe or a device would block
         return {}, [f"a readable flight log: {log.name} is not a regular file"]
     try:
@@ -380,7 +380,7 @@ def _against_log(
 
 
 def history_report(path: Path, files: Sequence[Path], kind: str, context: Surroundings) -> Report:
-    """Return the report of phase history.
+    """Return the report of a phase history.
 
     Parameters
     ----------
@@ -391,16 +391,16 @@ def history_report(path: Path, files: Sequence[Path], kind: str, context: Surrou
     kind
         A key of `apertura.formats.names.PHASE_HISTORIES`.
     context
-        Settings for reading them.
+        Settings for reading the files.
 
     Raises
     ------
     CampaignError
-        If there are no files, they are not of that format, or the format requires the waveform from the config of a
-        campaign and there is none.
+        If there are no files, if the files do not have the format `kind`, or if this format requires the waveform from
+        the config of a campaign and there is no config.
     """
     if not files:
-        raise CampaignError(f"no {kind} group, the folder is empty", path, "phase history", "Copy the folder again.")
+        raise CampaignError(f"no {kind} group in the folder", path, "a phase history", "Copy the folder again.")
     described = context.waveform if context.waveform.get("format") == kind else {}
     if PHASE_HISTORIES[kind].waveform != PHASE_HISTORY and not described:
         raise CampaignError(
@@ -424,7 +424,7 @@ def history_report(path: Path, files: Sequence[Path], kind: str, context: Surrou
 
 
 def _read_history(files: Sequence[Path], kind: str, node: str, described: Mapping[str, Any]) -> "xr.Dataset":
-    """Return the `echo` stage, read as monostatic or, where the format declares two antennas, as bistatic."""
+    """Return the `echo` stage of a phase history, read as monostatic or, if this fails, as bistatic."""
     try:
         return read_phase_history(kind, files, pair=f"{node}-{node}", described=described)
     except CampaignError as problem:
@@ -450,7 +450,7 @@ def _missing_of_history(facts: HistoryFacts, kind: str, context: Surroundings) -
     lacks = []
     if facts.frame is None and not context.logged:
         suffixes = "|".join(log_suffixes())
-        lacks.append(f"antenna positions: a flight log {NODE}.track.<{suffixes}> in the same folder for each antenna")
+        lacks.append(f"antenna positions: a flight log {NODE}.track.<{suffixes}> for each antenna in the same folder")
     if facts.frame is None and not context.aligned and facts.times.clock != "UTC":
         lacks.append("UTC times: the recorder has a free-running clock; `apertura align` estimates its offset to UTC")
     if not context.waveform:
@@ -494,7 +494,7 @@ def dem_report(path: Path) -> Report:
         open_dem(path, "a scene on Earth")
         lacks: tuple[str, ...] = ()
     except CampaignError as problem:
-        lacks = (f"{problem.found}; expected {problem.expected}: set scene.dem_datum if the datum is missing",)
+        lacks = (f"{problem.found}; expected {problem.expected}. If the datum is missing, set scene.dem_datum",)
     from apertura.views.inspect.pictures import draw_heights
 
     picture = (
@@ -506,7 +506,7 @@ def dem_report(path: Path) -> Report:
 
 
 def _product_rows(facts: DemFacts) -> dict[str, Any]:
-    """Return the report rows of a product of apertura, from its GeoTIFF tags."""
+    """Return the report rows of a product of apertura, computed from its GeoTIFF tags."""
     tags = facts.tags
     rows = {
         "title": tags.get("TIFFTAG_IMAGEDESCRIPTION", ""),
@@ -521,7 +521,7 @@ def _product_rows(facts: DemFacts) -> dict[str, Any]:
 
 
 def _tag(tags: Mapping[str, str], name: str, kind: type) -> Any:
-    """Return the JSON value of a tag, or an empty value if it is not of that type."""
+    """Return the JSON value of a tag, or an empty value of type `kind` if the tag has another type."""
     try:
         value = json.loads(tags.get(name, "null"))
     except ValueError:
@@ -538,7 +538,7 @@ def array_report(path: Path) -> Report:
         If the file is not a .npy file, or contains no numbers.
     """
     expected = f"a .npy file of at most {_MOST_NUMBERS} numbers"
-    array = read_npy(path, kinds="biufc", most=_MOST_NUMBERS, expected=expected, remedy="Save it again.")
+    array = read_npy(path, kinds="biufc", most=_MOST_NUMBERS, expected=expected, remedy="Save the array again.")
     sizes = np.abs(array[np.isfinite(array)]) if array.size else np.zeros(0)
     rows = {
         "shape": [int(side) for side in array.shape],

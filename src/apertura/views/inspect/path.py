@@ -1,4 +1,4 @@
-"""`apertura inspect`: identify a path with the first reader that matches its name and reads it without error."""
+"""`apertura inspect`: identify a file by the first reader that matches the name and reads the file without error."""
 
 import json
 import logging
@@ -42,25 +42,26 @@ def inspect_path(
     plot: Path | None = None,
     as_json: bool = False,
 ) -> int:
-    """Print the report of a file or folder; return 0, or 2 if no reader reads it.
+    """Print the report of a file or folder; return 0, or 2 if no reader can read the file.
 
     Parameters
     ----------
     path
         Absolute path.
     name
-        Name to print; None prints the path.
+        Name to print; None to print the path.
     settings
-        KEY=VALUE, keys of `apertura.formats.tracks.log_options.LogOptions`.
+        Settings KEY=VALUE with keys of `apertura.formats.tracks.log_options.LogOptions`.
     plot
-        Draw a preview into this .png file.
+        File name, with suffix .png, of a preview to be drawn.
     as_json
         Print JSON.
 
     Raises
     ------
     CampaignError
-        If the path does not exist, a setting is invalid, or `plot` is not a .png file or exists and is not an image.
+        If the path does not exist, a setting is invalid, or `plot` has another suffix or is an existing file that is
+        not a PNG image.
     """
     is_own_png = plot is None or (plot.suffix.lower() == ".png" and plot != path)
     if plot is not None and is_own_png and plot.exists():
@@ -79,12 +80,12 @@ def inspect_path(
     else:
         print_report(report, name if report.path == path else None)
         if plot is not None:
-            print(shown(drawn, 400) if drawn else "nothing to draw")
+            print(shown(drawn, 400) if drawn else "no plot: there is no preview for this file")
     return 2 if report.problem else 0
 
 
 def _drawn(figure: "Figure", plot: Path) -> Path:
-    """Write a plot as PNG; return its path."""
+    """Write a plot as PNG; return the path of the file."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     from apertura.common.atomic import replacement
@@ -103,7 +104,7 @@ def look(path: Path, settings: Sequence[str] = ()) -> Report:
     path
         Absolute path.
     settings
-        KEY=VALUE: options that a flight log does not contain.
+        Options KEY=VALUE for information that a flight log does not contain.
 
     Raises
     ------
@@ -134,13 +135,13 @@ def _folder(path: Path, settings: Sequence[str]) -> Report:
         parts.setdefault(part.path, part)  # all files of a recording give the same report
     more: tuple[str, ...] = ()
     if len(files) > MOST_FILES:
-        more = (f"{len(files) - MOST_FILES} more files were not inspected: inspect them individually",)
+        more = (f"{len(files) - MOST_FILES} more files were not inspected; inspect these files individually",)
     columns = ("first_utc", "duration_s", "rate_hz", "gaps")
     return Report(path, "folder", "", {"files": len(files)}, more, parts=tuple(parts.values()), columns=columns)
 
 
 def _file(path: Path, context: Surroundings) -> Report:
-    """Return the report of the first reader that reads a file, else the error of the first that matches its name."""
+    """Return the report of the first reader that reads a file; if none does, the error of the first matching reader."""
     refused: list[Report] = []
     for kind, name, read in _readers(path, context):
         try:
@@ -165,13 +166,13 @@ def _as_problem(error: Exception, path: Path) -> CampaignError:
     if isinstance(error, CampaignError):
         return error
     explanation = explained(error)
-    found = explanation or f"reader failed: {type(error).__name__}: {error}"
+    found = explanation or f"the reader failed: {type(error).__name__}: {error}"
     remedy = "Check whether the file is damaged; if not, report an internal error of apertura."
     return CampaignError(found, path, "an undamaged file", remedy)
 
 
 def _readers(path: Path, context: Surroundings) -> Iterator[tuple[str, str, Reader]]:
-    """Yield kind, format and reader for each table row that matches the name, or only for the configured format."""
+    """Yield kind, format and reader of each format that matches the name, or only of the configured format."""
     stated = "" if "format" in context.typed or ".track." in path.name else str(context.waveform.get("format", ""))
     if stated in PHASE_HISTORIES and path.name.endswith(PHASE_HISTORIES[stated].suffix):
         yield "phase history", stated, partial(_history, path, stated, context)
@@ -225,12 +226,12 @@ def _unknown(path: Path) -> Report:
     problem = CampaignError(
         f"no known format has the suffix {quoted(path.suffix)}",
         path,
-        f"a recording ({', '.join(recorders)}), phase history ({', '.join(histories)}), a flight log "
+        f"a recording ({', '.join(recorders)}), a phase history ({', '.join(histories)}), a flight log "
         f"({', '.join(logs)}), an elevation model (.tif) or a campaign folder",
-        "Rename the file to the suffix of its format, or convert it.",
+        "Give the file the suffix of its format, or convert the file.",
     )
     facts = {**_size(path), "begins_with": quoted(head)}
-    advice = (f"if the file is a flight log, give its format: --set format=<{'|'.join(TRACKS)}>",)
+    advice = (f"if the file is a flight log, specify its format: --set format=<{'|'.join(TRACKS)}>",)
     return Report(path, "unknown", "", facts, advice, problem)
 
 
@@ -249,7 +250,7 @@ _NEVER = np.array([], "datetime64[ns]")
 
 
 def campaign_report(root: Path) -> Report:
-    """Return the report of a campaign folder; the problems that `apertura check` finds are listed as missing."""
+    """Return the report of a campaign folder, which lists the problems found by `apertura check` as missing data."""
     campaign, problems = load(root)
     if campaign is None:
         lines = tuple(as_line(problem).replace(f"{root}/", "") for problem in problems)
@@ -286,7 +287,7 @@ def campaign_report(root: Path) -> Report:
 
 
 def _node_report(examined: Examination, key: Key) -> tuple[Report, dict[str, Span], list[CampaignError]]:
-    """Return the report of a node's recording and log in one flight, their spans, and errors in reading them."""
+    """Return the report of a node's recording and log in a flight, the time spans of both, and reading errors."""
     flight, node = key
     rows: dict[str, Any] = {}
     spans: dict[str, Span] = {}
@@ -316,7 +317,7 @@ def _node_report(examined: Examination, key: Key) -> tuple[Report, dict[str, Spa
 
 
 def _recorded(examined: Examination, key: Key) -> tuple[dict[str, Any], Times, Span | None]:
-    """Return facts of a node's recording, its pulse times in the clock of the log, and their span."""
+    """Return facts of a node's recording, its pulse times after clock correction, and the span of these times."""
     if examined.waveform is None:
         return _history_line(examined.campaign, key)
     if key not in examined.recorded:
@@ -327,7 +328,7 @@ def _recorded(examined: Examination, key: Key) -> tuple[dict[str, Any], Times, S
 
 
 def _history_line(campaign: Campaign, key: Key) -> tuple[dict[str, Any], Times, Span | None]:
-    """Return the same for phase history of a receiving node; no times if the format only numbers the pulses."""
+    """Return the values of `_recorded` for a phase history; without times if the format only numbers the pulses."""
     flight, node = campaign.flight(key[0]), key[1]
     pair = next((pair for pair in flight.pairs if pair.endswith(f"-{node}")), None)
     if pair is None:
@@ -347,7 +348,7 @@ def _rate_rows(times: TimeFacts) -> dict[str, Any]:
 
 
 def _span_row(span: Span) -> dict[str, str]:
-    """Return first and last time in ISO 8601 with all digits."""
+    """Return the first and last time of a span in ISO 8601 with all digits."""
     return {
         name: f"{time.astype('datetime64[ns]')}Z" for name, time in zip(("first_utc", "last_utc"), span, strict=True)
     }

@@ -1,4 +1,4 @@
-"""Previews of tracks, recordings, phase history, heights, and of the times of a campaign."""
+"""Previews of tracks, recordings, phase histories, height rasters, and the times of a campaign."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -39,7 +39,10 @@ Floats = NDArray[np.floating[Any]]
 
 
 def draw_log(track: "xr.Dataset", name: str) -> Figure:
-    """Plot a track in plan view, its height and its epoch intervals over time; colours give the fix, red lines gaps."""
+    """Plot a track in plan view, and its heights and epoch intervals over time.
+
+    Colours distinguish fix types; gaps are red.
+    """
     figure = _figure(name, (11, 6))
     grid = figure.add_gridspec(2, 2)
     plan, height = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
@@ -82,7 +85,7 @@ def east_north_up(position_m: NDArray[np.float64], frame: str, middle: NDArray[n
 
 
 def _intervals(axes: "Axes", across: NDArray[Any], times: NDArray[np.datetime64]) -> None:
-    """Plot intervals between consecutive times, s; logarithmic if they differ by more than a factor of 10."""
+    """Plot intervals between consecutive times, s; on a log scale if intervals differ by more than a factor of 10."""
     steps = np.diff(times) / np.timedelta64(1, "s")
     axes.plot(across, steps, "k.", markersize=2.5)
     if steps.max() > 10 * steps.min():
@@ -92,7 +95,7 @@ def _intervals(axes: "Axes", across: NDArray[Any], times: NDArray[np.datetime64]
 
 
 def _by_fix(track: "xr.Dataset") -> dict[str, NDArray[np.bool_]]:
-    """Return a mapping of kind of fix → (epoch,) bool."""
+    """Return fix type → (epoch,) bool, True for epochs of that type."""
     kinds = track.fix.values if "fix" in track else np.zeros(track.sizes["epoch"], np.int8)
     masks = {"fix" if kind == 1 else name: kinds == kind for name, kind in FIXES.items()}
     masks["not stated"] = ~np.isin(kinds, list(FIXES.values()))
@@ -127,11 +130,12 @@ def _captures(axes: "Axes", times: NDArray[np.datetime64]) -> None:
     typical_s = interval_s(times)
     axes.axhline(typical_s, color="tab:blue", linewidth=0.8, label=f"typical: {typical_s:.6g} s")
     axes.legend(loc="lower right", fontsize="small")
-    _named(axes, f"capture, first at {utc(times[0])}; red: preceded by a gap", "interval to the previous capture, s")
+    label = f"capture number, first capture at {utc(times[0])}; red: first capture after a gap"
+    _named(axes, label, "interval to the previous capture, s")
 
 
 def draw_history(echo: "xr.Dataset", name: str) -> Figure:
-    """Plot range profiles of pulses spread over the flight, and the antenna positions in plan view."""
+    """Plot range profiles of pulses at regular intervals over the flight, and the antenna positions in plan view."""
     placed = "tx_position" in echo
     figure = _figure(name, (11, 5))
     grid = figure.add_gridspec(1, 1 + placed, width_ratios=(1.6, 1)[: 1 + placed])
@@ -157,7 +161,7 @@ def draw_history(echo: "xr.Dataset", name: str) -> Figure:
 
 
 def draw_heights(heights: NDArray[np.float32], extent: tuple[float, ...], name: str, *, unit: str) -> Figure:
-    """Plot a raster of heights (in `unit`) as a map; `extent` is left, bottom, right, top in its CRS."""
+    """Plot a raster of heights (in `unit`) as a map; `extent` is left, bottom, right, top in the CRS of the raster."""
     figure = _figure(name, (7, 6))
     axes = figure.subplots()
     left, bottom, right, top = extent
@@ -170,7 +174,7 @@ def draw_heights(heights: NDArray[np.float32], extent: tuple[float, ...], name: 
 
 
 def draw_campaign(spans: Mapping[tuple[str, str], Mapping[str, Span]], name: str) -> Figure:
-    """Plot the time spans of recording and log of each node, in seconds from the first time of each flight."""
+    """Plot the time spans of recording and log of each node, in seconds since the first time of each flight."""
     flights = list(dict.fromkeys(flight for flight, _ in spans)) or [""]
     figure = _figure(name, (10, 1.5 + 1.2 * len(spans)))
     for axes, flight in zip(np.ravel(figure.subplots(len(flights), 1)), flights, strict=True):
@@ -217,7 +221,7 @@ def _decibels(values: NDArray[np.complexfloating]) -> Floats:
 
 
 def _image(axes: "Axes", level_db: Floats, across: tuple[float, float], label: str, *, rows: int | None = None) -> None:
-    """Draw levels as an image; `rows` scales the vertical axis if only some rows are drawn."""
+    """Draw levels as an image; `rows` is the number of rows on the vertical axis if only some rows are drawn."""
     extent = (*across, rows or len(level_db), 0)
     drawn = axes.imshow(level_db, extent=extent, aspect="auto", cmap="viridis", vmin=_FLOOR_DB, vmax=0)
     axes.figure.colorbar(drawn, ax=axes, label=label)

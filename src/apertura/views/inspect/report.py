@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _UNITS = {"hz": "Hz", "m": "m", "m_s": "m/s", "s": "s", "deg": "deg", "db": "dB", "utc": "UTC", "share": "share"}
-"""Suffix of a fact's name → unit."""
+"""Suffix in the name of a fact → unit."""
 
 _PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""))
 _LONGEST = 600
@@ -26,24 +26,24 @@ class Report:
     path
         The file or folder.
     kind
-        flight log, recording, phase history, elevation model, product of apertura, array, campaign folder, folder or
+        Flight log, recording, phase history, elevation model, product of apertura, array, campaign folder, folder or
         unknown.
     format
         Format name; empty for a kind with a single format.
     facts
-        Name, which ends in its unit → JSON value; a list of two numbers is a range.
+        Name, which ends in the unit → JSON value; a list of two numbers is a range.
     missing
-        Data missing for an image, a phrase each.
+        Data that are missing for image formation, one phrase per item.
     problem
-        Reason for refusing the file; None if it was read.
+        Reason for refusing the file; None if the file was read.
     parts
         Reports of the contents of a folder.
     columns
-        Facts of the parts that are table columns.
+        Names of the facts of the parts that are printed as table columns.
     lines_of_parts
-        Facts of the parts that are too long for a table, printed a line each.
+        Names of the facts of the parts that are too long for a table and are printed on separate lines.
     picture
-        Function that draws a preview.
+        Function that draws a preview; None if no preview is available.
     """
 
     path: Path
@@ -107,7 +107,7 @@ def _words(value: object, unit: str) -> str:
     if isinstance(value, float):
         return _number(value, unit)
     if value is None or isinstance(value, bool):
-        return {None: "not known", True: "yes", False: "no"}[value]
+        return {None: "unknown", True: "yes", False: "no"}[value]
     return f"{value} {unit}" if unit and not isinstance(value, str) else str(value)
 
 
@@ -129,7 +129,7 @@ def _number(value: float, unit: str) -> str:
 
 
 def print_report(report: Report, name: Path | None = None) -> None:
-    """Print a report as text; `name` is the path as the user typed it."""
+    """Print a report as text; `name` is the path as typed by the user."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -151,13 +151,13 @@ def print_report(report: Report, name: Path | None = None) -> None:
         sentence = f"{problem.found}; expected {problem.expected}. {problem.remedy}"
         console.print(Text.assemble(("refused: ", "red"), sentence))
     if report.missing:
-        console.print(Text("missing for an image:" if not report.problem else "remedies:", style="yellow"))
+        console.print(Text("missing for image formation:" if not report.problem else "remedies:", style="yellow"))
     for sentence in report.missing:
         console.print(Text(f"  - {shown(sentence, _LONGEST)}"))
 
 
 def _table(report: Report) -> Any:
-    """Return a table with a row for each part: name, kind and the facts named by the columns."""
+    """Return a table with a row for each part: name, kind, and a column for each fact in `columns`."""
     from rich import box
     from rich.table import Table
     from rich.text import Text

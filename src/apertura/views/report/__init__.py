@@ -7,4 +7,4 @@ PAGE = "report.html"
 """File name of the report of a flight, and of the report of all flights."""
 
 SUM_PICTURES = ("panels", "sum_cuts")
-"""Figures of the sums of a flight: the sums next to the pairs, and cuts through the brightest target."""
+"""Figures of the sums of a flight: images of the sums and pairs, and cuts through the brightest target."""

@@ -1,4 +1,4 @@
-"""Figures of an image: phase and cuts of its brightest target, and its error budget."""
+"""Figures of an image: phase of the brightest target, cuts through this target, and error budget."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ _COLOURS = (ORANGE, BLUE, GREEN)
 def sidelink_error_rad(
     phase_rad: NDArray[np.float64], length_m: NDArray[np.float64], *, wavenumber_rad_m: float
 ) -> NDArray[np.float64]:
-    """Estimate the phase error of clocks and triggers in each pulse from its sidelink.
+    """Estimate the phase error due to clocks and triggers in each pulse from the sidelink.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def sidelink_error_rad(
 
 
 def steadiness(phasors: NDArray[np.complex128]) -> tuple[float, float]:
-    """Return a target's phase scatter, rms radians about its mean, and coherence |Σz|/Σ|z|; NaN without an echo.
+    """Return the phase scatter of a target (rms deviation from the mean, rad) and coherence |Σz|/Σ|z|; NaN if no echo.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def draw_phase(
     path
         ``….png``; replaced atomically.
     time_s
-        (pulse,) float64, seconds from the first pulse.
+        (pulse,) float64, seconds since the first pulse.
     phasors
         Stage of correction → (pulse,) complex, contribution of each pulse at the target.
     title
@@ -129,7 +129,7 @@ class DrawnCut:
     Attributes
     ----------
     name
-        Name of its direction.
+        Name of the direction of the cut.
     along_m
         (sample,) float64, metres from the peak.
     power
@@ -189,11 +189,11 @@ def _draw_cut(axes: Axes, cut: DrawnCut, colour: str) -> None:
     if np.isfinite(cut.width_m):
         left, right = _crossings(cut)
         axes.plot([left, right], [-3, -3], color=RED, linewidth=2.2, solid_capstyle="butt")
-    width = f"−3 dB: {100 * cut.width_m:.1f} cm" if np.isfinite(cut.width_m) else "−3 dB: beyond the cut"
+    width = f"−3 dB width: {100 * cut.width_m:.1f} cm" if np.isfinite(cut.width_m) else "−3 dB width exceeds the cut"
     axes.set(
         title=f"{cut.name} — {width}",
         xlabel="distance from the peak, m",
-        ylabel="power re peak, dB",
+        ylabel="power relative to the peak, dB",
         ylim=(_LOWEST_DB, 3),
         xlim=(cut.along_m[0], cut.along_m[-1]),
     )
@@ -218,21 +218,26 @@ def _crossings(cut: DrawnCut) -> tuple[float, float]:
 _LEAST = {"loss_db": 1e-4, "shift_m": 1e-4, "phase_rad": 1e-4}
 _LABELS = {"loss_db": "peak loss, dB", "shift_m": "displacement, m", "phase_rad": "image phase, rad"}
 _STYLES: Mapping[bool, Any] = {
-    True: {"color": BLUE, "label": "in the sum: size stated, measured or assumed"},
-    False: {"facecolor": "white", "edgecolor": GREY, "hatch": "/////", "label": "not in the sum: size not configured"},
+    True: {"color": BLUE, "label": "in the sum: the size is stated, measured or assumed"},
+    False: {
+        "facecolor": "white",
+        "edgecolor": GREY,
+        "hatch": "/////",
+        "label": "not in the sum: the size is not configured",
+    },
 }
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Measured focus at an image's bright points.
+    """Focus measured at the bright points of an image.
 
     Attributes
     ----------
     loss_db, std_db
-        Their peak loss, negative, and its standard deviation; None if no point is bright enough.
+        Peak loss of the bright points (negative) and its standard deviation; None if no point is bright enough.
     expected_db
-        Peak loss expected by the error budget; None if no cause has a known size.
+        Peak loss predicted by the error budget; None if no cause has a known size.
     """
 
     loss_db: float | None = None
@@ -243,15 +248,15 @@ class Measured:
 def draw_budget(
     path: Path, lines: Sequence[Mapping[str, Any]], measured: Measured, *, title: str, tags: Mapping[str, str]
 ) -> None:
-    """Plot the expected effect of each cause as a PNG; causes without a known size are hatched and not summed.
+    """Plot the expected effect of each cause as a PNG; causes of unknown size are hatched and not in the sum.
 
     Parameters
     ----------
     path
         ``….png``; replaced atomically.
     lines
-        Lines of the budget in image.json: cause, stated, loss_db, shift_m, phase_rad; None for an effect that a cause
-        does not have.
+        Lines of the budget in image.json: cause, stated, loss_db, shift_m, phase_rad; an effect is None if the cause
+        does not have this effect.
     measured
         Measured focus at the bright points of the image.
     title
@@ -280,7 +285,7 @@ def draw_budget(
                             alpha=0.15,
                         )
         plotted, _ = figure.axes[0].get_legend_handles_labels()
-        bars = [Patch(**style) for style in _STYLES.values()]  # both styles, even if this image has only one of them
+        bars = [Patch(**style) for style in _STYLES.values()]  # both styles, even if this image uses only one style
         handles = [*(handle for handle in plotted if not isinstance(handle, Container)), *bars]
         figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
 
@@ -309,7 +314,7 @@ def _draw_causes(axes: Axes, lines: Sequence[Mapping[str, Any]], measure: str) -
 
 
 def _names(lines: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the cause of each line, qualified if a cause occurs twice.
+    """Return the cause of each line; causes that occur twice are distinguished by the origin of their size.
 
     Examples
     --------

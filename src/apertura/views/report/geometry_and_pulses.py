@@ -1,4 +1,4 @@
-"""Figures of a flight: geometry of a pair, its pulses over time, its range profiles."""
+"""Figures of a pair: geometry, pulses over time, and range profiles."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,7 +23,8 @@ _STYLES: Mapping[str, Any] = {
     "receiver": {"color": ORANGE, "linestyle": "--", "linewidth": 1.6},
 }
 _MARGIN, _BELOW = 0.18, 0.1
-"""Margin of the plan view around tracks and scene, and its downward shift for the scale bar; 1: their side."""
+"""Margin of the plan view around tracks and scene, and downward shift of the view for the scale bar, both relative to
+the longer side of tracks and scene."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,19 +34,19 @@ class FlownGeometry:
     Attributes
     ----------
     time_s
-        (pulse,) float64, times of the drawn pulses, seconds from the first.
+        (pulse,) float64, times of the drawn pulses, seconds since the first pulse.
     tracks_m
-        Antenna (transmitter, receiver) → (pulse, 3) float64, easting, northing and height on the map, metres.
+        Antenna (transmitter, receiver) → (pulse, 3) float64, easting, northing and height in map coordinates, metres.
     bounds_m
-        West, south, east, north of the scene.
+        West, south, east and north bounds of the scene.
     ground_m
         Terrain height at the scene centre, in the height reference of the tracks.
     target_m
-        (3,) float64, the brightest target on the map, metres.
+        (3,) float64, position of the brightest target in map coordinates, metres.
     footprint
-        Rings (vertex, 2) in map metres around the imaged area.
+        Rings around the imaged area, (vertex, 2) in map coordinates, metres.
     crs_name
-        Name of the map's CRS.
+        Name of the CRS of the map.
     local
         True if the frame is local, without georeference.
     counted
@@ -64,7 +65,7 @@ class FlownGeometry:
 
     @property
     def middle_m(self) -> NDArray[np.float64]:
-        """Scene centre on the terrain, (3,) float64, map metres."""
+        """Scene centre on the terrain, (3,) float64 in map coordinates, metres."""
         west, south, east, north = self.bounds_m
         return np.array([(west + east) / 2, (south + north) / 2, self.ground_m])
 
@@ -78,7 +79,7 @@ class FlownGeometry:
 
 
 def draw_geometry(path: Path, flown: FlownGeometry, *, title: str, tags: Mapping[str, str]) -> None:
-    """Plot a pair's geometry as a PNG: plan view, side view, heights over time.
+    """Plot the geometry of a pair as a PNG: plan view, side view, and heights over time.
 
     Parameters
     ----------
@@ -136,7 +137,7 @@ def _draw_plan(axes: Axes, flown: FlownGeometry) -> None:
 
 
 def _draw_scale_and_north(axes: Axes, *, north: bool) -> None:
-    """Draw a scale bar of a round length and, with `north`, an arrow to grid north in the lower corners."""
+    """Draw, in the lower corners, a scale bar of a round length and, with `north`, an arrow to grid north."""
     low, high = axes.get_xlim()
     metres = round_length((high - low) / 4)
     part = metres / (high - low)
@@ -150,7 +151,7 @@ def _draw_scale_and_north(axes: Axes, *, north: bool) -> None:
 
 
 def _draw_side(axes: Axes, flown: FlownGeometry) -> None:
-    """Draw the side view: heights over the horizontal distance towards the target, with equal scales."""
+    """Draw the side view: heights over the horizontal distance towards the target, both axes on the same scale."""
     origin = flown.target_m[:2]
     ends = np.array([[x, y] for x in flown.bounds_m[::2] for y in flown.bounds_m[1::2]])
     reach = (ends - origin) @ flown.towards
@@ -161,7 +162,7 @@ def _draw_side(axes: Axes, flown: FlownGeometry) -> None:
         sight = float(np.median(away)), float(np.median(height))
         axes.plot([sight[0], 0], [sight[1], flown.target_m[2] - flown.ground_m], color=_STYLES[name]["color"], lw=0.6)
     axes.plot(0, flown.target_m[2] - flown.ground_m, "*", color=RED, markersize=9, label="brightest target")
-    axes.set(title="side view", xlabel="distance towards the target, m", ylabel="height above the scene, m")
+    axes.set(title="side view", xlabel="distance in the target's direction, m", ylabel="height above the scene, m")
     axes.set_aspect("equal", adjustable="datalim")
     axes.xaxis.set_major_locator(MaxNLocator(5))
 
@@ -176,17 +177,17 @@ class PulseRecord:
     Attributes
     ----------
     sent_s
-        (sent,) float64, transmission times, seconds from the first.
+        (sent,) float64, transmission times, seconds since the first pulse.
     kept
         (sent,) bool, True for pulses used in the image.
     reasons
-        Reason for excluding pulses → their number, as in image.json.
+        Reason for exclusion → number of excluded pulses, as in image.json.
     time_s
-        (pulse,) float64, times of the used pulses.
+        (pulse,) float64, times of the used pulses, seconds since the first transmitted pulse.
     snr_db
         (pulse,) float64, sidelink SNR per subcarrier; None without a sidelink.
     delay_m
-        (pulse,) float64, sidelink delay less its length from the logs, metres; None without a sidelink.
+        (pulse,) float64, sidelink delay (in metres) minus the sidelink length from the logs; None without a sidelink.
     counted
         True if times count pulses, because the recording has no times.
     """
@@ -201,7 +202,7 @@ class PulseRecord:
 
 
 def draw_pulses(path: Path, record: PulseRecord, *, title: str, tags: Mapping[str, str]) -> None:
-    """Plot numbers of used and excluded pulses, and SNR and delay of a sidelink if there is one, as a PNG.
+    """Plot numbers of used and excluded pulses and, if available, SNR and delay of the sidelink as a PNG.
 
     Parameters
     ----------
@@ -218,7 +219,7 @@ def draw_pulses(path: Path, record: PulseRecord, *, title: str, tags: Mapping[st
         (values, label, heading)
         for values, label, heading in (
             (record.snr_db, "SNR, dB", "sidelink SNR per subcarrier"),
-            (record.delay_m, "delay − length, m", "sidelink delay relative to its length"),
+            (record.delay_m, "delay − length, m", "sidelink delay minus sidelink length"),
         )
         if values is not None and np.isfinite(values).any()
     ]
@@ -235,14 +236,14 @@ def draw_pulses(path: Path, record: PulseRecord, *, title: str, tags: Mapping[st
             lost = f"; {number_of(unlocked, 'pulse')} without lock" if unlocked else ""
             unit = label.rpartition(", ")[2]
             axes.set(title=f"{heading}: median {median:.3g} {unit}, spread {spread:.2g} {unit}{lost}", ylabel=label)
-        [first, *others][-1].set_xlabel(over(counted=record.counted, first="first pulse sent"))
+        [first, *others][-1].set_xlabel(over(counted=record.counted, first="first transmitted pulse"))
         first.set_xlim(0.0, max(float(record.sent_s.max(initial=0.0)), 1e-3))
 
 
 def _draw_counts(axes: Axes, record: PulseRecord) -> None:
     last = float(record.sent_s.max()) if record.sent_s.size else 0.0
     interval = float(np.median(np.diff(record.sent_s))) if last else 1.0
-    # bins of an integer number of pulse intervals: other widths would alternate in the number of pulses
+    # bin width: integer number of pulse intervals; for other widths, the number of pulses per bin would alternate
     width = interval * _pulses_per_bin(round(last / interval) + 1)
     edges = np.arange(-interval / 2, last + width, width)
     kept, excluded = (np.histogram(record.sent_s[selected], edges)[0] for selected in (record.kept, ~record.kept))
@@ -258,14 +259,14 @@ def _draw_counts(axes: Axes, record: PulseRecord) -> None:
         linewidth=0,
         label=f"excluded: {int((~record.kept).sum())}{_reasons_text(record.reasons)}",
     )
-    label = f"pulses per {width:.0f} transmitted" if record.counted else f"pulses in {width:.2g} s"
+    label = f"pulses per {width:.0f} transmitted" if record.counted else f"pulses per {width:.2g} s"
     axes.set(title="pulses", ylabel=label, ylim=(0, 1.45 * max(1, (kept + excluded).max())))
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.legend(loc="upper right", ncols=2)
 
 
 def _pulses_per_bin(slots: int) -> int:
-    """Return the number of pulses per histogram bin for which the last bin is as full as possible.
+    """Return the number of pulses per histogram bin for which the last bin contains as many pulses as possible.
 
     Examples
     --------
@@ -277,7 +278,7 @@ def _pulses_per_bin(slots: int) -> int:
 
 
 def _reasons_text(reasons: Mapping[str, int]) -> str:
-    """Format the number of excluded pulses for each reason, in brackets.
+    """Format the numbers of excluded pulses for each reason, in brackets.
 
     Examples
     --------
@@ -289,7 +290,7 @@ def _reasons_text(reasons: Mapping[str, int]) -> str:
 
 
 TIMES, PATHS = 560, 700
-"""Maximum number of bins of the waterfall in time and in path."""
+"""Maximum numbers of bins of the waterfall plot in time and in path."""
 
 _RANGE_DB = 50.0
 
@@ -302,9 +303,9 @@ class Waterfall:
     start_m
         (pulse,) float64, total path of sample 0, metres.
     step_m
-        Path interval between samples, metres.
+        Interval of the total path between samples, metres.
     samples
-        Number of samples of a profile.
+        Number of samples in a profile.
 
     Examples
     --------
@@ -331,7 +332,7 @@ class Waterfall:
         for row, line in enumerate(power):
             at = self._offset[first + row] + np.arange(line.size)
             lower = np.floor(at + 1e-9).astype(np.int64)
-            upper = np.clip(at - lower, 0, 1)  # linear interpolation: start paths lie between cells
+            upper = np.clip(at - lower, 0, 1)  # linear interpolation, because start paths lie between cells
             for cells, share in ((lower, 1 - upper), (lower + 1, upper)):
                 into = np.minimum(cells // self._together, size - 1)
                 column = (first + row) // self._pulses
@@ -340,11 +341,11 @@ class Waterfall:
 
     @property
     def mean(self) -> NDArray[np.float64]:
-        """(path, time) float64 mean power, NaN in bins without a sample."""
+        """(path, time) float64 mean power; NaN in bins without samples."""
         return np.where(self._count > 0, self._sum / np.maximum(self._count, 1), np.nan)
 
     def times(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the edges of the time bins, (bin + 1,) float64 seconds, from the times of all pulses."""
+        """Return the edges of the time bins, (bin + 1,) float64 seconds, computed from the times of all pulses."""
         starts = time_s[:: self._pulses]
         last = time_s[-1] + (time_s[-1] - time_s[0]) / max(1, len(time_s) - 1)
         return np.append(starts, last if last > starts[-1] else starts[-1] + 1.0)
@@ -369,7 +370,7 @@ def draw_waterfall(
     waterfall
         Waterfall that contains all profiles.
     time_s, target_path_m
-        (pulse,) float64, seconds from the first pulse, and path in metres.
+        (pulse,) float64, time in seconds since the first pulse, and total path to the target in metres.
     title
         Flight and pair.
     tags
@@ -389,8 +390,8 @@ def draw_waterfall(
         )
         drawn_pulses = np.linspace(0, len(time_s) - 1, min(len(time_s), 60)).round().astype(int)
         axes.plot(time_s[drawn_pulses], target_path_m[drawn_pulses], ":", color="white", linewidth=0.9)
-        title = "range profiles; dotted: path to the brightest target"
+        title = "range profiles; the dotted line is the path to the brightest target"
         axes.set(title=title, xlabel=over(counted=counted), ylabel="total path, m")
         axes.yaxis.set_major_locator(MaxNLocator(7))
         axes.grid(visible=False)
-        figure.colorbar(drawn, ax=axes, extend="min", pad=0.02).set_label("power re maximum, dB")
+        figure.colorbar(drawn, ax=axes, extend="min", pad=0.02).set_label("power relative to the maximum, dB")

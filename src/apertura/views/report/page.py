@@ -1,4 +1,4 @@
-"""Markup of reports: a self-contained HTML file, and reStructuredText for Snakemake's report."""
+"""Markup of reports: self-contained HTML, and reStructuredText for Snakemake's report."""
 
 import base64
 import re
@@ -57,7 +57,7 @@ td.number { white-space: nowrap; }
 </body>
 </html>
 """
-_NUMBERS = re.compile(r"[-−+±\d.,e\s/%]+")  # a purely numeric cell: line breaks only at explicit newlines
+_NUMBERS = re.compile(r"[-−+±\d.,e\s/%]+")  # a numeric cell, whose lines are broken only at explicit newlines
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Paragraph:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of text with a caption above it."""
+    """A table of text with a caption above the table."""
 
     caption: str
     head: Sequence[str]
@@ -86,7 +86,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """Contents of a PNG file with a caption below it."""
+    """Contents of a PNG file with a caption below the image."""
 
     png: bytes
     caption: str

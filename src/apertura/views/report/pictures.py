@@ -1,4 +1,4 @@
-"""Rules `pictures` and `pictures_fused`: figures of a pair and of the sums of a flight for the report."""
+"""Rules `pictures` and `pictures_fused`: figures of a pair, and figures of the sums of a flight, for the report."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -60,7 +60,7 @@ from apertura.workflow.lineage import result_of
 
 
 def pictures(campaign: Campaign, flight: str, pair: str) -> Sequence[Path]:
-    """Write the figures of one pair; return their paths."""
+    """Write the figures of a pair; return the paths of the files."""
     lineage = result_of(campaign, "pictures", flight, pair).begin(campaign.root)
     shown = Shown(campaign, flight, pair)
     written = [campaign.result(flight, pair, "pictures", f"{name}.png") for name in PICTURES]
@@ -82,7 +82,7 @@ def pictures(campaign: Campaign, flight: str, pair: str) -> Sequence[Path]:
 
 @dataclass(frozen=True)
 class Shown:
-    """Data of a pair for its figures, opened on first use.
+    """Data for the figures of a pair, opened on first use.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ class Shown:
 
     @cached_property
     def time_s(self) -> Floats:
-        """(pulse,) times of the imaged pulses, seconds from the first."""
+        """(pulse,) times of the pulses used in the image, seconds since the first of these pulses."""
         return seconds_since(self.echo.time.values, self.echo.time.values[0])
 
     @cached_property
@@ -146,12 +146,12 @@ class Shown:
         return aperture_of(self.profile).path(self._target_m)[:, 0]
 
     def geometry(self) -> FlownGeometry:
-        """Return tracks, scene and footprint on the map."""
+        """Return tracks, scene and footprint in map coordinates."""
         grid, aperture = self.scene.grid, aperture_of(self.echo)
         drawn = thinned(len(aperture), 400)
         legs = dict(zip(("transmitter", "receiver"), aperture[drawn].legs, strict=True))
         if is_monostatic(self.pair):
-            del legs["receiver"]  # same node, same track
+            del legs["receiver"]  # the transmitter is also the receiver
         step, _, west, _, _, north = grid.transform
         looks = few_looks(self.campaign, self.flight, self.pair)
         down, right = (size * step / dots for size, dots in zip(grid.shape, looks.shape, strict=True))
@@ -169,7 +169,7 @@ class Shown:
         )
 
     def record(self) -> PulseRecord:
-        """Return the imaged pulses and the measurements of their sidelink."""
+        """Return the transmitted pulses, the pulses used in the image, and the sidelink measurements."""
         echo, sent = self.echo, self._sent()
         counts = echo.attrs.get("pulses") or {}
         snr_db = echo.sidelink_snr.values if "sidelink_snr" in echo else None
@@ -188,7 +188,7 @@ class Shown:
         )
 
     def _sent(self) -> NDArray[np.datetime64]:
-        """Return transmission times in the transmitter's clock; for phase history, those of the contained pulses."""
+        """Return transmission times in UTC; for phase histories, those of the pulses in the file."""
         if not isinstance(self.campaign.settings.waveform, SampledWaveform):
             return np.asarray(self.echo.time.values)
         node = self.pair.split("-")[0]
@@ -196,7 +196,7 @@ class Shown:
         return np.asarray(self.campaign.clock(self.flight, node).utc(raw.time.values)).astype("datetime64[ns]")
 
     def phasors(self) -> dict[str, NDArray[np.complex128]]:
-        """Return the contribution of each pulse at the brightest target, at each stage of correction."""
+        """Return the contribution of each pulse at the brightest target for each stage of correction."""
         logged, echo = profiles_of(self.profile, lazy=True), self.echo
         every = np.arange(len(logged) + 1)
         phasors = block_contributions(logged, self._target_m, edges=every)[0].astype(np.complex128)
@@ -208,7 +208,7 @@ class Shown:
             stages["without sidelink correction"] = np.nan_to_num(phasors * np.exp(1j * error))
             stages["corrected with the sidelink"] = phasors
         else:
-            stages["as recorded, tracks from the logs"] = phasors
+            stages["as recorded, with the logged tracks"] = phasors
         refined = open_refined(self.campaign, self.flight)
         if refined.correction is not None:
             corrected = refined.profiles(open_pair(self.campaign, self.flight, self.pair, echo=echo), logged)
@@ -245,7 +245,7 @@ def draw_panels(
     tags: Mapping[str, str],
     local: bool = False,
 ) -> None:
-    """Plot images of one scene as a PNG, each in dB relative to its own peak, with a common dB range.
+    """Plot images of a scene as a PNG, each in dB relative to its peak, with the same dynamic range.
 
     Parameters
     ----------
@@ -254,15 +254,15 @@ def draw_panels(
     powers
         Title of a panel → (row, column) float64 mean power, north-up, NaN where no image was formed.
     size_m
-        Size of the scene, east and north, metres.
+        Size of the scene to the east and north, metres.
     target_m
-        Brightest target, metres east and north of the lower left corner.
+        Position of the brightest target, metres east and north of the lower left corner.
     title
-        Title with the flight.
+        Title that names the flight.
     tags
         Provenance, stored in the file.
     local
-        True if the scene is in a local frame: its axes are x and y.
+        True if the scene is in a local frame, the axes of which are x and y.
     """
     across, up = ("x", "y") if local else ("east", "north")
     rows = -(-len(powers) // _COLUMNS)
@@ -281,7 +281,7 @@ def draw_panels(
                 axes.set_xlabel(f"{across} from the lower left corner, m")
         _draw_scale(drawn[0][0], size_m, north=not local)
         bar = figure.colorbar(drawn[0][1], ax=[axes for axes, _ in drawn], extend="both", shrink=0.8, pad=0.02)
-        bar.set_label("power re peak of the panel, dB")
+        bar.set_label("power relative to the peak of the panel, dB")
 
 
 def _draw(axes: Axes, power: NDArray[np.float64], size_m: tuple[float, float]) -> AxesImage:
@@ -317,7 +317,7 @@ _MOST_PANELS = 2  # number of pairs drawn next to the sums
 
 
 def pictures_fused(campaign: Campaign, flight: str) -> Sequence[Path]:
-    """Write figures of a flight's sums and pairs, and of cuts through the brightest target; return their paths."""
+    """Write figures of the sums and pairs of a flight, and of cuts through the brightest target; return the paths."""
     lineage = result_of(campaign, "pictures_fused", flight).begin(campaign.root)
     written = [campaign.result(flight, FUSED, f"{name}.png") for name in SUM_PICTURES]
     panels, cuts = written

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from apertura.common.atomic import replacement
 
 WIDTH = 6.7
-"""Figure width in inches: A4 less margins of 2 cm."""
+"""Figure width in inches: width of an A4 page minus margins of 2 cm."""
 
 DPI = 220
 MOST_DOTS = 4000
-"""Maximum number of points drawn of a series; more would overlap."""
+"""Maximum number of points drawn for a series; more points would overlap."""
 
 BLUE, ORANGE, GREEN, RED, SKY, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#666666"
-"""Colours that are distinguishable with colour vision deficiency (Okabe and Ito)."""
+"""Colours that readers with colour vision deficiency can distinguish (Okabe and Ito)."""
 
 _STYLE: Any = {
     "font.size": 8,
@@ -41,14 +41,14 @@ _STYLE: Any = {
 
 
 def over(*, counted: bool, first: str = "first pulse") -> str:
-    """Return the label of an axis along a flight: seconds, or pulses if the recording has no times.
+    """Return the label of a time axis: seconds, or pulses if the recording contains no times.
 
     Examples
     --------
     >>> over(counted=False), over(counted=True)
-    ('time from the first pulse, s', 'pulses from the first pulse (no times recorded)')
+    ('time since the first pulse, s', 'pulses since the first pulse (no times recorded)')
     """
-    return f"pulses from the {first} (no times recorded)" if counted else f"time from the {first}, s"
+    return f"pulses since the {first} (no times recorded)" if counted else f"time since the {first}, s"
 
 
 @contextmanager
@@ -84,7 +84,7 @@ def sheet(path: Path, height: float, *, title: str, tags: Mapping[str, str]) -> 
 
 
 def column_of(figure: Figure, rows: int) -> list[Axes]:
-    """Add vertically stacked axes with a shared horizontal axis; only the lowest has tick labels there."""
+    """Add vertically stacked axes with a shared horizontal axis; only the lowest axes have horizontal tick labels."""
     grid = GridSpec(rows, 1, figure=figure)
     first = figure.add_subplot(grid[0])
     drawn = [first, *(figure.add_subplot(grid[row], sharex=first) for row in range(1, rows))]
@@ -94,7 +94,7 @@ def column_of(figure: Figure, rows: int) -> list[Axes]:
 
 
 def thinned(count: int, most: int = MOST_DOTS) -> NDArray[np.int64]:
-    """Return evenly spread indices for drawing a series, (point,) int64.
+    """Return evenly spaced indices of the points of a series to be drawn, (point,) int64.
 
     Examples
     --------

@@ -39,7 +39,7 @@ SETTING_COLUMNS = ("key", "value")
 
 
 def page(campaign: Campaign, flight: str) -> list[Path]:
-    """Write results/<flight>/report.html; return its path."""
+    """Write results/<flight>/report.html; return the path of the file."""
     lineage = result_of(campaign, "page", flight).begin(campaign.root)
     reports = {name: read_report(campaign, flight, name) for name in campaign.flight(flight).images}
     text = campaign.result(flight, PAGE)
@@ -58,7 +58,7 @@ def _blocks(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, 
     )
     yield Table("Image quality.", VERDICTS, [verdict_row(name, report) for name, report in reports.items()])
     if FUSED in reports:
-        yield Heading(2, "Pairs and their sums")
+        yield Heading(2, "Pairs and sums")
         yield Paragraph(" ".join(sentences("Sum of the pairs", reports[FUSED])))
         yield from _pictures(campaign.result(flight, FUSED), {f"{name}.png": "pictures" for name in SUM_PICTURES})
     for pair in campaign.flight(flight).pairs:
@@ -79,7 +79,7 @@ def _pair_blocks(campaign: Campaign, flight: str, pair: str, report: Mapping[str
     yield Paragraph(" ".join(sentences(f"Image {pair}", report)))
     yield from _pictures(folder, shown)
     yield Table(
-        "Error budget; values in brackets: not in the sum, because the size of the error is not configured.",
+        "Error budget. Values in brackets are not in the sum, because the size of the error is not configured.",
         BUDGET,
         budget_rows(report["budget"]),
     )
@@ -87,7 +87,7 @@ def _pair_blocks(campaign: Campaign, flight: str, pair: str, report: Mapping[str
 
 
 def _pictures(folder: Path, shown: Mapping[str, str]) -> Iterator[Block]:
-    """Yield figures of a folder, given as file → result that lists it, with their captions of the workflow's report."""
+    """Yield figures of a folder, given as file → result that lists the file, with captions of the workflow's report."""
     for name, result in shown.items():
         check_listed(folder / name, folder / f"{result}.manifest.json")
         caption = (shipped() / "workflow" / "report" / f"{Path(name).stem}.rst").read_text(encoding="utf-8")
@@ -95,7 +95,7 @@ def _pictures(folder: Path, shown: Mapping[str, str]) -> Iterator[Block]:
 
 
 def flight_rows(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
-    """Return table rows with date, location, band and geometry of a flight; the geometry is that of the first pair."""
+    """Return table rows with date, location, band and geometry of a flight; the first pair determines the geometry."""
     pairs = campaign.flight(flight).pairs
     views = [reports[pair]["view"] for pair in pairs if "view" in reports[pair]]
     scene = settled_scene(campaign)
@@ -127,7 +127,7 @@ def _position_text(position: Any) -> str:
 
 
 def setting_rows(campaign: Campaign) -> list[tuple[str, str]]:
-    """Return table rows with the settings of a campaign, config key and value, and its output grid with reasons."""
+    """Return table rows with the settings of a campaign (config key and value), and the output grid with reasons."""
     scene, values = settled_scene(campaign), campaign.values
     west, south, east, north = scene.grid.bounds_m
     rows, columns = scene.grid.shape
@@ -144,7 +144,7 @@ def setting_rows(campaign: Campaign) -> list[tuple[str, str]]:
 
 
 def _set_rows(section: str, values: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the settings of a section that are not chosen automatically and apply to its format."""
+    """Return the settings of a section that are not chosen automatically and apply to the configured format."""
     unset: tuple[object, ...] = ("auto", None, "", (), [], {})
     without = {"trigger"} if str(values.get("format")).startswith("beat_") and values["format"] != "beat_wav" else set()
     return [
@@ -193,7 +193,7 @@ def _why(scene: OpenScene, name: str) -> str:
 
 
 def landing(campaign: Campaign) -> dict[str, Any]:
-    """Return parts of the first page of the workflow's report as reStructuredText, without markup except tables."""
+    """Return parts of the first page of the workflow's report as reStructuredText with no markup other than tables."""
     flights = {flight.name: flight.pairs for flight in campaign.image_flights}
     reports = {
         f"{flight} {name}": read_report(campaign, flight, name)
@@ -222,7 +222,7 @@ def landing(campaign: Campaign) -> dict[str, Any]:
 def open_report(campaign: Campaign) -> Iterator[tuple[Path, Path]]:
     """Yield the paths of Snakemake's report and its style sheet; record the report when the context exits.
 
-    The sources are hashed on exit, because Snakemake updates file times before it writes the report.
+    The sources are hashed on exit, because Snakemake updates the times of files before writing the report.
     """
     path = campaign.result(PAGE)
     with TemporaryDirectory() as folder, replacement(path) as temporary:

@@ -1,4 +1,4 @@
-"""`apertura verify`: compare each link of the provenance chain from a product to the raw samples with its hashes."""
+"""`apertura verify`: check the hashes of each link in the provenance chain from a product to the raw samples."""
 
 import json
 import re
@@ -41,7 +41,7 @@ _VERSIONS_NAMED = 4
 HASH = re.compile("[0-9a-f]{64}")
 _NO_FILE = "is not a regular file"
 _FILES = {"missing": "missing", "altered": "changed", "added": "is new"}
-"""State of a file of a stage → text."""
+"""Result of the comparison of a file of a stage → text."""
 
 
 @dataclass
@@ -54,8 +54,8 @@ class ChainLink:
         A file or stage relative to the campaign folder; or "code of", "settings of" or "tags of" a file.
     state
         Result of the comparison with the recorded hash.
-    why
-        The differences, each with the file that contains the recorded hash.
+    reason
+        Differences, each with the name of the file that contains the recorded hash.
     """
 
     name: str
@@ -70,7 +70,7 @@ class ChainLink:
 
 
 class Links:
-    """Links by name; each file is read once.
+    """Links by name; each file is read only once.
 
     Parameters
     ----------
@@ -97,11 +97,11 @@ class Links:
         yield from self._links.values()
 
     def of(self, name: str) -> ChainLink:
-        """Return the link of a given name, created if necessary."""
+        """Return the link with a given name; create the link if necessary."""
         return self._links.setdefault(name, ChainLink(name))
 
     def sha256(self, name: str) -> str:
-        """Return the sha256 of a file below the campaign folder, empty if missing, or the reason for not reading it."""
+        """Return the SHA-256 of a file in the campaign folder; '' if missing; an error message if not readable."""
         if name not in self._digests:
             try:
                 self._digests[name] = sha256_present(ConfinedPath.at(self.root).named(name, where=self.root))
@@ -110,17 +110,17 @@ class Links:
         return self._digests[name]
 
     def exists(self, name: str) -> bool:
-        """Return True if a file exists and was read."""
+        """Return True if a file exists and can be read."""
         return HASH.fullmatch(self.sha256(name)) is not None
 
     def compare(self, recorded: Mapping[str, str], by: str) -> None:
-        """Compare files, relative to the campaign folder, with the hashes recorded in `by`."""
+        """Compare files, named relative to the campaign folder, with the hashes recorded in `by`."""
         for name in recorded:
             self.of(name)
         self.add(compare(recorded, self.sha256), by)
 
     def add(self, differences: Iterable[Difference], by: str) -> None:
-        """Add differences from the record `by` to the links of the files and sources."""
+        """Add differences from the record in `by` to the links of the files and sources."""
         for difference in differences:
             link = self.of(difference.name)
             if difference.state == "missing":
@@ -132,7 +132,7 @@ class Links:
                 link.add("changed", difference.present)
 
     def compare_stage(self, name: str, recorded: Mapping[str, str], by: str) -> None:
-        """Compare all files of a stage's folder, including chunks, with their hashes; as `compare`."""
+        """Compare all files in the folder of a stage, including chunks, with the hashes recorded in `by`."""
         link = self.of(name)
         try:
             folder = ConfinedPath.at(self.root).named(name, where=by)
@@ -189,7 +189,7 @@ class Chain:
     links
         Links in the order in which they were compared.
     notes
-        Software versions that differ from those installed, a line each.
+        Differences between recorded and installed software versions, one line per difference.
     """
 
     def __init__(self, root: Path) -> None:
@@ -207,17 +207,17 @@ class Chain:
                 self._rows[result.manifest] = result
             self._expected = [manifest for manifest in self._rows if not on_demand(campaign, manifest)]
             self._has_config = True
-        except CampaignError as error:  # the hashes in the manifests can still be compared
+        except CampaignError as error:  # without a config, the hashes in the manifests can still be compared
             self._has_config = False
             state: State = "changed" if (root / CONFIG).is_file() else "missing"
             self.links.of("campaign").add(state, str(error).replace(f"{root}/", ""))
 
     def promised(self) -> list[str]:
-        """Return the manifests of a finished campaign according to its config."""
+        """Return the manifests that a finished campaign contains according to its config."""
         return self._expected
 
     def walk(self, manifests: Iterable[str] = ()) -> None:
-        """Compare results with their manifests, and recursively all sources of them and of the tags compared before."""
+        """Compare results with their manifests; then, recursively, compare all sources of these results and of tags."""
         for manifest in manifests:
             link = self.links.of(manifest)
             if self.links.exists(manifest):
@@ -233,19 +233,20 @@ class Chain:
                 walked.add(manifest)
                 self._result(manifest)
         if all(link.state == "same" for link in self.links if link.name.endswith(SUFFIX)):
-            for name, inputs in self._inputs.items():  # only a complete chain contains all inputs
+            for name, inputs in self._inputs.items():  # only a complete provenance chain contains all inputs
                 for role in [role for role, digest in inputs.items() if digest not in self._leaves]:
                     self.links.of(name).add("changed", f"APERTURA_INPUTS: the hash of {role} is not in the chain")
 
     def tagged(self, path: Path, name: str, sources: Mapping[str, str] | None = None) -> bool:
-        """Compare the tags of a file; return False if it has none.
+        """Compare the tags of a file with its sources; return False if the file has no tags.
 
         Parameters
         ----------
         path, name
             Path of the file, and its name in messages.
         sources
-            Sources in the manifest that lists the file; None if no manifest does, and the chain starts at its tags.
+            Sources in the manifest that lists the file; None if no manifest lists the file, so that the chain starts at
+            the tags.
         """
         link = f"tags of {name}"
         try:
@@ -268,12 +269,12 @@ class Chain:
             if stated.get(source) != sources.get(source):
                 in_tag, in_manifest = (shortened(hashes_of.get(source)) for hashes_of in (stated, sources))
                 self.links.of(link).add(
-                    "changed", f"APERTURA_SOURCES: {source} is {in_tag}, in the manifest {in_manifest}"
+                    "changed", f"APERTURA_SOURCES: {source} is {in_tag} in the tag, and {in_manifest} in the manifest"
                 )
         return True
 
     def _follow(self, sources: Mapping[str, str]) -> None:
-        """Queue the manifests among a result's sources, and note the hashes of sources that are inputs."""
+        """Queue the manifests among the sources of a result, and record the hashes of the sources that are inputs."""
         for name, digest in sources.items():
             if not name.startswith("results/"):
                 self._leaves.add(digest)
@@ -281,7 +282,7 @@ class Chain:
                 self._waiting.append(name)
 
     def _result(self, manifest: str) -> None:
-        """Compare the files of a result, its sources, code and settings with its manifest."""
+        """Compare files, sources, code and settings of a result with its manifest."""
         link, path = self.links.of(manifest), self.root / manifest
         try:
             recorded = read_manifest(path)
@@ -289,16 +290,16 @@ class Chain:
             link.add("changed", error.found)
             return
         if path.read_text(encoding="utf-8") != json.dumps(recorded, indent=1, sort_keys=True) + "\n":
-            link.add("changed", "not in the form that the workflow writes")
+            link.add("changed", "not formatted as by the workflow")
         self._files(manifest, recorded["files"], recorded.get("sources", {}))
         if not states_origin(recorded):
-            link.add("changed", "contains no sources, code or settings, as manifests of versions before 0.1.0")
+            link.add("changed", "contains no sources, code or settings, like manifests of versions before 0.1.0")
             return
         self._origin(manifest, recorded)
         self._follow(recorded["sources"])
 
     def _files(self, manifest: str, files: Mapping[str, str], sources: Mapping[str, str]) -> None:
-        """Compare the files of a result; a stage with all of its chunks is one link."""
+        """Compare the files of a result; a stage with all its chunks is a single link."""
         folder, stages = manifest.rpartition("/")[0], dict[str, dict[str, str]]()
         for file, digest in files.items():
             stage, in_stage, rest = file.partition(".zarr/")
@@ -313,9 +314,9 @@ class Chain:
             self.links.compare_stage(name, chunks, manifest)
 
     def _origin(self, manifest: str, recorded: Mapping[str, Any]) -> None:
-        """Compare recorded sources, code and settings of a result with the present ones."""
+        """Compare the recorded sources, code and settings of a result with the current ones."""
         result, link = self._rows.get(manifest), self.links.of(manifest)
-        if result is None:  # without a config the formats, and so the code of a result, are unknown
+        if result is None:  # without a config, the formats and therefore the code of a result are unknown
             if self._has_config:
                 link.add("changed", "not a result of the campaign as configured")
             self.links.compare(recorded["sources"], manifest)
@@ -326,23 +327,23 @@ class Chain:
         for difference in compare_origin(recorded, result, self.links.sha256):
             if difference.part == "code":
                 made_by, installed = shortened(difference.recorded), shortened(difference.present)
-                parts["code"].add("changed", f"made by code {made_by}, installed is {installed}")
+                parts["code"].add("changed", f"made by code {made_by}, but code {installed} is installed")
             elif difference.part == "settings":
-                parts["settings"].add("changed", f"{CONFIG} or a table in its folder was changed since")
+                parts["settings"].add("changed", f"{CONFIG} or a table in its folder was changed after the run")
             elif difference.state == "added":
                 link.add("changed", f"has the additional source {difference.name}")
             else:
                 self.links.add([difference], manifest)
 
     def _runspec(self, link: ChainLink, stated: Mapping[str, Any], sources: Mapping[str, str]) -> None:
-        """Compare the settings in the tags with those of the source images."""
+        """Compare the settings in the tags with the settings of the source images."""
         for source in sources:
             folder, _, stage = source.rpartition("/")
             if stage == "image.manifest.json":
                 spec = _spec(ConfinedPath.at(self.root).named(f"{folder}/image.zarr/zarr.json", where=link.name))
-                image = folder.removeprefix("results/")  # with several images, settings are stored by image name
+                image = folder.removeprefix("results/")  # for several images, settings are stored by image name
                 candidates = stated, stated.get(image), stated.get(image.rpartition("/")[2])
-                # a calibrated layer has settings of its own in addition to those of the image
+                # a calibrated layer has further settings in addition to those of the image
                 is_stated = isinstance(spec, Mapping) and any(
                     isinstance(settings, Mapping) and {**settings, **spec} == settings for settings in candidates
                 )
@@ -359,27 +360,27 @@ def _spec(path: Path) -> Any:
 
 
 def other_versions(tags: Mapping[str, str], made_with: Mapping[str, Any], name: str) -> Iterator[str]:
-    """Yield a line for each difference between the software versions in a file's tags and those installed.
+    """Yield a line for each difference between the software versions in the tags of a file and the installed versions.
 
-    A different version is not a change of the product, but may explain one.
+    A different version is not a change of the product, but may explain a change.
 
     Parameters
     ----------
     tags
         Tags of the file.
     made_with
-        Its tag ``APERTURA_SOFTWARE``.
+        Contents of the tag ``APERTURA_SOFTWARE``.
     name
         Name of the file in messages.
 
     Examples
     --------
     >>> list(other_versions({"APERTURA_VERSION": "0.0.9"}, {}, "db.tif"))
-    ['apertura 0.0.9 made products such as db.tif, 0.1.0 is installed: the code differs']
+    ['apertura 0.0.9 made products such as db.tif, but 0.1.0 is installed: the code differs']
     """
     version = tags.get("APERTURA_VERSION", "before 0.1.0")
     if version != __version__:
-        yield f"apertura {version} made products such as {name}, {__version__} is installed: the code differs"
+        yield f"apertura {version} made products such as {name}, but {__version__} is installed: the code differs"
     installed = software() if made_with else {}
     packages = sorted(
         package
@@ -392,9 +393,9 @@ def other_versions(tags: Mapping[str, str], made_with: Mapping[str, Any], name: 
             for package in packages[:_VERSIONS_NAMED]
         )
         more = f" and {len(packages) - _VERSIONS_NAMED} more" if len(packages) > _VERSIONS_NAMED else ""
-        yield f"made with {listed}{more}: bytes may differ when products are recomputed"
+        yield f"products were made with {listed}{more}: bytes may differ after recomputation"
     if tags.get("APERTURA_LOCK_SHA256", lock_sha256()) != lock_sha256():
-        yield "made with a different requirements/all.txt"
+        yield "products were made with a different requirements/all.txt"
 
 
 def verify(path: Path, campaign: Path | None = None) -> Chain:
@@ -410,12 +411,12 @@ def verify(path: Path, campaign: Path | None = None) -> Chain:
     Returns
     -------
     Chain
-        The compared links; every byte was read, and nothing written.
+        The compared links. All bytes are read, and nothing is written.
 
     Raises
     ------
     CampaignError
-        If the path is not a product, or its campaign is unknown.
+        If the path is not a product, or the campaign of the product is unknown.
     """
     product = find_product(path, campaign)
     chain = Chain(product.root)
@@ -429,7 +430,7 @@ def verify(path: Path, campaign: Path | None = None) -> Chain:
 
 
 def _start(chain: Chain, product: Product, file: Path) -> None:
-    """Start a chain at a file: at the manifest that lists it, else at its tags."""
+    """Start a chain at a file: at the manifest that lists the file; if there is none, at the tags of the file."""
     below = file.is_relative_to(product.root)
     name = file.relative_to(product.root).as_posix() if below else file.name
     if product.manifest:
@@ -438,9 +439,9 @@ def _start(chain: Chain, product: Product, file: Path) -> None:
         return
     if not chain.tagged(file, name):
         expected = "a file that a manifest lists, or a file with tags of apertura"
-        raise CampaignError("not listed in any manifest", file, expected, "Name a file that the workflow wrote.")
+        raise CampaignError("not listed in any manifest", file, expected, "Specify a file that the workflow wrote.")
     found = "not listed in any manifest" if below else "not identical to any file of that campaign"
-    chain.links.of(name).add("changed", f"{found}; sources taken from its tags")
+    chain.links.of(name).add("changed", f"{found}; the sources are those in its tags")
 
 
 def print_verified(path: Path, campaign: Path | None = None, *, quiet: bool = False) -> int:
@@ -449,14 +450,14 @@ def print_verified(path: Path, campaign: Path | None = None, *, quiet: bool = Fa
     Parameters
     ----------
     path, campaign
-        As `verify`.
+        See `verify`.
     quiet
         Print only changed and missing links.
 
     Raises
     ------
     CampaignError
-        As `verify`; the tags of the file are printed before.
+        See `verify`; before the error is raised, the tags of the file are printed.
     """
     try:
         chain = verify(path, campaign)
@@ -498,14 +499,14 @@ def changed_files(root: Path, *, inputs: bool = True) -> dict[str, str]:
     Parameters
     ----------
     root
-        Folder of the crate, the results of a campaign.
+        Folder of the crate, i.e. the results folder of a campaign.
     inputs
         Include recordings and config, which are in the parent folder.
 
     Raises
     ------
     CampaignError
-        If there is no crate, it is damaged, or it names a file outside of these folders.
+        If the crate is missing or damaged, or names a file outside these folders.
     """
     files = recorded_files(root, inputs=inputs)
 
@@ -514,7 +515,7 @@ def changed_files(root: Path, *, inputs: bool = True) -> dict[str, str]:
         try:
             return sha256_file(path) if path.is_file() else ""
         except OSError as error:
-            expected, remedy = "a readable file", "Grant read permission, or copy it again."
+            expected, remedy = "a readable file", "Grant read permission, or copy the file again."
             raise CampaignError(f"not readable ({error.strerror})", path, expected, remedy) from error
 
     differences = compare({name: file.sha256 for name, file in files.items()}, present)
@@ -527,7 +528,7 @@ def print_checked(folder: Path, *, quiet: bool = False) -> int:
     Parameters
     ----------
     folder
-        A campaign folder, or its results; recordings are compared if the results are inside a campaign folder.
+        A campaign folder, or its results folder; recordings are compared if the results are inside a campaign folder.
     quiet
         Print differences only.
 
@@ -539,11 +540,11 @@ def print_checked(folder: Path, *, quiet: bool = False) -> int:
     Raises
     ------
     CampaignError
-        If there is no crate, or it is damaged.
+        If the crate is missing or damaged.
     """
     root = folder if (folder / CRATE).is_file() else folder / "results"
     if folder.is_file():
-        raise CampaignError("a file", folder, "a campaign folder, or its results", "Name the folder.")
+        raise CampaignError("a file", folder, "a campaign folder, or its results folder", "Specify the folder.")
     in_campaign = (root.parent / "config").is_dir()
     lines = [f"{name}: {state}" for name, state in changed_files(root, inputs=in_campaign).items()]
     if (root / "stac" / CATALOG).is_file():

@@ -31,20 +31,20 @@ _READ_BYTES = 1 << 20
 
 @dataclass
 class Tally:
-    """Difference statistics of two arrays, accumulated block by block.
+    """Statistics of the differences between two arrays, accumulated block by block.
 
     Attributes
     ----------
     compared
         Number of values that are finite in both arrays.
     only
-        Number of values that are finite in the first array only, and in the second only.
+        Numbers of values that are finite in the first array only and in the second array only.
     differing
-        Number of values that differ, including those finite in one array only.
+        Number of values that differ, including values that are finite in only one array.
     largest, square
-        Largest magnitude of the difference, and sum of its squares.
+        Largest magnitude of the differences, and sum of their squared magnitudes.
     peak
-        Largest magnitude in either array.
+        Largest magnitude in both arrays.
     phased
         True if values are complex.
 
@@ -67,14 +67,14 @@ class Tally:
 
     @classmethod
     def of(cls, blocks: Iterable[tuple[Pixels, Pixels]]) -> "Tally":
-        """Return the statistics of pairs of blocks of equal shape, real or complex."""
+        """Return the statistics of pairs of real or complex blocks; the blocks of a pair have equal shape."""
         tally = cls()
         for first, second in blocks:
             tally.add(np.asarray(first), np.asarray(second))
         return tally
 
     def add(self, first: Pixels, second: Pixels) -> None:
-        """Add a block of each array."""
+        """Add a block of either array."""
         valid = np.isfinite(first), np.isfinite(second)
         lacking = int((valid[0] & ~valid[1]).sum()), int((valid[1] & ~valid[0]).sum())
         self.only = self.only[0] + lacking[0], self.only[1] + lacking[1]
@@ -96,12 +96,12 @@ class Tally:
 
     @property
     def rms(self) -> float:
-        """RMS of the difference; 0 if no value is finite in both arrays."""
+        """RMS of the differences; 0 if no value is finite in both arrays."""
         return float(np.sqrt(self.square / self.compared)) if self.compared else 0.0
 
     @property
     def alike(self) -> float:
-        """Coherence |Σ a b*| / √(Σ|a|² Σ|b|²) of complex values, correlation of real values; NaN if undefined."""
+        """Coherence |Σ a b*| / √(Σ|a|² Σ|b|²) of complex values, or correlation of real values; NaN if undefined."""
         if self._sums is None:
             return float("nan")
         sum_a, sum_b, aa, bb, ab = self._sums
@@ -115,7 +115,7 @@ class Tally:
 
 
 def rows_of(shape: tuple[int, ...], itemsize: int, *, block_bytes: int = 1 << 24) -> Iterator[slice]:
-    """Yield slices of rows of an array, each of at most `block_bytes` or one row.
+    """Yield slices of rows of an array; each slice has at most `block_bytes`, or is a single row.
 
     Examples
     --------
@@ -128,24 +128,25 @@ def rows_of(shape: tuple[int, ...], itemsize: int, *, block_bytes: int = 1 << 24
 
 
 def differences(first: Path, second: Path) -> dict[str, list[str]]:
-    """Return section → differences between two products, a line each; empty for sections that agree.
+    """Return section → differences between two products, one line per difference; empty for sections that agree.
 
     Parameters
     ----------
     first, second
-        Rasters, PNG images, stages or other files, both of the same kind; of one campaign or of two.
+        Rasters, PNG images, stages or other files, both of the same kind, from the same or from different campaigns.
 
     Raises
     ------
     CampaignError
-        If one is missing or not readable, or they are of different kinds.
+        If a product is missing or not readable, or if the products are of different kinds.
     """
     first, second = as_product(first), as_product(second)
     for path in (first, second):
         if not path.exists():
             raise CampaignError("no such file or folder", path, EXPECTED, "Correct the path.")
     if first.is_dir() != second.is_dir() or first.suffix != second.suffix:
-        raise CampaignError(f"of a different kind than {first.name}", second, "two products of the same kind", REMEDY)
+        found = f"not of the same kind as {first.name}"
+        raise CampaignError(found, second, "two products of the same kind", REMEDY)
     sections = sections_of(first), sections_of(second)
     lines: dict[str, list[str]] = {}
     for section in (name for name in SECTIONS if name in sections[0]):
@@ -162,7 +163,7 @@ def differences(first: Path, second: Path) -> dict[str, list[str]]:
     elif first.suffix == ".png":
         images = [np.asarray(picture(path)).astype(np.float32) for path in (first, second)]
         tally = Tally.of([(images[0], images[1])]) if images[0].shape == images[1].shape else None
-        lines["pixels"] = list(difference_lines(tally, unit="of 255")) if tally else []  # sizes: see geometry
+        lines["pixels"] = list(difference_lines(tally, unit="of 255")) if tally else []  # section geometry lists sizes
     if not any(lines.values()):
         offset = first_difference(first, second)
         lines["bytes"] = [] if offset is None else [f"first difference at byte {offset}"]
@@ -176,7 +177,7 @@ def _cut(text: str | None) -> str:
 
 
 def first_difference(first: Path, second: Path) -> int | None:
-    """Return the offset of the first byte in which two files differ; None if they are identical.
+    """Return the offset of the first byte in which two files differ; None if the files are identical.
 
     Examples
     --------
@@ -196,12 +197,12 @@ def first_difference(first: Path, second: Path) -> int | None:
 
 
 def _rasters(*paths: Path) -> Iterator[str]:
-    """Yield the differences between the pixels of two rasters in the overlap of their grids."""
+    """Yield lines on the differences between the pixels of two rasters in the overlap of their grids."""
     with ExitStack() as stack:
         first, second = (stack.enter_context(opened_raster(path, expected=EXPECTED, remedy=REMEDY)) for path in paths)
         shift = _shift(first, second)
         if shift is None:
-            yield "not compared: CRS or pixel spacing differ, or the offset is not an integer number of pixels"
+            yield "not compared: CRS or pixel spacing differ, or the grid offset is not an integer number of pixels"
             return
         down, right = shift
         rows = range(max(0, down), min(first.height, second.height + down))
@@ -210,13 +211,13 @@ def _rasters(*paths: Path) -> Iterator[str]:
             yield "not compared: the grids do not overlap"
             return
         if (len(rows), len(columns)) != first.shape or first.shape != second.shape:
-            yield f"compared in the overlap: {len(columns)} × {len(rows)} pixels"
+            yield f"compared in the overlap of the grids, {len(columns)} × {len(rows)} pixels"
         tally = Tally.of(_blocks(first, second, (rows[0], columns[0]), shift, (len(rows), len(columns))))
         yield from difference_lines(tally, unit=first.units[0] or "1", power="power" in (first.descriptions[0] or ""))
 
 
 def _shift(first: Any, second: Any) -> tuple[int, int] | None:
-    """Return row and column of the second raster's origin in the first; None if the grids do not coincide."""
+    """Return the origin of the second raster as row and column of the first; None if the grids are not aligned."""
     a, b = first.transform, second.transform
     if first.crs != second.crs or not np.allclose(a[:2] + a[3:5], b[:2] + b[3:5], rtol=1e-9, atol=0):
         return None
@@ -242,7 +243,7 @@ def _blocks(
 
 
 def _stages(*folders: Path) -> Iterator[str]:
-    """Yield the differences between the arrays of two stages, prefixed with the array name."""
+    """Yield lines on the differences between the arrays of two stages, each with the array name as prefix."""
     first, second = (open_stage(folder, folder.stem) for folder in folders)
     for name in first.variables:
         if (
@@ -266,19 +267,19 @@ def _rows(first: Any, second: Any) -> Iterator[tuple[Pixels, Pixels]]:
 
 
 def _numbers(values: Pixels) -> Pixels:
-    """Return values as numbers, times in seconds."""
+    """Return values as numbers; times are converted to seconds."""
     return values.astype("M8[ns]").astype(np.int64) / 1e9 if values.dtype.kind == "M" else values
 
 
 def difference_lines(tally: Tally, *, unit: str = "1", power: bool = False) -> Iterator[str]:
-    """Describe the differences between two arrays in up to two lines; no line if they are identical.
+    """Describe the differences between two arrays in up to two lines; no line if the arrays are identical.
 
     Parameters
     ----------
     tally
-        Difference statistics of both arrays.
+        Statistics of the differences.
     unit
-        Unit of their values; without a unit, differences are in dB relative to the peak.
+        Unit of the values; if the unit is "1", differences are stated in dB relative to the peak.
     power
         True if values are powers, False for amplitudes.
 
@@ -300,11 +301,11 @@ def difference_lines(tally: Tally, *, unit: str = "1", power: bool = False) -> I
         count = tally.compared + sum(tally.only)
         yield f"{tally.differing} of {count} values differ: maximum {largest}, rms {rms}; {measure} {tally.alike:.6f}"
     if any(tally.only):
-        yield f"{tally.only[0]} values are finite in the first only, {tally.only[1]} in the second only"
+        yield f"{tally.only[0]} values are finite only in the first product, {tally.only[1]} only in the second"
 
 
 def print_differences(first: Path, second: Path, *, whole: bool = False) -> int:
-    """Print the differences between two products, a line each; return 0 without differences, else 1."""
+    """Print the differences between two products, one line per difference; return 0 without differences, else 1."""
     sections = differences(first, second)
     for section, lines in sections.items():
         most = len(lines) if whole else _LINES
@@ -320,7 +321,7 @@ _LONGEST = 400
 
 
 def print_reproduced(path: Path, *, cores: int, keep: Path | None = None) -> int:
-    """Recompute a product in another folder and print differences; the campaign itself is only read.
+    """Recompute a product in another folder and print the differences; the campaign folder is only read.
 
     Parameters
     ----------
@@ -329,28 +330,28 @@ def print_reproduced(path: Path, *, cores: int, keep: Path | None = None) -> int
     cores
         Number of cores to use.
     keep
-        A new folder for the recomputed results, which is kept; None uses a temporary folder.
+        A new folder for the recomputed results, which is kept; None for a temporary folder.
 
     Returns
     -------
     int
-        0 if every byte is identical, 1 if not; the exit status of the workflow if it fails.
+        0 if all bytes are identical, otherwise 1; the exit status of the workflow if the workflow fails.
 
     Raises
     ------
     CampaignError
-        If the path is not a product of the campaign as configured, or a run of the campaign is in progress.
+        If the path is not a product of the campaign as configured, or if a run of the campaign is in progress.
     """
     product = find_product(path)
     campaign, whole = Campaign.load(product.root), product.file is None
     running = holder(product.root)
     if running is not None:
-        found, remedy = f"a run is in progress: {running}", "Wait until it ends."
+        found, remedy = f"a run is in progress: {running}", "Wait until the run finishes."
         raise CampaignError(found, product.root, "a campaign without a run in progress", remedy)
     known = [result.manifest for _, result in results_of(campaign)]
     if not whole and product.manifest not in known:
-        expected = f"one of the {len(known)} results of its campaign"
-        remedy = "Choose one of the output of `apertura list`."
+        expected = f"one of the {len(known)} results of the campaign"
+        remedy = "Choose a result listed by `apertura list`."
         raise CampaignError("not a result of the campaign as configured", path, expected, remedy)
     requested = [manifest for manifest in known if (product.root / manifest).is_file()] if whole else [product.manifest]
     if not requested:
@@ -369,15 +370,15 @@ def print_reproduced(path: Path, *, cores: int, keep: Path | None = None) -> int
 
 
 def _outcome(root: Path, again: Path, requested: Sequence[str], known: Sequence[str]) -> list[str]:
-    """Return lines with the differences of the requested results and the first differing result, or their agreement."""
+    """Return lines on the differences of the requested results and the first differing result, or on the agreement."""
     lines = [line for manifest in requested for line in compared(root, again, manifest)]
     if not lines:
         count, more = sum(len(_files(root, manifest)) for manifest in requested), len(requested) - 1
         others = f" and {more} more results" if more else ""
-        return [f"same     {number_of(count, 'file')}, byte for byte, of {requested[0]}{others}"]
+        return [f"same     {number_of(count, 'file')} of {requested[0]}{others}, identical byte for byte"]
     first = next((manifest for manifest in known if _differs(root, again, manifest)), None)
     if first is None:
-        return [*lines, "the manifests agree: a file was changed after it was made, see `apertura verify`"]
+        return [*lines, "the manifests agree: a file was changed after the run, see `apertura verify`"]
     return [*lines, f"the first result of the chain that differs is {first}"]
 
 
@@ -390,22 +391,22 @@ def _scratch(campaign: Campaign, keep: Path | None) -> Iterator[Path]:
             yield with_inputs(campaign, Path(folder, root.name), link=True)
         return
     if keep.is_relative_to(root) or keep.is_symlink() or (keep.exists() and not keep.is_dir()):
-        found = "inside the campaign, a symbolic link or not a folder"
-        raise CampaignError(found, keep, "a new folder outside the campaign", "Name another folder.")
+        found = "a path inside the campaign, a symbolic link, or not a folder"
+        raise CampaignError(found, keep, "a new folder outside the campaign", "Specify another folder.")
     if keep.is_dir() and any(keep.iterdir()):
-        raise CampaignError("not empty", keep, "a new folder", "Name another folder; nothing was changed.")
+        raise CampaignError("not empty", keep, "a new folder", "Specify another folder; nothing was changed.")
     yield with_inputs(campaign, keep, link=False)
 
 
 def compared(root: Path, again: Path, manifest: str) -> list[str]:
-    """Return the differences between a result and its recomputation, a line each.
+    """Return the differences between a result and its recomputation, one line per difference.
 
     Parameters
     ----------
     root, again
-        Campaign folders of the result and of its recomputation.
+        Campaign folders of the result and of the recomputation.
     manifest
-        Manifest of the result, relative to both.
+        Manifest of the result, relative to both folders.
 
     Raises
     ------

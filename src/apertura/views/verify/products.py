@@ -1,4 +1,4 @@
-"""Identify the product at a path and read its contents: tags of a GeoTIFF or PNG, a stage, a report."""
+"""Identify the product at a path and read its contents: tags of a file, attributes of a stage, or a report."""
 
 import json
 import warnings
@@ -31,9 +31,9 @@ class Product:
     root
         The campaign folder.
     manifest
-        Manifest of its result, relative to `root`; empty if no manifest lists it.
+        Manifest of the result that contains the product, relative to `root`; empty if no manifest lists the product.
     file
-        Path of the file, stage or manifest, also outside `root`; None for the whole campaign.
+        Path of the file, stage or manifest, which may be outside `root`; None for the whole campaign.
     """
 
     root: ConfinedPath
@@ -70,16 +70,16 @@ def find_product(path: Path, campaign: Path | None = None) -> Product:
         remedy = "Correct the path." if results is None else "Correct the path, or run the workflow (`apertura run`)."
         raise CampaignError("no such file or folder", path, _EXPECTED, remedy)
     if not is_listed and not (product.root / CONFIG).is_file():
-        remedy = "Give its campaign folder with --campaign."
-        found = "outside a campaign folder, so that its chain cannot be followed"
+        remedy = "Specify the campaign folder with --campaign."
+        found = "outside a campaign folder, so that the provenance chain cannot be followed"
         raise CampaignError(found, path, "a file below results/", remedy)
     if path.is_dir() and not product.manifest:
-        raise CampaignError("a folder that is not a result", path, _EXPECTED, "Name one of its files.")
+        raise CampaignError("a folder that is not a result", path, _EXPECTED, "Specify a file of the folder.")
     return product
 
 
 def as_product(path: Path) -> Path:
-    """Return a path typed by a user, confined to the campaign that contains it in its results, if any."""
+    """Return a path typed by a user; a path below the results of a campaign is confined to that campaign."""
     root = next((folder.parent for folder in path.parents if folder.name == "results"), None)
     return path if root is None else ConfinedPath.at(root) / path.relative_to(root)
 
@@ -92,9 +92,9 @@ def _manifest(results: Path, path: Path) -> str:
 
 
 def _listing(results: Path, path: Path, *, sha256: str = "") -> str:
-    """Return the manifest that lists a file, relative to the campaign; empty if there is none.
+    """Return the manifest that lists a file, relative to the campaign; empty if no manifest does.
 
-    With `sha256`, the file is identified by its hash and not by its path.
+    With `sha256`, the file is identified by hash instead of path.
     """
     for manifest in manifests(results):
         with suppress(CampaignError):  # a damaged manifest lists nothing
@@ -116,13 +116,13 @@ TAGGED = (".tif", ".png")
 """Suffixes of files with tags of apertura."""
 
 _TAGGED_AS = "an undamaged GeoTIFF or PNG of the workflow"
-_COPY_AGAIN = "Copy it again from its campaign, or run the workflow again."
+_COPY_AGAIN = "Copy the file again from its campaign, or run the workflow again."
 
 _OURS = "APERTURA_"
 
 
 def read_tags(path: Path) -> dict[str, str]:
-    """Return the tags of apertura in a file; an empty mapping for other file types.
+    """Return the tags of apertura in a file; an empty mapping for file types without tags.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def read_tags(path: Path) -> dict[str, str]:
     Raises
     ------
     CampaignError
-        If the file has the suffix of a GeoTIFF or PNG and is not readable as such.
+        If the file has the suffix of a GeoTIFF or PNG and is not readable in this format.
     """
     if path.suffix == ".tif":
         with opened_raster(path, expected=_TAGGED_AS, remedy=_COPY_AGAIN) as raster:
@@ -152,18 +152,18 @@ def ours(tags: Mapping[Any, Any]) -> dict[str, str]:
 
 
 def picture(path: Path) -> Any:
-    """Read a PNG with its pixels as `PIL.Image.Image`; raises as `read_tags`."""
+    """Read a PNG, including its pixels, as `PIL.Image.Image`; raises the same errors as `read_tags`."""
     from PIL import Image
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # refuses decompression bombs before decoding
+            warnings.simplefilter("error")  # reject decompression bombs before decoding
             with path.open("rb") as stream, Image.open(stream, formats=["PNG"]) as opened:
                 opened.load()  # text chunks may follow the pixels
                 return opened
     except MemoryError:
         raise
-    except Exception as error:  # a codec may raise anything
+    except Exception as error:  # a codec may raise any exception
         found = shown(str(error).replace(str(path), path.name), 200)
         raise CampaignError(f"not readable as PNG ({found})", path, _TAGGED_AS, _COPY_AGAIN) from error
 
@@ -198,7 +198,7 @@ def document(tags: Mapping[str, str], name: str, where: Path) -> dict[str, Any]:
 
 
 def hashes(tags: Mapping[str, str], name: str, where: Path) -> dict[str, str]:
-    """Return the hashes in a tag, name → hex; as `document`."""
+    """Return the hashes in a tag, name → hex; parameters and errors as in `document`."""
     digests = document(tags, name, where)
     with undamaged(where, expected="a hash for each name", remedy=_COPY_AGAIN):
         if not all(isinstance(text, str) for text in digests.values()):
@@ -207,10 +207,10 @@ def hashes(tags: Mapping[str, str], name: str, where: Path) -> dict[str, str]:
 
 
 SECTIONS = ("geometry", "settings", "inputs", "stages", "code", "software", "flags", "report")
-"""Sections in the order of comparison."""
+"""Sections of a product in the order of comparison."""
 
 EXPECTED = "a raster, a PNG image, a stage or a JSON file that the workflow wrote"
-REMEDY = "Name a file of a result, and the file to compare it with."
+REMEDY = "Specify a file of a result, and the file to be compared with it."
 
 _IN_OTHER_SECTIONS = ("RUNSPEC", "INPUTS", "SOURCES", "CODE_SHA256", "SOFTWARE", "FLAGS", "VERSION", "LOCK_SHA256")
 
@@ -223,7 +223,7 @@ def sections_of(path: Path) -> Sections:
     Parameters
     ----------
     path
-        A .tif, .png, .json or .geojson file, or the folder of a stage. Other files have no sections.
+        A .tif, .png, .json or .geojson file, or the folder of a stage; other files have no sections.
 
     Raises
     ------
@@ -250,7 +250,7 @@ def sections_of(path: Path) -> Sections:
 
 
 def _tag_sections(path: Path) -> Sections:
-    """Return the sections that are stored in the tags of a file."""
+    """Return the sections stored in the tags of a file."""
     tags = read_tags(path)
     others = {name.removeprefix("APERTURA_"): text for name, text in tags.items()}
     return {
@@ -266,7 +266,7 @@ def _tag_sections(path: Path) -> Sections:
 
 
 def _value(text: str) -> Any:
-    """Return the JSON value of a tag, or its text."""
+    """Return the JSON value of a tag; the text of the tag if it is not JSON."""
     try:
         return json.loads(text) if text[:1] in {"{", "["} else text
     except (ValueError, RecursionError):
@@ -274,7 +274,7 @@ def _value(text: str) -> Any:
 
 
 def _stage_sections(folder: Path) -> Sections:
-    """Return the sections of a finished stage from its attributes, without its arrays."""
+    """Return the sections of a finished stage, read from its attributes; arrays are not read."""
     if folder.suffix != ".zarr" or folder.stem not in STAGES:
         raise CampaignError("a folder that is not a stage", folder, EXPECTED, REMEDY)
     stage = open_stage(folder, folder.stem)
@@ -294,7 +294,7 @@ def _stage_sections(folder: Path) -> Sections:
 
 
 def flat(value: Mapping[str, Any]) -> dict[str, str]:
-    """Flatten nested mappings and lists to key.key… → text of the value.
+    """Flatten nested mappings and lists to a mapping of key.key… → text of the value.
 
     Examples
     --------
@@ -302,7 +302,9 @@ def flat(value: Mapping[str, Any]) -> dict[str, str]:
     {'waveform.carrier_hz': '1200000000.0', 'nodes.0': 'uav1', 'flags': '{}'}
     """
     texts: dict[str, str] = {}
-    stack: list[tuple[str, Any]] = [("", value)]  # no recursion: an untrusted document may exceed Python's limit
+    stack: list[tuple[str, Any]] = [
+        ("", value)
+    ]  # no recursion, because an untrusted document may exceed Python's limit
     while stack:
         key, node = stack.pop()
         children = node.items() if isinstance(node, Mapping) else enumerate(node) if isinstance(node, list) else ()

@@ -1,1 +1,1 @@
-"""Map of a campaign in a browser: a page with its images, served on this machine only."""
+"""Map of a campaign in a browser: a page with the images, served on this machine only."""

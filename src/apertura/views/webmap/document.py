@@ -1,4 +1,4 @@
-"""Rule `map`: contents of the map page as JSON: images, layers and their display ranges, points, links to the files."""
+"""Rule `map`: contents of the map page as JSON, i.e. images, layers with display ranges, points, and links to files."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,10 +25,10 @@ from apertura.views.quality import ImageValues, explained_flags, read_report
 from apertura.workflow.lineage import result_of
 
 FORMAT = 1
-"""Format version of `map.json`; the page refuses other versions."""
+"""Format version of `map.json`; the page rejects other versions."""
 
 KINDS = ("image", "classes", "measure")
-"""Style of a layer: greyscale between two adjustable dB values, a colour for each class, a colour ramp."""
+"""Styles of a layer: greyscale between two adjustable values in dB; a colour for each class; a colour ramp."""
 
 CLASSES = {0: "visible", 1: "shadow", 2: "layover", 3: "shadow and layover"}
 """Value of the mask → class name."""
@@ -36,7 +36,7 @@ CLASSES = {0: "visible", 1: "shadow", 2: "layover", 3: "shadow and layover"}
 
 @dataclass(frozen=True)
 class Layer:
-    """One raster of an image.
+    """Raster of an image.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Layer:
     kind
         One of `KINDS`.
     title, unit
-        Quantity and unit of its values.
+        Quantity and unit of the values.
     low, high
         Values at the ends of the colour scale, in `unit`.
     """
@@ -72,7 +72,7 @@ class Place:
     x_m, y_m
         Easting and northing, metres in the campaign's CRS.
     image
-        ``flight/pair`` of the image in which it was found; None for other sources.
+        ``flight/pair`` of the image in which the point was found; None for other sources.
     """
 
     name: str
@@ -90,9 +90,9 @@ def image_entry(flight: str, image: str, report: Mapping[str, Any], layers: Iter
     flight, image
         Flight, and pair or 'fused'.
     report
-        Its ``image.json``.
+        Contents of the image's ``image.json``.
     layers
-        Its rasters.
+        Rasters of the image.
     """
     values = ImageValues.of(report)
     return {
@@ -109,7 +109,7 @@ def image_entry(flight: str, image: str, report: Mapping[str, Any], layers: Iter
 
 
 def found_places(flight: str, image: str, report: Mapping[str, Any]) -> list[Place]:
-    """Return the brightest pixel of an image and the bright points used for its focus verdict.
+    """Return the brightest pixel of an image and the bright points used for the focus verdict.
 
     Examples
     --------
@@ -130,7 +130,7 @@ def found_places(flight: str, image: str, report: Mapping[str, Any]) -> list[Pla
 
 
 def url_of(file: str, sha256: str) -> str:
-    """Return the URL of a results file relative to ``map/``, with the hash that `MapServer` compares.
+    """Return the URL of a file in the results, relative to ``map/``, with the hash that `MapServer` compares.
 
     Examples
     --------
@@ -141,7 +141,7 @@ def url_of(file: str, sha256: str) -> str:
 
 
 def requested_file(target: str) -> tuple[str, str | None]:
-    """Return file name and expected hash (None if absent) of a request; the name is '' for an invalid request.
+    """Return file name and expected hash (None if absent) of a request; '' as the name of an invalid request.
 
     Parameters
     ----------
@@ -164,12 +164,12 @@ def requested_file(target: str) -> tuple[str, str | None]:
 
 
 def named_files(document: Mapping[str, Any]) -> dict[str, str]:
-    """Return the result files named in a `map.json`, file → sha256; empty for a format that the page refuses.
+    """Return the result files named in a `map.json`, file → SHA-256; empty for a format that the page rejects.
 
     Parameters
     ----------
     document
-        A document of `map_document`.
+        A document returned by `map_document`.
 
     Examples
     --------
@@ -195,7 +195,7 @@ def map_document(
     notes: Sequence[str] = (),
     again_s: float | None = None,
 ) -> dict[str, Any]:
-    """Return `map.json`.
+    """Return the contents of `map.json`.
 
     Parameters
     ----------
@@ -205,15 +205,15 @@ def map_document(
         ``bounds_m`` (west, south, east, north), ``spacing_m``, ``shape`` (rows, columns).
     crs
         ``name``; ``local``; ``code`` and ``proj4`` (None if not available); ``control``: (n, 4) easting and northing
-        (m) with longitude and latitude (deg, WGS 84) by PROJ, which the page uses to check its own projection.
+        (m), and longitude and latitude (deg, WGS 84) computed by PROJ, with which the page checks its projection.
     images
-        Entries of `image_entry`.
+        Entries returned by `image_entry`.
     places
         The target list.
     coverage_url
         URL of the GeoJSON with tracks and footprints; None for a local frame.
     notes
-        Remarks on the map for the reader.
+        Remarks on the map for the user.
     again_s
         Interval in seconds at which the page reloads the document during a flight; None if it does not change.
     """
@@ -231,18 +231,18 @@ def map_document(
     }
 
 
-_RANGE_SAMPLES = 512  # samples along a raster's longer side from which its value range is taken
+_RANGE_SAMPLES = 512  # samples along the longer side of a raster from which the range of values is determined
 _MOST_TARGETS = 1000
 
 
 def webmap(campaign: Campaign) -> list[Path]:
-    """Write results/map/map.json; return its path."""
+    """Write results/map/map.json; return the path of the file."""
     lineage = result_of(campaign, "map").begin(campaign.root)
     scene = settled_scene(campaign)
     images, places = [], [*stated_places(campaign)]
     notes: list[str] = []
     places += true_places(campaign, scene.grid.crs, notes)
-    # The last image of a flight is its sum; first in the document, it is the one that the map opens with.
+    # The last image of a flight is the sum. It is listed first in the document, because the map shows the first image.
     names = [(flight, image) for flight, (*pairs, last) in campaign.images.items() for image in (last, *pairs)]
     for flight, image in names:
         report = read_report(campaign, flight, image)
@@ -268,7 +268,7 @@ def webmap(campaign: Campaign) -> list[Path]:
 
 
 def _layers(campaign: Campaign, flight: str, image: str, report: Mapping[str, Any]) -> list[Layer]:
-    """Return the layers of an image for display: real-valued rasters, linear ones only if there is no dB version."""
+    """Return the displayed layers of an image: real-valued rasters, in linear units only if there is no dB version."""
     of_pairs = [("export", "pair"), ("layers", "layers"), ("layers", "radiometry")]
     kinds = [("export", "fused")] if image == FUSED else of_pairs
     return [
@@ -311,11 +311,11 @@ _SHOWN_IN_DB = frozenset({"image", "coherent", "noncoherent", "magnitude"})
 
 
 def _rounded(value: float) -> float:
-    return float(f"{value:.4g}") + 0.0  # avoids -0
+    return float(f"{value:.4g}") + 0.0  # the sum avoids -0
 
 
 def crs_of(grid: SceneGrid) -> dict[str, Any]:
-    """Return the CRS of a grid for the page, with control points for checking its projection."""
+    """Return the CRS of a grid for the page, with control points for checking the page's projection."""
     from pyproj import CRS
 
     crs = CRS.from_user_input(grid.crs_wkt)
@@ -332,12 +332,12 @@ def _proj4(crs: Any) -> str | None:
     import warnings
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # the control points detect losses of the PROJ.4 string
+        warnings.simplefilter("ignore", UserWarning)  # control points detect information missing in the PROJ.4 string
         return str(crs.to_proj4()) or None
 
 
 def stated_places(campaign: Campaign) -> list[Place]:
-    """Return the reference points and the calibration reflector of the config."""
+    """Return the reference points and the calibration reflector given in the config."""
     scene, calibration = campaign.settings.scene, campaign.settings.calibration
     points = [(point.name, point.position_m) for point in scene.reference_points]
     points += [("reflector", calibration.reflector_m)] if calibration is not None else []
@@ -345,13 +345,13 @@ def stated_places(campaign: Campaign) -> list[Place]:
 
 
 def true_places(campaign: Campaign, crs: str, notes: list[str]) -> list[Place]:
-    """Return the targets of a simulation, numbered as by `apertura score`; an unreadable truth.json becomes a note."""
+    """Return the targets of a simulation, numbered as in `apertura score`; add a note if truth.json is unreadable."""
     path = campaign.root.named("truth.json", where=campaign.root)
     if not path.is_file():
         return []
     try:
-        document = read_json(path, expected="the truth of a simulation", remedy="Delete it.")
-        with undamaged(path, expected="the truth of a simulation", remedy="Delete it."):
+        document = read_json(path, expected="the true targets of a simulation", remedy="Delete the file.")
+        with undamaged(path, expected="the true targets of a simulation", remedy="Delete the file."):
             targets = [(float(target["x"]), float(target["y"])) for target in document["targets"]]
             if document.get("crs", crs) != crs:
                 raise ValueError("targets and images are in different CRSs")

@@ -1,9 +1,10 @@
-"""Read-only HTTP server for the map of one campaign on this machine: the page, and products verified by their hashes.
+"""Read-only HTTP server for the map of a campaign on this machine: the page, and products verified by their hashes.
 
-A content security policy does not prevent a page from navigating its own window to another site. The map is therefore
-a frame of another origin: the policy of the outer window limits the navigation of the frame, and a sandboxed frame
-can neither navigate nor open a window. Browsers that support connection allowlists (Chromium 152) apply them to all
-connections, including name look-ups, early connections and WebRTC, which the other headers do not cover.
+A content security policy does not prevent a page from navigating its window to another site. The map is therefore a
+frame of a different origin: the policy of the outer window restricts the navigation of the frame, and a sandboxed frame
+can neither navigate the outer window nor open a new window. Browsers that support connection allowlists (Chromium 152)
+apply these to all connections, including name look-ups, early connections and WebRTC, which the other headers do not
+cover.
 """
 
 import os
@@ -32,20 +33,20 @@ from apertura.formats.export import MAP, PREVIEW, product_files
 from apertura.views.webmap.document import named_files, requested_file
 
 LOOPBACK = "127.0.0.1"
-"""The only address on which the server listens, and host name of the map and its data."""
+"""The only address on which the server listens; also the host name of the map and its data."""
 
 WINDOW = "localhost"
-"""Host name of the window around the map: for a browser, a different origin."""
+"""Host name of the window around the map, which is a different origin for a browser."""
 
 _RANGE = re.compile(r"bytes=(?:(\d{1,18})-(\d{1,18})?|-(\d{1,18}))", re.ASCII)
 
 
 class UnsatisfiableRangeError(ValueError):
-    """Requested range without any byte of the file."""
+    """Requested range that contains no byte of the file."""
 
 
 def own_host(hosts: list[str], port: int) -> str | None:
-    """Return the host name of this server in a request; None for any other name (DNS rebinding).
+    """Return the host name of this server as given in a request; None for any other name (DNS rebinding).
 
     Parameters
     ----------
@@ -64,9 +65,9 @@ def own_host(hosts: list[str], port: int) -> str | None:
 
 
 def requested_range(header: str | None, size: int) -> tuple[int, int] | None:
-    """Return the requested range as offsets of the first byte and past the last; None for the whole file.
+    """Return the requested range as offsets of the first byte and of the byte after the last; None for the whole file.
 
-    An invalid header, or one with several ranges, is ignored: the whole file is sent (RFC 9110, 14.2).
+    A header that is invalid or contains several ranges is ignored, i.e. the whole file is sent (RFC 9110, 14.2).
 
     Parameters
     ----------
@@ -110,7 +111,7 @@ _COMMON_HEADERS = {
 
 
 def headers_of(port: int) -> Mapping[str, Mapping[str, str]]:
-    """Return host name → headers of all responses under that name.
+    """Return host name → headers of all responses to requests under that name.
 
     Parameters
     ----------
@@ -141,13 +142,13 @@ def headers_of(port: int) -> Mapping[str, Mapping[str, str]]:
 
 
 SHELL = ("shell.html", "shell.js", "shell.css")
-"""Files of the window that contains the map as a frame; the start page is first."""
+"""Files of the window that contains the map as a frame; the start page is the first."""
 
 FILES = ("index.html", "app.js", "app.css")
-"""Files of the map; its page is first."""
+"""Files of the map; the page is the first."""
 
 BUILT = Path(__file__).parent / "page"
-"""Output folder of `webmap/build.mjs`: part of the installed package, not of the sources."""
+"""Output folder of `webmap/build.mjs`, which is part of the installed package but not of the sources."""
 
 
 def page_files(built: Path = BUILT) -> Mapping[str, bytes]:
@@ -165,10 +166,10 @@ def page_files(built: Path = BUILT) -> Mapping[str, bytes]:
     """
     if not is_built(built):
         raise CampaignError(
-            "this installation has no map page, because pip install does not build it",
+            "this installation has no map page, because pip install does not build the page",
             "apertura map",
-            f"the output of make webmap (Node.js 20 or newer) in {built}",
-            "Run make setup in the sources of apertura, or make webmap and then pip install . again.",
+            f"the output of `make webmap` (Node.js 20 or newer) in {built}",
+            "In the sources of apertura, run `make setup`, or run `make webmap` and then `pip install .` again.",
         )
     return {name: (built / name).read_bytes() for name in (*SHELL, *FILES)}
 
@@ -192,19 +193,19 @@ _IDLE_S = 60.0
 
 
 class MapServer(ThreadingHTTPServer):
-    """HTTP server for a page and for listed files of a folder.
+    """HTTP server for a page and for a list of files in a folder.
 
     Parameters
     ----------
     folder
         The results folder.
     files
-        Function that returns the served files, name below the folder (with slashes) → required hash; no other file is
-        served. Called for every request; raises CampaignError if the list cannot be read.
+        Function that returns the served files, path relative to the folder (with slashes) → required hash; no other
+        file is served. The function is called for each request and raises CampaignError if the list cannot be read.
     page
-        Files of `apertura.views.webmap.server.page_files`.
+        Files returned by `apertura.views.webmap.server.page_files`.
     sha256_of
-        Function that returns the present hash of a file.
+        Function that returns the current hash of a file.
     port
         Port to listen on; 0 for any free port.
 
@@ -279,7 +280,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer()
 
     def __getattr__(self, name: str) -> Callable[[], None]:
-        """Return the refusing handler for all other methods."""
+        """Return the handler that refuses the request for all other methods."""
         if name.startswith("do_"):
             return self._refuse
         raise AttributeError(name)
@@ -291,7 +292,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer(self) -> None:
         host = own_host(self.headers.get_all("Host", []), self.server.server_port)
         if host is None:
-            self._respond(HTTPStatus.FORBIDDEN, "this server has a different host name")
+            self._respond(HTTPStatus.FORBIDDEN, "the requested host name is not a name of this server")
             return
         self.host = host
         if self.headers.get("Content-Length", "0").strip() != "0" or "Transfer-Encoding" in self.headers:
@@ -308,7 +309,7 @@ class _Handler(BaseHTTPRequestHandler):
         elif host == LOOPBACK:
             self._answer_file(name, expected)
         else:
-            self._respond(HTTPStatus.NOT_FOUND, "only the window around the map is served under this name")
+            self._respond(HTTPStatus.NOT_FOUND, "only the window around the map is served under this host name")
 
     def _answer_file(self, name: str, expected: str | None) -> None:
         try:
@@ -322,7 +323,9 @@ class _Handler(BaseHTTPRequestHandler):
             return
         with file:
             if expected not in {None, sha256} or not self._has_hash(file, name, sha256):
-                self._respond(HTTPStatus.CONFLICT, "changed since the map was made: run the workflow again")
+                self._respond(
+                    HTTPStatus.CONFLICT, "the file was changed after the map was made: run the workflow again"
+                )
                 return
             self._send(file, name)
 
@@ -333,7 +336,7 @@ class _Handler(BaseHTTPRequestHandler):
         return None
 
     def _has_hash(self, file: IO[bytes], name: str, sha256: str | None) -> bool:
-        """Return True if an open file has the hash, which is computed by path: products are replaced atomically."""
+        """Return True if an open file has the given hash, which is computed by path (files are replaced atomically)."""
         with suppress(OSError, CampaignError):
             same = self.server.sha256_of(name) == sha256
             return same and os.path.samestat(os.fstat(file.fileno()), (self.server.folder / name).stat())
@@ -362,7 +365,7 @@ class _Handler(BaseHTTPRequestHandler):
         while remaining and (block := file.read(min(remaining, _BLOCK_BYTES))):
             self.wfile.write(block)
             remaining -= len(block)
-        if remaining:  # truncated meanwhile: the client must not parse the next response as the rest of the file
+        if remaining:  # file truncated meanwhile: the client must not parse the next response as the rest of the file
             self.close_connection = True
 
     def _respond(self, status: HTTPStatus, message: str, **headers: str) -> None:
@@ -382,15 +385,18 @@ class _Handler(BaseHTTPRequestHandler):
         super().end_headers()
 
     def log_message(self, format: str, *arguments: object) -> None:  # noqa: A002
-        """Log nothing: a map requests hundreds of ranges."""
+        """Log nothing, because a map requests hundreds of ranges."""
 
 
 def served_look(campaign: Campaign, *, port: int = 0) -> MapServer:
-    """Return a server for the images of `apertura preview`, after waiting for the first; otherwise as `served`."""
+    """Wait for the first image of `apertura preview`, and return a server for its images; parameters as in `served`."""
     folder = campaign.result(PREVIEW)
     path = folder / MAP
     if not path.is_file():
-        print("waiting for the first image of `apertura preview` in another terminal; press Ctrl-C to stop", flush=True)
+        print(
+            "waiting for the first image of `apertura preview`, run in another terminal; press Ctrl-C to stop",
+            flush=True,
+        )
     while not path.is_file():
         time.sleep(_WAIT_S)
 
@@ -416,13 +422,13 @@ def served(campaign: Campaign, *, port: int = 0) -> MapServer:
     Raises
     ------
     CampaignError
-        If there is no map, it was modified, or the port is in use.
+        If the map is missing or was modified, or if the port is in use.
     """
     return _serving(campaign, campaign.results, _listing(campaign), port)
 
 
 def _serving(campaign: Campaign, folder: Path, files: Callable[[], Mapping[str, str]], port: int) -> MapServer:
-    """Return a server for a folder of the campaign; raise CampaignError if the list of files cannot be read."""
+    """Return a server for a folder of the campaign; raise CampaignError if the list of served files cannot be read."""
     files()
     prefix = campaign.relative(folder)
 
@@ -433,9 +439,9 @@ def _serving(campaign: Campaign, folder: Path, files: Callable[[], Mapping[str, 
 
 
 def _listing(campaign: Campaign) -> Callable[[], Mapping[str, str]]:
-    """Return a function that lists the served results, file → sha256: `map.json` and the layers named in it.
+    """Return a function that lists the served results, file → SHA-256: `map.json` and the layers named in `map.json`.
 
-    Both are read again when the manifest of `map.json` changes, which means that the workflow ran.
+    `map.json` and its manifest are read again if the manifest changed, which indicates a new run of the workflow.
     """
     products = frozenset(product_files(campaign.images, campaign.coefficients))
 
