@@ -249,7 +249,7 @@ STAGES: Mapping[str, Stage] = {
             **_FRAME,
             **_WAVE,
             "background": "echoes at constant delay: requested method, applied method, and reason",
-            "interference": "subcarriers and pulses with interference: number, frequencies, and whether they are excluded",
+            "interference": "subcarriers and pulses with interference: number, frequencies, whether excluded",
             "step_m": "total path between range samples, m",
             "centre_frequency_hz": "f_mid, reference frequency of the profile, Hz",
             "oversampling": "samples per resolution cell c/B of total path",

@@ -155,10 +155,15 @@ def sentences(name: str, report: Report) -> Iterator[str]:
         Name of the image.
     report
         Contents of the image's image.json.
+
+    Examples
+    --------
+    >>> next(sentences("f01 a-b", {"focus": {"verdict": "focused", "reason": "the peak loss is below 0.2 dB"}}))
+    'f01 a-b: focused; the peak loss is below 0.2 dB.'
     """
     focus = report.get("focus") or {}
     if focus:
-        yield f"{name}: {focus.get('verdict', 'not judged')}; {focus.get('why', 'no reason stated')}."
+        yield f"{name}: {focus.get('verdict', 'not judged')}; {focus.get('reason', 'no reason stated')}."
     yield certificate(report)
     agreement = report.get("agreement")
     if agreement and report.get("reference") != report.get("pair"):
