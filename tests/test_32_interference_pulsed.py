@@ -9,7 +9,7 @@ from test_32_interference import FREQUENCY, WEIGHT, noise_floor_db, profiles, re
 
 from apertura.campaign.store import open_stage
 from apertura.core.echo.captures import sampled_pulses
-from apertura.core.echo.interference import Bursts, Interference, PulsedInterference, SidelinkInterference, limited
+from apertura.core.echo.interference import Interference, NoisyPulses, PulsedInterference, SidelinkInterference, limited
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.impairments import Adc, Interferer
 from apertura.stages.transfer import PairEcho
@@ -113,7 +113,7 @@ def with_bursts(level_db, *, every=50, seed=3):
 
 
 def bursts_in(transfer):
-    bursts = Bursts()
+    bursts = NoisyPulses()
     for first in range(0, len(transfer), 100):
         block = transfer[first : first + 100]
         bursts.add(block, profiles(block)[:, 100:])  # ranges without targets
@@ -126,7 +126,7 @@ def test_pulses_with_interference_in_the_whole_band_are_excluded(level_db):
     assert np.flatnonzero(bursts.excluded).tolist() == list(range(0, PULSES, 50))
     raised_db = 10 * np.log10((0.98 + 0.02 * (1 + 10 ** (level_db / 10))) * 0.98)
     assert bursts.gain_db == pytest.approx(raised_db, abs=0.4)
-    assert bursts.flags["interference_bursts"].startswith("40 of 2000 pulses")
+    assert bursts.flags["pulses_noisy"].startswith("40 of 2000 pulses")
 
 
 def test_weak_bursts_are_kept():
@@ -142,11 +142,11 @@ def test_too_many_bursts_are_stated_and_kept():
     transfer[hit] *= 10
     bursts = bursts_in(transfer)
     assert not bursts.excluded.any()
-    assert "too many" in bursts.flags["interference_bursts"]
+    assert "too many" in bursts.flags["pulses_noisy"]
 
 
 def test_pulses_that_do_not_contribute_are_neither_interference_nor_a_reference():
-    bursts = Bursts()
+    bursts = NoisyPulses()
     bursts.skip(300)
     transfer = with_bursts(20)
     bursts.add(transfer, profiles(transfer)[:, 100:])
@@ -225,7 +225,7 @@ def test_clean_campaign_has_no_flag_of_interference(clean):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("source", "flag"), [(BURST, "interference_bursts"), (DME, "interference_pulsed")])
+@pytest.mark.parametrize(("source", "flag"), [(BURST, "pulses_noisy"), (DME, "interference_pulsed")])
 def test_pulsed_interference_of_a_campaign_is_flagged_and_removed(clean, source, flag, tmp_path):
     unchanged = campaign_with(tmp_path / "unchanged", source, setting="none")
     cleaned = campaign_with(tmp_path / "cleaned", source)
@@ -249,7 +249,7 @@ def test_pulses_with_bursts_are_absent_from_all_later_stages(tmp_path):
     for pair in ("uav1-uav1", "uav1-uav2"):
         recorded = open_stage(campaign.stage("echo", "f01", pair), "echo").sizes["pulse"]
         echo = PairEcho.cleaned(campaign, "f01", pair)
-        bursts = attributes(campaign, pair)[1]["bursts"]
+        bursts = attributes(campaign, pair)[1]["noisy_pulses"]
         assert recorded - bursts["pulses"] == echo.shape[0]
         assert echo.shape[0] == open_stage(campaign.stage("profile", "f01", pair), "profile").sizes["pulse"]
         noise = np.abs(np.diff(echo.read(np.arange(echo.shape[0])), axis=0)).mean(axis=1)

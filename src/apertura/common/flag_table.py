@@ -699,11 +699,12 @@ _OF_BENCHES = {
         "other transmitters near this frequency; antenna of the sidelink",
         "core/echo/interference.py",
     ),
-    "interference_bursts": Flag(
+    "pulses_noisy": Flag(
         "number of pulses; noise relative to neighbouring pulses, dB",
-        "interference in the whole band of single pulses adds noise at every range; the pulses are excluded unless "
-        "there are too many",
-        "transmitters on the UAV, such as telemetry and video; radars; processing.interference",
+        "interference over the whole band, or coupling that changes from pulse to pulse, adds noise at every range; "
+        "these pulses are excluded unless there are too many",
+        "transmitters on the UAV, such as telemetry and video; radars nearby; moving parts near the antennas; "
+        "processing.interference",
         "core/echo/interference.py",
     ),
     "contact_intermittent": Flag(

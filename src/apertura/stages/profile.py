@@ -18,7 +18,7 @@ from apertura.core.echo.background import Background, GroupMeans, background_exc
 from apertura.core.echo.captures import sampled_pulses
 from apertura.core.echo.compression import centre_frequency, window_weights
 from apertura.core.echo.demodulate import remove_path
-from apertura.core.echo.interference import Bursts, Interference, PulsedInterference
+from apertura.core.echo.interference import Interference, NoisyPulses, PulsedInterference
 from apertura.core.imaging.background import BackgroundScene, Removal, decide_removal
 from apertura.core.imaging.range_profiles import CompressionError, RangeWindow, phase_history_of, range_compress
 from apertura.stages.pair import open_pair, pattern_digests
@@ -40,28 +40,28 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     inputs = merged(scene.inputs, pattern_digests(campaign, pair))
     folder = campaign.stage("profile", flight, pair)
 
-    def write(wip: Path, echo: PairEcho, bursts: Bursts) -> float:
-        """Write the profiles of all pulses of an echo, add them to `bursts`; return the compression error, dB."""
+    def write(wip: Path, echo: PairEcho, noisy: NoisyPulses) -> float:
+        """Write the profiles of all pulses of an echo, add them to `noisy`; return the compression error, dB."""
         source, error = echo.stage, CompressionError(np.random.default_rng(0))
         window = ranges_of(campaign, open_pair(campaign, flight, pair, echo=source), scene)
         dataset = _empty(echo, window, campaign.settings.processing.window)
         parents = [source, *scene.parents]
         stage = stamped(dataset, "profile", modules=lineage.modules, parents=parents, settings=settings, inputs=inputs)
-        write_blocks(wip, stage, "profile", _compressed(source, dataset.attrs["window"], window, scene, error, bursts))
+        write_blocks(wip, stage, "profile", _compressed(source, dataset.attrs["window"], window, scene, error, noisy))
         return round(error.decibels, 2)
 
     with writing(folder) as wip:
-        bursts = Bursts()
-        error_db = write(wip, echo, bursts)
+        noisy = NoisyPulses()
+        error_db = write(wip, echo, noisy)
         if cleaning.interference is None:
-            bursts = Bursts()
-        elif bursts.excluded.any():
-            error_db = write(wip, echo.select(~bursts.excluded), Bursts())
+            noisy = NoisyPulses()
+        elif noisy.excluded.any():
+            error_db = write(wip, echo.select(~noisy.excluded), NoisyPulses())
         attributes = {
             "background": {"requested": campaign.settings.processing.background_method, **cleaning.background_report},
-            "interference": cleaning.interference_report(bursts),
+            "interference": cleaning.interference_report(noisy),
         }
-        flags = Flags.merged(echo.flags, cleaning.flags, bursts.flags)
+        flags = Flags.merged(echo.flags, cleaning.flags, noisy.flags)
         finish(wip, folder, lineage=lineage, flags=flags, compression_error_db=error_db, **attributes)
     return folder
 
@@ -114,11 +114,11 @@ class _Cleaning:
     def background_report(self) -> dict[str, Any]:
         return self.removal.report if self.removal else {}
 
-    def interference_report(self, bursts: Bursts) -> dict[str, Any]:
+    def interference_report(self, noisy: NoisyPulses) -> dict[str, Any]:
         if not self.interference:
             return {}
         pulsed = {"pulsed": self.pulsed.report} if self.pulsed else {}
-        return {**self.interference.report, **pulsed, **({"bursts": bursts.report} if bursts.report else {})}
+        return {**self.interference.report, **pulsed, **({"noisy_pulses": noisy.report} if noisy.report else {})}
 
     @property
     def flags(self) -> Flags:
@@ -163,17 +163,17 @@ def _compressed(
     window: RangeWindow,
     scene: OpenScene,
     error: CompressionError,
-    bursts: Bursts,
+    noisy: NoisyPulses,
 ) -> Iterator[NDArray[np.complex64]]:
     """Yield the profiles of one chunk of the echo at a time; zeros if none of its pulses contributes to the scene."""
     for part in blocks_of_rows(source, "transfer"):
         if not window.contributing[part].any():
-            bursts.skip(part.stop - part.start)
+            noisy.skip(part.stop - part.start)
             yield np.zeros((part.stop - part.start, window.samples), np.complex64)
             continue
         history = phase_history_of(source.isel(pulse=part), requested)
         chunk = replace(window, start_m=window.start_m[part], farthest_m=window.farthest_m[part])
         profiles = range_compress(history, scene.grid, scene.terrain, window=chunk)
         error.add(history, profiles)
-        bursts.add(history.transfer, profiles.samples)
+        noisy.add(history.transfer, profiles.samples)
         yield profiles.samples

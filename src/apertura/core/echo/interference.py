@@ -337,9 +337,9 @@ class PulsedInterference:
         >>> frequency = 1.05e9 + 1e6 * np.arange(64)
         >>> pulsed = PulsedInterference.measured([received], frequency, np.full(64, 1 / 64))
         >>> pulsed.flags["interference_pulsed"]
-        '10.0% of pulses, strongest at 1070.00 MHz (DME, TACAN, secondary radar): 28.8 dB above the level; excluded'
-        >>> np.flatnonzero(pulsed.removed(received[:1])[0] == 0).tolist()
-        [20, 21]
+        '10.0% of pulses, strongest at 1070.00 MHz (DME, TACAN, secondary radar): 28.4 dB above the level; excluded'
+        >>> pulsed.removed(received[:1])[0, 20:22]
+        array([0.+0.j, 0.+0.j], dtype=complex64)
         """
         transfer = np.concatenate(groups)
         level = np.median(np.abs(transfer) ** 2, axis=0).astype(np.float32)
@@ -398,22 +398,22 @@ class PulsedInterference:
         return Flags({"interference_pulsed": line})
 
 
-# ---- Pulses with interference in the whole band ----------------------------------------------------------------------
+# ---- Pulses with excess noise ----------------------------------------------------------------------------------------
 
-_BURST = 4.0
+_NOISY = 4.0
 """Noise of a pulse relative to that of its neighbours, above which the pulse is excluded."""
 
-_BLOCK = 128  # pulses over which the usual noise is a quartile
+_BLOCK = 128  # pulses over which the usual noise is a quantile
 _MOST_PULSES = 0.3
 """Largest share of pulses that is excluded; more is not interference, or cannot be distinguished from echoes."""
 
 
-class Bursts:
+class NoisyPulses:
     """Noise of each pulse, from transfer functions and range profiles, block by block.
 
     Notes
     -----
-    Source: docs/theory/interference.md, eq. 6. A burst raises both the difference from the neighbouring pulses, which
+    Source: docs/theory/interference.md, eq. 6. Noise raises both the difference from the neighbouring pulses, which
     echoes do not, and the median over the ranges, which single targets do not.
 
     Examples
@@ -421,10 +421,10 @@ class Bursts:
     >>> rng = np.random.default_rng(1)
     >>> received = (rng.normal(size=(400, 64, 2)) @ [1, 1j]).astype(np.complex64)
     >>> received[7] *= 10
-    >>> bursts = Bursts()
-    >>> bursts.add(received, np.fft.ifft(received, axis=1))
-    >>> np.flatnonzero(bursts.excluded).tolist(), bursts.flags["interference_bursts"]
-    ([7], '1 of 400 pulses: noise up to 20.5 dB above the neighbouring pulses; excluded')
+    >>> noisy = NoisyPulses()
+    >>> noisy.add(received, np.fft.ifft(received, axis=1))
+    >>> np.flatnonzero(noisy.excluded).tolist(), noisy.flags["pulses_noisy"]
+    ([7], '1 of 400 pulses: noise up to 20.0 dB above the neighbouring pulses; excluded')
     """
 
     def __init__(self) -> None:
@@ -434,11 +434,10 @@ class Bursts:
     def add(self, transfer: Complexes, profiles: Complexes) -> None:
         """Add consecutive pulses: (pulse, subcarrier) transfer functions and (pulse, range) profiles."""
         some = transfer[:, :: -(-transfer.shape[1] // _SAMPLES)]
-        change = (np.abs(np.diff(some, axis=0)) ** 2).mean(axis=1, dtype=np.float64) / 2
-        alone = np.zeros(len(some)) if not len(change) else None
-        # The difference from the nearer of both neighbours; a pulse at the end of a block has one.
-        noise = alone if alone is not None else np.minimum(np.append(change, change[-1]), np.append(change[0], change))
-        self._noise.append(np.asarray(noise))
+        change = np.full(len(some) + 1, np.inf)  # from the neighbours; infinite at the ends of the block
+        change[1:-1] = (np.abs(np.diff(some, axis=0)) ** 2).mean(axis=1) / 2
+        nearer = np.minimum(change[:-1], change[1:])
+        self._noise.append(np.where(np.isfinite(nearer), nearer, 0.0))
         samples = profiles[:, :: max(1, profiles.shape[1] // _SAMPLES)]
         self._floor.append(np.median(np.abs(samples) ** 2, axis=1).astype(np.float64))
 
@@ -450,38 +449,38 @@ class Bursts:
     @cached_property
     def _relative(self) -> Floats:
         """(pulse,) float64, noise relative to that of the neighbouring pulses, by differences (eq. 6)."""
-        return np.maximum(2 * _over_neighbours(np.concatenate(self._noise)) - 1, 0.0)
+        return np.maximum(2 * _over_neighbours(np.concatenate(self._noise), 0.25) - 1, 0.0)
 
     @cached_property
     def excess(self) -> Floats:
         """(pulse,) float64, noise relative to that of the neighbouring pulses: the lower of both tests."""
-        return np.minimum(self._relative, _over_neighbours(np.concatenate(self._floor)))
+        return np.minimum(self._relative, _over_neighbours(np.concatenate(self._floor), 0.5))
 
     @cached_property
     def excluded(self) -> NDArray[np.bool_]:
         """(pulse,) bool, True for pulses that are excluded: this gains SNR (eq. 7)."""
-        bursts = self.excess > _BURST
-        return bursts if bursts.any() and self.gain_db >= LEAST_GAIN_DB else np.zeros_like(bursts)
+        noisy = self.excess > _NOISY
+        return noisy if noisy.any() and self.gain_db >= LEAST_GAIN_DB else np.zeros_like(noisy)
 
     @property
     def gain_db(self) -> float:
         """SNR gained in the image by the exclusion, dB (eq. 7); 0 if more than 30 % of the pulses would be excluded."""
-        noise, bursts = self._relative, self.excess > _BURST
+        noise, noisy = self._relative, self.excess > _NOISY
         used = noise > 0
-        kept = used & ~bursts
-        if not kept.any() or bursts.sum() > _MOST_PULSES * used.sum():
+        kept = used & ~noisy
+        if not kept.any() or noisy.sum() > _MOST_PULSES * used.sum():
             return 0.0
         return decibels(float(noise[used].sum() / noise[kept].sum() * (kept.sum() / used.sum()) ** 2))
 
     @property
     def report(self) -> dict[str, Any]:
         """As JSON values; {} if no pulse has interference."""
-        bursts = self.excess > _BURST
+        noisy = self.excess > _NOISY
         if not self.flags:
             return {}
         return {
-            "pulses": int(bursts.sum()),
-            "of": len(bursts),
+            "pulses": int(noisy.sum()),
+            "of": len(noisy),
             "excess_db": round(decibels(float(self.excess.max())), 1),
             "excluded": bool(self.excluded.any()),
             "gain_db": round(self.gain_db, 2),
@@ -489,24 +488,24 @@ class Bursts:
 
     @property
     def flags(self) -> Flags:
-        """Flag `interference_bursts` if pulses have interference that is excluded, or too many to be excluded."""
-        bursts = self.excess > _BURST
-        too_many = bursts.sum() > _MOST_PULSES * len(bursts)
+        """Flag `pulses_noisy` if pulses have interference that is excluded, or too many to be excluded."""
+        noisy = self.excess > _NOISY
+        too_many = noisy.sum() > _MOST_PULSES * len(noisy)
         if not self.excluded.any() and not too_many:
             return Flags()
         done = "not excluded, as these are too many" if too_many else "excluded"
         excess_db = decibels(float(self.excess.max()))
         line = (
-            f"{bursts.sum()} of {number_of(len(bursts), 'pulse')}: noise up to {excess_db:.1f} dB above the "
+            f"{noisy.sum()} of {number_of(len(noisy), 'pulse')}: noise up to {excess_db:.1f} dB above the "
             f"neighbouring pulses; {done}"
         )
-        return Flags({"interference_bursts": line})
+        return Flags({"pulses_noisy": line})
 
 
-def _over_neighbours(values: Floats) -> Floats:
-    """Return (pulse,) values relative to their lower quartile in some hundred neighbouring pulses; 0 where zero."""
+def _over_neighbours(values: Floats, quantile: float) -> Floats:
+    """Return (pulse,) values relative to a quantile of some hundred neighbouring pulses; 0 where they are zero."""
     blocks = np.array_split(values, max(1, round(len(values) / _BLOCK)))
-    low = np.array([np.quantile(block[block > 0], 0.25) if (block > 0).any() else 0.0 for block in blocks])
-    usual = scipy.ndimage.median_filter(low, size=min(3, len(low)), mode="nearest")
+    each_block = np.array([np.quantile(block[block > 0], quantile) if (block > 0).any() else 0.0 for block in blocks])
+    usual = scipy.ndimage.median_filter(each_block, size=min(3, len(blocks)), mode="nearest")
     each = np.repeat(usual, [len(block) for block in blocks])
     return np.asarray(np.divide(values, each, out=np.zeros_like(values), where=each > 0))
