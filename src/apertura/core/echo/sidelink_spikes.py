@@ -23,7 +23,7 @@ SCALE_WINDOW = 129
 """Pulses over which the standard deviation is estimated, with a relative standard deviation of 10 %."""
 
 SIGMAS = 6.0
-"""Deviation of an outlier from the running median, standard deviations: false alarms below 10⁻⁶ per pulse (eq. 4)."""
+"""Deviation of an outlier from the running median, standard deviations: false alarms below 10⁻⁵ per pulse (eq. 4)."""
 
 MEASURABLE_RAD = 2.0
 """Limit of an outlier up to which phases have a median; random phases of a receiver have none."""
@@ -102,8 +102,11 @@ def find_spikes(
     locked = np.flatnonzero(path.locked)
     if locked.size < _LEAST_PULSES:
         return SidelinkSpikes(*nothing, {})
-    interval_s = float(np.median(np.diff(time_s[locked])))
-    number = np.rint((time_s[locked] - time_s[locked[0]]) / interval_s).astype(np.intp)
+    apart_s = np.diff(time_s[locked])
+    # a low quantile, because most pulses may be missing; steps are rounded singly, so that its error does not add up
+    steps = np.maximum(1, np.rint(apart_s / np.quantile(apart_s, 0.1)))
+    number = np.concatenate([[0], np.cumsum(steps)]).astype(np.intp)
+    prf_hz = float(number[-1] / apart_s.sum())
     late_cells = path.delay_cells[locked] - length_cells[locked]
     # eqs. 1 and 2: the phase of a shift of the time base follows the carrier (`triggered`) or not (`phase`)
     phase = path.phase_rad[locked] + 2 * np.pi * cycles_per_cell * length_cells[locked]
@@ -120,8 +123,8 @@ def find_spikes(
     steadier = min(residuals, key=lambda residual: float(np.median(residual.limit_rad)))
     cleaned = np.where(outlying, 0.0, steadier.detrended_rad)
     level = np.log(path.amplitude[locked])
-    level -= scipy.ndimage.median_filter(level, _DETREND)
-    flags = {**_spike_flags(error_rad, excluded, wave_m), **_line_flags(cleaned, level, number, 1 / interval_s)}
+    level -= scipy.ndimage.uniform_filter1d(level, _DETREND)
+    flags = {**_spike_flags(error_rad, excluded, wave_m), **_line_flags(cleaned, level, number, prf_hz)}
     return SidelinkSpikes(error_rad, excluded, flags)
 
 
@@ -142,11 +145,13 @@ class _Residual:
         unit = np.exp(1j * (phase_rad - np.concatenate([[0.0], np.cumsum(rotation * step)])))
         middle = _around(unit, WINDOW)
         windows = np.lib.stride_tricks.sliding_window_view(np.pad(unit, WINDOW // 2, mode="symmetric"), WINDOW)
-        others = np.delete(windows, WINDOW // 2, axis=1) * middle.conj()[:, None]
-        median = np.median(np.angle(others), axis=1)
-        deviation = np.angle(unit * middle.conj() * np.exp(-1j * median))
-        spread = scipy.ndimage.median_filter(np.abs(deviation), SCALE_WINDOW)
-        return cls(np.angle(unit * _around(unit, _DETREND).conj()), deviation, SIGMAS * 1.4826 * spread)
+        angles = np.angle(windows * middle.conj()[:, None])
+        others = np.delete(angles, WINDOW // 2, axis=1)  # a pulse that is itself the median has no deviation
+        spread = np.abs(np.angle(np.exp(1j * (angles[:, WINDOW // 2] - np.median(others, axis=1)))))
+        limit = SIGMAS * 1.4826 * scipy.ndimage.median_filter(spread, SCALE_WINDOW)
+        # the median of all pulses, this one included, is that of the pulses on the same side of a step of the clock
+        deviation = np.angle(np.exp(1j * (angles[:, WINDOW // 2] - np.median(angles, axis=1))))
+        return cls(np.angle(unit * _around(unit, _DETREND).conj()), deviation, limit)
 
 
 def _around(unit: NDArray[np.complex128], pulses: int) -> NDArray[np.complex128]:
@@ -158,7 +163,7 @@ def _spike_flags(error_rad: Floats, excluded: NDArray[np.bool_], wave_m: float) 
     """Return the flag of outlying pulses, if some are excluded or the others cost more than is tolerated."""
     outlying, count = error_rad != 0, error_rad.size
     kept = error_rad[outlying & ~excluded]
-    loss_db = -20 * np.log10(np.abs(1 + np.sum(np.exp(1j * kept) - 1) / max(1, count - int(excluded.sum()))))
+    loss_db = abs(20 * np.log10(np.abs(1 + np.sum(np.exp(1j * kept) - 1) / max(1, count - int(excluded.sum())))))
     if not excluded.any() and loss_db < TOLERATED_LOSS_DB:
         return {}
     rms, largest = float(np.sqrt(np.mean(error_rad[outlying] ** 2))), float(np.abs(error_rad).max())
@@ -188,7 +193,7 @@ def _line_flags(phase_rad: Floats, level: Floats, number: NDArray[np.intp], prf_
     lobe = slice(max(0, line - 2), line + 3)
     mean_gain = scipy.special.diric(2 * np.pi * frequency_hz[line] / prf_hz, _DETREND)  # of the mean over `_DETREND`
     depth_rad = float(2 * np.sqrt(max(0.0, phase_power[lobe].sum() - floor[lobe].sum()))) / (1 - mean_gain) ** 2
-    depth_db = float(2 * np.sqrt(level_power[lobe].sum())) * 20 / np.log(10)
+    depth_db = float(2 * np.sqrt(level_power[lobe].sum())) / (1 - mean_gain) * 20 / np.log(10)
     ghost_db = 20 * np.log10(max(depth_rad / 2, 1e-6))
     if ratio[line] <= 1 or ghost_db < ECHO_DB:
         return {}
