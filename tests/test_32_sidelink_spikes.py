@@ -146,6 +146,13 @@ def test_modulation_is_measured_at_its_frequency_or_alias(frequency_hz, alias_hz
     assert not spikes.excluded.any()
 
 
+def test_modulation_of_a_short_flight_has_its_frequency():
+    time_s = np.arange(75) / PRF_HZ
+    phase = 0.4 * np.cos(2 * np.pi * 40 * time_s) + 0.02 * np.random.default_rng(1).normal(size=time_s.size)
+    line = found(phase).flags["sidelink_modulation"]
+    assert float(re.search(r"at ([\d.]+) Hz", line).group(1)) == pytest.approx(40, abs=0.3)
+
+
 @pytest.mark.parametrize(("depth_rad", "flagged"), [(0.15, False), (0.25, True)])
 def test_modulation_is_flagged_if_its_ghosts_exceed_minus_20_db(depth_rad, flagged):
     rng, time_s = np.random.default_rng(2), np.arange(PULSES) / PRF_HZ

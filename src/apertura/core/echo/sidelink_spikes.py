@@ -181,7 +181,7 @@ def _line_flags(phase_rad: Floats, level: Floats, number: NDArray[np.intp], prf_
     even = np.arange(number[-1] + 1)
     phase_power, level_power = (_periodogram(np.interp(even, number, values)) for values in (phase_rad, level))
     segments = max(1, even.size // _SEGMENT)
-    frequency_hz = np.arange(phase_power.size) * prf_hz / (2 * (phase_power.size - 1))
+    frequency_hz = np.arange(phase_power.size) * prf_hz / min(_SEGMENT, even.size)
     near = np.abs(np.subtract.outer(np.arange(phase_power.size), np.arange(phase_power.size)))
     beside = (near >= _NEAR) & (near <= _FAR)
     floor = np.maximum((beside @ phase_power) / beside.sum(1), 1e-30)
