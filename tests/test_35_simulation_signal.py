@@ -18,6 +18,8 @@ from apertura.simulation.impairments import (
     PhaseWalk,
     Reflection,
     Ripple,
+    Rotor,
+    Spikes,
     Timing,
     UniformPhase,
     draw_impairments,
@@ -363,12 +365,15 @@ def test_enabling_one_impairment_leaves_the_others_unchanged():
     time_s = np.arange(100) / 10
     few = Impairments(missed_fraction=0.3, timing=Timing(half_width_s=1e-9))
     more = replace(few, carrier_phase=UniformPhase(), localization=Localization(0.1), sidelink_blockage=Blockage(0.3))
+    more = replace(more, sidelink_spikes=Spikes(0.5, phase_rad=1.0, level_db=-10.0), sidelink_rotor=Rotor(30.0, -10.0))
     first, second = (
         draw_impairments(impairments, time_s, 1e9, np.random.default_rng(3)) for impairments in (few, more)
     )
     assert (first.kept == second.kept).all()
     assert (first.start_s == second.start_s).all()
     assert second.phase_rad.std() > 1
+    assert not first.sidelink_error_rad.any()
+    assert second.sidelink_error_rad.std() > 0.3
 
 
 def test_localization_error_displaces_only_the_listed_antennas():

@@ -1,5 +1,6 @@
 """Flags of signal impairments: each is raised only beyond its threshold; each recording has one impairment."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,17 @@ from folders import complaint, copy_writable, edit_config, edit_data, ingest_all
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
 from apertura.simulation import ImageGrid, preset, simulate
-from apertura.simulation.impairments import Adc, Blockage, Clock, Reflection, Ripple, TimeTag, UniformPhase
+from apertura.simulation.impairments import (
+    Adc,
+    Blockage,
+    Clock,
+    PhaseWalk,
+    Reflection,
+    Ripple,
+    Spikes,
+    TimeTag,
+    UniformPhase,
+)
 from apertura.stages import echo, image, profile, refine, scene
 from apertura.stages.transfer import PairEcho
 
@@ -144,6 +155,19 @@ def test_pulses_without_sidelink_are_dropped_counted_and_flagged(tmp_path):
     assert int(flag.split()[0]) == round((1 - rate) * int(flag.split()[2]))
     assert len(dataset.pulse) == dataset.attrs["pulses"]["used"]
     assert len(dataset.pulse) < 38
+
+
+def test_pulses_with_a_disturbed_sidelink_are_dropped_counted_and_flagged(tmp_path):
+    steady = {"carrier_phase": PhaseWalk(0.5), "missed_fraction": 0.0}
+    campaign = simulated(tmp_path, pulses=100, sidelink_spikes=Spikes(0.08, phase_rad=2.0), **steady)
+    dataset = echo_of(campaign)
+    truth = json.loads((campaign.root / "truth.json").read_text())
+    struck = truth["flights"]["f01"]["nodes"]["uav2"]["sidelink_spikes"]
+    assert dataset.attrs["pulses"]["reasons"] == {"sidelink_spikes": len(struck)}
+    line = dataset.attrs["flags"]["sidelink_spikes"]
+    assert line.startswith(f"{len(struck)} of {len(dataset.pulse) + len(struck)} pulses")
+    assert f"; {len(struck)} above 1.05 rad excluded, loss by the others 0.00 dB" in line
+    assert not set(dataset.capture.values) & set(struck)
 
 
 def test_sidelink_without_lock_is_refused(tmp_path):

@@ -242,6 +242,18 @@ _OF_RECORDINGS = {
         "blockage; antenna of the sidelink",
         "core/echo/sidelink_state.py",
     ),
+    "sidelink_spikes": Flag(
+        "pulses whose sidelink phase deviates, rad and cm; pulses excluded; loss by the others, dB",
+        "the sidelink is disturbed in single pulses, which their echoes do not share",
+        "rotors and airframe in the line of sight; place of the sidelink antenna; interference",
+        "core/echo/sidelink_spikes.py",
+    ),
+    "sidelink_modulation": Flag(
+        "frequency or an alias of it, Hz; depth of phase and amplitude, rad and dB; ghosts, dB",
+        "the sidelink is modulated periodically: ghosts along track, unless the echo has the same modulation",
+        "reflection from rotors; vibration of the oscillator; place of the sidelink antenna",
+        "core/echo/sidelink_spikes.py",
+    ),
     "second_arrival": Flag(
         "level of the second path relative to the direct path, dB; delay of the second path",
         "a second path is nearly as strong as the direct path",

@@ -265,6 +265,8 @@ def flight_truth(
             "start_s": _series(draw.start_s),
             "tag_error_s": _series(draw.tag_error_s),
             "blocked": np.flatnonzero(draw.blocked).tolist(),
+            "sidelink_spikes": np.flatnonzero((draw.direct != 1) | (draw.spike_echo != 0)).tolist(),
+            "sidelink_error_rad": _series(draw.sidelink_error_rad),
             "position_error_m": draw.position_error_m.tolist() if draw.position_error_m.any() else 0.0,
             "channels": {
                 channel_name: {

@@ -106,6 +106,27 @@ class Blockage:
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
+class Spikes:
+    """Disturbance of the sidelink in single pulses, as of a blade or the airframe in the line of sight."""
+
+    fraction: float = Field(ge=0, lt=1, description="share of disturbed pulses")
+    phase_rad: float = Field(default=0.0, description="phase of the direct path in these pulses, either sign, rad")
+    level_db: float | None = Field(
+        default=None, description="reflection of random phase in these pulses, dB to the direct path; null: none"
+    )
+    excess_m: float = Field(default=0.1, description="path of the reflection in excess of the direct path, m")
+
+
+@dataclass(frozen=True, config=STRICT_KEYS)
+class Rotor:
+    """Reflection of the sidelink from moving blades, with a constant Doppler frequency."""
+
+    frequency_hz: float = Field(description="Doppler frequency of the reflection, Hz; may exceed the pulse rate")
+    level_db: float = Field(description="level relative to the direct path, dB")
+    excess_m: float = Field(default=0.1, description="path length in excess of the direct path, m")
+
+
+@dataclass(frozen=True, config=STRICT_KEYS)
 class Leakage:
     """Direct coupling between the radar antennas."""
 
@@ -205,6 +226,8 @@ class Impairments:
     sidelink_gain_db: float = Field(default=0.0, description="gain of the direct path, dB")
     sidelink_multipath: tuple[Reflection, ...] = Field(default=(), description="reflections of the sidelink")
     sidelink_blockage: Blockage | None = Field(default=None, description="shadowing of the sidelink")
+    sidelink_spikes: Spikes | None = Field(default=None, description="disturbance of the sidelink in single pulses")
+    sidelink_rotor: Rotor | None = Field(default=None, description="reflection of the sidelink from moving blades")
     leakage: Leakage | None = Field(default=None, description="direct coupling into the radar channel")
     interference: tuple[Interferer, ...] = Field(default=(), description="signals of other transmitters")
     transmit_ripple: Ripple | None = Field(default=None, description="ripple of the transmitter")
@@ -229,6 +252,9 @@ class ImpairmentDraw:
         (pulse,) bool, True if the sidelink is shadowed.
     position_error_m
         (pulse, 3) float64, logged minus true position, ECEF.
+    direct, spike_echo, rotor_echo
+        (pulse,) complex128, direct path of the sidelink and its additional reflections at mid-band, relative to the
+        undisturbed direct path.
     """
 
     kept: NDArray[np.bool_]
@@ -237,6 +263,14 @@ class ImpairmentDraw:
     tag_error_s: Floats
     blocked: NDArray[np.bool_]
     position_error_m: Floats
+    direct: NDArray[np.complex128]
+    spike_echo: NDArray[np.complex128]
+    rotor_echo: NDArray[np.complex128]
+
+    @property
+    def sidelink_error_rad(self) -> Floats:
+        """(pulse,) float64, phase error of the sidelink at mid-band that echoes do not have, unresolved in delay."""
+        return np.asarray(np.angle(self.direct + self.spike_echo + self.rotor_echo))
 
 
 def draw_impairments(
@@ -251,8 +285,9 @@ def draw_impairments(
     >>> drawn.phase_rad.round(2), drawn.start_s
     (array([...]), array([0., 0., 0., 0., 0.]))
     """
-    streams = independent_streams(generator, 6)
+    streams = independent_streams(generator, 8)
     pulses = time_s.size
+    direct, spike_echo = _spikes(impairments.sidelink_spikes, pulses, streams[6])
     return ImpairmentDraw(
         kept=streams[0].random(pulses) >= impairments.missed_fraction,
         phase_rad=_phases(impairments, time_s, streams[1]),
@@ -262,6 +297,9 @@ def draw_impairments(
         + impairments.time_tag.jitter_s * streams[3].standard_normal(pulses),
         blocked=_bursts(impairments.sidelink_blockage, pulses, streams[4]),
         position_error_m=_position_error(impairments.localization, time_s, streams[5]),
+        direct=direct,
+        spike_echo=spike_echo,
+        rotor_echo=_rotor_echo(impairments.sidelink_rotor, time_s, streams[7]),
     )
 
 
@@ -302,6 +340,27 @@ def _bursts(blockage: Blockage | None, pulses: int, generator: Generator) -> NDA
         state = bool(draw < probability)
         blocked[pulse] = state
     return blocked
+
+
+def _spikes(
+    spikes: Spikes | None, pulses: int, generator: Generator
+) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    """Return direct path and reflection of each pulse, relative to the undisturbed direct path."""
+    direct, echo = np.ones(pulses, np.complex128), np.zeros(pulses, np.complex128)
+    if spikes is not None:
+        hit = generator.random(pulses) < spikes.fraction
+        sign, phase = generator.choice([-1.0, 1.0], pulses), generator.uniform(-np.pi, np.pi, pulses)
+        direct[hit] = np.exp(1j * spikes.phase_rad * sign[hit])
+        if spikes.level_db is not None:
+            echo[hit] = 10 ** (spikes.level_db / 20) * np.exp(1j * phase[hit])
+    return direct, echo
+
+
+def _rotor_echo(rotor: Rotor | None, time_s: Floats, generator: Generator) -> NDArray[np.complex128]:
+    if rotor is None:
+        return np.zeros(time_s.size, np.complex128)
+    phase = 2 * np.pi * rotor.frequency_hz * time_s + generator.uniform(-np.pi, np.pi)
+    return np.asarray(10 ** (rotor.level_db / 20) * np.exp(1j * phase))
 
 
 def _position_error(localization: Localization | None, time_s: Floats, generator: Generator) -> Floats:

@@ -19,7 +19,7 @@ from scipy import fft
 
 from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.core.echo.compression import unit_phasor
+from apertura.core.echo.compression import centre_frequency, unit_phasor
 from apertura.simulation.impairments import Adc, ChannelName, ImpairmentDraw, Impairments, Interferer, Ripple
 from apertura.simulation.scatterers import Paths, TrueAir, direct_path, echo_paths, spectrum
 from apertura.simulation.targets import Scatterers
@@ -389,7 +389,7 @@ def receive(
     received = {"radar": (leaked, power, impairments.radar_ripple, impairments.radar_snr_db)}
     if sidelink:
         power = spectral_power(waveform, direct)
-        paths = _sidelink(direct, impairments, draw)
+        paths = _sidelink(direct, impairments, draw, centre_frequency(waveform.frequency_hz))
         received["sidelink"] = (paths, power, impairments.sidelink_ripple, impairments.sidelink_snr_db)
     return {
         name: Channel(
@@ -465,11 +465,18 @@ def _with_leakage(echoes: Paths, geometry: Geometry, impairments: Impairments, o
     return echoes.and_also(Paths(direct.delay_s, level, direct.delay_rate))
 
 
-def _sidelink(direct: Paths, impairments: Impairments, draw: ImpairmentDraw) -> Paths:
-    paths = direct
+def _sidelink(direct: Paths, impairments: Impairments, draw: ImpairmentDraw, middle_hz: float) -> Paths:
+    paths = replace(direct, amplitude=direct.amplitude * draw.direct[:, None])
     for reflection in impairments.sidelink_multipath:
         later_s = direct.delay_s + reflection.excess_m / SPEED_OF_LIGHT_M_S
         paths = paths.and_also(Paths(later_s, direct.amplitude * reflection.amplitude, direct.delay_rate))
+    for moving, echo in ((impairments.sidelink_spikes, draw.spike_echo), (impairments.sidelink_rotor, draw.rotor_echo)):
+        if moving is not None and echo.any():
+            excess_s = moving.excess_m / SPEED_OF_LIGHT_M_S
+            level = echo * np.exp(2j * np.pi * middle_hz * excess_s)  # phases of the draw are those at mid-band
+            paths = paths.and_also(
+                Paths(direct.delay_s + excess_s, direct.amplitude * level[:, None], direct.delay_rate)
+            )
     shadow_db = impairments.sidelink_blockage.attenuation_db if impairments.sidelink_blockage else 0.0
     gain = 10 ** ((impairments.sidelink_gain_db - shadow_db * draw.blocked) / 20)
     return replace(paths, amplitude=paths.amplitude * gain[:, None])

@@ -182,9 +182,11 @@ def _transfer(
     (docs/theory.md, "Geometry").
     """
     tx, rx = nodes
+    sent_ns = nanoseconds(at)
+    time_s = (sent_ns - sent_ns[0]) * 1e-9
     if tx.name == rx.name:
-        read, sent_ns = rx.reader(["radar"], captures), nanoseconds(at)
-        measured = transfer_by_code(read, sent.inverse, rx.numerology, time_s=(sent_ns - sent_ns[0]) * 1e-9)
+        read = rx.reader(["radar"], captures)
+        measured = transfer_by_code(read, sent.inverse, rx.numerology, time_s=time_s)
         return _with_waveform(measured, sent), np.zeros(len(at))
     length_m = air.electrical_m(tx.antenna("sidelink", at), rx.antenna("sidelink", at))
     measured = transfer_by_sidelink(
@@ -196,6 +198,7 @@ def _transfer(
         method=processing.sidelink,
         accuracy_db=strictest_accuracy_db(processing.accuracy_db),
         where=str(rx.files),
+        time_s=time_s,
     )
     return _with_waveform(measured, sent), length_m[measured.kept]
 
@@ -242,13 +245,14 @@ def _pulse_counts(
     sent: int, pulses: Association, repeats: NDArray[np.bool_], positions: PulsePositions, measured: Transfer
 ) -> dict[str, Any]:
     """Count the transmitted pulses that are used, and the excluded ones by reason."""
-    used = int(measured.kept.sum())
+    used, spikes = int(measured.kept.sum()), measured.report.get("sidelink", {}).get("spikes", 0)
     reasons = {
         "unpaired": pulses.tx_dropped,
         "time_tag_outlier": int(pulses.outlier.sum()),
         "captures_repeated": int((repeats & ~pulses.outlier).sum()),
         **positions.reasons,
-        "sidelink_lost": int((~measured.kept).sum()),
+        "sidelink_lost": int((~measured.kept).sum()) - spikes,
+        "sidelink_spikes": spikes,
     }
     return {
         "used": used,

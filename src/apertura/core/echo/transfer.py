@@ -34,6 +34,7 @@ from apertura.core.echo.interference import SidelinkInterference, limited
 from apertura.core.echo.line_of_sight import LineOfSight
 from apertura.core.echo.own_pulses import CodeEvidence, own_code, phase_stability
 from apertura.core.echo.sidelink import DIVIDING, METHODS, choose, edges
+from apertura.core.echo.sidelink_spikes import find_spikes
 from apertura.core.echo.sidelink_state import SidelinkState, measure_blocks, second_path_flags
 
 _INVERTED = (
@@ -207,6 +208,7 @@ def transfer_by_sidelink(
     method: str,
     accuracy_db: float,
     where: str,
+    time_s: Floats | None = None,
 ) -> Transfer:
     """Return the transfer functions of a secondary node, corrected by its sidelink.
 
@@ -226,6 +228,9 @@ def transfer_by_sidelink(
         Tolerated level of clock errors relative to the peak, dB.
     where
         Name of the recording in errors.
+    time_s
+        (capture,) float64, time of transmission, seconds from any origin, to exclude pulses in which only the sidelink
+        is disturbed; None: these are not searched for, as on a bench.
 
     Raises
     ------
@@ -260,16 +265,25 @@ def transfer_by_sidelink(
     inverted = "wrong_code" in state.flags and _compresses_conjugated(read, demodulator, len(sidelink_m))
     residual = baseline_residual(delay_m, sidelink_m)
     wrong = detect_wrong_association(residual)
+    kept, spike_flags = state.locked, Flags()
+    if time_s is not None and "wrong_code" not in state.flags:
+        middle_hz = numerology.carrier_hz + numerology.middle_hz
+        wave_m = SPEED_OF_LIGHT_M_S / middle_hz
+        spikes = find_spikes(state.path, sidelink_m / cell_m, time_s, cycles_per_cell=cell_m / wave_m, wave_m=wave_m)
+        kept, spike_flags = kept & ~spikes.excluded, Flags(spikes.flags)
     flags = Flags.merged(
         clock_flags,
         interference.flags,
         state.flags,
+        spike_flags,
         edges(chosen, state),
         second_path_flags(state, cell_m=cell_m),
         {"association_suspect": wrong} if wrong else {},
         {"spectrum_inverted": _INVERTED} if inverted else {},
     )
     quality = {"method": chosen, "reason": reason, **_sidelink_report(state, residual)}
+    if not np.array_equal(kept, state.locked):
+        quality["spikes"] = int((state.locked & ~kept).sum())
     # Second pass, block by block on demand.
     correction = Correction(chosen, state.path, receiver.clock_hz, receiver.sfo_ppm)
     saturation = Saturation()
@@ -280,14 +294,14 @@ def transfer_by_sidelink(
 
     report = {"clock": receiver.report, "sidelink": quality, "code": _sidelink_code(state).report}
     return Transfer(
-        state.locked,
+        kept,
         flags,
         report,
-        delay_m[state.locked],
+        delay_m[kept],
         form,
         saturation,
-        state.snr_of_pulses_db[state.locked],
-        state.phase_rad[state.locked],
+        state.snr_of_pulses_db[kept],
+        state.phase_rad[kept],
         correction,
     )
 
