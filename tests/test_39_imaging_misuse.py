@@ -410,6 +410,6 @@ def test_requested_engine_that_misses_the_accuracy_is_replaced_and_flagged(accur
     flags = json.loads(image.attrs["flags"])
     assert ("engine_replaced" in flags) == replaced
     if replaced:
-        assert flags["engine_replaced"] == "the image formed by reference: the requested native misses -100 dB"
+        assert flags["engine_replaced"] == "the image formed by reference: the requested native does not meet -100 dB"
     automatic = ap.backproject(HISTORY, TARGET_GRID, accuracy_db=accuracy_db, judge=False)
     assert "engine_replaced" not in json.loads(automatic.attrs["flags"])
