@@ -332,7 +332,7 @@ class Multilook:
         return rows, columns
 
     def mean(self, window: Window) -> Floats:
-        """Return the mean power in a window of squares, (row, column) float64; NaN if under half the pixels are valid."""
+        """Return the mean power in a window of squares, (row, column) float64; NaN if most pixels are invalid."""
         margin = WINDOW // 2 if self.filtered else 0
         rows, columns = (
             slice(max(0, part.start - margin), min(size, part.stop + margin))

@@ -216,7 +216,7 @@ class Mean:
 
     @property
     def chance(self) -> float:
-        """Probability of a χ² of at least this value, given the stated standard deviations; 1 for a single reflector."""
+        """Probability of a χ² of at least this value, given the stated deviations; 1 for a single reflector."""
         from scipy.stats import chi2
 
         return float(chi2.sf(self.chi2, self.freedom)) if self.freedom else 1.0

@@ -131,7 +131,7 @@ class Agreement:
 
     @property
     def out_of_phase(self) -> bool:
-        """True if the phase difference significantly exceeds the tolerance, so that the sum of the images loses power."""
+        """True if the phase difference significantly exceeds the tolerance, so that the coherent sum loses power."""
         return self.certain and abs(self.phase_rad) > OUT_OF_PHASE_RAD + 2 * self.phase_std_rad
 
     @property
