@@ -60,7 +60,7 @@ REFUSED = {
         "two or more",
     ),
     "carrier alone": (of(frequency_hz=1.2e9), {}, r"frequency_hz \(\)"),
-    "weights zero": (of(weight=np.zeros(200)), {}, "at least one above 0"),
+    "weights zero": (of(weight=np.zeros(200)), {}, "at least one positive weight"),
     "weights negative": (of(weight=np.linspace(-1, 1, 200)), {}, "no negative weight"),
     "weights NaN": (of(weight=np.full(200, np.nan)), {}, "not finite"),
     "weights by pulse": (of(weight=np.ones(96)), {}, r"weight \(96,\)"),
@@ -130,7 +130,7 @@ REFUSED = {
     "atmosphere an index": (lambda: HISTORY, {"atmosphere": [1.0003]}, "atmosphere"),
     "calibration a string": (lambda: HISTORY, {"calibration": "auto"}, "calibration"),
     "calibration negative": (lambda: HISTORY, {"calibration": -1.0}, "calibration"),
-    "track in half precision": (flown(APERTURE.tx_m.astype(np.float16)), {}, "float16, whose neighbouring numbers"),
+    "track in half precision": (flown(APERTURE.tx_m.astype(np.float16)), {}, "float16, in which adjacent numbers"),
     "track with a mask": (
         lambda: ap.Aperture(np.ma.masked_equal(APERTURE.tx_m, APERTURE.tx_m[5, 0]), APERTURE.rx_m),
         {},
