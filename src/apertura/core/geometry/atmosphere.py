@@ -1,4 +1,4 @@
-"""Wave speed in the atmosphere, from refractivity at the terrain, its profile over height, and its mean along a path."""
+"""Wave speed in the atmosphere: refractivity at the terrain, profile over height, and mean along a path."""
 
 from dataclasses import dataclass
 from typing import Any

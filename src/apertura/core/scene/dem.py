@@ -115,7 +115,7 @@ class Dem(Terrain):
         return np.asarray(self._sample(row, column) + shift)
 
     def check_cover(self, grid: SceneGrid) -> None:
-        """Raise CampaignError if the DEM does not cover the whole grid; the error names the missing fraction and side."""
+        """Raise CampaignError if the DEM does not cover the whole grid, with the missing fraction and side."""
         xy_m = grid.map_at(*np.rint(grid.sample_pixels(COVER_NODES)))
         column, row = self._posts(grid.crs, xy_m[..., 0], xy_m[..., 1])
         outside = ~self._inside(row, column)
@@ -300,7 +300,7 @@ class UncheckedDem(Terrain):
     grid: SceneGrid
 
     def heights(self, grid: SceneGrid) -> Floats:
-        """Return the heights of the DEM; a void in the scene raises CampaignError with the number of pixels affected."""
+        """Return the heights of the DEM; voids in the scene raise CampaignError with the number of pixels affected."""
         heights = self.dem.heights(grid)
         if grid.spacing_m == self.grid.spacing_m and np.isnan(heights).any():
             height_range(self.dem, self.grid, where=self.dem.path)

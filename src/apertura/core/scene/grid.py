@@ -284,5 +284,5 @@ class SceneGrid:
         return rows, columns
 
     def sample_points(self, count: int, height_m: float) -> Floats:
-        """Return positions (m) of `sample_pixels` at a common height, (count, count, 3) float64, from north to south."""
+        """Return positions (m) of `sample_pixels` at a given height, (count, count, 3) float64, from north to south."""
         return self.positions_at(*self.sample_pixels(count), height_m)

@@ -396,7 +396,7 @@ class Looks:
         return self._sums(window)[1].astype(np.float64)
 
     def centre(self, tile: Window) -> tuple[Floats, Floats]:
-        """Return both antenna positions at the closest approach to each pixel, (row, column, 3) float64, metres each."""
+        """Return both antenna positions (m) at the closest approach to each pixel, (row, column, 3) float64 each."""
         centre = self.lattice.between(self.centres, tile, farthest=self._jump_m)
         return centre[..., 0, :], centre[..., 1, :]
 

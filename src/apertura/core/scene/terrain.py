@@ -37,7 +37,7 @@ class Terrain(Protocol):
         """
 
     def heights_at(self, grid: SceneGrid, row: ArrayLike, column: ArrayLike) -> Floats:
-        """Return heights (m) interpolated bilinearly at fractional pixel indices, (...,) float64; NaN outside the grid."""
+        """Interpolate heights (m) bilinearly at fractional pixel indices, (...,) float64; NaN outside the grid."""
         rows, columns = (np.asarray(axis, np.float64) for axis in np.broadcast_arrays(row, column))
         heights = np.full(rows.shape, np.nan)
         for tile in grid.tiles(_TILE_PX):

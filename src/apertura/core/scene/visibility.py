@@ -159,7 +159,7 @@ def _in_layover(direction, legs, pixel, extreme, ground):  # type: ignore[no-unt
 
 @numba.njit(cache=True, nogil=True)
 def _path_gradient(legs, pixel, height_m, spacing):  # type: ignore[no-untyped-def]
-    """Return the gradient of the total path along rows and columns, which gives the horizontal line-of-sight direction."""
+    """Return the gradient of the total path along rows and columns: the horizontal line-of-sight direction."""
     down, right = 0.0, 0.0
     for leg in range(2):
         south, east = (pixel[0] - legs[leg, 0]) * spacing, (pixel[1] - legs[leg, 1]) * spacing
