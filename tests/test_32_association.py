@@ -142,7 +142,7 @@ def test_unpaired_pulses_are_flagged_above_5_percent(early, flagged):
 def test_offset_of_integer_intervals_is_reported():
     (tx, rx), _ = fly(np.random.default_rng(5), pulses=130, jitter_s=0.001)
     shifted = associate(tx, rx + NS // 2, repetition_interval_s=0.05).flags["pulses_unpaired"]
-    assert shifted.startswith("of 130 transmitted pulses, 10 are before and 0 after the receiver's recording: ")
+    assert shifted.startswith("of 130 transmitted pulses, 10 are before and 0 after the recording of the receiver: ")
     assert "equally long and start +0.499 s from each other" in shifted
     assert "equally" not in associate(tx, rx[10:], repetition_interval_s=0.05).flags["pulses_unpaired"]
 

@@ -398,7 +398,7 @@ def test_error_budget_contains_the_atmosphere_if_vacuum_is_assumed():
     line = next(entry for entry in budget if entry["cause"] == "atmosphere")
     slant_m = np.linalg.norm(APERTURE.tx_m.mean(axis=0) - TARGET)
     ground_m = np.linalg.norm((APERTURE.tx_m.mean(axis=0) - TARGET)[0, :2])
-    assert "N = 300" in line["stated"]
+    assert "a refractivity of 300 N units, with vacuum assumed" in line["stated"]
     assert line["shift_m"] == pytest.approx(300e-6 * slant_m * slant_m / ground_m, rel=0.1)
     stated = ap.backproject(HISTORY, TARGET_GRID, judge=False, atmosphere=285.0).attrs["budget"]
     assert "20 N units" in stated
