@@ -105,7 +105,7 @@ def test_weight_error_stays_below_its_bound():
 def test_invalid_input_is_refused(plain):
     _, profiles = plain
     tables = cuda.prepare(profiles)
-    with pytest.raises(ValueError, match="contains no pulse"):
+    with pytest.raises(ValueError, match="must contain at least one pulse"):
         cuda.prepare(profiles[slice(0, 0)])
     with pytest.raises(ValueError, match="must be finite"):
         cuda.prepare(replace(profiles, start_m=profiles.start_m * np.nan))

@@ -1,4 +1,4 @@
-"""Range compression of transfer functions to profiles that are referenced to the band centre and cropped to the swath."""
+"""Range compression of transfer functions to profiles, referenced to the band centre and cropped to the swath."""
 
 from collections.abc import Callable, Mapping
 
@@ -67,7 +67,7 @@ _PULSES_AT_ONCE = 32  # number of pulses per block, limited by the processor cac
 
 _TAPS = 7
 _ROOM = 2.0
-"""Length of a decimated profile relative to the swath; with seven taps, the error is below that of complex64 rounding."""
+"""Length of a decimated profile relative to the swath; with seven taps, the error is below complex64 rounding."""
 _LARGEST_FACTOR = 64
 
 WINDOWS: Mapping[str, Callable[[int], NDArray[np.float64]]] = {"hann": np.hanning, "none": np.ones}

@@ -80,8 +80,8 @@ def own_code(transfer: NDArray[np.complex64], *, prefix_cells: int) -> CodeEvide
         level, needed, scatter = _strongest(profile, run, 2 * prefix_cells, beyond)
         largest_scatter = max(largest_scatter, scatter)
         line = (
-            f"in the sum of {run} pulses, the strongest complete echo is {decibels(level):.1f} dB above the mean beyond "
-            "the longest delay"
+            f"in the sum of {run} pulses, the strongest complete echo is {decibels(level):.1f} dB above the mean "
+            "beyond the longest delay"
         )
         if level >= needed:
             return CodeEvidence(True, line)

@@ -155,8 +155,8 @@ def pulse_filter(spectrum: NDArray[np.complexfloating], *, requested: str) -> Pu
         flags["waveform_sidelobes"] = f"range sidelobes of {sidelobes_db:.1f} dB after the {name} filter"
     if loss_db > MOST_LOSS_DB:
         flags["waveform_noise"] = (
-            f"SNR loss of the {name} filter {loss_db:.1f} dB: {np.mean(power < mean / 10):.0%} of the band is more than "
-            "10 dB below the mean of the band"
+            f"SNR loss of the {name} filter {loss_db:.1f} dB: {np.mean(power < mean / 10):.0%} of the band is more "
+            "than 10 dB below the mean of the band"
         )
     report = {"filter": name, "reason": reason, "loss_db": round(loss_db, 2), "sidelobes_db": round(sidelobes_db, 1)}
     return PulseFilter(np.asarray(chosen, np.complex64), report, flags)
