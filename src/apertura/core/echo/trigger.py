@@ -205,7 +205,7 @@ def _power(samples: Complexes) -> NDArray[np.float32]:
 
 
 def _windows(blocks: Iterable[Samples], size: int, *, overlap: int) -> Iterator[tuple[int, Complexes]]:
-    """Yield the first sample number and the samples of overlapping windows of length `size` (the last may be shorter)."""
+    """Yield the first sample number and the samples of overlapping windows of length `size` (or less at the end)."""
     window = np.empty(size, np.complex64)
     parts = window.view(np.float32).reshape(size, 2)
     first, filled, new = 0, 0, 0
