@@ -160,8 +160,8 @@ def _near(
 
 # ---- Positions of the pixels of a projected grid
 # The transformation of a pixel by PROJ takes as long as the integration of hundreds of pulses at this pixel. Over a
-# block of pixels, polynomials of degree four are as accurate as positions in float64 (docs/theory/planner.md, "Pixel
-# positions").
+# block of pixels, polynomials of degree four are as accurate as positions in float64
+# (docs/theory/planner.md, "Pixel positions").
 
 BLOCK_PX = 256
 
