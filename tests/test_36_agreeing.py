@@ -183,7 +183,7 @@ def test_unmeasured_pair_is_summed_unless_it_lacks_points_of_others():
     uncertain = choose_fusion(rank, between | {("a", "c"): measured_agreement(2.0, std_rad=0.7)}, align=False)
     assert "the standard deviation is too large" in uncertain.unmeasured["c"]
     hidden = choose_fusion(rank, between, hidden={("a", "c")}, align=False)
-    assert "contains no bright points of a" in hidden.excluded["c"]
+    assert "contains none of the bright points of a" in hidden.excluded["c"]
     assert hidden.unmeasured == {}
 
 

@@ -168,8 +168,8 @@ def compress(
 
     Notes
     -----
-    Source: docs/theory.md, eq. 4. As profiles are referenced to the band centre, the bandwidth for interpolation is
-    halved; backprojection applies the factor exp(+j2πf_mid·ρ/v). If the swath is only a part of the unambiguous range,
+    Source: docs/theory.md, eq. 4. Because profiles are referenced to the band centre, the bandwidth for interpolation
+    is halved; backprojection applies the factor exp(+j2πf_mid·ρ/v). If the swath is only part of the unambiguous range,
     the subcarriers are first decimated (docs/theory.md, eq. 4a), with the accuracy of complex64.
 
     Examples

@@ -60,7 +60,7 @@ def as_array(value: Any, kind: type, where: str) -> Any:
         ``np.float64`` or ``np.complex64``. Real numbers are not accepted as complex samples, because the phase of the
         samples is lost.
     where
-        Name of the argument in errors.
+        Name of the argument in error messages.
 
     Raises
     ------
@@ -321,8 +321,8 @@ class Aperture:
         Parameters
         ----------
         ground_m
-            (row, column, 3) float64, metres: terrain points spread over the scene, corners included, rows from north
-            to south.
+            (row, column, 3) float64, metres: terrain points distributed over the scene, including its corners, rows
+            from north to south.
         band_hz
             Lowest and highest frequency.
         weigh
@@ -352,8 +352,8 @@ class Aperture:
         Parameters
         ----------
         ground_m
-            (row, column, 3) float64, metres: terrain points spread over the scene, corners included, rows from north
-            to south.
+            (row, column, 3) float64, metres: terrain points distributed over the scene, including its corners, rows
+            from north to south.
         wavelength_m
             Wavelength at band centre.
 

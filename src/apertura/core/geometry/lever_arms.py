@@ -136,7 +136,7 @@ def phase_centres(
     attitude_from
         Source of the body axes: 'log', 'course' (course over ground with level flight assumed), or 'none'.
     where
-        Name of the log in errors.
+        Name of the log in error messages.
     frame
         'ecef', or 'local' with axes east, north and up.
     smoothing_m

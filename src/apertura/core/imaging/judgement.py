@@ -95,8 +95,8 @@ def judge(
     Parameters
     ----------
     image
-        Result of `apertura.backproject`, still lazy: its graph contains the echoes, the phase centres and the terrain.
-        For a lazy selection or function of it, the whole image is assessed.
+        Lazy result of `apertura.backproject`; the graph of the array contains the echoes, the phase centres and the
+        terrain. For a lazy selection or function of this image, the whole image is assessed.
     position_std_m
         Standard deviation of the phase centres in each axis, metres, from which the expected loss is computed
         (default: not stated; no loss is expected).

@@ -65,7 +65,7 @@ def noise_power(
     profiles
         Profiles of all pulses; only a sample of the pulses is read.
     places_m
-        (point, 3) float64, metres: distributed over the scene.
+        (point, 3) float64, metres, distributed over the scene.
     time_s
         (pulse,) float64, seconds, for the detection of missing pulses (default: no pulse is missing).
     beams

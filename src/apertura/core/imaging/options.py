@@ -75,7 +75,7 @@ class ImagingChoices(BaseModel):
         "all (all pulses), {degrees: x} of a straight pass, or {resolution_m: x} along the track",
     )
     terrain: Literal["auto", "plane", "tilted_plane", "dem"] = Field(
-        "auto", description="terrain model; auto: the simplest that preserves focus and position"
+        "auto", description="terrain model; auto: the simplest model that preserves focus and position"
     )
 
     @property

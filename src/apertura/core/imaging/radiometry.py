@@ -326,7 +326,7 @@ class Calibration:
         return self.constant * parts.sum(axis=0) ** 2, noise
 
     def _between(self, logarithms: Floats, window: Window) -> Floats:
-        """Return values at the pixels of a window, interpolated between nodes with finite values; NaN without such."""
+        """Interpolate values at the pixels of a window between nodes with finite values; NaN if there are none."""
         known = np.isfinite(logarithms)
         share = self.lattice.between(known.astype(np.float64), window)
         mean = self.lattice.between(np.where(known, logarithms, 0.0), window)

@@ -183,7 +183,7 @@ class Resolution:
         )  # fmt: skip
 
     def _between(self, values: Floats, window: Window) -> Floats:
-        """Return values at the pixels of a window, interpolated between nodes with finite values; NaN without such."""
+        """Interpolate values at the pixels of a window between nodes with finite values; NaN if there are none."""
         known = np.isfinite(values)
         share = self.lattice.between(known.astype(np.float64), window)
         mean = self.lattice.between(np.where(known, values, 0.0), window)

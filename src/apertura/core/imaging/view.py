@@ -114,7 +114,7 @@ def _speed_m_s(middle_m: NDArray[np.float64], time_s: NDArray[np.float64]) -> fl
 
 
 def _side(middle_m: NDArray[np.float64], point_m: NDArray[np.float64], up: NDArray[np.float64]) -> str:
-    """Return the side of the heading on which a point lies: left or right if nearly all pulses agree, else both."""
+    """Return the side of the heading on which a point lies: left or right for nearly all pulses, otherwise both."""
     if len(middle_m) < 2:
         return "both"
     across = np.cross(np.gradient(middle_m, axis=0), point_m - middle_m) @ up  # positive to the left

@@ -150,8 +150,8 @@ def _height_tolerance(job: Job) -> tuple[float, str]:
     focus_m = FOCUS_RAD * job.wavelength_m * nearest / (4 * np.pi * max(wobble_m, 1e-9))
     shift_m = SHIFT_PIXELS * job.spacing_m / max(steepest, 1e-9)
     return min(focus_m, shift_m), (
-        f"limits {focus_m:.3g} m by focus (0.4 rad at a track deviation of {wobble_m:.3f} m rms and a ground range of "
-        f"{nearest:.1f} m) and {shift_m:.3g} m by displacement (half a pixel)"
+        f"limits {focus_m:.3g} m for focus (0.4 rad at a track deviation of {wobble_m:.3f} m rms and a ground range of "
+        f"{nearest:.1f} m) and {shift_m:.3g} m for displacement (half a pixel)"
     )
 
 

@@ -102,7 +102,7 @@ class SettingSearch:
     def fallbacks(self, chosen: Setting) -> tuple[Setting, ...]:
         """Return settings that are successively more exact by at least 6 dB, ending with the exact sum.
 
-        Each is the cheapest of its accuracy, regardless of the requested engine and options.
+        Each setting is the cheapest one with its accuracy, regardless of the requested engine and options.
         """
         if chosen.engine == "reference":
             return ()
@@ -294,7 +294,7 @@ def _decide_presum(
     presum_seconds = PRESUM_S * pulses * job.signal.samples
     presummed = search.cheapest(len(presum.at), accuracy_db - MARGIN_DB - 1)
     if not requested and presum_seconds + presummed.seconds > 0.9 * every_pulse.seconds:
-        return keep(f"presumming {presum.factor}:1 costs more than it saves")
+        return keep(f"presumming {presum.factor}:1 takes more time than it saves")
     line = f"{oversampled}; {pulses} pulses are presummed to {len(presum.at)} with an error of {error_db:.1f} dB"
     chosen = replace(presummed, table_seconds=presummed.table_seconds + presum_seconds)
     return Decision("presum", presum.factor, line, error_db), presum, chosen

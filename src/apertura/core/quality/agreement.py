@@ -36,7 +36,7 @@ constant phase."""
 LARGEST_PHASE_STD_RAD = 0.4
 """Largest standard deviation of a phase that is used, radians: the loss from a phase error of this size is 0.2 dB."""
 
-_MOST_PATCHES = 16  # largest number of patches compared, the brightest ones
+_MOST_PATCHES = 16  # largest number of patches that are compared; the brightest patches are selected
 _LEAST_LOOKS = 12
 """Least number of independent samples: fewer may lie on one flank of a point response (interferometry.md, eq. 6)."""
 _BY_CHANCE = 0.001  # significance level: probability with which unrelated images are classified as coherent
@@ -429,7 +429,7 @@ def _looks(
     size: NDArray[np.float64],
     powers: NDArray[np.float64],
 ) -> float:
-    """Return the number of independent samples: that of resolution cells, or less if the power is concentrated."""
+    """Return the number of independent samples: the number of resolution cells, or less if power is concentrated."""
     by_band = powers.prod() * first[0].size * PATCH_PX**2 / (np.abs(first) ** 2 * np.abs(second) ** 2).sum()
     joint = size.prod(axis=0)
     by_power = 2 * by_band * joint.sum() ** 2 / (np.count_nonzero(joint) * (joint**2).sum())

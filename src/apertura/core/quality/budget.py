@@ -72,7 +72,7 @@ class BudgetLine:
         Stated or measured size of the error, a phrase. None if no size is stated: the effect is then computed for an
         error of the size `unit`.
     unit
-        Size for which the effect is computed if none is stated.
+        Size for which the effect is computed if no size is stated.
     effect
         Expected effect.
     assumed

@@ -229,7 +229,7 @@ class Certificate:
     exact: NDArray[np.complex128]
 
     def failing(self, image: BlockRaster, accuracy_db: float, *, power: float) -> tuple[list[Window], list[Window]]:
-        """Return (tiles without a drawn pixel, tiles that miss the accuracy); both are empty if all tiles pass.
+        """Return (tiles without a drawn pixel, tiles that do not meet the accuracy); both are empty if all tiles pass.
 
         A tile fails if the mean squared difference at its pixels exceeds the accuracy times the larger of `power`, the
         mean |I|² of the image, and the mean exact |I|² at these pixels: errors are proportional to the amplitude of

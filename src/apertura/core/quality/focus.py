@@ -199,7 +199,7 @@ class PointFocus:
 
 
 def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
-    """Measure the focus of a point; None if it does not dominate its range cell over the whole aperture.
+    """Measure the focus of a point; None if the point does not dominate its range cell over the whole aperture.
 
     Parameters
     ----------
@@ -252,7 +252,7 @@ def log_amplitude_variance(log_amplitude: NDArray[np.float64]) -> float:
 
 
 def _snr_db(contributions: NDArray[np.complex128]) -> float:
-    """Return the SNR of a pixel from neighbouring pulses, which differ only by noise."""
+    """Return the SNR of a pixel from consecutive pulses, which differ only by noise."""
     count = len(contributions) // 2
     if count < 2:
         return float("nan")

@@ -308,7 +308,7 @@ def _first_minimum(line: NDArray[np.float64]) -> int:
 
 
 def half_power_width(power: NDArray[np.float64], middle: int) -> float:
-    """Return the −3 dB width, in samples, of a lobe that peaks at sample `middle`; NaN if it extends beyond the line.
+    """Return the −3 dB width, samples, of a lobe with the peak at sample `middle`; NaN if it lacks a half-power point.
 
     Examples
     --------

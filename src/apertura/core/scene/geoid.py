@@ -1,4 +1,4 @@
-"""Conversion of heights above a geoid to ellipsoidal heights with a grid of undulations, which is checked."""
+"""Conversion of heights above a geoid to ellipsoidal heights, and checks of the grid of undulations."""
 
 import os
 import struct

@@ -439,7 +439,7 @@ class Looks:
 
 
 def pulses_of(reaching: NDArray[np.bool_], pulses: int) -> slice:
-    """Return the slice from the first to the last pulse of the marked blocks; all pulses if none is marked."""
+    """Return the slice from the first to the last pulse of the marked blocks; all pulses if no block is marked."""
     blocks = np.flatnonzero(reaching)
     if not blocks.size:
         return slice(0, pulses)

@@ -291,7 +291,7 @@ class GroundModels:
     def of(cls, terrain: Terrain, level: FlatGround | None, grid: SceneGrid) -> "GroundModels":
         """Fit the simplified models to the heights of a terrain at the centres of blocks of pixels.
 
-        If no level is given, `level` has the mean of these heights, or is the terrain itself if that is flat.
+        If no level is given, `level` has the mean of these heights; a flat terrain is used as `level` itself.
 
         Examples
         --------

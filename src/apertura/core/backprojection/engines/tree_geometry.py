@@ -250,7 +250,7 @@ def _fit(pixels: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
     """Return the coefficients of the surface fitted to pixels of a tile."""
     middle = pixels[pixels.shape[0] // 2, pixels.shape[1] // 2]
     (rows, fit_rows), (columns, fit_columns) = (_fitting(size, degree) for size in pixels.shape[:2])
-    offsets = pixels[np.ix_(rows, columns)] - middle  # subtracted for accuracy, as positions may be geocentric
+    offsets = pixels[np.ix_(rows, columns)] - middle  # subtracted for accuracy because positions may be geocentric
     coefficients = np.tensordot(fit_rows, fit_columns @ offsets, 1)
     coefficients[0, 0] += middle
     return np.ascontiguousarray(coefficients)
