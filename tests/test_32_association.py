@@ -100,7 +100,8 @@ def test_small_overlap_of_recordings_is_flagged(common, flagged):
 
 def test_recordings_of_different_flights_are_rejected():
     (tx, rx), _ = fly(np.random.default_rng(8), 100)
-    with pytest.raises(CampaignError, match=r"starts \+18\.000 s.*half a repetition interval \(0\.025 s\)"):
+    found = r"differ by \+18\.000 s and \+18\.000 s from.*half a repetition interval \(0\.025 s\)"
+    with pytest.raises(CampaignError, match=found):
         associate(tx, rx + 18 * NS, repetition_interval_s=0.05)
 
 
@@ -115,7 +116,7 @@ def test_large_tag_offset_is_flagged_with_the_distance_flown(offset_s, flagged):
     (tx, rx), _ = fly(np.random.default_rng(5), interval_s=0.1, offset_s=offset_s)
     flags = associate(tx, rx, repetition_interval_s=0.1, speed_m_s=12.0).flags
     assert ("time_tag_offset" in flags) == flagged
-    assert not flagged or flags["time_tag_offset"].endswith("moved 0.25 m in that time")
+    assert not flagged or flags["time_tag_offset"].endswith("in this time, the transmitter moved by 0.25 m")
 
 
 @pytest.mark.parametrize(("late_s", "excluded"), [(0.004, False), (0.006, True)])
@@ -142,8 +143,8 @@ def test_unpaired_pulses_are_flagged_above_5_percent(early, flagged):
 def test_offset_of_integer_intervals_is_reported():
     (tx, rx), _ = fly(np.random.default_rng(5), pulses=130, jitter_s=0.001)
     shifted = associate(tx, rx + NS // 2, repetition_interval_s=0.05).flags["pulses_unpaired"]
-    assert shifted.startswith("of 130 transmitted pulses, 10 are before and 0 after the receiver's recording: ")
-    assert "equally long and start +0.499 s from each other" in shifted
+    assert shifted.startswith("of 130 transmitted pulses, 10 are before and 0 after the recording of the receiver: ")
+    assert "equally long, and their starts differ by +0.499 s" in shifted
     assert "equally" not in associate(tx, rx[10:], repetition_interval_s=0.05).flags["pulses_unpaired"]
 
 

@@ -68,7 +68,7 @@ def test_weak_reflector_is_rejected(level, visible):
     if visible:
         assert estimate_path_offset(transfer, FREQUENCY, path_m=predicted).offset_m == pytest.approx(1.374, abs=0.1)
         return
-    with pytest.raises(CampaignError, match="f01: no reflector: the highest echo within 10 m"):
+    with pytest.raises(CampaignError, match="f01: no reflector: the strongest echo within 10 m"):
         estimate_path_offset(transfer, FREQUENCY, path_m=predicted, where="f01")
 
 

@@ -69,7 +69,7 @@ def test_noise_neither_confirms_nor_rejects_a_code():
 def test_prefix_as_long_as_the_period_gives_no_decision():
     found = own_code(echoes(np.random.default_rng(1)), prefix_cells=CELLS - 30)
     assert found.carried is None
-    assert "too few others to measure the floor" in found.evidence
+    assert "too few cells remain to measure the floor" in found.evidence
 
 
 def stability(transfer, time_s=None):

@@ -138,7 +138,7 @@ def test_vertical_datum_of_the_dem_is_used_or_must_agree(shared, tmp_path, monke
     stated = open_dem(horizontal, UTM_GRID.crs, datum="egm96", geoid=gtx).heights(UTM_GRID)
     np.testing.assert_allclose(carried, stated, atol=1e-6)
     assert 45 < (carried - 600).mean() < 50
-    with pytest.raises(CampaignError, match="heights of egm96 declared by its own CRS"):
+    with pytest.raises(CampaignError, match="heights above egm96, according to the CRS of the file"):
         open_dem(compound, UTM_GRID.crs, datum="ellipsoid")
     with pytest.raises(CampaignError, match="a CRS without heights"):
         open_dem(horizontal, UTM_GRID.crs, datum="carried")
@@ -222,7 +222,7 @@ def test_void_filled_with_a_constant_is_rejected_in_the_scene(tmp_path, fill, si
     count = "1 post" if side == 1 else f"{side**2} posts"
     void = f"a void filled with {fill}: {count} of this value from row 30, column 20, surrounded by posts that differ"
     assert void in message
-    assert f"Declare {fill} as nodata for these posts, and fill them with a GIS" in message
+    assert f"Declare {fill} as nodata for these posts, and fill the voids with a GIS" in message
 
 
 @pytest.mark.parametrize("kind", ["sea cliff", "coast", "lake", "declared"])
@@ -306,9 +306,7 @@ def geographic_dem(path, slope):
 
 
 def test_dem_without_a_datum_is_rejected(tmp_path):
-    with pytest.raises(
-        CampaignError, match=r"without heights.*ellipsoid, egm96 or egm2008.*from Python: path and datum"
-    ):
+    with pytest.raises(CampaignError, match=r"without heights.*ellipsoid, egm96 or egm2008.*in Python: path and datum"):
         ap.open_dem(plane_dem(tmp_path / "dem.tif"), UTM_GRID.crs)
 
 

@@ -114,7 +114,7 @@ def test_doubled_gain_doubles_the_image(isa, plain):
 def test_invalid_beams_are_refused(plain):
     scene, pixels, profiles = plain
     good = swaying_beam(scene.tx, (12, 0, 0))
-    with pytest.raises(ValueError, match="must be one for each of 36 pulses"):
+    with pytest.raises(ValueError, match="must equal the number of pulses, 36"):
         native.form(native.prepare(profiles), ecef(pixels), beams=Beams(replace(good, axes=good.axes[:5])))
     with pytest.raises(ValueError, match="orthogonal unit vectors"):
         replace(good, axes=1.1 * good.axes)

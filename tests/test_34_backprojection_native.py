@@ -278,7 +278,7 @@ def test_invalid_input_is_refused(plain):
     tables = native.prepare(profiles)
     with pytest.raises(ValueError, match="degree=3"):
         native.prepare(profiles, degree=3)
-    with pytest.raises(ValueError, match="contains no pulse"):
+    with pytest.raises(ValueError, match="must contain at least one pulse"):
         native.prepare(profiles[slice(0, 0)])
     with pytest.raises(ValueError, match="must be finite"):
         native.prepare(replace(profiles, start_m=profiles.start_m * np.nan))

@@ -464,7 +464,7 @@ def test_tile_band_is_the_largest_phase_slope_plus_an_airy_tail():
                 "start_m": np.zeros(0),
                 "aperture": Aperture(*np.zeros((2, 0, 3))),
             },
-            "contains no pulse",
+            "must contain at least one pulse",
         ),
         ({"start_m": np.full(300, np.nan)}, "must be finite"),
     ],

@@ -125,7 +125,7 @@ def test_setting_that_misses_the_accuracy_is_replaced_by_the_next(toy):
     assert not image.attrs["setting"].startswith("toy")
     assert image.attrs["numerical_error_db"] < -60
     models = json.loads(image.attrs["models"])
-    assert "missed the requested accuracy" in models["engine"]
+    assert "did not meet the requested accuracy" in models["engine"]
     assert "refine" not in models
     assert "accuracy_not_met" not in json.loads(image.attrs["flags"])
 

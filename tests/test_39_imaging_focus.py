@@ -43,13 +43,13 @@ def echo_of(points, *, noise=1e-3, seed=1):
 def test_echo_beyond_the_ranges_of_the_scene_is_reported():
     line = echo_outside_scene(echo_of(np.array([[0.0, 40.0, 0.0]])), GRID, GROUND)
     assert "has a total path of 12" in line  # 2·√(60² + 10²) = 121.7 m
-    assert "those of the scene are" in line
+    assert "total paths of the scene are" in line
 
 
 def test_strong_echo_not_focused_in_the_image_is_reported():
     """The check is called without bright points, so that the echo of a point within the scene counts as unfocused."""
     line = echo_outside_scene(echo_of(np.zeros((1, 3))), GRID, GROUND)
-    assert "no pixel of the image focuses it" in line
+    assert "but it is not focused at any pixel of the image" in line
 
 
 def test_points_in_one_range_cell_are_not_an_outside_echo():
@@ -57,11 +57,13 @@ def test_points_in_one_range_cell_are_not_an_outside_echo():
     east = np.array([-2.6, 0.0, 2.6])
     points = np.column_stack([east, np.sqrt(400 - east**2) - 20, 0 * east])
     history = echo_of(points)
-    assert "no pixel of the image focuses it" in echo_outside_scene(history, GRID, GROUND)
+    assert "but it is not focused at any pixel of the image" in echo_outside_scene(history, GRID, GROUND)
     terms = list(reference.terms(history, points).T)
     assert echo_outside_scene(history, GRID, GROUND, points=terms) is None
     wrong_terms = list(reference.terms(history, points + [1.5, 0.0, 0.0]).T)
-    assert "no pixel of the image focuses it" in echo_outside_scene(history, GRID, GROUND, points=wrong_terms)
+    assert "but it is not focused at any pixel of the image" in echo_outside_scene(
+        history, GRID, GROUND, points=wrong_terms
+    )
 
 
 @pytest.mark.slow

@@ -60,7 +60,7 @@ REFUSED = {
         "two or more",
     ),
     "carrier alone": (of(frequency_hz=1.2e9), {}, r"frequency_hz \(\)"),
-    "weights zero": (of(weight=np.zeros(200)), {}, "at least one above 0"),
+    "weights zero": (of(weight=np.zeros(200)), {}, "at least one positive weight"),
     "weights negative": (of(weight=np.linspace(-1, 1, 200)), {}, "no negative weight"),
     "weights NaN": (of(weight=np.full(200, np.nan)), {}, "not finite"),
     "weights by pulse": (of(weight=np.ones(96)), {}, r"weight \(96,\)"),
@@ -77,8 +77,8 @@ REFUSED = {
     "real samples": (of(transfer=np.abs(ECHO)), {}, "complex"),
     "fewer pulses": (of(transfer=ECHO[:95]), {}, "aperture of 96 pulses"),
     "no pulses": (lambda: HISTORY[:0], {}, "no pulses"),
-    "aperture an array": (of(aperture=APERTURE.tx_m), {}, "Create one with Aperture"),
-    "aperture None": (of(aperture=None), {}, "Create one with Aperture"),
+    "aperture an array": (of(aperture=APERTURE.tx_m), {}, "Create an aperture with Aperture"),
+    "aperture None": (of(aperture=None), {}, "Create an aperture with Aperture"),
     "track of one position": (lambda: ap.Aperture([0.0, 0, 9], [0.0, 0, 9]), {}, "one row of x, y and z per pulse"),
     "track transposed": (lambda: ap.Aperture(APERTURE.tx_m.T, APERTURE.rx_m.T), {}, "one row of x, y and z per pulse"),
     "track in two dimensions": (flown(APERTURE.tx_m[:, :2], APERTURE.rx_m[:, :2]), {}, "x, y and z"),
@@ -130,7 +130,7 @@ REFUSED = {
     "atmosphere an index": (lambda: HISTORY, {"atmosphere": [1.0003]}, "atmosphere"),
     "calibration a string": (lambda: HISTORY, {"calibration": "auto"}, "calibration"),
     "calibration negative": (lambda: HISTORY, {"calibration": -1.0}, "calibration"),
-    "track in half precision": (flown(APERTURE.tx_m.astype(np.float16)), {}, "float16, whose neighbouring numbers"),
+    "track in half precision": (flown(APERTURE.tx_m.astype(np.float16)), {}, "float16, in which adjacent numbers"),
     "track with a mask": (
         lambda: ap.Aperture(np.ma.masked_equal(APERTURE.tx_m, APERTURE.tx_m[5, 0]), APERTURE.rx_m),
         {},
@@ -398,7 +398,7 @@ def test_error_budget_contains_the_atmosphere_if_vacuum_is_assumed():
     line = next(entry for entry in budget if entry["cause"] == "atmosphere")
     slant_m = np.linalg.norm(APERTURE.tx_m.mean(axis=0) - TARGET)
     ground_m = np.linalg.norm((APERTURE.tx_m.mean(axis=0) - TARGET)[0, :2])
-    assert "N = 300" in line["stated"]
+    assert "a refractivity of 300 N units, with vacuum assumed" in line["stated"]
     assert line["shift_m"] == pytest.approx(300e-6 * slant_m * slant_m / ground_m, rel=0.1)
     stated = ap.backproject(HISTORY, TARGET_GRID, judge=False, atmosphere=285.0).attrs["budget"]
     assert "20 N units" in stated
@@ -410,6 +410,6 @@ def test_requested_engine_that_misses_the_accuracy_is_replaced_and_flagged(accur
     flags = json.loads(image.attrs["flags"])
     assert ("engine_replaced" in flags) == replaced
     if replaced:
-        assert flags["engine_replaced"] == "the image formed by reference: the requested native misses -100 dB"
+        assert flags["engine_replaced"] == "the image formed by reference: the requested native does not meet -100 dB"
     automatic = ap.backproject(HISTORY, TARGET_GRID, accuracy_db=accuracy_db, judge=False)
     assert "engine_replaced" not in json.loads(automatic.attrs["flags"])

@@ -174,7 +174,7 @@ def test_an_override_that_misses_the_accuracy_is_kept_and_predicted():
     planned = plan(overrides={"engine_options": {"numba": {"oversampling": 2}}})
     assert planned.setting.options == {"oversampling": 2}
     assert planned.predicted_error_db > -60
-    assert f"predicted {planned.predicted_error_db:.1f} dB, requested -60 dB" in planned.reasons["engine"]
+    assert f"predicted error {planned.predicted_error_db:.1f} dB, requested -60 dB" in planned.reasons["engine"]
     assert "predicted" not in plan().reasons["engine"]
     assert planned.fallbacks[-1].engine == "reference"
 

@@ -487,6 +487,12 @@ def test_attitude_in_radians_is_refused_if_a_lever_arm_needs_it(tiny, unit, refu
 
     edit_track(tiny, "uav1", circle)
     lines = reported(tiny)
-    assert any(line.startswith(f"{TX}: attitude angles appear to be in radians: yaw") for line in lines) is refused
+    assert (
+        any(
+            line.startswith(f"{TX}: attitude angles appear to be in radians: with this convention, yaw")
+            for line in lines
+        )
+        is refused
+    )
     edit_config(tiny, lambda document: document["nodes"]["uav1"].update(lever_arms_m={}))
     assert not any("attitude" in line for line in reported(tiny))

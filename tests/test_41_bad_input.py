@@ -121,7 +121,7 @@ def test_lever_arm_with_a_log_without_attitude_is_refused(tiny):
     campaign = Campaign.load(tiny)
     ingest_all(campaign)
     message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav1"))
-    assert "no attitude" in message
+    assert "the attitude is unknown" in message
     assert message.startswith("raw/f01/uav1.track.csv")
 
 
@@ -157,7 +157,7 @@ def test_beam_with_a_log_without_attitude_is_refused(tiny):
     campaign = Campaign.load(tiny)
     ingest_all(campaign)
     message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav1"))
-    assert "an antenna beam is configured, but there is no attitude (attitude: log)" in message
+    assert "an antenna beam is configured, but the attitude is unknown (attitude: log)" in message
 
 
 @pytest.mark.parametrize(

@@ -197,6 +197,6 @@ def test_image_without_aperture_is_inconclusive_about_focus():
     image = ap.backproject(ap.PhaseHistory(echo, frequency, np.full(128, 1 / 128), np.zeros(64), aperture), grid)
     focus = ap.judge(image)
     assert focus.verdict == "inconclusive"
-    assert focus.reason.startswith("no aperture: antennas moved 0 m: no resolution")
+    assert focus.reason.startswith("no aperture: the antennas moved by 0 m, which yields no resolution")
     assert "no_aperture" in image.attrs["flags"]
     assert not focus.flags.keys() & {"defocused", "echo_outside_scene"}

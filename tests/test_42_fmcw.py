@@ -148,7 +148,7 @@ def test_mixer_of_opposite_sign_is_flagged(tmp_path):
     run_steps(root, exports=False)
     flags = image_of(root).attrs["quality"]["flags"]
     assert {"echo_outside_scene", "defocused"} & set(flags)
-    assert any("change waveform.iq between complex and conjugate" in line for line in flags.values())
+    assert any("change waveform.iq from complex to conjugate or vice versa" in line for line in flags.values())
 
 
 def test_antenna_motion_during_a_slow_sweep_is_flagged(tmp_path):

@@ -98,7 +98,7 @@ def test_toy_engine_is_configured_planned_charted_and_run(finished_tiny, tmp_pat
     assert {"toy refine=2"} <= {row["setting"] for row in csv.DictReader(paths[0].open(encoding="utf-8"))}
     document["processing"] = {"engine_options": {"toy": {"refined": 2}}}
     config.write_text(yaml.safe_dump(document))
-    with pytest.raises(CampaignError, match=r"engine_options\.toy\.refined: .*its options: refine"):
+    with pytest.raises(CampaignError, match=r"engine_options\.toy\.refined: .*options of toy: refine"):
         Campaign.load(root)
 
 

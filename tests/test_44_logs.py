@@ -295,8 +295,8 @@ def test_attitude_in_radians_is_flagged_with_a_lever_arm(arm_m, flagged):
     flags = place(log, log, time[5:-5]).flags
     assert ("attitude_suspect" in flags) is flagged
     if flagged:
-        measured = "yaw then deviates from the course by 0°, but by 88° as degrees clockwise from north"
-        assert f"a: attitude angles appear to be in radians: {measured}" in flags["attitude_suspect"]
+        found = "a: attitude angles appear to be in radians: with this convention, yaw deviates from the course by 0°"
+        assert f"{found}; as degrees clockwise from north, it deviates by 88°" in flags["attitude_suspect"]
 
 
 @pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])

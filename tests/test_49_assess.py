@@ -249,7 +249,7 @@ def test_sum_with_unobservable_phase_is_flagged(finished_tiny, tmp_path, monkeyp
     monkeypatch.setattr("apertura.stages.assess.agreement_of", lambda *_: None)
     report = with_longer_path(root, 0.214 / 4)
     assert [*report["fusion"]["phases_rad"]] == list(PAIRS)
-    assert "is added with phase 0: it shares no features with" in report["flags"]["phase_unobservable"]
+    assert "is added with phase 0: no common features with" in report["flags"]["phase_unobservable"]
     assert "peak loss for a phase error of a quarter cycle: 3 dB" in report["flags"]["phase_unobservable"]
     assert report["coherence"]["mean"] == pytest.approx(0.5, abs=0.15)
     assert "sum_incoherent" in report["flags"]

@@ -59,8 +59,12 @@ def test_scheduler_outdates_only_the_crate(with_scheduler):
 @pytest.mark.parametrize(
     ("address", "named", "expected"),
     [
-        ("tcp://127.0.0.1:9", None, r"tcp://127.0.0.1:9: no scheduler is reachable there; expected a dask scheduler"),
-        ("tcp://nowhere.invalid:8786", None, r"tcp://nowhere.invalid:8786: no scheduler is reachable there"),
+        (
+            "tcp://127.0.0.1:9",
+            None,
+            r"tcp://127.0.0.1:9: no scheduler is reachable at this address; expected a dask scheduler",
+        ),
+        ("tcp://nowhere.invalid:8786", None, r"tcp://nowhere.invalid:8786: no scheduler is reachable at this address"),
         ("tcp://127.0.0.1:9", "tcp://127.0.0.1:8786", r"tcp://127.0.0.1:9, but DASK_SCHEDULER_ADDRESS is tcp://127"),
     ],
 )

@@ -74,7 +74,7 @@ def test_attitude_in_radians_is_reported_without_a_campaign(tmp_path):
         path.write_text("\n".join(["time_utc,east_m,north_m,up_m,roll_deg,pitch_deg,yaw_deg", *rows, ""]))
         lines = [line for line in look(path).missing if line.startswith("an attitude in degrees")]
         assert bool(lines) is is_radians
-        assert not is_radians or "appear to be in radians: yaw then deviates from the course by 0°" in lines[0]
+        assert not is_radians or "in radians: with this convention, yaw deviates from the course by 0°" in lines[0]
 
 
 def test_preview_of_a_log_labels_the_axes_of_its_frame(shared, tmp_path):

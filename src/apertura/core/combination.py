@@ -1,4 +1,4 @@
-"""Coherent and non-coherent sums of the images of a flight: choice of the pairs, the sums, and their coherence."""
+"""Coherent and non-coherent sums of the images of a flight: choice of the pairs, summation, and coherence."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from apertura.core.quality.agreement import OUT_OF_PHASE_RAD, Agreement
 
 @dataclass(frozen=True)
 class InPhase:
-    """Share of the power of the images at bright points that is preserved in their coherent sum.
+    """Fraction of the power at bright points that is preserved in the coherent sum of several images.
 
     Attributes
     ----------
@@ -51,14 +51,14 @@ def in_phase(amplitudes: NDArray[np.complex128], background: NDArray[np.float64]
     Parameters
     ----------
     amplitudes
-        (point, image) complex128, of the images as they are added: peak-normalised, with their phases removed.
+        (point, image) complex128, amplitudes as they are added: peak-normalised, and without the phase of each image.
     background
-        (point,) float64, power of the surroundings of each point relative to that of the point.
+        (point,) float64, power of the surroundings of each point, relative to the power of the point.
 
     Notes
     -----
-    Source: docs/theory/fusion.md, eq. 4. Points must be selected in the non-coherent sum, without the phases: at the
-    maxima of the coherent sum the images agree by selection.
+    Source: docs/theory/fusion.md, eq. 4. Points must be selected in the non-coherent sum, which is independent of the
+    phases. A selection of maxima of the coherent sum favours points at which the images are in phase.
 
     Examples
     --------
@@ -71,7 +71,7 @@ def in_phase(amplitudes: NDArray[np.complex128], background: NDArray[np.float64]
     coherence = np.abs(amplitudes.sum(axis=1)) ** 2 / (count * np.maximum(power, 1e-30))
     share = power / power.sum()
     mean = float((share * coherence).sum())
-    # Scatter between points, plus the error of each point by its background; for a single point only the latter.
+    # Scatter between points, plus the error of each point caused by its background; a single point has no scatter.
     scatter = ((coherence - mean) ** 2 + background**2 / 4) * share**2
     return InPhase(mean, float(np.sqrt(scatter.sum())), 1 / count, len(amplitudes))
 
@@ -82,15 +82,15 @@ def clutter_reduction_db(single_db: Sequence[float], coherent_db: float) -> floa
     Parameters
     ----------
     single_db
-        (pair,) clutter of each image of the sum: its median power over its peak power, dB.
+        (pair,) clutter level of each image of the sum: median power relative to peak power, dB.
     coherent_db
-        Clutter of the sum, dB.
+        Clutter level of the sum, dB.
 
     Returns
     -------
     float
-        Reduction, dB: 10 lg of the number of images if the targets add in phase and the clutter does not; 0 if the
-        images are identical; less if the targets do not add in phase.
+        Reduction, dB. It is 10 lg n for n images if the targets add in phase and the clutter does not, and 0 if the
+        images are identical. If the targets do not add in phase, the reduction is smaller.
 
     Raises
     ------
@@ -115,12 +115,12 @@ def clutter_reduction_db(single_db: Sequence[float], coherent_db: float) -> floa
 
 
 MOST_SETS_OF = 12
-"""Largest number of pairs of which all 4096 subsets are tried; with more pairs, those that agree with most others are
-used."""
+"""Largest number of pairs for which all subsets are tried (4096 subsets). If there are more pairs, the 12 pairs that
+agree with the largest number of other pairs are used."""
 
 _SURE = 3.09
-"""Quantile of a normal variable, standard deviations, exceeded with probability 1/1000: above it a set is
-inconsistent."""
+"""Quantile of the standard normal distribution that is exceeded with probability 1/1000. A set with a misfit above the
+corresponding quantile of χ² is inconsistent."""
 
 
 @dataclass(frozen=True)
@@ -130,24 +130,25 @@ class CoherentSum:
     Attributes
     ----------
     reference
-        The best focused member, the reference of the phases.
+        Best focused pair of `agreeing`, to which all phases are relative.
     phases_rad
         Pair → phase removed before the pair is added; 0 if no removal was requested or needed.
     excluded
-        Excluded pair → reason, one line. Excluded pairs are part of the non-coherent sums only.
-    why
+        Excluded pair → reason, one line. Excluded pairs contribute to the non-coherent sums only.
+    reason
         Included pair → reason, one line.
     agreeing
-        The largest set of pairs whose differences in phase and position are measured and agree.
+        The largest set of pairs with measured and mutually consistent differences in phase and position.
     apart
-        Measured pair outside that set → its difference from the set.
+        Pair outside `agreeing` with a measured difference → this difference from the set.
     unmeasured
         Pair that is added with phase 0 because its phase is not measurable → reason, one line.
     ties
-        Other consistent sets of the same size that contradict `agreeing`: which set is correct is not observable.
+        Other consistent sets of the same size that contradict `agreeing`: the correct one of these sets is not
+        observable.
     misfit, freedom
-        χ² of the measured differences within the set, relative to a model with one phase and one position per pair, and
-        its degrees of freedom.
+        χ² of the measured differences within the set, relative to a model with one phase and one position per pair; and
+        the number of degrees of freedom.
     """
 
     reference: str
@@ -163,7 +164,7 @@ class CoherentSum:
 
     @property
     def report(self) -> dict[str, Any]:
-        """The choice as JSON values."""
+        """The choice of pairs as JSON values."""
         return {
             "phases_rad": {pair: round(phase, 4) for pair, phase in self.phases_rad.items()},
             "excluded": dict(self.excluded),
@@ -192,16 +193,16 @@ def choose_fusion(
     Parameters
     ----------
     rank
-        Every pair → rank of its focus, lower is better; decides among sets of equal size.
+        Pair → rank of its focus (lower is better), which decides among sets of equal size.
     between
-        Two pairs, in the order of `rank` → difference of the second from the first; None if not measurable.
+        Two pairs, in the order of `rank` → difference of the second pair from the first; None if not measurable.
     hidden
-        Two pairs: the second should contain the bright points of the first but contains none, so that it adds only
-        noise.
+        Two pairs, of which the second contains none of the bright points of the first although these should be within
+        its coverage: adding the second pair would add only noise.
     coarse
-        Reason why no two images can be compared, if the pixels are too wide for that.
+        Reason for which images cannot be compared, if the pixel spacing is too large; otherwise empty.
     align
-        True if a constant phase is removed from each pair: members may then differ by any constant phase.
+        True if a constant phase is removed from each pair; the pairs of a set may then differ by constant phases.
 
     Notes
     -----
@@ -211,7 +212,7 @@ def choose_fusion(
     --------
     >>> alone = choose_fusion({"a-a": (0,), "a-b": (1,)}, {("a-a", "a-b"): None}, align=False)
     >>> alone.phases_rad, alone.unmeasured
-    ({'a-a': 0.0, 'a-b': 0.0}, {'a-b': 'it shares no features with a-a from which a phase can be measured'})
+    ({'a-a': 0.0, 'a-b': 0.0}, {'a-b': 'no common features with a-a from which a phase can be measured'})
     """
     pairs = list(rank)
     compared = {two: agreement for two, agreement in between.items() if agreement is not None}
@@ -225,7 +226,7 @@ def choose_fusion(
     agreeing = tuple(pair for pair in pairs if pair in best.pairs)
     others = " and ".join(pair for pair in agreeing if pair != reference)
     phases, excluded, apart, unmeasured = {reference: 0.0}, {}, {}, {}
-    reason = {reference: f"it agrees with {others}" if others else "it is the reference of the phases"}
+    reason = {reference: f"agrees with {others}" if others else "phase reference"}
     for pair in pairs:
         if pair == reference:
             continue
@@ -238,13 +239,13 @@ def choose_fusion(
             apart[pair] = difference
             excluded[pair] = _reason(difference, _named(agreeing), reference, align=align)
         elif unseen := [member for member in best.pairs if (member, pair) in hidden]:
-            excluded[pair] = f"its image contains no bright points of {_named(unseen)} beyond random matches"
+            excluded[pair] = f"its image contains none of the bright points of {_named(unseen)}, except random matches"
         else:
             phases[pair], uncertain = 0.0, best.against(pair, compared, reference)
             unmeasured[pair] = (
-                coarse or f"it shares no features with {_named(agreeing)} from which a phase can be measured"
+                coarse or f"no common features with {_named(agreeing)} from which a phase can be measured"
                 if uncertain is None
-                else f"{_phase_line(uncertain, reference)} is not certain enough"
+                else f"{_phase_line(uncertain, reference)}: the standard deviation is too large"
             )
             reason[pair] = f"phase not measured: {unmeasured[pair]}"
     opposite = [rival.pairs for rival in rivals if rival.contradicts(best, measured)]
@@ -260,10 +261,10 @@ def _named(pairs: Collection[str]) -> str:
 
 
 def _phase_line(difference: Agreement, reference: str) -> str:
-    """Return the phase difference, its reference and the features on which it was measured, in one line."""
+    """Return one line with the phase difference, the reference pair, and the features of the measurement."""
     speckle = " of speckle" if difference.by == "looks" else ""
     phase = f"{difference.phase_rad:+.2f} ± {difference.phase_std_rad:.2f} rad"
-    return f"{phase} from {reference} at {difference.evidence}{speckle}"
+    return f"{phase} relative to {reference} at {difference.evidence}{speckle}"
 
 
 def _reason(difference: Agreement, agreeing: str, reference: str, *, align: bool) -> str:
@@ -272,22 +273,22 @@ def _reason(difference: Agreement, agreeing: str, reference: str, *, align: bool
         return f"its bright points are displaced by {100 * difference.shift_m:.1f} cm from those of {agreeing}"
     line = _phase_line(difference, reference)
     if difference.incoherent:
-        return f"{line}, coherence {difference.coherence:.2f}: no common phase"
+        return f"{line}, coherence {difference.coherence:.2f}: the points have no common phase"
     if align:
-        return f"{line}: its differences from {agreeing} contradict each other"
-    return f"{line}; processing.fusion.align_phase would add {-difference.phase_rad:+.2f} rad to align it"
+        return f"{line}: the differences measured relative to {agreeing} contradict each other"
+    return f"{line}; processing.fusion.align_phase would align this pair by adding {-difference.phase_rad:+.2f} rad"
 
 
 @dataclass(frozen=True)
 class _Set:
-    """Set of pairs, and the phase and position of each, by least squares over the differences measured between them.
+    """Set of pairs, with the phase and position of each pair from a least-squares fit to the measured differences.
 
     Attributes
     ----------
     pairs
         Members of the set.
     states
-        Pair → phase (radians), metres east and north, relative to the first.
+        Pair → phase, radians, and position east and north, metres, relative to the first pair.
     misfit, freedom
         χ² of the measured differences, and its degrees of freedom.
     """
@@ -299,7 +300,7 @@ class _Set:
 
     @classmethod
     def of(cls, pairs: Sequence[str], measured: Mapping[tuple[str, str], Agreement], *, align: bool) -> "_Set | None":
-        """Return the pairs as a set; None if they contradict each other or are not all connected."""
+        """Return pairs as a set; None if the pairs contradict each other or measurements do not connect all of them."""
         edges = {two: difference for two, difference in measured.items() if two[0] in pairs and two[1] in pairs}
         if any(difference.shifted or difference.incoherent for difference in edges.values()):
             return None
@@ -319,9 +320,9 @@ class _Set:
         return consistent if align or in_phase_as_recorded else None
 
     def against(self, pair: str, measured: Mapping[tuple[str, str], Agreement], reference: str) -> Agreement | None:
-        """Return the difference of a pair from the set's reference, from all measurements between the pair and the set.
+        """Return the difference of a pair from the reference, from all measurements between the pair and the set.
 
-        The phase is the weighted mean over the members; None if the pair was measured against no member.
+        The phase is the weighted mean over the members. None if the pair was not measured relative to any member.
         """
         if pair in self.states and pair != reference:
             direct = agreement_between(measured, reference, pair)
@@ -338,7 +339,7 @@ class _Set:
         phases = np.array([difference.phase_rad + state[0] for difference, state in of_members])
         weights = np.array([1 / difference.phase_std_rad**2 for difference, _ in of_members])
         phase = float(np.angle((weights * np.exp(1j * phases)).sum()))
-        # The noise of the outlier is common to all differences: their mean is not more accurate than the best of them.
+        # The noise of this pair is common to all differences: their mean is not more accurate than the best difference.
         is_displaced = sum(difference.shifted for difference, _ in of_members) > len(of_members) / 2
         best = min(
             (difference for difference, _ in of_members if difference.shifted == is_displaced),
@@ -362,7 +363,7 @@ def _largest(
     *,
     align: bool,
 ) -> tuple[_Set, list[_Set]]:
-    """Return the largest consistent set (of several, the best focused one), and the others of the same size."""
+    """Return the largest consistent set (the best focused one of several), and the other sets of this size."""
     if len(pairs) > MOST_SETS_OF:
         pairs = _without_the_worst(pairs, measured, align=align)
     for size in range(len(pairs), 0, -1):
@@ -377,7 +378,7 @@ def _largest(
 def _without_the_worst(
     pairs: Sequence[str], measured: Mapping[tuple[str, str], Agreement], *, align: bool
 ) -> list[str]:
-    """Return `MOST_SETS_OF` pairs: those that agree pairwise with the fewest others are omitted."""
+    """Return `MOST_SETS_OF` pairs: the pairs that agree with the fewest other pairs are omitted."""
     agreeing = {
         pair: sum(_Set.of(two, measured, align=align) is not None for two in combinations(pairs, 2) if pair in two)
         for pair in pairs
@@ -387,7 +388,7 @@ def _without_the_worst(
 
 
 def agreement_between(between: Mapping[tuple[str, str], Agreement | None], first: str, second: str) -> Agreement | None:
-    """Return the difference of a second pair from a first, regardless of the order of comparison; None: unknown.
+    """Return the difference of a second pair from a first, compared in either order; None if it is unknown.
 
     Examples
     --------
@@ -399,7 +400,7 @@ def agreement_between(between: Mapping[tuple[str, str], Agreement | None], first
 
 
 def _along(pairs: Sequence[str], edges: Mapping[tuple[str, str], Agreement]) -> NDArray[np.float64] | None:
-    """Return phases of pairs relative to the first, by the most accurate differences; None if not all are connected."""
+    """Return phases relative to the first pair, along the most accurate differences; None if a pair is unconnected."""
     phases = {pairs[0]: 0.0}
     for _ in pairs[1:]:
         open_ends = [
@@ -418,7 +419,7 @@ def _along(pairs: Sequence[str], edges: Mapping[tuple[str, str], Agreement]) -> 
 def _adjusted(
     pairs: Sequence[str], edges: Mapping[tuple[str, str], Agreement], start: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
-    """Return (pair, 3) phase and position of each pair, χ², and (pair, pair) deviations of phase differences."""
+    """Return (pair, 3) phases and positions, χ², and (pair, pair) standard deviations of phase differences."""
     count = len(pairs)
     matrix, measured, std = np.zeros((len(edges), count)), np.zeros((len(edges), 3)), np.zeros((len(edges), 3))
     for row, ((first, second), edge) in enumerate(edges.items()):
@@ -458,13 +459,13 @@ def coherent_sum(
 ) -> NDArray[np.complex64]:
     """Return the complex mean of peak-normalised images.
 
-    The spectra of the images adjoin, so the resolution of the sum is finer than that of each image. Mono- and bistatic
-    images add in phase if sidelink correction and path offsets are right (docs/theory.md, eq. 7).
+    The spectra of the images adjoin, so that the sum has a finer resolution than each image. Monostatic and bistatic
+    images add in phase if the sidelink correction and the path offsets are correct (docs/theory.md, eq. 7).
 
     Parameters
     ----------
     images
-        (pair, y, x) complex64 on one grid or a block of it, with the carrier phase. NaN where no pulse of a pair
+        (pair, y, x) complex64 on one grid or a block of a grid, with the carrier phase. NaN where no pulse of a pair
         illuminates the pixel: the pair does not contribute to that pixel.
     peaks
         (pair,) float64, largest magnitude of each whole image.
@@ -474,7 +475,8 @@ def coherent_sum(
     Returns
     -------
     ndarray
-        (y, x) complex64, 1 where all images peak in phase, NaN where no pair illuminates the pixel.
+        (y, x) complex64; of magnitude 1 where all images have their peak and are in phase, NaN where no pair
+        illuminates the pixel.
 
     Raises
     ------
@@ -528,6 +530,6 @@ def _mean(images: NDArray[Any]) -> NDArray[Any]:
 def _normalised(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> NDArray[np.complex64]:
     if not (peaks > 0).all():
         raise ValueError(f"{peaks=}: must be positive; exclude pairs whose image is empty")
-    # Real and imaginary parts as float32: numpy's complex division takes ten times as long, for the same values.
+    # Real and imaginary parts as float32: numpy's complex division yields the same values in ten times the time.
     parts = np.ascontiguousarray(images, np.complex64).view(np.float32)
     return (parts * (1 / np.asarray(peaks, np.float64))[:, None, None]).astype(np.float32).view(np.complex64)

@@ -35,7 +35,7 @@ def kaiser_window(position: Floats, beta: float) -> Floats:
     Parameters
     ----------
     position
-        (...,) float64, offset from the middle of the window as a fraction of its half width.
+        (...,) float64, offset from the centre of the window as a fraction of its half width.
     beta
         Shape parameter; a larger value gives a wider main lobe and lower sidelobes.
 
@@ -54,7 +54,7 @@ def kaiser_sinc(distance: Floats, *, half: int, beta: float) -> Floats:
     Parameters
     ----------
     distance
-        (...,) float64, from the interpolated position to each sample, in samples.
+        (...,) float64, distance from the interpolated position to each sample, in samples.
     half
         Number of samples used on each side.
     beta

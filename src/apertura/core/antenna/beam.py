@@ -12,24 +12,26 @@ from apertura.core.geometry.sector import Sector
 # ---- Antenna patterns: Gaussian or sampled cuts, and antenna axes
 
 Cut = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""One cut through a pattern: equally spaced angles (rad) and field relative to its peak."""
+"""Cut through a pattern: equally spaced angles (rad), and field relative to the peak of the cut."""
 
 LIMITS_RAD = {"azimuth": np.pi, "elevation": np.pi / 2}
-"""Largest angle from the boresight of each cut, radians."""
+"""Largest angle of each cut from the boresight, radians."""
 
-_SAMPLES = 513  # linear interpolation has an error of -100 dB with a cutoff of -20 dB
-_FINE = 4097  # samples of a cut; their spacing is 0.09° over 360°
+# number of samples of a Gaussian cut: with a cutoff of -20 dB, linear interpolation has an error of -100 dB
+_SAMPLES = 513
+_FINE = 4097  # number of samples of a sampled cut: a spacing of 0.09° over 360°
 
 
 def antenna_axes(body_axes: NDArray[np.float64], boresight_deg: tuple[float, float]) -> NDArray[np.float64]:
-    """Return the axes of an antenna as used by `Beam`.
+    """Return the axes of an antenna as required by `Beam`.
 
     Parameters
     ----------
     body_axes
-        (pulse, 3, 3) float64; columns are the body's forward, right and down unit vectors in the frame of the pixels.
+        (pulse, 3, 3) float64; columns are the forward, right and down unit vectors of the body in the frame of the
+        pixels.
     boresight_deg
-        Azimuth clockwise from forward and elevation above the forward-right plane, degrees.
+        Azimuth clockwise from forward, and elevation above the forward-right plane, degrees.
 
     Returns
     -------
@@ -69,9 +71,9 @@ def gaussian_cut(width_deg: float, *, cutoff_db: float, limit_rad: float) -> Cut
     width_deg
         Full width at half power, degrees.
     cutoff_db
-        Gain at which the cut ends, dB relative to its peak.
+        Gain at which the cut ends, dB relative to the peak.
     limit_rad
-        Largest angle of the cut.
+        Largest angle of the cut, radians.
 
     Examples
     --------
@@ -86,16 +88,16 @@ def gaussian_cut(width_deg: float, *, cutoff_db: float, limit_rad: float) -> Cut
 
 
 def sampled_cut(angle_deg: NDArray[np.float64], gain_db: NDArray[np.float64], *, cutoff_db: float) -> Cut:
-    """Return the main lobe of a sampled cut: the interval about its peak with a gain of at least `cutoff_db`.
+    """Return the main lobe of a sampled cut: the interval about the peak with a gain of at least `cutoff_db`.
 
     Parameters
     ----------
     angle_deg
         (sample,) float64, ascending, degrees from boresight.
     gain_db
-        (sample,) float64, dB relative to any level; interpolated linearly between samples.
+        (sample,) float64, dB relative to an arbitrary level; interpolated linearly between samples.
     cutoff_db
-        Gain at which the cut ends, dB relative to its peak.
+        Gain at which the cut ends, dB relative to the peak.
 
     Notes
     -----
@@ -118,7 +120,7 @@ def sampled_cut(angle_deg: NDArray[np.float64], gain_db: NDArray[np.float64], *,
 def sampled_phase(
     angle_deg: NDArray[np.float64], phase_deg: NDArray[np.float64], at_rad: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the phase of a sampled cut at the angles `at_rad`, unwrapped and linear between samples, rad.
+    """Return the unwrapped phase of a sampled cut at the angles `at_rad`, interpolated linearly, rad.
 
     Examples
     --------
@@ -133,7 +135,7 @@ def sampled_phase(
 
 @dataclass(frozen=True)
 class Beam:
-    """Separable antenna pattern about axes that rotate with the antenna; zero outside the sampled angles.
+    """Separable antenna pattern about axes that rotate with the antenna; the gain is 0 outside the sampled angles.
 
     A direction with components (a, b, c) along the axes has azimuth atan2(b, a) and elevation
     atan2(c, √(a² + b²)). The gain is the product of both cuts, linear between samples.
@@ -148,13 +150,13 @@ class Beam:
     azimuth_gain, elevation_gain
         (n,) and (m,) float64, field (not power) relative to boresight.
     azimuth_phase_rad, elevation_phase_rad
-        (n,) and (m,) float64, phase of the field, the sum of the phases of both cuts; None: unknown. Engines do not
-        compensate this phase.
+        (n,) and (m,) float64, phase of each cut; the phase of the field is the sum of both. None: unknown. Engines do
+        not compensate this phase.
 
     Raises
     ------
     ValueError
-        If shapes differ, angles are not equally spaced, or axes are not orthogonal unit vectors.
+        If shapes differ, if angles are not equally spaced, or if axes are not orthogonal unit vectors.
 
     Notes
     -----
@@ -191,7 +193,7 @@ class Beam:
 
     def __getitem__(self, pulses: slice | NDArray[np.int64]) -> "Beam":
         """Return the beam over the selected pulses."""
-        selected = copy(self)  # the fields of this beam are valid and not checked again
+        selected = copy(self)  # the attributes of this beam are valid and are not checked again
         object.__setattr__(selected, "axes", self.axes[pulses])
         return selected
 
@@ -244,7 +246,7 @@ class Beam:
     def angles(self, position_m: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return azimuth and elevation of each pixel, (2, pulse, pixel) rad; parameters and errors as for `gain`."""
         if len(self.axes) != len(position_m):
-            raise ValueError(f"{len(self.axes)=}: must be one for each of {len(position_m)} pulses")
+            raise ValueError(f"{len(self.axes)=}: must equal the number of pulses, {len(position_m)}")
         # Matrix products relative to a nearby origin, to preserve the precision of the coordinates.
         offset_m, antenna_m = (pixels - position_m[:1]).T, position_m - position_m[:1]
         ahead, right, above = (
@@ -260,7 +262,7 @@ class Beam:
 
     @property
     def steepest(self) -> float:
-        """Largest slope of the gain, per radian, of both cuts combined."""
+        """Upper bound of the slope of the gain in any direction, per radian."""
         slopes = [np.abs(np.diff(gain)).max() / (angle[1] - angle[0]) for _, angle, gain in self._patterns()]
         peaks = [np.abs(gain).max() for _, _, gain in self._patterns()]
         return float(np.hypot(slopes[0] * peaks[1], slopes[1] * peaks[0]))
@@ -274,14 +276,14 @@ class Beam:
 
 @dataclass(frozen=True)
 class Beams:
-    """Weights of pulses: beams of transmitter and receiver, and the sector of integration of each pixel.
+    """Weights of pulses: beams of transmitter and receiver, and the integration sector of each pixel.
 
     Attributes
     ----------
     transmit, receive
-        Beam over the pulses of an image; None: isotropic.
+        Beams at the pulses of an image; None: isotropic.
     sector
-        Sector over the same pulses; None: all pulses are integrated.
+        Sector at the same pulses; None: all pulses are integrated.
 
     Examples
     --------
@@ -299,26 +301,26 @@ class Beams:
         return Beams(transmit, receive, self.sector and self.sector[pulses])
 
     def check_pulses(self, pulses: int) -> None:
-        """Raise ValueError if beams or sector have a different number of pulses."""
+        """Raise ValueError if the beams or the sector have a different number of pulses."""
         for beam in (self.transmit, self.receive):
             if beam is not None and len(beam.axes) != pulses:
-                raise ValueError(f"{len(beam.axes)=}: must be one for each of {pulses} pulses")
+                raise ValueError(f"{len(beam.axes)=}: must equal the number of pulses, {pulses}")
         if self.sector is not None and len(self.sector.tx_axis) != pulses:
-            raise ValueError(f"{len(self.sector.tx_axis)=}: must be one for each of {pulses} pulses")
+            raise ValueError(f"{len(self.sector.tx_axis)=}: must equal the number of pulses, {pulses}")
 
     @property
     def antennas(self) -> "Beams | None":
-        """The beams without the sector; None if there are none."""
+        """The beams without the sector; None if neither antenna has a beam."""
         return Beams(self.transmit, self.receive) if self.transmit or self.receive else None
 
     @classmethod
     def within(cls, sector: Sector | None, antennas: "Beams | None") -> "Beams | None":
-        """Combine the beams of antennas with a sector; None if there is neither."""
+        """Combine the beams of antennas with a sector; None if there are neither beams nor a sector."""
         beams = antennas or cls()
         return cls(beams.transmit, beams.receive, sector) if antennas or sector else None
 
     def phase(self, aperture: Aperture, pixels: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return the sum of both antennas' phases towards each pixel, (pulse, pixel) rad; None: unknown."""
+        """Return the sum of the phases of both antennas towards each pixel, (pulse, pixel) rad; None: unknown."""
         legs = zip((self.transmit, self.receive), aperture.legs, strict=True)
         known = [
             beam.phase(position_m, pixels)
@@ -328,7 +330,7 @@ class Beams:
         return np.asarray(np.sum(known, axis=0)) if known else None
 
     def weight(self, aperture: Aperture, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the product of both gains and the sector's weight, (pulse, pixel) float64; see `Beam.gain`."""
+        """Return the product of both gains and the weight of the sector, (pulse, pixel) float64; see `Beam.gain`."""
         total = np.ones((len(aperture), len(pixels)))
         for beam, position_m in zip((self.transmit, self.receive), aperture.legs, strict=True):
             if beam is not None:

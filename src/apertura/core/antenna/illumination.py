@@ -26,7 +26,7 @@ class Illumination:
     Examples
     --------
     >>> Illumination(np.array([0, 20, 40, 60]), 100).line
-    'each point of the scene is illuminated by 0 to 60 of 100 pulses (median 30); 25 % of the points by no pulse'
+    'each point of the scene is illuminated by 0 to 60 of 100 pulses (median 30); 25 % of points are not illuminated'
     """
 
     pulse_counts: NDArray[np.int64]
@@ -34,7 +34,7 @@ class Illumination:
 
     @property
     def unilluminated(self) -> float:
-        """Share of the points that no pulse illuminates."""
+        """Fraction of the points that no pulse illuminates."""
         return float((self.pulse_counts == 0).mean())
 
     @property
@@ -45,10 +45,12 @@ class Illumination:
 
     @property
     def line(self) -> str:
-        """The counts in one line."""
+        """Numbers of illuminating pulses in one line."""
         least, median, most = self.counts.values()
         line = f"each point of the scene is illuminated by {least} to {most} of {self.pulses} pulses (median {median})"
-        return f"{line}; {100 * self.unilluminated:.0f} % of the points by no pulse" if self.unilluminated else line
+        if self.unilluminated:
+            line += f"; {100 * self.unilluminated:.0f} % of points are not illuminated"
+        return line
 
 
 def illuminate(beams: Beams, aperture: Aperture, point_m: NDArray[np.float64]) -> Illumination:
@@ -85,7 +87,7 @@ def illumination_mask(
     Parameters
     ----------
     beams
-        Beams of all pulses; None illuminates everything.
+        Beams of all pulses; None: every pulse illuminates every point.
     aperture
         Aperture of all pulses.
     middle_m, radius_m
@@ -96,7 +98,7 @@ def illumination_mask(
     Returns
     -------
     ndarray
-        (block, sphere) bool. False if the weight of every pulse of the block is zero throughout the sphere.
+        (block, sphere) bool; False if the weight of every pulse of the block is known to be zero throughout the sphere.
     """
     count = -(-len(aperture) // pulses)
     mask = np.ones((count, len(middle_m)), bool)
@@ -111,8 +113,8 @@ def illumination_mask(
 def _block_mask(
     beams: Beams, aperture: Aperture, middle_m: NDArray[np.float64], radius_m: NDArray[np.float64], pulses: int
 ) -> NDArray[np.bool_]:
-    # For each block, only its middle pulse is evaluated, with spheres enlarged by the distance to the block's other
-    # pulses.
+    # For each block, only the middle pulse is evaluated, with spheres enlarged by the distance to the other pulses of
+    # the block.
     starts = np.arange(0, len(aperture), pulses)
     middles = np.minimum(starts + pulses // 2, len(aperture) - 1)
     block = np.arange(len(aperture)) // pulses
@@ -121,7 +123,7 @@ def _block_mask(
         radius_m + np.maximum.reduceat(np.linalg.norm(position_m - middle_position_m[block], axis=1), starts)[:, None]
         for position_m, middle_position_m in zip(aperture.legs, middle.legs, strict=True)
     ]
-    # Exclude spheres outside the integration sector or either pattern; tolerances for the rotation within the block.
+    # Exclude spheres outside the integration sector or either pattern; tolerances include the rotation within a block.
     mask = np.ones((len(starts), len(middle_m)), bool)
     if beams.sector is not None:
         sector = beams.sector[middles]
@@ -141,9 +143,9 @@ def _in_pattern(
     offset_m: NDArray[np.float64],
     radius_m: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Return a mask of the spheres, (block, sphere), that may intersect the pattern's cone and elevations."""
+    """Return a mask, (block, sphere), of the spheres that may intersect the cone and the elevations of the pattern."""
     range_m = np.linalg.norm(offset_m, axis=-1)
-    # half angle of the sphere; the rotation is added below
+    # half angle of the sphere; the rotation of the antenna is added below
     tolerance = np.arcsin(np.minimum(1.0, radius_m / range_m)) + 1e-6
     from_boresight, from_up = (np.empty(range_m.shape) for _ in range(2))
     for axis, angle in ((0, from_boresight), (2, from_up)):

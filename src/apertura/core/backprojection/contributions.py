@@ -18,11 +18,11 @@ from apertura.core.windowed_sinc import kaiser_sinc
 # ---- Contributions of profiles by band-limited interpolation in float64
 
 _HALF_TAPS = KERNEL.term_taps // 2
-# shape of the window: the error is below -148 dB with `_HALF_TAPS` and half of the band as transition
+# shape parameter of the window: the error is below -148 dB with `_HALF_TAPS` and half of the band as transition
 _KAISER_BETA = 16.0
-_FRACTIONS = 4096  # number of tabulated weights per sample; with linear interpolation the error of a weight is 3e-8
-_PULSES_AT_ONCE = 256  # number of pulses whose terms are in memory at once
-_ROWS_AT_ONCE = 16  # number of pulses whose samples numpy gathers at once, to fit into the cache
+_FRACTIONS = 4096  # number of tabulated weights per sample; with linear interpolation, the error of a weight is 3e-8
+_PULSES_AT_ONCE = 256  # number of pulses for which terms are in memory at once
+_ROWS_AT_ONCE = 16  # number of pulses for which numpy gathers samples at once, so that these fit into the cache
 
 
 def band_limited_image(
@@ -44,12 +44,12 @@ def band_limited_terms(
     Parameters
     ----------
     profiles
-        Profiles, at least twice oversampled, with 12 samples or more beyond the scene at both ends; samples outside the
-        profiles are zero.
+        Profiles with an oversampling of at least 2 and with at least 12 samples beyond the scene at both ends; samples
+        outside the profiles are zero.
     pixels
         (pixel, 3) float64, metres, in the frame of the phase centres.
     beams
-        Antenna weight of each pulse at each pixel; none by default.
+        Antenna weight of each pulse at each pixel (default: 1).
 
     Returns
     -------
@@ -59,7 +59,7 @@ def band_limited_terms(
     Notes
     -----
     Source: docs/theory.md, eq. 6. The error is -148 dB for a tone at the band edge. The computation is in float64 and
-    independent of all engines; it uses numpy if the compiled library is not available.
+    independent of all engines. If the compiled library is not available, numpy is used.
     """
     terms = (_compiled_terms if available() else _terms)(profiles, np.ascontiguousarray(pixels, np.float64))
     if beams is not None:
@@ -107,7 +107,7 @@ def _terms(profiles: Profiles, pixels: NDArray[np.float64]) -> NDArray[np.comple
 
 @lru_cache(maxsize=1)
 def _interpolator() -> NDArray[np.float64]:
-    """Return (fraction, tap) weights of the samples around a position at a tabulated fraction behind a sample."""
+    """Return (fraction, tap) weights of the samples around a position that follows a sample by a tabulated fraction."""
     distance = np.arange(_FRACTIONS + 1)[:, None] / _FRACTIONS - np.arange(1 - _HALF_TAPS, _HALF_TAPS + 1)
     return kaiser_sinc(distance, half=_HALF_TAPS, beta=_KAISER_BETA)
 
@@ -133,12 +133,13 @@ def tap_polynomials() -> NDArray[np.float64]:
     Returns
     -------
     ndarray
-        (degree + 1, tap) float64, constant term first; the variable is -½…½ from the middle between taps 3 and 4.
+        (degree + 1, tap) float64, constant term first; the variable is -½…½ relative to the midpoint between taps 3
+        and 4.
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 5: least squares over the band of twice oversampled profiles, with value and
-    slope continuous from one sample to the next.
+    Source: docs/theory/autofocus.md, eq. 5: least-squares fit over the band of profiles with an oversampling of 2, such
+    that value and slope are continuous at the samples.
 
     Examples
     --------
@@ -147,7 +148,7 @@ def tap_polynomials() -> NDArray[np.float64]:
     >>> bool(abs(weights @ tone - np.exp(0.5j * np.pi * 0.9 * 3.75)) < 1e-3)
     True
     """
-    # Eq. 5: frequencies of the band and positions between two samples, with Gauss-Legendre weights of the positions.
+    # Eq. 5: frequencies of the band, and positions between two samples with their Gauss-Legendre weights.
     omega = np.pi / 2 * np.cos(np.pi * (np.arange(160) + 0.5) / 160)
     position, share = (values / 2 for values in np.polynomial.legendre.leggauss(24))
     powers = position[:, None] ** np.arange(DEGREE + 1)
@@ -170,7 +171,7 @@ def _rounded_taps() -> NDArray[np.float32]:
 
 
 def _continuous_basis() -> NDArray[np.float64]:
-    """Return the (tap·power, free) basis of polynomials whose value and slope are continuous between samples."""
+    """Return the (tap·power, free) basis of polynomials with value and slope continuous at the samples."""
     power = np.arange(DEGREE + 1)
     joins: list[NDArray[np.float64]] = []
     for end in (0.5**power, power * 0.5 ** (power - 1.0)):
@@ -207,7 +208,7 @@ class Echoes:
 
     @classmethod
     def read(cls, profiles: Profiles, parts: list[slice]) -> "Echoes":
-        """Read the pulses of the given slices, concatenated; no other pulses are read."""
+        """Read and concatenate the pulses of the given slices; no other pulses are read."""
         read = np.concatenate([np.asarray(profiles.samples[part]) for part in parts])
         samples = np.zeros((len(read), 2, read.shape[1] + 2 * TAPS), np.float32)
         samples[:, 0, TAPS:-TAPS], samples[:, 1, TAPS:-TAPS] = read.real, read.imag
@@ -226,9 +227,9 @@ class Echoes:
         return len(self.samples)
 
     def at(self, places_m: NDArray[np.float64]) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Return s(R)·exp(j2πf_mid R/c) at points and its derivative with respect to the path R.
+        """Return s(R)·exp(j2πf_mid R/c) at points, and its derivative with respect to the path R.
 
-        The computation is the same as in the compiled library, in float64.
+        The computation is the same as in the compiled library, but in float64.
 
         Parameters
         ----------
@@ -238,7 +239,7 @@ class Echoes:
         Returns
         -------
         value, slope
-            (pulse, point) complex128; the slope per metre.
+            (pulse, point) complex128 each; the slope is per metre.
 
         Notes
         -----
@@ -267,7 +268,7 @@ def job_of(echoes: Echoes, places_m: NDArray[np.float64], weight: NDArray[np.flo
     Parameters
     ----------
     echoes
-        Echoes; the caller keeps them and the other arrays alive while the job runs.
+        Echoes; the caller must keep the echoes and the other arrays in memory while the job runs.
     places_m
         (point, 3) float64, contiguous.
     weight
@@ -286,12 +287,12 @@ def job_of(echoes: Echoes, places_m: NDArray[np.float64], weight: NDArray[np.flo
 
 
 def pulses_at_once(profiles: Profiles) -> int:
-    """Return the number of pulses to read at once."""
+    """Return the number of pulses that are read at once."""
     return max(1, _BYTES_AT_ONCE // (8 * (int(profiles.samples.shape[1]) + 2 * TAPS)))
 
 
 def tiles(places: int, pulses: int) -> Iterator[slice]:
-    """Yield slices of points that are computed together within the memory bound."""
+    """Yield slices of points that are computed together without exceeding the memory bound."""
     step = max(1, _VALUES_AT_ONCE // max(1, pulses))
     for first in range(0, places, step):
         yield slice(first, first + step)
@@ -315,13 +316,13 @@ def block_contributions(
     Parameters
     ----------
     profiles
-        Profiles, at least twice oversampled; samples outside the profiles are zero. They may be read on access.
+        Profiles with an oversampling of at least 2, which may be read on access; samples outside the profiles are zero.
     places_m
         (point, 3) float64, metres, in the frame of the phase centres.
     edges
         (block + 1,) int64, ascending: block b contains pulses edges[b] to edges[b + 1].
     weights
-        (pulse,) float64, weight of each pulse; 1 by default. Blocks with zero weight are not read.
+        (pulse,) float64, weight of each pulse (default: 1). Blocks with zero weight are not read.
 
     Returns
     -------
@@ -331,13 +332,13 @@ def block_contributions(
     Raises
     ------
     ValueError
-        If shapes differ, or edges do not ascend within the pulses.
+        If shapes differ, or if edges do not ascend within the pulses.
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 4 and 5. The error is below -65 dB over the whole band of twice oversampled
-    profiles. Paths and carrier phase are computed in float64. The computation uses numpy if the compiled library is not
-    available.
+    Source: docs/theory/autofocus.md, eq. 4 and 5. The error is below -65 dB over the whole band of profiles with an
+    oversampling of 2. Paths and carrier phase are computed in float64. If the compiled library is not available, numpy
+    is used.
 
     Examples
     --------
@@ -353,7 +354,7 @@ def block_contributions(
     if places_m.ndim != 2 or places_m.shape[1] != 3 or weights.shape != (len(profiles),):
         raise ValueError(f"{places_m.shape=}, {weights.shape=}: must be (point, 3) and ({len(profiles)},)")
     if edges.size < 2 or (np.diff(edges) < 0).any() or edges[0] < 0 or edges[-1] > len(profiles):
-        raise ValueError(f"{edges=}: must ascend from 0 or more to {len(profiles)} or less, the number of pulses")
+        raise ValueError(f"{edges=}: must ascend and lie between 0 and the number of pulses, {len(profiles)}")
     places_m = np.ascontiguousarray(places_m, np.float64)
     sums = np.zeros((len(places_m), edges.size - 1), np.complex64)
     add = _add_compiled if available() else _add
@@ -364,7 +365,7 @@ def block_contributions(
 
 
 def _chunks(edges: NDArray[np.int64], weights: NDArray[np.float64], most: int) -> Iterator[list[Piece]]:
-    """Yield chunks of `most` pulses with the blocks, or parts of blocks, of nonzero weight."""
+    """Yield chunks of at most `most` pulses, as lists of blocks or parts of blocks with nonzero weight."""
     chunk: list[Piece] = []
     free = most
     for block, (first, end) in enumerate(pairwise(edges.tolist())):
@@ -420,15 +421,15 @@ def _add(
 
 @dataclass(frozen=True, eq=False)
 class Gradient:
-    """Derivatives of a real objective for each pulse, in the objective's unit per metre.
+    """Derivatives of a real objective for each pulse, in the unit of the objective per metre.
 
     Attributes
     ----------
     tx_m, rx_m
-        (pulse, 3) float64, with respect to the phase centre of transmitter and receiver, in the frame of the phase
-        centres. The derivative for a monostatic node is their sum.
+        (pulse, 3) float64, derivatives with respect to the phase centres of transmitter and receiver, in the frame of
+        the phase centres. The derivative for a monostatic node is the sum of both.
     path_m
-        (pulse,) float64, with respect to a path added to all echoes of a pulse (`Profiles.moved`).
+        (pulse,) float64, derivative with respect to a path added to all echoes of a pulse (`Profiles.moved`).
     """
 
     tx_m: NDArray[np.float64]
@@ -444,13 +445,13 @@ def path_gradient(
     Parameters
     ----------
     profiles
-        Profiles, at least twice oversampled; they may be read on access.
+        Profiles with an oversampling of at least 2, which may be read on access.
     places_m
         (point, 3) float64, metres, in the frame of the phase centres.
     slope
-        (point,) complex, G = ∂J/∂Re + j·∂J/∂Im: the objective changes by Re Σ G*·change of the sum.
+        (point,) complex, G = ∂J/∂Re + j·∂J/∂Im: if the sums change by dI, the objective changes by Re Σ G*·dI.
     beams
-        Weight of each pulse at each point; its dependence on the phase centres is neglected. None by default.
+        Weight of each pulse at each point (default: 1); the dependence of the weight on the phase centres is neglected.
 
     Returns
     -------
@@ -460,11 +461,11 @@ def path_gradient(
     Raises
     ------
     ValueError
-        If shapes differ, or points or slopes are not finite.
+        If shapes differ, or if points or slopes are not finite.
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 6 to 8. The computation uses numpy if the compiled library is not available.
+    Source: docs/theory/autofocus.md, eq. 6 to 8. If the compiled library is not available, numpy is used.
     """
     if places_m.shape != (*slope.shape, 3) or slope.ndim != 1:
         raise ValueError(f"{places_m.shape=}, {slope.shape=}: must be (point, 3) and (point,)")
@@ -472,7 +473,7 @@ def path_gradient(
         raise ValueError("points and slopes of the objective must be finite")
     derivatives, largest = np.zeros((7, len(profiles))), float(np.abs(slope).max(initial=0.0))
     if largest:
-        # Slopes are normalised, as the library uses float32 and the unit of the objective is arbitrary.
+        # Slopes are normalised, because the library uses float32 and the unit of the objective is arbitrary.
         places_m, slope = np.ascontiguousarray(places_m, np.float64), (slope / largest).astype(np.complex64)
         for first in range(0, len(profiles), pulses_at_once(profiles)):
             part = slice(first, min(first + pulses_at_once(profiles), len(profiles)))

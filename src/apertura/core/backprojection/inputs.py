@@ -13,13 +13,13 @@ from apertura.core.geometry.aperture import Aperture, as_array
 
 
 def _as_arrays(inputs: Any, kinds: dict[str, type]) -> None:
-    """Convert lists of an input to arrays; arrays, including lazily read ones, are unchanged.
+    """Convert lists of an input to arrays; arrays, including lazily read arrays, are unchanged.
 
     Raises
     ------
     CampaignError
-        If a value is not an array of numbers, `aperture` is not an `Aperture`, or the wave speed is not plausible for a
-        radio wave.
+        If a value is not an array of numbers, if `aperture` is not an `Aperture`, or if the wave speed is not plausible
+        for a radio wave.
     """
     where = type(inputs).__name__
     for name, kind in kinds.items():
@@ -29,7 +29,7 @@ def _as_arrays(inputs: Any, kinds: dict[str, type]) -> None:
         raise CampaignError(
             quoted(speed),
             where=f"{where}: wave_speed_m_s",
-            expected=f"a wave speed above {slowest:.0f} m/s, up to the speed of light, {SPEED_OF_LIGHT_M_S} m/s",
+            expected=f"a wave speed from {slowest:.0f} m/s to {SPEED_OF_LIGHT_M_S} m/s, the speed of light in vacuum",
             remedy="Use apertura.wave_speed(N units).",
         )
     if not isinstance(inputs.aperture, Aperture):
@@ -37,12 +37,12 @@ def _as_arrays(inputs: Any, kinds: dict[str, type]) -> None:
             f"an object of type {type(inputs.aperture).__name__}",
             where=f"{where}: aperture",
             expected="an Aperture: phase centres of transmitter and receiver, (pulse, 3) each",
-            remedy="Create one with Aperture(tx_m, rx_m).",
+            remedy="Create an aperture with Aperture(tx_m, rx_m).",
         )
 
 
 def _check_shapes(inputs: Any, expected: dict[str, tuple[int, ...]], description: str) -> None:
-    """Raise CampaignError unless the arrays have consistent shapes."""
+    """Raise CampaignError if the shapes of the arrays are inconsistent."""
     found = {name: tuple(getattr(inputs, name).shape) for name in expected}
     pulses = {"aperture": len(inputs.aperture)} | {name: shape[0] if shape else 0 for name, shape in found.items()}
     if found != expected or pulses["aperture"] != next(iter(expected.values()))[0]:
@@ -51,12 +51,12 @@ def _check_shapes(inputs: Any, expected: dict[str, tuple[int, ...]], description
             f"{shapes}, aperture of {pulses['aperture']} pulses",
             where=f"{type(inputs).__name__}",
             expected=description,
-            remedy="Transpose arrays with swapped axes; each array needs one row per pulse.",
+            remedy="Transpose arrays with interchanged axes; the rows of each array correspond to the pulses.",
         )
 
 
 class PhaseRotated:
-    """Samples of pulses, multiplied by one factor per pulse on access.
+    """Samples of pulses that are multiplied by a factor for each pulse on access.
 
     Examples
     --------
@@ -95,7 +95,7 @@ class PhaseHistory:
     weight
         (subcarrier,) float64, window over the subcarriers.
     reference_delay_s
-        (pulse,) float64, delay already removed from `transfer`.
+        (pulse,) float64, delay that is already removed from `transfer`, seconds.
     aperture
         Phase centres in the frame of the pixels.
     wave_speed_m_s
@@ -104,7 +104,7 @@ class PhaseHistory:
     Raises
     ------
     CampaignError
-        If a value is not an array of numbers, shapes are inconsistent, or the wave is faster than light.
+        If a value is not an array of numbers, if shapes are inconsistent, or if the wave is faster than light.
     """
 
     transfer: NDArray[np.complex64]
@@ -123,16 +123,16 @@ class PhaseHistory:
         description = f"{shapes}, and an aperture with the same number of pulses"
         _check_shapes(self, {"transfer": (pulses, subcarriers), **vectors}, description)
         if subcarriers == 0:
-            expected = "two or more subcarriers, whose bandwidth resolves range"
+            expected = "two or more subcarriers over a band that provides range resolution"
             remedy = "Provide the transfer function over a band."
-            raise CampaignError("no subcarrier", "PhaseHistory: transfer", expected, remedy)
+            raise CampaignError("no subcarriers", "PhaseHistory: transfer", expected, remedy)
 
     def __len__(self) -> int:
         """Return the number of pulses."""
         return len(self.transfer)
 
     def __getitem__(self, pulses: slice) -> "PhaseHistory":
-        """Return the phase history of a slice of pulses, as views."""
+        """Return the phase history of a slice of pulses; the arrays are views."""
         return replace(
             self,
             transfer=self.transfer[pulses],
@@ -141,7 +141,7 @@ class PhaseHistory:
         )
 
     def moved(self, aperture: Aperture, extra_path_m: NDArray[np.float64]) -> "PhaseHistory":
-        """Return the same echoes with other phase centres and with paths longer by `extra_path_m`.
+        """Return the same echoes with new phase centres and with paths increased by `extra_path_m`.
 
         See `Profiles.moved`.
         """
@@ -149,7 +149,7 @@ class PhaseHistory:
         return replace(self, reference_delay_s=delay_s, aperture=aperture)
 
     def at_speed(self, wave_speed_m_s: float) -> "PhaseHistory":
-        """Return the same delays for another wave speed, m/s."""
+        """Return the phase history with unchanged delays for a different wave speed, m/s."""
         return replace(self, wave_speed_m_s=wave_speed_m_s)
 
 
@@ -158,31 +158,31 @@ class Profiles:
     """Range profiles of a band-limited signal, cropped to the scene.
 
     Sample i of pulse p at the total path ``start_m[p] + i·step_m`` has the value
-    Σ_n w_n H_n exp(+j2π(f_n - f_mid)·path/v), with H_n for absolute delay and v the speed of the wave, so that
-    profile·exp(+j2π f_mid·path/v) is in phase at a target.
+    Σ_n w_n H_n exp(+j2π(f_n - f_mid)·path/v), where H_n refers to absolute delay and v is the wave speed. At a target,
+    the products profile·exp(+j2π f_mid·path/v) of all pulses are therefore in phase.
 
     Attributes
     ----------
     samples
-        (pulse, range) complex64, oversampled by `oversampling` ≥ 2 relative to v/B of total path.
+        (pulse, range) complex64, oversampled by `oversampling` ≥ 2 relative to the cell v/B of the total path.
     start_m
         (pulse,) float64, total path tx → pixel → rx of sample 0, metres.
     step_m
         Total path between samples, metres.
     centre_frequency_hz
-        f_mid.
+        Centre frequency f_mid, Hz.
     oversampling
         Samples per Nyquist cell, (v/B)/step_m.
     aperture
         Phase centres in the frame of the pixels.
     wave_speed_m_s
-        v, as in `PhaseHistory`.
+        Wave speed v, as in `PhaseHistory`.
 
     Raises
     ------
     CampaignError
-        If a value is not an array of numbers, shapes are inconsistent, the step is not positive, the oversampling is
-        1 or less, or the wave is faster than light.
+        If a value is not an array of numbers, if shapes are inconsistent, if the step is not positive, if the
+        oversampling is 1 or less, or if the wave is faster than light.
     """
 
     samples: NDArray[np.complex64]
@@ -202,7 +202,7 @@ class Profiles:
             value = getattr(self, name)
             if not (isinstance(value, Real) and least < float(value) < np.inf):
                 expected = f"a number above {least:g}" if np.isfinite(least) else "a number"
-                remedy = "Use the value of the range compression."
+                remedy = "Use the value that range compression returned."
                 raise CampaignError(quoted(value), f"Profiles: {name}", expected, remedy)
 
     @property
@@ -225,7 +225,7 @@ class Profiles:
         return len(self.samples)
 
     def __getitem__(self, pulses: slice) -> "Profiles":
-        """Return the profiles of a slice of pulses, as views; the images of pulse blocks add up to the whole image."""
+        """Return the profiles of a slice of pulses as views; the images of pulse blocks add up to the whole image."""
         return replace(
             self,
             samples=self.samples[pulses],
@@ -234,17 +234,17 @@ class Profiles:
         )
 
     def for_tables(self) -> tuple[NDArray[np.complex64], NDArray[np.float64], list[NDArray[np.float64]]]:
-        """Return samples, starts and phase centres of both legs as arrays, validated for polynomial tables.
+        """Return samples, starts and phase centres of both antennas as arrays, validated for polynomial tables.
 
         Raises
         ------
         ValueError
-            If the oversampling is below 1.5, there is no pulse, or a position or start is not finite.
+            If the oversampling is below 1.5, if there is no pulse, or if a position or start is not finite.
         """
         if not self.oversampling >= 1.5:
             raise ValueError(f"{self.oversampling=}: must be at least 1.5")
         if not len(self):
-            raise ValueError(f"{self.samples.shape=}: contains no pulse")
+            raise ValueError(f"{self.samples.shape=}: must contain at least one pulse")
         start_m = np.ascontiguousarray(self.start_m, np.float64)
         phase_centres = [np.asarray(leg, np.float64) for leg in self.aperture.legs]
         if not all(np.isfinite(values).all() for values in (start_m, *phase_centres)):
@@ -252,7 +252,7 @@ class Profiles:
         return np.ascontiguousarray(self.samples, np.complex64), start_m, phase_centres
 
     def moved(self, aperture: Aperture, extra_path_m: NDArray[np.float64]) -> "Profiles":
-        """Return the same echoes with other phase centres and with paths longer by `extra_path_m`.
+        """Return the same echoes with new phase centres and with paths increased by `extra_path_m`.
 
         Parameters
         ----------
@@ -274,6 +274,6 @@ class Profiles:
         return replace(self, samples=samples, start_m=self.start_m + extra_path_m, aperture=aperture)
 
     def at_speed(self, wave_speed_m_s: float) -> "Profiles":
-        """Return the same delays for another wave speed, m/s."""
+        """Return the profiles with unchanged delays for a different wave speed, m/s."""
         scale = wave_speed_m_s / self.wave_speed_m_s
         return replace(self, start_m=scale * self.start_m, step_m=scale * self.step_m, wave_speed_m_s=wave_speed_m_s)

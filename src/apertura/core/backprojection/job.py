@@ -1,4 +1,4 @@
-"""Numerical description of an imaging job, the input of the planner and of the engines' predictions."""
+"""Numerical description of an imaging job, which is the input of the planner and of the predictions of engines."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ class Signal:
     Attributes
     ----------
     centre_hz
-        f_mid.
+        Centre frequency f_mid, Hz.
     oversampling
         Samples per range cell c/B.
     step_m
@@ -30,7 +30,7 @@ class Signal:
     samples
         Number of samples per pulse.
     window
-        (subcarrier,) float64, weights over the band with any scale; flat by default.
+        (subcarrier,) float64, weights over the band with an arbitrary scale (default: flat).
     wave_speed_m_s
         As in `Profiles`.
     """
@@ -50,18 +50,19 @@ class Signal:
 
 @dataclass(frozen=True, eq=False)
 class Integration:
-    """Integrated part of a flight for the pixels of an image.
+    """Part of a flight that is integrated for the pixels of an image.
 
     Attributes
     ----------
     sector
         Integrated sector; None if every pulse contributes to every pixel.
     count
-        Divisor of the sum: number of all pulses, or the largest number inside the sector at any point of the scene.
+        Divisor of the sum: number of all pulses, or largest number of pulses inside the sector at any point of the
+        scene.
     value, reason
-        Selected integration and its reason, one phrase each.
+        Selected integration, and reason for the selection, one phrase each.
     share
-        Summed share of pixels × pulses.
+        Fraction of pixel-pulse pairs that is summed.
     report
         Section of image.json.
     flags
@@ -86,7 +87,7 @@ class Job:
     aperture
         Phase centres in the frame of the pixels.
     ground_m
-        (row, column, 3) float64, points spread evenly over the scene including corners, metres; rows go south.
+        (row, column, 3) float64, points evenly distributed over the scene, including corners, metres; rows go south.
     shape
         Rows and columns of the image.
     spacing_m
@@ -98,25 +99,26 @@ class Job:
     frame
         'ecef' or 'local'.
     tile_px, threads
-        Side of a tile, pixels; number of tiles formed at once.
+        Side of a tile, pixels; and number of tiles formed concurrently.
     terrain
-        Terrain of the scene and its simplified models.
+        Terrain of the scene, with simplified models.
     path_limit_m
-        Longest total path inside the cyclic prefix.
+        Longest total path within the cyclic prefix.
     memory_bytes
         Memory limit of the imaging step.
     beams, illumination
-        Weights from antenna beams and the integrated sector, and illumination by the beams, over all pulses; None
-        without beams and sector.
+        Weights of all pulses from antenna beams and the integrated sector; and illumination by the beams. None without
+        beams and sector.
     integration
         Integrated part of the flight; None for the whole flight.
     recorded
-        True if a phase history is available, which the double sum requires.
+        True if a phase history is available, which is required for the double sum.
     patches_on
         Function of a terrain that returns pixel positions in windows of the scene, (y, x, 3) float64 each, metres; None
         if pixel positions are not known.
     patches_m
-        Pixel positions in these windows on the selected terrain model; if empty, planes about points of `ground_m`.
+        Pixel positions in these windows on the selected terrain model; if empty, planes about points of `ground_m` are
+        used.
     """
 
     aperture: Aperture
@@ -157,7 +159,7 @@ class Job:
 
     @property
     def weights(self) -> int:
-        """Number of weights of a pulse at a pixel."""
+        """Number of weight factors of a pulse at a pixel."""
         return self.antennas + (self.sector is not None)
 
     @property
@@ -167,12 +169,12 @@ class Job:
 
     @property
     def share(self) -> float:
-        """Share of pixel-pulse combinations that is summed."""
+        """Fraction of pixel-pulse pairs that is summed."""
         return 1.0 if self.integration is None else self.integration.share
 
     @property
     def count(self) -> int:
-        """Divisor of the sum, a number of pulses."""
+        """Number of pulses by which the sum is divided."""
         return len(self.aperture) if self.integration is None else self.integration.count
 
     @property
@@ -182,10 +184,10 @@ class Job:
 
     @property
     def wavelength_m(self) -> float:
-        """Wavelength at the band centre."""
+        """Wavelength at band centre."""
         return self.signal.wave_speed_m_s / self.centre_hz
 
     @property
     def points_m(self) -> NDArray[np.float64]:
-        """`ground_m` as (point, 3), with the scene centre at the middle index."""
+        """`ground_m` as (point, 3); the central element is the scene centre."""
         return self.ground_m.reshape(-1, 3)

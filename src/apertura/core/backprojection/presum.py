@@ -1,8 +1,8 @@
 """Presumming of pulses of an oversampled aperture by a low-pass filter, with pulses aligned to the scene centre.
 
 Decimation without a filter would alias noise and echoes into the image. In presumming, all pulses contribute: the value
-of a pulse at a pixel is interpolated from virtual pulses at every k-th position, so that the sum over the virtual
-pulses, weighted by this interpolation, equals the sum over all pulses (docs/theory/planner.md, "Pulses").
+of a pulse at a pixel is interpolated from virtual pulses at every k-th position. The sum over the virtual pulses,
+weighted by this interpolation, then equals the sum over all pulses (docs/theory/planner.md, "Pulses").
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from scipy import sparse
 
 PRESUM_S = 8.0e-8
-"""Seconds per pulse and range sample, on one core."""
+"""Computing time of presumming per pulse and range sample on one core, seconds."""
 
 _HALF_TAPS = 10
 _KAISER_BETA = 10.0
@@ -36,7 +36,7 @@ class Presum:
     factor
         Pulses per virtual pulse.
     at
-        (virtual,) float64, positions of the virtual pulses in pulse numbers; some lie beyond both ends.
+        (virtual,) float64, positions of the virtual pulses in pulse numbers; some are beyond the ends.
     weight
         (virtual, pulse) sparse, interpolation filter.
     """
@@ -50,15 +50,15 @@ class Presum:
         weight = self.weight[virtual]
         first, last = int(weight.indices.min(initial=weight.shape[1] - 1)), int(weight.indices.max(initial=0))
         at = self.at[virtual]
-        # a position between two pulses requires both; positions beyond an end are extrapolated from the two outermost
-        # pulses
+        # a position between two pulses requires both pulses; a position beyond an end is extrapolated from the two
+        # outermost pulses
         first = max(0, min(first, int(at[0]), weight.shape[1] - 2))
         last = min(weight.shape[1], max(last, int(at[-1]) + 1, 1) + 1)
         return Presum(self.factor, at - first, weight[:, first:last]), slice(first, last)
 
 
 def design(pulses: int, factor: int, *, widest_cycles: float, error_db: float = -72.0) -> Presum | None:
-    """Design the filter for a factor; None if the scene's Doppler band is too wide for it.
+    """Design the filter for a factor; None if the Doppler band of the scene is too wide for the factor.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def design(pulses: int, factor: int, *, widest_cycles: float, error_db: float = 
     widest_cycles
         Largest phase rate of a pixel relative to the scene centre, cycles per pulse.
     error_db
-        Tolerated error of the filter.
+        Tolerated error of the filter, dB.
 
     Examples
     --------
@@ -110,9 +110,9 @@ def presum_error_db(presum: Presum, aperture: Aperture, place_m: NDArray[np.floa
     aperture
         Aperture of all pulses.
     place_m
-        (point, 3) float64, grid of points over the scene, with the scene centre at the middle of the array, metres.
+        (point, 3) float64, grid of points over the scene, metres; the central element of the array is the scene centre.
     highest_hz
-        Upper band edge, at which phases change fastest.
+        Upper band edge, at which phases change most rapidly.
     """
     k = 2 * np.pi * highest_hz / SPEED_OF_LIGHT_M_S
     paths = (each.path(place_m) for each in (aperture, _virtual(aperture, presum)))
@@ -138,7 +138,7 @@ def _positions(position_m: NDArray[np.float64], at: NDArray[np.float64]) -> NDAr
 
 
 def presummed(profiles: Profiles, presum: Presum, middle_m: NDArray[np.float64]) -> Profiles:
-    """Return range profiles of the virtual pulses, whose sum is that of all pulses.
+    """Return range profiles of the virtual pulses, the sum over which equals the sum over all pulses.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def presummed(profiles: Profiles, presum: Presum, middle_m: NDArray[np.float64])
 
 
 def _shifted(samples: NDArray[np.complex64], shift: NDArray[np.float64], count: int) -> NDArray[np.complex64]:
-    """Return samples i + shift of each pulse, i = 0…count-1, interpolated by a windowed sinc; zero beyond the ends."""
+    """Return samples at i + shift of each pulse, i = 0…count-1, by a windowed sinc; zero beyond the ends."""
     shifted = np.zeros((len(samples), count), np.complex64)
     first = np.floor(shift).astype(int)
     taps = np.arange(1 - _HALF_TAPS, _HALF_TAPS + 1)

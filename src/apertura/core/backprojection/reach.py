@@ -1,4 +1,4 @@
-"""Selection of the pulses that may contribute to windows of a scene; other pulses are not read, prepared or summed."""
+"""Selection of the pulses that may contribute to windows of a scene: other pulses are not read, prepared or summed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,8 @@ from apertura.core.scene.swath import balls
 from apertura.core.scene.terrain import Terrain
 
 PULSES = 64
-"""Number of pulses of a block. Engines sum blocks of this size: omitting blocks without contribution changes no bit."""
+"""Number of pulses per block. Engines sum blocks of this size: omitting blocks without a contribution leaves images
+bit-identical."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +70,10 @@ class Reach:
         return np.asarray(self.mask.any(axis=0))
 
     def within(self, piece: int, block: slice) -> slice | None:
-        """Return the first to the last pulse of a block that may illuminate a window, relative to the block's start.
+        """Return the slice from the first to the last pulse of a block that may illuminate a window.
 
-        None if no pulse does. `block` starts at a multiple of 64, unless every pulse contributes to the window.
+        The slice is relative to the start of the block; None if no pulse may illuminate the window. `block` starts at a
+        multiple of 64, unless every pulse contributes to the window.
         """
         if self.mask[:, piece].all():
             return slice(0, block.stop - block.start)
@@ -90,7 +92,8 @@ def pulse_blocks_of(pulses: int, count: int, *, any_start: bool) -> list[slice]:
     pulses, count
         Number of pulses, and largest number of blocks.
     any_start
-        True if blocks may start at any pulse, as every pulse contributes to every window; else at multiples of 64.
+        True if blocks may start at any pulse because every pulse contributes to every window; otherwise blocks start at
+        multiples of 64.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Images as dask arrays of tiles, each computed independently on request by local threads or a cluster."""
+"""Images as dask arrays of tiles; each tile is computed independently on request, by local threads or a cluster."""
 
 import os
 import sys
@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
 KEY = "processing.scheduler"
 NAMED_BY = "DASK_SCHEDULER_ADDRESS"
-"""dask's environment variable with the scheduler address, which must agree with that of the config: a client executes
-data from the scheduler, and a config is untrusted."""
+"""Environment variable of dask with the scheduler address. It must agree with the address in the config, because a
+client executes code from the scheduler, and a config is untrusted."""
 
 _CONNECT_S = 5.0  # timeout for the connection to a scheduler
 _WORKERS_S = 10.0  # timeout for the first worker of a scheduler
@@ -47,8 +47,8 @@ def cluster_tiles(
 ) -> Iterator[tuple[int, NDArray[np.complex64]]]:
     """Yield each tile with its number as soon as a worker has formed it.
 
-    Workers need this package but no file of the campaign: inputs are sent to them, and tiles are sent back. Tiles of a
-    lost worker are recomputed by the others.
+    Workers require this package but no file of the campaign: inputs are sent to the workers, and tiles are returned.
+    Tiles of a lost worker are recomputed by other workers.
 
     Parameters
     ----------
@@ -60,8 +60,8 @@ def cluster_tiles(
     Raises
     ------
     CampaignError
-        If the environment names no scheduler or a different one, or the scheduler is not reachable or has no workers
-        with this code.
+        If the environment variable names no scheduler or a different scheduler, if the scheduler is not reachable, or
+        if it has no workers with the same code.
     """
     with _connected(scheduler) as client:
         from distributed import as_completed
@@ -69,20 +69,20 @@ def cluster_tiles(
         futures = client.get(graph, list(keys), sync=False)
         numbers = {future.key: number for number, future in enumerate(futures)}
         done = as_completed(futures, loop=client.loop, with_results=True)
-        del futures  # so that workers release a tile once it is received
+        del futures  # so that workers release a tile after it is received
         for future, tile in done:
             yield numbers[future.key], tile
 
 
 def check_named(scheduler: str) -> None:
-    """Raise CampaignError unless the environment variable `NAMED_BY` confirms the scheduler's address."""
+    """Raise CampaignError if the environment variable `NAMED_BY` does not confirm the address of the scheduler."""
     named = os.environ.get(NAMED_BY)
     if named != scheduler:
         raise CampaignError(
             f"{scheduler}, but {NAMED_BY} is {named or 'not set'}",
             where=KEY,
-            expected=f"the scheduler named by {NAMED_BY}, as a scheduler may send code",
-            remedy=f"If you trust the scheduler, run `export {NAMED_BY}={scheduler}`; else set {KEY} to threads.",
+            expected=f"the scheduler named by {NAMED_BY}, because a scheduler may send code",
+            remedy=f"If you trust the scheduler, run `export {NAMED_BY}={scheduler}`; otherwise set {KEY} to threads.",
         )
 
 
@@ -96,7 +96,7 @@ def _connected(scheduler: str) -> Any:
         client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         remedy = "Start `dask scheduler`, or correct the address."
-        raise _unusable(scheduler, "no scheduler is reachable there", remedy) from error
+        raise _unusable(scheduler, "no scheduler is reachable at this address", remedy) from error
     try:
         _check_workers(client, scheduler)
     except BaseException:
@@ -115,7 +115,7 @@ def _check_workers(client: Any, scheduler: str) -> None:
     own, theirs = code_sha256(*modules), client.run(code_sha256, *modules)
     differing = [worker for worker, code in theirs.items() if code != own]
     if differing:
-        found = f"{len(differing)} of {len(theirs)} workers have a different version of the code, first {differing[0]}"
+        found = f"{len(differing)} of {len(theirs)} workers have a different version of the code, e.g. {differing[0]}"
         raise _unusable(scheduler, found, "Install the same version of apertura on the workers.")
 
 
@@ -128,7 +128,7 @@ def _unusable(scheduler: str, found: str, remedy: str) -> CampaignError:
 
 
 def _forget_threads() -> None:
-    """Reset dask's thread pools in a forked child, which inherits no threads and would wait indefinitely."""
+    """Reset the thread pools of dask in a forked child, which inherits no threads and would wait indefinitely."""
     threaded: Any = sys.modules.get("dask.threaded")
     if threaded is not None:
         threaded.default_pool, threaded.main_thread = None, threading.current_thread()
@@ -153,28 +153,28 @@ def image_array(
     """Return an image, the mean over the pulses, as a dask array with square tiles as chunks.
 
     Tables are prepared once per pulse block and shared by all tiles. With several blocks, the tables of a block are
-    prepared when the tiles of the previous block are done, so that only one block's inputs and tables are in memory.
-    Only pulses that may contribute to a tile are summed for it. The bits of a tile do not depend on the other computed
-    tiles, on their order, or on the use of threads, processes or a cluster.
+    prepared when the tiles of the previous block are complete, so that inputs and tables of only one block are in
+    memory. For each tile, only the pulses that may contribute to it are summed. The bits of a tile do not depend on
+    which other tiles are computed, on the order of tiles, or on the use of threads, processes or a cluster.
 
     Parameters
     ----------
     inputs
-        Input of the setting's engine.
+        Input required by the engine of the setting.
     setting
-        Engine, its options, and number of pulse blocks.
+        Engine, options of the engine, and number of pulse blocks.
     grid, terrain
         The scene; pixels lie on the terrain.
     side_px
         Side of a tile, a multiple of 16 pixels.
     weighing
-        Weights and presumming of pulses; by default all pulses have the weight 1.
+        Weights and presumming of pulses (default: all pulses have the weight 1).
 
     Returns
     -------
     dask.array.Array
-        (row, column) complex64, in units of the amplitude of an echo present in all counted pulses; 0 where no pulse
-        illuminates the pixel.
+        (row, column) complex64, in units of the amplitude of an echo present in `Weighing.count` pulses; 0 where no
+        pulse illuminates the pixel.
     """
     from dask.array.core import Array
     from dask.highlevelgraph import HighLevelGraph
@@ -197,13 +197,13 @@ class Weighing:
     Attributes
     ----------
     beams
-        Weight of each pulse at each pixel by its antennas and the integrated sector; none by default.
+        Weight of each pulse at each pixel due to antennas and integrated sector (default: 1).
     presum
-        Presumming filter and the point (3,) to which pulses are aligned, metres; none by default.
+        Presumming filter, and point (3,) to which pulses are aligned, metres (default: no presumming).
     count
-        Divisor of the sum; the number of all pulses by default.
+        Divisor of the sum (default: number of all pulses).
     variant_counts
-        Variant of the engine's sum → number of pixel-pulse contributions summed by it in this process.
+        Variant of the engine's sum → number of pixel-pulse contributions summed by this variant in this process.
     """
 
     beams: Beams | None = None
@@ -233,7 +233,7 @@ class _Forming:
 
 
 def _graph(forming: _Forming, inputs: PhaseHistory | Profiles, places: Collection[tuple[int, int]]) -> dict[Any, Any]:
-    """Return the tasks of the given tiles (row and column of tiles), and of their common tables."""
+    """Return the tasks for the given tiles (row and column of tiles) and for their common tables."""
     name, presum, beams = forming.name, forming.weighing.presum, forming.weighing.beams
     count = np.float32(forming.weighing.count or len(inputs))
     pulses = len(inputs) if presum is None else len(presum[0].at)
@@ -276,7 +276,7 @@ def _prepare(
     inputs: PhaseHistory | Profiles,
     _before: list[None],
 ) -> Any:
-    """Return the engine's tables of a pulse block, common to all tiles."""
+    """Return the tables of the engine for a pulse block, which are common to all tiles."""
     if presum is not None and isinstance(inputs, Profiles):
         block_filter, pulses = presum[0].part(block)
         return load_engine(setting.engine).prepare(
@@ -295,7 +295,7 @@ def _form(  # noqa: PLR0917
     beams: Beams | None,
     sum_before: NDArray[np.complex64] | None,
 ) -> NDArray[np.complex64]:
-    """Return a tile of the image of a pulse block, added to the sum of the previous blocks."""
+    """Return a tile of the image of a pulse block, added to the sum over the previous blocks."""
     setting, grid = forming.setting, forming.grid[forming.window(place)]
     if part != slice(0, block.stop - block.start):
         tables = tables[part]
@@ -321,7 +321,7 @@ def compute_tiles(
     threads: int,
     scheduler: str = "threads",
 ) -> None:
-    """Compute tiles of an image and write each as soon as it is done.
+    """Compute tiles of an image and write each tile as soon as it is complete.
 
     Pixels without contributing pulses are written as NaN, to distinguish them from measured values.
 
@@ -334,9 +334,9 @@ def compute_tiles(
     target
         (y, x) array to write to: numpy or zarr.
     threads
-        Number of tiles computed at once, which determines the memory for pixel positions and results.
+        Number of tiles computed concurrently, which determines the memory for pixel positions and results.
     scheduler
-        'threads', or the address of a `distributed` scheduler whose workers form the tiles, with identical bits.
+        'threads', or the address of a `distributed` scheduler, the workers of which form bit-identical tiles.
 
     Examples
     --------
@@ -373,5 +373,5 @@ def compute_tiles(
 
 
 def _write(target: Any, window: Window, tile: NDArray[np.complex64]) -> None:
-    """Write a tile to its window, with NaN for 0."""
+    """Write a tile to its window, with 0 replaced by NaN."""
     target[window] = np.where(tile == 0, _NOTHING, tile)

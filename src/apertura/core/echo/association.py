@@ -1,4 +1,4 @@
-"""Association of captures with transmitted pulses, its checks with time tags and sidelink, and missing pulses."""
+"""Association of captures with transmitted pulses, checks with time tags and sidelink, and missing pulses."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -15,18 +15,18 @@ from apertura.core.echo.trigger import ABSENT
 
 Integers = NDArray[np.int64]
 Pairs = tuple[Integers, Integers]
-"""Values of the transmitter and of the receiver: time tags, or indices of paired pulses."""
+"""Values for the transmitter and for the receiver: time tags, or indices of paired pulses."""
 
 LARGEST_DRIFT_PPM = 100.0
-"""Search limit of the drift between the time tags, ppm; free-running crystals drift by less."""
+"""Search limit for the drift between the time tags, ppm; the drift of free-running crystals is smaller."""
 
 
-# number of tags used, spread over the flight; more tags do not improve the offset modulo the interval
+# largest number of tags used, spread over the flight; more tags do not improve the offset modulo the interval
 _MOST_TAGS = 16_384
 
 
 class TagLine(NamedTuple):
-    """Linear model of the offset of the receiver's time tags: offset_ns + drift·(tag - origin_ns)."""
+    """Linear model of the receiver's tags minus the transmitter's: offset_ns + drift·(tag - origin_ns)."""
 
     offset_ns: float
     drift: float
@@ -34,10 +34,10 @@ class TagLine(NamedTuple):
 
 
 def fit_modulo_interval(tags: Pairs, interval_ns: float) -> TagLine:
-    """Fit the offset line that best aligns the receiver's tags with the transmitter's, modulo the interval."""
+    """Fit the offset line that best aligns the tags of receiver and transmitter, modulo the interval."""
     tx, rx = tags
     rx = rx[:: -(-rx.size // _MOST_TAGS)]
-    # any nearby pulse gives the same offset modulo the interval
+    # all nearby pulses yield the same offset modulo the interval
     nearby = np.minimum(np.searchsorted(tx, rx), tx.size - 1)
     cycles = (rx - tx[nearby]) / interval_ns
     elapsed_ns = (rx - rx[0]).astype(np.float64)
@@ -50,7 +50,7 @@ def fit_modulo_interval(tags: Pairs, interval_ns: float) -> TagLine:
 
 
 def nearest_pairs(tags: Pairs, line: TagLine, interval_ns: float) -> Pairs:
-    """Return pairs of mutually nearest pulses, within half an interval, after removal of the offset line."""
+    """Return pairs of mutually nearest pulses within half an interval, after removal of the offset line."""
     tx, rx = tags
     corrected = (rx - rx[0]) - _offset_ns(rx, line)
     tx_ns = (tx - rx[0]).astype(np.float64)
@@ -65,12 +65,12 @@ def nearest_pairs(tags: Pairs, line: TagLine, interval_ns: float) -> Pairs:
 
 
 def fit_pairs(tags: Pairs, pairs: Pairs, interval_ns: float) -> TagLine:
-    """Fit a line (Theil-Sen slope, then median) to the offsets of pairs; tolerates less than half wrong pairs."""
+    """Fit a line (Theil-Sen slope, then median) to the offsets of pairs; robust against up to half wrong pairs."""
     tx_tag, rx_tag = tags[0][pairs[0]], tags[1][pairs[1]]
     offset_ns = (rx_tag - tx_tag).astype(np.float64)
     elapsed_ns = (rx_tag - rx_tag[0]).astype(np.float64)
     drift = 0.0
-    # for shorter intervals, jitter would be fitted as drift
+    # in shorter recordings, jitter would be fitted as drift
     if LARGEST_DRIFT_PPM * 1e-6 * elapsed_ns[-1] > interval_ns / 100:
         sample = np.unique(np.linspace(0, rx_tag.size - 1, 300).astype(int))
         drift = _theil_sen_slope(elapsed_ns[sample], offset_ns[sample])
@@ -78,13 +78,13 @@ def fit_pairs(tags: Pairs, pairs: Pairs, interval_ns: float) -> TagLine:
 
 
 def _theil_sen_slope(x: Floats, y: Floats) -> float:
-    """Return the median slope over all pairs of points, x ascending; importing scipy.stats would take a second."""
+    """Return the median slope over all pairs of points with x ascending; importing scipy.stats would take a second."""
     first, second = np.triu_indices(x.size, 1)
     return float(np.median((y[second] - y[first]) / (x[second] - x[first])))
 
 
 def residual_ns(tags: Pairs, pairs: Pairs, line: TagLine) -> Floats:
-    """Return the residual of the receiver's tags from the line, (pair,) float64 nanoseconds."""
+    """Return the residuals of the receiver's tags from the line, (pair,) float64, nanoseconds."""
     rx_tag = tags[1][pairs[1]]
     return np.asarray(rx_tag - tags[0][pairs[0]] - _offset_ns(rx_tag, line), np.float64)
 
@@ -98,23 +98,23 @@ def _offset_ns(rx_tag: Integers, line: TagLine) -> Floats:
 
 @dataclass(frozen=True)
 class Association:
-    """Pairs of a transmitted pulse and its capture by a receiver.
+    """Pairs of transmitted pulses and their captures by a receiver.
 
     Attributes
     ----------
     tx_index, rx_index
         (pair,) int64, pulse indices in the two recordings, both strictly ascending.
     offset_s
-        Receiver's time tag minus transmitter's at the first pair, seconds.
+        Time tag of the receiver minus time tag of the transmitter at the first pair, seconds.
     drift_ppm
-        Drift of that offset, parts per million.
+        Drift of this offset, parts per million.
     residual_s
         RMS residual of the tags from the offset line, seconds.
     method
         Basis of the association: frame numbers or time tags.
     outlier
-        (pair,) bool, True where the tags deviate from the line by more than the error of a tag, so that one of the two
-        tags is wrong.
+        (pair,) bool, True where the tags deviate from the line by more than the accuracy of a tag: one of the two tags
+        is wrong.
     tx_dropped, rx_dropped
         Number of unpaired pulses of each recording.
     flags
@@ -146,29 +146,31 @@ def associate(
 ) -> Association:
     """Pair the pulses of a transmitter with the captures of a receiver.
 
-    If both nodes record frame numbers, pulses are associated by these. Otherwise the receiver's tags are assumed to
-    lead or lag by less than half a repetition interval at its first pulse, and to drift by at most 100 ppm.
+    If both nodes record frame numbers, pulses are associated by frame number. Otherwise, the tags of the receiver are
+    assumed to deviate by less than half a repetition interval at the first pulse, and to drift by at most 100 ppm.
 
     Parameters
     ----------
     tx_time_ns, rx_time_ns
-        (pulse,) int64, UTC time tags by the clock of each node, nanoseconds, ascending; with any common origin.
+        (pulse,) int64, UTC time tags from the clock of each node, nanoseconds, ascending, with any common origin.
     repetition_interval_s
         Nominal time between pulses, seconds.
     tx_frame, rx_frame
-        (pulse,) int64 frame numbers, -1 where the payload was not decoded; None without a counter.
+        (pulse,) int64, frame numbers, -1 where the payload was not decoded; None without a counter.
     frame_modulus
-        Count at which the counter returns to zero. None: if a counter steps back, the next power of two above the
-        largest number.
+        Count at which the counter returns to zero. None: the next power of two above the largest number if a counter
+        steps back; otherwise the counters do not wrap.
     speed_m_s
-        Speed of the transmitter, metres per second, to convert a tag offset into a displacement; None: unknown.
+        Speed of the transmitter, metres per second, with which a tag offset is converted to a displacement; None:
+        unknown.
     where
-        Name of the recordings in errors.
+        Name of the recordings in error messages.
 
     Raises
     ------
     CampaignError
-        If tags do not ascend, the counters have no frame in common, or no pair lies within half a repetition interval.
+        If tags do not ascend, if the counters have no frame in common, or if no pair lies within half a repetition
+        interval.
 
     Notes
     -----
@@ -217,7 +219,7 @@ def _require_ascending(tags: Integers, node: str, where: str) -> None:
     descents = np.flatnonzero(np.diff(tags) <= 0)
     if descents.size or tags.size == 0:
         found = (
-            f"the time tag of pulse {descents[0] + 1} of the {node} is not later than the one before it"
+            f"the time tag of pulse {descents[0] + 1} of the {node} is not later than the previous time tag"
             if tags.size
             else f"the recording of the {node} contains no pulses"
         )
@@ -229,11 +231,11 @@ def _require_ascending(tags: Integers, node: str, where: str) -> None:
 def _no_common_pulse(tags: Pairs, repetition_interval_s: float, where: str) -> CampaignError:
     gap_s = [(tags[1][0] - tags[0][0]) * 1e-9, (tags[1][-1] - tags[0][-1]) * 1e-9]
     return CampaignError(
-        f"no pulse pairs: the receiver's recording starts {gap_s[0]:+.3f} s and ends {gap_s[1]:+.3f} s relative to the "
-        "transmitter's",
+        f"no pulse pairs: start and end of the receiver's recording differ by {gap_s[0]:+.3f} s and {gap_s[1]:+.3f} s "
+        "from start and end of the transmitter's recording",
         where=where,
         expected=f"pairs within half a repetition interval ({repetition_interval_s / 2:.4g} s)",
-        remedy="Check that both recordings belong to the same flight, and check their core:datetime.",
+        remedy="Check that both recordings belong to the same flight, and check core:datetime in both recordings.",
     )
 
 
@@ -262,7 +264,7 @@ def _agreed_pairs(
 def pairs_by_frame(
     tags: Pairs, frames: tuple[Integers | None, Integers | None], interval_ns: float, modulus: int | None
 ) -> Pairs | None:
-    """Return pairs of equal frame number after unwrapping the counters; None if a node has no counter."""
+    """Return pairs with equal frame numbers after unwrapping the counters; None if a node has no counter."""
     if frames[0] is None or frames[1] is None:
         return None
     tx, rx = (np.flatnonzero(frame != ABSENT) for frame in (frames[0], frames[1]))
@@ -282,7 +284,7 @@ def pairs_by_frame(
 
 
 def _unwrapped(count: Integers, tags: Integers, interval_ns: float, modulus: int) -> Integers:
-    """Unwrap the counter; a misread number does not affect later ones."""
+    """Unwrap the counter; a misread number does not affect later numbers."""
     step = np.mod(np.diff(count), modulus)
     step += modulus * np.rint((np.diff(tags) / interval_ns - step) / modulus).astype(np.int64)
     return np.asarray(count[0] + np.concatenate([[0], np.cumsum(step)]), np.int64)
@@ -291,23 +293,22 @@ def _unwrapped(count: Integers, tags: Integers, interval_ns: float, modulus: int
 # ---- Flags of an association
 
 LARGEST_JITTER = 1 / 6
-"""RMS scatter of the tags, in repetition intervals, at which one tag in 370 (3σ) is closer to the neighbouring
-pulse."""
+"""RMS scatter of the tags, in repetition intervals, at which one tag in 370 (3σ) is closer to an adjacent pulse."""
 
 AMBIGUOUS_SHARE = 0.4
-"""Largest unambiguous offset as a share of a repetition interval, with a margin: beyond one half, a neighbour is
-closer."""
+"""Largest offset, in repetition intervals, that is considered unambiguous. Beyond one half, an adjacent pulse is
+closer; the difference is a margin."""
 
 LARGEST_OFFSET_S = 20e-3
 """Largest offset between the tags of two nodes, seconds, that is explained by errors of a few milliseconds each."""
 
 OUTLIER_S = 5e-3
-"""Deviation of a tag from the line, seconds, within the accuracy of time tags."""
+"""Deviation of a tag from the line, seconds, that is within the accuracy of time tags."""
 
 _OUTLIER_SIGMA = 6.0  # standard deviations of all tags: an outlier exceeds both this and `OUTLIER_S`
 
 LARGEST_UNPAIRED = 0.05
-"""Share of the transmitter's pulses before or after the receiver's recording, above which a flag is raised."""
+"""Fraction of the transmitted pulses before or after the recording of the receiver, above which a flag is raised."""
 
 _FEW = 2  # number of pulses by which a recorder may start late or stop early
 
@@ -325,12 +326,12 @@ def is_outlier(residual_s: Floats) -> NDArray[np.bool_]:
 
 
 def tag_jitter_s(time_ns: Integers) -> float:
-    """Return the RMS error of a node's tags relative to the equal intervals of a radar timer, seconds.
+    """Return the RMS error of the tags of a node relative to the equal intervals of a radar timer, seconds.
 
     Parameters
     ----------
     time_ns
-        (pulse,) int64, tags of one node, ascending; missed pulses are bridged.
+        (pulse,) int64, tags of one node, ascending; missing pulses have no effect.
 
     Notes
     -----
@@ -345,7 +346,7 @@ def tag_jitter_s(time_ns: Integers) -> float:
     if time_ns.size < 3:
         return 0.0
     steps = np.diff(time_ns)
-    # pulse number, missing pulses included
+    # pulse number, counting missing pulses
     number = np.concatenate([[0.0], np.cumsum(np.round(steps / np.median(steps)))])
     elapsed_s = (time_ns - time_ns[0]) * 1e-9
     return round(float(np.std(elapsed_s - np.polyval(np.polyfit(number, elapsed_s, 1), number))), 9)
@@ -354,7 +355,7 @@ def tag_jitter_s(time_ns: Integers) -> float:
 def association_flags(
     association: "Association", tags: Pairs, interval_s: float, *, conflicts: int, speed_m_s: float | None
 ) -> dict[str, str]:
-    """Return the flags of an association: flag → measured values, one line.
+    """Return the flags of an association: name of the flag → measured values, one line.
 
     Parameters
     ----------
@@ -377,7 +378,7 @@ def association_flags(
     share, by_tags = abs(association.offset_s) / interval_s, association.method == "time tags"
     if by_tags and share > AMBIGUOUS_SHARE:
         flags["association_ambiguous"] = (
-            f"time tags differ by {association.offset_s:+.4f} s, {share:.2f} of a repetition interval: "
+            f"time tags differ by {association.offset_s:+.4f} s, which is {share:.2f} repetition intervals: "
             "all pairs may be wrong by one pulse"
         )
     if abs(association.offset_s) > LARGEST_OFFSET_S:
@@ -389,7 +390,7 @@ def association_flags(
     if by_tags and association.residual_s > interval_s * LARGEST_JITTER:
         flags["time_tag_jitter"] = (
             f"time tags scatter by {association.residual_s:.4f} s rms at a repetition interval of {interval_s:.4g} s: "
-            "single captures may be paired with a neighbouring pulse"
+            "individual captures may be paired with an adjacent pulse"
         )
     if association.outlier.any():
         flags["time_tag_outlier"] = (
@@ -411,36 +412,36 @@ def _offset_line(association: "Association", speed_m_s: float | None) -> str:
     if speed_m_s is None:
         return line
     moved_m = abs(association.offset_s) * speed_m_s
-    return f"{line}: the transmitter's tags are used; it moved {moved_m:.2f} m in that time"
+    return f"{line}: the tags of the transmitter are used; in this time, the transmitter moved by {moved_m:.2f} m"
 
 
 def _unpaired(association: "Association", tags: Pairs, interval_s: float) -> str | None:
-    """Report the transmitter's pulses before the first and after the last pair, if above `LARGEST_UNPAIRED`."""
+    """Report transmitted pulses before the first and after the last pair, if their fraction is too large."""
     tx, rx = tags
     early, late = int(association.tx_index[0]), tx.size - 1 - int(association.tx_index[-1])
     if early + late <= max(LARGEST_UNPAIRED * tx.size, _FEW):
         return None
-    line = f"of {tx.size} transmitted pulses, {early} are before and {late} after the receiver's recording"
+    line = f"of {tx.size} transmitted pulses, {early} are before and {late} after the recording of the receiver"
     start_s, end_s = (rx[0] - tx[0]) * 1e-9, (rx[-1] - tx[-1]) * 1e-9
     if abs(start_s - end_s) <= 1.5 * interval_s < abs(start_s):
         line += (
-            f": the recordings are equally long and start {start_s:+.3f} s from each other, as if the time tags of one "
-            "were wrong by this offset"
+            f": the recordings are equally long, and their starts differ by {start_s:+.3f} s, which suggests that the "
+            "time tags of one recording are wrong by this offset"
         )
     return line
 
 
-# ---- Check of the association: sidelink delay against the baseline of the tracks
+# ---- Check of the association: comparison of the sidelink delay with the baseline of the tracks
 
 EXPLAINED_M = 0.05
 """Residual of a sidelink path, metres, that may be due to errors of the logged positions alone."""
 
 SIGMAS = 5.0
-"""Threshold in standard deviations of a median's noise: among 1000 windows of noise, it is exceeded in one of 3000
-flights."""
+"""Threshold in standard deviations of the noise of a median. In 1000 windows that contain only noise, the threshold is
+exceeded in one of 3000 flights."""
 
 _MEDIAN_PULSES = 15, 61, 241
-"""Lengths (odd) of the running medians that separate motion from jitter; longer ones have less noise and less
+"""Lengths (odd) of the running medians that separate motion from jitter; longer medians have less noise and less
 bandwidth."""
 
 _ENOUGH = 64  # disjoint windows required to estimate the noise of the median
@@ -453,11 +454,11 @@ class BaselineResidual:
     Attributes
     ----------
     residual_m, noise_m
-        RMS of the residual's running median, metres, and the standard deviation of that median from jitter alone.
+        RMS of the running median of the residual, and standard deviation of this median caused by jitter alone, metres.
     jitter_m
         Standard deviation of a single pulse, metres; mostly trigger jitter.
     largest_m, pulse
-        Largest running median, metres, and its pulse.
+        Largest magnitude of the running median, metres, and the pulse at which it occurs.
     excess
         `largest_m` relative to the threshold for noise and position errors, maximum over the running medians.
     """
@@ -471,18 +472,18 @@ class BaselineResidual:
 
 
 def baseline_residual(delay_m: Floats, baseline_m: Floats) -> BaselineResidual | None:
-    """Return the residual of a sidelink's measured path from its geometry; None for fewer than 30 pulses.
+    """Return the difference between measured and geometric path of a sidelink; None for fewer than 30 pulses.
 
     Parameters
     ----------
     delay_m, baseline_m
-        (pulse,) float64, metres: measured delay of the sidelink times c, NaN where it did not lock, and distance
-        between its antennas.
+        (pulse,) float64, metres: measured delay of the sidelink multiplied by c, NaN in pulses without lock; and
+        distance between the antennas of the sidelink.
 
     Notes
     -----
-    Source: docs/theory/echo_methods.md, "Association". Only full windows are evaluated: a window beyond the end would
-    repeat the last pulse.
+    Source: docs/theory/echo_methods.md, "Association". Only complete windows are evaluated, because a window beyond the
+    end would repeat the last pulse.
 
     Examples
     --------
@@ -523,7 +524,7 @@ def _smoothed(pulse: NDArray[np.intp], residual: Floats, jitter_m: float, width:
 
 
 def sigmas(windows: int) -> float:
-    """Return the threshold for the maximum of a number of windows, standard deviations, at a constant false-alarm rate.
+    """Return the threshold, standard deviations, for the maximum over several windows at a constant false-alarm rate.
 
     Examples
     --------
@@ -534,11 +535,11 @@ def sigmas(windows: int) -> float:
 
 
 def detect_wrong_association(residual: BaselineResidual | None) -> str | None:
-    """Report a deviation of the measured sidelink from the geometry of its pulses, in one line; None if there is none.
+    """Report a deviation of the measured sidelink path from the geometry, in one line; None if there is none.
 
-    A constant and a linear drift are attributed to the clocks. Trigger jitter does not explain a residual above
-    `EXPLAINED_M` and above five times its own noise (six in a long flight): captures are assigned to wrong pulses, or
-    positions are wrong.
+    A constant and a linear drift are attributed to the clocks. Trigger jitter does not explain a residual that exceeds
+    both `EXPLAINED_M` and five standard deviations of the median (six in a long flight): captures are assigned to wrong
+    pulses, or positions are wrong.
 
     Notes
     -----
@@ -551,30 +552,30 @@ def detect_wrong_association(residual: BaselineResidual | None) -> str | None:
     >>> detect_wrong_association(baseline_residual(distance + 3.0, distance)) is None
     True
     >>> detect_wrong_association(baseline_residual(np.roll(distance, 9), distance))
-    'the sidelink path deviates from its geometry by ... m at pulse ... (noise ... m): wrong association or positions'
+    'the measured sidelink path deviates from the geometry by ... m at pulse ... (noise ... m): wrong ...'
     """
     if residual is None or residual.excess <= 1:
         return None
     return (
-        f"the sidelink path deviates from its geometry by {residual.largest_m:.2f} m at pulse {residual.pulse} "
-        f"(noise {residual.noise_m:.3f} m): wrong association or positions"
+        f"the measured sidelink path deviates from the geometry by {residual.largest_m:.2f} m at pulse "
+        f"{residual.pulse} (noise {residual.noise_m:.3f} m): wrong association or wrong positions"
     )
 
 
 # ---- Missing pulses
 
 LARGEST_SIDELOBE = 0.1
-"""Largest tolerated sidelobe from missing pulses, amplitude relative to the peak: -20 dB, a gap of a tenth of the
-aperture."""
+"""Largest tolerated sidelobe from missing pulses, amplitude relative to the peak: -20 dB, as caused by a gap of a tenth
+of the aperture."""
 
 
 def missing_pulses(time_ns: Integers) -> tuple[int, float]:
-    """Return the number of pulses missing between the first and the last, and the highest sidelobe from the gaps.
+    """Return the number of missing pulses between the first and the last pulse, and the highest sidelobe due to gaps.
 
     Parameters
     ----------
     time_ns
-        (pulse,) int64, ascending tags of the recorded pulses; most are one interval apart.
+        (pulse,) int64, tags of the recorded pulses, ascending; most are separated by one interval.
 
     Returns
     -------
@@ -583,9 +584,8 @@ def missing_pulses(time_ns: Integers) -> tuple[int, float]:
 
     Notes
     -----
-    The response of the aperture is that of all pulses minus that of the missing ones:
-    |Σ_missing exp(j2πkm/M)|/used at one resolution cell or more from the peak, k ≥ 1. Source:
-    docs/theory/planner.md, "Pulses".
+    The response of the aperture is the response of all pulses minus that of the missing pulses. At one resolution cell
+    or more from the peak (k ≥ 1), it is |Σ_missing exp(j2πkm/M)|/used. Source: docs/theory/planner.md, "Pulses".
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Calibration on a reflector at a known position: the path offset of a node, and its phase from pulse to pulse."""
+"""Calibration on a reflector at a known position: path offset of a node, and echo phase from pulse to pulse."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,14 +24,15 @@ NEEDED_STD_M = 0.02
 """Standard deviation of a path offset, metres, above which coherent sums of several nodes are defocused."""
 
 RIVAL_DB = -6.0
-"""Level of a second echo, dB relative to the reflector, above which the identity of the reflector is uncertain."""
+"""Level of a second echo relative to the reflector, dB, above which the identification of the reflector is uncertain.
+"""
 
 _GROUPS = 16
 _OVERSAMPLING = 8
 
 
 class Pulses(Protocol):
-    """(pulse, subcarrier) complex64: an array, or an object that reads slices of one."""
+    """(pulse, subcarrier) complex64: an array, or an object that reads slices of an array."""
 
     def __len__(self) -> int: ...
 
@@ -45,13 +46,13 @@ class PathOffset:
     Attributes
     ----------
     offset_m
-        Metres of total path. Monostatic: `path_offset_m.radar`. Bistatic: radar minus sidelink, the only
-        combination observable in echoes divided by the sidelink.
+        Offset of the total path, metres. Monostatic: `path_offset_m.radar`. Bistatic: offset of the radar channel minus
+        that of the sidelink channel, the only combination observable in echoes divided by the sidelink.
     std_m
-        Standard deviation, from the scatter over sixteenths and quarters of the flight; infinite for fewer than 16
-        pulses.
+        Standard deviation of the offset, from the scatter over sixteenths and quarters of the flight; infinite for
+        fewer than 16 pulses.
     contrast_db
-        Power of the reflector relative to its surroundings.
+        Power of the reflector relative to the surroundings, dB.
     pulses
         Number of pulses used.
     flags
@@ -78,16 +79,16 @@ def estimate_path_offset(
     Parameters
     ----------
     transfer
-        (pulse, subcarrier) complex64: Σ a·exp(-j2πfτ), absolute delay, path offset not removed. An array, or an
-        object that reads slices of one from a file.
+        (pulse, subcarrier) complex64: Σ a·exp(-j2πfτ) with absolute delays, in which the path offset is included. An
+        array, or an object that reads slices of an array from a file.
     frequency_hz
-        (subcarrier,) float64, RF, equally spaced, ascending.
+        (subcarrier,) float64, RF frequencies, equally spaced, ascending.
     path_m
-        (pulse,) float64, predicted total path: tx → reflector → rx, minus the sidelink path in a bistatic pair.
+        (pulse,) float64, predicted total path tx → reflector → rx, minus the sidelink path in a bistatic pair, metres.
     search_m
         Largest offset of either sign that is searched, metres.
     where
-        Name of the flight in errors.
+        Name of the flight in error messages.
 
     Raises
     ------
@@ -96,8 +97,8 @@ def estimate_path_offset(
 
     Notes
     -----
-    Source: docs/theory/echo_methods.md, "Calibration". Pulses are added coherently within a sixteenth of the flight,
-    over which track errors are constant; powers of the sixteenths are added.
+    Source: docs/theory/echo_methods.md, "Calibration". Pulses are added coherently within each sixteenth of the flight,
+    over which track errors are nearly constant. The powers of the sixteenths are added.
 
     Examples
     --------
@@ -117,25 +118,25 @@ def estimate_path_offset(
     contrast_db = decibels(float(power[peak]) / max(surroundings, 1e-30))
     flags = Flags()
     if std_m > NEEDED_STD_M:
-        flags["calibration_uncertain"] = f"path offset {mean_m:.3f} ± {std_m:.3f} m; ± {NEEDED_STD_M} m is required"
+        flags["calibration_uncertain"] = f"path offset {mean_m:.3f} ± {std_m:.3f} m; tolerated ± {NEEDED_STD_M} m"
     rival_db, rival_m = _rival(offset_m, power, peak, frequency_hz)
     if rival_db > RIVAL_DB:
         flags["calibration_ambiguous"] = (
-            f"a second reflector of {rival_db:.1f} dB relative to the first, at a path offset of {rival_m:.2f} m; "
-            f"the first is at {mean_m:.2f} m"
+            f"a second reflector, {rival_db:.1f} dB relative to the first, has a path offset of {rival_m:.2f} m; the "
+            f"first has {mean_m:.2f} m"
         )
     return PathOffset(mean_m, std_m, contrast_db, len(transfer), flags)
 
 
 def reflector_history(transfer: Pulses, frequency_hz: Floats, *, path_m: Floats) -> NDArray[np.complex128]:
-    """Return the echo of a reflector, (pulse,) complex128; its phase is constant if path and clocks are correct.
+    """Return the echo of a reflector, (pulse,) complex128; the phase is constant if path and clocks are correct.
 
     Parameters
     ----------
     transfer, frequency_hz
         As for `estimate_path_offset`.
     path_m
-        (pulse,) float64, total path of the reflector including offsets; constant in a static recording.
+        (pulse,) float64, total path of the reflector including offsets, metres; constant in a static recording.
 
     Examples
     --------
@@ -170,7 +171,7 @@ def _mean(transfer: Pulses, frequency_hz: Floats, path_m: Floats, first: int, la
 
 
 def _offset_profile(groups: NDArray[np.complex128], frequency_hz: Floats, search_m: float) -> tuple[Floats, Floats]:
-    """Return the offsets searched and the mean power of the groups at each."""
+    """Return the offsets that are searched, metres, and the mean power of the groups at each offset."""
     length = scipy.fft.next_fast_len(_OVERSAMPLING * frequency_hz.size)
     spacing_hz = float(frequency_hz[-1] - frequency_hz[0]) / (frequency_hz.size - 1)
     step_m = SPEED_OF_LIGHT_M_S / (spacing_hz * length)
@@ -181,7 +182,7 @@ def _offset_profile(groups: NDArray[np.complex128], frequency_hz: Floats, search
 
 
 def _require_visible(power: Floats, peak: int, surroundings: float, groups: int, search_m: float, where: str) -> None:
-    """Raise CampaignError if the peak is at the edge, or not above the maximum expected of as many clutter cells."""
+    """Raise CampaignError if the peak is at the edge, or not above the maximum expected from clutter alone."""
     cells = power.size / _OVERSAMPLING
     highest = gammainccinv(groups, FALSE_REFLECTOR / cells) / groups
     ratio_db, needed_db = (decibels(r) for r in (power[peak] / max(surroundings, 1e-30), highest))
@@ -190,12 +191,12 @@ def _require_visible(power: Floats, peak: int, surroundings: float, groups: int,
         return
     at_edge = "" if inside else " and lies at the edge of the search interval"
     raise CampaignError(
-        f"no reflector: the highest echo within {search_m:g} m of its predicted path is {ratio_db:.1f} dB above "
-        f"the mean of its surroundings{at_edge}",
+        f"no reflector: the strongest echo within {search_m:g} m of the predicted path is {ratio_db:.1f} dB above "
+        f"the mean of the surroundings{at_edge}",
         where=where,
         expected=f"an echo of more than {needed_db:.1f} dB inside the search interval",
-        remedy="Check that the reflector's coordinates are right and that it was in the beam; or increase "
-        "calibration.search_m.",
+        remedy="Check that the coordinates of the reflector are correct and that the reflector was in the beam; or "
+        "increase calibration.search_m.",
     )
 
 
@@ -215,7 +216,7 @@ def _refine(groups: NDArray[np.complex128], frequency_hz: Floats, start_m: float
 
 
 def _deviation_of_mean(offsets_m: Floats) -> float:
-    """Return the standard deviation of the mean of the group offsets, whose neighbours may have common track errors."""
+    """Return the standard deviation of the mean offset; adjacent groups may have common track errors."""
     if len(offsets_m) < _GROUPS:
         return np.inf
     quarters_m = offsets_m.reshape(4, -1).mean(1)

@@ -1,9 +1,9 @@
-"""Clock offset of a receiver from the transmitter: measurement on the sidelink, and decision on correction.
+"""Clock offset of a receiver relative to the transmitter: measurement on the sidelink, and decision on correction.
 
-The symbol has the period 1/Δf and is longer than one period, so the start of a capture repeats at its end, rotated by
-the carrier offset and shifted by the sampling offset. The measurement requires neither code nor delay.
-A pulse that is sent once has no repetition: the clock offset is not measurable, and division by the sidelink does not
-require it (docs/theory/waveforms.md, "Clock").
+The symbol has the period 1/Δf and is longer than one period. The start of a capture is therefore repeated at the end,
+rotated by the carrier offset and shifted by the sampling offset. The measurement requires neither the code nor the
+delay. For a pulse without repetition, the clock offset is not measurable, and is not required for the division by the
+sidelink (docs/theory/waveforms.md, "Clock").
 """
 
 from collections.abc import Iterable
@@ -19,36 +19,36 @@ from apertura.core.echo.captures import AT_ONCE, spread
 from apertura.core.echo.demodulate import Numerology
 
 SIGMAS = 3.0
-"""Standard deviations below which a clock offset is not significant and is not corrected."""
+"""Number of standard deviations below which a clock offset is not significant and is not corrected."""
 
 AMBIGUOUS_SHARE = 0.4
-"""Share of Δf above which the sign of an offset is uncertain, because offsets are ambiguous beyond one half."""
+"""Carrier offset relative to Δf above which the sign is uncertain, because offsets beyond half of Δf are ambiguous."""
 
 GROUPS = 16
-"""Number of parts of the flight from whose scatter the standard deviation of the clock offset is computed."""
+"""Number of parts of the flight, from the scatter of which the standard deviation of the clock offset is computed."""
 
-_SMALLEST_REPEAT = 32  # least number of repeated samples of a capture
+_SMALLEST_REPEAT = 32  # least number of repeated samples in a capture
 _TAPERED = 0.25
-"""Tapered share of the repeated samples, both ends together. A capture that is triggered late extends beyond the end of
-the symbol; without a taper, the phase error for a chirp-like code was 70 standard deviations, 0.1 ppm or more."""
+"""Tapered fraction of the repeated samples, both ends together. A capture that is triggered late extends beyond the end
+of the symbol. Without a taper, the phase error for a chirp-like code was 70 standard deviations, 0.1 ppm or more."""
 
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """Offsets of the receiver's oscillators.
+    """Frequency offsets of a receiver relative to the transmitter.
 
     Attributes
     ----------
     cfo_hz
-        Receiver's oscillator frequency minus transmitter's at the middle of the flight, hertz.
+        Oscillator frequency of the receiver minus that of the transmitter, at the midpoint of the flight, hertz.
     cfo_slope_hz
-        Change of the carrier offset per pulse, hertz; 0 if it is not significant.
+        Change of the carrier offset per pulse, hertz; 0 if the change is not significant.
     sfo_ppm
-        Receiver's sampling rate above nominal, parts per million of the transmitter's.
+        Relative offset of the receiver's sampling rate from the transmitter's, parts per million.
     cfo_std_hz, sfo_std_ppm
-        Standard deviations from the scatter over the flight; for `sfo_ppm`, of the direct measurement.
+        Standard deviations from the scatter over the flight; for `sfo_ppm`, that of the direct measurement.
     one_clock
-        True if `sfo_ppm` is derived from the carrier offset, because the direct measurement agrees with it.
+        True if `sfo_ppm` is derived from the carrier offset because this agrees with the direct measurement.
     """
 
     cfo_hz: float
@@ -59,7 +59,7 @@ class ClockOffset:
     one_clock: bool
 
     def ppm(self, numerology: Numerology) -> tuple[float, float | None]:
-        """Return the oscillator's offset and its standard deviation, ppm; None if unknown."""
+        """Return the offset of the oscillator and its standard deviation, ppm; None if the latter is unknown."""
         std_ppm = self.cfo_std_hz / numerology.carrier_hz * 1e6
         return self.cfo_hz / numerology.carrier_hz * 1e6, std_ppm if np.isfinite(std_ppm) else None
 
@@ -100,8 +100,8 @@ def clock_of(groups: Iterable[Complexes], numerology: Numerology, *, pulses: int
     Parameters
     ----------
     groups
-        (pulse, sample) complex64 each, captures from the start of the cyclic prefix to the end of the symbol
-        (T_cp + T) and not beyond, from equal parts of the flight; pulses without signal are permitted.
+        (pulse, sample) complex64 each, groups of captures from equal parts of the flight. Captures extend from the
+        start of the cyclic prefix to the end of the symbol (T_cp + T) at most; pulses without signal are permitted.
     numerology
         Numerology of the symbol.
     pulses
@@ -110,15 +110,15 @@ def clock_of(groups: Iterable[Complexes], numerology: Numerology, *, pulses: int
     Raises
     ------
     ValueError
-        If captures contain too few repeated samples, or the transmitted signal does not repeat.
+        If captures contain too few repeated samples, or if the transmitted signal has no repetition.
 
     Notes
     -----
-    Source: docs/theory/echo_methods.md, "Clock". Unambiguous for |CFO| < Δf/2.
+    Source: docs/theory/echo_methods.md, "Clock". The result is unambiguous for |CFO| < Δf/2.
     """
     if not numerology.repeats:
         raise ValueError(
-            "not measurable: a pulse that is sent once has no repetition (division by the sidelink needs no clock)"
+            "clock offset not measurable in pulses without repetition (and not required for division by the sidelink)"
         )
     period_s = 1 / numerology.spacing_hz
     frequency_hz, parts = _repetition(groups, numerology)
@@ -131,7 +131,7 @@ def clock_of(groups: Iterable[Complexes], numerology: Numerology, *, pulses: int
     one_clock = abs(sfo_ppm - joint_ppm) <= 3 * sfo_std_ppm
     sfo_ppm = joint_ppm if one_clock else sfo_ppm
     cfo_std_hz = phase_std / (2 * np.pi * period_s)
-    if not one_clock:  # plus the error of the slope, with which the carrier is extrapolated from the middle of the band
+    if not one_clock:  # add the error of the slope, with which the carrier offset is extrapolated from the band centre
         cfo_std_hz = float(np.hypot(cfo_std_hz, centre_hz * sfo_std_ppm * 1e-6))
     return ClockOffset(
         cfo_hz=-phase / (2 * np.pi * period_s) - centre_hz * sfo_ppm * 1e-6,
@@ -157,7 +157,7 @@ def decide_clock(offset: ClockOffset, numerology: Numerology, *, accuracy_db: fl
     """
     floor_db = interference_floor_db(offset.cfo_hz, offset.sfo_ppm, numerology)
     ppm, std_ppm = offset.ppm(numerology)
-    residual_db = 0.0  # floor of the error of the correction
+    residual_db = 0.0  # floor caused by the error of the correction
     if std_ppm is not None:
         sfo_std_ppm = std_ppm if offset.one_clock else offset.sfo_std_ppm
         residual_db = interference_floor_db(offset.cfo_std_hz, sfo_std_ppm, numerology)
@@ -175,23 +175,23 @@ def decide_clock(offset: ClockOffset, numerology: Numerology, *, accuracy_db: fl
     if abs(offset.cfo_hz) > AMBIGUOUS_SHARE * numerology.spacing_hz:
         flags["clock_ambiguous"] = (
             f"CFO {offset.cfo_hz:+.0f} Hz is close to half a subcarrier ({numerology.spacing_hz / 2:.0f} Hz): "
-            "it may be wrong by an integer number of subcarriers"
+            "the measured CFO may be wrong by an integer number of subcarriers"
         )
     if residual_db > accuracy_db:
         flags["clock_uncertain"] = (
-            f"standard deviation of the clock offset {offset.cfo_std_hz:.0f} Hz: floor of {residual_db:.1f} dB, "
-            f"{accuracy_db:g} dB tolerated"
+            f"standard deviation of the clock offset {offset.cfo_std_hz:.0f} Hz, which causes a floor of "
+            f"{residual_db:.1f} dB; {accuracy_db:g} dB tolerated"
         )
     return ClockDecision(correct, reason, floor_db, flags)
 
 
 def interference_floor_db(cfo_hz: float, sfo_ppm: float, numerology: Numerology) -> float:
-    """Return the interference floor of a clock offset in a range profile, dB relative to its peak.
+    """Return the interference floor caused by a clock offset in a range profile, dB relative to the peak.
 
     Notes
     -----
-    Source: docs/theory/echo_methods.md, "Clock": a tone offset by δ bins retains sinc²(δ) of its power; the rest leaks
-    into the other subcarriers, in the echo and in the sidelink, and compression spreads it over N cells.
+    Source: docs/theory/echo_methods.md, "Clock": a tone offset by δ bins retains sinc²(δ) of its power. In the echo and
+    in the sidelink, the remaining power leaks into the other subcarriers; compression spreads it over N cells.
 
     Examples
     --------
@@ -209,7 +209,7 @@ _INTERFERED = 20.0
 
 
 def _repetition(groups: Iterable[Complexes], numerology: Numerology) -> tuple[Floats, NDArray[np.complex128]]:
-    """Return the occupied frequencies and, per group of pulses, the cross-spectrum of the end with the start."""
+    """Return the occupied frequencies and, for each group, the cross-spectrum between end and start of the captures."""
     crosses = [_cross_spectrum(pulses, numerology) for pulses in groups]
     size = crosses[0].size
     lowest_hz = numerology.middle_hz - numerology.sample_rate_hz / 2
@@ -241,7 +241,7 @@ def _cross_spectrum(sidelink: Complexes, numerology: Numerology) -> NDArray[np.c
 
 
 def _taper(length: int) -> Floats:
-    """Return a Tukey window of tapered share `_TAPERED`; importing scipy.signal would take a second."""
+    """Return a Tukey window with the tapered fraction `_TAPERED`; importing scipy.signal would take a second."""
     edge = np.minimum(np.arange(length), np.arange(length)[::-1]) / (_TAPERED / 2 * (length - 1))
     return np.asarray((1 - np.cos(np.pi * np.minimum(edge, 1))) / 2)
 
@@ -249,7 +249,7 @@ def _taper(length: int) -> Floats:
 def _phase_and_slope(
     cross: NDArray[np.complex128], frequency_hz: Floats, *, start: tuple[float, float]
 ) -> tuple[float, float, float]:
-    """Fit a line to the phase: phase (rad) at the power-weighted mean frequency, slope (rad/Hz) and that frequency."""
+    """Fit a line to the phase: return phase (rad) at the weighted mean frequency, slope (rad/Hz) and this frequency."""
     weight = np.abs(cross)
     centre_hz = float(np.average(frequency_hz, weights=weight))
     off_hz = frequency_hz - centre_hz
@@ -262,7 +262,7 @@ def _phase_and_slope(
 
 
 def _line(values: Floats) -> tuple[float, float]:
-    """Return the slope per step (0 if below four standard deviations) and the standard deviation of the mean."""
+    """Return the slope per step (0 below four standard deviations), and the standard deviation of the mean."""
     count = values.size
     if count < 3:
         return 0.0, np.inf

@@ -1,4 +1,4 @@
-"""Range compression: transfer functions to range profiles, referenced to the band centre and cropped to the swath."""
+"""Range compression of transfer functions to profiles, referenced to the band centre and cropped to the swath."""
 
 from collections.abc import Callable, Mapping
 
@@ -14,7 +14,7 @@ from apertura.core.windowed_sinc import kaiser_window
 
 
 def unit_phasor(cycles: NDArray[np.float64]) -> NDArray[np.complex64]:
-    """Return exp(j2π·cycles), complex64; integer cycles are removed in float64, the remainder is evaluated in float32.
+    """Return exp(j2π·cycles), complex64; integer cycles are removed in float64 before the evaluation in float32.
 
     Examples
     --------
@@ -39,15 +39,16 @@ def phasors(cycles: NDArray[np.float64], count: int, *, first: float = 0.0) -> N
     Parameters
     ----------
     cycles
-        (pulse,) float64, cycles from one n to the next.
+        (pulse,) float64, phase step from one n to the next, cycles.
     count
-        Number of n.
+        Number of values of n.
     first
-        The first n, possibly fractional.
+        The first n; may be fractional.
 
     Notes
     -----
-    Computed as products of coarse and fine phasors, to evaluate fewer exponentials; exact to the rounding of complex64.
+    Phasors are computed as products of coarse and fine phasors, so that fewer exponentials are evaluated. Results are
+    exact within the rounding error of complex64.
 
     Examples
     --------
@@ -66,15 +67,15 @@ _PULSES_AT_ONCE = 32  # number of pulses per block, limited by the processor cac
 
 _TAPS = 7
 _ROOM = 2.0
-"""Length of a decimated profile relative to the swath; with seven taps its error is below that of complex64."""
+"""Length of a decimated profile relative to the swath; with seven taps, the error is below complex64 rounding."""
 _LARGEST_FACTOR = 64
 
 WINDOWS: Mapping[str, Callable[[int], NDArray[np.float64]]] = {"hann": np.hanning, "none": np.ones}
-"""Window name → function of the number of subcarriers; the Hann window is symmetric (docs/theory.md, eq. 4)."""
+"""Name of the window → function of the number of subcarriers; the Hann window is symmetric (docs/theory.md, eq. 4)."""
 
 
 def window_weights(name: str, count: int) -> NDArray[np.float64]:
-    """Return the weights of a window, normalised to the sum 1, so that a profile peaks at the amplitude of the echo.
+    """Return the weights of a window with the sum 1, so that the peak of a profile is the amplitude of the echo.
 
     Examples
     --------
@@ -86,22 +87,22 @@ def window_weights(name: str, count: int) -> NDArray[np.float64]:
 
 
 def centre_frequency(frequency_hz: NDArray[np.float64]) -> float:
-    """Return the frequency of the subcarrier at mid-band, f_mid, to which profiles are referenced."""
+    """Return the frequency f_mid of the subcarrier at band centre, to which profiles are referenced."""
     return float(frequency_hz[len(frequency_hz) // 2])
 
 
 def range_step(
     frequency_hz: NDArray[np.float64], *, oversampling: float, wave_speed_m_s: float = SPEED_OF_LIGHT_M_S
 ) -> tuple[float, int]:
-    """Return the spacing of range samples (m of total path) and the corresponding length of the inverse DFT.
+    """Return the spacing of range samples (total path, metres) and the corresponding length of the inverse DFT.
 
-    `frequency_hz`, (subcarrier,), is equally spaced; the profile has at least `oversampling` samples per resolution
-    cell v/B at the wave speed v, `wave_speed_m_s`.
+    `frequency_hz`, (subcarrier,), is equally spaced. With the wave speed v, `wave_speed_m_s`, the profile has at least
+    `oversampling` samples per resolution cell v/B.
 
     Raises
     ------
     CampaignError
-        If there is only one frequency, or the frequencies do not ascend in steps that are equal within 1 %.
+        If there is only one frequency, or if the frequencies do not ascend in steps that are equal within 1 %.
 
     Examples
     --------
@@ -134,26 +135,26 @@ def compress(
     oversampling: float = 2.0,
     wave_speed_m_s: float = SPEED_OF_LIGHT_M_S,
 ) -> NDArray[np.complex64]:
-    """Return range profiles p(ρ) = Σ w_n H_n exp(+j2π(f_n-f_mid)ρ/v), sampled from `start_m` on.
+    """Return range profiles p(ρ) = Σ w_n H_n exp(+j2π(f_n-f_mid)ρ/v), sampled at total paths ρ from `start_m` on.
 
     Parameters
     ----------
     transfer
         (pulse, subcarrier) complex64: Σ a·exp(-j2πf(τ-reference_delay_s)).
     frequency_hz
-        (subcarrier,) float64, RF, equally spaced.
+        (subcarrier,) float64, RF frequencies, equally spaced.
     weight
-        (subcarrier,) float64.
+        (subcarrier,) float64, window over the subcarriers.
     reference_delay_s
-        (pulse,) float64; added to the delays, so that profiles have absolute delays.
+        (pulse,) float64, seconds; added to the delays, so that profiles have absolute delays.
     start_m
-        (pulse,) float64, total path of sample 0.
+        (pulse,) float64, total path of sample 0, metres.
     count
         Number of samples per pulse.
     oversampling
-        As for `range_step`, which gives the spacing of the samples.
+        As for `range_step`, which returns the spacing of the samples.
     wave_speed_m_s
-        v, wave speed along the paths.
+        Wave speed v along the paths.
 
     Returns
     -------
@@ -167,9 +168,9 @@ def compress(
 
     Notes
     -----
-    Source: docs/theory.md, eq. 4. With the profile referenced to the band centre, the bandwidth for interpolation is
-    halved; backprojection applies the factor exp(+j2πf_mid·ρ/v). If the swath is only a part of the unambiguous range,
-    the subcarriers are first decimated to it (docs/theory.md, eq. 4a), at the accuracy of complex64.
+    Source: docs/theory.md, eq. 4. Because profiles are referenced to the band centre, the bandwidth for interpolation
+    is halved; backprojection applies the factor exp(+j2πf_mid·ρ/v). If the swath is only part of the unambiguous range,
+    the subcarriers are first decimated (docs/theory.md, eq. 4a), with the accuracy of complex64.
 
     Examples
     --------
@@ -183,7 +184,7 @@ def compress(
     _, length = range_step(frequency_hz, oversampling=oversampling)
     if count > length:
         raise ValueError(f"{count=}: the unambiguous range contains {length} samples")
-    middle, offset = len(frequency_hz) // 2, np.arange(count) - count // 2  # samples from the middle of the swath
+    middle, offset = len(frequency_hz) // 2, np.arange(count) - count // 2  # samples from the centre of the swath
     spacing_hz = float(frequency_hz[-1] - frequency_hz[0]) / (len(frequency_hz) - 1)
     cycles = (start_m / wave_speed_m_s - reference_delay_s) * spacing_hz + (count // 2) / length  # per subcarrier
     carrier = np.exp(-2j * np.pi * (frequency_hz[middle] * reference_delay_s % 1.0))
@@ -195,7 +196,7 @@ def compress(
         pulses = slice(first, min(first + _PULSES_AT_ONCE, len(transfer)))
         block = weighted[: pulses.stop - first]
         np.multiply(transfer[pulses], weight.astype(np.float32), out=block[:, : len(frequency_hz)])
-        # decimation (eq. 4a): after a shift to the middle of the swath, `factor` subcarriers are summed to one
+        # decimation (eq. 4a): after a shift to the centre of the swath, groups of `factor` subcarriers are summed
         taps = filters * phasors(cycles[pulses], factor)[:, :, None]
         sums = block.reshape(len(block), blocks, factor) @ taps
         start = rotated(carrier[pulses], -middle * cycles[pulses])
@@ -211,8 +212,8 @@ def compress(
 def _decimation(subcarriers: int, length: int, count: int) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
     """Return the decimation filter, (factor, tap), and the inverse of its response over the swath, (count,).
 
-    The factor is the largest for which the unambiguous range is at least `_ROOM` times the swath; it is 1 if the swath
-    fills the unambiguous range.
+    The factor is the largest for which the unambiguous range after decimation is at least `_ROOM` times the swath. It
+    is 1 if the swath fills the unambiguous range.
     """
     offset, middle = np.arange(count) - count // 2, subcarriers // 2
     factors = [factor for factor in range(4, _LARGEST_FACTOR + 1) if length % factor == 0]

@@ -16,10 +16,11 @@ Mixing = Literal["real", "complex", "conjugate"]
 
 _SWEEPS_AT_ONCE = 256
 _BEFORE_ZERO = 1 / 16
-"""Share of the sample rate of a complex beat signal reserved for negative paths, into which the direct path leaks."""
+"""Fraction of the sample rate of a complex beat signal that is reserved for negative paths, into which the direct path
+leaks."""
 
 _MOTION_WAVES = 1 / 8
-"""Tolerated change of total path within a sweep, wavelengths: a motion by λ/16 of a monostatic antenna."""
+"""Tolerated change of the total path within a sweep, wavelengths: motion of a monostatic antenna by λ/16."""
 
 _FASTEST = 95.0
 """Percentile of the speeds between pulses that is evaluated, so that single errors of a log have no effect."""
@@ -40,12 +41,12 @@ class FrequencySweep:
     sample_rate_hz
         Sample rate of the beat signal.
     iq
-        real: one mixer; complex: echo times the conjugate of the sweep; conjugate: sweep times the conjugate of the
-        echo.
+        Mixing of the echo with the sweep. real: one mixer; complex: echo multiplied by the conjugate of the sweep;
+        conjugate: sweep multiplied by the conjugate of the echo.
     settle_s
         Time excluded at the start of the sweep, seconds.
     reference_path_m
-        Path of the sweep to the mixer, metres.
+        Length of the path of the sweep to the mixer inside the radar, metres.
 
     Examples
     --------
@@ -69,7 +70,7 @@ class FrequencySweep:
 
     @property
     def sweep_samples(self) -> int:
-        """Number of samples of a sweep from its start."""
+        """Number of samples of a sweep, counted from the start of the sweep."""
         return int(self.sweep_s * self.sample_rate_hz + 1e-6)
 
     @property
@@ -84,12 +85,12 @@ class FrequencySweep:
 
     @property
     def middle_s(self) -> float:
-        """Middle of the samples used, seconds after the start of the sweep: the epoch of the phase centres (eq. 6)."""
+        """Time of the central used sample after the start of the sweep, seconds: epoch of the phase centres (eq. 6)."""
         return (self.first + (self.samples - 1) / 2) / self.sample_rate_hz
 
     @property
     def reference_delay_s(self) -> float:
-        """Delay of the reference path τ_r, seconds."""
+        """Delay τ_r of the reference path, seconds."""
         return self.reference_path_m / SPEED_OF_LIGHT_M_S
 
     @property
@@ -101,7 +102,7 @@ class FrequencySweep:
 
     @property
     def beats_hz(self) -> tuple[float, float]:
-        """Lowest and highest unambiguous γΔ, Hz: positive Δ for real samples, else one sample rate (eq. 4)."""
+        """Lowest and highest unambiguous γΔ, Hz: Δ ≥ 0 for real samples, otherwise one sample rate (eq. 4)."""
         rate = self.sample_rate_hz
         if self.iq == "real":
             return 0.0, rate / 2
@@ -110,7 +111,7 @@ class FrequencySweep:
 
     @property
     def path_limit_m(self) -> float:
-        """Total path, metres, beyond which a beat frequency is ambiguous or half of its band is lost (eq. 4)."""
+        """Total path, metres, beyond which a beat frequency is ambiguous or an echo lacks half of its band (eq. 4)."""
         longest_s = min(self.beats_hz[1] / abs(self.slope_hz_s), self.samples / self.sample_rate_hz / 2)
         return SPEED_OF_LIGHT_M_S * (self.reference_delay_s + longest_s)
 
@@ -123,13 +124,13 @@ def transfer_of(
     Parameters
     ----------
     beat
-        (pulse, sample) real or complex, `sweep.sweep_samples` samples from the start of each sweep, or more.
+        (pulse, sample) real or complex, at least `sweep.sweep_samples` samples from the start of each sweep.
     sweep
         Parameters of the sweep.
     late_s
         (pulse,) float64, delay of the first sample of each sweep after its start, seconds; None: 0.
     deskewed
-        If False, the residual video phase is retained, for comparison.
+        False to retain the residual video phase for comparison.
 
     Returns
     -------
@@ -154,11 +155,11 @@ def transfer_of(
     kept, slope = sweep.samples, sweep.slope_hz_s
     low, high = sweep.beats_hz
     farthest = min(round((high - min(low, 0.0)) / abs(slope) * sweep.sample_rate_hz) + 1, kept)
-    length = scipy.fft.next_fast_len(kept + farthest)  # zero padding, so that no delay wraps around
+    length = scipy.fft.next_fast_len(kept + farthest)  # zero padding prevents circular wrap-around of delays
     bins = -np.sign(slope) * scipy.fft.fftfreq(length, 1 / sweep.sample_rate_hz)
     shift = (bins - low) % sweep.sample_rate_hz + low  # γΔ of each bin; f_b = -γΔ, eq. 1
     response = np.exp(-1j * np.pi * shift**2 / slope) if deskewed else np.ones(length, np.complex128)
-    if sweep.iq == "real":  # the analytic signal: one-sided spectrum
+    if sweep.iq == "real":  # analytic signal with a one-sided spectrum
         response = response * np.where(shift > high, 0.0, np.where((shift == 0) | (shift == high), 1.0, 2.0))
     beat_hz = -np.sign(slope) * shift
     transfer = np.empty((len(beat), kept), np.complex64)
@@ -184,17 +185,18 @@ def sweep_motion_flags(
     Parameters
     ----------
     time
-        (pulse,) datetime64[ns], the middles of the sweeps.
+        (pulse,) datetime64[ns], centre times of the sweeps.
     antennas
-        Positions of the transmitting and the receiving antenna, (pulse, 3) float64 metres each, in one Cartesian frame.
+        Positions of the transmitting and the receiving antenna, (pulse, 3) float64 each, metres, in the same Cartesian
+        frame.
     lasting_s
-        Length of the used part of a sweep, seconds; 0: no sweep.
+        Duration of the used part of a sweep, seconds; 0: no sweep.
     frequency_hz
         (subcarrier,) float64, ascending.
 
     Notes
     -----
-    Source: docs/theory/fmcw.md, eq. 7. The path of an echo changes by at most the sum of both antennas' motions.
+    Source: docs/theory/fmcw.md, eq. 7. The path of an echo changes by at most the sum of the motions of both antennas.
     """
     if not lasting_s or len(time) < 2:
         return {}

@@ -1,7 +1,7 @@
-"""Demodulation of captured symbols: a DFT over one period 1/Δf, and removal of path delays.
+"""Demodulation of captured symbols by a DFT over one period 1/Δf, and removal of path delays.
 
 Subcarrier n of the symbol s(t) = Σ c_n exp(j2πnΔf(t-T_cp)) is received over a path of delay τ as
-c_n·exp(-j2π(f_c+nΔf)τ), if τ is shorter than the cyclic prefix (docs/theory.md, eqs. 1 and 2).
+c_n·exp(-j2π(f_c+nΔf)τ), provided that τ is shorter than the cyclic prefix (docs/theory.md, eqs. 1 and 2).
 """
 
 from dataclasses import dataclass
@@ -17,21 +17,21 @@ _PULSES_AT_ONCE = 64
 
 @dataclass(frozen=True)
 class Numerology:
-    """Sampling of the transmitted signal: a periodic OFDM symbol, or a pulse that is sent once.
+    """Sampling of the transmitted signal: a periodic OFDM symbol, or a pulse without repetition.
 
     Attributes
     ----------
     carrier_hz, sample_rate_hz
-        Nominal RF frequency at baseband zero and complex samples per second.
+        Nominal RF frequency at baseband zero; and number of complex samples per second.
     numbers
-        (subcarrier,) int64, the n of each subcarrier in multiples of Δf from the carrier, ascending.
+        (subcarrier,) int64, number n of each subcarrier, in multiples of Δf from the carrier, ascending.
     prefix_samples
         T_cp·f_s, start of the DFT window.
     dft_samples
         f_s/Δf, length of the DFT window.
     longest_samples
-        Largest delay, samples, at which captures contain the complete echo of a pulse sent once. None: symbol with the
-        period 1/Δf, whose echoes are complete for delays up to the length of the prefix.
+        Largest delay, samples, at which captures contain the complete echo of a pulse without repetition. None: symbol
+        with the period 1/Δf, for which echoes are complete at delays up to the length of the prefix.
     """
 
     carrier_hz: float
@@ -48,7 +48,7 @@ class Numerology:
 
     @property
     def middle_hz(self) -> float:
-        """Baseband frequency at the middle of the occupied band."""
+        """Baseband frequency at the centre of the occupied band, Hz."""
         return float(self.numbers[0] + self.numbers[-1]) / 2 * self.spacing_hz
 
     @property
@@ -63,13 +63,13 @@ class Numerology:
 
     @property
     def delay_cells(self) -> int:
-        """Number of delay cells of 1/B with complete echoes; for a symbol, those within the cyclic prefix."""
+        """Number of delay cells of 1/B with complete echoes; for a symbol, the cells within the cyclic prefix."""
         samples = self.prefix_samples if self.longest_samples is None else self.longest_samples
         return round(samples * self.numbers.size / self.dft_samples)
 
 
 def subcarrier_numbers(count: int, *, carrier_is: str) -> NDArray[np.int64]:
-    """Return the number n of each subcarrier, ascending: 0…N-1 for band_start, -N/2…N/2-1 for band_centre.
+    """Return the number n of each subcarrier, ascending: 0…N-1 for band_start, or -N/2…N/2-1 for band_centre.
 
     Examples
     --------
@@ -85,14 +85,14 @@ def demodulate(captures: NDArray[np.complex64], numerology: Numerology) -> NDArr
     Parameters
     ----------
     captures
-        (pulse, sample) complex64 ADC counts; sample 0 is the start of the cyclic prefix.
+        (pulse, sample) complex64, ADC counts; sample 0 is the start of the cyclic prefix.
     numerology
         Numerology of the symbol.
 
     Raises
     ------
     ValueError
-        If a capture is shorter than prefix and DFT window together.
+        If a capture is shorter than the cyclic prefix and the DFT window together.
 
     Notes
     -----
@@ -108,10 +108,10 @@ def demodulate(captures: NDArray[np.complex64], numerology: Numerology) -> NDArr
     pulses, samples = captures.shape
     start, stop = numerology.prefix_samples, numerology.prefix_samples + numerology.dft_samples
     if samples < stop:
-        raise ValueError(f"{samples=}: a capture must have at least {stop} (prefix and DFT window)")
+        raise ValueError(f"{samples=}: a capture must have at least {stop} samples (prefix and DFT window)")
     symbols = np.empty((pulses, numerology.numbers.size), np.complex64)
     count, lowest = numerology.numbers.size, int(numerology.numbers[0]) % numerology.dft_samples
-    # bins of negative frequencies; the other frequencies start at bin 0
+    # number of bins with negative frequencies; the other frequencies start at bin 0
     below = min(count, numerology.dft_samples - lowest)
     for first in range(0, pulses, _PULSES_AT_ONCE):
         spectrum = scipy.fft.fft(captures[first : first + _PULSES_AT_ONCE, start:stop], axis=1, norm="forward")
@@ -124,9 +124,9 @@ def demodulate(captures: NDArray[np.complex64], numerology: Numerology) -> NDArr
 def remove_path(
     transfer: NDArray[np.complex64], frequency_hz: NDArray[np.float64], *, delay_s: NDArray[np.float64]
 ) -> NDArray[np.complex64]:
-    """Remove a delay per pulse from (pulse, subcarrier) `transfer`: multiply by exp(+j2πf·delay).
+    """Remove the delay of each pulse from transfer functions, (pulse, subcarrier), by the factor exp(+j2πf·delay).
 
-    The frequencies, (subcarrier,), ascend in equal steps.
+    `frequency_hz`, (subcarrier,), ascends in equal steps.
 
     Examples
     --------

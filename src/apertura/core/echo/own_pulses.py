@@ -1,4 +1,4 @@
-"""Checks of the monostatic echoes of a node: code, and phase stability from pulse to pulse."""
+"""Checks of the monostatic echoes of a node: transmitted code, and phase stability from pulse to pulse."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -9,26 +9,26 @@ from numpy.typing import NDArray
 
 from apertura.common.units import decibels
 
-# ---- Code of a node's own pulses
+# ---- Code of the pulses of a monostatic node
 
 FALSE_ALARM = 1e-5
 """Probability that a wrong code is confirmed."""
 
-_COHERENT_PULSES = 8, 32, 128  # number of pulses added coherently, at each Doppler frequency
-_GUARD_CELLS = 8  # cells excluded on both sides of the prefix, for sidelobes of echoes inside the prefix
-_FEWEST_CELLS = 32  # cells outside the prefix required to estimate the floor
-_NOISE_SIGMAS = 6.0  # excess scatter above which cells outside the prefix may contain more than noise
-_SPREAD_SIGMAS = 10.0  # excess scatter above which these cells certainly contain more than noise
+_COHERENT_PULSES = 8, 32, 128  # numbers of pulses that are added coherently at each Doppler frequency
+_GUARD_CELLS = 8  # cells excluded on both sides of the prefix because of sidelobes of echoes inside the prefix
+_FEWEST_CELLS = 32  # least number of cells outside the prefix to estimate the floor
+_NOISE_SIGMAS = 6.0  # excess scatter above which cells outside the prefix may contain signals in addition to noise
+_SPREAD_SIGMAS = 10.0  # excess scatter above which these cells certainly contain signals in addition to noise
 
 
 @dataclass(frozen=True)
 class CodeEvidence:
-    """Evidence on the code of a recording.
+    """Evidence for the code of a recording.
 
     Attributes
     ----------
     carried
-        True if the recording contains the code; None without evidence.
+        True if the recording contains the code, False if it does not; None without evidence.
     evidence
         Measured values, one line.
     """
@@ -43,7 +43,7 @@ class CodeEvidence:
 
     @property
     def flags(self) -> dict[str, str]:
-        """Flag raised if the recording does not contain the code."""
+        """Flag that is raised if the recording does not contain the code."""
         return {"code_unconfirmed": self.evidence} if self.carried is False else {}
 
 
@@ -53,9 +53,9 @@ def own_code(transfer: NDArray[np.complex64], *, prefix_cells: int) -> CodeEvide
     Parameters
     ----------
     transfer
-        (pulse, subcarrier) complex64, code removed; echoes lie in the first `prefix_cells` cells of 1/B.
+        (pulse, subcarrier) complex64, with the code removed; echoes are in the first `prefix_cells` cells of 1/B.
     prefix_cells
-        Number of cells of 1/B in the cyclic prefix, or in the longest complete delay of a pulse sent once.
+        Number of cells of 1/B in the cyclic prefix, or in the longest complete delay of a pulse without repetition.
 
     Notes
     -----
@@ -72,34 +72,34 @@ def own_code(transfer: NDArray[np.complex64], *, prefix_cells: int) -> CodeEvide
     outside = slice(prefix_cells + _GUARD_CELLS, cells - _GUARD_CELLS)
     if not prefix_cells or outside.stop - outside.start < _FEWEST_CELLS:
         return CodeEvidence(
-            None, f"{prefix_cells} of {cells} delay cells may contain echoes: too few others to measure the floor"
+            None, f"{prefix_cells} of {cells} delay cells may contain echoes: too few cells remain to measure the floor"
         )
-    profile = scipy.fft.ifft(transfer, 2 * cells, axis=1)  # half cells, so that no echo falls between two
+    profile = scipy.fft.ifft(transfer, 2 * cells, axis=1)  # half cells, so that no echo falls between two cells
     largest_scatter, beyond = -np.inf, slice(2 * outside.start, -2 * _GUARD_CELLS, 2)
     for run in [run for run in _COHERENT_PULSES if run <= pulses] or [pulses]:
         level, needed, scatter = _strongest(profile, run, 2 * prefix_cells, beyond)
         largest_scatter = max(largest_scatter, scatter)
         line = (
-            f"the strongest complete echo, {run} pulses added, is {decibels(level):.1f} dB above the mean beyond the "
-            "longest delay"
+            f"in the sum of {run} pulses, the strongest complete echo is {decibels(level):.1f} dB above the mean "
+            "beyond the longest delay"
         )
         if level >= needed:
             return CodeEvidence(True, line)
     if largest_scatter > _SPREAD_SIGMAS:
         return CodeEvidence(
             False,
-            f"{line}; the signal common to all pulses is spread over all delays: the code is wrong, or another node "
+            f"{line}; a signal common to all pulses is spread over all delays: the code is wrong, or another node "
             "transmits",
         )
     return CodeEvidence(
-        None, f"{line}, {decibels(needed):.1f} dB required: no echo exceeds the noise, or the code is wrong"
+        None, f"{line}; {decibels(needed):.1f} dB are required: no echo exceeds the noise, or the code is wrong"
     )
 
 
 def _strongest(profile: NDArray[np.complex64], run: int, inside: int, beyond: slice) -> tuple[float, float, float]:
-    """Return the strongest cell inside the prefix, its threshold, and the excess scatter of cells outside it, in σ.
+    """Return the level of the strongest cell inside the prefix, its threshold, and the excess scatter outside, in σ.
 
-    Levels are relative to the mean beyond the prefix at the same Doppler frequency.
+    Levels are relative to the mean over the cells outside the prefix at the same Doppler frequency.
     """
     blocks = len(profile) // run
     power = np.zeros((2 * run, profile.shape[1]), np.float32)
@@ -110,8 +110,8 @@ def _strongest(profile: NDArray[np.complex64], run: int, inside: int, beyond: sl
     scatter = floor.std(1) / mean
     false_alarm = FALSE_ALARM / (inside * len(power))  # per cell
     sigmas = (blocks * scatter**2 - 1) / np.sqrt((2 + 6 / blocks) / floor.shape[1])
-    # The floor of a wrong code is the same in all pulses: unlike noise, it is exponentially distributed over the cells
-    # for any number of added pulses.
+    # The floor caused by a wrong code is the same in all pulses. Unlike noise, it is exponentially distributed over the
+    # cells for any number of added pulses.
     is_noise = sigmas.max() < _NOISE_SIGMAS
     needed = (
         scipy.special.gammainccinv(blocks, false_alarm) / blocks
@@ -126,16 +126,18 @@ def _strongest(profile: NDArray[np.complex64], run: int, inside: int, beyond: sl
 # ---- Phase stability of monostatic echoes
 
 LEAST_COHERENCE = 0.3
-"""Least coherence of the second differences of phase: 1.55 rad rms, or white phase noise of 0.63 rad."""
+"""Least coherence of the second differences of phase; it corresponds to 1.55 rad rms, or white phase noise of 0.63 rad.
+"""
 
 STEADY = 0.93
-"""Least agreement of magnitudes from pulse to pulse: it is π/4 for independent speckle, 0.95 at an SNR of 10 dB."""
+"""Least agreement of magnitudes from pulse to pulse. The agreement is π/4 for independent speckle, and 0.95 for an SNR
+of 10 dB."""
 
 ECHO_DB = 13.0
 """Least mean power of evaluated cells relative to the noise, dB; in weaker cells, noise dominates the phase."""
 
 _FEWEST_TRIPLES = 20  # least number of triples of consecutive pulses to estimate a coherence
-_EVEN = 0.25  # tolerated deviation from the median interval, as a share; a larger one indicates missing pulses
+_EVEN = 0.25  # tolerated relative deviation from the median interval; a larger deviation indicates missing pulses
 
 
 @dataclass(frozen=True)
@@ -147,7 +149,7 @@ class PhaseStability:
     coherence
         |mean exp(jφ'')| of the second differences φ'' of phase, weighted by power; 1 for smooth motion.
     steadiness
-        Agreement of the magnitudes of neighbouring pulses; 1 for constant scatterers.
+        Agreement of the magnitudes of consecutive pulses; 1 for constant scatterers.
     """
 
     coherence: float
@@ -165,13 +167,13 @@ class PhaseStability:
 
     @property
     def flags(self) -> dict[str, str]:
-        """Flag raised if echoes of constant magnitude have a random phase from pulse to pulse."""
+        """Flag that is raised if echoes of constant magnitude have a random phase from pulse to pulse."""
         if self.steadiness < STEADY or self.coherence >= LEAST_COHERENCE:
             return {}
         line = (
-            f"monostatic echoes have a constant magnitude from pulse to pulse (agreement {self.steadiness:.2f}) and an "
-            f"unstable phase: second differences of {self.rms_rad:.1f} rad rms, less than 0.1 expected from antenna "
-            "motion; the image is speckle"
+            f"monostatic echoes have a constant magnitude from pulse to pulse (agreement {self.steadiness:.2f}) but an "
+            f"unstable phase: its second differences are {self.rms_rad:.1f} rad rms, whereas antenna motion causes "
+            "less than 0.1 rad; the image is speckle"
         )
         return {"phase_unstable": line}
 
@@ -184,11 +186,11 @@ def phase_stability(
     Parameters
     ----------
     transfer
-        (pulse, subcarrier) complex64, code removed; echoes lie in the first `prefix_cells` cells of 1/B.
+        (pulse, subcarrier) complex64, with the code removed; echoes are in the first `prefix_cells` cells of 1/B.
     time_s
-        (pulse,) float64, time of transmission, seconds; triples with missing pulses are excluded.
+        (pulse,) float64, times of transmission, seconds; triples with missing pulses are excluded.
     prefix_cells
-        Number of cells of 1/B in the cyclic prefix, or in the longest complete delay of a pulse sent once.
+        Number of cells of 1/B in the cyclic prefix, or in the longest complete delay of a pulse without repetition.
 
     Notes
     -----
@@ -207,7 +209,7 @@ def phase_stability(
         return None
     profile = scipy.fft.ifft(transfer, axis=1)
     power = (np.abs(profile) ** 2).mean(0)
-    # averaged over the pulses, the noise power is nearly equal in all cells: its median is its mean
+    # averaged over the pulses, the noise power is nearly equal in all cells, so that its median approximates its mean
     strong = np.flatnonzero(power[:prefix_cells] > 10 ** (ECHO_DB / 10) * np.median(power[prefix_cells:]))
     if not strong.size:
         return None

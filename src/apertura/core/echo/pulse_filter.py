@@ -1,7 +1,7 @@
-"""Compression filter of a pulse that is sent once: occupied band, choice of inverse or matched filter, and its loss.
+"""Compression filter for a pulse without repetition: occupied band, choice of inverse or matched filter, and loss.
 
-A capture that contains the pulse and its complete echoes is a linear convolution. A DFT of the length of the capture
-transforms it into an exact product, bin by bin (docs/theory/waveforms.md, eq. 1).
+A capture that contains the pulse and the complete echoes is a linear convolution. A DFT of the length of the capture
+transforms this convolution into an exact product, bin by bin (docs/theory/waveforms.md, eq. 1).
 """
 
 from dataclasses import dataclass
@@ -15,36 +15,36 @@ from apertura.common.arrays import Floats
 from apertura.common.units import decibels
 
 BAND_FLOOR_DB = -10.0
-"""Level of the band edges if the band is not configured, dB relative to the highest power of the pulse."""
+"""Level of the band edges if the band is not configured, dB relative to the highest spectral power of the pulse."""
 
 NULL_DB = -20.0
-"""Level below which bins are attenuated instead of divided, dB relative to the mean: limits noise amplification to 20
-dB."""
+"""Spectral level, dB relative to the mean, below which the inverse filter attenuates bins instead of inverting them;
+limits the noise amplification to 20 dB."""
 
 FLAT_DB = -30.0
-"""Ripple power below which a spectrum is not divided, dB: the range sidelobes from ripple are below this level."""
+"""Ripple power, dB, below which a spectrum is not inverted: the range sidelobes from ripple are below this level."""
 
 SIDELOBES_DB = -25.0
-"""Level of range sidelobes above which a flag is raised, dB; that of the Hann window is -31.5 dB."""
+"""Level of range sidelobes above which a flag is raised, dB; the sidelobes of the Hann window are at -31.5 dB."""
 
 MOST_LOSS_DB = 6.0
-"""Largest loss of SNR for which the inverse filter is chosen, dB; if the loss of a requested filter exceeds it, a flag
-is raised."""
+"""Largest SNR loss for which the inverse filter is chosen, dB. A flag is raised if the loss of a requested filter is
+larger."""
 
-_SMOOTH = 64  # the level is averaged over this fraction (1/64) of the sampled band
+_SMOOTH = 64  # the spectral level is averaged over 1/64 of the sampled band
 
 
 @dataclass(frozen=True)
 class PulseFilter:
-    """Compression filter of echoes, and its loss.
+    """Compression filter of echoes, and loss of the filter.
 
     Attributes
     ----------
     inverse
-        (bin,) complex64, factor of the DFT of a capture.
+        (bin,) complex64, factor by which the DFT of a capture is multiplied.
     report
-        Name of the filter, its reason, loss_db (of SNR relative to the matched filter) and sidelobes_db (the highest
-        range sidelobe of a point, with a Hann window).
+        Name of the filter, reason for its choice, loss_db (SNR loss relative to the matched filter), and sidelobes_db
+        (highest range sidelobe of a point with a Hann window).
     flags
         Flag → measured values, one line.
     """
@@ -62,7 +62,7 @@ def pulse_spectrum(pulse: NDArray[np.complexfloating], *, lead: float, length: i
     pulse
         (sample,) complex.
     lead
-        Number of samples, possibly fractional, of the capture before the pulse.
+        Number of samples of the capture before the pulse; may be fractional.
     length
         Number of samples of the capture.
 
@@ -100,7 +100,7 @@ def occupied_band(power: Floats) -> tuple[int, int]:
     top = int(level.argmax())
     first = int(below[below < top].max(initial=-1)) + 1
     last = int(below[below > top].min(initial=length)) - 1
-    # the running mean widens the band: restrict it to bins whose own power exceeds the threshold
+    # the running mean widens the band: restrict the band to bins with a power above the threshold
     strong = first + np.flatnonzero(ordered[first : last + 1] >= threshold)
     return int(strong[0]) - length // 2, int(strong[-1]) - length // 2
 
@@ -113,7 +113,8 @@ def pulse_filter(spectrum: NDArray[np.complexfloating], *, requested: str) -> Pu
     spectrum
         (bin,) complex, spectrum S of the pulse over the band.
     requested
-        'inverse', 'matched', or 'auto': matched for a flat spectrum, otherwise inverse if it is adequate.
+        'inverse', 'matched', or 'auto': matched for a flat spectrum; otherwise inverse if loss and sidelobes are
+        acceptable.
 
     Raises
     ------
@@ -143,7 +144,7 @@ def pulse_filter(spectrum: NDArray[np.complexfloating], *, requested: str) -> Pu
         name, reason = "matched", f"flat spectrum: ripple of {uneven_db:.1f} dB"
     elif loss_db <= MOST_LOSS_DB and sidelobes_db <= SIDELOBES_DB:
         name = "inverse"
-        reason = f"spectrum with ripple of {uneven_db:.1f} dB; SNR loss of the inverse filter {loss_db:.2f} dB"
+        reason = f"spectrum with ripple of {uneven_db:.1f} dB; inverse filter with an SNR loss of {loss_db:.2f} dB"
     else:
         name = "matched"
         reason = f"the inverse filter has an SNR loss of {loss_db:.1f} dB and sidelobes of {sidelobes_db:.1f} dB"
@@ -154,8 +155,8 @@ def pulse_filter(spectrum: NDArray[np.complexfloating], *, requested: str) -> Pu
         flags["waveform_sidelobes"] = f"range sidelobes of {sidelobes_db:.1f} dB after the {name} filter"
     if loss_db > MOST_LOSS_DB:
         flags["waveform_noise"] = (
-            f"SNR loss of the {name} filter {loss_db:.1f} dB: {np.mean(power < mean / 10):.0%} of the band is 10 dB "
-            "below its mean"
+            f"SNR loss of the {name} filter {loss_db:.1f} dB: {np.mean(power < mean / 10):.0%} of the band is more "
+            "than 10 dB below the mean of the band"
         )
     report = {"filter": name, "reason": reason, "loss_db": round(loss_db, 2), "sidelobes_db": round(sidelobes_db, 1)}
     return PulseFilter(np.asarray(chosen, np.complex64), report, flags)
@@ -164,7 +165,7 @@ def pulse_filter(spectrum: NDArray[np.complexfloating], *, requested: str) -> Pu
 def truncation_flags(
     delay_s: Floats, *, lead_s: float, pulse_s: float, listen_s: float, cell_s: float
 ) -> dict[str, str]:
-    """Return the flag of captures that truncate the direct pulse; {} without such captures.
+    """Return a flag for captures that truncate the direct pulse; {} if there are none.
 
     Parameters
     ----------
@@ -172,9 +173,9 @@ def truncation_flags(
         (pulse,) float64, delay of the direct path, seconds after `lead_s`, modulo the length of the capture; NaN:
         unknown.
     lead_s, pulse_s, listen_s
-        Lengths of the parts of a capture: before the pulse, the pulse, and after it, seconds.
+        Lengths of the parts of a capture before, during and after the pulse, seconds.
     cell_s
-        1/B, tolerated error of a delay, seconds.
+        Tolerated error of a delay, 1/B, seconds.
 
     Examples
     --------
@@ -183,7 +184,7 @@ def truncation_flags(
     """
     known = delay_s[np.isfinite(delay_s)]
     length_s = lead_s + pulse_s + listen_s
-    # a delay is known only modulo the length of the capture: up to half of the pulse may be missing on either side
+    # a delay is known only modulo the length of the capture: up to half of the pulse may be missing at either end
     after_s = (known + lead_s + pulse_s / 2) % length_s - pulse_s / 2
     cut = int(((after_s < -cell_s) | (after_s > lead_s + listen_s + cell_s)).sum())
     line = f"captures of {cut} of {len(delay_s)} pulses start or end within the direct pulse"

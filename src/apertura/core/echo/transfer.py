@@ -1,8 +1,8 @@
-"""Transfer functions from the captures of a pair: with the code alone, or corrected by the sidelink.
+"""Transfer functions from the captures of a pair, computed from the code alone or corrected by the sidelink.
 
-Captures are read in two passes: the first measures clock and sidelink, a few numbers per pulse; the second computes
-transfer functions from the captures and these numbers, block by block and on demand. Only one block of captures is in
-memory at a time, for any length of the flight.
+Captures are read in two passes. The first pass measures clock and sidelink, a few numbers per pulse. The second pass
+computes transfer functions from the captures and these numbers, block by block and on demand. Only one block of
+captures is in memory at a time, for any length of the flight.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -41,7 +41,8 @@ _INVERTED = (
     "the conjugate samples contain the code: set waveform.iq to swapped if I and Q are swapped, or to conjugate if the "
     "local oscillator is above the band; for a single node, set nodes.<n>.iq"
 )
-_COMPRESSED = 4.0  # least ratio of the peak-to-mean ratio of delay profiles of conjugate samples to that of the samples
+# least factor by which the peak-to-mean ratio of delay profiles increases if the samples are conjugated
+_COMPRESSED = 4.0
 
 _STRETCH = 128  # number of consecutive pulses in each part of the flight in which code and phase are checked
 _CLOCK_STRETCH = 256  # number of consecutive pulses in each part of the flight in which the clock is measured
@@ -56,11 +57,11 @@ class Correction:
     method
         A key of `METHODS`.
     path
-        The direct path in the sidelink of each pulse.
+        Direct path in the sidelink of each pulse.
     clock_hz
-        (pulse,) float64, carrier offset removed from the samples of the receiver; None: not corrected.
+        (pulse,) float64, carrier offset removed from the samples of the receiver, Hz; None: not corrected.
     sfo_ppm
-        Offset of the receiver's sampling rate, corrected together with the carrier offset.
+        Offset of the sampling rate of the receiver, which is corrected together with the carrier offset.
     """
 
     method: str
@@ -76,12 +77,12 @@ class Correction:
 
 @dataclass(frozen=True)
 class Demodulator:
-    """Demodulator of captures: samples to symbols and transfer functions.
+    """Demodulator that converts samples of captures to symbols and transfer functions.
 
     Attributes
     ----------
     inverse, numerology
-        (subcarrier,) complex64, inverse of the transmitted signal (1/c_n of a symbol), and its sampling.
+        (subcarrier,) complex64, inverse of the transmitted signal (1/c_n for a symbol); and sampling of the signal.
     symbol_samples
         (T_cp + T)·f_s, or the length of a capture; later samples are not used.
     """
@@ -91,7 +92,7 @@ class Demodulator:
     symbol_samples: int
 
     def symbols(self, iq: Samples, clock_hz: Floats | None = None, sfo_ppm: float = 0.0) -> Complexes:
-        """Demodulate samples, (pulse, sample, 2), on the transmitter's clock; return (pulse, subcarrier) complex64."""
+        """Demodulate samples, (pulse, sample, 2), after clock correction; return (pulse, subcarrier) complex64."""
         numerology = self.numerology
         if clock_hz is None:
             return demodulate(as_complex(iq), numerology) * self.inverse
@@ -129,11 +130,11 @@ class Transfer:
     report
         Decisions with reasons: clock, sidelink, code.
     sidelink_delay_m, sidelink_snr_db, sidelink_phase_rad
-        (pulse,) float64, measurements of the sidelink in the captures used: delay times c, metres, SNR per
-        subcarrier and phase at mid-band; NaN in pulses without lock, None without a sidelink.
+        (pulse,) float64, measurements of the sidelink in the captures that are used: delay multiplied by c, metres; SNR
+        per subcarrier; and phase at band centre. NaN in pulses without lock; None without a sidelink.
     form
-        Function of ascending capture numbers that returns their transfer functions, (pulse, subcarrier) complex64.
-        The code is removed; electrical paths are not removed.
+        Function of ascending capture numbers that returns their transfer functions, (pulse, subcarrier) complex64. The
+        code is removed; electrical paths are not removed.
     saturation
         Saturation of the captures demodulated so far.
     correction
@@ -152,16 +153,16 @@ class Transfer:
 
 
 def transfer_by_code(read: Read, inverse: Complexes, numerology: Numerology, *, time_s: Floats) -> Transfer:
-    """Return the monostatic transfer functions of a node; its transmitter and receiver have the same clock.
+    """Return the monostatic transfer functions of a node; transmitter and receiver have the same clock.
 
     Parameters
     ----------
     read
         Reader of channel `radar`.
     inverse, numerology
-        (subcarrier,) complex64, inverse of the transmitted signal (1/c_n of a symbol), and its sampling.
+        (subcarrier,) complex64, inverse of the transmitted signal (1/c_n for a symbol); and sampling of the signal.
     time_s
-        (capture,) float64, time of transmission, seconds from any origin.
+        (capture,) float64, times of transmission, seconds from any origin.
 
     Notes
     -----
@@ -217,17 +218,18 @@ def transfer_by_sidelink(
     read
         Reader of channels `radar` and `sidelink`.
     inverse, numerology
-        (subcarrier,) complex64, inverse of the transmitted signal (1/c_n of a symbol), and its sampling.
+        (subcarrier,) complex64, inverse of the transmitted signal (1/c_n for a symbol); and sampling of the signal.
     symbol_samples
         (T_cp + T)·f_s, or the length of a capture; later samples are not used.
     sidelink_m
-        (capture,) float64, distance between the antennas of the sidelink, metres, to check the measured delay.
+        (capture,) float64, distance between the antennas of the sidelink, metres, with which the measured delay is
+        compared.
     method
-        A key of `METHODS`, or auto.
+        A key of `METHODS`, or 'auto'.
     accuracy_db
         Tolerated level of clock errors relative to the peak, dB.
     where
-        Name of the recording in errors.
+        Name of the recording in error messages.
     time_s
         (capture,) float64, time of transmission, seconds from any origin, to exclude pulses in which only the sidelink
         is disturbed; None: these are not searched for, as on a bench.
@@ -235,14 +237,14 @@ def transfer_by_sidelink(
     Raises
     ------
     CampaignError
-        If the sidelink locks in no capture.
+        If the sidelink does not lock in any capture.
 
     Notes
     -----
     Source: docs/theory/echo_methods.md. The clock is measured on up to 4096 captures, in 16 groups spread over the
     flight; the state of the sidelink is measured on all captures.
     """
-    # First pass: measure the clock on a sample of captures, the state of the sidelink on all.
+    # First pass: measure the clock on a sample of captures, and the state of the sidelink on all captures.
     demodulator = Demodulator(inverse, numerology, symbol_samples)
     receiver = _Receiver.measured(read, demodulator, len(sidelink_m), accuracy_db)
     interference = SidelinkInterference(numerology.frequency_hz)
@@ -257,7 +259,7 @@ def transfer_by_sidelink(
                 "Set waveform.iq, or nodes.<n>.iq of a single node.",
             )
             raise CampaignError(f"{unlocked.found}; {_INVERTED}", f"{where}: sidelink", expected, remedy) from None
-    # Choose the method; raise flags for errors that it does not remove and for faults of the recording.
+    # Choose the method; raise flags for errors that the method does not remove, and for faults of the recording.
     chosen, reason = choose(state) if method == "auto" else (method, "requested")
     clock_flags = receiver.clock_flags if numerology.repeats or chosen not in DIVIDING else {}
     cell_m = SPEED_OF_LIGHT_M_S / (numerology.numbers.size * numerology.spacing_hz)
@@ -309,7 +311,7 @@ def transfer_by_sidelink(
 def forming(
     read: Read, demodulator: Demodulator, saturation: Saturation
 ) -> Callable[[Pulses, Correction | None], Complexes]:
-    """Return a function that computes the transfer functions of captures from their correction and counts samples."""
+    """Return a function that computes transfer functions of captures and counts saturated samples."""
 
     def form(captures: Pulses, correction: Correction | None) -> Complexes:
         iq = read(captures)
@@ -320,7 +322,7 @@ def forming(
 
 
 def _compresses_conjugated(read: Read, demodulator: Demodulator, count: int) -> bool:
-    """Return True if only the conjugate samples of the sidelink compress to a path after removal of the code."""
+    """Return True if, after removal of the code, only the conjugated samples of the sidelink compress to a path."""
     pulses = np.concatenate(spread(count, groups=4, each=16))
 
     def compression(samples: Samples) -> float:
@@ -332,13 +334,13 @@ def _compresses_conjugated(read: Read, demodulator: Demodulator, count: int) -> 
 
 
 def as_complex(iq: Samples) -> Complexes:
-    """Return (…, 2) I and Q as complex64."""
+    """Convert I and Q, (…, 2), to complex64."""
     return np.ascontiguousarray(iq, np.float32).view(np.complex64)[..., 0]
 
 
 @dataclass(frozen=True)
 class _Receiver:
-    """Receiver with its own clock, whose offset is corrected in the samples if necessary."""
+    """Receiver with a separate clock; the clock offset is corrected in the samples if necessary."""
 
     read: Read
     demodulator: Demodulator
@@ -350,7 +352,7 @@ class _Receiver:
 
     @classmethod
     def measured(cls, read: Read, demodulator: Demodulator, count: int, accuracy_db: float) -> "_Receiver":
-        """Measure the clock offset, and decide on its correction in the samples."""
+        """Measure the clock offset, and decide whether to correct it in the samples."""
         groups, numerology = spread(count, groups=GROUPS, each=_CLOCK_STRETCH), demodulator.numerology
         length = demodulator.symbol_samples
         sidelink: Iterable[Complexes] = (as_complex(read(group)["sidelink"][:, :length]) for group in groups)
@@ -374,7 +376,7 @@ class _Receiver:
         return cls(read, demodulator, count, report, decision.flags, *corrected)
 
     def sidelink(self, done: Callable[[int], None]) -> Iterator[Complexes]:
-        """Yield the symbols of the sidelink, (pulse, subcarrier) complex64, code removed."""
+        """Yield the symbols of the sidelink, (pulse, subcarrier) complex64, with the code removed."""
         for block in blocks_of(np.arange(self.count)):
             clock_hz = None if self.clock_hz is None else self.clock_hz[block]
             yield self.demodulator.symbols(self.read(block)["sidelink"], clock_hz, self.sfo_ppm)

@@ -20,7 +20,7 @@ ABSENT = -1
 
 @dataclass(frozen=True)
 class PulseFraming:
-    """Framing of a pulse: preamble | counter, high bit first | inverted counter | guard | prefix and symbol.
+    """Framing of a pulse: preamble | counter, most significant bit first | inverted counter | guard | prefix, symbol.
 
     Attributes
     ----------
@@ -29,15 +29,15 @@ class PulseFraming:
     chip_samples
         Samples per chip.
     centre_hz
-        Baseband frequency of the carrier that the chips modulate.
+        Baseband frequency of the carrier that is modulated by the chips.
     sample_rate_hz
         Complex samples per second.
     counter_bits
         Width of the frame counter; 0 without payload.
     bit_chips
-        Chips per payload bit, all with the same sign: +1 for a one, -1 for a zero.
+        Chips per payload bit; all chips of a bit have the same sign, +1 for a one and -1 for a zero.
     guard_samples
-        Length of the pause between payload and cyclic prefix.
+        Length of the guard interval between payload and cyclic prefix, samples.
     """
 
     preamble: NDArray[np.int64]
@@ -63,12 +63,12 @@ class PulseFraming:
         return np.asarray(np.repeat(self.preamble, self.chip_samples) * self._carrier(0, len(self.preamble)))
 
     def read_counter(self, samples: Samples) -> int:
-        """Decode the frame number of a capture that starts with its preamble; -1 if a bit is uncertain.
+        """Decode the frame number of a capture that starts with the preamble; return -1 if a bit is uncertain.
 
         Parameters
         ----------
         samples
-            (sample, 2), at least preamble and payload.
+            (sample, 2), at least the samples of preamble and payload.
 
         Examples
         --------
@@ -103,20 +103,20 @@ class PulseFraming:
 
 
 _SMALLEST_TRANSFORM = 2**16
-# energy over the length of a preamble relative to that of the window, below which rounding errors dominate
+# energy over the length of a preamble relative to the energy of the window, below which rounding errors dominate
 _NO_SIGNAL = 1e-10
 
 
 @dataclass(frozen=True)
 class Detection:
-    """A preamble in a recording.
+    """Preamble detected in a recording.
 
     Attributes
     ----------
     sample
-        Its first sample, counted from the start of the recording.
+        First sample of the preamble, counted from the start of the recording.
     score
-        Squared normalised correlation, 0…1: share of the energy that is due to the preamble.
+        Squared normalised correlation, 0…1: fraction of the energy that is due to the preamble.
     snr_db
         SNR per sample, derived from the score.
     """
@@ -129,18 +129,18 @@ class Detection:
 def find_preambles(
     blocks: Iterable[Samples], framing: PulseFraming, *, symbol_samples: int, false_alarms_per_s: float
 ) -> Iterator[Detection]:
-    """Yield the preambles of a recording in order, with a bounded number of samples in memory.
+    """Yield the preambles of a recording in order of time, with a bounded number of samples in memory.
 
     Parameters
     ----------
     blocks
-        (sample, 2) each, consecutive blocks of any length, I and Q of the trigger channel.
+        (sample, 2) each, I and Q of the trigger channel in consecutive blocks of any length.
     framing
         Framing of the symbols.
     symbol_samples
-        (T_cp + T)·f_s; no other preamble is searched from a preamble to the end of its symbol.
+        (T_cp + T)·f_s; from a preamble to the end of the following symbol, no other preamble is searched.
     false_alarms_per_s
-        Tolerated rate of triggers by noise alone.
+        Tolerated rate of triggers caused by noise alone.
 
     Raises
     ------
@@ -149,8 +149,8 @@ def find_preambles(
 
     Notes
     -----
-    Source: docs/theory/echo_methods.md, "Trigger". The threshold does not depend on the noise level, which is measured
-    in the same samples.
+    Source: docs/theory/echo_methods.md, "Trigger". The threshold does not depend on the noise level, because the
+    correlation is normalised by the energy of the same samples.
 
     Examples
     --------
@@ -172,8 +172,8 @@ def find_preambles(
 def score_threshold(template_samples: int, false_alarm: float) -> float:
     """Return the score that is exceeded by noise with probability `false_alarm` at one sample.
 
-    For white Gaussian noise the score is the squared cosine between two directions, one of which is random. Its
-    distribution is Beta(1, L-1) at any noise level, so P(score > γ) = (1-γ)^(L-1).
+    For white Gaussian noise, the score is the squared cosine between two directions, one of which is random. At any
+    noise level, its distribution is Beta(1, L-1), so that P(score > γ) = (1-γ)^(L-1).
 
     Examples
     --------
@@ -181,12 +181,12 @@ def score_threshold(template_samples: int, false_alarm: float) -> float:
     0.00617
     """
     if not 0 < false_alarm < 1:
-        raise ValueError(f"{false_alarm=}: must lie between 0 and 1 per sample")
+        raise ValueError(f"{false_alarm=}: the probability per sample must lie between 0 and 1")
     return float(-np.expm1(np.log(false_alarm) / (template_samples - 1)))
 
 
 def _scores(blocks: Iterable[Samples], template: Complexes) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    """Yield the first sample and the scores of each window, one score per complete template, by overlap-save FFTs."""
+    """Yield the first sample and the scores of each window, one per template position, by the overlap-save method."""
     length = template.size
     size = max(_SMALLEST_TRANSFORM, 1 << int(8 * length - 1).bit_length())
     matched = scipy.fft.fft(template, size).conj() / np.sqrt((np.abs(template) ** 2).sum())
@@ -205,7 +205,7 @@ def _power(samples: Complexes) -> NDArray[np.float32]:
 
 
 def _windows(blocks: Iterable[Samples], size: int, *, overlap: int) -> Iterator[tuple[int, Complexes]]:
-    """Yield the first sample number and the samples of overlapping windows of `size`; the last may be shorter."""
+    """Yield the first sample number and the samples of overlapping windows of length `size` (or less at the end)."""
     window = np.empty(size, np.complex64)
     parts = window.view(np.float32).reshape(size, 2)
     first, filled, new = 0, 0, 0
@@ -224,9 +224,9 @@ def _windows(blocks: Iterable[Samples], size: int, *, overlap: int) -> Iterator[
 
 
 class _PeakSearch:
-    """Search for the highest score within one preamble length of the first score above threshold; a dead time follows.
+    """Search for the highest score within one preamble length after a threshold crossing, followed by a dead time.
 
-    Sidelobes of a strong preamble exceed the threshold up to one preamble length before its main peak. The dead time is
+    Sidelobes of a strong preamble exceed the threshold up to one preamble length before the main peak. The dead time is
     the length of a frame.
     """
 
@@ -237,7 +237,7 @@ class _PeakSearch:
         self.until = 0
 
     def feed(self, first: int, scores: NDArray[np.float32]) -> Iterator[Detection]:
-        """Add the scores of consecutive samples from `first` on; yield the detections that they complete."""
+        """Add the scores of consecutive samples from `first` on; yield the detections completed by these scores."""
         above = np.flatnonzero(scores > self.threshold)
         samples = above + first
         at = 0
@@ -273,7 +273,7 @@ _SAMPLES_AT_ONCE = 2**18
 
 
 class SampleSource(Protocol):
-    """(sample, 2), I and Q: an array, or an object that reads slices of one from a file."""
+    """(sample, 2), I and Q: an array, or an object that reads slices of an array from a file."""
 
     def __len__(self) -> int: ...
 
@@ -282,14 +282,14 @@ class SampleSource(Protocol):
 
 @dataclass(frozen=True)
 class TriggeredCaptures:
-    """Captures extracted from a continuous recording, in the form stored by a triggered recorder.
+    """Captures extracted from a continuous recording, as a triggered recorder would store them.
 
     Attributes
     ----------
     start
-        (capture,) int64, first sample of each symbol's cyclic prefix.
+        (capture,) int64, first sample of the cyclic prefix of each symbol.
     frame
-        (capture,) int64, frame number of each symbol, -1 if not decoded.
+        (capture,) int64, frame number of each symbol; -1 if it is not decoded.
     report
         Number of captures, false-alarm rate, median SNR, duty cycle and mean data rate.
     """
@@ -312,7 +312,7 @@ def trigger_captures(
     Parameters
     ----------
     samples
-        (sample, 2), I and Q of the trigger channel; read in blocks.
+        (sample, 2), I and Q of the trigger channel, which are read in blocks.
     framing, symbol_samples, false_alarms_per_s
         As for `find_preambles`.
     sample_bits

@@ -12,16 +12,16 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError, quoted
 
 Weigh = Callable[[slice, NDArray[np.float64]], NDArray[np.float64]]
-"""Pulses and points (point, 3) → (pulse, point) float64."""
+"""Slice of pulses and points (point, 3) → weights (pulse, point) float64."""
 
 _PULSES_AT_ONCE = 2048
 _STRETCHES = 64  # number of subapertures at which phase rates are evaluated
-_STEPS_IN_A_ROW = 63  # number of consecutive steps whose median is used, so that missing pulses have no effect
+_STEPS_IN_A_ROW = 63  # consecutive steps over which the median is computed, so that missing pulses have no effect
 
 
 _COARSEST_M = 2.0**-10
-"""Spacing of floating-point numbers, metres, above which a track is rejected: the rounding error is 0.01 cycles of
-two-way path at L-band."""
+"""Spacing of floating-point numbers, metres, from which a track is rejected: the rounding error of the two-way path is
+then 0.01 cycles at L-band."""
 
 
 def distance(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -34,8 +34,8 @@ def distance(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray
 
     Notes
     -----
-    The result equals `numpy.linalg.norm` of the difference to the last bit. The computation takes a quarter of the time
-    or less, because the axes are processed separately.
+    The result equals `numpy.linalg.norm` of the difference to the last bit. The computation takes at most a quarter of
+    the time of `numpy.linalg.norm`, because the axes are processed separately.
 
     Examples
     --------
@@ -57,15 +57,15 @@ def as_array(value: Any, kind: type, where: str) -> Any:
     value
         An array, a list or a number.
     kind
-        ``np.float64`` or ``np.complex64``. Real numbers are not accepted as complex samples, because their phase is
-        lost.
+        ``np.float64`` or ``np.complex64``. Real numbers are not accepted as complex samples, because the phase of the
+        samples is lost.
     where
-        Name of the argument in errors.
+        Name of the argument in error messages.
 
     Raises
     ------
     CampaignError
-        If the argument is not an array of such numbers.
+        If the argument is not an array of numbers of this kind, or is a masked array.
 
     Examples
     --------
@@ -95,7 +95,7 @@ def as_array(value: Any, kind: type, where: str) -> Any:
         raise CampaignError(
             f"{int(np.ma.getmaskarray(value).sum())} masked values",
             where=where,
-            expected="an array without masked values: masks are ignored",
+            expected="an array without masked values, because masks are ignored",
             remedy="Remove the pulses with masked values, or fill them.",
         )
     return _native(array, kind) if isinstance(array, np.ndarray) or not array.dtype.isnative else array
@@ -108,14 +108,14 @@ _KEPT: Mapping[type, tuple[type, ...]] = {
 
 
 def _native(array: Any, kind: type) -> NDArray[Any]:
-    """Return a numpy array in native byte order, of a precision that the engines support."""
+    """Return a numpy array in native byte order, with a precision that the engines support."""
     plain = np.asarray(array)
     return plain if plain.dtype.isnative and plain.dtype.type in _KEPT[kind] else plain.astype(kind)
 
 
 @dataclass(frozen=True, eq=False)
 class Aperture:
-    """Phase centres of a transmitter–receiver pair, pulse by pulse; both are equal for a monostatic node.
+    """Phase centres of a transmitter–receiver pair, pulse by pulse; both phase centres are equal for a monostatic node.
 
     Attributes
     ----------
@@ -125,7 +125,7 @@ class Aperture:
     Raises
     ------
     CampaignError
-        If an argument is not an array of numbers, or shapes differ or are not (pulse, 3).
+        If an argument is not an array of numbers, or if the shapes differ or are not (pulse, 3).
 
     Examples
     --------
@@ -148,9 +148,9 @@ class Aperture:
             spacing_m = float(np.spacing(np.array(farthest, dtype))) if farthest else 0.0
             if spacing_m >= _COARSEST_M:
                 raise CampaignError(
-                    f"{dtype.name}, whose neighbouring numbers near {farthest:.3g} m differ by {spacing_m:.2g} m",
+                    f"{dtype.name}, in which adjacent numbers near {farthest:.3g} m differ by {spacing_m:.2g} m",
                     where=f"Aperture: {name}",
-                    expected="float64: phase centres must be accurate to fractions of a wavelength",
+                    expected="float64, because phase centres must be accurate to a fraction of a wavelength",
                     remedy="Use float64 throughout, starting with the log.",
                 )
         if self.tx_m.shape != self.rx_m.shape or self.tx_m.ndim != 2 or self.tx_m.shape[1] != 3:
@@ -158,7 +158,7 @@ class Aperture:
                 f"tx_m {self.tx_m.shape}, rx_m {self.rx_m.shape}",
                 where="Aperture",
                 expected="phase centres of the same number of pulses, (pulse, 3) each, metres",
-                remedy="Pass one row of x, y and z per pulse; for a monostatic antenna pass the same array twice.",
+                remedy="Pass one row of x, y and z per pulse; for a monostatic antenna, pass the same array twice.",
             )
 
     def __len__(self) -> int:
@@ -166,12 +166,12 @@ class Aperture:
         return len(self.tx_m)
 
     def copied(self) -> "Aperture":
-        """Return the aperture with copied arrays; a monostatic aperture keeps a single array."""
+        """Return a copy of the aperture; a monostatic aperture still has a single array."""
         tx_m = self.tx_m.copy()
         return Aperture(tx_m, tx_m if self.rx_m is self.tx_m else self.rx_m.copy())
 
     def __getitem__(self, pulses: slice | NDArray[np.bool_] | NDArray[np.int64]) -> "Aperture":
-        """Return the aperture of the selected pulses; slices are views."""
+        """Return the aperture of the selected pulses; for slices, the arrays are views."""
         return Aperture(self.tx_m[pulses], self.rx_m[pulses])
 
     @property
@@ -185,7 +185,7 @@ class Aperture:
         return (self.tx_m + self.rx_m) / 2
 
     def sample(self, most: int) -> slice:
-        """Return a slice of evenly spaced pulses, fewer than twice `most`.
+        """Return a slice that selects evenly spaced pulses, fewer than twice `most`.
 
         Examples
         --------
@@ -230,8 +230,8 @@ class Aperture:
     def path_gradient(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gradient of the total path with respect to the point, (pulse, ..., 3) float64, metres per metre.
 
-        It is the sum of the unit vectors from both phase centres to the point; multiplied by 2πf/c, it is the spatial
-        frequency at which a pulse samples the scene (docs/theory.md, eq. 8).
+        The gradient is the sum of the unit vectors from both phase centres to the point. Multiplied by 2πf/c, it is the
+        spatial frequency at which a pulse samples the scene (docs/theory.md, eq. 8).
         """
         gradient = np.zeros((len(self), *points_m.shape))
         for leg in self.legs:
@@ -240,12 +240,15 @@ class Aperture:
         return gradient
 
     def phase_rates(self, points_m: NDArray[np.float64], *, wavelength_m: float) -> tuple[float, float]:
-        """Return the spread of phase rates over the scene, and the largest relative to its centre, cycles per pulse.
+        """Return the spread of phase rates over the scene, and the largest deviation from the rate at the centre.
+
+        Both results are in cycles per pulse.
 
         Parameters
         ----------
         points_m
-            (point, 3) float64, metres: spread over the scene, with its centre at the middle of the array.
+            (point, 3) float64, metres, distributed over the scene; the central element of the array is the scene
+            centre.
         wavelength_m
             Wavelength of the highest frequency.
 
@@ -278,16 +281,16 @@ class Aperture:
         Parameters
         ----------
         points_m
-            (point, 3) float64, metres: spread over the scene, corners included.
+            (point, 3) float64, metres, distributed over the scene and including its corners.
         wavelength_m
             Wavelength of the highest frequency.
 
         Returns
         -------
         ndarray
-            (point,) float64: number of orders n ≠ 0, mean over the pulses, for which some point of the scene has a
-            phase rate that differs by n cycles per pulse from that of the point. 0: unambiguous; 1: ambiguities as
-            strong as the surroundings.
+            (point,) float64, number of orders n ≠ 0, mean over the pulses, for which any other point of the scene has a
+            phase rate that differs by n cycles per pulse from the rate of the point. 0: unambiguous; 1: ambiguities are
+            as strong as the echoes of the surroundings.
 
         Notes
         -----
@@ -318,13 +321,13 @@ class Aperture:
         Parameters
         ----------
         ground_m
-            (row, column, 3) float64, metres: terrain points spread over the scene, corners included, rows from north
-            to south.
+            (row, column, 3) float64, metres: terrain points distributed over the scene, including its corners, rows
+            from north to south.
         band_hz
             Lowest and highest frequency.
         weigh
-            Pulses and points → weights; pulses with a weight below one half are excluded at a point. By default all
-            pulses are used.
+            Pulses and points → weights; pulses with a weight below one half at a point are excluded at this point
+            (default: all pulses are used).
 
         Notes
         -----
@@ -349,15 +352,15 @@ class Aperture:
         Parameters
         ----------
         ground_m
-            (row, column, 3) float64, metres: terrain points spread over the scene, corners included, rows from north
-            to south.
+            (row, column, 3) float64, metres: terrain points distributed over the scene, including its corners, rows
+            from north to south.
         wavelength_m
-            Wavelength at the middle of the band.
+            Wavelength at band centre.
 
         Notes
         -----
-        Source: docs/theory.md, eq. 8 at one frequency: λ over the largest spread of the path gradient on the terrain,
-        λ/2Δθ for a monostatic node that moves by an angle Δθ about the point.
+        Source: docs/theory.md, eq. 8 at one frequency: λ divided by the largest spread of the path gradient along the
+        terrain, that is, λ/2Δθ for a monostatic node that moves by an angle Δθ about the point.
         """
         middle = ground_m.reshape(-1, 3)[ground_m.size // 6]
         gradient = self[self.sample(64)].path_gradient(middle[None])[:, 0]
@@ -392,20 +395,20 @@ class Aperture:
         Returns
         -------
         ndarray
-            (axis, axis) float64. At a noise power of ε relative to the point, the position of its peak has the
-            covariance ε/2·(4π²·spectrum)⁻¹ (docs/theory/focus.md, eq. 6).
+            (axis, axis) float64. If the noise power is ε relative to the power of the point, the position of the peak
+            has the covariance ε/2·(4π²·spectrum)⁻¹ (docs/theory/focus.md, eq. 6).
         """
         sample = self.sample(64 if weigh is None else 1024)
         slope = self[sample].path_gradient(point_m) @ axes.T
         if weigh is not None:
             used = weigh(sample, point_m[None])[:, 0] >= 0.5
-            slope = slope[used] if used.any() else slope  # a point outside all sectors: all pulses are used
+            slope = slope[used] if used.any() else slope  # for a point outside all sectors, all pulses are used
         cycles = slope[:, None] * (frequency_hz / SPEED_OF_LIGHT_M_S)[None, :, None]
         return np.asarray(np.cov(cycles.reshape(-1, len(axes)), rowvar=False, bias=True))
 
     @property
     def wobble_m(self) -> float:
-        """RMS distance of the midpoints from the best-fitting straight line, metres.
+        """RMS distance of the midpoints between both phase centres from the best-fitting straight line, metres.
 
         Examples
         --------

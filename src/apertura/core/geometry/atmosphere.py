@@ -1,4 +1,4 @@
-"""Wave speed in the atmosphere: refractivity at the terrain, its profile with height, and its mean along a path."""
+"""Wave speed in the atmosphere: refractivity at the terrain, profile over height, and mean along a path."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -15,10 +15,10 @@ SCALE_HEIGHT_M = 7350.0
 """Height over which the refractivity of air decreases to 1/e, metres: global mean profile of ITU-R P.453."""
 
 STANDARD_HUMIDITY_PERCENT = 50.0
-"""Relative humidity if none is configured, percent; the standard atmosphere is dry."""
+"""Relative humidity that is assumed if none is configured, percent; the standard atmosphere itself is dry."""
 
 USUAL_N = 300.0
-"""Typical refractivity at the terrain, N units: the error if vacuum is assumed for a recorded flight."""
+"""Typical refractivity at the terrain, N units; equal to the error if vacuum is assumed for a recorded flight."""
 
 _STANDARD_K, _STANDARD_HPA, _LAPSE_K_M, _BAROMETRIC = 288.15, 1013.25, 6.5e-3, 5.2559  # ISO 2533, below 11 km
 _HIGHEST_M = 11_000.0  # upper height limit of this lapse rate
@@ -44,8 +44,8 @@ def refractivity(temperature_c: float, pressure_hpa: float, relative_humidity: f
 
     Notes
     -----
-    Source: ITU-R P.453, N = 77.6/T·(P + 4810·e/T), accurate to 0.1 % up to 100 GHz and non-dispersive, with its
-    formula of the saturation vapour pressure over water; docs/theory/atmosphere.md, eq. 1.
+    Source: ITU-R P.453, N = 77.6/T·(P + 4810·e/T), accurate to 0.1 % up to 100 GHz and non-dispersive, with the
+    saturation vapour pressure over water of the same recommendation; docs/theory/atmosphere.md, eq. 1.
 
     Examples
     --------
@@ -73,7 +73,7 @@ def standard_weather(height_m: float) -> tuple[float, float, float]:
 
 
 def wave_speed(refractivity_n: float) -> float:
-    """Return the wave speed in a medium of given refractivity, m/s; exactly that of vacuum for 0.
+    """Return the wave speed in a medium of given refractivity, m/s; for 0, exactly the speed of light in vacuum.
 
     Parameters
     ----------
@@ -97,13 +97,13 @@ class Atmosphere:
     Attributes
     ----------
     refractivity_n
-        N units at `ground_m`; 0: vacuum.
+        Refractivity at `ground_m`, N units; 0: vacuum.
     ground_m
-        Terrain height, metres; all heights have one datum and are used as heights above sea level.
+        Terrain height, metres. All heights refer to the same datum and are used as heights above sea level.
     source
         Source of the refractivity, a short phrase.
     std_n
-        Standard deviation at the terrain, N units.
+        Standard deviation of the refractivity at the terrain, N units.
 
     Examples
     --------
@@ -119,11 +119,11 @@ class Atmosphere:
 
     @classmethod
     def vacuum(cls) -> "Atmosphere":
-        """Return vacuum as an approximation of an unknown atmosphere; its error is the refractivity of the air.
+        """Return vacuum as an approximation of an unknown atmosphere, with the refractivity of air as its error.
 
-        `stated(0.0)` is exact: for recordings simulated in vacuum, or corrected for the atmosphere.
+        `stated(0.0)` is vacuum without an error, for recordings simulated in vacuum or corrected for the atmosphere.
         """
-        return cls(0.0, 0.0, f"vacuum assumed instead of air of about N = {USUAL_N:.0f}", USUAL_N)
+        return cls(0.0, 0.0, f"vacuum assumed, although air has about N = {USUAL_N:.0f}", USUAL_N)
 
     @classmethod
     def standard(cls, ground_m: float) -> "Atmosphere":
@@ -136,14 +136,14 @@ class Atmosphere:
     def of_weather(
         cls, temperature_c: float, pressure_hpa: float, relative_humidity: float, *, ground_m: float
     ) -> "Atmosphere":
-        """Return the atmosphere of weather measured at the terrain; parameters as for `refractivity`."""
+        """Return the atmosphere for weather measured at the terrain; parameters as for `refractivity`."""
         weather = temperature_c, pressure_hpa, relative_humidity
         source = f"configured: {temperature_c:g} °C, {pressure_hpa:g} hPa, {relative_humidity:g} % at the terrain"
         return cls(refractivity(*weather), ground_m, source, _spread(weather, _MEASURED))
 
     @classmethod
     def stated(cls, refractivity_n: float, *, ground_m: float) -> "Atmosphere":
-        """Return the atmosphere of a refractivity given for the terrain, N units."""
+        """Return the atmosphere for a given refractivity at the terrain, N units."""
         if not (refractivity_n == 0 or _LEAST_N <= refractivity_n <= _MOST_N):
             raise CampaignError(
                 f"a refractivity of {refractivity_n:g}",
@@ -151,11 +151,11 @@ class Atmosphere:
                 expected=f"N units, (n - 1)·10⁶: {_LEAST_N:g} to {_MOST_N:g}, or 0 for vacuum",
                 remedy="Convert a refractive index n to (n - 1)·10⁶.",
             )
-        std_n = _STATED_N if refractivity_n else 0.0  # 0: simulated in vacuum, without error
+        std_n = _STATED_N if refractivity_n else 0.0  # a refractivity of 0 is exact: simulated in vacuum
         return cls(refractivity_n, ground_m, f"configured: N = {refractivity_n:g} at the terrain", std_n)
 
     def at_n(self, height_m: Any) -> Floats:
-        """Return N at heights (m), in their shape."""
+        """Return N at heights (m), in the shape of `height_m`."""
         return np.asarray(self.refractivity_n * np.exp((self.ground_m - np.asarray(height_m)) / SCALE_HEIGHT_M))
 
     def mean_n(self, one_m: Any, other_m: Any) -> Floats:
@@ -168,8 +168,8 @@ class Atmosphere:
 
         Notes
         -----
-        Source: docs/theory/atmosphere.md, eq. 3. Height is linear along a path, so the mean does not depend on its
-        length.
+        Source: docs/theory/atmosphere.md, eq. 3. The height is linear along a path, so that the mean does not depend on
+        the length of the path.
 
         Examples
         --------
@@ -190,7 +190,7 @@ class Atmosphere:
         tx_m, rx_m
             (pulse,) float64, heights of the antennas, metres.
         range_m
-            (pulse,) float64 each: distances of both antennas from the scene, metres, used as weights of the one-way
+            (pulse,) float64 each, distances of both antennas from the scene, metres; used as weights of the one-way
             paths.
         """
         legs = np.stack([self.mean_n(tx_m, self.ground_m), self.mean_n(rx_m, self.ground_m)])
@@ -212,16 +212,16 @@ class Atmosphere:
 
 @dataclass(frozen=True)
 class FlightAir:
-    """Atmosphere of the flight of a pair: a constant refractivity for all its paths.
+    """Atmosphere of the flight of a pair: a constant refractivity for all paths.
 
     Attributes
     ----------
     refractivity_n
         Mean of N along both one-way paths and over the pulses.
     std_n
-        Its standard deviation, N units.
+        Standard deviation of `refractivity_n`, N units.
     atmosphere
-        Atmosphere whose refractivity is averaged.
+        Atmosphere from which the mean is computed.
     antennas_m
         Mean height of the antennas, metres.
     path_m
@@ -278,15 +278,16 @@ class SceneAir:
     frame: str
 
     def over(self, aperture: Aperture) -> FlightAir:
-        """Return the constant refractivity of a pair's paths to the scene."""
+        """Return the constant refractivity of the paths of a pair to the scene."""
         tx_m, rx_m = (self._heights(position_m) for position_m in aperture.legs)
         ranges = tuple(np.linalg.norm(position_m - self.middle_m, axis=1) for position_m in aperture.legs)
         return self.atmosphere.over(tx_m, rx_m, (ranges[0], ranges[1]))
 
     def electrical_m(self, one_m: Floats, other_m: Floats) -> Floats:
-        """Return the electrical length (c times delay) of straight paths between antennas (pulse, 3), (pulse,) metres.
+        """Return the electrical lengths (c times delay) of straight paths between antennas (pulse, 3), (pulse,) metres.
 
-        The refractivity at the height of the antennas is used, which is lower than that along paths to the scene.
+        The refractivity at the height of the antennas is used, which is lower than the refractivity along paths to the
+        scene.
         """
         length_m = np.linalg.norm(one_m - other_m, axis=1)
         mean_n = self.atmosphere.mean_n(self._heights(one_m), self._heights(other_m))

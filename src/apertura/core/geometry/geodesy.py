@@ -1,6 +1,7 @@
 """Geodetic, projected and Earth-centred coordinates, and rotations of body axes.
 
-Positions are processed in ECEF (EPSG:4978), float64, so that no zones, scale factors or Earth curvature are modelled.
+Positions are processed in ECEF (EPSG:4978) in float64, so that no zones, scale factors or Earth curvature need to be
+modelled.
 """
 
 from functools import lru_cache
@@ -30,7 +31,7 @@ def ecef_from_geodetic(latitude_deg: Positions, longitude_deg: Positions, height
     Parameters
     ----------
     latitude_deg, longitude_deg
-        (...,) float64, degrees, north and east positive.
+        (...,) float64, degrees, positive to the north and to the east.
     height_m
         (...,) float64, metres above the ellipsoid.
 
@@ -66,16 +67,16 @@ def ecef_from_projected(crs: str, x: Positions, y: Positions, height_m: Position
     Parameters
     ----------
     crs
-        Any definition that pyproj reads, with a geographic origin.
+        Any definition of a georeferenced CRS that pyproj reads.
     x, y
-        (...,) float64, metres, easting then northing, for any axis order of the CRS.
+        (...,) float64, easting and northing, metres, regardless of the axis order of the CRS.
     height_m
-        (...,) float64, metres above the ellipsoid of WGS 84, for any ellipsoid of `crs`.
+        (...,) float64, metres above the WGS 84 ellipsoid, regardless of the ellipsoid of `crs`.
 
     Raises
     ------
     CampaignError
-        If PROJ has no exact transformation from `crs` to ECEF, or a transformed position is infinite.
+        If PROJ has no exact transformation from `crs` to ECEF, or if a transformed position is infinite.
 
     Examples
     --------
@@ -84,12 +85,12 @@ def ecef_from_projected(crs: str, x: Positions, y: Positions, height_m: Position
     """
     if is_on_wgs84(crs):
         position = np.stack(_transformer(crs, ECEF).transform(x, y, height_m), axis=-1)
-    else:  # horizontal coordinates only: heights above the ellipsoid of `crs` differ by tens of metres
+    else:  # transform horizontal coordinates only: heights above the ellipsoid of `crs` differ by tens of metres
         longitude, latitude = _transformer(crs, _PLANE).transform(x, y)
         position = ecef_from_geodetic(latitude, longitude, height_m)
     if not np.isfinite(position).all():
         raise CampaignError(
-            f"positions in {crs} outside the domain of its projection",
+            f"positions outside the domain of the projection of {crs}",
             where="scene",
             expected="coordinates within the area of use of the CRS",
             remedy="Check scene.crs and scene.bounds_m.",
@@ -121,7 +122,7 @@ def is_on_wgs84(crs: str) -> bool:
 
 
 def longitude_range(longitude_deg: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the westernmost and easternmost of longitudes in -180 to 180°; west > east across the antimeridian.
+    """Return the westernmost and easternmost longitude, within -180 to 180°; west > east across the antimeridian.
 
     The range excludes the widest gap between neighbouring longitudes on the circle (RFC 7946, section 5.2).
 
@@ -132,13 +133,13 @@ def longitude_range(longitude_deg: NDArray[np.float64]) -> tuple[float, float]:
     """
     ordered = np.sort(longitude_deg)
     gaps = np.append(np.diff(ordered), ordered[0] + 360 - ordered[-1])
-    last = int(gaps[::-1].argmax())  # of equal gaps, the one across the antimeridian is selected
+    last = int(gaps[::-1].argmax())  # if gaps are equal, the gap across the antimeridian is selected
     end = len(ordered) - 1 - last
     return float(ordered[(end + 1) % len(ordered)]), float(ordered[end])
 
 
 def longitudes_about(longitude_deg: NDArray[np.float64], middle_deg: float) -> NDArray[np.float64]:
-    """Return longitudes without wraps, within 180° of a middle longitude.
+    """Return longitudes without wraps, within 180° of a reference longitude.
 
     Examples
     --------
@@ -154,7 +155,7 @@ def frame_from_map(crs: str, x: ArrayLike, y: ArrayLike, height_m: ArrayLike) ->
     Parameters
     ----------
     crs
-        As for `ecef_from_projected`, or 'local'.
+        CRS as for `ecef_from_projected`, or 'local'.
     x, y
         (...,) float64, metres, easting and northing.
     height_m
@@ -189,7 +190,7 @@ def map_from_frame(crs: str, position: Positions) -> Positions:
 
 @lru_cache(maxsize=64)
 def _transformer(source: str, target: str) -> Transformer:
-    """Return the PROJ transformer between two systems, cached because its creation takes milliseconds."""
+    """Return the PROJ transformer between two CRSs, cached because the creation of a transformer takes milliseconds."""
     if GEODETIC in (source, target):
         return Transformer.from_crs(source, target)
     if _PLANE in (source, target):
@@ -209,7 +210,7 @@ def ned_axes(position: Positions) -> NDArray[np.float64]:
     Returns
     -------
     ndarray
-        (..., 3, 3) float64; columns are north, east, down in ECEF: the rotation from NED to ECEF.
+        (..., 3, 3) float64; columns are north, east and down in ECEF. Each matrix is the rotation from NED to ECEF.
 
     Examples
     --------
@@ -230,7 +231,7 @@ def body_axes(attitude_rad: Positions) -> NDArray[np.float64]:
     Parameters
     ----------
     attitude_rad
-        (..., 3) float64: roll, pitch, yaw in radians, yaw clockwise from north.
+        (..., 3) float64: roll, pitch and yaw in radians, with yaw clockwise from north.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Phase centres of antennas at each pulse: logged track, attitude, lever arms, and track corrections by autofocus."""
+"""Phase centres of antennas at each pulse, from logged track, attitude, lever arms, and corrections by autofocus."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -21,17 +21,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class TrackCorrection:
-    """Corrections of the tracks of a flight's nodes; positions of nodes that are not listed are unchanged.
+    """Corrections of the tracks of the nodes of a flight; positions of nodes that are not listed are unchanged.
 
     Attributes
     ----------
     time_s
-        (knot,) float64, seconds of the flight's clock, ascending; corrections are interpolated linearly between knots
-        and constant beyond the ends.
+        (knot,) float64, seconds of the flight's clock, ascending. Corrections are linear between knots and constant
+        before the first and after the last knot.
     moved_m
         Node → (knot, 3) float64, displacement of all antennas of the node, metres, in the frame of the phase centres.
     extra_path_m
-        Pair → (knot,) float64, metres of total path added to all echoes of the pair, in addition to the effect of
+        Pair → (knot,) float64, total path added to all echoes of the pair, metres, in addition to the effect of
         displaced nodes; 0 for a pair that is not listed.
 
     Examples
@@ -46,41 +46,41 @@ class TrackCorrection:
     extra_path_m: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def at(self, node: str, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the correction of a node's positions at given times, (pulse, 3) float64, metres."""
+        """Return the correction of the positions of a node at given times, (pulse, 3) float64, metres."""
         displacement = self.moved_m.get(node)
         if displacement is None:
             return np.zeros((len(time_s), 3))
         return np.stack([np.interp(time_s, self.time_s, axis) for axis in displacement.T], axis=-1)
 
     def with_further(self, later: "TrackCorrection") -> "TrackCorrection":
-        """Return the sum of this correction and a later one of the corrected tracks, at the same knots."""
+        """Return the sum of this correction and a later correction of the corrected tracks, at the same knots."""
         moved_m = {node: self.moved_m.get(node, 0.0) + added for node, added in later.moved_m.items()}
         return TrackCorrection(self.time_s, {**self.moved_m, **moved_m}, {**self.extra_path_m, **later.extra_path_m})
 
     def aperture(self, logged: Aperture, pair: str, time_s: NDArray[np.float64]) -> Aperture:
-        """Return the corrected phase centres of a pair, transmitter-receiver, at the times of its pulses."""
+        """Return the corrected phase centres of a pair, named transmitter-receiver, at the times of its pulses."""
         tx, rx = pair.split("-")
         return Aperture(logged.tx_m + self.at(tx, time_s), logged.rx_m + self.at(rx, time_s))
 
     def longer_m(
         self, pair: str, time_s: NDArray[np.float64], between_m: NDArray[np.float64] | None
     ) -> NDArray[np.float64]:
-        """Return the path added to all echoes of a pair: ∆ of the sidelink, and the correction of the pair itself.
+        """Return the path added to all echoes of a pair: ∆ of the sidelink plus the path correction of the pair.
 
         Parameters
         ----------
         pair
-            Name, transmitter-receiver.
+            Name of the pair, transmitter-receiver.
         time_s
             (pulse,) float64, seconds of the flight's clock.
         between_m
-            (pulse, 3) float64, metres: logged vector from the receiver's sidelink antenna to the transmitter's antenna;
+            (pulse, 3) float64, logged vector from the receiver's sidelink antenna to the transmitter's antenna, metres;
             None if no sidelink path was added to the echoes.
 
         Returns
         -------
         ndarray
-            (pulse,) float64, metres of total path.
+            (pulse,) float64, total path, metres.
 
         Notes
         -----
@@ -126,19 +126,19 @@ def phase_centres(
     track_time
         (epoch,) datetime64[ns], UTC.
     position
-        (epoch, 3) float64, logged point in `frame`, metres.
+        (epoch, 3) float64, position of the logged point in `frame`, metres.
     attitude
-        (epoch, 3) float64, roll, pitch, yaw in radians; NaN where not logged.
+        (epoch, 3) float64, roll, pitch and yaw in radians; NaN where not logged.
     at
         (pulse,) datetime64[ns], UTC.
     lever_arm_m
-        From the logged point to the antenna, body axes forward-right-down, metres.
+        Vector from the logged point to the antenna in body axes (forward, right, down), metres.
     attitude_from
-        Source of the body axes: the log, the course over ground (level flight assumed), or none.
+        Source of the body axes: 'log', 'course' (course over ground with level flight assumed), or 'none'.
     where
-        Name of the log in errors.
+        Name of the log in error messages.
     frame
-        'ecef', or 'local' with axes to east, north and up.
+        'ecef', or 'local' with axes east, north and up.
     smoothing_m
         Noise of the logged positions, removed by a smoothing spline, metres; None: the spline interpolates all epochs.
 
@@ -150,7 +150,7 @@ def phase_centres(
     Raises
     ------
     CampaignError
-        If the track does not cover `at`, or the lever arm needs an attitude that is not in the log.
+        If the track does not cover `at`, or if the lever arm requires an attitude that is not logged.
 
     Notes
     -----
@@ -185,12 +185,12 @@ def attitude_axes(
     Returns
     -------
     ndarray
-        (pulse, 3, 3) float64; columns are the body's forward, right and down unit vectors in `frame`.
+        (pulse, 3, 3) float64; columns are the forward, right and down unit vectors of the body in `frame`.
 
     Raises
     ------
     CampaignError
-        If the track does not cover `at`, or the log contains no attitude.
+        If the track does not cover `at`, or if the log contains no attitude.
     """
     _check_covered(track_time, at, where)
     spline = position_spline(seconds_since(track_time, track_time[0]), position, smoothing_m=smoothing_m)
@@ -204,7 +204,7 @@ def attitude_axes(
 def position_spline(
     time_s: NDArray[np.float64], position: NDArray[np.float64], *, smoothing_m: float | None = None
 ) -> "BSpline":
-    """Fit a cubic spline to the epochs of a log, interpolating or smoothing.
+    """Fit an interpolating or smoothing cubic spline to the epochs of a log.
 
     Parameters
     ----------
@@ -213,8 +213,8 @@ def position_spline(
     position
         (epoch, 3) float64, metres.
     smoothing_m
-        Noise of the epochs in each axis, metres: the spline has the smallest number of knots that yields this RMS
-        residual; None: the spline interpolates all epochs.
+        Standard deviation of the noise in each axis, metres: the spline has the smallest number of knots that yields
+        this RMS residual; None: the spline interpolates all epochs.
 
     Notes
     -----
@@ -246,7 +246,7 @@ def _rotations(
     purpose: str,
     where: object,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the rotations NED → `frame` and body → NED at given times; errors name their `purpose`."""
+    """Return the rotations NED → `frame` and body → NED at given times; error messages name the `purpose`."""
     pulses = seconds_since(at, track_time[0])
     ned = ned_axes(spline(pulses)) if frame == "ecef" else np.broadcast_to(LOCAL_NED, (len(pulses), 3, 3))
     angles = (
@@ -256,11 +256,11 @@ def _rotations(
     )
     if not np.isfinite(angles).all():
         raise CampaignError(
-            f"{purpose} is configured, but there is no attitude (attitude: {attitude_from})",
+            f"{purpose} is configured, but the attitude is unknown (attitude: {attitude_from})",
             where=where,
             expected="roll, pitch and yaw at every epoch of the log",
-            remedy="Log the attitude, or set the node's attitude to course, or set its lever arms to zero and its "
-            "antennas to null.",
+            remedy="Log the attitude; or set the attitude of the node to course; or set the lever arms of the node to "
+            "zero and its antennas to null.",
         )
     return ned, body_axes(angles)
 
@@ -275,14 +275,14 @@ def _check_covered(track_time: NDArray[np.datetime64], at: NDArray[np.datetime64
             f"the track ({track_time[0]} to {track_time[-1]}) {' and '.join(ends)}",
             where=where,
             expected=f"a track that covers the pulses, {at.min()} to {at.max()}",
-            remedy="Check the time system of the log (GPST is 18 s ahead of UTC) and the transmitter's time tags, at "
-            "which the positions of both nodes are evaluated; or provide the complete log. If the recorder has its own "
-            "clock, use `apertura align`.",
+            remedy="Check the time system of the log (GPST is 18 s ahead of UTC) and the time tags of the transmitter, "
+            "at which the positions of both nodes are evaluated; or provide the complete log. If the recorder has a "
+            "separate clock, use `apertura align`.",
         )
 
 
 def _course(velocity: NDArray[np.float64], ned: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return level attitude with the yaw of the course over ground, (pulse, 3) rad."""
+    """Return level attitude with the yaw equal to the course over ground, (pulse, 3) rad."""
     north, east, _ = np.moveaxis(np.einsum("pij,pi->pj", ned, velocity), -1, 0)
     return np.stack([np.zeros_like(north), np.zeros_like(north), np.arctan2(east, north)], -1)
 

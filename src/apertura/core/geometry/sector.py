@@ -1,4 +1,4 @@
-"""Sector of integration of a pixel: weights of the pulses of a long flight at each pixel."""
+"""Integration sector of a pixel: weights of the pulses of a long flight at each pixel."""
 
 from dataclasses import dataclass, replace
 
@@ -9,39 +9,38 @@ from apertura.common.units import decibels
 from apertura.core.geometry.aperture import Aperture, Weigh, distance
 
 TAPER = 0.1
-"""Half width of an edge as a share of the sector's half width: the weight decreases from 1 to 0 between (1 - TAPER) and
-(1 + TAPER) times the half width (docs/theory/integration.md)."""
+"""Half width of an edge relative to the half width of the sector: the weight decreases from 1 to 0 between (1 - TAPER)
+and (1 + TAPER) times the half width (docs/theory/integration.md)."""
 
-_SAMPLES = 256  # number of samples of the window, for a relative accuracy of 1e-6 of -3 dB width and sidelobe
-_TRIED = 256  # pulses searched for the extremes of s
-_END = 0.01  # tolerated error of these extremes as a share of the half width
+_SAMPLES = 256  # number of samples of the window, for a relative error of 1e-6 of the -3 dB width and the sidelobe
+_TRIED = 256  # number of pulses searched for the extremes of s
+_END = 0.01  # tolerated error of these extremes relative to the half width
 
 
 @dataclass(frozen=True, eq=False)
 class Sector:
-    """Interval of the direction cosine to the flight in which pulses are integrated at a pixel.
+    """Interval of the direction cosine relative to the flight in which pulses are integrated at a pixel.
 
     With u_t, u_r the unit vectors from the antennas to the pixel, s = a_t·u_t + a_r·u_r is the decrease of the total
     path per metre of motion of both antennas together: 0 at the closest approach, 1 straight ahead. A pulse is
-    integrated at a pixel if s is within `half` of the centre, with a smooth edge. The centre of a pixel is `centre`, or
-    the nearest centre whose sector lies within the flight (`following`).
+    integrated at a pixel if s is within `half` of the centre of the interval, with a smooth edge. The centre at a pixel
+    is `centre`, or the nearest value for which the sector lies within the flight (`following`).
 
     Attributes
     ----------
     tx_axis, rx_axis
         (pulse, 3) float64: displacement of each antenna divided by the sum of the lengths of both displacements, so
-        that the lengths of both axes sum to 1. Both are 0 if no antenna moves: every pixel is then at its closest
-        approach.
+        that the lengths of both axes add up to 1. Both axes are 0 if no antenna moves; s is then 0 at every pixel.
     centre, half
         Centre and half width of the interval of s; the weight is one half at the centre ± `half`.
     ends
-        Pulses that include those at which s of any pixel is smallest or largest, and the sector of these pulses; None:
-        all pixels have the same `centre`.
+        Pulses that include those at which s of any pixel is smallest or largest, and the sector of these pulses; None
+        if all pixels have the same `centre`.
 
     Raises
     ------
     ValueError
-        If shapes differ, or the half width is not positive.
+        If shapes differ, or if the half width is not positive.
 
     Notes
     -----
@@ -80,7 +79,7 @@ class Sector:
             Distance over which a direction is determined: long relative to position errors, short relative to the
             radius of turns.
         centre, half
-            As of a `Sector`.
+            Attributes of the `Sector`.
         """
         return cls(*flight_axes(aperture, chord_m=chord_m), centre, half)
 
@@ -96,7 +95,7 @@ class Sector:
         aperture
             Aperture of the same pulses.
         points_m
-            (point, 3) float64, metres, spread over the scene.
+            (point, 3) float64, metres, distributed over the scene.
 
         Notes
         -----
@@ -126,7 +125,7 @@ class Sector:
         return replace(self, ends=(sample[np.array(ends)], sector[np.array(ends)]))
 
     def centre_at(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the centre of the interval of s at each point, (...) float64, of points (..., 3) in metres."""
+        """Return the centre of the interval of s at points (..., 3) in metres, (...) float64."""
         if self.ends is None:
             return np.full(points_m.shape[:-1], self.centre)
         aperture, sector = self.ends
@@ -152,7 +151,7 @@ class Sector:
         return (1 + TAPER) * self.half
 
     def place(self, aperture: Aperture, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return s minus the centre of the point, (pulse, ...) float64, of points (..., 3) in metres.
+        """Return s minus the centre of the interval at points (..., 3) in metres, (pulse, ...) float64.
 
         Raises
         ------
@@ -160,7 +159,7 @@ class Sector:
             If the aperture has a different number of pulses.
         """
         if len(self.tx_axis) != len(aperture):
-            raise ValueError(f"{len(self.tx_axis)=}: must be one for each of {len(aperture)} pulses")
+            raise ValueError(f"{len(self.tx_axis)=}: must equal the number of pulses, {len(aperture)}")
         # Matrix products relative to a nearby origin, to preserve the precision of squared distances.
         flat, origin = points_m.reshape(-1, 3), aperture.legs[0][:1].sum(axis=0)
         offset_m = flat - origin
@@ -177,7 +176,7 @@ class Sector:
         return cosine.reshape(len(aperture), *points_m.shape[:-1])
 
     def weight(self, aperture: Aperture, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the weight of each pulse at each point, 0 to 1; parameters and shape as for `place`."""
+        """Return the weight of each pulse at each point, 0 to 1; parameters and shape of the result as for `place`."""
         return edge((self.outer - np.abs(self.place(aperture, points_m))) / (self.outer - self.inner))
 
     def over(self, aperture: Aperture) -> Weigh:
@@ -197,7 +196,7 @@ class Sector:
             Radii of spheres about the points, metres, in a shape that broadcasts with (pulse, ...).
         """
         slack = np.zeros((len(aperture), *points_m.shape[:-1]))
-        if self.ends is not None:  # a centre changes by no more than the extremes of s
+        if self.ends is not None:  # the centre of a pixel changes by no more than the extremes of s
             slack += (
                 self.ends[1]
                 .slack(self.ends[0], points_m, np.broadcast_to(radius_m, slack.shape).max(axis=0))
@@ -213,7 +212,7 @@ class Sector:
 
 
 def edge(depth: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the weight at a depth inside a sector in units of the edge width: smoothstep from 0 at 0 to 1 at 1.
+    """Return the weight at a depth inside a sector, in units of the edge width: a smoothstep function from 0 to 1.
 
     Examples
     --------
@@ -225,7 +224,7 @@ def edge(depth: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def flight_axes(aperture: Aperture, *, chord_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the axes of a `Sector` at each pulse, over a distance `chord_m` about the pulse, clipped at the ends.
+    """Return the axes of a `Sector` at each pulse, from the displacement over a chord of `chord_m` about the pulse.
 
     Examples
     --------
@@ -245,12 +244,12 @@ def flight_axes(aperture: Aperture, *, chord_m: float) -> tuple[NDArray[np.float
 
 
 def response() -> tuple[float, float]:
-    """Return width and highest sidelobe of the point response along the flight for the smooth edges.
+    """Return width and highest sidelobe of the point response along the flight for a sector with smooth edges.
 
     Returns
     -------
     width : float
-        -3 dB width times the width of the sector's spectrum between its points of weight one half.
+        -3 dB width multiplied by the width of the sector's spectrum between the points of half weight.
     sidelobe_db : float
         Highest sidelobe, dB.
 

@@ -14,28 +14,28 @@ from apertura.core.geometry.lever_arms import position_spline
 
 # ---- Spikes and steps
 #
-# Thresholds are derived from the log itself. An epoch is compared with the cubic through two epochs on either side. A
-# group of epochs is a fault if the log is smooth without it. Undersampled motion does not become smooth in this way,
-# and is not reported.
+# Thresholds are derived from the log itself. An epoch is compared with the cubic polynomial through two epochs on
+# either side. A group of epochs is a fault if the log is smooth without this group. Undersampled motion does not become
+# smooth if epochs are removed, and is not reported.
 
 
 LEAST_FAULT_M = 5e-3
-"""Smallest error of single epochs that is distinguished from noise, metres; 5 mm is λ/48 at L-band."""
+"""Smallest error of a single epoch that is distinguished from noise, metres; 5 mm is λ/48 at L-band."""
 
 FINEST_GRAIN_M = 0.01
-"""Largest rounding step of a log that resolves centimetres, metres: upper limit of the scatter of a static log."""
+"""Largest rounding step of a log that resolves centimetres, metres; upper limit for the scatter of a static log."""
 
 _SIGMA = 10.0  # least size of a fault relative to the scatter of the log
 _SMOOTHER = {1: 7.0, 2: 12.0, 3: 20.0}  # number of faulty epochs → least size relative to the residual misfits
 _STEP_SMOOTHER = 10.0  # least size of a step relative to the residual misfits
-# acceleration that a node may have, in both directions within an interval: smaller steps are attributed to motion
+# acceleration that a node may have in either direction within an interval: smaller steps are attributed to motion
 _AGILE_M_S2 = 10.0
 _CHI3_MEDIAN = 1.538  # median length of a vector of three standard normal components
 _MOST_ROUNDS = 20
 
 
 class Fault(NamedTuple):
-    """Fault: epochs first…last with an error of `size_m`; for a step, the two epochs before and after it."""
+    """Fault of a log: epochs first…last with an error of `size_m`; for a step, the epochs before and after the step."""
 
     first: int
     last: int
@@ -43,7 +43,7 @@ class Fault(NamedTuple):
 
 
 def misfits(time_s: Floats, position_m: Floats) -> Floats:
-    """Return the deviation of each epoch from the cubic through two epochs on either side.
+    """Return the deviation of each epoch from the cubic polynomial through two epochs on either side.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def misfits(time_s: Floats, position_m: Floats) -> Floats:
 
 
 def scatter_m(misfit_m: Floats) -> float:
-    """Return the robust scatter of `misfits` per axis, metres, also for a log that mostly repeats one position.
+    """Return the robust scatter of `misfits` per axis, metres.
 
     If most epochs repeat a coarsely rounded position exactly, the scatter is estimated from the other epochs.
 
@@ -94,7 +94,7 @@ def scatter_m(misfit_m: Floats) -> float:
 
 
 def find_spikes(time_s: Floats, position_m: Floats) -> list[Fault]:
-    """Detect spikes: one to three consecutive epochs that deviate from their neighbours.
+    """Detect spikes: one to three consecutive epochs that deviate from the neighbouring epochs.
 
     Notes
     -----
@@ -123,7 +123,7 @@ def find_spikes(time_s: Floats, position_m: Floats) -> list[Fault]:
 
 
 def find_steps(time_s: Floats, position_m: Floats) -> list[Fault]:
-    """Detect steps: pairs of epochs between which the position changes abruptly, as by a new GNSS fix.
+    """Detect steps: pairs of epochs between which the position changes abruptly, for example after a new GNSS fix.
 
     Examples
     --------
@@ -153,7 +153,7 @@ def _lagrange(nodes: Floats, at: Floats) -> Floats:
 
 
 def _outlying(misfit_m: Floats, scatter: float) -> list[int]:
-    """Return epochs whose misfit exceeds the threshold and is the largest within six epochs on either side."""
+    """Return epochs with a misfit above the threshold that is the largest within six epochs on either side."""
     size = np.linalg.norm(misfit_m, axis=1)
     around = np.lib.stride_tricks.sliding_window_view(np.pad(size, 6), 13).max(axis=1)
     return np.flatnonzero((size > max(0.6 * _SIGMA * scatter, 0.6 * LEAST_FAULT_M)) & (size >= around)).tolist()
@@ -181,7 +181,7 @@ def _spike(time_s: Floats, position_m: Floats, epoch: int, scatter: float) -> Fa
 
 
 def _step(time_s: Floats, misfit_m: Floats, before: int, scatter: float) -> Fault | None:
-    """Fit a step after epoch `before` to the misfits around it; None if it is not significant."""
+    """Fit a step after epoch `before` to the surrounding misfits; None if the step is not significant."""
     near = np.arange(max(before - 5, 0), min(before + 7, len(time_s)))
     pattern = misfits(time_s[near], (near > before)[:, None].astype(float))[2:-2, 0]
     power = float(pattern @ pattern)
@@ -202,10 +202,10 @@ def _step(time_s: Floats, misfit_m: Floats, before: int, scatter: float) -> Faul
 def find_frozen(time_s: Floats, position_m: Floats) -> NDArray[np.bool_]:
     """Detect epochs that repeat the preceding position although the node was moving, (epoch,) bool.
 
-    A node that stops decelerates first and accelerates afterwards. A run of repeated positions is frozen if the node
-    moved just before and just after it and the distance covered agrees with that speed. Noise may also lead to repeats
-    of a coarsely rounded position: at least three consecutive repeats are required, unless more than a tenth of the
-    epochs are repeats.
+    A node that stops decelerates before the stop and accelerates afterwards. A run of repeated positions is frozen if
+    the node moved just before and just after the run, and if the distance covered agrees with the speed of this motion.
+    Noise may also lead to repeats of a coarsely rounded position. Therefore at least three consecutive repeats are
+    required, unless more than a tenth of the epochs are frozen.
 
     Examples
     --------
@@ -240,9 +240,9 @@ def rounded_time_m(time_s: Floats, position_m: Floats) -> float:
 
     Notes
     -----
-    Times rounded to a step g have an error of g/√12, positions an along-track error of g/√12 times the speed. Rounding
-    is detected if the intervals are unequal, and the along-track scatter is at least half of this error and more than
-    three times the cross-track scatter. Source: docs/theory/tracks.md, "Rounded times".
+    Times rounded to a step g have an error of g/√12; positions then have an along-track error of g/√12 times the speed.
+    Rounding is detected if the intervals are unequal and if the along-track scatter is at least half of this error and
+    more than three times the cross-track scatter. Source: docs/theory/tracks.md, "Rounded times".
 
     Examples
     --------
@@ -269,7 +269,7 @@ def rounded_time_m(time_s: Floats, position_m: Floats) -> float:
 
 
 def rounded_position_m(time_s: Floats, position_m: Floats, *, least_m: float) -> float:
-    """Return the RMS error of positions due to rounded coordinates, metres; 0 if they are not rounded.
+    """Return the RMS error of positions due to rounded coordinates, metres; 0 if coordinates are not rounded.
 
     Parameters
     ----------
@@ -283,9 +283,9 @@ def rounded_position_m(time_s: Floats, position_m: Floats, *, least_m: float) ->
     Notes
     -----
     A coordinate rounded to a step g has an error of g/√12. The step is the greatest common divisor of the differences
-    of all values of a coordinate: of the axes of the frame and, for ECEF positions, of latitude, longitude and height.
-    It is accepted if positions scatter by at least a tenth of it. Steps up to 1.5 cm occur in logs that resolve
-    centimetres, and are ignored. Source: docs/theory/tracks.md, "Rounded positions".
+    between all values of a coordinate. Coordinates are the axes of the frame and, for ECEF positions, latitude,
+    longitude and height. The step is accepted if positions scatter by at least a tenth of the step. Steps up to 1.5 cm
+    occur in logs that resolve centimetres, and are ignored. Source: docs/theory/tracks.md, "Rounded positions".
 
     Examples
     --------
@@ -313,8 +313,8 @@ def rounded_position_m(time_s: Floats, position_m: Floats, *, least_m: float) ->
 
 _ON_EARTH_M = 1e6
 _DEGREE_M = 111_195.0  # metres per degree of latitude
-_ROUGH = 0.1  # least scatter of rounded positions as a share of the rounding step
-_SAME_M = 1e-5  # difference below which two values are equal
+_ROUGH = 0.1  # least scatter of rounded positions relative to the rounding step
+_SAME_M = 1e-5  # difference below which two values are considered equal, metres
 _COARSE_M = 1.5e-2  # receivers that resolve centimetres write multiples of 1e-7 degrees, 1.1 cm
 _FEWEST_VALUES, _MOST_VALUES = 8, 500
 
@@ -338,14 +338,14 @@ def _grain(values_m: Floats, least_m: float) -> float:
 # ---- Valid epochs and gaps
 
 LONG_GAP = 3.5
-"""Length of a gap, in median intervals between epochs, above which its interpolation error is estimated."""
+"""Length of a gap, in median intervals between epochs, above which the interpolation error is estimated."""
 
-_TRIED = 40  # artificial gaps of the same length elsewhere in the log, to measure the error of the spline
+_TRIED = 40  # number of artificial gaps of the same length elsewhere in the log, at which the spline error is measured
 _SUPPORT = 6  # epochs on either side of an artificial gap
 
 
 class Hole(NamedTuple):
-    """Interval without valid positions, seconds of the log, with its cause and the error (m) of a spline through it."""
+    """Interval without valid positions, in seconds of the log, with its cause and the interpolation error (m)."""
 
     start_s: float
     end_s: float
@@ -360,7 +360,7 @@ class CheckedTrack:
     Attributes
     ----------
     kept
-        (epoch,) bool, valid epochs.
+        (epoch,) bool, True for valid epochs.
     holes
         Intervals in which pulses have no position.
     faults
@@ -375,7 +375,7 @@ class CheckedTrack:
     interpolation_m: float | None
 
     def excluded(self, at_s: Floats) -> dict[str, NDArray[np.bool_]]:
-        """Return the pulses in intervals without positions: cause → (pulse,) bool."""
+        """Return masks of the pulses in intervals without positions: cause → (pulse,) bool."""
         causes = dict.fromkeys(hole.cause for hole in self.holes)
         return {
             cause: np.any([(at_s > h.start_s) & (at_s < h.end_s) for h in self.holes if h.cause == cause], axis=0)
@@ -391,20 +391,20 @@ def check_track(
     tolerated_m: float,
     longest_gap_s: float = np.inf,
 ) -> CheckedTrack:
-    """Check a log for faults and gaps; return its valid epochs and the intervals without positions.
+    """Check a log for faults and gaps; return the valid epochs and the intervals without positions.
 
     Parameters
     ----------
     time_s
         (epoch,) float64, seconds, ascending.
     position_m
-        (epoch, 3) float64, logged point, any Cartesian frame, metres.
+        (epoch, 3) float64, logged point in any Cartesian frame, metres.
     poor_fix
-        (epoch,) bool, epochs whose GNSS solution is worse than required.
+        (epoch,) bool, True for epochs with a GNSS solution that is worse than required.
     tolerated_m
         Tolerated error of the spline through a gap, such as λ/16, metres.
     longest_gap_s
-        Longest gap that is interpolated, for any error of the spline, seconds.
+        Longest gap that is interpolated regardless of the error of the spline, seconds.
 
     Notes
     -----
@@ -457,7 +457,7 @@ def _classified(time_s: Floats, position_m: Floats, poor_fix: NDArray[np.bool_])
 
 
 def _parts(time_s: Floats, cause: NDArray[np.str_]) -> list[NDArray[np.intp]]:
-    """Return the valid epochs between gaps; epochs are not compared across a gap."""
+    """Return the groups of valid epochs between gaps; epochs are not compared across a gap."""
     valid = np.flatnonzero(cause == "")
     if valid.size < 2:
         return []
@@ -494,7 +494,8 @@ def _holes(
 def _gap_error_m(time_s: Floats, position_m: Floats, missing: int) -> float:
     """Estimate the error of the spline through a gap of `missing` epochs from artificial gaps in the log, metres.
 
-    It is the 90 % quantile of the largest error within each artificial gap; inf if no part of the log is long enough.
+    The result is the 90 % quantile of the largest error within each artificial gap; inf if no part of the log is long
+    enough.
     """
     width = missing + 2 * _SUPPORT
     interval_s = float(np.median(np.diff(time_s)))
@@ -511,7 +512,7 @@ def _gap_error_m(time_s: Floats, position_m: Floats, missing: int) -> float:
 
 
 def _interpolation_m(time_s: Floats, position_m: Floats) -> float | None:
-    """Estimate the RMS error of the spline between epochs per axis, metres: 2⁻⁴ of that with every second epoch."""
+    """Estimate the RMS spline error between epochs per axis, metres: 2⁻⁴ of the error with every second epoch."""
     if len(time_s) < 12:
         return None
     error_m = position_spline(time_s[::2], position_m[::2])(time_s[1:-1:2]) - position_m[1:-1:2]
@@ -519,26 +520,26 @@ def _interpolation_m(time_s: Floats, position_m: Floats) -> float | None:
     return float(np.sqrt(np.mean(inner**2))) / 16
 
 
-# ---- Yaw against the course
+# ---- Comparison of yaw with the course
 
 _COURSE_STEP_M = 2.0  # distance over ground from which a course is determined: 1 cm of noise causes an error of 0.4°
 _LEAST_STEPS = 10
 # least mean phasor of yaw minus course if yaw follows the course: 33° RMS from wind, sideslip and manual turns
 _FOLLOWS = 0.85
 _LEAVES = 0.8  # largest mean phasor if yaw does not follow the course: 38° RMS
-_CLOSER = 2.0  # least ratio of the scatter of yaw about the course as logged to that by another convention
+_CLOSER = 2.0  # least ratio of the scatter of yaw about the course as logged to the scatter with another convention
 # widest gap between courses for which a constant heading, or a heading towards the scene, can be excluded
 _ROUND_DEG = 60.0
 _WHOLE_TURN = 1.01 * 2 * np.pi  # limit of an angle in radians
 _UPSIDE = 1.01 * np.pi / 2  # limit of roll and pitch in radians of an upright node
-_LEVEL = 0.6  # limit of roll and pitch in radians in level flight; values in degrees exceed it in any flight
+_LEVEL = 0.6  # limit of roll and pitch in radians in level flight, which values in degrees exceed in any flight
 _STILL = 1e-3  # smallest range of roll or pitch that is accepted as measured
-# limits of yaw minus course in straight flight: by the other convention, and as logged
+# limits of yaw minus course in straight flight: largest with the other convention, and smallest as logged
 _NEAR_DEG, _FAR_DEG = 20.0, 45.0
 
 
 class YawFault(NamedTuple):
-    """Yaw that follows the course by another convention than degrees clockwise from north.
+    """Yaw that follows the course in a convention other than degrees clockwise from north.
 
     Attributes
     ----------
@@ -547,7 +548,8 @@ class YawFault(NamedTuple):
     certain
         True if the course covers so many directions that there is no other explanation.
     as_logged_deg, otherwise_deg
-        RMS scatter of yaw minus course about its mean, as logged and by `convention`; in straight flight, its mean.
+        RMS scatter of the difference between yaw and course about the mean difference, as logged and with `convention`;
+        in straight flight, the mean difference.
     """
 
     convention: str
@@ -559,16 +561,16 @@ class YawFault(NamedTuple):
     def line(self) -> str:
         """The measured deviations in one line."""
         return (
-            f"attitude angles appear to be {self.convention}: yaw then deviates from the course by "
-            f"{self.otherwise_deg:.0f}°, but by {self.as_logged_deg:.0f}° as degrees clockwise from north"
+            f"attitude angles appear to be {self.convention}: with this convention, yaw deviates from the course by "
+            f"{self.otherwise_deg:.0f}°; as degrees clockwise from north, it deviates by {self.as_logged_deg:.0f}°"
         )
 
 
 def check_yaw(position_m: Floats, attitude_rad: Floats, ned: Floats) -> YawFault | None:
-    """Detect a wrong convention of yaw: another convention follows the course over ground, and the logged yaw does not.
+    """Detect a wrong convention of yaw: yaw follows the course over ground with another convention, but not as logged.
 
-    A node that flies sideways, backwards, in wind or with a constant heading is not reported: its yaw follows the
-    course by no convention, or as logged.
+    A node that flies sideways, backwards, in wind or with a constant heading is not reported: its yaw either follows
+    the course as logged, or follows it with no convention.
 
     Parameters
     ----------
@@ -622,7 +624,7 @@ def check_yaw(position_m: Floats, attitude_rad: Floats, ned: Floats) -> YawFault
 
 
 def _thinned(position_m: Floats, least_m: float) -> NDArray[np.intp]:
-    """Return indices of positions that are each at least `least_m` from the preceding one."""
+    """Return indices of positions, each at least `least_m` from the previously selected position."""
     kept, positions = [0], position_m.tolist()
     for index, position in enumerate(positions):
         if math.dist(position, positions[kept[-1]]) >= least_m:
@@ -638,12 +640,12 @@ def _scatter_deg(mean: complex) -> float:
 # ---- Hovers: pulses transmitted while the antennas are stationary
 
 HOVER_SPEED = 0.2
-"""Limit of the speed in a hover relative to that of the flight: lower than in turns or climbs, higher than in a hover
-in wind."""
+"""Upper limit of the speed in a hover relative to the speed of the flight. The limit is below the speed in turns or
+climbs and above the speed in a hover in wind."""
 
 HOVER_S, HOVER_SHARE = 5.0, 0.05
-"""Least duration of a hover, seconds, and least share of pulses in hovers: a smaller share causes a pedestal below -26
-dB."""
+"""Least duration of a hover, seconds, and least fraction of pulses in hovers: a smaller fraction causes a pedestal
+below -26 dB."""
 
 _HOVER_WINDOW_S = 2.0  # interval of the speed estimate: 1 cm of log noise causes an error of 1 cm/s
 

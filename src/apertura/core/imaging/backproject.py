@@ -1,4 +1,4 @@
-"""Backprojection from Python: form a planned, certified, lazy image of range profiles or a phase history."""
+"""Backprojection from Python: planned, certified, lazy images of range profiles or of a phase history."""
 
 import json
 from collections.abc import Mapping
@@ -66,71 +66,74 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, for completion in 
     Parameters
     ----------
     profiles
-        Range profiles; or calibrated transfer functions, which are compressed in range first; or the dataset of a
-        campaign's stage `profile` or `echo`. They contain the wave speed: by default that in vacuum;
-        ``ap.wave_speed(285)`` for a refractivity of 285 N units; in the dataset of a stage, that of the configured
-        atmosphere.
+        Range profiles; or calibrated transfer functions, which are compressed in range first; or the dataset of the
+        stage `profile` or `echo` of a campaign. The wave speed is part of these inputs. In arrays, the default is the
+        wave speed in vacuum; use ``ap.wave_speed(285)`` for a refractivity of 285 N units. In the dataset of a stage,
+        it is the wave speed in the configured atmosphere.
     grid
-        Pixels; their frame is that of the phase centres: ECEF, or the local frame of a grid with ``crs="local"``.
+        Pixels, in the same frame as the phase centres: ECEF, or the local frame of a grid with ``crs="local"``.
     accuracy_db
         Requested numerical error: RMS over all pixels relative to the exact sum, dB, -120 to -10.
     terrain
-        Heights of the terrain, or one height (m): above the ellipsoid of the grid's CRS, or z in a local frame
-        (default: 0).
+        Heights of the terrain, or a single height, metres: above the ellipsoid of the grid's CRS, or z in a local frame
+        (default in a local frame: 0).
     engine
         'auto' or a key of `apertura.core.backprojection.engines.ENGINES`.
     beams
         Antenna beams (default: isotropic).
     atmosphere
-        Atmosphere that replaces the wave speed in `profiles`: 'auto', the standard atmosphere over the terrain; an
-        `Atmosphere`; the refractivity at the terrain, N units; 'vacuum'. The wave speed is constant over the flight and
-        is computed from its heights.
+        Atmosphere that replaces the wave speed in `profiles`: 'auto' for the standard atmosphere over the terrain, an
+        `Atmosphere`, the refractivity at the terrain in N units, or 'vacuum'. The wave speed is constant over the
+        flight and is computed from the heights of the flight.
     calibration
-        K, |H|² of a target of 1 m² on both boresights with R_tx·R_rx = 1 m²: ``ap.Link(...).constant(...)``, or
-        measured on a reflector. With it, the image has the coordinates `sigma0` and `rcs`.
+        Calibration constant K, |H|² of a target of 1 m² on both boresights with R_tx·R_rx = 1 m², from
+        ``ap.Link(...).constant(...)`` or measured on a reflector. If K is given, the image has the coordinates `sigma0`
+        and `rcs`.
     certified_pixels
-        Number of random pixels that are also computed exactly, immediately, for the certificate; 0 for none. The error
-        bound is no lower than the predicted error. A setting that misses the accuracy at these pixels is replaced by
-        the next setting of the plan.
+        Number of random pixels that are computed exactly for the certificate, at once; 0 for no certificate. The error
+        bound is no lower than the predicted error. If a setting does not meet the requested accuracy at these pixels,
+        it is replaced by the next setting of the plan.
     judge
-        If True, the image is formed immediately, in addition to the lazy image, and its focus and unfocused echoes are
-        assessed as by `apertura.judge`. 'auto': if the predicted run time is at most ten seconds.
+        If True, the image is formed at once, in addition to the lazy image, and its focus and unfocused echoes are
+        assessed as by `apertura.judge`. 'auto': this is done if the predicted run time is at most ten seconds.
     terrain_model
         Terrain model: 'auto', 'plane', 'tilted_plane' or 'dem'.
     window
         Window over the subcarriers of transfer functions; profiles are already windowed.
     integration
-        Extent of the pass over which a pixel is integrated: 'auto', as much as the pixel spacing can represent; 'all',
-        the whole pass; ``{"degrees": x}``, integration angle of a straight pass; ``{"resolution_m": x}``, resolution
-        along the flight.
+        Extent of the pass over which a pixel is integrated: 'auto' for the finest resolution that the pixel spacing can
+        represent, 'all' for the whole pass, ``{"degrees": x}`` for an integration angle of a straight pass, or
+        ``{"resolution_m": x}`` for a resolution along the flight.
     presum
-        Number of pulses that a low-pass sum combines into one where the aperture is oversampled; 1: no presumming.
+        Number of pulses that a low-pass sum combines into one virtual pulse if the aperture is oversampled; 1: no
+        presumming.
     pulse_blocks
-        Number of pulse blocks, processed sequentially to limit the memory for tables; 1: all pulses at once.
+        Number of pulse blocks, which are processed sequentially to limit the memory for tables; 1: all pulses at once.
     tile_px
-        Side of a tile, pixels: a chunk of the array.
+        Side of a tile, pixels; each tile is a chunk of the array.
     engine_options
         Engine options fixed by the caller: engine → option → value.
 
     Returns
     -------
     xarray.DataArray
-        (y, x) complex64 with the carrier phase, in units of the amplitude of an echo present in every pulse; a dask
-        array, computed by the caller's scheduler. Attributes: units; `wave_speed_m_s`; the plan: `setting`,
-        `predicted_error_db`, and as JSON `models` (choice → value and reason) and `flags` (exceeded limit → measured
-        value); the judgement: `verdict` ('not judged' if deferred), `verdict_why`, and as JSON `budget`; the
-        certificate: `numerical_error_db`, an upper bound at `numerical_error_confidence` for the whole image, and
-        `numerical_error_estimate_db`, relative to the double sum over pulses and subcarriers, or, for profiles alone,
-        to their band-limited interpolation in float64. With `calibration` also lazy coordinates (y, x) float32:
-        `sigma0` of terrain, noise included, and `rcs`, the cross-section (m²) of a point at the pixel; NaN where no
-        pulse illuminates the pixel.
+        (y, x) complex64 with the carrier phase, in units of the amplitude of an echo present in every pulse. The data
+        is a dask array, which is computed by the caller's scheduler. Attributes of the image are units and
+        `wave_speed_m_s`. Attributes of the plan are `setting`, `predicted_error_db`, and, as JSON, `models` (choice →
+        value and reason) and `flags` (exceeded limit → measured value). Attributes of the judgement are `verdict` ('not
+        judged' if deferred), `verdict_reason`, and, as JSON, `budget`. Attributes of the certificate are
+        `numerical_error_db`, an upper bound for the whole image at `numerical_error_confidence`, and
+        `numerical_error_estimate_db`. Errors are relative to the double sum over pulses and subcarriers, or, if only
+        profiles are given, to the band-limited interpolation of the profiles in float64. With `calibration`, there are
+        also lazy coordinates (y, x) float32: `sigma0` of terrain, including noise, and `rcs`, the radar cross-section
+        (m²) of a point at the pixel; both are NaN where no pulse illuminates the pixel.
 
     Raises
     ------
     CampaignError
-        If an argument is invalid, positions, samples or heights are not finite, an antenna is below the terrain, the
-        samples contain no echo of the scene, the scene is deeper than the unambiguous range, or no setting can run on
-        this machine as requested.
+        If an argument is invalid; positions, samples or heights are not finite; an antenna is below the terrain; the
+        samples contain no echo of the scene; the scene is deeper than the unambiguous range; or no requested setting is
+        available on this machine.
 
     Notes
     -----
@@ -183,7 +186,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, for completion in 
     )
     # Check inputs and scene.
     inputs = inputs_of(profiles, choices.window)
-    inputs = replace(inputs, aperture=inputs.aperture.copied())  # the image is lazy, and the caller's arrays may change
+    inputs = replace(inputs, aperture=inputs.aperture.copied())  # the caller may change arrays before computing tiles
     ground = ground_of(terrain, grid)
     _check_kinds(inputs, beams, certified_pixels)
     if atmosphere is not None:
@@ -197,7 +200,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, for completion in 
     compressed = _compressed(inputs, grid, ground, job.beams)
     plan = make_plan(job, accuracy_db=accuracy_db, overrides=choices.planned, where="backproject")
     formation = Formation(history, compressed, grid, plan, choices.tile_px)
-    # Certificate: compare random pixels with the exact sum; use the plan's next setting if they miss the accuracy.
+    # Certificate: compare random pixels with the exact sum; use the next setting if these do not meet the accuracy.
     attributes: dict[str, Any] = {}
     if certified_pixels:
         formation, error = _certified(formation, accuracy_db, certified_pixels)
@@ -238,14 +241,14 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, for completion in 
 
 
 def _check_kinds(inputs: PhaseHistory | Profiles, beams: Any, certified_pixels: Any) -> None:
-    """Raise CampaignError unless `beams` and `certified_pixels` have valid types and sizes."""
+    """Raise CampaignError if the type or size of `beams` or `certified_pixels` is invalid."""
     counted = isinstance(certified_pixels, Integral) and not isinstance(certified_pixels, bool)
     if not counted or not 0 <= certified_pixels <= _MOST_CERTIFIED:
         raise CampaignError(
             quoted(certified_pixels),
             "backproject: certified_pixels",
             f"a number of pixels, 0 to {_MOST_CERTIFIED}",
-            "Pass 0 for no certificate.",
+            "Pass a number in this interval; 0 means no certificate.",
         )
     if beams is None:
         return
@@ -258,30 +261,30 @@ def _check_kinds(inputs: PhaseHistory | Profiles, beams: Any, certified_pixels: 
             raise CampaignError(
                 f"{len(beam.axes)} pulses",
                 where=f"backproject: Beams.{name}",
-                expected=f"{len(inputs)} pulses, as in the echo",
+                expected=f"{len(inputs)} pulses, the number of pulses of the input",
                 remedy="Provide one set of antenna axes per pulse.",
             )
 
 
 _MOST_CERTIFIED = 1_000_000
-"""Largest number of pixels compared with the exact sum: a hundredth of it yields practically the same bound."""
+"""Largest number of pixels compared with the exact sum: a hundredth of this number yields nearly the same bound."""
 
 _SUM = 1e-3
 """Tolerated deviation of the sum of weights from 1: a hundredth of a decibel."""
 
 _AT_ONCE_S = 10.0
-"""Longest predicted run time (s) up to which judge='auto' forms and assesses the image immediately."""
+"""Longest predicted run time (s) at which the image is formed and assessed at once for judge='auto'."""
 
 
 def _judged(formation: Formation, judge: bool | str, *, error_db: float | None) -> Judgement:
-    """Return the judgement of an image, or the reason why it is deferred."""
+    """Return the judgement of an image, or the reason for deferring the judgement."""
     if not (isinstance(judge, bool) or judge == "auto"):
         raise CampaignError(quoted(judge), "backproject: judge", "True, False or 'auto'", "Use one of these values.")
     lines = budget_by_hand(formation, error_db=error_db)
     seconds = formation.plan.predicted_seconds
     if judge is True or (judge == "auto" and seconds <= _AT_ONCE_S):
         return judgement(formation, np.asarray(formation.image), lines)
-    reason = "not requested" if judge is False else f"predicted run time of the image {seconds:.2g} s"
+    reason = "judgement not requested" if judge is False else f"predicted run time of the image {seconds:.2g} s"
     reason = f"{reason}; apertura.judge forms and judges the image"
     return Judgement("not judged", reason, Flags(), [line.report for line in lines], {})
 
@@ -298,7 +301,7 @@ def _wave_speed(
             quoted(atmosphere),
             where="backproject: atmosphere",
             expected="auto, vacuum, an Atmosphere, or the refractivity at the terrain in N units",
-            remedy="Use one of these.",
+            remedy="Use one of these values.",
         )
     if atmosphere == "auto":
         air = Atmosphere.standard(ground_m)
@@ -321,7 +324,7 @@ def _check_calibration(constant: float | None, inputs: PhaseHistory | Profiles) 
             f"a constant of {quoted(constant)}",
             where="backproject: calibration",
             expected="a positive number: |H|² of 1 m² at R_tx·R_rx = 1 m²",
-            remedy="Use the value of Link.constant, or measure it on a reflector.",
+            remedy="Use the value of Link.constant, or a constant measured on a reflector.",
         )
     if isinstance(inputs, PhaseHistory) and abs(float(inputs.weight.sum()) - 1) > _SUM:
         raise CampaignError(
@@ -342,7 +345,7 @@ def _check_calibration(constant: float | None, inputs: PhaseHistory | Profiles) 
 def _calibrated(
     image: Any, formation: Formation, history: PhaseHistory, ground: Terrain, constant: float
 ) -> dict[str, tuple[tuple[str, str], Any, dict[str, str]]]:
-    """Return lazy σ⁰ and radar cross-section of an image, as coordinates."""
+    """Return the lazy σ⁰ and radar cross-section of an image as coordinates."""
     grid, level = formation.grid, isinstance(ground, FlatGround)
     calibration = Calibration.of(
         grid,
@@ -365,7 +368,7 @@ def _calibrated(
         "sigma0": {
             "standard_name": CF_SIGMA0,
             "units": "1",
-            "long_name": "radar cross-section of terrain per terrain area, noise included",
+            "long_name": "radar cross-section of terrain per terrain area, including noise",
         },
         "rcs": {"units": "m2", "long_name": "radar cross-section of a point at the pixel"},
     }
@@ -380,7 +383,7 @@ def _calibrated(
 
 
 def _certified(formation: Formation, accuracy_db: float, count: int) -> tuple[Formation, ErrorBound]:
-    """Return the image formation with the plan's first setting whose error bound meets the accuracy, or its last."""
+    """Return the image formation with the first setting of the plan that meets the accuracy, or with the last one."""
     pixels = np.random.default_rng(0).integers(0, formation.grid.shape, (count, 2))
     exact = formation.exact(pixels)
     error = _error(formation, pixels, exact)
@@ -393,7 +396,7 @@ def _certified(formation: Formation, accuracy_db: float, count: int) -> tuple[Fo
 
 
 def _error(formation: Formation, pixels: NDArray[np.int64], exact: NDArray[np.complex128]) -> ErrorBound:
-    """Return the error bound from uniformly drawn pixels, not below the predicted error."""
+    """Return the error bound from uniformly drawn pixels; it is at least the predicted error."""
     values, power = formation.values(pixels)
     error = error_bound(values, exact, np.ones(len(pixels)), power=power)
     return replace(error, bound_db=max(error.bound_db, formation.plan.predicted_error_db))

@@ -16,10 +16,10 @@ from apertura.core.quality.point_targets import CUT_REACH_M, cuts_report, find_p
 from apertura.core.scene.grid import SceneGrid
 
 RANDOM_PIXELS, BRIGHT_PIXELS = 160, 112
-"""Numbers of pixels recomputed exactly: drawn uniformly over the tiles, and drawn with probabilities that increase with
-brightness (docs/theory.md, eq. 6a)."""
+"""Numbers of pixels recomputed exactly: pixels drawn uniformly over the tiles, and pixels drawn with a probability that
+increases with brightness (docs/theory.md, eq. 6a)."""
 
-# number of tiles (8192 x 8192 pixels) that receive a random pixel; an exact pixel costs as much as 500 by `tree`
+# largest number of tiles with a random pixel (8192 x 8192 pixels); an exact pixel costs as much as 500 pixels by `tree`
 _MOST_TILES = 1024
 
 
@@ -32,30 +32,30 @@ def certified(
     scheduler: str = "threads",
     rewriting: Callable[[Sequence[Window]], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Certify the error bound of an image; tiles that miss the accuracy are first recomputed with better settings.
+    """Certify the error bound of an image, after recomputing tiles that do not meet the requested accuracy.
 
     Parameters
     ----------
     formation
         Formation of the image.
     target
-        The image as written: (y, x) complex64, read and written by blocks.
+        The stored image, (y, x) complex64, which is read and written by blocks.
     accuracy_db
-        Requested error.
+        Requested numerical error, dB.
     threads
         Number of tiles computed concurrently.
     scheduler
         Scheduler for recomputed tiles, as for `compute_tiles`.
     rewriting
-        Called with the tiles before they are recomputed, so that a killed run recomputes them with their planned
-        setting on resuming.
+        Function called with the tiles before these are recomputed, so that after an interruption the resumed run
+        recomputes these tiles with the planned setting.
     """
     count = min(max(RANDOM_PIXELS, len(formation.windows)), _MOST_TILES)
     drawn, certificate = random_pixels(formation.windows, count, np.random.default_rng(0)), None
     settings, recomputed, flags = iter(formation.plan.fallbacks), [], Flags()
     while True:
         brightness, setting = Brightness.of(target, formation.windows), next(settings, None)
-        # Bright pixels depend on the image, random pixels do not: for the first image, pulses are read once for both.
+        # Bright pixels depend on the image, random pixels do not. For the first image, pulses are read once for both.
         bright = brightness.draw(target, formation.windows, BRIGHT_PIXELS, np.random.default_rng(1))
         pixels = bright if certificate else np.concatenate([drawn, bright])
         exact = formation.exact(pixels, threads=threads)
@@ -66,8 +66,9 @@ def certified(
             error = error.with_error(formation.compression_db)
             if error.bound_db <= accuracy_db or setting is None:
                 break
-            worse = formation.windows  # each tile passes, but the bound of the image does not
-        print(f"{len(worse)} tiles exceed {accuracy_db} dB: recomputed with {setting.line}", flush=True)  # noqa: T201
+            worse = formation.windows  # each tile meets the accuracy, but the bound of the whole image does not
+        line = f"{len(worse)} tiles exceed a numerical error of {accuracy_db} dB and are recomputed with {setting.line}"
+        print(line, flush=True)  # noqa: T201
         image = formation.image_by(setting)
         rewriting([*uncertified, *worse])
         for tiles in (uncertified, worse):
@@ -109,7 +110,7 @@ def measures(formation: Formation, target: Any) -> dict[str, Any]:
 
 
 def _flown(formation: Formation, row: float, column: float) -> NDArray[np.float64]:
-    """Return the vector between the transmitter's first and last positions that may illuminate a pixel, metres."""
+    """Return the vector between the transmitter's first and last position from which a pixel is illuminated, metres."""
     blocks = [
         (pulses, parts) for pulses, parts in formation.illuminating_pulses(formation.positions_at([row], [column]))
     ]
@@ -119,7 +120,7 @@ def _flown(formation: Formation, row: float, column: float) -> NDArray[np.float6
 
 
 def _direction(grid: SceneGrid, vector_m: NDArray[np.float64], row: float, column: float) -> tuple[float, float]:
-    """Return the components (east, north) of a vector of the processing frame along the grid's axes at a pixel."""
+    """Return the components (east, north) of a vector in the processing frame along the axes of the grid at a pixel."""
     origin, east, north = grid.positions_at([row, row, row - 1], [column, column + 1, column], 0.0)
     axes = np.stack([east - origin, north - origin])
     steps = axes @ vector_m / np.linalg.norm(axes, axis=1)

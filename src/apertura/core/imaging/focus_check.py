@@ -1,4 +1,4 @@
-"""Focus of an image, measured without ground truth: bright points, subapertures, and echoes from outside the scene."""
+"""Focus of an image without ground truth, from bright points, subapertures, and echoes from outside the scene."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -37,13 +37,13 @@ PARTS = 8
 PART_PX = 64
 """Side of a patch, pixels: the size of a `BandLimitedPatch`."""
 
-_MARGIN_SAMPLES = 16  # range samples beyond a patch that engines need
+_MARGIN_SAMPLES = 16  # range samples beyond a patch that are required by engines
 
 
 def part_images(
     profiles: Profiles, places: Sequence[NDArray[np.float64]], *, beams: Beams | None = None
 ) -> NDArray[np.complex64]:
-    """Form patches of the image by subapertures; their sum over subapertures is the image.
+    """Form subaperture images of patches of the image; the sum over the subapertures is the image.
 
     Parameters
     ----------
@@ -57,8 +57,8 @@ def part_images(
     Returns
     -------
     ndarray
-        (patch, 2, subaperture, y, x) complex64: from the even and from the odd pulses of each subaperture. Patches with
-        fewer than four pulses per subaperture are omitted.
+        (patch, 2, subaperture, y, x) complex64, formed from the even and from the odd pulses of each subaperture. The
+        array contains no patches if there are fewer than four pulses per subaperture.
     """
     images = np.zeros((len(places), 2, PARTS, PART_PX, PART_PX), np.complex64)
     aperture = profiles.aperture
@@ -110,26 +110,28 @@ def _around(profiles: Profiles, places: NDArray[np.float64]) -> Profiles:
 # ---- Strongest echoes outside the scene
 
 OUTSIDE_ECHO_DB = 20.0
-"""Level above the strongest echo of the scene, dB: an echo outside above it is not a sidelobe; the scene is
-misplaced."""
+"""Level relative to the strongest echo of the scene, dB. An echo from outside the scene that exceeds this level is not
+a sidelobe: the scene is misplaced."""
 
 UNFOCUSED_ECHO_DB = 25.0
-"""Level above the median over the scene's ranges, dB: an echo above it is a point target, which must focus at some
-pixel; speckle reaches only 10 dB."""
+"""Level relative to the median over the ranges of the scene, dB. An echo that exceeds this level is a point target,
+which must be focused at some pixel, because speckle reaches only 10 dB."""
 
 LEAST_PULSES = 64
-"""Least number of pulses to determine whether a point dominates its cell: 2 in each of the 32 blocks of
-`point_focus`."""
+"""Least number of pulses to determine whether a point dominates its resolution cell: 2 pulses in each of the 32 blocks
+of `point_focus`."""
 
 _MOST_PULSES = 64  # pulses sampled in the search for echoes outside the scene
-_NEAR_CELLS = 4  # range cells excluded about the direct path and at the swath's edges: sidelobes of point responses
+# range cells excluded about the direct path and at the edges of the swath, where sidelobes of point responses occur
+_NEAR_CELLS = 4
 
 
 LEAST_GATHERED = 0.2
-"""Least ratio of the focused power of an image's points to the strongest echo in its pulses. Points in one range cell
-sum to one echo, of which up to half may not be counted; an image with a peak loss of 7 dB has a lower ratio."""
+"""Least ratio of the focused power of the points of an image to the power of the strongest echo in the pulses. Points
+in one range cell add up to one echo, of which up to half may be missing in the ratio. An image with a peak loss of 7 dB
+has a lower ratio."""
 
-_BY_CHANCE = 2.0  # in units of ln(pixels)/pulses, the largest coherence factor of contributions with random phases
+_BY_CHANCE = 2.0  # largest coherence factor of contributions with random phases, in units of ln(pixels)/pulses
 
 
 def echo_outside_scene(
@@ -140,26 +142,26 @@ def echo_outside_scene(
     points: Sequence[NDArray[np.complex128]] = (),
     measured: bool = False,
 ) -> str | None:
-    """Detect a strong echo in the pulses that is not focused in the image, described in one line; None without one.
+    """Return a one-line description of a strong echo that is not focused in the image; None if there is none.
 
     Parameters
     ----------
     inputs
-        Data of all pulses; a sample is evaluated. Profiles cropped to the scene contain no echo outside it.
+        Data of all pulses, of which a sample is evaluated. Profiles cropped to the scene contain no echo from outside.
     grid, terrain
         The scene.
     points
         `Formation.contributions` at each bright point of the image, (pulse,) complex128.
     measured
-        True if points of the image dominate their range cells. In that case an echo outside the scene is reported only
-        if these points may be its range sidelobes.
+        True if points of the image dominate their range cells. In that case, an echo from outside the scene is reported
+        only if these points may be range sidelobes of the echo.
 
     Notes
     -----
     Source: docs/theory/focus.md, "Echo elsewhere". The direct path between the antennas is excluded.
     """
     sampled = inputs[inputs.aperture.sample(_MOST_PULSES)]
-    # Power of the profiles inside the scene's paths, and outside them and a margin, without the direct path.
+    # Power of the profiles within the total paths of the scene, and beyond these and a margin, without the direct path.
     path_m, power, cell_m, span_m = _profiles(sampled)
     nearest, farthest = swath(grid, terrain, sampled.aperture)
     margin = _NEAR_CELLS * cell_m
@@ -171,8 +173,8 @@ def echo_outside_scene(
     outside = power_outside.max(axis=1)
     within = np.where(beyond, np.nan, power)
     inside = np.nanmax(within, axis=1)
-    scene = f"those of the scene are {nearest.min():.1f} to {farthest.max():.1f} m"
-    # An echo outside the scene that is stronger than all echoes inside and is not a sidelobe of a focused echo.
+    scene = f"total paths of the scene are {nearest.min():.1f} to {farthest.max():.1f} m"
+    # An echo from outside the scene that is stronger than all echoes of the scene and no sidelobe of a focused echo.
     above_db = _median_db(outside / np.maximum(inside, 1e-30))
     alone = min(above_db, _median_db(outside / np.maximum(np.median(power, axis=1), 1e-30))) > OUTSIDE_ECHO_DB
     if alone and measured:
@@ -188,7 +190,7 @@ def echo_outside_scene(
         )
     if measured:
         return None
-    # An echo inside the scene, too strong for speckle, that is not focused at any point of the image.
+    # An echo within the ranges of the scene that is too strong for speckle but not focused at any point of the image.
     alone_db = _median_db(inside / np.maximum(np.nanmedian(within, axis=1), 1e-30))
     if len(inputs) < LEAST_PULSES or alone_db <= UNFOCUSED_ECHO_DB:
         return None
@@ -196,13 +198,13 @@ def echo_outside_scene(
     if gathered >= LEAST_GATHERED:
         return None
     share = (
-        f"the image's points focus {100 * gathered:.0f} % of its power"
+        f"only {100 * gathered:.0f} % of its power is focused at points of the image"
         if gathered
-        else "no pixel of the image focuses it"
+        else "it is not focused at any pixel of the image"
     )
     return (
-        f"pulses contain an echo {alone_db:.0f} dB above the median over the scene's ranges, and {share}: times, "
-        "positions or heights are wrong, or it comes from outside the scene"
+        f"pulses contain an echo {alone_db:.0f} dB above the median over the ranges of the scene, but {share}: times, "
+        "positions or heights are wrong, or the echo originates outside the scene"
     )
 
 
@@ -211,9 +213,9 @@ _LOBE_SAMPLES = 8  # samples of a response per range cell
 
 
 def _sidelobe_db(inputs: PhaseHistory | Profiles, cells: float) -> float:
-    """Return the sidelobe level relative to the peak at a distance in range cells, plus a margin; dB.
+    """Return the sidelobe level relative to the peak at a distance in range cells, plus a margin, dB.
 
-    For profiles, whose window is unknown, the level without a window is used: 1/(π·cells).
+    The window of profiles is unknown: the sidelobe level without a window, 1/(π·cells), is used.
     """
     if isinstance(inputs, Profiles):
         return float(20 * np.log10(1 / (np.pi * max(cells, 1.0)))) + _SIDELOBE_MARGIN_DB
@@ -225,7 +227,7 @@ def _sidelobe_db(inputs: PhaseHistory | Profiles, cells: float) -> float:
 
 
 def _gathered(points: Sequence[NDArray[np.complex128]], *, pixels: int) -> float:
-    """Return the summed power of points whose coherence exceeds the largest expected of random phases at any pixel."""
+    """Return the summed power of points with a coherence above the largest one expected for random phases."""
     return sum(
         abs(complex(terms.mean())) ** 2
         for terms in points
@@ -263,11 +265,11 @@ def _profiles(
 
 # ---- Joint focus of several pairs, to compare hypotheses
 
-_EVERY = 8  # number of points along a side of a patch from which bounds of its paths are computed
+_EVERY = 8  # number of points along a side of a patch, from which bounds of the total paths are computed
 
 
 def joint_peak_power(histories: Sequence[PhaseHistory], grid: SceneGrid, height_m: float) -> float:
-    """Return the peak power of the joint image of several pairs, relative to that of perfectly focused echoes.
+    """Return the peak power of the joint image of several pairs relative to that of perfectly focused echoes.
 
     Parameters
     ----------
@@ -281,8 +283,8 @@ def joint_peak_power(histories: Sequence[PhaseHistory], grid: SceneGrid, height_
     Returns
     -------
     float
-        0 to 1: mean of the incoherent and the coherent sum over pairs, relative to an echo that contains all the energy
-        of its pulses. Two hypotheses about the same recording are compared by the ratio of their values.
+        Value from 0 to 1: mean of the incoherent and the coherent sum over pairs, relative to an echo that contains all
+        the energy of the pulses. Two hypotheses about the same recording are compared by the ratio of these values.
 
     Raises
     ------
@@ -318,7 +320,8 @@ def joint_peak_power(histories: Sequence[PhaseHistory], grid: SceneGrid, height_
 def strongest_echo(history: PhaseHistory, grid: SceneGrid, height_m: float) -> float:
     """Return the mean amplitude of the strongest echo of a grid, relative to the root of the pulse energy.
 
-    It bounds the brightest pixel of a focused image of any geometry. Parameters as for `joint_peak_power`.
+    This value is an upper bound for the brightest pixel of an image focused with any geometry. Parameters as for
+    `joint_peak_power`.
     """
     window = _window(history, FlatGround(height_m).positions(grid))
     profiles = range_compress(history, grid, FlatGround(height_m), window=window)
@@ -339,27 +342,27 @@ def _window(history: PhaseHistory, places: NDArray[np.float64]) -> RangeWindow:
 
 
 def _echo_power(history: PhaseHistory) -> float:
-    """Return the power in a profile of an echo with all the energy of a pulse, averaged over the pulses."""
+    """Return the power in a range profile of an echo that contains all energy of a pulse, mean over the pulses."""
     power: NDArray[np.float64] = (np.abs(history.transfer) ** 2).astype(np.float64) @ history.weight
     return float(power.mean()) * float(history.weight.sum())
 
 
 # ---- Focus report of an image
 
-# side of the squares whose brightest maximum is evaluated: in resolution cells, and at least in pixels
+# side of the squares in which the brightest maximum is evaluated, resolution cells; and least side, pixels
 _SQUARE_CELLS, _LEAST_PX = 2.0, 4
 _PATCHES = 4  # number of patches imaged by subapertures, at the brightest points
 _PATCHES_APART = PART_PX / 2  # least distance of two patches, in patch pixels, for independent measurements
 _PLACES_PER_CELL = 2.5  # pixels of a patch per resolution cell, along a side
 _CELL_POINTS = 5  # points along a side of the scene at which the resolution cell is computed
 _BAND_SAMPLES = 9  # frequency samples of the spatial spectrum
-_UNEXPECTED_SIGMAS = 3.0  # standard deviations by which a loss must exceed the expected loss to be flagged
-_RESPONSE_OVERSAMPLING = 8.0  # oversampling of a pulse's response, which is interpolated linearly between samples
+_UNEXPECTED_SIGMAS = 3.0  # standard deviations by which a loss must exceed the expected loss to raise a flag
+_RESPONSE_OVERSAMPLING = 8.0  # oversampling of the response of a pulse, which is interpolated linearly between samples
 _WINDOWED = 0.62  # standard deviation of a Hann-windowed band relative to that of the unwindowed band
 
 
 def resolution_cell_m(formation: Formation) -> float:
-    """Return the finest resolution cell of the image's scene, metres."""
+    """Return the finest resolution cell of the image over the scene, metres."""
     profiles, grid = formation.profiles, formation.grid
     half = profiles.bandwidth_hz / 2
     pixels = grid.sample_pixels(_CELL_POINTS)
@@ -375,7 +378,7 @@ def _sector_of(formation: Formation) -> Weigh | None:
 
 
 def _response(formation: Formation) -> PointResponse:
-    """Return the point response of the image, for the sidelobes of a point at other points."""
+    """Return the point response of the image, from which the sidelobes of a point at other points are computed."""
     history, profiles = formation.history, formation.profiles
     if history is None:  # assume a full and flat band, like the planner
         count = 2 * profiles.samples.shape[1]
@@ -402,12 +405,12 @@ def _response(formation: Formation) -> PointResponse:
 def _shown(
     formation: Formation, response: PointResponse, pixel: NDArray[np.int64], others: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the response of a point at a pixel, evaluated at other pixels."""
+    """Return the response at other pixels of a point at a given pixel."""
     return response.at(formation.positions_at(*pixel), formation.positions_at(*others.T))
 
 
 def _spectrum(formation: Formation) -> NDArray[np.float64]:
-    """Return the covariance of a point's spatial spectrum at the scene centre, east and north."""
+    """Return the covariance of the spatial spectrum of a point at the scene centre, east and north."""
     profiles, grid = formation.profiles, formation.grid
     row, column = ((size - 1) / 2 for size in grid.shape)
     middle_m, axes = ground_axes(formation, row, column)
@@ -424,7 +427,7 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
     formation
         Formation of the image.
     target
-        (y, x) complex64, the image as written.
+        (y, x) complex64, the stored image.
 
     Notes
     -----
@@ -466,12 +469,12 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
 
 
 _CONJUGATED_LOSS_DB = -6.0  # loss beyond which the samples of a defocused image are tested for conjugation
-_CONJUGATED_DB = 10.0  # least gain in peak by conjugation; a track error does not cause such a gain
+_CONJUGATED_DB = 10.0  # least increase of the peak by conjugation, dB; a track error does not cause such an increase
 _CONJUGATED_S = 60.0  # longest predicted run time (s) of an image to which this test is applied
 
 
 def _conjugated(formation: Formation, peak: float) -> str | None:
-    """Detect conjugated samples by a much brighter peak in the image of their conjugates; one line, or None.
+    """Detect conjugated samples: return one line if the image of their conjugates has a much brighter peak, else None.
 
     Notes
     -----
@@ -491,14 +494,14 @@ def _conjugated(formation: Formation, peak: float) -> str | None:
     if gained_db < _CONJUGATED_DB:
         return None
     return (
-        f"with conjugated samples the brightest pixel is {min(gained_db, 99):.0f} dB brighter: I and Q are swapped, "
-        "or the phase convention is opposite; change waveform.iq between complex and conjugate, or the sign of "
-        "waveform.bandwidth_hz for real beat signals; from Python, conjugate the samples"
+        f"with conjugated samples, the brightest pixel is {min(gained_db, 99):.0f} dB brighter: I and Q are swapped, "
+        "or the opposite phase convention applies; change waveform.iq from complex to conjugate or vice versa, or the "
+        "sign of waveform.bandwidth_hz for real beat signals; in Python, conjugate the samples"
     )
 
 
 UNEXPECTED_DB = 0.2
-"""Least loss beyond the expected loss that is flagged, dB: the accuracy of the measured loss with many points."""
+"""Least loss in excess of the expected loss that raises a flag, dB: accuracy of the loss measured with many points."""
 
 
 def focus_flags(report: dict[str, Any], expected: Effect) -> Flags:
@@ -509,24 +512,26 @@ def focus_flags(report: dict[str, Any], expected: Effect) -> Flags:
     report
         Result of `focus_report`.
     expected
-        Expected effect of all causes in the error budget.
+        Expected effect of all error sources in the error budget.
 
     Notes
     -----
-    Source: docs/theory/focus.md, "Focus of a point". The standard deviation of the measured loss is estimated from its
-    points; that of the expected loss describes its variation between flights.
+    Source: docs/theory/focus.md, "Focus of a point". The standard deviation of the measured loss is estimated from the
+    points. The standard deviation of the expected loss describes the variation between flights.
     """
     flags = Flags({"echo_outside_scene": report["elsewhere"]} if "elsewhere" in report else {})
     budget = f"{abs(expected.loss_db):.1f} ± {expected.loss_std_db:.1f} dB expected from the error budget"
     if report["verdict"] == "defocused":
         flags["defocused"] = (
             f"{report['reason']}; {budget}: positions, lever arms, heights or times are less accurate than configured, "
-            "or their accuracy is not configured"
+            "or the accuracy of one of these is not configured"
         )
     elif "loss_db" in report:
         beyond_db = expected.loss_db - report["loss_db"]
         if beyond_db > max(UNEXPECTED_DB, _UNEXPECTED_SIGMAS * float(np.hypot(report["std_db"], expected.loss_std_db))):
-            flags["loss_unexpected"] = f"{report['reason']}; {budget}: an error source exceeds its entry in the budget"
+            flags["loss_unexpected"] = (
+                f"{report['reason']}; {budget}: an error source exceeds the value in the error budget"
+            )
     if "conjugated" in report:
         return Flags({name: f"{line}; {report['conjugated']}" for name, line in flags.items()})
     return flags

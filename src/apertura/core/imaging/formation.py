@@ -1,4 +1,4 @@
-"""Image formation: inputs, scene, antennas and plan of one image, shared by tiles, certificate and measures."""
+"""Image formation: inputs, scene, antennas and plan of one image, used by tiles, certificate and measures."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from dask.array.core import Array
 
 PULSES_READ = 1024
-"""Pulses read per block of a phase history, or of profiles at single points: limits memory."""
+"""Number of pulses read per block of a phase history, or of profiles at single points; limits the memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Formation:
     history
         Phase history; None if only profiles are available.
     profiles
-        The same data as range profiles, for the engines that use tables.
+        The same data as range profiles, for the engines that interpolate tables.
     grid
         Grid of the image.
     plan
@@ -78,7 +78,7 @@ class Formation:
 
     @cached_property
     def windows(self) -> list[Window]:
-        """Tiles that a pulse may illuminate, a full-sized one first if any; other tiles are zero and not computed."""
+        """Tiles that a pulse may illuminate, starting with a full-sized tile if any; other tiles remain zero."""
         tiles = self.tiles
         reach = Reach.of(self.beams, self.profiles.aperture, self.grid, self.plan.terrain, tiles)
         formed = [tile for tile, illuminated in zip(tiles, reach.illuminated, strict=True) if illuminated]
@@ -128,9 +128,9 @@ class Formation:
             return np.asarray(sum(blocks, np.zeros(len(points_m), np.complex128)) / self.count)
 
     def values(self, pixels: NDArray[np.int64]) -> tuple[NDArray[np.complex64], NDArray[np.float64]]:
-        """Return the planned image at (pixel, 2) rows and columns, computing only the pieces that contain them.
+        """Return the planned image at (pixel, 2) rows and columns, computing only the pieces that contain these pixels.
 
-        (pixel,) complex64, and mean |I|² over each pixel's piece, (pixel,) float64.
+        Returns (pixel,) complex64, and the mean |I|² over the piece of each pixel, (pixel,) float64.
         """
         windows = list(dict.fromkeys(self._piece(*pixel) for pixel in pixels.tolist()))
         images = self.image_of([(slice(*window[:2]), slice(*window[2:])) for window in windows])
@@ -142,7 +142,7 @@ class Formation:
         return values, power
 
     def _piece(self, row: int, column: int) -> tuple[int, int, int, int]:
-        """Return the row and column limits of the engine's piece that contains a pixel: first, end, first, end."""
+        """Return the limits of the engine's piece that contains a pixel: first and end row, first and end column."""
         tile = [
             (at // self.side_px * self.side_px, size) for at, size in zip((row, column), self.grid.shape, strict=True)
         ]
@@ -177,9 +177,10 @@ class Formation:
         return image
 
     def contributions(self, row: ArrayLike, column: ArrayLike) -> list[NDArray[np.complex128]]:
-        """Return for each fractional pixel the contributions of the pulses that illuminate it, (pulse,) complex128.
+        """Return the contributions of the illuminating pulses at each fractional pixel, (pulse,) complex128.
 
-        Computed by the sum over a history's subcarriers, or by band-limited interpolation of profiles.
+        Contributions are computed by the sum over the subcarriers of a history, or by band-limited interpolation of
+        profiles.
         """
         points_m = self.positions_at(np.atleast_1d(row), np.atleast_1d(column))
         terms_of: list[list[NDArray[np.complex128]]] = [[np.empty(0, np.complex128)] for _ in points_m]
@@ -194,7 +195,7 @@ class Formation:
     def illuminating_pulses(
         self, points_m: NDArray[np.float64]
     ) -> Iterator[tuple[slice, list[tuple[slice, NDArray[np.bool_]]]]]:
-        """Yield pulse blocks to read, each with sub-blocks that may illuminate points, and masks of these points.
+        """Yield pulse blocks to read, each with the sub-blocks that may illuminate points and masks of these points.
 
         Parameters
         ----------

@@ -25,7 +25,7 @@ def gradient(
     terrain: Terrain | float | None = None,
     beams: Beams | None = None,
 ) -> Gradient:
-    """Compute the gradient of a real objective J of an image with respect to phase centres and path of each pulse.
+    """Compute the gradient of a real image objective J with respect to the phase centres and the path of each pulse.
 
     Parameters
     ----------
@@ -34,9 +34,10 @@ def gradient(
     grid
         Pixels of the image, often only a patch of a grid, such as ``grid[40:60, 10:30]``.
     dj_dimage
-        (y, x) complex: G with J(I + dI) = J(I) + Re Σ conj(G)·dI, that is ∂J/∂Re I + j·∂J/∂Im I; for J = Σ|I|⁴ it is
-        4|I|²·I. PyTorch's gradient of a complex tensor is this G, JAX's is its conjugate. The image I is that of
-        `backproject` with integration='all': with the carrier phase, and divided by the number of pulses.
+        (y, x) complex, derivative G, defined by J(I + dI) = J(I) + Re Σ conj(G)·dI, that is, ∂J/∂Re I + j·∂J/∂Im I. For
+        J = Σ|I|⁴, G is 4|I|²·I. PyTorch's gradient of a complex tensor is G; JAX's gradient is the conjugate of G. The
+        image I is the result of `backproject` with integration='all': it has the carrier phase and is divided by the
+        number of pulses.
     terrain
         As for `backproject`.
     beams
@@ -45,25 +46,25 @@ def gradient(
     Returns
     -------
     Gradient
-        `tx_m` and `rx_m`, (pulse, 3), and `path_m`, (pulse,), in J's unit per metre. `path_m` refers to an extra path
-        common to all echoes of a pulse (`Profiles.moved`).
+        `tx_m` and `rx_m`, (pulse, 3), and `path_m`, (pulse,), in the unit of J per metre. `path_m` is the derivative
+        with respect to an extra path common to all echoes of a pulse (`Profiles.moved`).
 
     Raises
     ------
     CampaignError
-        If `profiles` are no range profiles (`range_compress` computes them from a phase history), `dj_dimage` does not
-        have the grid's shape, or a georeferenced grid has no terrain.
+        If `profiles` are not range profiles (`range_compress` computes them from a phase history), if the shape of
+        `dj_dimage` differs from that of the grid, or if no terrain is given for a georeferenced grid.
     ValueError
         If `dj_dimage` or a position on the terrain is not finite.
 
     Notes
     -----
     Source: docs/theory/autofocus.md, eq. 6 to 8: the exact derivative of the interpolated, rotated and summed samples.
-    Finite differences of images formed by `backproject` agree with the gradient within the error of their engine.
+    Finite differences of images formed by `backproject` agree with the gradient within the error of the engine.
 
     Examples
     --------
-    Sharpness J = Σ|I|⁴, with a logged receiver position that is 2 cm too high at one pulse.
+    Sharpness J = Σ|I|⁴, with a logged receiver position that is 2 cm too high at one pulse:
 
     >>> import apertura as ap
     >>> frequency = 1.2e9 + 1e6 * np.arange(256)
@@ -85,7 +86,7 @@ def gradient(
     if not isinstance(profiles, Profiles):
         found = f"an object of type {type(profiles).__name__}"
         expected = "Profiles, or the dataset of stage profile"
-        raise CampaignError(found, "profiles", expected, "Compute them from a phase history by range_compress.")
+        raise CampaignError(found, "profiles", expected, "Compute profiles from a phase history by range_compress.")
     try:
         slope = np.asarray(dj_dimage, np.complex128)
     except (TypeError, ValueError):
@@ -93,6 +94,7 @@ def gradient(
     if slope.shape != grid.shape:
         found = f"shape {slope.shape}" if slope.size else f"an object of type {type(dj_dimage).__name__}"
         expected = f"a complex array of the grid's shape, {grid.shape}"
-        raise CampaignError(found, "dj_dimage", expected, "Differentiate the objective by every pixel of this grid.")
+        remedy = "Differentiate the objective with respect to every pixel of this grid."
+        raise CampaignError(found, "dj_dimage", expected, remedy)
     places_m = ground.positions(grid).reshape(-1, 3)
     return path_gradient(profiles, places_m, slope.ravel() / len(profiles), beams=beams)

@@ -1,4 +1,4 @@
-"""The planner's job from the inputs of a pair and a scene, checked before planning."""
+"""Construction of the planner's job from a scene and the inputs of a pair, and checks before planning."""
 
 from functools import partial
 from typing import Any
@@ -27,25 +27,25 @@ from apertura.core.scene.terrain import FlatGround, GroundModels, Terrain
 _POINTS = 9  # sample points along a side of the scene
 _PULSES = 256  # pulses sampled for total paths
 _RADIO_HZ = (1e5, 1e12)  # accepted radio frequencies, wider than any radar band
-_USUAL_HZ = (1e7, 1e12)  # a frequency in a wrong unit is recognised if the converted value lies in this interval
+_USUAL_HZ = (1e7, 1e12)  # a wrong unit of frequencies is recognised if the converted values lie in this interval
 
 
 def check_inputs(inputs: PhaseHistory | Profiles, grid: SceneGrid, terrain: Terrain) -> dict[str, str]:
-    """Check inputs against a scene and return flags: exceeded limit → measured value, in one line.
+    """Check inputs against a scene and return flags: name of the exceeded limit → measured value, in one line.
 
     Parameters
     ----------
     inputs
-        Phase history or profiles, their phase centres in the frame of the pixels.
+        Phase history or profiles, with phase centres in the frame of the pixels.
     grid, terrain
         The scene.
 
     Raises
     ------
     CampaignError
-        If the grid's CRS is not suitable for a scene, frequencies are not radio frequencies, a weight is negative, a
-        position, delay, weight, sample or height is not finite, an antenna is below the terrain, all weights or samples
-        are zero, or the scene lies beyond the samples of all pulses.
+        If the CRS of the grid is not suitable for a scene; frequencies are not radio frequencies; a weight is negative;
+        a position, delay, weight, sample or height is not finite; an antenna is below the terrain; all weights or all
+        samples are zero; or the scene lies beyond the samples of all pulses.
     """
     if grid.crs != LOCAL:
         check_crs(grid.crs, grid.bounds_m)
@@ -60,25 +60,26 @@ def check_inputs(inputs: PhaseHistory | Profiles, grid: SceneGrid, terrain: Terr
             "heights of the terrain are not finite",
             where="backproject: terrain",
             expected="a height in metres at every pixel",
-            remedy="Fill the voids of the terrain model, or make the grid smaller.",
+            remedy="Fill the voids of the terrain model, or reduce the extent of the grid.",
         )
     outside = _outside(inputs, points)
     if outside == 1:
         raise CampaignError(
-            "the samples contain no echo of the scene: its total paths lie beyond them at every pulse",
+            "the samples contain no echo of the scene: at every pulse, the total paths to the scene lie beyond the "
+            "samples",
             where="backproject: grid",
             expected="phase centres and pixels in one frame, in metres, within the recorded range",
-            remedy="Check the grid's CRS and corner, the terrain's height, the frame of the positions, and that delays "
-            "are in seconds.",
+            remedy="Check the CRS and the corner of the grid, the height of the terrain, and the frame of the "
+            "positions, and that delays are in seconds.",
         )
     flags = check_antennas(grid, terrain, inputs.aperture, where="backproject")
     if outside:
-        flags["scene_beyond_samples"] = f"{100 * outside:.1f} % of the scene's total paths lie beyond the samples"
+        flags["scene_beyond_samples"] = f"{100 * outside:.1f} % of the total paths to the scene lie beyond the samples"
     return flags
 
 
 def _check_band(inputs: PhaseHistory | Profiles) -> None:
-    """Raise CampaignError unless frequencies are radio frequencies, and weights and delays are finite."""
+    """Raise CampaignError if frequencies are not radio frequencies, or if a weight or delay is not finite."""
     if isinstance(inputs, Profiles):
         frequency, name = np.array([inputs.centre_frequency_hz]), "centre_frequency_hz"
         finite = {"start_m": inputs.start_m}
@@ -112,7 +113,7 @@ def _check_band(inputs: PhaseHistory | Profiles) -> None:
         raise CampaignError(
             f"{inputs.weight.min():.6g} to {inputs.weight.max():.6g}",
             where="backproject: weight",
-            expected="a window over the subcarriers: no negative weight, at least one above 0",
+            expected="a window over the subcarriers: no negative weights, and at least one positive weight",
             remedy="Use window='hann', or correct the weights.",
         )
 
@@ -132,12 +133,12 @@ def _check_samples(inputs: PhaseHistory | Profiles) -> None:
 
 
 _LEAST_BAND = 0.05
-"""Least share of subcarriers that contain a pulse's energy: an echo fills the band in frequency, but few samples in
-time."""
+"""Least fraction of subcarriers that contain the energy of a pulse: in frequency, an echo occupies the whole band; in
+time, it occupies few samples."""
 
 
 def _check_spectrum(history: PhaseHistory) -> None:
-    """Raise CampaignError if samples appear to be in the time domain: few of them contain a pulse's energy."""
+    """Raise CampaignError if samples appear to be in the time domain: few samples contain the energy of a pulse."""
     transfer = np.asarray(history[history.aperture.sample(_PULSES)].transfer)
     power = np.abs(transfer).astype(np.float64) ** 2
     total = power.sum(axis=1)
@@ -153,9 +154,10 @@ def _check_spectrum(history: PhaseHistory) -> None:
 
 
 def _outside(inputs: PhaseHistory | Profiles, points: np.ndarray) -> float:
-    """Return the share of total paths, from sampled pulses to sampled points, that lie beyond the samples.
+    """Return the fraction of total paths, from sampled pulses to sampled points, that lie beyond the samples.
 
-    A phase history has the period c/Δf; total paths that differ from its reference by more than that lie beyond it.
+    A phase history has the period c/Δf: a total path lies beyond the samples if it differs from the reference of the
+    history by more than this period.
     """
     sampled = inputs[inputs.aperture.sample(_PULSES)]
     path_m = sampled.aperture.path(points)
@@ -167,9 +169,9 @@ def _outside(inputs: PhaseHistory | Profiles, points: np.ndarray) -> float:
     return float(((at < 0) | (at > sampled.samples.shape[1] - 1)).mean())
 
 
-# ---- The planner's job of a pair and a scene
+# ---- Planner's job for a pair and a scene
 
-_PATCH_PX = 256  # side of the windows at whose pixels the engines' errors are predicted
+_PATCH_PX = 256  # side of the windows at the pixels of which the errors of the engines are predicted
 
 
 def decide_integration(
@@ -181,12 +183,12 @@ def decide_integration(
     antennas: Beams | None = None,
     requested: Any = "auto",
 ) -> Integration:
-    """Decide the integration of a scene's pixels: the sector of the flight that contributes to them.
+    """Decide the integration of the pixels of a scene: the sector of the flight that contributes to each pixel.
 
     Parameters
     ----------
     aperture, centre_hz
-        Phase centres in the frame of the pixels; middle of the band.
+        Phase centres in the frame of the pixels; centre frequency of the band.
     grid, level
         The scene, on level ground.
     antennas, requested
@@ -228,7 +230,8 @@ def imaging_job(
     Returns
     -------
     Job
-        Without limits of path and memory, and with default tiles and threads; the caller replaces these.
+        Job without limits of path and memory, and with default numbers of tile pixels and threads. The caller sets
+        these values.
     """
     centre, count = centre_frequency(frequency_hz), len(frequency_hz)
     ground_m = grid.sample_points(_POINTS, ground.level.height_m)
@@ -255,12 +258,12 @@ def imaging_job(
 def profiles_job(
     profiles: Profiles, grid: SceneGrid, ground: GroundModels, *, beams: Beams | None = None, integration: Any = "auto"
 ) -> Job:
-    """Return the planner's job for range profiles alone; their band is assumed full and flat.
+    """Return the planner's job for range profiles without a phase history; the band is assumed full and flat.
 
     Parameters
     ----------
     profiles
-        In the frame of the pixels.
+        Range profiles, with phase centres in the frame of the pixels.
     grid, ground, beams, integration
         As for `imaging_job`.
     """
@@ -286,7 +289,7 @@ def profiles_job(
 
 
 def _patches(grid: SceneGrid, ground: Terrain) -> tuple[NDArray[np.float64], ...]:
-    """Return the positions of the pixels of windows in the corners and at the centre of a scene."""
+    """Return the pixel positions of windows in the corners and at the centre of a scene."""
     sides = [min(_PATCH_PX, size) for size in grid.shape]
     ends = [(0, (size - side) // 2, size - side) for size, side in zip(grid.shape, sides, strict=True)]
     corners = {(ends[0][row], ends[1][column]) for row, column in ((0, 0), (0, 2), (1, 1), (2, 0), (2, 2))}

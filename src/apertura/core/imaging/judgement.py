@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _CM = 1e-2
-# assumed duration of an aperture without times; the correlation time of position errors, one second, is a tenth of it
+# assumed duration of an aperture without times: ten times the correlation time of position errors, one second
 _APERTURE_S = 10.0
 
 
@@ -45,7 +45,7 @@ class Judgement:
     ----------
     verdict
         'focused', 'defocused' or 'inconclusive' (not observable).
-    why
+    reason
         Reason for the verdict, one line.
     flags
         Exceeded limit → measured value, as listed in docs/flags.md.
@@ -64,22 +64,22 @@ class Judgement:
 
 
 def judgement(formation: Formation, target: Any, lines: Sequence[BudgetLine]) -> Judgement:
-    """Assess an image: common implementation of the step `image` of a campaign and of `judge`.
+    """Assess an image: implementation shared by the step `image` of a campaign and by `judge`.
 
     Parameters
     ----------
     formation
         Formation of the image.
     target
-        (y, x) complex64, the image; read by blocks.
+        (y, x) complex64, the image, which is read by blocks.
     lines
-        Its error budget.
+        Error budget of the image.
     """
     focus, effect = focus_report(formation, target), expected(lines)
     focus |= {"expected_db": round(effect.loss_db, 3), "expected_std_db": round(effect.loss_std_db, 3)}
     focus |= {"expected_shift_m": round(effect.shift_m, 3)}
     still = formation.plan.flags.get("no_aperture")
-    if still:  # the image resolves range only: focus measures of points are meaningless
+    if still:  # the image has range resolution only: focus measures of points are meaningless
         focus = {key: value for key, value in focus.items() if key not in {"loss_db", "std_db", "elsewhere", "points"}}
         focus |= {"verdict": "inconclusive", "reason": f"no aperture: {still}", "points": []}
     flags = Flags.merged(antenna_flags(lines), {} if still else focus_flags(focus, effect))
@@ -90,13 +90,13 @@ def judgement(formation: Formation, target: Any, lines: Sequence[BudgetLine]) ->
 def judge(
     image: "xr.DataArray", *, position_std_m: float | None = None, time_s: NDArray[np.float64] | None = None
 ) -> Judgement:
-    """Assess the quality of an image of `backproject` without ground truth; computes the whole image.
+    """Assess the quality of an image of `backproject` without ground truth; the whole image is computed.
 
     Parameters
     ----------
     image
-        Result of `apertura.backproject`, still lazy: its graph contains the echoes, the phase centres and the terrain.
-        For a lazy selection or function of it, the whole image is assessed.
+        Lazy result of `apertura.backproject`; the graph of the array contains the echoes, the phase centres and the
+        terrain. For a lazy selection or function of this image, the whole image is assessed.
     position_std_m
         Standard deviation of the phase centres in each axis, metres, from which the expected loss is computed
         (default: not stated; no loss is expected).
@@ -106,13 +106,13 @@ def judge(
     Returns
     -------
     Judgement
-        verdict, why, flags, budget and focus.
+        Verdict, reason, flags, budget and focus.
 
     Raises
     ------
     CampaignError
-        If the graph of the array contains no image of `backproject`, or several; or position_std_m is given without
-        times.
+        If the graph of the array contains no image of `backproject` or several images, or if position_std_m is given
+        without time_s.
 
     Notes
     -----
@@ -199,11 +199,11 @@ _OTHER_N = 20.0
 
 
 def _air_line(paths: PointPaths, wave_speed_m_s: float) -> BudgetLine:
-    """Return the budget line of the atmosphere: neglected refractivity, or its deviation from the assumed one."""
+    """Return the budget line of the atmosphere: neglected refractivity, or deviation from the assumed refractivity."""
     in_vacuum = math.isclose(wave_speed_m_s, SPEED_OF_LIGHT_M_S, rel_tol=1e-9)
     units = USUAL_N if in_vacuum else _OTHER_N
     path_m = sum(np.linalg.norm(leg - paths.point_m, axis=1) for leg in paths.aperture.legs)
-    unit = f"air of N = {units:.0f}, with vacuum assumed" if in_vacuum else f"{units:.0f} N units"
+    unit = f"a refractivity of {units:.0f} N units, with vacuum assumed" if in_vacuum else f"{units:.0f} N units"
     return BudgetLine("atmosphere", None, paths.of_offset(1e-6 * units * path_m, common=True), unit=unit)
 
 
@@ -219,7 +219,7 @@ def _formation_of(image: Any) -> Formation:
             else f"an object of type {type(image).__name__} without an image",
             where="judge",
             expected="one image of apertura.backproject, not yet computed",
-            remedy="Judge the lazy image returned by backproject, then compute it.",
+            remedy="Pass the lazy image returned by backproject to judge before computing it.",
         )
     formation: Formation = formations[0]
     return formation

@@ -15,18 +15,18 @@ LAGS_PX = 32
 """Largest lag of the speckle correlation, pixels: a resolution cell is 2 to 4 pixels wide, and the correlation vanishes
 within ten cells."""
 
-_MEASURED_PX = 128  # side of the blocks for the correlation: at least 96² pixel pairs at each lag
-_MEASURED_WINDOWS = 3  # least number of windows of the local ENL along a block
-_LARGEST_PX = 4096  # largest side of a block; with wider windows the ENL is not estimated
-_MEASURED_BLOCKS, _MOST_PX = 64, 1 << 24  # largest number of blocks, and approximate largest number of their pixels
+_MEASURED_PX = 128  # side of the blocks used for the correlation: at least 96² pixel pairs at each lag
+_MEASURED_WINDOWS = 3  # least number of windows of the local ENL along a side of a block
+_LARGEST_PX = 4096  # largest side of a block; the ENL is not estimated if windows are wider
+_MEASURED_BLOCKS, _MOST_PX = 64, 1 << 24  # largest number of blocks, and approximate largest total number of pixels
 WINDOW = 7
-"""Side of the window of the filter and of the local ENL, pixels of the multilooked raster, as in Lee (1980)."""
+"""Side of the window for filter and local ENL, in pixels of the multilooked raster, as in Lee (1980)."""
 
-_PARTS = 4  # subdivisions of a block per axis, for the variation of the look direction across it
+_PARTS = 4  # subdivisions of a block per axis, which model the variation of the look direction across the block
 # |ρ|² at large lags above which a block is excluded: blocks of two resolution cells, or a constant image
 _MOST_CHANCE = 0.5
-_FEWEST_PX = 10  # least side of a block: a smaller block has only lags close to zero
-_STEP, _SCATTER = 0.02, 0.2  # of ln(ENL): histogram bin, and standard deviation of a local estimate, for smoothing
+_FEWEST_PX = 10  # least side of a block: a smaller block contains only lags close to zero
+_STEP, _SCATTER = 0.02, 0.2  # histogram bin, and standard deviation of a local estimate for smoothing, of ln(ENL)
 
 
 def block_means(values: Floats, side: int) -> Floats:
@@ -37,13 +37,13 @@ def block_means(values: Floats, side: int) -> Floats:
     values
         (row, column) real; NaN is excluded.
     side
-        Side of a block, pixels. The value of a block that extends beyond the image is the mean of its pixels inside the
+        Side of a block, pixels. If a block extends beyond the image, its value is the mean of the pixels inside the
         image.
 
     Returns
     -------
     ndarray
-        (block row, block column) float64, NaN where fewer than half of a block's pixels are valid.
+        (block row, block column) float64, NaN where fewer than half of the pixels of a block are valid.
 
     Examples
     --------
@@ -68,7 +68,7 @@ class Speckle:
     ----------
     correlation
         (2·lags + 1, 2·lags + 1) float64, |ρ|² over lags of rows and columns up to ±`LAGS_PX`, with ρ the correlation of
-        complex pixels; for fully developed speckle it equals the correlation of their powers.
+        complex pixels. For fully developed speckle, |ρ|² equals the correlation of the pixel powers.
 
     Notes
     -----
@@ -84,13 +84,13 @@ class Speckle:
         Parameters
         ----------
         blocks
-            (row, column) complex64 each, of one shape; blocks with fewer than half valid (not NaN) pixels, or without
-            power, are excluded.
+            (row, column) complex64 each, of equal shape. Blocks are excluded if fewer than half of the pixels are valid
+            (not NaN), or if all pixels are zero.
 
         Raises
         ------
         ValueError
-            If no valid block is large enough, or the correlation does not decay within the blocks.
+            If no valid block is large enough, or if the correlation does not decay within the blocks.
 
         Examples
         --------
@@ -108,7 +108,7 @@ class Speckle:
         corner = slice(0, len(middle) // 4)
         floor = np.median(middle[corner, corner])  # bias of |ρ|² from a finite number of pixels
         if floor > _MOST_CHANCE:
-            raise ValueError(f"the correlation of the image's pixels is {floor:.2f} even at large lags")
+            raise ValueError(f"the correlation between pixels of the image is {floor:.2f} even at large lags")
         return cls(np.maximum(middle - floor, 0.0) / (1 - floor))
 
     @property
@@ -117,7 +117,7 @@ class Speckle:
         return float(self.correlation.sum())
 
     def looks(self, side: int) -> float:
-        """Return the equivalent number of looks of the mean power of a square of pixels.
+        """Return the equivalent number of looks of the mean power over a square of pixels.
 
         Parameters
         ----------
@@ -130,7 +130,7 @@ class Speckle:
 
 
 def _flattened(block: NDArray[Any], parts: int) -> NDArray[Any]:
-    """Return a block without its quadratic phase, fitted to the phase gradients in parts × parts of the block."""
+    """Return a block without its quadratic phase, which is fitted to phase gradients in parts × parts subdivisions."""
     places = [np.arange(size) - (size - 1) / 2 for size in block.shape]
     rows, columns = np.meshgrid(*places, indexing="ij")
     equations, gradients, weights = list[list[float]](), list[float](), list[float]()
@@ -149,7 +149,7 @@ def _flattened(block: NDArray[Any], parts: int) -> NDArray[Any]:
 
 
 def _squared_correlation(block: NDArray[np.complex64]) -> Floats:
-    """Return |ρ|² of a block, averaged at each lag over its pixel pairs."""
+    """Return |ρ|² of a block; at each lag, ρ is averaged over all pixel pairs."""
     lags = min(LAGS_PX, min(block.shape) // 2 - 1)
     rows, columns = (slice(size - lags, size + lags + 1) for size in block.shape)
     known = np.isfinite(block)
@@ -164,7 +164,7 @@ def _squared_correlation(block: NDArray[np.complex64]) -> Floats:
 
 
 def _local(power: Floats, within: float) -> tuple[Floats, Floats]:
-    """Return the mean over the window about each pixel, and variance over squared mean (eq. 4); NaN is excluded."""
+    """Return mean, and variance divided by squared mean (eq. 4), over the window about each pixel; NaN is excluded."""
     from scipy.ndimage import correlate1d
 
     def summed(
@@ -195,7 +195,7 @@ def found_looks(rasters: Iterable[Floats], within: float) -> float:
     Returns
     -------
     float
-        NaN if no block is as large as a window.
+        Number of looks; NaN if all blocks are smaller than a window.
 
     Notes
     -----
@@ -227,7 +227,7 @@ def lee(power: Floats, *, looks: float, within: float) -> Floats:
     Parameters
     ----------
     power
-        (row, column) float64, multilooked power, noise included; NaN is excluded and preserved.
+        (row, column) float64, multilooked power, including noise. NaN is excluded from the statistics and preserved.
     looks
         Equivalent number of looks of a pixel.
     within
@@ -236,7 +236,7 @@ def lee(power: Floats, *, looks: float, within: float) -> Floats:
     Returns
     -------
     ndarray
-        (row, column) float64.
+        (row, column) float64, filtered power.
 
     Notes
     -----
@@ -269,12 +269,12 @@ class Multilook:
     side
         Side of a square, pixels.
     noise
-        Window of pixels → (row, column) float64, mean noise power, which is subtracted; None: not subtracted.
+        Window of pixels → (row, column) float64, mean noise power, which is subtracted; None: noise is not subtracted.
     filtered
-        True if speckle is filtered, before noise is subtracted; False if the number of looks is unknown.
+        True if speckle is filtered before noise is subtracted; False if the number of looks is unknown.
     looks, within, found
-        Equivalent numbers of looks: of a square and of the filter's window, both computed from the speckle correlation;
-        and of a square of homogeneous terrain, measured. NaN if the image has too few valid pixels.
+        Equivalent numbers of looks of a square, and of the filter window, both computed from the speckle correlation;
+        and number of looks of a square measured on homogeneous terrain. NaN if the image has too few valid pixels.
     """
 
     image: Callable[[Window], NDArray[np.complex64]]
@@ -296,7 +296,7 @@ class Multilook:
         noise: Callable[[Window], Floats] | None = None,
         filtered: bool = False,
     ) -> "Multilook":
-        """Create the multilooked power of an image, with its number of looks measured in randomly placed blocks.
+        """Create the multilooked power of an image; the number of looks is measured in randomly placed blocks.
 
         Parameters
         ----------
@@ -327,12 +327,12 @@ class Multilook:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of squares; the last of each may extend beyond the image."""
+        """Rows and columns of squares; squares of the last row and column may extend beyond the image."""
         rows, columns = (-(-size // self.side) for size in self.pixels)
         return rows, columns
 
     def mean(self, window: Window) -> Floats:
-        """Return the mean power in a window of squares, (row, column) float64; NaN where fewer than half are valid."""
+        """Return the mean power in a window of squares, (row, column) float64; NaN if most pixels are invalid."""
         margin = WINDOW // 2 if self.filtered else 0
         rows, columns = (
             slice(max(0, part.start - margin), min(size, part.stop + margin))
@@ -351,7 +351,7 @@ class Multilook:
         return np.asarray(self._parts(window)[1])
 
     def _parts(self, window: Window) -> Floats:
-        """Return power and noise in a window of squares, read in parts no larger than a tile or a square."""
+        """Return power and noise in a window of squares; the image is read in parts of at most a tile or a square."""
         step, (rows, columns) = max(1, BLOCK_PX // self.side), window
         values = np.zeros((2, rows.stop - rows.start, columns.stop - columns.start))
         for row in range(rows.start, rows.stop, step):

@@ -1,4 +1,4 @@
-"""Noise power of a pulse, measured at Doppler frequencies outside the scene's, and the noise added by a sidelink."""
+"""Noise power of a pulse, measured outside the Doppler band of the scene, and noise added by a sidelink."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -18,24 +18,24 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain
 
 _PLACES, _BLOCKS = 64, 8
-"""Number of random points, and largest number of 64-pulse blocks, at which the noise is measured."""
+"""Number of random points at which the noise is measured, and largest number of 64-pulse blocks used."""
 
 _MARGIN, _BAND = 2.0, (0.25, 0.4375)
-"""Excluded Doppler band: twice the scene's band, to cover echoes from its surroundings; limits of the band in cycles
-per pulse."""
+"""Width of the excluded Doppler band relative to that of the scene, such that echoes from the surroundings are
+excluded; and limits of the excluded band, cycles per pulse."""
 
 _LEAKED_DB = 0.6
-"""Increase (dB) of the measured noise by echoes outside the scene if the PRF is too low for that margin: +0.1 to +0.6
-dB in images of five flights at a PRF of 40 Hz with a Doppler bandwidth of 18 Hz."""
+"""Increase (dB) of the measured noise by echoes outside the scene if the PRF is too low for the margin of the excluded
+band: +0.1 to +0.6 dB in images of five flights at a PRF of 40 Hz with a Doppler bandwidth of 18 Hz."""
 
 _LEAK = 1e-5
-"""Largest share of a taper's energy within the excluded band."""
+"""Largest fraction of the energy of a taper within the excluded band."""
 
-# number of groups for which sidelink noise is drawn, and pulses per group, for which one geometry is assumed
+# number of groups for which sidelink noise is drawn, and pulses per group, within which the geometry is constant
 _GROUPS, _ALIKE = 16, 8
 _BLOCKS_DRAWN = 16  # random draws per group
 _FEWEST = 16  # least number of pulses in a block
-_LEAST_WEIGHT = 0.1  # least weight of a block at a point, relative to the largest; points below it are excluded
+_LEAST_WEIGHT = 0.1  # least weight of a block at a point, relative to the largest weight; lower weights are excluded
 
 
 def noise_places(grid: SceneGrid, terrain: Terrain) -> NDArray[np.float64]:
@@ -63,20 +63,20 @@ def noise_power(
     Parameters
     ----------
     profiles
-        Profiles of all pulses; a sample is read.
+        Profiles of all pulses; only a sample of the pulses is read.
     places_m
-        (point, 3) float64, metres: distributed over the scene.
+        (point, 3) float64, metres, distributed over the scene.
     time_s
-        (pulse,) float64, seconds, from which missing pulses are detected (default: no pulse is missing).
+        (pulse,) float64, seconds, for the detection of missing pulses (default: no pulse is missing).
     beams
         Weights of the pulses.
 
     Returns
     -------
     PulseNoise
-        NaN if no block illuminates a point. An upper bound if the PRF is so low that echoes of every other pulse alias.
-        If twice the scene's Doppler band fills the whole band, the standard deviation includes the effect of echoes
-        from outside the scene.
+        NaN if no block illuminates a point. The power is an upper bound if the phase rates of the scene spread over
+        more than half a cycle per pulse, so that echoes alias into the measured band. If the excluded band reaches its
+        upper limit, the standard deviation includes the effect of echoes from outside the scene.
 
     Notes
     -----
@@ -124,7 +124,7 @@ def _numbers(block: slice, time_s: NDArray[np.float64] | None) -> NDArray[np.flo
 def _tapers(number: tuple[float, ...], band: float) -> NDArray[np.float64]:
     """Return tapers over pulses, (taper, pulse) float64 of norm 1, that suppress |f| < band (cycles per pulse).
 
-    At least one taper is returned: that with the least leakage.
+    At least one taper is returned, the one with the least leakage.
     """
     leak, taper = np.linalg.eigh(2 * band * np.sinc(2 * band * np.subtract.outer(number, number)))
     return np.asarray(taper[:, leak <= max(_LEAK, float(leak[0]))].T)
@@ -145,11 +145,11 @@ def sidelink_noise(
     Parameters
     ----------
     history
-        Corrected transfer functions, noise included; a sample is read.
+        Corrected transfer functions, including noise; only a sample of the pulses is read.
     grid, terrain
         The scene.
     places_m, beams
-        As for `noise_power`, which measures this noise together with all other noise.
+        As for `noise_power`, whose result includes this noise.
     method
         Correction method, a key of `apertura.core.echo.sidelink.METHODS`.
     snr_db
@@ -157,8 +157,8 @@ def sidelink_noise(
 
     Notes
     -----
-    Source: docs/theory/radiometry.md, eq. 8a. Simulated noise passes through the correction itself, so that the share
-    and the range distribution that each method retains are included.
+    Source: docs/theory/radiometry.md, eq. 8a. Simulated noise is processed by the correction method itself: the result
+    accounts for the fraction of the noise that the method retains, and for its distribution over range.
     """
     starts = np.unique(np.linspace(0, max(0, len(history) - _ALIKE), _GROUPS).astype(int)).tolist()
     groups, generator = [slice(first, min(first + _ALIKE, len(history))) for first in starts], np.random.default_rng(0)

@@ -20,7 +20,7 @@ class IntegrationResolution(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    resolution_m: float = Field(gt=0, description="resolution along the flight that the angle shall give, m")
+    resolution_m: float = Field(gt=0, description="required resolution along the flight, m")
 
 
 PLANNED = ("engine", "engine_options", "presum", "pulse_blocks", "terrain")
@@ -46,8 +46,8 @@ class ImagingChoices(BaseModel):
     window: Literal["hann", "none"] = Field("hann", description="weighting over the subcarriers")
     accuracy_db: Annotated[float, Field(le=-10, ge=-120)] | Literal["auto"] = Field(
         "auto",
-        description="requested numerical error of the image, dB; auto: 10 dB below the largest other error, between "
-        "-40 and -60",
+        description="requested numerical error of the image, dB; auto: 10 dB below the largest other error, limited to "
+        "-60 … -40 dB",
     )
     engine: str = Field(
         "auto",
@@ -66,16 +66,16 @@ class ImagingChoices(BaseModel):
     )
     pulse_blocks: Annotated[int, Field(ge=1, le=1024)] | Literal["auto"] = Field(
         "auto",
-        description="number of pulse blocks that are processed one after the other, to limit memory; 1: all pulses "
+        description="number of pulse blocks that are processed one after the other to limit memory use; 1: all pulses "
         "at once",
     )
     integration: Literal["auto", "all"] | IntegrationAngle | IntegrationResolution = Field(
         "auto",
-        description="integration angle of a pixel: auto (as much as the pixel spacing can represent), all, "
-        "{degrees: x} of a straight pass, or {resolution_m: x} along the track",
+        description="integration angle of a pixel: auto (the finest resolution that the pixel spacing can represent), "
+        "all (all pulses), {degrees: x} of a straight pass, or {resolution_m: x} along the track",
     )
     terrain: Literal["auto", "plane", "tilted_plane", "dem"] = Field(
-        "auto", description="terrain model; auto: the simplest that preserves focus and position"
+        "auto", description="terrain model; auto: the simplest model that preserves focus and position"
     )
 
     @property
@@ -106,5 +106,6 @@ class ImagingChoices(BaseModel):
                 first = error.errors()[0]
                 known = ", ".join(load_engine(name).Options.model_fields) or "none"
                 option = ".".join(map(str, first["loc"]))
-                raise ValueError(f"engine_options.{name}.{option}: {first['msg']} (its options: {known})") from error
+                line = f"engine_options.{name}.{option}: {first['msg']} (options of {name}: {known})"
+                raise ValueError(line) from error
         return self

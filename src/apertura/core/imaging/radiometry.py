@@ -22,23 +22,23 @@ Quantity = Literal["sigma0", "beta0", "gamma0"]
 # ---- Radio link of a pair: from radar cross-section to recorded samples
 
 MOST_DBM = 90.0
-"""Largest accepted transmit power, dBm: above one megawatt a wrong unit is assumed."""
+"""Largest accepted transmit power, dBm: values above one megawatt are attributed to a wrong unit."""
 
 
 @dataclass(frozen=True)
 class Link:
-    """Link budget of a pair: from the radar cross-section of a target to the recorded samples.
+    """Link budget of a pair, from the radar cross-section of a target to the recorded samples.
 
     Attributes
     ----------
     transmit_power_dbm
         Mean power of the signal during transmission, at the port of the transmitting antenna.
     transmit_gain_dbi, receive_gain_dbi
-        Peak gains of the antennas; patterns are relative to them.
+        Peak gains of the antennas, to which the patterns are relative.
     receiver_gain_db
         Gain from the port of the receiving antenna to the ADC.
     full_scale_dbm
-        Power at the ADC of a complex sine whose |I + jQ| is `full_scale_counts`.
+        Power at the ADC of a complex sinusoid with |I + jQ| = `full_scale_counts`.
     full_scale_counts
         Full-scale amplitude in recorded samples.
 
@@ -66,7 +66,7 @@ class Link:
 
     @property
     def counts_w(self) -> float:
-        """|y|² of recorded samples per watt at the receiving antenna's port."""
+        """|y|² of recorded samples per watt at the port of the receiving antenna."""
         return self.full_scale_counts**2 * 10 ** ((self.receiver_gain_db - self.full_scale_dbm + 30) / 10)
 
     def constant(self, *, wavelength_m: float, sent_power: float) -> float:
@@ -77,7 +77,8 @@ class Link:
         wavelength_m
             Wavelength at band centre.
         sent_power
-            Mean |s|² of the transmitted signal in the units by which echoes are divided: Σ|c_n|² of an OFDM symbol.
+            Mean |s|² of the transmitted signal, in the units of the signal by which echoes are divided: Σ|c_n|² for an
+            OFDM symbol.
 
         Raises
         ------
@@ -91,12 +92,12 @@ class Link:
         return 10 ** (sent_dbw / 10) * wavelength_m**2 / (4 * np.pi) ** 3 * self.counts_w / sent_power
 
     def pulse_noise(self, noise_figure_db: float, *, spacing_hz: float, squares: float) -> float:
-        """Return the power of thermal noise in a range profile, kT₀F over the DFT's bins: eq. 8.
+        """Return the power of thermal noise in a range profile, kT₀F over the DFT bins (eq. 8).
 
         Parameters
         ----------
         noise_figure_db
-            Noise figure of the receiver, referred to the antenna's port.
+            Noise figure of the receiver, referred to the port of the antenna.
         spacing_hz
             Δf, bandwidth of a bin.
         squares
@@ -109,7 +110,7 @@ class Link:
 def cell_constant(frequency_hz: Floats, weight: Floats) -> float:
     """Return c²/Δf · Σ w_n²/f_n, m²: contribution of the band to the area of a resolution cell (eq. 5).
 
-    It is λ·c/B for a flat band without window.
+    For a flat band without a window, this value is λ·c/B.
 
     Parameters
     ----------
@@ -127,17 +128,17 @@ def cell_constant(frequency_hz: Floats, weight: Floats) -> float:
 
 
 Turn = tuple[Floats, tuple[bool, bool]]
-"""Attitude error: rotation vector (3,), rad, and two booleans: applies to the transmitting antenna, to the receiving
-one."""
+"""Attitude error: rotation vector (3,), rad, and two booleans, which are true if the error applies to the transmitting
+and to the receiving antenna, respectively."""
 
 
 def pointing_std_db(beams: Beams | None, aperture: Aperture, place_m: Floats, turns: Sequence[Turn]) -> float:
-    """Return the standard deviation of a point's power caused by mispointed beams, from attitude errors.
+    """Return the standard deviation of the power of a point due to beam mispointing by attitude errors.
 
     Parameters
     ----------
     beams, aperture
-        Weights used in image formation, and all pulses.
+        Weights used in image formation; and phase centres of all pulses.
     place_m
         (3,) float64, point of the scene, metres, in the frame of the aperture.
     turns
@@ -177,26 +178,26 @@ def pointing_std_db(beams: Beams | None, aperture: Aperture, place_m: Floats, tu
 # ---- Calibration of an image, on a lattice
 
 _RANGE_SHARE = 24  # node pitch is range / 24: interpolation error of log gain and area 0.1 dB in a beam of 20°
-_PULSES = 128  # at least this number of pulses, at most twice as many, are summed for a block of the lattice
+_PULSES = 128  # least number of pulses summed for a block of the lattice; the largest number is twice this number
 _POINT_PULSES = 8192  # the same limit for a single point
 _BINS = 32  # bins of the pulse density over spatial frequency, whose square is integrated
 _LEAST = 1e-3  # weight relative to the strongest pulse, below which a pulse does not extend the aperture
-# n·n_s below which σ⁰ is NaN: there, a slope error of 1° causes an error of 0.7 dB; n·n_s = 0 is the onset of layover
+# n·n_s below which σ⁰ is NaN: a slope error of 1° then causes an error of 0.7 dB; n·n_s = 0 is the onset of layover
 _STEEPEST = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Radiometric calibration of an image: pixel power to radar cross-section and backscattering coefficients.
+    """Radiometric calibration of an image: conversion of pixel power to cross-section and backscattering coefficients.
 
     Attributes
     ----------
     grid, terrain
         The scene.
     aperture, beams
-        All pulses, and their weights in image formation: antennas and sector.
+        Phase centres of all pulses, and weights of the pulses in image formation (antennas and sector).
     count
-        M, divisor of the image's sum.
+        M, by which the sum over pulses is divided.
     constant
         K of eq. 2, configured or measured.
     cell_m2
@@ -204,13 +205,13 @@ class Calibration:
     lattice
         Nodes at which the following arrays are computed.
     gain, area_m2, noise
-        (node row, node column) float64: ln A² (eq. 3), ln of the cell's area on level ground (eq. 5), and ln Σw²/M² of
-        the pixel's noise; -inf where no pulse illuminates the node.
+        (node row, node column) float64: ln A² (eq. 3), ln of the resolution cell area on level ground (eq. 5), and
+        ln Σw²/M² of the pixel noise; -inf where no pulse illuminates the node.
     directions
-        (node row, node column, 3, 3) float64, unit vectors: up, normal of the slant plane, towards the bisector of
-        both antennas.
+        (node row, node column, 3, 3) float64, unit vectors: vertical, normal of the slant plane, and bisector of the
+        directions to both antennas.
     across
-        (node row, node column) float64, sine of the incidence across the track: 0 at nadir.
+        (node row, node column) float64, sine of the incidence angle across the track: 0 at nadir.
 
     Notes
     -----
@@ -249,7 +250,8 @@ class Calibration:
         Parameters
         ----------
         grid, terrain, aperture, beams, constant, cell_m2, count
-            As for `Calibration`; positions in the grid's processing frame; `count` defaults to the number of pulses.
+            As for `Calibration`, with positions in the processing frame of the grid (default of `count`: number of
+            pulses).
         threads
             Number of lattice blocks computed concurrently.
 
@@ -324,14 +326,14 @@ class Calibration:
         return self.constant * parts.sum(axis=0) ** 2, noise
 
     def _between(self, logarithms: Floats, window: Window) -> Floats:
-        """Return values at the pixels of a window, interpolated between finite nodes; NaN where no node is finite."""
+        """Interpolate values at the pixels of a window between nodes with finite values; NaN if there are none."""
         known = np.isfinite(logarithms)
         share = self.lattice.between(known.astype(np.float64), window)
         mean = self.lattice.between(np.where(known, logarithms, 0.0), window)
         return np.where(share > 0, np.exp(mean / np.where(share > 0, share, 1.0)), np.nan)
 
     def rcs_power(self, window: Window) -> Floats:
-        """Return the power |I|² of a point of 1 m² at each pixel of a window, K·A²; NaN where not illuminated."""
+        """Return the power |I|² of a point of 1 m² at each pixel of a window, K·A²; NaN at pixels not illuminated."""
         return self.constant * self._between(self.gain, window)
 
     def cell(self, window: Window) -> Floats:
@@ -350,17 +352,17 @@ class Calibration:
         window
             Rows and columns of the grid.
         quantity
-            sigma0, per terrain area; beta0, per area of the slant plane; gamma0, per area perpendicular to the
-            bisector.
+            sigma0, normalised to terrain area; beta0, normalised to area in the slant plane; or gamma0, normalised to
+            area perpendicular to the bisector.
         normal
             (row, column, 3) float64, upward unit normals of the terrain (default: level).
 
         Returns
         -------
         ndarray
-            (row, column) float64. NaN where no pulse illuminates the pixel; for sigma0 of level terrain also within
-            5.7° of nadir; with `normal`, also in and near layover, where the area is ill-conditioned, and for gamma0 on
-            slopes that face away.
+            (row, column) float64. NaN where no pulse illuminates the pixel. For sigma0 of level terrain, also NaN
+            within 5.7° of nadir. With `normal`, also NaN in and near layover, where the area is ill-conditioned; and
+            for gamma0, on slopes that face away from the radar.
         """
         level = self.rcs_power(window) * self.cell(window)
         if quantity == "sigma0" and (normal is None or isinstance(self.terrain, FlatGround)):
@@ -384,7 +386,7 @@ class Calibration:
 def point_weights(aperture: Aperture, beams: Beams | None, points: Floats) -> tuple[Floats, Floats]:
     """Return the contribution of each pulse to a point target, w·f/(R_tx·R_rx), and w, (pulse, point) each.
 
-    Parameters as for `point_parts`, which divides them by the number of pulses.
+    Parameters as for `point_parts`, which divides these contributions by the number of pulses.
 
     Examples
     --------
@@ -402,7 +404,7 @@ def point_weights(aperture: Aperture, beams: Beams | None, points: Floats) -> tu
 def point_parts(
     aperture: Aperture, beams: Beams | None, points: Floats, *, count: int
 ) -> tuple[Aperture, Floats, Floats]:
-    """Return the contributions of pulses to the image of points of 1 m² with K = 1: the terms of A in eq. 3.
+    """Return the contributions of pulses to the image of points of 1 m² with K = 1, the terms of A in eq. 3.
 
     Parameters
     ----------
@@ -414,8 +416,8 @@ def point_parts(
     Returns
     -------
     tuple
-        The pulses used, a regular subsample; (pulse, point) float64, their contributions, which add up to A;
-        (point,) float64, the noise power relative to that of a pulse.
+        Phase centres of the pulses used, a regular subsample; (pulse, point) float64, contributions of these pulses,
+        which add up to A; and (point,) float64, noise power relative to that of a pulse.
 
     Examples
     --------
@@ -445,8 +447,9 @@ def _directions(gradient: Floats, parts: Floats, up: Floats) -> tuple[Floats, Fl
 def _across(gradient: Floats, parts: Floats, up: Floats) -> Floats:
     """Return the sine of the incidence angle across the track, (point,).
 
-    Half the RMS of the horizontal gradient's component perpendicular to the principal axis of its spread over the
-    pulses: sin θ to the side of a straight track, and of the same order at the centre of a circular track.
+    The value is half the RMS of a component of the horizontal gradient, perpendicular to the principal axis of the
+    gradient's spread over the pulses. It equals sin θ to the side of a straight track, and has the same order of
+    magnitude at the centre of a circular track.
     """
     size = np.abs(parts)
     weight = size / np.maximum(size.sum(axis=0), 1e-300)
@@ -462,16 +465,16 @@ def _unit(vectors: Floats) -> Floats:
 
 
 def _spread(gradient: Floats, parts: Floats, up: Floats) -> Floats:
-    """Return ∫(dU/ds)² ds / U² at each point, per unit of spatial frequency on level ground: eq. 5.
+    """Return ∫(dU/ds)² ds / U² at each point, per unit of spatial frequency on level ground (eq. 5).
 
     Pulses are sorted by azimuth, so that contributions of an irregular or repeated track accumulate at their spatial
-    frequency. Their density is averaged over bins of the aperture: its finer structure affects only points far from the
-    cell.
+    frequency. The density of contributions is averaged over bins of the aperture, because finer structure of the
+    density affects only points far from the cell.
 
     Parameters
     ----------
     gradient
-        (point, pulse, 3) float64, of the total path.
+        (point, pulse, 3) float64, gradient of the total path.
     parts
         (point, pulse) float64, contribution of each pulse to a point target.
     up
@@ -480,8 +483,8 @@ def _spread(gradient: Floats, parts: Floats, up: Floats) -> Floats:
     Returns
     -------
     ndarray
-        (point,) float64; NaN where fewer than two pulses have a significant weight, or all pulses with one have the
-        same spatial frequency.
+        (point,) float64; NaN where fewer than two pulses have a significant weight, or where all pulses with a
+        significant weight have the same spatial frequency.
     """
     # Spatial frequency of each pulse on level ground: its azimuth relative to the mean, and its squared magnitude.
     points, pulses = parts.shape
@@ -494,7 +497,7 @@ def _spread(gradient: Floats, parts: Floats, up: Floats) -> Floats:
     ahead = _unit(mean)
     across = np.cross(up, ahead)
     azimuth = np.arctan2((level @ across[:, :, None])[..., 0], (level @ ahead[:, :, None])[..., 0])
-    # Insignificant pulses are sorted behind the others, where the steps between them are set to zero.
+    # Insignificant pulses are sorted behind the significant ones, and the steps between them are set to zero.
     order = np.argsort(np.where(counts, azimuth, np.inf), axis=1, kind="stable")
     parts, azimuth = (np.take_along_axis(array, order, axis=1) for array in (parts, azimuth))
     # s: ∫|f|² dφ from pulse to pulse.
@@ -505,14 +508,14 @@ def _spread(gradient: Floats, parts: Floats, up: Floats) -> Floats:
     spread, known = np.full(points, np.nan), (many > 1) & (arc[:, -1] > 0)
     if not known.any():
         return spread
-    # U(s): the running sum of the contributions, from half a step before the first pulse to half a step after the last.
+    # U(s): running sum of the contributions from half a step before the first pulse to half a step after the last one.
     arc, parts, many = arc[known], parts[known], many[known, None]
     length, edge = arc[:, -1:], 1 / (2 * (many - 1))  # a pulse represents half a step on both sides
     arc = np.concatenate([-edge, arc / length, 1 + edge], axis=1)
     summed = np.cumsum(parts, axis=1)
     total = summed[:, -1:]
     summed = np.concatenate([np.zeros_like(total), summed - parts / 2, total], axis=1)
-    # One interpolation for all points: each point has its own interval of a common axis, offset by 4 from the previous.
+    # One interpolation for all points: on a common axis, the interval of each point is offset by 4 from the previous.
     bins = np.minimum(_BINS, many)
     at = np.minimum(np.arange(_BINS + 1) / bins, 1.0) * (1 + 2 * edge) - edge
     offset = 4.0 * np.arange(len(arc))[:, None]

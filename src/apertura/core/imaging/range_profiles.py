@@ -1,4 +1,4 @@
-"""Range profiles of a scene: range window of each pulse, range compression, and datasets of stages as arrays."""
+"""Range profiles of a scene: range window of each pulse, range compression, and conversion of datasets to arrays."""
 
 from dataclasses import dataclass
 from typing import Any, cast
@@ -20,10 +20,10 @@ from apertura.core.scene.terrain import Terrain, ground_of
 # ---- Range windows and compression
 
 GUARD_SAMPLES = 32
-"""Guard samples beyond both edges of the swath, needed by the interpolation filters of the engines."""
+"""Number of guard samples beyond each edge of the swath, required by the interpolation filters of the engines."""
 
 OVERSAMPLING = 2.0
-"""Oversampling factor of the profiles: leaves half the band for the transition of an engine's interpolation filter."""
+"""Oversampling factor of the profiles: half of the band remains for the transition of the interpolation filter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,9 +41,10 @@ class RangeWindow:
     unambiguous
         Period of a profile, samples.
     farthest_m
-        (pulse,) float64, longest total path to a pixel that the pulse contributes to, metres; -inf without any.
+        (pulse,) float64, longest total path to a pixel to which the pulse contributes, metres; -inf if there is no such
+        pixel.
     wave_speed_m_s
-        Wave speed by which delays are converted to paths.
+        Wave speed with which delays are converted to paths.
     """
 
     start_m: NDArray[np.float64]
@@ -81,13 +82,13 @@ class RangeWindow:
         frequency_hz
             (subcarrier,) float64, ascending in equal steps.
         beams
-            Weights of pulses: each pulse's window covers the pixels that it may contribute to. By default the whole
-            scene.
+            Weights of pulses: the window of a pulse covers the pixels to which the pulse may contribute (default: the
+            whole scene).
         wave_speed_m_s
             Speed of the wave along the paths.
         together
-            Number of consecutive pulses whose windows are bounded by the window of one of them: faster to compute, and
-            wider by the motion of the antennas during these pulses.
+            Number of consecutive pulses for which a single window is computed. Larger numbers reduce the computing
+            time; the window becomes wider by the motion of the antennas during these pulses.
 
         Notes
         -----
@@ -113,7 +114,7 @@ def range_compress(
     grid, terrain
         The scene, as for `backproject`.
     window
-        Total paths to cover (default: those of the scene).
+        Total paths to cover (default: total paths of the scene).
 
     Returns
     -------
@@ -146,18 +147,18 @@ def range_compress(
     ground, inputs = ground_of(terrain, grid), history if isinstance(history, PhaseHistory) else inputs_of(history)
     if not isinstance(inputs, PhaseHistory):
         raise CampaignError(
-            "range profiles", "history", "a PhaseHistory", "Use the profiles: they are already compressed in range."
+            "range profiles", "history", "a PhaseHistory", "Use the profiles, which are already compressed in range."
         )
     history, frequency, speed = inputs, inputs.frequency_hz, inputs.wave_speed_m_s
     window = window or RangeWindow.of(history.aperture, grid, ground, frequency, wave_speed_m_s=speed)
     if window.wave_speed_m_s != speed:
-        raise ValueError(f"{window.wave_speed_m_s=}: must be {speed}, that of the history")
+        raise ValueError(f"{window.wave_speed_m_s=}: must be {speed}, the wave speed of the history")
     if window.samples > window.unambiguous:
         raise CampaignError(
             f"the scene spans {window.samples} range samples",
             where="grid",
             expected=f"at most {window.unambiguous} range samples, the unambiguous range",
-            remedy="Make the scene smaller, or sample frequency more finely.",
+            remedy="Reduce the extent of the scene, or sample the band with a smaller frequency step.",
         )
     samples = compress(
         history.transfer,
@@ -181,7 +182,7 @@ def range_compress(
 
 
 class CompressionError:
-    """Error of range profiles relative to their transfer functions, at random samples of random pulses per block.
+    """Error of range profiles relative to the transfer functions, at random samples of random pulses of each block.
 
     Parameters
     ----------
@@ -190,7 +191,8 @@ class CompressionError:
 
     Notes
     -----
-    Source: docs/theory.md, eq. 4 and 5: the sum over the subcarriers at the path of a sample, in float64.
+    Source: docs/theory.md, eq. 4 and 5: the reference is the sum over the subcarriers at the path of a sample, in
+    float64.
 
     Examples
     --------
@@ -213,7 +215,7 @@ class CompressionError:
         self._generator, self._error_power, self._power = generator, 0.0, 0.0
 
     def add(self, history: PhaseHistory, profiles: Profiles) -> None:
-        """Compare random samples of random pulses of profiles with the exact sum over their transfer functions."""
+        """Compare random samples of random pulses of profiles with the exact sum over the transfer functions."""
         for pulse in self._generator.integers(len(history), size=self._PULSES):
             sample_indices = self._generator.integers(profiles.samples.shape[1], size=self._SAMPLES)
             path_m = profiles.start_m[pulse] + profiles.step_m * sample_indices
@@ -230,13 +232,13 @@ class CompressionError:
         return decibels(self._error_power / max(self._power, 1e-300))
 
 
-# ---- Stages as inputs of engines
+# ---- Datasets of stages as inputs of engines
 
-_SPARSE_STEP = 64  # pulses; slices with larger steps are read pulse by pulse
+_SPARSE_STEP = 64  # step in pulses, above which a slice is read pulse by pulse
 
 
 class Rows:
-    """Samples of a stage's dataset, read on access by pulse.
+    """Samples of the dataset of a stage, read on access for slices of pulses.
 
     Parameters
     ----------
@@ -259,7 +261,7 @@ class Rows:
         return int(self.shape[0])
 
     def __getitem__(self, pulses: slice) -> NDArray[Any]:
-        """Return the samples of a slice of pulses; for a sparse slice no other pulses are decoded."""
+        """Return the samples of a slice of pulses; for a sparse slice, only the pulses of the slice are decoded."""
         first, last, step = pulses.indices(len(self))
         if step > _SPARSE_STEP:
             return np.stack([self._array[number].values for number in range(first, last, step)])
@@ -271,7 +273,7 @@ class Rows:
 
 
 def phase_history_of(echo: xr.Dataset, window: str, *, lazy: bool = False) -> PhaseHistory:
-    """Return the dataset of stage `echo` as arrays, windowed over the subcarriers; `lazy`: samples read on access."""
+    """Return the dataset of stage `echo` as arrays with a subcarrier window; `lazy`: samples are read on access."""
     return PhaseHistory(
         cast("NDArray[np.complex64]", Rows(echo.transfer)) if lazy else echo.transfer.values,
         echo.frequency.values,
@@ -296,7 +298,7 @@ def profiles_of(profile: xr.Dataset, *, lazy: bool = False) -> Profiles:
 
 
 def wave_speed_of(stage: xr.Dataset) -> float:
-    """Return the wave speed (m/s) stated in the dataset of stage `echo` or `profile`."""
+    """Return the wave speed (m/s) recorded in the dataset of stage `echo` or `profile`."""
     return float(stage.attrs["wave_speed_m_s"])
 
 
@@ -311,7 +313,7 @@ def inputs_of(given: PhaseHistory | Profiles | xr.Dataset, window: str = "hann")
     Raises
     ------
     CampaignError
-        If the argument is none of these.
+        If the argument is neither such an array object nor such a dataset.
     """
     if isinstance(given, PhaseHistory | Profiles):
         return given

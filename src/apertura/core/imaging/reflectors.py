@@ -1,4 +1,4 @@
-"""Reference reflectors: radar cross-sections by shape and size, and their combined calibration constant."""
+"""Reference reflectors: radar cross-sections by shape and size, and the combined calibration constant."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,11 +14,11 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 Shape = Literal["trihedral", "dihedral", "sphere"]
 
 MOST_TURNED_DB = 1.0
-"""Largest bistatic loss (dB) of a corner reflector for which its cross-section is computed: the second-order formula
-then has an error of 0.05 dB."""
+"""Largest bistatic loss (dB) up to which the cross-section of a corner reflector is computed: the second-order formula
+then has an error of at most 0.05 dB."""
 
 DRIFT_SIGMAS = 3.0
-"""Significance level for a change of the constant, standard deviations: probability of a false alarm 1/370."""
+"""Significance threshold for a change of the constant, standard deviations: the false-alarm probability is 1/370."""
 
 _SEAMS = np.array(
     [
@@ -46,11 +46,11 @@ class Reflector:
     shape
         'trihedral' (three right-angled triangles), 'dihedral' (two rectangles) or 'sphere'.
     size_m
-        Trihedral: leg of the triangles. Dihedral: width across and length along the seam of the rectangles. Sphere:
-        radius.
+        Trihedral: leg length of the triangles. Dihedral: width of a rectangle across the seam, and length along the
+        seam. Sphere: radius.
     axes
-        (3, 3) float64, unit vectors right, up and ahead along the boresight, as rows, in the frame of the antennas; the
-        seam of a dihedral lies to the right.
+        (3, 3) float64, rows are the unit vectors right, up and ahead (along the boresight) in the frame of the
+        antennas; the seam of a dihedral is parallel to the first vector.
 
     Notes
     -----
@@ -81,8 +81,8 @@ class Reflector:
         Returns
         -------
         tuple of ndarray
-            (direction,) float64 each; 0 m² for directions outside the opening of a corner, NaN where the separation of
-            the antennas is too large for the formula.
+            (direction,) float64 each. The cross-section is 0 m² in directions outside the opening of a corner, and NaN
+            where the bistatic angle is too large for the formula.
         """
         tx, rx = towards_tx @ self.axes.T, towards_rx @ self.axes.T
         if self.shape == "sphere":
@@ -109,8 +109,8 @@ class Reflector:
 
         Notes
         -----
-        An image is a sum of amplitudes, not of powers: the square root of the cross-section is averaged over the
-        pulses.
+        An image is a sum of amplitudes, not of powers. Therefore the square root of the cross-section is averaged over
+        the pulses.
 
         Examples
         --------
@@ -137,7 +137,7 @@ class Reflector:
 
 
 def _trihedral(size_m: Sequence[float], tx: Floats, rx: Floats, k: float) -> tuple[Floats, Floats, float]:
-    """Return effective area, bistatic amplitude factor, and the power of edge diffraction of a trihedral: eq. 11."""
+    """Return effective area, bistatic amplitude factor and edge diffraction power of a trihedral, eq. 11."""
     (leg_m,) = size_m
     first, second, third = np.sort(_unit(tx + rx) @ _SEAMS.T, axis=-1).T
     total = first + second + third
@@ -150,7 +150,7 @@ def _trihedral(size_m: Sequence[float], tx: Floats, rx: Floats, k: float) -> tup
 
 
 def _dihedral(size_m: Sequence[float], tx: Floats, rx: Floats, k: float) -> tuple[Floats, Floats, float]:
-    """Return the same as `_trihedral` for a dihedral: eq. 12."""
+    """Return effective area, bistatic amplitude factor and edge diffraction power of a dihedral, eq. 12."""
     across_m, along_m = size_m
     between = _unit(tx + rx)
     off = np.abs(np.arctan2(between[:, 1], between[:, 2]))
@@ -162,10 +162,10 @@ def _dihedral(size_m: Sequence[float], tx: Floats, rx: Floats, k: float) -> tupl
 
 
 def _sphere(radius_m: float, cosine: Floats, k: float) -> tuple[Floats, Floats]:
-    """Return the cross-section of a conducting sphere by Mie's series at cosines of the scattering angle: eq. 13.
+    """Return the cross-section of a conducting sphere by the Mie series at cosines of the scattering angle, eq. 13.
 
-    Returns the mean over both polarisations, which are equal only for backscattering; half of their difference is used
-    as the standard deviation.
+    The result is the mean of the cross-sections in both polarisations, which are equal only for backscattering. Half of
+    their difference is used as the standard deviation.
     """
     from scipy.special import spherical_jn, spherical_yn
 
@@ -204,8 +204,8 @@ class Mean:
     chi2, freedom
         χ² of the differences between reflectors, and its degrees of freedom.
     drift
-        The two flights with the most significant difference: first, second, second minus first, and its standard
-        deviation. None if no reflector was measured in two flights.
+        The two flights with the most significant difference: first flight, second flight, difference (second minus
+        first), and its standard deviation. None if no reflector was measured in two flights.
     """
 
     value: float
@@ -216,7 +216,7 @@ class Mean:
 
     @property
     def chance(self) -> float:
-        """Probability of a χ² as large as this under the stated standard deviations; 1 for a single reflector."""
+        """Probability of a χ² of at least this value, given the stated deviations; 1 for a single reflector."""
         from scipy.stats import chi2
 
         return float(chi2.sf(self.chi2, self.freedom)) if self.freedom else 1.0

@@ -18,9 +18,9 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.looks import Lattice, fill, pulses_of
 from apertura.core.scene.terrain import FlatGround, Terrain
 
-_ORDER = 4  # highest order of moments: the second order yields the width of the spectrum, the fourth its shape
+_ORDER = 4  # highest order of moments: the second order yields the width of the spectrum, the fourth order its shape
 _ORDERS = [(east, total - east) for total in range(_ORDER + 1) for east in range(total + 1)]
-_PULSES = 128  # at least this number of pulses, at most twice as many, are summed for a block of the lattice
+_PULSES = 128  # least number of pulses summed for a block of the lattice; the largest number is twice this number
 _HALF_POWER = np.log(2) / 2  # -ln|p| where |p|² is one half
 _UPRIGHT = 4  # moments that involve the vertical, needed on slopes
 _LEAST_SPREAD = 1e-12  # cycles² per m²: a spectrum with a smaller second moment is treated as a single point
@@ -37,9 +37,10 @@ class Resolution:
     lattice
         Nodes at which the moments are computed.
     moments
-        (node row, node column, moment) float64, moments of the spectral density, cycles per metre to the power of their
-        order: first those of `_ORDERS` over level ground, eastward and northward (the first is 1, or 0 where no pulse
-        illuminates the node), then those that involve the vertical u: u, east·u, north·u and u².
+        (node row, node column, moment) float64, moments of the spectral density, cycles per metre to the power of the
+        order of the moment. First the moments of `_ORDERS` over level ground, eastward and northward, of which the
+        first is 1, or 0 where no pulse illuminates the node. Then the moments that involve the vertical u: u, east·u,
+        north·u and u².
 
     Notes
     -----
@@ -92,7 +93,7 @@ class Resolution:
         """
         lattice = Lattice.of(
             grid.shape
-        )  # the same pitch for all pairs, so that their moments can be added node by node
+        )  # the same pitch for all pairs, so that moments of several pairs can be added node by node
         moments = np.zeros((*lattice.shape, len(_ORDERS) + _UPRIGHT))
         share = weight / weight.sum()
         of_band = [float((share * (frequency_hz / SPEED_OF_LIGHT_M_S) ** order).sum()) for order in range(_ORDER + 1)]
@@ -131,7 +132,7 @@ class Resolution:
         return replace(images[0], moments=total / np.maximum(total[..., :1], 1e-300))
 
     def axes(self, window: Window) -> tuple[Floats, Floats, Floats]:
-        """Return −3 dB widths of a point in the finest and the coarsest direction, and the azimuth of the finest.
+        """Return the −3 dB widths of a point in the finest and coarsest directions, and the azimuth of the finest one.
 
         Parameters
         ----------
@@ -141,8 +142,9 @@ class Resolution:
         Returns
         -------
         tuple of ndarray
-            (row, column) float64 each: both widths in metres, and the azimuth in degrees clockwise from grid north, −90
-            to 90. NaN where no pulse illuminates the pixel; widths are infinite in a direction without resolution.
+            (row, column) float64 each: both widths in metres, and the azimuth in degrees clockwise from grid north,
+            −90 to 90. Values are NaN where no pulse illuminates the pixel. The width is infinite in a direction without
+            resolution.
         """
         if isinstance(self.terrain, FlatGround):
             fine, coarse, azimuth = self._axes_at_nodes
@@ -164,7 +166,7 @@ class Resolution:
         return np.asarray(np.degrees(np.arctan2(east, north)))
 
     def _raw(self, order: tuple[int, int]) -> Floats:
-        """Return a moment at the nodes; NaN where no pulse illuminates them."""
+        """Return a moment at the nodes; NaN at nodes that no pulse illuminates."""
         illuminated = self.moments[..., 0] > 0
         return np.where(illuminated, self.moments[..., _ORDERS.index(order)], np.nan)
 
@@ -181,7 +183,7 @@ class Resolution:
         )  # fmt: skip
 
     def _between(self, values: Floats, window: Window) -> Floats:
-        """Return values at the pixels of a window, interpolated between finite nodes; NaN where no node is finite."""
+        """Interpolate values at the pixels of a window between nodes with finite values; NaN if there are none."""
         known = np.isfinite(values)
         share = self.lattice.between(known.astype(np.float64), window)
         mean = self.lattice.between(np.where(known, values, 0.0), window)
@@ -216,7 +218,7 @@ class Resolution:
 
     @cached_property
     def _axes_at_nodes(self) -> tuple[Floats, Floats, Floats]:
-        """Widths along both axes, and the azimuth of the finest, radians, on level ground."""
+        """Widths along both axes, metres, and azimuth of the finest direction, radians, on level ground."""
         _, _, azimuth, *values = _principal(*self._spread_at_nodes[:3])
         fine, coarse = (_width(shape, value) for shape, value in zip(self._shapes_at_nodes, values, strict=True))
         return fine, coarse, azimuth
@@ -237,7 +239,7 @@ def _width(shape: Floats, variance: Floats) -> Floats:
 
 
 def _on_slopes(spread: list[Floats], slopes: tuple[Floats, Floats]) -> tuple[Floats, Floats, Floats]:
-    """Return covariances east-east, east-north and north-north along the sloping terrain, per metre on the map."""
+    """Return covariances east-east, east-north and north-north along sloping terrain, per horizontal metre."""
     east, both, north, east_up, north_up, up_up = spread
     to_east, to_north = slopes
     return (

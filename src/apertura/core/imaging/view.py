@@ -9,13 +9,13 @@ from apertura.core.imaging.formation import Formation
 from apertura.core.scene.angles import bistatic_angle_deg, incidence_deg
 
 _COUNTS = 0.5
-"""Least weight for which a pulse counts as illuminating the scene centre: half amplitude."""
+"""Least weight of a pulse that is considered to illuminate the scene centre: half amplitude."""
 
 _ONE_SIDE = 0.95
-"""Share of pulses with the scene on one side, above which the image is assigned that side."""
+"""Fraction of pulses with the scene on one side of the track, above which the image is assigned to this side."""
 
 _OBSERVABLE_RAD = 1.0
-"""RMS phase of a mirrored scene, above which it is defocused: peak loss 4 dB."""
+"""RMS phase of a mirrored scene, radians, above which the mirrored scene is defocused: peak loss 4 dB."""
 
 _PULSES = 1024  # pulses sampled for the carriers, which are means over a smooth track
 
@@ -28,20 +28,21 @@ def view_report(formation: Formation, began: np.datetime64, time_s: NDArray[np.f
     formation
         Formation of the image.
     began, time_s
-        Time of the first pulse, UTC; and (pulse,) float64, seconds since then.
+        Time of the first pulse, UTC; and (pulse,) float64, times of the pulses in seconds since the first pulse.
 
     Returns
     -------
     dict
-        `first_utc`, `last_utc`: first and last pulse that illuminate the scene centre; of all pulses if none does.
-        `heading_deg`, `look_deg`: heading and look direction of the antennas' midpoint, clockwise from grid north.
-        `incidence_deg`: incidence angle of the transmitter, from the vertical. `bistatic_angle_deg`. `range_m`: half
-        the total path. `height_m`: height of the midpoint above the terrain. `speed_m_s`: mean speed of the midpoint.
-        `side`: side of the heading on which the scene lies, right, left, or both where the track encircles it;
-        `side_mirror_rad`: RMS phase between the echoes of the scene and of the mirrored scene; `side_observable`: true
-        if it exceeds 1 rad, so that a mirrored image is defocused. `centre_hz`, `band_hz`. `carrier_cycles_m`: centre
-        of the image's spatial frequency band, east and north (docs/theory/interferometry.md, eq. 1).
-        `carriers_cycles_m`: the same at 3 x 3 points from corner to corner (`carrier_at`).
+        `first_utc`, `last_utc`: times of the first and last pulse that illuminate the scene centre, or of the first and
+        last pulse of the flight if none does. `heading_deg`, `look_deg`: heading and look direction of the midpoint
+        between the antennas, clockwise from grid north. `incidence_deg`: incidence angle of the transmitter, from the
+        vertical. `bistatic_angle_deg`. `range_m`: half the total path. `height_m`: height of the midpoint above the
+        terrain. `speed_m_s`: mean speed of the midpoint. `side`: side of the heading on which the scene lies: right,
+        left, or both if the track encircles the scene. `side_mirror_rad`: RMS phase between the echoes of the scene and
+        of the mirrored scene. `side_observable`: true if this phase exceeds 1 rad, so that a mirrored image is
+        defocused. `centre_hz`, `band_hz`: centre frequency and bandwidth. `carrier_cycles_m`: centre of the spatial
+        frequency band of the image at the scene centre, east and north (docs/theory/interferometry.md, eq. 1).
+        `carriers_cycles_m`: the same centre at 3 x 3 points from corner to corner (`carrier_at`).
     """
     # The scene centre, and the pulses that illuminate it.
     point, (east, north) = ground_axes(formation, *((size - 1) / 2 for size in formation.grid.shape))
@@ -49,7 +50,7 @@ def view_report(formation: Formation, began: np.datetime64, time_s: NDArray[np.f
     weight = np.ones(len(profiles)) if beams is None else beams.weight(profiles.aperture, point[None])[:, 0]
     counted = np.flatnonzero(weight >= _COUNTS)
     counted = counted if counted.size else np.arange(len(profiles))
-    # Closest approach: least total path. The carrier is the mean path gradient divided by the wavelength.
+    # Closest approach: shortest total path. The carrier is the mean path gradient divided by the wavelength.
     aperture, up = profiles.aperture[counted], np.cross(east, north)
     path, middle = aperture.path(point), aperture.middle_m
     closest = int(path.argmin())
@@ -82,9 +83,9 @@ def view_report(formation: Formation, began: np.datetime64, time_s: NDArray[np.f
 
 
 def carriers_of(formation: Formation) -> NDArray[np.float64]:
-    """Return the carriers of points at corners, edges and centre of the scene, (3, 3, 2) as required by `carrier_at`.
+    """Return the carriers at the corners, edges and centre of the scene, (3, 3, 2) as required by `carrier_at`.
 
-    Each is a mean over the pulses that illuminate the point, or over all pulses if none does.
+    Each carrier is a mean over the pulses that illuminate the point, or over all pulses if none does.
     """
     profiles, beams, shape = formation.profiles, formation.beams, formation.grid.shape
     sampled = profiles.aperture.sample(_PULSES)
@@ -100,7 +101,7 @@ def carriers_of(formation: Formation) -> NDArray[np.float64]:
 
 
 def ground_axes(formation: Formation, row: float, column: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return a point on the terrain, (3,) metres, and unit vectors along the grid's east and north at it, (2, 3)."""
+    """Return a point on the terrain, (3,) metres, and unit vectors along grid east and north at this point, (2, 3)."""
     point, east, north = formation.positions_at([row, row, row - 0.5], [column, column + 0.5, column])
     axes = np.stack([east - point, north - point])
     return point, axes / np.linalg.norm(axes, axis=1, keepdims=True)
@@ -113,7 +114,7 @@ def _speed_m_s(middle_m: NDArray[np.float64], time_s: NDArray[np.float64]) -> fl
 
 
 def _side(middle_m: NDArray[np.float64], point_m: NDArray[np.float64], up: NDArray[np.float64]) -> str:
-    """Return the side of the heading on which a point lies, left or right for nearly all pulses, else both."""
+    """Return the side of the heading on which a point lies: left or right for nearly all pulses, otherwise both."""
     if len(middle_m) < 2:
         return "both"
     across = np.cross(np.gradient(middle_m, axis=0), point_m - middle_m) @ up  # positive to the left
@@ -124,8 +125,8 @@ def _side(middle_m: NDArray[np.float64], point_m: NDArray[np.float64], up: NDArr
 def _mirror_rad(middle_m: NDArray[np.float64], up: NDArray[np.float64], incidence: float, wavelength_m: float) -> float:
     """Return the RMS phase between the echoes of a point and of its mirror image on the other side of the track.
 
-    A horizontal deviation w of the track from a straight line shortens one path by 2w sin θ and lengthens the other:
-    their phases differ by 4π/λ·2w sin θ.
+    A horizontal deviation w of the track from a straight line decreases one total path by 2w sin θ and increases the
+    other by the same amount: the phases differ by 4π/λ·2w sin θ.
     """
     flat = middle_m - middle_m.mean(axis=0)
     flat = flat - np.outer(flat @ up, up)

@@ -1,1 +1,1 @@
-"""Planning of image formation: engine, models, their reasons and their cost."""
+"""Planning of image formation: choice of engine and models, with reasons and cost."""

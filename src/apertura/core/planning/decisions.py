@@ -25,7 +25,7 @@ from apertura.core.scene.terrain import FlatGround
 
 
 def decide_accuracy(lines: Sequence[BudgetLine]) -> Decision:
-    """Decide the numerical error to request, from the dominant line of the error budget.
+    """Decide the numerical error to request from the largest term of the error budget.
 
     Examples
     --------
@@ -40,7 +40,7 @@ def decide_accuracy(lines: Sequence[BudgetLine]) -> Decision:
         return Decision("accuracy_db", value, reason)
     cause = f"{largest.cause} ({largest.stated})"
     if value == LEAST_ACCURACY_DB:
-        reason = f"auto: largest numerical error that is not visible; more than 10 dB below {cause}"
+        reason = f"auto: the largest numerical error that is not visible, more than 10 dB below {cause}"
         return Decision("accuracy_db", value, reason)
     return Decision("accuracy_db", value, f"auto: {ARITHMETIC_BELOW_DB:g} dB below {cause}")
 
@@ -50,8 +50,8 @@ def decide_accuracy(lines: Sequence[BudgetLine]) -> Decision:
 TOLERATED_LOSS_DB = 0.2
 """Peak loss from position errors that is tolerated without autofocus, dB.
 
-The best RTK accuracy, half a centimetre in each log, causes a loss of 0.3 dB at L-band. A smaller loss is not visible
-in an image, and does not justify a step that reads all pairs of a flight together.
+With the best RTK accuracy, half a centimetre in each log, the loss at L-band is 0.3 dB. A smaller loss is not visible
+in an image and does not justify a step that reads all pairs of a flight together.
 """
 
 
@@ -92,7 +92,7 @@ FOCUS_RAD = 0.4
 """
 
 SHIFT_PIXELS = 0.5
-"""Tolerated displacement by a simpler terrain model, pixels: a point remains in its pixel."""
+"""Tolerated displacement caused by a simpler terrain model, pixels: a point remains within its pixel."""
 
 
 def decide_terrain(job: Job, *, requested: str | None = None, where: str = "processing") -> Decision:
@@ -150,8 +150,8 @@ def _height_tolerance(job: Job) -> tuple[float, str]:
     focus_m = FOCUS_RAD * job.wavelength_m * nearest / (4 * np.pi * max(wobble_m, 1e-9))
     shift_m = SHIFT_PIXELS * job.spacing_m / max(steepest, 1e-9)
     return min(focus_m, shift_m), (
-        f"limits {focus_m:.3g} m by focus (0.4 rad at a track deviation of {wobble_m:.3f} m rms and a ground range of "
-        f"{nearest:.1f} m) and {shift_m:.3g} m by displacement (half a pixel)"
+        f"limits {focus_m:.3g} m for focus (0.4 rad at a track deviation of {wobble_m:.3f} m rms and a ground range of "
+        f"{nearest:.1f} m) and {shift_m:.3g} m for displacement (half a pixel)"
     )
 
 
@@ -161,10 +161,10 @@ CHORD = 0.1
 """Chord over which the direction of flight is computed, in units of the range: long relative to position errors."""
 
 MOST_ASPECT = 1.5
-"""Ratio of a point's aspect angle to the integration angle, above which `track_turns` is raised."""
+"""Ratio of the aspect angle of a point to the integration angle, above which the flag `track_turns` is raised."""
 
 _PULSES = 256  # pulses sampled for the geometry
-_FEWEST = 3  # least number of pulses at the pixel with the most pulses: focus cannot be assessed from two pulses
+_FEWEST = 3  # least number of pulses required at any one pixel: focus cannot be assessed from two pulses
 _COUNTED = 16384  # pulses sampled to count the pulses per pixel
 
 
@@ -178,14 +178,14 @@ def integrate(
     requested: Any = "auto",
     where: str = "processing",
 ) -> Integration:
-    """Decide the integration of a scene's pixels: the sector of the flight that contributes to them.
+    """Decide the integration of the pixels of a scene: the sector of the flight that contributes to each pixel.
 
     Parameters
     ----------
     aperture
         All pulses, in the frame of the points.
     points_m
-        (row, column, 3) float64, metres: distributed over the scene, corners included; rows go south.
+        (row, column, 3) float64, metres, distributed over the scene and including its corners; rows go south.
     spacing_m, wavelength_m
         Pixel spacing, and wavelength at band centre.
     antennas
@@ -219,7 +219,7 @@ def integrate(
         span = float(np.ptp(position, axis=0).max())
         if span <= 2 * half * (1 + TAPER):
             cell_m = wavelength_m / (per_path * span) if span else np.inf
-            resolution = f"the flight's resolution of {cell_m:.3g} m"
+            resolution = f"the resolution of the flight, {cell_m:.3g} m"
             reason = f"all pulses contribute: pixels of {spacing_m:g} m suffice for {resolution}"
             return Integration(None, len(aperture), "all", reason)
     sector = Sector(whole.tx_axis, whole.rx_axis, squint, half).following(aperture, points)
@@ -229,7 +229,7 @@ def integrate(
 def sector_half(
     requested: Any, wavelength_m: float, spacing_m: float, *, per_path: float = 2.0, squint: float = 0.0
 ) -> float:
-    """Return the half width in s of the requested sector.
+    """Return the half width of the requested sector in units of s.
 
     Parameters
     ----------
@@ -240,7 +240,7 @@ def sector_half(
     per_path
         Change of the path gradient along the flight per change of s: 2 for antennas on parallel tracks.
     squint
-        s at the centre of the sector.
+        Value of s at the centre of the sector.
 
     Notes
     -----
@@ -259,7 +259,7 @@ def sector_half(
 
 
 def _squint(whole: Sector, antennas: Beams | None) -> float:
-    """Return s along the boresights, median over the pulses; 0 without beams."""
+    """Return the value of s along the boresights, median over the pulses; 0 without beams."""
     if antennas is None:
         return 0.0
     boresights = [beam.axes[:, 0] for beam in (antennas.transmit, antennas.receive) if beam is not None]
@@ -290,7 +290,7 @@ def _integration_of(
             expected=f"at least {_FEWEST} pulses: a flight past the scene, and antennas directed at it",
             remedy="Set processing.integration to all or to a larger angle, or correct scene.bounds_m.",
         )
-    # Report: angle, response with tapered edges, squint over the scene, pulses per pixel.
+    # Report: angle, response with tapered edges, squint over the scene, and pulses per pixel.
     degrees = float(np.degrees(2 * np.arcsin(min(1.0, sector.half))))
     least, median, most = (round(float(np.quantile(counts, part))) for part in (0, 0.5, 1))
     counted = f"{least} to {most} of {len(aperture)} pulses per pixel (median {median})"
@@ -312,7 +312,7 @@ def _integration_of(
     aspect_deg = _aspect_deg(sector, aperture, points[counts > 0], vertical(points_m))
     if aspect_deg > MOST_ASPECT * degrees * (1 + TAPER):
         flags["track_turns"] = (
-            f"aspect angle of a point {aspect_deg:.0f}° in total, integration angle of a straight pass {degrees:.3g}°: "
+            f"total aspect angle of a point {aspect_deg:.0f}°, integration angle of a straight pass {degrees:.3g}°: "
             "the track turns, or passes the scene more than once"
         )
     value, count = f"{degrees:.3g}°, {resolution_m:.3g} m", max(1, round(float(total.max())))
@@ -323,7 +323,7 @@ def _integration_of(
 def _pulses_per_place(
     sector: Sector, aperture: Aperture, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the sum of weights and the number of pulses with weight at each point; estimated by subsampling."""
+    """Estimate the sum of weights and the number of weighted pulses at each point from a subset of the pulses."""
     every = slice(None, None, -(-len(aperture) // _COUNTED))
     pulses, sampled = aperture[every], sector[every]
     total, counts = np.zeros((2, len(points)))

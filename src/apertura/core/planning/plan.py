@@ -28,7 +28,7 @@ from apertura.core.scene.terrain import Terrain
 
 
 def check_geometry(job: Job) -> dict[str, str]:
-    """Check the geometry of a job and return flags: exceeded limit → measured value, in one line.
+    """Check the geometry of a job and return flags: name of the exceeded limit → measured value, in one line.
 
     Parameters
     ----------
@@ -49,8 +49,8 @@ def check_geometry(job: Job) -> dict[str, str]:
         over |= _over(leg, ground_m, up, job.spacing_m)
     if over.any():
         flags["platform_inside_scene"] = (
-            f"{int(over.sum())} of {len(aperture)} pulses are transmitted or received above the scene: left-right "
-            "ambiguity"
+            f"{int(over.sum())} of {len(aperture)} pulses are transmitted or received above the scene, which causes a "
+            "left-right ambiguity"
         )
     weigh = None if job.sector is None else job.sector.over(aperture)
     cell_m = aperture.resolution_cell_m(ground_m, band_hz=job.band_hz, weigh=weigh)
@@ -72,11 +72,11 @@ def check_geometry(job: Job) -> dict[str, str]:
 
 
 _LEAST_CELLS = 2.0
-"""Least number of resolution cells across the line of sight: with fewer, an image resolves range only."""
+"""Least number of resolution cells across the line of sight: with fewer cells, an image is resolved in range only."""
 
 
 def no_aperture(aperture: Aperture, ground_m: NDArray[np.float64], *, wavelength_m: float) -> str | None:
-    """Detect a track too short for resolution across the line of sight, described in one line; None if sufficient.
+    """Return a one-line description of a track too short for cross-range resolution; None if the track is sufficient.
 
     Parameters
     ----------
@@ -96,21 +96,22 @@ def no_aperture(aperture: Aperture, ground_m: NDArray[np.float64], *, wavelength
     moved_m = max(float(np.linalg.norm(leg - leg[0], axis=1).max()) for leg in aperture.legs)
     resolution = f"a resolution of {cell_m:.3g} m" if np.isfinite(cell_m) else "no resolution"
     return (
-        f"antennas moved {moved_m:.3g} m: {resolution} across the line of sight in a scene of {side_m:.3g} m (a bench "
-        "recording?)"
+        f"the antennas moved by {moved_m:.3g} m, which yields {resolution} across the line of sight in a scene of "
+        f"{side_m:.3g} m; possibly a bench recording"
     )
 
 
 GHOST_DB, REACHED = -20.0, 0.1
-"""Limits above which ghosts are visible: level of ghosts relative to their point, dB, and ambiguous share of the scene,
-mean over the pulses."""
+"""Limits above which ghosts are visible: level of a ghost relative to the point that causes it, dB; and ambiguous
+fraction of the scene, mean over the pulses."""
 
 FOLDED_DB = 1.0
-"""Mean increase of the scene's power by aliased echoes, dB, above which they are visible between targets."""
+"""Mean increase of the power of the scene by aliased echoes, dB, above which these echoes are visible between targets.
+"""
 
 
 def undersampling(job: Job) -> str | None:
-    """Detect undersampling of the aperture with visible ambiguities, described in one line; None if none is visible.
+    """Return a one-line description of visible ambiguities from an undersampled aperture; None if none is visible.
 
     Notes
     -----
@@ -122,7 +123,7 @@ def undersampling(job: Job) -> str | None:
         return None
     folded = job.aperture.ambiguities(job.points_m, wavelength_m=wavelength_m)
     pulses = len(job.aperture) if job.integration is None else job.integration.count
-    # The path of a ghost changes by a wavelength per pulse: it crosses the range response in 2·f/B pulses.
+    # The path of a ghost changes by a wavelength per pulse: a ghost crosses the range response in 2·f/B pulses.
     walked = (lowest_hz + highest_hz) / max(highest_hz - lowest_hz, 1.0) / max(pulses, 1)
     ghost_db = 20 * np.log10(max(min(1.0, walked, float(folded.max())), 1e-6))
     reached, brighter_db = float(np.minimum(folded, 1).mean()), decibels(1 + float(folded.mean()))
@@ -136,7 +137,7 @@ def undersampling(job: Job) -> str | None:
 
 
 def check_positions(aperture: Aperture) -> None:
-    """Raise CampaignError unless there is a pulse and each has finite phase centres."""
+    """Raise CampaignError if there is no pulse, or if a pulse has phase centres that are not finite."""
     if len(aperture) == 0:
         raise CampaignError(
             "no pulses", where="echo", expected="at least one pulse", remedy="Check the triggers and the sidelink."
@@ -175,8 +176,8 @@ def _share_beyond(aperture: Aperture, points_m: NDArray[np.float64], path_limit_
     beyond = shortest > path_limit_m
     if beyond.all():
         raise CampaignError(
-            f"no pulse receives an echo of the scene: the shortest total path is {shortest.min():.1f} m, and the scene "
-            f"is at least {shortest.min() / 2000:.3g} km from the tracks",
+            f"no echo of the scene is received: the shortest total path is {shortest.min():.1f} m, and the scene is at "
+            f"least {shortest.min() / 2000:.3g} km from the tracks",
             where="scene.bounds_m",
             expected=f"a total path of at most {path_limit_m:.1f} m, the length of the cyclic prefix",
             remedy="Correct scene.bounds_m (easting before northing), scene.crs, the positions of the tracks, or the "
@@ -211,12 +212,12 @@ class Decision:
     Attributes
     ----------
     name, value
-        Option and its value. The option, a key of section `processing` of the configuration or an option of the engine,
-        can be set to override the decision.
+        Option and its value. The decision is overridden if the option is set: it is a key of section `processing` of
+        the configuration, or an option of the engine.
     reason
-        Reason with its numbers, one line.
+        Reason, including numbers, one line.
     error_db
-        Error added by this decision, relative to the full model; None if the decision adds no error.
+        Error added by this decision, relative to the full model, dB; None if the decision adds no error.
     """
 
     name: str
@@ -234,7 +235,7 @@ class Plan:
     setting
         Engine and options.
     fallbacks
-        More exact settings, for tiles whose certified error exceeds the requested one; the last one is `reference`.
+        More exact settings, for tiles with a certified error above the requested error; the last one is `reference`.
     decisions
         All decisions with their reasons.
     accuracy_db
@@ -248,9 +249,10 @@ class Plan:
     flags
         Limits exceeded by the job: name → measured value, in one line.
     presum, middle_m
-        Low-pass sum over pulses, and the point to which they are aligned; not used by the settings of `fallbacks`.
+        Low-pass sum over pulses, and the point to which the pulses are aligned; not used by the settings of
+        `fallbacks`.
     terrain
-        Terrain model of the image: the full terrain, a plane through it, or level ground.
+        Terrain model of the image: the full terrain, a plane fitted to it, or level ground.
     beams, integration, illumination
         As in the job.
     fixed_engine
@@ -286,7 +288,7 @@ class Plan:
 
     @property
     def choices(self) -> dict[str, Any]:
-        """Option → value: all decisions that affect the image's pixels; no predictions."""
+        """Option → value: all decisions that affect the pixels of the image, without predictions."""
         return {decision.name: decision.value for decision in self.decisions} | {"ground": self.terrain.spec}
 
     @property
@@ -296,18 +298,18 @@ class Plan:
 
     @property
     def presumming(self) -> tuple[Presum, NDArray[np.float64]] | None:
-        """Low-pass sum over pulses and the point to which they are aligned; None: no presumming."""
+        """Low-pass sum over pulses, and the point to which the pulses are aligned; None: no presumming."""
         return None if self.presum is None or self.middle_m is None else (self.presum, self.middle_m)
 
     def fallen_back(self, setting: Setting) -> "Plan":
-        """Return the plan with one of its fallbacks, without presumming."""
-        reason = f"{self.setting.line} missed the requested accuracy at the compared pixels"
+        """Return the plan with one of its fallback settings, without presumming."""
+        reason = f"{self.setting.line} did not meet the requested accuracy at the pixels that were recomputed exactly"
         replaced = {"engine", "presum", "pulse_blocks", *self.setting.reasons}
         decisions = (
             Decision("engine", setting.engine, reason, setting.error_db),
             *(Decision(name, setting.all_options[name], reason) for name, reason in setting.reasons.items()),
             Decision("presum", 1, "no presumming in a fallback"),
-            Decision("pulse_blocks", setting.pulse_blocks, "number of the fallback setting"),
+            Decision("pulse_blocks", setting.pulse_blocks, "number of pulse blocks of the fallback setting"),
             *(decision for decision in self.decisions if decision.name not in replaced),
         )
         return replace(
@@ -320,10 +322,10 @@ class Plan:
         )
 
     def replaced_by(self, setting: Setting, what: str) -> Flags:
-        """Return a flag if a requested engine is replaced for `what`: the image, or a number of its tiles."""
+        """Return a flag if the requested engine is replaced for `what`: the image, or a number of its tiles."""
         if not self.fixed_engine or setting.engine == self.engine:
             return Flags()
-        line = f"{what} formed by {setting.engine}: the requested {self.engine} misses {self.accuracy_db:.0f} dB"
+        line = f"{what} formed by {setting.engine}: the requested {self.engine} does not meet {self.accuracy_db:.0f} dB"
         return Flags({"engine_replaced": line})
 
     def inputs(self, profiles: Profiles) -> Profiles:
@@ -334,23 +336,24 @@ class Plan:
 # ---- Memory, disk and pulse blocks
 
 BLOCK_BYTES = 512 << 20
-"""Largest size of a pulse block in memory, samples and tables, so that memory does not grow with the flight."""
+"""Largest size of the samples and tables of a pulse block, bytes: the memory does not grow with the flight duration."""
 
-_BASE_BYTES = 350_000_000  # the interpreter and its libraries
+_BASE_BYTES = 350_000_000  # bytes of the interpreter and its libraries
 _PULSE_BYTES = 500  # bytes per pulse in addition to its samples: phase centres, axes, and copies of them
 _TILE_BYTES = 150  # bytes per pixel during formation: positions, their projection, the sum
 _READ_BYTES = 3  # bytes in memory per byte of a block while it is read: compressed, decoded, and in its destination
 _SUM_BYTES = 8  # bytes per pixel for the sum over pulse blocks
 _CHECKED_PULSES, _CHECKED_BYTES = 1024, 40  # pulses per read for certificate and focus; bytes per subcarrier and pulse
 _LEAST_PULSES = 64  # least pulses of a block: batch size of the kernel
-# bytes per pixel on disk before compression: image, its share of the cube, three rasters with overviews
+# bytes per pixel on disk before compression: image, part of the cube, three rasters with overviews
 _PRODUCT_BYTES = 76
 
 
 def pulse_blocks(setting: Setting, job: Job, presum: Presum | None, *, requested: int | None = None) -> int:
-    """Return the number of pulse blocks: the requested number, or the smallest whose blocks fit into the job's memory.
+    """Return the number of pulse blocks: as requested, or the smallest number with which a block fits into memory.
 
-    If not even the smallest blocks fit, these are used, and the plan's memory exceeds the limit.
+    If not even the smallest blocks fit into the job's memory, the smallest blocks are used, and the memory of the plan
+    exceeds the limit.
     """
     pulses = len(job.aperture) if presum is None else len(presum.at)
     resident = _resident_bytes(setting, job, presum)
@@ -363,7 +366,7 @@ def pulse_blocks(setting: Setting, job: Job, presum: Presum | None, *, requested
 
 
 def block_decision(chosen: Setting, job: Job, presum: Presum | None, *, requested: bool) -> Decision:
-    """Return the decision on pulse blocks; the reason for a single block does not depend on the machine."""
+    """Return the decision on pulse blocks; for a single block, the stated reason does not depend on the machine."""
     size = f"{decimal(int(_resident_bytes(chosen, job, presum)))} of samples and tables"
     if requested:
         reason = f"requested, with at least {_LEAST_PULSES} pulses per block; {size} in total"
@@ -399,7 +402,7 @@ def _forming_bytes(job: Job) -> int:
 
 
 def memory_limit(*, groups: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> int:
-    """Return the memory available to this process, bytes: that of the machine, or the limit of its control groups.
+    """Return the memory available to this process, bytes: memory of the machine, or limit of the control groups.
 
     Batch systems and containers limit a job by a control group (version 1 or 2); limits of parent groups apply as well.
 

@@ -19,7 +19,8 @@ from apertura.core.planning.plan import Decision, Plan, block_decision, bytes_ne
 # ---- Search among the settings of all engines
 
 EQUAL_COST = 1.05
-"""Cost relative to the cheapest setting up to which settings count as equally cheap; the most exact one is chosen."""
+"""Cost relative to the cheapest setting, up to which settings are considered equally cheap. The most exact of these
+settings is chosen."""
 
 _PLACE_S = {"ecef": 2.0e-8, "local": 2.7e-9}  # seconds per pixel position
 _TILE_S = 4.0e-3  # seconds per tile, for its task and for writing
@@ -38,7 +39,7 @@ class SettingSearch:
     options
         Engine → option → requested value.
     pulse_blocks
-        Requested number of pulse blocks; None: the least that fits into memory.
+        Requested number of pulse blocks; None: the smallest number with which a block fits into memory.
     where
         Section of the configuration with the request, for messages.
     """
@@ -56,7 +57,7 @@ class SettingSearch:
 
     @property
     def tile_seconds(self) -> float:
-        """Seconds for pixel positions and writing of all tiles, without their sums."""
+        """Seconds for computing the pixel positions and writing all tiles, without the sums over pulses."""
         return self.job.pixels * _PLACE_S[self.job.frame] + self.job.tiles * _TILE_S
 
     def cheapest(self, pulses: int, target_db: float) -> Setting:
@@ -77,9 +78,9 @@ class SettingSearch:
         return min(equal, key=lambda setting: setting.error_db)
 
     def settings(self, pulses: int) -> list[Setting]:
-        """Return all available settings that match the request, cheapest first, and most exact first at equal cost.
+        """Return all available settings that match the request, sorted by cost; at equal cost, most exact first.
 
-        `form_seconds` includes pixel positions and writing of tiles.
+        `form_seconds` includes the computation of pixel positions and the writing of tiles.
 
         Raises
         ------
@@ -99,7 +100,10 @@ class SettingSearch:
         return {option: value for option, value in self.options.get(engine, {}).items() if value is not None}
 
     def fallbacks(self, chosen: Setting) -> tuple[Setting, ...]:
-        """Return the cheapest setting per 6 dB of accuracy, regardless of the request; the last is the exact sum."""
+        """Return settings that are successively more exact by at least 6 dB, ending with the exact sum.
+
+        Each setting is the cheapest one with its accuracy, regardless of the requested engine and options.
+        """
         if chosen.engine == "reference":
             return ()
         is_restricted = self.engine is not None or any(self._requested(engine) for engine in self.options)
@@ -118,19 +122,19 @@ class SettingSearch:
         return (*(self.fitted(setting, None) for setting in better), *last)
 
     def fitted(self, setting: Setting, presum: Presum | None) -> Setting:
-        """Return the setting with pulse blocks that fit into memory; pixel positions are recomputed for each block."""
+        """Return the setting with pulse blocks that fit into memory; each block recomputes the pixel positions."""
         blocks = pulse_blocks(setting, self.job, presum, requested=self.pulse_blocks)
         extra_seconds = (blocks - 1) * self.tile_seconds
         return replace(setting, pulse_blocks=blocks, form_seconds=setting.form_seconds + extra_seconds)
 
     def decisions(self, chosen: Setting, expected_db: float, accuracy_db: float) -> Iterator[Decision]:
-        """Yield the decisions of a setting with their reasons, the first with its error relative to the accuracy."""
+        """Yield the decisions of a setting with their reasons; the first reason compares error and accuracy."""
         requested = self._requested(chosen.engine)
         candidates = "all engines and settings" if self.engine is None and not requested else "the requested settings"
         reason = f"cheapest of {candidates} (within 5 %) that meets {accuracy_db:.0f} dB"
         if expected_db > accuracy_db:
-            reason = f"most exact of {candidates}, predicted {expected_db:.1f} dB, requested {accuracy_db:.0f} dB: "
-            reason += "tiles that miss the accuracy are recomputed"
+            reason = f"most exact of {candidates}: predicted error {expected_db:.1f} dB, requested {accuracy_db:.0f} "
+            reason += "dB; tiles that do not meet the requested accuracy are recomputed"
         yield Decision("engine", chosen.engine, reason, chosen.error_db)
         for name, reason in chosen.reasons.items():
             prefix = "requested; " if name in requested else ""
@@ -139,8 +143,8 @@ class SettingSearch:
     def _engines(self) -> list[str]:
         """Return the available engines that match the request.
 
-        Engines without a measured cost are included only if requested. A substitute engine, whose compilation at run
-        time takes ten seconds, is excluded if the engine for which it is the substitute was built.
+        Engines without a measured cost are included only if requested. A substitute engine needs ten seconds for
+        compilation at run time and is therefore excluded if the engine that it replaces was built.
         """
         reads = {"profiles", "phase_history"} if self.job.recorded else {"profiles"}
         runnable = [name for name in ENGINES if load_engine(name).available() and load_engine(name).READS in reads]
@@ -149,15 +153,15 @@ class SettingSearch:
             problem = (
                 "is not available on this machine"
                 if engine.READS in reads
-                else f"requires a {engine.READS.replace('_', ' ')}, which this job does not have"
+                else f"requires a {engine.READS.replace('_', ' ')}, which is not available for this job"
             )
             needs = getattr(engine, "NEEDS", None)
-            remedy = f"It needs {needs}. " if needs and engine.READS in reads else ""
+            remedy = f"Engine {self.engine} needs {needs}. " if needs and engine.READS in reads else ""
             raise CampaignError(
                 f"engine {self.engine} {problem}",
                 where=f"{self.where}.engine",
                 expected=f"an available engine: {', '.join(runnable)}",
-                remedy=f"{remedy}Choose one of these engines, or auto.",
+                remedy=f"{remedy}Choose an available engine, or auto.",
             )
         if self.engine is not None:
             return [self.engine]
@@ -175,8 +179,8 @@ MARGIN_DB = 3.0
 (benchmarks/planner.py)."""
 
 _PRESUM_DB = 6.0
-"""Margin of the presumming error below the total error, dB: a quarter of the error power is assigned to presumming, the
-rest to tables."""
+"""Margin of the presumming error below the total error, dB: a quarter of the error power is assigned to presumming, and
+the rest to the tables of the engine."""
 
 PRESUM_FACTORS = (16, 12, 8, 6, 5, 4, 3, 2)
 """Candidate numbers of pulses per virtual (presummed) pulse, in descending order."""
@@ -185,17 +189,17 @@ PRESUM_FACTORS = (16, 12, 8, 6, 5, 4, 3, 2)
 def make_plan(
     job: Job, *, accuracy_db: float, overrides: Mapping[str, Any] | None = None, where: str = "processing"
 ) -> Plan:
-    """Choose the cheapest setting and models that meet the requested accuracy; deterministic.
+    """Choose deterministically the cheapest setting and models that meet the requested accuracy.
 
     Parameters
     ----------
     job
         Imaging job.
     accuracy_db
-        Requested numerical error.
+        Requested numerical error, dB.
     overrides
-        Option → requested value: engine, engine_options (engine → option → value), presum, pulse_blocks, terrain.
-        With 'auto' or None the planner decides.
+        Option → requested value: engine, engine_options (engine → option → value), presum, pulse_blocks, terrain. The
+        planner decides the options that are 'auto', None or missing.
     where
         Section of the configuration with the request, for messages.
 
@@ -259,7 +263,7 @@ def _decide_presum(
     """Decide on presumming: return the decision, the low-pass sum over pulses or None, and the setting."""
     job, pulses = search.job, len(search.job.aperture)
     _, widest = job.aperture.phase_rates(job.points_m, wavelength_m=SPEED_OF_LIGHT_M_S / job.band_hz[1])
-    oversampled = f"phase rates of the scene differ from its middle by up to {widest:.3f} cycles per pulse"
+    oversampled = f"phase rates differ from that of the scene centre by up to {widest:.3f} cycles per pulse"
 
     def keep(reason: str) -> tuple[Decision, None, Setting]:
         return Decision("presum", 1, f"{oversampled}; {reason}"), None, every_pulse
@@ -271,7 +275,7 @@ def _decide_presum(
             raise _no_presum(requested, search.where)
         return keep(f"the weights of the {'antennas' if job.antennas else 'sector'} differ from pulse to pulse")
     if every_pulse.engine == "reference":
-        return keep("the exact sum uses every pulse")
+        return keep("the exact sum is computed over all pulses")
     limit_db = accuracy_db - MARGIN_DB - _PRESUM_DB
     best = _best_presum(job, (requested,) if requested else PRESUM_FACTORS, widest, limit_db)
     if best is None and requested:
@@ -284,14 +288,14 @@ def _decide_presum(
         )
     if best is None:
         return keep(
-            f"the error of every presumming factor exceeds {limit_db:.0f} dB, its share of the requested accuracy"
+            f"the error of every presumming factor exceeds {limit_db:.0f} dB, the limit for the requested accuracy"
         )
     presum, error_db = best
     presum_seconds = PRESUM_S * pulses * job.signal.samples
     presummed = search.cheapest(len(presum.at), accuracy_db - MARGIN_DB - 1)
     if not requested and presum_seconds + presummed.seconds > 0.9 * every_pulse.seconds:
-        return keep(f"presumming {presum.factor}:1 costs more than it saves")
-    line = f"{oversampled}; presumming of {pulses} pulses to {len(presum.at)}, error {error_db:.1f} dB"
+        return keep(f"presumming {presum.factor}:1 takes more time than it saves")
+    line = f"{oversampled}; {pulses} pulses are presummed to {len(presum.at)} with an error of {error_db:.1f} dB"
     chosen = replace(presummed, table_seconds=presummed.table_seconds + presum_seconds)
     return Decision("presum", presum.factor, line, error_db), presum, chosen
 
@@ -300,13 +304,13 @@ def _no_presum(requested: int, where: str) -> CampaignError:
     return CampaignError(
         f"presum factor {requested} with antenna beams or a limited integration angle",
         where=f"{where}.presum",
-        expected="1 or auto: the weights of antennas and sector differ from pulse to pulse",
+        expected="1 or auto, because the weights of antennas and sector differ from pulse to pulse",
         remedy="Set presum to auto, or set the nodes' antennas to null and processing.integration to all.",
     )
 
 
 def _best_presum(job: Job, factors: tuple[int, ...], widest: float, limit_db: float) -> tuple[Presum, float] | None:
-    """Return the low-pass sum with the largest factor whose error is within the limit, and its error."""
+    """Return the low-pass sum with the largest factor that meets the error limit, and its error."""
     pulses = len(job.aperture)
     for factor in factors:
         presum = design(pulses, factor, widest_cycles=widest, error_db=limit_db)

@@ -1,4 +1,4 @@
-"""Agreement of two images of one scene: relative shift and phase, from bright points or patches of terrain."""
+"""Agreement of two images of one scene: relative shift and phase, from bright points or from patches of terrain."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -16,8 +16,8 @@ from apertura.core.quality.measures import BlockRaster, weighted_median
 from apertura.core.quality.point_targets import PATCH_PX, BandLimitedPatch
 
 REACH_M = 4.0
-"""Largest shift between two images that is searched, metres (at least 12 cells): with larger shifts, other points
-match."""
+"""Largest shift between two images that is searched, metres; shifts of at least 12 resolution cells are searched. With
+larger shifts, different points would be matched."""
 
 WIDEST_PIXEL = 1.05
 """Largest pixel spacing in units of the finest resolution cell: pixels of 1.13 cells sample a flat band critically."""
@@ -30,23 +30,25 @@ OUT_OF_PHASE_RAD = 0.6
 """Tolerated phase difference of two images, radians: the loss of their sum is 0.4 dB."""
 
 LEAST_COHERENCE = 0.5
-"""Least mean phasor over common points, 0 to 1: phases with more scatter cannot be corrected by a constant phase."""
+"""Least magnitude of the mean phasor over common points, 0 to 1: phases with more scatter cannot be corrected by a
+constant phase."""
 
 LARGEST_PHASE_STD_RAD = 0.4
 """Largest standard deviation of a phase that is used, radians: the loss from a phase error of this size is 0.2 dB."""
 
-_MOST_PATCHES = 16  # largest number of patches compared, the brightest ones
+_MOST_PATCHES = 16  # largest number of patches that are compared; the brightest patches are selected
 _LEAST_LOOKS = 12
-"""Least number of independent samples: fewer may lie on one flank of a point response (eq. 6 of interferometry)."""
+"""Least number of independent samples: fewer may lie on one flank of a point response (interferometry.md, eq. 6)."""
 _BY_CHANCE = 0.001  # significance level: probability with which unrelated images are classified as coherent
 _WIDER = (2.0, 4.0, 8.0)  # resolution cells: gates within which points with different shifts are matched
 _FEWEST_SPREAD = 3  # least number of points for a wide gate: matches of two points may be accidental
 _FAR = 4.0  # standard deviations from the median shift, beyond which a match is an outlier
-# factor on the bounds of phase and position from looks, for the excess scatter of terrain (eq. 8 of interferometry)
+# factor on the bounds of phase and position from looks, for the excess scatter of terrain (interferometry.md, eq. 8)
 _MARGIN = 1.4
 
-_HALF_CYCLE = 0.5  # carrier cycles: a larger shift is closer to that by a path error of one wavelength than to no shift
-_POINT = 0.09  # in units of eq. 6: neighbours displace a peak by about a twentieth of a cell
+# carrier cycles: a larger shift is closer to the shift caused by a path error of one wavelength than to zero
+_HALF_CYCLE = 0.5
+_POINT = 0.09  # displacement of a peak by neighbours, in units of eq. 6: about a twentieth of a resolution cell
 _POINT_RAD = 0.05  # phase error of a peak caused by neighbours
 
 
@@ -66,10 +68,11 @@ class Agreement:
         Mean shift and its standard deviation in units of eq. 6; a resolution cell is about 1.8 units in every
         direction.
     cycles, cycles_std
-        Shift in the direction of the carrier, in which a path error displaces a point, and its standard deviation, in
-        cycles: below half a cycle the phase determines the path error unambiguously. 0 for looks.
+        Component of the shift along the carrier, the direction in which a path error displaces a point, and its
+        standard deviation, in carrier cycles. Below half a cycle, the phase determines the path error unambiguously.
+        0 for looks.
     phase_rad, phase_std_rad
-        Mean phase over the points, and its standard deviation.
+        Mean phase difference over the points, and its standard deviation.
     coherence
         For points, the magnitude of their mean phasor: 1 for equal phases, 1/√points for random phases. For patches,
         the coherence in their common band.
@@ -103,7 +106,7 @@ class Agreement:
 
     @property
     def shift_std_along_m(self) -> float:
-        """Standard deviation along the direction of the shift, metres."""
+        """Standard deviation of the shift along its own direction, metres."""
         return self.shift_m * self.shift_std_units / self.shift_units if self.shift_units else self.shift_std_m
 
     @property
@@ -128,7 +131,7 @@ class Agreement:
 
     @property
     def out_of_phase(self) -> bool:
-        """True if the phase difference is significant and the sum of the images loses power."""
+        """True if the phase difference significantly exceeds the tolerance, so that the coherent sum loses power."""
         return self.certain and abs(self.phase_rad) > OUT_OF_PHASE_RAD + 2 * self.phase_std_rad
 
     @property
@@ -138,7 +141,7 @@ class Agreement:
 
     @property
     def reversed(self) -> "Agreement":
-        """Agreement with the images exchanged: of the first image relative to the second."""
+        """The same agreement with the images interchanged: that of the first image relative to the second."""
         signed = ("shift_east_m", "shift_north_m", "cycles", "phase_rad")
         return replace(self, **{name: -getattr(self, name) for name in signed})
 
@@ -157,8 +160,8 @@ def agreement(
 ) -> Agreement | None:
     """Measure the agreement of two images by their common bright points; None without common points.
 
-    At least two common points and half of the points of either image are required, or the brightest points of both
-    images in one resolution cell.
+    The common points must number at least two and half of the points of the image with fewer points. Otherwise, the
+    brightest points of both images must lie in one resolution cell.
 
     Parameters
     ----------
@@ -177,8 +180,8 @@ def agreement(
 
     Notes
     -----
-    Source: docs/theory/focus.md, "Pairs". The phase is evaluated halfway between both peaks: at the peaks themselves
-    it would change with the carrier by the displacement that noise and neighbours cause.
+    Source: docs/theory/focus.md, "Pairs". The phase is evaluated halfway between both peaks. At the peaks themselves,
+    the displacement caused by noise and neighbours would add carrier phase.
 
     Examples
     --------
@@ -204,7 +207,8 @@ def agreement(
     unit = np.asarray(2 * np.pi * np.linalg.cholesky(spectrum), np.float64)  # metres to units of eq. 6
     carriers = np.array([[_carrier(points[0][i]), _carrier(points[1][j])] for i, j in matched]) / spacing_m
     # Variance of the shift, ε/2 along an axis in units of eq. 6, and of the phase, ε/2 rad², plus the effects of
-    # neighbours. If the carriers differ, the phase also varies with the midpoint, whose variance is a quarter.
+    # neighbours. If the carriers differ, the phase also varies with the midpoint, whose variance is a quarter of the
+    # variance of the shift.
     differ = np.diff(carriers, axis=1)[:, 0]
     slope = np.einsum("pi,ij,pj->p", differ, np.linalg.inv(spectrum), differ)
     shift_variance = background / 2 + _POINT**2
@@ -236,11 +240,12 @@ def agreement(
 def _common_points(
     lists: Sequence[Sequence[tuple[float, float, float]]], cell_m: float, *, alone: bool
 ) -> tuple[list[tuple[int, int]], bool]:
-    """Return the common points of two images, and True if their shifts differ by more than a cell.
+    """Return the common points of two images, and True if the shifts of these points differ by more than a cell.
 
-    Required are matches within one cell, after a common shift, for half of the points of either image; or the brightest
-    points of both images in one cell. Height, heading and drift errors displace points by different amounts. Points are
-    therefore also matched within wider gates, provided that the number of matches is statistically significant.
+    After a common shift, half of the points of the image with fewer points must have matches within one cell.
+    Otherwise, the brightest points of both images must lie in one cell. Height, heading and drift errors displace
+    points by different amounts. Points are therefore also matched within wider gates, provided that the number of
+    matches is statistically significant.
     """
     reach, fewest = max(REACH_M, 12 * cell_m), min(map(len, lists))
     _, matched = common_shift(lists[0], lists[1], reach=reach, gate=cell_m)
@@ -256,14 +261,15 @@ def _common_points(
 def _chance(lists: Sequence[Sequence[tuple[float, float, float]]], matches: int, reach: float, gate: float) -> float:
     """Return an upper bound of the probability of `matches` accidental matches of unrelated points under any shift.
 
-    Shifts within reach are tested at intervals of one gate. At each shift, a point has a match with the probability p,
-    the share of the area that is covered by the gates of the denser image's points (binomial distribution).
+    Shifts within reach are tested at intervals of one gate. At each shift, the number of matches has a binomial
+    distribution: a point of the image with fewer points has a match with the probability p, the fraction of the area
+    covered by the gates around the points of the other image.
     """
     fewer, more = sorted(lists, key=len)
     position = np.array([point[:2] for point in more])
     width, height = np.ptp(position, axis=0) + 2 * gate
     covered = min(1.0, len(more) * np.pi * gate**2 / (width * height))
-    trials = len(fewer) * len(more)  # each pair of points defines a shift, under which it matches itself
+    trials = len(fewer) * len(more)  # each pair of points defines a shift with which this pair matches
     at_least = sum(
         comb(len(fewer) - 1, count) * covered**count * (1 - covered) ** (len(fewer) - 1 - count)
         for count in range(matches - 1, len(fewer))
@@ -272,7 +278,7 @@ def _chance(lists: Sequence[Sequence[tuple[float, float, float]]], matches: int,
 
 
 def _brightest_of_both(lists: Sequence[Sequence[tuple[float, float, float]]], cell_m: float) -> list[tuple[int, int]]:
-    """Return the brightest points of two images if they lie in one cell, which is statistically significant."""
+    """Return the brightest points of two images if these lie in one cell, which is statistically significant."""
     if not all(lists):
         return []
     i, j = (int(np.argmax([amplitude for _, _, amplitude in points])) for points in lists)
@@ -284,8 +290,8 @@ def _weighted_shift(
 ) -> tuple[NDArray[np.float64], float]:
     """Return the mean of (point, 2) shifts, metres, and its standard deviation along an axis, units of eq. 6.
 
-    The given variances of the points are lower bounds: they are increased if the points scatter more. Outliers far from
-    the median are excluded as accidental matches with other points.
+    The given variances are lower bounds, which are increased if the points scatter more. Outliers far from the median
+    are excluded as accidental matches with other points.
     """
     middle = np.array([weighted_median(along, 1 / variance) for along in shifts.T])
     off = np.abs((shifts - middle) @ unit) / np.sqrt(variance)[:, None]
@@ -295,9 +301,10 @@ def _weighted_shift(
 
 
 def _excess(off: NDArray[np.float64], variance: NDArray[np.float64]) -> float:
-    """Return the ratio of the scatter of points to their standard deviations, at least 1; `off` (point, axis).
+    """Return the ratio of the scatter of points to their standard deviations, at least 1.
 
-    The weighted median is robust against weak points that are a sidelobe in one of the images.
+    `off`: (point, axis), deviations in units of the standard deviations. The weighted median is robust against weak
+    points that are sidelobes in one of the images.
     """
     weights = np.repeat(1 / variance, off.shape[1])
     return max(1.0, 1.4826 * weighted_median(off.ravel(), weights)) if len(off) > 1 else 1.0
@@ -341,8 +348,8 @@ def agreement_of_ground(
 
     Notes
     -----
-    Source: docs/theory/fusion.md, eq. 6. Spatial frequencies contained in only one image do not contribute, so neither
-    carrier has to be removed; the phase refers to a point of the terrain, as in `agreement`.
+    Source: docs/theory/fusion.md, eq. 6. Spatial frequencies contained in only one image do not contribute, so that
+    neither carrier has to be removed. As in `agreement`, the phase refers to a point of the terrain.
 
     Examples
     --------
@@ -409,7 +416,7 @@ def _brightest(images: tuple[BlockRaster, BlockRaster], windows: Iterable[Window
 
 
 def _read(image: BlockRaster, window: Window) -> NDArray[np.complex128]:
-    """Return a patch of (`PATCH_PX`, `PATCH_PX`), zero outside its window."""
+    """Return a patch of shape (`PATCH_PX`, `PATCH_PX`), zero outside the window."""
     patch = np.zeros((PATCH_PX, PATCH_PX), np.complex128)
     block = np.nan_to_num(np.asarray(image[window]))
     patch[: block.shape[0], : block.shape[1]] = block
@@ -422,7 +429,7 @@ def _looks(
     size: NDArray[np.float64],
     powers: NDArray[np.float64],
 ) -> float:
-    """Return the number of independent samples of patches: resolution cells, fewer if power is concentrated."""
+    """Return the number of independent samples: the number of resolution cells, or less if power is concentrated."""
     by_band = powers.prod() * first[0].size * PATCH_PX**2 / (np.abs(first) ** 2 * np.abs(second) ** 2).sum()
     joint = size.prod(axis=0)
     by_power = 2 * by_band * joint.sum() ** 2 / (np.count_nonzero(joint) * (joint**2).sum())

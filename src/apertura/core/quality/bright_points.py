@@ -12,32 +12,33 @@ from apertura.core.quality.measures import BlockRaster
 from apertura.core.quality.point_targets import PATCH_PX, find_peak
 
 SPECKLE = 0.06
-"""Power around a bright point relative to the point, above which it may be speckle: 0.07 for the brightest of 10⁶.
-"""
+"""Mean power around a bright point relative to the power of the point, above which the point may be speckle. The ratio
+for the brightest of 10⁶ speckle pixels is 0.07."""
 
 # ---- Point response at other points
 
 SMEARED_CELLS = 6.0
-"""Cells across the line of sight over which phase errors may smear a point, and within which eq. 1b is used."""
+"""Number of resolution cells across the line of sight over which phase errors may smear a point: eq. 1b is used within
+this distance."""
 
 OVER_RESPONSE = 2.0
-"""Least ratio of a point's amplitude to the responses of brighter points at its position: 6 dB, because tapers and
-phase errors displace and raise sidelobes."""
+"""Least ratio of the amplitude of a point to the summed responses of brighter points at its position: 6 dB, because
+tapers and phase errors displace and raise sidelobes."""
 
 _RESPONSE_PULSES = 512  # number of sampled pulses, sufficient for a quarter of this number of phase cycles
 
 
 @dataclass(frozen=True, eq=False)
 class PointResponse:
-    """Point response of an image: upper bound of the amplitude of a single point at other points.
+    """Point response of an image: upper bound of the amplitude that a single point causes at other points.
 
     Attributes
     ----------
     aperture
         Phase centres of the pair, all pulses.
     envelope
-        (sample,) complex, range response of a pulse over a period of the total path, referred to band centre; 1 at the
-        middle sample, which lies at the path of the point.
+        (sample,) complex, range response of a pulse over one period of the total path, referred to band centre. The
+        centre sample corresponds to the path of the point and is 1.
     step_m
         Total path between samples.
     wavelength_m
@@ -51,7 +52,7 @@ class PointResponse:
 
     Examples
     --------
-    Phase errors may smear the point by four cells in azimuth, but not by eight; two range cells away the response is 0:
+    Phase errors may smear the point by four cells in azimuth, but not by eight. At two range cells, the response is 0:
 
     >>> track = np.stack([np.linspace(-5, 5, 512), np.full(512, -100.0), np.full(512, 0.0)], -1)
     >>> response = PointResponse(Aperture(track, track), np.sinc(np.arange(-600, 600) / 120), 0.1, 0.26)
@@ -96,13 +97,13 @@ class PointResponse:
         cycles = np.ptp(extra_path_m, axis=0) / self.wavelength_m
         # Eq. 1a; eq. 1b applies within the cells over which phase errors may smear the point.
         lobe = np.abs((weight * range_response * np.exp(2j * np.pi / self.wavelength_m * extra_path_m)).sum(axis=0))
-        # If the sampled pulses undersample the phase, the sum would alias: use the envelope of far sidelobes.
+        # If the sampled pulses undersample the phase, the sum aliases: the envelope of far sidelobes is used instead.
         is_sampled = cycles < len(aperture) / 4
         lobe = np.where(is_sampled, lobe, bound / np.maximum(np.pi * cycles, 1.0))
         return np.asarray(np.where(cycles < SMEARED_CELLS, bound, lobe))
 
     def _range_response(self, extra_path_m: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return the range response of a pulse at extra paths: periodic, interpolated linearly."""
+        """Return the periodic range response of a pulse at extra paths, interpolated linearly."""
         count = len(self.envelope)
         at = extra_path_m / self.step_m + count // 2
         below = np.floor(at)
@@ -120,14 +121,16 @@ def separated(
     amplitude
         (maximum,) float, brightest first.
     shown
-        A maximum and others → (other,) float64, response at the others of a point at the first, as `PointResponse.at`.
+        Index of a maximum, and indices of other maxima → (other,) float64, response at the other maxima of a point at
+        the first, as returned by `PointResponse.at`.
     most
         Largest number of points.
 
     Returns
     -------
     list of int
-        Brightest first. Each exceeds the summed responses of all brighter points by `OVER_RESPONSE`.
+        Indices of the points, brightest first. The amplitude of each point exceeds the summed responses of all brighter
+        points by the factor `OVER_RESPONSE`.
 
     Notes
     -----
@@ -162,7 +165,7 @@ def near(
     Parameters
     ----------
     spectrum
-        (2, 2) float64, east and north, cycles² per m².
+        (2, 2) float64, covariance of the spatial spectrum, east and north, cycles² per m².
     spacing_m
         Pixel spacing; row 0 in the north.
     cell_m
@@ -171,8 +174,9 @@ def near(
     Returns
     -------
     callable
-        As `shown` of `bright_points`: 1 within two resolution cells in each direction, beyond which sidelobes are below
-        `DEEPEST_DB`, and within `SMEARED_CELLS` finest cells, over which errors may smear a point; 0 elsewhere.
+        Parameter `shown` of `bright_points`. Its values are 1 within two resolution cells in each direction, beyond
+        which sidelobes are below `DEEPEST_DB`; 1 within `SMEARED_CELLS` finest cells, over which phase errors may smear
+        a point; and 0 elsewhere.
 
     Examples
     --------
@@ -194,7 +198,7 @@ def near(
 
 MOST_POINTS = 16  # largest number of points measured in an image
 DEEPEST_DB = -12.0
-"""Least amplitude relative to the brightest point, dB: weaker points may be lobes of a defocused point."""
+"""Least amplitude of a point relative to the brightest point, dB: weaker maxima may be lobes of a defocused point."""
 
 _MOST_MAXIMA = 1024  # largest number of maxima compared with the responses of brighter points
 _POINT_CONTRAST = 10.0  # least power of a point relative to the surrounding speckle: 10 dB
@@ -211,7 +215,7 @@ class BrightPoint:
     amplitude
         Magnitude at the maximum.
     background
-        Mean power of the surrounding speckle relative to the point's, from the median over a patch.
+        Mean power of the surrounding speckle relative to the power of the point, estimated by the median over a patch.
     carrier
         Spatial frequency of the carrier down and right, cycles per pixel; None: the aliased frequency is used.
     """
@@ -241,8 +245,8 @@ def bright_points(
     cell_px
         Side of the squares in each of which only the brightest maximum is considered.
     shown
-        (2,) int64 pixel of a point and (n, 2) int64 pixels → (n,) float64, response of the point at these pixels, as
-        `PointResponse.at`.
+        (2,) int64 pixel of a point, and (n, 2) int64 pixels → (n,) float64, response of the point at these pixels, as
+        returned by `PointResponse.at`.
 
     Examples
     --------
@@ -274,7 +278,7 @@ def bright_points(
 
 
 def has_point(image: BlockRaster, row: int, column: int, *, reach: int) -> bool:
-    """Return True if an image has a pixel 10 dB above its surroundings within `reach` pixels of a pixel.
+    """Return True if a pixel within `reach` rows and columns of a given pixel is 10 dB above its surroundings.
 
     Examples
     --------
@@ -318,12 +322,12 @@ def brightest_near(image: BlockRaster, row: float, column: float, reach: float) 
 
 
 def _cell_maxima(magnitude: NDArray[np.float32], window: Window, cell_px: int) -> NDArray[np.float64]:
-    """Return (magnitude, row, column) of the largest local maximum in each square cell of a block; 0 without any.
+    """Return (magnitude, row, column) of the largest local maximum in each square cell of a block; magnitude 0 if none.
 
     Pixels at the edges of the block are compared with their neighbours inside it.
     """
     cell_px = min(cell_px, max(magnitude.shape))
-    # Largest of the 3 × 3 neighbours of every pixel, then the largest local maximum of each cell.
+    # Maximum over the 3 × 3 neighbourhood of every pixel, then the largest local maximum of each cell.
     highest = magnitude
     for axis in (0, 1):
         lines, about = np.swapaxes(highest, 0, axis), np.swapaxes(highest.copy(), 0, axis)
@@ -343,7 +347,7 @@ def _cell_maxima(magnitude: NDArray[np.float32], window: Window, cell_px: int) -
 
 
 def _is_local_maximum(image: BlockRaster, magnitude: float, row: int, column: int) -> bool:
-    """Return True if no neighbour of a pixel exceeds it, including neighbours in other blocks."""
+    """Return True if no neighbour of a pixel, in its own or another block, exceeds the pixel's magnitude."""
     about = image[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2]
     return bool(np.abs(np.nan_to_num(np.asarray(about))).max() <= magnitude)
 
@@ -355,7 +359,7 @@ def common_shift(
     reach: float,
     gate: float,
 ) -> tuple[tuple[float, float], list[tuple[int, int]]]:
-    """Estimate the common shift between two lists of points, weighted by brightness, and match the points under it.
+    """Estimate the common shift between two lists of points, weighted by brightness, and match the shifted points.
 
     Parameters
     ----------
@@ -364,13 +368,13 @@ def common_shift(
     reach
         Largest shift considered, in the unit of x and y.
     gate
-        Largest distance between differences of positions that count as the same shift.
+        Largest difference between two shifts that are considered equal, in the unit of x and y.
 
     Returns
     -------
     tuple
-        (Δx, Δy), second minus first, and pairs of indices of the matched points. Without a match within reach, zero and
-        no pairs.
+        (Δx, Δy), second minus first, and pairs of indices of the matched points. If no points match within reach, the
+        shift is zero and the list of pairs is empty.
 
     Examples
     --------
@@ -384,7 +388,7 @@ def common_shift(
     difference = b[None, :, :2] - a[:, None, :2]
     weight = np.minimum(a[:, None, 2] / a[:, 2].max(initial=1e-30), b[None, :, 2] / b[:, 2].max(initial=1e-30))
     weight = np.where(np.hypot(difference[..., 0], difference[..., 1]) <= reach, weight, 0.0)
-    # Each difference of two points is a candidate shift; its vote is the weight of all points matched under it.
+    # Each difference of two points is a candidate shift; its score is the total weight of the points that match.
     best, votes = np.zeros(2), 0.0
     for i, j in zip(*np.nonzero(weight), strict=True):
         near = np.hypot(*np.moveaxis(difference - difference[i, j], -1, 0)) <= gate
@@ -399,7 +403,7 @@ def common_shift(
 
 
 def _matched(difference: NDArray[np.float64], weight: NDArray[np.float64], gate: float) -> list[tuple[int, int]]:
-    """Match points within the gate, nearest first and each point at most once; return index pairs."""
+    """Match points within the gate, closest points first and each point at most once; return pairs of indices."""
     distance = np.where(weight > 0, np.hypot(difference[..., 0], difference[..., 1]), np.inf)
     matched: list[tuple[int, int]] = []
     for flat in np.argsort(distance, axis=None):

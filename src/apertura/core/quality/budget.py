@@ -12,7 +12,8 @@ from apertura.common.flags import Flags
 from apertura.core.quality.path_errors import Effect, PointPaths
 
 ARITHMETIC_BELOW_DB = 10.0
-"""Margin of the numerical error below the largest other error, dB: it then adds 0.4 dB to the sum."""
+"""Margin of the numerical error below the largest other error, dB: the numerical error then adds 0.4 dB to the total
+error."""
 
 LEAST_ACCURACY_DB, MOST_ACCURACY_DB = -40.0, -60.0
 """Range of `accuracy_db: auto`, dB: errors above the first limit are visible as sidelobes, errors below the second are
@@ -25,27 +26,29 @@ _NOT_STATED, _ASSUMED = "not configured", "assumed"
 RECEIVER_STD_M = {"fix": 0.01, "float": 0.3, "sbas": 1.0, "dgps": 0.5, "single": 1.0, "ppp": 0.1, "unknown": 0.01}
 """Assumed standard deviation of positions in each axis by solution class, metres, if no accuracy is stated: one
 centimetre for a fixed RTK solution, decimetres for a float solution, metres without RTK. A log without a solution class
-is assumed to be fixed, as required for a radar image."""
+is assumed to contain fixed solutions, as required for a radar image."""
 
 ATTITUDE_STD_DEG = {"log": (1.0, 3.0), "course": (8.0, 10.0)}
 """Assumed standard deviations of roll and pitch (each) and of heading by attitude source, degrees, if none are stated.
-A small inertial unit has about 1° in roll and pitch; a magnetometer near motors has a few degrees in heading. Axes from
-the course assume a level body that flies straight ahead, but multirotors tilt by 5° to 15° and crab in wind."""
+A small inertial unit has errors of about 1° in roll and pitch; a magnetometer near motors has errors of a few degrees
+in heading. Axes derived from the course presuppose a level body that flies straight ahead, whereas multirotors tilt by
+5° to 15° and crab in wind."""
 
 LEVER_ARM_STD_M = 0.01
-"""Assumed standard deviation of a lever arm in each axis, metres, if none is stated: measured with a ruler to a phase
-centre whose position is not exactly known."""
+"""Assumed standard deviation of a lever arm in each axis, metres, if none is stated: a lever arm is measured with a
+ruler, to a phase centre whose position is not exactly known."""
 
 LEAST_FIELD = 0.1
-"""Least field of a pulse relative to the strongest, for the effect of the pattern's phase."""
+"""Least field of a pulse relative to the strongest pulse: the phase of the pattern is neglected at weaker pulses."""
 
 UNDETECTABLE_LOSS_DB = 0.2
-"""Peak loss that is not detectable in an image, dB: tolerated for the phase of antenna patterns and height errors."""
+"""Peak loss that is not detectable in an image, dB; tolerated for the phase of antenna patterns and for height errors.
+"""
 
 GROUND_STD_M = 3.0
-"""Assumed standard deviation of the terrain height, metres, if none is stated and it is not observable in the image:
-it covers errors of map contours and barometers, and crops and roofs. A confusion of geoid and ellipsoid, tens of
-metres, raises an error in other checks."""
+"""Assumed standard deviation of the terrain height, metres, if none is stated and height errors are not observable in
+the image. The value covers errors of map contours and barometers, and the heights of crops and roofs. A confusion of
+geoid and ellipsoid causes an error of tens of metres, which other checks detect."""
 
 _SMALL_M = 1e-2  # height error for which the loss is quadratic
 
@@ -66,14 +69,15 @@ class BudgetLine:
     cause
         Name of the error source.
     stated
-        Stated or measured size, a phrase. None if unstated: the effect is that of an error of the size `unit`.
+        Stated or measured size of the error, a phrase. None if no size is stated: the effect is then computed for an
+        error of the size `unit`.
     unit
-        Size for which the effect is computed if none is stated.
+        Size for which the effect is computed if no size is stated.
     effect
         Expected effect.
     assumed
-        Size that is assumed if none is stated, with the reason; the effect of this size is expected. None: no size is
-        assumed.
+        Size that is assumed if none is stated, with the reason; the effect of an error of this size is expected. None:
+        no size is assumed.
     """
 
     cause: str
@@ -84,7 +88,7 @@ class BudgetLine:
 
     @property
     def counts(self) -> bool:
-        """True if the effect is expected: its size is stated, measured or assumed."""
+        """True if the effect is expected, that is, if the size of the error is stated, measured or assumed."""
         return self.stated is not None or self.assumed is not None
 
     @property
@@ -112,7 +116,7 @@ def is_stated(report: Mapping[str, Any]) -> bool:
 
 
 def is_counted(report: Mapping[str, Any]) -> bool:
-    """Return True if the effect of an error source is expected: its size is stated, measured or assumed.
+    """Return True if the effect of an error is expected, that is, if its size is stated, measured or assumed.
 
     Examples
     --------
@@ -135,7 +139,7 @@ class NodePositions:
     stated_by
         Source of the accuracy: 'config' or 'log'.
     drift_m
-        Standard deviation of a slow error over the whole flight, in each axis.
+        Standard deviation of a slow error over the whole flight, in each axis, metres.
     receiver
         Solution class, a key of `RECEIVER_STD_M`; None if positions are not from a receiver's log.
     """
@@ -148,7 +152,7 @@ class NodePositions:
 
     @property
     def assumed(self) -> "NodePositions":
-        """Accuracy as stated, else that of the solution class."""
+        """Stated accuracy, otherwise the accuracy assumed for the solution class."""
         if self.std_m is not None or self.receiver is None:
             return self
         correlation_s = self.correlation_s if self.receiver in _FIXED else max(self.correlation_s, _SLOW_S)
@@ -156,7 +160,7 @@ class NodePositions:
 
 
 def position_lines(paths: PointPaths, nodes: Sequence[NodePositions], *, sidelink: bool) -> list[BudgetLine]:
-    """Return the budget lines of position errors: stated, assumed by solution class, else per centimetre of error.
+    """Return the budget lines of position errors of stated size, of a size assumed by solution class, or of 1 cm.
 
     Parameters
     ----------
@@ -194,7 +198,7 @@ def position_lines(paths: PointPaths, nodes: Sequence[NodePositions], *, sidelin
 
 
 _CLASSES = {name: f"solution class {name}" for name in RECEIVER_STD_M} | {
-    "fix": "fixed RTK solution", "unknown": "taken as a fixed RTK solution (no solution class in the log)"
+    "fix": "fixed RTK solution", "unknown": "treated as a fixed RTK solution (no solution class in the log)"
 }  # fmt: skip
 
 
@@ -308,8 +312,8 @@ def antenna_line(paths: PointPaths, phase_rad: NDArray[np.float64], weight: NDAr
     paths
         Paths to a point at the scene centre.
     phase_rad, weight
-        (pulse,) float64: sum of the phases, and product of the fields, of both antennas towards the point; pulses with
-        a field below `LEAST_FIELD` of the strongest are excluded.
+        (pulse,) float64: sum of the phases, and product of the fields, of both antennas in the direction of the point.
+        Pulses with a field below `LEAST_FIELD` of the strongest pulse are excluded.
 
     Notes
     -----
@@ -317,7 +321,7 @@ def antenna_line(paths: PointPaths, phase_rad: NDArray[np.float64], weight: NDAr
     """
     illuminating = weight >= LEAST_FIELD * weight.max()
     if weight.max() <= 0 or illuminating.sum() < _FEWEST_PULSES:
-        return BudgetLine("antenna", None, NO_EFFECT, "beams that do not illuminate the middle of the scene")
+        return BudgetLine("antenna", None, NO_EFFECT, "beams that do not illuminate the scene centre")
     part = replace(paths, aperture=paths.aperture[np.flatnonzero(illuminating)], time_s=paths.time_s[illuminating])
     # A constant phase does not displace the point.
     phase, mean = phase_rad[illuminating], float(phase_rad[illuminating].mean())
@@ -369,7 +373,7 @@ def arithmetic_line(error_db: float) -> BudgetLine:
 
 
 def height_line(paths: PointPaths, std_m: float | None, *, expected_db: float = 0.0) -> BudgetLine:
-    """Return the budget line of the terrain height: stated, or the largest error that is not observable in the image.
+    """Return the budget line of the terrain height: its stated error, or the largest one not observable in the image.
 
     Parameters
     ----------
@@ -378,12 +382,12 @@ def height_line(paths: PointPaths, std_m: float | None, *, expected_db: float = 
     std_m
         Configured standard deviation of the heights, metres; None: not configured.
     expected_db
-        Expected loss from other error sources, 0 or less: a height error with the same loss is not detectable.
+        Expected loss from other error sources, dB, 0 or less: a height error that causes this loss is not detectable.
 
     Notes
     -----
-    Source: docs/theory/focus.md, eq. 2a. An assumed height error displaces points without a loss: a larger error would
-    be observable in the image.
+    Source: docs/theory/focus.md, eq. 2a. An assumed height error is expected to displace points without a peak loss,
+    because an error that causes a loss would be observable in the image.
 
     Examples
     --------
@@ -392,7 +396,7 @@ def height_line(paths: PointPaths, std_m: float | None, *, expected_db: float = 
     >>> track = np.stack([along, np.full(101, -10.0), np.full(101, 10.0)], -1)
     >>> paths = PointPaths(Aperture(track, track), along, np.zeros(3), np.eye(3), 0.2)
     >>> print(height_line(paths, None).report["stated"])
-    not configured; assumed 3 m: not observable with this track
+    not configured; assumed 3 m, because height errors are not observable with this track
     """
     slope = -paths.gradient[:, 2]
     if std_m is not None:
@@ -400,14 +404,14 @@ def height_line(paths: PointPaths, std_m: float | None, *, expected_db: float = 
     loss_db_m2 = -paths.of_offset(_SMALL_M * slope, common=True).loss_db / _SMALL_M**2
     undetectable_db = UNDETECTABLE_LOSS_DB - expected_db
     observable_m = math.sqrt(undetectable_db / max(loss_db_m2, 1e-9))
-    assumed_m, reason = GROUND_STD_M, "not observable with this track"
+    assumed_m, reason = GROUND_STD_M, "height errors are not observable with this track"
     if observable_m < assumed_m:
         assumed_m, reason = (
             observable_m,
-            f"a larger error would cost more than {undetectable_db:.2g} dB and be observable",
+            f"a larger error would cause an observable peak loss of more than {undetectable_db:.2g} dB",
         )
     effect = replace(paths.of_offset(assumed_m * slope, common=True), loss_db=0.0, loss_std_db=0.0)
-    return BudgetLine("heights", None, effect, assumed=f"{assumed_m:.2g} m: {reason}")
+    return BudgetLine("heights", None, effect, assumed=f"{assumed_m:.2g} m, because {reason}")
 
 
 def summed(effects: Iterable[Effect]) -> Effect:
@@ -438,7 +442,7 @@ def noise_loss(variance_rad2: float) -> Effect:
 
 
 def strictest_accuracy_db(requested: float | Literal["auto"]) -> float:
-    """Return the smallest numerical error that may be requested, which determines the accuracy of the echo.
+    """Return the smallest numerical error that may be requested, which determines the accuracy of echo processing.
 
     Examples
     --------
@@ -453,7 +457,7 @@ def accuracy_for(lines: Iterable[BudgetLine]) -> float:
 
     Notes
     -----
-    Source: docs/theory/focus.md, eq. 5: the power lost by a peak is spread around it.
+    Source: docs/theory/focus.md, eq. 5: the power lost by a peak is spread around the peak.
 
     Examples
     --------

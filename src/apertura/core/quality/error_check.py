@@ -11,7 +11,7 @@ from apertura.core.quality.measures import BlockRaster
 
 # ---- Error bound from drawn pixels
 
-# confidence of the error bound; it was valid in at least 98.5 % of images (benchmarks/certificate.py)
+# confidence of the error bound, which was valid in at least 98.5 % of images (benchmarks/certificate.py)
 CONFIDENCE = 0.95
 
 _SIGMAS = 2.0  # instead of 1.645, the 95 % quantile of a Gaussian: sums of skewed errors have longer tails
@@ -54,7 +54,7 @@ def error_bound(
     *,
     power: float | NDArray[np.float64],
 ) -> ErrorBound:
-    """Estimate the error of a whole image from random pixels, after a common complex gain.
+    """Estimate the error of a whole image from random pixels, after correction by a common complex gain.
 
     Parameters
     ----------
@@ -93,8 +93,8 @@ def error_bound(
         limit_db = _db(0.0 if not error else np.inf)
         return ErrorBound(limit_db, limit_db)
     deviation = np.sqrt(errors.size) * float((errors - error / total * levels).std())  # √K·s
-    # q at 95 %: the draws may have missed an error as large as the largest, and may include the brightest pixel by
-    # chance.
+    # Upper bound of q at 95 %: an error as large as the largest one may not have been drawn, and the brightest pixel
+    # may have been drawn by chance.
     above = (error + float(errors.max())) / (total - largest) * np.exp(_SIGMAS * deviation / error)
     return ErrorBound(_db(above), _db(error / total))
 
@@ -116,7 +116,7 @@ def random_pixels(windows: Sequence[Window], count: int, generator: np.random.Ge
     Parameters
     ----------
     windows
-        All tiles; a pixel is drawn from one tile after the other, in random order, until `count` pixels are drawn.
+        All tiles. One pixel is drawn from each tile in turn, in random order, until `count` pixels are drawn.
     count
         Number of pixels.
     generator
@@ -169,9 +169,9 @@ class Brightness:
     def density(
         self, pixels: NDArray[np.int64], values: NDArray[np.complexfloating], windows: Sequence[Window], *, random: int
     ) -> NDArray[np.float64]:
-        """Return the expected number of draws of drawn pixels by `random_pixels` and `draw`, (pixel,) float64.
+        """Return the expected number of draws of each pixel by `random_pixels` and `draw` together, (pixel,) float64.
 
-        `pixels`: (pixel, 2) int64, pixels of both draws, starting with the `random` pixels from `random_pixels`.
+        `pixels`: (pixel, 2) int64, drawn pixels, of which the first `random` pixels are drawn by `random_pixels`.
         `values`: the image at these pixels.
         """
         density = np.zeros(len(pixels))
@@ -221,7 +221,7 @@ class Certificate:
     pixels
         (pixel, 2) int64 rows and columns.
     exact
-        (pixel,) complex128 by the exact sum.
+        (pixel,) complex128, values of the exact sum.
     """
 
     windows: Sequence[Window]
@@ -229,12 +229,12 @@ class Certificate:
     exact: NDArray[np.complex128]
 
     def failing(self, image: BlockRaster, accuracy_db: float, *, power: float) -> tuple[list[Window], list[Window]]:
-        """Return (tiles without a drawn pixel, tiles that miss the accuracy); both are empty if all tiles pass.
+        """Return (tiles without a drawn pixel, tiles that do not meet the accuracy); both are empty if all tiles pass.
 
         A tile fails if the mean squared difference at its pixels exceeds the accuracy times the larger of `power`, the
         mean |I|² of the image, and the mean exact |I|² at these pixels: errors are proportional to the amplitude of
-        bright targets. The pixels do not depend on the image, so a run that was killed while it recomputed tiles
-        selects the same tiles again, provided the failing tiles are recomputed last.
+        bright targets. The drawn pixels do not depend on the image. If a run is killed while it recomputes tiles, the
+        resumed run therefore selects the same tiles, provided that the failing tiles are recomputed last.
         """
         squared, exact_power = np.abs(values_at(image, self.pixels) - self.exact) ** 2, np.abs(self.exact) ** 2
         tolerated = 10 ** (accuracy_db / 10)

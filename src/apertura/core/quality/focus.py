@@ -1,4 +1,4 @@
-"""Focus of an image without ground truth, from pulse contributions at bright points and from subapertures."""
+"""Assessment of focus without ground truth, from pulse contributions at bright points and from subapertures."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from apertura.core.quality.measures import coherence_factor, weighted_median
 
 # ---- Subapertures: noise, drift and entropy
 
-_RANDOM_DRAWS = 8  # draws of random phases that are averaged
+_RANDOM_DRAWS = 8  # number of draws of random phases, over which the entropy is averaged
 
 
 @dataclass(frozen=True)
@@ -23,12 +23,12 @@ class SubApertures:
     Attributes
     ----------
     snr_db
-        SNR of a pixel, from images of even and of odd pulses.
+        SNR of a pixel, from the images of the even and of the odd pulses.
     drift_m, drift_std_m
         RMS shift of the patch between subapertures, and its standard deviation.
     entropy, entropy_random_phase
-        Shannon entropy of the patch, nats, and that of the sum of the same subapertures with random phases: if both are
-        equal, the patch is not focused.
+        Shannon entropy of the patch, nats, and entropy of the sum of the same subapertures with random phases. If both
+        values are equal, the patch is not focused.
     """
 
     snr_db: float
@@ -125,11 +125,11 @@ LEAST_BLOCKS = 32
 """Least number of pulse blocks, each dominated by the point, to separate phase errors from noise."""
 
 MOST_INTERFERENCE = 0.08
-"""Log-amplitude variance of a point over the aperture, above which it does not dominate its cell."""
+"""Log-amplitude variance of a point over the aperture, above which the point does not dominate its resolution cell."""
 
 LEAST_PEAK_SHARE = 0.35
-"""Least ratio of the amplitude at the point to the largest amplitude over all linear phases: below it, the point is a
-sidelobe of another echo."""
+"""Least ratio of the amplitude at a point to the largest amplitude obtained with any linear phase. A point with a
+smaller ratio is a sidelobe of another echo."""
 
 DEFOCUSED_DB = -1.0
 """Peak loss beyond which an image is defocused, dB."""
@@ -137,7 +137,8 @@ DEFOCUSED_DB = -1.0
 Verdict = Literal["focused", "defocused", "inconclusive"]
 
 MOST_ERROR_DB = -20.0
-"""Numerical error relative to the peak, dB, above which bright points may be artefacts if the accuracy is missed."""
+"""Numerical error relative to the peak, dB. If the requested accuracy is not met and the error exceeds this level,
+bright points may be artefacts."""
 
 GEOMETRY_CONTRADICTED = frozenset(
     {
@@ -162,12 +163,12 @@ GEOMETRY_CONTRADICTED = frozenset(
         "wrong_code",
     }
 )
-"""Flags that show a contradiction in the geometry, the clocks or the code of image formation: an image with any of them
-is not reported as focused."""
+"""Flags that report a contradiction in the geometry, the clocks or the transmitted code. An image with any of these
+flags is not reported as focused."""
 
 _TREND = 5  # degree of the polynomial that models patterns, range and aspect in the log-amplitude
-_PADDING = 8  # zero-padding factor of the spectrum of blocks, whose maximum removes a linear phase
-_SIGMAS = 5.0  # significance of a drift above a resolution cell for the verdict defocused, standard deviations
+_PADDING = 8  # zero-padding factor of the spectrum over blocks, whose maximum is independent of a linear phase
+_SIGMAS = 5.0  # standard deviations by which a drift must exceed a resolution cell for the verdict defocused
 
 
 @dataclass(frozen=True)
@@ -177,16 +178,16 @@ class PointFocus:
     Attributes
     ----------
     loss_db
-        Peak power relative to that of the same contributions in phase, 0 or less, with the loss from noise and
-        neighbours removed.
+        Peak power relative to the peak power of the same contributions in phase, dB, 0 or less. The loss caused by
+        noise and neighbours is removed.
     interference
-        Power of noise and neighbours relative to the point: the log-amplitude variance.
+        Power of noise and neighbours relative to the power of the point: the log-amplitude variance.
     pulses
         Pulses per block; phase errors that vary within a block are not measured.
     snr_db
-        SNR of the point in the image, from its even and odd pulses; NaN with fewer than four pulses.
+        SNR of the point in the image, from even and odd pulses; NaN with fewer than four pulses.
     coherence, coherence_noise_limit
-        |Σ s|²/(M Σ|s|²) of the contributions s of M pulses, and its value with noise alone.
+        |Σ s|²/(M Σ|s|²) of the contributions s of M pulses, and its expected value if noise is the only disturbance.
     """
 
     loss_db: float
@@ -198,7 +199,7 @@ class PointFocus:
 
 
 def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
-    """Measure the focus of a point; None if it does not dominate its range cell over the whole aperture.
+    """Measure the focus of a point; None if the point does not dominate its range cell over the whole aperture.
 
     Parameters
     ----------
@@ -207,9 +208,9 @@ def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
 
     Notes
     -----
-    Source: docs/theory/focus.md, eq. 1. Phase errors do not change the amplitude of a contribution, while noise and
-    neighbours change phase and amplitude equally: the log-amplitude variance equals the phase variance that they cause.
-    Pulses are averaged in the shortest blocks that the point dominates.
+    Source: docs/theory/focus.md, eq. 1. Phase errors do not change the amplitude of a contribution. Noise and
+    neighbours change phase and amplitude equally, so that the log-amplitude variance equals the phase variance caused
+    by noise and neighbours. Pulses are averaged over the shortest blocks in which the point is dominant.
 
     Examples
     --------
@@ -244,14 +245,14 @@ def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
 
 
 def log_amplitude_variance(log_amplitude: NDArray[np.float64]) -> float:
-    """Return the variance of the log-amplitudes of blocks about their smooth trend: patterns, range and aspect."""
+    """Return the log-amplitude variance of blocks about a smooth trend, which models patterns, range and aspect."""
     along = np.linspace(-1, 1, len(log_amplitude))
     trend = np.polynomial.legendre.Legendre.fit(along, log_amplitude, _TREND)(along)
     return float(((log_amplitude - trend) ** 2).sum() / (len(along) - _TREND - 1))
 
 
 def _snr_db(contributions: NDArray[np.complex128]) -> float:
-    """Return the SNR of a pixel from neighbouring pulses, which differ only by noise."""
+    """Return the SNR of a pixel from consecutive pulses, which differ only by noise."""
     count = len(contributions) // 2
     if count < 2:
         return float("nan")
@@ -275,7 +276,7 @@ class Focus:
         Median peak loss over the points, weighted by amplitude, and its standard deviation; NaN without points.
     points
         Number of measured points.
-    why
+    reason
         Reason for the verdict, one line.
     """
 
@@ -317,7 +318,7 @@ def judge(points: Sequence[tuple[float, PointFocus | None]]) -> Focus:
     count = number_of(len(measured), "bright point")
     line = f"peak loss {abs(loss):.2f} ± {std:.2f} dB from phase errors, {count}"
     if verdict == "inconclusive":
-        line += f": not significantly above or below {-DEFOCUSED_DB:g} dB (two standard deviations)"
+        line += f": within two standard deviations of the limit, {-DEFOCUSED_DB:g} dB"
     return Focus(verdict, loss, std, len(measured), line)
 
 
@@ -342,7 +343,7 @@ def focus_with_flags(
     Parameters
     ----------
     focus
-        Section with `verdict` and `why` from the bright points alone.
+        Section with `verdict` and `reason` from the bright points alone.
     flags
         Names of the flags of the image.
     error_db
@@ -373,7 +374,7 @@ def judge_parts(parts: SubApertures, *, cell_m: float) -> Focus:
     parts
         Subaperture measures of patches.
     cell_m
-        Resolution cell: subapertures with a larger drift do not sum to a focused image.
+        Size of the resolution cell, metres: subapertures with a larger drift do not add up to a focused image.
 
     Examples
     --------
@@ -386,7 +387,7 @@ def judge_parts(parts: SubApertures, *, cell_m: float) -> Focus:
     line = "no bright point dominates its range cell"
     if parts.drift_m - _SIGMAS * parts.drift_std_m > cell_m and parts.drift_std_m > 0:
         drift = f"{parts.drift_m:.2f} ± {parts.drift_std_m:.2f} m"
-        return Focus("defocused", *nothing, f"{line}, and subaperture images are displaced by {drift}")
+        return Focus("defocused", *nothing, f"{line}, and subaperture images are displaced from each other by {drift}")
     if np.isfinite(parts.entropy):
-        line += f"; entropy {parts.entropy:.2f}, {parts.entropy_random_phase:.2f} with random phases"
+        line += f"; entropy {parts.entropy:.2f}, or {parts.entropy_random_phase:.2f} with random phases"
     return Focus("inconclusive", *nothing, line)

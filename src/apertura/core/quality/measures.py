@@ -70,9 +70,9 @@ class ImageStatistics:
     Attributes
     ----------
     entropy
-        Shannon entropy −Σ q ln q of the power shares q of the pixels, nats: lower for a better focused image.
+        Shannon entropy −Σ q ln q, nats, with each pixel's fraction q of the total power: lower for better focus.
     noise_floor_db
-        Median power relative to peak power, to 0.01 dB: the level between targets.
+        Median power relative to peak power, rounded to 0.01 dB: the level between targets.
     peak
         Largest magnitude.
     row, column
@@ -102,7 +102,7 @@ def image_statistics(image: BlockRaster, windows: Iterable[tuple[slice, slice]])
     Raises
     ------
     ValueError
-        If no pixel has power.
+        If all pixels are zero or NaN.
 
     Examples
     --------
@@ -123,7 +123,8 @@ def image_statistics(image: BlockRaster, windows: Iterable[tuple[slice, slice]])
             peak = float(power.flat[best])
             row, column = np.unravel_index(best, power.shape)
             peak_pixel = (window[0].start + int(row), window[1].start + int(column))
-        # Sums Σp and Σp ln p of the entropy, and a histogram of power by 0.01 dB; pixels without power lie below it.
+        # Sums Σp and Σp ln p for the entropy, and a histogram of power with bins of 0.01 dB. Pixels without power are
+        # below the lowest bin.
         present = power[power > 0]
         empty += int(np.isfinite(block).sum()) - present.size
         total += present.sum()
@@ -131,7 +132,7 @@ def image_statistics(image: BlockRaster, windows: Iterable[tuple[slice, slice]])
         bins = np.clip((10 * np.log10(present) - _LOWEST_DB) * _BINS_PER_DB, 0, counts.size - 1)
         counts += np.bincount(bins.astype(np.int64), minlength=counts.size)
     if not peak:
-        raise ValueError("no pixel of the image has power")
+        raise ValueError("all pixels of the image are zero or NaN")
     median_bin = int(np.searchsorted(empty + np.cumsum(counts), (empty + counts.sum()) / 2))
     # Median power over the peak; −Σ q ln q = ln Σp − Σp ln p/Σp with q = p/Σp.
     floor = _LOWEST_DB + median_bin / _BINS_PER_DB - 10 * np.log10(peak)

@@ -1,4 +1,4 @@
-"""Effect of total path errors on the image of a point: peak loss, displacement and phase."""
+"""Effect of errors of the total path on the image of a point: peak loss, displacement and phase."""
 
 from dataclasses import dataclass
 
@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from apertura.core.geometry.aperture import Aperture
 
 MOST_PULSES = 200
-"""Largest number of evenly spaced pulses of `PointPaths`, sufficient for errors correlated over several of them."""
+"""Largest number of evenly spaced pulses of `PointPaths`: sufficient if errors are correlated over several samples."""
 
 
 def autocorrelation(lag_s: NDArray[np.float64], correlation_s: float) -> NDArray[np.float64]:
-    """Return the autocorrelation of position errors at a time lag, which defines `position_correlation_s`.
+    """Return the autocorrelation of position errors at a time lag: the definition of `position_correlation_s`.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class PointPaths:
         axes: NDArray[np.float64],
         wavelength_m: float,
     ) -> "PointPaths":
-        """Return the paths to a point at evenly spaced pulses; parameters are the attributes for all pulses."""
+        """Return the paths to a point at evenly spaced pulses; the parameters are the attributes at all pulses."""
         sampled = aperture.sample(MOST_PULSES)
         return cls(aperture[sampled], time_s[sampled], point_m, axes, wavelength_m)
 
@@ -123,15 +123,15 @@ class PointPaths:
         return np.gradient(self.aperture.path(self.point_m), self.time_s)
 
     def by_node(self, *, same: bool, sidelink: bool) -> tuple[NDArray[np.float64], ...]:
-        """Return the derivatives of the measured path by the position of each node, (pulse, 3) east, north, up.
+        """Return the derivatives of the measured path with respect to each node's position, (pulse, 3) east, north, up.
 
         Parameters
         ----------
         same
-            True if one node transmits and receives, so that its error affects both one-way paths: a single array is
-            returned.
+            True if a single node transmits and receives, so that its position error affects both one-way paths: a
+            single array is returned.
         sidelink
-            True if the echo was corrected by the sidelink, whose path length is computed from the same logs.
+            True if the echo was corrected by the sidelink; the sidelink's path length is computed from the same logs.
 
         Notes
         -----
@@ -177,13 +177,13 @@ class PointPaths:
         error_m
             (pulse,) float64, true path minus the path assumed in image formation, metres.
         common
-            True if all pairs share the cause, so that their images have nearly the same displacement: the residual
-            phase between them is not predicted.
+            True if the cause is common to all pairs. Their images then have nearly the same displacement, and the
+            residual phase between the images is not predicted.
 
         Notes
         -----
-        Source: docs/theory/focus.md, eq. 2: the component that fits a horizontal shift displaces the point, the
-        residual defocuses it.
+        Source: docs/theory/focus.md, eq. 2: the component equivalent to a horizontal shift displaces the point, and the
+        residual defocuses the point.
         """
         # Δx = G⁺e, r = e − GΔx and L of eq. 2.
         ground = self.gradient[:, :2]
@@ -200,8 +200,8 @@ class PointPaths:
         Parameters
         ----------
         *parts
-            Standard deviation at each pulse, (pulse,) float64 metres, and correlation time of `autocorrelation`,
-            seconds, of each error.
+            For each error, its standard deviation at each pulse, (pulse,) float64, metres, and its correlation time as
+            for `autocorrelation`, seconds.
 
         Notes
         -----

@@ -12,10 +12,10 @@ from apertura.core.quality.measures import BlockRaster
 PATCH_PX = 64  # side of a patch, pixels
 
 CUT_REACH_M = 3.0
-"""Half length of the cuts through an image's brightest target, metres: main lobe and first sidelobes."""
+"""Half length of the cuts through the brightest target of an image, metres: includes main lobe and first sidelobes."""
 
 _REFINEMENTS = 7
-"""Number of refinement rounds, each by a factor of four: from one pixel to a grid of 6e-5 pixel."""
+"""Number of refinement rounds, each of which reduces the grid spacing by a factor of four: from one to 6e-5 pixel."""
 
 
 class BandLimitedPatch:
@@ -26,16 +26,16 @@ class BandLimitedPatch:
     image
         (y, x) complex64, with the carrier phase.
     row, column
-        Pixel at the middle of the patch.
+        Pixel at the centre of the patch.
     carrier
-        Centre of the spatial frequency band, down and right, cycles per pixel. By default the centre of the aliased
-        band; phases between pixels are then correct up to a constant phase step per pixel.
+        Centre of the spatial frequency band, down and right, cycles per pixel (default: centre of the aliased band;
+        phases between pixels are then correct up to a constant phase step per pixel).
 
     Notes
     -----
-    The bins of the patch's discrete Fourier transform are assigned frequencies about the centre of the band, also if
-    the band is aliased; between pixels the trigonometric polynomial is evaluated exactly. Splines of real and imaginary
-    parts are unsuitable: the carrier phase changes by more than a radian per pixel.
+    Each bin of the discrete Fourier transform of the patch is assigned the alias frequency nearest to the band centre.
+    Between pixels, the trigonometric polynomial is evaluated exactly. Splines of the real and imaginary parts are
+    unsuitable, because the carrier phase changes by more than a radian per pixel.
     """
 
     def __init__(self, image: BlockRaster, row: int, column: int, carrier: tuple[float, float] | None = None) -> None:
@@ -68,8 +68,8 @@ def carrier_at(carriers: NDArray[np.float64], shape: tuple[int, int], row: float
 
     Notes
     -----
-    Interpolated by parabolas through the nine points: the direction to an antenna varies smoothly over the scene, and
-    its third order is neglected.
+    Values are interpolated by parabolas through the nine points. The direction to an antenna varies smoothly over the
+    scene; third-order variations are neglected.
 
     Examples
     --------
@@ -91,7 +91,7 @@ def _span(at: int, size: int) -> slice:
 
 
 def _centred(spectrum: NDArray[np.complex128], axis: int, middle: float | None) -> NDArray[np.float64]:
-    """Return the frequency (cycles per pixel) of each DFT bin, unwrapped about a middle or the band's centroid."""
+    """Return the frequency (cycles per pixel) of each DFT bin, unwrapped about a given or the estimated band centre."""
     power = (np.abs(spectrum) ** 2).sum(axis=1 - axis)
     count = len(power)
     bins = np.arange(count)
@@ -158,9 +158,10 @@ def locate_maximum(
     start, reach
         The search covers `start` ± `reach` in each coordinate.
     rounds
-        Number of grids: each spans one step of the previous grid to both sides of its best point.
+        Number of successive grids. Each grid extends over one step of the previous grid to both sides of the best
+        point found.
     counts
-        Points of the first grid along each coordinate; later grids have 9 × 9.
+        Number of points of the first grid along each coordinate; later grids have 9 × 9 points.
 
     Examples
     --------
@@ -188,7 +189,7 @@ class Cut:
     width_m
         −3 dB width, metres; NaN if the main lobe extends beyond the cut.
     pslr_db, islr_db
-        Peak and integrated sidelobe ratio along the cut, dB; NaN without sidelobes.
+        Peak and integrated sidelobe ratios along the cut, dB; NaN without sidelobes.
     """
 
     width_m: float
@@ -221,8 +222,8 @@ def cut_through(
 
     Notes
     -----
-    The main lobe ends at the first minima on both sides. PSLR is the highest sample outside the main lobe relative to
-    the peak, ISLR the energy outside relative to the energy inside.
+    The main lobe ends at the first minima on both sides. The PSLR is the highest sample outside the main lobe relative
+    to the peak; the ISLR is the energy outside the main lobe relative to the energy inside it.
 
     Examples
     --------
@@ -247,7 +248,7 @@ def cut_through(
 def cuts_report(
     image: BlockRaster, peak: Peak, *, cross_range: tuple[float, float], spacing_m: float, reach_m: float
 ) -> dict[str, float | None]:
-    """Report the cuts through a peak along and across the flight for image.json; None for values beyond a cut.
+    """Report cuts through a peak along and across the flight for image.json; None for values that a cut does not yield.
 
     Parameters as for `cut_through`; `cross_range` is the (east, north) direction of the flight.
 
@@ -275,7 +276,7 @@ def line_through(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Sample a line through a peak: distances from the peak, metres, and power, (sample,) float64 each.
 
-    Parameters as for `cut_through`; 32 samples per pixel, with the peak at the middle sample.
+    Parameters as for `cut_through`. The line has 32 samples per pixel; its centre sample is at the peak.
 
     Examples
     --------
@@ -293,7 +294,7 @@ def line_through(
 
 
 def _summit(line: NDArray[np.float64]) -> int:
-    """Return the index of the maximum next to the middle of a line: a wide lobe is flat there within rounding."""
+    """Return the index of the maximum near the centre of a line, where a wide lobe is flat within rounding errors."""
     middle = len(line) // 2
     for step in (-1, 1):
         while 0 < middle < len(line) - 1 and line[middle + step] > line[middle]:
@@ -307,7 +308,7 @@ def _first_minimum(line: NDArray[np.float64]) -> int:
 
 
 def half_power_width(power: NDArray[np.float64], middle: int) -> float:
-    """Return the −3 dB width, in samples, of a lobe that peaks at sample `middle`; NaN if it extends beyond the line.
+    """Return the −3 dB width, samples, of a lobe with the peak at sample `middle`; NaN if it lacks a half-power point.
 
     Examples
     --------

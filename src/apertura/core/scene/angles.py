@@ -11,17 +11,17 @@ from apertura.core.scene.terrain import FlatGround, Terrain
 
 
 def surface_normals(position: Floats) -> Floats:
-    """Return the upward unit normals of a surface given at pixels.
+    """Return the upward unit normals of a surface that is given by the positions of pixels.
 
     Parameters
     ----------
     position
-        (row, column, 3) float64 metres, rows southward and columns eastward, at least 2 × 2.
+        (row, column, 3) float64, metres, rows southward and columns eastward, at least 2 × 2 pixels.
 
     Returns
     -------
     ndarray
-        (row, column, 3) float64, from central differences, at the edges from one-sided differences.
+        (row, column, 3) float64, from central differences inside and one-sided differences at the edges.
 
     Examples
     --------
@@ -34,7 +34,7 @@ def surface_normals(position: Floats) -> Floats:
 
 
 def surface(grid: SceneGrid, terrain: Terrain, window: Window) -> tuple[Floats, Floats]:
-    """Return positions and unit normals of the terrain in a window, seamless between windows.
+    """Return positions and unit normals of the terrain in a window, continuous across adjacent windows.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def surface(grid: SceneGrid, terrain: Terrain, window: Window) -> tuple[Floats, 
     Returns
     -------
     tuple of ndarray
-        (row, column, 3) float64 each: metres in the grid's processing frame; normals upward.
+        (row, column, 3) float64 each: positions in the processing frame of the grid, metres; and upward normals.
     """
     if isinstance(terrain, FlatGround):
         position = terrain.positions(grid[window])
@@ -71,14 +71,14 @@ def incidence_deg(position: Floats, normal: Floats, antenna: Floats) -> Floats:
     Parameters
     ----------
     position, normal
-        (..., 3) float64, metres and unit vectors, in one frame.
+        (..., 3) float64, positions in metres and unit vectors, in the same frame.
     antenna
         (3,) float64, metres.
 
     Returns
     -------
     ndarray
-        (...) float64 degrees, above 90 where the surface faces away from the antenna.
+        (...) float64, degrees; above 90 where the surface faces away from the antenna.
 
     Examples
     --------
@@ -89,7 +89,7 @@ def incidence_deg(position: Floats, normal: Floats, antenna: Floats) -> Floats:
 
 
 def bistatic_angle_deg(position: Floats, tx: Floats, rx: Floats) -> Floats:
-    """Return the angle at each position (..., 3) between the directions to two antennas (3,), metres, in degrees.
+    """Return the angle, degrees, at each position (..., 3) between the directions to two antennas (3,), metres.
 
     Examples
     --------

@@ -11,10 +11,11 @@ from apertura.core.geometry.geodesy import frame_from_map, geodetic_from_ecef, m
 from apertura.core.scene.grid import SceneGrid
 
 GRAZING_LIMIT_DEG = 10.0
-"""Smallest grazing angle within automatic bounds, degrees; below it, backscatter and terrain accuracy decrease."""
+"""Smallest grazing angle within automatic bounds, degrees: at smaller angles, backscatter and terrain accuracy are
+lower."""
 
 PIXELS_PER_CELL = 3.0
-"""Pixels per finest resolution cell; the Nyquist limit of a band-limited magnitude is 2."""
+"""Number of pixels per finest resolution cell, along each axis; the Nyquist limit of a band-limited magnitude is 2."""
 
 
 def utm_crs(position: NDArray[np.float64]) -> str:
@@ -57,7 +58,7 @@ def auto_bounds(
     Returns
     -------
     tuple
-        xmin, ymin, xmax, ymax, integer metres.
+        xmin, ymin, xmax, ymax, rounded outward to integer metres.
 
     Notes
     -----
@@ -74,8 +75,8 @@ def auto_bounds(
         east, north = (middle + (reach + 1) * corners).T  # outer corners, rounded to metres
         return float(sample.path(frame_from_map(crs, east, north, np.full(4, height_m))).max())
 
-    # The paths from the ends of the track to the corners of the square may exceed the limit: reduce the square until
-    # they do not. If no size fits, the square is unchanged, and checks of the scene report paths beyond the limit.
+    # The paths from the ends of the track to the corners of the square may exceed the limit: the square is reduced
+    # until no path does. If no size fits, the square is unchanged, and checks of the scene report the excess.
     fitting = (reach * share for share in np.linspace(1, 0.1, 91) if longest_m(reach * share) <= path_limit_m)
     reach = next(fitting, reach)
     low, high = np.floor(middle - reach), np.ceil(middle + reach)
@@ -90,7 +91,7 @@ def auto_spacing(
     bounds_m: tuple[float, float, float, float],
     height_m: float,
 ) -> float:
-    """Return a pixel spacing (m, of the series 1-2-5) that samples the finest resolution cell of the scene.
+    """Return a pixel spacing (metres, from the series 1-2-5) that samples the finest resolution cell of the scene.
 
     The spatial spectrum of a pixel is spanned by the gradient of the phase 2πf·path/c over pulses and frequencies. Its
     largest extent along x or y over the pixels of a coarse grid is the inverse of the resolution cell.
@@ -126,13 +127,13 @@ def auto_spacing(
 MOST_PIXELS = 25_000_000
 """Largest number of pixels of an automatic grid: 200 MB per image."""
 
-_FEWEST_PIXELS = 250_000  # number of pixels permitted for any recording
+_FEWEST_PIXELS = 250_000  # number of pixels that is permitted for any recording
 
 
 def most_pixels(pulses: int, subcarriers: int) -> int:
-    """Return the largest number of pixels of an automatic grid: one resolution cell per recorded sample.
+    """Return the largest number of pixels of an automatic grid, which corresponds to one resolution cell per sample.
 
-    A cell has `PIXELS_PER_CELL` pixels along each axis.
+    A resolution cell has `PIXELS_PER_CELL` pixels along each axis.
 
     Examples
     --------
@@ -143,7 +144,7 @@ def most_pixels(pulses: int, subcarriers: int) -> int:
 
 
 def coarsened(spacing_m: float, bounds_m: tuple[float, float, float, float], most: int) -> float:
-    """Return a spacing of the series 1-2-5, not below the given one, that limits the pixels within bounds to `most`.
+    """Return a spacing not below `spacing_m`, from the series 1-2-5, with at most `most` pixels within the bounds.
 
     Examples
     --------

@@ -15,19 +15,20 @@ _BLOCKS = 33
 def clearance(
     grid: SceneGrid, terrain: Terrain, antenna: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the height of each phase centre above the pixel below it, and the height of that pixel.
+    """Return the height of each phase centre above the pixel below it, and the terrain height of this pixel.
 
     Parameters
     ----------
     grid, terrain
         Grid and terrain of the scene.
     antenna
-        (pulse, 3) float64 phase centres, metres, in the grid's processing frame.
+        (pulse, 3) float64, phase centres, metres, in the processing frame of the grid.
 
     Returns
     -------
     tuple of ndarray
-        (pulse,) float64 metres each. Outside the scene, a flat terrain is extrapolated, and heights over a DEM are NaN.
+        (pulse,) float64 each, metres. Outside the scene, a flat terrain is extrapolated, and heights over a DEM are
+        NaN.
 
     Examples
     --------
@@ -41,22 +42,22 @@ def clearance(
 
 
 def check_antennas(grid: SceneGrid, terrain: Terrain, aperture: Aperture, *, where: str) -> dict[str, str]:
-    """Reject antennas that are not above the terrain; return a flag for antennas below the lowest height of the DEM.
+    """Reject antennas that are not above the terrain; return a flag for antennas below the lowest terrain of a DEM.
 
     Parameters
     ----------
     grid, terrain
         Grid and terrain of the scene.
     aperture
-        Aperture in the grid's processing frame.
+        Aperture in the processing frame of the grid.
     where
-        Flight and pair, for errors.
+        Flight and pair, for error messages.
 
     Returns
     -------
     dict
-        Flag → measured values, one line. It is no error, because a radar outside the scene may image a hillside above
-        the radar.
+        Flag → measured values, one line. An antenna below the scene is not an error, because a radar outside the scene
+        may image a hillside above the radar.
 
     Raises
     ------
@@ -86,7 +87,7 @@ def _below_ground(
         f"{ground[pulse]:.2f} m",
         where="scene.height_m" if flat else "scene.dem",
         expected="an antenna above the terrain",
-        remedy=f"Check {keys}, and the heights in the flight log (they may refer to the geoid).",
+        remedy=f"Check {keys}, and the heights in the flight log, which may refer to the geoid.",
     )
 
 
@@ -96,5 +97,5 @@ def _below_scene(grid: SceneGrid, terrain: Terrain, antenna: NDArray[np.float64]
         return {}
     return {
         "platform_below_scene": f"the {which} is {below_m:.1f} m below the lowest terrain of the scene: check the unit "
-        "and the datum of the DEM, unless the radar images a hillside above it"
+        "and the datum of the DEM, unless the radar images a hillside above the radar"
     }

@@ -1,4 +1,4 @@
-"""DEM in any CRS: opening and checks of the file, and ellipsoidal heights at the pixels of a grid."""
+"""DEM in any CRS: opening and checking the file, and ellipsoidal heights at the pixels of a grid."""
 
 import re
 from dataclasses import dataclass
@@ -22,28 +22,29 @@ from apertura.core.scene.terrain import Terrain, bilinear
 # ---- Ellipsoidal heights of a DEM at the pixels of a grid
 
 LATTICE_M = 50.0
-"""Metres between nodes at which coordinates of another CRS are computed; bilinear interpolation between them has an
-error of 0.1 mm."""
+"""Spacing of nodes at which coordinates in another CRS are computed, metres. Bilinear interpolation between nodes has
+an error of 0.1 mm."""
 
 COVER_NODES = 129
-"""Nodes along each side of the scene at which coverage is checked."""
+"""Number of nodes along each side of the scene at which coverage is checked."""
 
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
-"""Range of land heights on Earth above any datum, metres: Dead Sea −430 m, Everest 8849 m."""
+"""Range of possible land heights on Earth above any datum, metres; the extremes are −430 m (Dead Sea) and 8849 m
+(Mount Everest)."""
 
 MOST_POSTS = 100_000_000
 """Largest number of posts of a DEM in memory at once: 0.8 GB of float64."""
 
 FILLS = (0.0, -1.0, 1.0, 255.0, -99.0, 99.0, 999.0, -100.0, -499.0)
-"""Common fill values of voids within the range of land heights."""
+"""Common fill values of voids that lie within the range of land heights."""
 
 STEEPEST = 5.0
-"""Slope, rise over run, over `STEP_M` or one post, above which a flag is raised: 79 degrees."""
+"""Slope (rise over run) over `STEP_M` or one post spacing, above which a flag is raised: 79 degrees."""
 
 STEP_M = 20.0
-"""Horizontal distance over which a step is measured, metres: at the limit the step is 100 m high."""
+"""Horizontal distance over which a step is measured, metres: a step at the limit of the slope is 100 m high."""
 
-_FILL_MARGIN = 16  # number of posts around the scene that are also read, to find the edges of a void
+_FILL_MARGIN = 16  # number of posts around the scene that are also read in order to find the edges of a void
 _MOST_STEPS = 1_000_000
 _TILE_PX = 512
 _SAME_RASTER = "the raster that was opened before"
@@ -60,15 +61,15 @@ class Dem(Terrain):
     shape
         Rows and columns of the raster.
     pixel_from_map
-        Affine coefficients a…f of (x, y) → (column, row), outer corner of the raster at (0, 0).
+        Affine coefficients a…f of (x, y) → (column, row), with the outer corner of the raster at (0, 0).
     horizontal
-        WKT of the raster's horizontal CRS; empty in a local frame.
+        WKT of the horizontal CRS of the raster; empty in a local frame.
     geodetic
-        Three-dimensional geodetic CRS (any pyproj definition) to whose ellipsoid the undulations refer.
+        Three-dimensional geodetic CRS (any pyproj definition), to the ellipsoid of which the undulations refer.
     geoid
         Grid of undulations; None if heights are ellipsoidal.
     metres_per_unit
-        Unit of the raster's heights, metres; negative if heights are positive downward.
+        Unit of the heights in the raster, metres; negative if heights are positive downward.
 
     Notes
     -----
@@ -84,24 +85,24 @@ class Dem(Terrain):
     metres_per_unit: float
 
     def heights(self, grid: SceneGrid) -> Floats:
-        """Return the height of each pixel of a grid or of a window of it; only the required part of the DEM is read.
+        """Return the height of each pixel of a grid or of a window; only the required part of the DEM is read.
 
         Parameters
         ----------
         grid
-            Grid or window of it; the height of a pixel does not depend on the window.
+            Grid or window of a grid; the height of a pixel does not depend on the window.
 
         Returns
         -------
         ndarray
-            (row, column) float64, metres above the ellipsoid of `grid.crs` (z in a local frame), bilinear between
-            posts; NaN outside the DEM and where one of the posts is a void.
+            (row, column) float64, metres above the ellipsoid of `grid.crs` (z in a local frame), interpolated
+            bilinearly between posts; NaN outside the DEM and where one of the posts is a void.
 
         Raises
         ------
         CampaignError
             If a height depends on a post outside the range of land heights (undeclared void or wrong unit), or on a
-            block of posts equal to one of `FILLS` and surrounded by steep walls (undeclared void).
+            block of posts that equal one of `FILLS` and are surrounded by steep walls (undeclared void).
         """
         side = max(1, int(LATTICE_M / grid.spacing_m))
         rows, columns = (np.arange(size) + first for size, first in zip(grid.shape, grid.first, strict=True))
@@ -114,7 +115,7 @@ class Dem(Terrain):
         return np.asarray(self._sample(row, column) + shift)
 
     def check_cover(self, grid: SceneGrid) -> None:
-        """Raise CampaignError with the missing share and side if the DEM does not cover the whole grid."""
+        """Raise CampaignError if the DEM does not cover the whole grid, with the missing fraction and side."""
         xy_m = grid.map_at(*np.rint(grid.sample_pixels(COVER_NODES)))
         column, row = self._posts(grid.crs, xy_m[..., 0], xy_m[..., 1])
         outside = ~self._inside(row, column)
@@ -126,10 +127,10 @@ class Dem(Terrain):
         rows, columns = self.shape
         raise CampaignError(
             f"{100 * outside.mean():.1f} % of the scene lies outside the DEM, to the {', '.join(sides) or 'inside'}: "
-            f"the scene extends over its columns {column.min():.1f} to {column.max():.1f} and rows {row.min():.1f} to "
-            f"{row.max():.1f}",
+            f"the scene extends over columns {column.min():.1f} to {column.max():.1f} and rows {row.min():.1f} to "
+            f"{row.max():.1f} of the DEM",
             where=self.path,
-            expected=f"a DEM that covers the whole scene; this one has {columns} columns and {rows} rows",
+            expected=f"a DEM that covers the whole scene; this DEM has {columns} columns and {rows} rows",
             remedy="Obtain the missing part of the DEM, or reduce scene.bounds_m.",
         )
 
@@ -139,17 +140,17 @@ class Dem(Terrain):
         return inside[0] & inside[1]
 
     def _posts(self, crs: str, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        """Return fractional column and row of map coordinates in the raster: (0, 0) is the first post."""
+        """Return fractional column and row of map coordinates in the raster; (0, 0) is the first post."""
         a, b, c, d, e, f = self.pixel_from_map
         if self.horizontal:
             x, y = _transformer(crs, self.horizontal).transform(x, y)
-            if CRS(self.horizontal).is_geographic:  # to the longitude range of the raster, 0…360° or −180…180°
+            if CRS(self.horizontal).is_geographic:  # convert to the longitude range of the raster, 0…360° or −180…180°
                 middle = (self.shape[1] / 2 - c) / a if a else 0.0
                 x = x + 360 * np.round((middle - x) / 360)
         return np.asarray(a * x + b * y + c - 0.5), np.asarray(d * x + e * y + f - 0.5)
 
     def _shift(self, crs: str, xy_m: Floats) -> Floats:
-        """Return the offset that converts heights of the DEM to heights of a grid in `crs`, above WGS 84, metres."""
+        """Return the offset that converts heights of the DEM to heights of a grid in `crs`, metres."""
         if crs == LOCAL:
             return np.zeros(xy_m.shape[:-1])
         longitude, latitude = _transformer(crs, CRS(self.geodetic).to_2d()).transform(xy_m[..., 0], xy_m[..., 1])
@@ -159,7 +160,7 @@ class Dem(Terrain):
         return np.asarray(transformed[2], np.float64)
 
     def _sample(self, row: Floats, column: Floats) -> Floats:
-        """Return the raster's heights (m, above its datum) between posts; NaN outside it."""
+        """Return heights of the raster (m, above the datum of the raster) between posts; NaN outside the raster."""
         sampled = np.full(row.shape, np.nan)
         inside = self._inside(row, column)
         if not inside.any():
@@ -197,9 +198,9 @@ class Dem(Terrain):
         return sampled
 
     def _check_fills(self, raster: Any, first: list[int], counts: list[int], index: tuple[Floats, Floats]) -> None:
-        """Raise CampaignError if a height depends on a block of posts of one fill value surrounded by steep walls.
+        """Raise CampaignError if a height depends on a block of posts with a fill value, surrounded by steep walls.
 
-        Posts around the requested ones are also read, because only a block that ends within the window is a void.
+        Posts around the requested posts are also read, because only a block that ends within the window is a void.
         """
         from rasterio.windows import Window
 
@@ -218,12 +219,12 @@ class Dem(Terrain):
                     f"{row}, column {column}, surrounded by posts that differ by at least {lowest_m:.0f} m",
                     where=self.path,
                     expected="terrain heights, and voids declared as nodata",
-                    remedy=f"Declare {value:g} as nodata for these posts, and fill them with a GIS.",
+                    remedy=f"Declare {value:g} as nodata for these posts, and fill the voids with a GIS.",
                 )
 
     @property
     def _post_m(self) -> float:
-        """Spacing of posts along the axis with the wider spacing, metres."""
+        """Spacing of posts along the axis with the larger spacing, metres."""
         a, b, _, d, e, _ = self.pixel_from_map
         unit_m = 111_195.0 if CRS(self.horizontal).is_geographic else 1.0
         return unit_m / max(float(min(np.hypot(a, d), np.hypot(b, e))), 1e-12)
@@ -242,22 +243,22 @@ class Dem(Terrain):
 
 
 def walled(heights: Floats, same: NDArray[np.bool_], *, wall_m: float) -> tuple[NDArray[np.bool_], float]:
-    """Find blocks of `same` posts that are surrounded by steps in height, and the lowest of these steps.
+    """Return the blocks of `same` posts that are surrounded by steps in height, and the lowest of these steps.
 
     Parameters
     ----------
     heights
         (row, column) float64, metres; NaN in voids, which are ignored as neighbours.
     same
-        (row, column) bool, posts of equal height.
+        (row, column) bool, True for posts of equal height.
     wall_m
         Least height difference from all neighbours in the same row or column, metres.
 
     Returns
     -------
     tuple
-        (row, column) bool, posts of the blocks, without blocks that touch an edge; lowest step in metres, infinite if
-        there is no block.
+        (row, column) bool, mask of the posts of blocks that do not touch an edge; and lowest step in metres, infinite
+        if there is no block.
 
     Examples
     --------
@@ -287,7 +288,7 @@ def walled(heights: Floats, same: NDArray[np.bool_], *, wall_m: float) -> tuple[
 
 @dataclass(frozen=True)
 class UncheckedDem(Terrain):
-    """DEM of a scene not yet checked by the stage `terrain`: voids raise the same error as in that stage.
+    """DEM of a scene that the stage `terrain` has not checked yet: voids raise the same error as in this stage.
 
     Attributes
     ----------
@@ -299,7 +300,7 @@ class UncheckedDem(Terrain):
     grid: SceneGrid
 
     def heights(self, grid: SceneGrid) -> Floats:
-        """Return the DEM's heights; a void in the scene raises CampaignError with the number of pixels affected."""
+        """Return the heights of the DEM; voids in the scene raise CampaignError with the number of pixels affected."""
         heights = self.dem.heights(grid)
         if grid.spacing_m == self.grid.spacing_m and np.isnan(heights).any():
             height_range(self.dem, self.grid, where=self.dem.path)
@@ -307,19 +308,19 @@ class UncheckedDem(Terrain):
 
 
 def height_range(terrain: Terrain, grid: SceneGrid, *, where: Path) -> tuple[float, float]:
-    """Return the lowest and the highest terrain height of a scene (m), read tile by tile.
+    """Return the lowest and highest terrain heights of a scene (m); heights are read tile by tile.
 
     Parameters
     ----------
     terrain, grid
         The terrain, and the whole grid.
     where
-        The DEM, for errors.
+        File of the DEM, for error messages.
 
     Raises
     ------
     CampaignError
-        If pixels have no height; the error states their number and the position of the first.
+        If pixels have no height; the error states the number of these pixels and the position of the first one.
     """
     voids, first, low, high = 0, "", np.inf, -np.inf
     for window in grid.tiles(_TILE_PX):
@@ -342,13 +343,13 @@ def height_range(terrain: Terrain, grid: SceneGrid, *, where: Path) -> tuple[flo
 
 
 def _heights(raster: Any, window: Any) -> tuple[Floats, Floats]:
-    """Return the stored values of a window, NaN in voids, and the heights in the raster's unit."""
+    """Return the stored values of a window, with NaN in voids, and the heights in the unit of the raster."""
     stored = raster.read(1, window=window, masked=True).astype(np.float64).filled(np.nan)
     return stored, stored * raster.scales[0] + raster.offsets[0]
 
 
 class Step(NamedTuple):
-    """Steepest step of the terrain of a scene: height difference, horizontal distance, and map position, metres."""
+    """Step of the terrain of a scene: height difference, horizontal distance, and map position, metres."""
 
     height_m: float
     over_m: float
@@ -359,8 +360,8 @@ class Step(NamedTuple):
 def steepest_step(terrain: Terrain, grid: SceneGrid) -> Step | None:
     """Return the highest step of the terrain that is steeper than `STEEPEST` over `STEP_M`; None if there is none.
 
-    Cliffs are rarely that steep. Typical causes are voids filled with a constant, and areas with another datum or
-    source.
+    Cliffs are rarely this steep. Typical causes are voids filled with a constant, and areas with a different datum or
+    from a different source.
 
     Parameters
     ----------
@@ -391,8 +392,8 @@ def _transformer(source: str | CRS, target: str | CRS) -> Transformer:
         raise CampaignError(
             f"PROJ has no exact transformation from {CRS(source).name} to {CRS(target).name}",
             where="scene.dem",
-            expected="a DEM in a CRS that PROJ can transform to that of the scene",
-            remedy="Reproject the DEM to scene.crs with a GIS, and configure its datum.",
+            expected="a DEM in a CRS that PROJ can transform to the CRS of the scene",
+            remedy="Reproject the DEM to scene.crs with a GIS, and configure the datum of the DEM.",
         ) from error
 
 
@@ -401,9 +402,9 @@ def _transformer(source: str | CRS, target: str | CRS) -> Transformer:
 _COLOURS = {"red", "green", "blue", "palette", "hue", "saturation", "lightness", "cyan", "magenta", "yellow"}
 _EXPECTED = "the DEM of scene.dem, a GeoTIFF of heights"
 NAMES_FILES = re.compile(r'\+proj=|grids=|init=|"PROJ4"|PARAMETERFILE\["[^"]*","[^"]*[/\\:~]', re.IGNORECASE)
-"""Keywords of a CRS (WKT) that cause PROJ to open files other than the grids in its own folders."""
+"""Keywords of a CRS (WKT) that cause PROJ to open files other than the grids in the folders of PROJ."""
 
-_REMEDY = "Correct the DEM, or scene.dem and scene.dem_datum (from Python: path and datum)."
+_REMEDY = "Correct the DEM, or scene.dem and scene.dem_datum (in Python: path and datum)."
 
 
 def open_dem(
@@ -416,18 +417,19 @@ def open_dem(
     path
         GeoTIFF with heights in band 1; sidecar files (.aux.xml, .ovr, .tfw) are ignored.
     scene
-        The grid that the DEM must cover; or only its CRS, a pyproj definition or 'local', to skip the coverage check.
+        Grid that the DEM must cover; or only the CRS of the grid (a pyproj definition or 'local'), to omit the coverage
+        check.
     datum
-        Datum of the heights: 'ellipsoid', 'egm96', 'egm2008', or 'carried': that declared by the raster's CRS, in a
-        local scene z of the frame.
+        Datum of the heights: 'ellipsoid', 'egm96', 'egm2008', or 'carried'. 'carried' selects the datum that the CRS of
+        the raster declares; in a local frame, heights are z of the frame.
     geoid
-        Grid of undulations; searched on PROJ's path if None.
+        Grid of undulations; None: the grid is searched in the folders of PROJ.
 
     Raises
     ------
     CampaignError
-        If the file is not a DEM, its CRS contradicts `datum` or is required to declare a datum but does not, the grid
-        of undulations is missing, or the DEM does not cover the scene.
+        If the file is not a DEM; the CRS of the file contradicts `datum`, or does not declare the required datum; the
+        grid of undulations is missing; or the DEM does not cover the scene.
 
     Examples
     --------
@@ -445,7 +447,7 @@ def open_dem(
     612.5
     """
     if not isinstance(scene, str | SceneGrid):
-        raise CampaignError(quoted(scene), "open_dem: scene", "a SceneGrid, or its CRS", "Pass the grid of the images.")
+        raise CampaignError(quoted(scene), "open_dem: scene", "a SceneGrid, or a CRS", "Pass the grid of the images.")
     crs = scene if isinstance(scene, str) else scene.crs
     dem = _dem(Path(path), crs, datum=datum, geoid=None if geoid is None else Path(geoid))
     if not isinstance(scene, str):
@@ -467,8 +469,8 @@ def _dem(path: Path, crs: str, *, datum: str, geoid: Path | None) -> Dem:
     vertical_datum = _datum(path, system, datum)
     metres = _metres_per_unit(path, system, unit)
     horizontal = system.sub_crs_list[0] if system.is_compound else system.to_2d()
-    # Undulations of EGM96 and EGM2008, and configured ellipsoidal heights, refer to WGS 84; all others to the ellipsoid
-    # of the raster's own CRS.
+    # Undulations of EGM96 and EGM2008, and configured ellipsoidal heights, refer to WGS 84. All other heights refer to
+    # the ellipsoid of the CRS of the raster.
     refers_to_wgs84 = vertical_datum in {"egm96", "egm2008"} or (
         datum == "ellipsoid" and not is_on_wgs84(horizontal.to_wkt())
     )
@@ -495,7 +497,7 @@ def _header(path: Path) -> tuple[tuple[float, ...], tuple[int, int], str, CRS | 
         try:
             system = CRS.from_user_input(raster.crs) if raster.crs else None
             if system and NAMES_FILES.search(system.to_wkt()):
-                raise _wrong(path, "a CRS that names a file", "a self-contained CRS, or one that names a known grid")
+                raise _wrong(path, "a CRS that refers to a file", "a self-contained CRS, or a CRS with a known grid")
         except ProjError as error:
             raise _wrong(path, f"a CRS that PROJ does not read ({shown(error)})", "a CRS that PROJ reads") from error
     if colours:
@@ -526,7 +528,7 @@ def _wrong(path: Path, found: str, expected: str) -> CampaignError:
 
 
 def _datum(path: Path, system: CRS, configured: str) -> str:
-    """Return the vertical datum of a raster, checked against the configured one."""
+    """Return the vertical datum of a raster, after a comparison with the configured datum."""
     declared = declared_datum(system)
     if configured == "carried":
         if declared is None:
@@ -535,12 +537,13 @@ def _datum(path: Path, system: CRS, configured: str) -> str:
             )
         return declared
     if declared not in {None, configured}:
-        raise _wrong(path, f"heights of {declared} declared by its own CRS", f"{configured}, as configured, or carried")
+        found = f"heights above {declared}, according to the CRS of the file"
+        raise _wrong(path, found, f"heights above {configured}, as configured; or dem_datum: carried")
     return configured
 
 
 def _metres_per_unit(path: Path, system: CRS, unit: str) -> float:
-    """Return the unit of a raster's heights, metres; negative if heights are positive downward."""
+    """Return the unit of the heights of a raster, metres; negative if heights are positive downward."""
     axis = system.axis_info[-1]
     if len(system.axis_info) == 3:
         return float(axis.unit_conversion_factor * (-1 if axis.direction == "down" else 1))

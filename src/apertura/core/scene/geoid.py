@@ -1,4 +1,4 @@
-"""Conversion of heights above a geoid to ellipsoidal heights by a checked grid of undulations."""
+"""Conversion of heights above a geoid to ellipsoidal heights, and checks of the grid of undulations."""
 
 import os
 import struct
@@ -21,17 +21,19 @@ from apertura.core.scene.terrain import bilinear
 
 # ---- Grids of undulations: checked headers and values
 #
-# PROJ reads .gtx. Its TIFF reader divides by zero for a damaged file; TIFF grids are therefore read by GDAL, like DEMs.
+# PROJ reads .gtx grids. The TIFF reader of PROJ divides by zero if a file is damaged; TIFF grids are therefore read by
+# GDAL, like DEMs.
 
 HIGHEST_M = 150.0
-"""Limit of the magnitude of undulations, metres: −107 m south of India, +86 m in New Guinea."""
+"""Largest accepted magnitude of undulations, metres; the extremes are −107 m south of India and +86 m in New Guinea."""
 
 MOST_POSTS = 300_000_000
-"""Largest number of posts of a grid: a global grid of one arc minute has 233 million."""
+"""Largest number of posts of a grid: a global grid with a spacing of one arc minute has 233 million posts."""
 
 _STEPS_DEG = (1e-4, 30.0)  # limits of the spacing of posts
 _GTX = struct.Struct(">4d2i")
-"""Header of a grid: latitude and longitude of the first post, and steps of both, degrees; rows and columns."""
+"""Header of a grid: latitude and longitude of the first post, steps in latitude and longitude, degrees; numbers of rows
+and columns."""
 
 _EXPECTED = "a .gtx or .tif grid of undulations in the format of PROJ's grid collection"
 _REMEDY = "Download the file again, or correct scene.geoid."
@@ -70,14 +72,14 @@ def undulation(grid: Path, longitude_deg: Floats, latitude_deg: Floats) -> Float
     Parameters
     ----------
     grid
-        Grid of PROJ's collection (.gtx, .tif).
+        Grid of undulations in a format of PROJ's grid collection (.gtx, .tif).
     longitude_deg, latitude_deg
         (...,) float64, degrees, in the geodetic CRS of the grid.
 
     Returns
     -------
     ndarray
-        (...,) float64, metres, bilinear in the grid: ellipsoidal height = height above the geoid + undulation.
+        (...,) float64, metres, interpolated bilinearly: ellipsoidal height = height above the geoid + undulation.
 
     Raises
     ------
@@ -99,7 +101,7 @@ def undulation(grid: Path, longitude_deg: Floats, latitude_deg: Floats) -> Float
             f"no valid undulation at longitude {longitude:.4f}, latitude {latitude:.4f}",
             where=grid,
             expected="a grid that covers the scene",
-            remedy="Obtain a grid of the region and set scene.geoid to it.",
+            remedy="Obtain a grid of the region and set scene.geoid to its path.",
         )
     return height.reshape(shape)
 
@@ -107,8 +109,8 @@ def undulation(grid: Path, longitude_deg: Floats, latitude_deg: Floats) -> Float
 def _of_gtx(grid: Path, longitude: Floats, latitude: Floats) -> Floats:
     """Return undulations interpolated by PROJ.
 
-    The operation contains the absolute path of the grid, because PROJ skips missing grids and searches a name without a
-    path in other folders.
+    The operation contains the absolute path of the grid, because PROJ ignores missing grids and searches file names
+    without a path in other folders.
     """
     with on_disk(grid.absolute().parent) as folder:  # PROJ derives the format from the file name
         steps = f'+step +proj=vgridshift +grids="{folder / grid.name}" +multiplier=1'
@@ -120,7 +122,7 @@ def _of_gtx(grid: Path, longitude: Floats, latitude: Floats) -> Floats:
 
 
 def _of_tif(grid: Path, longitude: Floats, latitude: Floats) -> Floats:
-    """Return band 1, interpolated between posts and NaN outside the grid; a global grid wraps in longitude."""
+    """Return band 1, interpolated between posts; NaN outside the grid. A global grid is periodic in longitude."""
     from rasterio.windows import Window
 
     with opened_raster(grid, expected=_EXPECTED, remedy=_REMEDY) as raster:
@@ -149,7 +151,7 @@ def _of_tif(grid: Path, longitude: Floats, latitude: Floats) -> Floats:
 # ---- Vertical datums and their grids
 
 GRIDS = {"egm96": ("us_nga_egm96_15.tif", "egm96_15.gtx"), "egm2008": ("us_nga_egm08_25.tif", "egm08_25.gtx")}
-"""Datum → file names of its grid of undulations in PROJ's collection."""
+"""Datum → file names of the grid of undulations in PROJ's grid collection."""
 
 _MARKS = {"egm96": ("egm96",), "egm2008": ("egm08", "egm2008")}
 
@@ -160,16 +162,16 @@ def geoid_file(datum: str, given: Path | None, *, names: Sequence[str] = ()) -> 
     Parameters
     ----------
     datum
-        Datum of the heights, for errors and to check that the file does not belong to another datum.
+        Datum of the heights, for error messages and to check that the file does not belong to another datum.
     given
-        Path of scene.geoid; None if it is not configured.
+        Path configured as scene.geoid; None if it is not configured.
     names
-        File names to search; by default those of the datum in `GRIDS`.
+        File names to search (default: names for the datum in `GRIDS`).
 
     Raises
     ------
     CampaignError
-        If there is no such file: heights are not processed as ellipsoidal heights instead.
+        If no file is found: heights are never treated as ellipsoidal heights instead.
 
     Examples
     --------
@@ -185,18 +187,18 @@ def geoid_file(datum: str, given: Path | None, *, names: Sequence[str] = ()) -> 
         if paths:
             return paths[0]
         raise CampaignError(
-            f"heights refer to {datum}, but its geoid grid is not installed",
+            f"heights refer to {datum}, but the grid of this geoid is not installed",
             where="scene.geoid",
             expected=expected,
             remedy=f"Obtain {names[0] if names else 'the grid'} from PROJ's grid collection (`projsync`), "
-            "put it into the folder of the DEM, and set scene.geoid to it.",
+            "copy it to the folder of the DEM, and set scene.geoid to its path.",
         )
     others = [mark for other, marks in _MARKS.items() if other != datum for mark in marks]
     wrong = "no such file" if not given.is_file() else None
     if any(mark in given.name.lower() for mark in others):
-        wrong = f"the grid of a geoid other than {datum}"
+        wrong = f"grid of a geoid other than {datum}"
     if any(mark in str(given.absolute()) for mark in '",'):
-        wrong = "a path with a comma or a quotation mark, which PROJ cannot open"
+        wrong = "path with a comma or a quotation mark, which PROJ cannot open"
     if wrong:
         raise CampaignError(wrong, where=given, expected=expected, remedy="Obtain the file, or correct scene.geoid.")
     check_grid(given)
@@ -204,7 +206,7 @@ def geoid_file(datum: str, given: Path | None, *, names: Sequence[str] = ()) -> 
 
 
 def grid_folders() -> list[Path]:
-    """Return PROJ's folders, in which grids of undulations are searched."""
+    """Return the folders of PROJ in which grids of undulations are searched."""
     listed = [*os.environ.get("PROJ_DATA", "").split(os.pathsep), *get_data_dir().split(os.pathsep)]
     return [Path(folder) for folder in [*listed, get_user_data_dir()] if folder]
 

@@ -1,4 +1,4 @@
-"""Grid of a scene, an immutable value: CRS, origin, spacing and shape; slices are windows. Heights are separate."""
+"""Immutable grid of a scene: CRS, origin, spacing and shape. Slices of a grid are windows; heights are separate."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from apertura.core.scene.map_crs import BLOCK_PX, axis_attributes, block, check_
 
 @dataclass(frozen=True)
 class SceneGrid:
-    """North-up pixel grid on a map; `apertura.core.scene.terrain` provides the heights of its pixels.
+    """North-up pixel grid on a map; the heights of the pixels are provided by `apertura.core.scene.terrain`.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class SceneGrid:
         Rows, columns.
     first
         Row and column of pixel (0, 0) in the whole grid. Coordinates of a window are computed from the corner of the
-        whole grid, so that they are identical to the last bit.
+        whole grid, so that coordinates of a pixel are bit-identical in all windows.
     name
         Name of a local frame in GIS software.
 
@@ -81,13 +81,13 @@ class SceneGrid:
     def from_bounds(
         cls, crs: str, bounds_m: tuple[float, float, float, float], *, spacing_m: float, name: str = LOCAL
     ) -> "SceneGrid":
-        """Return the grid of the given bounds, whose outer corner is (xmin, ymax).
+        """Return the grid with the given bounds; its outer north-west corner is (xmin, ymax).
 
         Raises
         ------
         CampaignError
-            If the CRS is unknown, is not in metres, or its area of use does not contain the bounds; if `bounds_m` is
-            not [xmin, ymin, xmax, ymax], or the spacing is not positive.
+            If the CRS is unknown or not in metres; the area of use of the CRS does not contain the bounds; `bounds_m`
+            is not [xmin, ymin, xmax, ymax]; or the spacing is not positive.
         """
         try:
             xmin, ymin, xmax, ymax = map(float, bounds_m)
@@ -116,7 +116,7 @@ class SceneGrid:
 
     @property
     def crs_wkt(self) -> str:
-        """CRS of rasters on this grid, WKT as written by GDAL."""
+        """CRS of rasters on this grid, in the WKT that GDAL writes."""
         from rasterio.crs import CRS
 
         return str(CRS.from_user_input(local_crs(self.name) if self.crs == LOCAL else self.crs).to_wkt())
@@ -132,13 +132,13 @@ class SceneGrid:
 
     @property
     def bounds_m(self) -> tuple[float, float, float, float]:
-        """[xmin, ymin, xmax, ymax], outer pixel edges."""
+        """[xmin, ymin, xmax, ymax] of the outer pixel edges, metres."""
         (west, north), (rows, columns) = self._corner, self.shape
         return (west, north - rows * self.spacing_m, west + columns * self.spacing_m, north)
 
     @property
     def transform(self) -> tuple[float, float, float, float, float, float]:
-        """Affine coefficients a…f of (column, row) → (x, y), in rasterio's order."""
+        """Affine coefficients a…f of (column, row) → (x, y), in the order used by rasterio."""
         west, north = self._corner
         return (self.spacing_m, 0.0, west, 0.0, -self.spacing_m, north)
 
@@ -148,12 +148,12 @@ class SceneGrid:
 
     @property
     def x_m(self) -> Floats:
-        """Pixel centres eastward, (column,) float64."""
+        """Eastings of pixel centres from west to east, (column,) float64."""
         return self._easting(np.arange(self.shape[1]))
 
     @property
     def y_m(self) -> Floats:
-        """Pixel centres from north to south, (row,) float64."""
+        """Northings of pixel centres from north to south, (row,) float64."""
         return self._northing(np.arange(self.shape[0]))
 
     def _easting(self, column: ArrayLike) -> Floats:
@@ -200,13 +200,13 @@ class SceneGrid:
         Parameters
         ----------
         height_m
-            Scalar or (row, column) float64: one height of all pixels, or the height of each pixel, metres above the
-            ellipsoid of `crs` (z in a local frame).
+            Scalar or (row, column) float64: a common height of all pixels, or the height of each pixel, metres above
+            the ellipsoid of `crs` (z in a local frame).
 
         Returns
         -------
         ndarray
-            (row, column, 3) float64, metres, ECEF or the axes of the local frame.
+            (row, column, 3) float64, metres, in ECEF or in the local frame.
         """
         height = np.asarray(height_m, np.float64)
         if self.crs == LOCAL:
@@ -218,7 +218,7 @@ class SceneGrid:
         return positions
 
     def _blocks(self) -> Iterator[tuple[slice, slice]]:
-        """Yield the intersections of the whole grid's blocks with this window."""
+        """Yield the intersections of the blocks of the whole grid with this window."""
         rows, columns = (
             [slice(*cuts) for cuts in pairwise([0, *range(BLOCK_PX - first % BLOCK_PX, size, BLOCK_PX), size])]
             for first, size in zip(self.first, self.shape, strict=True)
@@ -234,7 +234,7 @@ class SceneGrid:
         return polynomials.positions(row, column, height_m)
 
     def positions_at(self, row: ArrayLike, column: ArrayLike, height_m: ArrayLike) -> Floats:
-        """Return the positions (m) of fractional pixel indices, (..., 3) float64; (0, 0) is the first pixel's centre.
+        """Return the positions (m) of fractional pixel indices, (..., 3) float64; (0, 0) is the first pixel centre.
 
         Examples
         --------
@@ -261,7 +261,7 @@ class SceneGrid:
         return np.asarray(row), np.asarray(column)
 
     def pixel_below(self, position: Floats) -> Floats:
-        """Return fractional row and column, and height (m), of positions in the processing frame, (..., 3) float64.
+        """Return (..., 3) float64: fractional row and column, and height (m), of positions in the processing frame.
 
         Examples
         --------
@@ -272,7 +272,7 @@ class SceneGrid:
         return np.stack([*self.pixel_of(xyz_m[..., 0], xyz_m[..., 1]), xyz_m[..., 2]], -1)
 
     def sample_pixels(self, count: int) -> tuple[Floats, Floats]:
-        """Return rows and columns of pixels evenly spread over the grid including its corners, (count, count) float64.
+        """Return rows and columns of pixels evenly distributed over the grid, with its corners, (count, count) float64.
 
         Examples
         --------
@@ -284,5 +284,5 @@ class SceneGrid:
         return rows, columns
 
     def sample_points(self, count: int, height_m: float) -> Floats:
-        """Return positions (m) of `sample_pixels` at one height, (count, count, 3) float64, from north to south."""
+        """Return positions (m) of `sample_pixels` at a given height, (count, count, 3) float64, from north to south."""
         return self.positions_at(*self.sample_pixels(count), height_m)

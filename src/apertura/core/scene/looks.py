@@ -73,7 +73,7 @@ class Lattice:
         return [(row, column) for row in rows for column in columns]
 
     def between(self, values: NDArray[Any], window: Window, *, farthest: float | None = None) -> NDArray[Any]:
-        """Interpolate values at the pixels of a window, bilinear between nodes; float32 stays float32, else float64.
+        """Interpolate values bilinearly at the pixels of a window, in float32 for float32 values, otherwise in float64.
 
         Parameters
         ----------
@@ -82,14 +82,14 @@ class Lattice:
         window
             Window of pixels.
         farthest
-            Largest length of the difference (along the last axis) between two corners of a cell for which values are
-            interpolated; above it, the value of the nearest corner is used.
+            Largest distance between the values (vectors along the last axis) of two corners of a cell, up to which
+            values are interpolated; in cells with a larger distance, the value of the nearest corner is used.
         """
         (low, high, up), (left, right, across) = self._cells(window)
         extra, dtype = (1,) * (values.ndim - 2), np.float32 if values.dtype == np.float32 else np.float64
         up, across = up.reshape(-1, 1, *extra).astype(dtype), across.reshape(1, -1, *extra).astype(dtype)
         values, left, right = values[:, left[0] : right[-1] + 1], left - left[0], right - left[0]
-        # First between rows of nodes, which have few columns, so that only one pass over all pixels remains.
+        # Interpolate between rows of nodes first: these have few columns, so that one pass over all pixels remains.
         rows = values[low] + up * (values[high] - values[low])
         smooth: NDArray[Any] = rows.take(left, axis=1)
         slope = (rows.take(np.arange(1, rows.shape[1] + 1), axis=1, mode="clip") - rows).take(left, axis=1)
@@ -110,7 +110,7 @@ class Lattice:
         return smooth
 
     def inside_positive(self, values: NDArray[Any], window: Window) -> NDArray[np.bool_]:
-        """Return a mask of the pixels of a window, (row, column), between nodes that are all positive."""
+        """Return a mask, (row, column), of the pixels of a window for which all surrounding nodes are positive."""
         if (values[self.around(window)] > 0).all():
             return np.ones([part.stop - part.start for part in window], bool)
         (low, high, _), (left, right, _) = self._cells(window)
@@ -118,12 +118,12 @@ class Lattice:
         return np.asarray(np.logical_and.reduce(corners))
 
     def around(self, window: Window) -> Window:
-        """Return the window of the nodes that surround the pixels of a window."""
+        """Return the window of nodes that surround the pixels of a window."""
         rows, columns = (slice(int(before[0]), int(after[-1]) + 1) for before, after, _ in self._cells(window))
         return rows, columns
 
     def _cells(self, window: Window) -> "tuple[_Cells, _Cells]":
-        """Return, along both axes, the nodes before and after each pixel, and its fractional position between them."""
+        """Return the nodes before and after each pixel and the fractional position between them, along both axes."""
         return self._along(0, window[0]), self._along(1, window[1])
 
     def _along(self, axis: int, part: slice) -> "_Cells":
@@ -137,7 +137,7 @@ class Lattice:
         return self._known[key]
 
     def nearest(self, window: Window) -> list[tuple[tuple[int, int], Window]]:
-        """Return the nodes nearest to the pixels of a window, each with its part of the window."""
+        """Return the nodes nearest to the pixels of a window, each with the part of the window nearest to the node."""
         owned = []
         for at, part in zip(self.nodes, window, strict=True):
             ends = np.append((at[1:] + at[:-1] + 1) // 2, at[-1] + 1)
@@ -165,12 +165,12 @@ def fill(
     *,
     threads: int,
 ) -> None:
-    """Call a function for each of `Lattice.blocks`, with the blocks of `AT_ONCE` pulses that may illuminate it.
+    """Call a function for each of `Lattice.blocks`, with the blocks of `AT_ONCE` pulses that may illuminate the block.
 
     Parameters
     ----------
     lattice, grid, terrain, aperture, beams
-        As of `Looks`.
+        As for `Looks`.
     block
         Function called with a window of nodes and a mask of pulse blocks, (block,) bool.
     threads
@@ -184,38 +184,39 @@ def fill(
 # ---- Number of looks and aperture centre of each pixel
 
 SPREAD = 17
-"""Number of pulses, evenly spread over those that illuminate a pixel, used to decide on shadow."""
+"""Number of pulses used to decide on shadow, evenly spread over the pulses that illuminate a pixel."""
 
 PITCHES_PX = (128, 64, 32, 16)
 """Candidate pitches of a lattice, pixels; the widest pitch with sufficient accuracy is used."""
 
 # least ratio of range to pitch: the error of the number of looks between nodes is 0.3 % in a beam of 20°
 _RANGE_SHARE = 48
-_PULSES = 256  # least number of pulses summed for a block of the lattice; at most twice as many are summed
-# least number of pulses with weight at half of the nodes (if fewer, more pulses are summed), and limit of that sum
+_PULSES = 256  # least number of pulses summed for a block of the lattice; the largest number is twice this number
+# least median number of pulses with weight at a node, below which more pulses are summed; and limit of their number
 _FEWEST, _MOST = 48, 2048
 AT_ONCE = 64  # block size in pulses of the illumination test
 _EXACT = (AT_ONCE, 8)  # block sizes in pulses of the exact illumination test, from coarse to fine
-_CELL_PX = 8  # side, pixels, of the cells that are tested as a whole first
-_PIXELS = 4096  # pixels tested together
-# number of pulses evaluated for the centres of a block without illumination, needed to interpolate in its neighbours
+_CELL_PX = 8  # side of the cells that are first tested as a whole, pixels
+_PIXELS = 4096  # number of pixels tested together
+# number of pulses evaluated for the centres of a block without illumination, used for interpolation in adjacent blocks
 _DARK_PULSES = 64
 # added to the distance of a pulse without weight, which is selected as centre only if no pulse has weight
 _NO_WEIGHT_PENALTY = 1e6
-_ALIKE = 0.02  # largest change of Σ|w|/Σw² between nodes for bilinear looks: error of 0.08 % relative to the two sums
-_JUMP_PITCHES = 4.0  # in node pitches: centres of neighbouring nodes that are farther apart belong to different passes
+# largest change of Σ|w|/Σw² between nodes for bilinear looks: the error relative to interpolated sums is 0.08 %
+_ALIKE = 0.02
+_JUMP_PITCHES = 4.0  # node pitches; centres of adjacent nodes separated by more than this belong to different passes
 
 
 @dataclass(frozen=True, eq=False)
 class Looks:
-    """Number of looks and aperture centre of each point of an image; windows are read tile by tile.
+    """Number of looks and aperture centre of each pixel of an image; windows are read tile by tile.
 
     Attributes
     ----------
     grid, terrain
         Grid and terrain of the scene.
     aperture, beams
-        Aperture of all pulses, and their weights; None: equal weights.
+        Aperture of all pulses, and weights of the pulses; None: equal weights.
     lattice
         Nodes at which the following values are computed.
     total, squares
@@ -251,7 +252,7 @@ class Looks:
         Parameters
         ----------
         grid, terrain, aperture, beams
-            As of `Looks`; positions in the grid's processing frame.
+            As for `Looks`, with positions in the processing frame of the grid.
         threads
             Number of lattice blocks processed in parallel.
 
@@ -302,7 +303,7 @@ class Looks:
         self.pulses[block] = (pulses.start + every * _spread(weight)).reshape(*shape, SPREAD)
 
     def illuminated(self, tile: Window) -> NDArray[np.bool_]:
-        """Return a mask of the pixels of a tile that any pulse illuminates, (row, column) bool; evaluated exactly.
+        """Return a mask of the pixels of a tile that any pulse illuminates, (row, column) bool, evaluated exactly.
 
         Parameters
         ----------
@@ -323,7 +324,7 @@ class Looks:
         return np.unpackbits(cached, count=shape[0] * shape[1]).reshape(shape).astype(bool)
 
     def _fill_mask(self, mask: NDArray[np.bool_], tile: Window) -> None:
-        """Set the illuminated pixels of a tile, cell by cell, from all pulses that may illuminate them."""
+        """Set the illuminated pixels of a tile, cell by cell, from all pulses that may illuminate the cell."""
         if mask.all():
             return
         part = self.grid[tile]
@@ -361,8 +362,8 @@ class Looks:
     def effective(self, tile: Window) -> NDArray[np.float32]:
         """Return the number of looks of the pixels of a tile, (row, column) float32; 0 without illumination.
 
-        The number is interpolated bilinearly between nodes if Σ|w| and Σw² change by equal factors, else computed from
-        the interpolated Σ|w| and Σw².
+        The number is interpolated bilinearly between nodes if Σ|w| and Σw² change by equal factors; otherwise it is
+        computed from the interpolated Σ|w| and Σw².
         """
         if self._alike(tile):
             looks = self.lattice.between(self._node_looks, tile)
@@ -378,7 +379,7 @@ class Looks:
         return np.asarray(self.total**2 / np.where(self.squares > 0, self.squares, np.float32(np.inf)))
 
     def _alike(self, tile: Window) -> bool:
-        """Return True if both sums change by equal factors between nodes, at most by two (layers.md, eq. 4)."""
+        """Return True if both sums change by equal factors of at most two between nodes (layers.md, eq. 4)."""
         nodes = self.lattice.around(tile)
         total = self.total[nodes]
         if not total.all():
@@ -395,7 +396,7 @@ class Looks:
         return self._sums(window)[1].astype(np.float64)
 
     def centre(self, tile: Window) -> tuple[Floats, Floats]:
-        """Return the antenna positions at each pixel's closest approach, (row, column, 3) float64 metres each."""
+        """Return both antenna positions (m) at the closest approach to each pixel, (row, column, 3) float64 each."""
         centre = self.lattice.between(self.centres, tile, farthest=self._jump_m)
         return centre[..., 0, :], centre[..., 1, :]
 
@@ -404,16 +405,16 @@ class Looks:
         return _JUMP_PITCHES * self.lattice.pitch_px * self.grid.spacing_m
 
     def incidence_deg(self, tile: Window) -> NDArray[Any]:
-        """Return the incidence angle of the transmitter at closest approach, (row, column) degrees.
+        """Return the incidence angle of the transmitter at closest approach, (row, column), degrees.
 
-        Over level terrain the angle is interpolated bilinearly between nodes (docs/theory/layers.md, section 4).
+        Over level terrain, the angle is interpolated bilinearly between nodes (docs/theory/layers.md, section 4).
         """
         if self._smooth(tile):
             return self.lattice.between(self._angles_deg[0], tile)
         return incidence_deg(*surface(self.grid, self.terrain, tile), self.centre(tile)[0])
 
     def bistatic_angle_deg(self, tile: Window) -> NDArray[Any]:
-        """Return the bistatic angle at closest approach, (row, column) degrees; interpolated as `incidence_deg`."""
+        """Return the bistatic angle at closest approach, (row, column), degrees; interpolated as in `incidence_deg`."""
         if self._smooth(tile):
             return self.lattice.between(self._angles_deg[1], tile)
         return bistatic_angle_deg(self.terrain.positions(self.grid[tile]), *self.centre(tile))
@@ -429,7 +430,7 @@ class Looks:
         return angles[0].astype(np.float32), angles[1].astype(np.float32)
 
     def _smooth(self, tile: Window) -> bool:
-        """Return True if angles can be interpolated: level terrain, a pitch far below the range, and one pass."""
+        """Return True if angles can be interpolated: level terrain, pitch far below the range, and a single pass."""
         if not isinstance(self.terrain, FlatGround) or self.lattice.pitch_px == PITCHES_PX[-1]:
             return False
         nodes = self.lattice.around(tile)
@@ -438,7 +439,7 @@ class Looks:
 
 
 def pulses_of(reaching: NDArray[np.bool_], pulses: int) -> slice:
-    """Return the slice from the first to the last pulse of the marked blocks; all pulses if none is marked."""
+    """Return the slice from the first to the last pulse of the marked blocks; all pulses if no block is marked."""
     blocks = np.flatnonzero(reaching)
     if not blocks.size:
         return slice(0, pulses)
@@ -446,14 +447,14 @@ def pulses_of(reaching: NDArray[np.bool_], pulses: int) -> slice:
 
 
 def pitch_px(grid: SceneGrid, terrain: Terrain, aperture: Aperture, *, share: float) -> int:
-    """Return the widest pitch of a lattice, pixels, that is at most 1/`share` of the range to the scene.
+    """Return the widest pitch of a lattice, pixels, that is at most the range to the scene divided by `share`.
 
     Parameters
     ----------
     grid, terrain, aperture
-        As of `Looks`.
+        As for `Looks`.
     share
-        Least ratio of range to pitch; the narrowest of `PITCHES_PX` is used if none satisfies it.
+        Least ratio of range to pitch; if no pitch satisfies this ratio, the narrowest of `PITCHES_PX` is used.
     """
     middle = terrain.positions_at(grid, *(np.array([size // 2]) for size in grid.shape))
     sample = aperture[aperture.sample(_PULSES)]
@@ -487,8 +488,8 @@ def _any(
 
 def _centres(aperture: Aperture, beams: Beams | None, points: Floats, weight: Floats) -> Floats:
     """Return both antenna positions at the closest approach to each point, (point, 2, 3), interpolated over pulses."""
-    # The pulse with the shortest total path, or the smallest |s| in a sector; one without weight only if none has
-    # weight.
+    # Select the pulse with the shortest total path, or with the smallest |s| in a sector. A pulse without weight is
+    # selected only if no pulse has weight.
     sector = None if beams is None else beams.sector
     distance = aperture.path(points) if sector is None else sector.place(aperture, points) ** 2
     dark = weight == 0
@@ -497,7 +498,7 @@ def _centres(aperture: Aperture, beams: Beams | None, points: Floats, weight: Fl
     legs = np.stack(aperture.legs, axis=1)
     if len(aperture) < 3:
         return np.asarray(legs[best])
-    # A parabola through this pulse and its neighbours, if all three have weight or none has weight.
+    # Fit a parabola through this pulse and its neighbours if all three pulses have weight or none of them has weight.
     inner = np.clip(best, 1, len(aperture) - 2)
     before, middle, after = (distance[inner + step, column] for step in (-1, 0, 1))
     same_weighting = (dark[inner - 1, column] == dark[inner, column]) & (dark[inner, column] == dark[inner + 1, column])
@@ -509,7 +510,7 @@ def _centres(aperture: Aperture, beams: Beams | None, points: Floats, weight: Fl
 
 
 def _spread(weight: Floats) -> NDArray[np.int64]:
-    """Return pulses, (point, `SPREAD`), evenly spread over those with at least half of the largest weight."""
+    """Return pulses, (point, `SPREAD`), evenly spread over the pulses with at least half of the largest weight."""
     size = np.abs(weight)
     count = np.cumsum(size >= size.max(axis=0) / 2, axis=0).T
     ranks = 1 + np.round(np.linspace(0, 1, SPREAD) * (count[:, -1:] - 1))

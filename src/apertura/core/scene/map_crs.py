@@ -12,20 +12,20 @@ from pyproj.exceptions import ProjError
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import ecef_from_geodetic, ecef_from_projected, projected_from_ecef
 
-# ---- Checks of a scene's CRS
+# ---- Checks of the CRS of a scene
 
 MARGIN_DEG = 3.0
-"""Largest distance from its area of use at which a projection is accepted, degrees: half a UTM zone, with a scale error
-of 0.5 %."""
+"""Largest accepted distance of a scene from the area of use of its projection, degrees: half a UTM zone, where the
+scale error is 0.5 %."""
 
 RETURN_M = 1e-3
-"""Round-trip error of a projection, metres, above which a point is outside the projection's domain."""
+"""Round-trip error of a projection, metres, above which a point is outside the domain of the projection."""
 
 _WHERE = "scene"
 
 
 def grid_mapping(crs_wkt: str) -> dict[str, str | float]:
-    """Return the attributes of a CF grid mapping: the WKT of the CRS, unchanged, and its parameters by name.
+    """Return the attributes of a CF grid mapping: the unchanged WKT of the CRS, and the named parameters of the CRS.
 
     Examples
     --------
@@ -51,7 +51,7 @@ def axis_attributes(side: str, *, projected: bool) -> dict[str, str]:
 
 
 def horizontal_crs(crs: str) -> CRS:
-    """Return a horizontal CRS; raise CampaignError if PROJ does not know it or it has a vertical component.
+    """Return a horizontal CRS; raise CampaignError if the CRS is unknown to PROJ or has a vertical component.
 
     Examples
     --------
@@ -74,7 +74,7 @@ def horizontal_crs(crs: str) -> CRS:
         raise CampaignError(
             f"crs {crs} ({system.name}) includes a vertical CRS",
             where=_WHERE,
-            expected="only the horizontal CRS: the datum of heights is configured by height_datum or dem_datum",
+            expected="a horizontal CRS, because the datum of heights is configured by height_datum or dem_datum",
             remedy=f"Set scene.crs to {':'.join(horizontal.to_authority() or (horizontal.name,))}.",
         )
     return system
@@ -104,7 +104,7 @@ def check_crs(crs: str, bounds_m: tuple[float, float, float, float]) -> None:
             f"crs {crs} ({system.name}) is not projected in metres",
             where=_WHERE,
             expected="a projected CRS in metres, such as a UTM zone",
-            remedy="Set scene.crs to such a CRS.",
+            remedy="Set scene.crs to a projected CRS in metres.",
         )
     try:
         _check_usable(system, bounds_m)
@@ -113,13 +113,13 @@ def check_crs(crs: str, bounds_m: tuple[float, float, float, float]) -> None:
         raise CampaignError(
             f"this installation of PROJ has no exact transformation from {crs} ({system.name}) to WGS 84",
             where=_WHERE,
-            expected="a CRS with a parametric transformation to WGS 84, or whose shift grids are installed",
+            expected="a CRS with a parametric transformation to WGS 84, or with installed datum shift grids",
             remedy="Install the grid with `projsync`, or set scene.crs to another CRS, such as the local UTM zone.",
         ) from error
 
 
 def _check_usable(system: CRS, bounds_m: tuple[float, float, float, float]) -> None:
-    """Raise CampaignError for corners outside the domain of the projection, or far from its area of use."""
+    """Raise CampaignError if a corner is outside the domain of the projection or far from its area of use."""
     area = system.area_of_use
     inverse = Transformer.from_crs(system, system.geodetic_crs, always_xy=True)
     xmin, ymin, xmax, ymax = bounds_m
@@ -150,7 +150,7 @@ def _check_usable(system: CRS, bounds_m: tuple[float, float, float, float]) -> N
 def _near(
     area_deg: tuple[float, float, float, float], longitude: NDArray[np.float64], latitude: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Return a mask of points within `MARGIN_DEG` of an area (west, south, east, north), which may wrap at 180°."""
+    """Return a mask of points within `MARGIN_DEG` of an area (west, south, east, north), which may extend over 180°."""
     west, south, east, north = area_deg
     width = (east - west) % 360 or 360.0
     longitude = np.where(np.isfinite(longitude), longitude, np.nan)
@@ -159,33 +159,35 @@ def _near(
 
 
 # ---- Positions of the pixels of a projected grid
-# The transformation of a pixel by PROJ takes as long as the integration of hundreds of pulses. Over a block of pixels,
-# polynomials of degree four are as accurate as positions in float64 (docs/theory/planner.md, "Pixel positions").
+# The transformation of a pixel by PROJ takes as long as the integration of hundreds of pulses at this pixel. Over a
+# block of pixels, polynomials of degree four are as accurate as positions in float64
+# (docs/theory/planner.md, "Pixel positions").
 
 BLOCK_PX = 256
 
 DEGREE = 4
 
 TOLERANCE_M = 3e-8
-"""Error of a block's polynomials between nodes, metres, above which each pixel is transformed with PROJ; the rounding
-error of float64 is 1e-9 m."""
+"""Error of the polynomials of a block between nodes, metres, above which each pixel is transformed with PROJ; the
+rounding error of float64 is 1e-9 m."""
 
-_CLIMB_M = 1e4  # metres between the two heights evaluated: two suffice, as ECEF is exactly linear in ellipsoidal height
+# metres between two evaluated heights, which are sufficient because ECEF is exactly linear in ellipsoidal height
+_CLIMB_M = 1e4
 _NODES = np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))
 _BETWEEN = np.array([-1.0, -0.5, 0.45, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Polynomials of the positions of BLOCK_PX × BLOCK_PX pixels over -1 ≤ u, v ≤ 1, downward and to the right.
+    """Polynomials of the positions of BLOCK_PX × BLOCK_PX pixels over -1 ≤ u, v ≤ 1, u downward and v to the right.
 
     Attributes
     ----------
     middle_m
-        (3,) float64, ECEF metres, on the ellipsoid.
+        (3,) float64, centre of the block on the ellipsoid, ECEF metres.
     offset_m, normal
-        (DEGREE + 1, DEGREE + 1, 3) float64, coefficients of u^k v^l: ECEF metres from the middle, on the ellipsoid; and
-        the change of these positions per metre of height.
+        (DEGREE + 1, DEGREE + 1, 3) float64, coefficients of u^k v^l: positions on the ellipsoid relative to the centre,
+        ECEF metres; and change of the positions per metre of height.
     exact
         True if the polynomials are within `TOLERANCE_M` of PROJ.
     """
@@ -203,12 +205,12 @@ class Block:
         Parameters
         ----------
         row, column
-            (row,) and (column,) int64, counted from the block's corner.
+            (row,) and (column,) int64, counted from the corner of the block.
         height_m
-            () or (row, column) float64, ellipsoidal height: one for all pixels, or one for each pixel.
+            () or (row, column) float64, ellipsoidal height of all pixels, or of each pixel.
         """
         down, right = ((2 * index + 1) / BLOCK_PX - 1 for index in (row, column))
-        if height_m.ndim == 0:  # a constant height: only one polynomial is evaluated
+        if height_m.ndim == 0:  # for a constant height, only one polynomial is evaluated
             return _evaluated(self.offset_m + height_m * self.normal, down, right) + self.middle_m
         offset = _evaluated(self.offset_m, down, right)
         offset += height_m[..., None] * _evaluated(self.normal, down, right)
@@ -224,7 +226,7 @@ def block(crs: str, north_west_m: tuple[float, float], spacing_m: float, index: 
     crs
         Projected CRS in metres.
     north_west_m
-        Northing and easting of the grid's outer corner.
+        Northing and easting of the outer north-west corner of the grid.
     spacing_m
         Pixel spacing.
     index
@@ -258,7 +260,7 @@ def block(crs: str, north_west_m: tuple[float, float], spacing_m: float, index: 
 def _evaluated(
     coefficients: NDArray[np.float64], down: NDArray[np.float64], right: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Evaluate Σ c_kl u^k v^l by Horner's rule, element by element: identical to the last bit in any window."""
+    """Evaluate Σ c_kl u^k v^l by Horner's rule, element by element, so that results are bit-identical in any window."""
     along = coefficients[:, -1, None]
     for power in range(DEGREE - 1, -1, -1):
         along = along * right[:, None] + coefficients[:, power, None]

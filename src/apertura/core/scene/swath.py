@@ -15,8 +15,8 @@ from apertura.core.scene.terrain import Terrain
 
 _BLOCKS = 33
 _PULSES_AT_ONCE = 256
-_PIXELS_AT_ONCE = 2**20  # number of heights read together, because a DEM is slow to open and to read piecewise
-_MOST_PULSES = 4096  # largest number of pulses whose paths are computed; paths of the other pulses are bounded
+_PIXELS_AT_ONCE = 2**20  # number of heights read together, because opening a DEM and reading small parts is slow
+_MOST_PULSES = 4096  # largest number of pulses for which paths are computed; for the other pulses, bounds are derived
 
 
 def swath(
@@ -24,26 +24,26 @@ def swath(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return a lower and an upper bound of the total paths from each pulse to the scene.
 
-    The scene is divided into about 33 × 33 blocks of pixels, each contained in a sphere; within a block the total path
-    changes by at most twice the radius. In a long flight, bounds are computed from a sample of the pulses: a path
-    changes by at most the sum of both antennas' displacements.
+    The scene is divided into about 33 × 33 blocks of pixels, each of which is contained in a sphere. From the centre of
+    a sphere, the total path changes by at most twice the radius. In a long flight, bounds are derived from a sample of
+    the pulses: between two pulses, a path changes by at most the sum of the displacements of both antennas.
 
     Parameters
     ----------
     grid, terrain
         Grid and terrain of the scene.
     aperture
-        Aperture in the grid's processing frame.
+        Aperture in the processing frame of the grid.
     beams
         Weights of pulses: blocks of pixels that a pulse cannot illuminate are excluded.
     together
-        Least number of consecutive pulses whose paths are bounded from the path of one of them.
+        Least number of consecutive pulses for which bounds are derived from the path of one of these pulses.
 
     Returns
     -------
     tuple of ndarray
-        (pulse,) float64 metres each. For a pulse that illuminates no pixel, the lower bound is infinite and the upper
-        bound minus infinite.
+        (pulse,) float64 each, metres. For a pulse that illuminates no pixel, the lower bound is +inf and the upper
+        bound is -inf.
 
     Examples
     --------
@@ -73,7 +73,7 @@ def _spans(
     radius_m: NDArray[np.float64],
     every: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the swath of a block of pulses, bounded from the middle pulse of every `every` pulses."""
+    """Return the swath of pulses, with bounds derived from the middle pulse of each group of `every` pulses."""
     block = np.arange(len(aperture)) // every
     middle = aperture[np.minimum(np.arange(0, len(aperture), every) + every // 2, len(aperture) - 1)]
     displacement = sum(
@@ -100,7 +100,7 @@ def balls(
 
 
 def _strips(windows: Sequence[Window]) -> Iterator[list[Window]]:
-    """Yield the windows in runs of adjacent windows of the same rows, limited to `_PIXELS_AT_ONCE` pixels."""
+    """Yield runs of adjacent windows with the same rows; each run has at most `_PIXELS_AT_ONCE` pixels if possible."""
     strip: list[Window] = []
     for rows, columns in windows:
         if strip:

@@ -1,4 +1,4 @@
-"""Terrain of a scene (a constant height, a plane, or heights from a DEM), and its two simplified models."""
+"""Terrain of a scene (a constant height, a plane, or heights from a DEM), and two simplified terrain models."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ from apertura.core.scene.grid import SceneGrid
 
 # ---- Terrain models: flat, a plane, heights of a grid
 #
-# A `Terrain` provides the heights of a grid, of a window of it, or of single pixels.
+# A `Terrain` provides the heights of a grid, of a window of a grid, or of single pixels.
 
 
 _TILE_PX = 512  # side of the tiles in which heights at single pixels are read
@@ -23,12 +23,12 @@ class Terrain(Protocol):
     """Terrain heights; a subclass defines `heights`, from which the other methods are derived."""
 
     def heights(self, grid: SceneGrid) -> Floats:
-        """Return the height of each pixel of a grid or of a window of it.
+        """Return the height of each pixel of a grid or of a window of a grid.
 
         Parameters
         ----------
         grid
-            Grid or window of it; a pixel has the same height, to the last bit, in any window.
+            Grid or window of a grid; the height of a pixel is bit-identical in any window.
 
         Returns
         -------
@@ -37,7 +37,7 @@ class Terrain(Protocol):
         """
 
     def heights_at(self, grid: SceneGrid, row: ArrayLike, column: ArrayLike) -> Floats:
-        """Return heights (m) at fractional pixel indices, bilinear, (...,) float64; NaN outside the grid."""
+        """Interpolate heights (m) bilinearly at fractional pixel indices, (...,) float64; NaN outside the grid."""
         rows, columns = (np.asarray(axis, np.float64) for axis in np.broadcast_arrays(row, column))
         heights = np.full(rows.shape, np.nan)
         for tile in grid.tiles(_TILE_PX):
@@ -61,7 +61,7 @@ class Terrain(Protocol):
 
     @property
     def spec(self) -> dict[str, Any]:
-        """Parameters of the terrain as JSON values for provenance; empty if a file or stage defines it."""
+        """Parameters of the terrain as JSON values for provenance; empty if a file or stage defines the terrain."""
         return {}
 
 
@@ -72,7 +72,7 @@ class FlatGround(Terrain):
     Attributes
     ----------
     height_m
-        Metres above the ellipsoid, or z of the local frame.
+        Height above the ellipsoid, or z of the local frame, metres.
 
     Examples
     --------
@@ -98,7 +98,7 @@ class FlatGround(Terrain):
         return np.full(np.broadcast_shapes(np.shape(row), np.shape(column)), self.height_m)
 
     def positions(self, grid: SceneGrid) -> Floats:
-        """Return the positions of the pixels at the constant height, computed faster than for varying heights."""
+        """Return the positions of the pixels at the constant height; this is faster than for varying heights."""
         return grid.positions(self.height_m)
 
     @property
@@ -114,7 +114,8 @@ class Plane(Terrain):
     Attributes
     ----------
     x_m, y_m, height_m
-        A point of the plane: easting and northing in the grid's CRS, height above the ellipsoid (z in a local frame).
+        A point of the plane: easting and northing in the CRS of the grid, and height above the ellipsoid (z in a local
+        frame).
     east, north
         Slope eastward and northward, metres per metre.
 
@@ -133,7 +134,7 @@ class Plane(Terrain):
 
     @classmethod
     def through(cls, grid: SceneGrid, height_m: Floats) -> "Plane":
-        """Fit a plane to the heights (row, column) at the pixels of a grid, metres, by least squares.
+        """Fit a plane by least squares to the heights at the pixels of a grid, (row, column), metres.
 
         Examples
         --------
@@ -148,11 +149,11 @@ class Plane(Terrain):
         return cls(float(grid.x_m[0]), float(grid.y_m[0]), float(height_m.mean() + height), float(east), float(north))
 
     def heights(self, grid: SceneGrid) -> Floats:
-        """Return the plane's height at every pixel."""
+        """Return the height of the plane at every pixel."""
         return self._over(grid.x_m, grid.y_m[:, None])
 
     def heights_at(self, grid: SceneGrid, row: ArrayLike, column: ArrayLike) -> Floats:
-        """Return the plane's heights, also outside the grid."""
+        """Return the height of the plane at fractional pixel indices, also outside the grid."""
         xy_m = grid.map_at(*np.broadcast_arrays(row, column))
         return self._over(xy_m[..., 0], xy_m[..., 1])
 
@@ -166,12 +167,12 @@ class Plane(Terrain):
 
 
 def ground_of(terrain: Terrain | float | None, grid: SceneGrid) -> Terrain:
-    """Return the terrain of an argument: flat for a number; in a local frame of height 0 by default.
+    """Convert an argument to a terrain: a number gives a flat terrain; the default in a local frame has height 0.
 
     Raises
     ------
     CampaignError
-        If the terrain of a georeferenced grid is missing, or an argument is of a wrong type.
+        If the terrain of a georeferenced grid is missing, or if an argument has a wrong type.
 
     Examples
     --------
@@ -185,7 +186,7 @@ def ground_of(terrain: Terrain | float | None, grid: SceneGrid) -> Terrain:
             "no terrain for a georeferenced grid",
             where="terrain",
             expected=f"terrain heights above the ellipsoid of {grid.crs}",
-            remedy="Pass a height in metres, or a terrain such as that of an opened campaign's scene.",
+            remedy="Pass a height in metres, or a terrain such as that of the scene of an opened campaign.",
         )
     if terrain is None or (isinstance(terrain, int | float | np.floating) and not isinstance(terrain, bool)):
         return FlatGround(float(terrain or 0.0))
@@ -193,7 +194,7 @@ def ground_of(terrain: Terrain | float | None, grid: SceneGrid) -> Terrain:
         raise CampaignError(
             quoted(terrain) if isinstance(terrain, str | Path) else f"an object of type {type(terrain).__name__}",
             where="terrain",
-            expected="a height in metres, a FlatGround, Plane or Dem",
+            expected="a height in metres, a FlatGround, a Plane or a Dem",
             remedy="Open a DEM file by apertura.open_dem(path, grid, datum=...).",
         )
     return terrain
@@ -205,14 +206,14 @@ class _Array(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class GridHeights(Terrain):
-    """Terrain heights at the pixels of a grid, such as those of the stage `terrain`.
+    """Terrain heights at the pixels of a grid, such as the heights of the stage `terrain`.
 
     Attributes
     ----------
     grid
         The whole grid.
     height_m
-        (row, column) float64 metres, read by windows: a numpy or a zarr array.
+        (row, column) float64, metres; a numpy or zarr array, which is read by windows.
 
     Examples
     --------
@@ -235,14 +236,14 @@ class GridHeights(Terrain):
 
 
 def bilinear(values: Floats, row: Floats, column: Floats) -> Floats:
-    """Interpolate (layer, ...) values bilinearly between pixels; a pixel of weight 0 may be NaN.
+    """Interpolate values bilinearly between pixels, (layer, ...); a pixel with weight 0 may be NaN.
 
     Parameters
     ----------
     values
         (layer, row, column) float64.
     row, column
-        Fractional indices, broadcast against each other; linear extrapolation beyond the edges.
+        Fractional indices in shapes that broadcast; values are extrapolated linearly beyond the edges.
     """
     first = [
         np.clip(np.floor(axis), 0, max(0, size - 2)).astype(np.int64)
@@ -263,21 +264,21 @@ def _within(part: slice, at: Floats) -> NDArray[np.bool_]:
     return np.asarray((at >= part.start - 0.5) & (at < part.stop - 0.5))
 
 
-# ---- Terrain of a scene and its two simplified models
+# ---- Terrain of a scene and two simplified models
 
 _BLOCKS = 33
 
 
 @dataclass(frozen=True)
 class GroundModels:
-    """Terrain of a scene and its two simplified models, with their largest errors.
+    """Terrain of a scene and two simplified models, with the largest errors of the models.
 
     Attributes
     ----------
     full, level, plane
-        The terrain, its model of constant height, and its best-fitting plane.
+        The terrain, a model of constant height, and the best-fitting plane.
     relief_m, off_plane_m
-        Largest difference of the terrain from `level` and from `plane`, metres.
+        Largest differences of the terrain from `level` and from `plane`, metres.
     """
 
     full: Terrain
@@ -288,9 +289,9 @@ class GroundModels:
 
     @classmethod
     def of(cls, terrain: Terrain, level: FlatGround | None, grid: SceneGrid) -> "GroundModels":
-        """Fit the models of a terrain to its heights at the centres of blocks of pixels.
+        """Fit the simplified models to the heights of a terrain at the centres of blocks of pixels.
 
-        If no level is given, the mean of these heights is used, or the terrain itself if it is flat.
+        If no level is given, `level` has the mean of these heights; a flat terrain is used as `level` itself.
 
         Examples
         --------
@@ -310,10 +311,10 @@ class GroundModels:
 
     @classmethod
     def flat(cls, height_m: float = 0.0) -> "GroundModels":
-        """Return the models of a flat terrain, which are all the same."""
+        """Return the models of a flat terrain, which are all identical."""
         level = FlatGround(height_m)
         return cls(level, level, Plane(0.0, 0.0, height_m, 0.0, 0.0), 0.0, 0.0)
 
     def model(self, name: str) -> Terrain:
-        """Return the model of the given name in a decision: 'plane' (level), 'tilted_plane' or 'dem'."""
+        """Return the model with the name used in a decision: 'plane' (level), 'tilted_plane' or 'dem'."""
         return {"plane": self.level, "tilted_plane": self.plane, "dem": self.full}[name]

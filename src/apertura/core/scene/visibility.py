@@ -16,16 +16,16 @@ from apertura.core.scene.terrain import Terrain
 #
 # Kernels (docs/theory/terrain.md, sections 3 and 4). `legs` is (pulse, antenna, 3): row, column and height of each
 # phase centre. `ground` contains heights (row, column) float32, the pixel spacing (m) and 1/2R of the Earth (1/m). Each
-# step is one pixel along one index, so that the terrain is interpolated between two pixels only.
+# step along a line is one pixel along one index, so that the terrain is interpolated between two pixels only.
 
 SHADOW, LAYOVER = 1, 2
 """Bits of the mask."""
 
 BLOCK = 16
-"""Side of the blocks whose highest terrain is precomputed, pixels."""
+"""Side of the blocks for which the highest terrain is precomputed, pixels."""
 
 TOLERANCE_M = 1e-3
-"""Largest height of terrain above a line of sight that does not block it, metres: float32 rounding of a relief."""
+"""Height up to which terrain above a line of sight does not block the line, metres: float32 rounding of a relief."""
 
 STRAIGHT_BELOW = 0.05
 """Horizontal gradient of the path, m/m, below which the antenna is above the pixel and layover is undefined."""
@@ -33,19 +33,19 @@ STRAIGHT_BELOW = 0.05
 
 @numba.njit(cache=True, nogil=True)
 def _interpolated(height, row, column):  # type: ignore[no-untyped-def]
-    """Interpolate the height at a point of which at least one index is an integer; NaN outside the scene."""
+    """Interpolate the height at a point with at least one integer index; NaN outside the scene."""
     rows, columns = height.shape
     r, c = int(np.floor(row)), int(np.floor(column))
     if row < 0 or column < 0 or row > rows - 1 or column > columns - 1:
         return np.nan
     down, right = row - r, column - c
-    # Between two pixels of the row above the point; the next column is read only if it has weight.
+    # Between two pixels of the row above the point; the next column is read only if its weight is not zero.
     low = height[r, c]
     if right > 0:
         low = (1 - right) * low + right * height[r, c + 1]
     if down == 0:
         return low
-    # Between two pixels of the row below it.
+    # Between two pixels of the row below the point.
     high = height[r + 1, c]
     if right > 0:
         high = (1 - right) * high + right * height[r + 1, c + 1]
@@ -54,7 +54,7 @@ def _interpolated(height, row, column):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _steps_left(index, step):  # type: ignore[no-untyped-def]
-    """Return the number of whole steps to the edge of the block of `index`, along one axis."""
+    """Return the number of whole steps to the edge of the block that contains `index`, along one axis."""
     if step == 0:
         return 1 << 30
     block = np.floor(index / BLOCK) * BLOCK
@@ -73,7 +73,7 @@ def _blocked(antenna, row, column, highest, top, ground):  # type: ignore[no-unt
     if steps < 1:
         return False
     dr, dc = down / steps, right / steps
-    # On the curved Earth a line of length d is s(1 − s)d²/2R below the linear rise between its ends, s = t/steps.
+    # On the curved Earth, a line of length d is s(1 − s)d²/2R below the linear rise between its ends, with s = t/steps.
     bend = curvature * spacing * spacing * (dr * dr + dc * dc)
     t = 1
     while t < steps:
@@ -84,9 +84,9 @@ def _blocked(antenna, row, column, highest, top, ground):  # type: ignore[no-unt
         line = own + up * t / steps - bend * t * (steps - t)
         if terrain > line + TOLERANCE_M:
             return True
-        # `least` is a lower bound of the rest of a rising line, which is not blocked if it is above all terrain of the
-        # scene. If the line is above all terrain of this block and one pixel around it, the search skips to the last
-        # step inside the block.
+        # `least` is a lower bound of the rest of a rising line. If this bound is above all terrain of the scene, the
+        # line is not blocked. If it is above all terrain of this block and of one pixel around the block, the search
+        # skips to the last step inside the block.
         leap, least = 1, line - bend * steps
         if up > 0 and least > top:
             return False
@@ -100,15 +100,15 @@ def _blocked(antenna, row, column, highest, top, ground):  # type: ignore[no-unt
 def mark_shadow(mask, first, legs, highest, ground):  # type: ignore[no-untyped-def]
     """Set `SHADOW` in `mask`, (row, column) uint8 with first pixel `first`, where most pulses are blocked.
 
-    A pulse is blocked if its line of sight to the transmitter or to the receiver is blocked. A pixel is in shadow if
-    more than half of the pulses are blocked.
+    A pulse is blocked at a pixel if terrain blocks the line of sight to the transmitter or to the receiver. A pixel is
+    in shadow if more than half of the pulses are blocked.
     """
     pulses, top = legs.shape[0], highest.max()
     for i in range(mask.shape[0]):
         for j in range(mask.shape[1]):
             blocked = 0
             for pulse in range(pulses):
-                # Stop if more than half are already blocked, or if this is no longer possible.
+                # Stop if more than half of the pulses are already blocked, or if this is no longer possible.
                 if 2 * blocked > pulses or 2 * (pulse - blocked) >= pulses:
                     break
                 for leg in range(legs.shape[1]):
@@ -137,9 +137,9 @@ def _total_path(legs, pixel, height_m, ground):  # type: ignore[no-untyped-def]
 def _in_layover(direction, legs, pixel, extreme, ground):  # type: ignore[no-untyped-def]
     """Return True if terrain along `direction` (rows and columns per step, sign) has the same total path as the pixel.
 
-    Without layover, paths behind the pixel (sign +1) are longer, and those in front of it (−1) shorter. `extreme` is
-    the height that violates this condition at the largest distance: the highest terrain behind the pixel, the lowest in
-    front of it.
+    Without layover, paths are longer behind the pixel (sign +1) and shorter in front of the pixel (sign −1). `extreme`
+    is the height that violates this condition at the largest distance: the highest terrain behind the pixel, or the
+    lowest terrain in front of the pixel.
     """
     height, sign = ground[0], direction[2]
     own = _total_path(legs, pixel, height[pixel[0], pixel[1]], ground)
@@ -159,7 +159,7 @@ def _in_layover(direction, legs, pixel, extreme, ground):  # type: ignore[no-unt
 
 @numba.njit(cache=True, nogil=True)
 def _path_gradient(legs, pixel, height_m, spacing):  # type: ignore[no-untyped-def]
-    """Return the horizontal gradient of the total path by row and column, which gives the horizontal line of sight."""
+    """Return the gradient of the total path along rows and columns: the horizontal line-of-sight direction."""
     down, right = 0.0, 0.0
     for leg in range(2):
         south, east = (pixel[0] - legs[leg, 0]) * spacing, (pixel[1] - legs[leg, 1]) * spacing
@@ -177,7 +177,7 @@ def mark_layover(mask, first, legs, extremes, ground):  # type: ignore[no-untype
         for j in range(mask.shape[1]):
             pixel = (first[0] + i, first[1] + j)
             own = height[pixel]
-            # Find the pulse of the shortest path, at which the gradient is perpendicular to the track.
+            # Find the pulse with the shortest path, at which the gradient is perpendicular to the track.
             nearest, least = 0, np.inf
             for pulse in range(legs.shape[0]):
                 path = _total_path(legs[pulse], pixel, own, ground)
@@ -187,7 +187,7 @@ def mark_layover(mask, first, legs, extremes, ground):  # type: ignore[no-untype
             steep = max(abs(down), abs(right))
             if steep < STRAIGHT_BELOW:  # antenna directly above the pixel
                 continue
-            # Search away from the antenna, then towards it, with one pixel per step along the steeper axis.
+            # Search away from the antenna, then towards the antenna, with one pixel per step along the steeper axis.
             dr, dc = down / steep, right / steep
             if _in_layover((dr, dc, 1), legs[nearest], pixel, extremes[1], ground) or _in_layover(
                 (dr, dc, -1), legs[nearest], pixel, extremes[0], ground
@@ -209,11 +209,12 @@ class Relief:
     Attributes
     ----------
     grid, base_m
-        Grid of the scene, and reference level of the following heights, metres.
+        Grid of the scene; and reference level of the following heights, metres.
     height_m
         (row, column) float32, metres above `base_m`.
     highest_m
-        (block row, block column) float32: highest terrain of each block of 16 × 16 pixels and one pixel around it.
+        (block row, block column) float32: highest terrain of each block of 16 × 16 pixels and of one pixel around the
+        block, metres above `base_m`.
     lowest_m
         Lowest terrain, metres above `base_m`.
     """
@@ -226,7 +227,7 @@ class Relief:
 
     @classmethod
     def of(cls, grid: SceneGrid, terrain: Terrain, base_m: float) -> "Relief":
-        """Return the relief of a scene relative to a height (m) near its terrain, for micrometres in float32."""
+        """Return the relief relative to a height (m) near the terrain, so that float32 resolves micrometres."""
         relative = np.empty(grid.shape, np.float32)
         for row in range(0, grid.shape[0], _STRIP):
             strip = (slice(row, min(row + _STRIP, grid.shape[0])), slice(0, grid.shape[1]))
@@ -245,12 +246,12 @@ class Relief:
         return 0.0 if self.grid.crs == LOCAL else 0.5 / EARTH_RADIUS_M
 
     def above(self, antenna: Floats) -> Floats:
-        """Return fractional row and column, and height above `base_m` (m), of phase centres, (pulse, 3) float64.
+        """Return (pulse, 3) float64: fractional row and column, and height above `base_m` (m), of phase centres.
 
         Parameters
         ----------
         antenna
-            (pulse, 3) float64 metres, in the grid's processing frame.
+            (pulse, 3) float64, metres, in the processing frame of the grid.
         """
         return self.grid.pixel_below(antenna) - [0.0, 0.0, self.base_m]
 
@@ -258,16 +259,16 @@ class Relief:
 def visibility(relief: Relief, tx: Floats, rx: Floats, window: Window) -> NDArray[np.uint8]:
     """Compute the mask of shadow and layover of a window for one pair.
 
-    Shadow: at more than half of the given pulses, terrain of the scene blocks the line of sight to the transmitter or
-    to the receiver. Layover: at the pulse with the shortest total path, another point along the line of sight has the
-    same path, because the path does not increase monotonically. Terrain outside the scene is ignored.
+    A pixel is in shadow if terrain of the scene blocks the line of sight to the transmitter or to the receiver at more
+    than half of the given pulses. A pixel is in layover if, at the pulse with the shortest total path, another point
+    along the line of sight has the same total path. Terrain outside the scene is ignored.
 
     Parameters
     ----------
     relief
         Relief of the whole scene.
     tx, rx
-        (pulse, 3) float64 from `Relief.above`: a selection of pulses, evenly spread over the aperture.
+        (pulse, 3) float64 from `Relief.above`, for a selection of pulses that are evenly spread over the aperture.
     window
         Rows and columns of the mask.
 

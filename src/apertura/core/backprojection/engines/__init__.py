@@ -1,4 +1,4 @@
-"""Backprojection engines: one module and one entry of `ENGINES` each, all tested against `reference`."""
+"""Backprojection engines. Each engine has a module and an entry in `ENGINES`, and is tested against `reference`."""
 
 from collections.abc import Mapping
 from importlib import import_module
@@ -18,8 +18,8 @@ ENGINES: dict[str, str] = {
 """Name → module that implements `Engine`, imported when the engine is loaded."""
 
 PATCH_PX = 16
-"""Side of a patch, pixels. Tiles start at multiples of it, so that an engine that forms patches of this size yields the
-same bits in every tiling."""
+"""Side of a patch, pixels. Tiles start at multiples of this number, so that an engine that forms patches of this size
+yields bit-identical images for every tiling."""
 
 
 def load_engine(name: str) -> "Engine":
@@ -39,7 +39,7 @@ def load_engine(name: str) -> "Engine":
 
 
 def pieces(name: str, shape: tuple[int, ...], form_options: Mapping[str, Any]) -> "list[Window]":
-    """Return windows of a tile that an engine can form independently with the same bits.
+    """Return windows of a tile that an engine can form independently with bit-identical results.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def pieces(name: str, shape: tuple[int, ...], form_options: Mapping[str, Any]) -
 
 
 def instruction_set(name: str) -> str:
-    """Return the instruction set of an engine's sums on this machine; 'unknown' if the engine does not report it.
+    """Return the instruction set used for the sums of an engine on this machine; 'unknown' if it is not reported.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
-"""Backprojection on an NVIDIA GPU with range tables and one thread block per patch of pixels; needs extra ``cuda``.
+"""Backprojection on an NVIDIA GPU with range tables and one thread block per patch of pixels; requires extra ``cuda``.
 
-`prepare` stores profiles and filters. With the first tile they are expanded on the device to tables: cells of
-polynomials that include the carrier (docs/theory/engine.md, "Cells"). `form` starts a thread block for each patch of
-16 × 16 pixels. Paths are computed by a series about the patch's middle ("A GPU", eq. 8), or exactly in float64 if the
-error of the series is too large, and weighted by beams and sector. The kernels in `cuda_kernels` are compiled at their
-first use; `candidates` predicts error and cost.
+`prepare` stores profiles and filters. For the first tile, the profiles are expanded on the device to tables of cells
+with polynomials that include the carrier (docs/theory/engine.md, "Cells"). `form` starts a thread block for each patch
+of 16 × 16 pixels. Paths are computed by a series about the centre of the patch ("A GPU", eq. 8), or exactly in float64
+if the error of the series is too large. Contributions are weighted by beams and sector. The kernels in `cuda_kernels`
+are compiled at their first use. `candidates` predicts error and cost.
 """
 
 import ctypes
@@ -33,7 +33,7 @@ from apertura.core.backprojection.inputs import Profiles
 # ---- Device and arrays on the device
 #
 # numba.cuda is imported when a device is used. The device executes one call at a time: threads that form tiles wait
-# for its lock without the GIL.
+# for the lock of the device without the GIL.
 
 _LOCK = Lock()
 # threads per block of the kernel that fills tables, and of the kernel that compares pulses
@@ -42,7 +42,7 @@ _THREADS, _CHUNK_THREADS = 128, 32
 
 @cache
 def available() -> bool:
-    """Return True if a device can be used or numba's simulator is enabled; never raises.
+    """Return True if a device can be used or the simulator of numba is enabled; never raises.
 
     Examples
     --------
@@ -51,16 +51,16 @@ def available() -> bool:
     """
     try:
         if not simulated():
-            ctypes.CDLL("libcuda.so.1")  # fails without the driver's library, before the slow import below
+            ctypes.CDLL("libcuda.so.1")  # fails without the library of the driver, before the slow import below
         from numba import cuda
 
         return bool(cuda.is_available())
-    except Exception:  # driver, toolkit or package missing or incompatible
+    except Exception:  # driver, toolkit or package is missing or incompatible
         return False
 
 
 def instruction_set() -> str:
-    """Return the device on this machine and the package that uses it.
+    """Return the device on this machine and the package with which it is used.
 
     Examples
     --------
@@ -83,7 +83,7 @@ def instruction_set() -> str:
 
 
 class Resident:
-    """Arrays on the device, created by the first tile and shared by all slices of the tables; not pickled."""
+    """Arrays on the device, created with the first tile and shared by all slices of the tables; not pickled."""
 
     def __init__(self) -> None:
         self.arrays: tuple[Any, ...] | None = None
@@ -108,13 +108,13 @@ def sum_on_device(
     tables, pixels, beams, tolerance_rad, counts
         As for `form`.
     rejecting
-        If False, the weight of every pulse is evaluated at every pixel, even if it is one or zero over a whole patch;
-        the result has the same bits. For tests.
+        If False, the weight of every pulse is evaluated at every pixel, even if the weight is one or zero over a whole
+        patch; the result is bit-identical. For tests.
 
     Raises
     ------
     CampaignError
-        If no device can be used, or the device fails.
+        If no device can be used, or if the device fails.
     """
     sector = beams and beams.sector
     weights = _weights(beams or Beams())
@@ -131,7 +131,7 @@ def sum_on_device(
         if not PHASE_POLYNOMIALS[tables.design.phase_polynomial][2]:
             phase[-1] = 0  # no reduction by multiples of π
         numbers = np.array([*scales, *phase, *bounds], np.float64)
-        # Weights; and the spread of axes and antenna positions within each chunk of 64 pulses, for the rejection of
+        # Weights, and spread of axes and antenna positions within each chunk of 64 pulses, which is used to reject
         # chunks.
         on_device = [cuda.to_device(array) for array in weights]
         spread = cuda.to_device(np.full((-(-len(start_m) // CHUNK) + 1, 2, 3), np.inf))
@@ -161,9 +161,10 @@ def sum_on_device(
 def _weights(beams: Beams) -> tuple[NDArray[Any], ...]:
     """Return beams and sector as arrays of the kernels; empty arrays without beams or sector.
 
-    (pulse, 2, 3) float64, axes of the sector for transmitter and receiver; (pulse, 2, 3, 3) float64, axes of their
-    beams; (2, 2, 3) float32, first angle, samples per radian and index of the last sample of both cuts, or -1 without a
-    beam; (2, 2, sample) float32, gains; (end, 2, 2, 3) float64, phase centres and axes of the sector's ends.
+    The arrays are: (pulse, 2, 3) float64, axes of the sector for transmitter and receiver; (pulse, 2, 3, 3) float64,
+    axes of the beams of both; (2, 2, 3) float32, first angle, samples per radian and index of the last sample of both
+    cuts, or -1 without a beam; (2, 2, sample) float32, gains; and (end, 2, 2, 3) float64, phase centres and axes at the
+    ends of the sector.
     """
     sector, legs = beams.sector, [(n, beam) for n, beam in enumerate((beams.transmit, beams.receive)) if beam]
     axes = np.zeros((len(legs[0][1].axes) if legs else 0, 2, 3, 3))
@@ -203,7 +204,7 @@ def _tables_on_device(cuda: Any, tables: "ResidentTables") -> tuple[Any, ...]:
 
 @contextmanager
 def _device() -> Iterator[Any]:
-    """Yield numba.cuda under the device's lock; report failures of the device as a CampaignError."""
+    """Yield numba.cuda under the lock of the device; report failures of the device as CampaignError."""
     if not available():
         raise _unusable("no device can be used")
     from numba import cuda
@@ -212,7 +213,7 @@ def _device() -> Iterator[Any]:
     with _LOCK:
         try:
             yield cuda
-        except (CudaAPIError, LinkerError, ImportError) as error:  # ImportError: driver or compiler missing
+        except (CudaAPIError, LinkerError, ImportError) as error:  # ImportError: driver or compiler is missing
             raise _unusable(f"the device failed: {' '.join(str(error).split())}") from error
 
 
@@ -220,8 +221,8 @@ def _unusable(found: str) -> CampaignError:
     return CampaignError(
         f"engine cuda: {found}",
         where="processing.engine",
-        expected="an NVIDIA GPU with its driver and sufficient memory for a pulse block (docs/howto/gpu.md)",
-        remedy="Select engine native or numba, or free memory of the device.",
+        expected="an NVIDIA GPU with driver and sufficient memory for a pulse block (docs/howto/gpu.md)",
+        remedy="Select engine native or numba, or free memory on the device.",
     )
 
 
@@ -230,9 +231,9 @@ def _unusable(found: str) -> CampaignError:
 __all__ = ["NEEDS", "READS", "TIMED", "VARIANTS", "available", "candidates", "form", "instruction_set", "prepare"]
 
 READS: Literal["profiles"] = "profiles"
-TIMED = False  # the cost is based on published rates of other software, but the planner compares measured costs
+TIMED = False  # the cost is based on published rates of other software, whereas the planner compares measured costs
 VARIANTS = ("by series", "by exact paths", "without an echo", "without an echo of 64")
-NEEDS = "an NVIDIA GPU with its driver, and apertura[cuda] (docs/howto/gpu.md)"
+NEEDS = "an NVIDIA GPU with driver, and apertura[cuda] (docs/howto/gpu.md)"
 
 
 class Options(EngineOptions):
@@ -248,7 +249,7 @@ class Options(EngineOptions):
 
 @dataclass(frozen=True, eq=False)
 class ResidentTables:
-    """Profiles, and their tables on the device: polynomials per cell that include the carrier.
+    """Profiles, and tables of the profiles on the device: polynomials per cell that include the carrier.
 
     Attributes
     ----------
@@ -257,7 +258,7 @@ class ResidentTables:
     places_m
         (pulse, 2, 3) float64, phase centres of transmitter and receiver in the frame of the pixels.
     start_m
-        (pulse,) float64, total path of sample 0, which is also that at the middle of cell 0, metres.
+        (pulse,) float64, total path of sample 0 and of the centre of cell 0, metres.
     cell_m
         Total path across one cell, metres.
     wavenumber_rad_m
@@ -283,7 +284,7 @@ class ResidentTables:
     resident: Resident
 
     def __getitem__(self, pulses: slice) -> "ResidentTables":
-        """Return the tables of a slice of pulses, with the same arrays on the device."""
+        """Return the tables of a slice of pulses, which use the same arrays on the device."""
         first, last, _ = pulses.indices(self.pulses.stop - self.pulses.start)
         start = self.pulses.start
         return replace(self, pulses=slice(start + first, start + max(first, last)))
@@ -295,9 +296,9 @@ def prepare(profiles: Profiles, *, oversampling: int = 6) -> ResidentTables:
     Parameters
     ----------
     profiles
-        Band-limited profiles with eight samples or more beyond the scene at both ends.
+        Band-limited profiles with at least eight samples beyond the scene at both ends.
     oversampling
-        Table cells per Nyquist cell c/B of total path; `ResidentTables.error_db` predicts their error.
+        Table cells per Nyquist cell c/B of total path; `ResidentTables.error_db` is the predicted error.
 
     Returns
     -------
@@ -307,7 +308,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 6) -> ResidentTables:
     Raises
     ------
     ValueError
-        If the oversampling of the profiles is below 1.5, there is no pulse, or a position or start is not finite.
+        If the oversampling of the profiles is below 1.5, if there is no pulse, or if a position or start is not finite.
 
     Notes
     -----
@@ -345,29 +346,29 @@ def form(
         Tables from `prepare`.
     pixels
         (y, x, 3) float64, metres, in the frame of the phase centres, on any surface. A tile of a larger grid that
-        starts at multiples of 16 pixels has the same bits as in the larger grid.
+        starts at multiples of 16 pixels is bit-identical to this part of the image of the larger grid.
     beams
-        Weight of each pulse at each pixel; none by default. Pulses whose beam or sector does not illuminate a patch
-        cost little.
+        Weight of each pulse at each pixel (default: 1). Pulses for which beam or sector does not illuminate a patch
+        require little time.
     tolerance_rad
-        Largest phase error of the path series anywhere in a patch of 16 × 16 pixels; paths of patches and pulses that
-        exceed it are exact, computed pixel by pixel in float64.
+        Largest phase error of the path series anywhere in a patch of 16 × 16 pixels. For patches and pulses that exceed
+        this error, exact paths are computed pixel by pixel in float64.
     counts
         (4,) int64 array to which the numbers of pixel-pulse contributions are added: summed with path series, summed
-        with exact paths, without an echo, and in chunks of 64 pulses without any echo, which cost very little.
+        with exact paths, without an echo, and in chunks of 64 pulses without any echo, which require very little time.
 
     Returns
     -------
     ndarray
-        (y, x) complex64. Pulses whose profile does not cover a pixel add zero; a pixel without a finite position is
-        NaN.
+        (y, x) complex64. Pulses do not contribute to pixels that are not covered by their profiles; a pixel without a
+        finite position is NaN.
 
     Raises
     ------
     ValueError
-        If the shape of `pixels` is not (y, x, 3), or a beam or the sector has another number of pulses.
+        If the shape of `pixels` is not (y, x, 3), or if a beam or the sector has a different number of pulses.
     CampaignError
-        If no device can be used, or the device fails.
+        If no device can be used, or if the device fails.
 
     Notes
     -----

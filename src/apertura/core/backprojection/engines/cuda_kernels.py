@@ -1,4 +1,4 @@
-"""GPU kernels: tables of profiles, and their weighted sums over patches; imported only if a device is used."""
+"""GPU kernels for tables of profiles and for weighted sums over patches; imported only if a device is used."""
 
 import math
 import warnings
@@ -22,7 +22,7 @@ from apertura.core.backprojection.engines.cuda_prediction import (
 
 @cuda.jit
 def expand(samples, taps, lead, down, carrier, turn, cells):  # type: ignore[no-untyped-def]  # noqa: PLR0917
-    """Fill cells (pulse, 6, cell) from samples (pulse, range) by eq. 2, one thread per cell."""
+    """Fill cells (pulse, 6, cell) from samples (pulse, range) by eq. 2, with one thread per cell."""
     used, length, up = cells.shape[2], samples.shape[1], len(lead)
     number = cuda.grid(1)
     if number >= len(samples) * used:
@@ -47,17 +47,19 @@ def expand(samples, taps, lead, down, carrier, turn, cells):  # type: ignore[no-
 
 # ---- Sums of tables over patches on a GPU
 #
-# numba compiles these functions for the device, or its simulator runs them as Python (NUMBA_ENABLE_CUDASIM=1).
-# numba treats literals as float64: float32 constants have names, because a single literal would slow down every pixel.
-# Equation numbers refer to docs/theory/engine.md, "A GPU"; for weights, to its section "Antennas" and integration.md.
+# numba compiles these functions for the device, or the simulator of numba runs them as Python functions
+# (NUMBA_ENABLE_CUDASIM=1). numba treats literals as float64; float32 constants have names, because a single literal
+# would slow down every pixel. Equation numbers refer to docs/theory/engine.md, section "A GPU"; for weights, they refer
+# to section "Antennas" and to integration.md.
 
-warnings.filterwarnings("ignore", "Grid size .* low occupancy")  # a warning expected for the patches of the certificate
+warnings.filterwarnings("ignore", "Grid size .* low occupancy")  # this warning is expected for patches of certificates
 
 ROWS = 4
-"""Rows of threads of a patch: each thread sums every fourth pixel of a column, and reads common values once."""
+"""Number of rows of threads of a patch. Each thread sums every fourth pixel of a column and reads common values once.
+"""
 
 _PIXELS, _EACH, _LANES = SIDE * SIDE, SIDE // ROWS, SIDE * ROWS
-# indices of the engine's VARIANTS; _UNSEEN: a whole chunk without an echo
+# indices of the VARIANTS of the engine; _UNSEEN: a whole chunk without an echo
 _SERIES, _EXACT, _SKIPPED, _UNSEEN = range(4)
 _NO_CELL = 2**32 - 1
 _ROUNDER = np.float32(1.5 * 2**23)  # adding and subtracting this number rounds to an integer
@@ -66,19 +68,19 @@ _ONE, _ZERO, _TWO, _THREE = np.float32(1), np.float32(0), np.float32(2), np.floa
 _B1, _B2, _B3, _B4 = np.float32(-1 / 4), np.float32(1 / 8), np.float32(-5 / 64), np.float32(7 / 128)
 _LEG, _MIDDLE, _WORDS = 5, 10, 11  # layout of a pulse in shared memory: five words per leg, position of the origin
 _CELLS_PER_M, _WAVENUMBER, _TOLERANCE, _CELLS, _PHASE = range(5)  # indices in `numbers`
-_CENTRE, _INNER, _OUTER = 13, 14, 15  # indices of the sector's parameters in `numbers`
+_CENTRE, _INNER, _OUTER = 13, 14, 15  # indices of the sector parameters in `numbers`
 _X, _Y, _Z, _REACH, _PATCH_CENTRE, _CENTRE_REACH = range(
     6
-)  # indices in `patch`: origin, its reach, sector centre, its reach
+)  # indices in `patch`: origin (three), reach of the patch, sector centre, reach of the sector centre
 _VARIANT, _ORIGIN, _ZONE = range(3)  # indices in `steps`: path variant, cell of the origin, zone of the sector
 
 
 def _over_an_image(weighed):  # type: ignore[no-untyped-def]
-    """Return the kernel that sums the cells over an image (y, x), one thread block per patch, four pixels per thread.
+    """Return the kernel that sums cells over an image (y, x), with one thread block per patch and 4 pixels per thread.
 
     Arguments of the kernel: pixels; phase centres, starts and cells; numbers; axes of the sector and of beams, cuts,
-    gains, ends of the sector, spread of chunks; image and counts. `weighed` is a compile-time constant: a sum without
-    weights uses no registers for them.
+    gains, ends of the sector, spread of chunks; image and counts. `weighed` is a compile-time constant, so that a sum
+    without weights uses no registers for weights.
     """
     width, own = (_WEIGHED_WORDS, _PIXELS) if weighed else (_WORDS, 1)
 
@@ -94,7 +96,7 @@ def _over_an_image(weighed):  # type: ignore[no-untyped-def]
         total = cuda.local.array((_EACH, 2), np.float64)
         tally = cuda.local.array(4, np.int64)
         lane = cuda.threadIdx.y * SIDE + cuda.threadIdx.x
-        # The patch: positions, origin, offsets; with weights, the sector centres of its pixels.
+        # Patch: positions, origin and offsets of the pixels; with weights, also their sector centres.
         _load_positions(pixels, lane, positions)
         cuda.syncthreads()
         _fit(lane, positions, patch)
@@ -106,18 +108,18 @@ def _over_an_image(weighed):  # type: ignore[no-untyped-def]
         turn, pulses = _carrier(numbers), len(tables[1])
         for first in range(0, pulses, CHUNK):
             count = min(CHUNK, pulses - first)
-            # Skip whole chunks of pulses whose weights are zero over the patch.
+            # Skip whole chunks of pulses with zero weight over the patch.
             if weighed and not _is_reached(first // CHUNK, lane, patch, numbers, (tables, weights, reached, words)):
                 tally[_UNSEEN] += count if lane == 0 else 0
                 continue
-            # One thread per pulse: series of the paths, and weights.
+            # One thread per pulse: compute the series of the paths, and the weights.
             if lane < count:
                 _view(first + lane, patch, numbers, tables, (words[lane], steps[lane]))
                 if weighed:
                     _weigh(first + lane, patch, numbers, (tables, weights), (words[lane], steps[lane]))
                 tally[steps[lane, _VARIANT]] += 1
             cuda.syncthreads()
-            # Four pixels per thread: the sum over these pulses.
+            # Four pixels per thread: sum over these pulses.
             _chunk(
                 (first, count),
                 (lane, positions, near, total),
@@ -133,7 +135,7 @@ def _over_an_image(weighed):  # type: ignore[no-untyped-def]
 
 @cuda.jit(device=True)
 def _write(lane, positions, total, tally, results):  # type: ignore[no-untyped-def]
-    """Write the sums of a thread to the image; add the pixel-pulse contributions to the counts of their variants."""
+    """Write the sums of a thread to the image; add the numbers of contributions to the counts of the variants."""
     image, counts = results
     above, left = cuda.blockIdx.y * SIDE, cuda.blockIdx.x * SIDE
     for n in range(_EACH):
@@ -149,7 +151,7 @@ def _write(lane, positions, total, tally, results):  # type: ignore[no-untyped-d
 
 @cuda.jit(device=True)
 def _carrier(numbers):  # type: ignore[no-untyped-def]
-    """Return float32 arguments of `_carrier_at`: four cosine and four sine coefficients, half cycles per table cell."""
+    """Return float32 arguments of `_carrier_at`: four cosine and four sine coefficients, and half cycles per cell."""
     a, b, c, d = numbers[_PHASE], numbers[_PHASE + 1], numbers[_PHASE + 2], numbers[_PHASE + 3]
     e, f, g, h = numbers[_PHASE + 4], numbers[_PHASE + 5], numbers[_PHASE + 6], numbers[_PHASE + 7]
     cosine = (np.float32(a), np.float32(b), np.float32(c), np.float32(d))
@@ -173,7 +175,7 @@ def _load_positions(pixels, lane, positions):  # type: ignore[no-untyped-def]
 
 @cuda.jit(device=True)
 def _fit(lane, positions, patch):  # type: ignore[no-untyped-def]
-    """Write the middle of a patch's bounding box and the largest distance of its pixels to shared memory."""
+    """Write the centre of a patch's bounding box, and the largest distance of a pixel from it, to shared memory."""
     if lane < 3:
         low, high = math.inf, -math.inf
         for other in range(_PIXELS):
@@ -193,7 +195,7 @@ def _fit(lane, positions, patch):  # type: ignore[no-untyped-def]
 
 @cuda.jit(device=True)
 def _offsets(lane, positions, patch, near, total):  # type: ignore[no-untyped-def]
-    """Fill the offsets of a thread's pixels; a pixel without a position is summed at the origin but not written."""
+    """Fill the offsets of a thread's pixels; pixels without positions are summed at the origin but not written."""
     for n in range(_EACH):
         at = lane + n * ROWS * SIDE
         squared = _ZERO
@@ -209,7 +211,7 @@ def _offsets(lane, positions, patch, near, total):  # type: ignore[no-untyped-de
 
 @cuda.jit(device=True)
 def _view(p, patch, numbers, tables, shared):  # type: ignore[no-untyped-def]
-    """Write the series of a pulse's paths over a patch, eq. 8, and the path variant of its pixels to shared memory."""
+    """Write the series of the paths of a pulse over a patch (eq. 8) and the path variant to shared memory."""
     antennas, start_m = tables[0][p], tables[1][p]
     words, step = shared
     reach, per_cell = patch[_REACH], numbers[_CELLS_PER_M]
@@ -244,24 +246,24 @@ def _view(p, patch, numbers, tables, shared):  # type: ignore[no-untyped-def]
 
 @cuda.jit(device=True)
 def _chunk(chunk, mine, shared, inputs, weighing):  # type: ignore[no-untyped-def]
-    """Add a chunk of pulses to a thread's pixels; the chunk is summed in float32 first."""
+    """Add a chunk of pulses to the pixels of a thread; the chunk is first summed in float32."""
     first, count = chunk
     lane, positions, near, total = mine
     words, steps, patch = shared
     (antennas, start_m, cells), turn, numbers = inputs
     weights, weighed = weighing
-    # Sums of this chunk in float32; rows of cells are read once for all pixels of a thread.
+    # Sum this chunk in float32; rows of cells are read once for all pixels of a thread.
     part = cuda.local.array((_EACH, 2), np.float32)
     for n in range(_EACH):
         part[n, 0], part[n, 1] = _ZERO, _ZERO
     weight = _ONE
     for number in range(count):
-        c, p = np.uint64(number), np.uint64(first + number)  # unsigned, as signed indices may count from the end
+        c, p = np.uint64(number), np.uint64(first + number)  # unsigned, because signed indices may count from the end
         if steps[c, _VARIANT] == _SKIPPED:
             continue
         rows = (cells[p, 0], cells[p, 1], cells[p, 2], cells[p, 3], cells[p, 4], cells[p, 5])
         if steps[c, _VARIANT] == _SERIES:
-            w = words[c]  # eq. 8, the pulse's series about the patch
+            w = words[c]  # series of the pulse about the origin of the patch, eq. 8
             word = (w[0], w[1], w[2], w[3], w[4], w[5], w[6], w[7], w[8], w[9], w[10])
             for n in range(_EACH):
                 at, u, legs = _by_series(word, steps[c, _ORIGIN], near[n, 0], near[n, 1], (near[n, 2], near[n, 3]))
@@ -283,7 +285,7 @@ def _chunk(chunk, mine, shared, inputs, weighing):  # type: ignore[no-untyped-de
 
 @cuda.jit(device=True)
 def _by_series(word, middle, x, y, rest):  # type: ignore[no-untyped-def]
-    """Return cell and position in the cell of a pixel's path by eq. 8, and s of both legs."""
+    """Return the cell of a pixel's path and the position in the cell by eq. 8, and s of both one-way paths."""
     z, squared = rest
     s = word[3] * squared + word[0] * x + word[1] * y + word[2] * z
     t = word[8] * squared + word[5] * x + word[6] * y + word[7] * z
@@ -294,13 +296,13 @@ def _by_series(word, middle, x, y, rest):  # type: ignore[no-untyped-def]
 
 @cuda.jit(device=True)
 def _root(s):  # type: ignore[no-untyped-def]
-    """Return 2 (√(1 + s) − 1) / s by its series."""
+    """Return the series of 2 (√(1 + s) − 1) / s."""
     return _ONE + s * (_B1 + s * (_B2 + s * (_B3 + s * _B4)))
 
 
 @cuda.jit(device=True)
 def _exact(antennas, start_m, numbers, positions, at):  # type: ignore[no-untyped-def]
-    """Return cell and position in the cell of a pixel's path in float64; `_NO_CELL` if it lies outside the table."""
+    """Return the cell of a pixel's path and the position in the cell in float64; `_NO_CELL` outside the table."""
     path = 0.0
     for leg in range(2):
         x, y, z = (
@@ -318,7 +320,7 @@ def _exact(antennas, start_m, numbers, positions, at):  # type: ignore[no-untype
 
 @cuda.jit(device=True)
 def _add(rows, i, u, turn, sums):  # type: ignore[no-untyped-def]
-    """Add the weighted polynomial of a cell at position u, times the carrier, eq. 2; nothing outside the table."""
+    """Add the weighted polynomial of a cell at position u, multiplied by the carrier (eq. 2), if inside the table."""
     weight, part = sums
     if i >= np.uint32(len(rows[0])) or weight == _ZERO:
         return
@@ -347,21 +349,21 @@ def _carrier_at(turn, u):  # type: ignore[no-untyped-def]
 
 # ---- Weights of pulses: antenna beams and the integrated sector
 #
-# The weights of a pulse are prepared once for a patch and written after the series of its paths; weights of the pixels
-# are computed from them and the offsets from the origin.
+# Values for the weights of a pulse are prepared once for a patch and stored after the series of the paths. The weights
+# of pixels are computed from these values and from the offsets of the pixels from the origin.
 
 _INSIDE, _EDGE, _OUTSIDE = range(3)
-"""Zones of a patch by weight: one inside the sector, variable at the sector's edge, zero outside the sector or a
-beam."""
+"""Zones of a patch by weight: one inside the sector, variable at the edge of the sector, zero outside the sector or
+outside a beam."""
 
 _ENDS, _SPREAD = 4, 5  # indices in `weights`
 # layout of a cut: first angle, samples per radian, index of the last sample (-1: no beam)
 _FIRST, _PER_RAD, _LAST = range(3)
 _ANTENNA_SPREAD, _BEAM_SPREAD, _SECTOR_SPREAD = range(
     3
-)  # largest differences of a chunk's pulses from its middle pulse
+)  # largest differences of the pulses of a chunk from the middle pulse
 _SECTOR, _S, _BEAM, _BEAM_WORDS = 11, 19, 20, 12  # layout of a pulse in shared memory, after the series of its paths
-_WEIGHED_WORDS = 45  # odd, to avoid bank conflicts of threads that write them
+_WEIGHED_WORDS = 45  # odd, to avoid bank conflicts between threads that write these words
 _HALF_PI = np.float32(math.pi / 2)
 _PI = np.float32(math.pi)
 # margin of angles, rad, and of s: exceeds the float32 error, so that a weight of zero or one is valid at each pixel
@@ -370,10 +372,10 @@ _MARGIN = 1e-5
 
 @cuda.jit
 def spread_of_chunks(antennas, sector_axes, beam_axes, spread):  # type: ignore[no-untyped-def]
-    """Fill the spread of each chunk, (chunk, 2, 3), one thread per chunk.
+    """Fill the spread of each chunk, (chunk, 2, 3), with one thread per chunk.
 
-    For each leg: the largest differences of the chunk's pulses from its middle pulse in position (metres), beam axes
-    and sector axis. The last row applies to a single pulse and contains zeros.
+    The spread of each antenna is the largest difference between the pulses of the chunk and the middle pulse in
+    position (metres), beam axes and sector axis. The last row applies to a single pulse and contains zeros.
     """
     chunk = cuda.grid(1)
     if chunk >= len(spread):
@@ -400,7 +402,7 @@ def spread_of_chunks(antennas, sector_axes, beam_axes, spread):  # type: ignore[
 
 @cuda.jit(device=True)
 def _centres(lane, positions, weights, numbers, mine):  # type: ignore[no-untyped-def]
-    """Compute the sector centres of pixels (integration.md, eq. 4), their middle value, and offsets from it."""
+    """Compute the sector centres of pixels (integration.md, eq. 4), the midpoint of their range, and the offsets."""
     ends, (patch, centres, near) = weights[_ENDS], mine
     for n in range(_EACH):
         at = lane + n * ROWS * SIDE
@@ -421,7 +423,7 @@ def _centres(lane, positions, weights, numbers, mine):  # type: ignore[no-untype
 
 @cuda.jit(device=True)
 def _centre(x, y, z, ends, numbers):  # type: ignore[no-untyped-def]
-    """Return the sector centre of a pixel: the configured one, or the nearest whose sector lies within the flight."""
+    """Return the sector centre of a pixel: configured, or the nearest one with the sector within the flight."""
     if not len(ends):
         return numbers[_CENTRE]
     low, high = math.inf, -math.inf
@@ -439,7 +441,7 @@ def _centre(x, y, z, ends, numbers):  # type: ignore[no-untyped-def]
 
 @cuda.jit(device=True)
 def _is_reached(chunk, lane, patch, numbers, inputs):  # type: ignore[no-untyped-def]
-    """Return True if any pulse of a chunk may have a weight in a patch; one chunk per thread is evaluated at once."""
+    """Return True if any pulse of a chunk may have weight in a patch; each thread evaluates one chunk in parallel."""
     tables, weights, reached, words = inputs
     if chunk % _LANES == 0:
         spread, mine = weights[_SPREAD], chunk + lane
@@ -454,7 +456,7 @@ def _is_reached(chunk, lane, patch, numbers, inputs):  # type: ignore[no-untyped
 
 @cuda.jit(device=True)
 def _weigh(p, patch, numbers, inputs, shared):  # type: ignore[no-untyped-def]
-    """Write the weights of a pulse over a patch and its zone to shared memory; skip the pulse if they are zero."""
+    """Write the weights of a pulse over a patch, and the zone, to shared memory; skip a pulse with zero weights."""
     (tables, weights), (word, step) = inputs, shared
     if step[_VARIANT] != _SKIPPED:
         spread = weights[_SPREAD]
@@ -465,11 +467,11 @@ def _weigh(p, patch, numbers, inputs, shared):  # type: ignore[no-untyped-def]
 
 @cuda.jit(device=True)
 def _zone(p, spread, patch, numbers, pulse):  # type: ignore[no-untyped-def]
-    """Return the zone of a patch for a pulse, and for all pulses that differ from it by no more than `spread`.
+    """Return the zone of a patch for a pulse, and for all pulses that differ from this pulse by at most `spread`.
 
-    Write the values from which the weights of pixels are computed to `word`: for each leg, the sector's axis over range
-    and s at the origin (integration.md, eq. 1); s of both legs minus the centre; for each beam, the vector from antenna
-    to origin along its axes, and the axes.
+    The values from which the weights of pixels are computed are written to `word`. For each antenna, these are the
+    sector axis divided by the range, and s at the origin (integration.md, eq. 1). The sum of s over both antennas minus
+    the centre follows. For each beam, the vector from antenna to origin in the axes of the beam, and the axes, follow.
     """
     antennas, (sector_axes, beam_axes, cuts, _, _, _), word = pulse
     s, slack = -patch[_PATCH_CENTRE], patch[_CENTRE_REACH] + _MARGIN
@@ -492,7 +494,7 @@ def _zone(p, spread, patch, numbers, pulse):  # type: ignore[no-untyped-def]
                 word[at + n] = axis[0] * x + axis[1] * y + axis[2] * z
                 first = at + 3 + 3 * n
                 word[first], word[first + 1], word[first + 2] = axis[0], axis[1], axis[2]
-            # A rotation of the axes displaces a point along them by the angle times its distance.
+            # A rotation of the axes changes the coordinates of a point along them by the angle times its distance.
             beam_reach = reach + spread[leg, _BEAM_SPREAD] * (distance + reach)
             if _misses(word[at], word[at + 1], word[at + 2], np.float32(beam_reach), cuts[leg]):
                 return _OUTSIDE
@@ -506,7 +508,7 @@ def _zone(p, spread, patch, numbers, pulse):  # type: ignore[no-untyped-def]
 
 @cuda.jit(device=True)
 def _misses(ahead, right, above, reach, cuts):  # type: ignore[no-untyped-def]
-    """Return True if a ball about a point, given along an antenna's axes, lies outside one of its cuts."""
+    """Return True if a sphere about a point, in the axes of an antenna, lies outside one of the cuts."""
     margin, level = np.float32(_MARGIN), np.float32(math.sqrt(ahead * ahead + right * right))
     if reach < np.float32(math.sqrt(level * level + above * above)):
         elevation = np.float32(math.atan2(above, level))
@@ -527,11 +529,11 @@ def _last_angle(cut):  # type: ignore[no-untyped-def]
 
 @cuda.jit(device=True)
 def _weight(w, zone, near, legs, inputs):  # type: ignore[no-untyped-def]
-    """Return the weight of a pulse at a pixel from its offset to the origin, in float32; `legs` are s of eq. 8."""
+    """Return the weight of a pulse at a pixel from the pixel's offset, in float32; `legs` are the values s of eq. 8."""
     (_, _, cuts, gains, _, _), numbers = inputs
     x, y, z, weight = near[0], near[1], near[2], _ONE
     if zone == _EDGE:
-        # s of eq. 1 changes little over a patch: only this change has float32 errors.
+        # s of eq. 1 changes little over a patch, and only this change has float32 errors.
         s = w[_S] - near[4]
         s += _change(w[_SECTOR] * x + w[_SECTOR + 1] * y + w[_SECTOR + 2] * z, w[_SECTOR + 3], legs[0])
         s += _change(w[_SECTOR + 4] * x + w[_SECTOR + 5] * y + w[_SECTOR + 6] * z, w[_SECTOR + 7], legs[1])
@@ -549,7 +551,7 @@ def _weight(w, zone, near, legs, inputs):  # type: ignore[no-untyped-def]
 
 @cuda.jit(device=True)
 def _change(along, s, relative):  # type: ignore[no-untyped-def]
-    """Return the difference of s of one leg from its value at the origin, eq. 8a."""
+    """Return the difference of s of one antenna from the value at the origin, eq. 8a."""
     longer = relative * _root(relative) / _TWO
     return (along - s * longer) / (_ONE + longer)
 
@@ -563,7 +565,7 @@ def _smooth(depth):  # type: ignore[no-untyped-def]
 
 @cuda.jit(device=True)
 def _gain(ahead, right, above, cuts, gains):  # type: ignore[no-untyped-def]
-    """Return the gain of an antenna in a direction given along its axes, eq. 6."""
+    """Return the gain of an antenna in a direction given in the axes of the antenna, eq. 6."""
     azimuth = np.float32(math.atan2(right, ahead))
     elevation = np.float32(math.atan2(above, np.float32(math.sqrt(ahead * ahead + right * right))))
     return _look_up(azimuth, cuts[0], gains[0]) * _look_up(elevation, cuts[1], gains[1])
@@ -571,7 +573,7 @@ def _gain(ahead, right, above, cuts, gains):  # type: ignore[no-untyped-def]
 
 @cuda.jit(device=True)
 def _look_up(radians, cut, gains):  # type: ignore[no-untyped-def]
-    """Return the gain at an angle of a cut, linear between samples and zero beyond them."""
+    """Return the gain at an angle of a cut, interpolated linearly; zero beyond the samples."""
     position = (radians - cut[_FIRST]) * cut[_PER_RAD]
     if not _ZERO <= position <= cut[_LAST]:
         return _ZERO
@@ -582,7 +584,7 @@ def _look_up(radians, cut, gains):  # type: ignore[no-untyped-def]
 
 @cuda.jit(device=True)
 def _exact_weight(p, zone, pixel, centre, inputs):  # type: ignore[no-untyped-def]
-    """Return the weight of a pulse at a pixel from its position, in float64."""
+    """Return the weight of a pulse at a pixel from the position of the pixel, in float64."""
     antennas, (sector_axes, beam_axes, cuts, gains, _, _), numbers = inputs
     positions, at = pixel
     s, weight = -centre, _ONE

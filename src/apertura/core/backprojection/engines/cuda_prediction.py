@@ -1,4 +1,4 @@
-"""Predicted error and cost of settings of the GPU kernel, and the sizes and bounds compiled into the kernel."""
+"""Prediction of error and cost for settings of the GPU kernel, and sizes and bounds compiled into the kernel."""
 
 import os
 from collections.abc import Iterator, Mapping
@@ -17,15 +17,15 @@ from apertura.core.backprojection.engines.range_interpolation import design_tabl
 from apertura.core.backprojection.job import Job
 
 SIDE = KERNEL.patch_side
-"""Pixels along a patch, which is summed by one thread block; tiles start at multiples of this number."""
+"""Number of pixels along a patch, which is summed by one thread block; tiles start at multiples of this number."""
 
 
 TAPS = KERNEL.taps
-"""Taps of a table's filters."""
+"""Number of taps of the table filters."""
 
 
 DEGREE = 2
-"""Degree of the polynomials in a cell; degree 1 saves two of six look-ups but requires 1.7 times as many cells."""
+"""Degree of the polynomials in a cell. Degree 1 would save two of six look-ups but require 1.7 times as many cells."""
 
 
 CHUNK = 64
@@ -33,12 +33,12 @@ CHUNK = 64
 
 
 LAST_ORDER, LAST_TERM = 6, 21 / 1024
-"""First order of √(1 + s) neglected in eq. 8, and its coefficient; all neglected terms sum to at most that term/(1 −
-|s|)."""
+"""First order of √(1 + s) that is neglected in eq. 8, and its coefficient. The sum of all neglected terms is at most
+this term divided by 1 − |s|."""
 
 
 FARTHEST = 0.5
-"""Largest |s| at which the series is used; for larger |s| the error bound is too loose."""
+"""Largest |s| at which the series is used; for larger |s|, the error bound is too loose."""
 
 
 FLOAT32_ERROR, FLOAT32_RMS = 2.5e-7, 3.2e-8
@@ -46,19 +46,19 @@ FLOAT32_ERROR, FLOAT32_RMS = 2.5e-7, 3.2e-8
 
 
 MOST_CELLS = 2.0**20
-"""Cells across a patch above which float32 cannot resolve neighbouring cells."""
+"""Number of cells across a patch, above which float32 cannot resolve adjacent cells."""
 
 
 ANGLE_ERROR, ANGLE_RMS = 1e-6, 2e-7
-"""Float32 error of a pixel's angle in a cut, rad: bound, and RMS."""
+"""Float32 error of the angle of a pixel in a cut, rad: bound, and RMS."""
 
 
 PLACE_ERROR, PLACE_RMS = 3e-7, 3.2e-8
-"""Float32 error of s of docs/theory/integration.md, eq. 1, relative to D/R: bound, and RMS."""
+"""Float32 error of s in docs/theory/integration.md, eq. 1, relative to D/R: bound, and RMS."""
 
 
 def simulated() -> bool:
-    """Return True if numba's simulator replaces the device, as in tests; it is thousands of times slower.
+    """Return True if the simulator of numba, which is thousands of times slower, replaces the device, as in tests.
 
     Examples
     --------
@@ -68,17 +68,19 @@ def simulated() -> bool:
     return os.environ.get("NUMBA_ENABLE_CUDASIM", "0") not in ("", "0")
 
 
-_WORST_TO_RMS = 0.105  # RMS over maximum of a sixth power along the diagonal of a square patch, √(2/13 − 2/14)
+# ratio of RMS to maximum of a sixth power along the diagonal of a square patch, √(2/13 − 2/14)
+_WORST_TO_RMS = 0.105
 
 
 _FLOAT32_RAD = 2e-6  # rounding error of tables and look-ups, as in native
 
 
-_NO_ERROR = 1e-20  # added before a logarithm
+_NO_ERROR = 1e-20  # added before taking a logarithm
 
 
-# Seconds, not measured: a tenth of the rate published by torchbp for a card of 2022 (docs/theory/engine.md, "A GPU"),
-# float64 at 1/64 of the rate of float32 as on consumer cards, transfers at 10 GB/s, and the start of the first kernel.
+# Seconds, which are not measured: a tenth of the rate published by torchbp for a card of 2022 (docs/theory/engine.md,
+# "A GPU"), float64 at 1/64 of the rate of float32 as on consumer cards, transfers at 10 GB/s, and start of the first
+# kernel.
 _PIXEL_S, _EXACT_S = 5e-11, 5e-9  # per pixel and pulse: by the series, by exact paths
 
 
@@ -98,7 +100,7 @@ _SIMULATED_S = 1e-4  # per pixel and pulse in the simulator, and half of that pe
 
 
 def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterator[Setting]:
-    """Yield settings of the GPU engine, as `apertura.core.backprojection.engines.engine.Engine` describes.
+    """Yield settings of the GPU engine, as described in `apertura.core.backprojection.engines.engine.Engine`.
 
     Notes
     -----
@@ -112,7 +114,7 @@ def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterat
 
 
 def series(view: View, *, wavenumber_rad_m: float, tolerance_rad: float) -> tuple[float, float]:
-    """Return the share of patch-pulse combinations with exact paths, and the phase error of all paths.
+    """Return the fraction of patch-pulse pairs with exact paths, and the phase error of all paths.
 
     Parameters
     ----------
@@ -126,9 +128,9 @@ def series(view: View, *, wavenumber_rad_m: float, tolerance_rad: float) -> tupl
     Returns
     -------
     exact : float
-        Share of patch-pulse combinations.
+        Fraction of patch-pulse pairs.
     error_rad : float
-        RMS over patches, pulses and pixels.
+        RMS phase error over patches, pulses and pixels, rad.
 
     Examples
     --------
@@ -159,8 +161,8 @@ def weights_error(job: Job, view: View) -> float:
 
     Notes
     -----
-    Source: docs/theory/engine.md, "A GPU": angle errors times the steepest slopes of the cuts; error of s over the
-    width of the sector's edge.
+    Source: docs/theory/engine.md, "A GPU": angle errors multiplied by the steepest slopes of the cuts, and error of s
+    divided by the width of the sector's edge.
     """
     if job.beams is None:
         return 0.0
@@ -203,7 +205,7 @@ def _setting(job: Job, view: View, weights: float, pulses: int, oversampling: in
         table_bytes=8 * coefficients,
         reasons={
             "oversampling": f"predicted errors: table {table_db:.1f} dB, paths {paths_db:.1f} dB{weighted}; "
-            "seconds are not measured",
-            "tolerance_rad": f"exact float64 paths for {100 * exact:.0f} % of pixels × pulses",
+            "the predicted time is not based on measurements",
+            "tolerance_rad": f"exact float64 paths for {100 * exact:.0f} % of pixel-pulse pairs",
         },
     )

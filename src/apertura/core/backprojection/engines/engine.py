@@ -1,4 +1,4 @@
-"""Engine interface, and engine settings with predicted error and cost."""
+"""Interface of engines, and engine settings with predicted error and cost."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from apertura.common.units import decibels
 from apertura.core.backprojection.job import Job
 
 BEAM_S = 1.2e-7
-"""Seconds of `Beams.weight` per pixel, pulse, and antenna or sector."""
+"""Computing time of `Beams.weight` per pixel, pulse, and antenna or sector, seconds."""
 
 
 class EngineOptions(BaseModel):
@@ -34,15 +34,15 @@ class Setting:
     error_db
         Predicted RMS error at random pixels, dB.
     form_seconds, table_seconds
-        Predicted time for all pixels, and for the tables common to all tiles, on one core of a 2023 server with
-        AVX-512. On other machines, the times of settings have approximately the same ratios, so that the choice depends
-        only on the job.
+        Predicted time for all pixels, and for the tables common to all tiles, on one core of a server of 2023 with
+        AVX-512. On other machines, the ratios between the times of settings are approximately the same; the choice
+        therefore depends only on the job.
     table_bytes
         Size of the tables of all pulses.
     reasons
-        Option → reason of its value, one line.
+        Option → reason for its value, one line.
     pulse_blocks
-        Number of pulse blocks, so that the tables of one block fit into memory; the images of blocks add up.
+        Number of pulse blocks with which the tables of one block fit into memory; the image is the sum over the blocks.
     """
 
     engine: str
@@ -57,7 +57,7 @@ class Setting:
 
     @property
     def seconds(self) -> float:
-        """Predicted time for tables and pixels."""
+        """Predicted time for tables and pixels, seconds."""
         return self.table_seconds + self.form_seconds
 
     @property
@@ -67,7 +67,7 @@ class Setting:
 
     @property
     def line(self) -> str:
-        """Engine and options, one phrase.
+        """Engine and options in one phrase.
 
         Examples
         --------
@@ -83,33 +83,33 @@ class Engine(Protocol):
     Attributes
     ----------
     Options
-        Options in the config; its fields are options of `prepare` or `form`.
+        Model of the options in the config; its fields are options of `prepare` or `form`.
     READS
         Input type: phase history or profiles.
     available
         Returns True if the engine can run on this machine.
     NEEDS
-        Requirements, one phrase; omitted by an engine without requirements.
+        Requirements, one phrase; not defined by an engine without requirements.
     TIMED
-        False if the cost of the engine has not been measured: the engine is used only on request, never selected by the
-        planner.
+        False if the cost of the engine has not been measured: the engine is used only on request and is never selected
+        by the planner.
     candidates
-        (job, pulses=, requested=) → settings with predicted error and cost; `pulses` may be fewer than the job's,
-        `requested` contains options fixed by the config.
+        (job, pulses=, requested=) → settings with predicted error and cost. `pulses` may be smaller than the number of
+        pulses of the job; `requested` contains options fixed by the config.
     prepare
-        (inputs, **options) → tables common to all tiles; indexing them by a slice of pulses, which starts at a multiple
-        of 64, gives the tables of these pulses.
+        (inputs, **options) → tables common to all tiles. Indexing the tables with a slice of pulses that starts at a
+        multiple of 64 returns the tables of these pulses.
     instruction_set
         Returns the instruction set of the sums on this machine; optional.
     pieces
-        (shape of a block of pixels, form_options) → windows that can be formed independently with the same bits;
-        omitted by an engine that forms pixels in patches of `PATCH_PX`.
+        (shape of a block of pixels, form_options) → windows that can be formed independently with bit-identical
+        results; not defined by an engine that forms pixels in patches of `PATCH_PX`.
     VARIANTS
         Names of the variants of the sum; `form` adds the number of pixel-pulse contributions of each variant to an
-        int64 array `counts`. Omitted by an engine with one variant.
+        int64 array `counts`. Not defined by an engine with a single variant.
     form
-        (prepared, pixels (y, x, 3) float64, beams=None, **form_options) → (y, x) complex, the sum over the pulses;
-        releases the GIL and starts no threads.
+        (prepared, pixels (y, x, 3) float64, beams=None, **form_options) → (y, x) complex, the sum over the pulses. The
+        function releases the GIL and starts no threads.
     """
 
     Options: type[EngineOptions]
@@ -123,7 +123,7 @@ class Engine(Protocol):
 
 
 def checked_pixels(pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return pixel positions as contiguous float64, validated for an engine's `form`.
+    """Return pixel positions as contiguous float64, validated for `form` of an engine.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def checked_pixels(pixels: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def compiled_for() -> str:
-    """Return LLVM's name of the processor for which numba compiles on this machine."""
+    """Return the LLVM name of the processor for which numba compiles on this machine."""
     from llvmlite.binding import get_host_cpu_name
     from numba.core import config
 

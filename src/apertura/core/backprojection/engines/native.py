@@ -1,14 +1,15 @@
-"""Backprojection by the project's compiled kernel: range tables without gather instructions, AVX-512, AVX2 or portable.
+"""Backprojection by the compiled kernel: range tables without gather instructions, AVX-512, AVX2 or portable code.
 
 1. `prepare` converts range profiles to tables (native/expand.hpp): each cell contains the least-squares polynomial of
-   the profile, times the carrier (docs/theory/engine.md, "Cells"; `range_interpolation` designs the filters).
+   the profile, multiplied by the carrier (docs/theory/engine.md, "Cells"; `range_interpolation` designs the filters).
 2. `form` sums the tables over patches of 16 × 16 pixels (native/patch.cpp, batch.hpp). Paths are polynomials in blocks
-   of 4 × 4 pixels with one curvature for the patch or one for each block, or are computed exactly in float64, whichever
-   has the lowest cost within `tolerance_rad` ("Paths"). Beam weights are polynomials over the patch if they are smooth
-   (eq. 7), sector weights polynomials at the edge of the sector (docs/theory/integration.md, eq. 3).
-3. `candidates` predicts the share of each path variant, error and cost (docs/theory/planner.md).
+   of 4 × 4 pixels with a shared curvature for the patch or a curvature for each block, or are computed exactly in
+   float64; the variant with the lowest cost within `tolerance_rad` is used ("Paths"). Beam weights are polynomials over
+   the patch if the weights are smooth (eq. 7). Sector weights are polynomials at the edge of the sector
+   (docs/theory/integration.md, eq. 3).
+3. `candidates` predicts the fraction of each path variant, the error and the cost (docs/theory/planner.md).
 
-`prepare` and `form` release the GIL and start no threads. `available` returns False if no compiler was present at
+`prepare` and `form` release the GIL and start no threads. `available` returns False if no compiler was available at
 installation.
 """
 
@@ -81,10 +82,10 @@ def prepare(profiles: Profiles, *, oversampling: int = 6, degree: int = 2) -> Ta
     Parameters
     ----------
     profiles
-        Band-limited profiles with eight samples or more beyond the scene at both ends.
+        Band-limited profiles with at least eight samples beyond the scene at both ends.
     oversampling
-        Table cells per Nyquist cell c/B of total path. The error is about -75 dB for 6 cells with degree 2 and -62 dB
-        for 10 cells with degree 1; `Tables.error_db` predicts it.
+        Table cells per Nyquist cell c/B of total path. The error is about -75 dB for 6 cells with degree 2, and -62 dB
+        for 10 cells with degree 1; `Tables.error_db` is the predicted error.
     degree
         Degree of the polynomials, 1 or 2.
 
@@ -96,8 +97,8 @@ def prepare(profiles: Profiles, *, oversampling: int = 6, degree: int = 2) -> Ta
     Raises
     ------
     ValueError
-        If `degree` is neither 1 nor 2, the oversampling of the profiles is below 1.5, there is no pulse, or a position
-        or start is not finite.
+        If `degree` is neither 1 nor 2, if the oversampling of the profiles is below 1.5, if there is no pulse, or if a
+        position or start is not finite.
 
     Notes
     -----
@@ -141,29 +142,30 @@ def form(
         Tables from `prepare`.
     pixels
         (y, x, 3) float64, metres, in the frame of the phase centres (ECEF or local), on any surface. A tile of a
-        larger grid that starts at multiples of 16 pixels has the same bits as in the larger grid.
+        larger grid that starts at multiples of 16 pixels is bit-identical to this part of the image of the larger grid.
     beams
-        Weight of each pulse at each pixel; none by default. Pulses whose beam or sector does not illuminate a patch
-        cost little.
+        Weight of each pulse at each pixel (default: 1). Pulses for which beam or sector does not illuminate a patch
+        require little time.
     accumulate
         Numeric type of the sum over pulse blocks.
     tolerance_rad
-        Largest phase error of the path series anywhere in a patch of 16 × 16 pixels; paths of patches and pulses that
-        exceed it are exact, computed pixel by pixel in float64.
+        Largest phase error of the path series anywhere in a patch of 16 × 16 pixels. For patches and pulses that exceed
+        this error, exact paths are computed pixel by pixel in float64.
     counts
-        (4,) int64 array to which the numbers of patch-pulse combinations are added: with shared curvature, own
-        curvature, exact paths, and without an echo.
+        (4,) int64 array to which the numbers of patch-pulse pairs are added: with a shared curvature, with a curvature
+        for each block, with exact paths, and without an echo.
 
     Returns
     -------
     ndarray
-        (y, x) complex64. Pulses whose profile does not cover a pixel add zero; a pixel without a finite position is
-        NaN.
+        (y, x) complex64. Pulses do not contribute to pixels that are not covered by their profiles; a pixel without a
+        finite position is NaN.
 
     Raises
     ------
     ValueError
-        If the shape of `pixels` is not (y, x, 3), `accumulate` is unknown, or a beam has another number of pulses.
+        If the shape of `pixels` is not (y, x, 3), if `accumulate` is unknown, or if a beam has a different number of
+        pulses.
     MemoryError
         If the kernel cannot allocate memory.
 
@@ -204,7 +206,7 @@ def _expand(
     used = (length - 1) * design.up // design.down + 1
     steps = -(-used // (design.up * TAPS)) * TAPS
     width = -(-(used + 2 * MARGIN) // TAPS) * TAPS
-    # otherwise all rows map to the same cache lines, and the sum is up to four times slower
+    # padding, without which all rows map to the same cache lines and the sum is up to four times slower
     width += 16 * (width % 256 == 0)
     index = np.arange(steps) * design.up + np.arange(design.up)[:, None]
     carrier = _parts(np.exp(1j * _turn(np.asarray(carrier_rad_per_cell * index))), axis=1)
@@ -231,18 +233,18 @@ def _turn(phase_rad: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class PatchWeights:
-    """Shares of patch-pulse combinations by the method of computing antenna weights.
+    """Fractions of patch-pulse pairs by the method of computing antenna weights.
 
     Attributes
     ----------
     smooth, pixelwise, dark
-        Share weighted by a polynomial, share weighted pixel by pixel, and share not illuminated; they sum to 1.
+        Fractions that are weighted by a polynomial, weighted pixel by pixel, and not illuminated; the sum is 1.
     error
         RMS error of the polynomials relative to the RMS of the weights.
     antennas
         Number of beams.
     edge
-        Of the combinations inside the sector, the share at its smooth edge.
+        Fraction of the pairs inside the sector that are at the smooth edge of the sector.
     """
 
     smooth: float = 1.0
@@ -262,7 +264,7 @@ def patch_weights(
     steps_m: NDArray[np.float64],
     place_m: NDArray[np.float64],
 ) -> PatchWeights:
-    """Return the shares of patches about points of the scene by the method of computing their weights.
+    """Return the fractions of patches about points of the scene by the method of computing weights.
 
     Parameters
     ----------
@@ -283,13 +285,13 @@ def patch_weights(
     half_patch = (KERNEL.patch_side - 1) / 2  # pixels
     across = half_patch * np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), -1).reshape(9, 2)
     nodes = place_m + np.einsum("ns,spc->npc", across, steps_m)
-    # Of the pulses inside the sector, the share at its edge.
+    # Fraction of the pulses inside the sector that are at the edge of the sector.
     weight = None if beams.sector is None else beams.sector.weight(aperture, place_m)
     illuminated = np.array([]) if weight is None else weight > 0
     edge = float((weight[illuminated] < 1).mean()) if weight is not None and illuminated.any() else 0.0
     if beams.antennas is None:
         return PatchWeights(edge=edge)
-    # Eq. 7: a polynomial if first and second differences between the nodes are small.
+    # Eq. 7: a polynomial is used if first and second differences between the nodes are small.
     gain = beams.antennas.weight(aperture, nodes.reshape(-1, 3)).reshape(len(aperture), 3, 3, len(place_m))
     curvature = [np.abs(np.diff(gain, 2, axis=axis)).max(axis=(1, 2)) for axis in (1, 2)]
     change = [np.abs(np.diff(gain.take([0, 2], axis), axis=axis)).max(axis=(1, 2)) for axis in (1, 2)]
@@ -329,16 +331,15 @@ TOLERANCES_RAD = (1.5e-3, 1e-3, 7e-4, 5e-4, 3e-4, 1.5e-4, 5e-5, 1.5e-5)
 """Candidate phase tolerances of the path series, rad."""
 
 WIDE_SUM_DB = -105.0
-"""Tolerated error below which the sum over pulses is computed in float64; the error of a float32 sum is about -115
-dB."""
+"""Error below which the sum over pulses is computed in float64, dB; the error of a float32 sum is about -115 dB."""
 
-_PULSES, _PULSES_OF_SECTOR = 48, 512  # pulses sampled for the geometry
-_WORST_TO_RMS = 1 / 3  # RMS phase error relative to the largest in a patch
+_PULSES, _PULSES_OF_SECTOR = 48, 512  # numbers of pulses sampled for the geometry, without and with a sector
+_WORST_TO_RMS = 1 / 3  # RMS phase error relative to the largest phase error in a patch
 _FLOAT32_RAD = 2e-6  # rounding error of tables and look-ups
-_NO_ERROR = 1e-20  # added before a logarithm
+_NO_ERROR = 1e-20  # added before taking a logarithm
 
-# Seconds on one core: per pulse, cell and coefficient; per pixel and pulse by degree, for each path variant; with beams
-# per pixel and pulse for smooth antenna weights (additional), pixelwise weights (instead), and no illumination.
+# Seconds on one core: per pulse, cell and coefficient; per pixel and pulse by degree, for each path variant; with
+# beams, per pixel and pulse for smooth antenna weights (additional), pixelwise weights (instead), and no illumination.
 _CELL_S = 1.5e-9
 _SHARED_S, _WIDE_S, _EXACT_S = {1: 2.1e-10, 2: 2.6e-10}, {1: 2.9e-10, 2: 3.7e-10}, {1: 3.2e-9, 2: 3.8e-9}
 _BEAM_S, _EDGE_S, _DARK_S = 6.7e-10, 3.4e-8, 1.2e-10
@@ -346,7 +347,7 @@ _SECTOR_S = 6.7e-10  # per pixel and pulse at the edge of a sector (additional)
 
 
 _BLOCK_REACH = np.sqrt(2) * (KERNEL.patch_side - KERNEL.block_side) / 2
-"""D of a flat patch, pixels: distance from the middle of the patch to the centre of a corner block."""
+"""D of a flat patch, pixels: distance from the centre of the patch to the centre of a corner block."""
 _PIXEL_REACH = np.sqrt(2) * (KERNEL.block_side - 1) / 2
 """δ, pixels: distance from the centre of a block to a corner pixel."""
 
@@ -375,7 +376,7 @@ class View:
 
 @lru_cache(maxsize=8)
 def view_of(job: Job) -> View:
-    """Return the imaging geometry of a job's scene."""
+    """Return the imaging geometry of the scene of a job."""
     pulses = job.aperture.sample(_PULSES if job.sector is None else _PULSES_OF_SECTOR)
     aperture, points = job.aperture[pulses], job.points_m
     right, down = (pixel_steps(job.ground_m, axis, job.spacing_m).reshape(-1, 3) for axis in (1, 0))
@@ -403,14 +404,14 @@ def pixel_steps(ground_m: NDArray[np.float64], axis: int, spacing_m: float) -> N
 def path_variants(
     view: View, *, cell_m: float, wavenumber_rad_m: float, tolerance_rad: float
 ) -> tuple[tuple[float, float, float], float]:
-    """Return the share of patch-pulse combinations with each path variant, and the phase error of the paths.
+    """Return the fractions of patch-pulse pairs with each path variant, and the phase error of the paths.
 
     Parameters
     ----------
     view
         Imaging geometry of the scene.
     cell_m
-        Total path across one cell of the table.
+        Total path across one cell of the table, metres.
     wavenumber_rad_m
         2πf_mid/c.
     tolerance_rad
@@ -419,14 +420,14 @@ def path_variants(
     Returns
     -------
     shares : tuple of float
-        Share with shared curvature in narrow windows, share with wide windows (shared or own curvature), and share with
-        exact paths.
+        Fractions with a shared curvature in narrow windows, with wide windows (shared curvature or a curvature for each
+        block), and with exact paths.
     error_rad : float
-        RMS over patches and pulses of the largest error in a patch.
+        RMS over patches and pulses of the largest phase error in a patch, rad.
 
     Notes
     -----
-    Source: docs/theory/engine.md, "Paths" and "Look-ups", for flat patches and windows of AVX-512.
+    Source: docs/theory/engine.md, "Paths" and "Look-ups", for flat patches and AVX-512 windows.
 
     Examples
     --------
@@ -435,22 +436,21 @@ def path_variants(
     >>> path_variants(near, **limits)[0], path_variants(far, **limits)[0]
     ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
     """
-    # Error bounds of one leg, with D = reach and δ = inner: terms neglected by both series, and the errors of shared
-    # and own curvature (native/bounds.hpp).
+    # Error bounds of a one-way path, with D = reach and δ = inner: terms neglected by both series, and errors of a
+    # shared curvature and of a curvature for each block (native/bounds.hpp).
     reach, inner = _BLOCK_REACH * view.spacing_m, _PIXEL_REACH * view.spacing_m
     inverse = (1 / view.range_m) ** 2
     base = inverse * (KERNEL.third_order * inner**3 + inverse * reach**4 * (KERNEL.fifth_order * reach + inner))
     shared = base + KERNEL.shared_curvature_error * reach * inner**2 * inverse
     own = base + KERNEL.own_curvature_error * reach**2 * inner**2 * inverse**1.5
     shared_rad, own_rad = (wavenumber_rad_m * path_m.sum(axis=0) for path_m in (shared, own))
-    # Cells spanned by a block of pixels, and by the 2 × 2 blocks of a narrow window.
+    # Number of cells spanned by a block of pixels, and by the 2 × 2 blocks of a narrow window.
     step = np.abs(view.slope).sum(axis=0)
     curvature = KERNEL.curvature_span * view.spacing_m**2 * (1 / view.range_m).sum(axis=0)
     block_cells = ((KERNEL.block_side - 1) * step + 2 * curvature) / cell_m + 1
-    # cells spanned by the 2 × 2 blocks in a narrow window
     group_cells = block_cells + KERNEL.block_side * step / cell_m
     window_cells = KERNEL.window - KERNEL.window_margin
-    # The cheapest variant with a bound within the tolerance, else exact paths.
+    # Cheapest variant with an error bound within the tolerance, otherwise exact paths.
     has_shared_curvature = (block_cells <= window_cells) & (shared_rad <= tolerance_rad)
     has_own_curvature = (block_cells <= window_cells) & (shared_rad > tolerance_rad) & (own_rad <= tolerance_rad)
     narrow = has_shared_curvature & (group_cells <= window_cells)
@@ -460,7 +460,7 @@ def path_variants(
 
 
 def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterator[Setting]:
-    """Yield settings of the compiled engine, as `apertura.core.backprojection.engines.engine.Engine` describes.
+    """Yield settings of the compiled engine, as described in `apertura.core.backprojection.engines.engine.Engine`.
 
     Notes
     -----
@@ -518,12 +518,14 @@ def _reasons(
 ) -> dict[str, str]:
     shared, wide, exact = (100 * share for share in shares)
     paths = (
-        f"pixel-pulse pairs with shared curvature {shared:.0f} %, wide windows {wide:.0f} %, exact paths {exact:.0f} %"
+        f"fractions of pixel-pulse pairs: shared curvature {shared:.0f} %, wide windows {wide:.0f} %, exact paths "
+        f"{exact:.0f} %"
     )
     beams = "" if beams_db is None else f", antenna weights {beams_db:.1f} dB"
     return {
         "degree": "lowest cost with this oversampling",
         "oversampling": f"predicted errors: table {table_db:.1f} dB, paths {paths_db:.1f} dB{beams}",
         "tolerance_rad": paths,
-        "accumulate": f"the error of float32 sums is -115 dB; float64 for a predicted error below {WIDE_SUM_DB:.0f} dB",
+        "accumulate": "the error of float32 sums is -115 dB; float64 sums are used for a predicted error below "
+        f"{WIDE_SUM_DB:.0f} dB",
     }

@@ -17,52 +17,54 @@ from apertura.core.antenna.beam import Beam, Beams
 from apertura.core.geometry.sector import Sector
 
 # ---- Sizes and error bounds of the compiled kernel
-# They are required by the planner also if the engine is not compiled; a test compares them with those of the library.
+# The planner requires these values even if the engine is not compiled; a test compares them with those of the library.
 
 
 @dataclass(frozen=True)
 class KernelConstants:
     """Sizes and error bounds of the kernel.
 
-    D is the largest distance of a block from the origin of its patch, δ the largest distance of a pixel from the centre
-    of its block, and R the range; errors refer to the one-way path, in the unit of D, δ and R.
+    D is the largest distance of a block from the origin of its patch, δ is the largest distance of a pixel from the
+    centre of its block, and R is the range. Errors refer to the one-way path, in the unit of D, δ and R.
 
     Attributes
     ----------
     patch_side, block_side
-        Pixels along a patch, whose paths are series about its origin, and along a block with one polynomial.
+        Number of pixels along a patch, over which paths are series about the origin of the patch; and number of pixels
+        along a block, over which a path is one polynomial.
     batch
-        Pulses whose paths are computed together; phase centres are padded to a multiple of it.
+        Number of pulses for which paths are computed together; phase centres are padded to a multiple of this number.
     taps
-        Taps of a table's filters.
+        Number of taps of the table filters.
     window
-        Table cells within reach of one look-up; tables have the same number of empty cells at both ends.
+        Number of table cells within reach of one look-up; tables have the same number of empty cells at each end.
     echo_taps, echo_degree
-        Number of samples used for an echo at a single point, and degree of their weight polynomials
+        Number of samples used for an echo at a single point, and degree of the weight polynomials of these samples
         (docs/theory/autofocus.md, "What pulses add").
     term_taps
         Number of samples used for an echo in float64, for certificates.
     window_margin
-        Margin of a window, cells: a path lies up to ½ cell beyond the cell to which it is rounded; the rest is for
-        float32 rounding.
+        Margin of a window, cells: a path lies up to ½ cell beyond the cell to which it is rounded; the remainder
+        accounts for float32 rounding.
     fifth_order
-        Factor of D⁵/R⁴. Order n of |w + d| is at most max |P_{n-2} − P_n| / (2n − 1) · dⁿ/Rⁿ⁻¹, 0.083 for n = 5, plus a
-        margin for higher orders.
+        Factor of D⁵/R⁴. Order n of |w + d| is at most max |P_{n-2} − P_n| / (2n − 1) · dⁿ/Rⁿ⁻¹, that is, 0.083 for
+        n = 5; the factor includes a margin for higher orders.
     third_order
         Factor of δ³/R²: 1/(3√3).
     shared_curvature_error
         Factor of Dδ²/R² if all blocks of a patch share one curvature: three terms of 1/(3√3).
     own_curvature_error
-        Factor of D²δ²/R³ if each block has its own curvature: six terms of 1/8, which it includes except for a tenth.
+        Factor of D²δ²/R³ if each block has its own curvature: a tenth of the six terms of 1/8, because the curvature of
+        the block includes the remainder.
     curvature_span
-        Second-order terms displace a pixel of a block by at most 1.5² times their coefficients; twice that value is a
+        Second-order terms displace a pixel of a block by at most 1.5² times their coefficients; twice this value is a
         bound for all blocks.
     weight_change, weight_curvature
-        Largest first and second differences of antenna weights between the nodes of a patch, relative to the beam's
-        peak, for which the weights are a polynomial.
+        Largest first and second differences of antenna weights between the nodes of a patch, relative to the peak of
+        the beam, for which the weights are represented by a polynomial.
     sector_bend
-        Largest curvature of a pixel's position in a sector's edge within a block, relative to the width of the edge,
-        for which the position is linear.
+        Largest curvature, within a block, of the position of a pixel in the edge of a sector, relative to the width of
+        the edge, for which the position is represented by a linear function.
 
     Notes
     -----
@@ -98,21 +100,23 @@ class TreeConstants:
     Attributes
     ----------
     nodes, side, levels
-        Largest number of nodes and of pixels along an axis of a tile, and of levels of a tree.
+        Largest numbers of nodes and of pixels along an axis of a tile, and of levels of a tree.
     slots
-        Number of slots for node counts and, above them, for sides of tiles in pixels, to which nodes are interpolated.
+        Number of slots for node counts, followed by slots for the sides of tiles in pixels, to which nodes are
+        interpolated.
     leaf
-        Number of pulses of a leaf, all summed by the same variant.
+        Number of pulses of a leaf, which are all summed by the same variant.
     virtual, virtual_margin
-        Largest number of virtual pulses of a leaf, and excess of their number over the degree of their curve.
+        Largest number of virtual pulses of a leaf, and excess of this number over the degree of the curve on which the
+        virtual pulses lie.
     terms
         Number of polynomials of the track over a leaf: one more than the highest degree of a curve.
     degree
         Degree of a nonplanar surface of a tile.
     delays
-        Taps of the filter that aligns a pulse to a tile.
+        Number of taps of the filter that aligns a pulse to a tile.
     weights
-        Coefficients of the antenna gain over a tile.
+        Number of coefficients of the antenna gain over a tile.
     weighted_rad
         Additional band at the nodes of a tile due to smooth weights, rad per half tile.
     """
@@ -253,20 +257,20 @@ STRUCTS = (BeamJob, SectorJob, ApertureJob, TableJob, EchoJob, TermsJob, TreeTil
 
 # ---- Loading the compiled library
 #
-# Bound with ctypes: the GIL is released during a call, and one wheel supports every Python version. The library
-# reports the layout of its structs; a library whose layout differs from that of this module is rejected on loading.
+# The library is bound with ctypes, so that the GIL is released during a call and one wheel supports every Python
+# version. The library reports the layout of its structs. A library with a different layout is rejected on loading.
 
 INSTRUCTION_SETS = ("avx512", "avx2", "portable")
 
 NAMED_BY = "APERTURA_KERNEL"
 """Environment variable: path of a library that replaces the installed one."""
 
-# Resolved only once, as calls may be short.
+# Resolved only once, because calls may be short.
 _BUILT = Path(str(files("apertura.core.backprojection.engines") / "_backprojection.so"))
 
 
 def layout() -> dict[str, str]:
-    """Return the layout of the structs of this module: field → offset and size, struct → its size.
+    """Return the layout of the structs of this module: field → offset and size; struct → size.
 
     Examples
     --------
@@ -307,8 +311,8 @@ def check_layout(theirs: dict[str, str], path: Path) -> None:
             raise CampaignError(
                 f"{name}: {theirs.get(name, 'no such field')}",
                 where=str(path),
-                expected=f"{name}: {ours.get(name, 'no such field')}, as in apertura's native_binding.py",
-                remedy="Reinstall apertura to get the library of the same version, and unset APERTURA_KERNEL.",
+                expected=f"{name}: {ours.get(name, 'no such field')}, as in native_binding.py of apertura",
+                remedy="Reinstall apertura to obtain the library of the same version, and unset APERTURA_KERNEL.",
             )
 
 
@@ -324,7 +328,7 @@ def available() -> bool:
 
 
 def instruction_set() -> str:
-    """Return the instruction set in use: the best of this machine, or the one requested by APERTURA_ISA.
+    """Return the instruction set in use: the best one on this machine, or the one requested by APERTURA_ISA.
 
     Raises
     ------
@@ -354,7 +358,7 @@ def supports(isa: str) -> bool:
 
 def _unsupported(requested: str, expected: str) -> CampaignError:
     return CampaignError(
-        f"{requested!r}", where="environment variable APERTURA_ISA", expected=expected, remedy="Unset it."
+        f"{requested!r}", where="environment variable APERTURA_ISA", expected=expected, remedy="Unset the variable."
     )
 
 
@@ -370,9 +374,9 @@ def call(function: str, job: ctypes.Structure) -> None:
     """
     status = getattr(library(), function)(instruction_set().encode(), ctypes.byref(job))
     if status == 1:
-        raise MemoryError(f"{function}: work memory cannot be allocated")
+        raise MemoryError(f"{function}: the work memory cannot be allocated")
     if status:
-        raise RuntimeError(f"{function}: failed with status {status}")
+        raise RuntimeError(f"{function} failed with status {status}")
 
 
 def library_path() -> Path:
@@ -381,20 +385,21 @@ def library_path() -> Path:
     Raises
     ------
     CampaignError
-        If APERTURA_KERNEL is not an existing file, or a relative path, as working directories differ between processes.
+        If APERTURA_KERNEL is not an existing file, or if it is a relative path: processes may have different working
+        directories.
     """
     named = os.environ.get(NAMED_BY)
     if not named:
         return _BUILT
     if not (Path(named).is_absolute() and Path(named).is_file()):
-        raise _no_kernel(named, "no such file" if Path(named).is_absolute() else "a relative path")
+        raise _no_kernel(named, "no such file" if Path(named).is_absolute() else "relative path")
     return Path(named)
 
 
 def _no_kernel(named: str, found: str) -> CampaignError:
     where = f"environment variable {NAMED_BY}"
     expected = "the absolute path of a library built from native/ of this version"
-    return CampaignError(f"{quoted(named)}: {found}", where=where, expected=expected, remedy="Unset it.")
+    return CampaignError(f"{quoted(named)}: {found}", where=where, expected=expected, remedy="Unset the variable.")
 
 
 def library() -> ctypes.CDLL:
@@ -403,9 +408,9 @@ def library() -> ctypes.CDLL:
     Raises
     ------
     RuntimeError
-        If it was not compiled.
+        If the library was not compiled.
     CampaignError
-        If the layout of its structs differs from that of this module.
+        If the layout of the structs of the library differs from that of this module.
     """
     return _load(library_path())
 
@@ -447,7 +452,7 @@ def _lines(function: Callable[[], bytes]) -> list[list[str]]:
 # ---- Beams and sectors as structures
 
 KeptArrays = list[NDArray[np.generic]]
-"""Arrays referenced by a struct, kept alive while the struct is used."""
+"""Arrays referenced by a struct, which must remain in memory while the struct is used."""
 
 
 def weights_of(beams: Beams | None, pulses: int, padded: int) -> tuple[Any, Any, KeptArrays]:
@@ -463,7 +468,7 @@ def weights_of(beams: Beams | None, pulses: int, padded: int) -> tuple[Any, Any,
     Raises
     ------
     ValueError
-        If a beam or the sector has another number of pulses.
+        If a beam or the sector has a different number of pulses.
     """
     beams = beams or Beams()
     beams.check_pulses(pulses)
@@ -495,7 +500,7 @@ def _beam(beam: Beam, padded: int) -> tuple[BeamJob, KeptArrays]:
 
 
 def _padded(axes: NDArray[np.float64], padded: int) -> NDArray[np.float64]:
-    """Return the axes padded to `padded` pulses by repeating the last."""
+    """Return the axes padded to `padded` pulses by repeating the axes of the last pulse."""
     return np.concatenate([axes, np.repeat(axes[-1:], padded - len(axes), axis=0)]) if padded > len(axes) else axes
 
 

@@ -27,15 +27,15 @@ from apertura.core.windowed_sinc import kaiser_sinc
 instruction_set = compiled_for
 READS: Literal["profiles"] = "profiles"
 STANDS_IN_FOR = "native"
-"""Engine for which this engine is the substitute in the planner's selection if that engine cannot run."""
+"""Engine that this engine replaces in the selection of the planner if that engine is not available."""
 OVERSAMPLINGS = (2, 4, 6, 8, 12, 16, 24, 32)
 
 _SAMPLE_S = 3.1e-8  # seconds per pulse and table sample
 _PIXEL_S = 3.2e-8  # seconds per pixel and pulse
 _REFINED_DB = -98.0  # error of the sinc filter of the table
 _HALF_TAPS = 10
-_PIXELS_AT_ONCE = 1024  # number of pixels whose weights are in memory at once
-_KAISER_BETA = 10.0  # shape of the window for an error of -100 dB, with half the band as transition
+_PIXELS_AT_ONCE = 1024  # number of pixels for which weights are in memory at once
+_KAISER_BETA = 10.0  # shape parameter of the window for an error of -100 dB, with half of the band as transition
 
 
 class Options(EngineOptions):
@@ -47,12 +47,12 @@ class Options(EngineOptions):
 
 
 def available() -> bool:
-    """Return True, as numba is installed with the package."""
+    """Return True, because numba is installed with the package."""
     return True
 
 
 def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterator[Setting]:
-    """Yield a setting for each oversampling, as `apertura.core.backprojection.engines.engine.Engine` describes.
+    """Yield a setting for each oversampling, as described in `apertura.core.backprojection.engines.engine.Engine`.
 
     Notes
     -----
@@ -67,7 +67,8 @@ def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterat
         samples = pulses * signal.samples * factor
         cubic_db = cubic_error_db(signal.oversampling * factor, signal.window)
         reason = (
-            f"predicted error of cubic interpolation in a {signal.oversampling * factor:.3g}× table {cubic_db:.1f} dB"
+            f"predicted error {cubic_db:.1f} dB for cubic interpolation in a table with an oversampling of "
+            f"{signal.oversampling * factor:.3g}"
         )
         yield Setting(
             "numba",
@@ -82,7 +83,7 @@ def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterat
 
 
 def cubic_error_db(oversampling: float, window: NDArray[np.float64]) -> float:
-    """Return the RMS error of four-point Lagrange interpolation of echoes with a window (subcarrier,), dB.
+    """Return the RMS error, dB, of four-point Lagrange interpolation of echoes with a window, (subcarrier,).
 
     Examples
     --------
@@ -110,9 +111,9 @@ class OversampledTables:
     samples
         (pulse, range) complex64.
     start_m
-        (pulse,) float64, total path of sample 0.
+        (pulse,) float64, total path of sample 0, metres.
     step_m
-        Total path between samples.
+        Total path between samples, metres.
     wavenumber_rad_m
         2πf_mid/c.
     aperture
@@ -136,9 +137,10 @@ def prepare(profiles: Profiles, *, oversampling: int = 8) -> OversampledTables:
     Parameters
     ----------
     profiles
-        Profiles, at least twice oversampled to leave half the band for the transition of the filter.
+        Profiles with an oversampling of at least 2, so that half of the band is available for the transition of the
+        filter.
     oversampling
-        Samples per range cell c/B; the error of cubic interpolation of 8 samples is about -80 dB
+        Samples per range cell c/B; with 8 samples per cell, the error of cubic interpolation is about -80 dB
         (docs/theory/planner.md, "Error").
     """
     factor = max(1, round(oversampling / profiles.oversampling))
@@ -153,19 +155,19 @@ def prepare(profiles: Profiles, *, oversampling: int = 8) -> OversampledTables:
 
 
 def refine(samples: NDArray[np.complex64], factor: int) -> NDArray[np.complex64]:
-    """Interpolate samples to `factor` times their rate by a windowed sinc; the first samples coincide.
+    """Interpolate samples to `factor` times the sampling rate by a windowed sinc; the first samples coincide.
 
     Parameters
     ----------
     samples
-        (pulse, range) complex64, at least twice oversampled.
+        (pulse, range) complex64, with an oversampling of at least 2.
     factor
-        New samples per original sample.
+        Number of new samples per original sample.
 
     Returns
     -------
     ndarray
-        (pulse, range·factor) complex64; within ten samples of an end, missing neighbours are zero.
+        (pulse, range·factor) complex64; within ten samples of an end, missing neighbours are assumed to be zero.
 
     Examples
     --------
@@ -195,16 +197,16 @@ def form(
     pixels
         (y, x, 3) float64, metres, in the frame of the phase centres.
     beams
-        Antenna weight of each pulse at each pixel; none by default.
+        Antenna weight of each pulse at each pixel (default: 1).
 
     Returns
     -------
     ndarray
-        (y, x) complex64. A path outside the table adds zero.
+        (y, x) complex64. A pulse does not contribute to a pixel with a path outside the table.
 
     Notes
     -----
-    Source: docs/theory.md, eq. 6; four-point Lagrange interpolation.
+    Source: docs/theory.md, eq. 6, with four-point Lagrange interpolation.
     """
     flat = np.ascontiguousarray(pixels.reshape(-1, 3))
     image = np.zeros(len(flat), np.complex128)

@@ -1,7 +1,7 @@
-"""Range tables of the compiled engine: polynomials of the profile inside each cell, and their error.
+"""Range tables of the compiled engine: polynomials of the profile inside each cell, and error of these polynomials.
 
 A cell contains the coefficients of the least-squares polynomial of the profile over the cell, multiplied by the carrier
-at its middle; the carrier relative to the middle is a short polynomial as well (docs/theory/engine.md).
+at the centre of the cell. The carrier relative to the centre is a short polynomial as well (docs/theory/engine.md).
 """
 
 from dataclasses import dataclass, replace
@@ -14,15 +14,16 @@ from apertura.common.units import decibels
 from apertura.core.backprojection.engines.native_binding import KERNEL
 
 TAPS = KERNEL.taps
-MARGIN = KERNEL.window  # empty cells at both ends for look-up windows that extend beyond the profile
-# Sine terms, cosine terms, reduction by multiples of π: the polynomials of native/phase.hpp, cheapest first.
+MARGIN = KERNEL.window  # number of empty cells at each end, for look-up windows that extend beyond the profile
+# Polynomials of native/phase.hpp, in ascending order of cost: sine terms, cosine terms, reduction by multiples of π.
 PHASE_POLYNOMIALS = ((2, 3, False), (3, 4, False), (4, 4, False), (3, 4, True))
 
 BAND = np.cos(np.pi * (np.arange(160) + 0.5) / 160)
-"""Frequencies at which errors are evaluated, with the band edges at ±1: Chebyshev nodes, dense at the edges."""
+"""Frequencies at which errors are evaluated, with the band edges at ±1: Chebyshev nodes, which are dense at the edges.
+"""
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
-_WITHIN = _NODES / 2  # positions inside a cell at which errors are evaluated, in cells
+_WITHIN = _NODES / 2  # positions inside a cell at which errors are evaluated, cells
 _WITHIN_WEIGHTS = _WEIGHTS / 2
 
 
@@ -33,18 +34,17 @@ class Tables:
     Attributes
     ----------
     cells
-        (pulse, 2·(degree + 1), cell) float32: real and imaginary part of each coefficient, zero outside
-        the profile.
+        (pulse, 2·(degree + 1), cell) float32: real and imaginary parts of each coefficient; zero outside the profile.
     transmitter_m, receiver_m
-        (3, padded) float64, phase centres in the frame of the pixels; pulses padded to a multiple of 8.
+        (3, padded) float64, phase centres in the frame of the pixels; pulses are padded to a multiple of 8.
     first_path_m
-        (padded,) float64, total path at the middle of cell 0, metres.
+        (padded,) float64, total path at the centre of cell 0, metres.
     cell_m
         Total path across one cell, metres.
     carrier_rad_per_cell
-        Carrier phase over one cell.
+        Change of the carrier phase over one cell, rad.
     phase_polynomial, phase_coefficients
-        Index into `PHASE_POLYNOMIALS` and its (9,) float32 coefficients.
+        Index of a polynomial in `PHASE_POLYNOMIALS`; and coefficients of this polynomial, (9,) float32.
     degree
         Degree of the polynomials, 1 or 2.
     error_db
@@ -63,7 +63,7 @@ class Tables:
     error_db: float
 
     def __getitem__(self, pulses: slice) -> "Tables":
-        """Return the tables of a slice of pulses that starts at a multiple of a batch."""
+        """Return the tables of a slice of pulses that starts at a multiple of the batch size."""
         first, last, _ = pulses.indices(len(self.cells))
         padded = slice(first, first - (first - last) // KERNEL.batch * KERNEL.batch)
         return replace(
@@ -84,9 +84,9 @@ class TableDesign:
     up, down
         `up` cells cover `down` samples.
     taps
-        (up, degree + 1, tap) float32, filters for each coefficient of each of the `up` cells.
+        (up, degree + 1, tap) float32, filter for each coefficient of each of the `up` cells.
     lead
-        (up,) int32, sample of the first tap relative to the first of the `down` samples.
+        (up,) int32, sample at the first tap relative to the first of the `down` samples.
     phase_polynomial, phase_coefficients
         As in `Tables`.
     squared_error
@@ -102,24 +102,24 @@ class TableDesign:
     squared_error: NDArray[np.float64]
 
     def error_db(self, window: NDArray[np.float64]) -> float:
-        """Return the predicted RMS error at random pixels for echoes with a window, as `band_error_db`."""
+        """Return the predicted RMS error at random pixels for echoes with a window, dB; see `band_error_db`."""
         return band_error_db(self.squared_error, window)
 
 
 def band_error_db(squared_error: NDArray[np.float64], window: NDArray[np.float64]) -> float:
-    """Return the RMS error of a windowed white echo, relative to the echo, dB.
+    """Return the RMS error of a windowed echo with a white spectrum, relative to the echo, dB.
 
     Parameters
     ----------
     squared_error
         (160,) float64, squared error at each frequency of `BAND`.
     window
-        (subcarrier,) float64, weights from the lowest to the highest subcarrier, with any scale.
+        (subcarrier,) float64, weights from the lowest to the highest subcarrier, with an arbitrary scale.
 
     Returns
     -------
     float
-        dB.
+        RMS error, dB.
 
     Notes
     -----
@@ -138,7 +138,7 @@ def band_error_db(squared_error: NDArray[np.float64], window: NDArray[np.float64
 
 
 def ratio(profile_oversampling: float, oversampling: float) -> tuple[int, int]:
-    """Return the numbers of cells and of samples of equal length, with at least `oversampling` cells per Nyquist cell.
+    """Return the numbers of cells and samples that span equal lengths, with `oversampling` cells per Nyquist cell.
 
     Examples
     --------
@@ -158,20 +158,20 @@ def design_table(
     Parameters
     ----------
     profile_oversampling
-        Samples per Nyquist cell of the profiles, ≥ 1.5.
+        Samples of the profiles per Nyquist cell, at least 1.5.
     carrier_rad_per_sample
-        Phase of the carrier over one sample of total path, rad.
+        Change of the carrier phase over one sample of total path, rad.
     oversampling
-        Cells of the table per Nyquist cell.
+        Least number of cells of the table per Nyquist cell.
     degree
         Degree of the polynomials, 1 or 2.
     taps
-        Taps of the filters.
+        Number of taps of the filters.
 
     Notes
     -----
-    Source: docs/theory/engine.md, "Cells". The filters are least-squares optimal over the band of the profiles, so that
-    oversampled profiles require a small number of taps.
+    Source: docs/theory/engine.md, "Cells". The filters are optimal in the least-squares sense over the band of the
+    profiles, so that oversampled profiles require a small number of taps.
 
     Examples
     --------
@@ -184,13 +184,13 @@ def design_table(
     starts = np.arange(up) * down / up
     first_sample = np.floor(starts)
     omega = np.pi / profile_oversampling * BAND
-    # Coefficients of each frequency in each cell, and least-squares filter taps for them.
+    # Ideal coefficients at each frequency in each cell, and filter taps fitted by least squares.
     ideal = np.exp(1j * omega * (starts - first_sample)[:, None])[:, None] * _coefficients(omega * down / up, degree)
     before = taps // 2 - 1
     basis = np.exp(1j * omega[:, None] * (np.arange(taps) - before))
     target = ideal.reshape(-1, omega.size).T
     filters = np.linalg.lstsq(_stacked(basis), _stacked(target), rcond=1e-9)[0].T.reshape(up, degree + 1, taps)
-    # Error of the polynomials, with the carrier inside a cell as a short polynomial.
+    # Error of the polynomials; the carrier inside a cell is approximated by a short polynomial.
     coefficients = np.einsum("pkt,wt->pkw", filters, basis)
     carrier_rad_per_cell = carrier_rad_per_sample * down / up
     polynomial, phase = _phase(carrier_rad_per_cell)
@@ -212,7 +212,7 @@ def _stacked(values: NDArray[np.complex128]) -> NDArray[np.float64]:
 
 
 def _coefficients(omega: NDArray[np.float64], degree: int) -> NDArray[np.complex128]:
-    """Return (degree + 1, omega) least-squares polynomials of exp(jωu) over -½ ≤ u ≤ ½ (Legendre projection)."""
+    """Return (degree + 1, omega) coefficients of least-squares polynomials of exp(jωu) over -½ ≤ u ≤ ½ (Legendre)."""
     wave = np.exp(1j * omega[:, None] * _WITHIN) * _WITHIN_WEIGHTS
     level, slope = wave.sum(1), 12 * (wave * _WITHIN).sum(1)
     if degree == 1:
@@ -222,7 +222,7 @@ def _coefficients(omega: NDArray[np.float64], degree: int) -> NDArray[np.complex
 
 
 def _phase(carrier_rad_per_cell: float) -> tuple[int, NDArray[np.float32]]:
-    """Return the index of the cheapest accurate phase polynomial of the carrier inside a cell, and its coefficients."""
+    """Return the index and coefficients of the cheapest sufficiently accurate phase polynomial inside a cell."""
     u = 0.5 * np.cos(np.pi * (np.arange(200) + 0.5) / 200)
     for sines, cosines, reduced in PHASE_POLYNOMIALS:
         scale = np.pi if reduced else carrier_rad_per_cell

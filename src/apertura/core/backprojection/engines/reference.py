@@ -25,18 +25,18 @@ class Options(EngineOptions):
 
 
 def available() -> bool:
-    """Return True, as the engine has no requirements."""
+    """Return True, because the engine has no requirements."""
     return True
 
 
 def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> list[Setting]:  # noqa: ARG001
-    """Return the single setting, as `apertura.core.backprojection.engines.engine.Engine` describes."""
+    """Return the only setting, as described in `apertura.core.backprojection.engines.engine.Engine`."""
     each = job.subcarriers * _SUBCARRIER_S + job.weights * BEAM_S
     return [Setting("reference", {}, {}, _ERROR_DB, job.pixels * pulses * job.share * each)]
 
 
 def prepare(history: PhaseHistory) -> PhaseHistory:
-    """Return the phase history unchanged, as the double sum needs no table."""
+    """Return the phase history unchanged, because the double sum requires no table."""
     return history
 
 
@@ -50,7 +50,7 @@ def form(history: PhaseHistory, pixels: NDArray[np.float64], *, beams: Beams | N
     pixels
         (..., 3) float64, metres, in the frame of the phase centres.
     beams
-        Antenna weight of each pulse at each pixel; none by default.
+        Antenna weight of each pulse at each pixel (default: 1).
 
     Returns
     -------
@@ -80,7 +80,7 @@ def form(history: PhaseHistory, pixels: NDArray[np.float64], *, beams: Beams | N
 
 
 def terms(history: PhaseHistory, pixels: NDArray[np.float64], beams: Beams | None = None) -> NDArray[np.complex128]:
-    """Return the contribution of each pulse at each pixel, the sum over subcarriers.
+    """Return the contribution of each pulse at each pixel, which is the sum over the subcarriers.
 
     Parameters
     ----------
@@ -96,8 +96,8 @@ def terms(history: PhaseHistory, pixels: NDArray[np.float64], beams: Beams | Non
 
     Notes
     -----
-    The sum is a polynomial in exp(j2πΔfτ), evaluated by Horner's rule without table or interpolation; the rounding
-    error of thousands of terms is 1e-12.
+    The sum is a polynomial in exp(j2πΔfτ), which is evaluated by Horner's rule without tables or interpolation. The
+    rounding error for thousands of terms is 1e-12.
     """
     frequency = history.frequency_hz
     step = float(frequency[-1] - frequency[0]) / (len(frequency) - 1)

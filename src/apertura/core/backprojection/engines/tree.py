@@ -1,25 +1,25 @@
 """Backprojection by subaperture trees on Cartesian tiles, with a lower order of complexity for large images.
 
-Over a tile of up to 256 × 256 pixels, the sum of neighbouring pulses is band-limited after removal of the phase φ of a
-reference pulse (docs/theory/tree.md, eq. 3 and 4). It is therefore computed at a small number of nodes and
+Over a tile of up to 256 × 256 pixels, the sum over consecutive pulses is band-limited after removal of the phase φ of a
+reference pulse (docs/theory/tree.md, eq. 3 and 4). The sum is therefore computed at a small number of nodes and
 interpolated:
 
 1. **Surface** (`tree_geometry`). The pixel positions of a tile are approximated by a plane or by Legendre polynomials
    of degree 6.
 2. **Plan** (native/tree_plan.hpp). Every subaperture of each level is assigned the smallest number of nodes that
    supports its band (4b), and every leaf of 64 pulses the smallest number of virtual pulses (8). The highest level is
-   the last at which 128 nodes are sufficient.
-3. **Leaves** (native/tree_leaf.hpp). The pulses of a leaf are aligned to the tile's centre (7), presummed to virtual
+   the last level at which 128 nodes are sufficient.
+3. **Leaves** (native/tree_leaf.hpp). The pulses of a leaf are aligned to the tile centre (7), presummed to virtual
    pulses (8), expanded to cells and summed at the nodes of the leaf, with the weights of antennas and sector (13).
 4. **Merges** (native/tree_merge.hpp). Subapertures of 64, 256 and `chunk` pulses are merged by two small matrix
-   products each, with φ of the child removed and that of the parent restored (5); the last merge evaluates the pixels.
-5. **Height layers** (`tree_geometry`). If pixels lie off the surface (9), the tile is formed on several parallel layers
-   and interpolated between them (11).
+   products each, with φ of the child removed and φ of the parent restored (5); the last merge evaluates the pixels.
+5. **Height layers** (`tree_geometry`). If pixels deviate from the surface (9), the tile is formed on several parallel
+   layers, and the pixels are interpolated between the layers (11).
 
 Contributions that a tree cannot sum are summed on the quarters of the tile, or otherwise by the direct kernel (engine
 `native`). This applies to ends of profiles inside the tile, weights that are not smooth, more than 128 nodes, and tiles
 below 32 × 32 pixels. A tile depends only on its own pixels. `tree_inputs` prepares the inputs common to all tiles and
-the jobs of the library, `tree_prediction` predicts error (10) and cost of a setting.
+the jobs of the library; `tree_prediction` predicts error (10) and cost of a setting.
 """
 
 from collections.abc import Iterator, Mapping
@@ -80,9 +80,9 @@ class Options(EngineOptions):
     side_px: Annotated[int, Field(ge=16, le=TREE.side)] | None = Field(
         None, description="largest side of a tile of a tree, pixels"
     )
-    chunk: Literal[256, 512, 1024, 2048] | None = Field(None, description="pulses of the largest subaperture")
+    chunk: Literal[256, 512, 1024, 2048] | None = Field(None, description="number of pulses of the largest subaperture")
     height_layers: Annotated[int, Field(ge=0, le=MOST_LAYERS)] | None = Field(
-        None, description="largest number of height layers between which a tile of rough terrain is interpolated"
+        None, description="largest number of height layers for the interpolation of a tile of rough terrain"
     )
 
 
@@ -107,17 +107,17 @@ def form(
     pixels
         (y, x, 3) float64, metres, in the frame of the phase centres, on any surface.
     beams
-        Weight of each pulse at each pixel; none by default.
+        Weight of each pulse at each pixel (default: 1).
     nodes_db
         Tolerated error of one interpolation between nodes, dB.
     presum_db
-        Tolerated error from deviations of the track from the curve of the virtual pulses, dB RMS.
+        Tolerated RMS error from deviations of the track from the curve of the virtual pulses, dB.
     side_px
-        Largest side of the tiles into which the block is divided; the bits of a tile do not depend on the other tiles.
+        Largest side of the tiles into which the block is divided; the bits of a tile do not depend on other tiles.
     chunk
-        Pulses of the largest subaperture.
+        Number of pulses of the largest subaperture.
     height_layers
-        Largest number of height layers between which a tile of rough terrain is interpolated; tiles that require more
+        Largest number of height layers for the interpolation of a tile of rough terrain; tiles that require more layers
         are summed directly.
     counts
         (3,) int64 array to which the numbers of pixel-pulse contributions are added: summed by tree, summed directly,
@@ -126,14 +126,14 @@ def form(
     Returns
     -------
     ndarray
-        (y, x) complex64. Pulses whose profile does not cover a pixel add zero; a pixel without a finite position is
-        NaN.
+        (y, x) complex64. Pulses do not contribute to pixels that are not covered by their profiles; a pixel without a
+        finite position is NaN.
 
     Raises
     ------
     ValueError
-        If the shape of `pixels` is not (y, x, 3), beams have another number of pulses, or an option is not in the range
-        of `Options`.
+        If the shape of `pixels` is not (y, x, 3), if beams have a different number of pulses, or if an option is not in
+        the range of `Options`.
     MemoryError
         If the library cannot allocate memory.
 
@@ -167,13 +167,13 @@ def form(
 
 
 def pieces(shape: tuple[int, ...], form_options: Mapping[str, Any]) -> Iterator[Window]:
-    """Yield the tiles of a block of pixels, windows that can be formed independently with the same bits."""
+    """Yield the tiles of a block of pixels: windows that can be formed independently with bit-identical results."""
     return windows(shape, form_options["side_px"])
 
 
 @dataclass(eq=False)
 class _Block:
-    """Sum of all pulses at a block of pixels: image, tolerated errors, and number of contributions per variant."""
+    """Sum over all pulses at a block of pixels: image, tolerated errors, and number of contributions per variant."""
 
     trees: Trees
     nodes_db: int
@@ -185,7 +185,7 @@ class _Block:
     _quarters: dict[JobTile, list[JobTile]] = field(default_factory=dict)
 
     def tiles(self, tile_windows: list[Window]) -> list[JobTile]:
-        """Return the tiles that correspond to windows of the block; small and rough tiles are not summed by tree."""
+        """Return the tiles that correspond to windows of the block; small or rough tiles are not summed by tree."""
         limit = 2 * 10 ** (self.nodes_db / 10)
         return [
             JobTile(
@@ -197,7 +197,7 @@ class _Block:
         ]
 
     def height_layers(self, tile: JobTile, most: int) -> HeightLayers | None:
-        """Return the height layers for a rough tile; None if more than `most` are required."""
+        """Return the height layers for a rough tile; None if more than `most` layers are required."""
         trees, limit = self.trees, 10 ** (self.nodes_db / 20)
         pixels = self.pixels[tile.window]
         if not most or not np.isfinite(tile.surface.rough_m) or pixels.size < 3 * LEAST_PIXELS:
@@ -218,7 +218,7 @@ class _Block:
                 self.add(trees, beams and beams[pulses], [(tile, all_groups) for tile in tiles])
 
     def add(self, trees: Trees, beams: Beams | None, tasks: list[Task]) -> None:
-        """Add groups of pulses to tiles; groups unfit for a tree are summed on quarters of the tile, or directly."""
+        """Add groups of pulses to tiles, by tree if possible, otherwise on quarters of the tile, or directly."""
         chunk = Chunk(
             trees, beams, self.nodes_db, self.presum_db, subaperture_sizes(self.chunk), self.pixels, self.image
         )

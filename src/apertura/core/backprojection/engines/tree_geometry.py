@@ -1,6 +1,6 @@
-"""Geometry of trees: nodes along the axes of a tile, its surface, leaves of the track, and height layers.
+"""Geometry of trees: nodes along the axes of a tile, surface of a tile, leaves of the track, and height layers.
 
-docs/theory/tree.md: "Nodes" (6), "Surface" (2), "Leaves" (7) and (8b), "Height layers" (9) and (11).
+Source: docs/theory/tree.md, "Nodes" (6), "Surface" (2), "Leaves" (7) and (8b), "Height layers" (9) and (11).
 """
 
 import ctypes
@@ -21,19 +21,19 @@ from apertura.core.geometry.aperture import Aperture
 #
 # docs/theory/tree.md, "Nodes".
 
-_NOISE_DB = -20.0  # white noise in the design of weights, relative to the tolerated error
+_NOISE_DB = -20.0  # white noise assumed in the design of weights, dB relative to the tolerated error
 
 
 @lru_cache(maxsize=4096)
 def nodes(count: int, error_db: int) -> NDArray[np.float64]:
-    """Return node positions, (count,) float64, in -1…1: Chebyshev nodes, mapped to be nearly equidistant.
+    """Return node positions, (count,) float64, in -1…1: Chebyshev nodes mapped to nearly equidistant nodes.
 
     Parameters
     ----------
     count
         Number of nodes, at least 1.
     error_db
-        Tolerated error of one interpolation.
+        Tolerated error of one interpolation, dB.
 
     Notes
     -----
@@ -52,7 +52,7 @@ def nodes(count: int, error_db: int) -> NDArray[np.float64]:
 
 
 def weights(count: int, places: NDArray[np.float64], error_db: int, band_rad: float) -> NDArray[np.float64]:
-    """Return least-squares interpolation weights of nodes at target positions for a flat band.
+    """Return least-squares interpolation weights from nodes to target positions for a flat band.
 
     Parameters
     ----------
@@ -121,12 +121,12 @@ def matrices(
     target
         Number of target nodes or pixels.
     pixels
-        True if the targets are equidistant pixels, with the outermost at -1 and 1.
+        True if the targets are equidistant pixels with the outermost pixels at -1 and 1.
 
     Returns
     -------
     spread
-        (count, 2·padded) float32, each weight repeated for real and imaginary part; zero beyond the target.
+        (count, 2·padded) float32, each weight repeated for real and imaginary parts; zero in the padding.
     mix
         (target, count) float32.
     """
@@ -154,7 +154,7 @@ def _sinc(band_rad: float, a: NDArray[np.float64], b: NDArray[np.float64]) -> ND
 
 
 def nodes_for(band_rad: NDArray[np.float64], error_db: int) -> NDArray[np.int64]:
-    """Return the least numbers of nodes that support bands; `TREE.nodes` + 1 if no allowed number is sufficient.
+    """Return the smallest numbers of nodes that support bands; `TREE.nodes` + 1 if no permitted number suffices.
 
     Examples
     --------
@@ -164,10 +164,10 @@ def nodes_for(band_rad: NDArray[np.float64], error_db: int) -> NDArray[np.int64]
     return np.maximum(2, np.searchsorted(supports(error_db), band_rad))
 
 
-# ---- Tiles, and the smooth surface through their pixels
+# ---- Tiles, and smooth surfaces through the pixels of tiles
 
-_PLANE_M = 2e-5  # largest RMS distance of pixels from a plane for which a plane surface is used
-_THIN = 20  # largest number of pixels along a side in the fit of a surface
+_PLANE_M = 2e-5  # largest RMS distance of pixels from a plane, up to which the plane is used as the surface, metres
+_THIN = 20  # largest number of pixels along a side that are used in the fit of a surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,8 +177,8 @@ class Surface:
     Attributes
     ----------
     coefficients
-        (degree + 1, degree + 1, 3) float64, coefficients of Legendre polynomials along rows and columns, in -1…1 from
-        the first pixel to the last, metres.
+        (degree + 1, degree + 1, 3) float64, coefficients of Legendre polynomials along rows and columns, metres; the
+        variables are -1…1 from the first to the last pixel.
     centre_m
         (3,) float64, position at (0, 0).
     up
@@ -194,7 +194,7 @@ class Surface:
 
 
 def windows(shape: tuple[int, ...], side_px: int) -> Iterator[Window]:
-    """Yield windows with sides of at most `side_px` pixels that divide a block of pixels as evenly as possible.
+    """Yield windows with sides of at most `side_px` pixels, into which a block is divided as evenly as possible.
 
     Examples
     --------
@@ -211,7 +211,7 @@ def windows(shape: tuple[int, ...], side_px: int) -> Iterator[Window]:
 
 
 def surfaces_of(pixels: NDArray[np.float64], parts: list[Window]) -> list[Surface]:
-    """Fit surfaces to the pixels of tiles: planes if they are sufficiently accurate.
+    """Fit surfaces to the pixels of tiles; planes are used if sufficiently accurate.
 
     Parameters
     ----------
@@ -250,7 +250,7 @@ def _fit(pixels: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
     """Return the coefficients of the surface fitted to pixels of a tile."""
     middle = pixels[pixels.shape[0] // 2, pixels.shape[1] // 2]
     (rows, fit_rows), (columns, fit_columns) = (_fitting(size, degree) for size in pixels.shape[:2])
-    offsets = pixels[np.ix_(rows, columns)] - middle  # subtracted for accuracy, as positions may be geocentric
+    offsets = pixels[np.ix_(rows, columns)] - middle  # subtracted for accuracy because positions may be geocentric
     coefficients = np.tensordot(fit_rows, fit_columns @ offsets, 1)
     coefficients[0, 0] += middle
     return np.ascontiguousarray(coefficients)
@@ -271,7 +271,7 @@ def _residuals(
 
 @lru_cache(maxsize=64)
 def _fitting(size: int, degree: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the pixels along a side used in the fit of a surface, and the matrix of the fit."""
+    """Return the pixels along a side that are used in the fit of a surface, and the matrix of the fit."""
     position = np.linspace(-1, 1, size) if size > 1 else np.zeros(1)
     indices: NDArray[np.int64] = np.unique(
         np.round(np.linspace(0, size - 1, min(size, 4 if degree == 1 else _THIN))).astype(np.int64)
@@ -280,7 +280,7 @@ def _fitting(size: int, degree: int) -> tuple[NDArray[np.int64], NDArray[np.floa
 
 
 def _normal(coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the unit normal of a surface, from its linear coefficients."""
+    """Return the unit normal of a surface from the linear coefficients."""
     normal = np.cross(coefficients[0, 1], coefficients[1, 0])
     length = np.linalg.norm(normal)
     return np.asarray(normal / length if length else np.array([0.0, 0.0, 1.0]))
@@ -289,16 +289,17 @@ def _normal(coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
 # ---- Leaves and larger subapertures
 
 LEAF = TREE.leaf
-"""Number of pulses of a leaf; they are presummed to virtual pulses if possible, and summed at the nodes of the leaf."""
+"""Number of pulses of a leaf, which are presummed to virtual pulses if possible, and summed at the nodes of the leaf.
+"""
 
 DEGREES = (5, 9, 14, 20)
-"""Candidate degrees of the curve through a leaf's track on which virtual pulses lie."""
+"""Candidate degrees of the curve fitted to the track of a leaf, on which virtual pulses lie."""
 
-_SECOND = 256  # number of pulses of a subaperture of several leaves
+_SECOND = 256  # number of pulses of a subaperture at the second level
 
 
 def subaperture_sizes(chunk: int) -> tuple[int, ...]:
-    """Return the number of pulses of the subapertures of each level, the largest last.
+    """Return the number of pulses of a subaperture at each level, in ascending order.
 
     Examples
     --------
@@ -309,14 +310,14 @@ def subaperture_sizes(chunk: int) -> tuple[int, ...]:
 
 
 def leaves_of(places_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (leaf, pulse, 3) positions; the last position is repeated to complete the last leaf."""
+    """Return positions, (leaf, pulse, 3); the last position is repeated to complete the last leaf."""
     count = -(-len(places_m) // LEAF)
     filling = np.repeat(places_m[-1:], count * LEAF - len(places_m), axis=0)
     return np.concatenate([places_m, filling]).reshape(count, LEAF, 3)
 
 
 def parabola_deviation(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (leaf,) largest distance of pulses from the parabola through the first, middle and last pulse, metres."""
+    """Return the largest distance, (leaf,) metres, of pulses from the parabola through first, middle and last pulse."""
     x, nodes_of_parabola = np.linspace(-1, 1, LEAF), [0, (LEAF - 1) // 2, LEAF - 1]
     to_all = np.vander(x, 3) @ np.linalg.inv(np.vander(x[nodes_of_parabola], 3))
     residual = leaves_m - to_all @ leaves_m[:, nodes_of_parabola]
@@ -324,22 +325,25 @@ def parabola_deviation(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def tracks(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (leaf, term, 3) float64, coefficients of each leaf's track in orthonormal polynomials of pulse numbers."""
+    """Return the coefficients of the track of each leaf in orthonormal polynomials of the pulse number.
+
+    The result is (leaf, term, 3) float64.
+    """
     return np.asarray(_polynomials()[0].T @ leaves_m)
 
 
 def leaf_roughness(one_m: NDArray[np.float64], other_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the deviation of tracks from fitted curves of increasing degree, along the worst direction.
+    """Return the deviation of tracks from fitted curves of increasing degree, in the worst direction.
 
     Parameters
     ----------
     one_m, other_m
-        (leaf, pulse, 3) float64, phase centres of the two antennas, possibly on one platform.
+        (leaf, pulse, 3) float64, phase centres of the two antennas, which may be on the same platform.
 
     Returns
     -------
     ndarray
-        (leaf, curve) float64, deviation of both one-way paths together, metres RMS.
+        (leaf, curve) float64, RMS deviation of both one-way paths together, metres.
 
     Examples
     --------
@@ -353,7 +357,7 @@ def leaf_roughness(one_m: NDArray[np.float64], other_m: NDArray[np.float64]) -> 
 
 
 def _widest(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (leaf, curve) largest variance along any direction of deviations from curves of increasing degree."""
+    """Return the largest variance, (leaf, curve), in any direction of deviations from curves of increasing degree."""
     shifted, widest = leaves_m - leaves_m[:, :1], np.empty((len(leaves_m), len(DEGREES)))
     terms = tracks(shifted)
     for number, degree in enumerate(DEGREES):
@@ -379,19 +383,19 @@ def curve(count: int, nodes_db: int) -> NDArray[np.float64]:
 
 @cache
 def _polynomials() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (pulse, term) orthonormal polynomials, and their coefficients in Legendre polynomials."""
+    """Return orthonormal polynomials, (pulse, term), and their coefficients in Legendre polynomials."""
     basis, triangle = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, LEAF), TREE.terms - 1))
     return basis, np.linalg.inv(triangle)
 
 
-# ---- Rough terrain: a tile formed on several height layers, with interpolation between them
+# ---- Rough terrain: tiles are formed on several height layers and interpolated between the layers
 #
 # docs/theory/tree.md, "Height layers".
 
-MOST_LAYERS = 32  # largest number of layers of a tile; with a larger number the direct sum is faster
+MOST_LAYERS = 32  # largest number of layers of a tile; with a larger number, the direct sum is faster
 
-_TABLE = 8192  # number of heights with tabulated weights
-_SAMPLED = 64  # pulses sampled for the band
+_TABLE = 8192  # number of heights for which weights are tabulated
+_SAMPLED = 64  # number of pulses sampled for the band
 
 
 @dataclass(frozen=True, eq=False)
@@ -403,7 +407,7 @@ class SurfaceResidual:
     pixels
         (y, x, 3) float64, pixel positions, metres.
     up
-        (3,) unit vector of the largest deviations.
+        (3,) float64, unit vector in the direction of the largest deviations.
     off_m
         (y, x) float64, deviation along `up`, metres.
     aside_m
@@ -437,7 +441,7 @@ class SurfaceResidual:
 
     @property
     def span_m(self) -> tuple[float, float]:
-        """Middle and half span of the deviations, metres."""
+        """Midpoint and half span of the deviations, metres."""
         low, high = float(self.off_m.min()), float(self.off_m.max())
         return (low + high) / 2, (high - low) / 2
 
@@ -461,11 +465,11 @@ class HeightLayers:
     Attributes
     ----------
     relief
-        Deviation of the tile's pixels from its surface.
+        Deviation of the pixels of the tile from its surface.
     heights_m
-        (layer,) float64, heights above the surface.
+        (layer,) float64, heights above the surface, metres.
     error_db
-        Tolerated error of the interpolation between layers.
+        Tolerated error of the interpolation between layers, dB.
     """
 
     relief: SurfaceResidual
@@ -474,7 +478,7 @@ class HeightLayers:
 
     @classmethod
     def of(cls, relief: SurfaceResidual, band_rad: float, error_db: int) -> "HeightLayers":
-        """Return the smallest number of layers that supports a band, at the nodes (eq. 6) of the tile's heights."""
+        """Return the smallest set of layers that supports a band, at the nodes (eq. 6) of the range of heights."""
         middle, half = relief.span_m
         return cls(relief, middle + half * nodes(layers_for(band_rad, error_db), error_db), error_db)
 
@@ -487,12 +491,12 @@ class HeightLayers:
 
     @property
     def windows(self) -> list[Window]:
-        """Window of each layer in `pixels`."""
+        """Windows of the layers in `pixels`."""
         rows, columns = self.relief.off_m.shape
         return [(slice(n * rows, (n + 1) * rows), slice(0, columns)) for n in range(len(self.heights_m))]
 
     def read(self, images: NDArray[np.complex64], pulse: Aperture, wavenumber_rad_m: float) -> NDArray[np.complex64]:
-        """Interpolate the image at the pixels, (y, x) complex64, from the image on the layers; `pulse` is s of eq. 11.
+        """Interpolate the image on the layers to the pixels, (y, x) complex64; `pulse` is s of eq. 11.
 
         Notes
         -----
@@ -504,7 +508,7 @@ class HeightLayers:
         number = np.minimum(position.astype(np.int64), _TABLE - 1)
         part = (position - number).astype(np.float32)
         table = _layer_weights(len(self.heights_m), self.error_db)
-        # |w|² and 2w·up of each leg, with w from the antenna to the pixel.
+        # |w|² and 2w·up for each antenna, with w the vector from the antenna to the pixel.
         legs = []
         for leg in pulse.legs:
             away = relief.pixels - leg[0]

@@ -1,4 +1,4 @@
-"""Inputs of trees: filters and tracks common to all tiles, tables of the direct kernel, and jobs of pulse chunks."""
+"""Inputs of trees: filters and tracks common to all tiles, tables of the direct kernel, and jobs for pulse chunks."""
 
 import ctypes
 from collections.abc import Iterator
@@ -57,7 +57,7 @@ _TOLERANCES_RAD = {-74: 1.5e-3, -80: 7e-4, -86: 3e-4, -92: 1.5e-4, -98: 1e-4}
 
 @lru_cache
 def direct_setting(nodes_db: int, profile_oversampling: float, carrier_rad_per_sample: float) -> DirectSetting:
-    """Return a setting of the direct kernel whose error is below that of trees with the node error `nodes_db`.
+    """Return a setting of the direct kernel with an error below that of trees with the node error `nodes_db`.
 
     Examples
     --------
@@ -65,7 +65,7 @@ def direct_setting(nodes_db: int, profile_oversampling: float, carrier_rad_per_s
     [4, 5, 12]
     """
     least: tuple[float, int] = (np.inf, 0)
-    for oversampling in range(4, 33):  # the error is not monotonic, as the phase polynomial changes
+    for oversampling in range(4, 33):  # the error is not monotonic, because the phase polynomial changes
         design = design_table(profile_oversampling, carrier_rad_per_sample, oversampling=float(oversampling), degree=2)
         least = min(least, (design.error_db(np.ones(64)), oversampling))
         if least[0] <= nodes_db + 5:
@@ -74,7 +74,7 @@ def direct_setting(nodes_db: int, profile_oversampling: float, carrier_rad_per_s
 
 
 class DirectTables:
-    """Tables of the direct kernel, computed when a tile first requires them, and shared by all tiles."""
+    """Tables of the direct kernel, which are computed when a tile first requires them and shared by all tiles."""
 
     def __init__(self, profiles: Profiles):
         self._profiles, self._lock, self._tables = profiles, Lock(), dict[int, Tables]()
@@ -89,15 +89,15 @@ class DirectTables:
 # ---- Inputs common to all tiles
 
 CELLS_AT_ONCE = 4
-"""Divisor of the number of cells per sample, given by the lanes of an AVX-512 vector."""
+"""Divisor of the number of cells per sample, determined by the lanes of an AVX-512 vector."""
 
 LEAST_PIXELS = 32**2
-"""Least number of pixels of a tile; for a smaller tile, the overhead of a tree exceeds the cost of the direct sum."""
+"""Least number of pixels of a tile: for a smaller tile, the overhead of a tree exceeds the cost of the direct sum."""
 
 LEAST_QUARTER_PX = 64
-"""Least side of the quarter of a tile, pixels; for smaller quarters, the direct sum is cheaper."""
+"""Least side of the quarter of a tile, pixels: for smaller quarters, the cost of the direct sum is lower."""
 
-_SAMPLED = 64  # pulses sampled for the roughness
+_SAMPLED = 64  # number of pulses sampled for the roughness
 _DELAY_DEGREE = 9
 
 
@@ -113,9 +113,9 @@ class Trees:
         Filters of the cells.
     deviation_m
         (leaf,) float32, largest deviation of the pulses of a leaf from the parabola through its first, middle and last
-        pulse, metres.
+        pulses, metres.
     rough_m
-        (leaf, 4) float32, deviation from curves of increasing degree, metres RMS.
+        (leaf, 4) float32, RMS deviation from curves of increasing degree, metres.
     tracks_m
         (leaf, antenna, term, 3) float64, polynomial coefficients of the phase centres over each leaf.
     first
@@ -142,7 +142,7 @@ class Trees:
         Raises
         ------
         ValueError
-            If the slice starts elsewhere, or its step is not 1.
+            If the slice does not start at such a multiple, or if its step is not 1.
         """
         first, last, step = pulses.indices(len(self))
         if step != 1 or first % LEAF:
@@ -158,7 +158,7 @@ class Trees:
         )
 
     def chunks(self, size: int) -> Iterator[slice]:
-        """Yield slices of `size` pulses; they end at the same pulses for every tile."""
+        """Yield slices of `size` pulses, which end at the same pulses for every tile."""
         first = 0
         while first < len(self):
             last = min(len(self), first + size - (self.first + first) % size)
@@ -166,7 +166,7 @@ class Trees:
             first = last
 
     def direct_tables(self, nodes_db: int) -> Tables:
-        """Return the direct kernel's tables for these pulses."""
+        """Return the tables of the direct kernel for these pulses."""
         return self.tables[self.direct_setting(nodes_db).oversampling][self.first : self.first + len(self)]
 
     def direct_setting(self, nodes_db: int) -> DirectSetting:
@@ -174,7 +174,7 @@ class Trees:
         return direct_setting(nodes_db, self.profiles.oversampling, self.wavenumber_rad_m * self.profiles.step_m)
 
     def roughness(self, surface: Surface) -> float:
-        """Return the error from pixels off the surface of a tile, computed by the function `roughness`."""
+        """Return the relative mean squared error from pixels off the surface of a tile; see function `roughness`."""
         aperture = self.profiles.aperture
         sampled = aperture[aperture.sample(_SAMPLED)]
         return roughness(sampled, surface, wavenumber_rad_m=self.wavenumber_rad_m, band_rad_m=self.band_rad_m)
@@ -191,12 +191,12 @@ class Trees:
 
     @property
     def band_rad_m(self) -> float:
-        """Half the band as a wavenumber, πB/c."""
+        """Half of the bandwidth as a wavenumber, πB/c."""
         return float(np.pi / (self.profiles.step_m * self.profiles.oversampling))
 
 
 def roughness(aperture: Aperture, surface: Surface, *, wavenumber_rad_m: float, band_rad_m: float) -> float:
-    """Return the relative mean squared error from pixels off the surface of their tile.
+    """Return the relative mean squared error from pixels off the surface of a tile.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ def roughness(aperture: Aperture, surface: Surface, *, wavenumber_rad_m: float, 
     if not np.isfinite(surface.rough_m):
         return np.inf
     rate = aperture.path_gradient(surface.centre_m[None])[:, 0] @ surface.up
-    reference = rate[len(rate) // 2]  # the middle pulse of the whole flight, not of a chunk
+    reference = rate[len(rate) // 2]  # middle pulse of the whole flight, not of a chunk
     of_phase, of_delay = wavenumber_rad_m**2 * ((rate - reference) ** 2).mean(), band_rad_m**2 / 3 * (rate**2).mean()
     return float(surface.rough_m**2 * (of_phase + of_delay))
 
@@ -240,17 +240,17 @@ def cells(profile_oversampling: float, carrier_rad_per_sample: float, oversampli
 
 @lru_cache
 def delay_filter(profile_oversampling: float) -> NDArray[np.float32]:
-    """Return the fractional-delay filter of a profile, as polynomials of the position between two samples.
+    """Return the fractional-delay filter for profiles as polynomials of the position between two samples.
 
     Returns
     -------
     ndarray
         (degree + 1, tap) float32, constant term first; the variable is 0…1 from the previous to the next sample. The
-        first tap belongs to the sample `tap / 2 - 1` before the previous one.
+        first tap corresponds to the sample that precedes the previous sample by `tap / 2 - 1` samples.
 
     Notes
     -----
-    Source: docs/theory/tree.md, eq. 7: least squares over the band.
+    Source: docs/theory/tree.md, eq. 7: least-squares fit over the band.
 
     Examples
     --------
@@ -269,7 +269,7 @@ def delay_filter(profile_oversampling: float) -> NDArray[np.float32]:
 
 
 def prepare(profiles: Profiles, *, oversampling: int = 24, taps: int = 8) -> Trees:
-    """Return the inputs common to the trees of all tiles; pulses are expanded to cells later, tile by tile.
+    """Return the inputs that are common to the trees of all tiles; pulses are later expanded to cells tile by tile.
 
     Parameters
     ----------
@@ -278,16 +278,16 @@ def prepare(profiles: Profiles, *, oversampling: int = 24, taps: int = 8) -> Tre
     oversampling
         Least number of table cells per Nyquist cell c/B of total path.
     taps
-        Taps of the filters from samples to cells, 8 or 16.
+        Number of taps of the filters from samples to cells, 8 or 16.
 
     Raises
     ------
     ValueError
-        If the oversampling of the profiles is below 1.5, there is no pulse, or a position or start is not finite.
+        If the oversampling of the profiles is below 1.5, if there is no pulse, or if a position or start is not finite.
 
     Notes
     -----
-    Source: docs/theory/tree.md, "Leaves"; the cells are those of docs/theory/engine.md, "Cells".
+    Source: docs/theory/tree.md, "Leaves"; for the cells, docs/theory/engine.md, "Cells".
     """
     samples, start_m, phase_centres = profiles.for_tables()
     contiguous = replace(profiles, samples=samples, start_m=start_m)
@@ -320,10 +320,10 @@ class Weighed(NamedTuple):
     edge
         (group,) bool, True if the sector ends within the tile.
     slope
-        (group, 3) float32, change of the depth in the sector's edge along ξ, along η and over the pulses, per half
-        extent.
+        (group, 3) float32, change of the depth in the edge of the sector along ξ, along η and over the pulses, each per
+        half extent.
     each
-        (group,) bool, True if weights change abruptly from pulse to pulse, which prevents presumming.
+        (group,) bool, True if weights change abruptly from pulse to pulse, so that pulses cannot be presummed.
     """
 
     variant: NDArray[np.uint8]
@@ -333,7 +333,7 @@ class Weighed(NamedTuple):
 
 
 def weighed(beams: Beams, aperture: Aperture, surface: Surface, nodes_db: float) -> Weighed:
-    """Classify the groups of an aperture over a tile by their weights.
+    """Classify the groups of pulses of an aperture over a tile by their weights.
 
     Notes
     -----
@@ -386,7 +386,7 @@ class JobTile:
 
 
 Task = tuple[JobTile, NDArray[np.bool_]]
-"""Tile, and mask of the groups of 64 pulses to add to it, (group,) bool."""
+"""Tile, and mask of the groups of 64 pulses that are added to this tile, (group,) bool."""
 
 
 @dataclass(eq=False)
@@ -398,11 +398,12 @@ class Chunk:
     trees, beams
         Trees and beams of the pulses.
     nodes_db, presum_db
-        Tolerated errors of one interpolation, and from deviations of a leaf's track from its curve, dB.
+        Tolerated error of one interpolation, and tolerated error from deviations of the track of a leaf from the fitted
+        curve, dB.
     sizes
-        Pulses of the subapertures of each level.
+        Number of pulses of the subapertures of each level.
     pixels, image
-        (y, x, 3) float64 and (y, x) complex64, to which the pulses are added.
+        (y, x, 3) float64, pixel positions; and (y, x) complex64, image to which the pulses are added.
     """
 
     trees: Trees
@@ -417,7 +418,7 @@ class Chunk:
     _n_virtual: list[NDArray[np.uint8]] = field(default_factory=list)  # virtual pulses of each leaf
 
     def add(self, tasks: list[Task]) -> list[NDArray[np.uint8]]:
-        """Sum the given groups of 64 pulses of each tile by tree; return the variant of each group."""
+        """Sum the given groups of 64 pulses at each tile by tree; return the variant of each group."""
         variants = [
             np.where(selected, BY_TREE if tile.by_tree else DIRECTLY, NO_ECHO).astype(np.uint8)
             for tile, selected in tasks
@@ -506,12 +507,13 @@ class Chunk:
         return job
 
     def _fill(self, job: TreeJob, tiles: "ctypes.Array[TreeTile]") -> None:
-        """Add to a planned job the nodes and the matrices A of eq. 5, 6 and 8 for its node counts.
+        """Add the nodes and the matrices A of eq. 5, 6 and 8 for the node counts of a planned job to the job.
 
-        The tables are indexed by slot: the node count, or, for the pixels as targets of the last merge, a higher slot
-        for each side of a tile.
+        The tables are indexed by slot. The slot is the node count or, for pixels as targets of the last merge, a higher
+        number for each side of a tile.
         """
-        # Required A: from a child's node count to the slot of its parent's node count or of the pixels.
+        # Required matrices A: from the node count of a child to the slot of the node count of its parent, or of the
+        # pixels.
         slots: dict[int, int] = {}  # pixels along a side → slot
         merges: set[tuple[int, int]] = set()  # node count, slot
         ends = np.cumsum([-(-len(self.trees) // size) for size in self.sizes])
@@ -526,7 +528,7 @@ class Chunk:
                 for axis, slot in enumerate((tile.column_slot, tile.row_slot)):
                     merges.update((count, slot) for count in set(top[:, axis].tolist()))
         side_of = {slot: side for side, slot in slots.items()}
-        # Eq. 5: both layouts of each A, and the positions of nodes and pixels for the phases u, v and m of eq. 3.
+        # Eq. 5: both layouts of each matrix A, and positions of nodes and pixels for the phases u, v and m of eq. 3.
         positions = np.zeros(TREE.slots, np.uintp)
         spread, mix = (np.zeros((TREE.nodes + 1, TREE.slots), np.uintp) for _ in range(2))
         for count, slot in merges:
@@ -535,7 +537,7 @@ class Chunk:
         for slot in {slot for merge in merges for slot in merge}:
             targets = pixel_places(side_of[slot]) if slot in side_of else nodes(slot, self.nodes_db)
             positions[slot] = self._pointer_to(np.ascontiguousarray(targets))
-        # Eq. 8: weights A_pv of a leaf's pulses in virtual pulses, and the polynomials of the track at these.
+        # Eq. 8: weights A_pv of the pulses of a leaf in virtual pulses, and track polynomials at the virtual pulses.
         presum, curves = (np.zeros(TREE.virtual + 1, np.uintp) for _ in range(2))
         for count in {int(n) for counts in self._n_virtual for n in counts if n > 1}:
             presum[count] = self._pointer_to(

@@ -1,7 +1,7 @@
-"""Prediction of the error, the directly summed share, and the cost of trees (docs/theory/tree.md, "Error" and "Cost").
+"""Prediction of error, directly summed fraction, and cost of trees (docs/theory/tree.md, "Error" and "Cost").
 
-The library computes the bands of a sample of tiles and pulse chunks of the job. The bands determine the numbers of
-nodes and virtual pulses for every tolerated error; these numbers determine the predicted error and cost.
+The library computes the bands for a sample of tiles and pulse chunks of the job. The bands determine the numbers of
+nodes and virtual pulses for every tolerated error. These numbers determine the predicted error and cost.
 """
 
 import ctypes
@@ -62,13 +62,13 @@ class TileView:
     bands_rad
         (2,) float for each level, half width of the band along columns and rows, rad per half tile.
     turn_rad
-        Largest change of the carrier phase, relative to that at the tile's centre, within half a leaf.
+        Largest change of the carrier phase, relative to the phase at the tile centre, within half a leaf, rad.
     rough_rad
-        (curve,) RMS phase of deviations from curves of increasing degree, eq. 8b.
+        (curve,) float64, RMS phase of deviations from curves of increasing degree, eq. 8b, rad.
     span_m
-        Total path across the tile.
+        Total path across the tile, metres.
     phase_rad
-        RMS phase of the tile's points relative to its centre.
+        RMS phase of the points of the tile relative to the tile centre, rad.
     """
 
     bands_rad: tuple[NDArray[np.floating], ...]
@@ -81,7 +81,7 @@ class TileView:
 def view_of_tile(
     aperture: Aperture, surface: Surface, sizes: tuple[int, ...], *, wavenumber_rad_m: float, band_rad_m: float
 ) -> TileView:
-    """Return the geometry of one tile and one pulse chunk, as used in the library's plan.
+    """Return the geometry of one tile and one pulse chunk, as used in the plan of the library.
 
     Parameters
     ----------
@@ -90,14 +90,14 @@ def view_of_tile(
     surface
         Surface of the tile.
     sizes
-        Pulses of the subapertures of each level.
+        Number of pulses of the subapertures of each level.
     wavenumber_rad_m, band_rad_m
         2πf_mid/c and πB/c.
 
     Notes
     -----
-    Source: docs/theory/tree.md, eq. 4, 8 and 8b; native/tree_view.cpp. The first, middle and last subaperture of each
-    level and of the leaves are evaluated.
+    Source: docs/theory/tree.md, eq. 4, 8 and 8b; native/tree_view.cpp. The first, middle and last subapertures of each
+    level, and the first, middle and last leaves, are evaluated.
     """
     pulses, counts = len(aperture), [-(-len(aperture) // size) for size in sizes]
     tx, rx = (np.ascontiguousarray(leg, np.float64) for leg in aperture.legs)
@@ -132,25 +132,25 @@ def view_of_tile(
 
 
 def _widest_of_three(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return (column,) largest value of the first, middle and last row."""
+    """Return the largest value in the first, middle and last rows, (column,)."""
     return np.asarray(values[np.unique(np.linspace(0, len(values) - 1, 3).astype(int))].max(axis=0))
 
 
 @lru_cache(maxsize=64)
 def _roughest_m(aperture: Aperture) -> NDArray[np.float64]:
-    """Return (curve,) largest deviation of a leaf from curves of increasing degree."""
+    """Return the largest deviation, (curve,) metres, of a leaf from curves of increasing degree."""
     return np.asarray(leaf_roughness(*(leaves_of(leg) for leg in aperture.legs)).max(axis=0))
 
 
 def widened_rad(slope: float, band_rad: NDArray[np.floating], nodes_db: float) -> NDArray[np.floating]:
-    """Return the widening of bands by the edge of a sector, rad: native/tree_weight.hpp.
+    """Return the widening of bands by the edge of a sector, rad, as in native/tree_weight.hpp.
 
     Parameters
     ----------
     slope
         Change of the depth in the edge per half tile.
     band_rad
-        Band without the edge, rad per half tile.
+        Band without the effect of the edge, rad per half tile.
     nodes_db
         Tolerated error ε of one interpolation, dB.
 
@@ -173,12 +173,12 @@ class Counts(NamedTuple):
     Attributes
     ----------
     nodes
-        (2,) numbers of nodes along columns and rows for each level, up to the first level that requires too many nodes;
+        (2,) numbers of nodes along columns and rows for each level below the first level that requires too many nodes;
         empty if no tree is possible.
     virtual
-        Virtual pulses of a leaf; 0 if it is not presummed.
+        Number of virtual pulses of a leaf; 0 if the leaf is not presummed.
     presum_rad
-        RMS phase error from presumming.
+        RMS phase error due to presumming, rad.
     """
 
     nodes: tuple[tuple[int, int], ...]
@@ -195,7 +195,7 @@ def counts_of(
     slope: NDArray[np.floating] | None = None,
     each: bool = False,
 ) -> Counts:
-    """Return the numbers of nodes of each level, and of virtual pulses of a leaf.
+    """Return the numbers of nodes at each level, and the number of virtual pulses of a leaf.
 
     Parameters
     ----------
@@ -208,11 +208,11 @@ def counts_of(
     slope
         (3,) slope of the depth in the edge of a sector, as in `Weighed.slope`; None inside the sector.
     each
-        True if the pulses of a leaf are summed one by one.
+        True if the pulses of a leaf are summed individually.
     """
 
     def count(band_rad: float, axis: int) -> int:
-        """Return the number of nodes along ξ (0), η (1) or the pulses of a leaf (2), weights included."""
+        """Return the number of nodes along ξ (0), along η (1) or over the pulses of a leaf (2), including weights."""
         band_rad += TREE.weighted_rad if weighted else 0.0
         widening = 0.0 if slope is None else float(widened_rad(slope[axis], np.array(band_rad), nodes_db))
         return int(nodes_for(np.array([band_rad + widening]), nodes_db)[0])
@@ -223,7 +223,7 @@ def counts_of(
         if max(along, across) > TREE.nodes:
             break
         levels.append((along, across))
-    # Eq. 8b: the lowest degree with a sufficiently small deviation; eq. 8: nodes for the carrier, and a margin.
+    # Eq. 8b: lowest degree with a sufficiently small deviation; eq. 8: nodes for the carrier, and margin.
     smooth = np.flatnonzero(view.rough_rad <= 10 ** (presum_db / 20))
     if len(smooth) and not each:
         virtual = max(DEGREES[smooth[0]] + TREE.virtual_margin, count(view.turn_rad, 2))
@@ -235,21 +235,21 @@ def counts_of(
 
 # ---- Sample of tiles and chunks
 
-_TILES, _CHUNKS = 5, 3  # tiles and chunks sampled for a prediction
-_GROUPS = 96  # sampled groups of 64 pulses for the weights over a tile
+_TILES, _CHUNKS = 5, 3  # numbers of tiles and chunks sampled for a prediction
+_GROUPS = 96  # number of groups of 64 pulses sampled for the weights over a tile
 
 
 class SampledTile(NamedTuple):
-    """Tile with its geometry for sampled pulse chunks; without geometry if a pixel has no position.
+    """Tile with the geometry for sampled pulse chunks; without geometry if a pixel has no position.
 
     Attributes
     ----------
     surface, views
         Surface of the tile, and geometry for each chunk.
     rough
-        Mean squared error from pixels off the surface.
+        Relative mean squared error from pixels off the surface.
     layers_rad, aside_rad
-        Band along the heights, and phase of the deviation perpendicular to the direction of heights.
+        Band along the direction of heights, and phase of deviations perpendicular to this direction, rad.
     """
 
     surface: Surface
@@ -261,7 +261,7 @@ class SampledTile(NamedTuple):
 
 @lru_cache(maxsize=64)
 def sample_tiles(job: Job, pulses: int, side_px: int, chunk: int) -> tuple[SampledTile, ...]:
-    """Return sampled tiles of one side with their geometry for sampled chunks."""
+    """Return sampled tiles with sides of `side_px` pixels, and their geometry for sampled chunks."""
     side = min(side_px, job.tile_px, *job.shape)
     window = slice(0, side), slice(0, side)
     wave = {
@@ -294,7 +294,7 @@ def sample_tiles(job: Job, pulses: int, side_px: int, chunk: int) -> tuple[Sampl
 
 
 def _patches(job: Job, side: int) -> list[NDArray[np.float64]]:
-    """Return pixel positions of sampled tiles: those of the job, or planes about sampled points of its terrain."""
+    """Return pixel positions of sampled tiles: patches of the job, or planes about sampled points of the terrain."""
     if job.patches_m:
         return list(job.patches_m)
     count = len(job.points_m)
@@ -319,7 +319,7 @@ def _chunks(job: Job, surface: Surface, pulses: int, chunk: int) -> list[NDArray
 
 
 def _sampled_pulses(flown: int, pulses: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the indices of the summed pulses of a flight, and of sampled groups of 64 (all in a short flight)."""
+    """Return the indices of the summed pulses of a flight, and of sampled groups of 64 pulses."""
     summed = np.linspace(0, flown - 1, pulses).astype(int)
     count = pulses // LEAF
     if not count:
@@ -334,9 +334,9 @@ class SampledWeights(NamedTuple):
     Attributes
     ----------
     directly
-        Share summed on smaller tiles or directly.
+        Fraction of groups that are summed on smaller tiles or directly.
     edge
-        Of the other groups, the share at the edge of the sector.
+        Fraction of the remaining groups that are at the edge of the sector.
     slope
         (3,) RMS slope of the depth in the edge, as in `Weighed.slope`; None without an edge.
     each
@@ -372,22 +372,22 @@ SETTINGS: Mapping[int, tuple[int, int]] = {
     -50: (8, 8), -56: (16, 8), -62: (16, 8), -68: (24, 8), -74: (24, 8), -80: (32, 16),
     -86: (64, 16), -92: (64, 16), -98: (64, 16),
 }  # fmt: skip
-"""Error of one interpolation between nodes, dB → table cells per resolution cell and taps whose error is below it."""
+"""Error of one interpolation between nodes, dB → table cells per resolution cell, and taps, with a lower error."""
 
 PRESUMS_DB = (0, 6, 12)
-"""Candidate errors of virtual pulses, dB above the error of an interpolation."""
+"""Candidate errors of virtual pulses, in dB relative to the error of one interpolation."""
 
 SIDES_PX, CHUNKS = (64, 128, 256), (256, 1024, 2048)
-"""Candidate sides of tiles, and pulses of the largest subaperture."""
+"""Candidate sides of tiles, and candidate numbers of pulses of the largest subaperture."""
 
-_FLOAT32_DB = -92.0  # error of float32 sums
-_FLOAT32 = 2e-7  # relative rounding error of phases: path lengths, and positions of cells
+_FLOAT32_DB = -92.0  # error of float32 sums, dB
+_FLOAT32 = 2e-7  # relative rounding error of phases, due to path lengths and positions of cells
 
-# Seconds on one core, measured on the same machine as those of the direct kernel in native.py.
+# Seconds on one core, measured on the same machine as the times of the direct kernel in native.py.
 _NODE_S = 7e-10  # per look-up of a pulse at a node
 _EXPAND_S = 2.6e-9  # per cell with sixteen filter taps
-_EACH_EXPAND_S = 4.6e-9  # per cell of pulses without presumming, whose cells are common to neighbouring tiles
-_ALIGN_S = 8e-11  # per sample and tap or pulse, for alignment to a tile and presumming
+_EACH_EXPAND_S = 4.6e-9  # per cell of pulses that are not presummed; these cells are common to adjacent tiles
+_ALIGN_S = 8e-11  # per sample, and per tap or pulse, for alignment to a tile and presumming
 _MIX_S = 5e-12  # per complex multiply-add of merges and pixels
 _LAYER_BYTES = 64  # per pixel of a height layer
 _READ_S = 5e-8  # per pixel and height layer, for the interpolation
@@ -395,18 +395,18 @@ _PIXEL_S = 4.5e-9  # per pixel of a subaperture
 _LEAF_S = 6e-6  # per leaf of a tile, for its plan
 _SURFACE_S = 1.6e-8  # per pixel, for the fit of the surface
 _TILE_S = 4e-5  # per tile of a chunk
-_PIECEWISE = 1.1  # cost of direct sums tile by tile and chunk by chunk, relative to one call
-_ANTENNA_S = 5e-7  # per pulse, antenna and tile, for gains and their polynomial
-_EDGE = 1.6  # cost of a look-up at the edge of a sector, relative to one inside
+_PIECEWISE = 1.1  # cost of direct sums tile by tile and chunk by chunk, relative to a single call
+_ANTENNA_S = 5e-7  # per pulse, antenna and tile, for gains and the polynomials of gains
+_EDGE = 1.6  # cost of a look-up at the edge of a sector, relative to a look-up inside the sector
 _FORM_S = 4e-4  # per block of pixels
-_TYPICAL_DB = -74  # error of nodes for the selection of chunks
-# number of pixel-pulse contributions below which one candidate is sufficient, as the direct kernel is fast
+_TYPICAL_DB = -74  # node error assumed for the selection of chunks, dB
+# number of pixel-pulse contributions below which one candidate is sufficient, because the direct kernel is fast
 _SMALL = 1e8
 _START_S = 0.03  # once per job, for the interpolation weights of all numbers of nodes
 
 
 def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterator[Setting]:
-    """Yield settings of trees, as `apertura.core.backprojection.engines.engine.Engine` describes.
+    """Yield settings of trees, as described in `apertura.core.backprojection.engines.engine.Engine`.
 
     Notes
     -----
@@ -428,7 +428,7 @@ def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterat
 
 
 def _partitions(job: Job, pulses: int, requested: Mapping[str, Any]) -> list[tuple[int, int]]:
-    """Return candidate sides of tiles and pulses of chunks; a single candidate for a small job."""
+    """Return candidate sides of tiles and chunk sizes in pulses; a single candidate for a small job."""
     pairs = list(product(option_values(requested, "side_px", SIDES_PX), option_values(requested, "chunk", CHUNKS)))
     most_px, most_pulses = 2 * min(job.tile_px, max(job.shape)), 8 * max(pulses, LEAF)
     fitting = [(side, chunk) for side, chunk in pairs if side < most_px and chunk < most_pulses] or pairs[:1]
@@ -449,13 +449,13 @@ class _Options(NamedTuple):
 
 def _setting(job: Job, pulses: int, options: _Options) -> Setting:
     signal, nodes_db = job.signal, options.nodes_db
-    # Direct kernel, tile by tile, for the share that cannot be summed by tree.
+    # Direct kernel, tile by tile, for the fraction that cannot be summed by tree.
     carrier_rad = signal.wavenumber_rad_m * signal.step_m
     requested = {"degree": 2, **direct_setting(nodes_db, signal.oversampling, carrier_rad)._asdict()}
     direct = next(iter(native.candidates(job, pulses=pulses, requested=requested)))
     direct_s = _PIECEWISE * direct.form_seconds / (job.pixels * pulses * job.share)
     cost = _cost(job, pulses, options, direct_s)
-    # Eq. 10, with float32 sums and phases; errors of trees and of direct sums are weighted by their shares.
+    # Eq. 10, with errors of float32 sums and phases; errors of trees and direct sums are weighted by their fractions.
     design = cells(signal.oversampling, carrier_rad, float(options.oversampling), options.taps)
     table_db, levels = design.error_db(signal.window), len(subaperture_sizes(options.chunk))
     presum_db = decibels(cost.presum_rad2 + 1e-30)
@@ -473,7 +473,7 @@ def _setting(job: Job, pulses: int, options: _Options) -> Setting:
         {"oversampling": options.oversampling, "taps": options.taps},
         {name: getattr(options, name) for name in ("nodes_db", "presum_db", "side_px", "chunk")}
         | {"height_layers": cost.most_layers},
-        # rounded, so that a difference of 0.01 dB does not lead to tiles of half the side
+        # rounded, so that a difference of 0.01 dB does not halve the side of tiles
         float(np.ceil(2 * error_db) / 2),
         cost.seconds,
         table_seconds=_START_S + (direct.table_seconds if cost.directly else 0.0),
@@ -482,12 +482,13 @@ def _setting(job: Job, pulses: int, options: _Options) -> Setting:
         + _LAYER_BYTES * options.side_px**2 * layers,
         reasons={
             "oversampling": f"predicted error of the table {table_db:.1f} dB",
-            "taps": "taps of the table's filters",
+            "taps": "number of taps of the table filters",
             "nodes_db": f"predicted error of interpolation between nodes {nodes_db} dB at each of {levels} levels",
             "presum_db": f"predicted error of virtual pulses {presum_db:.0f} dB",
-            "side_px": f"lowest cost; about {100 * cost.directly:.0f} % of pixels × pulses are summed directly",
-            "chunk": "pulses of the largest subaperture, lowest cost",
-            "height_layers": f"more layers cost more than the direct sum; this scene requires {layers or 'no'} layers",
+            "side_px": f"lowest cost; about {100 * cost.directly:.0f} % of pixel-pulse pairs are summed directly",
+            "chunk": "number of pulses of the largest subaperture with the lowest cost",
+            "height_layers": f"with more layers, the direct sum has a lower cost; this scene requires {layers or 'no'} "
+            "layers",
         },
     )
 
@@ -498,13 +499,13 @@ class _Cost(NamedTuple):
     Attributes
     ----------
     seconds
-        Time of the image; for tiles of one side, the time if these tiles sum the whole image.
+        Time for the image; for tiles of one side, time if the whole image is summed with these tiles.
     directly
-        Share that is not summed by tree.
+        Fraction that is not summed by tree.
     presum_rad2
-        Mean squared phase error of virtual pulses.
+        Mean squared phase error of virtual pulses, rad².
     most_layers
-        Largest number of height layers between which a tile may be interpolated.
+        Largest permitted number of height layers of a tile.
     layers
         Largest number of height layers that a sampled tile requires.
     """
@@ -517,11 +518,11 @@ class _Cost(NamedTuple):
 
 
 def _cost(job: Job, pulses: int, options: _Options, direct_s: float) -> _Cost:
-    """Return the cost of the image, with `direct_s` seconds of the direct sum per pixel and pulse."""
+    """Return the cost of the image, if the direct sum takes `direct_s` seconds per pixel and pulse."""
     side = min(options.side_px, job.tile_px, *job.shape)
     first = part = _by_tree(job, pulses, options, side, direct_s)
     seconds = _SURFACE_S * job.pixels + _FORM_S * job.tiles
-    remaining, presum = 1.0, 0.0  # share not summed by larger tiles
+    remaining, presum = 1.0, 0.0  # fraction not summed by larger tiles
     while True:
         weights_s = job.antennas * job.share * job.pixels / side**2 * pulses * _ANTENNA_S
         summed = max(0.0, remaining - part.directly)
@@ -543,13 +544,13 @@ def _by_tree(job: Job, pulses: int, options: _Options, side: int, direct_s: floa
     """
     tiles = sample_tiles(job, pulses, side, options.chunk)
     counted = [_counted(job, pulses, options, side, tile) for tile in tiles]
-    # Each layer requires a tree and an interpolation: the number of layers is limited by the cost of the direct sum.
+    # Each layer requires a tree and an interpolation; the number of layers is limited by the cost of the direct sum.
     tile_s = [value for _, seconds, _ in counted for value in seconds]
     once_s, read_s = float(np.mean(tile_s or [np.inf])), _READ_S * side**2
     most_layers = min(MOST_LAYERS, int(pulses * side**2 * direct_s / (once_s + read_s))) if direct_s else 0
     if direct_s and options.height_layers is not None:
         most_layers = options.height_layers
-    # Tiles: sufficiently flat by eq. 9, on the number of layers of eq. 11, or summed directly.
+    # Tiles are sufficiently flat by eq. 9, formed on the number of layers of eq. 11, or summed directly.
     error2, tree_s, shares, presum, layers_needed = (
         10 ** (options.nodes_db / 10),
         list[float](),
@@ -575,7 +576,7 @@ def _by_tree(job: Job, pulses: int, options: _Options, side: int, direct_s: floa
 def _counted(
     job: Job, pulses: int, options: _Options, side: int, tile: SampledTile
 ) -> tuple[list[Counts], list[float], float]:
-    """Return counts of a tile per sampled chunk, seconds of the chunks with a tree, and the directly summed share."""
+    """Return counts of a tile per sampled chunk, seconds of chunks with a tree, and directly summed fraction."""
     counts, seconds, too_steep = list[Counts](), list[float](), list[bool]()
     if not tile.views:
         return counts, seconds, 0.0
@@ -603,7 +604,7 @@ def _counted(
 def _tree_seconds(
     job: Job, pulses: int, options: _Options, side: int, view: TileView, counts: Counts, *, lookup: float = 1.0
 ) -> float:
-    """Return the seconds of a tree over a tile and a chunk; `lookup` is the relative cost of a look-up."""
+    """Return the time of a tree over a tile and a chunk, seconds; `lookup` is the relative cost of a look-up."""
     chunk = min(pulses, options.chunk)
     subapertures = [-(-chunk // size) for size in subaperture_sizes(options.chunk)]
     # Leaves: pulses are aligned and presummed (eq. 7, 8), expanded to cells, and looked up at the nodes.
@@ -612,7 +613,7 @@ def _tree_seconds(
     expanded = summed * samples * cells_per_sample(job.signal.oversampling, options.oversampling) * options.taps / 16
     tiles_in_row = min(job.tile_px, *job.shape) / side  # tiles with common cells of pulses that are not presummed
     aligned = chunk * (samples + options.taps) * (TREE.delays + counts.virtual) if counts.virtual else 0.0
-    # Merges (eq. 5): the product along ξ for all rows of nodes, then along η; the last one evaluates the pixels.
+    # Merges (eq. 5): product along ξ for all rows of nodes, then along η; the last merge evaluates the pixels.
     targets = [*counts.nodes[1:], (side, side)]
     mixed = sum(
         count * (-(-wide // 8) * 8) * (tall_from * wide_from + tall * tall_from)
