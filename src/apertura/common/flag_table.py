@@ -392,11 +392,11 @@ _OF_IMAGES = {
         "pulses section of image.json: pulses dropped, with reasons",
         "core/echo/association.py",
     ),
-    "beyond_cyclic_prefix": Flag(
-        "share of the scene whose echoes are too late",
-        "echoes of part of the scene arrive after the cyclic prefix, or the listening time, in every pulse",
-        "scene.bounds_m",
-        "core/planning/plan.py",
+    "scene_beyond_recording": Flag(
+        "shares of the scene not recorded by all pulses and by none; pulses; longest and recorded total path",
+        "echoes of part of the scene arrive after the recorded delays: its pixels are formed from fewer pulses, or empty",
+        "scene.bounds_m; scene.height_m if it is the default; looks.tif and nesz.tif of these pixels",
+        "stages/planning.py",
     ),
     "scene_beyond_samples": Flag(
         "share of the total paths of the scene",

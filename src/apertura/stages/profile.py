@@ -22,7 +22,7 @@ from apertura.core.echo.interference import Interference
 from apertura.core.imaging.background import BackgroundScene, Removal, decide_removal
 from apertura.core.imaging.range_profiles import CompressionError, RangeWindow, phase_history_of, range_compress
 from apertura.stages.pair import open_pair, pattern_digests
-from apertura.stages.planning import ranges_of
+from apertura.stages.planning import gated, ranges_of
 from apertura.stages.scene import OpenScene, open_scene
 from apertura.stages.tags import stamped
 from apertura.stages.transfer import PairEcho
@@ -41,7 +41,7 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
         echo = replace(echo, gain=interference.gain)
     echo = replace(echo, removed=removal.background) if removal else echo
     source = echo.stage
-    window = ranges_of(campaign, open_pair(campaign, flight, pair, echo=source), scene)
+    window = ranges_of(campaign, gated(campaign, open_pair(campaign, flight, pair, echo=source), scene), scene)
     frequency = source.frequency.values
     zeros = np.broadcast_to(np.complex64(0), (source.sizes["pulse"], window.samples))
     dataset = source[["time", "tx_position", "rx_position"]].assign(
@@ -106,7 +106,7 @@ def _compressed(
             yield np.zeros((part.stop - part.start, window.samples), np.complex64)
             continue
         history = phase_history_of(source.isel(pulse=part), requested)
-        chunk = replace(window, start_m=window.start_m[part], farthest_m=window.farthest_m[part])
+        chunk = window.part(part)
         profiles = range_compress(history, scene.grid, scene.terrain, window=chunk)
-        error.add(history, profiles)
+        error.add(history, profiles, chunk.gate)
         yield profiles.samples

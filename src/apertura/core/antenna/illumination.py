@@ -121,8 +121,11 @@ def _block_mask(
         radius_m + np.maximum.reduceat(np.linalg.norm(position_m - middle_position_m[block], axis=1), starts)[:, None]
         for position_m, middle_position_m in zip(aperture.legs, middle.legs, strict=True)
     ]
-    # Exclude spheres outside the integration sector or either pattern; tolerances for the rotation within the block.
+    # Exclude spheres beyond the recorded paths, outside the integration sector, and outside either pattern; tolerances
+    # for the motion and the rotation within the block.
     mask = np.ones((len(starts), len(middle_m)), bool)
+    if beams.gate is not None:
+        mask &= middle.path(middle_m) - radius[0] - radius[1] < np.maximum.reduceat(beams.gate.limit_m, starts)[:, None]
     if beams.sector is not None:
         sector = beams.sector[middles]
         rotation = beams.sector.axis_change(sector[block])

@@ -101,13 +101,11 @@ class Job:
         Side of a tile, pixels; number of tiles formed at once.
     terrain
         Terrain of the scene and its simplified models.
-    path_limit_m
-        Longest total path inside the cyclic prefix.
     memory_bytes
         Memory limit of the imaging step.
     beams, illumination
-        Weights from antenna beams and the integrated sector, and illumination by the beams, over all pulses; None
-        without beams and sector.
+        Weights from antenna beams, the integrated sector and the recorded paths, and illumination by beams and sector,
+        over all pulses; None without them.
     integration
         Integrated part of the flight; None for the whole flight.
     recorded
@@ -131,7 +129,6 @@ class Job:
     tile_px: int = 256
     threads: int = 1
     terrain: GroundModels = field(default_factory=GroundModels.flat)
-    path_limit_m: float = np.inf
     memory_bytes: float = np.inf
     beams: Beams | None = None
     illumination: Illumination | None = None

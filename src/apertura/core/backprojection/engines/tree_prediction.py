@@ -310,8 +310,8 @@ def _chunks(job: Job, surface: Surface, pulses: int, chunk: int) -> list[NDArray
     """Return the pulses of sampled chunks that illuminate a tile."""
     summed, groups = _sampled_pulses(len(job.aperture), pulses)
     starts = np.arange(0, pulses, chunk)
-    if job.beams is not None:
-        variant = weighed(job.beams[groups], job.aperture[groups], surface, _TYPICAL_DB).variant
+    if beams := job.beams and job.beams.on_profiles:
+        variant = weighed(beams[groups], job.aperture[groups], surface, _TYPICAL_DB).variant
         first = np.searchsorted(summed, groups[::LEAF][variant != NO_ECHO])
         starts = np.unique(first // chunk * chunk) if len(first) else starts
     selected = starts[np.unique(np.linspace(0, len(starts) - 1, _CHUNKS).astype(int))]
@@ -352,10 +352,11 @@ class SampledWeights(NamedTuple):
 @lru_cache(maxsize=1024)
 def sample_weights(job: Job, surface: Surface, pulses: int, nodes_db: int) -> SampledWeights:
     """Return the weights of sampled groups of pulses over a tile."""
-    if job.beams is None:
+    beams = job.beams and job.beams.on_profiles
+    if beams is None:
         return SampledWeights()
     groups = _sampled_pulses(len(job.aperture), pulses)[1]
-    classified = weighed(job.beams[groups], job.aperture[groups], surface, nodes_db)
+    classified = weighed(beams[groups], job.aperture[groups], surface, nodes_db)
     illuminated, by_tree = classified.variant != NO_ECHO, classified.variant == BY_TREE
     edge = by_tree & classified.edge
     return SampledWeights(
