@@ -394,7 +394,7 @@ _OF_IMAGES = {
     ),
     "scene_beyond_recording": Flag(
         "shares of the scene not recorded by all pulses and by none; pulses; longest and recorded total path",
-        "echoes of part of the scene arrive after the recorded delays: its pixels are formed from fewer pulses, or empty",
+        "echoes of part of the scene arrive after the recorded delays: its pixels have fewer pulses, or none",
         "scene.bounds_m; scene.height_m if it is the default; looks.tif and nesz.tif of these pixels",
         "stages/planning.py",
     ),

@@ -338,7 +338,7 @@ def weighing(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Beams | No
 
 # ---- Scenes beyond the recorded paths
 
-_GATE_POINTS, _GATE_PULSES = 33, 1024
+_GATE_POINTS, _GATE_PULSES = 65, 512
 """Points along a side of the scene, and largest number of pulses, from which the recorded share is estimated."""
 
 
@@ -387,7 +387,7 @@ def recording_flags(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Fla
     unrecorded = illuminated.any(axis=0) & ~(illuminated & (weight > 0)).any(axis=0)
     _, limit_name, hint = _limit_words(campaign)
     line = (
-        f"{100 * is_cut.any(axis=0).mean():.1f} % of the scene is not recorded by all of its pulses, "
+        f"about {100 * is_cut.any(axis=0).mean():.1f} % of the scene is not recorded by all of its pulses, "
         f"{100 * unrecorded.mean():.1f} % by none: echoes arrive after {limit_name} at {pulses} of "
         f"{number_of(len(pair.aperture), 'pulse')}; longest total path {path_m[illuminated].max():.1f} m, "
         f"recorded up to {pair.path_limit_m:.1f} m.{hint}"

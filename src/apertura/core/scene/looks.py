@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Floats
 from apertura.common.contracts import Window
 from apertura.core.antenna.beam import Beams
-from apertura.core.antenna.illumination import illumination_mask
+from apertura.core.antenna.illumination import EXACT, any_illuminates, illumination_mask
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.angles import bistatic_angle_deg, incidence_deg, surface
 from apertura.core.scene.grid import SceneGrid
@@ -195,7 +195,6 @@ _PULSES = 256  # least number of pulses summed for a block of the lattice; at mo
 # least number of pulses with weight at half of the nodes (if fewer, more pulses are summed), and limit of that sum
 _FEWEST, _MOST = 48, 2048
 AT_ONCE = 64  # block size in pulses of the illumination test
-_EXACT = (AT_ONCE, 8)  # block sizes in pulses of the exact illumination test, from coarse to fine
 _CELL_PX = 8  # side, pixels, of the cells that are tested as a whole first
 _PIXELS = 4096  # pixels tested together
 # number of pulses evaluated for the centres of a block without illumination, needed to interpolate in its neighbours
@@ -333,7 +332,7 @@ class Looks:
         middle_m, radius_m = balls(part, self.terrain, cells)
         # Exclude combinations of cells and pulse blocks without illumination, with successively smaller pulse blocks.
         reached, pulses = np.arange(len(cells)), np.arange(len(self.aperture))
-        for size in _EXACT:
+        for size in EXACT:
             reaching = illumination_mask(
                 self.beams[pulses], self.aperture[pulses], middle_m[reached], radius_m[reached], pulses=size
             )
@@ -346,7 +345,7 @@ class Looks:
         points = self.terrain.positions_at(part, rows, columns)
         for first in range(0, len(rows), _PIXELS):
             pixels = slice(first, first + _PIXELS)
-            mask[rows[pixels], columns[pixels]] = _any(self.beams, self.aperture, points[pixels], pulses)
+            mask[rows[pixels], columns[pixels]] = any_illuminates(self.beams, self.aperture, points[pixels], pulses)
 
     def _sums(self, tile: Window) -> list[NDArray[np.float32]]:
         """Interpolate Σ|w| and Σw² at the pixels of a tile between nodes with pulses; 0 if no node has pulses."""
@@ -460,29 +459,6 @@ def pitch_px(grid: SceneGrid, terrain: Terrain, aperture: Aperture, *, share: fl
     nearest_m = min(float(np.linalg.norm(leg - middle, axis=-1).min()) for leg in sample.legs)
     widest_px = nearest_m / share / grid.spacing_m
     return next((pitch for pitch in PITCHES_PX if pitch <= widest_px), PITCHES_PX[-1])
-
-
-def _any(
-    beams: Beams, aperture: Aperture, points: Floats, pulses: NDArray[np.int64], sizes: tuple[int, ...] = _EXACT
-) -> NDArray[np.bool_]:
-    """Return a mask of the points (point, 3) at which any of the pulses has a weight.
-
-    One pulse of each block is evaluated first. Blocks that cannot illuminate a point are then excluded. This is
-    repeated with smaller blocks, so that all pulses are evaluated only near the edges of beams.
-    """
-    if not pulses.size or not len(points):
-        return np.zeros(len(points), bool)
-    sample = pulses[sizes[0] // 2 :: sizes[0]] if sizes else pulses
-    illuminated = (beams[sample].weight(aperture[sample], points) != 0).any(axis=0)
-    if not sizes or illuminated.all():
-        return np.asarray(illuminated)
-    dark = np.flatnonzero(~illuminated)
-    reaching = illumination_mask(beams[pulses], aperture[pulses], points[dark], np.zeros(dark.size), pulses=sizes[0])
-    for number in np.flatnonzero(reaching.any(axis=1)):
-        undecided = dark[reaching[number] & ~illuminated[dark]]
-        block = pulses[number * sizes[0] : (number + 1) * sizes[0]]
-        illuminated[undecided] = _any(beams, aperture, points[undecided], block, sizes[1:])
-    return np.asarray(illuminated)
 
 
 def _centres(aperture: Aperture, beams: Beams | None, points: Floats, weight: Floats) -> Floats:
