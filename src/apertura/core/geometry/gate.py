@@ -6,11 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.core.geometry.aperture import Aperture
-from apertura.core.geometry.sector import edge
 
 EDGE_CELLS = 8.0
-"""Width of the edge of a gate, resolution cells v/B of total path (docs/theory/integration.md, eq. 5): four times the
-half width of the main lobe with a Hann window, so that the gated profile remains within twice the band."""
+"""Width of the edge of a gate, resolution cells v/B of total path: four times the half width of the main lobe with a
+Hann window, so that the gated profile remains within twice the band (docs/theory/integration.md, eq. 6)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,14 +25,14 @@ class RangeGate:
 
     Notes
     -----
-    Source: docs/theory/integration.md, eq. 5.
+    Source: docs/theory/integration.md, eq. 6.
 
     Examples
     --------
     >>> gate = RangeGate(np.array([100.0, 90.0]), 10.0)
-    >>> gate.at(np.array([[85.0, 90.0, 95.0, 100.0]])).round(2)
-    array([[1.  , 1.  , 0.5 , 0.  ],
-           [0.5 , 0.  , 0.  , 0.  ]])
+    >>> gate.at(np.array([[85.0, 90.0, 95.0, 100.0]])).round(2) + 0.0
+    array([[1. , 1. , 0.5, 0. ],
+           [0.5, 0. , 0. , 0. ]])
     """
 
     limit_m: NDArray[np.float64]
@@ -45,7 +44,9 @@ class RangeGate:
 
     def at(self, path_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the weight at total paths (pulse or 1, ...), 0 to 1."""
-        return edge((self.limit_m.reshape(-1, *(1,) * (path_m.ndim - 1)) - path_m) / self.edge_m)
+        depth = (self.limit_m.reshape(-1, *(1,) * (path_m.ndim - 1)) - path_m) / self.edge_m
+        z = np.clip(depth, 0.0, 1.0)
+        return np.asarray(z**4 * (35 - 84 * z + 70 * z**2 - 20 * z**3))
 
     def weight(self, aperture: Aperture, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the weight of each pulse at points (point, 3) in metres, (pulse, point) float64."""
