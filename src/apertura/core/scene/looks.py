@@ -16,6 +16,7 @@ from apertura.core.antenna.illumination import EXACT, any_illuminates, illuminat
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.angles import bistatic_angle_deg, incidence_deg, surface
 from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.recorded import RecordedShares
 from apertura.core.scene.swath import balls
 from apertura.core.scene.terrain import FlatGround, Terrain
 
@@ -218,7 +219,9 @@ class Looks:
     lattice
         Nodes at which the following values are computed.
     total, squares
-        (node row, node column) float32, Σ|w| and Σw² over the pulses.
+        (node row, node column) float32, Σ|w| and Σw² over the pulses, with the weights of antennas and sector.
+    lit
+        (node row, node column) bool, True where any sampled pulse has a weight, including that of the gate.
     centres
         (node row, node column, 2, 3) float64, metres: transmitter and receiver at the closest approach.
     pulses
@@ -237,6 +240,7 @@ class Looks:
     lattice: Lattice
     total: NDArray[np.float32]
     squares: NDArray[np.float32]
+    lit: NDArray[np.bool_]
     centres: Floats
     pulses: NDArray[np.int32]
     _masks: dict[tuple[int, int], NDArray[np.uint8] | bool] = field(default_factory=dict)
@@ -273,10 +277,11 @@ class Looks:
             lattice,
             np.zeros(lattice.shape, np.float32),
             np.zeros(lattice.shape, np.float32),
+            np.zeros(lattice.shape, bool),
             np.zeros((*lattice.shape, 2, 3)),
             np.zeros((*lattice.shape, SPREAD), np.int32),
         )
-        fill(lattice, looks._fill, grid, terrain, aperture, beams, threads=threads)
+        fill(lattice, looks._fill, grid, terrain, aperture, beams and beams.on_profiles, threads=threads)
         return looks
 
     def _fill(self, block: Window, reaching: NDArray[np.bool_]) -> None:
@@ -288,7 +293,8 @@ class Looks:
         while True:
             sample = slice(pulses.start, pulses.stop, every)
             aperture, beams = self.aperture[sample], self.beams and self.beams[sample]
-            weight = np.ones((len(aperture), len(points))) if beams is None else beams.weight(aperture, points)
+            applied = beams and beams.on_profiles
+            weight = np.ones((len(aperture), len(points))) if applied is None else applied.weight(aperture, points)
             n_weighted = (weight != 0).sum(axis=0)
             median = int(np.median(n_weighted[n_weighted > 0])) if n_weighted.any() else _FEWEST
             if every == 1 or median >= _FEWEST or len(aperture) >= _MOST:
@@ -297,6 +303,9 @@ class Looks:
         shape, pulses_each = (len(rows), len(columns)), (pulses.stop - pulses.start) / len(aperture)
         self.total[block] = (np.abs(weight).sum(axis=0) * pulses_each).reshape(shape)
         self.squares[block] = ((weight**2).sum(axis=0) * pulses_each).reshape(shape)
+        if beams and beams.gate:
+            weight *= beams.gate.weight(aperture, points)
+        self.lit[block] = (weight != 0).any(axis=0).reshape(shape)
         self.centres[block] = _centres(aperture, beams, points, weight).reshape(*shape, 2, 3)
         self.pulses[block] = (pulses.start + every * _spread(weight)).reshape(*shape, SPREAD)
 
@@ -313,7 +322,7 @@ class Looks:
             return np.ones(shape, bool)
         key = (tile[0].start, tile[1].start)
         if key not in self._masks:
-            mask = self.lattice.inside_positive(self.total, tile)
+            mask = self.lattice.inside_positive(self.lit, tile)
             self._fill_mask(mask, tile)
             self._masks[key] = bool(mask[0, 0]) if (mask == mask[0, 0]).all() else np.packbits(mask)
         cached = self._masks[key]
@@ -348,7 +357,10 @@ class Looks:
             mask[rows[pixels], columns[pixels]] = any_illuminates(self.beams, self.aperture, points[pixels], pulses)
 
     def _sums(self, tile: Window) -> list[NDArray[np.float32]]:
-        """Interpolate Σ|w| and Σw² at the pixels of a tile between nodes with pulses; 0 if no node has pulses."""
+        """Interpolate Σ|w| and Σw² at the pixels of a tile between nodes with pulses; 0 if no node has pulses.
+
+        The weights are those of antennas and sector, without the gate.
+        """
         sums = [self.lattice.between(values, tile) for values in (self.total, self.squares)]
         lit = self.total[self.lattice.around(tile)] > 0
         if not lit.all():
@@ -368,6 +380,8 @@ class Looks:
         else:
             total, squares = self._sums(tile)
             looks = total**2 / np.where(squares > 0, squares, np.float32(np.inf))
+        if shares := self._recorded.at(tile):
+            looks = (looks * shares[0] ** 2 / np.where(shares[1] > 0, shares[1], np.inf)).astype(np.float32)
         looks = np.maximum(np.float32(1), looks, out=looks)
         lit = self.illuminated(tile)
         return looks if lit.all() else np.where(lit, looks, np.float32(0))
@@ -391,7 +405,12 @@ class Looks:
 
     def weight_squares(self, window: Window) -> Floats:
         """Return Σw² at the pixels of a window, (row, column) float64; 0 where no surrounding node has pulses."""
-        return self._sums(window)[1].astype(np.float64)
+        squares, shares = self._sums(window)[1].astype(np.float64), self._recorded.at(window)
+        return squares if shares is None else squares * shares[1]
+
+    @cached_property
+    def _recorded(self) -> RecordedShares:
+        return RecordedShares(self.grid, self.terrain, self.aperture, self.beams)
 
     def centre(self, tile: Window) -> tuple[Floats, Floats]:
         """Return the antenna positions at each pixel's closest approach, (row, column, 3) float64 metres each."""
