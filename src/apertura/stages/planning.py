@@ -363,13 +363,15 @@ def gated(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> OpenPair:
     cell_m, _ = range_step(pair.frequency_hz, oversampling=1.0, wave_speed_m_s=pair.wave_speed_m_s)
     gate = RangeGate(limit_m, EDGE_CELLS * cell_m)
     path_m, illuminated, weight = _recorded(campaign, pair, scene, gate)
+    if not illuminated.any():  # an error of the antennas, raised by `job_of`
+        return pair
     if (illuminated & (weight > 0)).sum(axis=0).max() >= FEWEST:
         return replace(pair, gate=gate)
     key, limit_name, hint = _limit_words(campaign)
-    pulse, point = np.unravel_index(np.where(illuminated, path_m, np.inf).argmin(), path_m.shape)
+    shortest_m = float(path_m[illuminated].min())
     raise CampaignError(
         f"echoes of the scene arrive after {limit_name} at {number_of(len(limit_m), 'pulse')}; shortest total path "
-        f"{path_m[pulse, point]:.1f} m",
+        f"{shortest_m:.1f} m: the scene is at least {shortest_m / 2000:.3g} km from the tracks",
         where=f"flight {pair.flight}, pair {pair.name}",
         expected=f"at most {limit_m.max():.1f} m (c·{key} minus the path offsets), at {FEWEST} pulses of a pixel",
         remedy="Correct scene.bounds_m (easting before northing), scene.crs, the positions of the tracks or the "
@@ -387,12 +389,23 @@ def recording_flags(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Fla
     unrecorded = illuminated.any(axis=0) & ~(illuminated & (weight > 0)).any(axis=0)
     _, limit_name, hint = _limit_words(campaign)
     line = (
-        f"about {100 * is_cut.any(axis=0).mean():.1f} % of the scene is not recorded by all of its pulses, "
-        f"{100 * unrecorded.mean():.1f} % by none: echoes arrive after {limit_name} at {pulses} of "
+        f"{_percent(is_cut.any(axis=0).mean())} of the scene is not recorded by all of its pulses, "
+        f"{_percent(unrecorded.mean())} by none: echoes arrive after {limit_name} at {pulses} of "
         f"{number_of(len(pair.aperture), 'pulse')}; longest total path {path_m[illuminated].max():.1f} m, "
         f"recorded up to {pair.path_limit_m:.1f} m.{hint}"
     )
     return Flags({"scene_beyond_recording": line})
+
+
+def _percent(share: float) -> str:
+    """Return a share, sampled at points, in whole percent.
+
+    Examples
+    --------
+    >>> _percent(0.2349), _percent(0.002), _percent(0.0)
+    ('23 %', 'less than 1 %', '0 %')
+    """
+    return "less than 1 %" if 0 < share < 0.01 else f"{100 * share:.0f} %"
 
 
 def _recorded(
