@@ -191,6 +191,13 @@ def test_partly_recorded_point_has_its_place_amplitude_and_width():
     assert (east_m, north_m) == pytest.approx((POINT[0, 0], POINT[0, 1]), abs=0.1)
     # the mean over all pulses, of which a part recorded the point
     assert np.sqrt(power.max()) == pytest.approx(weight.mean(), rel=0.02)
+    # The calibration contains this factor: a calibrated point has its true cross-section.
+    window = (slice(row, row + 1), slice(column, column + 1))
+    per_m2 = [
+        Calibration.of(grid, GROUND, MONO, beams, constant=1.0, cell_m2=1.0).rcs_power(window)[0, 0]
+        for beams in (Beams(gate=gate_of(MONO)), None)
+    ]
+    assert per_m2[0] / per_m2[1] == pytest.approx(power.max(), rel=0.04)
     resolution = Resolution.of(
         grid, GROUND, MONO, Beams(gate=gate_of(MONO)), frequency_hz=FREQUENCY, weight=np.hanning(SUBCARRIERS)
     )

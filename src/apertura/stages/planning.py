@@ -392,7 +392,7 @@ def recording_flags(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Fla
         f"{_percent(is_cut.any(axis=0).mean())} of the scene is not recorded by all of its pulses, "
         f"{_percent(unrecorded.mean())} by none: echoes arrive after {limit_name} at {pulses} of "
         f"{number_of(len(pair.aperture), 'pulse')}; longest total path {path_m[illuminated].max():.1f} m, "
-        f"recorded up to {pair.path_limit_m:.1f} m.{hint}"
+        f"recorded up to {pair.path_limit_m:.1f} m{f'.{hint}' if hint else ''}"
     )
     return Flags({"scene_beyond_recording": line})
 
