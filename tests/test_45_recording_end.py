@@ -119,6 +119,18 @@ def test_tree_is_not_chosen_where_a_flat_window_widens_the_band():
     assert plan(-45.0, **size, beams=gate).engine == "tree"
 
 
+def test_gate_moves_with_the_paths_of_a_refined_track():
+    """Profiles that are corrected by a path contain the gate at the corrected path."""
+    gate, history, engine = gate_of(MONO), history_of(MONO, SCATTERED, np.ones(80)), load_engine("numba")
+    extra_m, moved = 0.5 + 0.2 * np.cos(ALONG), Aperture(MONO.tx_m + [0.0, 0.1, 0.05], MONO.rx_m + [0.0, 0.1, 0.05])
+    profiles = profiles_of(history, Beams(gate=gate)).moved(moved, extra_m)
+    exact = reference.form(history.moved(moved, extra_m), pixels(), beams=Beams(gate=gate.moved(extra_m)))
+    image = engine.form(engine.prepare(profiles, oversampling=16), pixels())
+    assert rms_db(image - exact, exact) < -62
+    unmoved = reference.form(history.moved(moved, extra_m), pixels(), beams=Beams(gate=gate))
+    assert rms_db(image - unmoved, exact) > -40
+
+
 def test_partly_recorded_scene_is_not_presummed():
     gate = Beams(gate=RangeGate(np.full(300, 55.0), EDGE_M))
     reasons = plan(beams=gate).reasons["presum"]

@@ -188,8 +188,9 @@ class RefinedTrack:
             return logged
         aperture, extra_path_m = self._moved(self.correction, logged)
         history = None if logged.history is None else logged.history.moved(aperture, extra_path_m)
-        residual = self.stage.attrs["left"]
-        return replace(logged, aperture=aperture, history=history, left=Effect(**residual) if residual else None)
+        residual, gate = self.stage.attrs["left"], logged.gate and logged.gate.moved(extra_path_m)
+        left = Effect(**residual) if residual else None
+        return replace(logged, aperture=aperture, history=history, left=left, gate=gate)
 
     def profiles(self, logged: OpenPair, profiles: Profiles) -> Profiles:
         """Return the range profiles of a pair with corrected phase centres and paths."""

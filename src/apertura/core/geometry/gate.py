@@ -42,6 +42,10 @@ class RangeGate:
         """Return the gate of the selected pulses."""
         return replace(self, limit_m=self.limit_m[pulses])
 
+    def moved(self, extra_path_m: NDArray[np.float64]) -> "RangeGate":
+        """Return the gate of echoes with paths longer by `extra_path_m`, (pulse,) metres, as `Profiles.moved`."""
+        return replace(self, limit_m=self.limit_m + extra_path_m)
+
     def at(self, path_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the weight at total paths (pulse or 1, ...), 0 to 1."""
         depth = (self.limit_m.reshape(-1, *(1,) * (path_m.ndim - 1)) - path_m) / self.edge_m
