@@ -90,6 +90,7 @@ ENGINES = {
 
 
 @compiled
+@pytest.mark.quick("True-bi")
 @pytest.mark.parametrize("flown", APERTURES)
 @pytest.mark.parametrize("with_sector", [False, True])
 def test_engines_sum_the_recorded_echoes(flown, with_sector):
@@ -140,11 +141,14 @@ def test_partly_recorded_scene_is_not_presummed():
 
 
 @compiled
-def test_image_has_no_data_exactly_where_no_pulse_recorded_the_pixel():
+@pytest.mark.parametrize("blocks", ["auto", 3])
+def test_image_has_no_data_exactly_where_no_pulse_recorded_the_pixel(blocks):
     """Interpolation and the sidelobes of a strong echo must not leak beyond the end of the recording."""
     gate = gate_of(MONO)
     history = history_of(MONO, [[0.0, 36.5, 0.0], *SCATTERED], [300.0, *np.ones(80)])
-    image = ap.backproject(history, GRID, terrain=GROUND, beams=Beams(gate=gate), integration="all")
+    image = ap.backproject(
+        history, GRID, terrain=GROUND, beams=Beams(gate=gate), integration="all", pulse_blocks=blocks
+    )
     unrecorded = ~(recorded(gate, MONO, pixels().reshape(-1, 3)) > 0).any(axis=0).reshape(GRID.shape)
     assert 0.1 < unrecorded.mean() < 0.5
     np.testing.assert_array_equal(image.values == 0, unrecorded)
@@ -177,7 +181,7 @@ def point_image(spacing_m=0.05):
     gate = gate_of(MONO)
     grid = SceneGrid("local", POINT[0, 0] - 3.0, POINT[0, 1] + 3.0, spacing_m, (121, 121))
     history = history_of(MONO, POINT, [1.0])
-    image = ap.backproject(history, grid, terrain=GROUND, beams=Beams(gate=gate), integration="all", engine="reference")
+    image = ap.backproject(history, grid, terrain=GROUND, beams=Beams(gate=gate), integration="all")
     return image.values, grid, recorded(gate, MONO, POINT)[:, 0]
 
 
@@ -194,6 +198,7 @@ def width(power, spacing_m):
     return (ends[0] - ends[1]) * spacing_m
 
 
+@compiled
 def test_partly_recorded_point_has_its_place_amplitude_and_width():
     image, grid, weight = point_image()
     assert 0.3 < weight.mean() < 0.75
@@ -233,6 +238,7 @@ def some_pixels(count=1500):
     return rows, columns, GROUND.positions_at(GRID, rows, columns)
 
 
+@pytest.mark.quick("bi")
 @pytest.mark.parametrize("flown", APERTURES)
 def test_looks_are_those_of_the_recorded_pulses(flown):
     aperture = APERTURES[flown]
@@ -321,6 +327,7 @@ def shares_of(line):
     return [float(part.split(" %")[0].split()[-1]) for part in line.split(":")[0].split(",")]
 
 
+@pytest.mark.quick("uav1-uav2")
 @pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
 def test_flag_states_the_recorded_shares(tiny, pair):
     campaign, _, scene = opened(tiny, pair)
