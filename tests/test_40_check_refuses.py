@@ -37,7 +37,7 @@ def metadata(node, **keys):
 def distant_scene(root):
     """Move the scene beyond the recorded ranges, but within the bounds of check `distance`."""
     west, south, east, north = Campaign.load(root).settings.scene.bounds_m
-    state(root, "scene", bounds_m=[west + 116, south, east + 116, north])
+    state(root, "scene", bounds_m=[west + 110.5, south, east + 110.5, north])
 
 
 def raise_terrain(root):
