@@ -373,7 +373,7 @@ INVALID = {
     "unknown key": (plan_of(requires={"nesz_db": -20}), "requires: unknown key (did you mean 'require'?)"),
     "beyond the prefix": (
         plan_of(waveform=plan_of()["waveform"] | {"cyclic_prefix_s": 1e-7}),
-        "no echo of the scene is received",
+        "echoes of the scene arrive after the cyclic prefix",
     ),
     "tracks elsewhere": (
         with_tracks(plan_of(), uav1=line(start_m=[4840.0, 990.0], end_m=[4880.0, 990.0])),

@@ -34,10 +34,10 @@ def metadata(node, **keys):
     return lambda root: edit_meta(root, node, lambda meta: meta["global"].update(named))
 
 
-def wider_scene(root):
-    """Extend the scene beyond the recorded ranges."""
+def distant_scene(root):
+    """Move the scene beyond the recorded ranges, but within the bounds of check `distance`."""
     west, south, east, north = Campaign.load(root).settings.scene.bounds_m
-    state(root, "scene", bounds_m=[west - 100, south - 100, east + 100, north + 100], spacing_m=1.0)
+    state(root, "scene", bounds_m=[west + 110.5, south, east + 110.5, north])
 
 
 def raise_terrain(root):
@@ -72,7 +72,7 @@ def dem_not_below_the_track(root):
 
 
 INVALID = {
-    "wide scene": (wider_scene, "echoes of the scene arrive after the cyclic prefix"),
+    "distant scene": (distant_scene, "echoes of the scene arrive after the cyclic prefix"),
     "in the ground": (raise_terrain, "is at or below the terrain of the scene, worst at pulse"),
     "beam to the other side": (antenna([-90.0, 0.0]), "no pulse illuminates the scene"),
     "beam to the sky": (antenna([90.0, 80.0]), "no pulse illuminates the scene"),

@@ -330,7 +330,7 @@ _MOST_PIXELS = 1_000_000  # pixels of the largest scene whose DEM heights are re
 
 def check_imaging(examined: Examination) -> Iterator[CampaignError]:
     """Yield the errors that the steps `echo`, `scene`, `profile` and `image` would raise for the first pairs."""
-    from apertura.stages.planning import job_of, ranges_of
+    from apertura.stages.planning import gated, job_of, ranges_of
 
     campaign, problems = examined.campaign, list[CampaignError]()
     pairs, scene = _opened(examined, problems)
@@ -341,9 +341,10 @@ def check_imaging(examined: Examination) -> Iterator[CampaignError]:
     search_m = campaign.settings.calibration.search_m if campaign.settings.calibration else 0.0
     for pair in pairs:
         try:
-            ranges_of(campaign, replace(pair, path_limits_m=pair.path_limits_m + search_m), scene)
+            recorded = gated(campaign, replace(pair, path_limits_m=pair.path_limits_m + search_m), scene)
+            ranges_of(campaign, recorded, scene)
             if pair.beams is not None:
-                job_of(campaign, pair, scene)
+                job_of(campaign, recorded, scene)
         except CampaignError as problem:
             yield problem
 

@@ -405,11 +405,13 @@ _OF_IMAGES = {
         "section pulses of image.json: pulses dropped, with reasons",
         "core/echo/association.py",
     ),
-    "beyond_cyclic_prefix": Flag(
-        "fraction of the scene whose echoes arrive too late",
-        "in every pulse, echoes of part of the scene arrive after the cyclic prefix or the listening time",
-        "scene.bounds_m",
-        "core/planning/plan.py",
+    "scene_beyond_recording": Flag(
+        "fraction of the scene not recorded by all pulses, and fraction recorded by none; number of pulses; longest and "
+        "recorded total path",
+        "echoes of part of the scene arrive after the recorded delays: these pixels are formed from fewer pulses or have "
+        "no data",
+        "scene.bounds_m; scene.height_m if it is the default; looks.tif and nesz.tif of these pixels",
+        "stages/planning.py",
     ),
     "scene_beyond_samples": Flag(
         "fraction of the scene's interval of total paths",

@@ -32,7 +32,7 @@ from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.imaging.view import view_report
 from apertura.core.quality.budget import arithmetic_line
 from apertura.stages.pair import OpenPair, antennas_report, open_pair, pattern_digests
-from apertura.stages.planning import budget_of, plan_pair
+from apertura.stages.planning import budget_of, gated, plan_pair
 from apertura.stages.refine import RefinedTrack, open_refined
 from apertura.stages.scene import OpenScene, open_scene
 from apertura.stages.tags import stamped
@@ -179,7 +179,8 @@ class _Work:
 def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
     echo = PairEcho.cleaned(campaign, flight, pair).stage
     profile = open_stage(campaign.stage("profile", flight, pair), "profile")
-    scene, logged = open_scene(campaign), open_pair(campaign, flight, pair, echo=echo)
+    scene = open_scene(campaign)
+    logged = gated(campaign, open_pair(campaign, flight, pair, echo=echo), scene)
     track = open_refined(campaign, flight)
     opened, profiles = track.pair(logged), track.profiles(logged, profiles_of(profile, lazy=True))
     if opened.history is None:

@@ -32,7 +32,7 @@ from apertura.methods.interferometry.heights import KnownHeight, Level
 from apertura.methods.interferometry.sensitivity import FlownAntenna, Legs, Sensitivity, TrackPhase, sensitivity
 from apertura.stages.agreement import opened_layer
 from apertura.stages.pair import OpenPair, open_pair
-from apertura.stages.planning import weighing
+from apertura.stages.planning import gated, weighing
 from apertura.stages.refine import clock_s, open_refined
 from apertura.stages.scene import OpenScene, open_scene
 from apertura.stages.tags import tags_of
@@ -89,7 +89,7 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
     for sign, (flight, pair) in zip((1, -1), images, strict=True):
         echo = PairEcho.cleaned(campaign, flight, pair).stage
         profile = open_stage(campaign.stage("profile", flight, pair), "profile")
-        opened = open_pair(campaign, flight, pair, echo=echo)
+        opened = gated(campaign, open_pair(campaign, flight, pair, echo=echo), scene)
         bands.append((float(opened.frequency_hz.min()), float(opened.frequency_hz.max())))
         looks.append(Looks.of(scene.grid, scene.terrain, aperture_of(profile), weighing(campaign, opened, scene)))
         legs.append(legs_of(looks[-1]))

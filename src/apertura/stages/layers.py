@@ -35,7 +35,7 @@ from apertura.formats.export.layers import OUTSIDE
 from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, of_coefficient
 from apertura.stages.multilook import LazyLayer, coarse, mean_power_report, multilook_of, side_of
 from apertura.stages.pair import open_pair, pattern_digests
-from apertura.stages.planning import integration_of, weighing
+from apertura.stages.planning import gated, integration_of, weighing
 from apertura.stages.radiometry import POINTS_LISTED, CalibratedPair, calibrated_pair, points_of
 from apertura.stages.scene import OpenScene, open_scene
 from apertura.stages.tags import tags_of
@@ -52,7 +52,7 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
     echo = PairEcho.cleaned(campaign, flight, pair).stage
     profile = open_stage(campaign.stage("profile", flight, pair), "profile")
     scene, profiles = open_scene(campaign), profiles_of(profile, lazy=True)
-    opened = open_pair(campaign, flight, pair, echo=echo)
+    opened = gated(campaign, open_pair(campaign, flight, pair, echo=echo), scene)
     beams, calibrated = weighing(campaign, opened, scene), calibrated_pair(campaign, opened, scene, threads=threads)
     looks = Looks.of(scene.grid, scene.terrain, profiles.aperture, beams, threads=threads)
     points_m = noise_places(scene.grid, scene.terrain)

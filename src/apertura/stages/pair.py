@@ -20,6 +20,7 @@ from apertura.core.antenna.illumination import Illumination, illuminate
 from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.echo.compression import window_weights
 from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.gate import RangeGate
 from apertura.core.imaging.range_profiles import phase_history_of
 from apertura.core.quality.budget import NodePositions
 from apertura.core.quality.path_errors import Effect
@@ -186,6 +187,8 @@ class OpenPair:
         Phase history; None before the echo is formed.
     beams
         Antenna beams; None if the antennas are isotropic.
+    gate
+        Gate of the recorded paths, from `apertura.stages.planning.gated`; None if all echoes of the scene are recorded.
     axes
         Body axes as in `beams_of`, for the antennas that are affected by attitude.
     sidelink_m
@@ -212,6 +215,7 @@ class OpenPair:
     positions: tuple[NodePositions, ...]
     history: PhaseHistory | None = None
     beams: Beams | None = None
+    gate: RangeGate | None = None
     axes: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     sidelink_m: NDArray[np.float64] | None = None
     left: Effect | None = None

@@ -15,11 +15,12 @@ from apertura.common.errors import CampaignError, number_of
 from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.job import Integration, Job
-from apertura.core.echo.compression import centre_frequency
+from apertura.core.echo.compression import centre_frequency, range_step
 from apertura.core.geometry.atmosphere import USUAL_N
+from apertura.core.geometry.gate import EDGE_CELLS, RangeGate
 from apertura.core.imaging.job import decide_integration, imaging_job
 from apertura.core.imaging.range_profiles import GUARD_SAMPLES, RangeWindow
-from apertura.core.planning.decisions import decide_accuracy
+from apertura.core.planning.decisions import FEWEST, decide_accuracy
 from apertura.core.planning.plan import Decision, Plan, memory_limit
 from apertura.core.planning.planner import make_plan
 from apertura.core.quality.budget import (
@@ -37,6 +38,7 @@ from apertura.core.quality.budget import (
 )
 from apertura.core.quality.path_errors import MOST_PULSES, Effect, PointPaths
 from apertura.core.scene.clearance import check_antennas
+from apertura.core.scene.swath import swath
 from apertura.core.scene.terrain import GroundModels
 from apertura.stages.pair import OpenPair, scene_illumination
 from apertura.stages.scene import OpenScene
@@ -282,7 +284,7 @@ def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: 
     plan = replace(
         plan,
         decisions=(*plan.decisions, accuracy, air_decision(pair), background_decision(pair)),
-        flags=Flags.merged(flags, scene.flags, plan.flags),
+        flags=Flags.merged(flags, scene.flags, plan.flags, recording_flags(campaign, pair, scene)),
     )
     is_written = campaign.is_current(campaign.stage("image", pair.flight, pair.name))
     free_disk = None if is_written else campaign.root.free_bytes()
@@ -313,35 +315,128 @@ def job_of(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: int
         pair.weight,
         scene.grid,
         ground,
-        beams=pair.beams,
+        beams=Beams.within(None, pair.beams, pair.gate),
         integration=campaign.settings.processing.integrated,
         wave_speed_m_s=pair.wave_speed_m_s,
     )
     return replace(
         job,
-        illumination=scene_illumination(campaign, pair.name, job.beams, scene, pair.aperture),
+        illumination=scene_illumination(campaign, pair.name, job.beams and job.beams.on_profiles, scene, pair.aperture),
         tile_px=campaign.settings.processing.tile_px,
         threads=threads,
-        path_limit_m=pair.path_limit_m,
         memory_bytes=memory_limit(),
     )
 
 
 def weighing(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Beams | None:
-    """Return the weights of a pair's pulses over the scene, by antennas and angular sector; None if all are equal.
+    """Return the weights of a pair's pulses over the scene: antennas, angular sector, gate; None if all are equal.
 
     The weights are those of `job_of`, without the echo: they determine the ranges that profiles must cover.
     """
-    return Beams.within(integration_of(campaign, pair, scene).sector, pair.beams)
+    return Beams.within(integration_of(campaign, pair, scene).sector, pair.beams, pair.gate)
 
 
-def ranges_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> RangeWindow:
-    """Return the ranges that the profiles of a pair cover.
+# ---- Scenes beyond the recorded paths
+
+_GATE_POINTS, _GATE_PULSES = 65, 512
+"""Points along a side of the scene, and largest number of pulses, from which the recorded share is estimated."""
+
+
+def gated(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> OpenPair:
+    """Return a pair with the gate of its recorded paths; without a gate if all echoes of the scene are recorded.
+
+    The gate is decided with the positions of the logs, so that all stages use the same one.
 
     Raises
     ------
     CampaignError
-        If an antenna is below the terrain, or echoes of the scene were not recorded or are ambiguous in range.
+        If no point of the scene is recorded by three pulses.
+
+    Notes
+    -----
+    Source: docs/theory/integration.md, eq. 6.
+    """
+    pair = replace(pair, gate=None)
+    beams, limit_m = weighing(campaign, pair, scene), pair.path_limits_m
+    if np.isinf(limit_m).all() or (swath(scene.grid, scene.terrain, pair.aperture, beams=beams)[1] <= limit_m).all():
+        return pair
+    cell_m, _ = range_step(pair.frequency_hz, oversampling=1.0, wave_speed_m_s=pair.wave_speed_m_s)
+    gate = RangeGate(limit_m, EDGE_CELLS * cell_m)
+    path_m, illuminated, weight = _recorded(campaign, pair, scene, gate)
+    if not illuminated.any():  # an error of the antennas, raised by `job_of`
+        return pair
+    if (illuminated & (weight > 0)).sum(axis=0).max() >= FEWEST:
+        return replace(pair, gate=gate)
+    key, limit_name, hint = _limit_words(campaign)
+    shortest_m = float(path_m[illuminated].min())
+    raise CampaignError(
+        f"echoes of the scene arrive after {limit_name} at {number_of(len(limit_m), 'pulse')}; shortest total path "
+        f"{shortest_m:.1f} m: the scene is at least {shortest_m / 2000:.3g} km from the tracks",
+        where=f"flight {pair.flight}, pair {pair.name}",
+        expected=f"at most {limit_m.max():.1f} m (c·{key} minus the path offsets), at {FEWEST} pulses of a pixel",
+        remedy="Correct scene.bounds_m (easting before northing), scene.crs, the positions of the tracks or the "
+        f"terrain height; or check path_offset_m and {key}.{hint}",
+    )
+
+
+def recording_flags(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Flags:
+    """Return the flag of a scene with pixels that some pulses did not record; empty for a pair without a gate."""
+    if pair.gate is None:
+        return Flags()
+    path_m, illuminated, weight = _recorded(campaign, pair, scene, pair.gate)
+    is_cut = illuminated & (weight < 1)
+    pulses = round(is_cut.any(axis=1).mean() * len(pair.aperture))
+    unrecorded = illuminated.any(axis=0) & ~(illuminated & (weight > 0)).any(axis=0)
+    _, limit_name, hint = _limit_words(campaign)
+    line = (
+        f"{_percent(is_cut.any(axis=0).mean())} of the scene is not recorded by all of its pulses, "
+        f"{_percent(unrecorded.mean())} by none: echoes arrive after {limit_name} at {pulses} of "
+        f"{number_of(len(pair.aperture), 'pulse')}; longest total path {path_m[illuminated].max():.1f} m, "
+        f"recorded up to {pair.path_limit_m:.1f} m{f'.{hint}' if hint else ''}"
+    )
+    return Flags({"scene_beyond_recording": line})
+
+
+def _percent(share: float) -> str:
+    """Return a share, sampled at points, in whole percent.
+
+    Examples
+    --------
+    >>> _percent(0.2349), _percent(0.002), _percent(0.0)
+    ('23 %', 'less than 1 %', '0 %')
+    """
+    return "less than 1 %" if 0 < share < 0.01 else f"{100 * share:.0f} %"
+
+
+def _recorded(
+    campaign: Campaign, pair: OpenPair, scene: OpenScene, gate: RangeGate
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.float64]]:
+    """Return total paths, illumination by antennas and sector, and weights of the gate, (pulse, point) of a sample."""
+    pulses = slice(None, None, -(-len(pair.aperture) // _GATE_PULSES))
+    aperture = pair.aperture[pulses]
+    points_m = scene.terrain.positions_at(scene.grid, *scene.grid.sample_pixels(_GATE_POINTS)).reshape(-1, 3)
+    beams = weighing(campaign, replace(pair, gate=None), scene)
+    path_m = aperture.path(points_m)
+    illuminated = np.ones(path_m.shape, bool) if beams is None else beams[pulses].weight(aperture, points_m) != 0
+    return path_m, illuminated, gate[pulses].at(path_m)
+
+
+def _limit_words(campaign: Campaign) -> tuple[str, str, str]:
+    """Return key and name of the limit of recorded delays, and the hint at a default height."""
+    waveform = campaign.settings.waveform
+    hint = f" A likely cause: {HEIGHT_DEFAULT}." if campaign.settings.scene.height_is_default else ""
+    if isinstance(waveform, SampledWaveform):
+        return waveform.delay_key, waveform.limit_name, hint
+    return "path_limit", "the recorded delays", hint
+
+
+def ranges_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> RangeWindow:
+    """Return the ranges that the profiles of a pair from `gated` cover.
+
+    Raises
+    ------
+    CampaignError
+        If an antenna is below the terrain, or recorded echoes of the scene are ambiguous in range.
     """
     where = f"flight {pair.flight}, pair {pair.name}"
     check_antennas(scene.grid, scene.terrain, pair.aperture, where=where)
@@ -353,30 +448,8 @@ def ranges_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> RangeWind
         beams=weighing(campaign, pair, scene),
         wave_speed_m_s=pair.wave_speed_m_s,
     )
-    _check_recorded(window.farthest_m, pair.path_limits_m, campaign, where=where)
     _check_unambiguous(window)
     return window
-
-
-def _check_recorded(
-    farthest: NDArray[np.float64], limit: NDArray[np.float64], campaign: Campaign, *, where: str
-) -> None:
-    """Check that echoes of the scene arrive before the captures end; raise CampaignError if not."""
-    waveform = campaign.settings.waveform
-    key, limit_name = "path_limit", "the recorded delays"
-    if isinstance(waveform, SampledWaveform):
-        key, limit_name = waveform.delay_key, waveform.limit_name
-    beyond = np.flatnonzero(farthest > limit)
-    if beyond.size:
-        pulse = int((farthest - limit).argmax())
-        height = f" A likely cause: {HEIGHT_DEFAULT}." if campaign.settings.scene.height_is_default else ""
-        raise CampaignError(
-            f"echoes of the scene arrive after {limit_name} at {number_of(beyond.size, 'pulse')}; longest total path "
-            f"{farthest[pulse]:.1f} m at pulse {pulse}",
-            where=where,
-            expected=f"at most {limit[pulse]:.1f} m (c·{key} minus the path offsets)",
-            remedy=f"Make scene.bounds_m smaller, or check path_offset_m and {key}.{height}",
-        )
 
 
 def _check_unambiguous(window: RangeWindow) -> None:

@@ -22,7 +22,7 @@ from apertura.core.echo.interference import Interference, NoisyPulses, PulsedInt
 from apertura.core.imaging.background import BackgroundScene, Removal, decide_removal
 from apertura.core.imaging.range_profiles import CompressionError, RangeWindow, phase_history_of, range_compress
 from apertura.stages.pair import open_pair, pattern_digests
-from apertura.stages.planning import ranges_of
+from apertura.stages.planning import gated, ranges_of
 from apertura.stages.scene import OpenScene, open_scene
 from apertura.stages.tags import stamped
 from apertura.stages.transfer import PairEcho
@@ -43,7 +43,7 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     def write(wip: Path, echo: PairEcho, noisy: NoisyPulses) -> float:
         """Write the profiles of all pulses of an echo, add them to `noisy`; return the compression error, dB."""
         source, error = echo.stage, CompressionError(np.random.default_rng(0))
-        window = ranges_of(campaign, open_pair(campaign, flight, pair, echo=source), scene)
+        window = ranges_of(campaign, gated(campaign, open_pair(campaign, flight, pair, echo=source), scene), scene)
         dataset = _empty(echo, window, campaign.settings.processing.window)
         parents = [source, *scene.parents]
         stage = stamped(dataset, "profile", modules=lineage.modules, parents=parents, settings=settings, inputs=inputs)
@@ -172,8 +172,8 @@ def _compressed(
             yield np.zeros((part.stop - part.start, window.samples), np.complex64)
             continue
         history = phase_history_of(source.isel(pulse=part), requested)
-        chunk = replace(window, start_m=window.start_m[part], farthest_m=window.farthest_m[part])
+        chunk = window.part(part)
         profiles = range_compress(history, scene.grid, scene.terrain, window=chunk)
-        error.add(history, profiles)
+        error.add(history, profiles, chunk.gate)
         noisy.add(history.transfer, profiles.samples)
         yield profiles.samples

@@ -477,7 +477,7 @@ def image_weights(campaign: Campaign, opened: OpenPair, scene: OpenScene) -> tup
     """Return the weights of a pair's pulses in its image, and the divisor of the image."""
     integration = integration_of(campaign, opened, scene)
     count = integration.count if integration.sector else None
-    return Beams.within(integration.sector, opened.beams), count or len(opened.aperture)
+    return Beams.within(integration.sector, opened.beams, opened.gate), count or len(opened.aperture)
 
 
 def _attitude_errors(campaign: Campaign, opened: OpenPair, scene: OpenScene) -> list[Turn]:

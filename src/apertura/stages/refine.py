@@ -34,7 +34,7 @@ from apertura.methods.causes import Cause, late_logs, other_arm, other_height
 from apertura.stages.acquisition import Acquisition
 from apertura.stages.node_log import raw_log
 from apertura.stages.pair import OpenPair, open_pair, pattern_digests
-from apertura.stages.planning import paths_to, positions_loss_db, weighing
+from apertura.stages.planning import gated, paths_to, positions_loss_db, weighing
 from apertura.stages.scene import OpenScene, open_scene
 from apertura.stages.tags import stamped
 from apertura.workflow.lineage import result_of
@@ -188,8 +188,9 @@ class RefinedTrack:
             return logged
         aperture, extra_path_m = self._moved(self.correction, logged)
         history = None if logged.history is None else logged.history.moved(aperture, extra_path_m)
-        residual = self.stage.attrs["left"]
-        return replace(logged, aperture=aperture, history=history, left=Effect(**residual) if residual else None)
+        residual, gate = self.stage.attrs["left"], logged.gate and logged.gate.moved(extra_path_m)
+        left = Effect(**residual) if residual else None
+        return replace(logged, aperture=aperture, history=history, left=left, gate=gate)
 
     def profiles(self, logged: OpenPair, profiles: Profiles) -> Profiles:
         """Return the range profiles of a pair with corrected phase centres and paths."""
@@ -360,7 +361,7 @@ def refine(campaign: Campaign, flight: str) -> Path:
     lineage = result_of(campaign, "refined_track", flight).begin(campaign.root)
     names, scene = campaign.flight(flight).pairs, open_scene(campaign)
     requested = campaign.settings.processing.autofocus
-    pairs = [] if requested == "off" else [open_pair(campaign, flight, pair) for pair in names]
+    pairs = [] if requested == "off" else [gated(campaign, open_pair(campaign, flight, pair), scene) for pair in names]
     decisions, folder = autofocus_of(campaign, pairs, scene), campaign.stage("refined_track", flight)
     if decisions[0].value == "on":
         stages = {pair: open_stage(campaign.stage("profile", flight, pair), "profile") for pair in names}

@@ -31,6 +31,7 @@ from apertura.core.quality.bright_points import BrightPoint, bright_point, brigh
 from apertura.core.quality.point_targets import BandLimitedPatch, carrier_at
 from apertura.stages.agreement import opened_layer
 from apertura.stages.pair import OpenPair, open_pair
+from apertura.stages.planning import gated
 from apertura.stages.radiometry import (
     FILE,
     LEAST_CONTRAST,
@@ -116,7 +117,7 @@ def measured_constants(campaign: Campaign) -> tuple[Constants, list[str]]:
     for flight in campaign.image_flights:
         track = open_refined(campaign, flight.name)
         for pair in flight.pairs:
-            opened = track.pair(open_pair(campaign, flight.name, pair))
+            opened = track.pair(gated(campaign, open_pair(campaign, flight.name, pair), scene))
             radars.setdefault(pair, Radar.of(campaign, opened))
             view, measured = _View.of(campaign, opened, scene), list[Measurement]()
             for reflector in stated:

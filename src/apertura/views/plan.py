@@ -10,7 +10,7 @@ from apertura.core.planning.plan import Plan
 from apertura.core.quality.budget import BudgetLine, expected
 from apertura.core.quality.path_errors import Effect
 from apertura.stages.pair import open_pair
-from apertura.stages.planning import budget_of, plan_pair
+from apertura.stages.planning import budget_of, gated, plan_pair
 from apertura.stages.refine import expected_track
 from apertura.stages.scene import Flown, expected_scene
 from apertura.workflow.stale import outdated_lines, without_outdated
@@ -42,7 +42,7 @@ def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
     for key, reason in scene.chosen.items():
         console.print(f"  scene.{key}: {reason}", highlight=False)
     for flight in campaign.image_flights:
-        logged = [open_pair(campaign, flight.name, pair) for pair in flight.pairs]
+        logged = [gated(campaign, open_pair(campaign, flight.name, pair), scene) for pair in flight.pairs]
         pairs, autofocus = expected_track(campaign, logged, scene)
         for opened in pairs:
             plan = plan_pair(campaign, opened, scene, threads=threads)

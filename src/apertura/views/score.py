@@ -20,6 +20,7 @@ from apertura.core.quality.point_targets import cut_through, find_peak
 from apertura.formats.export import product, product_files
 from apertura.formats.export.radiometry import CROSS_SECTIONS
 from apertura.stages.pair import open_pair
+from apertura.stages.planning import gated
 from apertura.stages.radiometry import calibrated_pair
 from apertura.stages.scene import open_scene, settled_scene
 from apertura.views.summary import print_summary
@@ -115,7 +116,7 @@ def _cross_sections(
     if not campaign.calibrated or pair == FUSED:
         return None
     scene, path = open_scene(campaign), campaign.result(flight, pair, CROSS_SECTIONS)
-    calibrated = calibrated_pair(campaign, open_pair(campaign, flight, pair), scene)
+    calibrated = calibrated_pair(campaign, gated(campaign, open_pair(campaign, flight, pair), scene), scene)
     noise = open_listed(path, campaign.root / campaign.manifest("layers", flight, pair))["noise"]["pulse"]
 
     def measure(point: BrightPoint, true_rcs_m2: float | None) -> dict[str, Any]:

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.aperture import Aperture, Weigh
+from apertura.core.geometry.gate import RangeGate
 from apertura.core.geometry.sector import Sector
 
 # ---- Antenna patterns: Gaussian or sampled cuts, and antenna axes
@@ -276,7 +277,7 @@ class Beam:
 
 @dataclass(frozen=True)
 class Beams:
-    """Weights of pulses: beams of transmitter and receiver, and the integration sector of each pixel.
+    """Weights of pulses: beams of transmitter and receiver, integration sector of each pixel, and recorded paths.
 
     Attributes
     ----------
@@ -284,6 +285,8 @@ class Beams:
         Beams at the pulses of an image; None: isotropic.
     sector
         Sector at the same pulses; None: all pulses are integrated.
+    gate
+        Gate of the recorded paths at the same pulses; None: all echoes are recorded.
 
     Examples
     --------
@@ -294,30 +297,45 @@ class Beams:
     transmit: Beam | None = None
     receive: Beam | None = None
     sector: Sector | None = None
+    gate: RangeGate | None = None
 
     def __getitem__(self, pulses: slice | NDArray[np.int64]) -> "Beams":
         """Return the beams over the selected pulses."""
         transmit, receive = (beam and beam[pulses] for beam in (self.transmit, self.receive))
-        return Beams(transmit, receive, self.sector and self.sector[pulses])
+        return Beams(transmit, receive, self.sector and self.sector[pulses], self.gate and self.gate[pulses])
 
     def check_pulses(self, pulses: int) -> None:
-        """Raise ValueError if the beams or the sector have a different number of pulses."""
+        """Raise ValueError if beams, sector or gate have a different number of pulses."""
         for beam in (self.transmit, self.receive):
             if beam is not None and len(beam.axes) != pulses:
                 raise ValueError(f"{len(beam.axes)=}: must equal the number of pulses, {pulses}")
         if self.sector is not None and len(self.sector.tx_axis) != pulses:
             raise ValueError(f"{len(self.sector.tx_axis)=}: must equal the number of pulses, {pulses}")
+        if self.gate is not None and len(self.gate.limit_m) != pulses:
+            raise ValueError(f"{len(self.gate.limit_m)=}: must equal the number of pulses, {pulses}")
 
     @property
     def antennas(self) -> "Beams | None":
-        """The beams without the sector; None if neither antenna has a beam."""
+        """The beams without sector and gate; None if neither antenna has a beam."""
         return Beams(self.transmit, self.receive) if self.transmit or self.receive else None
 
+    @property
+    def on_profiles(self) -> "Beams | None":
+        """The weights that multiply range profiles, which contain the gate; None if there are none."""
+        return Beams.within(self.sector, self.antennas)
+
+    def coverage(self, aperture: Aperture) -> Weigh | None:
+        """Return the weights by sector and gate as a function of pulses and points; None if all pulses contribute."""
+        if self.sector is None and self.gate is None:
+            return None
+        covered = Beams(sector=self.sector, gate=self.gate)
+        return lambda pulses, points_m: covered[pulses].weight(aperture[pulses], points_m)
+
     @classmethod
-    def within(cls, sector: Sector | None, antennas: "Beams | None") -> "Beams | None":
-        """Combine the beams of antennas with a sector; None if there are neither beams nor a sector."""
+    def within(cls, sector: Sector | None, antennas: "Beams | None", gate: RangeGate | None = None) -> "Beams | None":
+        """Combine the beams of antennas with a sector and a gate; None if all three are absent."""
         beams = antennas or cls()
-        return cls(beams.transmit, beams.receive, sector) if antennas or sector else None
+        return cls(beams.transmit, beams.receive, sector, gate) if antennas or sector or gate else None
 
     def phase(self, aperture: Aperture, pixels: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return the sum of the phases of both antennas towards each pixel, (pulse, pixel) rad; None: unknown."""
@@ -330,11 +348,13 @@ class Beams:
         return np.asarray(np.sum(known, axis=0)) if known else None
 
     def weight(self, aperture: Aperture, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the product of both gains and the weight of the sector, (pulse, pixel) float64; see `Beam.gain`."""
+        """Return the product of gains and the weights of sector and gate, (pulse, pixel) float64; see `Beam.gain`."""
         total = np.ones((len(aperture), len(pixels)))
         for beam, position_m in zip((self.transmit, self.receive), aperture.legs, strict=True):
             if beam is not None:
                 total *= beam.gain(position_m, pixels)
         if self.sector is not None:
             total *= self.sector.weight(aperture, pixels)
+        if self.gate is not None:
+            total *= self.gate.weight(aperture, pixels)
         return total

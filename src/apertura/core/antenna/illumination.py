@@ -123,8 +123,11 @@ def _block_mask(
         radius_m + np.maximum.reduceat(np.linalg.norm(position_m - middle_position_m[block], axis=1), starts)[:, None]
         for position_m, middle_position_m in zip(aperture.legs, middle.legs, strict=True)
     ]
-    # Exclude spheres outside the integration sector or either pattern; tolerances include the rotation within a block.
+    # Exclude spheres beyond the recorded paths, outside the integration sector, or outside either pattern; tolerances
+    # include the motion and the rotation within a block.
     mask = np.ones((len(starts), len(middle_m)), bool)
+    if beams.gate is not None:
+        mask &= middle.path(middle_m) - radius[0] - radius[1] < np.maximum.reduceat(beams.gate.limit_m, starts)[:, None]
     if beams.sector is not None:
         sector = beams.sector[middles]
         rotation = beams.sector.axis_change(sector[block])
@@ -161,6 +164,56 @@ def _in_pattern(
 
 def _angle(cosine: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+EXACT = (64, 8)
+"""Block sizes, in pulses, of the exact illumination test, from coarse to fine."""
+
+
+def any_illuminates(
+    beams: Beams,
+    aperture: Aperture,
+    points: NDArray[np.float64],
+    pulses: NDArray[np.int64],
+    sizes: tuple[int, ...] = EXACT,
+) -> NDArray[np.bool_]:
+    """Return a mask of the points (point, 3) at which any of the pulses has a weight.
+
+    One pulse of each block is evaluated first. Blocks that cannot illuminate a point are then excluded. This is
+    repeated with smaller blocks, so that all pulses are evaluated only near the edges of beams.
+    """
+    if not pulses.size or not len(points):
+        return np.zeros(len(points), bool)
+    sample = pulses[sizes[0] // 2 :: sizes[0]] if sizes else pulses
+    illuminated = (beams[sample].weight(aperture[sample], points) != 0).any(axis=0)
+    if not sizes or illuminated.all():
+        return np.asarray(illuminated)
+    dark = np.flatnonzero(~illuminated)
+    reaching = illumination_mask(beams[pulses], aperture[pulses], points[dark], np.zeros(dark.size), pulses=sizes[0])
+    for number in np.flatnonzero(reaching.any(axis=1)):
+        undecided = dark[reaching[number] & ~illuminated[dark]]
+        block = pulses[number * sizes[0] : (number + 1) * sizes[0]]
+        illuminated[undecided] = any_illuminates(beams, aperture, points[undecided], block, sizes[1:])
+    return np.asarray(illuminated)
+
+
+_POINTS_AT_ONCE = 4096
+
+
+def recorded_mask(beams: Beams, aperture: Aperture, pixels: NDArray[np.float64]) -> NDArray[np.bool_] | None:
+    """Return a mask of the pixels (y, x, 3) with the weight of any pulse; None if the gate cuts no pulse.
+
+    Around the end of a gate, the interpolation of range profiles yields a small value at pixels without a weight.
+    """
+    if beams.gate is None:
+        return None
+    points, pulses = pixels.reshape(-1, 3), np.arange(len(aperture))
+    middle_m = points[len(points) // 2]
+    radius_m = float(np.linalg.norm(points - middle_m, axis=1).max())
+    if (aperture.path(middle_m[None])[:, 0] + 2 * radius_m < beams.gate.limit_m).all():
+        return None
+    parts = [points[first : first + _POINTS_AT_ONCE] for first in range(0, len(points), _POINTS_AT_ONCE)]
+    return np.concatenate([any_illuminates(beams, aperture, part, pulses) for part in parts]).reshape(pixels.shape[:2])
 
 
 def decide_antennas(

@@ -62,8 +62,8 @@ def band_limited_terms(
     independent of all engines. If the compiled library is not available, numpy is used.
     """
     terms = (_compiled_terms if available() else _terms)(profiles, np.ascontiguousarray(pixels, np.float64))
-    if beams is not None:
-        terms *= beams.weight(profiles.aperture, pixels)
+    if weights := beams and beams.on_profiles:
+        terms *= weights.weight(profiles.aperture, pixels)
     return terms
 
 
@@ -489,7 +489,7 @@ def _derivatives(
     beams: Beams | None,
 ) -> NDArray[np.float64]:
     """Return (7, pulse) derivatives with respect to transmitter, receiver and path."""
-    echoes = Echoes.read(profiles, [part])
+    echoes, beams = Echoes.read(profiles, [part]), beams and beams.on_profiles
     derivatives = np.zeros((7, len(echoes)))
     add = _differentiate_compiled if available() else _differentiate
     for tile in [slice(None)] if beams is None else tiles(len(places_m), len(echoes)):

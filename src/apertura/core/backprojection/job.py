@@ -102,13 +102,11 @@ class Job:
         Side of a tile, pixels; and number of tiles formed concurrently.
     terrain
         Terrain of the scene, with simplified models.
-    path_limit_m
-        Longest total path within the cyclic prefix.
     memory_bytes
         Memory limit of the imaging step.
     beams, illumination
-        Weights of all pulses from antenna beams and the integrated sector; and illumination by the beams. None without
-        beams and sector.
+        Weights of all pulses from antenna beams, the integrated sector and the recorded paths; and illumination by
+        beams and sector. None without them.
     integration
         Integrated part of the flight; None for the whole flight.
     recorded
@@ -133,7 +131,6 @@ class Job:
     tile_px: int = 256
     threads: int = 1
     terrain: GroundModels = field(default_factory=GroundModels.flat)
-    path_limit_m: float = np.inf
     memory_bytes: float = np.inf
     beams: Beams | None = None
     illumination: Illumination | None = None

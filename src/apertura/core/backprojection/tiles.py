@@ -19,11 +19,13 @@ from apertura.common.errors import CampaignError
 from apertura.common.progress import progress
 from apertura.common.provenance import code_sha256
 from apertura.core.antenna.beam import Beams
+from apertura.core.antenna.illumination import recorded_mask
 from apertura.core.backprojection.engines import ENGINES, load_engine
 from apertura.core.backprojection.engines.engine import Setting
 from apertura.core.backprojection.inputs import PhaseHistory, Profiles
 from apertura.core.backprojection.presum import Presum, presummed
 from apertura.core.backprojection.reach import Reach, pulse_blocks_of
+from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain
 
@@ -237,7 +239,8 @@ def _graph(forming: _Forming, inputs: PhaseHistory | Profiles, places: Collectio
     name, presum, beams = forming.name, forming.weighing.presum, forming.weighing.beams
     count = np.float32(forming.weighing.count or len(inputs))
     pulses = len(inputs) if presum is None else len(presum[0].at)
-    graph: dict[Any, Any] = {f"{name}-inputs": inputs, f"{name}-beams": beams}
+    common = {"inputs": inputs, "beams": beams, "aperture": inputs.aperture if beams and beams.gate else None}
+    graph: dict[Any, Any] = {f"{name}-{key}": value for key, value in common.items()}
     sums: dict[tuple[int, int], Any] = {}  # tile → key of its sum over the blocks so far
     before: list[Any] = []  # tasks to finish before the tables of the next block are prepared
     for number, pulse_block in enumerate(
@@ -256,7 +259,7 @@ def _graph(forming: _Forming, inputs: PhaseHistory | Profiles, places: Collectio
         for place, covered in covering.items():
             part = slice(covered.start - first, covered.stop - first)
             form, key = partial(_form, forming, place, block, part, count), (f"{name}-{number}", *place)
-            graph[key] = (form, tables, f"{name}-beams", sums.get(place))
+            graph[key] = (form, tables, f"{name}-beams", f"{name}-aperture", sums.get(place))
             graph[f"{name}-done-{number}", *place] = (_nothing, key)
             before.append((f"{name}-done-{number}", *place))
             sums[place] = key
@@ -293,19 +296,23 @@ def _form(  # noqa: PLR0917
     count: np.float32,
     tables: Any,
     beams: Beams | None,
+    aperture: Aperture | None,
     sum_before: NDArray[np.complex64] | None,
 ) -> NDArray[np.complex64]:
     """Return a tile of the image of a pulse block, added to the sum over the previous blocks."""
     setting, grid = forming.setting, forming.grid[forming.window(place)]
     if part != slice(0, block.stop - block.start):
         tables = tables[part]
-    part_beams = beams and beams[block.start + part.start : block.start + part.stop]
+    pulses = slice(block.start + part.start, block.start + part.stop)
+    part_beams = beams and beams[pulses]
     engine, pixels = load_engine(setting.engine), forming.terrain.positions(grid)
     variants: tuple[str, ...] = getattr(engine, "VARIANTS", ())
     counts = {"counts": np.zeros(len(variants), np.int64)} if variants else {}
     image = engine.form(tables, pixels, beams=part_beams, **setting.form_options, **counts)
     forming.weighing.variant_counts.update({name: int(counts["counts"][n]) for n, name in enumerate(variants)})
     tile = np.asarray(image / count, np.complex64)
+    if part_beams and aperture and (recorded := recorded_mask(part_beams, aperture[pulses], pixels)) is not None:
+        tile[~recorded] = 0
     return tile if sum_before is None else sum_before + tile
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.units import decibels
-from apertura.core.geometry.aperture import Aperture, Weigh, distance
+from apertura.core.geometry.aperture import Aperture, distance
 
 TAPER = 0.1
 """Half width of an edge relative to the half width of the sector: the weight decreases from 1 to 0 between (1 - TAPER)
@@ -178,10 +178,6 @@ class Sector:
     def weight(self, aperture: Aperture, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the weight of each pulse at each point, 0 to 1; parameters and shape of the result as for `place`."""
         return edge((self.outer - np.abs(self.place(aperture, points_m))) / (self.outer - self.inner))
-
-    def over(self, aperture: Aperture) -> Weigh:
-        """Return a function that computes the weights of a slice of pulses at points."""
-        return lambda pulses, points_m: self[pulses].weight(aperture[pulses], points_m)
 
     def slack(
         self, aperture: Aperture, points_m: NDArray[np.float64], radius_m: NDArray[np.float64]

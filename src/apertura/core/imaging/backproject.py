@@ -420,5 +420,6 @@ def _job(
     else:
         known = (inputs.aperture, inputs.frequency_hz, inputs.weight)
         job = imaging_job(*known, grid, ground, wave_speed_m_s=inputs.wave_speed_m_s, **weighed)
-    illumination = None if job.beams is None else illuminate(job.beams, job.aperture, job.points_m)
+    applied = job.beams and job.beams.on_profiles
+    illumination = None if applied is None else illuminate(applied, job.aperture, job.points_m)
     return replace(job, illumination=illumination, memory_bytes=memory_limit())

@@ -368,13 +368,12 @@ def resolution_cell_m(formation: Formation) -> float:
     pixels = grid.sample_pixels(_CELL_POINTS)
     band = profiles.centre_frequency_hz - half, profiles.centre_frequency_hz + half
     return profiles.aperture.resolution_cell_m(
-        formation.positions_at(*pixels), band_hz=band, weigh=_sector_of(formation)
+        formation.positions_at(*pixels), band_hz=band, weigh=_coverage_of(formation)
     )
 
 
-def _sector_of(formation: Formation) -> Weigh | None:
-    sector = None if formation.beams is None else formation.beams.sector
-    return None if sector is None else sector.over(formation.profiles.aperture)
+def _coverage_of(formation: Formation) -> Weigh | None:
+    return None if formation.beams is None else formation.beams.coverage(formation.profiles.aperture)
 
 
 def _response(formation: Formation) -> PointResponse:
@@ -416,7 +415,7 @@ def _spectrum(formation: Formation) -> NDArray[np.float64]:
     middle_m, axes = ground_axes(formation, row, column)
     half = profiles.bandwidth_hz / 2
     band = profiles.centre_frequency_hz + half * np.linspace(-1, 1, _BAND_SAMPLES) * _WINDOWED
-    return profiles.aperture.spectrum(middle_m, axes, frequency_hz=band, weigh=_sector_of(formation))
+    return profiles.aperture.spectrum(middle_m, axes, frequency_hz=band, weigh=_coverage_of(formation))
 
 
 def focus_report(formation: Formation, target: Any) -> dict[str, Any]:

@@ -221,7 +221,7 @@ def imaging_job(
     grid, ground
         The scene: its pixels, its terrain and simpler terrain models.
     beams
-        Antenna beams; None: isotropic.
+        Antenna beams and gate; None: isotropic, all echoes recorded.
     integration
         As `requested` of `apertura.core.planning.decisions.integrate`.
     wave_speed_m_s
@@ -230,13 +230,13 @@ def imaging_job(
     Returns
     -------
     Job
-        Job without limits of path and memory, and with default numbers of tile pixels and threads. The caller sets
-        these values.
+        Job without a memory limit, and with default numbers of tile pixels and threads. The caller sets these values.
     """
     centre, count = centre_frequency(frequency_hz), len(frequency_hz)
     ground_m = grid.sample_points(_POINTS, ground.level.height_m)
-    decided = decide_integration(aperture, centre, grid, ground.level, antennas=beams, requested=integration)
-    beams = Beams.within(decided.sector, beams)
+    antennas, gate = (beams.antennas, beams.gate) if beams else (None, None)
+    decided = decide_integration(aperture, centre, grid, ground.level, antennas=antennas, requested=integration)
+    beams = Beams.within(decided.sector, antennas, gate)
     window = RangeWindow.of(aperture, grid, ground.full, frequency_hz, beams=beams, wave_speed_m_s=wave_speed_m_s)
     return Job(
         aperture=aperture,
@@ -269,7 +269,10 @@ def profiles_job(
     """
     centre, samples = profiles.centre_frequency_hz, profiles.samples.shape[1]
     ground_m = grid.sample_points(_POINTS, ground.level.height_m)
-    decided = decide_integration(profiles.aperture, centre, grid, ground.level, antennas=beams, requested=integration)
+    antennas, gate = (beams.antennas, beams.gate) if beams else (None, None)
+    decided = decide_integration(
+        profiles.aperture, centre, grid, ground.level, antennas=antennas, requested=integration
+    )
     return Job(
         aperture=profiles.aperture,
         ground_m=ground_m,
@@ -282,7 +285,7 @@ def profiles_job(
         frame=grid.frame,
         terrain=ground,
         patches_on=partial(_patches, grid),
-        beams=Beams.within(decided.sector, beams),
+        beams=Beams.within(decided.sector, antennas, gate),
         integration=decided,
         recorded=False,
     )

@@ -97,9 +97,13 @@ def noise_power(
         tapers = _tapers(tuple(number.tolist()), round(float(np.clip(_MARGIN * spread, *_BAND)), 2))
         sparse |= _MARGIN * spread > _BAND[1]
         terms, _ = Echoes.read(profiles, [block]).at(places_m)
-        beam_weight = np.ones(terms.shape) if beams is None else beams[block].weight(aperture, places_m)
-        power.extend(np.abs(tapers @ (beam_weight * terms)) ** 2)
-        weight.extend(tapers**2 @ beam_weight**2)
+        # The profiles contain the gate; the other weights multiply them.
+        gated = np.ones(terms.shape) if beams is None else beams[block].weight(aperture, places_m)
+        applied = beams[block].on_profiles if beams else None
+        if applied is not None:
+            terms = terms * applied.weight(aperture, places_m)
+        power.extend(np.abs(tapers @ terms) ** 2)
+        weight.extend(tapers**2 @ gated**2)
     powers, weights = np.array(power), np.array(weight)
     enough = weights > _LEAST_WEIGHT * weights.max()
     if not enough.any():

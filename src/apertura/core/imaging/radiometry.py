@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -15,6 +16,7 @@ from apertura.core.antenna.beam import Beams
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.looks import Lattice, fill, pitch_px, pulses_of
+from apertura.core.scene.recorded import RecordedShares
 from apertura.core.scene.terrain import FlatGround, Terrain
 
 Quantity = Literal["sigma0", "beta0", "gamma0"]
@@ -195,7 +197,8 @@ class Calibration:
     grid, terrain
         The scene.
     aperture, beams
-        Phase centres of all pulses, and weights of the pulses in image formation (antennas and sector).
+        Phase centres of all pulses, and weights of the pulses in image formation (antennas, sector and gate). The
+        lattice contains the weights of antennas and sector; values at pixels are multiplied by the recorded fractions.
     count
         M, by which the sum over pulses is divided.
     constant
@@ -283,7 +286,7 @@ class Calibration:
             np.zeros((*lattice.shape, 3, 3)),
             np.ones(lattice.shape),
         )
-        fill(lattice, calibration._fill, grid, terrain, aperture, beams, threads=threads)
+        fill(lattice, calibration._fill, grid, terrain, aperture, beams and beams.on_profiles, threads=threads)
         return calibration
 
     def _fill(self, block: Window, reaching: NDArray[np.bool_]) -> None:
@@ -297,7 +300,8 @@ class Calibration:
         every = max(1, (reached.stop - reached.start) // _PULSES)
         sampled, share = slice(reached.start, reached.stop, every), every / self.count
         gradient = self.aperture[sampled].path_gradient(points)
-        parts, weight = point_weights(self.aperture[sampled], self.beams and self.beams[sampled], points)
+        applied = self.beams and self.beams[sampled].on_profiles
+        parts, weight = point_weights(self.aperture[sampled], applied, points)
         amplitude = parts.sum(axis=0) * share
         slant, towards = _directions(gradient, parts, up)
         level = _spread(gradient.swapaxes(0, 1), parts.T, up)
@@ -334,15 +338,22 @@ class Calibration:
 
     def rcs_power(self, window: Window) -> Floats:
         """Return the power |I|² of a point of 1 m² at each pixel of a window, K·A²; NaN at pixels not illuminated."""
-        return self.constant * self._between(self.gain, window)
+        power, shares = self.constant * self._between(self.gain, window), self._recorded.at(window)
+        return power if shares is None else power * _or_nan(shares[0]) ** 2
 
     def cell(self, window: Window) -> Floats:
         """Return the area of a resolution cell on level ground, m², at each pixel of a window."""
-        return self._between(self.area_m2, window)
+        area_m2, shares = self._between(self.area_m2, window), self._recorded.at(window)
+        return area_m2 if shares is None else area_m2 * shares[1] / _or_nan(shares[0]) ** 2
 
     def pixel_noise(self, window: Window) -> Floats:
         """Return the noise power at each pixel of a window relative to that of a pulse, Σw²/M²."""
-        return self._between(self.noise, window)
+        noise, shares = self._between(self.noise, window), self._recorded.at(window)
+        return noise if shares is None else noise * _or_nan(shares[1])
+
+    @cached_property
+    def _recorded(self) -> RecordedShares:
+        return RecordedShares(self.grid, self.terrain, self.aperture, self.beams)
 
     def power(self, window: Window, quantity: Quantity, normal: Floats | None = None) -> Floats:
         """Return the mean power |I|² of terrain whose σ⁰, β⁰ or γ⁰ is 1, at each pixel of a window.
@@ -395,9 +406,9 @@ def point_weights(aperture: Aperture, beams: Beams | None, points: Floats) -> tu
     [[[0.01]], [[1.0]]]
     """
     tx_range_m, rx_range_m = (np.linalg.norm(points - leg[:, None], axis=-1) for leg in aperture.legs)
-    antennas, sector = beams and beams.antennas, beams and beams.sector
+    antennas, coverage = (beams.antennas, beams.coverage(aperture)) if beams else (None, None)
     field = np.ones(tx_range_m.shape) if antennas is None else antennas.weight(aperture, points)
-    weight = field if sector is None else field * sector.weight(aperture, points)
+    weight = field if coverage is None else field * coverage(slice(None), points)
     return weight * field / (tx_range_m * rx_range_m), weight
 
 
@@ -430,6 +441,11 @@ def point_parts(
     pulses, share = aperture[sampled], sampled.step / count
     parts, weight = point_weights(pulses, beams and beams[sampled], points)
     return pulses, parts * share, (weight**2).sum(axis=0) * share / count
+
+
+def _or_nan(share: Floats) -> Floats:
+    """Return shares with NaN where nothing is recorded."""
+    return np.where(share > 0, share, np.nan)
 
 
 def _directions(gradient: Floats, parts: Floats, up: Floats) -> tuple[Floats, Floats]:

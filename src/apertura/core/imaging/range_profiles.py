@@ -1,6 +1,6 @@
 """Range profiles of a scene: range window of each pulse, range compression, and conversion of datasets to arrays."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -13,6 +13,7 @@ from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.inputs import PhaseHistory, Profiles
 from apertura.core.echo.compression import centre_frequency, compress, range_step, window_weights
 from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.gate import RangeGate
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.swath import swath
 from apertura.core.scene.terrain import Terrain, ground_of
@@ -45,6 +46,8 @@ class RangeWindow:
         pixel.
     wave_speed_m_s
         Wave speed with which delays are converted to paths.
+    gate
+        Gate of the recorded paths, which profiles contain; None: all echoes are recorded.
     """
 
     start_m: NDArray[np.float64]
@@ -53,6 +56,7 @@ class RangeWindow:
     unambiguous: int
     farthest_m: NDArray[np.float64]
     wave_speed_m_s: float
+    gate: RangeGate | None = None
 
     @property
     def contributing(self) -> NDArray[np.bool_]:
@@ -99,7 +103,13 @@ class RangeWindow:
         spans = farthest - nearest
         samples = int(np.ceil(spans.max(initial=0.0, where=np.isfinite(spans)) / step)) + 2 * GUARD_SAMPLES + 1
         nearest = np.where(np.isfinite(nearest), nearest, 0.0)
-        return cls(nearest - GUARD_SAMPLES * step, samples, step, length, farthest, wave_speed_m_s)
+        gate = None if beams is None else beams.gate
+        return cls(nearest - GUARD_SAMPLES * step, samples, step, length, farthest, wave_speed_m_s, gate)
+
+    def part(self, pulses: slice) -> "RangeWindow":
+        """Return the window of a slice of pulses."""
+        gate = self.gate and self.gate[pulses]
+        return replace(self, start_m=self.start_m[pulses], farthest_m=self.farthest_m[pulses], gate=gate)
 
 
 def range_compress(
@@ -119,7 +129,7 @@ def range_compress(
     Returns
     -------
     Profiles
-        Oversampled by 2, with 32 guard samples on both sides of the swath.
+        Oversampled by 2, with 32 guard samples on both sides of the swath; multiplied by the gate of the window.
 
     Raises
     ------
@@ -170,6 +180,10 @@ def range_compress(
         oversampling=OVERSAMPLING,
         wave_speed_m_s=speed,
     )
+    if window.gate is not None:
+        samples *= window.gate.at(window.start_m[:, None] + window.step_m * np.arange(window.samples)).astype(
+            np.float32
+        )
     return Profiles(
         samples,
         window.start_m,
@@ -214,7 +228,7 @@ class CompressionError:
     def __init__(self, generator: np.random.Generator):
         self._generator, self._error_power, self._power = generator, 0.0, 0.0
 
-    def add(self, history: PhaseHistory, profiles: Profiles) -> None:
+    def add(self, history: PhaseHistory, profiles: Profiles, gate: RangeGate | None = None) -> None:
         """Compare random samples of random pulses of profiles with the exact sum over the transfer functions."""
         for pulse in self._generator.integers(len(history), size=self._PULSES):
             sample_indices = self._generator.integers(profiles.samples.shape[1], size=self._SAMPLES)
@@ -222,6 +236,8 @@ class CompressionError:
             delay_s = path_m / history.wave_speed_m_s - history.reference_delay_s[pulse]
             cycles = history.frequency_hz[:, None] * delay_s
             exact = (history.weight * history.transfer[pulse]) @ np.exp(2j * np.pi * (cycles % 1.0))
+            if gate is not None:
+                exact = exact * gate[pulse : pulse + 1].at(path_m[None])[0]
             carrier = np.exp(1j * np.remainder(profiles.wavenumber_rad_m * path_m, 2 * np.pi))
             self._error_power += float((np.abs(profiles.samples[pulse, sample_indices] * carrier - exact) ** 2).sum())
             self._power += float((np.abs(exact) ** 2).sum())

@@ -164,7 +164,9 @@ MOST_ASPECT = 1.5
 """Ratio of the aspect angle of a point to the integration angle, above which the flag `track_turns` is raised."""
 
 _PULSES = 256  # pulses sampled for the geometry
-_FEWEST = 3  # least number of pulses required at any one pixel: focus cannot be assessed from two pulses
+FEWEST = 3
+"""Least number of pulses required at any one pixel: focus cannot be assessed from two pulses."""
+
 _COUNTED = 16384  # pulses sampled to count the pulses per pixel
 
 
@@ -282,12 +284,12 @@ def _integration_of(
     """Return the integration over a sector, with its pulses per pixel, resolution and flags."""
     points = points_m.reshape(-1, 3)
     total, counts = _pulses_per_place(sector, aperture, points)
-    if counts.max() < _FEWEST:
+    if counts.max() < FEWEST:
         pulses = "no pulses" if not counts.any() else f"at most {counts.max():.0f} pulses"
         raise CampaignError(
             f"{pulses} illuminate a pixel inside the integration angle (s = {sector.centre:.3g} ± {sector.half:.3g})",
             where=f"{where}.integration",
-            expected=f"at least {_FEWEST} pulses: a flight past the scene, and antennas directed at it",
+            expected=f"at least {FEWEST} pulses: a flight past the scene, and antennas directed at it",
             remedy="Set processing.integration to all or to a larger angle, or correct scene.bounds_m.",
         )
     # Report: angle, response with tapered edges, squint over the scene, and pulses per pixel.

@@ -38,7 +38,7 @@ def check_geometry(job: Job) -> dict[str, str]:
     Raises
     ------
     CampaignError
-        If there is no pulse, a position is not finite, or all echoes of the scene arrive after the cyclic prefix.
+        If there is no pulse, or a position is not finite.
     """
     aperture, ground_m = job.aperture, job.ground_m
     check_positions(aperture)
@@ -52,7 +52,7 @@ def check_geometry(job: Job) -> dict[str, str]:
             f"{int(over.sum())} of {len(aperture)} pulses are transmitted or received above the scene, which causes a "
             "left-right ambiguity"
         )
-    weigh = None if job.sector is None else job.sector.over(aperture)
+    weigh = None if job.beams is None else job.beams.coverage(aperture)
     cell_m = aperture.resolution_cell_m(ground_m, band_hz=job.band_hz, weigh=weigh)
     if job.spacing_m > WIDEST_PIXEL * cell_m:
         flags["spacing_coarse"] = (
@@ -62,12 +62,6 @@ def check_geometry(job: Job) -> dict[str, str]:
         flags["no_aperture"] = missing
     if sparse := undersampling(job):
         flags["azimuth_undersampled"] = sparse
-    beyond = _share_beyond(aperture, job.points_m, job.path_limit_m)
-    if beyond:
-        flags["beyond_cyclic_prefix"] = (
-            f"echoes from {100 * beyond:.0f} % of the scene arrive after the cyclic prefix, or after listen_s, in all "
-            "captures"
-        )
     return flags
 
 
@@ -167,23 +161,6 @@ def _over(
         along = (position_m - corner) @ side / np.linalg.norm(side)
         over &= np.abs(along - length / 2) <= (length + spacing_m) / 2
     return over
-
-
-def _share_beyond(aperture: Aperture, points_m: NDArray[np.float64], path_limit_m: float) -> float:
-    if not np.isfinite(path_limit_m):
-        return 0.0
-    shortest = aperture[aperture.sample(256)].path(points_m).min(axis=0)
-    beyond = shortest > path_limit_m
-    if beyond.all():
-        raise CampaignError(
-            f"no echo of the scene is received: the shortest total path is {shortest.min():.1f} m, and the scene is at "
-            f"least {shortest.min() / 2000:.3g} km from the tracks",
-            where="scene.bounds_m",
-            expected=f"a total path of at most {path_limit_m:.1f} m, the length of the cyclic prefix",
-            remedy="Correct scene.bounds_m (easting before northing), scene.crs, the positions of the tracks, or the "
-            "terrain height (scene.height_m, or unit and datum of scene.dem); or use a longer prefix.",
-        )
-    return float(beyond.mean())
 
 
 def vertical(ground_m: NDArray[np.float64]) -> NDArray[np.float64]:

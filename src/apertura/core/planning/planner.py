@@ -273,7 +273,8 @@ def _decide_presum(
     if job.beams is not None:
         if requested is not None:
             raise _no_presum(requested, search.where)
-        return keep(f"the weights of the {'antennas' if job.antennas else 'sector'} differ from pulse to pulse")
+        weights = "antennas" if job.antennas else "sector" if job.sector else "recorded paths"
+        return keep(f"the weights of the {weights} differ from pulse to pulse")
     if every_pulse.engine == "reference":
         return keep("the exact sum is computed over all pulses")
     limit_db = accuracy_db - MARGIN_DB - _PRESUM_DB
@@ -302,10 +303,11 @@ def _decide_presum(
 
 def _no_presum(requested: int, where: str) -> CampaignError:
     return CampaignError(
-        f"presum factor {requested} with antenna beams or a limited integration angle",
+        f"presum factor {requested} with antenna beams, a limited integration angle or a partly recorded scene",
         where=f"{where}.presum",
-        expected="1 or auto, because the weights of antennas and sector differ from pulse to pulse",
-        remedy="Set presum to auto, or set the nodes' antennas to null and processing.integration to all.",
+        expected="1 or auto, because the weights of antennas, sector and recorded paths differ from pulse to pulse",
+        remedy="Set presum to auto, or set the nodes' antennas to null and processing.integration to all, and make the "
+        "scene smaller.",
     )
 
 

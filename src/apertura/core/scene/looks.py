@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Floats
 from apertura.common.contracts import Window
 from apertura.core.antenna.beam import Beams
-from apertura.core.antenna.illumination import illumination_mask
+from apertura.core.antenna.illumination import EXACT, any_illuminates, illumination_mask
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.angles import bistatic_angle_deg, incidence_deg, surface
 from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.recorded import RecordedShares
 from apertura.core.scene.swath import balls
 from apertura.core.scene.terrain import FlatGround, Terrain
 
@@ -195,7 +196,6 @@ _PULSES = 256  # least number of pulses summed for a block of the lattice; the l
 # least median number of pulses with weight at a node, below which more pulses are summed; and limit of their number
 _FEWEST, _MOST = 48, 2048
 AT_ONCE = 64  # block size in pulses of the illumination test
-_EXACT = (AT_ONCE, 8)  # block sizes in pulses of the exact illumination test, from coarse to fine
 _CELL_PX = 8  # side of the cells that are first tested as a whole, pixels
 _PIXELS = 4096  # number of pixels tested together
 # number of pulses evaluated for the centres of a block without illumination, used for interpolation in adjacent blocks
@@ -220,7 +220,9 @@ class Looks:
     lattice
         Nodes at which the following values are computed.
     total, squares
-        (node row, node column) float32, Σ|w| and Σw² over the pulses.
+        (node row, node column) float32, Σ|w| and Σw² over the pulses, with the weights of antennas and sector.
+    lit
+        (node row, node column) bool, True where any sampled pulse has a weight, including that of the gate.
     centres
         (node row, node column, 2, 3) float64, metres: transmitter and receiver at the closest approach.
     pulses
@@ -239,6 +241,7 @@ class Looks:
     lattice: Lattice
     total: NDArray[np.float32]
     squares: NDArray[np.float32]
+    lit: NDArray[np.bool_]
     centres: Floats
     pulses: NDArray[np.int32]
     _masks: dict[tuple[int, int], NDArray[np.uint8] | bool] = field(default_factory=dict)
@@ -275,10 +278,11 @@ class Looks:
             lattice,
             np.zeros(lattice.shape, np.float32),
             np.zeros(lattice.shape, np.float32),
+            np.zeros(lattice.shape, bool),
             np.zeros((*lattice.shape, 2, 3)),
             np.zeros((*lattice.shape, SPREAD), np.int32),
         )
-        fill(lattice, looks._fill, grid, terrain, aperture, beams, threads=threads)
+        fill(lattice, looks._fill, grid, terrain, aperture, beams and beams.on_profiles, threads=threads)
         return looks
 
     def _fill(self, block: Window, reaching: NDArray[np.bool_]) -> None:
@@ -290,7 +294,8 @@ class Looks:
         while True:
             sample = slice(pulses.start, pulses.stop, every)
             aperture, beams = self.aperture[sample], self.beams and self.beams[sample]
-            weight = np.ones((len(aperture), len(points))) if beams is None else beams.weight(aperture, points)
+            applied = beams and beams.on_profiles
+            weight = np.ones((len(aperture), len(points))) if applied is None else applied.weight(aperture, points)
             n_weighted = (weight != 0).sum(axis=0)
             median = int(np.median(n_weighted[n_weighted > 0])) if n_weighted.any() else _FEWEST
             if every == 1 or median >= _FEWEST or len(aperture) >= _MOST:
@@ -299,6 +304,9 @@ class Looks:
         shape, pulses_each = (len(rows), len(columns)), (pulses.stop - pulses.start) / len(aperture)
         self.total[block] = (np.abs(weight).sum(axis=0) * pulses_each).reshape(shape)
         self.squares[block] = ((weight**2).sum(axis=0) * pulses_each).reshape(shape)
+        if beams and beams.gate:
+            weight *= beams.gate.weight(aperture, points)
+        self.lit[block] = (weight != 0).any(axis=0).reshape(shape)
         self.centres[block] = _centres(aperture, beams, points, weight).reshape(*shape, 2, 3)
         self.pulses[block] = (pulses.start + every * _spread(weight)).reshape(*shape, SPREAD)
 
@@ -315,7 +323,7 @@ class Looks:
             return np.ones(shape, bool)
         key = (tile[0].start, tile[1].start)
         if key not in self._masks:
-            mask = self.lattice.inside_positive(self.total, tile)
+            mask = self.lattice.inside_positive(self.lit, tile)
             self._fill_mask(mask, tile)
             self._masks[key] = bool(mask[0, 0]) if (mask == mask[0, 0]).all() else np.packbits(mask)
         cached = self._masks[key]
@@ -334,7 +342,7 @@ class Looks:
         middle_m, radius_m = balls(part, self.terrain, cells)
         # Exclude combinations of cells and pulse blocks without illumination, with successively smaller pulse blocks.
         reached, pulses = np.arange(len(cells)), np.arange(len(self.aperture))
-        for size in _EXACT:
+        for size in EXACT:
             reaching = illumination_mask(
                 self.beams[pulses], self.aperture[pulses], middle_m[reached], radius_m[reached], pulses=size
             )
@@ -347,10 +355,13 @@ class Looks:
         points = self.terrain.positions_at(part, rows, columns)
         for first in range(0, len(rows), _PIXELS):
             pixels = slice(first, first + _PIXELS)
-            mask[rows[pixels], columns[pixels]] = _any(self.beams, self.aperture, points[pixels], pulses)
+            mask[rows[pixels], columns[pixels]] = any_illuminates(self.beams, self.aperture, points[pixels], pulses)
 
     def _sums(self, tile: Window) -> list[NDArray[np.float32]]:
-        """Interpolate Σ|w| and Σw² at the pixels of a tile between nodes with pulses; 0 if no node has pulses."""
+        """Interpolate Σ|w| and Σw² at the pixels of a tile between nodes with pulses; 0 if no node has pulses.
+
+        The weights are those of antennas and sector, without the gate.
+        """
         sums = [self.lattice.between(values, tile) for values in (self.total, self.squares)]
         lit = self.total[self.lattice.around(tile)] > 0
         if not lit.all():
@@ -370,6 +381,8 @@ class Looks:
         else:
             total, squares = self._sums(tile)
             looks = total**2 / np.where(squares > 0, squares, np.float32(np.inf))
+        if shares := self._recorded.at(tile):
+            looks = (looks * shares[0] ** 2 / np.where(shares[1] > 0, shares[1], np.inf)).astype(np.float32)
         looks = np.maximum(np.float32(1), looks, out=looks)
         lit = self.illuminated(tile)
         return looks if lit.all() else np.where(lit, looks, np.float32(0))
@@ -393,7 +406,12 @@ class Looks:
 
     def weight_squares(self, window: Window) -> Floats:
         """Return Σw² at the pixels of a window, (row, column) float64; 0 where no surrounding node has pulses."""
-        return self._sums(window)[1].astype(np.float64)
+        squares, shares = self._sums(window)[1].astype(np.float64), self._recorded.at(window)
+        return squares if shares is None else squares * shares[1]
+
+    @cached_property
+    def _recorded(self) -> RecordedShares:
+        return RecordedShares(self.grid, self.terrain, self.aperture, self.beams)
 
     def centre(self, tile: Window) -> tuple[Floats, Floats]:
         """Return both antenna positions (m) at the closest approach to each pixel, (row, column, 3) float64 each."""
@@ -461,29 +479,6 @@ def pitch_px(grid: SceneGrid, terrain: Terrain, aperture: Aperture, *, share: fl
     nearest_m = min(float(np.linalg.norm(leg - middle, axis=-1).min()) for leg in sample.legs)
     widest_px = nearest_m / share / grid.spacing_m
     return next((pitch for pitch in PITCHES_PX if pitch <= widest_px), PITCHES_PX[-1])
-
-
-def _any(
-    beams: Beams, aperture: Aperture, points: Floats, pulses: NDArray[np.int64], sizes: tuple[int, ...] = _EXACT
-) -> NDArray[np.bool_]:
-    """Return a mask of the points (point, 3) at which any of the pulses has a weight.
-
-    One pulse of each block is evaluated first. Blocks that cannot illuminate a point are then excluded. This is
-    repeated with smaller blocks, so that all pulses are evaluated only near the edges of beams.
-    """
-    if not pulses.size or not len(points):
-        return np.zeros(len(points), bool)
-    sample = pulses[sizes[0] // 2 :: sizes[0]] if sizes else pulses
-    illuminated = (beams[sample].weight(aperture[sample], points) != 0).any(axis=0)
-    if not sizes or illuminated.all():
-        return np.asarray(illuminated)
-    dark = np.flatnonzero(~illuminated)
-    reaching = illumination_mask(beams[pulses], aperture[pulses], points[dark], np.zeros(dark.size), pulses=sizes[0])
-    for number in np.flatnonzero(reaching.any(axis=1)):
-        undecided = dark[reaching[number] & ~illuminated[dark]]
-        block = pulses[number * sizes[0] : (number + 1) * sizes[0]]
-        illuminated[undecided] = _any(beams, aperture, points[undecided], block, sizes[1:])
-    return np.asarray(illuminated)
 
 
 def _centres(aperture: Aperture, beams: Beams | None, points: Floats, weight: Floats) -> Floats:

@@ -116,7 +116,8 @@ class Blocks:
         Source: docs/theory/autofocus.md, eq. 9: within a patch, path differences between the pulses of a block are
         approximated by those at the patch centre.
         """
-        profiles, beams, edges = self.record.profiles, self.record.beams, self.edges
+        profiles, edges = self.record.profiles, self.edges
+        beams = self.record.beams and self.record.beams.on_profiles
         starts = [self._offsets(patch) for patch in patches]
         sums = [np.zeros((len(offsets), len(edges) - 1), np.complex64) for offsets in starts]
         first = 0

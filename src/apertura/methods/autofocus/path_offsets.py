@@ -190,7 +190,7 @@ def _contributions(
         inside = edges[block_slice.start : block_slice.stop + 1] - pulses.start
         part = record.profiles[pulses]
         part = replace(part, samples=np.asarray(part.samples))
-        beams = None if record.beams is None else record.beams[pulses]
+        beams = record.beams and record.beams[pulses].on_profiles
         for patch, target in zip(patches, cached, strict=True):
             weights = None if beams is None else beams.weight(part.aperture, patch.place_m[None])[:, 0]
             target[:, block_slice] = block_contributions(part, patch.pixels_m, edges=inside, weights=weights)

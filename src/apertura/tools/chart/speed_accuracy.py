@@ -22,7 +22,7 @@ from apertura.core.planning.plan import Plan
 from apertura.core.planning.planner import SettingSearch
 from apertura.core.quality.error_check import Brightness, error_bound, random_pixels
 from apertura.stages.pair import open_pair
-from apertura.stages.planning import accuracy_of, job_of, plan_job
+from apertura.stages.planning import accuracy_of, gated, job_of, plan_job
 from apertura.stages.refine import open_refined
 from apertura.stages.scene import OpenScene, open_scene
 from apertura.tools.chart.pareto import Point, draw_points, with_front, write_page
@@ -87,17 +87,19 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     all settings, are not included.
     """
     lineage = result_of(campaign, "speed_accuracy").begin(campaign.root)
-    logged, track = open_pair(campaign, flight, pair), open_refined(campaign, flight)
-    scene = open_scene(campaign)
+    scene, track = open_scene(campaign), open_refined(campaign, flight)
+    logged = gated(campaign, open_pair(campaign, flight, pair), scene)
     profiles = profiles_of(open_stage(campaign.stage("profile", flight, pair), "profile"))
     opened, profiles = track.pair(logged), track.profiles(logged, profiles)
     middle = len(profiles) // 2
     block = slice(max(0, middle - PULSES // 2), middle + PULSES // 2)
     if opened.history is None:
         raise ValueError("no echo stage")
-    history, beams = opened.history[block], opened.beams and opened.beams[block]
+    history = opened.history[block]
+    antennas, gate = opened.beams and opened.beams[block], opened.gate and opened.gate[block]
+    beams = Beams.within(None, antennas, gate)
     accuracy_db = float(accuracy_of(campaign, opened, scene).value)
-    opened = replace(opened, aperture=history.aperture, history=history, beams=beams)
+    opened = replace(opened, aperture=history.aperture, history=history, beams=antennas, gate=gate)
     job = job_of(campaign, opened, scene)
     plan, search = plan_job(campaign, job, accuracy_db=accuracy_db), SettingSearch(job)
     part = _part(history, profiles[block], scene, plan, total_pixels=job.pixels, beams=beams)

@@ -26,7 +26,7 @@ from apertura.formats.export.layers import OUTSIDE
 from apertura.stages.interferogram import legs_of, sensed_heights
 from apertura.stages.layers import layer_rasters
 from apertura.stages.pair import OpenPair, scene_illumination
-from apertura.stages.planning import budget_of, integration_of
+from apertura.stages.planning import budget_of, gated, integration_of, recording_flags
 from apertura.stages.radiometry import CalibratedPair, calibrated_pair
 from apertura.stages.scene import OpenScene
 
@@ -141,9 +141,14 @@ def planned_image(
     threads
         Number of tiles computed in parallel.
     """
-    grid = scene.grid
+    grid, pair = scene.grid, gated(campaign, pair, scene)
     job, integration, beams = planned_job(campaign, pair, scene)
-    flags = Flags.merged(check_geometry(job), decide_antennas(job.beams, job.illumination)[1], integration.flags)
+    flags = Flags.merged(
+        check_geometry(job),
+        decide_antennas(job.beams, job.illumination)[1],
+        integration.flags,
+        recording_flags(campaign, pair, scene),
+    )
     calibrated = calibrated_pair(campaign, pair, scene, weights=(beams, integration.count), threads=threads)
     noise = float("nan")  # noise of a pulse, if the receiver's noise figure is configured
     if calibrated is not None and calibrated.thermal_noise is not None and calibrated.noise_figure_db is not None:
@@ -255,7 +260,7 @@ def resolution_layers(resolution: Resolution, shape: tuple[int, int]) -> dict[st
 def planned_job(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> tuple[Job, Integration, Beams | None]:
     """Return the planner's job with a placeholder signal, for checks of imaging limits, and integration and weights."""
     integration = integration_of(campaign, pair, scene)
-    beams = Beams.within(integration.sector, pair.beams)
+    beams = Beams.within(integration.sector, pair.beams, pair.gate)
     grid, frequency_hz = scene.grid, pair.frequency_hz
     centre_hz, count = centre_frequency(frequency_hz), len(frequency_hz)
     job = Job(
@@ -267,10 +272,9 @@ def planned_job(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> tuple[J
         bandwidth_hz=float(frequency_hz[-1] - frequency_hz[0]) * count / (count - 1),
         subcarriers=count,
         signal=Signal(centre_hz, 1.0, 1.0, 1),
-        path_limit_m=pair.path_limit_m,
         beams=beams,
         integration=integration,
-        illumination=scene_illumination(campaign, pair.name, beams, scene, pair.aperture),
+        illumination=scene_illumination(campaign, pair.name, beams and beams.on_profiles, scene, pair.aperture),
     )
     return job, integration, beams
 
@@ -338,5 +342,6 @@ def _contributing(pair: OpenPair, beams: Beams | None, point_m: Floats) -> OpenP
         aperture=pair.aperture[pulses],
         time_s=pair.time_s[pulses],
         beams=pair.beams and pair.beams[pulses],
+        gate=pair.gate and pair.gate[pulses],
         axes={point: axes[pulses] for point, axes in pair.axes.items()},
     )

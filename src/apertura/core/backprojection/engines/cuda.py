@@ -374,7 +374,7 @@ def form(
     -----
     Source: docs/theory/engine.md, "A GPU" and "Antennas"; docs/theory/integration.md.
     """
-    pixels = checked_pixels(pixels)
+    pixels, beams = checked_pixels(pixels), beams and beams.on_profiles
     if beams is not None:
         beams.check_pulses(tables.pulses.stop - tables.pulses.start)
     if not pixels.size:

@@ -208,6 +208,7 @@ def form(
     -----
     Source: docs/theory.md, eq. 6, with four-point Lagrange interpolation.
     """
+    beams = beams and beams.on_profiles
     flat = np.ascontiguousarray(pixels.reshape(-1, 3))
     image = np.zeros(len(flat), np.complex128)
     none, at_once = np.empty((0, 0)), len(flat) if beams is None else _PIXELS_AT_ONCE

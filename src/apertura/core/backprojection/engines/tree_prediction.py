@@ -310,8 +310,8 @@ def _chunks(job: Job, surface: Surface, pulses: int, chunk: int) -> list[NDArray
     """Return the pulses of sampled chunks that illuminate a tile."""
     summed, groups = _sampled_pulses(len(job.aperture), pulses)
     starts = np.arange(0, pulses, chunk)
-    if job.beams is not None:
-        variant = weighed(job.beams[groups], job.aperture[groups], surface, _TYPICAL_DB).variant
+    if beams := job.beams and job.beams.on_profiles:
+        variant = weighed(beams[groups], job.aperture[groups], surface, _TYPICAL_DB).variant
         first = np.searchsorted(summed, groups[::LEAF][variant != NO_ECHO])
         starts = np.unique(first // chunk * chunk) if len(first) else starts
     selected = starts[np.unique(np.linspace(0, len(starts) - 1, _CHUNKS).astype(int))]
@@ -352,10 +352,11 @@ class SampledWeights(NamedTuple):
 @lru_cache(maxsize=1024)
 def sample_weights(job: Job, surface: Surface, pulses: int, nodes_db: int) -> SampledWeights:
     """Return the weights of sampled groups of pulses over a tile."""
-    if job.beams is None:
+    beams = job.beams and job.beams.on_profiles
+    if beams is None:
         return SampledWeights()
     groups = _sampled_pulses(len(job.aperture), pulses)[1]
-    classified = weighed(job.beams[groups], job.aperture[groups], surface, nodes_db)
+    classified = weighed(beams[groups], job.aperture[groups], surface, nodes_db)
     illuminated, by_tree = classified.variant != NO_ECHO, classified.variant == BY_TREE
     edge = by_tree & classified.edge
     return SampledWeights(
@@ -380,6 +381,7 @@ PRESUMS_DB = (0, 6, 12)
 SIDES_PX, CHUNKS = (64, 128, 256), (256, 1024, 2048)
 """Candidate sides of tiles, and candidate numbers of pulses of the largest subaperture."""
 
+_GATED_DB = {True: -70.0, False: -50.0}  # error at the end of a gate, by `is_tapered`: the gate widens the band
 _FLOAT32_DB = -92.0  # error of float32 sums, dB
 _FLOAT32 = 2e-7  # relative rounding error of phases, due to path lengths and positions of cells
 
@@ -464,7 +466,9 @@ def _setting(job: Job, pulses: int, options: _Options) -> Setting:
     phases = [view.phase_rad for tile in tiles for view in tile.views]
     phase_rad = float(np.sqrt(np.mean(np.square(phases)))) if phases else 1.0
     phase_db = 2 * decibels(_FLOAT32 * phase_rad + 1e-9)
-    tree_db = power_sum_db(table_db, interpolated_db, presum_db, _FLOAT32_DB, phase_db)
+    is_tapered = bool(signal.window[0] < signal.window.max() / 4)
+    gate_db = [_GATED_DB[is_tapered]] if job.beams and job.beams.gate else []
+    tree_db = power_sum_db(table_db, interpolated_db, presum_db, _FLOAT32_DB, phase_db, *gate_db)
     powers = 10 ** (np.array([tree_db, direct.error_db]) / 10)
     error_db = decibels(float(powers @ [1 - cost.directly, cost.directly]))
     layers = cost.layers if cost.layers > 1 else 0
