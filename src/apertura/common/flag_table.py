@@ -406,10 +406,10 @@ _OF_IMAGES = {
         "core/echo/association.py",
     ),
     "scene_beyond_recording": Flag(
-        "fraction of the scene not recorded by all pulses, and fraction recorded by none; number of pulses; longest and "
-        "recorded total path",
-        "echoes of part of the scene arrive after the recorded delays: these pixels are formed from fewer pulses or have "
-        "no data",
+        "fraction of the scene not recorded by all pulses, and fraction recorded by none; number of pulses; longest "
+        "total path and recorded total path",
+        "echoes of part of the scene arrive after the recorded delays: these pixels are formed from fewer pulses or "
+        "have no data",
         "scene.bounds_m; scene.height_m if it is the default; looks.tif and nesz.tif of these pixels",
         "stages/planning.py",
     ),
