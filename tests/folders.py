@@ -59,7 +59,7 @@ from apertura.stages import (
     tracks,
 )
 from apertura.stages.pair import open_pair
-from apertura.stages.planning import plan_pair
+from apertura.stages.planning import gated, plan_pair
 from apertura.views.plan import first_flight
 from apertura.views.webmap import document as webmap
 
@@ -87,7 +87,7 @@ def require_files(campaign: Campaign) -> None:
 def expected_plan(campaign: Campaign, flight: str, pair: str) -> Plan:
     """Plan the image of a pair from its echo, or from the flight logs before the echo step has run."""
     ground = scene.expected_scene(campaign, lambda: first_flight(campaign))
-    return plan_pair(campaign, open_pair(campaign, flight, pair), ground)
+    return plan_pair(campaign, gated(campaign, open_pair(campaign, flight, pair), ground), ground)
 
 
 def settle_ground(campaign: Campaign) -> None:

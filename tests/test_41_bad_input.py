@@ -249,14 +249,14 @@ def test_nan_position_is_reported(tiny):
     assert "uav1.track.csv" in message
 
 
-def test_echoes_beyond_the_cyclic_prefix_are_refused_with_the_worst_pulse(tiny):
+def test_scene_beyond_the_cyclic_prefix_is_refused_with_its_shortest_path(tiny):
     edit_config(tiny, lambda document: document["waveform"].update(cyclic_prefix_s=20 / 1.024e9))
     campaign = Campaign.load(tiny)
     ingest_all(campaign)
     echo.echo(campaign, "f01", "uav1-uav1")
     scene.scene(campaign)
     message = complaint(lambda: profile.profile(campaign, "f01", "uav1-uav1"))
-    assert "after the cyclic prefix at 40 pulses; longest total path" in message
+    assert "after the cyclic prefix at 40 pulses; shortest total path" in message
     assert not (tiny / "results/f01/uav1-uav1/profile.manifest.json").exists()
 
 

@@ -48,7 +48,7 @@ def test_broken_file_of_any_suffix_is_reported_with_a_reason(tmp_path, suffix, c
 def test_exception_of_a_reader_is_reported_without_traceback(shared, monkeypatch):
     monkeypatch.setitem(TRACKS, "csv", LogFormat((".csv",), operator.truediv))
     report = look(F01 / "uav1.track.csv")
-    assert report.problem.found.startswith("reader failed: TypeError")
+    assert report.problem.found.startswith("the reader failed: TypeError")
 
 
 def test_samples_without_own_description_require_a_campaign(tmp_path, monkeypatch):

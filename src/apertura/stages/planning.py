@@ -367,15 +367,18 @@ def gated(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> OpenPair:
         return pair
     if (illuminated & (weight > 0)).sum(axis=0).max() >= FEWEST:
         return replace(pair, gate=gate)
+    where = f"flight {pair.flight}, pair {pair.name}"
+    check_antennas(scene.grid, scene.terrain, pair.aperture, where=where)  # terrain above the antennas is the cause
     key, limit_name, hint = _limit_words(campaign)
     shortest_m = float(path_m[illuminated].min())
     raise CampaignError(
         f"echoes of the scene arrive after {limit_name} at {number_of(len(limit_m), 'pulse')}; shortest total path "
         f"{shortest_m:.1f} m: the scene is at least {shortest_m / 2000:.3g} km from the tracks",
-        where=f"flight {pair.flight}, pair {pair.name}",
+        where=where,
         expected=f"at most {limit_m.max():.1f} m (c·{key} minus the path offsets), at {FEWEST} pulses of a pixel",
-        remedy="Correct scene.bounds_m (easting before northing), scene.crs, the positions of the tracks or the "
-        f"terrain height; or check path_offset_m and {key}.{hint}",
+        remedy="Correct scene.bounds_m (easting before northing), scene.crs, the positions of the tracks, or the "
+        "terrain height (scene.height_m, or unit and datum of scene.dem); or check path_offset_m and "
+        f"{key}.{hint}",
     )
 
 
