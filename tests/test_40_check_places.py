@@ -65,15 +65,15 @@ def test_log_late_by_18_seconds_suggests_gpst_taken_for_utc(tiny):
     line = only(tiny)
     assert line.startswith(f"{RX}: the log starts 1")
     assert "pulses without a position; the times of log and recording differ by 18." in line
-    assert " s: GPST taken for UTC?" in line
+    assert " s (possible cause: GPST interpreted as UTC)" in line
 
 
 @pytest.mark.parametrize(
     ("shift_s", "cause"),
     [
-        (18.9, "GPST taken"),
-        (-18.0, "UTC taken for GPST"),
-        (36.1, "TAI taken for UTC"),
+        (18.9, "GPST interpreted as UTC"),
+        (-18.0, "UTC interpreted as GPST"),
+        (36.1, "TAI interpreted as UTC"),
         (3600 * 9.5, "local time"),
         (5e5, "another day"),
         (400.0, ""),

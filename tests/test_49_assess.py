@@ -81,7 +81,7 @@ def test_summary_prints_each_flag_once(finished_sample, capsys, tmp_path):
 
 
 def test_common_part_of_several_flags_is_printed_once():
-    cause = "4.1 of 4.5 dB peak loss are explained if the times of the log of uav1 are 0.50 s late"
+    cause = "4.1 of 4.5 dB of the peak loss are explained if the times of the log of uav1 are 0.50 s late"
     lines = {"defocused": f"4.5 dB lost; {cause}", "pairs_displaced": f"5 points lie 12 cm apart; {cause}"}
     reports = {"f01 a-a": {"flags": lines}, "f01 a-b": {"flags": {"defocused": f"3.2 dB lost; {cause}"}}}
     console = Console(file=StringIO(), width=200)

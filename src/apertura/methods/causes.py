@@ -23,10 +23,10 @@ losses.
 
 _TAI_S = 19  # TAI − GPST
 _TIME_SYSTEMS = {
-    LATEST_S: ": GPST taken for UTC?",
-    -LATEST_S: ": UTC taken for GPST?",
-    LATEST_S + _TAI_S: ": TAI taken for UTC?",
-    _TAI_S: ": TAI taken for GPST?",
+    LATEST_S: " (possible cause: GPST interpreted as UTC)",
+    -LATEST_S: " (possible cause: UTC interpreted as GPST)",
+    LATEST_S + _TAI_S: " (possible cause: TAI interpreted as UTC)",
+    _TAI_S: " (possible cause: TAI interpreted as GPST)",
 }
 _NEAR_S = 3.0  # the log and the recording of a flight start and stop within a few seconds of each other
 _NEAR_ZONE_S = 120.0
@@ -40,7 +40,7 @@ def mistaken_time(shift_s: float, *, tolerance_s: float = _NEAR_S) -> str:
     Examples
     --------
     >>> mistaken_time(17.9), mistaken_time(-7201.0), mistaken_time(400.0)
-    (': GPST taken for UTC?', ': local time taken for UTC?', '')
+    (' (possible cause: GPST interpreted as UTC)', ' (possible cause: local time interpreted as UTC)', '')
     """
     for system_s, question in _TIME_SYSTEMS.items():
         if abs(shift_s - system_s) <= tolerance_s:
@@ -48,8 +48,8 @@ def mistaken_time(shift_s: float, *, tolerance_s: float = _NEAR_S) -> str:
     size = abs(shift_s)
     zones = round(size / _ZONE_S)
     if zones and size <= _LONGEST_ZONE_S + _NEAR_ZONE_S and abs(size - zones * _ZONE_S) <= _NEAR_ZONE_S:
-        return ": local time taken for UTC?"
-    return ": log of another day?" if size > 86400 else ""
+        return " (possible cause: local time interpreted as UTC)"
+    return " (possible cause: a log of another day)" if size > 86400 else ""
 
 
 # ---- Table of the quantities that may be wrong ----------------------------------------------------------------------
@@ -78,7 +78,7 @@ class Quantity:
     Examples
     --------
     >>> TIME.line(18.0, whose="all logs")
-    'the times of all logs are 18.00 s late: GPST taken for UTC?'
+    'the times of all logs are 18.00 s late (possible cause: GPST interpreted as UTC)'
     """
 
     kind: str
@@ -122,16 +122,16 @@ HEIGHT = Quantity(
     (50.0, 47.0, 20.0, 10.0, 5.0, 4.0, 3.0, 2.5, 2.0, 1.5, 1.0, 0.5),
     std=3.0,
     # an error of 10 m or more may be due to geoid heights that are interpreted as ellipsoidal, or the reverse
-    question=lambda height_m: ": another vertical datum?" if abs(height_m) >= 10.0 else "",
+    question=lambda height_m: " (possible cause: a different vertical datum)" if abs(height_m) >= 10.0 else "",
 )
 PREFIX = Quantity(
     "prefix",
-    "paths of {pair} are wrong by {path_m} m: captures start {0:+d} samples from {begin}?",
+    "the path of {pair} has an error of {path_m} m (possible cause: captures start {0:+d} samples from {begin})",
     sizes=(1, 2, 3, 5, 10, 20, 50),
 )
 RANGE = Quantity(
     "range",
-    "paths of {pair} are wrong by {0:+.2f} m: wrong path offset?",
+    "the path of {pair} has an error of {0:+.2f} m (possible cause: a wrong path offset)",
     sizes=(0.05, 0.1, 0.15, 0.3, 0.5, 1.0, 2.0, 4.0),
 )
 CARRIER = Quantity("carrier_is", "waveform.carrier_is is {other}")

@@ -174,7 +174,7 @@ def _hypotheses(
     causes = hypotheses(campaign, flight, brightest=brightest, cell_m=quality["focus"]["cell_m"], focused=sharp)
     cause = "; no single cause explains this"
     if causes:
-        cause = f"; {causes[0]['gain_db']:.1f} of {causes[0]['lost_db']:.1f} dB peak loss are explained if "
+        cause = f"; {causes[0]['gain_db']:.1f} of {causes[0]['lost_db']:.1f} dB of the peak loss are explained if "
         cause += str(causes[0]["what"])
     for pair, names in suspicious.items():
         for name in names:

@@ -375,7 +375,7 @@ def _flags_of_choice(fusion: Mapping[str, Any]) -> Flags:
     """Return the flags of the choice of a coherent sum: excluded pairs, and pairs added with an unmeasured phase."""
     excluded = "; ".join(f"{pair} is not in the coherent sum: {reason}" for pair, reason in fusion["excluded"].items())
     if ties := " or ".join(" and ".join(tie) for tie in fusion["ties"]):
-        excluded += f"; tie: {ties} form an equally large set that agrees, and the better focused set was used"
+        excluded += f"; {ties} form an equally large set of pairs that agree, but the used set is better focused"
     flags = {"pair_excluded": excluded} if excluded else {}
     if unmeasured := fusion["unmeasured"]:
         known, unknown = len(fusion["phases_rad"]) - len(unmeasured), len(unmeasured)

@@ -85,7 +85,7 @@ class Hypothesis:
     Attributes
     ----------
     what
-        Sentence for reports: 'the times of the log of uav1 are 18.00 s late: GPST taken for UTC?'.
+        Sentence for reports: 'the times of the log of uav1 are 18.00 s late (possible cause: GPST interpreted as UTC)'.
     kind
         Short name of the kind of error.
     histories
