@@ -126,7 +126,7 @@ def patch_pixels(centre_m, east_m, north_m, count=13):
 
 def patches_at(points_m, east_m, north_m):
     patches = [Patch(point, patch_pixels(point, east_m, north_m)) for point in points_m]
-    return Candidates(patches, len(patches), np.eye(3))
+    return Candidates(patches, len(patches), np.eye(3), 5.0)
 
 
 def peak(profiles, point_m, east_m, north_m):
@@ -228,6 +228,7 @@ def test_three_patches_are_accepted_by_their_gain():
 
 def test_missing_bright_points_are_flagged():
     record, _ = record_of(FAR, FAR_POINTS_M[:3])
-    refined = refine_one_phase([record], Candidates([], 0, np.eye(3)), FAR_ERRORS, method="phase_gradient")
+    refined = refine_one_phase([record], Candidates([], 0, np.eye(3), 20.0), FAR_ERRORS, method="phase_gradient")
     assert list(refined.flags) == ["refinement_no_bright_point"]
+    assert "exceeds its background by 13 dB" in refined.flags["refinement_no_bright_point"]  # a factor of 20
     assert not refined.correction.extra_path_m

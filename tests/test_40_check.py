@@ -3,6 +3,7 @@
 import io
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -142,6 +143,13 @@ def test_every_missing_file_is_reported(tiny):
     for name in missing[:3]:
         assert sum(line.startswith(f"{name}: no such file") for line in lines) == 1
     assert sum(": no flight log" in line for line in lines) == 1
+
+
+def test_two_logs_of_a_node_are_named_with_their_remedy(tiny):
+    shutil.copyfile(tiny / "raw/f01/uav2.track.pos", tiny / "raw/f01/uav2.track.nmea")
+    line = only(tiny)
+    assert "2 flight logs ['uav2.track.nmea', 'uav2.track.pos']" in line
+    assert line.endswith("Remove or rename all but one of them.")
 
 
 @pytest.mark.parametrize("name", ["raw/codes.npy", "raw/f01/uav1.sigmf-data", "raw/f01/uav2.track.pos"])

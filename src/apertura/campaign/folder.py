@@ -104,7 +104,9 @@ class RawFolder:
             f"{number_of(len(logs), 'flight log')} {logs}" if logs else "no flight log",
             where=self.flight_folder(flight) / f"{node}.track.*",
             expected=f"exactly one flight log of node {node}",
-            remedy=f"Copy the log there with the name <node>.track.<{'|'.join(log_suffixes())}>.",
+            remedy="Remove or rename all but one of them."
+            if logs
+            else f"Copy the log there with the name <node>.track.<{'|'.join(log_suffixes())}>.",
         )
 
     def _logs(self, flight: str, node: str) -> list[str]:

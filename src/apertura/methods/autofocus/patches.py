@@ -208,11 +208,14 @@ class Candidates:
         Number of points above the detection threshold.
     axes
         (3, 3) float64, rows are east, north, up at the scene in the frame.
+    threshold
+        Detection threshold: power of a point relative to its background.
     """
 
     patches: Sequence[Patch]
     points: int
     axes: Floats
+    threshold: float
 
     @classmethod
     def of(
@@ -256,16 +259,18 @@ class Candidates:
         axes = east_north_up(grid, places_m)
         points = int((ratio > least).sum())
         if not points:
-            return cls([], 0, axes)
+            return cls([], 0, axes, least)
         typical = patch_at(places_m[0], records, axes, correlation_s=correlation_s)
         apart_m = _APART * float(np.abs((typical.pixels_m - typical.place_m) @ axes[:2].T).max())
         helpful = ratio > max(min(HELPFUL_RATIO, least), _SHARE_OF_CLEAREST * float(ratio.max()))
         chosen = separated(places_m[helpful], ratio[helpful], axes, apart_m=apart_m)
-        return cls([patch_at(place, records, axes, correlation_s=correlation_s) for place in chosen], points, axes)
+        return cls(
+            [patch_at(place, records, axes, correlation_s=correlation_s) for place in chosen], points, axes, least
+        )
 
     def rejected(self, errors: Mapping[str, TrackErrors], by_speckle: Refinement | None = None) -> Refinement:
         """Return a rejected refinement, whose reason states that bright points and speckle are insufficient."""
-        line = f"no point of the scene exceeds its background by {decibels(LEAST_RATIO):.0f} dB"
+        line = f"no point of the scene exceeds its background by {decibels(self.threshold):.0f} dB"
         report: dict[str, Any] = {"patches": self.points}
         if by_speckle is not None:
             line, report = f"{line}; {by_speckle.reason}", {**report, "speckle": dict(by_speckle.report)}
