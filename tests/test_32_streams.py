@@ -140,6 +140,21 @@ def test_saturation_counts_all_blocks():
     assert saturation.shares["radar"] == pytest.approx((4 + 1 - 2) / 12)
 
 
+@pytest.mark.parametrize(
+    ("interfered", "line"), [(4, "in 4 of 200 captures, whose power is +"), (200, "in 200 of 200")]
+)
+def test_saturated_captures_are_counted_with_their_power(interfered, line):
+    """Interference saturates single captures of high power; echoes of a wrong gain saturate all captures."""
+    generator, saturation = np.random.default_rng(3), Saturation()
+    iq = symbols(generator, 200)
+    iq[:interfered] *= 20.0
+    saturation.count({"radar": iq.clip(-16383, 16383).astype(np.int16)})
+    text = saturation.flags["saturated_radar"]
+    assert line in text
+    if interfered < 200:
+        assert float(text.split("power is ")[1].split(" dB")[0]) > 10
+
+
 def symbols(generator, captures):
     """Return noise with the envelope of OFDM symbols, crest factor 12 dB, as (capture, sample, 2) counts."""
     return generator.normal(0, 1500, (captures, 2048, 2))

@@ -194,15 +194,15 @@ _OF_RECORDINGS = {
         "core/echo/captures.py",
     ),
     "saturated_radar": Flag(
-        "fraction of the samples",
+        "fraction of the samples; number of captures, and their power relative to the other captures, dB",
         "samples are at full scale of the converter",
-        "gain",
+        "gain; if a few captures have a much higher power than the others: interference",
         "core/echo/captures.py",
     ),
     "saturated_sidelink": Flag(
-        "fraction of the samples",
+        "fraction of the samples; number of captures, and their power relative to the other captures, dB",
         "samples are at full scale of the converter",
-        "gain",
+        "gain; if a few captures have a much higher power than the others: interference",
         "core/echo/captures.py",
     ),
     "code_unconfirmed": Flag(

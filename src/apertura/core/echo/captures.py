@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Complexes, Floats
+from apertura.common.errors import number_of
 from apertura.common.flags import Flags
 from apertura.common.units import decibels
 from apertura.core.echo.demodulate import Numerology
@@ -24,7 +25,7 @@ AT_ONCE = 64
 """Captures processed at a time; their number is limited by the processor caches."""
 
 SATURATED_SHARE = 1e-4
-"""Share of samples at the end stops of a converter, above which it clips; a symbol 12 dB below has one or two such
+"""Share of samples at full scale of a converter, above which it clips; a symbol 12 dB below has one or two such
 samples."""
 
 
@@ -110,11 +111,11 @@ of 128 subcarriers have a low crest factor, because their samples are not indepe
 
 
 class Saturation:
-    """Counter of samples at a converter's end stops, and of captures limited below them, block by block.
+    """Counter of samples at a converter's full scale, and of captures limited below them, block by block.
 
     Notes
     -----
-    With a clipping converter of any number of bits, samples accumulate at the end stops; without clipping the extreme
+    With a clipping converter of any number of bits, samples accumulate at full scale; without clipping the extreme
     values occur once or twice. A limiter in front of the converter lowers both the peak of a capture and its crest
     factor, max|s|²/mean|s|². A weak capture has a lower peak and an unchanged crest factor; a strong tone has a lower
     crest factor and an unchanged peak. Captures are compared with the 90th percentile of all captures.
@@ -136,16 +137,19 @@ class Saturation:
         self._extremes: dict[str, list[_Extreme]] = {}
         self._samples: dict[str, int] = {}
         self._powers: dict[str, list[Floats]] = {}
+        self._captures: dict[str, list[Floats]] = {}
 
     def count(self, iq: Mapping[str, Samples]) -> None:
         """Count the samples of a block of captures, channel → (capture, sample, 2)."""
         for name, samples in iq.items():
             self._samples[name] = self._samples.get(name, 0) + samples.size
             extremes = self._extremes.setdefault(name, [_Extreme(+1), _Extreme(-1)])
-            for extreme, value in zip(extremes, (samples.max().item(), samples.min().item()), strict=True):
+            highest, lowest = samples.max(axis=(1, 2)), samples.min(axis=(1, 2))
+            for extreme, value in zip(extremes, (highest.max().item(), lowest.min().item()), strict=True):
                 extreme.count(samples, value)
             step = max(1, samples.shape[1] // _CREST_SAMPLES)
             power = (samples[:, ::step].astype(np.float64) ** 2).sum(axis=-1)
+            self._captures.setdefault(name, []).append(np.stack([highest, lowest, power.mean(axis=1)]))
             if power.shape[1] >= _CREST_SAMPLES:
                 self._powers.setdefault(name, []).append(np.stack([power.max(axis=1), power.mean(axis=1)]))
 
@@ -161,12 +165,23 @@ class Saturation:
     def flags(self) -> Flags:
         """Flags of channels with a clipping converter, and of captures limited in front of the converter."""
         clipped = {
-            f"saturated_{name}": f"{share:.2%} of the samples of channel {name} are at the converter's end stops"
+            f"saturated_{name}": f"{share:.2%} of the samples of channel {name} are at full scale, {self._where(name)}"
             for name, share in self.shares.items()
             if share > SATURATED_SHARE
         }
         limited = [self._limited(name, *np.concatenate(powers, axis=1)) for name, powers in self._powers.items()]
         return Flags.merged(clipped, *limited)
+
+    def _where(self, channel: str) -> str:
+        """Return the number of saturated captures, and their power relative to the others: high for interference."""
+        highest, lowest, power = np.concatenate(self._captures[channel], axis=1)
+        high, low = (extreme.value for extreme in self._extremes[channel])
+        saturated = (highest >= high) | (lowest <= low)
+        line = f"in {saturated.sum()} of {number_of(len(saturated), 'capture')}"
+        if saturated.all():
+            return line
+        ratio = float(np.median(power[saturated]) / max(np.median(power[~saturated]), np.finfo(np.float64).tiny))
+        return f"{line}, whose power is {decibels(ratio):+.1f} dB relative to that of the others"
 
     @staticmethod
     def _limited(channel: str, peak: Floats, mean: Floats) -> Flags:
