@@ -55,13 +55,13 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
         error_db = write(wip, echo, noisy)
         if cleaning.interference is None:
             noisy = NoisyPulses()
-        elif noisy.excluded.any():
+        flags = Flags.merged(echo.flags, cleaning.flags, noisy.flags)  # before samples are read again
+        if noisy.excluded.any():
             error_db = write(wip, echo.select(~noisy.excluded), NoisyPulses())
         attributes = {
             "background": {"requested": campaign.settings.processing.background_method, **cleaning.background_report},
             "interference": cleaning.interference_report(noisy),
         }
-        flags = Flags.merged(echo.flags, cleaning.flags, noisy.flags)
         finish(wip, folder, lineage=lineage, flags=flags, compression_error_db=error_db, **attributes)
     return folder
 
