@@ -320,7 +320,7 @@ def height_range(terrain: Terrain, grid: SceneGrid, *, where: Path) -> tuple[flo
     Raises
     ------
     CampaignError
-        If pixels have no height; the error states the number of these pixels and the position of the first one.
+        If pixels have no height; the message contains the number of these pixels and the position of the first one.
     """
     voids, first, low, high = 0, "", np.inf, -np.inf
     for window in grid.tiles(_TILE_PX):
