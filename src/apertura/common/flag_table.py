@@ -520,7 +520,8 @@ _OF_IMAGES = {
     "phase_unobservable": Flag(
         "pair, reason, peak loss caused by a wrong phase, dB",
         "the phase offset of a pair in the coherent sum is not observable; a wrong phase splits targets",
-        "the remedy given in the flag message: a finer scene.spacing_m, a reflector in the scene, or a calibration flight",
+        "the remedy given in the flag message: a finer scene.spacing_m, a reflector in the scene, or a calibration "
+        "flight",
         "stages/export.py",
     ),
     "sum_incoherent": Flag(
