@@ -52,7 +52,7 @@ class Outcome:
 
 
 def frequencies(geometry: Geometry) -> NDArray[np.float64]:
-    """Return the frequencies of the lines; the centre frequency is halfway between the middle two."""
+    """Return the frequencies of the lines; the centre frequency is midway between the middle two."""
     return geometry.carrier_hz + geometry.bandwidth_hz / LINES * (np.arange(LINES) - (LINES - 1) / 2)
 
 

@@ -386,7 +386,7 @@ def read_toy_track(path, *, node, options):
 
 
 def test_new_recorder_is_one_function_and_one_row(tmp_path, monkeypatch):
-    """The file is found, opened, checked against its hash, and cut into captures; messages name it."""
+    """The file is found, opened, checked against its hash, and cut into captures; messages contain its name."""
     monkeypatch.setitem(RECORDERS, (".toy",), open_toy_recording)
     path = tmp_path / "raw" / "f01" / "a.toy"
     path.parent.mkdir(parents=True)

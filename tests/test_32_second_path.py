@@ -38,7 +38,7 @@ def test_ripple_above_a_ghost_level_of_minus_20_db_is_flagged(ripple_db, flagged
 
 
 def test_constant_unresolved_echo_reports_path_and_phase_errors():
-    """For an echo of -6 dB delayed by half a metre, 5.4 cm of range (10.8 cm of path) and 0.33 rad were measured."""
+    """An echo of -6 dB delayed by half a metre causes errors of 5.4 cm in range (10.8 cm in path) and 0.33 rad."""
     text = flag_text(echo=0.5)
     path_cm, phase_rad = (float(number) for number in re.search(r"about (\d+) cm.*about (\d\.\d+) rad", text).groups())
     assert 8 < path_cm < 40

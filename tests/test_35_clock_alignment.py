@@ -80,7 +80,7 @@ def test_known_path_offset_is_kept():
 
 
 def test_clock_drift_is_estimated_on_a_long_recording():
-    """Over ten minutes of oscillation, 40 ppm cause 24 ms and 4 cm of path, more than half a wavelength."""
+    """Over ten minutes of oscillation, 40 ppm cause 24 ms and a path error of 4 cm, more than half a wavelength."""
 
     def to_and_fro(time_s):
         return 2.0 * np.sin(0.6 * time_s + 0.4 * np.sin(0.05 * time_s))

@@ -1,4 +1,4 @@
-"""Damaged results: the message names the file and the remedy."""
+"""Damaged results: the message contains the file and the remedy."""
 
 import re
 

@@ -132,7 +132,7 @@ def test_planned_pair_agrees_with_the_formed_echo(tiny):
 
 
 def test_stop_and_go_error_is_that_of_the_pulse_duration(imaged):
-    """The error is that of half the pulse of 1 µs at a path rate of a few decimetres per second."""
+    """The error is that of half the pulse of 1 µs if the total path changes by a few decimetres per second."""
     lines = {line.cause: line for line in budget_of(imaged, open_pair(imaged, "f01", PAIRS[0]), open_scene(imaged))}
     assert 0 < lines["stop and go"].effect.shift_m < 1e-6
 

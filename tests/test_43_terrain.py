@@ -301,7 +301,7 @@ def test_dem_above_the_antennas_is_flagged_and_flat_terrain_refused(tiny):
 
 
 def test_command_line_names_the_file_of_a_key(tiny, monkeypatch, capsys):
-    """Library functions name the key only, because their Python callers have no config file."""
+    """Error messages of library functions contain the key only, because their Python callers have no config file."""
     edit_scene(tiny, height_m=2034.0)
     monkeypatch.setattr("sys.argv", ["apertura", "plan", str(tiny)])
     with pytest.raises(SystemExit, match="2"):

@@ -104,7 +104,7 @@ WORKFLOW_COMMANDS = {
         "{campaign}",
     ),
 }
-"""Workflow runs, two of them up to the last product: name → command and working folder."""
+"""Workflow runs, two of them up to the last product: name → command and working directory."""
 
 PART = "--until profile"
 SOON = (
@@ -729,5 +729,5 @@ def test_deleted_working_folder_is_one_message(tmp_path):
     )
     assert (process.returncode, process.stderr) == (
         2,
-        "error: the working folder: No such file or directory. Go to a folder that exists.\n",
+        "error: the working directory: No such file or directory. Go to a folder that exists.\n",
     )

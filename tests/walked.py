@@ -21,7 +21,7 @@ def blocks(page: Path):
 
 
 def walk(page: Path) -> dict[str, object]:
-    """Run a page's blocks in the working folder and return the names that they define.
+    """Run a page's blocks in the working directory and return the names that they define.
 
     Printed words and integers must equal the words and integers shown; numbers with a decimal point may differ by 5 %.
     """

@@ -1,4 +1,4 @@
-"""Entry point of the command `apertura`: leave the working folder before all other imports."""
+"""Entry point of the command `apertura`: change out of the working directory before all other imports."""
 
 import os
 import sys
@@ -18,11 +18,11 @@ def _refuse(message: str) -> NoReturn:
 
 
 def main() -> None:
-    """Leave the working folder, which may be untrusted, and run the command line."""
+    """Change out of the working directory, which may be untrusted, and run the command line."""
     try:
         leave_working_folder()
     except OSError as error:
-        _refuse(f"the working folder: {error.strerror}. Go to a folder that exists.")
+        _refuse(f"the working directory: {error.strerror}. Go to a folder that exists.")
     for name in _PROJ:
         folders = list(filter(None, os.environ.get(name, "").split(os.pathsep)))
         if folders and not any(Path(folder, "proj.db").is_file() for folder in folders):

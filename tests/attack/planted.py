@@ -22,7 +22,7 @@ _EVENT = struct.Struct("iIII")
 _LIBC = ctypes.CDLL(None, use_errno=True)
 
 SNAKEMAKES_OWN = ".snakemake/pip-deployments"
-"""Folder in the working folder that Snakemake adds to the module search path."""
+"""Folder in the working directory that Snakemake adds to the module search path."""
 
 PROFILES = ("default", "slurm", "own", "none")
 SETTINGS = {

@@ -259,7 +259,7 @@ class Examination:
 
     @property
     def level_m(self) -> float:
-        """Height of flat terrain below the grid, metres above the ellipsoid; with a DEM, the height of the track."""
+        """Ellipsoidal height (m) of flat terrain under the grid; height of the track if unknown or if a DEM is used."""
         return self._ground[2]
 
     @cached_property

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _AHEAD_S = 5.0
 _IMPORTED = ".snakemake/pip-deployments"
-"""Folder for plugins installed by jobs, relative to the working folder (Snakemake 9, `PIP_DEPLOYMENTS_PATH`)."""
+"""Folder for plugins installed by jobs, relative to the working directory (Snakemake 9, `PIP_DEPLOYMENTS_PATH`)."""
 
 _KEPT = (
     "If the settings of the echo are unchanged, transfer functions kept by `processing: {keep: [echo]}` replace the "

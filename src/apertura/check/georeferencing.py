@@ -116,7 +116,7 @@ def _elsewhere(examined: Examination, crs: str) -> Iterator[CampaignError]:
 
 
 def _not_in_metres(examined: Examination, crs: str) -> CampaignError:
-    """Return the problem of a CRS that is not in metres; the remedy names the suitable UTM zone."""
+    """Return the problem of a CRS that is not in metres; the remedy contains the suitable UTM zone."""
     try:
         system = horizontal_crs(crs)
     except CampaignError as problem:

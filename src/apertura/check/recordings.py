@@ -29,7 +29,8 @@ _OFF = 0.2
 """Tolerated relative deviation of intervals from 1/prf_hz: time tags have errors of a few ms, or a resolution of 1 ms.
 """
 
-_SOME = 0.1  # least fraction of intervals equal to 1/prf_hz for which longer intervals are attributed to missed pulses
+# minimum fraction of intervals equal to 1/prf_hz for which longer intervals are attributed to missed pulses
+_SOME = 0.1
 
 
 def check_codes(examined: Examination) -> Iterator[CampaignError]:

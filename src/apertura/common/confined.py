@@ -90,7 +90,7 @@ class ConfinedPath(PosixPath):
         return path if isinstance(path, ConfinedPath) else cls.at(path.parent) / path.name
 
     def with_elsewhere(self, elsewhere: Mapping[str, Path]) -> "ConfinedPath":
-        """Return the same path with replaced subfolders of the root, see `at`."""
+        """Return the same path with the subfolders of the root replaced; see `at`."""
         return ConfinedPath.at(self._top, elsewhere=elsewhere) / self.relative_to(self._top)
 
     def named(self, name: str, *, where: object) -> "ConfinedPath":

@@ -87,7 +87,7 @@ QUOTED: dict[str, Row] = {
     "noise_floor": (_IMAGES, "float64", "dB", "median power of the image relative to its peak"),
     "pulses_used": (_IMAGES, "float64", "1", "number of pulses that form the image"),
     "pulses_dropped": (_IMAGES, "float64", "1", "number of pulses excluded from the image"),
-    "peak": (_IMAGES, "float64", "1", "largest magnitude, by which the image is divided in sums"),
+    "peak": (_IMAGES, "float64", "1", "largest magnitude; the image is normalised by it before summation"),
     "phase_removed": (_IMAGES, "float64", "rad", "phase removed before the coherent sum; NaN: pair not in the sum"),
     "verdict": (_IMAGES, "T", "", "focus: focused, defocused or inconclusive; empty: no flight"),
     "flags": (_IMAGES, "T", "", "comma-separated names of the image's flags"),
@@ -148,7 +148,7 @@ _KNOTS = "node", "knot", "axis"
 _FRAME = {
     "frame": "'ecef' (EPSG:4978) or 'local' (Cartesian axes of the campaign, not georeferenced)",
     "pair": "transmitter-receiver",
-    "flags": "flags raised so far: flag name → measured text, one line",
+    "flags": "flags raised so far: flag name → one-line text with the measured values",
 }
 _WAVE = {"wave_speed_m_s": "propagation speed along the paths, m/s: path = wave_speed_m_s · delay"}
 
@@ -292,7 +292,7 @@ STAGES: Mapping[str, Stage] = {
         },
         {
             "frame": _FRAME["frame"],
-            "flags": "flags raised by the refinement: flag name → measured text, one line",
+            "flags": "flags raised by the refinement: flag name → one-line text with the measured values",
             "nodes": "names along `node`",
             "pairs": "names along `pair`: pairs with a separate path offset; may be empty",
             "decisions": "autofocus, and autofocus_method if enabled: value and reason",

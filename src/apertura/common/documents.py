@@ -279,7 +279,7 @@ def validated(model: type[T], document: object, *, where: object, expected: str)
     Raises
     ------
     CampaignError
-        If keys or values are invalid; the message states file, key, invalid value and valid values.
+        If keys or values are invalid; the message contains file, key, invalid value and valid values.
     """
     adapter = TypeAdapter(model)
     try:

@@ -244,7 +244,7 @@ _OF_RECORDINGS = {
     ),
     "sidelink_spikes": Flag(
         "pulses whose sidelink phase deviates, rad and cm; pulses excluded; loss by the others, dB",
-        "the sidelink is disturbed in single pulses, which their echoes do not share",
+        "the sidelink is disturbed in individual pulses; the echoes of these pulses are not affected",
         "rotors and airframe in the line of sight; place of the sidelink antenna; interference",
         "core/echo/sidelink_spikes.py",
     ),
@@ -479,7 +479,7 @@ _OF_IMAGES = {
     "defocused": Flag(
         "peak loss of bright points, dB; peak loss predicted by the error budget, dB",
         "phase errors reduced the peaks of bright points by more than 1 dB",
-        "the hypothesis, if the flag states one; positions, lever arms, heights, times",
+        "the hypothesis, if one is given in the flag message; positions, lever arms, heights, times",
         "core/imaging/focus_check.py",
     ),
     "loss_unexpected": Flag(
@@ -501,7 +501,7 @@ _OF_IMAGES = {
         "displacement of the points to the east and north, cm",
         "bright points of a pair are displaced relative to the other pairs, or no majority of the pairs agrees on "
         "the position of the points",
-        "the hypothesis, if the flag states one; path offsets, lever arms, scene.height_m",
+        "the hypothesis, if one is given in the flag message; path offsets, lever arms, scene.height_m",
         "stages/assess.py",
     ),
     "pairs_out_of_phase": Flag(
@@ -520,7 +520,8 @@ _OF_IMAGES = {
     "phase_unobservable": Flag(
         "pair, reason, peak loss caused by a wrong phase, dB",
         "the phase offset of a pair in the coherent sum is not observable; a wrong phase splits targets",
-        "the remedy stated in the flag: a finer scene.spacing_m, a reflector in the scene, or a calibration flight",
+        "the remedy given in the flag message: a finer scene.spacing_m, a reflector in the scene, or a calibration "
+        "flight",
         "stages/export.py",
     ),
     "sum_incoherent": Flag(

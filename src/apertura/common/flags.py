@@ -1,4 +1,4 @@
-"""Raised flags: mapping from flag name to lines of measured text, and the merging of flags from several sources."""
+"""Raised flags: mapping from flag name to lines with measured values, and the merging of flags from several sources."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -8,7 +8,7 @@ from apertura.common.flag_table import FLAGS
 
 
 class Flags(dict[str, str]):
-    """Flags of a stage or an image: name in `apertura.common.flag_table.FLAGS` → measured text.
+    """Flags of a stage or an image: name in `apertura.common.flag_table.FLAGS` → text with measured values.
 
     The text of a flag consists of one line per source (node, pair, image) that raised it, joined by "; ". A line may
     itself contain "; ".

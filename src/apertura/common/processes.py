@@ -1,4 +1,4 @@
-"""Processes of a run: lock, isolation from an untrusted working folder, and orderly termination by signals."""
+"""Processes of a run: lock, isolation from an untrusted working directory, and orderly termination by signals."""
 
 import ctypes
 import fcntl
@@ -84,9 +84,9 @@ def ended_by_signals() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-# ---- Isolation from an untrusted working folder ---------------------------------------------------------------------
+# ---- Isolation from an untrusted working directory ------------------------------------------------------------------
 #
-# Python and libraries load modules and settings from the working folder (``yaml.py``, numba's ``.numba_config.yaml``
+# Python and libraries load modules and settings from the working directory (``yaml.py``, numba's ``.numba_config.yaml``
 # with its cache of pickled code, ``matplotlibrc``). Users run commands in campaign folders, and Snakemake starts every
 # step in such a folder.
 
@@ -99,12 +99,12 @@ _left: list[Path] = []
 
 
 def leave_working_folder() -> None:
-    """Change the working folder to the package folder and call `isolate`; `given` then resolves command-line paths.
+    """Change the working directory to the package folder and call `isolate`; `given` then resolves command-line paths.
 
     Raises
     ------
     FileNotFoundError
-        If the working folder no longer exists.
+        If the working directory no longer exists.
     """
     _left[:] = [Path.cwd()]
     os.chdir(Path(__file__).parents[1])
@@ -112,9 +112,9 @@ def leave_working_folder() -> None:
 
 
 def isolate() -> None:
-    """Prevent imports and commands from the working folder, in this process and its child processes.
+    """Prevent imports and commands from the working directory, in this process and its child processes.
 
-    Empty and relative entries of PATH, PYTHONPATH and ``sys.path``, which refer to the working folder, are removed.
+    Empty and relative entries of PATH, PYTHONPATH and ``sys.path``, which refer to the working directory, are removed.
     Snakemake itself adds such an entry, ``.snakemake/pip-deployments``.
 
     Examples
@@ -283,7 +283,7 @@ def hold(root: Path) -> IO[str]:
     Raises
     ------
     CampaignError
-        If another process holds the lock; the message states process ID, machine and start time.
+        If another process holds the lock; the message contains process ID, machine and start time.
 
     Examples
     --------

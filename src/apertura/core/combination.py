@@ -89,7 +89,7 @@ def clutter_reduction_db(single_db: Sequence[float], coherent_db: float) -> floa
     Returns
     -------
     float
-        Reduction, dB. It is 10 lg n for n images if the targets add in phase and the clutter does not, and 0 if the
+        Reduction, dB. It is 10 log10 n for n images if the targets add in phase and the clutter does not, and 0 if the
         images are identical. If the targets do not add in phase, the reduction is smaller.
 
     Raises

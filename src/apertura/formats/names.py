@@ -73,7 +73,7 @@ class HistoryFormat(NamedTuple):
     described: bool = False
     """True if the reader also has the parameter described=, the section `waveform` of the config."""
     frame: str = ""
-    """Frame of the positions, local or ecef; empty: stated by the files or a flight log."""
+    """Frame of the positions, local or ecef; empty: given in the files or a flight log."""
     waveform: str = "phase_history"
     """waveform.kind of the format."""
     beside: str = ""

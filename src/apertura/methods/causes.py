@@ -181,7 +181,7 @@ class Cause:
         return np.full(len(next(iter(self.moved_m.values()))), self.quantity.std)
 
     def line(self, values: Floats) -> str:
-        """Return a sentence that states the wrong quantity and its error."""
+        """Return a sentence that contains the wrong quantity and its error."""
         return self.quantity.line(*values.tolist(), **self.words)
 
 

@@ -52,9 +52,9 @@ _HOLDS_CODE = ("--profile", "--workflow-profile", "--configfiles", "--snakefile"
 """Options whose values are files from which Snakemake executes code; Snakemake accepts abbreviations of options."""
 _HOLDS_NONE = ("--config", "--jobs")
 _PICKLED = "--trust-io-cache"
-"""Option with which Snakemake reads the state of files from a pickle in the working folder."""
+"""Option with which Snakemake reads the state of files from a pickle in the working directory."""
 _SHORT = re.compile(r"(-[hntkfFlSDvpa]*s)(.*)")
-"""Short options without values, followed by `-s` (`--snakefile`) and its value if there is no space between them."""
+"""Short options that take no value, ending in `-s` (`--snakefile`), and the value of `-s` if no space precedes it."""
 _PROFILE = "SNAKEMAKE_PROFILE"
 """Environment variable: default profile of Snakemake."""
 _DRY_RUN = re.compile(r"-n|-np|--dry-?run")

@@ -157,7 +157,7 @@ def in_bytes(size: int) -> str:
 
 
 def _refuse_writers(results: ConfinedPath) -> None:
-    """Raise CampaignError if a step that outlived its run still writes a stage."""
+    """Raise CampaignError if a step left over from an earlier run is still writing a stage."""
     for path in _files(results):
         if path.name.startswith(".") and path.name.endswith(_LOCK):
             with path.open("rb") as lock:

@@ -208,7 +208,7 @@ class TimeLeft:
         *,
         all_of_it: bool,
     ) -> float:
-        """Return the duration of all work on all cores, but at least the duration of a sequential chain of steps, s."""
+        """Return the larger of total work divided by the number of cores and duration of the critical path, seconds."""
         running = [seconds for seconds, sure in left.values() if sure or all_of_it]
         at_once = self._cores or max(1, len(left))
         work, chain = sum(running) / at_once, max(running, default=0.0)

@@ -332,7 +332,10 @@ def _secondary(radar_m: float, sidelink_m: float, *, tag_s: float, missed: float
 
 
 def _pass_by(middle_m: float, pulses: int, *, right_m: float = -11.5, up_m: float = 4.8) -> Straight:
-    """Return a track along azimuth 40° at 0.5 m/s, scene on the right, midpoint `middle_m` ahead of the scene."""
+    """Return a track along azimuth 40° at 0.5 m/s, with the scene to its right.
+
+    Along the track, the midpoint of the track is `middle_m` metres beyond the scene centre.
+    """
     along = np.array([np.sin(np.radians(40.0)), np.cos(np.radians(40.0)), 0.0])
     right = np.array([along[1], -along[0], 0.0])
     duration_s = (pulses - 1) / _DEMO_WAVEFORM.prf_hz

@@ -260,9 +260,10 @@ class TransmitPulse(TransmitWaveform):
         return "pulse.npy", self.pulse.astype(np.complex64)
 
     def presence(self, arrival: Floats, rate_hz: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return the first and last sample of each path: the whole capture, or no sample if outside the capture.
+        """Return the first sample of each path and the first sample after its end, (path,) each.
 
-        The tones contain the edges of a pulse, including the ringing of a fractional delay beyond them.
+        Each path occupies the whole capture, or no sample if it arrives outside the capture. The tones
+        contain the edges of a pulse, including the ringing of a fractional delay beyond them.
         """
         lead = self.lead_s * rate_hz
         early, late = arrival < -lead - len(self.pulse), arrival >= self.capture_samples - lead

@@ -135,7 +135,7 @@ def _raise_unilluminated(
     middle_m: NDArray[np.float64],
     aperture: Aperture,
 ) -> None:
-    """Raise an error that states, for each antenna, the smallest angle between boresight and scene centre."""
+    """Raise an error whose message contains the smallest angle of each antenna between boresight and scene centre."""
     stated = campaign.antennas(pair)
     keys, lines = [f"nodes.{node}.antennas.{point}" for point, (node, _) in stated.items()], []
     legs = {"radar_tx": (beams.transmit, aperture.tx_m), "radar_rx": (beams.receive, aperture.rx_m)}

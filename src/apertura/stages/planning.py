@@ -88,7 +88,8 @@ def budget_of(
             "calibration",
             np.full(len(paths.time_s), _CM),
             _scaled(pair.report, "calibration", "std_m", _CM),
-            unit="cm of path",
+            unit="cm",
+            quantity="path error",
         ),
         _air(campaign, pair, paths),
         BudgetLine("missing pulses", stated, NO_EFFECT),
@@ -114,7 +115,7 @@ def budget_of(
             ]
     if isinstance(campaign.settings.waveform, SampledWaveform):
         effect = paths.of_offset(campaign.settings.waveform.middle_s * paths.rate_m_s)
-        rate = f"path rate at most {np.abs(paths.rate_m_s).max():.2g} m/s"
+        rate = f"rate of change of the total path at most {np.abs(paths.rate_m_s).max():.2g} m/s"
         lines.append(BudgetLine("stop and go", rate, effect))
     return [*lines, *_between_epochs(paths, pair)]
 
@@ -214,7 +215,7 @@ def air_decision(pair: OpenPair) -> Decision:
     reason = (
         f"{air['source']}; mean along the paths from {air['antennas_m']:.0f} m height; displacement of the image "
         f"relative to {reference} {100 * displaced_m:.2g} cm in slant range, {displaced_m / cell_m:.2g} cells"
-        f"{observable}; path error of a single value for all pulses {100 * residual_m:.1g} cm"
+        f"{observable}; a refractivity common to all pulses causes a path error of {100 * residual_m:.1g} cm"
     )
     return Decision("atmosphere", f"N = {air['refractivity_n']:.1f}", reason)
 
@@ -383,7 +384,7 @@ def gated(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> OpenPair:
 
 
 def recording_flags(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Flags:
-    """Return the flag of a scene with pixels that some pulses did not record; empty for a pair without a gate."""
+    """Return the flag of a scene with pixels beyond the recorded range window of some pulses; empty without a gate."""
     if pair.gate is None:
         return Flags()
     path_m, illuminated, weight = _recorded(campaign, pair, scene, pair.gate)

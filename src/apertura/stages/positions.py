@@ -241,7 +241,7 @@ def _longest_hole(node: NodeLog, checked: CheckedTrack, cause: str) -> str:
 GROUND_STEP_M = 10.0
 """Rounding of the terrain height for the refractivity, metres: 0.4 N units.
 
-A small change of the configured height then does not require echoes to be formed again.
+A small change of the configured height then does not require the echoes to be recomputed.
 """
 
 _SIDE = 16  # pixels per side of the grid on which the mean height of a DEM is computed

@@ -414,7 +414,7 @@ def calibrated_pair(
     weights: tuple[Beams | None, int] | None = None,
     threads: int = 1,
 ) -> CalibratedPair | None:
-    """Return the calibration of an open pair's image; None if neither radio nor constant is known.
+    """Return the calibration of the image of an open pair; None if radio and calibration constant are unknown.
 
     Parameters
     ----------

@@ -34,7 +34,7 @@ from apertura.stages.scene import OpenScene, settled_scene
 from apertura.workflow.lineage import result_of
 
 _SUMS = {"coherent": "SLC", "noncoherent": "MLI"}
-"""Sum of a flight's pairs → type of product; file names of a sum begin with its name."""
+"""Mapping from the name of each sum, with which its file names begin, to its product type."""
 
 
 def stac(campaign: Campaign) -> list[Path]:

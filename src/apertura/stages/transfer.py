@@ -293,7 +293,8 @@ def recorded_echo(campaign: Campaign, flight: str, pair: str) -> xr.Dataset:
         raise CampaignError(
             "positions both with the samples and in a flight log" if logged else "samples without positions",
             where=campaign.history_files(flight, rx)[0],
-            expected="positions from one source: with the samples, or in a flight log raw/<flight>/<node>.track.*",
+            expected="positions from a single source: either stored with the samples or read from a flight log "
+            "raw/<flight>/<node>.track.*",
             remedy="Remove one of them." if logged else "Copy the flight log there.",
         )
     if logged:

@@ -70,8 +70,8 @@ class Measurement:
     flight, pair, reflector
         Names of flight, pair and reflector.
     constant_db, scatter_db, common_db
-        10 lg K, and two standard deviations: of errors independent in each image, and of errors common to all images of
-        the reflector.
+        10 log10 K, and two standard deviations: of errors independent in each image, and of errors common to all images
+        of the reflector.
     phase_rad, phase_scatter_rad
         Phase of the peak relative to that expected from the reflector's position, and its standard deviation.
     gradient

@@ -194,8 +194,9 @@ def _check_degrees(stem: Path, recorded: RecordedNode, scene: Scene) -> None:
     """Raise CampaignError if latitude and longitude of a track are in radians.
 
     Radians interpreted as degrees give positions in the Gulf of Guinea, where there is no land, and distances that are
-    57 times too short. A track there is refused if only its interpretation as radians fits the scene (or, without a
-    georeferenced scene, the speed of a flight).
+    57 times too short. A track in that region is rejected if it agrees with the scene only when its angles are
+    interpreted as radians. Without a georeferenced scene, it is rejected if only this interpretation results in the
+    speed of a flight.
     """
     track = recorded.track
     if isinstance(track, str | Path) or (np.abs(np.asarray(track)[:, :2]) > _LARGEST_RAD).any():

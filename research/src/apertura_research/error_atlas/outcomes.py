@@ -167,7 +167,7 @@ class ErrorAtlasRow:
     loss_db, shift_m
         Mean over the five targets, relative to the same draw without the error.
     phase_rad
-        Phase difference of the pairs halfway between their peaks, relative to the same draw without the error.
+        Phase difference of the pairs midway between their peaks, relative to the same draw without the error.
     ghost_db
         Increase of the brightest pixel at 1.5 m or more from all targets, relative to the brightest target.
     cell_m
@@ -264,6 +264,6 @@ def _sum_loss_db(right: dict[str, PairImage], wrong: dict[str, PairImage]) -> fl
 
 
 def _phasors(images: dict[str, PairImage]) -> NDArray[np.complex128]:
-    """Return values of both images halfway between their peaks, (pair, target) complex128."""
+    """Return values of both images midway between their peaks, (pair, target) complex128."""
     middle = np.mean([one.peaks[:, :2] for one in images.values()], axis=0)
     return np.array([one.at(middle[:, :1], middle[:, 1:])[:, 0] for one in images.values()], np.complex128)

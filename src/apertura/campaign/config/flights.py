@@ -97,7 +97,7 @@ def read_flights(path: Path, *, nodes: Collection[str]) -> Iterator[Flight]:
     Raises
     ------
     CampaignError
-        If a line is invalid; the message states file and line.
+        If a line is invalid; the message contains file and line.
     """
     names: set[str] = set()
     for where, cells in table_rows(path, _COLUMNS, remedy="Write one line per flight."):
@@ -175,7 +175,7 @@ def read_segments(path: Path, *, flights: Sequence[Flight]) -> Iterator[Segment]
     Raises
     ------
     CampaignError
-        If a line is invalid; the message states file and line.
+        If a line is invalid; the message contains file and line.
     """
     if not path.is_file():
         return
@@ -272,7 +272,7 @@ def read_clocks(path: Path, *, flights: Sequence[Flight]) -> Iterator[ClockRow]:
     Raises
     ------
     CampaignError
-        If a line is invalid; the message states file and line.
+        If a line is invalid; the message contains file and line.
     """
     if not path.is_file():
         return

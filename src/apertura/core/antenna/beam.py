@@ -139,7 +139,8 @@ class Beam:
     """Separable antenna pattern about axes that rotate with the antenna; the gain is 0 outside the sampled angles.
 
     A direction with components (a, b, c) along the axes has azimuth atan2(b, a) and elevation
-    atan2(c, √(a² + b²)). The gain is the product of both cuts, linear between samples.
+    atan2(c, √(a² + b²)). The gain is the product of the two cuts, each interpolated linearly between
+    samples.
 
     Attributes
     ----------

@@ -303,7 +303,7 @@ LARGEST_OFFSET_S = 20e-3
 """Largest offset between the tags of two nodes, seconds, that is explained by errors of a few milliseconds each."""
 
 OUTLIER_S = 5e-3
-"""Deviation of a tag from the line, seconds, that is within the accuracy of time tags."""
+"""Largest deviation of a time tag from the fitted line that is attributed to time-tag accuracy, seconds."""
 
 _OUTLIER_SIGMA = 6.0  # standard deviations of all tags: an outlier exceeds both this and `OUTLIER_S`
 

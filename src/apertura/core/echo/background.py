@@ -1,7 +1,7 @@
 """Background of a recording: echoes at constant delay while the antennas move, such as antenna coupling.
 
-docs/theory/background.md: signal model (eq. 1), Doppler test (eq. 2), estimators (eq. 3). The decision on its removal
-requires the scene, and is made by `apertura.core.imaging.background`.
+docs/theory/background.md: signal model (eq. 1), Doppler test (eq. 2), estimators (eq. 3). Whether the
+background is removed depends on the scene and is decided in `apertura.core.imaging.background`.
 """
 
 import math
@@ -32,7 +32,7 @@ _FALSE_ALARM = 1e-6
 """Probability that noise alone passes the test."""
 
 _LEAST_GROUPS = 16
-"""Least length of a running median in groups; least number of pulses for the test."""
+"""Minimum length of a running median in groups; minimum number of pulses for the test."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,8 +25,8 @@ AT_ONCE = 64
 """Captures processed at a time; their number is limited by the processor caches."""
 
 SATURATED_SHARE = 1e-4
-"""Share of samples at full scale of a converter, above which it clips; a symbol 12 dB below has one or two such
-samples."""
+"""Share of samples at the full-scale codes of a converter, above which it clips; a symbol 12 dB below has one or two
+such samples."""
 
 
 def ordered(iq: Samples, order: str) -> Samples:
@@ -111,14 +111,14 @@ of 128 subcarriers have a low crest factor, because their samples are not indepe
 
 
 class Saturation:
-    """Counter of samples at a converter's full scale, and of captures limited below them, block by block.
+    """Counter of samples at a converter's full-scale codes, and of captures limited below them, block by block.
 
     Notes
     -----
-    With a clipping converter of any number of bits, samples accumulate at full scale; without clipping the extreme
-    values occur once or twice. A limiter in front of the converter lowers both the peak of a capture and its crest
-    factor, max|s|²/mean|s|². A weak capture has a lower peak and an unchanged crest factor; a strong tone has a lower
-    crest factor and an unchanged peak. Captures are compared with the 90th percentile of all captures.
+    With a clipping converter of any number of bits, samples accumulate at the full-scale codes; without clipping the
+    extreme values occur once or twice. A limiter in front of the converter lowers both the peak of a capture and its
+    crest factor, max|s|²/mean|s|². A weak capture has a lower peak and an unchanged crest factor; a strong tone has a
+    lower crest factor and an unchanged peak. Captures are compared with the 90th percentile of all captures.
 
     Examples
     --------

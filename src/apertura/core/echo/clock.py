@@ -27,7 +27,7 @@ AMBIGUOUS_SHARE = 0.4
 GROUPS = 16
 """Number of parts of the flight, from the scatter of which the standard deviation of the clock offset is computed."""
 
-_SMALLEST_REPEAT = 32  # least number of repeated samples in a capture
+_SMALLEST_REPEAT = 32  # minimum number of repeated samples in a capture
 _TAPERED = 0.25
 """Tapered fraction of the repeated samples, both ends together. A capture that is triggered late extends beyond the end
 of the symbol. Without a taper, the phase error for a chirp-like code was 70 standard deviations, 0.1 ppm or more."""

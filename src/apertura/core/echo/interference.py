@@ -19,7 +19,7 @@ from apertura.common.flags import Flags
 from apertura.common.units import decibels
 
 LEAST_GAIN_DB = 0.1
-"""Least gain in SNR by an exclusion, dB; a smaller gain does not justify its sidelobes or the loss of pulses."""
+"""Minimum gain in SNR by an exclusion, dB; a smaller gain does not justify its sidelobes or the loss of pulses."""
 
 SERVICES: tuple[tuple[float, float, str], ...] = (
     (420e6, 450e6, "radar, amateur radio"),
@@ -493,7 +493,7 @@ class NoisyPulses:
         too_many = noisy.sum() > _MOST_PULSES * len(noisy)
         if not self.excluded.any() and not too_many:
             return Flags()
-        done = "not excluded, as these are too many" if too_many else "excluded"
+        done = "not excluded, because there are too many" if too_many else "excluded"
         excess_db = decibels(float(self.excess.max()))
         line = (
             f"{noisy.sum()} of {number_of(len(noisy), 'pulse')}: noise up to {excess_db:.1f} dB above the "

@@ -16,7 +16,7 @@ FALSE_ALARM = 1e-5
 
 _COHERENT_PULSES = 8, 32, 128  # numbers of pulses that are added coherently at each Doppler frequency
 _GUARD_CELLS = 8  # cells excluded on both sides of the prefix because of sidelobes of echoes inside the prefix
-_FEWEST_CELLS = 32  # least number of cells outside the prefix to estimate the floor
+_FEWEST_CELLS = 32  # minimum number of cells outside the prefix to estimate the floor
 _NOISE_SIGMAS = 6.0  # excess scatter above which cells outside the prefix may contain signals in addition to noise
 _SPREAD_SIGMAS = 10.0  # excess scatter above which these cells certainly contain signals in addition to noise
 
@@ -126,17 +126,17 @@ def _strongest(profile: NDArray[np.complex64], run: int, inside: int, beyond: sl
 # ---- Phase stability of monostatic echoes
 
 LEAST_COHERENCE = 0.3
-"""Least coherence of the second differences of phase; it corresponds to 1.55 rad rms, or white phase noise of 0.63 rad.
-"""
+"""Minimum coherence of the second differences of phase; it corresponds to 1.55 rad rms, or white phase noise of
+0.63 rad."""
 
 STEADY = 0.93
-"""Least agreement of magnitudes from pulse to pulse. The agreement is π/4 for independent speckle, and 0.95 for an SNR
-of 10 dB."""
+"""Minimum agreement of magnitudes from pulse to pulse. The agreement is π/4 for independent speckle, and 0.95 for an
+SNR of 10 dB."""
 
 ECHO_DB = 13.0
-"""Least mean power of evaluated cells relative to the noise, dB; in weaker cells, noise dominates the phase."""
+"""Minimum mean power of evaluated cells relative to the noise, dB; in weaker cells, noise dominates the phase."""
 
-_FEWEST_TRIPLES = 20  # least number of triples of consecutive pulses to estimate a coherence
+_FEWEST_TRIPLES = 20  # minimum number of triples of consecutive pulses to estimate a coherence
 _EVEN = 0.25  # tolerated relative deviation from the median interval; a larger deviation indicates missing pulses
 
 

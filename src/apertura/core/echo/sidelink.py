@@ -20,10 +20,10 @@ from apertura.core.echo.sidelink_state import ECHO_DB, GATE_CELLS, NULL_DB, Side
 __all__ = ["METHODS", "choose", "divide", "edges", "gated", "measure", "two_parameter", "wiener"]
 
 DIVIDE_SNR_DB = 10.0
-"""Least SNR per subcarrier for `divide`, dB (docs/theory/echo_methods.md, "Which correction")."""
+"""Minimum SNR per subcarrier for `divide`, dB (docs/theory/echo_methods.md, "Which correction")."""
 
 WIENER_SNR_DB = 6.0
-"""Least SNR per subcarrier for `wiener`, dB (same source)."""
+"""Minimum SNR per subcarrier for `wiener`, dB (same source)."""
 
 RIPPLE_DB = 0.5
 """Largest ripple that may remain after a correction, dB peak to peak (same source)."""

@@ -32,7 +32,7 @@ EXCLUDED_RAD = np.pi / 3
 """Phase error above which a pulse degrades the image more than its absence does (eq. 5)."""
 
 TOLERATED_LOSS_DB = 0.2
-"""Peak loss by the remaining outliers below which they are not reported; the least loss that images resolve."""
+"""Peak loss by the remaining outliers below which they are not reported; the minimum loss that images resolve."""
 
 LINE_FALSE_ALARM = 1e-6
 """Probability that noise alone causes a line in the spectrum of a flight."""
@@ -130,7 +130,7 @@ def find_spikes(
 
 @dataclass(frozen=True)
 class _Residual:
-    """Phase after removal of its rotation, its deviation from the running median, and the limit of an outlier."""
+    """Derotated phase, its deviation from the running median, and the outlier threshold."""
 
     detrended_rad: Floats
     deviation_rad: Floats

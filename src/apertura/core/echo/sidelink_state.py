@@ -241,7 +241,7 @@ def measure_blocks(blocks: Callable[[], Iterable[Complexes]], where: str = "side
     """Measure the sidelink of a flight, block by block.
 
     `blocks` yields the sidelink from its start, (pulse, subcarrier) complex64 each, code removed; it is called again
-    if no pulse locks. Raises CampaignError, which names the recording `where`, if there is no signal.
+    if no pulse locks. Raises CampaignError, whose message contains the recording `where`, if there is no signal.
 
     Notes
     -----

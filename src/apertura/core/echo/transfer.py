@@ -41,7 +41,7 @@ _INVERTED = (
     "the conjugate samples contain the code: set waveform.iq to swapped if I and Q are swapped, or to conjugate if the "
     "local oscillator is above the band; for a single node, set nodes.<n>.iq"
 )
-# least factor by which the peak-to-mean ratio of delay profiles increases if the samples are conjugated
+# minimum factor by which the peak-to-mean ratio of delay profiles increases if the samples are conjugated
 _COMPRESSED = 4.0
 
 _STRETCH = 128  # number of consecutive pulses in each part of the flight in which code and phase are checked

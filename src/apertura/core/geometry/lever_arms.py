@@ -246,7 +246,7 @@ def _rotations(
     purpose: str,
     where: object,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the rotations NED → `frame` and body → NED at given times; error messages name the `purpose`."""
+    """Return the rotations NED → `frame` and body → NED at given times; error messages contain the `purpose`."""
     pulses = seconds_since(at, track_time[0])
     ned = ned_axes(spline(pulses)) if frame == "ecef" else np.broadcast_to(LOCAL_NED, (len(pulses), 3, 3))
     angles = (

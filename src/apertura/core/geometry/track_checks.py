@@ -25,9 +25,9 @@ LEAST_FAULT_M = 5e-3
 FINEST_GRAIN_M = 0.01
 """Largest rounding step of a log that resolves centimetres, metres; upper limit for the scatter of a static log."""
 
-_SIGMA = 10.0  # least size of a fault relative to the scatter of the log
-_SMOOTHER = {1: 7.0, 2: 12.0, 3: 20.0}  # number of faulty epochs → least size relative to the residual misfits
-_STEP_SMOOTHER = 10.0  # least size of a step relative to the residual misfits
+_SIGMA = 10.0  # minimum size of a fault relative to the scatter of the log
+_SMOOTHER = {1: 7.0, 2: 12.0, 3: 20.0}  # number of faulty epochs → minimum size relative to the residual misfits
+_STEP_SMOOTHER = 10.0  # minimum size of a step relative to the residual misfits
 # acceleration that a node may have in either direction within an interval: smaller steps are attributed to motion
 _AGILE_M_S2 = 10.0
 _CHI3_MEDIAN = 1.538  # median length of a vector of three standard normal components
@@ -313,7 +313,7 @@ def rounded_position_m(time_s: Floats, position_m: Floats, *, least_m: float) ->
 
 _ON_EARTH_M = 1e6
 _DEGREE_M = 111_195.0  # metres per degree of latitude
-_ROUGH = 0.1  # least scatter of rounded positions relative to the rounding step
+_ROUGH = 0.1  # minimum scatter of rounded positions relative to the rounding step
 _SAME_M = 1e-5  # difference below which two values are considered equal, metres
 _COARSE_M = 1.5e-2  # receivers that resolve centimetres write multiples of 1e-7 degrees, 1.1 cm
 _FEWEST_VALUES, _MOST_VALUES = 8, 500
@@ -524,10 +524,10 @@ def _interpolation_m(time_s: Floats, position_m: Floats) -> float | None:
 
 _COURSE_STEP_M = 2.0  # distance over ground from which a course is determined: 1 cm of noise causes an error of 0.4°
 _LEAST_STEPS = 10
-# least mean phasor of yaw minus course if yaw follows the course: 33° RMS from wind, sideslip and manual turns
+# minimum mean phasor of yaw minus course if yaw follows the course: 33° RMS from wind, sideslip and manual turns
 _FOLLOWS = 0.85
 _LEAVES = 0.8  # largest mean phasor if yaw does not follow the course: 38° RMS
-_CLOSER = 2.0  # least ratio of the scatter of yaw about the course as logged to the scatter with another convention
+_CLOSER = 2.0  # minimum ratio of the scatter of yaw about the course as logged to the scatter with another convention
 # widest gap between courses for which a constant heading, or a heading towards the scene, can be excluded
 _ROUND_DEG = 60.0
 _WHOLE_TURN = 1.01 * 2 * np.pi  # limit of an angle in radians
@@ -644,7 +644,7 @@ HOVER_SPEED = 0.2
 climbs and above the speed in a hover in wind."""
 
 HOVER_S, HOVER_SHARE = 5.0, 0.05
-"""Least duration of a hover, seconds, and least fraction of pulses in hovers: a smaller fraction causes a pedestal
+"""Minimum duration of a hover, seconds, and minimum fraction of pulses in hovers: a smaller fraction causes a pedestal
 below -26 dB."""
 
 _HOVER_WINDOW_S = 2.0  # interval of the speed estimate: 1 cm of log noise causes an error of 1 cm/s

@@ -22,7 +22,7 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
 
 LEAST_NET_DB = 0.5
-"""Least gain minus loss, dB, for which `auto` removes a background: a smaller one is not visible in the image."""
+"""Minimum gain minus loss, dB, for which `auto` removes a background: a smaller one is not visible in the image."""
 
 MOST_LOSS_DB = 3.0
 """Largest loss of a target, dB, that `auto` accepts, whatever the gain: half of its power."""
@@ -34,7 +34,7 @@ FLAGGED_GAIN_DB = 3.0
 """Gain that the decision leaves unused, dB, above which `background` is raised."""
 
 SIMPLER_DB = 2.0
-"""Least additional net gain, dB, for which a method is preferred to a simpler one. Longer windows are simpler than
+"""Minimum additional net gain, dB, for which a method is preferred to a simpler one. Longer windows are simpler than
 shorter ones, and removal at all delays is simpler than removal at some."""
 
 RUNNING = 4, 8, 16

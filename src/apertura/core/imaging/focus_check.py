@@ -118,8 +118,8 @@ UNFOCUSED_ECHO_DB = 25.0
 which must be focused at some pixel, because speckle reaches only 10 dB."""
 
 LEAST_PULSES = 64
-"""Least number of pulses to determine whether a point dominates its resolution cell: 2 pulses in each of the 32 blocks
-of `point_focus`."""
+"""Minimum number of pulses to determine whether a point dominates its resolution cell: 2 pulses in each of the 32
+blocks of `point_focus`."""
 
 _MOST_PULSES = 64  # pulses sampled in the search for echoes outside the scene
 # range cells excluded about the direct path and at the edges of the swath, where sidelobes of point responses occur
@@ -127,7 +127,7 @@ _NEAR_CELLS = 4
 
 
 LEAST_GATHERED = 0.2
-"""Least ratio of the focused power of the points of an image to the power of the strongest echo in the pulses. Points
+"""Minimum ratio of the focused power of the points of an image to the power of the strongest echo in the pulses. Points
 in one range cell add up to one echo, of which up to half may be missing in the ratio. An image with a peak loss of 7 dB
 has a lower ratio."""
 
@@ -349,10 +349,10 @@ def _echo_power(history: PhaseHistory) -> float:
 
 # ---- Focus report of an image
 
-# side of the squares in which the brightest maximum is evaluated, resolution cells; and least side, pixels
+# side of the squares in which the brightest maximum is evaluated, resolution cells; and minimum side, pixels
 _SQUARE_CELLS, _LEAST_PX = 2.0, 4
 _PATCHES = 4  # number of patches imaged by subapertures, at the brightest points
-_PATCHES_APART = PART_PX / 2  # least distance of two patches, in patch pixels, for independent measurements
+_PATCHES_APART = PART_PX / 2  # minimum distance of two patches, in patch pixels, for independent measurements
 _PLACES_PER_CELL = 2.5  # pixels of a patch per resolution cell, along a side
 _CELL_POINTS = 5  # points along a side of the scene at which the resolution cell is computed
 _BAND_SAMPLES = 9  # frequency samples of the spatial spectrum
@@ -468,7 +468,7 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
 
 
 _CONJUGATED_LOSS_DB = -6.0  # loss beyond which the samples of a defocused image are tested for conjugation
-_CONJUGATED_DB = 10.0  # least increase of the peak by conjugation, dB; a track error does not cause such an increase
+_CONJUGATED_DB = 10.0  # minimum increase of the peak by conjugation, dB; a track error does not cause such an increase
 _CONJUGATED_S = 60.0  # longest predicted run time (s) of an image to which this test is applied
 
 
@@ -500,7 +500,8 @@ def _conjugated(formation: Formation, peak: float) -> str | None:
 
 
 UNEXPECTED_DB = 0.2
-"""Least loss in excess of the expected loss that raises a flag, dB: accuracy of the loss measured with many points."""
+"""Minimum loss in excess of the expected loss that raises a flag, dB: accuracy of the loss measured with a number of
+points."""
 
 
 def focus_flags(report: dict[str, Any], expected: Effect) -> Flags:

@@ -133,7 +133,7 @@ def _check_samples(inputs: PhaseHistory | Profiles) -> None:
 
 
 _LEAST_BAND = 0.05
-"""Least fraction of subcarriers that contain the energy of a pulse: in frequency, an echo occupies the whole band; in
+"""Minimum fraction of subcarriers that contain the energy of a pulse: in frequency, an echo occupies the whole band; in
 time, it occupies few samples."""
 
 

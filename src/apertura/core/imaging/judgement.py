@@ -188,7 +188,7 @@ def budget_by_hand(
     return [
         *position_lines(paths, nodes, sidelink=False),
         height_line(paths, None),
-        offset_line(paths, "calibration", cm_of_path, None, unit="cm of path"),
+        offset_line(paths, "calibration", cm_of_path, None, unit="cm", quantity="path error"),
         _air_line(paths, profiles.wave_speed_m_s),
         *([] if error_db is None else [arithmetic_line(error_db)]),
     ]

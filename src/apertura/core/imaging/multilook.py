@@ -16,7 +16,7 @@ LAGS_PX = 32
 within ten cells."""
 
 _MEASURED_PX = 128  # side of the blocks used for the correlation: at least 96² pixel pairs at each lag
-_MEASURED_WINDOWS = 3  # least number of windows of the local ENL along a side of a block
+_MEASURED_WINDOWS = 3  # minimum number of windows of the local ENL along a side of a block
 _LARGEST_PX = 4096  # largest side of a block; the ENL is not estimated if windows are wider
 _MEASURED_BLOCKS, _MOST_PX = 64, 1 << 24  # largest number of blocks, and approximate largest total number of pixels
 WINDOW = 7
@@ -25,7 +25,7 @@ WINDOW = 7
 _PARTS = 4  # subdivisions of a block per axis, which model the variation of the look direction across the block
 # |ρ|² at large lags above which a block is excluded: blocks of two resolution cells, or a constant image
 _MOST_CHANCE = 0.5
-_FEWEST_PX = 10  # least side of a block: a smaller block contains only lags close to zero
+_FEWEST_PX = 10  # minimum side of a block: a smaller block contains only lags close to zero
 _STEP, _SCATTER = 0.02, 0.2  # histogram bin, and standard deviation of a local estimate for smoothing, of ln(ENL)
 
 

@@ -21,8 +21,8 @@ _PLACES, _BLOCKS = 64, 8
 """Number of random points at which the noise is measured, and largest number of 64-pulse blocks used."""
 
 _MARGIN, _BAND = 2.0, (0.25, 0.4375)
-"""Width of the excluded Doppler band relative to that of the scene, such that echoes from the surroundings are
-excluded; and limits of the excluded band, cycles per pulse."""
+"""Ratio of the width of the excluded Doppler band to that of the scene, chosen to exclude echoes from the surroundings.
+Lower and upper limits of the half-width of the excluded band, cycles per pulse (W in docs/theory/layers.md, eq. 2b)."""
 
 _LEAKED_DB = 0.6
 """Increase (dB) of the measured noise by echoes outside the scene if the PRF is too low for the margin of the excluded
@@ -34,8 +34,8 @@ _LEAK = 1e-5
 # number of groups for which sidelink noise is drawn, and pulses per group, within which the geometry is constant
 _GROUPS, _ALIKE = 16, 8
 _BLOCKS_DRAWN = 16  # random draws per group
-_FEWEST = 16  # least number of pulses in a block
-_LEAST_WEIGHT = 0.1  # least weight of a block at a point, relative to the largest weight; lower weights are excluded
+_FEWEST = 16  # minimum number of pulses in a block
+_LEAST_WEIGHT = 0.1  # minimum weight of a block at a point, relative to the largest weight; lower weights are excluded
 
 
 def noise_places(grid: SceneGrid, terrain: Terrain) -> NDArray[np.float64]:

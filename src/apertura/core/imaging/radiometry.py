@@ -180,7 +180,7 @@ def pointing_std_db(beams: Beams | None, aperture: Aperture, place_m: Floats, tu
 # ---- Calibration of an image, on a lattice
 
 _RANGE_SHARE = 24  # node pitch is range / 24: interpolation error of log gain and area 0.1 dB in a beam of 20°
-_PULSES = 128  # least number of pulses summed for a block of the lattice; the largest number is twice this number
+_PULSES = 128  # minimum number of pulses summed for a block of the lattice; the largest number is twice this number
 _POINT_PULSES = 8192  # the same limit for a single point
 _BINS = 32  # bins of the pulse density over spatial frequency, whose square is integrated
 _LEAST = 1e-3  # weight relative to the strongest pulse, below which a pulse does not extend the aperture
@@ -314,7 +314,9 @@ class Calibration:
         self.directions[block] = np.stack([up, slant, towards], axis=1).reshape(*shape, 3, 3)
 
     def at(self, points: Floats) -> tuple[Floats, Floats]:
-        """Return the image power of a point of 1 m², K·A², and the noise power relative to that of a pulse, at points.
+        """Return the image power of point targets, and the noise power relative to that of a pulse, at points.
+
+        The power of a point target with a radar cross-section of 1 m² is K·A².
 
         Parameters
         ----------
@@ -337,7 +339,10 @@ class Calibration:
         return np.where(share > 0, np.exp(mean / np.where(share > 0, share, 1.0)), np.nan)
 
     def rcs_power(self, window: Window) -> Floats:
-        """Return the power |I|² of a point of 1 m² at each pixel of a window, K·A²; NaN at pixels not illuminated."""
+        """Return the power |I|² of a point target with a radar cross-section of 1 m², K·A², at each pixel of a window.
+
+        The power is NaN at pixels that are not illuminated.
+        """
         power, shares = self.constant * self._between(self.gain, window), self._recorded.at(window)
         return power if shares is None else power * _or_nan(shares[0]) ** 2
 

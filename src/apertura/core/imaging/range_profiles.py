@@ -29,7 +29,7 @@ OVERSAMPLING = 2.0
 
 @dataclass(frozen=True, eq=False)
 class RangeWindow:
-    """Interval of total paths that range profiles cover.
+    """Interval of total path lengths (bistatic ranges) covered by the range profiles.
 
     Attributes
     ----------

@@ -20,7 +20,7 @@ from apertura.core.scene.terrain import FlatGround, Terrain
 
 _ORDER = 4  # highest order of moments: the second order yields the width of the spectrum, the fourth order its shape
 _ORDERS = [(east, total - east) for total in range(_ORDER + 1) for east in range(total + 1)]
-_PULSES = 128  # least number of pulses summed for a block of the lattice; the largest number is twice this number
+_PULSES = 128  # minimum number of pulses summed for a block of the lattice; the largest number is twice this number
 _HALF_POWER = np.log(2) / 2  # -ln|p| where |p|² is one half
 _UPRIGHT = 4  # moments that involve the vertical, needed on slopes
 _LEAST_SPREAD = 1e-12  # cycles² per m²: a spectrum with a smaller second moment is treated as a single point
@@ -218,7 +218,7 @@ class Resolution:
 
     @cached_property
     def _axes_at_nodes(self) -> tuple[Floats, Floats, Floats]:
-        """Widths along both axes, metres, and azimuth of the finest direction, radians, on level ground."""
+        """Widths along both axes (m) and azimuth (rad) of the direction of finest resolution, on level ground."""
         _, _, azimuth, *values = _principal(*self._spread_at_nodes[:3])
         fine, coarse = (_width(shape, value) for shape, value in zip(self._shapes_at_nodes, values, strict=True))
         return fine, coarse, azimuth
@@ -239,7 +239,7 @@ def _width(shape: Floats, variance: Floats) -> Floats:
 
 
 def _on_slopes(spread: list[Floats], slopes: tuple[Floats, Floats]) -> tuple[Floats, Floats, Floats]:
-    """Return covariances east-east, east-north and north-north along sloping terrain, per horizontal metre."""
+    """Return the east-east, east-north and north-north covariances on sloping terrain, in horizontal coordinates."""
     east, both, north, east_up, north_up, up_up = spread
     to_east, to_north = slopes
     return (

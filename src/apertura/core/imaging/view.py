@@ -9,7 +9,7 @@ from apertura.core.imaging.formation import Formation
 from apertura.core.scene.angles import bistatic_angle_deg, incidence_deg
 
 _COUNTS = 0.5
-"""Least weight of a pulse that is considered to illuminate the scene centre: half amplitude."""
+"""Minimum weight of a pulse that is considered to illuminate the scene centre: half amplitude."""
 
 _ONE_SIDE = 0.95
 """Fraction of pulses with the scene on one side of the track, above which the image is assigned to this side."""

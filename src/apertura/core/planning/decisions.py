@@ -165,7 +165,7 @@ MOST_ASPECT = 1.5
 
 _PULSES = 256  # pulses sampled for the geometry
 FEWEST = 3
-"""Least number of pulses required at any one pixel: focus cannot be assessed from two pulses."""
+"""Minimum number of pulses required at any one pixel: focus cannot be assessed from two pulses."""
 
 _COUNTED = 16384  # pulses sampled to count the pulses per pixel
 

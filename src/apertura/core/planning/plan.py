@@ -66,7 +66,7 @@ def check_geometry(job: Job) -> dict[str, str]:
 
 
 _LEAST_CELLS = 2.0
-"""Least number of resolution cells across the line of sight: with fewer cells, an image is resolved in range only."""
+"""Minimum number of resolution cells across the line of sight: with fewer cells, an image is resolved in range only."""
 
 
 def no_aperture(aperture: Aperture, ground_m: NDArray[np.float64], *, wavelength_m: float) -> str | None:
@@ -321,7 +321,7 @@ _TILE_BYTES = 150  # bytes per pixel during formation: positions, their projecti
 _READ_BYTES = 3  # bytes in memory per byte of a block while it is read: compressed, decoded, and in its destination
 _SUM_BYTES = 8  # bytes per pixel for the sum over pulse blocks
 _CHECKED_PULSES, _CHECKED_BYTES = 1024, 40  # pulses per read for certificate and focus; bytes per subcarrier and pulse
-_LEAST_PULSES = 64  # least pulses of a block: batch size of the kernel
+_LEAST_PULSES = 64  # minimum number of pulses of a block: batch size of the kernel
 # bytes per pixel on disk before compression: image, part of the cube, three rasters with overviews
 _PRODUCT_BYTES = 76
 

@@ -30,7 +30,7 @@ OUT_OF_PHASE_RAD = 0.6
 """Tolerated phase difference of two images, radians: the loss of their sum is 0.4 dB."""
 
 LEAST_COHERENCE = 0.5
-"""Least magnitude of the mean phasor over common points, 0 to 1: phases with more scatter cannot be corrected by a
+"""Minimum magnitude of the mean phasor over common points, 0 to 1: phases with more scatter cannot be corrected by a
 constant phase."""
 
 LARGEST_PHASE_STD_RAD = 0.4
@@ -38,10 +38,10 @@ LARGEST_PHASE_STD_RAD = 0.4
 
 _MOST_PATCHES = 16  # largest number of patches that are compared; the brightest patches are selected
 _LEAST_LOOKS = 12
-"""Least number of independent samples: fewer may lie on one flank of a point response (interferometry.md, eq. 6)."""
+"""Minimum number of independent samples: fewer may lie on one flank of a point response (interferometry.md, eq. 6)."""
 _BY_CHANCE = 0.001  # significance level: probability with which unrelated images are classified as coherent
 _WIDER = (2.0, 4.0, 8.0)  # resolution cells: gates within which points with different shifts are matched
-_FEWEST_SPREAD = 3  # least number of points for a wide gate: matches of two points may be accidental
+_FEWEST_SPREAD = 3  # minimum number of points for a wide gate: matches of two points may be accidental
 _FAR = 4.0  # standard deviations from the median shift, beyond which a match is an outlier
 # factor on the bounds of phase and position from looks, for the excess scatter of terrain (interferometry.md, eq. 8)
 _MARGIN = 1.4
@@ -180,7 +180,7 @@ def agreement(
 
     Notes
     -----
-    Source: docs/theory/focus.md, "Pairs". The phase is evaluated halfway between both peaks. At the peaks themselves,
+    Source: docs/theory/focus.md, "Pairs". The phase is evaluated midway between the two peaks. At the peaks themselves,
     the displacement caused by noise and neighbours would add carrier phase.
 
     Examples
@@ -193,7 +193,7 @@ def agreement(
     >>> round(result.shift_m, 3), round(result.phase_rad, 3), result.out_of_phase
     (0.0, 1.571, True)
     """
-    # Common points, their shifts from first to second, and the values of both images halfway between the peaks.
+    # Common points, their shifts from first to second, and the values of both images midway between the peaks.
     lists = [
         [(point.column * spacing_m, -point.row * spacing_m, point.amplitude) for point in of_image]
         for of_image in points
@@ -316,7 +316,7 @@ def _carrier(point: BrightPoint) -> tuple[float, float]:
 
 
 def _between(images: tuple[BlockRaster, BlockRaster], first: BrightPoint, second: BrightPoint) -> list[complex]:
-    """Return the values of both images halfway between their peaks."""
+    """Return the values of both images midway between their peaks."""
     row, column = (first.row + second.row) / 2, (first.column + second.column) / 2
     return [
         complex(BandLimitedPatch(image, round(row), round(column), point.carrier).at(row, column))

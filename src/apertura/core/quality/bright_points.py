@@ -22,7 +22,7 @@ SMEARED_CELLS = 6.0
 this distance."""
 
 OVER_RESPONSE = 2.0
-"""Least ratio of the amplitude of a point to the summed responses of brighter points at its position: 6 dB, because
+"""Minimum ratio of the amplitude of a point to the summed responses of brighter points at its position: 6 dB, because
 tapers and phase errors displace and raise sidelobes."""
 
 _RESPONSE_PULSES = 512  # number of sampled pulses, sufficient for a quarter of this number of phase cycles
@@ -198,10 +198,10 @@ def near(
 
 MOST_POINTS = 16  # largest number of points measured in an image
 DEEPEST_DB = -12.0
-"""Least amplitude of a point relative to the brightest point, dB: weaker maxima may be lobes of a defocused point."""
+"""Minimum amplitude of a point relative to the brightest point, dB: weaker maxima may be lobes of a defocused point."""
 
 _MOST_MAXIMA = 1024  # largest number of maxima compared with the responses of brighter points
-_POINT_CONTRAST = 10.0  # least power of a point relative to the surrounding speckle: 10 dB
+_POINT_CONTRAST = 10.0  # minimum power of a point relative to the surrounding speckle: 10 dB
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ LEVER_ARM_STD_M = 0.01
 ruler, to a phase centre whose position is not exactly known."""
 
 LEAST_FIELD = 0.1
-"""Least field of a pulse relative to the strongest pulse: the phase of the pattern is neglected at weaker pulses."""
+"""Minimum field of a pulse relative to the strongest pulse: the phase of the pattern is neglected at weaker pulses."""
 
 UNDETECTABLE_LOSS_DB = 0.2
 """Peak loss that is not detectable in an image, dB; tolerated for the phase of antenna patterns and for height errors.
@@ -52,7 +52,7 @@ geoid and ellipsoid causes an error of tens of metres, which other checks detect
 
 _SMALL_M = 1e-2  # height error for which the loss is quadratic
 
-_FEWEST_PULSES = 3  # least number of pulses to separate a horizontal shift from the residual
+_FEWEST_PULSES = 3  # minimum number of pulses to separate a horizontal shift from the residual
 
 _FIXED = frozenset({"fix", "unknown"})
 _SLOW_S = 100.0
@@ -341,7 +341,14 @@ def antenna_flags(lines: Iterable[BudgetLine]) -> Flags:
 
 
 def offset_line(
-    paths: PointPaths, cause: str, slope: NDArray[np.float64], std: float | None, *, unit: str, common: bool = False
+    paths: PointPaths,
+    cause: str,
+    slope: NDArray[np.float64],
+    std: float | None,
+    *,
+    unit: str,
+    quantity: str = "",
+    common: bool = False,
 ) -> BudgetLine:
     """Return the budget line of a constant error.
 
@@ -357,12 +364,15 @@ def offset_line(
         Standard deviation of the error in that unit; None: unstated.
     unit
         Name of the unit.
+    quantity
+        Name of the quantity in that unit, if it is not obvious from the error source.
     common
         As for `PointPaths.of_offset`.
     """
     effect = paths.of_offset(slope * (1.0 if std is None else std), common=common)
     effect = replace(effect, loss_std_db=math.sqrt(2) * -effect.loss_db)  # the loss is quadratic in a Gaussian error
-    return BudgetLine(cause, None if std is None else f"{std:.3g} {unit}", effect, f"1 {unit}")
+    stated = None if std is None else f"{quantity} {std:.3g} {unit}".lstrip()
+    return BudgetLine(cause, stated, effect, f"a {quantity} of 1 {unit}" if quantity else f"1 {unit}")
 
 
 def arithmetic_line(error_db: float) -> BudgetLine:

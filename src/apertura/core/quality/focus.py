@@ -122,13 +122,13 @@ def _entropy_by_chance(parts: NDArray[np.complex64], generator: np.random.Genera
 # ---- Focus of isolated bright points, from pulse contributions
 
 LEAST_BLOCKS = 32
-"""Least number of pulse blocks, each dominated by the point, to separate phase errors from noise."""
+"""Minimum number of pulse blocks, each dominated by the point, to separate phase errors from noise."""
 
 MOST_INTERFERENCE = 0.08
 """Log-amplitude variance of a point over the aperture, above which the point does not dominate its resolution cell."""
 
 LEAST_PEAK_SHARE = 0.35
-"""Least ratio of the amplitude at a point to the largest amplitude obtained with any linear phase. A point with a
+"""Minimum ratio of the amplitude at a point to the largest amplitude obtained with any linear phase. A point with a
 smaller ratio is a sidelobe of another echo."""
 
 DEFOCUSED_DB = -1.0

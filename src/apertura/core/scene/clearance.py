@@ -62,7 +62,8 @@ def check_antennas(grid: SceneGrid, terrain: Terrain, aperture: Aperture, *, whe
     Raises
     ------
     CampaignError
-        If an antenna is not above the terrain at its map position; the error names the source of the terrain height.
+        If an antenna is not above the terrain at its map position; the message contains the source of the terrain
+        height.
     """
     flags = Flags()
     for antenna, which in zip(aperture.legs, ("transmitter", "receiver"), strict=True):

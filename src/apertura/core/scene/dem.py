@@ -252,7 +252,7 @@ def walled(heights: Floats, same: NDArray[np.bool_], *, wall_m: float) -> tuple[
     same
         (row, column) bool, True for posts of equal height.
     wall_m
-        Least height difference from all neighbours in the same row or column, metres.
+        Minimum height difference from all neighbours in the same row or column, metres.
 
     Returns
     -------
@@ -320,7 +320,7 @@ def height_range(terrain: Terrain, grid: SceneGrid, *, where: Path) -> tuple[flo
     Raises
     ------
     CampaignError
-        If pixels have no height; the error states the number of these pixels and the position of the first one.
+        If pixels have no height; the message contains the number of these pixels and the position of the first one.
     """
     voids, first, low, high = 0, "", np.inf, -np.inf
     for window in grid.tiles(_TILE_PX):
@@ -499,7 +499,7 @@ def _header(path: Path) -> tuple[tuple[float, ...], tuple[int, int], str, CRS | 
             if system and NAMES_FILES.search(system.to_wkt()):
                 raise _wrong(path, "a CRS that refers to a file", "a self-contained CRS, or a CRS with a known grid")
         except ProjError as error:
-            raise _wrong(path, f"a CRS that PROJ does not read ({shown(error)})", "a CRS that PROJ reads") from error
+            raise _wrong(path, f"a CRS that PROJ cannot parse ({shown(error)})", "a CRS that PROJ can parse") from error
     if colours:
         found = f"colours ({', '.join(colours)}), not heights"
         raise _wrong(path, found, "a band of heights, not a shaded relief or a map")

@@ -190,10 +190,10 @@ SPREAD = 17
 PITCHES_PX = (128, 64, 32, 16)
 """Candidate pitches of a lattice, pixels; the widest pitch with sufficient accuracy is used."""
 
-# least ratio of range to pitch: the error of the number of looks between nodes is 0.3 % in a beam of 20°
+# minimum ratio of range to pitch: the error of the number of looks between nodes is 0.3 % in a beam of 20°
 _RANGE_SHARE = 48
-_PULSES = 256  # least number of pulses summed for a block of the lattice; the largest number is twice this number
-# least median number of pulses with weight at a node, below which more pulses are summed; and limit of their number
+_PULSES = 256  # minimum number of pulses summed for a block of the lattice; the largest number is twice this number
+# minimum median number of pulses with weight at a node, below which more pulses are summed; and limit of their number
 _FEWEST, _MOST = 48, 2048
 AT_ONCE = 64  # block size in pulses of the illumination test
 _CELL_PX = 8  # side of the cells that are first tested as a whole, pixels
@@ -472,7 +472,7 @@ def pitch_px(grid: SceneGrid, terrain: Terrain, aperture: Aperture, *, share: fl
     grid, terrain, aperture
         As for `Looks`.
     share
-        Least ratio of range to pitch; if no pitch satisfies this ratio, the narrowest of `PITCHES_PX` is used.
+        Minimum ratio of range to pitch; if no pitch satisfies this ratio, the narrowest of `PITCHES_PX` is used.
     """
     middle = terrain.positions_at(grid, *(np.array([size // 2]) for size in grid.shape))
     sample = aperture[aperture.sample(_PULSES)]

@@ -37,7 +37,7 @@ def swath(
     beams
         Weights of pulses: blocks of pixels that a pulse cannot illuminate are excluded.
     together
-        Least number of consecutive pulses for which bounds are derived from the path of one of these pulses.
+        Minimum number of consecutive pulses for which bounds are derived from the path of one of these pulses.
 
     Returns
     -------

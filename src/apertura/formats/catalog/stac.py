@@ -84,7 +84,9 @@ class AcquisitionTime:
 
     @classmethod
     def together(cls, parts: Sequence["AcquisitionTime"]) -> "AcquisitionTime":
-        """Combine the acquisitions of the images of a sum: from the first to the last pulse, over all frequencies.
+        """Combine the acquisition metadata of the summed images.
+
+        The result extends from the first to the last pulse and covers all frequencies.
 
         Examples
         --------

@@ -167,7 +167,10 @@ def _grey(low: float, high: float, *, unit: str = "") -> ET.Element:
 
 @contextmanager
 def _opened_raster_of(path: Path) -> Iterator[rasterio.DatasetReader]:
-    """Open the raster of a style; a mosaic by its absolute path, because it contains relative paths of rasters."""
+    """Open the raster of a style.
+
+    A mosaic is opened by its absolute path, because it refers to its source rasters by relative paths.
+    """
     file = next(file for file in map(path.with_suffix, (".tif", ".vrt")) if file.is_file())
     opened_path = nullcontext(Path(file.absolute())) if file.suffix == ".vrt" else on_disk(file)
     with opened_path as name, rasterio.Env(**ISOLATED), rasterio.open(name) as raster:

@@ -1,4 +1,4 @@
-"""Atomic writing of files with GDAL, with error messages that state the cause."""
+"""Atomic writing of files with GDAL, with error messages that contain the cause."""
 
 import errno
 import os

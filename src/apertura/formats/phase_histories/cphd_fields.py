@@ -85,7 +85,7 @@ def _check(tree: Any) -> None:
     if domain != "FX":
         raise ValueError(f"samples in domain {domain}, not in the frequency domain (DomainType FX)")
     if tree.find("{*}Data/{*}SignalCompressionID") is not None:
-        raise ValueError("compressed samples, by a method outside the standard")
+        raise ValueError("samples compressed by a method that is not part of the standard")
 
 
 def _of_channel(channel: Any, pulses: NDArray[Any]) -> dict[str, NDArray[Any]]:

@@ -71,7 +71,7 @@ def check_array(name: str, shape: Sequence[int], dtype: np.dtype[Any]) -> None:
 
 
 def check_attributes(frame: object, units: object, *, placed: bool) -> None:
-    """Raise ValueError unless a file states the units of its times and, if `placed`, the frame of its positions.
+    """Raise ValueError unless a file specifies the units of its times and, if `placed`, the frame of its positions.
 
     Examples
     --------

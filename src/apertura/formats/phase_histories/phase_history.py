@@ -70,7 +70,7 @@ class History:
     dropped
         Reason → number of pulses excluded by `used`.
     flags
-        Flag name → measured text, one line.
+        Flag name → one-line text with the measured values.
     reference
         Reference of the samples: a measured delay, or a point, for which τ_ref is the path to the point divided by the
         speed of light in vacuum.

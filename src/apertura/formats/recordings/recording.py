@@ -63,7 +63,7 @@ class Recording:
     files
         Metadata files first, sample file last, for messages and hashes; may be a single file.
     sha512
-        Hash of the sample file stated by the recorder; None: not stated.
+        Hash of the sample file given in the metadata of the recording; None: not given.
     """
 
     samples: SampleFile
@@ -81,7 +81,7 @@ class Recording:
         return Captures(start, length, self.captures.time[0] + elapsed, frame)
 
     def check_hash(self, sha512_of: Callable[[Path], str] = _sha512) -> None:
-        """Raise CampaignError if the samples do not match the hash stated by the recorder."""
+        """Raise CampaignError if the samples do not match the hash given in the metadata of the recording."""
         if self.sha512 is None:
             return
         digest = sha512_of(self.files[-1])

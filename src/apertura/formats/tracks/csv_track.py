@@ -363,7 +363,7 @@ def _missing_column(name: str, table: pd.DataFrame, log: _Log) -> CampaignError:
 
 
 def _frame(table: pd.DataFrame, log: _Log) -> Literal["geodetic", "ecef", "local"]:
-    """Return the first frame with all its columns; the error names a missing column of the most complete frame."""
+    """Return the first frame with all its columns; the message contains a missing column of the most complete frame."""
     missing = {frame: [name for name in names if name not in table] for frame, names in _POSITIONS.items()}
     nearest = min(missing, key=lambda frame: len(missing[frame]))
     if missing[nearest]:
@@ -372,7 +372,7 @@ def _frame(table: pd.DataFrame, log: _Log) -> Literal["geodetic", "ecef", "local
 
 
 def _time(table: pd.DataFrame, log: _Log) -> NDArray[np.datetime64]:
-    """Return UTC; the config does not override a time system stated by the name of the column."""
+    """Return UTC; the config does not override a time system given in the name of the column."""
     columns = [name for name in _TIMES if name in table]
     if not columns:
         raise _missing_column("time_utc", table, log)

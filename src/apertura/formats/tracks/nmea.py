@@ -295,7 +295,7 @@ def _track(log: _Log) -> xr.Dataset:
         remark = f"{log.late_dates} dates after midnight are those of the previous day; corrected by one day"
         track = remarked(track, remark, log.path)
     if log.unsealed:
-        remark = f"none of {log.unsealed} sentences has a checksum: damaged digits are not detected"
+        remark = f"none of {log.unsealed} sentences has a checksum: corrupted digits cannot be detected"
         track = remarked(track, remark, log.path)
     return track
 

@@ -24,7 +24,8 @@ _ENU_FROM_MOTIVE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
 """Rows are east, north and up in Motive's x, y (up) and z."""
 
 _NED_FROM_MOTIVE = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""Rows are north, east and down; also forward, right and down of a body that is level and faces north when defined."""
+"""Rows are the north, east and down axes in Motive's x, y (up) and z. They coincide with the forward, right and down
+axes of the body if it was level and facing north when the rigid body was defined."""
 
 
 def read_optitrack(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> xr.Dataset:

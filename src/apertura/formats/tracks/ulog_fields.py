@@ -85,7 +85,7 @@ def _keyed(data: bytes, at: int, size: int) -> bool:
 
 
 def _levelled(data: bytes, at: int, size: int) -> bool:
-    """Return True if a payload may be a logged text: level "0" to "7", time, text."""
+    """Return True if a payload may be a logged text message: level "0" to "7", time stamp, text."""
     return size > 9 and 0x30 <= data[at] <= 0x37
 
 

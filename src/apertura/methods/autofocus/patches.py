@@ -69,7 +69,7 @@ def separated(places_m: Floats, ratio: Floats, axes: Floats, *, apart_m: float) 
     axes
         (3, 3) float64, rows are east, north, up.
     apart_m
-        Least distance between two points, metres.
+        Minimum distance between two points, metres.
 
     Returns
     -------
@@ -238,7 +238,7 @@ class Candidates:
         errors
             Node → error statistics of its log.
         looks
-            Least number of subapertures; the pixel spacing may require more. The default is determined from the
+            Minimum number of subapertures; the pixel spacing may require more. The default is determined from the
             subaperture lengths that the errors of the logs may require: the shortest length at which at least half as
             many bright points are detected as at any other length.
         """

@@ -184,7 +184,8 @@ class Requirements(Section):
     snr_db: float | None = Field(None, description="minimum SNR of terrain with expect.sigma0_db, dB")
     point_snr_db: float | None = Field(None, description="minimum SNR of a point with expect.rcs_dbsm, dB")
     coverage: Annotated[float, Field(gt=0, le=1)] | None = Field(
-        None, description="minimum visible fraction of the scene: no shadow or layover, within the recordable path"
+        None,
+        description="minimum visible fraction of the scene: no shadow or layover, within the recorded range window",
     )
     loss_db: Annotated[float, Field(ge=0)] | None = Field(
         None, description="maximum peak loss of a point due to all expected errors, dB"

@@ -37,14 +37,14 @@ Bilinear interpolation between these points suffices, because the loss varies wi
 """
 
 AMBIGUITY_NODES = 9
-"""Number of points along each side of the scene at which ambiguous echoes and path margins are computed."""
+"""Number of points along each side of the scene at which ambiguous echoes and range-window margins are computed."""
 
 Layer = NDArray[Any]
 
 UNITS: Mapping[str, tuple[str, str]] = {
     "resolution": ("m", "−3 dB width of a point in its coarsest direction"),
     "resolution_fine": ("m", "−3 dB width of a point in its finest direction"),
-    "orientation": ("deg", "azimuth of the finest direction, clockwise from grid north"),
+    "orientation": ("deg", "azimuth of the direction of finest resolution, clockwise from grid north"),
     "looks": ("pulses", "effective number of integrated pulses"),
     "incidence": ("deg", "incidence angle at closest approach, from the terrain normal"),
     "bistatic_angle": ("deg", "angle between transmitter and receiver at closest approach"),
@@ -292,7 +292,7 @@ def _point_snr(calibrated: CalibratedPair | None, noise: float, rcs_dbsm: float,
 def _coarse_layers(
     campaign: Campaign, pair: OpenPair, scene: OpenScene, beams: Beams | None, left: Effect | None
 ) -> dict[str, Layer]:
-    """Return layers of expected loss, ambiguous echoes and path margin, interpolated bilinearly."""
+    """Return layers of expected loss, ambiguous echoes and range-window margin, interpolated bilinearly."""
     wavelength_m = pair.wave_speed_m_s / float(pair.frequency_hz[-1])
 
     def loss_db(points: Floats, residual: Effect | None = None) -> Floats:

@@ -31,7 +31,7 @@ class NotFollowedError(CampaignError):
 
 
 class NodeSoFar:
-    """Recording and log of a node so far, complete captures and lines only.
+    """Recording and log of a node up to the present time, without incomplete captures and lines.
 
     Data read earlier are discarded if the files no longer begin with these data, which means that the recorder was
     restarted with the same file names. Only the first and last bytes of the samples are compared: other changes are not

@@ -328,7 +328,7 @@ def _recorded(examined: Examination, key: Key) -> tuple[dict[str, Any], Times, S
 
 
 def _history_line(campaign: Campaign, key: Key) -> tuple[dict[str, Any], Times, Span | None]:
-    """Return the values of `_recorded` for a phase history; without times if the format only numbers the pulses."""
+    """Return the values of `_recorded` for a phase history; times are omitted if it has pulse numbers only."""
     flight, node = campaign.flight(key[0]), key[1]
     pair = next((pair for pair in flight.pairs if pair.endswith(f"-{node}")), None)
     if pair is None:

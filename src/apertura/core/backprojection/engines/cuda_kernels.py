@@ -441,7 +441,7 @@ def _centre(x, y, z, ends, numbers):  # type: ignore[no-untyped-def]
 
 @cuda.jit(device=True)
 def _is_reached(chunk, lane, patch, numbers, inputs):  # type: ignore[no-untyped-def]
-    """Return True if any pulse of a chunk may have weight in a patch; each thread evaluates one chunk in parallel."""
+    """Return True if any pulse of a chunk may have nonzero weight in a patch; each thread evaluates one chunk."""
     tables, weights, reached, words = inputs
     if chunk % _LANES == 0:
         spread, mine = weights[_SPREAD], chunk + lane

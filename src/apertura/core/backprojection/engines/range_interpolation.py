@@ -162,7 +162,7 @@ def design_table(
     carrier_rad_per_sample
         Change of the carrier phase over one sample of total path, rad.
     oversampling
-        Least number of cells of the table per Nyquist cell.
+        Minimum number of cells of the table per Nyquist cell.
     degree
         Degree of the polynomials, 1 or 2.
     taps

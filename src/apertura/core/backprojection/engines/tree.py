@@ -197,7 +197,7 @@ class _Block:
         ]
 
     def height_layers(self, tile: JobTile, most: int) -> HeightLayers | None:
-        """Return the height layers for a rough tile; None if more than `most` layers are required."""
+        """Return the height layers for a tile with rough terrain; None if more than `most` layers are required."""
         trees, limit = self.trees, 10 ** (self.nodes_db / 20)
         pixels = self.pixels[tile.window]
         if not most or not np.isfinite(tile.surface.rough_m) or pixels.size < 3 * LEAST_PIXELS:

@@ -478,7 +478,7 @@ class HeightLayers:
 
     @classmethod
     def of(cls, relief: SurfaceResidual, band_rad: float, error_db: int) -> "HeightLayers":
-        """Return the smallest set of layers that supports a band, at the nodes (eq. 6) of the range of heights."""
+        """Return the minimum number of layers required for a band, at the nodes (eq. 6) of the height range."""
         middle, half = relief.span_m
         return cls(relief, middle + half * nodes(layers_for(band_rad, error_db), error_db), error_db)
 

@@ -92,10 +92,10 @@ CELLS_AT_ONCE = 4
 """Divisor of the number of cells per sample, determined by the lanes of an AVX-512 vector."""
 
 LEAST_PIXELS = 32**2
-"""Least number of pixels of a tile: for a smaller tile, the overhead of a tree exceeds the cost of the direct sum."""
+"""Minimum number of pixels of a tile: for a smaller tile, the overhead of a tree exceeds the cost of the direct sum."""
 
 LEAST_QUARTER_PX = 64
-"""Least side of the quarter of a tile, pixels: for smaller quarters, the cost of the direct sum is lower."""
+"""Minimum side of the quarter of a tile, pixels: for smaller quarters, the cost of the direct sum is lower."""
 
 _SAMPLED = 64  # number of pulses sampled for the roughness
 _DELAY_DEGREE = 9
@@ -276,7 +276,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 24, taps: int = 8) -> Tre
     profiles
         Band-limited profiles.
     oversampling
-        Least number of table cells per Nyquist cell c/B of total path.
+        Minimum number of table cells per Nyquist cell c/B of total path.
     taps
         Number of taps of the filters from samples to cells, 8 or 16.
 

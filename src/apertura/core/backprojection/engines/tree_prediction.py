@@ -540,7 +540,7 @@ def _cost(job: Job, pulses: int, options: _Options, direct_s: float) -> _Cost:
 
 
 def _by_tree(job: Job, pulses: int, options: _Options, side: int, direct_s: float | None) -> _Cost:
-    """Return the cost of tiles of one side; height layers are considered if `direct_s` is given.
+    """Return the cost for tiles of a given side length; height layers are considered if `direct_s` is given.
 
     Notes
     -----
