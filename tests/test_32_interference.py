@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.core.echo.captures import sampled_pulses
+from apertura.core.echo.captures import runs, sampled_pulses
 from apertura.core.echo.compression import compress, window_weights
 from apertura.core.echo.interference import EXCESS_DB, Interference
 
@@ -26,7 +26,8 @@ def received(*, tone_db=None, noise=1.0, pulses=400, seed=1):
 
 
 def measured(transfer):
-    return Interference.measured([transfer[group] for group in sampled_pulses(len(transfer))], FREQUENCY, WEIGHT)
+    groups = sampled_pulses(len(transfer))
+    return Interference.measured(runs(groups, [transfer[group] for group in groups]), FREQUENCY, WEIGHT)
 
 
 def profiles(transfer):
@@ -47,6 +48,12 @@ def test_tone_is_detected_at_its_frequency(tone_db):
     assert np.flatnonzero(found.excluded).tolist() == [TONE]
     assert f"{1e-6 * FREQUENCY[TONE]:.2f} MHz" in found.flags["interference"]
     assert "GNSS" in found.flags["interference"]
+
+
+@pytest.mark.parametrize("pulses", [20, 60, 100, 600, 2000])
+def test_tone_is_detected_in_flights_of_any_length(pulses):
+    assert np.flatnonzero(measured(received(tone_db=10, pulses=pulses)).excluded).tolist() == [TONE]
+    assert not measured(received(pulses=pulses)).is_removed
 
 
 @pytest.mark.parametrize("noise", [0.05, 1.0, 10.0])

@@ -179,6 +179,7 @@ def test_tone_in_the_sidelink_is_limited_and_flagged(level_db):
 BURST = Interferer(1.4e9, 30.0, bandwidth_hz=1e9, duration_s=20e-6, rate_hz=2e3)
 DME = Interferer(1.35e9, 30.0, duration_s=7e-6, rate_hz=10e3, envelope="hann")
 TONE = Interferer(1.31e9, 20.0, channel="sidelink")
+RADAR_TONE = Interferer(1.31e9, 20.0)
 
 
 def campaign_with(root, *sources, setting="auto"):
@@ -225,8 +226,10 @@ def test_clean_campaign_has_no_flag_of_interference(clean):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("source", "flag"), [(BURST, "pulses_noisy"), (DME, "interference_pulsed")])
-def test_pulsed_interference_of_a_campaign_is_flagged_and_removed(clean, source, flag, tmp_path):
+@pytest.mark.parametrize(
+    ("source", "flag"), [(BURST, "pulses_noisy"), (DME, "interference_pulsed"), (RADAR_TONE, "interference")]
+)
+def test_interference_of_a_campaign_is_flagged_and_removed(clean, source, flag, tmp_path):
     unchanged = campaign_with(tmp_path / "unchanged", source, setting="none")
     cleaned = campaign_with(tmp_path / "cleaned", source)
     for pair in ("uav1-uav1", "uav1-uav2"):

@@ -15,7 +15,7 @@ from apertura.campaign.store import blocks_of_rows, finish, write_blocks, writin
 from apertura.common.flags import Flags
 from apertura.common.provenance import merged
 from apertura.core.echo.background import Background, GroupMeans, background_excess_db
-from apertura.core.echo.captures import sampled_pulses
+from apertura.core.echo.captures import runs, sampled_pulses
 from apertura.core.echo.compression import centre_frequency, window_weights
 from apertura.core.echo.demodulate import remove_path
 from apertura.core.echo.interference import Interference, NoisyPulses, PulsedInterference
@@ -132,7 +132,7 @@ def _decide(echo: PairEcho, scene: OpenScene, processing: Processing) -> _Cleani
     sampled = [echo.read(group) for group in pulses] if (processing.interference, method) != ("none", "none") else []
     weight = window_weights(processing.window, echo.shape[1])
     if processing.interference != "none":
-        cleaning = _Cleaning(Interference.measured(sampled, frequency, weight))
+        cleaning = _Cleaning(Interference.measured(runs(pulses, sampled), frequency, weight))
         if cleaning.gain is not None:
             echo = replace(echo, gain=cleaning.gain)
             sampled = [group * cleaning.gain for group in sampled]

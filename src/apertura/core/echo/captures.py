@@ -1,6 +1,6 @@
 """Captures of a pair: reading in blocks of pulses, saturation check, and resampling to the transmitter's clock."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -93,6 +93,26 @@ def sampled_pulses(count: int) -> list[Pulses]:
     (64, [777, 778, 779, 780, 781, 782, 783, 784])
     """
     return spread(count, groups=64, each=8)
+
+
+def runs(pulses: Sequence[Pulses], parts: Sequence[Complexes]) -> list[Complexes]:
+    """Join the transfer functions of groups whose pulses follow each other, as in a short flight.
+
+    Examples
+    --------
+    >>> groups = [np.array([0, 1]), np.array([2]), np.array([7, 8])]
+    >>> [part.shape[0] for part in runs(groups, [np.zeros((len(group), 4), np.complex64) for group in groups])]
+    [3, 2]
+    """
+    joined: list[list[Complexes]] = []
+    last = -2
+    for group, part in zip(pulses, parts, strict=True):
+        if group[0] == last + 1:
+            joined[-1].append(part)
+        else:
+            joined.append([part])
+        last = int(group[-1])
+    return [np.concatenate(run) for run in joined]
 
 
 _CREST_SAMPLES = 256

@@ -97,7 +97,8 @@ class Interference:
         Parameters
         ----------
         groups
-            (pulse, subcarrier) transfer functions of the pulses of `apertura.core.echo.captures.sampled_pulses`.
+            (pulse, subcarrier) transfer functions of the pulses of `apertura.core.echo.captures.sampled_pulses`,
+            joined by `apertura.core.echo.captures.runs`.
         frequency_hz, weight
             Of the subcarriers.
 

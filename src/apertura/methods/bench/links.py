@@ -15,7 +15,7 @@ from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.flags import Flags
 from apertura.common.units import decibels
-from apertura.core.echo.captures import Pulses, blocks_of, sampled_pulses
+from apertura.core.echo.captures import Pulses, blocks_of, runs, sampled_pulses
 from apertura.core.echo.clock import ClockOffset
 from apertura.core.echo.compression import phasors
 from apertura.core.echo.demodulate import Numerology
@@ -436,7 +436,8 @@ def measure_link(
     noise = float(np.median(changes)) / (1 - 1 / (9 * (used - 1))) ** 3
     mean = total / used
     scatter = float(np.std(relative[locked]))
-    sampled = [form(numbers[locked][group]) for group in sampled_pulses(used)]
+    groups = sampled_pulses(used)
+    sampled = runs(groups, [form(numbers[locked][group]) for group in groups])
     interference = Interference.measured(sampled, numerology.frequency_hz, np.full(subcarriers, 1 / subcarriers))
     direct = _at_sidelink(mean, delay, noise / used) if divided else None
     # 4. Path from the mean under a Hann window; otherwise sidelobes of other arrivals displace the path by millimetres.
