@@ -183,7 +183,7 @@ def test_log_with_heights_above_sea_level_needs_height_offset(shared):
     report, higher = (look(path, [f"height_offset_m={offset}"]) for offset in (40, 50))
     rows = rows_of(path)
     latitude = [float(row["latitude"]) for row in rows if float(row["latitude"])]
-    assert report.facts["epochs"] + sum(report.facts["left_out"].values()) == len(rows)
+    assert report.facts["epochs"] + sum(report.facts["excluded"].values()) == len(rows)
     assert report.facts["bounds"]["latitude_deg"] == pytest.approx([min(latitude), max(latitude)], abs=1e-7)
     raised = np.subtract(higher.facts["bounds"]["height_m"], report.facts["bounds"]["height_m"])
     assert raised == pytest.approx(10.0, abs=1e-6)
@@ -194,7 +194,7 @@ def test_facts_of_a_ulog_agree_with_its_messages(shared):
     gps = pyulog.ULog(str(path)).get_dataset("vehicle_gps_position").data
     report = look(path)
     assert (report.kind, report.format) == ("flight log", "px4")
-    assert report.facts["epochs"] + sum(report.facts["left_out"].values()) == len(gps["lat"])
+    assert report.facts["epochs"] + sum(report.facts["excluded"].values()) == len(gps["lat"])
     latitude = gps["lat"] * 1e-7
     assert report.facts["bounds"]["latitude_deg"] == pytest.approx([latitude.min(), latitude.max()], abs=1e-7)
     assert report.facts["unusable_epochs"] == 0  # single solutions are used in a log without RTK

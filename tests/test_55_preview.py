@@ -400,7 +400,7 @@ def test_delayed_pair_uses_every_second_pulse(tiny):
     status = json.loads((tiny / "results/preview/status.json").read_text())
     assert status["one_pulse_in"] == 2
     counts = status["pairs"]["f01/uav1-uav1"]["pulses"]
-    assert counts["added"] + counts["left_out"] == counts["recorded"]
+    assert counts["added"] + counts["excluded"] == counts["recorded"]
     assert counts["added"] == counts["recorded"] // 2
     assert "1 pulse in 2 used" in (tiny / "results/preview/index.html").read_text()
 

@@ -517,7 +517,7 @@ class PairSoFar:
     @property
     def counts(self) -> dict[str, int]:
         """Numbers of pulses recorded, added to the shown image, and excluded."""
-        return {"recorded": len(self.time), "added": self.shown.pulses if self.shown else 0, "left_out": self.dropped}
+        return {"recorded": len(self.time), "added": self.shown.pulses if self.shown else 0, "excluded": self.dropped}
 
     @property
     def flags(self) -> dict[str, str]:

@@ -223,7 +223,7 @@ def _log_rows(log: LogFacts, track: "xr.Dataset") -> dict[str, Any]:
     checked = log_faults(track)
     rows: dict[str, Any] = {
         "epochs": log.times.count,
-        "left_out": dict(log.dropped),
+        "excluded": dict(log.dropped),
         **time_rows(log.times),
         "fix": log.fixes,
         "attitude_share": log.attitude_share,
@@ -298,8 +298,8 @@ def recording_report(files: Sequence[Path], context: Surroundings) -> Report:
     logs = sorted(log for log in files[0].parent.glob("*.track.*") if log.name.startswith(f"{node}.track."))
     lacks = _missing_of_recording(recording, facts, context)
     if logs:
-        covered, left_out = _against_log(recording, node, logs[0], context)
-        rows, lacks = rows | covered, lacks + left_out
+        covered, missing = _against_log(recording, node, logs[0], context)
+        rows, lacks = rows | covered, lacks + missing
     else:
         lacks.append(f"antenna positions: the folder contains no flight log {node}.track.<{'|'.join(log_suffixes())}>")
     return Report(
@@ -442,7 +442,7 @@ def _history_rows(facts: HistoryFacts) -> dict[str, Any]:
     if facts.frame is not None:
         rows |= {"frame": facts.frame, "bistatic": facts.bistatic}
         rows |= {f"{leg}_bounds": dict(bounds) for leg, bounds in facts.bounds.items()}
-    rows |= {"left_out": dict(facts.dropped), "flags": dict(facts.flags)}
+    rows |= {"excluded": dict(facts.dropped), "flags": dict(facts.flags)}
     return rows | ({"remarks": list(facts.remarks)} if facts.remarks else {})
 
 
