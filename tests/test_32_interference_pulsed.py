@@ -112,11 +112,12 @@ def with_bursts(level_db, *, every=50, seed=3):
     return transfer
 
 
-def bursts_in(transfer):
+def bursts_in(transfer, ranges=slice(100, None)):
+    """Return the noise of pulses, by default at ranges without targets."""
     bursts = NoisyPulses()
     for first in range(0, len(transfer), 100):
         block = transfer[first : first + 100]
-        bursts.add(block, profiles(block)[:, 100:])  # ranges without targets
+        bursts.add(block, profiles(block)[:, ranges])
     return bursts
 
 
@@ -127,6 +128,16 @@ def test_pulses_with_interference_in_the_whole_band_are_excluded(level_db):
     raised_db = 10 * np.log10((0.98 + 0.02 * (1 + 10 ** (level_db / 10))) * 0.98)
     assert bursts.gain_db == pytest.approx(raised_db, abs=0.4)
     assert bursts.flags["pulses_noisy"].startswith("40 of 2000 pulses")
+
+
+def test_radar_that_starts_to_move_has_no_noisy_pulses():
+    """At rest, echoes are constant and removed with the background; they appear when the radar moves."""
+    rng = np.random.default_rng(6)
+    moving = received(pulses=PULSES, noise=0.0) + 0.03 * (rng.normal(size=(PULSES, 512, 2)) @ np.array([1, 1j]))
+    moving[:150] -= received(pulses=PULSES, noise=0.0)[:150]
+    bursts = bursts_in(moving.astype(np.complex64), ranges=slice(None))
+    assert not bursts.excluded.any()
+    assert bursts.flags == {}
 
 
 def test_weak_bursts_are_kept():

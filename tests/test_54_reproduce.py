@@ -53,7 +53,7 @@ def test_products_are_reproduced_in_another_folder_with_other_cores(root, tmp_pa
     assert print_reproduced(root, cores=1, keep=tmp_path / "another folder") == 0
     same, kept = capsys.readouterr().out.splitlines()[-2:]
     assert same.startswith("same     ")
-    assert same.endswith(f"and {len(list(manifests(root / 'results'))) - 1} more results")
+    assert same.endswith(f"and {len(list(manifests(root / 'results'))) - 1} more results, identical byte for byte")
     assert kept == f"recomputed in {tmp_path / 'another folder'}"
     assert contents(root) == before
     assert result_files(root).items() <= result_files(tmp_path / "another folder").items()

@@ -404,6 +404,10 @@ class PulsedInterference:
 _NOISY = 4.0
 """Noise of a pulse relative to that of its neighbours, above which the pulse is excluded."""
 
+_NOISE_SHARE = 0.2
+"""Difference of a pulse from its neighbours relative to its power, above which noise dominates it; 0.5 for noise alone.
+A share that is four times the usual one is sufficient."""
+
 _BLOCK = 128  # pulses over which the usual noise is a quantile
 _MOST_PULSES = 0.3
 """Largest share of pulses that is excluded; more is not interference, or cannot be distinguished from echoes."""
@@ -431,6 +435,7 @@ class NoisyPulses:
     def __init__(self) -> None:
         self._noise: list[Floats] = [np.zeros(0)]
         self._floor: list[Floats] = [np.zeros(0)]
+        self._power: list[Floats] = [np.zeros(0)]
 
     def add(self, transfer: Complexes, profiles: Complexes) -> None:
         """Add consecutive pulses: (pulse, subcarrier) transfer functions and (pulse, range) profiles."""
@@ -439,6 +444,7 @@ class NoisyPulses:
         change[1:-1] = (np.abs(np.diff(some, axis=0)) ** 2).mean(axis=1) / 2
         nearer = np.minimum(change[:-1], change[1:])
         self._noise.append(np.where(np.isfinite(nearer), nearer, 0.0))
+        self._power.append((np.abs(some) ** 2).mean(axis=1, dtype=np.float64))
         samples = profiles[:, :: max(1, profiles.shape[1] // _SAMPLES)]
         self._floor.append(np.median(np.abs(samples) ** 2, axis=1).astype(np.float64))
 
@@ -446,6 +452,7 @@ class NoisyPulses:
         """Add pulses that do not contribute to the scene."""
         self._noise.append(np.zeros(pulses))
         self._floor.append(np.zeros(pulses))
+        self._power.append(np.zeros(pulses))
 
     @cached_property
     def _relative(self) -> Floats:
@@ -454,8 +461,12 @@ class NoisyPulses:
 
     @cached_property
     def excess(self) -> Floats:
-        """(pulse,) float64, noise relative to that of the neighbouring pulses: the lower of both tests."""
-        return np.minimum(self._relative, _over_neighbours(np.concatenate(self._floor), 0.5))
+        """(pulse,) float64, noise relative to the usual noise: the lower of both tests; 0 where echoes dominate."""
+        excess = np.minimum(self._relative, _over_neighbours(np.concatenate(self._floor), 0.5))
+        power = np.concatenate(self._power)
+        share = np.divide(np.concatenate(self._noise), power, out=np.zeros_like(power), where=power > 0)
+        usual = float(np.median(share[power > 0])) if (power > 0).any() else 0.0
+        return np.where(share > min(_NOISE_SHARE, _NOISY * usual), excess, 0.0)
 
     @cached_property
     def excluded(self) -> NDArray[np.bool_]:
@@ -504,9 +515,11 @@ class NoisyPulses:
 
 
 def _over_neighbours(values: Floats, quantile: float) -> Floats:
-    """Return (pulse,) values relative to a quantile of some hundred neighbouring pulses; 0 where they are zero."""
+    """Return (pulse,) values relative to a quantile of some hundred neighbours, or of all pulses if that is higher."""
     blocks = np.array_split(values, max(1, round(len(values) / _BLOCK)))
     each_block = np.array([np.quantile(block[block > 0], quantile) if (block > 0).any() else 0.0 for block in blocks])
     usual = scipy.ndimage.median_filter(each_block, size=min(3, len(blocks)), mode="nearest")
+    # At rest, echoes are constant and removed with the background: the usual value is at least that of all pulses.
+    usual = np.maximum(usual, np.quantile(values[values > 0], quantile) if (values > 0).any() else 0.0)
     each = np.repeat(usual, [len(block) for block in blocks])
     return np.asarray(np.divide(values, each, out=np.zeros_like(values), where=each > 0))
