@@ -76,8 +76,9 @@ test-slow: export EXAMPLES := all
 test: $(SETUP)
 	$(BIN)/python -m pytest -q -n 2 -m "not slow" $(TESTS)
 
+# Folders of tests that passed are deleted at once, because the slow tests write 4.5 GB.
 test-slow: $(SETUP)
-	$(BIN)/python -m pytest -q -n 2 -m slow $(TESTS)
+	$(BIN)/python -m pytest -q -n 2 -m slow -o tmp_path_retention_policy=failed $(TESTS)
 
 # Every parser on thousands of wrong files, every step killed, starved and short of disk, whole runs killed, and every
 # physical mistake: hours.

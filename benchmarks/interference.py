@@ -66,7 +66,7 @@ def _levels(campaign: Campaign) -> Iterator[tuple[str, tuple[float, float]]]:
 def _flags(campaign: Campaign) -> Iterator[str]:
     for pair in ("uav1-uav1", "uav1-uav2"):
         flags = open_stage(campaign.stage("image", "f01", pair), "image").attrs["flags"]
-        yield from (name for name in flags if name.startswith(("interference", "pulses_noisy", "sidelink", "saturated")))
+        yield from (name for name in flags if name.startswith(("interference", "pulses", "sidelink", "saturated")))
 
 
 def main() -> None:

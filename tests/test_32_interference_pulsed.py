@@ -229,6 +229,7 @@ def clean(tmp_path_factory):
     return campaign_with(tmp_path_factory.mktemp("clean") / "campaign")
 
 
+@pytest.mark.slow
 def test_clean_campaign_has_no_flag_of_interference(clean):
     for pair in ("uav1-uav1", "uav1-uav2"):
         flags, report = attributes(clean, pair)

@@ -270,6 +270,7 @@ def noisy(draws, rng):
         yield replace(silent, transfer=noise.astype(np.complex64))
 
 
+@pytest.mark.slow
 def test_noise_of_a_pixel_is_that_of_its_recorded_pulses():
     """The variance of pixels of pure noise is σ²Σw²/M², and σ² is measured in spite of the gate."""
     beams, rng = Beams(gate=gate_of(MONO)), np.random.default_rng(11)
