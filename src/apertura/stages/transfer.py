@@ -131,7 +131,7 @@ class PairEcho:
         gain = profile.subcarrier_gain.values if "subcarrier_gain" in profile else None
         if "interference_level" in profile:
             weight = window_weights(profile.attrs["window"], profile.sizes["subcarrier"])
-            pulsed = PulsedInterference.of(profile.interference_level.values, weight, gain)
+            pulsed = PulsedInterference(profile.interference_level.values, weight if gain is None else weight * gain)
         kept = np.isin(echo.dataset.time.values, profile.time.values)
         echo = echo if kept.all() else echo.select(kept)
         reports = {name: profile.attrs[name] for name in ("background", "interference")}

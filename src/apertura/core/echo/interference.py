@@ -311,11 +311,6 @@ class PulsedInterference:
     report: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, level: NDArray[np.float32], weight: Floats, gain: NDArray[np.float32] | None) -> "PulsedInterference":
-        """Return the interference for the weights of a window and the factors of eq. 2."""
-        return cls(level, weight if gain is None else weight * gain)
-
-    @classmethod
     def measured(cls, groups: Sequence[Complexes], frequency_hz: Floats, weight: Floats) -> "PulsedInterference | None":
         """Measure the interference on some pulses; None if its exclusion would gain less than `LEAST_GAIN_DB`.
 
@@ -469,30 +464,32 @@ class NoisyPulses:
         return np.where(share > min(_NOISE_SHARE, _NOISY * usual), excess, 0.0)
 
     @cached_property
+    def _noisy(self) -> NDArray[np.bool_]:
+        """(pulse,) bool, True for pulses whose noise exceeds the limit in both tests."""
+        return np.asarray(self.excess > _NOISY)
+
+    @cached_property
     def excluded(self) -> NDArray[np.bool_]:
         """(pulse,) bool, True for pulses that are excluded: this gains SNR (eq. 7)."""
-        noisy = self.excess > _NOISY
-        return noisy if noisy.any() and self.gain_db >= LEAST_GAIN_DB else np.zeros_like(noisy)
+        return self._noisy if self.gain_db >= LEAST_GAIN_DB else np.zeros_like(self._noisy)
 
     @property
     def gain_db(self) -> float:
         """SNR gained in the image by the exclusion, dB (eq. 7); 0 if more than 30 % of the pulses would be excluded."""
-        noise, noisy = self._relative, self.excess > _NOISY
-        used = noise > 0
-        kept = used & ~noisy
-        if not kept.any() or noisy.sum() > _MOST_PULSES * used.sum():
+        noise, used = self._relative, self._relative > 0
+        kept = used & ~self._noisy
+        if not kept.any() or self._noisy.sum() > _MOST_PULSES * used.sum():
             return 0.0
         return decibels(float(noise[used].sum() / noise[kept].sum() * (kept.sum() / used.sum()) ** 2))
 
     @property
     def report(self) -> dict[str, Any]:
         """As JSON values; {} if no pulse has interference."""
-        noisy = self.excess > _NOISY
         if not self.flags:
             return {}
         return {
-            "pulses": int(noisy.sum()),
-            "of": len(noisy),
+            "pulses": int(self._noisy.sum()),
+            "of": len(self._noisy),
             "excess_db": round(decibels(float(self.excess.max())), 1),
             "excluded": bool(self.excluded.any()),
             "gain_db": round(self.gain_db, 2),
@@ -501,14 +498,14 @@ class NoisyPulses:
     @property
     def flags(self) -> Flags:
         """Flag `pulses_noisy` if pulses have interference that is excluded, or too many to be excluded."""
-        noisy = self.excess > _NOISY
-        too_many = noisy.sum() > _MOST_PULSES * len(noisy)
+        number, pulses = int(self._noisy.sum()), len(self._noisy)
+        too_many = number > _MOST_PULSES * pulses
         if not self.excluded.any() and not too_many:
             return Flags()
         done = "not excluded, because there are too many" if too_many else "excluded"
         excess_db = decibels(float(self.excess.max()))
         line = (
-            f"{noisy.sum()} of {number_of(len(noisy), 'pulse')}: noise up to {excess_db:.1f} dB above the "
+            f"{number} of {number_of(pulses, 'pulse')}: noise up to {excess_db:.1f} dB above the "
             f"neighbouring pulses; {done}"
         )
         return Flags({"pulses_noisy": line})
