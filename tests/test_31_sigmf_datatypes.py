@@ -132,7 +132,7 @@ def as_real(counts, if_hz):
     return np.real((counts[..., 0] + 1j * counts[..., 1]) * carrier)
 
 
-@pytest.mark.quick("-24000000.0")
+@pytest.mark.slow
 @pytest.mark.parametrize("if_hz", [8e6, 8e6 + 5 * RATE_HZ, -24e6])
 def test_real_samples_at_an_intermediate_frequency_give_the_same_echo(campaign, plain, if_hz):
     """The echoes agree within the -80 dB of the filter, in any Nyquist zone, upright or mirrored."""
@@ -280,6 +280,7 @@ def nonconforming(root, node, *, header=24, trailing=10):
     edit_meta(root, node, describe)
 
 
+@pytest.mark.slow
 def test_header_and_trailing_bytes_are_skipped(campaign, plain):
     recorded = {node: counts_of(campaign, node) for node in NODES}
     for node in NODES:
@@ -324,6 +325,7 @@ def collection(root, **nodes):
     return body
 
 
+@pytest.mark.slow
 def test_collection_assigns_recordings_to_nodes(campaign, plain):
     collection(campaign, a="rx_0", b="rx_1")
     for pair, transfer in transfers(campaign).items():

@@ -36,6 +36,7 @@ def with_pulsed(level_db, *, every=5, lines=3, moving=False, noise=1.0, seed=2):
     return transfer
 
 
+@pytest.mark.quick("False-20", "True-0")
 @pytest.mark.parametrize("level_db", [0, 20, 40])
 @pytest.mark.parametrize("moving", [False, True])
 def test_pulsed_interference_is_removed_from_the_pulses_that_contain_it(level_db, moving):
@@ -70,6 +71,7 @@ def test_interference_of_single_pulses_excludes_no_subcarrier_from_all_pulses(mo
     assert found.flags == {}
 
 
+@pytest.mark.quick("0-*")
 @pytest.mark.parametrize("noise", [0.0, 0.05, 1.0, 10.0])
 @pytest.mark.parametrize("seed", range(3))
 def test_recordings_without_interference_are_unchanged(noise, seed):
@@ -86,6 +88,7 @@ def flash(transfer, *, gain_db, width):
     return transfer + (visible[:, None] * np.exp(-2j * np.pi * FREQUENCY * 80 / 299792458.0)).astype(np.complex64)
 
 
+@pytest.mark.quick("20-3", "40-0.5")
 @pytest.mark.parametrize("width", [0.5, 3, 40])
 @pytest.mark.parametrize("gain_db", [20, 40])
 def test_flash_of_a_bright_point_is_not_interference(width, gain_db):
@@ -130,6 +133,7 @@ def test_pulses_with_interference_in_the_whole_band_are_excluded(level_db):
     assert bursts.flags["pulses_noisy"].startswith("40 of 2000 pulses")
 
 
+@pytest.mark.slow
 def test_radar_that_starts_to_move_has_no_noisy_pulses():
     """At rest, echoes are constant and removed with the background; they appear at all ranges when the radar moves."""
     rng = np.random.default_rng(6)

@@ -71,6 +71,7 @@ def test_short_wavelengths_are_accurate(isa, carrier_hz):
     assert error_db(scene, pixels, image) <= -70
 
 
+@pytest.mark.quick("*size1*", "*size4*")
 @pytest.mark.parametrize("size", [(1, 1), (1, 17), (33, 5), (15, 16), (17, 49)])
 def test_tiles_of_any_size_are_accurate(isa, size):
     pixels = pixel_grid(*size)

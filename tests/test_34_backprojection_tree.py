@@ -31,7 +31,7 @@ def plain():
     return flown(pixel_grid(70, 90), pulses=300)
 
 
-@pytest.mark.quick("monostatic-*--74")
+@pytest.mark.slow
 @pytest.mark.parametrize("nodes_db", [-50, -74, -98])
 def test_every_instruction_set_meets_the_predicted_error(isa, flights, nodes_db):
     image, share = formed(flights, nodes_db=nodes_db)
@@ -112,7 +112,7 @@ def test_pulses_off_a_smooth_track_are_not_presummed(plain, jitter_m):
     assert error_db(scene, plain.pixels, image) <= -64
 
 
-@pytest.mark.quick("0.003-True", "0.0003-False")
+@pytest.mark.slow
 @pytest.mark.parametrize("together", [True, False])
 @pytest.mark.parametrize("jitter_m", [3e-4, 3e-3])
 def test_presumming_on_a_rough_track_has_the_predicted_error(plain, jitter_m, together):
@@ -127,7 +127,7 @@ def test_presumming_on_a_rough_track_has_the_predicted_error(plain, jitter_m, to
     assert predicted_db - 7 <= decibels(images[1] - images[0], images[0]) <= predicted_db
 
 
-@pytest.mark.quick("0.05--74-4")
+@pytest.mark.slow
 @pytest.mark.parametrize(("height_m", "nodes_db", "layers"), [(0.02, -50, 3), (0.05, -74, 4), (0.3, -62, 7)])
 def test_rough_terrain_is_interpolated_between_height_layers(height_m, nodes_db, layers):
     """Eq. 11: relief between pixels is summed by trees on height layers, or by the direct kernel with fewer layers."""
@@ -153,6 +153,7 @@ def test_rough_terrain_uses_the_direct_kernel():
     assert error_db(flight.scene, rough, image) <= -70
 
 
+@pytest.mark.slow
 def test_rolling_terrain_uses_the_tree():
     rolling = pixel_grid(70, 90)
     rolling[..., 2] = 0.15 * np.sin(rolling[..., 0]) * np.cos(1.3 * rolling[..., 1])

@@ -114,6 +114,7 @@ def test_subapertures_of_a_longer_flight_contain_no_more_pulses():
     assert pulses[1] == pytest.approx(pulses[0], rel=0.15)
 
 
+@pytest.mark.slow
 def test_blocks_contribute_the_sum_of_their_pulses(search):
     blocks, echo = search.problem.pairs[1], search.problem.echoes[1][0]
     no_motion = blocks.moves({node: np.zeros((len(search.problem.knots_s), 3)) for node in ("uav1", "uav2")})
@@ -284,6 +285,7 @@ def test_exact_tracks_are_left_unchanged():
     assert "no improvement over the logs" in result.reason
 
 
+@pytest.mark.slow
 def test_track_slip_is_found_by_delays_and_corrected():
     """For 4 cm in 7.5 s, the sharpest tracks have one-wavelength slips, which are resolved by comparison of delays."""
     simulated = case("points-4", "short", "mono", 0.04, 10.0, 13)

@@ -292,6 +292,7 @@ def test_unequal_displacements_of_points_are_detected(displacement_m):
     assert result.shifted is (displacement_m > 0)
 
 
+@pytest.mark.slow
 def test_points_of_different_scenes_are_not_matched():
     """At most three false matches occur in 1000 draws."""
     generator, image = np.random.default_rng(4), np.ones((400, 400), np.complex64)

@@ -175,7 +175,7 @@ def test_phase_of_a_ramp_equals_that_of_its_heights():
 # Sections 3 to 5: valid pixels and height accuracy
 
 
-@pytest.mark.quick("1.0")
+@pytest.mark.slow
 @pytest.mark.parametrize("rise_m", [1.0, 4.0])
 def test_height_errors_of_a_ramp_match_the_stated_deviation(rise_m):
     first, second, response = two_tracks(rise_m, marked=True)
@@ -282,7 +282,7 @@ def test_tracks_with_too_long_a_baseline_are_flagged_and_give_no_height(rise_m, 
     assert np.isfinite(interferogram.panels["height"]).mean() < 0.03
 
 
-@pytest.mark.quick("1.0-0.93")
+@pytest.mark.slow
 @pytest.mark.parametrize(("rise_m", "overlap"), [(1.0, 0.93), (4.0, 0.74), (7.0, 0.55)])
 def test_coherence_equals_the_geometric_overlap(rise_m, overlap):
     interferogram, _ = interferogram_of(rise_m)

@@ -85,6 +85,7 @@ def test_local_campaign_has_features_without_geometry():
     assert features[2]["properties"]["covered_share"] == 0
 
 
+@pytest.mark.slow
 def test_coverage_map_is_reproducible_and_depends_on_its_input(tmp_path):
     several = [covered(), covered("f02", np.roll(RING, 2, axis=1)), covered("f03", 0 * RING)]
     tags = {"APERTURA_VERSION": "0.1.0"}

@@ -308,6 +308,7 @@ def test_changes_that_violate_met_requirements_come_last(tmp_path):
     assert [*map(bool, violated.values())] == sorted(map(bool, violated.values()))
 
 
+@pytest.mark.slow
 def test_search_is_reproducible_and_improves_the_plan(tmp_path):
     plan = FlightPlan.model_validate(plan_of(require={"resolution_m": 0.8}, bounds={"height_m": [-20, 20]}))
     best, tried = search(plan, tmp_path, ["height"], most=5)

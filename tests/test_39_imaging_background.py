@@ -193,6 +193,7 @@ def test_coupling_is_kept_and_flagged_if_every_target_would_be_lost():
     assert "background" in removal.flags
 
 
+@pytest.mark.slow
 def test_drifting_coupling_is_removed_by_a_running_median():
     clean = recorded(straight(1600, 60.0))
     drifting = coupled(clean, 40, drift=6.0)

@@ -96,6 +96,7 @@ def test_changed_log_with_kept_time_outdates_all_dependent_results(finished):
     assert stale_results(campaign) == {}
 
 
+@pytest.mark.slow
 def test_changed_samples_with_kept_time_and_size_are_noticed(finished):
     campaign, path = Campaign.load(finished), finished / "raw/f01/uav1.sigmf-data"
     os.utime(path, (1e9, 1e9))
@@ -172,6 +173,7 @@ def test_changed_code_outdates_its_results(finished, monkeypatch):
     assert not {"raw", "track", "echo", "scene"} & names(outdated)
 
 
+@pytest.mark.slow
 def test_missing_source_or_damaged_manifest_outdates_a_result(finished):
     campaign = Campaign.load(finished)
     (finished / "results/f01/uav1/track.manifest.json").unlink()
@@ -204,7 +206,7 @@ def test_product_with_one_changed_byte_is_reported(finished, file, manifest):
     assert list(damaged_results(Campaign.load(finished))) == [f"results/{manifest}.manifest.json"]
 
 
-@pytest.mark.quick("edited-f01/uav1-uav1/db.tif", "gone-scene.json")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "file", ["f01/uav1-uav1/db.tif", "f01/fused/image.json", "f01/uav1-uav1/mask.tif", "coverage.png", "scene.json"]
 )
@@ -220,7 +222,7 @@ def test_edited_or_missing_product_is_out_of_date(finished, file, how):
     assert [reason for reason in outdated.values() if reason] == [f"{path.name} {reason}"]
 
 
-@pytest.mark.quick("0")
+@pytest.mark.slow
 @pytest.mark.parametrize("before", [0, 1])
 def test_edited_product_is_kept_under_another_name(finished, before, capsys):
     folder = finished / "results/f01/uav1-uav1"
@@ -236,6 +238,7 @@ def test_edited_product_is_kept_under_another_name(finished, before, capsys):
     assert f"kept as results/f01/uav1-uav1/{kept}" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_stage_with_a_missing_array_is_out_of_date(finished):
     shutil.rmtree(finished / "results/f01/uav1-uav1/echo.zarr/path_removed")
     outdated = stale_results(Campaign.load(finished))
@@ -296,6 +299,7 @@ def archive(root):
     return Campaign.load(root)
 
 
+@pytest.mark.slow
 def test_archived_recordings_leave_results_up_to_date(finished):
     campaign = archive(finished)
     assert stale_results(campaign) == {}
@@ -314,6 +318,7 @@ def test_check_compares_each_result_with_its_inputs_once(finished_tiny, monkeypa
     assert len(manifests) == len(set(manifests)) > 10
 
 
+@pytest.mark.slow
 def test_results_are_up_to_date_without_any_raw_file(finished):
     shutil.rmtree(finished / "raw")
     campaign = Campaign.load(finished)
@@ -337,6 +342,7 @@ def test_image_is_recomputed_only_from_a_kept_transfer_function(finished):
     assert "processing: {keep: [echo]}" in problem
 
 
+@pytest.mark.slow
 def test_kept_transfer_function_outdates_only_the_crate(finished):
     campaign, kept = Campaign.load(finished), "results/f01/uav1-uav2/transfer.manifest.json"
     assert on_demand(campaign, kept)

@@ -91,6 +91,7 @@ def test_white_phase_noise_has_the_allan_deviation_of_its_snr():
         assert deviation == pytest.approx(white / averaged_s, rel=0.1)
 
 
+@pytest.mark.slow
 def test_bench_needs_no_log_and_forms_no_image(tmp_path, capsys, monkeypatch):
     campaign = Campaign.load(SPOILT["cable warms up"].write(tmp_path / "bench", 1))
     assert not problems(campaign.root)
@@ -125,6 +126,7 @@ def test_path_of_a_flagged_link_is_not_written_to_the_config(tmp_path, capsys):
     assert (root / "config/config.yaml").read_text() == before
 
 
+@pytest.mark.slow
 def test_only_measured_paths_are_written_to_the_config(tmp_path):
     root = RIGHT.write(tmp_path / "bench", 1)
     edit_config(root, lambda config: config["nodes"]["uav2"]["path_offset_m"].update(radar=0.5))

@@ -96,6 +96,7 @@ def brightest(root):
     return float(image.x[peak["x"]]) - EAST, float(image.y[peak["y"]]) - NORTH, float(image.max())
 
 
+@pytest.mark.slow
 def test_clock_offset_puts_the_target_at_its_position(campaign):
     write_clocks(campaign)
     assert problems(campaign) == []

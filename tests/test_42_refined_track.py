@@ -51,6 +51,7 @@ def run_steps_before_image(campaign):
         profile.profile(campaign, "f01", pair)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("configured", "loss_db", "unstated_nodes", "value"),
     [
@@ -67,6 +68,7 @@ def test_tracks_are_refined_if_configured_or_if_errors_exceed_tolerance(configur
     assert ("position_std_m" in decision.reason) is (unstated_nodes == ["b"])
 
 
+@pytest.mark.slow
 def test_unrefined_tracks_have_no_knots_and_the_reason_is_reported(finished_tiny):
     stage = open_campaign(finished_tiny.root).stage("refined_track", "f01")
     assert dict(stage.sizes) == {"node": 2, "knot": 0, "axis": 3, "pair": 0}
@@ -81,6 +83,7 @@ def test_unrefined_tracks_have_no_knots_and_the_reason_is_reported(finished_tiny
     assert quality["models"]["autofocus"].startswith("off: auto: position accuracy")
 
 
+@pytest.mark.slow
 def test_without_correction_images_use_the_original_arrays(finished_tiny):
     track, pair = open_refined(finished_tiny, "f01"), open_pair(finished_tiny, "f01", "uav1-uav2")
     profiles = profiles_of(open_stage(finished_tiny.stage("profile", "f01", "uav1-uav2"), "profile"))
@@ -197,6 +200,7 @@ def test_hypotheses_start_from_the_refined_tracks(erroneous):
         np.testing.assert_allclose(moved.history.reference_delay_s, imaged.reference_delay_s, atol=1e-3 / 3e8)
 
 
+@pytest.mark.slow
 def test_settings_of_refinement_outdate_only_dependent_results(finished_tiny, tmp_path):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     x, y = np.mean(np.reshape(finished_tiny.settings.scene.bounds_m, (2, 2)), axis=0).tolist()
@@ -209,6 +213,7 @@ def test_settings_of_refinement_outdate_only_dependent_results(finished_tiny, tm
     assert not problems(root)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("by_m", "message"),
     [((4.0, 0.0, 0.0), "outside the scene"), ((0.0, 0.0, 2000.0), "close to the terrain of the scene, about 620.0 m")],
@@ -225,6 +230,7 @@ def test_reference_point_outside_the_scene_is_reported(finished_tiny, tmp_path, 
         state(root, "scene", crs="auto")
 
 
+@pytest.mark.slow
 def test_on_and_off_are_read_as_text_and_not_as_booleans(tiny):
     for word in ("on", "off", "auto"):
         path = tiny / "config" / "config.yaml"
@@ -232,6 +238,7 @@ def test_on_and_off_are_read_as_text_and_not_as_booleans(tiny):
         assert Campaign.load(tiny).settings.processing.autofocus == word
 
 
+@pytest.mark.slow
 def test_plan_reports_the_autofocus_decision(tiny, capsys):
     edit_config(tiny, lambda document: [node.update(position_std_m=0.02) for node in document["nodes"].values()])
     print_plan(Campaign.load(tiny))
@@ -348,6 +355,7 @@ def rms(values, axis=0):
     return np.sqrt((values**2).mean(axis=axis))
 
 
+@pytest.mark.slow
 def test_refined_track_applies_to_a_pair_without_sidelink(erroneous):
     """Phase histories have no sidelink, whose length would be added to the paths."""
     campaign, (start, correction) = erroneous

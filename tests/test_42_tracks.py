@@ -196,6 +196,7 @@ def test_plot_has_a_column_per_node(log, tmp_path):
     assert four.shape[1] > 1.5 * one.shape[1]
 
 
+@pytest.mark.slow
 def test_plot_without_correction_has_two_panels(log, tmp_path):
     still = replace(log, moved_m=np.zeros((30, 3)), left_m=np.full((30, 3), np.nan))
     for name, logs in (("still", [still] * 4), ("moved", [log] * 4)):

@@ -80,6 +80,7 @@ def test_echo_stage_reports_sidelink_clock_and_code(undisturbed):
     assert 5 < float(secondary.sidelink_delay.std()) < 9
 
 
+@pytest.mark.slow
 def test_random_transmit_phase_is_flagged_in_the_monostatic_image(tmp_path):
     flags = echo_of(simulated(tmp_path, "uav1", carrier_phase=UniformPhase()), "uav1-uav1").attrs["flags"]
     assert set(flags) == {"phase_unstable"}
@@ -104,7 +105,7 @@ def test_saturated_converter_is_flagged(tmp_path, backoff_db, flagged):
     assert ("saturated_sidelink" in flags) is flagged
 
 
-@pytest.mark.quick("30.0-divide")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("snr_db", "method"),
     [(30.0, "divide"), (8.0, "wiener"), (-5.0, "two_parameter"), (-14.0, "two_parameter")],
@@ -126,7 +127,7 @@ def test_configured_correction_below_its_snr_limit_is_flagged(tmp_path, snr_db, 
     assert ("sidelink_noisy" in attrs["flags"]) is flagged
 
 
-@pytest.mark.quick("0.3-True")
+@pytest.mark.slow
 @pytest.mark.parametrize(("amplitude", "flagged"), [(0.3, True), (0.03, False)])
 def test_echo_in_the_sidelink_is_flagged_with_configured_division(tmp_path, amplitude, flagged):
     campaign = simulated(tmp_path, sidelink_multipath=(Reflection(excess_m=9.0, amplitude=amplitude),))
@@ -147,6 +148,7 @@ def test_transmitter_ripple_does_not_prevent_division(tmp_path):
     assert attrs["flags"] == {}
 
 
+@pytest.mark.slow
 def test_pulses_without_sidelink_are_dropped_counted_and_flagged(tmp_path):
     dataset = echo_of(simulated(tmp_path, sidelink_blockage=Blockage(0.3, mean_pulses=5)))
     flag = dataset.attrs["flags"]["sidelink_lost"]
@@ -170,13 +172,14 @@ def test_pulses_with_a_disturbed_sidelink_are_dropped_counted_and_flagged(tmp_pa
     assert not set(dataset.capture.values) & set(struck)
 
 
+@pytest.mark.slow
 def test_sidelink_without_lock_is_refused(tmp_path):
     campaign = simulated(tmp_path, sidelink_snr_db=-60.0)
     message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav2"))
     assert "uav2: sidelink" in message
 
 
-@pytest.mark.quick("8.0-True")
+@pytest.mark.slow
 @pytest.mark.parametrize(("ppm", "corrected"), [(8.0, True), (0.5, False)])
 def test_clock_is_corrected_in_samples_only_if_significant(tmp_path, ppm, corrected):
     clock = Clock(cfo_hz=ppm * 1200.0, sfo_hz=ppm * 1024.0)
@@ -185,6 +188,7 @@ def test_clock_is_corrected_in_samples_only_if_significant(tmp_path, ppm, correc
     assert float(attrs["clock"]["reason"].split()[1]) == pytest.approx(ppm, abs=0.1)
 
 
+@pytest.mark.slow
 def test_wrong_code_is_flagged_in_a_monostatic_image(undisturbed):
     campaign = undisturbed
     codes = np.load(str(campaign.root / "raw" / "codes.npy"))
@@ -205,7 +209,7 @@ def conjugate(samples):
     np.negative(samples[1::2], out=samples[1::2])
 
 
-@pytest.mark.quick("swap-swapped")
+@pytest.mark.slow
 @pytest.mark.parametrize(("change", "order"), [(swap, "swapped"), (conjugate, "conjugate")])
 def test_other_i_q_order_is_reported_and_configurable(undisturbed, change, order):
     campaign, pairs = undisturbed, ("uav1-uav1", "uav1-uav2")
@@ -228,7 +232,7 @@ def test_other_i_q_order_is_reported_and_configurable(undisturbed, change, order
         np.testing.assert_array_equal(stage.transfer.values, transfer)
 
 
-@pytest.mark.quick("swap-swapped")
+@pytest.mark.slow
 @pytest.mark.parametrize(("change", "order"), [(swap, "swapped"), (conjugate, "conjugate")])
 def test_i_q_order_is_configurable_per_node(undisturbed, change, order):
     campaign, pair = undisturbed, "uav1-uav2"
@@ -245,7 +249,7 @@ def test_i_q_order_is_configurable_per_node(undisturbed, change, order):
     assert campaign.settings.iq_of("uav1") == "complex"
 
 
-@pytest.mark.quick("0.022-True")
+@pytest.mark.slow
 @pytest.mark.parametrize(("offset_s", "flagged"), [(22e-3, True), (4e-3, False)])
 def test_tag_offset_near_half_an_interval_is_flagged(tmp_path, offset_s, flagged):
     flags = echo_of(simulated(tmp_path, time_tag=TimeTag(offset_s=offset_s))).attrs["flags"]

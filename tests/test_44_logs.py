@@ -136,6 +136,7 @@ def test_log_with_float_solutions_only_is_refused(tmp_path):
     assert "poorer than fix" in complaint(lambda: echo_of(campaign))
 
 
+@pytest.mark.slow
 def test_pulses_in_a_log_gap_are_excluded(tmp_path):
     plan = small_simulation().flights[0]
     swaying = replace(plan.tracks["a"], wobble=Wobble((0.3, 0.3, 0.3), smoothing_s=0.3))
@@ -178,7 +179,7 @@ def test_repeated_positions_of_a_log_are_skipped(tmp_path):
     np.testing.assert_allclose(dataset.rx_position.values, clean, atol=1e-3)
 
 
-@pytest.mark.quick("0.2-True")
+@pytest.mark.slow
 @pytest.mark.parametrize(("grain_s", "flagged"), [(0.1, False), (0.2, True)])
 def test_log_with_rounded_times_is_flagged_with_the_position_error(tmp_path, grain_s, flagged):
     """Times rounded to 0.2 s at 5 m/s cause a position error of 5 m/s · 0.2 s/√12 = 0.29 m."""
@@ -251,7 +252,7 @@ def test_tag_offset_between_nodes_does_not_change_the_bistatic_phase(tmp_path, o
     assert abs(np.angle(np.exp(1j * (phases[1] - phases[0])))) < 0.05
 
 
-@pytest.mark.quick("b")
+@pytest.mark.slow
 @pytest.mark.parametrize("node", ["a", "b"])
 def test_repeated_captures_are_excluded(tmp_path, node):
     """Eight captures repeat the samples of the preceding eight, from other positions, and would form a ghost."""

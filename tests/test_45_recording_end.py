@@ -89,8 +89,8 @@ ENGINES = {
 }
 
 
+@pytest.mark.slow
 @compiled
-@pytest.mark.quick("True-bi")
 @pytest.mark.parametrize("flown", APERTURES)
 @pytest.mark.parametrize("with_sector", [False, True])
 def test_engines_sum_the_recorded_echoes(flown, with_sector):
@@ -110,6 +110,7 @@ def test_engines_sum_the_recorded_echoes(flown, with_sector):
         assert rms_db(image - exact, exact) < -62, name
 
 
+@pytest.mark.slow
 @compiled
 def test_tree_is_not_chosen_where_a_flat_window_widens_the_band():
     """The edge of a gate widens the band of a flat window, which the nodes of a tree do not resolve."""
@@ -120,6 +121,7 @@ def test_tree_is_not_chosen_where_a_flat_window_widens_the_band():
     assert plan(-45.0, **size, beams=gate).engine == "tree"
 
 
+@pytest.mark.slow
 def test_gate_moves_with_the_paths_of_a_refined_track():
     """Profiles that are corrected by a path contain the gate at the corrected path."""
     gate, history, engine = gate_of(MONO), history_of(MONO, SCATTERED, np.ones(80)), load_engine("numba")

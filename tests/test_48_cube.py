@@ -18,6 +18,8 @@ from apertura.methods.interferometry.coherence import chance, coherence
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.stages import cube
 
+pytestmark = pytest.mark.slow  # the campaign of two flights takes 5 s
+
 HEIGHT_OFFSET_M = 0.1
 
 
@@ -204,7 +206,6 @@ def test_images_of_an_older_version_are_one_message(campaign, tmp_path):
     assert "Run the workflow again" in message
 
 
-@pytest.mark.slow
 def test_code_blocks_of_the_how_to_print_what_they_show(campaign, tmp_path, monkeypatch):
     copy_writable(campaign.root, tmp_path / "campaign")
     monkeypatch.chdir(tmp_path)

@@ -43,6 +43,7 @@ def run_command(monkeypatch, capsys):
     return run
 
 
+@pytest.mark.quick("plan", "list", "status")
 @pytest.mark.parametrize("words", ["check", "plan", "summary", "list", "status", "run -n", "score"])
 def test_default_campaign_is_the_current_directory(finished_tiny, run_command, words):
     status, out, err = run_command(*words.split(), folder=finished_tiny.root)
@@ -201,7 +202,7 @@ def test_summary_reports_the_number_of_outdated_results(finished_tiny, tmp_path,
     assert re.fullmatch(r"\d+ results are out of date: `apertura run` recomputes them", last)
 
 
-@pytest.mark.quick("True")
+@pytest.mark.slow
 @pytest.mark.parametrize("has_scene", [True, False])
 def test_reflector_position_is_in_the_automatic_crs(finished_tiny, tmp_path, has_scene):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
@@ -233,6 +234,7 @@ def test_summary_without_results_names_the_command_to_run(tiny, run_command):
     assert "Run the workflow first" in err
 
 
+@pytest.mark.slow
 def test_plan_states_its_inputs(tiny, finished_tiny, run_command):
     before, after = (run_command("plan", root)[1] for root in (tiny, finished_tiny.root))
     assert "This plan is based on the flight logs alone" in before

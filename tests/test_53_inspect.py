@@ -330,7 +330,7 @@ def test_log_in_a_campaign_is_read_with_the_options_of_the_config(tiny, tmp_path
     assert look(alone, ["columns.height_m=up"]).problem is None
 
 
-@pytest.mark.quick("campaign-sample", "dem_isce3*")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

@@ -71,7 +71,7 @@ def difference_db(image, exact):
     return 10 * np.log10(np.mean(np.abs(image - exact) ** 2) / np.mean(np.abs(exact) ** 2))
 
 
-@pytest.mark.quick("16")
+@pytest.mark.slow
 @pytest.mark.parametrize("pulses", [7, 16, 2048])
 def test_image_added_in_blocks_equals_that_of_all_pulses(finished_tiny, tmp_path, monkeypatch, pulses):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
@@ -223,7 +223,7 @@ def other_log(root):
     log.write_text(head + "".join(lines[1:]))
 
 
-@pytest.mark.quick("other_flight", "other_log")
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [other_flight, shorter, other_samples, other_last_samples, other_log])
 def test_restarted_recorder_restarts_its_images(tiny, change, capsys):
     preview = Preview(Campaign.load(tiny), follow=True)
@@ -304,6 +304,7 @@ def test_partially_rewritten_metadata_are_no_restart(tiny):
         assert (node.restart, len(node.time)) == ("", count)
 
 
+@pytest.mark.slow
 def test_idle_recording_is_finished_and_missing_data_reported(tiny, capsys):
     meta = tiny / "raw/f01/uav1.sigmf-meta"
     meta.write_text(meta.read_text().rstrip().rstrip("}"))
@@ -324,6 +325,7 @@ def test_last_image_is_at_full_resolution(tiny):
     assert [status["share"] for status in statuses.values()] == [1, 1]
 
 
+@pytest.mark.slow
 def test_preview_waits_for_missing_files(tiny):
     for path in (tiny / "raw/f01").iterdir():
         path.unlink()
