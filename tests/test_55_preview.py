@@ -19,8 +19,11 @@ from folders import ROOT, copy_writable, ingest_all, settle_ground, state
 import apertura as ap
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
+from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import window_weights
+from apertura.core.geometry.gate import EDGE_CELLS, RangeGate
 from apertura.formats.recordings.sigmf import GrowingSigmf, open_sigmf
 from apertura.run.results import clean
 from apertura.simulation import ImageGrid, preset
@@ -69,6 +72,29 @@ def in_blocks(root, pulses, monkeypatch):
 def difference_db(image, exact):
     """Return the RMS difference of two images relative to that of the second, dB."""
     return 10 * np.log10(np.mean(np.abs(image - exact) ** 2) / np.mean(np.abs(exact) ** 2))
+
+
+@pytest.mark.slow
+def test_pixels_beyond_the_recorded_delays_have_no_data(finished_tiny, tmp_path, monkeypatch):
+    """Blocks are gated at the end of the recorded delays, as the images of the run are."""
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    west, south, east, north = finished_tiny.settings.scene.bounds_m
+    state(root, "scene", bounds_m=[west, south, east + 120, north + 120], spacing_m=0.5)
+    state(root, "processing", integration="all")
+    pair = in_blocks(root, 16, monkeypatch)[0]
+    fine = pair.images[1]
+    echo = PairEcho.opened(finished_tiny, "f01", pair.name).stage.load()
+    step_m = SPEED_OF_LIGHT_M_S / float(np.ptp(echo.frequency.values) + np.diff(echo.frequency.values[:2])[0])
+    gate = Beams(gate=RangeGate(echo.path_limit.values, EDGE_CELLS * step_m))
+    height_m = finished_tiny.settings.scene.height_m
+    options = {"terrain": height_m, "engine": "reference", "certified_pixels": 0, "judge": False}
+    exact = ap.backproject(echo, fine.grid, beams=gate, **options).values
+    recorded = exact != 0
+    assert 0.1 < recorded.mean() < 0.9
+    np.testing.assert_array_equal(fine.sums != 0, recorded)
+    assert difference_db(fine.image[recorded], exact[recorded]) < -60
+    assert f"{100 * (1 - recorded.mean()):.0f} % has no data" in fine.flags["scene_beyond_recording"]
+    assert in_blocks(finished_tiny.root, 2048, monkeypatch)[0].images[1].flags == {}
 
 
 @pytest.mark.slow

@@ -226,7 +226,7 @@ class Preview:
             return report
         judged, bound_db = pair.judged(), float(shown.error_db)
         error_db = round(bound_db, 1) if np.isfinite(bound_db) else None
-        report |= {"peak": shown.peak, **judged, "flags": Flags.merged(pair.flags, judged["flags"])}
+        report |= {"peak": shown.peak, **judged, "flags": Flags.merged(pair.flags, shown.flags, judged["flags"])}
         report |= {"share": shown.share, "error_db": error_db}
         report |= {"spacing_m": shown.grid.spacing_m, "setting": shown.setting}
         report["delay_s"] = pair.delay_s

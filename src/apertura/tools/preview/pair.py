@@ -18,8 +18,9 @@ from apertura.core.backprojection.contributions import band_limited_image
 from apertura.core.backprojection.inputs import PhaseHistory, Profiles
 from apertura.core.backprojection.tiles import Weighing, image_array
 from apertura.core.echo.association import associate
-from apertura.core.echo.compression import centre_frequency, window_weights
+from apertura.core.echo.compression import centre_frequency, range_step, window_weights
 from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.gate import EDGE_CELLS, RangeGate
 from apertura.core.geometry.sector import TAPER, Sector
 from apertura.core.imaging.focus_check import LEAST_PULSES, resolution_cell_m
 from apertura.core.imaging.formation import Formation
@@ -65,6 +66,8 @@ class PulseBlock:
         Body axes, as required by `apertura.stages.pair.beams_of`.
     time
         (pulse,) datetime64[ns], UTC.
+    path_limit_m
+        (pulse,) float64, longest total path whose echo is recorded completely, metres.
     weight
         Decimation factor: number of recorded pulses that each pulse represents.
     """
@@ -72,16 +75,21 @@ class PulseBlock:
     history: PhaseHistory
     axes: Axes
     time: Times
+    path_limit_m: NDArray[np.float64]
     weight: int = 1
 
 
 @dataclass(frozen=True, eq=False)
 class Compressed:
-    """Range-compressed pulses of a block that contribute to an image, with axes, times and pulse count of the block."""
+    """Range-compressed pulses of a block that contribute to an image, with axes, times and pulse count of the block.
+
+    `gate_m` (pulse,) is the path limit of a gated block, in metres, and infinite in other blocks.
+    """
 
     profiles: Profiles
     axes: Axes
     time: Times
+    gate_m: NDArray[np.float64]
     pulses: int
     weight: int = 1
 
@@ -90,7 +98,7 @@ class Compressed:
         selected = self.profiles[::step]
         axes = {name: values[::step] for name, values in self.axes.items()}
         profiles = replace(selected, samples=np.array(selected.samples))
-        return replace(self, profiles=profiles, axes=axes, time=self.time[::step])
+        return replace(self, profiles=profiles, axes=axes, time=self.time[::step], gate_m=self.gate_m[::step])
 
     @classmethod
     def joined(cls, blocks: Sequence["Compressed"]) -> "Compressed":
@@ -105,8 +113,8 @@ class Compressed:
             aperture=Aperture(*(np.concatenate([part.aperture.legs[leg] for part in parts]) for leg in (0, 1))),
         )
         axes = {name: np.concatenate([block.axes[name] for block in blocks]) for name in blocks[0].axes}
-        times = np.concatenate([block.time for block in blocks])
-        return cls(profiles, axes, times, sum(block.pulses for block in blocks))
+        times, gate_m = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("time", "gate_m"))
+        return cls(profiles, axes, times, gate_m, sum(block.pulses for block in blocks))
 
 
 class ImageSoFar:
@@ -149,7 +157,8 @@ class ImageSoFar:
         self._pixels = np.random.default_rng(0).integers(0, grid.shape, (_CERTIFIED, 2))
         self._exact = np.zeros(_CERTIFIED, np.complex128)
         self._plans = plans
-        self._speed_m_s = 0.0
+        self._speed_m_s = self._edge_m = 0.0
+        self._cut = 0  # pulses that do not record the whole scene
         self._summed, self._every, self._kept = 0, 1, list[Compressed]()
 
     def compressed(self, block: PulseBlock) -> "Compressed":
@@ -163,15 +172,27 @@ class ImageSoFar:
         banded = replace(
             history, transfer=history.transfer[:, band], frequency_hz=history.frequency_hz[band], weight=weight
         ).at_speed(self._speed_m_s)
-        window = RangeWindow.of(
-            banded.aperture,
-            self.grid,
-            self._terrain,
-            banded.frequency_hz,
-            beams=self._beams(banded.aperture, block.axes, centre_frequency(banded.frequency_hz)),
-            wave_speed_m_s=self._speed_m_s,
-            together=_TOGETHER,
-        )
+        cell_m, _ = range_step(banded.frequency_hz, oversampling=1.0, wave_speed_m_s=self._speed_m_s)
+        self._edge_m = EDGE_CELLS * cell_m
+        gate_m = np.full(len(block.time), np.inf)
+
+        def window_of(limit_m: NDArray[np.float64]) -> RangeWindow:
+            return RangeWindow.of(
+                banded.aperture,
+                self.grid,
+                self._terrain,
+                banded.frequency_hz,
+                beams=self._beams(banded.aperture, block.axes, centre_frequency(banded.frequency_hz), limit_m),
+                wave_speed_m_s=self._speed_m_s,
+                together=_TOGETHER,
+            )
+
+        window = window_of(gate_m)
+        cut = window.contributing & (window.farthest_m > block.path_limit_m)
+        if cut.any():  # eq. 6 of docs/theory/integration.md, decided per block
+            self._cut += int(cut.sum())
+            gate_m = block.path_limit_m
+            window = window_of(gate_m)
         contributing = window.contributing
         banded = replace(
             banded,
@@ -182,7 +203,7 @@ class ImageSoFar:
         window = replace(window, start_m=window.start_m[contributing], farthest_m=window.farthest_m[contributing])
         profiles = range_compress(banded, self.grid, self._terrain, window=window)
         axes = {name: values[contributing] for name, values in block.axes.items()}
-        return Compressed(profiles, axes, block.time[contributing], len(block.time), block.weight)
+        return Compressed(profiles, axes, block.time[contributing], gate_m[contributing], len(block.time), block.weight)
 
     def add(self, block: "Compressed") -> None:
         """Add a block of `compressed` pulses.
@@ -193,7 +214,7 @@ class ImageSoFar:
         profiles = block.profiles
         if not len(profiles):
             return
-        beams = self._beams(profiles.aperture, block.axes, profiles.centre_frequency_hz)
+        beams = self._beams(profiles.aperture, block.axes, profiles.centre_frequency_hz, block.gate_m)
         if self._plan is None or self._accuracy_db < self.error_db < np.inf:
             self._plans[self.share] = self._planned(profiles, beams)
         plan = self._plans[self.share]
@@ -229,10 +250,11 @@ class ImageSoFar:
             replace(job, beams=beams), accuracy_db=self._accuracy_db, overrides=overrides, where=str(CONFIG)
         )
 
-    def _beams(self, aperture: Aperture, axes: Axes, centre_hz: float) -> Beams | None:
-        """Return pulse weights of antennas and integration sector, independent of later pulses; None: equal weights."""
+    def _beams(self, aperture: Aperture, axes: Axes, centre_hz: float, gate_m: NDArray[np.float64]) -> Beams | None:
+        """Return pulse weights of antennas, sector and gate, independent of later pulses; None: all are 1."""
         requested = self._campaign.settings.processing.integrated
-        antennas = beams_of(self._campaign, self._pair, axes)
+        gate = RangeGate(gate_m, self._edge_m) if np.isfinite(gate_m).any() else None
+        antennas = Beams.within(None, beams_of(self._campaign, self._pair, axes), gate)
         if requested == "all" or len(aperture) < 2:
             return antennas
         half = sector_half(requested, self._speed_m_s / centre_hz, self.grid.spacing_m)
@@ -241,12 +263,21 @@ class ImageSoFar:
             return antennas
         middle_m = self._terrain.positions_at(self.grid, *((size - 1) / 2 for size in self.grid.shape))
         range_m = float(np.linalg.norm(aperture.middle_m - middle_m, axis=-1).min())
-        return Beams.within(Sector.of(aperture, chord_m=CHORD * range_m, centre=0.0, half=half), antennas)
+        return Beams.within(Sector.of(aperture, chord_m=CHORD * range_m, centre=0.0, half=half), antennas, gate)
 
     @property
     def image(self) -> NDArray[np.complex64]:
         """(y, x) complex64, the mean over the contributing pulses so far."""
         return np.asarray(self.sums / np.float32(max(1, self._summed)), np.complex64)
+
+    @property
+    def flags(self) -> dict[str, str]:
+        """Flag of a scene that is larger than what was recorded so far; empty if all pulses recorded all pixels."""
+        if not self._cut:
+            return {}
+        missing = 100 * float(np.mean(self.sums == 0))
+        line = f"{self._cut} of {self.pulses} pulses so far do not record the whole scene; {missing:.0f} % has no data"
+        return {"scene_beyond_recording": line}
 
     @property
     def setting(self) -> str:
@@ -270,7 +301,7 @@ class ImageSoFar:
             return {"verdict": "inconclusive", "reason": f"{pulses} pulses so far", "flags": {}}
         joined = Compressed.joined(self._kept)
         profiles, times = joined.profiles, joined.time
-        beams = self._beams(profiles.aperture, joined.axes, profiles.centre_frequency_hz)
+        beams = self._beams(profiles.aperture, joined.axes, profiles.centre_frequency_hz, joined.gate_m)
         # integration and flags of the plan are those of its first block
         plan = replace(self._plan, beams=beams, integration=None, flags={})
         side = self._campaign.settings.processing.tile_px
@@ -460,7 +491,7 @@ class PairSoFar:
         for name, line in Flags.merged(formed.attrs["flags"], echo.saturation.flags).items():
             self._raised[name] = self._raised.get(name, (0, ""))[0] + 1, line
         history = phase_history_of(formed, self.campaign.settings.processing.window)
-        return PulseBlock(history, body_axes(formed), formed.time.values)
+        return PulseBlock(history, body_axes(formed), formed.time.values, formed.path_limit.values)
 
     def _new_images(self, block: PulseBlock) -> list[ImageSoFar]:
         """Return an empty coarse and an empty fine image."""
