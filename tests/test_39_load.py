@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -120,3 +121,16 @@ def test_path_limit_of_the_prefix_equals_the_planned_one(tiny, pair):
     ingest_all(campaign)
     echo.echo(campaign, "f01", pair)
     assert open_pair(campaign, "f01", pair).path_limit_m == pytest.approx(expected_m, abs=0.05)
+
+
+def test_text_of_a_campaign_has_at_most_ten_lines(tiny):
+    """Notebooks show the text of the last value of a cell."""
+    campaign = Campaign.load(tiny)
+    flight = campaign.flights[0]
+    many = replace(campaign, flights=tuple(replace(flight, name=f"f{number:02d}") for number in range(1, 301)))
+    assert repr(many) == f"<Campaign {campaign.settings.campaign} in {campaign.root}: 300 flights, nodes uav1, uav2>"
+    lines = repr(OpenCampaign(many)).splitlines()
+    assert len(lines) == 9
+    assert lines[1] == "  f01: uav1-uav1, uav1-uav2"
+    assert lines[-1] == "  and 293 more flights>"
+    assert repr(OpenCampaign(campaign)).splitlines()[1:] == ["  f01: uav1-uav1, uav1-uav2>"]

@@ -36,9 +36,11 @@ _PUBLIC = {
     "open_campaign": "apertura.tools.open_campaign",
     "open_dem": "apertura.core.scene.dem",
     "range_compress": "apertura.core.imaging.range_profiles",
+    "read_geotiff": "apertura.formats.export.geotiff",
     "simulate": "apertura.simulation",
     "wave_speed": "apertura.core.geometry.atmosphere",
     "write_campaign": "apertura.tools.write_campaign",
+    "write_geotiff": "apertura.formats.export.geotiff",
 }
 """Public name → module that defines it."""
 

@@ -207,6 +207,11 @@ class Campaign(RawFolder):
     planned: bool = False
     outdated: frozenset[str] = frozenset()
 
+    def __repr__(self) -> str:
+        """Return one line; `settings` contains the configuration."""
+        count = number_of(len(self.flights), "flight")
+        return f"<Campaign {self.settings.campaign} in {self.root}: {count}, nodes {', '.join(self.settings.nodes)}>"
+
     @classmethod
     def load(cls, root: str | Path) -> "Campaign":
         """Read and validate `root`/config; raise CampaignError for the first invalid file."""

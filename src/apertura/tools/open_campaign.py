@@ -23,6 +23,10 @@ _OF_THE_CAMPAIGN = {"cube", "terrain"}
 """Stages of a node in a flight, of a flight, and of the campaign; all others are of a pair in a flight."""
 
 
+_LISTED = 8
+"""Maximum number of flights in the text of a campaign."""
+
+
 @dataclass(frozen=True)
 class OpenCampaign:
     """A validated campaign folder with its results, which are read on access.
@@ -36,11 +40,22 @@ class OpenCampaign:
     campaign: Campaign
 
     def __repr__(self) -> str:
-        """Return a text with the folder and the pairs of each flight."""
-        pairs = "; ".join(f"{flight}: {', '.join(names)}" for flight, names in self.pairs.items())
-        return (
-            f"<OpenCampaign {self.campaign.settings.campaign} in {self.campaign.root}: {pairs or 'no image flights'}>"
-        )
+        """Return the folder and the pairs of the first image flights, in at most ten lines.
+
+        Examples
+        --------
+        >>> from apertura.simulation import preset, simulate
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     _ = simulate(f"{folder}/campaign", preset("demo", pulses=4), seed=1)
+        ...     print(str(open_campaign(f"{folder}/campaign")).replace(folder, "folder"))
+        <OpenCampaign tandem_demo in folder/campaign
+          f01: uav1-uav1, uav1-uav2>
+        """
+        lines = [f"{flight}: {', '.join(names)}" for flight, names in self.pairs.items()] or ["no image flights"]
+        if len(lines) > _LISTED:
+            lines = [*lines[: _LISTED - 1], f"and {len(lines) - _LISTED + 1} more flights"]
+        return "\n  ".join([f"<OpenCampaign {self.campaign.settings.campaign} in {self.campaign.root}", *lines]) + ">"
 
     @property
     def pairs(self) -> dict[str, tuple[str, ...]]:
