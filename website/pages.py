@@ -7,6 +7,7 @@ from apertura.campaign.config.template import config_schema, config_template, fl
 from website.api import api_page
 from website.cli import cli_page
 from website.flags import flags_page
+from website.notebooks import notebook_pages
 from website.sizing import sizing_page
 from website.theory_tests import theory_tests_page
 
@@ -21,9 +22,11 @@ PAGES: dict[str, Callable[[], str]] = {
     "docs/flags.md": flags_page,
     "docs/howto/sizing.md": sizing_page,
     "docs/theory/tests.md": theory_tests_page,
+    **notebook_pages(),
 }
 """File → function that returns the content of the file."""
 
 if __name__ == "__main__":
     for name, page in PAGES.items():
+        (ROOT / name).parent.mkdir(exist_ok=True)
         (ROOT / name).write_text(page(), encoding="utf-8")
