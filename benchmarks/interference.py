@@ -27,7 +27,7 @@ from apertura.simulation import preset
 from apertura.simulation.impairments import Adc, Interferer
 
 KINDS = {
-    "tone": Interferer(1.31e9, 0.0),
+    "tone": Interferer(1.31012e9, 0.0),  # between two subcarriers, so that it leaks into all of them
     "DME-like": Interferer(1.35e9, 0.0, duration_s=7e-6, rate_hz=10e3, envelope="hann"),
     "burst": Interferer(1.4e9, 0.0, bandwidth_hz=1e9, duration_s=20e-6, rate_hz=2e3),
 }

@@ -11,7 +11,7 @@ from apertura.campaign.store import open_stage
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.echo.demodulate import remove_path
-from apertura.core.echo.transfer import transfer_by_sidelink
+from apertura.core.echo.transfer import Demodulator, transfer_by_sidelink
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.range_profiles import CompressionError, range_compress
 from apertura.core.scene.grid import SceneGrid
@@ -70,9 +70,7 @@ def test_stored_pulse_parameters_give_the_measured_transfer(drifting, tmp_path, 
     rx, captures = open_acquisition(campaign, "f01", "uav2", sent), stage.capture.values
     measured = transfer_by_sidelink(
         rx.reader(["radar", "sidelink"], captures),
-        sent.inverse,
-        rx.numerology,
-        symbol_samples=sent.waveform.capture_samples,
+        Demodulator(sent.inverse, rx.numerology, sent.waveform.capture_samples),
         sidelink_m=np.linalg.norm(stage.sidelink_vector.values, axis=1),
         method=method,
         accuracy_db=-60.0,

@@ -12,7 +12,7 @@ from apertura.core.echo.clock import clock_of, estimate_clock
 from apertura.core.echo.demodulate import Numerology, remove_path
 from apertura.core.echo.line_of_sight import fit_line_of_sight
 from apertura.core.echo.sidelink_state import measure, measure_blocks
-from apertura.core.echo.transfer import transfer_by_code, transfer_by_sidelink
+from apertura.core.echo.transfer import Demodulator, transfer_by_code, transfer_by_sidelink
 
 NUMEROLOGY = Numerology(1.2e9, 32e6, np.arange(200), prefix_samples=64, dft_samples=256)
 CODES = np.exp(2j * np.pi * np.random.default_rng(1).random(200)).astype(np.complex64)
@@ -39,9 +39,7 @@ def formed(iq, **more):
     pulses = len(iq["radar"])
     measured = transfer_by_sidelink(
         lambda pulses: {name: samples[pulses] for name, samples in iq.items()},
-        1 / CODES,
-        NUMEROLOGY,
-        symbol_samples=SYMBOL,
+        Demodulator(1 / CODES, NUMEROLOGY, SYMBOL),
         sidelink_m=np.full(pulses, 15.0),
         accuracy_db=-60.0,
         where="here",
@@ -200,7 +198,9 @@ def test_memory_does_not_grow_with_the_length_of_a_flight(monkeypatch):
     for pulses in (500, 5000):
         tracemalloc.start()
         measured = transfer_by_code(
-            lambda pulses: {"radar": captures[pulses % 64]}, 1 / CODES, NUMEROLOGY, time_s=np.arange(pulses) / 20
+            lambda pulses: {"radar": captures[pulses % 64]},
+            Demodulator(1 / CODES, NUMEROLOGY, SYMBOL),
+            time_s=np.arange(pulses) / 20,
         )
         for block in blocks_of(np.arange(pulses)):
             assert measured.form(block).shape == (len(block), 200)

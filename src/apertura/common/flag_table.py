@@ -694,10 +694,12 @@ _OF_BENCHES = {
         "methods/bench/links.py",
     ),
     "interference": Flag(
-        "noise of a subcarrier relative to adjacent subcarriers, dB; frequency of the subcarrier and its usual service",
-        "a narrow-band signal in the band adds noise at every range; excluded subcarriers cause sidelobes",
+        "noise of a subcarrier relative to adjacent subcarriers, dB, or power of a tone relative to the rest of the "
+        "capture, dB; frequency and its usual service",
+        "a narrow-band signal in the band adds noise at every range; subtracted tones cause no sidelobes, excluded "
+        "subcarriers do",
         "other transmitters; spurious signals of the node's clocks; processing.interference",
-        "methods/bench/links.py, core/echo/interference.py",
+        "methods/bench/links.py, core/echo/tones.py, core/echo/interference.py",
     ),
     "interference_pulsed": Flag(
         "proportion of pulses, strongest frequency and its usual service, power relative to the level of echoes and "
@@ -708,11 +710,12 @@ _OF_BENCHES = {
         "core/echo/interference.py",
     ),
     "interference_sidelink": Flag(
-        "proportion of pulses, strongest frequency and its usual service, power relative to the median subcarrier, dB",
-        "interference in the sidelink: limited subcarriers do not affect its delay and phase, but interference in the "
+        "proportion of pulses, strongest frequency and its usual service, power relative to the median subcarrier, or "
+        "of a tone relative to the rest of the capture, dB",
+        "interference in the sidelink: tones are subtracted, and limited subcarriers do not affect its delay and phase, but interference in the "
         "whole band does",
         "other transmitters near this frequency; antenna of the sidelink",
-        "core/echo/interference.py",
+        "core/echo/tones.py, core/echo/interference.py",
     ),
     "pulses_noisy": Flag(
         "number of pulses; noise relative to neighbouring pulses, dB",

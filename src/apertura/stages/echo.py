@@ -21,7 +21,6 @@ from apertura.common.flags import Flags
 from apertura.common.provenance import merged
 from apertura.common.units import nanoseconds
 from apertura.core.echo.association import Association, missing_flags, tag_jitter_s
-from apertura.core.echo.captures import Saturation
 from apertura.core.echo.pulse_filter import truncation_flags
 from apertura.core.echo.sidelink import DIVIDING
 from apertura.core.echo.transfer import (
@@ -36,7 +35,7 @@ from apertura.stages.acquisition import Acquisition, common_pulses, open_acquisi
 from apertura.stages.calibration import calibrated, calibration_spec
 from apertura.stages.positions import PulsePositions, place, scene_air, stated_air
 from apertura.stages.tags import stamped
-from apertura.stages.transfer import PairEcho, forming_from, recorded_echo, save_transfer
+from apertura.stages.transfer import PairEcho, demodulator_of, recorded_echo, save_transfer
 from apertura.stages.transmitted import Transmitted, transmitted
 from apertura.workflow.lineage import result_of
 
@@ -126,8 +125,7 @@ def pair_echo(
         attrs=_attributes((tx, rx), pulses, positions, measured, repeats, at=at, calibration=calibration)
         | {"stated_offset_m": offset_m, **stated_air(air_on_track)},
     )
-    saturation = Saturation()
-    return PairEcho(dataset, forming_from(rx, sent, saturation, divided=tx.name != rx.name), saturation)
+    return PairEcho.formed(dataset, lambda: (rx, sent, processing))
 
 
 def _attributes(
@@ -186,14 +184,12 @@ def _transfer(
     time_s = (sent_ns - sent_ns[0]) * 1e-9
     if tx.name == rx.name:
         read = rx.reader(["radar"], captures)
-        measured = transfer_by_code(read, sent.inverse, rx.numerology, time_s=time_s)
+        measured = transfer_by_code(read, demodulator_of(rx, sent, processing), time_s=time_s)
         return _with_waveform(measured, sent), np.zeros(len(at))
     length_m = air.electrical_m(tx.antenna("sidelink", at), rx.antenna("sidelink", at))
     measured = transfer_by_sidelink(
         rx.reader(["radar", "sidelink"], captures),
-        sent.inverse,
-        rx.numerology,
-        symbol_samples=sent.waveform.capture_samples,
+        demodulator_of(rx, sent, processing),
         sidelink_m=length_m,
         method=processing.sidelink,
         accuracy_db=strictest_accuracy_db(processing.accuracy_db),

@@ -1,6 +1,6 @@
 """Transfer functions of a pair: formed from the recording on reading, recorded, or stored by rule `transfer`."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
-from apertura.campaign.config import CONFIG, SampledWaveform
+from apertura.campaign.config import CONFIG, Processing, SampledWaveform
 from apertura.campaign.digests import Lineage
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import finish, open_stage, write_blocks, writing
@@ -29,11 +29,8 @@ from apertura.core.echo.dechirp import sweep_motion_flags
 from apertura.core.echo.demodulate import remove_path
 from apertura.core.echo.interference import PulsedInterference
 from apertura.core.echo.line_of_sight import LineOfSight
-from apertura.core.echo.transfer import (
-    Correction,
-    Demodulator,
-    forming,
-)
+from apertura.core.echo.tones import Tones
+from apertura.core.echo.transfer import Correction, Demodulator, forming
 from apertura.core.geometry.geodesy import LOCAL
 from apertura.stages.acquisition import Acquisition, open_acquisition
 from apertura.stages.node_log import raw_log, read_history, shortest_wave
@@ -69,6 +66,8 @@ class PairEcho:
         (subcarrier,) float32, factors that `stage` applies: 0 for subcarriers with interference; None: no factors.
     pulsed
         Interference that `stage` removes from subcarriers of single pulses; None: nothing is removed.
+    tones
+        Channel → tones removed from the samples read so far; empty: tones are not removed.
     """
 
     dataset: xr.Dataset
@@ -77,6 +76,7 @@ class PairEcho:
     removed: Background | None = None
     gain: NDArray[np.float32] | None = None
     pulsed: PulsedInterference | None = None
+    tones: Mapping[str, Tones] = field(default_factory=dict)
 
     @classmethod
     def recorded(cls, echo: xr.Dataset) -> "PairEcho":
@@ -100,24 +100,39 @@ class PairEcho:
             If the stage is damaged or missing; on reading transfer functions, if the recording is damaged or missing
             and stage `transfer` was not kept.
         """
-        stage, saturation = open_stage(campaign.stage("echo", flight, pair), "echo"), Saturation()
+        stage = open_stage(campaign.stage("echo", flight, pair), "echo")
         if "transfer" not in stage and reads_kept(campaign, flight, pair):
             kept = open_stage(campaign.stage("transfer", flight, pair), "transfer")
             stage = stage.assign(transfer=kept.transfer).assign_attrs(flags=kept.attrs["flags"])
 
-        @cache
-        def source() -> Form:
+        def receiver() -> tuple[Acquisition, Transmitted, Processing]:
             waveform = campaign.settings.waveform
             if not isinstance(waveform, SampledWaveform):
                 raise TypeError("the echo has no transfer functions although its recorder stores them")
             sent = transmitted(campaign, waveform)
-            receiver = open_acquisition(campaign, flight, pair.split("-")[1], sent)
-            return forming_from(receiver, sent, saturation, divided="sidelink_amplitude" in stage)
+            return open_acquisition(campaign, flight, pair.split("-")[1], sent), sent, campaign.settings.processing
+
+        return cls.formed(stage, receiver)
+
+    @classmethod
+    def formed(
+        cls, dataset: xr.Dataset, receiver: Callable[[], tuple[Acquisition, Transmitted, Processing]]
+    ) -> "PairEcho":
+        """Return the echo of a dataset whose captures `receiver` opens when transfer functions are first read."""
+        saturation, tones = Saturation(), dict[str, Tones]()
+
+        @cache
+        def source() -> Form:
+            rx, sent, processing = receiver()
+            demodulator = demodulator_of(rx, sent, processing)
+            tones.update(demodulator.tones)
+            channels = ["radar", "sidelink"] if "sidelink_amplitude" in dataset else ["radar"]
+            return forming(rx.reader(channels, np.arange(len(rx.raw.start))), demodulator, saturation)
 
         def form(captures: Pulses, correction: Correction | None) -> Complexes:
             return source()(captures, correction)
 
-        return cls(stage, form, saturation)
+        return cls(dataset, form, saturation, tones=tones)
 
     @classmethod
     def cleaned(cls, campaign: Campaign, flight: str, pair: str) -> "PairEcho":
@@ -151,7 +166,8 @@ class PairEcho:
     @property
     def flags(self) -> dict[str, str]:
         """Flags of the stage, and of the samples read so far."""
-        return Flags.merged(self.dataset.attrs["flags"], self.saturation.flags)
+        tones = self.tones["radar"].flags("interference") if "radar" in self.tones else {}
+        return Flags.merged(self.dataset.attrs["flags"], self.saturation.flags, tones)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -250,11 +266,10 @@ class _Transfer(BackendArray):
         return np.asarray((transfer if pulses.ndim else transfer[0])[..., key[1]])
 
 
-def forming_from(rx: Acquisition, sent: Transmitted, saturation: Saturation, *, divided: bool) -> Form:
-    """Return a function that forms transfer functions from a recording, by division by the sidelink or by the code."""
-    read = rx.reader(["radar", "sidelink"] if divided else ["radar"], np.arange(len(rx.raw.start)))
-    demodulator = Demodulator(sent.inverse, rx.numerology, sent.waveform.capture_samples)
-    return forming(read, demodulator, saturation)
+def demodulator_of(rx: Acquisition, sent: Transmitted, processing: Processing) -> Demodulator:
+    """Return the demodulator of a receiving node; it removes tones unless `processing.interference` is none."""
+    create = Demodulator if processing.interference == "none" else Demodulator.without_tones
+    return create(sent.inverse, rx.numerology, sent.waveform.capture_samples)
 
 
 def _correction(stage: xr.Dataset) -> Correction | None:

@@ -305,6 +305,7 @@ _ROWS = (
         settings=(
             "waveform",
             "processing.sidelink",
+            "processing.interference",
             "processing.accuracy_db",
             inputs.pair_settings,
             inputs.air,

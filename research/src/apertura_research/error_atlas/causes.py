@@ -18,6 +18,7 @@ from apertura_research.error_atlas.flight import (
     between_epochs,
     flight,
 )
+from apertura_research.error_atlas.reception import Receive, echoes_alone, with_coupling, with_pulses, with_tone
 
 Assume = Callable[[TrueFlight, float, Generator], AssumedFlight]
 Expect = Callable[[TrueFlight, str, float], Effect]
@@ -45,6 +46,8 @@ class AssumedError:
         True if the error affects only the coherent sum of both pairs; the loss is then that of the sum.
     pulses
         Number of pulses in 10 s.
+    receive
+        Echoes of a pair → these echoes with other signals, after their removal.
     """
 
     title: str
@@ -57,6 +60,7 @@ class AssumedError:
     beamed: bool = False
     added: bool = False
     pulses: int = 300
+    receive: Receive = echoes_alone
 
     def flight(self) -> TrueFlight:
         """Return the true flight."""
@@ -66,6 +70,11 @@ class AssumedError:
 def nothing(flown: TrueFlight, pair: str, size: float) -> Effect:  # noqa: ARG001
     """Return no expected effect, for causes without a line in the budget."""
     return Effect(0.0, 0.0, 0.0)
+
+
+def known_flight(flown: TrueFlight, size: float, generator: Generator) -> AssumedFlight:  # noqa: ARG001
+    """Return the assumptions without any error, for causes in the received signal."""
+    return flown.truth
 
 
 def positions(flown: TrueFlight, pair: str, *known: NodePositions) -> Effect:
@@ -205,5 +214,17 @@ CAUSES: Mapping[str, AssumedError] = {
         lambda flown, size, _: replace(flown.truth, turned_rad={"a-b": size}),
         lambda _, __, size: Effect(20 * float(np.log10(max(abs(np.cos(size / 2)), 1e-3))), 0.0, size),
         "phase of a pair", draws=2, added=True,
+    ),
+    "tone": AssumedError(
+        "Continuous tone relative to the echoes", "dB", (-40, -30, -20, -10, 0, 10, 20, 40, 60), known_flight, nothing,
+        "no line", draws=2, receive=with_tone,
+    ),
+    "pulsed_tones": AssumedError(
+        "Pulsed tones in a tenth of the pulses relative to the echoes", "dB", (-40, -30, -20, -10, 0, 10, 20, 40, 60),
+        known_flight, nothing, "no line", draws=2, receive=with_pulses,
+    ),
+    "coupling": AssumedError(
+        "Coupling of the antennas relative to the echoes", "dB", (-40, -20, -10, 0, 10, 20, 40, 60), known_flight,
+        nothing, "no line", draws=2, receive=with_coupling,
     ),
 }  # fmt: skip

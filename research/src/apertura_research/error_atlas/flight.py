@@ -51,10 +51,13 @@ class Received:
         (pulse, subcarrier) complex64; divided by the sidelink if the pair is bistatic.
     sidelink_m
         (pulse,) float64, measured path of the sidelink; None for a monostatic pair.
+    flags
+        Flags raised on the echoes.
     """
 
     transfer: Complexes
     sidelink_m: Floats | None
+    flags: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -88,7 +88,8 @@ def _pair_image(flown: TrueFlight, assumed: AssumedFlight, pair: str, received: 
     with contextlib.redirect_stdout(io.StringIO()):  # the progress bars of recomputed tiles
         certificate = certified(formation, image, accuracy_db=ACCURACY_DB, threads=1)
     focus = focus_report(formation, image)
-    flags = {**assumed.flags, **assumed.sidelink_flags(pair, received), **formation.plan.flags, **certificate["flags"]}
+    flags = {**assumed.flags, **assumed.sidelink_flags(pair, received), **received.flags}
+    flags |= {**formation.plan.flags, **certificate["flags"]}
     flags |= focus_flags(focus, NO_EFFECT)
     at = _interpolator(formation)
     peaks = _peaks(image, at, flown.targets_m)
@@ -208,7 +209,11 @@ def run_draw(name: str, draw: int, *, seed: int = 1) -> Iterator[ErrorAtlasRow]:
     right = form_images(flown, flown.truth, received)
     for size in cause.sizes:
         assumed = cause.assume(flown, size, np.random.default_rng([seed, draw, 1]))
-        yield _outcome(name, size, draw, right, _images_or_none(flown, assumed, received))
+        disturbed = {
+            pair: cause.receive(flown, pair, received[pair], size, np.random.default_rng([seed, draw, 2, number]))
+            for number, pair in enumerate(PAIRS)
+        }
+        yield _outcome(name, size, draw, right, _images_or_none(flown, assumed, disturbed))
 
 
 def _images_or_none(

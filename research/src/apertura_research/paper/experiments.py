@@ -13,7 +13,7 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.backprojection.engines import reference
 from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.echo.demodulate import remove_path
-from apertura.core.echo.transfer import transfer_by_code
+from apertura.core.echo.transfer import Demodulator, transfer_by_code
 from apertura.core.imaging.range_profiles import phase_history_of
 from apertura.core.quality.measures import coherence_factor
 from apertura.simulation import CampaignSpecification, Line, PointTarget, preset
@@ -71,7 +71,11 @@ class Experiment:
         receiver = open_acquisition(campaign, FLIGHT, receiver_name, sent)
         every = np.arange(len(receiver.raw.time))
         time_s = receiver.log_seconds(receiver.raw.time.values)
-        measured = transfer_by_code(receiver.reader(["radar"], every), sent.inverse, receiver.numerology, time_s=time_s)
+        measured = transfer_by_code(
+            receiver.reader(["radar"], every),
+            Demodulator(sent.inverse, receiver.numerology, sent.waveform.capture_samples),
+            time_s=time_s,
+        )
         history = self.history(BISTATIC, window)
         offset_m = campaign.settings.nodes[receiver_name].path_offset_m.radar
         offset_s = np.full(len(every), offset_m / SPEED_OF_LIGHT_M_S)

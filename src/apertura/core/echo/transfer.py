@@ -6,7 +6,7 @@ captures is in memory at a time, for any length of the flight.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,7 @@ from apertura.core.echo.own_pulses import CodeEvidence, own_code, phase_stabilit
 from apertura.core.echo.sidelink import DIVIDING, METHODS, choose, edges
 from apertura.core.echo.sidelink_spikes import find_spikes
 from apertura.core.echo.sidelink_state import SidelinkState, measure_blocks, second_path_flags
+from apertura.core.echo.tones import Tones
 
 _INVERTED = (
     "the conjugate samples contain the code: set waveform.iq to swapped if I and Q are swapped, or to conjugate if the "
@@ -85,20 +86,34 @@ class Demodulator:
         (subcarrier,) complex64, inverse of the transmitted signal (1/c_n for a symbol); and sampling of the signal.
     symbol_samples
         (T_cp + T)·f_s, or the length of a capture; later samples are not used.
+    tones
+        Channel → removal of tones of other transmitters; empty: tones are not removed.
     """
 
     inverse: Complexes
     numerology: Numerology
     symbol_samples: int
+    tones: Mapping[str, Tones] = field(default_factory=dict)
 
-    def symbols(self, iq: Samples, clock_hz: Floats | None = None, sfo_ppm: float = 0.0) -> Complexes:
+    @classmethod
+    def without_tones(cls, inverse: Complexes, numerology: Numerology, symbol_samples: int) -> "Demodulator":
+        """Return a demodulator that removes the tones of other transmitters from both channels."""
+        tones = {channel: Tones.of(numerology, inverse) for channel in ("radar", "sidelink")}
+        return cls(inverse, numerology, symbol_samples, tones)
+
+    def symbols(
+        self, iq: Samples, clock_hz: Floats | None = None, sfo_ppm: float = 0.0, *, channel: str = "radar"
+    ) -> Complexes:
         """Demodulate samples, (pulse, sample, 2), after clock correction; return (pulse, subcarrier) complex64."""
         numerology = self.numerology
         if clock_hz is None:
-            return demodulate(as_complex(iq), numerology) * self.inverse
-        samples = as_complex(iq[:, : self.symbol_samples])
-        corrected = correct_clock(samples, numerology, cfo_hz=clock_hz, sfo_ppm=sfo_ppm)
-        return demodulate(corrected, numerology) * self.inverse
+            received = demodulate(as_complex(iq), numerology)
+        else:
+            samples = as_complex(iq[:, : self.symbol_samples])
+            received = demodulate(correct_clock(samples, numerology, cfo_hz=clock_hz, sfo_ppm=sfo_ppm), numerology)
+        if channel in self.tones:
+            received = self.tones[channel].removed(received)
+        return received * self.inverse
 
     def transfer(self, iq: Mapping[str, Samples], correction: Correction | None = None) -> Complexes:
         """Return the transfer functions of a block of captures, (pulse, subcarrier) complex64.
@@ -113,7 +128,7 @@ class Demodulator:
         if correction is None:
             return self.symbols(iq["radar"])
         clock = correction.clock_hz, correction.sfo_ppm
-        radar, sidelink = (self.symbols(iq[name], *clock) for name in ("radar", "sidelink"))
+        radar, sidelink = (self.symbols(iq[name], *clock, channel=name) for name in ("radar", "sidelink"))
         return METHODS[correction.method](radar, limited(sidelink)[0], correction.path)
 
 
@@ -152,15 +167,15 @@ class Transfer:
     correction: Correction | None = None
 
 
-def transfer_by_code(read: Read, inverse: Complexes, numerology: Numerology, *, time_s: Floats) -> Transfer:
+def transfer_by_code(read: Read, demodulator: Demodulator, *, time_s: Floats) -> Transfer:
     """Return the monostatic transfer functions of a node; transmitter and receiver have the same clock.
 
     Parameters
     ----------
     read
         Reader of channel `radar`.
-    inverse, numerology
-        (subcarrier,) complex64, inverse of the transmitted signal (1/c_n for a symbol); and sampling of the signal.
+    demodulator
+        Demodulator of the captures.
     time_s
         (capture,) float64, times of transmission, seconds from any origin.
 
@@ -173,13 +188,12 @@ def transfer_by_code(read: Read, inverse: Complexes, numerology: Numerology, *, 
     >>> numerology = Numerology(1e9, 16e6, np.arange(8), prefix_samples=4, dft_samples=16)
     >>> tone = 1000 * np.exp(2j * np.pi * 3 * np.arange(20) / 16)
     >>> iq = np.stack([tone.real, tone.imag], -1)[None].round().astype(np.int16)
-    >>> measured = transfer_by_code(lambda pulses: {"radar": iq[pulses]}, np.full(8, 0.5, np.complex64),
-    ...                             numerology, time_s=np.zeros(1))
+    >>> demodulator = Demodulator(np.full(8, 0.5, np.complex64), numerology, 20)
+    >>> measured = transfer_by_code(lambda pulses: {"radar": iq[pulses]}, demodulator, time_s=np.zeros(1))
     >>> abs(measured.form(np.arange(1))).round(0)
     array([[  0.,   0.,   0., 500.,   0.,   0.,   0.,   0.]], dtype=float32)
     """
-    symbol_samples = numerology.prefix_samples + numerology.dft_samples
-    demodulator, saturation = Demodulator(inverse, numerology, symbol_samples), Saturation()
+    numerology, saturation = demodulator.numerology, Saturation()
     formed = forming(read, demodulator, saturation)
 
     def form(captures: Pulses) -> Complexes:
@@ -201,10 +215,8 @@ def transfer_by_code(read: Read, inverse: Complexes, numerology: Numerology, *, 
 
 def transfer_by_sidelink(
     read: Read,
-    inverse: Complexes,
-    numerology: Numerology,
+    demodulator: Demodulator,
     *,
-    symbol_samples: int,
     sidelink_m: Floats,
     method: str,
     accuracy_db: float,
@@ -217,10 +229,8 @@ def transfer_by_sidelink(
     ----------
     read
         Reader of channels `radar` and `sidelink`.
-    inverse, numerology
-        (subcarrier,) complex64, inverse of the transmitted signal (1/c_n for a symbol); and sampling of the signal.
-    symbol_samples
-        (T_cp + T)·f_s, or the length of a capture; later samples are not used.
+    demodulator
+        Demodulator of the captures.
     sidelink_m
         (capture,) float64, distance between the antennas of the sidelink, metres, with which the measured delay is
         compared.
@@ -245,7 +255,7 @@ def transfer_by_sidelink(
     flight; the state of the sidelink is measured on all captures.
     """
     # First pass: measure the clock on a sample of captures, and the state of the sidelink on all captures.
-    demodulator = Demodulator(inverse, numerology, symbol_samples)
+    numerology = demodulator.numerology
     receiver = _Receiver.measured(read, demodulator, len(sidelink_m), accuracy_db)
     interference = SidelinkInterference(numerology.frequency_hz)
     with progress("sidelinks", len(sidelink_m)) as done:
@@ -276,6 +286,7 @@ def transfer_by_sidelink(
     flags = Flags.merged(
         clock_flags,
         interference.flags,
+        demodulator.tones["sidelink"].flags("interference_sidelink") if demodulator.tones else {},
         state.flags,
         spike_flags,
         edges(chosen, state),
@@ -326,7 +337,7 @@ def _compresses_conjugated(read: Read, demodulator: Demodulator, count: int) -> 
     pulses = np.concatenate(spread(count, groups=4, each=16))
 
     def compression(samples: Samples) -> float:
-        power = np.abs(np.fft.ifft(demodulator.symbols(samples), axis=1)) ** 2
+        power = np.abs(np.fft.ifft(demodulator.symbols(samples, channel="sidelink"), axis=1)) ** 2
         return float(np.median(power.max(axis=1) / power.mean(axis=1)))
 
     sidelink = read(pulses)["sidelink"]
@@ -379,7 +390,7 @@ class _Receiver:
         """Yield the symbols of the sidelink, (pulse, subcarrier) complex64, with the code removed."""
         for block in blocks_of(np.arange(self.count)):
             clock_hz = None if self.clock_hz is None else self.clock_hz[block]
-            yield self.demodulator.symbols(self.read(block)["sidelink"], clock_hz, self.sfo_ppm)
+            yield self.demodulator.symbols(self.read(block)["sidelink"], clock_hz, self.sfo_ppm, channel="sidelink")
             done(len(block))
 
 

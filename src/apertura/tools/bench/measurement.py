@@ -26,7 +26,7 @@ from apertura.core.echo.captures import (
 from apertura.core.echo.clock import GROUPS, ClockOffset, clock_of
 from apertura.core.echo.demodulate import demodulate
 from apertura.core.echo.interference import EXCESS_DB
-from apertura.core.echo.transfer import Transfer, as_complex, transfer_by_code, transfer_by_sidelink
+from apertura.core.echo.transfer import Demodulator, Transfer, as_complex, transfer_by_code, transfer_by_sidelink
 from apertura.core.quality.budget import strictest_accuracy_db
 from apertura.methods.bench.channels import (
     DC_DB,
@@ -439,8 +439,9 @@ def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, is_t
         flags.append({"spectrum_inverted": line})
     before, clock, contact, state = None, None, None, None
     measured: Transfer | None = None
+    demodulator = Demodulator(sent.inverse, captured.numerology, sent.waveform.capture_samples)
     if is_transmitter:
-        measured = transfer_by_code(read, sent.inverse, captured.numerology, time_s=time_s)
+        measured = transfer_by_code(read, demodulator, time_s=time_s)
     else:
         contact = measure_contact(f"{name} sidelink", _by_code(read, sent, "sidelink"), len(every))
         flags.append(contact.flags if contact else {})
@@ -450,7 +451,7 @@ def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, is_t
         before = uncorrected.coherence if uncorrected else None
         try:
             measured = transfer_by_sidelink(
-                read, sent.inverse, captured.numerology, symbol_samples=sent.waveform.capture_samples,
+                read, demodulator,
                 sidelink_m=np.zeros(len(every)), method=campaign.settings.processing.sidelink,
                 accuracy_db=strictest_accuracy_db(campaign.settings.processing.accuracy_db), where=where,
             )  # fmt: skip

@@ -488,7 +488,7 @@ class PairSoFar:
     def _read(self, echo: PairEcho, pulses: NDArray[np.int64]) -> PulseBlock:
         formed = replace(echo, dataset=echo.dataset.isel(pulse=pulses)).at(slice(None))
         self._blocks += 1
-        for name, line in Flags.merged(formed.attrs["flags"], echo.saturation.flags).items():
+        for name, line in Flags.merged(formed.attrs["flags"], echo.flags).items():
             self._raised[name] = self._raised.get(name, (0, ""))[0] + 1, line
         history = phase_history_of(formed, self.campaign.settings.processing.window)
         return PulseBlock(history, body_axes(formed), formed.time.values, formed.path_limit.values)
