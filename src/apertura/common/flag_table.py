@@ -712,8 +712,8 @@ _OF_BENCHES = {
     "interference_sidelink": Flag(
         "proportion of pulses, strongest frequency and its usual service, power relative to the median subcarrier, or "
         "of a tone relative to the rest of the capture, dB",
-        "interference in the sidelink: tones are subtracted, and limited subcarriers do not affect its delay and phase, but interference in the "
-        "whole band does",
+        "interference in the sidelink: tones are subtracted, and limited subcarriers do not affect its delay and "
+        "phase, but interference in the whole band does",
         "other transmitters near this frequency; antenna of the sidelink",
         "core/echo/tones.py, core/echo/interference.py",
     ),

@@ -21,6 +21,8 @@ from apertura.common.flags import Flags
 from apertura.common.provenance import merged
 from apertura.common.units import nanoseconds
 from apertura.core.echo.association import Association, missing_flags, tag_jitter_s
+from apertura.core.echo.captures import runs, sampled_pulses
+from apertura.core.echo.interference import Interference
 from apertura.core.echo.pulse_filter import truncation_flags
 from apertura.core.echo.sidelink import DIVIDING
 from apertura.core.echo.transfer import (
@@ -125,7 +127,19 @@ def pair_echo(
         attrs=_attributes((tx, rx), pulses, positions, measured, repeats, at=at, calibration=calibration)
         | {"stated_offset_m": offset_m, **stated_air(air_on_track)},
     )
+    if processing.interference != "none":
+        unchanged = processing.model_copy(update={"interference": "none"})
+        lines = _tone_lines(PairEcho.formed(dataset, lambda: (rx, sent, unchanged)))
+        dataset = dataset.assign_attrs(tone_lines=lines)
     return PairEcho.formed(dataset, lambda: (rx, sent, processing))
+
+
+def _tone_lines(echo: PairEcho) -> list[int]:
+    """Return the subcarriers with a line in most pulses, measured before the removal of tones."""
+    groups, subcarriers = sampled_pulses(echo.shape[0]), echo.shape[1]
+    sampled = runs(groups, [echo.read(group) for group in groups])
+    equal = np.full(subcarriers, 1 / subcarriers)
+    return Interference.measured(sampled, echo.dataset.frequency.values, equal).lines
 
 
 def _attributes(

@@ -54,8 +54,8 @@ class Processing(ImagingChoices):
     )
     interference: Literal["auto", "none"] = Field(
         "auto",
-        description="auto: tones are subtracted, and subcarriers and pulses with radio interference are excluded if that "
-        "raises the SNR",
+        description="auto: tones are subtracted, and subcarriers and pulses with radio interference are excluded if "
+        "that raises the SNR",
     )
     fusion: Fusion = Field(default_factory=Fusion, description="sum of the images of a flight's pairs")
     autofocus: Literal["auto", "on", "off"] = Field(

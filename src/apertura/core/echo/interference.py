@@ -66,6 +66,7 @@ EXCESS_DB = 6.0
 _SAMPLES = 64  # number of subcarriers or ranges that represent a pulse
 _NEIGHBOURS = 32  # inverse share of the band in half the window of the noise median
 _FEWEST_NEIGHBOURS = 8
+_LINES, _APART = 8, 8  # largest number of lines that are subtracted as tones, and their distance in subcarriers
 _LISTED = 32  # largest number of frequencies in a report
 
 
@@ -131,6 +132,14 @@ class Interference:
     def excluded(self) -> NDArray[np.bool_]:
         """(subcarrier,) bool, True for subcarriers with interference."""
         return self.excess >= 10 ** (EXCESS_DB / 10)
+
+    @property
+    def lines(self) -> list[int]:
+        """Numbers of the subcarriers with the strongest interference, each the maximum within `_APART` subcarriers."""
+        highest = scipy.ndimage.maximum_filter1d(self.noise, 2 * _APART + 1)
+        peaks = np.flatnonzero(self.excluded & (self.noise == highest))
+        strongest = peaks[np.argsort(-self.noise[peaks], kind="stable")][:_LINES]
+        return [int(number) for number in np.sort(strongest)]
 
     @property
     def lost_share(self) -> float:

@@ -44,6 +44,8 @@ class Tones:
         (subcarrier,) complex128, transmitted signal.
     shape
         (subcarrier,) float64, its power relative to the mean, at least 0.1.
+    lines
+        Numbers of subcarriers with a tone in all captures, which is subtracted whatever its power.
     captures, affected
         Number of captures, and of those from which a tone was removed.
     power
@@ -53,6 +55,7 @@ class Tones:
     numerology: Numerology
     sent: NDArray[np.complex128]
     shape: Floats
+    lines: tuple[int, ...] = ()
     captures: int = 0
     affected: int = 0
     power: Floats = field(default_factory=lambda: np.zeros(0))
@@ -81,31 +84,42 @@ class Tones:
         >>> left = tones.removed((echo + np.fft.fft(tone, norm="forward")).astype(np.complex64)) - echo
         >>> float(np.round((np.abs(left) ** 2).mean(), 2)) < 0.1  # echoes have a power of 1, the tone 15 600
         True
-        >>> print(tones.flags("interference")["interference"])
-        tone in 100% of captures, strongest at 1220.00 MHz (GNSS L2/E6, air surveillance radar): 42.0 dB above the rest of
-        the capture; subtracted
+        >>> tones.flags("interference")["interference"].partition(" MHz")[0]
+        'tone in 100% of captures, strongest at 1220.00'
         """
+        if symbols.shape[1] < _WIDTH:
+            return symbols
         self.captures += len(symbols)
-        has_tone = np.zeros(len(symbols), np.bool_)
-        cleaned = symbols
+        has_tone = np.full(len(symbols), bool(self.lines))
+        cleaned, every = symbols, np.arange(len(symbols))
+        for line in self.lines:
+            near = np.clip(line + np.arange(-1, 2), 0, symbols.shape[1] - 1)
+            peak = near[np.abs(cleaned[:, near]).argmax(axis=1)]
+            cleaned = self._subtracted(cleaned, every, peak, self._fitted(cleaned, peak)[0])
         for _ in range(_MOST):
             relative = (np.square(cleaned.real) + np.square(cleaned.imag)) / self.shape
             peak = relative.argmax(axis=1)
             suspect = np.flatnonzero(relative.max(axis=1) > _PEAK * relative.mean(axis=1))
             if not suspect.size:
                 break
-            tone, is_tone = self._fitted(cleaned[suspect].astype(np.complex128), peak[suspect])
+            tone, is_tone = self._fitted(cleaned[suspect], peak[suspect])
             found = suspect[is_tone]
             if not found.size:
                 break
-            if cleaned is symbols:
-                cleaned = symbols.copy()
-            cleaned[found] -= tone[is_tone]
+            cleaned = self._subtracted(cleaned, found, peak[found], tone[is_tone])
             has_tone[found] = True
-            rest = np.sum(np.abs(cleaned[found]) ** 2, axis=1)
-            ratio = np.sum(np.abs(tone[is_tone]) ** 2, axis=1) / np.maximum(rest, np.finfo(np.float32).tiny)
-            np.add.at(self.power, peak[found], ratio)
         self.affected += int(has_tone.sum())
+        return cleaned
+
+    def _subtracted(
+        self, symbols: Complexes, pulses: NDArray[np.intp], peak: NDArray[np.intp], tone: Complexes
+    ) -> Complexes:
+        """Return symbols without the tones of some pulses, whose relative power is added to `power`."""
+        cleaned = symbols.copy()
+        cleaned[pulses] -= tone
+        rest = np.sum(np.abs(cleaned[pulses]) ** 2, axis=1)
+        ratio = np.sum(np.abs(tone) ** 2, axis=1) / np.maximum(rest, np.finfo(np.float32).tiny)
+        np.add.at(self.power, peak, ratio)
         return cleaned
 
     def flags(self, name: str) -> Flags:
@@ -133,17 +147,18 @@ class Tones:
         turns = np.exp(-2j * np.pi * numerology.numbers[near][..., None] * delays)
         return np.asarray(self.sent[near][..., None] * turns / np.sqrt(_WIDTH))
 
-    def _fitted(self, symbols: NDArray[np.complex128], peak: NDArray[np.intp]) -> tuple[Complexes, NDArray[np.bool_]]:
+    def _fitted(self, symbols: Complexes, peak: NDArray[np.intp]) -> tuple[Complexes, NDArray[np.bool_]]:
         """Fit a tone to the subcarriers around the peak; return it in all subcarriers, and whether it is a tone."""
+        exact = symbols.astype(np.complex128)
         count, window = symbols.shape[1], self.numerology.dft_samples
         first = np.clip(peak - _WIDTH // 2, 0, count - _WIDTH)
         near = first[:, None] + np.arange(_WIDTH)
-        received, numbers = np.take_along_axis(symbols, near, axis=1), self.numerology.numbers[near].astype(np.float64)
+        received, numbers = np.take_along_axis(exact, near, axis=1), self.numerology.numbers[near].astype(np.float64)
         at = self.numerology.numbers[peak].astype(np.float64)
         # Two lines give the start (eq. 11): Y_{k+1}/Y_k = exp(jπ/N)·x/(x − 1) for |x| ≪ N, x = κ − k.
         right = np.minimum(peak + 1, count - 1) - (peak == count - 1)
         row, lower = np.arange(len(peak)), np.minimum(peak, right)
-        ratio = symbols[row, lower + 1] / np.where(symbols[row, lower] == 0, 1, symbols[row, lower])
+        ratio = exact[row, lower + 1] / np.where(exact[row, lower] == 0, 1, exact[row, lower])
         ratio = (ratio * np.exp(-1j * np.pi / window)).real
         start = self.numerology.numbers[lower] + ratio / np.where(ratio == 1, np.inf, ratio - 1)
         outside = ((peak == 0) & (start < at)) | ((peak == count - 1) & (start > at))  # next to the occupied band
@@ -163,7 +178,7 @@ class Tones:
         is_tone = np.sum(np.abs(left) ** 2 * around, axis=1) < _LEFT * np.sum(np.abs(received) ** 2 * around, axis=1)
         tone = amplitude[:, None] * _kernel(at[:, None] - self.numerology.numbers, window)
         # The far part of a tone next to the band may be wrong, although it fits around the peak.
-        is_tone &= np.sum(np.abs(symbols - tone) ** 2, axis=1) < np.sum(np.abs(symbols) ** 2, axis=1)
+        is_tone &= np.sum(np.abs(exact - tone) ** 2, axis=1) < np.sum(np.abs(exact) ** 2, axis=1)
         return np.asarray(tone, np.complex64), is_tone
 
 
