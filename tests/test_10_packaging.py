@@ -77,6 +77,16 @@ def test_catalogue_campaign_matches_its_specification(tmp_path):
             assert kept.is_file()
 
 
+def test_conda_recipe_matches_environment_yml_and_version():
+    recipe = yaml.safe_load((ROOT / "recipe" / "recipe.yaml").read_text())
+    *conda, _ = yaml.safe_load((ROOT / "environment.yml").read_text())["dependencies"]
+    required = [re.sub(r"(?<=\w)(?=[<>=])", " ", line, count=1) for line in conda if line != "pip"]
+    assert recipe["requirements"]["run"] == required
+    assert recipe["context"]["version"] == apertura.__version__
+    about = project()
+    assert (recipe["about"]["summary"], recipe["about"]["license"]) == (about["description"], about["license"])
+
+
 def container_lines():
     text = (ROOT / "Containerfile").read_text(encoding="utf-8")
     return [line for line in text.splitlines() if line and not line.startswith("#")]
