@@ -52,18 +52,18 @@ def timed(command: Sequence[str | Path], environment: dict[str, str], log: Path)
 
 
 def shows_map(apertura: Path, campaign: Path, environment: dict[str, str]) -> int:
-    """Start `apertura map`, fetch the page from the printed address and end the server; return the size in bytes."""
+    """Start `apertura map`, fetch the script of the map and end the server; return the size of the script in bytes."""
     server = subprocess.Popen(
         [apertura, "map", campaign], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
     try:
         text = ""
-        while not (address := re.search(r"http://\S+", text)):
+        while not (port := re.search(r"http://[^/\s]+:(\d+)", text)):
             line = server.stdout.readline()
             if not line:
                 sys.exit(f"apertura map ended: {text}")
             text += line
-        with urllib.request.urlopen(address[0], timeout=30) as answer:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port[1]}/map/app.js", timeout=30) as answer:
             return len(answer.read())
     finally:
         server.send_signal(signal.SIGINT)
@@ -93,10 +93,10 @@ def fresh(name: str, python: Path, wheel: Path, *, has_kernel: bool) -> None:
     stated = MISSING_KERNEL in (folder / "run.log").read_text()
     if stated == has_kernel:
         sys.exit(f"{name}: the summary {'reports' if stated else 'does not report'} a missing kernel")
-    page = shows_map(apertura, campaign, environment)
+    script = shows_map(apertura, campaign, environment)
     print(
         f"{name:<14} pip install {install_s:.0f} s, {used_mb:.0f} MB; simulate {simulate_s:.0f} s; run {run_s:.0f} s; "
-        f"map: page of {page} bytes",
+        f"map: script of {script} bytes",
         flush=True,
     )
     shutil.rmtree(venv)
