@@ -8,6 +8,7 @@ the first failure. Folders are below ``build/wheel-test``.
 """
 
 import argparse
+import json
 import os
 import re
 import shutil
@@ -19,6 +20,7 @@ import urllib.request
 from collections.abc import Sequence
 from pathlib import Path
 
+from apertura.core.backprojection.engines import native_binding
 from tests.wheels import aarch64
 
 ROOT = Path(__file__).parents[2]
@@ -93,9 +95,14 @@ def fresh(name: str, python: Path, wheel: Path, *, has_kernel: bool) -> None:
     stated = MISSING_KERNEL in (folder / "run.log").read_text()
     if stated == has_kernel:
         sys.exit(f"{name}: the summary {'reports' if stated else 'does not report'} a missing kernel")
+    reports = [json.loads(path.read_text()) for path in campaign.glob("results/*/*-*/image.json")]
+    used = sorted({f"{report['engine']} ({report['instruction_set']})" for report in reports})
+    if has_kernel and {report["instruction_set"] for report in reports} != {native_binding.instruction_set()}:
+        sys.exit(f"{name}: images formed by {', '.join(used)}; this machine has {native_binding.instruction_set()}")
     script = shows_map(apertura, campaign, environment)
     print(
-        f"{name:<14} pip install {install_s:.0f} s, {used_mb:.0f} MB; simulate {simulate_s:.0f} s; run {run_s:.0f} s; "
+        f"{name:<14} pip install {install_s:.0f} s, {used_mb:.0f} MB; simulate {simulate_s:.0f} s; run {run_s:.0f} s, "
+        f"{', '.join(used)}; "
         f"map: script of {script} bytes",
         flush=True,
     )

@@ -38,7 +38,16 @@ def install(system: Path, wheel: Path) -> None:
     site = system / SITE
     shutil.rmtree(site, ignore_errors=True)
     target = ["--python-platform", "aarch64-manylinux_2_36", "--python-version", "3.11", "--target", site]
-    command = ["uv", "pip", "install", "--quiet", *target, "--constraint", ROOT / "requirements/all.txt", wheel]
+    command = [
+        Path(sys.executable).with_name("uv"),
+        "pip",
+        "install",
+        "--quiet",
+        *target,
+        "--constraint",
+        ROOT / "requirements/all.txt",
+        wheel,
+    ]
     subprocess.run(command, check=True)
 
 
