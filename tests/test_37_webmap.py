@@ -256,7 +256,7 @@ def test_only_hashed_files_of_the_current_format_are_listed():
 
 
 def test_missing_map_page_is_reported_with_a_remedy(tmp_path):
-    with pytest.raises(CampaignError, match=r"no map page, because pip install does not build the page.*make webmap"):
+    with pytest.raises(CampaignError, match=r"no map page: the page was not built in the sources.*make webmap"):
         page_files(tmp_path)
     for name in PAGE:
         (tmp_path / name).write_text(name)

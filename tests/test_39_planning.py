@@ -1,8 +1,10 @@
 """Planner: decision rules on both sides of their limits, predicted and certified errors, and cost."""
 
+import json
 import re
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,12 +13,14 @@ from scenes import WAVELENGTH, compiled, ground_points, monostatic, plan, planni
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.common.errors import CampaignError
-from apertura.core.backprojection.engines import load_engine, native, reference
+from apertura.core.backprojection.engines import load_engine, missing_kernel, native, reference
 from apertura.core.backprojection.engines.native import path_variants, view_of
 from apertura.core.backprojection.inputs import Profiles
 from apertura.core.echo.compression import window_weights
 from apertura.core.planning.planner import MARGIN_DB, SettingSearch, make_plan
 from apertura.core.quality.measures import numerical_error_db
+from apertura.views.plan import print_plan
+from apertura.views.summary import print_summary
 
 
 def error_db(drawn, image, window=(...,)):
@@ -251,3 +255,30 @@ def test_most_accurate_setting_of_equal_cost_is_chosen():
     assert planned.setting.error_db == min(setting.error_db for setting in within)
     cheapest = next(s for s in within if s.error_db <= -56)
     assert planned.setting.seconds <= 1.05 * cheapest.seconds
+
+
+@compiled
+def test_plan_and_summary_state_the_cost_of_a_missing_kernel(finished_tiny, monkeypatch, capsys):
+    stated = "no compiled kernel is installed: engine numba forms the images, 16 to 115 times slower"
+    printed = {}
+    for kernel in (True, False):
+        if not kernel:
+            without_library(monkeypatch)
+        for view in (print_plan, print_summary):
+            view(finished_tiny)
+            printed[view, kernel] = " ".join(capsys.readouterr().out.split())
+    assert [stated in text for text in printed.values()] == [False, False, True, True]
+    assert "numba" not in printed[print_plan, True]
+    assert "uav1-uav1: numba oversampling=" in printed[print_plan, False]
+
+
+def test_stated_slowness_without_the_kernel_is_the_benchmarked_one(monkeypatch):
+    rows = json.loads((Path(__file__).parents[1] / "benchmarks" / "latest.json").read_text())
+    ratio = {
+        row["name"]: row["ratio_to_native"]
+        for row in rows
+        if row.get("geometry") == "bistatic" and "ratio_to_native" in row
+    }
+    without_library(monkeypatch)
+    least, most = ratio["numba"] / ratio["native portable"], ratio["numba"] / ratio["native avx512"]
+    assert f"{least:.0f} to {most:.0f} times slower" in missing_kernel()

@@ -44,6 +44,11 @@ _PUBLIC = {
 }
 """Public name → module that defines it."""
 
+_ON_LINUX = frozenset(
+    ("Dem", "RecordedFlight", "RecordedNode", "design", "open_campaign", "open_dem", "simulate", "write_campaign")
+)
+"""Public names that access campaign folders or rasters; the others work on every operating system."""
+
 __all__ = list(_PUBLIC)
 
 
@@ -52,6 +57,10 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
+    if name in _ON_LINUX:
+        from apertura.common.platforms import require_linux
+
+        require_linux(f"apertura.{name}")
     return globals().setdefault(name, getattr(import_module(_PUBLIC[name]), name))
 
 

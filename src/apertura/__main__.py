@@ -5,7 +5,8 @@ import sys
 from pathlib import Path
 from typing import NoReturn
 
-from apertura.common.processes import ALGEBRA_THREADS, leave_working_folder
+from apertura.common.errors import CampaignError
+from apertura.common.platforms import require_linux
 
 _ENCODING, _BACKEND = "PYTHONIOENCODING", "MPLBACKEND"
 _PROJ = ("PROJ_DATA", "PROJ_LIB")
@@ -19,6 +20,12 @@ def _refuse(message: str) -> NoReturn:
 
 def main() -> None:
     """Change out of the working directory, which may be untrusted, and run the command line."""
+    try:
+        require_linux("the command apertura")
+    except CampaignError as error:
+        _refuse(str(error))
+    from apertura.common.processes import ALGEBRA_THREADS, leave_working_folder
+
     try:
         leave_working_folder()
     except OSError as error:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from apertura.campaign.folder import Campaign
 from apertura.common.errors import CampaignError, number_of
+from apertura.core.backprojection.engines import missing_kernel
 from apertura.core.planning.plan import Plan
 from apertura.core.quality.budget import BudgetLine, expected
 from apertura.core.quality.path_errors import Effect
@@ -62,6 +63,8 @@ def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
         f"total: about {seconds:.2g} s of image formation on {number_of(threads, 'thread')}, {decimal(disk)} on disk "
         "before compression"
     )
+    if slow := missing_kernel():
+        console.print(slow, highlight=False, soft_wrap=True)
     free = campaign.root.free_bytes()
     if disk > free and not campaign.results.is_dir():
         raise CampaignError(

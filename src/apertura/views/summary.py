@@ -9,6 +9,7 @@ from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_listed
 from apertura.common.documents import undamaged
 from apertura.common.errors import number_of, shown
+from apertura.core.backprojection.engines import missing_kernel
 from apertura.formats.export import MAP, exports_in
 from apertura.run.results import counted, states
 from apertura.views.quality import (
@@ -66,6 +67,8 @@ def print_summary(campaign: Campaign) -> None:
             undecided.setdefault(f"{image_values.verdict}: {image_values.reason}", []).append(name)
     for reason, images in undecided.items():
         console.print(f"{_abbreviated(images)}: {reason}", soft_wrap=True)
+    if slow := missing_kernel():
+        console.print(slow, soft_wrap=True)
     uncertain = max(values.values(), key=lambda image_values: image_values.place_m, default=None)
     if uncertain and uncertain.place_m:
         console.print(

@@ -378,6 +378,9 @@ def _forming_bytes(job: Job) -> int:
     return _BASE_BYTES + _PULSE_BYTES * len(job.aperture) + tiles
 
 
+_UNKNOWN_BYTES = 4 << 30  # memory assumed on systems that do not report it
+
+
 def memory_limit(*, groups: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> int:
     """Return the memory available to this process, bytes: memory of the machine, or limit of the control groups.
 
@@ -397,6 +400,8 @@ def memory_limit(*, groups: Path = Path("/proc/self/cgroup"), root: Path = Path(
     >>> 0 < memory_limit() <= memory_limit(groups=Path("none"))
     True
     """
+    if not hasattr(os, "sysconf"):  # Windows
+        return _UNKNOWN_BYTES
     limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
     for line in groups.read_text(encoding="utf-8").splitlines() if groups.is_file() else ():
         _, controllers, path = line.split(":", 2)

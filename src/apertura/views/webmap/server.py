@@ -166,10 +166,11 @@ def page_files(built: Path = BUILT) -> Mapping[str, bytes]:
     """
     if not is_built(built):
         raise CampaignError(
-            "this installation has no map page, because pip install does not build the page",
+            "this installation has no map page: the page was not built in the sources that it was installed from",
             "apertura map",
-            f"the output of `make webmap` (Node.js 20 or newer) in {built}",
-            "In the sources of apertura, run `make setup`, or run `make webmap` and then `pip install .` again.",
+            f"the page in {built}; wheels and source distributions of apertura contain it, clones do not",
+            "Run `make webmap` (Node.js 20 or newer) in the sources and then, unless the installation is editable, "
+            "`pip install .` again; or install a wheel or a source distribution.",
         )
     return {name: (built / name).read_bytes() for name in (*SHELL, *FILES)}
 
