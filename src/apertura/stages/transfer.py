@@ -126,8 +126,8 @@ class PairEcho:
             rx, sent, processing = receiver()
             demodulator = demodulator_of(rx, sent, processing)
             tones.update(demodulator.tones)
-            if tones:
-                tones["radar"].lines = tuple(dataset.attrs.get("tone_lines", ()))
+            for channel in tones.values():
+                channel.lines = tuple(dataset.attrs.get("tone_lines", ()))
             channels = ["radar", "sidelink"] if "sidelink_amplitude" in dataset else ["radar"]
             return forming(rx.reader(channels, np.arange(len(rx.raw.start))), demodulator, saturation)
 

@@ -21,6 +21,9 @@ _PEAK = 20.0
 _LEFT = 0.15
 """Largest share of the power around a tone that remains after its subtraction; more is not a tone (eq. 12)."""
 
+_ABOVE = 5.0
+"""Largest power around a tone after its subtraction relative to the median level of the capture; more is not a tone."""
+
 _WIDTH = 15  # subcarriers to which a tone and the echo are fitted
 _MOST_CELLS = 6  # longest delay, cells of the fitted band, up to which the echo is fitted
 _NEAR = 3  # subcarriers on either side of the peak in which the fit is tested
@@ -175,7 +178,10 @@ class Tones:
         amplitude = _least_squares(np.concatenate([kernel[..., None], echo], axis=-1), received)[:, 0]
         around = np.abs(near - peak[:, None]) <= _NEAR
         left = received - amplitude[:, None] * kernel
-        is_tone = np.sum(np.abs(left) ** 2 * around, axis=1) < _LEFT * np.sum(np.abs(received) ** 2 * around, axis=1)
+        # Level of the echo and of the leakage of the tone: of an exponential distribution, by its median.
+        level = np.median(np.abs(exact) ** 2 / self.shape, axis=1) / np.log(2)
+        rest, power = (np.sum(np.abs(values) ** 2 * around, axis=1) for values in (left, received))
+        is_tone = (rest < _LEFT * power) & (rest < _ABOVE * (2 * _NEAR + 1) * level)
         tone = amplitude[:, None] * _kernel(at[:, None] - self.numerology.numbers, window)
         # The far part of a tone next to the band may be wrong, although it fits around the peak.
         is_tone &= np.sum(np.abs(exact - tone) ** 2, axis=1) < np.sum(np.abs(exact) ** 2, axis=1)
