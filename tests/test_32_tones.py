@@ -95,7 +95,8 @@ def test_swept_and_pulsed_signals_are_not_subtracted():
     level = np.sqrt(COUNT * 1e2)
     swept = np.exp(2j * np.pi * (150 * time + 20 * time**2))
     pulsed = np.exp(2j * np.pi * 200.3 * time) * (np.abs(time - 0.7) < 0.1)
-    for signal in (swept, pulsed):
+    rising = np.exp(2j * np.pi * 200.3 * time) * np.sin(np.pi * (time + 0.4) / 2.24) ** 2  # 97 % of it is a tone
+    for signal in (swept, pulsed, rising):
         symbols = (echoes() + spectrum(np.tile(level * signal, (PULSES, 1)))).astype(np.complex64)
         tones = removal()
         np.testing.assert_array_equal(tones.removed(symbols), symbols)
