@@ -625,23 +625,16 @@ def map_page(
         str, typer.Option(metavar="TEXT", help="source of the tiles, named on the map and in exported pictures")
     ] = "",
     tiles_zoom: Annotated[int, typer.Option(min=0, max=24, help="highest zoom level of the tiles")] = 19,
-    kmz: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="write every image as KMZ for Google Earth instead")
-    ] = None,
 ) -> None:
     """Show a campaign on a map in a browser; the server is accessible only from this machine and runs until Ctrl-C."""
     opened = _opened(campaign)
     opened.check_images()
     from apertura.views.summary import print_stale
-    from apertura.views.webmap.kmz import write_overlays
     from apertura.views.webmap.server import Tiles, served, served_look
 
     background = None if tiles is None else Tiles(tiles, tiles_attribution, tiles_zoom)
     if not preview_:
         print_stale(opened)
-    if kmz is not None:
-        print(*map(as_typed, write_overlays(opened, given(kmz))), sep="\n")
-        return
     (served_look if preview_ else served)(opened, tiles=background, port=port).show(in_browser=open_)
 
 

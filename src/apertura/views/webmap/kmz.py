@@ -17,9 +17,6 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.campaign.digests import digest_of
-from apertura.campaign.folder import Campaign
-from apertura.common.atomic import write_beside
 from apertura.common.errors import CampaignError
 from apertura.common.raster import opened_raster
 from apertura.core.geometry.geodesy import (
@@ -30,7 +27,7 @@ from apertura.core.geometry.geodesy import (
     map_from_frame,
 )
 from apertura.formats.export.map_layout import flag_words
-from apertura.views.webmap.document import listed_document, requested_file
+from apertura.views.webmap.document import requested_file
 
 COLOURS = {"grey": "gray", "inferno": "inferno", "viridis": "viridis"}
 """Colour ramp of the page → colour map of Matplotlib."""
@@ -45,35 +42,6 @@ _SEMI_MAJOR_M, _ECCENTRICITY_SQUARED = 6_378_137.0, 0.00669437999014  # WGS 84
 _UNPRINTABLE = re.compile(r"[^\t\n\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")  # not allowed in XML 1.0
 
 
-def write_overlays(campaign: Campaign, folder: Path) -> list[Path]:
-    """Write the KMZ of every image with the colour scale with which the map begins; return the paths of the files.
-
-    Parameters
-    ----------
-    campaign
-        A campaign with results.
-    folder
-        Folder for the files, created if missing.
-
-    Raises
-    ------
-    CampaignError
-        If the map is missing, if an image was changed after the map was made, or if the frame is local.
-    """
-    document = listed_document(campaign)
-    written = []
-    for entry in document["images"]:
-        name, sha256 = requested_file(entry["layers"][0]["url"].removeprefix(".."))
-        if digest_of(campaign.root, campaign.relative(campaign.results / name)) != sha256:
-            raise CampaignError(
-                "changed after the map was made", name, "the file of the map", "Run the workflow again."
-            )
-        path = folder / f"{name.removesuffix('.tif').replace('/', '_')}.kmz"
-        write_beside(path, overlay_of(campaign.results, document, name, {}))
-        written.append(path)
-    return written
-
-
 def overlay_of(folder: Path, document: Mapping[str, Any], name: str, parameters: Mapping[str, str]) -> bytes:
     """Return the KMZ of a layer of the map, with the colour scale of the page.
 
@@ -86,7 +54,7 @@ def overlay_of(folder: Path, document: Mapping[str, Any], name: str, parameters:
     name
         Raster of the layer, relative to `folder`.
     parameters
-        ``low``, ``high`` and ``colours`` as in `kmz_of`; the default is the scale with which the map begins.
+        ``low``, ``high`` and ``colours`` as in `kmz_of`.
 
     Raises
     ------
@@ -101,16 +69,15 @@ def overlay_of(folder: Path, document: Mapping[str, Any], name: str, parameters:
         for layer in entry["layers"]
         if requested_file(layer["url"].removeprefix(".."))[0] == name and layer["kind"] != "classes"
     ]
-    entry, layer = named[0] if named else ({}, {"kind": "", "low": 0.0, "high": 1.0})
-    colours = parameters.get("colours", "grey" if layer["kind"] == "image" else "viridis")
     try:
-        low, high = (float(parameters.get(end, layer[end])) for end in ("low", "high"))
-    except ValueError:
+        low, high, colours = float(parameters["low"]), float(parameters["high"]), parameters["colours"]
+    except (KeyError, ValueError):
         low = high = math.nan
     if not (named and -math.inf < low < high < math.inf and colours in COLOURS):
         raise CampaignError(
             f"parameters {dict(parameters)}", name, "an image and a colour scale", "Export the image from the map page."
         )
+    entry, layer = named[0]
     return kmz_of(folder / name, document, entry, layer, low=low, high=high, colours=colours)
 
 
