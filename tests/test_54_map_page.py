@@ -371,7 +371,7 @@ COMPARED = "image=f01/uav1-uav1&layer=db.tif&right=f01/uav1-uav2&right_layer=db.
 
 
 def halves(frame):
-    """Return the mean difference between two views, left and right of the middle, from a view without overlays."""
+    """Return the parts of a view left and right of its middle, without divider and captions."""
     frame.wait_for_timeout(400)
     rendered = pixels(frame).mean(axis=-1)
     middle = rendered.shape[1] // 2
@@ -392,6 +392,9 @@ def test_divider_separates_two_images(browser, address):
         frame.focus("#low")
         frame.page.keyboard.press("PageUp")
         assert frame.inner_text("#right-ramp-low") == frame.inner_text("#ramp-low") != "−15 dB"
+        frame.select_option("#right", "f01/fused")  # relative to the peak: another quantity in dB, with its own scale
+        assert frame.inner_text("#right-ramp-high") == "0.0 dB"
+        frame.select_option("#right", "f01/uav1-uav2")
         frame.select_option("#right-layer", "incidence.tif")
         assert frame.inner_text("#right-ramp-low").endswith("deg")
         box = frame.locator("#map").bounding_box()
@@ -468,7 +471,8 @@ def test_exported_picture_contains_the_view_and_the_flags(browser, address, fini
     start = next(row for row in range(80) if (plain[row, 200:600] < 0.2).all())  # first row of the map
     picture = plain[start : start + height, 16:-16]
     middle = slice(80, height - 60), slice(100, -100)
-    np.testing.assert_allclose(picture[middle], on_screen[:height][middle], atol=0.02)
+    first = round(view["y"]) - int(view["y"])  # row of the screenshot that shows the first row of the map
+    np.testing.assert_allclose(picture[middle], on_screen[first:][:height][middle], atol=0.02)
 
 
 def test_exported_picture_of_a_comparison_names_both_images(browser, address):

@@ -169,10 +169,11 @@ class Page {
     this.over();
   }
 
-  /** Set the colour scale of the right image: that of the left image, if both have the same kind and unit. */
+  /** Set the colour scale of the right image: that of the left image, if both show the same quantity. */
   scaleRight() {
     const { layer } = this.right;
-    const common = layer.kind === this.layer.kind && layer.unit === this.layer.unit;
+    const [left, right] = [this.layer, layer].map((each) => quantity(each).replace(/\d+/g, '')); // sums of any number of pairs
+    const common = left === right;
     const colours = common ? byId('colours').value : layer.kind === 'image' ? 'grey' : 'viridis';
     Object.assign(this.right, { colours, ...(common ? { low: this.low, high: this.high } : { low: layer.low, high: layer.high }) });
     drawRamp(byId('right-ramp'), colours);

@@ -105,7 +105,8 @@ function wrapped(pen, lines, width) {
   });
 }
 
-const tall = (lines) => lines.reduce((height, [name]) => height + 1.35 * STYLES[name].size, 0);
+/** Height of lines in whole pixels, so that the map is drawn without interpolation. */
+const tall = (lines) => Math.ceil(lines.reduce((height, [name]) => height + 1.35 * STYLES[name].size, 0));
 
 function write(pen, lines, left, top) {
   let y = top;
