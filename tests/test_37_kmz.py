@@ -183,6 +183,21 @@ def test_bright_point_is_drawn_at_its_position(tmp_path):
     assert northing == pytest.approx(north - (point[0] + 0.5) * 0.5, abs=0.01)
 
 
+def test_layer_in_decibels_is_averaged_in_power(tmp_path):
+    """At an edge between -20 and 0 dB, the mean of equal parts is -3 dB; a mean of decibels is -10 dB."""
+    values = np.full((300, 200), -20.0, "f4")
+    values[:, 100:] = 0.0
+    crs, west, north = EDGE_OF_ZONE
+    document = raster(tmp_path, values, crs=crs, west=west, north=north)
+    _, picture, _ = unpacked(overlay_of(tmp_path, document, "f01/fused/coherent_db.tif", SCALE))
+    grey = picture[..., 0][picture[..., 3] == 1]
+    assert np.median(grey[grey < 0.51]) == pytest.approx(0.5, abs=2 / 256)
+    assert (grey > 0.99).mean() == pytest.approx(0.5, abs=0.01)
+    between = grey[(grey > 0.51) & (grey < 0.99)]
+    assert len(between) > 100
+    assert np.median(between) == pytest.approx((40 - 2.97) / 40, abs=0.04)  # 10 log10(0.5 + 0.5 / 100)
+
+
 def test_kmz_of_a_large_raster_uses_an_overview_at_the_same_positions(tmp_path, monkeypatch):
     monkeypatch.setattr(kmz, "MOST_PIXELS", 600)
     crs, west, north = EDGE_OF_ZONE

@@ -26,7 +26,6 @@ from apertura.core.geometry.geodesy import (
     longitudes_about,
     map_from_frame,
 )
-from apertura.formats.export.map_layout import flag_words
 from apertura.views.webmap.document import requested_file
 
 COLOURS = {"grey": "gray", "inferno": "inferno", "viridis": "viridis"}
@@ -281,6 +280,8 @@ def _legend(title: str, entry: Mapping[str, Any], low: float, high: float, colou
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
+
+    from apertura.formats.export.map_layout import flag_words
 
     with matplotlib.style.context("default"):
         figure = Figure(figsize=(4.2, 1.5), dpi=100)
