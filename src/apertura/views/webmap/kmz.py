@@ -169,7 +169,7 @@ def geographic(
     >>> values = np.ones((20, 10), "f4")
     >>> placed, edges = geographic(values, crs="EPSG:32632", west=7e5, north=5.3e6, spacing_m=1.0)
     >>> placed.shape, np.round(edges, 4).tolist()
-    ((21, 11), [11.6652, 47.8199, 11.6653, 47.8201])
+    ((21, 11), [11.672, 47.822, 11.6722, 47.8222])
     """
     from scipy.ndimage import map_coordinates
 
