@@ -342,7 +342,7 @@ def map_(folder: Path) -> Made | None:
     with serving(demo()) as address, sync_playwright() as tool:
         opened = tool.chromium.launch(executable_path=browser, headless=True, args=list(SOFTWARE_GL))
         page = opened.new_page(viewport={"width": 900, "height": 640})
-        page.goto(f"{address}#image=f01/fused")
+        page.goto(f"{address}#image=f01/fused&right=f01/uav1-uav2&right_layer=incidence.tif")
         _, frame = page.frames
         frame.wait_for_selector("html[data-drawn]", timeout=60_000)
         frame.wait_for_timeout(500)

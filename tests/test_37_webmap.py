@@ -14,7 +14,7 @@ import pytest
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import sha256_file
 from apertura.views.webmap.document import FORMAT, Layer, image_entry, map_document, named_files
-from apertura.views.webmap.server import FILES, SHELL, MapServer, page_files
+from apertura.views.webmap.server import FILES, SHELL, MapServer, Tiles, page_files
 
 ROOT = Path(__file__).parents[1]
 SOURCES = ROOT / "webmap"
@@ -40,10 +40,24 @@ def results(tmp_path):
     return folder
 
 
+def overlay(name, parameters):
+    """Return name and parameters of a request for an overlay; refuse the colours 'x'."""
+    if parameters.get("colours") == "x":
+        raise CampaignError("colours x", name, "a colour scale", "Choose another.")
+    return json.dumps([name, parameters]).encode()
+
+
 @contextmanager
-def serving(folder, files, page=PAGE):
-    """Run a server with a list of files, and a page whose files contain their own names."""
-    with MapServer(folder, lambda: files, page=page, sha256_of=lambda name: sha256_file(folder / name)) as server:
+def serving(folder, files, tiles=None):
+    """Run a server with a list of files, a page whose files contain their own names, and overlays likewise."""
+    with MapServer(
+        folder,
+        lambda: files,
+        page=PAGE,
+        sha256_of=lambda name: sha256_file(folder / name),
+        overlay=overlay,
+        tiles=tiles,
+    ) as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
         try:
@@ -166,6 +180,69 @@ def test_only_get_and_head_are_allowed(server, method):
     assert (response.status, response.headers["Allow"]) == (405, "GET, HEAD")
 
 
+def test_overlay_is_made_of_a_verified_raster(server, results):
+    sha256 = sha256_file(results / IMAGE)
+    response, body = request(server, f"/f01/a-b/db.kmz?sha256={sha256}&low=-40&high=0")
+    assert (response.status, response.headers["Content-Type"]) == (200, "application/vnd.google-earth.kmz")
+    assert json.loads(body) == [IMAGE, {"sha256": sha256, "low": "-40", "high": "0"}]
+    assert request(server, f"/f01/a-b/db.kmz?sha256={'0' * 64}")[0].status == 409
+    response, body = request(server, f"/f01/a-b/db.kmz?sha256={sha256}&colours=x")
+    assert (response.status, body) == (400, b"f01/a-b/db.tif: colours x; expected a colour scale. Choose another.\n")
+    for target in ("/f01/a-b/unlisted.kmz", "/../secret/key.kmz", "/link.kmz", "/empty.kmz", "/.kmz"):
+        assert request(server, target)[0].status == 404
+    (results / IMAGE).write_bytes(CONTENT[::-1])
+    assert request(server, "/f01/a-b/db.kmz")[0].status == 409
+
+
+TILES = Tiles("https://tiles.example:8443/{z}/{x}/{y}.png?key=1", "© Example")
+
+
+def test_tiles_admit_their_host_for_pictures_only(results):
+    with serving(results, {}) as server:
+        plain = request(server, "/map/index.html")[0].headers
+        assert request(server, "/map/tiles.json")[1] == b"null"
+    with serving(results, {}, TILES) as server:
+        response, body = request(server, "/map/tiles.json")
+        window = request(server, "/", Host=f"localhost:{server.server_port}")[0].headers
+    assert json.loads(body) == {"url": TILES.url, "attribution": "© Example", "deepest_zoom": 19}
+    before, after = (
+        dict(part.split(" ", 1) for part in headers["Content-Security-Policy"].split("; "))
+        for headers in (plain, response.headers)
+    )
+    changed = {name: after[name] for name in after if name != "frame-ancestors" and after[name] != before[name]}
+    assert changed == {"img-src": "'self' data: blob: https://tiles.example:8443"}
+    assert response.headers["Connection-Allowlist"] == '(response-origin "https://tiles.example:8443")'
+    assert not any("tiles.example" in value for value in window.values())
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "https://{s}.tiles.example/{z}/{x}/{y}.png",
+        "https://tiles.example/{z}/{x}.png",
+        "https://tiles.example/{z}/{x}/{x}.png",
+        "https://tiles.example/{z}/{x}/{y}/{a-c}.png",
+        "https://tiles.example; script-src */{z}/{x}/{y}.png",
+        'https://tiles.example"/{z}/{x}/{y}.png',
+        "https://user@tiles.example/{z}/{x}/{y}.png",
+        "https://*/{z}/{x}/{y}.png",
+        "//tiles.example/{z}/{x}/{y}.png",
+        "javascript:{z}{x}{y}",
+        "https://tiles.exämple/{z}/{x}/{y}.png",
+        "https://{z}/{x}/{y}.png",
+        "",
+    ],
+)
+def test_tiles_of_several_hosts_or_none_are_refused(url):
+    with pytest.raises(CampaignError, match="expected the address of tiles on one host"):
+        Tiles(url, "© Example")
+
+
+def test_tiles_require_an_attribution():
+    with pytest.raises(CampaignError, match=r"tiles without attribution; .* Add --tiles-attribution"):
+        Tiles(TILES.url, " ")
+
+
 @pytest.mark.parametrize(("host", "other"), [("127.0.0.1", "localhost"), ("localhost", "127.0.0.1")])
 @pytest.mark.parametrize("target", ["/", "/map/index.html", f"/{IMAGE}", "/nothing", f"/{IMAGE}?sha256=0"])
 def test_every_response_forbids_other_hosts(server, target, host, other):
@@ -233,14 +310,14 @@ def test_connection_reset_leaves_the_server_running_without_output(server, capfd
 
 def test_port_in_use_is_reported(server, results):
     with pytest.raises(CampaignError, match=r"apertura map: port \d+: Address already in use; expected a free port"):
-        MapServer(results, dict, page={}, sha256_of=str, port=server.server_port)
+        MapServer(results, dict, page={}, sha256_of=str, overlay=overlay, port=server.server_port)
 
 
 def test_untrusted_names_are_encoded_in_urls():
     name = 'a"<b>#?&%2f é'
     layer = Layer(f"{name}.tif", "0f", "image", name, "dB", -50.0, 0.0)
     report = {"focus": {"verdict": name, "reason": ""}, "numerical_error_db": -60, "flags": {}}
-    entry = image_entry(name, "a-b", report, [layer])
+    entry = image_entry(name, "a-b", report, [layer], {"TIFFTAG_COPYRIGHT": name})
     assert re.fullmatch(r"\.\./[\w%./-]+\.tif\?sha256=0f", entry["layers"][0]["url"], re.ASCII)
     grid = {"bounds_m": [0, 0, 1, 1], "spacing_m": 1.0, "shape": [1, 1]}
     document = map_document(name, grid=grid, crs={}, images=[entry], places=[], coverage_url=None)

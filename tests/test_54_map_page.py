@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import shutil
 import signal
 import socket
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+import zipfile
 from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -16,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from folders import ROOT, copy_writable, run_steps
-from matplotlib.image import imread
+from matplotlib.image import imread, imsave
 from pyproj import Transformer
 
 from apertura.campaign.folder import Campaign
@@ -73,8 +75,8 @@ def browsing(tool, arguments):
 
 
 @contextmanager
-def shown(browser, address, *, size=(1000, 700), drawn=True):
-    """Yield the frame of the map and a list of its console errors and requests to other hosts."""
+def shown(browser, address, *, size=(1000, 700), drawn=True, also=()):
+    """Yield the frame of the map and a list of its console errors and requests to hosts other than those of `also`."""
     page = browser.new_page()
     page.set_viewport_size({"width": size[0], "height": size[1]})
     errors_and_requests = []
@@ -83,7 +85,7 @@ def shown(browser, address, *, size=(1000, 700), drawn=True):
     )
     page.on("pageerror", lambda error: errors_and_requests.append(str(error)))
     window = address.partition("#")[0]
-    allowed = (window, window.replace("localhost", "127.0.0.1"), "data:", "blob:")
+    allowed = (window, window.replace("localhost", "127.0.0.1"), "data:", "blob:", *also)
     page.on(
         "request", lambda request: None if request.url.startswith(allowed) else errors_and_requests.append(request.url)
     )
@@ -363,6 +365,224 @@ REQUESTS = {
     "peer.createOffer().then((offer) => peer.setLocalDescription(offer))",
 }
 ADD = "const add = (name, with_) => document.body.appendChild(Object.assign(document.createElement(name), with_));"
+
+
+COMPARED = "image=f01/uav1-uav1&layer=db.tif&right=f01/uav1-uav2&right_layer=db.tif&colours=grey&over="
+
+
+def halves(frame):
+    """Return the parts of a view left and right of its middle, without divider and captions."""
+    frame.wait_for_timeout(400)
+    rendered = pixels(frame).mean(axis=-1)
+    middle = rendered.shape[1] // 2
+    return rendered[150:-80, : middle - 60], rendered[150:-80, middle + 60 :]
+
+
+def test_divider_separates_two_images(browser, address):
+    alone = []
+    for image in ("f01/uav1-uav1", "f01/uav1-uav2"):
+        with shown(browser, f"{address}#image={image}&layer=db.tif&colours=grey&stretch=-15,32&over=") as (frame, _):
+            alone.append(halves(frame))
+    assert np.abs(alone[0][0] - alone[1][0]).max() > 0.3
+    with shown(browser, f"{address}#{COMPARED}&stretch=-15,32&divider=0.5") as (frame, errors_and_requests):
+        left, right = halves(frame)
+        np.testing.assert_allclose(left, alone[0][0], atol=0.01)
+        np.testing.assert_allclose(right, alone[1][1], atol=0.01)
+        assert frame.inner_text("#right-ramp-low") == frame.inner_text("#ramp-low") == "−15 dB"
+        frame.focus("#low")
+        frame.page.keyboard.press("PageUp")
+        assert frame.inner_text("#right-ramp-low") == frame.inner_text("#ramp-low") != "−15 dB"
+        frame.select_option("#right", "f01/fused")  # relative to the peak: another quantity in dB, with its own scale
+        assert frame.inner_text("#right-ramp-high") == "0.0 dB"
+        frame.select_option("#right", "f01/uav1-uav2")
+        frame.select_option("#right-layer", "incidence.tif")
+        assert frame.inner_text("#right-ramp-low").endswith("deg")
+        box = frame.locator("#map").bounding_box()
+        frame.page.mouse.move(box["x"] + box["width"] / 4, box["y"] + box["height"] / 2)
+        until(frame, lambda: re.fullmatch(r"left · .* dB +right · .* deg", frame.inner_text("#value")))
+        assert errors_and_requests == []
+
+
+def test_divider_is_a_slider_for_mouse_touch_and_keyboard(browser, address):
+    with browser.new_context(has_touch=True) as context, shown(context, f"{address}#{COMPARED}") as (frame, problems):
+        divider, page = frame.locator("#divider"), frame.page
+        view = frame.locator("#view").bounding_box()
+
+        def share():
+            return float(divider.get_attribute("aria-valuenow")) / 100
+
+        def at(position):
+            return view["x"] + position * view["width"], view["y"] + view["height"] * 0.7
+
+        assert (divider.get_attribute("role"), share()) == ("slider", 0.5)
+        page.mouse.move(*at(0.5))
+        page.mouse.down()
+        page.mouse.move(*at(0.25), steps=4)
+        page.mouse.up()
+        assert share() == pytest.approx(0.25, abs=0.011)
+        until(frame, lambda: "divider=0.25" in page.url)
+        touch = context.new_cdp_session(page)
+        for kind, position in (("touchStart", 0.25), ("touchMove", 0.5), ("touchMove", 0.8), ("touchEnd", None)):
+            points = [] if position is None else [dict(zip("xy", at(position), strict=True))]
+            touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+        until(frame, lambda: abs(share() - 0.8) < 0.011)
+        divider.focus()
+        for key, expected in (("Home", 0), ("ArrowRight", 0.01), ("PageUp", 0.11), ("ArrowLeft", 0.1), ("End", 1)):
+            page.keyboard.press(key)
+            assert share() == pytest.approx(expected)
+        assert divider.get_attribute("aria-valuetext") == "100 % f01 · uav1-uav1 · db, 0 % f01 · uav1-uav2 · db"
+        frame.select_option("#right", "")
+        assert divider.is_hidden()
+        until(frame, lambda: "divider" not in page.url)
+        assert problems == []
+
+
+def downloaded(frame, button):
+    """Click a button; return name and content of the file that the page saves."""
+    with frame.page.expect_download() as download:
+        frame.click(button)
+    return download.value.suggested_filename, Path(download.value.path()).read_bytes()
+
+
+def test_exported_picture_contains_the_view_and_the_flags(browser, address, finished, tmp_path):
+    root = copy_writable(finished.root, tmp_path / "campaign")
+    path = root / "results" / "map" / "map.json"
+    map_document = json.loads(path.read_text())
+    long = {f"flag_{number}": "A measured value exceeds its limit. " * 8 for number in range(3)}
+    map_document["images"][0] |= {"verdict": "defocused", "flags": long, "licence": "CC-BY-4.0"}
+    path.write_text(json.dumps(map_document))
+    record_files(path.with_name("map.manifest.json"), [path])
+    with shown(browser, f"{address}#over=") as (frame, _):
+        name, plain = downloaded(frame, "#png")
+        view = frame.locator("#map").bounding_box()
+        on_screen = pixels(frame)
+    assert name == "f01_fused_coherent_db.png"
+    with serving(root) as other, shown(browser, f"{other}#over=") as (frame, errors_and_requests):
+        _, flagged = downloaded(frame, "#png")
+        assert errors_and_requests == []
+    plain, flagged = (imread(io.BytesIO(content))[..., :3] for content in (plain, flagged))
+    assert plain.shape[1] == flagged.shape[1] == view["width"] + 32
+    is_red = (flagged[..., 0] > 0.6) & (flagged[..., 1:].max(axis=-1) < 0.3)
+    red_rows = np.flatnonzero(is_red.any(axis=1))
+    assert (np.diff(red_rows) > 20).sum() == 2  # three names of flags in red, with their texts between
+    assert not ((plain[..., 0] > 0.6) & (plain[..., 1:].max(axis=-1) < 0.3)).any()
+    assert flagged.shape[0] > plain.shape[0] + 3 * 2 * 16
+    height = int(view["height"])
+    start = next(row for row in range(80) if (plain[row, 200:600] < 0.2).all())  # first row of the map
+    picture = plain[start : start + height, 16:-16]
+    middle = slice(80, height - 60), slice(100, -100)
+    first = round(view["y"]) - int(view["y"])  # row of the screenshot that shows the first row of the map
+    np.testing.assert_allclose(picture[middle], on_screen[first:][:height][middle], atol=0.02)
+
+
+def test_exported_picture_of_a_comparison_names_both_images(browser, address):
+    with shown(browser, f"{address}#{COMPARED}") as (frame, errors_and_requests):
+        name, content = downloaded(frame, "#png")
+        assert errors_and_requests == []
+    assert name == "f01_uav1-uav1_db_and_f01_uav1-uav2_db.png"
+    assert content[1:4] == b"PNG"
+
+
+def test_kmz_has_the_colour_scale_of_the_page(browser, address):
+    with shown(browser, f"{address}#image=f01/uav1-uav2&layer=db.tif&colours=inferno&stretch=0,20") as (
+        frame,
+        problems,
+    ):
+        name, content = downloaded(frame, "#kmz")
+        assert problems == []
+    assert name == "f01_uav1-uav2_db.kmz"
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        assert "f01 · uav1-uav2 · echo power" in archive.read("doc.kml").decode()
+        picture = imread(io.BytesIO(archive.read("image.png")))
+    brightest = picture.reshape(-1, 4)[picture[..., :3].sum(axis=-1).argmax()]
+    assert brightest[0] > brightest[2] + 0.2  # not grey
+
+
+class TileAnswer(BaseHTTPRequestHandler):
+    """Tiles of Web Mercator: red north-east, green north-west, blue south of a place; with CORS headers."""
+
+    def do_GET(self):
+        zoom, column, row = (int(part) for part in re.findall(r"\d+", self.path)[:3])
+        longitude, latitude = self.server.place
+        lines, samples = np.mgrid[0:256, 0:256] + 0.5
+        size = 256 * 2**zoom
+        is_east = (256 * column + samples) / size > longitude / 360 + 0.5
+        mercator = np.arctanh(np.sin(np.radians(latitude))) / (2 * np.pi)
+        is_north = (256 * row + lines) / size < 0.5 - mercator
+        colours = np.stack([is_north & is_east, is_north & ~is_east, ~is_north], axis=-1) * np.uint8(255)
+        file = io.BytesIO()
+        imsave(file, colours.astype("u1"), format="png")
+        self.server.requests.append((self.headers["Referer"], zoom))
+        self.send_response(200)
+        self.send_header("Content-Type", "image/png")
+        self.send_header("Access-Control-Allow-Origin", "*")
+        self.end_headers()
+        self.wfile.write(file.getvalue())
+
+    def log_message(self, *_):
+        """Print nothing."""
+
+
+@contextmanager
+def tiles_of(place):
+    with ThreadingHTTPServer(("127.0.0.1", 0), TileAnswer) as server:
+        server.place, server.requests = place, []
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        try:
+            yield server, f"http://127.0.0.1:{server.server_port}"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def test_background_tiles_are_reprojected_and_no_other_host_is_contacted(browser, finished):
+    """Two lines of latitude and longitude cross at a corner of the scene; on the map they are at the same point."""
+    west, _, _, north = finished.settings.scene.bounds_m
+    place = Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True).transform(west - 2, north + 2)
+    view = f"over=&view={west - 2},{north + 2},0.02"
+    with tiles_of(place) as (tiles, host), listening() as foreign:
+        options = (
+            "--tiles",
+            f"{host}/{{z}}/{{x}}/{{y}}.png",
+            "--tiles-attribution",
+            "© <b>Example</b>",
+            "--tiles-zoom",
+            "22",
+        )
+        with (
+            serving(finished.root, *options) as address,
+            shown(browser, f"{address}#{view}", also=[host]) as (frame, problems),
+        ):
+            until(frame, lambda: tiles.requests)
+            frame.wait_for_timeout(1500)
+            rendered = pixels(frame)
+            assert frame.inner_text("#attribution") == "© <b>Example</b>"
+            name, picture = downloaded(frame, "#png")
+            assert (name, problems) == ("f01_fused_coherent_db.png", [])
+            assert {referrer for referrer, _ in tiles.requests} == {address.replace("localhost", "127.0.0.1")}
+            assert max(zoom for _, zoom in tiles.requests) <= 22
+            for code in REQUESTS.values():
+                attack(frame, code, foreign.url)
+            before = len(tiles.requests)
+            for name in ("fetch", "XMLHttpRequest", "beacon", "script", "frame", "WebSocket"):
+                attack(frame, REQUESTS[name], f"{host}/1/1/1.png")
+            frame.wait_for_timeout(500)
+            assert (foreign.received(), foreign.requests, len(tiles.requests)) == ([], [], before)
+    exported = imread(io.BytesIO(picture))
+    assert ((exported[..., 0] > 0.9) & (exported[..., 1:3].max(axis=-1) < 0.1)).sum() > 1000
+    red, green, blue = (rendered[..., band] > 0.9 for band in range(3))
+    dark = rendered.max(axis=-1) < 0.9
+    rows, columns = (size // 2 for size in rendered.shape[:2])
+    near = slice(rows - 80, rows + 80), slice(columns - 80, columns + 80)
+    red, green, blue = (band[near] & ~dark[near] for band in (red, green, blue))
+    angle = np.radians(0.71)  # convergence, by which the parallel is inclined
+    down, right = np.mgrid[-80:80, -80:80] + 0.5
+    is_north = down + right * np.tan(angle) < 0
+    is_east = right - down * np.tan(angle) > 0
+    clear = (np.abs(down + right * np.tan(angle)) > 3) & (np.abs(right - down * np.tan(angle)) > 3)
+    for drawn, expected in ((blue, ~is_north), (red, is_north & is_east), (green, is_north & ~is_east)):
+        assert (drawn == expected)[clear].mean() > 0.99
 
 
 class Listener(ThreadingHTTPServer):

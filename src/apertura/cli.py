@@ -613,19 +613,29 @@ def report(
 @app.command("map")
 def map_page(
     campaign: CampaignFolder = HERE,
+    *,
     port: Annotated[int, typer.Option(min=0, max=65535, help="port of the server; 0: any free port")] = 0,
     preview_: Annotated[bool, typer.Option("--preview", help="show the live images of `apertura preview`")] = False,
     open_: Annotated[bool, typer.Option("--open", help="open the map in the browser")] = False,
+    tiles: Annotated[
+        str | None,
+        typer.Option(metavar="URL", help="background tiles, https://…/{z}/{x}/{y}.png; the only other host contacted"),
+    ] = None,
+    tiles_attribution: Annotated[
+        str, typer.Option(metavar="TEXT", help="source of the tiles, named on the map and in exported pictures")
+    ] = "",
+    tiles_zoom: Annotated[int, typer.Option(min=0, max=24, help="highest zoom level of the tiles")] = 19,
 ) -> None:
     """Show a campaign on a map in a browser; the server is accessible only from this machine and runs until Ctrl-C."""
     opened = _opened(campaign)
     opened.check_images()
     from apertura.views.summary import print_stale
-    from apertura.views.webmap.server import served, served_look
+    from apertura.views.webmap.server import Tiles, served, served_look
 
+    background = None if tiles is None else Tiles(tiles, tiles_attribution, tiles_zoom)
     if not preview_:
         print_stale(opened)
-    (served_look if preview_ else served)(opened, port=port).show(in_browser=open_)
+    (served_look if preview_ else served)(opened, tiles=background, port=port).show(in_browser=open_)
 
 
 @app.command()

@@ -1,16 +1,20 @@
-// The map: a raster, mask overlay, tracks, footprints, targets, and the line of the cross-section.
+// The map: one raster, or two with a divider, mask overlay, tracks, footprints, targets, line of the cross-section, and
+// background tiles.
 import Map from 'ol/Map.js';
 import View from 'ol/View.js';
 import { extend } from 'ol/extent.js';
 import { getPointResolution } from 'ol/proj.js';
+import { getRenderPixel } from 'ol/render.js';
 import Feature from 'ol/Feature.js';
 import GeoJSON from 'ol/format/GeoJSON.js';
 import LineString from 'ol/geom/LineString.js';
 import Point from 'ol/geom/Point.js';
+import BackgroundLayer from 'ol/layer/Tile.js';
 import TileLayer from 'ol/layer/WebGLTile.js';
 import VectorLayer from 'ol/layer/Vector.js';
 import GeoTIFF from 'ol/source/GeoTIFF.js';
 import VectorSource from 'ol/source/Vector.js';
+import XYZ from 'ol/source/XYZ.js';
 import Zoom from 'ol/control/Zoom.js';
 import { Circle, Fill, Stroke, Style, Text } from 'ol/style.js';
 import { maskStyle, rampStyle } from './colours.js';
@@ -28,6 +32,10 @@ export function canDraw() {
 export class Chart {
   constructor(target, places) {
     this.places = places;
+    this.rasters = { left: null, right: null };
+    this.masks = { left: null, right: null };
+    this.divider = 1; // position as a fraction of the width; left of it, the left raster is shown
+    this.opacity = 1;
     const { bounds_m: bounds, spacing_m: spacing } = places.grid;
     this.tracks = vector(3, (feature) => trackStyle(feature));
     this.footprints = vector(2, (feature) => footprintStyle(feature));
@@ -61,29 +69,51 @@ export class Chart {
     return this.map.getView();
   }
 
-  /** Draw a scale bar that represents a round length. */
+  /** Draw background tiles, reprojected from Web Mercator; a tile that cannot be loaded is reported once. */
+  background({ url, deepest_zoom: maxZoom }) {
+    const source = new XYZ({ url, maxZoom, crossOrigin: 'anonymous', referrerPolicy: 'origin' });
+    source.on('tileloaderror', () => {
+      notice(`Background tiles of ${new URL(url).host} cannot be loaded. The service must permit other origins (CORS).`);
+    });
+    this.map.addLayer(new BackgroundLayer({ source, zIndex: -1 }));
+  }
+
+  /** Draw a scale bar that represents a round length; its length in pixels and its text are also used by `picture`. */
   scale() {
     const metres = getPointResolution(this.places.projection, this.view.getResolution(), this.view.getCenter(), 'm');
     const most = 140 * metres;
     const power = 10 ** Math.floor(Math.log10(most));
     const length = power * [5, 2, 1].find((each) => each * power <= most);
     const [unit, metre] = length >= 1000 ? ['km', 1000] : length >= 1 ? ['m', 1] : ['cm', 0.01];
-    byId('scale').style.width = `${length / metres}px`;
-    byId('scale').textContent = `${Number((length / metre).toPrecision(2))} ${unit}`;
+    this.bar = { length: length / metres, text: `${Number((length / metre).toPrecision(2))} ${unit}` };
+    byId('scale').style.width = `${this.bar.length}px`;
+    byId('scale').textContent = this.bar.text;
   }
 
-  /** Replace the displayed raster and its colour scale. */
-  show(layer, colours, low, high) {
-    this.raster = this.replaced(this.raster, layer, () => rampStyle(colours, low, high), 0);
+  /** Replace the raster of a side and its colour scale; null removes the raster. */
+  show(side, layer, colours, low, high) {
+    this.rasters[side] = this.replaced(this.rasters[side], side, layer, () => rampStyle(colours, low, high), 0);
+    this.rasters[side]?.setOpacity(this.opacity);
   }
 
-  /** Show a mask over the raster; null removes the mask. */
-  mask(layer) {
-    this.overlay = this.replaced(this.overlay, layer, maskStyle, 1);
-    this.overlay?.setOpacity(0.55);
+  /** Show a mask over the raster of a side; null removes the mask. */
+  mask(side, layer) {
+    this.masks[side] = this.replaced(this.masks[side], side, layer, maskStyle, 1);
+    this.masks[side]?.setOpacity(0.55);
   }
 
-  replaced(before, layer, style, zIndex) {
+  fade(opacity) {
+    this.opacity = opacity;
+    for (const raster of Object.values(this.rasters)) raster?.setOpacity(opacity);
+  }
+
+  /** Move the divider between the two rasters to a fraction of the width. */
+  divide(share) {
+    this.divider = share;
+    this.map.render();
+  }
+
+  replaced(before, side, layer, style, zIndex) {
     const removeBefore = () => {
       if (before) this.map.removeLayer(before);
       before?.dispose();
@@ -103,6 +133,15 @@ export class Chart {
       if (source.getState() === 'error') explain(layer); // the handler returns nothing, because false would stop the propagation of the event
     });
     const added = new TileLayer({ source, style: style(), zIndex });
+    added.on('prerender', (event) => {
+      const [width, height] = this.map.getSize();
+      const [from, to] = side === 'left' ? [0, this.divider] : [this.divider, 1];
+      const [left, bottom] = getRenderPixel(event, [from * width, height]).map(Math.round);
+      const [right, top] = getRenderPixel(event, [to * width, 0]).map(Math.round);
+      event.context.enable(event.context.SCISSOR_TEST);
+      event.context.scissor(left, bottom, right - left, top - bottom);
+    });
+    added.on('postrender', ({ context }) => context.disable(context.SCISSOR_TEST));
     this.map.addLayer(added);
     this.map.once('rendercomplete', removeBefore); // earlier removal would make the map flicker
     return added;
@@ -110,11 +149,26 @@ export class Chart {
 
   /** True if there is no raster, or if the file of the raster has been opened. */
   get drawn() {
-    return !this.raster || this.raster.getSource()?.getState() === 'ready';
+    return Object.values(this.rasters).every((raster) => !raster || raster.getSource()?.getState() === 'ready');
   }
 
-  stretch(low, high) {
-    this.raster?.updateStyleVariables({ low, high });
+  stretch(side, low, high) {
+    this.rasters[side]?.updateStyleVariables({ low, high });
+  }
+
+  /** Draw the view as it is on the screen. */
+  draw(pen) {
+    this.map.renderSync();
+    for (const canvas of this.map.getViewport().querySelectorAll('.ol-layer canvas, canvas.ol-layer')) {
+      if (!canvas.width) continue;
+      const { style, parentNode } = canvas;
+      const matrix = style.transform.match(/matrix\(([^)]*)\)/)?.[1].split(',').map(Number);
+      pen.save();
+      pen.globalAlpha = Number(parentNode.style.opacity || style.opacity || 1);
+      pen.transform(...(matrix ?? [parseFloat(style.width) / canvas.width, 0, 0, parseFloat(style.height) / canvas.height, 0, 0]));
+      pen.drawImage(canvas, 0, 0);
+      pen.restore();
+    }
   }
 
   async cover(url) {

@@ -5,6 +5,7 @@ export const RAMPS = {
   viridis: ['#440154', '#482878', '#3e4989', '#31688e', '#26828e', '#1f9e89', '#35b779', '#6ece58', '#b5de2b', '#fde725'],
 };
 export const MASK = { 1: '#3b82f6', 2: '#f59e0b', 3: '#d946ef' };
+export const MASK_NAMES = { 1: 'blue', 2: 'orange', 3: 'magenta' };
 
 const CLEAR = ['color', 0, 0, 0, 0];
 

@@ -25,5 +25,12 @@ export function notice(message) {
   if ([...box.children].every((child) => child.textContent !== message)) box.append(element('p', { textContent: message }));
 }
 
+/** Save a file from the page. */
+export function save(blob, name) {
+  const link = element('a', { download: name, href: URL.createObjectURL(blob) });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+}
+
 /** Format a number with a given number of decimals and a true minus sign. */
 export const number = (value, decimals) => value.toFixed(decimals).replace('-', '−');

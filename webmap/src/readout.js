@@ -4,9 +4,9 @@ import { byId, number } from './dom.js';
 const PAUSE_MS = 40;
 
 export class Readout {
-  /** `raster` and `mask` are functions that return the rasters to be read, or null. */
-  constructor(chart, places, raster, mask, classes) {
-    Object.assign(this, { chart, places, raster, mask, classes, request: 0 });
+  /** `sides` is a function that returns label, raster and mask (or null) of each displayed image. */
+  constructor(chart, places, sides, classes) {
+    Object.assign(this, { chart, places, sides, classes, request: 0 });
     const { map } = chart;
     map.on('pointermove', (event) => {
       if (!event.dragging) this.at(event.coordinate);
@@ -40,19 +40,21 @@ export class Readout {
   }
 
   async showValue(place, request) {
-    const texts = await Promise.all([this.value(place), this.masked(place)]).catch((error) => [error.message]);
-    if (request === this.request) byId('value').textContent = texts.filter(Boolean).join(' · ');
+    const words = this.sides().map(async ({ label, raster, mask }) => {
+      const texts = await Promise.all([this.value(raster, place), this.masked(mask, place)]).catch((error) => [error.message]);
+      return [label, ...texts].filter(Boolean).join(' · ');
+    });
+    const text = (await Promise.all(words)).join('   ');
+    if (request === this.request) byId('value').textContent = text;
   }
 
-  async value(place) {
-    const raster = this.raster();
+  async value(raster, place) {
     if (!raster) return '';
     const value = await raster.value(place);
     return Number.isFinite(value) ? `${number(value, 2)} ${raster.layer.unit}` : 'no value';
   }
 
-  async masked(place) {
-    const mask = this.mask();
+  async masked(mask, place) {
     if (!mask) return '';
     return this.classes[await mask.value(place)] ?? 'outside';
   }

@@ -1,6 +1,6 @@
 // Cross-section tool: a line on the map, with a plot of the values along the line and a CSV export.
 import Draw from 'ol/interaction/Draw.js';
-import { byId, element, number } from './dom.js';
+import { byId, element, number, save } from './dom.js';
 import { plot, width3dB } from './plot.js';
 
 const NAMES = { earth: ['from E', 'from N', 'to E', 'to N'], local: ['from x', 'from y', 'to x', 'to y'] };
@@ -109,9 +109,6 @@ export class Section {
     });
     const unit = this.of.unit.toLowerCase().replace(/[^a-z0-9]/g, '') || 'value';
     const text = [`${[...names, `value_${unit}`].join(',')}`, ...rows].join('\n');
-    const link = element('a', { download: 'cross-section.csv' });
-    link.href = URL.createObjectURL(new Blob([`${text}\n`], { type: 'text/csv' }));
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+    save(new Blob([`${text}\n`], { type: 'text/csv' }), 'cross-section.csv');
   }
 }

@@ -442,6 +442,8 @@ class LiveMap:
             "reason": report["reason"],
             "error_db": report["error_db"],
             "flags": explained_flags(report["flags"]),
+            "acquired": [],
+            "licence": None,
             "layers": [{**asdict(layer), "url": url_of(f"{name}/{path.name}", layer.sha256)}],
         }
         peak = report["peak"]

@@ -12,7 +12,7 @@ import numpy as np
 from apertura.campaign.config import FUSED
 from apertura.campaign.digests import digest_of
 from apertura.campaign.folder import Campaign
-from apertura.campaign.store import check_listed, read_manifest, record_files, remake_from
+from apertura.campaign.store import check_listed, manifest_of, open_listed, read_manifest, record_files, remake_from
 from apertura.common.atomic import write_json
 from apertura.common.documents import read_json, undamaged
 from apertura.common.errors import CampaignError
@@ -24,7 +24,7 @@ from apertura.stages.scene import settled_scene
 from apertura.views.quality import ImageValues, explained_flags, read_report
 from apertura.workflow.lineage import result_of
 
-FORMAT = 1
+FORMAT = 2
 """Format version of `map.json`; the page rejects other versions."""
 
 KINDS = ("image", "classes", "measure")
@@ -82,7 +82,9 @@ class Place:
     image: str | None = None
 
 
-def image_entry(flight: str, image: str, report: Mapping[str, Any], layers: Iterable[Layer]) -> dict[str, Any]:
+def image_entry(
+    flight: str, image: str, report: Mapping[str, Any], layers: Iterable[Layer], tags: Mapping[str, str]
+) -> dict[str, Any]:
     """Return the entry of an image in the document.
 
     Parameters
@@ -93,8 +95,11 @@ def image_entry(flight: str, image: str, report: Mapping[str, Any], layers: Iter
         Contents of the image's ``image.json``.
     layers
         Rasters of the image.
+    tags
+        Tags of the image's GeoTIFF, with the time of acquisition and the licence.
     """
     values = ImageValues.of(report)
+    times = [tags[name] for name in ("APERTURA_ACQUISITION_START", "APERTURA_ACQUISITION_END") if name in tags]
     return {
         "flight": flight,
         "image": image,
@@ -102,6 +107,8 @@ def image_entry(flight: str, image: str, report: Mapping[str, Any], layers: Iter
         "reason": values.reason,
         "error_db": values.error_db,
         "flags": explained_flags(values.flags),
+        "acquired": times,
+        "licence": tags.get("TIFFTAG_COPYRIGHT"),
         "layers": [
             {**asdict(layer), "url": url_of(f"{flight}/{image}/{layer.file}", layer.sha256)} for layer in layers
         ],
@@ -184,6 +191,12 @@ def named_files(document: Mapping[str, Any]) -> dict[str, str]:
     return {name: sha256 for name, sha256 in requests if sha256 is not None}
 
 
+def listed_document(campaign: Campaign) -> Mapping[str, Any]:
+    """Return the contents of the campaign's `map.json`, verified by its manifest."""
+    path = campaign.result(MAP)
+    return open_listed(path, manifest_of(path))
+
+
 def map_document(
     campaign: str,
     *,
@@ -247,7 +260,13 @@ def webmap(campaign: Campaign) -> list[Path]:
     for flight, image in names:
         report = read_report(campaign, flight, image)
         with undamaged(campaign.result(flight, image, "image.json"), expected="a report", remedy="Run export again."):
-            images.append(image_entry(flight, image, report, _layers(campaign, flight, image, report)))
+            layers = _layers(campaign, flight, image, report)
+            first = campaign.result(flight, image, layers[0].file)
+            with opened_raster(
+                first, expected="an image that the workflow wrote", remedy="Run export again."
+            ) as raster:
+                tags = raster.tags()
+            images.append(image_entry(flight, image, report, layers, tags))
             places += found_places(flight, image, report)
     coverage = None
     if scene.grid.crs != LOCAL:

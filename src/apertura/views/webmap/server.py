@@ -7,30 +7,35 @@ apply these to all connections, including name look-ups, early connections and W
 cover.
 """
 
+import json
 import os
 import re
 import sys
+import threading
 import time
 import webbrowser
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from io import BytesIO
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
+from urllib.parse import parse_qsl, urlsplit
 
 from apertura.campaign.digests import digest_of
 from apertura.campaign.folder import Campaign
-from apertura.campaign.store import manifest_of, open_listed, read_manifest
+from apertura.campaign.store import manifest_of, read_manifest
 from apertura.common.confined import ConfinedPath
 from apertura.common.documents import read_json, undamaged
 from apertura.common.errors import CampaignError
 from apertura.common.processes import Interrupted
 from apertura.common.provenance import sha256_file
 from apertura.formats.export import MAP, PREVIEW, product_files
-from apertura.views.webmap.document import named_files, requested_file
+from apertura.views.webmap.document import listed_document, named_files, requested_file
+from apertura.views.webmap.kmz import overlay_of
 
 LOOPBACK = "127.0.0.1"
 """The only address on which the server listens; also the host name of the map and its data."""
@@ -39,6 +44,63 @@ WINDOW = "localhost"
 """Host name of the window around the map, which is a different origin for a browser."""
 
 _RANGE = re.compile(r"bytes=(?:(\d{1,18})-(\d{1,18})?|-(\d{1,18}))", re.ASCII)
+
+
+_TILES = re.compile(r"(https?://[A-Za-z0-9.-]+(?::\d{1,5})?)/[^\s\"'<>\\{}]+", re.ASCII)
+_DEEPEST_ZOOM = 19  # of most public services; nearer views show these tiles enlarged
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """Background tiles of the map in the Web Mercator projection, from the only other host that the page contacts.
+
+    Attributes
+    ----------
+    url
+        Address of a tile, with ``{z}``, ``{x}`` and ``{y}`` (or ``{-y}``) for zoom level, column and row.
+    attribution
+        Text that names the source of the tiles on the map and in exported pictures.
+    deepest_zoom
+        Highest zoom level of the service.
+
+    Raises
+    ------
+    CampaignError
+        If the address is not that of tiles on a single host, or if the attribution is missing.
+
+    Examples
+    --------
+    >>> Tiles("https://tiles.example/{z}/{x}/{y}.png", "© Example").origin
+    'https://tiles.example'
+    """
+
+    url: str
+    attribution: str
+    deepest_zoom: int = _DEEPEST_ZOOM
+
+    def __post_init__(self) -> None:
+        fields = [field.replace("-", "") for field in re.findall(r"\{(?:z|x|-?y)\}", self.url)]
+        path_only = re.sub(r"\{(z|x|-?y)\}", "()", self.url)  # parentheses are not allowed in a host name
+        if _TILES.fullmatch(path_only) is None or sorted(fields) != ["{x}", "{y}", "{z}"]:
+            raise CampaignError(
+                f"tiles {self.url!r}",
+                "apertura map --tiles",
+                "the address of tiles on one host, for example https://tiles.example/{z}/{x}/{y}.png",
+                "Copy the address from the documentation of the tile service, with one host name instead of {s}.",
+            )
+        if not self.attribution.strip():
+            raise CampaignError(
+                "tiles without attribution",
+                "apertura map --tiles",
+                "the text that the tile service requires on a map",
+                'Add --tiles-attribution "© …".',
+            )
+
+    @property
+    def origin(self) -> str:
+        """Scheme, host and port of the tile service."""
+        split = urlsplit(self.url)
+        return f"{split.scheme}://{split.netloc}".lower()
 
 
 class UnsatisfiableRangeError(ValueError):
@@ -110,13 +172,15 @@ _COMMON_HEADERS = {
 }
 
 
-def headers_of(port: int) -> Mapping[str, Mapping[str, str]]:
+def headers_of(port: int, tiles: Tiles | None = None) -> Mapping[str, Mapping[str, str]]:
     """Return host name → headers of all responses to requests under that name.
 
     Parameters
     ----------
     port
         Port of the server.
+    tiles
+        Background tiles; without them, the map may connect to this server only.
 
     Examples
     --------
@@ -128,16 +192,17 @@ def headers_of(port: int) -> Mapping[str, Mapping[str, str]]:
         f"default-src 'none'; script-src 'self'; style-src 'self'; frame-src {page}; "
         "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
     )
+    images = "'self' data: blob:" + (f" {tiles.origin}" if tiles else "")
+    allowed = "(response-origin" + (f' "{tiles.origin}")' if tiles else ")")
     page_policy = (
-        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
+        f"default-src 'none'; script-src 'self'; style-src 'self'; img-src {images}; connect-src 'self'; "
         f"worker-src blob:; base-uri 'none'; form-action 'none'; frame-ancestors {window}; "
         "sandbox allow-scripts allow-same-origin allow-downloads"
     )
     return {
         WINDOW: _COMMON_HEADERS
         | {"Content-Security-Policy": window_policy, "Connection-Allowlist": f'(response-origin "{page}")'},
-        LOOPBACK: _COMMON_HEADERS
-        | {"Content-Security-Policy": page_policy, "Connection-Allowlist": "(response-origin)"},
+        LOOPBACK: _COMMON_HEADERS | {"Content-Security-Policy": page_policy, "Connection-Allowlist": allowed},
     }
 
 
@@ -187,6 +252,7 @@ _TYPES = {
     ".json": "application/json",
     ".geojson": "application/geo+json",
     ".tif": "image/tiff",
+    ".kmz": "application/vnd.google-earth.kmz",
 }
 _BLOCK_BYTES = 1 << 16
 _WAIT_S = 0.2  # interval between checks for the first image
@@ -207,6 +273,10 @@ class MapServer(ThreadingHTTPServer):
         Files returned by `apertura.views.webmap.server.page_files`.
     sha256_of
         Function that returns the current hash of a file.
+    overlay
+        Function that returns the KMZ of a served raster; its arguments are the file and the parameters of the request.
+    tiles
+        Background tiles of the map.
     port
         Port to listen on; 0 for any free port.
 
@@ -217,7 +287,7 @@ class MapServer(ThreadingHTTPServer):
 
     Examples
     --------
-    >>> with MapServer(Path("results"), dict, page={}, sha256_of=str) as server:
+    >>> with MapServer(Path("results"), dict, page={}, sha256_of=str, overlay=lambda *_: b"") as server:
     ...     server.url.startswith("http://localhost:")
     True
     """
@@ -231,12 +301,18 @@ class MapServer(ThreadingHTTPServer):
         *,
         page: Mapping[str, bytes],
         sha256_of: Callable[[str], str],
+        overlay: Callable[[str, Mapping[str, str]], bytes],
+        tiles: Tiles | None = None,
         port: int = 0,
     ) -> None:
         self.folder, self.files, self.sha256_of = ConfinedPath.at(folder), files, sha256_of
+        self.overlay, self.overlay_lock = overlay, threading.Lock()
         self.pages = {
             WINDOW: {name: content for name, content in page.items() if name in SHELL},
-            LOOPBACK: {f"map/{name}": content for name, content in page.items() if name in FILES},
+            LOOPBACK: {
+                **{f"map/{name}": content for name, content in page.items() if name in FILES},
+                "map/tiles.json": json.dumps(tiles and asdict(tiles)).encode(),
+            },
         }
         try:
             super().__init__((LOOPBACK, port), _Handler)
@@ -248,7 +324,7 @@ class MapServer(ThreadingHTTPServer):
                 "Choose another --port, or omit the option.",
             ) from error
         self.url = f"http://{WINDOW}:{self.server_port}/"
-        self.headers = headers_of(self.server_port)
+        self.headers = headers_of(self.server_port, tiles)
 
     def show(self, *, in_browser: bool = False) -> None:
         """Print the URL, open it in a browser if requested, and serve until interrupted."""
@@ -313,22 +389,32 @@ class _Handler(BaseHTTPRequestHandler):
             self._respond(HTTPStatus.NOT_FOUND, "only the window around the map is served under this host name")
 
     def _answer_file(self, name: str, expected: str | None) -> None:
+        source = f"{name.removesuffix('.kmz')}.tif" if name.endswith(".kmz") else name
         try:
-            sha256 = self.server.files().get(name)
+            sha256 = self.server.files().get(source)
         except CampaignError as error:
             self._respond(HTTPStatus.CONFLICT, str(error))
             return
-        file = None if sha256 is None else self._opened(name)
+        file = None if sha256 is None else self._opened(source)
         if file is None:
             self._respond(HTTPStatus.NOT_FOUND, "not a product of this campaign")
             return
         with file:
-            if expected not in {None, sha256} or not self._has_hash(file, name, sha256):
+            if expected not in {None, sha256} or not self._has_hash(file, source, sha256):
                 self._respond(
                     HTTPStatus.CONFLICT, "the file was changed after the map was made: run the workflow again"
                 )
                 return
-            self._send(file, name)
+            if source == name:
+                self._send(file, name)
+                return
+        try:
+            with self.server.overlay_lock:  # one at a time, because each needs several copies of the raster in memory
+                content = self.server.overlay(source, dict(parse_qsl(urlsplit(self.path).query)))
+        except CampaignError as error:
+            self._respond(HTTPStatus.BAD_REQUEST, str(error))
+            return
+        self._send(BytesIO(content), name)
 
     def _opened(self, name: str) -> IO[bytes] | None:
         """Open a listed file; None if it is missing, behind a symbolic link, or not a regular file."""
@@ -389,7 +475,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Log nothing, because a map requests hundreds of ranges."""
 
 
-def served_look(campaign: Campaign, *, port: int = 0) -> MapServer:
+def served_look(campaign: Campaign, *, tiles: Tiles | None = None, port: int = 0) -> MapServer:
     """Wait for the first image of `apertura preview`, and return a server for its images; parameters as in `served`."""
     folder = campaign.result(PREVIEW)
     path = folder / MAP
@@ -400,43 +486,69 @@ def served_look(campaign: Campaign, *, port: int = 0) -> MapServer:
         )
     while not path.is_file():
         time.sleep(_WAIT_S)
+    expected, remedy = "a document of `apertura preview`", "Run `apertura preview CAMPAIGN` again."
+
+    def document() -> Mapping[str, Any]:
+        return read_json(path, expected=expected, remedy=remedy)
 
     def files() -> Mapping[str, str]:
-        expected, remedy = "a document of `apertura preview`", "Run `apertura preview CAMPAIGN` again."
-        document = read_json(path, expected=expected, remedy=remedy)
         with undamaged(path, expected=expected, remedy=remedy):
-            return {**named_files(document), MAP: sha256_file(path)}
+            return {**named_files(document()), MAP: sha256_file(path)}
 
-    return _serving(campaign, folder, files, port)
+    return _serving(campaign, folder, files, document, tiles=tiles, port=port)
 
 
-def served(campaign: Campaign, *, port: int = 0) -> MapServer:
+def served(campaign: Campaign, *, tiles: Tiles | None = None, port: int = 0) -> MapServer:
     """Return a server for the campaign's map and the products listed in it.
 
     Parameters
     ----------
     campaign
         A campaign with results.
+    tiles
+        Background tiles of the map.
     port
         Port to listen on; 0 for any free port.
 
     Raises
     ------
     CampaignError
-        If the map is missing or was modified, or if the port is in use.
+        If the map is missing or was modified, if the port is in use, or if a local frame is given background tiles.
     """
-    return _serving(campaign, campaign.results, _listing(campaign), port)
+    return _serving(
+        campaign, campaign.results, _listing(campaign), lambda: listed_document(campaign), tiles=tiles, port=port
+    )
 
 
-def _serving(campaign: Campaign, folder: Path, files: Callable[[], Mapping[str, str]], port: int) -> MapServer:
+def _serving(
+    campaign: Campaign,
+    folder: Path,
+    files: Callable[[], Mapping[str, str]],
+    document: Callable[[], Mapping[str, Any]],
+    *,
+    tiles: Tiles | None,
+    port: int,
+) -> MapServer:
     """Return a server for a folder of the campaign; raise CampaignError if the list of served files cannot be read."""
     files()
+    if tiles and document()["crs"]["local"]:
+        raise CampaignError(
+            "background tiles for a local frame",
+            "apertura map --tiles",
+            "a campaign with geographic positions",
+            "Omit --tiles.",
+        )
     prefix = campaign.relative(folder)
 
     def sha256_of(name: str) -> str:
         return digest_of(campaign.root, f"{prefix}/{name}")
 
-    return MapServer(folder, files, page=page_files(), sha256_of=sha256_of, port=port)
+    def overlay(name: str, parameters: Mapping[str, str]) -> bytes:
+        with undamaged(folder / MAP, expected="a map document", remedy="Run the workflow again."):
+            return overlay_of(folder, document(), name, parameters)
+
+    page = page_files()
+    return MapServer(folder, files, page=page, sha256_of=sha256_of, overlay=overlay, tiles=tiles, port=port)
 
 
 def _listing(campaign: Campaign) -> Callable[[], Mapping[str, str]]:
@@ -449,11 +561,10 @@ def _listing(campaign: Campaign) -> Callable[[], Mapping[str, str]]:
     @lru_cache(maxsize=1)
     def listed(*_: int) -> Mapping[str, str]:
         path = campaign.result(MAP)
-        manifest = manifest_of(path)
-        document = open_listed(path, manifest)
+        document = listed_document(campaign)
         with undamaged(path, expected="the map of a finished campaign", remedy="Run the workflow again."):
             named = {name: sha256 for name, sha256 in named_files(document).items() if name in products}
-        return {**named, MAP: read_manifest(manifest)["files"][path.name]}
+        return {**named, MAP: read_manifest(manifest_of(path))["files"][path.name]}
 
     def listed_now() -> Mapping[str, str]:
         with suppress(OSError):
