@@ -18,7 +18,7 @@ from apertura.common.provenance import Provenance, packages, sha256_file, softwa
 from apertura.core.backprojection.engines import instruction_set
 from apertura.formats.export import exports_in, product_files
 from apertura.simulation import ImageGrid, preset, simulate
-from apertura.stages.tags import quality_tags
+from apertura.stages.image_tags import quality_tags
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
 PRODUCTS = list(product_files({"f01": (*PAIRS, "fused")}))

@@ -4,7 +4,7 @@ rule export:
         image="results/{flight}/{pair}/image.manifest.json",
         assessment="results/{flight}/assessment.manifest.json",
         scene="results/scene.manifest.json",
-        layers=files(inputs.calibration_of_images),
+        layers="results/{flight}/{pair}/layers.manifest.json",
     output:
         "results/{flight}/{pair}/image.json",
         "results/{flight}/{pair}/slc.tif",
@@ -69,7 +69,7 @@ rule export_fused:
         assessment="results/{flight}/assessment.manifest.json",
         cube="results/cube.manifest.json",
         scene="results/scene.manifest.json",
-        noise=files(inputs.noise_of_sums),
+        layers=each("results/{flight}/{pair}/layers.manifest.json"),
     output:
         "results/{flight}/fused/image.json",
         "results/{flight}/fused/coherent_slc.tif",

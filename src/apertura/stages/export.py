@@ -33,9 +33,10 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import product, remove_outdated, write_exports
 from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, of_sums
 from apertura.stages.agreement import ComparedImage, assessment_of, bright_points_within
+from apertura.stages.image_tags import acquisition_tags, angle_tags, quality_tags
 from apertura.stages.multilook import LazyLayer, coarse, mean_power_report, multilook_of
 from apertura.stages.scene import settled_scene
-from apertura.stages.tags import acquisition_tags, quality_tags, tags_of
+from apertura.stages.tags import tags_of
 from apertura.workflow.lineage import result_of
 
 
@@ -71,7 +72,10 @@ def export_pair(campaign: Campaign, flight: str, pair: str) -> list[Path]:
         {"image": held(image.image)},
         radiometry=report["radiometry"],
         titles={"image": f"{campaign.settings.campaign} · flight {flight} · {pair}"},
-        tags=tags_of(origin, lineage) | quality_tags(report) | acquisition_tags(campaign, {pair: quality["view"]}),
+        tags=tags_of(origin, lineage)
+        | quality_tags(report)
+        | acquisition_tags(campaign, {(flight, pair): quality["view"]})
+        | angle_tags(campaign, flight, [pair]),
         **_georeference(settled_scene(campaign).grid),
     )
     return _finish(folder, written, {"flight": flight, "pair": pair, **report}, lineage)
@@ -150,7 +154,10 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     origin = Provenance.of(lineage.modules, images, settings={"fusion": assessed["fusion"]})
     code_sha256 = chained_sha256(lineage.result.code_sha256, [cube.attrs["code_sha256"]])
     tags = tags_of(replace(origin, code_sha256=code_sha256), lineage) | quality_tags(report)
-    tags |= acquisition_tags(campaign, {pair: image.attrs["quality"]["view"] for pair, image in images.items()})
+    tags |= acquisition_tags(
+        campaign, {(flight, pair): image.attrs["quality"]["view"] for pair, image in images.items()}
+    )
+    tags |= angle_tags(campaign, flight, pairs)
     written = write_exports(
         "fused",
         folder,
