@@ -253,12 +253,14 @@ class Campaign(RawFolder):
 
     @property
     def coefficients(self) -> tuple[str, ...]:
-        """Names of the backscattering coefficients (none for relative images) and multilooked powers to be written."""
+        """Sources of kinds ``radiometry`` (none for relative images) and ``multilook`` to be written."""
         processing = self.settings.processing
-        written = processing.radiometry if self.calibrated else ()
+        coefficients = processing.radiometry if self.calibrated else ()
+        areas = ("scattering_area", "gamma_sigma_ratio") if "gamma0" in coefficients else ()
+        written = (*coefficients, *areas)
         if processing.multilook is None:
             return written
-        averaged = [f"multilook_{name}" for name in written] or ["multilook"]
+        averaged = [f"multilook_{name}" for name in coefficients] or ["multilook"]
         noise = ["multilook_noise"] * processing.multilook.subtract_noise
         return (*written, *averaged, *noise, "multilook_coherent", "multilook_noncoherent")
 

@@ -10,6 +10,7 @@ from apertura.campaign.folder import Campaign
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.provenance import canonical_json
 from apertura.common.raster import opened_raster
+from apertura.common.units import frequency_band
 from apertura.formats.export import product
 
 _FIRST_CLOCK = np.datetime64("1980-01-06")  # times of a recording without a clock start in 1970
@@ -54,6 +55,7 @@ def acquisition_tags(campaign: Campaign, views: Mapping[tuple[str, str], Mapping
         "APERTURA_MODE": mode_of(pairs),
         "APERTURA_ACQUISITION_START": f"{first[:26]}Z" if has_clock else None,
         "APERTURA_ACQUISITION_END": f"{last[:26]}Z" if has_clock else None,
+        "APERTURA_FREQUENCY_BAND": frequency_band(centre_hz),
         "APERTURA_CENTRE_FREQUENCY_HZ": f"{centre_hz:.12g}",
         "APERTURA_BANDWIDTH_HZ": f"{high - low:.12g}",
         "APERTURA_WAVELENGTH_M": f"{SPEED_OF_LIGHT_M_S / centre_hz:.6g}",
@@ -61,6 +63,7 @@ def acquisition_tags(campaign: Campaign, views: Mapping[tuple[str, str], Mapping
         "APERTURA_LOOK_SIDE": side if side == "both" or is_observable else f"{side}, assumed",
         "APERTURA_LOOK_DIRECTION_DEG": direction("look_deg"),
         "APERTURA_HEADING_DEG": direction("heading_deg"),
+        "APERTURA_LOOK_VECTOR_ECEF": _look_vector(each),
         "APERTURA_RANGE_M": mean("range_m"),
         "APERTURA_HEIGHT_ABOVE_TERRAIN_M": mean("height_m"),
         "APERTURA_INCIDENCE_DEG": mean("incidence_deg"),
@@ -69,6 +72,12 @@ def acquisition_tags(campaign: Campaign, views: Mapping[tuple[str, str], Mapping
         **_attribution_tags(campaign, int(first[:4]) if has_clock else None),
     }
     return {name: value for name, value in tags.items() if value is not None}
+
+
+def _look_vector(views: Sequence[Mapping[str, Any]]) -> str | None:
+    """Return the unit vector from the antennas to the scene centre; None for several images or in a local frame."""
+    vector = views[0]["look_vector_ecef"] if len(views) == 1 else None
+    return None if vector is None else " ".join(f"{part:.6f}" for part in vector)
 
 
 _COMMON_DIRECTION = 0.5
@@ -133,10 +142,13 @@ def quality_tags(report: Mapping[str, Any]) -> dict[str, str]:
     reports = {
         name: report[name] for name in ("budget", "budgets", "focus", "fusion", "recomputed") if report.get(name)
     }
-    focus = report.get("focus", {})
+    focus, budgets = report.get("focus", {}), [report.get("budget", ()), *report.get("budgets", {}).values()]
+    lines = [line for budget in budgets for line in budget]
+    largest = max(lines, key=lambda line: line["shift_m"] or 0.0, default=None)
     readable = {
         "FOCUS_VERDICT": focus.get("verdict"),
         "PEAK_LOSS_DB": f"{abs(focus['loss_db']):.2f}" if "loss_db" in focus else None,
+        "GEOLOCATION_METHOD": largest and f"predicted by the error budget; largest term: {largest['cause']}",
         "GEOLOCATION_UNCERTAINTY_M": f"{focus['expected_shift_m']:.3g}" if "expected_shift_m" in focus else None,
     }
     return {

@@ -1,7 +1,7 @@
 """Rule `layers`: angles, mask, looks, noise, σ⁰ and mean power of a pair, as GeoTIFFs."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -101,11 +101,12 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
         powers, means = dict[str, GroundPower](), dict[str, Mapping[str, Any]]()
         if campaign.calibrated:
             mask = folder / product("mask", "write_mask").file
-            known = calibrated is not None
-            powers = {name: GroundPower(scene, image, calibrated, mask, name, known) for name in coefficients}
+            one = GroundPower(scene, image, calibrated, mask, is_known=calibrated is not None)
+            powers = {name: replace(one, quantity=name) for name in coefficients}
             means = {name: means_of(name) for name in coefficients}
             images = ((name, power.amplitude) for name, power in powers.items())
-            write("radiometry", {name: LazyLayer(scene.grid, np.complex64, of, threads) for name, of in images}, means)
+            rasters = {name: LazyLayer(scene.grid, np.complex64, of, threads) for name, of in images}
+            write("radiometry", rasters | (_area_ratios(one, threads) if "gamma0" in powers else {}), means)
             written.append(folder / CROSS_SECTIONS)
             report = _report(scene, image, calibrated, measured_noise) if calibrated else _no_constant(campaign, pair)
             write_json(written[-1], report | {"polarisation": label})
@@ -184,6 +185,20 @@ class GroundPower:
         """Return the complex pixels of a window scaled to this power, (row, column)."""
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(self.image.image[window].values / np.sqrt(self.per_one(window)), np.complex64)
+
+
+def _area_ratios(power: GroundPower, threads: int) -> dict[str, LazyLayer]:
+    """Return the ratios of the areas to which the coefficients are normalised (docs/theory/radiometry.md, eq. 6a)."""
+
+    def ratio(normalised_to: Quantity, window: Window) -> NDArray[np.float32]:
+        # The power of terrain with a coefficient of 1 is proportional to the area to which it is normalised.
+        areas = (replace(power, quantity=quantity).per_one(window) for quantity in ("gamma0", normalised_to))
+        return np.asarray(next(areas) / next(areas), np.float32)
+
+    others: dict[str, Quantity] = {"scattering_area": "beta0", "gamma_sigma_ratio": "sigma0"}
+    return {
+        name: LazyLayer(power.scene.grid, np.float32, partial(ratio, other), threads) for name, other in others.items()
+    }
 
 
 def _multilooked(

@@ -49,7 +49,8 @@ def view_report(scene: ViewedScene, began: np.datetime64, time_s: NDArray[np.flo
     dict
         `first_utc`, `last_utc`: times of the first and last pulse that illuminate the scene centre, or of the first and
         last pulse of the flight if none does. `heading_deg`, `look_deg`: heading and look direction of the midpoint
-        between the antennas, clockwise from grid north. `incidence_deg`: incidence angle of the transmitter, from the
+        between the antennas, clockwise from grid north. `look_vector_ecef`: unit vector of the look direction in ECEF;
+        None in a local frame. `incidence_deg`: incidence angle of the transmitter, from the
         vertical. `bistatic_angle_deg`. `range_m`: half the total path. `height_m`: height of the midpoint above the
         terrain. `speed_m_s`: mean speed of the midpoint. `side`: side of the heading on which the scene lies: right,
         left, or both if the track encircles the scene. `side_mirror_rad`: RMS phase between the echoes of the scene and
@@ -79,6 +80,7 @@ def view_report(scene: ViewedScene, began: np.datetime64, time_s: NDArray[np.flo
         "last_utc": str(times[1]),
         "heading_deg": _bearing_deg(flight_m @ east, flight_m @ north),
         "look_deg": _bearing_deg(look_m @ east, look_m @ north),
+        "look_vector_ecef": _unit(look_m) if scene.grid.frame == "ecef" else None,
         "speed_m_s": _speed_m_s(middle, time_s[counted]),
         "side": _side(middle, point, up),
         "side_mirror_rad": float(f"{mirror_rad:.4g}"),
@@ -117,6 +119,10 @@ def ground_axes(scene: ViewedScene, row: float, column: float) -> tuple[NDArray[
     point, east, north = scene.positions_at([row, row, row - 0.5], [column, column + 0.5, column])
     axes = np.stack([east - point, north - point])
     return point, axes / np.linalg.norm(axes, axis=1, keepdims=True)
+
+
+def _unit(vector: NDArray[np.float64]) -> list[float]:
+    return [round(float(part), 9) for part in vector / np.linalg.norm(vector)]
 
 
 def _speed_m_s(middle_m: NDArray[np.float64], time_s: NDArray[np.float64]) -> float | None:

@@ -15,6 +15,7 @@ from pystac.layout import CustomLayoutStrategy
 from apertura.common.attribution import Attribution
 from apertura.common.errors import CampaignError
 from apertura.common.raster import opened_raster
+from apertura.common.units import frequency_band
 from apertura.core.geometry.geodesy import longitude_range
 from apertura.formats.catalog import CATALOG
 
@@ -33,18 +34,6 @@ EXTENSIONS: Mapping[str, str] = {
     "view": f"{_BASE}/view/v1.1.0/schema.json",
 }
 """Prefix of the fields → URI of the schema, which is used only as an identifier and is not downloaded."""
-
-_BANDS_GHZ = {
-    "P": (0.25, 1.0),
-    "L": (1.0, 2.0),
-    "S": (2.0, 4.0),
-    "C": (4.0, 8.0),
-    "X": (8.0, 12.5),
-    "Ku": (12.5, 18.0),
-    "K": (18.0, 26.5),
-    "Ka": (26.5, 40.0),
-}
-"""Frequency bands of the SAR extension, which defines no bands below P and above Ka."""
 
 POLARISATIONS = frozenset({"HH", "HV", "VH", "VV", "LH", "LV", "RH", "RV"})
 """Polarisations of the SAR extension that a configured pair of antennas can have."""
@@ -78,10 +67,9 @@ class AcquisitionTime:
     @property
     def fields(self) -> dict[str, Any]:
         """Fields of the SAR extension; the frequency band is omitted if no letter is defined for it."""
-        ghz = self.centre_hz / 1e9
-        band = next((name for name, (low, high) in _BANDS_GHZ.items() if low <= ghz < high), None)
+        band = frequency_band(self.centre_hz)
         return {
-            "sar:center_frequency": round(ghz, 9),
+            "sar:center_frequency": round(self.centre_hz / 1e9, 9),
             "sar:bandwidth": round(self.bandwidth_hz / 1e9, 9),
             **({"sar:frequency_band": band} if band else {}),
             **({"apertura:clock": _NO_CLOCK} if self.start < _FIRST_CLOCK else {}),

@@ -247,6 +247,8 @@ def with_radiometry(band: Band, tags: Mapping[str, str]) -> tuple[Band, dict[str
     readable = {"APERTURA_QUANTITY": meaning, "APERTURA_UNIT": band.unit}
     if "one_is" in meanings:
         readable["APERTURA_REFERENCE"] = f"{'0 dB' if band.unit == 'dB' else '1'}: {meanings['one_is']}"
+        readable["APERTURA_SPECKLE_FILTER"] = meanings.get("speckle_filter", "none")
+        readable["APERTURA_NOISE_REMOVAL"] = "subtracted" if meanings.get("noise") == "subtracted" else "none"
     if "calibration_std_db" in meanings:
         readable["APERTURA_CALIBRATION_STD_DB"] = f"{meanings['calibration_std_db']:g}"
     return replace(band, meaning=meaning), {**tags, **readable, TAG: tag}
