@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.inputs import Profiles
+from apertura.core.geometry.geodesy import ned_axes
 from apertura.core.scene.angles import bistatic_angle_deg, incidence_deg
 from apertura.core.scene.grid import SceneGrid
 
@@ -66,7 +67,7 @@ def view_report(scene: ViewedScene, began: np.datetime64, time_s: NDArray[np.flo
     counted = np.flatnonzero(weight >= _COUNTS)
     counted = counted if counted.size else np.arange(len(profiles))
     # Closest approach: shortest total path. The carrier is the mean path gradient divided by the wavelength.
-    aperture, up = profiles.aperture[counted], np.cross(east, north)
+    aperture, up = profiles.aperture[counted], _vertical(scene.grid, point)
     path, middle = aperture.path(point), aperture.middle_m
     closest = int(path.argmin())
     tx, rx = (leg[closest] for leg in aperture.legs)
@@ -74,12 +75,15 @@ def view_report(scene: ViewedScene, began: np.datetime64, time_s: NDArray[np.flo
     times = began + (1e9 * time_s[counted[[0, -1]]]).round().astype("timedelta64[ns]")
     flight_m, look_m = middle[-1] - middle[0], point - middle[closest]
     incidence = float(incidence_deg(point, up, tx))
+    # Directions are measured in the horizontal plane; on slopes, the axes along the terrain are inclined.
+    level = np.stack([axis - (axis @ up) * up for axis in (east, north)])
+    level /= np.linalg.norm(level, axis=1, keepdims=True)
     mirror_rad = _mirror_rad(middle, up, incidence, profiles.wavelength_m)
     return {
         "first_utc": str(times[0]),
         "last_utc": str(times[1]),
-        "heading_deg": _bearing_deg(flight_m @ east, flight_m @ north),
-        "look_deg": _bearing_deg(look_m @ east, look_m @ north),
+        "heading_deg": _bearing_deg(*level @ flight_m),
+        "look_deg": _bearing_deg(*level @ look_m),
         "look_vector_ecef": _unit(look_m) if scene.grid.frame == "ecef" else None,
         "speed_m_s": _speed_m_s(middle, time_s[counted]),
         "side": _side(middle, point, up),
@@ -119,6 +123,11 @@ def ground_axes(scene: ViewedScene, row: float, column: float) -> tuple[NDArray[
     point, east, north = scene.positions_at([row, row, row - 0.5], [column, column + 0.5, column])
     axes = np.stack([east - point, north - point])
     return point, axes / np.linalg.norm(axes, axis=1, keepdims=True)
+
+
+def _vertical(grid: SceneGrid, point: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the upward unit vector at a point, in the frame of the grid."""
+    return -ned_axes(point)[..., 2] if grid.frame == "ecef" else np.array([0.0, 0.0, 1.0])
 
 
 def _unit(vector: NDArray[np.float64]) -> list[float]:
