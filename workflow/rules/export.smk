@@ -7,6 +7,8 @@ rule export:
         layers="results/{flight}/{pair}/layers.manifest.json",
     output:
         "results/{flight}/{pair}/image.json",
+        "results/{flight}/{pair}/ceos_ard.json",
+        "results/{flight}/{pair}/ceos_ard.html",
         "results/{flight}/{pair}/slc.tif",
         "results/{flight}/{pair}/power.tif",
         "results/{flight}/{pair}/power.qml",
@@ -72,6 +74,8 @@ rule export_fused:
         layers=each("results/{flight}/{pair}/layers.manifest.json"),
     output:
         "results/{flight}/fused/image.json",
+        "results/{flight}/fused/ceos_ard.json",
+        "results/{flight}/fused/ceos_ard.html",
         "results/{flight}/fused/coherent_slc.tif",
         "results/{flight}/fused/coherent_power.tif",
         "results/{flight}/fused/coherent_power.qml",

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from apertura.common.lazy import Lazy, module_of
+from apertura.formats.export import DOCUMENTS
 from apertura.workflow import rule_inputs as inputs
 from apertura.workflow.rule_inputs import Scope
 
@@ -453,7 +454,7 @@ _ROWS = (
         _STAGES.export.export,
         sources=("image", "assessment", "scene", "layers"),
         settings=("campaign", "metadata", inputs.polarisations),
-        documents=("image.json",),
+        documents=DOCUMENTS,
         exports="pair",
         demand=Demand(500, pixel_bytes=50, pixel_s=30),
         cost=Cost(0.4, mpx_s=0.3, last=True),
@@ -502,7 +503,7 @@ _ROWS = (
         result="fused",
         sources=("image", "assessment", "cube", "scene", "layers"),
         settings=("campaign", "metadata", inputs.polarisations, "processing.tile_px", inputs.multilook),
-        documents=("image.json",),
+        documents=DOCUMENTS,
         exports="fused",
         manifest="{flight}/fused/export",
         needed=inputs.adds_up,

@@ -196,6 +196,9 @@ _OPTIONAL = ("radiometry", "multilook", "multilook_fused")  # kinds whose files 
 PHASE_HISTORY = "phase_history.cphd"
 """Product with the transfer functions of a pair; written only if requested, because it is as large as the echo."""
 
+DOCUMENTS = ("image.json", "ceos_ard.json", "ceos_ard.html")
+"""Documents in the folder of an image: report, and CEOS-ARD sheet with its page."""
+
 COVERAGE = ("coverage.png", "coverage.geojson")
 """Plot and GeoJSON file of the coverage of the whole campaign."""
 
@@ -309,7 +312,7 @@ def product_files(images: Mapping[str, Sequence[str]], coefficients: Sequence[st
     for flight, folders in images.items():
         for folder in folders:
             files = [row.file for row in _written(folder, coefficients)]
-            yield from (f"{flight}/{folder}/{file}" for file in (*files, "image.json"))
+            yield from (f"{flight}/{folder}/{file}" for file in (*files, *DOCUMENTS))
     yield from mosaic_files(images, coefficients)
     yield MAP
 
