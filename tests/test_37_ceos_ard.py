@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from rasterio import Affine
 
+from apertura.common.confined import ConfinedPath
 from apertura.formats.catalog.ceos_ard import (
     PAGE,
     REQUIREMENTS,
@@ -58,10 +59,9 @@ REPORT = {
 
 def folder_of(parent, crs="EPSG:32632", without=(), west_m=500000.0):
     """Write the files of a calibrated image with a DEM, except the files and tags in `without`."""
-    folder = parent / "results/f01/a-a"
-    folder.mkdir(parents=True)
-    (folder / "echo.zarr").mkdir()
-    (folder / "../../terrain.zarr").mkdir()
+    (parent / "results/f01/a-a/echo.zarr").mkdir(parents=True)
+    (parent / "results/terrain.zarr").mkdir()
+    folder = ConfinedPath.at(parent).named("results/f01/a-a", where=parent)
     gamma0 = json.dumps(of_coefficient("gamma0", std_db=0.5, polarisation="VV"))
     noise = json.dumps(of_coefficient("sigma0", std_db=0.5, noise="alone"))
     tags = {name: value for name, value in TAGS.items() if name not in without}

@@ -14,8 +14,9 @@ from pyproj import Transformer
 from apertura.campaign.folder import Campaign
 from apertura.common.attribution import Attribution
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.scene.grid import SceneGrid
 from apertura.stages import export, layers
-from apertura.stages.image_tags import acquisition_tags
+from apertura.stages.image_tags import acdd_attributes, acquisition_tags
 
 CREATOR = {"name": "A. Nother", "orcid": "0000-0002-1825-0097", "affiliation": "An Institute"}
 STATED = {
@@ -151,8 +152,31 @@ def tags_for(views, **stated):
 VIEW = {
     "first_utc": "2025-05-14T09:30:00.000000000", "last_utc": "2025-05-14T09:30:20.000000000", "heading_deg": 0.0,
     "look_deg": 90.0, "range_m": 50.0, "height_m": 30.0, "incidence_deg": 53.0, "bistatic_angle_deg": 0.0,
-    "side": "right", "side_observable": False, "centre_hz": 9.6e9, "band_hz": 6e8,
+    "look_vector_ecef": None, "side": "right", "side_observable": False, "centre_hz": 9.6e9, "band_hz": 6e8,
 }  # fmt: skip
+
+
+def test_cube_states_the_configured_attribution():
+    settings = SimpleNamespace(campaign="c", metadata=Attribution(**STATED))
+    grid = SceneGrid("local", 0.0, 4.0, 1.0, (4, 6))
+    attributes = acdd_attributes(SimpleNamespace(settings=settings), [VIEW], grid)
+    assert (
+        attributes.items()
+        >= {
+            "title": "Harbour in May",
+            "creator_name": "A. Nother, B. Other",
+            "creator_url": "https://orcid.org/0000-0002-1825-0097",
+            "creator_institution": "An Institute",
+            "institution": "An Institute",
+            "license": "CC-BY-4.0",
+            "platform": "hexacopter",
+            "instrument": "L-band radar",
+            "id": "10.5281/zenodo.1",
+            "references": WHO["APERTURA_CITATION"],
+            "time_coverage_duration": "PT20.000000S",
+        }.items()
+    )
+    assert not [name for name in attributes if name.startswith("geospatial")]  # a local frame has no position
 
 
 def test_recording_without_a_clock_has_no_time_of_day():

@@ -490,7 +490,7 @@ _ROWS = (
         "Stack all images and compute sums and interferometric phases, cube.zarr.",
         _STAGES.cube.cube,
         sources=("image", "assessment", "scene"),
-        settings=("campaign", "processing.tile_px"),
+        settings=("campaign", "metadata", "processing.tile_px"),
         demand=Demand(500, pixel_bytes=50, pixel_s=10, threads=2),
         cost=Cost(0.3, mpx_s=0.65),
         options=("threads",),

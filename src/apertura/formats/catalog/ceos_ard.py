@@ -475,7 +475,7 @@ REQUIREMENTS: Sequence[Requirement] = (
         "Per-pixel DEM",
         _PIXELS,
         goal=_when(
-            lambda files: files.has_dem and files.has("../../terrain.zarr"),
+            lambda files: files.has_dem and (files.folder.parent.parent / "terrain.zarr").exists(),
             "results/terrain.zarr: height of every pixel, on the same grid",
             _NO_DEM,
         ),
