@@ -106,7 +106,7 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
             means = {name: means_of(name) for name in coefficients}
             images = ((name, power.amplitude) for name, power in powers.items())
             rasters = {name: LazyLayer(scene.grid, np.complex64, of, threads) for name, of in images}
-            write("radiometry", rasters | (_area_ratios(one, threads) if "gamma0" in powers else {}), means)
+            write("radiometry", rasters | (area_ratios(one, threads) if "gamma0" in powers else {}), means)
             written.append(folder / CROSS_SECTIONS)
             report = _report(scene, image, calibrated, measured_noise) if calibrated else _no_constant(campaign, pair)
             write_json(written[-1], report | {"polarisation": label})
@@ -187,8 +187,21 @@ class GroundPower:
             return np.asarray(self.image.image[window].values / np.sqrt(self.per_one(window)), np.complex64)
 
 
-def _area_ratios(power: GroundPower, threads: int) -> dict[str, LazyLayer]:
-    """Return the ratios of the areas to which the coefficients are normalised (docs/theory/radiometry.md, eq. 6a)."""
+def area_ratios(power: GroundPower, threads: int) -> dict[str, LazyLayer]:
+    """Return the ratios of the areas to which the coefficients are normalised.
+
+    Parameters
+    ----------
+    power
+        Power of a coefficient, of which only scene, calibration and mask are used.
+    threads
+        Number of tiles processed in parallel.
+
+    Returns
+    -------
+    dict
+        `scattering_area`, β⁰/γ⁰, and `gamma_sigma_ratio`, σ⁰/γ⁰ (docs/theory/radiometry.md, eq. 6a).
+    """
 
     def ratio(normalised_to: Quantity, window: Window) -> NDArray[np.float32]:
         # The power of terrain with a coefficient of 1 is proportional to the area to which it is normalised.
