@@ -1,6 +1,7 @@
 """CEOS-ARD sheet: the rows are those of the specifications, and a requirement is met only if its item is present."""
 
 import json
+import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -57,32 +58,46 @@ REPORT = {
 }
 
 
-def folder_of(parent, crs="EPSG:32632", without=(), west_m=500000.0):
-    """Write the files of a calibrated image with a DEM, except the files and tags in `without`."""
-    (parent / "results/f01/a-a/echo.zarr").mkdir(parents=True)
-    (parent / "results/terrain.zarr").mkdir()
-    folder = ConfinedPath.at(parent).named("results/f01/a-a", where=parent)
-    gamma0 = json.dumps(of_coefficient("gamma0", std_db=0.5, polarisation="VV"))
-    noise = json.dumps(of_coefficient("sigma0", std_db=0.5, noise="alone"))
-    tags = {name: value for name, value in TAGS.items() if name not in without}
-    image, real = np.ones((4, 6), np.complex64), np.ones((4, 6), np.float32)
+GRID = {"transform": Affine(0.5, 0, 500000.0, 0, -0.5, 100), "crs": "EPSG:32632"}
+IMAGE, REAL = np.ones((4, 6), np.complex64), np.ones((4, 6), np.float32)
+
+
+@pytest.fixture(scope="module")
+def complete(tmp_path_factory):
+    """Write the files of a calibrated image with a DEM."""
+    folder = tmp_path_factory.mktemp("complete")
+    gamma0 = {TAG: json.dumps(of_coefficient("gamma0", std_db=0.5, polarisation="VV"))}
+    noise = {TAG: json.dumps(of_coefficient("sigma0", std_db=0.5, noise="alone"))}
     for name, write, pixels, radiometry in (
-        ("db.tif", write_db, image, json.dumps({"one_is": "an echo"})),
-        ("slc.tif", write_slc, image, "{}"),
-        ("mask.tif", write_mask, real.astype(np.uint8), None),
-        ("incidence.tif", write_incidence, real, None),
-        ("nesz.tif", write_nesz, real, noise),
-        ("gamma0_power.tif", write_power, image, gamma0),
-        ("gamma0_slc.tif", write_slc, image, gamma0),
-        ("scattering_area.tif", write_incidence, real, None),
-        ("gamma_sigma_ratio.tif", write_incidence, real, None),
-        ("multilook_gamma0_power.tif", write_incidence, real, None),
+        ("slc.tif", write_slc, IMAGE, {}),
+        ("mask.tif", write_mask, REAL.astype(np.uint8), {}),
+        ("incidence.tif", write_incidence, REAL, {}),
+        ("nesz.tif", write_nesz, REAL, noise),
+        ("gamma0_power.tif", write_power, IMAGE, gamma0),
+        ("gamma0_slc.tif", write_slc, IMAGE, gamma0),
+        ("scattering_area.tif", write_incidence, REAL, {}),
+        ("gamma_sigma_ratio.tif", write_incidence, REAL, {}),
+        ("multilook_gamma0_power.tif", write_incidence, REAL, {}),
     ):
-        if name not in without:
-            meaning = {} if radiometry is None else {TAG: radiometry}
-            transform = Affine(0.5, 0, west_m, 0, -0.5, 100)
-            write(folder / name, pixels, transform=transform, crs=crs, tags=tags | meaning)
+        write(folder / name, pixels, tags=radiometry, **GRID)
+    (folder / "echo.zarr").mkdir()
     return folder
+
+
+@pytest.fixture
+def folder_of(complete, tmp_path):
+    """Return a function that copies the files, except the files and tags in `without`, with another georeference."""
+
+    def copied(*without, **georeference):
+        (tmp_path / "results/terrain.zarr").mkdir(parents=True, exist_ok=True)
+        folder = ConfinedPath.at(tmp_path).named(f"results/f01/{len([*tmp_path.glob('results/*/*')])}", where=tmp_path)
+        shutil.copytree(complete, str(folder), ignore=shutil.ignore_patterns(*without))
+        tags = {name: value for name, value in TAGS.items() if name not in without}
+        tags |= {TAG: json.dumps({"one_is": "an echo"})}
+        write_db(folder / "db.tif", IMAGE, tags=tags, **(GRID | georeference))
+        return folder
+
+    return copied
 
 
 def statuses(folder, report=REPORT):
@@ -134,38 +149,37 @@ MISSING = {
 
 
 @pytest.mark.parametrize("item", MISSING)
-def test_requirement_is_met_only_with_its_item(tmp_path, item):
+def test_requirement_is_met_only_with_its_item(folder_of, item):
     """Removing one file or tag changes exactly its requirements from met to not met."""
-    complete, incomplete = (
-        statuses(folder_of(tmp_path / name, without=without)) for name, without in (("a", ()), ("b", (item,)))
-    )
+    complete, incomplete = statuses(folder_of()), statuses(folder_of(item))
     changed = {key for key, status in incomplete.items() if status != complete[key]}
     assert {(name, level) for name, _, level in changed} == MISSING[item]
     assert {complete[key] for key in changed} == {"met"}
     assert {incomplete[key] for key in changed} == {"not met"}
 
 
-def test_flat_terrain_is_not_terrain_flattened(tmp_path):
-    flat = statuses(folder_of(tmp_path), REPORT | {"terrain": None})
+def test_flat_terrain_is_not_terrain_flattened(folder_of):
+    flat = statuses(folder_of(), REPORT | {"terrain": None})
     for name in ("backsca-nrb", "radtalg-appl", "cdem"):
         assert flat[name, "NRB", "threshold"] == "not met"
     assert flat["ploinca", "NRB", "threshold"] == "not met"  # the specification requires a DEM-based angle
     assert flat["pelinca", "GSLC", "threshold"] == "met"  # over level terrain, the same raster is the other angle
 
 
-def test_local_frame_has_no_crs_and_no_extent(tmp_path):
-    local = statuses(folder_of(tmp_path, crs='LOCAL_CS["yard",UNIT["metre",1]]', without=["APERTURA_LOOK_VECTOR_ECEF"]))
+def test_local_frame_has_no_crs_and_no_extent(folder_of):
+    local = statuses(folder_of(crs='LOCAL_CS["yard",UNIT["metre",1]]'))
     for name in ("crs-sar", "geoarea-sar", "gridconv"):
         assert local[name, "NRB", "threshold"] == "not met"
 
 
-def test_grid_off_the_pixel_size_is_reported(tmp_path):
-    assert statuses(folder_of(tmp_path / "a"))["gridconv", "NRB", "threshold"] == "met"
-    assert statuses(folder_of(tmp_path / "b", west_m=500000.2))["gridconv", "NRB", "threshold"] == "not met"
+def test_grid_off_the_pixel_size_is_reported(folder_of):
+    assert statuses(folder_of())["gridconv", "NRB", "threshold"] == "met"
+    shifted = folder_of(transform=Affine(0.5, 0, 500000.2, 0, -0.5, 100))
+    assert statuses(shifted)["gridconv", "NRB", "threshold"] == "not met"
 
 
-def test_predicted_accuracy_is_not_counted_as_measured(tmp_path):
-    sheet = ceos_ard_sheet(ImageFiles(folder_of(tmp_path), REPORT), "an image")
+def test_predicted_accuracy_is_not_counted_as_measured(folder_of):
+    sheet = ceos_ard_sheet(ImageFiles(folder_of(), REPORT), "an image")
     (row,) = (row for row in sheet["requirements"] if row["id"] == "geomacc-sar")
     assert row["threshold"]["status"] == "not met"
     assert row["threshold"]["evidence"].startswith("0.5 m is predicted by the error budget")
@@ -187,8 +201,8 @@ class _Cells(HTMLParser):
             self.cells[-1] += data
 
 
-def test_page_shows_every_finding_and_escapes_names(tmp_path):
-    sheet = ceos_ard_sheet(ImageFiles(folder_of(tmp_path), REPORT), "<script>a</script>")
+def test_page_shows_every_finding_and_escapes_names(folder_of):
+    sheet = ceos_ard_sheet(ImageFiles(folder_of(), REPORT), "<script>a</script>")
     page = ceos_ard_page(sheet)
     assert "<script>" not in page
     parser = _Cells()

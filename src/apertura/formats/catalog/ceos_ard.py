@@ -116,14 +116,14 @@ _CONFIGURED_BY = {
 """Tag → config key or property of the recording that provides the tag."""
 
 
-def _tags(*names: str, note: str = "") -> Assessment:
+def _tags(*names: str) -> Assessment:
     """Met if the rasters of the image have all these tags."""
 
     def assess(files: ImageFiles) -> Finding:
         missing = [name for name in names if name not in files.main.tags]
         if missing:
             return Finding("not met", f"requires {'; '.join(_CONFIGURED_BY.get(name, name) for name in missing)}")
-        return Finding("met", f"tags {', '.join(names)}{note}")
+        return Finding("met", f"tags {', '.join(names)}")
 
     return assess
 
@@ -141,14 +141,20 @@ def _inapplicable(reason: str) -> Assessment:
     return lambda _: Finding("not applicable", reason)
 
 
-_NO_ORBIT = "a UAV has no orbit"
-_NO_IONOSPHERE = "the paths lie below the ionosphere"
 _GAMMA0 = "requires a calibrated pair and gamma0 in processing.radiometry"
 _NO_DEM = "flat terrain is configured (scene.height_m): requires scene.dem"
 
 
-def _is_absolute_noise(files: ImageFiles) -> bool:
-    return "nesz.tif" in files.rasters and "APERTURA_REFERENCE" in files.rasters["nesz.tif"].tags
+def _with_dem(name: str, content: str, missing: str = "") -> Assessment:
+    """Met if a raster exists that is computed from a DEM; `missing`: what the raster requires besides the DEM."""
+    condition, otherwise = lambda files: name in files.rasters and files.has_dem, f"{missing}{_NO_DEM}"
+    return _when(condition, f"{name}: {content}", otherwise)
+
+
+def _brightest(key: str, content: str) -> Assessment:
+    """Met if a property of the brightest point was measured."""
+    met = f"image.json, brightest: {content}"
+    return _when(lambda files: (files.report.get("brightest") or {}).get(key) is not None, met, "no isolated point")
 
 
 def _gamma0(name: str) -> Assessment:
@@ -217,14 +223,6 @@ def _looks(files: ImageFiles) -> Finding:
     return Finding("met", f"{averaged}: tag APERTURA_RADIOMETRY, equivalent_looks")
 
 
-def _has_sidelobes(files: ImageFiles) -> bool:
-    return (files.report.get("brightest") or {}).get("cross_range_pslr_db") is not None
-
-
-def _has_widths(files: ImageFiles) -> bool:
-    return (files.report.get("brightest") or {}).get("ground_range_width_m") is not None
-
-
 # ---- Table of requirements ------------------------------------------------------------------------------------------
 
 
@@ -233,372 +231,169 @@ class Requirement(NamedTuple):
 
     id: str
     title: str
-    category: str
-    threshold: Assessment | None = None
-    goal: Assessment | None = None
+    threshold: Assessment | None
+    goal: Assessment | None
     types: tuple[str, ...] = ("NRB", "GSLC")
+    category: str = ""
 
 
+def _section(category: str, *rows: Requirement) -> tuple[Requirement, ...]:
+    return tuple(row._replace(category=category) for row in rows)
+
+
+_R = Requirement
+_NRB, _GSLC = ("NRB",), ("GSLC",)
 _TIME = _tags("APERTURA_ACQUISITION_START", "APERTURA_ACQUISITION_END", "APERTURA_FLIGHTS")
-_GENERAL, _SOURCES, _PRODUCT = "general metadata", "source metadata", "product metadata"
-_PIXELS, _MEASURES, _GEOMETRY = "per-pixel metadata", "radiometrically corrected measurements", "geometric corrections"
+_RADAR = _tags(*(f"APERTURA_{name}" for name in ("FREQUENCY_BAND", "CENTRE_FREQUENCY_HZ", "MODE", "POLARISATION")))
+_THIS_SHEET = _when(lambda _: True, "this sheet: specifications", "")
 _READABLE = _when(lambda files: bool(files.rasters), "GeoTIFF tags, image.json, STAC item, this sheet", "no GeoTIFF")
+_STANDARD = _never("GeoTIFF tags follow no standard; the STAC item and the cube (CF, ACDD) of the campaign repeat them")
+_NOT_RETRIEVABLE = _never("no location from which a program can retrieve the files is stated")
+_NO_SOURCE_PRODUCT = _inapplicable("the sources are recordings, not processed products; APERTURA_INPUTS: their hashes")
+_NO_SLANT_RANGE = _inapplicable("the image is formed on the map grid; no image in slant range exists")
+_UNDER_IONOSPHERE = _inapplicable("the paths lie below the ionosphere")
+_NO_REFERENCE_ORBIT = _inapplicable("a UAV has no orbit, and no reference orbit is used")
+_CENTRE_ONLY = _never("stated at the scene centre only")
+_NO_DEM_RESOLUTION = _never("the resolution of the DEM is not compared with that of the image")
+_HEADING = _when(
+    lambda files: "APERTURA_HEADING_DEG" in files.main.tags and "positions" in files.report,
+    "tag APERTURA_HEADING_DEG in place of the pass direction; image.json, positions: source of the track",
+    "no heading or no source of the track is stated for this image",
+)
+_TRACK = _when(
+    lambda files: files.has("echo.zarr") and "APERTURA_HEADING_DEG" in files.main.tags,
+    "echo.zarr: phase centres of every pulse; tags APERTURA_HEADING_DEG and APERTURA_HEIGHT_ABOVE_TERRAIN_M",
+    "the phase centres of the pulses are not in the folder of this image",
+)
+_CALIBRATED = _when(
+    lambda files: (files.report.get("cross_sections") or {}).get("constant_db") is not None,
+    "radiometry.json: calibration constant and link budget",
+    "the pair is not calibrated",
+)
+_NOISE = _when(
+    lambda files: "APERTURA_REFERENCE" in files.rasters["nesz.tif"].tags if "nesz.tif" in files.rasters else False,
+    "nesz.tif: noise-equivalent σ⁰",
+    "nesz.tif is relative, or missing: the pair is not calibrated",
+)
+_SIDELOBES = _brightest("cross_range_pslr_db", "PSLR and ISLR")
+_WIDTHS = _brightest("ground_range_width_m", "−3 dB widths")
+_DEM = _when(lambda files: files.has_dem, "image.json, terrain: DEM, geoid and datum; one DEM for all steps", _NO_DEM)
+_CRS = _when(lambda files: files.main.is_georeferenced, "GeoTIFF: CRS", "local frame (scene.crs: local)")
+_MASK = _when(lambda files: "mask.tif" in files.rasters, "mask.tif: 0 valid, 255 no data", "no mask.tif in this folder")
+_SHADOW = _with_dem("mask.tif", "bit 1 shadow, bit 2 layover")
+_LOCAL_ANGLE = _with_dem("incidence.tif", "from the normal of each facet")
+_LEVEL_ANGLE = _when(
+    lambda files: "incidence.tif" in files.rasters and not files.has_dem,
+    "incidence.tif: angle from the normal of level terrain",
+    "with a DEM, incidence.tif contains the local angle only",
+)
+_HEIGHTS = _when(
+    lambda files: files.has_dem and (files.folder.parent.parent / "terrain.zarr").exists(),
+    "results/terrain.zarr: height of every pixel, on the same grid",
+    _NO_DEM,
+)
+_GRID = _when(
+    lambda files: files.main.is_georeferenced and _is_snapped(files),
+    "GeoTIFF: the corner is a multiple of the pixel size, the same for all images of the campaign",
+    "the corner is not a multiple of the pixel size, or the frame is local: see scene.bounds_m",
+)
 
 REQUIREMENTS: Sequence[Requirement] = (
-    Requirement(
-        "trace-sar",
-        "Traceability",
-        _GENERAL,
-        goal=_never("no document with a DOI relates the values to SI standards"),
+    *_section(
+        "general metadata",
+        _R("trace-sar", "Traceability", None, _never("no document with a DOI relates the values to SI standards")),
+        _R("memare-sar", "Metadata machine readability", _READABLE, _STANDARD),
+        _R("protype", "Product type", _THIS_SHEET, None),
+        _R("pfsurl", "Document identifier", _THIS_SHEET, None),
+        _R("time-sar", "Data collection time", _TIME, _TIME),
     ),
-    Requirement(
-        "memare-sar",
-        "Metadata machine readability",
-        _GENERAL,
-        _READABLE,
-        _never("GeoTIFF tags follow no standard; the STAC item and the cube (CF, ACDD) of the campaign repeat them"),
-    ),
-    Requirement("protype", "Product type", _GENERAL, _when(lambda _: True, "this sheet: specifications", "")),
-    Requirement("pfsurl", "Document identifier", _GENERAL, _when(lambda _: True, "this sheet: specifications", "")),
-    Requirement("time-sar", "Data collection time", _GENERAL, _TIME, _TIME),
-    Requirement("macqid", "Acquisition ID", _SOURCES, _tags("APERTURA_FLIGHTS", "APERTURA_PAIRS")),
-    Requirement(
-        "daccess-src",
-        "Source data access",
-        _SOURCES,
-        _tags("APERTURA_DOI", "APERTURA_INPUTS", note=" (hashes of the recordings)"),
-        _never("no location from which a program can retrieve the recordings is stated"),
-    ),
-    Requirement(
-        "instru-sar",
-        "Instrument",
-        _SOURCES,
-        _tags("APERTURA_PLATFORM", "APERTURA_INSTRUMENT"),
-        _inapplicable("the CEOS database lists instruments of satellites"),
-    ),
-    Requirement("time-src", "Source data acquisition time", _SOURCES, _tags("APERTURA_ACQUISITION_START")),
-    Requirement(
-        "acqpar",
-        "Source data acquisition parameters",
-        _SOURCES,
-        _tags(
-            "APERTURA_FREQUENCY_BAND",
-            "APERTURA_CENTRE_FREQUENCY_HZ",
-            "APERTURA_MODE",
-            "APERTURA_POLARISATION",
-            "APERTURA_LOOK_SIDE",
-            note="; a single beam without identifier",
+    *_section(
+        "source metadata",
+        _R("macqid", "Acquisition ID", _tags("APERTURA_FLIGHTS", "APERTURA_PAIRS"), None),
+        _R("daccess-src", "Source data access", _tags("APERTURA_DOI", "APERTURA_INPUTS"), _NOT_RETRIEVABLE),
+        _R(
+            "instru-sar",
+            "Instrument",
+            _tags("APERTURA_PLATFORM", "APERTURA_INSTRUMENT"),
+            _inapplicable("the CEOS database lists instruments of satellites"),
         ),
+        _R("time-src", "Source data acquisition time", _tags("APERTURA_ACQUISITION_START"), None),
+        _R("acqpar", "Source data acquisition parameters", _RADAR, None),
+        _R("orbit", "Source data orbit information", _HEADING, _TRACK, _NRB),
+        _R("orbit-gslc", "Source data orbit information", _HEADING, _TRACK, _GSLC),
+        _R("propar", "Source data processing parameters", _NO_SOURCE_PRODUCT, _NO_SOURCE_PRODUCT),
+        _R("imgatt-sar", "Source data image attributes", _NO_SLANT_RANGE, _tags("APERTURA_OUTLINE_WGS84")),
+        _R("sencal-sar", "Sensor calibration", None, _CALIBRATED),
+        _R("perfind", "Performance indicators", _NOISE, _SIDELOBES),
+        _R("polcalm", "Polarimetric calibration matrices", None, _inapplicable("a pair has a single polarisation")),
+        _R("farotan", "Mean Faraday rotation angle", None, _UNDER_IONOSPHERE),
+        _R("ionind", "Ionosphere indicator", None, _UNDER_IONOSPHERE),
     ),
-    *(
-        Requirement(
-            name,
-            "Source data orbit information",
-            _SOURCES,
-            _when(
-                lambda files: "APERTURA_HEADING_DEG" in files.main.tags and "positions" in files.report,
-                "tag APERTURA_HEADING_DEG in place of the pass direction; image.json, positions: source of the track",
-                "no heading or no source of the track is stated for this image",
-            ),
-            _when(
-                lambda files: files.has("echo.zarr") and "APERTURA_HEADING_DEG" in files.main.tags,
-                "echo.zarr: phase centres of every pulse; tags APERTURA_HEADING_DEG, APERTURA_HEIGHT_ABOVE_TERRAIN_M; "
-                "orbit numbers do not exist",
-                "the phase centres of the pulses are not in the folder of this image",
-            ),
-            types=(kind,),
-        )
-        for kind, name in (("NRB", "orbit"), ("GSLC", "orbit-gslc"))
+    *_section(
+        "product metadata",
+        _R("daccess-prod", "Product data access", _product_access, _NOT_RETRIEVABLE),
+        _R("auxdat-sar", "Auxiliary data", None, _DEM),
+        _R("samspa", "Product sample spacing", _when(lambda _: True, "GeoTIFF: pixel size", ""), None),
+        _R("enl", "Product equivalent number of looks", None, _looks, _NRB),
+        _R("resol", "Product resolution", None, _WIDTHS),
+        _R("spekfil", "Product filtering", _tags("APERTURA_SPECKLE_FILTER"), None, _NRB),
+        _R("geobbox", "Product bounding box", _when(lambda _: True, "GeoTIFF: bounds", ""), None),
+        _R("geoarea-sar", "Product geographical extent", _tags("APERTURA_OUTLINE_WGS84"), None),
+        _R("imgsize", "Product image size", _when(lambda _: True, "GeoTIFF: width and height", ""), None),
+        _R("pixcoco", "Product pixel coordinate convention", _tags("AREA_OR_POINT"), None),
+        _R("crs-sar", "Product coordinate reference system", _CRS, None),
+        _R("reorbit-nrb-pol", "Reference orbit", None, _NO_REFERENCE_ORBIT, _NRB),
+        _R("rulvec", "Radar unit look vector", _tags("APERTURA_LOOK_VECTOR_ECEF"), None, _GSLC),
+        _R("slarass", "Slant range sensor to surface", _tags("APERTURA_RANGE_M"), None, _GSLC),
+        _R("reorbit-gslc", "Reference orbit", None, _NO_REFERENCE_ORBIT, _GSLC),
+        _R("catpha", "Atmospheric phase correction", _atmosphere, None, _GSLC),
+        _R("ionpha", "Ionospheric phase correction", _UNDER_IONOSPHERE, None, _GSLC),
     ),
-    Requirement(
-        "propar",
-        "Source data processing parameters",
-        _SOURCES,
-        _inapplicable("the sources are recordings, not processed products; tag APERTURA_INPUTS lists their hashes"),
-        _inapplicable("the sources are recordings, not processed products"),
+    *_section(
+        "per-pixel metadata",
+        _R("memare-sar", "Metadata machine readability", _READABLE, _STANDARD),
+        _R("damaski", "Data mask image", _MASK, _SHADOW),
+        _R("piscata", "Scattering area image", None, _with_dem("scattering_area.tif", "β⁰/γ⁰", f"{_GAMMA0}; ")),
+        _R("ploinca", "Local incident angle image", _LOCAL_ANGLE, None, _NRB),
+        _R("ploinca", "Local incident angle image", None, _LOCAL_ANGLE, _GSLC),
+        _R("pelinca", "Ellipsoidal incident angle image", None, _LEVEL_ANGLE, _NRB),
+        _R("pelinca", "Ellipsoidal incident angle image", _LEVEL_ANGLE, None, _GSLC),
+        _R("pinopow", "Noise power image", None, _NOISE),
+        _R("gasiri", "Gamma-to-sigma ratio image", None, _with_dem("gamma_sigma_ratio.tif", "σ⁰/γ⁰", f"{_GAMMA0}; ")),
+        _R("pacqidm", "Acquisition ID image", _inapplicable("the image is not a mosaic of flights"), None),
+        _R("pidem", "Per-pixel DEM", None, _HEIGHTS),
+        _R("radulov-gslc", "Radar unit look vector grid image", None, _CENTRE_ONLY, _GSLC),
+        _R("slarassi-gslc", "Slant range sensor to surface image", None, _CENTRE_ONLY, _GSLC),
+        _R("pinphun", "InSAR phase uncertainty image", None, _never("interferograms have height_std.tif"), _GSLC),
+        _R("atphaci", "Atmospheric phase correction image", None, _never("applied to each path, not written"), _GSLC),
+        _R("piopha", "Ionospheric phase correction image", None, _UNDER_IONOSPHERE, _GSLC),
     ),
-    Requirement(
-        "imgatt-sar",
-        "Source data image attributes",
-        _SOURCES,
-        _inapplicable("the image is formed on the map grid; no image in slant range exists"),
-        _tags("APERTURA_OUTLINE_WGS84"),
-    ),
-    Requirement(
-        "sencal-sar",
-        "Sensor calibration",
-        _SOURCES,
-        goal=_when(
-            lambda files: (files.report.get("cross_sections") or {}).get("constant_db") is not None,
-            "radiometry.json: calibration constant and link budget",
-            "the pair is not calibrated",
+    *_section(
+        "radiometrically corrected measurements",
+        _R("backsca-nrb", "Backscatter measurements", _gamma0("gamma0_power.tif"), None, _NRB),
+        _R("backsca-gslc", "Backscatter measurements", _backscatter_gslc, _gamma0("gamma0_slc.tif"), _GSLC),
+        _R(
+            "scaconv",
+            "Scaling conversion",
+            _tags("APERTURA_QUANTITY", "APERTURA_UNIT", "APERTURA_REFERENCE"),
+            _when(lambda files: files.main.dtype == "float32", "GeoTIFF: float32", "the raster is not float32"),
         ),
+        _R("noiser", "Noise removal", _tags("APERTURA_NOISE_REMOVAL"), None),
+        _R("radtalg-appl", "Radiometric terrain correction algorithm", _gamma0("gamma0_power.tif"), None, _NRB),
+        _R("radtalg-min", "Radiometric terrain correction algorithm", None, _NO_DEM_RESOLUTION, _GSLC),
+        _R("radacc-sar", "Radiometric accuracy", None, _never("no document with a DOI; see radiometry.json, std_db")),
+        _R("flapha", "Flattened phase", None, _inapplicable("slc.tif contains amplitude and phase"), _NRB),
     ),
-    Requirement(
-        "perfind",
-        "Performance indicators",
-        _SOURCES,
-        _when(_is_absolute_noise, "nesz.tif: noise-equivalent σ⁰", "nesz.tif is relative, or missing: not calibrated"),
-        _when(_has_sidelobes, "image.json, brightest: PSLR and ISLR", "no sidelobes were measured"),
-    ),
-    Requirement(
-        "polcalm",
-        "Polarimetric calibration matrices",
-        _SOURCES,
-        goal=_inapplicable("a pair has a single polarisation"),
-    ),
-    Requirement("farotan", "Mean Faraday rotation angle", _SOURCES, goal=_inapplicable(_NO_IONOSPHERE)),
-    Requirement("ionind", "Ionosphere indicator", _SOURCES, goal=_inapplicable(_NO_IONOSPHERE)),
-    Requirement(
-        "daccess-prod",
-        "Product data access",
-        _PRODUCT,
-        _product_access,
-        _never("no location from which a program can retrieve the product is stated"),
-    ),
-    Requirement(
-        "auxdat-sar",
-        "Auxiliary data",
-        _PRODUCT,
-        goal=_when(
-            lambda files: files.has_dem,
-            "image.json, terrain: DEM, geoid and datum; tag APERTURA_INPUTS: their hashes",
-            "no auxiliary data: flat terrain",
-        ),
-    ),
-    Requirement("samspa", "Product sample spacing", _PRODUCT, _when(lambda _: True, "GeoTIFF: pixel size", "")),
-    Requirement("enl", "Product equivalent number of looks", _PRODUCT, goal=_looks, types=("NRB",)),
-    Requirement(
-        "resol",
-        "Product resolution",
-        _PRODUCT,
-        goal=_when(_has_widths, "image.json, brightest: −3 dB widths", "no isolated bright point was measured"),
-    ),
-    Requirement("spekfil", "Product filtering", _PRODUCT, _tags("APERTURA_SPECKLE_FILTER"), types=("NRB",)),
-    Requirement("geobbox", "Product bounding box", _PRODUCT, _when(lambda _: True, "GeoTIFF: bounds", "")),
-    Requirement("geoarea-sar", "Product geographical extent", _PRODUCT, _tags("APERTURA_OUTLINE_WGS84")),
-    Requirement("imgsize", "Product image size", _PRODUCT, _when(lambda _: True, "GeoTIFF: width and height", "")),
-    Requirement("pixcoco", "Product pixel coordinate convention", _PRODUCT, _tags("AREA_OR_POINT")),
-    Requirement(
-        "crs-sar",
-        "Product coordinate reference system",
-        _PRODUCT,
-        _when(
-            lambda files: files.main.is_georeferenced,
-            "GeoTIFF: CRS",
-            "local frame (scene.crs: local), not georeferenced",
-        ),
-    ),
-    Requirement(
-        "reorbit-nrb-pol",
-        "Reference orbit",
-        _PRODUCT,
-        goal=_inapplicable("no flattened phase layer is provided"),
-        types=("NRB",),
-    ),
-    Requirement("rulvec", "Radar unit look vector", _PRODUCT, _tags("APERTURA_LOOK_VECTOR_ECEF"), types=("GSLC",)),
-    Requirement("slarass", "Slant range sensor to surface", _PRODUCT, _tags("APERTURA_RANGE_M"), types=("GSLC",)),
-    Requirement("reorbit-gslc", "Reference orbit", _PRODUCT, goal=_inapplicable(_NO_ORBIT), types=("GSLC",)),
-    Requirement("catpha", "Atmospheric phase correction", _PRODUCT, _atmosphere, types=("GSLC",)),
-    Requirement("ionpha", "Ionospheric phase correction", _PRODUCT, _inapplicable(_NO_IONOSPHERE), types=("GSLC",)),
-    Requirement("memare-sar", "Metadata machine readability", _PIXELS, _READABLE, _never("see general metadata")),
-    Requirement(
-        "damaski",
-        "Data mask image",
-        _PIXELS,
-        _when(
-            lambda files: "mask.tif" in files.rasters, "mask.tif: 0 valid, 255 no data", "no mask.tif in this folder"
-        ),
-        _when(
-            lambda files: "mask.tif" in files.rasters and files.has_dem,
-            "mask.tif: bit 1 shadow, bit 2 layover",
-            f"no shadow and layover: {_NO_DEM}",
-        ),
-    ),
-    Requirement(
-        "piscata",
-        "Scattering area image",
-        _PIXELS,
-        goal=_when(
-            lambda files: "scattering_area.tif" in files.rasters and files.has_dem,
-            "scattering_area.tif",
-            f"{_GAMMA0}, and scene.dem",
-        ),
-    ),
-    *(
-        Requirement(
-            "ploinca",
-            "Local incident angle image",
-            _PIXELS,
-            types=(kind,),
-            **{
-                level: _when(
-                    lambda files: "incidence.tif" in files.rasters and files.has_dem,
-                    "incidence.tif",
-                    f"no incidence.tif with a DEM: {_NO_DEM}",
-                )
-            },
-        )
-        for kind, level in (("NRB", "threshold"), ("GSLC", "goal"))
-    ),
-    *(
-        Requirement(
-            "pelinca",
-            "Ellipsoidal incident angle image",
-            _PIXELS,
-            types=(kind,),
-            **{
-                level: _when(
-                    lambda files: "incidence.tif" in files.rasters and not files.has_dem,
-                    "incidence.tif: angle from the normal of level terrain",
-                    "with a DEM, incidence.tif contains the local angle only",
-                )
-            },
-        )
-        for kind, level in (("NRB", "goal"), ("GSLC", "threshold"))
-    ),
-    Requirement(
-        "pinopow",
-        "Noise power image",
-        _PIXELS,
-        goal=_when(_is_absolute_noise, "nesz.tif: noise-equivalent σ⁰", "nesz.tif is relative, or missing"),
-    ),
-    Requirement(
-        "gasiri",
-        "Gamma-to-sigma ratio image",
-        _PIXELS,
-        goal=_when(lambda files: "gamma_sigma_ratio.tif" in files.rasters, "gamma_sigma_ratio.tif", _GAMMA0),
-    ),
-    Requirement("pacqidm", "Acquisition ID image", _PIXELS, _inapplicable("the image is not a mosaic of flights")),
-    Requirement(
-        "pidem",
-        "Per-pixel DEM",
-        _PIXELS,
-        goal=_when(
-            lambda files: files.has_dem and (files.folder.parent.parent / "terrain.zarr").exists(),
-            "results/terrain.zarr: height of every pixel, on the same grid",
-            _NO_DEM,
-        ),
-    ),
-    Requirement(
-        "radulov-gslc",
-        "Radar unit look vector grid image",
-        _PIXELS,
-        goal=_never("the look vector is stated at the scene centre only"),
-        types=("GSLC",),
-    ),
-    Requirement(
-        "slarassi-gslc",
-        "Slant range sensor to surface image",
-        _PIXELS,
-        goal=_never("the range is stated at the scene centre only"),
-        types=("GSLC",),
-    ),
-    Requirement(
-        "pinphun",
-        "InSAR phase uncertainty image",
-        _PIXELS,
-        goal=_never("not written for single images; interferograms have height_std.tif"),
-        types=("GSLC",),
-    ),
-    Requirement(
-        "atphaci",
-        "Atmospheric phase correction image",
-        _PIXELS,
-        goal=_never("the correction is applied to each path and not written as a raster"),
-        types=("GSLC",),
-    ),
-    Requirement(
-        "piopha",
-        "Ionospheric phase correction image",
-        _PIXELS,
-        goal=_inapplicable(_NO_IONOSPHERE),
-        types=("GSLC",),
-    ),
-    Requirement("backsca-nrb", "Backscatter measurements", _MEASURES, _gamma0("gamma0_power.tif"), types=("NRB",)),
-    Requirement(
-        "backsca-gslc",
-        "Backscatter measurements",
-        _MEASURES,
-        _backscatter_gslc,
-        _gamma0("gamma0_slc.tif"),
-        types=("GSLC",),
-    ),
-    Requirement(
-        "scaconv",
-        "Scaling conversion",
-        _MEASURES,
-        _tags("APERTURA_QUANTITY", "APERTURA_UNIT", "APERTURA_REFERENCE"),
-        _when(lambda files: files.main.dtype == "float32", "GeoTIFF: float32", "the raster is not float32"),
-    ),
-    Requirement(
-        "noiser",
-        "Noise removal",
-        _MEASURES,
-        _tags("APERTURA_NOISE_REMOVAL", note=" (docs/theory/speckle.md)"),
-    ),
-    Requirement(
-        "radtalg-appl",
-        "Radiometric terrain correction algorithm",
-        _MEASURES,
-        _gamma0("gamma0_power.tif"),
-        types=("NRB",),
-    ),
-    Requirement(
-        "radtalg-min",
-        "Radiometric terrain correction algorithm",
-        _MEASURES,
-        goal=_never("the resolution of the DEM is not compared with that of the image"),
-        types=("GSLC",),
-    ),
-    Requirement(
-        "radacc-sar",
-        "Radiometric accuracy",
-        _MEASURES,
-        goal=_never("no document with a DOI; if calibrated, the standard deviation is in radiometry.json"),
-    ),
-    Requirement(
-        "flapha",
-        "Flattened phase",
-        _MEASURES,
-        goal=_inapplicable("alternative to GSLC: slc.tif contains amplitude and phase"),
-        types=("NRB",),
-    ),
-    Requirement(
-        "geocalg",
-        "Geometric correction algorithm",
-        _GEOMETRY,
-        goal=_never("backprojection onto the map grid without resampling; no citable document is stated"),
-    ),
-    Requirement(
-        "cdem",
-        "Digital elevation model",
-        _GEOMETRY,
-        _when(lambda files: files.has_dem, "image.json, terrain: DEM, geoid and datum; one DEM for all steps", _NO_DEM),
-        _never("the resolution of the DEM is not compared with that of the image"),
-    ),
-    Requirement(
-        "geomacc-sar",
-        "Geometric accuracy",
-        _GEOMETRY,
-        _geolocation,
-        _never("no accuracy measured at reflectors is stated"),
-    ),
-    Requirement("georacc", "Geometric refined accuracy", _GEOMETRY, goal=_refined),
-    Requirement(
-        "gridconv",
-        "Gridding convention",
-        _GEOMETRY,
-        _when(
-            lambda files: files.main.is_georeferenced and _is_snapped(files),
-            "GeoTIFF: the corner is a multiple of the pixel size, the same for all images of the campaign",
-            "the corner is not a multiple of the pixel size, or the frame is local: see scene.bounds_m",
-        ),
-        _never("no document of the gridding convention is stated"),
+    *_section(
+        "geometric corrections",
+        _R("geocalg", "Geometric correction algorithm", None, _never("no citable document is stated")),
+        _R("cdem", "Digital elevation model", _DEM, _NO_DEM_RESOLUTION),
+        _R("geomacc-sar", "Geometric accuracy", _geolocation, _never("no error measured at reflectors is stated")),
+        _R("georacc", "Geometric refined accuracy", None, _refined),
+        _R("gridconv", "Gridding convention", _GRID, _never("no document of the gridding convention is stated")),
     ),
 )
 """Requirements of both specifications, in their order."""
-
 
 _LEVELS = ("threshold", "goal")
 
