@@ -76,6 +76,7 @@ def complete(tmp_path_factory):
         ("gamma0_power.tif", write_power, IMAGE, gamma0),
         ("gamma0_slc.tif", write_slc, IMAGE, gamma0),
         ("scattering_area.tif", write_incidence, REAL, {}),
+        ("ellipsoidal_incidence.tif", write_incidence, REAL, {}),
         ("gamma_sigma_ratio.tif", write_incidence, REAL, {}),
         ("multilook_gamma0_power.tif", write_incidence, REAL, {}),
     ):
@@ -131,6 +132,7 @@ MISSING = {
     "gamma0_power.tif": {("backsca-nrb", "threshold"), ("radtalg-appl", "threshold")},
     "gamma0_slc.tif": {("backsca-gslc", "threshold"), ("backsca-gslc", "goal")},
     "scattering_area.tif": {("piscata", "goal")},
+    "ellipsoidal_incidence.tif": {("pelinca", "goal"), ("pelinca", "threshold")},
     "gamma_sigma_ratio.tif": {("gasiri", "goal")},
     "multilook_gamma0_power.tif": {("enl", "goal")},
     "APERTURA_POLARISATION": {

@@ -17,12 +17,13 @@ from apertura.core.geometry.geodesy import projected_from_ecef
 from apertura.core.imaging.radiometry import Calibration
 from apertura.core.quality.bright_points import BrightPoint
 from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.looks import Looks
 from apertura.core.scene.terrain import Plane
 from apertura.formats.export import product_files
 from apertura.simulation import GaussianBeam, ImageGrid, PointTarget, Radio, preset, simulate
 from apertura.simulation.presets import DEMO_ORIGIN
 from apertura.stages.export import export_fused
-from apertura.stages.layers import GroundPower, area_ratios, layers
+from apertura.stages.layers import GroundPower, gamma0_layers, layers
 from apertura.stages.mosaic import mosaic
 from apertura.stages.pair import open_pair
 from apertura.stages.radiometry import calibrated_pair
@@ -166,18 +167,22 @@ def test_area_ratios_relate_the_coefficients(rise_deg):
     grid, terrain = SceneGrid("local", -3.0, 23.0, 0.125, (48, 48)), Plane(0, 20, 0, 0, np.tan(np.radians(rise_deg)))
     calibration = Calibration.of(grid, terrain, Aperture(track, track), None, constant=1.0, cell_m2=0.2)
     scene = SimpleNamespace(grid=grid, terrain=terrain)
-    ratios = area_ratios(GroundPower(scene, None, SimpleNamespace(calibration=calibration)), 1)
+    looks = Looks.of(grid, terrain, Aperture(track, track), None, threads=1)
+    power = GroundPower(scene, None, SimpleNamespace(calibration=calibration))
+    ratios = gamma0_layers(power, looks, threads=1)
     window = slice(24, 25), slice(24, 25)
     local = np.arctan2(20.0, 22.0) - np.radians(rise_deg)
     assert ratios["scattering_area"][window][0, 0] == pytest.approx(1 / np.tan(local), rel=0.01)
     assert ratios["gamma_sigma_ratio"][window][0, 0] == pytest.approx(np.cos(local), rel=0.01)
+    vertical_deg = np.degrees(np.arctan2(20.0, 22.0))  # does not depend on the slope
+    assert ratios["ellipsoidal_incidence"][window][0, 0] == pytest.approx(vertical_deg, abs=0.5)
 
 
 def test_gamma0_writes_the_products_of_ceos_ard(tiny):
     campaign = state(tiny, "processing", radiometry=["gamma0"])
     assert campaign.coefficients == ()  # not calibrated
-    files = set(product_files({"f01": ["a-b"]}, ["gamma0", "scattering_area", "gamma_sigma_ratio"]))
-    for name in ("gamma0_power.tif", "gamma0_slc.tif", "scattering_area.tif", "gamma_sigma_ratio.tif"):
+    files = set(product_files({"f01": ["a-b"]}, ["gamma0", "scattering_area", "ellipsoidal_incidence"]))
+    for name in ("gamma0_power.tif", "gamma0_slc.tif", "scattering_area.tif", "ellipsoidal_incidence.tif"):
         assert f"f01/a-b/{name}" in files
     assert not [name for name in files if name.startswith("mosaic") and "slc" in name]
 

@@ -256,8 +256,8 @@ class Campaign(RawFolder):
         """Sources of kinds ``radiometry`` (none for relative images) and ``multilook`` to be written."""
         processing = self.settings.processing
         coefficients = processing.radiometry if self.calibrated else ()
-        areas = ("scattering_area", "gamma_sigma_ratio") if "gamma0" in coefficients else ()
-        written = (*coefficients, *areas)
+        of_gamma0 = ("scattering_area", "gamma_sigma_ratio", "ellipsoidal_incidence")
+        written = (*coefficients, *(of_gamma0 if "gamma0" in coefficients else ()))
         if processing.multilook is None:
             return written
         averaged = [f"multilook_{name}" for name in coefficients] or ["multilook"]

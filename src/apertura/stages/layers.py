@@ -106,7 +106,11 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
             means = {name: means_of(name) for name in coefficients}
             images = ((name, power.amplitude) for name, power in powers.items())
             rasters = {name: LazyLayer(scene.grid, np.complex64, of, threads) for name, of in images}
-            write("radiometry", rasters | (area_ratios(one, threads) if "gamma0" in powers else {}), means)
+            write(
+                "radiometry",
+                rasters | (gamma0_layers(one, looks, threads=threads) if "gamma0" in powers else {}),
+                means,
+            )
             written.append(folder / CROSS_SECTIONS)
             report = _report(scene, image, calibrated, measured_noise) if calibrated else _no_constant(campaign, pair)
             write_json(written[-1], report | {"polarisation": label})
@@ -187,20 +191,23 @@ class GroundPower:
             return np.asarray(self.image.image[window].values / np.sqrt(self.per_one(window)), np.complex64)
 
 
-def area_ratios(power: GroundPower, threads: int) -> dict[str, LazyLayer]:
-    """Return the ratios of the areas to which the coefficients are normalised.
+def gamma0_layers(power: GroundPower, looks: Looks, *, threads: int) -> dict[str, LazyLayer]:
+    """Return the layers of a calibrated pair that γ⁰ requires.
 
     Parameters
     ----------
     power
         Power of a coefficient, of which only scene, calibration and mask are used.
+    looks
+        The pulses that contribute to each pixel.
     threads
         Number of tiles processed in parallel.
 
     Returns
     -------
     dict
-        `scattering_area`, β⁰/γ⁰, and `gamma_sigma_ratio`, σ⁰/γ⁰ (docs/theory/radiometry.md, eq. 6a).
+        `scattering_area`, β⁰/γ⁰, `gamma_sigma_ratio`, σ⁰/γ⁰ (docs/theory/radiometry.md, eq. 6a), and
+        `ellipsoidal_incidence`, the incidence angle from the vertical.
     """
 
     def ratio(normalised_to: Quantity, window: Window) -> NDArray[np.float32]:
@@ -208,10 +215,15 @@ def area_ratios(power: GroundPower, threads: int) -> dict[str, LazyLayer]:
         areas = (replace(power, quantity=quantity).per_one(window) for quantity in ("gamma0", normalised_to))
         return np.asarray(next(areas) / next(areas), np.float32)
 
-    others: dict[str, Quantity] = {"scattering_area": "beta0", "gamma_sigma_ratio": "sigma0"}
-    return {
-        name: LazyLayer(power.scene.grid, np.float32, partial(ratio, other), threads) for name, other in others.items()
+    def from_vertical(window: Window) -> NDArray[np.float32]:
+        return np.asarray(_inside(looks, window, looks.ellipsoidal_incidence_deg(window)), np.float32)
+
+    values: dict[str, Callable[[Window], NDArray[np.float32]]] = {
+        "scattering_area": partial(ratio, "beta0"),
+        "gamma_sigma_ratio": partial(ratio, "sigma0"),
+        "ellipsoidal_incidence": from_vertical,
     }
+    return {name: LazyLayer(power.scene.grid, np.float32, of, threads) for name, of in values.items()}
 
 
 def _multilooked(

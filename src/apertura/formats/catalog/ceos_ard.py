@@ -283,9 +283,11 @@ _MASK = _when(lambda files: "mask.tif" in files.rasters, "mask.tif: 0 valid, 255
 _SHADOW = _with_dem("mask.tif", "bit 1 shadow, bit 2 layover")
 _LOCAL_ANGLE = _with_dem("incidence.tif", "from the normal of each facet")
 _LEVEL_ANGLE = _when(
-    lambda files: "incidence.tif" in files.rasters and not files.has_dem,
-    "incidence.tif: angle from the normal of level terrain",
-    "with a DEM, incidence.tif contains the local angle only",
+    lambda files: (
+        "ellipsoidal_incidence.tif" in files.rasters or ("incidence.tif" in files.rasters and not files.has_dem)
+    ),
+    "ellipsoidal_incidence.tif; without a DEM, incidence.tif: angle from the vertical (WGS 84)",
+    f"with a DEM, incidence.tif contains the local angle only: {_GAMMA0}",
 )
 _HEIGHTS = _when(
     lambda files: files.has_dem and (files.folder.parent.parent / "terrain.zarr").exists(),

@@ -32,6 +32,7 @@ SOURCES: Mapping[str, str] = {
     "beta0": "radiometry",
     "scattering_area": "radiometry",
     "gamma_sigma_ratio": "radiometry",
+    "ellipsoidal_incidence": "radiometry",
     "multilook": "multilook",
     "multilook_sigma0": "multilook",
     "multilook_gamma0": "multilook",
@@ -52,10 +53,10 @@ SOURCES: Mapping[str, str] = {
 power sum, stored as complex amplitude without phase. ``magnitude`` is the sum of the magnitudes of the pairs. Layers
 are real rasters that describe the image of a pair, and are stored in the folder of that image. Rasters of radiometry
 exist for calibrated pairs, in the same folder; their values are complex amplitudes whose power is the named
-coefficient, and with gamma0 the ratios of the areas to which the coefficients are normalised. Rasters of multilook
-exist if requested; their values are the mean power of square blocks of pixels, on a coarser grid. ``multilook_noise``
-is the mean noise power that is subtracted from the echo power. Rasters of an interferogram are computed from two
-images; ``panels`` is a mapping from their names to these rasters.
+coefficient. With gamma0, they include the ratios of the areas to which the coefficients are normalised, and the
+incidence angle from the vertical. Rasters of multilook exist if requested; their values are the mean power of square
+blocks of pixels, on a coarser grid. ``multilook_noise`` is the mean noise power that is subtracted from the echo power.
+Rasters of an interferogram are computed from two images; ``panels`` is a mapping from their names to these rasters.
 """
 
 
@@ -159,6 +160,8 @@ EXPORTS: tuple[Export, ...] = (
     Export("scattering_area.qml", "scattering_area", _WRITERS.style.write_layer_style),
     Export("gamma_sigma_ratio.tif", "gamma_sigma_ratio", _WRITERS.layers.write_gamma_sigma_ratio),
     Export("gamma_sigma_ratio.qml", "gamma_sigma_ratio", _WRITERS.style.write_layer_style),
+    Export("ellipsoidal_incidence.tif", "ellipsoidal_incidence", _WRITERS.layers.write_ellipsoidal_incidence),
+    Export("ellipsoidal_incidence.qml", "ellipsoidal_incidence", _WRITERS.style.write_layer_style),
     Export("beta0_db.tif", "beta0", _WRITERS.db.write_db),
     Export("beta0_db.qml", "beta0", _WRITERS.style.write_backscatter_style),
     *(

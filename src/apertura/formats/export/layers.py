@@ -28,6 +28,7 @@ INCIDENCE = Band(
 BISTATIC_ANGLE = Band(
     "float32", np.nan, "deg", "angle between transmitter and receiver at closest approach", "AVERAGE", smooth=True
 )
+ELLIPSOIDAL_INCIDENCE = replace(INCIDENCE, meaning="incidence angle at closest approach, from the vertical (WGS 84)")
 MASK = Band(
     "uint8",
     OUTSIDE,
@@ -57,6 +58,14 @@ def write_incidence(
 ) -> None:
     """Write the incidence angle, (y, x) float32 degrees, NaN outside. Otherwise as `cog.write_slc`."""
     write_cog(path, angle_deg, INCIDENCE, transform=transform, crs=crs, tags=tags, title=title, value=only("float32"))
+
+
+def write_ellipsoidal_incidence(
+    path: Path, angle_deg: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+) -> None:
+    """Write the angle from the vertical, (y, x) float32 degrees, NaN outside. Otherwise as `cog.write_slc`."""
+    band, check = ELLIPSOIDAL_INCIDENCE, only("float32")
+    write_cog(path, angle_deg, band, transform=transform, crs=crs, tags=tags, title=title, value=check)
 
 
 def write_bistatic_angle(
