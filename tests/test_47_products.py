@@ -16,7 +16,8 @@ from apertura.campaign.store import open_stage, read_manifest
 from apertura.common.paths import shipped
 from apertura.common.provenance import Provenance, packages, sha256_file, software
 from apertura.core.backprojection.engines import instruction_set
-from apertura.formats.export import DOCUMENTS, exports_in, product_files
+from apertura.formats.catalog import DOCUMENTS
+from apertura.formats.export import exports_in, product_files
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.stages.image_tags import quality_tags
 

@@ -30,8 +30,9 @@ from apertura.core.quality.focus import DEFOCUSED_DB, focus_with_flags, verdict_
 from apertura.core.quality.measures import Amplitude, BlockRaster, held, image_statistics
 from apertura.core.quality.point_targets import CUT_REACH_M, cuts_report, find_peak
 from apertura.core.scene.grid import SceneGrid
+from apertura.formats.catalog import DOCUMENTS
 from apertura.formats.catalog.ceos_ard import PAGE, SHEET, ImageFiles, ceos_ard_page, ceos_ard_sheet
-from apertura.formats.export import DOCUMENTS, product, remove_outdated, write_exports
+from apertura.formats.export import product, remove_outdated, write_exports
 from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, of_sums
 from apertura.stages.agreement import ComparedImage, assessment_of, bright_points_within
 from apertura.stages.image_tags import acquisition_tags, angle_tags, quality_tags

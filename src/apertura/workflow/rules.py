@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from apertura.common.lazy import Lazy, module_of
-from apertura.formats.export import DOCUMENTS
+from apertura.formats.catalog import DOCUMENTS
 from apertura.workflow import rule_inputs as inputs
 from apertura.workflow.rule_inputs import Scope
 

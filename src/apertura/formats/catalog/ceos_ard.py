@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from apertura.common.raster import opened_raster
-from apertura.formats.export import DOCUMENTS, EXPORTS
+from apertura.formats.catalog import DOCUMENTS
+from apertura.formats.export import EXPORTS
 
 _, SHEET, PAGE = DOCUMENTS
 """Names of the sheet and of its page, in the folder of an image."""
@@ -244,9 +245,10 @@ def _section(category: str, *rows: Requirement) -> tuple[Requirement, ...]:
 _R = Requirement
 _NRB, _GSLC = ("NRB",), ("GSLC",)
 _TIME = _tags("APERTURA_ACQUISITION_START", "APERTURA_ACQUISITION_END", "APERTURA_FLIGHTS")
-_RADAR = _tags(*(f"APERTURA_{name}" for name in ("FREQUENCY_BAND", "CENTRE_FREQUENCY_HZ", "MODE", "POLARISATION")))
+_OF_RADAR = "FREQUENCY_BAND", "CENTRE_FREQUENCY_HZ", "MODE", "POLARISATION", "LOOK_SIDE"
+_RADAR = _tags(*(f"APERTURA_{name}" for name in _OF_RADAR))
 _THIS_SHEET = _when(lambda _: True, "this sheet: specifications", "")
-_READABLE = _when(lambda files: bool(files.rasters), "GeoTIFF tags, image.json, STAC item, this sheet", "no GeoTIFF")
+_READABLE = _when(lambda files: bool(files.rasters), "GeoTIFF tags, image.json, this sheet", "no GeoTIFF")
 _STANDARD = _never("GeoTIFF tags follow no standard; the STAC item and the cube (CF, ACDD) of the campaign repeat them")
 _NOT_RETRIEVABLE = _never("no location from which a program can retrieve the files is stated")
 _NO_SOURCE_PRODUCT = _inapplicable("the sources are recordings, not processed products; APERTURA_INPUTS: their hashes")

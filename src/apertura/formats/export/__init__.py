@@ -15,6 +15,7 @@ from typing import Any
 
 from apertura.common.lazy import Lazy, module_of, name_of
 from apertura.common.provenance import canonical_json
+from apertura.formats.catalog import DOCUMENTS
 from apertura.formats.export.radiometry import CROSS_SECTIONS, TAG
 
 SOURCES: Mapping[str, str] = {
@@ -198,9 +199,6 @@ _OPTIONAL = ("radiometry", "multilook", "multilook_fused")  # kinds whose files 
 
 PHASE_HISTORY = "phase_history.cphd"
 """Product with the transfer functions of a pair; written only if requested, because it is as large as the echo."""
-
-DOCUMENTS = ("image.json", "ceos_ard.json", "ceos_ard.html")
-"""Documents in the folder of an image: report, and CEOS-ARD sheet with its page."""
 
 COVERAGE = ("coverage.png", "coverage.geojson")
 """Plot and GeoJSON file of the coverage of the whole campaign."""
