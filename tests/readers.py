@@ -33,8 +33,9 @@ def _outside(*command: str | Path, given: str = "") -> "subprocess.CompletedProc
     """Run a system program in the environment of the system instead of that of the tests."""
     kept = {name: os.environ[name] for name in ("PATH", "HOME", "LANG", "TMPDIR") if name in os.environ}
     # PAM off: statistics are not written next to the file.
+    words = [str(word) for word in command]
     return subprocess.run(
-        command, env=kept | {"GDAL_PAM_ENABLED": "NO"}, input=given, capture_output=True, text=True, check=False
+        words, env=kept | {"GDAL_PAM_ENABLED": "NO"}, input=given, capture_output=True, text=True, check=False
     )
 
 

@@ -189,3 +189,25 @@ def test_bounds_off_the_spacing_report_the_nearest_grid():
         refused.value
     )
     assert refused.value.expected == "consistent values"
+
+
+@pytest.mark.parametrize(
+    ("orcid", "problem"),
+    [
+        ("0000-0002-1825-0097", None),
+        ("https://orcid.org/0000-0002-1694-233X", None),
+        ("0000-0002-1825-0079", "the check character must be 0"),
+        ("0000-0002-1825-009X", "the check character must be 7"),
+        ("0000-0002-1852-0097", "the check character must be"),
+        ("0000 0002 1825 0097", "must be an ORCID iD such as 0000-0002-1825-0097"),
+    ],
+)
+def test_orcid_with_a_wrong_digit_is_rejected(orcid, problem):
+    """ISO 7064 MOD 11-2 detects every single wrong digit and every transposition; the valid iDs are published ones."""
+    document = {"campaign": "c", "waveform": {"kind": "phase_history", "format": "cphd"}, "nodes": {"a": {}}}
+    document["metadata"] = {"creators": [{"name": "A. Nother", "orcid": orcid}]}
+    if problem is None:
+        assert validated(document, where="x").metadata.creators[0].orcid == orcid.removeprefix("https://orcid.org/")
+    else:
+        with pytest.raises(CampaignError, match=problem):
+            validated(document, where="x")

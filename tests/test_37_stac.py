@@ -2,13 +2,16 @@
 
 import json
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import numpy as np
 import pystac
 import pytest
-from pyproj import CRS
+from pyproj import CRS, Proj
+from pystac.validation.stac_validator import JsonSchemaSTACValidator
 from rasterio import Affine
 
+from apertura.common.attribution import Attribution
 from apertura.common.errors import CampaignError
 from apertura.formats.catalog import CATALOG
 from apertura.formats.catalog.stac import (
@@ -21,6 +24,7 @@ from apertura.formats.catalog.stac import (
     item_of,
     projection,
     read_facts,
+    true_azimuth_deg,
 )
 from apertura.formats.catalog.validation import document_problem, stac_problems
 from apertura.formats.export.cog import write_slc
@@ -42,6 +46,7 @@ def facts():
         "view:incidence_angle": 45.0,
         "processing:level": "L1",
         "processing:lineage": "apertura step export f01 a-b",
+        "processing:version": "1",
         "processing:software": {"apertura": "1", "python": "3", "gdal": "3", "proj": "9"},
     }
 
@@ -71,9 +76,12 @@ def test_bands_and_inputs_are_read_from_a_raster(slc):
     raster_facts = read_facts(slc)
     assert raster_facts.bands == [
         {
+            "name": "slc",
+            "description": "amplitude of the focused scene, complex, with carrier phase",
             "data_type": "cfloat32",
             "raster:sampling": "area",
             "raster:spatial_resolution": 0.5,
+            "raster:bits_per_sample": 64,
             "nodata": "nan",
             "unit": "1",
         }
@@ -90,7 +98,7 @@ def test_file_that_is_no_geotiff_is_refused(tmp_path):
 
 def test_item_declares_and_conforms_to_every_extension(slc):
     document = item(slc)
-    assert sorted(document["stac_extensions"]) == sorted(EXTENSIONS.values())
+    assert sorted([*document["stac_extensions"], EXTENSIONS["sci"]]) == sorted(EXTENSIONS.values())
     assert document_problem(document) is None
 
 
@@ -132,7 +140,7 @@ def test_extension_without_a_shipped_schema_is_refused(slc):
 
 
 def written(folder, images, campaign="tandem"):
-    for name, document in catalog_files(campaign, images).items():
+    for name, document in catalog_files(campaign, images, Attribution()).items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(document))
@@ -154,7 +162,7 @@ def test_pystac_finds_every_item_and_file_of_the_catalog(slc, tmp_path):
 
 
 def test_links_are_relative_and_no_file_links_to_itself(slc, tmp_path):
-    files = catalog_files("tandem", [image(slc)])
+    files = catalog_files("tandem", [image(slc)], Attribution())
     hrefs = [link["href"] for document in files.values() for link in document["links"]]
     assert all(href.startswith(".") for href in hrefs)
     assert not [link for document in files.values() for link in document["links"] if link["rel"] == "self"]
@@ -204,16 +212,77 @@ def test_frequency_band_letter_follows_the_table_of_the_extension(slc, ghz, band
     assert document_problem(document) is None
 
 
-def test_author_licence_and_doi_are_written_to_the_collection(slc):
-    files = catalog_files("tandem", [image(slc)], licence="CC-BY-4.0", author="A. Nother", doi="10.5281/zenodo.1")
-    collection = files["collection.json"]
-    assert document_problem(collection) is None
-    assert (collection["license"], collection["providers"]) == (
-        "CC-BY-4.0",
-        [{"name": "A. Nother", "roles": ["producer"]}],
-    )
+STATED = Attribution(
+    title="Harbour in May",
+    creators=[{"name": "A. Nother", "orcid": "0000-0002-1825-0097", "affiliation": "An Institute"}],
+    institution="An Institute",
+    licence="CC-BY-4.0",
+    platform="hexacopter",
+    instrument="L-band radar",
+    doi="10.5281/zenodo.1",
+)
+CITATION = "A. Nother (2025): Harbour in May. An Institute. https://doi.org/10.5281/zenodo.1"
+PRODUCERS = [
+    {"name": "An Institute", "roles": ["producer", "processor"]},
+    {
+        "name": "A. Nother (ORCID 0000-0002-1825-0097, An Institute)",
+        "roles": ["producer"],
+        "url": "https://orcid.org/0000-0002-1825-0097",
+    },
+]
+
+
+def test_attribution_is_written_to_the_collection_and_to_every_item(slc):
+    files = catalog_files("tandem", [image(slc)], STATED)
+    collection, entry = files["collection.json"], files["images/f01/a-b.json"]
+    for document in (collection, entry):
+        assert document_problem(document) is None
+        fields = document if document is collection else document["properties"]
+        assert fields["license"] == "CC-BY-4.0"
+        assert (fields["sci:doi"], fields["sci:citation"]) == ("10.5281/zenodo.1", CITATION)
+        assert sorted(map(str, fields["providers"])) == sorted(map(str, PRODUCERS))
+        assert EXTENSIONS["sci"] in document["stac_extensions"]
+    assert entry["properties"]["platform"] == "hexacopter"
+    assert entry["properties"]["instruments"] == ["L-band radar"]
     assert {"rel": "cite-as", "href": "https://doi.org/10.5281/zenodo.1"} in collection["links"]
-    assert catalog_files("tandem", [image(slc)])["collection.json"]["license"] == "other"
+
+
+def test_attribution_that_is_not_stated_leaves_no_field(slc):
+    files = catalog_files("tandem", [image(slc)], Attribution())
+    assert files["collection.json"]["license"] == "other"
+    absent = {"license", "providers", "platform", "instruments", "processing:facility"}
+    properties = files["images/f01/a-b.json"]["properties"]
+    assert not [name for name in properties if name in absent or name.startswith("sci:")]
+
+
+@pytest.mark.parametrize("stated", [Attribution(), STATED])
+def test_catalog_conforms_to_the_published_schemas(slc, stated):
+    """The schemas in tests/stac are those of github.com/stac-extensions, in the versions that the items name."""
+    official = JsonSchemaSTACValidator()
+    for path in (Path(__file__).parent / "stac").glob("*.json"):
+        schema = json.loads(path.read_text())
+        official.schema_cache[schema["$id"].removesuffix("#")] = schema
+    assert set(EXTENSIONS.values()) <= official.schema_cache.keys()
+    for document in catalog_files("tandem", [image(slc)], stated).values():
+        kind = pystac.STACObjectType(document["type"])
+        official.validate(document, kind, "1.1.0", document.get("stac_extensions", []))
+    document["properties"]["sar:bandwidth"] = "wide"
+    with pytest.raises(pystac.STACValidationError):
+        official.validate(document, kind, "1.1.0", document["stac_extensions"])
+
+
+def test_view_azimuth_is_referred_to_true_north():
+    """Meridian convergence of a transverse Mercator projection at longitude λ from its meridian: λ sin φ."""
+    point = 640000.0, 5300000.0
+    longitude, latitude = Proj("EPSG:32632")(*point, inverse=True)
+    convergence_deg = (longitude - 9) * np.sin(np.radians(latitude))
+    assert convergence_deg > 1
+    for grid_deg in (0.0, 130.0, 359.5):
+        assert true_azimuth_deg("EPSG:32632", point, grid_deg) == pytest.approx(
+            (grid_deg + convergence_deg) % 360, abs=2e-3
+        )
+    assert true_azimuth_deg("EPSG:32632", point, None) is None
+    assert true_azimuth_deg('LOCAL_CS["yard",UNIT["metre",1]]', point, 10.0) is None
 
 
 def test_recording_without_a_clock_is_marked(slc):
@@ -234,4 +303,6 @@ def test_untrusted_names_are_escaped_and_links_encoded(slc, tmp_path):
 
 def test_catalog_does_not_depend_on_the_order_of_images(slc):
     images = [image(slc), image(slc, "coherent", made_from=["a-b"])]
-    assert json.dumps(catalog_files("tandem", images)) == json.dumps(catalog_files("tandem", images[::-1]))
+    assert json.dumps(catalog_files("tandem", images, Attribution())) == json.dumps(
+        catalog_files("tandem", images[::-1], Attribution())
+    )

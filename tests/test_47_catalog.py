@@ -16,6 +16,7 @@ from rocrate.rocrate import ROCrate
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage, read_manifest
+from apertura.common.attribution import Attribution
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import lock_sha256, sha256_file, software
 from apertura.formats.catalog import CATALOG, CRATE
@@ -296,14 +297,20 @@ def test_verdict_is_equal_in_all_products(finished, monkeypatch):
             assert str(stated.values) == verdict
 
 
-def test_crate_states_author_licence_and_doi_if_configured():
+def test_crate_states_creators_institution_licence_and_doi_if_configured():
     rules = [Listed("workflow/Snakefile", "2" * 64, 10)]
     versions = {"apertura": "1", "snakemake": "9"}
     run = CrateRun("tandem", "2025-05-14T09:30:00Z", versions, "3" * 64, [], [], rules)
+    creators = [{"name": "A. Nother", "orcid": "0000-0002-1825-0097", "affiliation": "An Institute"}, {"name": "B"}]
+    stated = {"creators": creators, "institution": "An Institute", "doi": "10.5281/zenodo.1", "title": "Harbour"}
     for options, licence in (({}, "#licence"), ({"licence": "CC-BY-4.0"}, "https://spdx.org/licenses/CC-BY-4.0")):
-        document = crate_document(replace(run, author="A. Nother", doi="10.5281/zenodo.1", **options))
+        document = crate_document(replace(run, attribution=Attribution(**stated, **options)))
         entities = {entity["@id"]: entity for entity in document["@graph"]}
         assert entities["./"]["license"] == {"@id": licence}
         assert entities["./"]["identifier"] == "https://doi.org/10.5281/zenodo.1"
-        assert entities[entities["./"]["author"]["@id"]]["name"] == "A. Nother"
+        assert (entities["./"]["name"], entities["./"]["alternateName"]) == ("Harbour", "tandem")
+        first, second = (entities[identifier] for identifier in ids(entities["./"]["author"]))
+        assert (first["@id"], first["name"]) == ("https://orcid.org/0000-0002-1825-0097", "A. Nother")
+        assert entities[first["affiliation"]["@id"]] == entities[entities["./"]["publisher"]["@id"]]
+        assert (second["name"], "affiliation" in second) == ("B", False)
         assert licence in entities

@@ -16,9 +16,10 @@ from apertura.campaign.store import open_stage, read_manifest
 from apertura.common.paths import shipped
 from apertura.common.provenance import Provenance, packages, sha256_file, software
 from apertura.core.backprojection.engines import instruction_set
+from apertura.formats.catalog import DOCUMENTS
 from apertura.formats.export import exports_in, product_files
 from apertura.simulation import ImageGrid, preset, simulate
-from apertura.stages.tags import quality_tags
+from apertura.stages.image_tags import quality_tags
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
 PRODUCTS = list(product_files({"f01": (*PAIRS, "fused")}))
@@ -40,9 +41,7 @@ def tags_of(campaign, name):
 def test_products_are_exactly_those_of_the_table(finished_tiny):
     results = finished_tiny.results
     suffixes = {".tif", ".png", ".geojson", ".qml", ".vrt"}
-    products = {
-        path for path in results.rglob("*") if path.suffix in suffixes or path.name in {"image.json", "map.json"}
-    }
+    products = {path for path in results.rglob("*") if path.suffix in suffixes or path.name in {*DOCUMENTS, "map.json"}}
     assert (len(RASTERS), len(LAYERS)) == (12, 10)
     assert {path.relative_to(results).as_posix() for path in products} == {*PRODUCTS, "f01/tracks/tracks.png"}
 

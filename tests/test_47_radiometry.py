@@ -2,21 +2,28 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import rasterio
 import rasterio.transform
 from folders import complaint, copy_writable, edit_config, export_flight, run_steps, state
+from scenes import straight_track
 
 from apertura.campaign.folder import Campaign
+from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import projected_from_ecef
+from apertura.core.imaging.radiometry import Calibration
 from apertura.core.quality.bright_points import BrightPoint
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.looks import Looks
+from apertura.core.scene.terrain import Plane
 from apertura.formats.export import product_files
 from apertura.simulation import GaussianBeam, ImageGrid, PointTarget, Radio, preset, simulate
 from apertura.simulation.presets import DEMO_ORIGIN
 from apertura.stages.export import export_fused
-from apertura.stages.layers import layers
+from apertura.stages.layers import GroundPower, gamma0_layers, layers
 from apertura.stages.mosaic import mosaic
 from apertura.stages.pair import open_pair
 from apertura.stages.radiometry import calibrated_pair
@@ -151,6 +158,33 @@ def test_radiometric_coefficients_are_products():
     files = set(product_files({"f01": ["a-b"]}, ["gamma0"]))
     assert {"f01/a-b/gamma0_db.tif", "f01/a-b/gamma0_db.qml", "mosaic/a-b/gamma0_db.vrt"} <= files
     assert not any("sigma0" in name for name in files)
+
+
+@pytest.mark.parametrize("rise_deg", [0.0, -20.0, 15.0])
+def test_area_ratios_relate_the_coefficients(rise_deg):
+    """On a facet with local incidence θ in the range plane, γ⁰ = β⁰ tan θ and σ⁰ = γ⁰ cos θ (eqs. 6a and 9)."""
+    track = straight_track(96, length_m=0.5) + [0.0, 0.0, 12.0]
+    grid, terrain = SceneGrid("local", -3.0, 23.0, 0.125, (48, 48)), Plane(0, 20, 0, 0, np.tan(np.radians(rise_deg)))
+    calibration = Calibration.of(grid, terrain, Aperture(track, track), None, constant=1.0, cell_m2=0.2)
+    scene = SimpleNamespace(grid=grid, terrain=terrain)
+    looks = Looks.of(grid, terrain, Aperture(track, track), None, threads=1)
+    power = GroundPower(scene, None, SimpleNamespace(calibration=calibration))
+    ratios = gamma0_layers(power, looks, threads=1)
+    window = slice(24, 25), slice(24, 25)
+    local = np.arctan2(20.0, 22.0) - np.radians(rise_deg)
+    assert ratios["scattering_area"][window][0, 0] == pytest.approx(1 / np.tan(local), rel=0.01)
+    assert ratios["gamma_sigma_ratio"][window][0, 0] == pytest.approx(np.cos(local), rel=0.01)
+    vertical_deg = np.degrees(np.arctan2(20.0, 22.0))  # does not depend on the slope
+    assert ratios["ellipsoidal_incidence"][window][0, 0] == pytest.approx(vertical_deg, abs=0.5)
+
+
+def test_gamma0_writes_the_products_of_ceos_ard(tiny):
+    campaign = state(tiny, "processing", radiometry=["gamma0"])
+    assert campaign.coefficients == ()  # not calibrated
+    files = set(product_files({"f01": ["a-b"]}, ["gamma0", "scattering_area", "ellipsoidal_incidence"]))
+    for name in ("gamma0_power.tif", "gamma0_slc.tif", "scattering_area.tif", "ellipsoidal_incidence.tif"):
+        assert f"f01/a-b/{name}" in files
+    assert not [name for name in files if name.startswith("mosaic") and "slc" in name]
 
 
 def test_incomplete_radio_is_one_message(tiny):

@@ -10,6 +10,7 @@ import rioxarray  # noqa: F401
 import xarray as xr
 import zarr
 from folders import ROOT, complaint, copy_writable, edit_config, run_steps
+from pyproj import Transformer
 from walked import walk
 
 from apertura.campaign.folder import Campaign
@@ -65,7 +66,7 @@ def test_images_are_selected_by_name(campaign, opened):
 
 def test_cube_has_the_metadata_of_cf(campaign, opened):
     """The cube passes the IOOS compliance checker for CF-1.11, except for dB, which CF permits."""
-    assert opened.attrs["Conventions"] == "CF-1.11"
+    assert opened.attrs["Conventions"] == "CF-1.11, ACDD-1.3"
     assert campaign.settings.campaign in opened.attrs["title"]
     assert opened.attrs["history"]
     standard_names = {
@@ -83,6 +84,28 @@ def test_cube_has_the_metadata_of_cf(campaign, opened):
         texts = array.dtype.kind in "TOM" or name == "spatial_ref"
         assert texts or array.attrs["units"] in {"1", "m", "Hz", "dB", "rad", "degree"}
     assert not any("_FillValue" in array.attrs for array in opened.variables.values())
+
+
+def test_cube_has_the_metadata_of_acdd(campaign, opened):
+    """The IOOS compliance checker for ACDD-1.3 reports no missing attribute of the level "highly recommended"."""
+    attributes = opened.attrs
+    assert all(attributes[name] for name in ("title", "summary", "keywords", "Conventions", "project", "source"))
+    start, end = (np.datetime64(attributes[f"time_coverage_{name}"].removesuffix("Z")) for name in ("start", "end"))
+    assert start <= opened.time.values.min() < opened.time.values.max() <= end
+    duration_s = float(attributes["time_coverage_duration"].removeprefix("PT").removesuffix("S"))
+    assert duration_s == pytest.approx((end - start) / np.timedelta64(1, "s"), abs=1e-3)
+    to_map = Transformer.from_crs("EPSG:4326", 32632)
+    outline = attributes["geospatial_bounds"].removeprefix("POLYGON ((").removesuffix("))").split(", ")
+    latitude, longitude = np.transpose([list(map(float, corner.split())) for corner in outline])
+    east, north = to_map.transform(latitude, longitude)
+    xmin, ymin, xmax, ymax = campaign.settings.scene.bounds_m
+    assert (min(east), min(north)) < (xmin + 1e-3, ymin + 1e-3)
+    assert (max(east), max(north)) > (xmax - 1e-3, ymax - 1e-3)
+    assert attributes["geospatial_lat_min"] == pytest.approx(latitude.min())
+    assert attributes["geospatial_lon_max"] == pytest.approx(longitude.max())
+    not_stated = {"license", "creator_name", "institution", "id", "platform", "instrument", "references"}
+    assert not attributes.keys() & not_stated
+    assert all(array.attrs["coverage_content_type"] for array in opened.data_vars.values())
 
 
 def test_rioxarray_reads_the_crs_of_every_raster(campaign, opened):

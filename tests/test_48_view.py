@@ -1,6 +1,8 @@
 """Viewing geometry of an image: angles, carrier, side and times, compared with layers, echo and tags."""
 
 import json
+from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -37,7 +39,7 @@ def test_spatial_carrier_of_the_view_is_that_of_the_image(finished_tiny, pair):
         assert abs((measured - cycles * spacing_m + 0.5) % 1 - 0.5) < 0.02
 
 
-def view_of(track_m):
+def view_of(track_m, positions_at=None):
     """Return the view report of a scene centred at (0, 20) for a track."""
     frequency = 1.2e9 + 1e6 * np.arange(64)
     history = ap.PhaseHistory(
@@ -49,7 +51,24 @@ def view_of(track_m):
     )
     image = ap.backproject(history, ap.SceneGrid("local", -2.0, 22.0, 0.2, (20, 20)), judge=False).data
     formation = image.dask.layers[image.name].origin
-    return view_report(formation, np.datetime64("2025-05-14", "ns"), np.arange(len(track_m)) / 10)
+    scene = SimpleNamespace(profiles=formation.profiles, beams=None, grid=formation.grid)
+    scene.positions_at = partial(positions_at, formation.grid) if positions_at else formation.positions_at
+    return view_report(scene, np.datetime64("2025-05-14", "ns"), np.arange(len(track_m)) / 10)
+
+
+def test_angles_of_the_view_are_referred_to_the_vertical_on_slopes():
+    """A slope of 35 degrees at the scene centre changes the local incidence, not the incidence at the ellipsoid."""
+    track = straight_track()
+    level, slope = view_of(track), np.tan(np.radians(35.0))
+
+    def tilted(grid, row, column):
+        x, y = grid.map_at(np.asarray(row), np.asarray(column)).T
+        return np.stack([x, y, slope * (y - 20.0) + 0.2 * x], -1)
+
+    view = view_of(track, positions_at=tilted)
+    assert view["incidence_deg"] == pytest.approx(np.degrees(np.arctan2(20, 10)), abs=0.3)
+    for name in ("incidence_deg", "height_m", "heading_deg", "look_deg"):
+        assert view[name] == pytest.approx(level[name], abs=0.05)
 
 
 def straight_track(north_m=0.0):

@@ -462,9 +462,13 @@ def with_text(config, path, text):
 
 ANY_TEXT = {
     ("campaign",),
-    ("metadata", "author"),
+    ("metadata", "title"),
+    ("metadata", "creators", 0, "name"),
+    ("metadata", "creators", 0, "affiliation"),
+    ("metadata", "institution"),
     ("metadata", "licence"),
     ("metadata", "platform"),
+    ("metadata", "instrument"),
     ("nodes", "*", "log", "columns", "*"),
     ("nodes", "*", "log", "start_utc"),
     ("nodes", "*", "log", "body"),

@@ -258,12 +258,14 @@ class Campaign(RawFolder):
 
     @property
     def coefficients(self) -> tuple[str, ...]:
-        """Names of the backscattering coefficients (none for relative images) and multilooked powers to be written."""
+        """Sources of kinds ``radiometry`` (none for relative images) and ``multilook`` to be written."""
         processing = self.settings.processing
-        written = processing.radiometry if self.calibrated else ()
+        coefficients = processing.radiometry if self.calibrated else ()
+        of_gamma0 = ("scattering_area", "gamma_sigma_ratio", "ellipsoidal_incidence")
+        written = (*coefficients, *(of_gamma0 if "gamma0" in coefficients else ()))
         if processing.multilook is None:
             return written
-        averaged = [f"multilook_{name}" for name in written] or ["multilook"]
+        averaged = [f"multilook_{name}" for name in coefficients] or ["multilook"]
         noise = ["multilook_noise"] * processing.multilook.subtract_noise
         return (*written, *averaged, *noise, "multilook_coherent", "multilook_noncoherent")
 

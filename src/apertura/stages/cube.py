@@ -22,6 +22,7 @@ from apertura.core.quality.measures import BlockRaster, held, image_statistics
 from apertura.core.scene.grid import SceneGrid
 from apertura.methods.interferometry.coherence import chance, coherence, common_band, window_px
 from apertura.stages.agreement import ComparedImage, agreement_of, agreement_report, assessment_of
+from apertura.stages.image_tags import acdd_attributes
 from apertura.stages.scene import settled_scene
 from apertura.stages.tags import stamped
 from apertura.workflow.lineage import result_of
@@ -66,7 +67,10 @@ def labels(images: Images, assessed: Mapping[str, Mapping[str, Any]], sums: Sums
                     if value is not None:
                         values[name][row, pairs.index(pair)] = value
     return xr.Dataset(
-        {name: (QUOTED[name][0], array) for name, array in values.items()},
+        {
+            name: (QUOTED[name][0], array, {"coverage_content_type": "auxiliaryInformation"})
+            for name, array in values.items()
+        },
         coords={
             "flight": ("flight", np.array([*assessed], _TEXTS)),
             "pair": ("pair", np.array(pairs, _TEXTS)),
@@ -259,7 +263,7 @@ def cube(campaign: Campaign, *, threads: int = 1) -> Path:
     grid, side = settled_scene(campaign).grid, campaign.settings.processing.tile_px
     folder, windows = campaign.stage("cube"), list(grid.tiles(side))
     with undamaged(folder, expected="images formed by this version", remedy="Run the workflow again."):
-        template = _empty_cube(campaign.settings.campaign, images, assessed, sums, grid, windows)
+        template = _empty_cube(campaign, images, assessed, sums, grid, windows)
     with writing(folder) as wip, ThreadPoolExecutor(threads) as workers:
         empty = stamped(
             template,
@@ -401,17 +405,14 @@ def _between_flights(
 
 
 def _empty_cube(
-    campaign: str,
+    campaign: Campaign,
     images: Images,
     assessed: Mapping[str, Mapping[str, Any]],
     sums: Sums,
     grid: SceneGrid,
     windows: Sequence[Window],
 ) -> xr.Dataset:
-    """Return the cube with its coordinates and labels; rasters and measures computed from them are NaN.
-
-    `campaign` is the campaign's name.
-    """
+    """Return the cube with its coordinates and labels; rasters and measures computed from them are NaN."""
     pairs = sorted({pair for _, pair in images})
     empty = labels(images, assessed, sums, pairs)
     sizes = {**empty.sizes, "y": grid.shape[0], "x": grid.shape[1]}
@@ -419,11 +420,12 @@ def _empty_cube(
         if name in SUMMED and not sums:
             continue
         nan = np.full((), complex(np.nan, np.nan) if dtype == "complex64" else np.nan, dtype)
-        empty[name] = dims, np.broadcast_to(nan, tuple(sizes[dim] for dim in dims))
+        content = {"coverage_content_type": "image" if name in RASTERS else "qualityInformation"}
+        empty[name] = dims, np.broadcast_to(nan, tuple(sizes[dim] for dim in dims)), content
     references = {flight: images[flight, assessment["reference"]] for flight, assessment in assessed.items()}
     return empty.assign_coords(grid.coordinates).assign_attrs(
-        Conventions="CF-1.11",
-        title=f"SAR images of campaign {campaign}",
+        Conventions="CF-1.11, ACDD-1.3",
+        **acdd_attributes(campaign, [image.attrs["quality"]["view"] for image in images.values()], grid),
         history="written by rule cube of apertura; runspec, inputs and code_sha256 state settings, data and code",
         flights=[*assessed],
         pairs=pairs,

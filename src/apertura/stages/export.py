@@ -17,7 +17,7 @@ from apertura.campaign.digests import Lineage
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_listed, open_stage, record_files
 from apertura.common.arrays import Floats
-from apertura.common.atomic import write_json
+from apertura.common.atomic import write_json, write_text
 from apertura.common.contracts import Window
 from apertura.common.errors import number_of
 from apertura.common.flags import Flags
@@ -30,12 +30,15 @@ from apertura.core.quality.focus import DEFOCUSED_DB, focus_with_flags, verdict_
 from apertura.core.quality.measures import Amplitude, BlockRaster, held, image_statistics
 from apertura.core.quality.point_targets import CUT_REACH_M, cuts_report, find_peak
 from apertura.core.scene.grid import SceneGrid
+from apertura.formats.catalog import DOCUMENTS
+from apertura.formats.catalog.ceos_ard import PAGE, SHEET, ImageFiles, ceos_ard_page, ceos_ard_sheet
 from apertura.formats.export import product, remove_outdated, write_exports
 from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, of_sums
 from apertura.stages.agreement import ComparedImage, assessment_of, bright_points_within
+from apertura.stages.image_tags import acquisition_tags, angle_tags, quality_tags
 from apertura.stages.multilook import LazyLayer, coarse, mean_power_report, multilook_of
 from apertura.stages.scene import settled_scene
-from apertura.stages.tags import acquisition_tags, quality_tags, tags_of
+from apertura.stages.tags import tags_of
 from apertura.workflow.lineage import result_of
 
 
@@ -64,17 +67,20 @@ def export_pair(campaign: Campaign, flight: str, pair: str) -> list[Path]:
     report["focus"] = focus_with_flags(quality["focus"], report["flags"], error_db=report["numerical_error_db"])
     origin = Provenance.of(lineage.modules, [image])
     origin = replace(origin, code_sha256=chained_sha256(origin.code_sha256, [assessed["code_sha256"]]))
-    folder = campaign.result(flight, pair)
+    folder, title = campaign.result(flight, pair), f"{campaign.settings.campaign} · flight {flight} · {pair}"
     written = write_exports(
         "pair",
         folder,
         {"image": held(image.image)},
         radiometry=report["radiometry"],
-        titles={"image": f"{campaign.settings.campaign} · flight {flight} · {pair}"},
-        tags=tags_of(origin, lineage) | quality_tags(report) | acquisition_tags(campaign, {pair: quality["view"]}),
+        titles={"image": title},
+        tags=tags_of(origin, lineage)
+        | quality_tags(report)
+        | acquisition_tags(campaign, {(flight, pair): quality["view"]})
+        | angle_tags(campaign, flight, [pair]),
         **_georeference(settled_scene(campaign).grid),
     )
-    return _finish(folder, written, {"flight": flight, "pair": pair, **report}, lineage)
+    return _finish(folder, written, title, {"flight": flight, "pair": pair, **report}, lineage)
 
 
 def _calibrated(campaign: Campaign, flight: str, pair: str, report: Mapping[str, Any]) -> dict[str, Any]:
@@ -150,7 +156,10 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     origin = Provenance.of(lineage.modules, images, settings={"fusion": assessed["fusion"]})
     code_sha256 = chained_sha256(lineage.result.code_sha256, [cube.attrs["code_sha256"]])
     tags = tags_of(replace(origin, code_sha256=code_sha256), lineage) | quality_tags(report)
-    tags |= acquisition_tags(campaign, {pair: image.attrs["quality"]["view"] for pair, image in images.items()})
+    tags |= acquisition_tags(
+        campaign, {(flight, pair): image.attrs["quality"]["view"] for pair, image in images.items()}
+    )
+    tags |= angle_tags(campaign, flight, pairs)
     written = write_exports(
         "fused",
         folder,
@@ -174,7 +183,7 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
                 **_georeference(layer.grid),
             )
     remove_outdated(folder, written)
-    return _finish(folder, written, {"flight": flight, "pairs": list(pairs), **report}, lineage)
+    return _finish(folder, written, f"{name} · sums", {"flight": flight, "pairs": list(pairs), **report}, lineage)
 
 
 def _averaged_sum(
@@ -220,10 +229,13 @@ def _noise_of_sum(
     return noise
 
 
-def _finish(folder: Path, written: list[Path], report: Mapping[str, Any], lineage: Lineage) -> list[Path]:
-    """Write image.json next to the products, then the manifest of all files."""
-    files = [*written, folder / "image.json"]
-    write_json(files[-1], report)
+def _finish(folder: Path, written: list[Path], title: str, report: Mapping[str, Any], lineage: Lineage) -> list[Path]:
+    """Write image.json and the CEOS-ARD sheet next to the products, then the manifest of all files."""
+    files = [*written, *(folder / name for name in DOCUMENTS)]
+    write_json(folder / "image.json", report)
+    sheet = ceos_ard_sheet(ImageFiles(folder, report), title)
+    write_json(folder / SHEET, sheet)
+    write_text(folder / PAGE, ceos_ard_page(sheet))
     record_files(folder / "export.manifest.json", files, lineage)
     return files
 

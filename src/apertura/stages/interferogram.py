@@ -31,6 +31,7 @@ from apertura.methods.interferometry.comparison import (
 from apertura.methods.interferometry.heights import KnownHeight, Level
 from apertura.methods.interferometry.sensitivity import FlownAntenna, Legs, Sensitivity, TrackPhase, sensitivity
 from apertura.stages.agreement import opened_layer
+from apertura.stages.image_tags import acquisition_tags
 from apertura.stages.pair import OpenPair, open_pair
 from apertura.stages.planning import gated, weighing
 from apertura.stages.refine import clock_s, open_refined
@@ -252,6 +253,8 @@ def interferogram(campaign: Campaign, name: str) -> list[Path]:
         settings=lineage.result.settings,
     )
     report = _report(formed, two)
+    at = [name.partition("/")[::2] for name in two.names]
+    views = {where: stage.attrs["quality"]["view"] for where, stage in zip(at, two.images, strict=True)}
     folder = campaign.result(INTERFEROMETRY, name)
     title = f"{campaign.settings.campaign} · {two.names[0]} against {two.names[1]}"
     written = write_exports(
@@ -259,7 +262,7 @@ def interferogram(campaign: Campaign, name: str) -> list[Path]:
         folder,
         {**formed.panels, "panels": formed.panels},
         titles={source: f"{title} · {source}" for source in formed.panels} | {"panels": title},
-        tags=tags_of(origin, lineage) | _tags(report),
+        tags=tags_of(origin, lineage) | acquisition_tags(campaign, views) | _tags(report),
         transform=Affine(*scene.grid.transform),
         crs=scene.grid.crs_wkt,
     )

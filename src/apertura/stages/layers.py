@@ -1,7 +1,7 @@
 """Rule `layers`: angles, mask, looks, noise, σ⁰ and mean power of a pair, as GeoTIFFs."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import rasterio.windows
 import xarray as xr
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from rasterio import Affine
 
 from apertura.campaign.config import polarisation_of
@@ -23,16 +23,21 @@ from apertura.common.flags import Flags
 from apertura.common.provenance import Provenance
 from apertura.common.raster import opened_raster
 from apertura.common.units import decibels
+from apertura.core.antenna.beam import Beams
+from apertura.core.backprojection.inputs import Profiles
 from apertura.core.imaging.multilook import Multilook
 from apertura.core.imaging.noise import PulseNoise, noise_places, noise_power
 from apertura.core.imaging.radiometry import Quantity
 from apertura.core.imaging.range_profiles import profiles_of
+from apertura.core.imaging.view import view_report
 from apertura.core.scene.angles import surface
+from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.looks import BLOCK_PX, Looks
-from apertura.core.scene.terrain import FlatGround
+from apertura.core.scene.terrain import FlatGround, Terrain
 from apertura.formats.export import product, remove_outdated, write_exports
 from apertura.formats.export.layers import OUTSIDE
 from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, of_coefficient
+from apertura.stages.image_tags import acquisition_tags, angle_tags, quality_tags
 from apertura.stages.multilook import LazyLayer, coarse, mean_power_report, multilook_of, side_of
 from apertura.stages.pair import open_pair, pattern_digests
 from apertura.stages.planning import gated, integration_of, weighing
@@ -68,6 +73,9 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
         inputs=pattern_digests(campaign, pair) | scene.inputs,
     )
     folder, written = campaign.result(flight, pair), list[Path]()
+    viewed = _Viewed(profiles, beams, scene.grid, scene.terrain)
+    tags = tags_of(origin, lineage) | {"APERTURA_PULSE_NOISE": f"{noise:.4g}"}
+    tags |= acquisition_tags(campaign, {(flight, pair): view_report(viewed, opened.began, opened.time_s)})
 
     def write(kind: str, rasters: Mapping[str, LazyLayer], means: Mapping[str, Mapping[str, Any]]) -> None:
         (grid,) = {raster.grid for raster in rasters.values()} or {scene.grid}
@@ -77,7 +85,7 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
                 folder,
                 rasters,
                 titles={name: f"{campaign.settings.campaign} · flight {flight} · {pair} · {name}" for name in rasters},
-                tags=tags_of(origin, lineage) | {"APERTURA_PULSE_NOISE": f"{noise:.4g}"},
+                tags=tags,
                 radiometry=means,
                 transform=Affine(*grid.transform),
                 crs=grid.crs_wkt,
@@ -89,14 +97,20 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
     absolute = {} if calibrated is None else {"nesz": means_of("sigma0", noise="alone")}
     write("layers", layer_rasters(scene, looks, noise, calibrated, threads=threads), absolute)
     if image is not None:
+        tags |= angle_tags(campaign, flight, [pair]) | _quality_tags(image)
         powers, means = dict[str, GroundPower](), dict[str, Mapping[str, Any]]()
         if campaign.calibrated:
             mask = folder / product("mask", "write_mask").file
-            known = calibrated is not None
-            powers = {name: GroundPower(scene, image, calibrated, mask, name, known) for name in coefficients}
+            one = GroundPower(scene, image, calibrated, mask, is_known=calibrated is not None)
+            powers = {name: replace(one, quantity=name) for name in coefficients}
             means = {name: means_of(name) for name in coefficients}
             images = ((name, power.amplitude) for name, power in powers.items())
-            write("radiometry", {name: LazyLayer(scene.grid, np.complex64, of, threads) for name, of in images}, means)
+            rasters = {name: LazyLayer(scene.grid, np.complex64, of, threads) for name, of in images}
+            write(
+                "radiometry",
+                rasters | (gamma0_layers(one, looks, threads=threads) if "gamma0" in powers else {}),
+                means,
+            )
             written.append(folder / CROSS_SECTIONS)
             report = _report(scene, image, calibrated, measured_noise) if calibrated else _no_constant(campaign, pair)
             write_json(written[-1], report | {"polarisation": label})
@@ -113,6 +127,27 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
     remove_outdated(folder, written)
     record_files(campaign.root / lineage.result.manifest, written, lineage)
     return written
+
+
+@dataclass(frozen=True, eq=False)
+class _Viewed:
+    """Scene and profiles of a pair, for `view_report`."""
+
+    profiles: Profiles
+    beams: Beams | None
+    grid: SceneGrid
+    terrain: Terrain
+
+    def positions_at(self, row: ArrayLike, column: ArrayLike) -> Floats:
+        """Return (..., 3) float64 positions (m) of fractional pixel indices, on the terrain."""
+        return self.terrain.positions_at(self.grid, row, column)
+
+
+def _quality_tags(image: xr.Dataset) -> dict[str, str]:
+    """Return the quality of the image of a pair alone; the verdict also depends on the other pairs of the flight."""
+    quality = image.attrs["quality"]
+    focus = {name: value for name, value in quality["focus"].items() if name not in {"verdict", "reason"}}
+    return quality_tags({**quality, "focus": focus})
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +189,41 @@ class GroundPower:
         """Return the complex pixels of a window scaled to this power, (row, column)."""
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(self.image.image[window].values / np.sqrt(self.per_one(window)), np.complex64)
+
+
+def gamma0_layers(power: GroundPower, looks: Looks, *, threads: int) -> dict[str, LazyLayer]:
+    """Return the layers of a calibrated pair that γ⁰ requires.
+
+    Parameters
+    ----------
+    power
+        Power of a coefficient, of which only scene, calibration and mask are used.
+    looks
+        The pulses that contribute to each pixel.
+    threads
+        Number of tiles processed in parallel.
+
+    Returns
+    -------
+    dict
+        `scattering_area`, β⁰/γ⁰, `gamma_sigma_ratio`, σ⁰/γ⁰ (docs/theory/radiometry.md, eq. 6a), and
+        `ellipsoidal_incidence`, the incidence angle from the vertical.
+    """
+
+    def ratio(normalised_to: Quantity, window: Window) -> NDArray[np.float32]:
+        # The power of terrain with a coefficient of 1 is proportional to the area to which it is normalised.
+        areas = (replace(power, quantity=quantity).per_one(window) for quantity in ("gamma0", normalised_to))
+        return np.asarray(next(areas) / next(areas), np.float32)
+
+    def from_vertical(window: Window) -> NDArray[np.float32]:
+        return np.asarray(_inside(looks, window, looks.ellipsoidal_incidence_deg(window)), np.float32)
+
+    values: dict[str, Callable[[Window], NDArray[np.float32]]] = {
+        "scattering_area": partial(ratio, "beta0"),
+        "gamma_sigma_ratio": partial(ratio, "sigma0"),
+        "ellipsoidal_incidence": from_vertical,
+    }
+    return {name: LazyLayer(power.scene.grid, np.float32, of, threads) for name, of in values.items()}
 
 
 def _multilooked(

@@ -46,9 +46,7 @@ def ro_crate(campaign: Campaign) -> Sequence[Path]:
         list(_jobs(campaign, results, hashes)),
         [Listed(name, hashes[name], _size(campaign.root.named(name, where=campaign.root))) for name in inputs],
         [Listed(name, sha256_text(text), len(text.encode())) for name, text in workflow.items()],
-        author=campaign.settings.metadata.author,
-        licence=campaign.settings.metadata.licence,
-        doi=campaign.settings.metadata.doi,
+        attribution=campaign.settings.metadata,
     )
     written = [campaign.result(name) for name in (CRATE, *workflow)]
     write_json(written[0], crate_document(run))

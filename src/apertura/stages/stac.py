@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import acos, degrees
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -10,6 +11,7 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura import __version__
 from apertura.campaign.config import FUSED, is_monostatic, polarisation_of
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_listed, open_stage, read_manifest, record_files, remake_from
@@ -20,6 +22,7 @@ from apertura.common.provenance import lock_sha256, software
 from apertura.core.echo.compression import centre_frequency
 from apertura.formats.catalog import CATALOG
 from apertura.formats.catalog.stac import (
+    POLARISATIONS,
     AcquisitionTime,
     Image,
     asset_of,
@@ -27,9 +30,11 @@ from apertura.formats.catalog.stac import (
     instant,
     projection,
     read_facts,
+    true_azimuth_deg,
 )
 from apertura.formats.export.coverage import Covered, feature_collection
 from apertura.stages.coverage import few_looks, place_of, transform_of
+from apertura.stages.image_tags import mode_of
 from apertura.stages.scene import OpenScene, settled_scene
 from apertura.workflow.lineage import result_of
 
@@ -42,9 +47,7 @@ def stac(campaign: Campaign) -> list[Path]:
     lineage = result_of(campaign, "stac").begin(campaign.root)
     manifest, folder = campaign.root / lineage.result.manifest, campaign.result("stac")
     images = _ImageDescriptions(campaign, settled_scene(campaign)).images()
-    metadata = campaign.settings.metadata
-    attribution = {"licence": metadata.licence, "author": metadata.author, "doi": metadata.doi}
-    files = catalog_files(campaign.settings.campaign, images, **attribution)
+    files = catalog_files(campaign.settings.campaign, images, campaign.settings.metadata)
     manifest.unlink(missing_ok=True)
     for name, document in files.items():
         write_json(campaign.result("stac", name), document)
@@ -73,13 +76,13 @@ class _ImageDescriptions:
     def _pair(self, flight: str, pair: str, looks: NDArray[np.float32]) -> Image:
         files = self._listed(flight, pair, "export") | self._listed(flight, pair, "layers")
         facts: dict[str, Any] = {
-            "sar:instrument_mode": "monostatic" if is_monostatic(pair) else "bistatic",
+            "sar:instrument_mode": mode_of([pair]),
             "product:type": "SLC",
             "sar:looks_range": 1,
             "sar:looks_azimuth": 1,
         }
         label = polarisation_of(self.campaign.settings.nodes, pair)
-        if label and {*label} <= {"H", "V"}:
+        if label in POLARISATIONS:
             facts["sar:polarizations"] = [label]
         return Image(
             flight,
@@ -94,7 +97,10 @@ class _ImageDescriptions:
     def _sum(self, flight: str, name: str, pairs: Sequence[Image], looks: NDArray[np.float32]) -> Image:
         others = tuple(f"{other}_" for other in _SUMS if other != name)
         listed = self._listed(flight, FUSED, "export")
-        facts: dict[str, Any] = {"sar:instrument_mode": "multistatic", "product:type": _SUMS[name]}
+        facts: dict[str, Any] = {
+            "sar:instrument_mode": mode_of([pair.name for pair in pairs]),
+            "product:type": _SUMS[name],
+        }
         sides = {pair.properties.get("sar:observation_direction") for pair in pairs}
         if len(sides) == 1 and None not in sides:
             facts["sar:observation_direction"] = sides.pop()
@@ -145,10 +151,17 @@ class _ImageDescriptions:
                     if brightest.get(width) is not None:
                         facts[f"sar:resolution_{axis}"] = float(brightest[width])
             if "view" in report:  # look direction of the pair at the scene centre
-                view = report["view"]
-                directions = {"sar:observation_direction": view["side"], "view:azimuth": view["look_deg"]}
+                view, grid = report["view"], self.scene.grid
+                west, south, east, north = grid.bounds_m
+                centre = (west + east) / 2, (south + north) / 2
+                directions = {
+                    "sar:observation_direction": view["side"],
+                    "view:azimuth": true_azimuth_deg(grid.crs_wkt, centre, view["look_deg"]),
+                }
                 facts |= {name: value for name, value in directions.items() if value not in {"both", None}}
                 facts["view:incidence_angle"] = float(view["incidence_deg"])
+                if name != FUSED and is_monostatic(name) and 0 < view["height_m"] <= view["range_m"]:
+                    facts["view:off_nadir"] = round(degrees(acos(view["height_m"] / view["range_m"])), 4)
             return {
                 **self._shared,
                 **facts,
@@ -170,8 +183,8 @@ class _ImageDescriptions:
             **projection(grid.crs_wkt, grid.shape, grid.transform),
             "sar:pixel_spacing_range": grid.spacing_m,
             "sar:pixel_spacing_azimuth": grid.spacing_m,
-            **({"platform": platform} if (platform := self.campaign.settings.metadata.platform) else {}),
             "processing:level": "L1",
+            "processing:version": __version__,
             "processing:software": software(),
         }
 

@@ -1,17 +1,13 @@
-"""Provenance attributes of stages, and GeoTIFF tags: settings, inputs and code of upstream stages, time, quality."""
+"""Provenance of stages as attributes, and of exported files as tags: settings, inputs and code of upstream stages."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import xarray as xr
 
 from apertura import __version__
-from apertura.campaign.config import polarisation_of
 from apertura.campaign.digests import Lineage
-from apertura.campaign.folder import Campaign
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.contracts import STAGES, STANDARD_NAMES, check
 from apertura.common.provenance import (
     Provenance,
@@ -62,6 +58,7 @@ def tags_of(origin: Provenance, lineage: Lineage) -> dict[str, str]:
     return replace(origin, software=joined(origin.software, software())).tags() | {
         "APERTURA_SOURCES": canonical_json(lineage.sources.digests),
         "APERTURA_LOCK_SHA256": lock_sha256(),
+        "TIFFTAG_SOFTWARE": f"apertura {__version__}",
     }
 
 
@@ -120,53 +117,3 @@ def stamp(
         "software": dict(software or {}),
     }
     return stamped
-
-
-_FIRST_CLOCK = np.datetime64("1980-01-06")  # times of a recording without a clock start in 1970
-
-
-def acquisition_tags(campaign: Campaign, views: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-    """Return time, frequency, look side and author of an image as tags; for a sum, those of all its pairs together."""
-    each = list(views.values())
-    first, last = min(view["first_utc"] for view in each), max(view["last_utc"] for view in each)
-    centres = {view["centre_hz"] for view in each}
-    low = min(view["centre_hz"] - view["band_hz"] / 2 for view in each)
-    high = max(view["centre_hz"] + view["band_hz"] / 2 for view in each)
-    centre_hz = centres.pop() if len(centres) == 1 else (low + high) / 2
-    sides = {view["side"] for view in each}
-    side = sides.pop() if len(sides) == 1 else "both"
-    is_observable = any(view["side_observable"] for view in each)
-    labels = {label for pair in views if (label := polarisation_of(campaign.settings.nodes, pair))}
-    incidence = [view["incidence_deg"] for view in each]
-    metadata, has_clock = campaign.settings.metadata, np.datetime64(first) >= _FIRST_CLOCK
-    tags = {
-        "APERTURA_ACQUISITION_START": f"{first[:26]}Z" if has_clock else None,
-        "APERTURA_ACQUISITION_END": f"{last[:26]}Z" if has_clock else None,
-        "APERTURA_CENTRE_FREQUENCY_HZ": f"{centre_hz:.12g}",
-        "APERTURA_BANDWIDTH_HZ": f"{high - low:.12g}",
-        "APERTURA_WAVELENGTH_M": f"{SPEED_OF_LIGHT_M_S / centre_hz:.6g}",
-        "APERTURA_LOOK_SIDE": side if side == "both" or is_observable else f"{side}, assumed",
-        "APERTURA_INCIDENCE_DEG": f"{np.mean(incidence):.2f}",
-        "APERTURA_POLARISATION": ", ".join(sorted(labels)) or None,
-        "APERTURA_PLATFORM": metadata.platform,
-        "APERTURA_DOI": metadata.doi,
-        "TIFFTAG_DATETIME": f"{first[:19].replace('-', ':').replace('T', ' ')}" if has_clock else None,
-        "TIFFTAG_ARTIST": metadata.author,
-        "TIFFTAG_COPYRIGHT": metadata.licence,
-    }
-    return {name: value for name, value in tags.items() if value is not None}
-
-
-def quality_tags(report: Mapping[str, Any]) -> dict[str, str]:
-    """Return instruction set, error bound, flags, models and error budget of an image as tags."""
-    reports = {
-        name: report[name] for name in ("budget", "budgets", "focus", "fusion", "recomputed") if report.get(name)
-    }
-    return {
-        "APERTURA_INSTRUCTION_SET": report["instruction_set"],
-        "APERTURA_ERROR_DB": f"{report['numerical_error_db']:.2f}",
-        "APERTURA_ERROR_CONFIDENCE": f"{report['numerical_error_confidence']:.2f}",
-        "APERTURA_FLAGS": canonical_json(report["flags"]),
-        "APERTURA_MODELS": canonical_json(report["models"]),
-        **{f"APERTURA_{name.upper()}": canonical_json(value) for name, value in reports.items()},
-    }

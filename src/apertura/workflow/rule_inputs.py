@@ -331,13 +331,6 @@ def multilook(scope: JobScope) -> Mapping[str, Any]:
     return {"multilook": stated} if stated else {}
 
 
-def noise_of_sums(scope: JobScope) -> Iterable[str]:
-    """Return the manifests with the noise of a flight's images; empty unless noise is subtracted from the sums."""
-    multilooking = scope.campaign.settings.processing.multilook
-    subtracted = multilooking is not None and multilooking.subtract_noise
-    return [scope.campaign.manifest("layers", *pair) for pair in scope.pairs] if subtracted else []
-
-
 def measured_image(scope: JobScope) -> Iterable[str]:
     """Return the image, transmitted signal and file of constants, as far as calibration or multilooking need these."""
     campaign, files = scope.campaign, list[Path]()
@@ -346,12 +339,6 @@ def measured_image(scope: JobScope) -> Iterable[str]:
         files += [path for path in [campaign.calibration_file] if path is not None]
     is_needed = campaign.calibrated or multilook(scope)
     return [*map(campaign.relative, files), *(campaign.manifest("image", *pair) for pair in scope.pairs if is_needed)]
-
-
-def calibration_of_images(scope: JobScope) -> Iterable[str]:
-    """Return the manifests with the radiometric calibration of images; empty if images are relative."""
-    campaign = scope.campaign
-    return [campaign.manifest("layers", *pair) for pair in scope.pairs] if campaign.calibrated else []
 
 
 def pair_settings(scope: JobScope) -> Mapping[str, Any]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from apertura.common.lazy import Lazy, module_of
+from apertura.formats.catalog import DOCUMENTS
 from apertura.workflow import rule_inputs as inputs
 from apertura.workflow.rule_inputs import Scope
 
@@ -420,7 +421,15 @@ _ROWS = (
         "Write incidence, bistatic angle, mask, looks, noise and, if calibrated, sigma0 of a pair as GeoTIFFs.",
         _STAGES.layers.layers,
         sources=(*_FORMED, inputs.measured_image),
-        settings=("campaign", "processing.integration", inputs.antennas, inputs.radio, inputs.multilook),
+        settings=(
+            "campaign",
+            "metadata",
+            inputs.polarisations,
+            "processing.integration",
+            inputs.antennas,
+            inputs.radio,
+            inputs.multilook,
+        ),
         exports="layers",
         forms=True,
         demand=Demand(600, pulse_bytes=500, pixel_bytes=30, pixel_s=5, recorded_s=20, threads=2),
@@ -444,9 +453,9 @@ _ROWS = (
         Scope.PAIR,
         "Write GeoTIFFs and the quicklook of a pair, or of the sums ('fused').",
         _STAGES.export.export,
-        sources=("image", "assessment", "scene", inputs.calibration_of_images),
+        sources=("image", "assessment", "scene", "layers"),
         settings=("campaign", "metadata", inputs.polarisations),
-        documents=("image.json",),
+        documents=DOCUMENTS,
         exports="pair",
         demand=Demand(500, pixel_bytes=50, pixel_s=30),
         cost=Cost(0.4, mpx_s=0.3, last=True),
@@ -482,7 +491,7 @@ _ROWS = (
         "Stack all images and compute sums and interferometric phases, cube.zarr.",
         _STAGES.cube.cube,
         sources=("image", "assessment", "scene"),
-        settings=("campaign", "processing.tile_px"),
+        settings=("campaign", "metadata", "processing.tile_px"),
         demand=Demand(500, pixel_bytes=50, pixel_s=10, threads=2),
         cost=Cost(0.3, mpx_s=0.65),
         options=("threads",),
@@ -493,9 +502,9 @@ _ROWS = (
         "Write GeoTIFFs and the quicklook of the sums of the pairs of a flight.",
         _STAGES.export.export,
         result="fused",
-        sources=("image", "assessment", "cube", "scene", inputs.noise_of_sums),
+        sources=("image", "assessment", "cube", "scene", "layers"),
         settings=("campaign", "metadata", inputs.polarisations, "processing.tile_px", inputs.multilook),
-        documents=("image.json",),
+        documents=DOCUMENTS,
         exports="fused",
         manifest="{flight}/fused/export",
         needed=inputs.adds_up,
@@ -513,6 +522,8 @@ _ROWS = (
         sources=(*_FORMED, "image", "layers"),
         settings=(
             "campaign",
+            "metadata",
+            inputs.polarisations,
             inputs.two_images,
             "interferometry.window_px",
             "scene.reference_points",

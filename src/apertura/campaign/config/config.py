@@ -13,24 +13,14 @@ from apertura.campaign.config.processing import (
     Processing,
     Scene,
 )
-from apertura.campaign.config.section import Doi, Licence, Name, RawRoot, Section, Title
+from apertura.campaign.config.section import Name, RawRoot, Section
 from apertura.campaign.config.waveform import PhaseHistoryWaveform, SampledWaveform, Waveform
 from apertura.common import documents
+from apertura.common.attribution import Attribution, Title
 from apertura.common.documents import read_yaml
 
 CONFIG = Path("config/config.yaml")
 """Path of the config in a campaign folder."""
-
-
-class Metadata(Section):
-    """Metadata of the campaign that recordings and logs do not contain."""
-
-    author: Title | None = Field(None, description="author of the recordings; null: not stated")
-    licence: Licence | None = Field(
-        None, description="licence of the products, an SPDX identifier such as CC-BY-4.0; null: not stated"
-    )
-    platform: Title | None = Field(None, description="aircraft, such as a type or a registration; null: not stated")
-    doi: Doi | None = Field(None, description="DOI of the data set, such as 10.5281/zenodo.1234567; null: none")
 
 
 class Settings(Section):
@@ -54,8 +44,10 @@ class Settings(Section):
     interferometry: Interferometry = Field(
         default_factory=Interferometry, description="pairs of images for interferometry: coherence and heights"
     )
-    metadata: Metadata = Field(
-        default_factory=Metadata, description="author, licence, platform and DOI for GeoTIFF tags, STAC and RO-Crate"
+    metadata: Attribution = Field(
+        default_factory=Attribution,
+        description="title, creators, institution, licence, platform, instrument and DOI, written to all products; "
+        "polarisations are keys of nodes.<name>.antennas",
     )
 
     @model_validator(mode="after")

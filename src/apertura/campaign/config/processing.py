@@ -7,7 +7,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from apertura.campaign.config.section import CrsName, Metres3, Name, Section, Title, plain_crs
+from apertura.campaign.config.section import CrsName, Metres3, Name, Section, plain_crs
+from apertura.common.attribution import Title
 from apertura.common.constants import LARGEST_REFRACTIVITY, VERTICAL_DATUMS
 from apertura.common.errors import CampaignError, quoted
 from apertura.core.imaging.options import ImagingChoices

@@ -1,4 +1,4 @@
-"""Base class of config sections, types of names and texts, and reading of config tables."""
+"""Base class of config sections, types of names, and reading of config tables."""
 
 import csv
 import io
@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict
 
 from apertura.common.documents import read_text
 from apertura.common.errors import CampaignError, quoted
@@ -34,7 +34,6 @@ WAVEFORM_KINDS = (
 _AUTHORITY = "[A-Za-z][A-Za-z0-9_]{0,31}"
 _CODE = _AUTHORITY + ":[A-Za-z0-9_.-]{1,31}"
 _LONGEST = 64
-_LONGEST_TITLE = 120
 
 Metres3 = tuple[float, float, float]
 
@@ -53,17 +52,6 @@ def _plain_name(name: str) -> str:
     if name.lower() in RESERVED_NAMES or name.lower().endswith(_RESERVED_ENDS):
         raise ValueError(f"name {name!r} is reserved for files in the results folder; choose another name")
     return name
-
-
-def _title(text: str) -> str:
-    invalid = next((char for char in text if not char.isprintable() or char in '"<>&\\'), None)
-    if invalid is not None:
-        raise ValueError(
-            f"{quoted(text)}: {quoted(invalid)} may not be used, because the text is written to WKT, HTML and file tags"
-        )
-    if not 1 <= len(text.strip()) <= _LONGEST_TITLE:
-        raise ValueError(f"{len(text.strip())} characters: 1 to {_LONGEST_TITLE} may be used")
-    return text
 
 
 def _absolute(path: str) -> str:
@@ -96,15 +84,6 @@ CrsName = Annotated[str, AfterValidator(plain_crs)]
 
 RawRoot = Annotated[str, AfterValidator(_absolute)]
 """Path of a folder outside the campaign."""
-
-Licence = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9.+-]{0,63}$")]
-"""SPDX identifier."""
-
-Doi = Annotated[str, Field(pattern=r"^10\.[0-9]{4,9}/[A-Za-z0-9._;()/:-]{1,100}$")]
-"""Digital object identifier, without https://doi.org/."""
-
-Title = Annotated[str, AfterValidator(_title)]
-"""One line of text without characters that WKT, HTML or a terminal interpret."""
 
 
 # ---- Tab-separated tables of the config: a header line, then one line per row ----------------------------------------

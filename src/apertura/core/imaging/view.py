@@ -1,12 +1,15 @@
 """Imaging geometry of a pair at the scene centre: direction, angles, distance and band."""
 
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from apertura.core.imaging.formation import Formation
+from apertura.core.antenna.beam import Beams
+from apertura.core.backprojection.inputs import Profiles
+from apertura.core.geometry.geodesy import ned_axes
 from apertura.core.scene.angles import bistatic_angle_deg, incidence_deg
+from apertura.core.scene.grid import SceneGrid
 
 _COUNTS = 0.5
 """Minimum weight of a pulse that is considered to illuminate the scene centre: half amplitude."""
@@ -20,13 +23,25 @@ _OBSERVABLE_RAD = 1.0
 _PULSES = 1024  # pulses sampled for the carriers, which are means over a smooth track
 
 
-def view_report(formation: Formation, began: np.datetime64, time_s: NDArray[np.float64]) -> dict[str, Any]:
+class ViewedScene(Protocol):
+    """Grid and terrain of a scene, with the profiles and the weights of the pulses; such as a `Formation`."""
+
+    @property
+    def profiles(self) -> Profiles: ...  # noqa: D102
+    @property
+    def beams(self) -> Beams | None: ...  # noqa: D102
+    @property
+    def grid(self) -> SceneGrid: ...  # noqa: D102
+    def positions_at(self, row: ArrayLike, column: ArrayLike) -> NDArray[np.float64]: ...  # noqa: D102
+
+
+def view_report(scene: ViewedScene, began: np.datetime64, time_s: NDArray[np.float64]) -> dict[str, Any]:
     """Report the imaging geometry at the scene centre for image.json; angles and distance at closest approach.
 
     Parameters
     ----------
-    formation
-        Formation of the image.
+    scene
+        The scene, for example the formation of the image.
     began, time_s
         Time of the first pulse, UTC; and (pulse,) float64, times of the pulses in seconds since the first pulse.
 
@@ -35,7 +50,8 @@ def view_report(formation: Formation, began: np.datetime64, time_s: NDArray[np.f
     dict
         `first_utc`, `last_utc`: times of the first and last pulse that illuminate the scene centre, or of the first and
         last pulse of the flight if none does. `heading_deg`, `look_deg`: heading and look direction of the midpoint
-        between the antennas, clockwise from grid north. `incidence_deg`: incidence angle of the transmitter, from the
+        between the antennas, clockwise from grid north. `look_vector_ecef`: unit vector of the look direction in ECEF;
+        None in a local frame. `incidence_deg`: incidence angle of the transmitter, from the
         vertical. `bistatic_angle_deg`. `range_m`: half the total path. `height_m`: height of the midpoint above the
         terrain. `speed_m_s`: mean speed of the midpoint. `side`: side of the heading on which the scene lies: right,
         left, or both if the track encircles the scene. `side_mirror_rad`: RMS phase between the echoes of the scene and
@@ -45,13 +61,13 @@ def view_report(formation: Formation, began: np.datetime64, time_s: NDArray[np.f
         `carriers_cycles_m`: the same centre at 3 x 3 points from corner to corner (`carrier_at`).
     """
     # The scene centre, and the pulses that illuminate it.
-    point, (east, north) = ground_axes(formation, *((size - 1) / 2 for size in formation.grid.shape))
-    profiles, beams = formation.profiles, formation.beams
+    point, (east, north) = ground_axes(scene, *((size - 1) / 2 for size in scene.grid.shape))
+    profiles, beams = scene.profiles, scene.beams
     weight = np.ones(len(profiles)) if beams is None else beams.weight(profiles.aperture, point[None])[:, 0]
     counted = np.flatnonzero(weight >= _COUNTS)
     counted = counted if counted.size else np.arange(len(profiles))
     # Closest approach: shortest total path. The carrier is the mean path gradient divided by the wavelength.
-    aperture, up = profiles.aperture[counted], np.cross(east, north)
+    aperture, up = profiles.aperture[counted], _vertical(scene.grid, point)
     path, middle = aperture.path(point), aperture.middle_m
     closest = int(path.argmin())
     tx, rx = (leg[closest] for leg in aperture.legs)
@@ -59,12 +75,16 @@ def view_report(formation: Formation, began: np.datetime64, time_s: NDArray[np.f
     times = began + (1e9 * time_s[counted[[0, -1]]]).round().astype("timedelta64[ns]")
     flight_m, look_m = middle[-1] - middle[0], point - middle[closest]
     incidence = float(incidence_deg(point, up, tx))
+    # Directions are measured in the horizontal plane; on slopes, the axes along the terrain are inclined.
+    level = np.stack([axis - (axis @ up) * up for axis in (east, north)])
+    level /= np.linalg.norm(level, axis=1, keepdims=True)
     mirror_rad = _mirror_rad(middle, up, incidence, profiles.wavelength_m)
     return {
         "first_utc": str(times[0]),
         "last_utc": str(times[1]),
-        "heading_deg": _bearing_deg(flight_m @ east, flight_m @ north),
-        "look_deg": _bearing_deg(look_m @ east, look_m @ north),
+        "heading_deg": _bearing_deg(*level @ flight_m),
+        "look_deg": _bearing_deg(*level @ look_m),
+        "look_vector_ecef": _unit(look_m) if scene.grid.frame == "ecef" else None,
         "speed_m_s": _speed_m_s(middle, time_s[counted]),
         "side": _side(middle, point, up),
         "side_mirror_rad": float(f"{mirror_rad:.4g}"),
@@ -76,35 +96,42 @@ def view_report(formation: Formation, began: np.datetime64, time_s: NDArray[np.f
         "centre_hz": float(profiles.centre_frequency_hz),
         "band_hz": float(f"{profiles.bandwidth_hz:.8g}"),
         "carrier_cycles_m": [float(f"{part:.8g}") for part in slope / profiles.wavelength_m],
-        "carriers_cycles_m": [
-            [[float(f"{x:.8g}") for x in carrier] for carrier in row] for row in carriers_of(formation)
-        ],
+        "carriers_cycles_m": [[[float(f"{x:.8g}") for x in carrier] for carrier in row] for row in carriers_of(scene)],
     }
 
 
-def carriers_of(formation: Formation) -> NDArray[np.float64]:
+def carriers_of(scene: ViewedScene) -> NDArray[np.float64]:
     """Return the carriers at the corners, edges and centre of the scene, (3, 3, 2) as required by `carrier_at`.
 
     Each carrier is a mean over the pulses that illuminate the point, or over all pulses if none does.
     """
-    profiles, beams, shape = formation.profiles, formation.beams, formation.grid.shape
+    profiles, beams, shape = scene.profiles, scene.beams, scene.grid.shape
     sampled = profiles.aperture.sample(_PULSES)
     aperture, carriers = profiles.aperture[sampled], np.zeros((3, 3, 2))
     for row, column in np.ndindex(3, 3):
         at = row * (shape[0] - 1) / 2, column * (shape[1] - 1) / 2
         # `ground_axes` evaluates the pixels above and to the right, which must lie inside the grid.
-        point, axes = ground_axes(formation, max(1.0, at[0]), min(at[1], shape[1] - 2.0))
+        point, axes = ground_axes(scene, max(1.0, at[0]), min(at[1], shape[1] - 2.0))
         weight = np.ones(len(aperture)) if beams is None else beams[sampled].weight(aperture, point[None])[:, 0]
         slope = np.average(aperture.path_gradient(point), axis=0, weights=weight if weight.any() else None)
         carriers[row, column] = axes @ slope / profiles.wavelength_m
     return carriers
 
 
-def ground_axes(formation: Formation, row: float, column: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def ground_axes(scene: ViewedScene, row: float, column: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return a point on the terrain, (3,) metres, and unit vectors along grid east and north at this point, (2, 3)."""
-    point, east, north = formation.positions_at([row, row, row - 0.5], [column, column + 0.5, column])
+    point, east, north = scene.positions_at([row, row, row - 0.5], [column, column + 0.5, column])
     axes = np.stack([east - point, north - point])
     return point, axes / np.linalg.norm(axes, axis=1, keepdims=True)
+
+
+def _vertical(grid: SceneGrid, point: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the upward unit vector at a point, in the frame of the grid."""
+    return -ned_axes(point)[..., 2] if grid.frame == "ecef" else np.array([0.0, 0.0, 1.0])
+
+
+def _unit(vector: NDArray[np.float64]) -> list[float]:
+    return [round(float(part), 9) for part in vector / np.linalg.norm(vector)]
 
 
 def _speed_m_s(middle_m: NDArray[np.float64], time_s: NDArray[np.float64]) -> float | None:

@@ -431,6 +431,16 @@ class Looks:
             return self.lattice.between(self._angles_deg[0], tile)
         return incidence_deg(*surface(self.grid, self.terrain, tile), self.centre(tile)[0])
 
+    def ellipsoidal_incidence_deg(self, tile: Window) -> NDArray[Any]:
+        """Return the angle of the transmitter from the vertical at closest approach, (row, column), degrees.
+
+        Over level terrain this is `incidence_deg`.
+        """
+        grid = self.grid[tile]
+        height_m = self.terrain.heights(grid)
+        position, above = (grid.positions(height_m + more) for more in (0.0, 1.0))
+        return incidence_deg(position, above - position, self.centre(tile)[0])
+
     def bistatic_angle_deg(self, tile: Window) -> NDArray[Any]:
         """Return the bistatic angle at closest approach, (row, column), degrees; interpolated as in `incidence_deg`."""
         if self._smooth(tile):

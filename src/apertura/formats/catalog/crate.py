@@ -1,7 +1,7 @@
 """RO-Crate of a run, profile Provenance Run Crate 0.5: creation of the document, and reading of its hashes."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote
@@ -9,6 +9,7 @@ from urllib.parse import quote, unquote
 from rocrate.model.entity import Entity
 from rocrate.rocrate import ROCrate
 
+from apertura.common.attribution import Attribution, Creator
 from apertura.common.confined import ConfinedPath
 from apertura.common.documents import DAMAGED, read_json, undamaged
 from apertura.common.provenance import LARGEST_DOCUMENT, canonical_json, sha256_text
@@ -92,8 +93,8 @@ class CrateRun:
         Input files in the campaign folder.
     workflow
         Files of the workflow, copied to the folder of the crate.
-    author, licence, doi
-        Configured name of the author, SPDX identifier and DOI; None: not configured.
+    attribution
+        Section `metadata` of the config.
     """
 
     campaign: str
@@ -103,9 +104,7 @@ class CrateRun:
     jobs: Sequence[CrateJob]
     inputs: Sequence[Listed]
     workflow: Sequence[Listed]
-    author: str | None = None
-    licence: str | None = None
-    doi: str | None = None
+    attribution: Attribution = field(default_factory=Attribution)
 
 
 # ---- RO-Crate document, profile Provenance Run Crate 0.5 ------------------------------------------------------------
@@ -126,7 +125,7 @@ _PROFILES = {
 }
 _TERMS = "https://w3id.org/ro/terms/workflow-run/context"
 _COMPLETED = "http://schema.org/CompletedActionStatus"
-_LICENCE, _AUTHOR = "#licence", "#author"
+_LICENCE = "#licence"
 _RUN, _ORGANISED, _LOCK = "#run", "#organised", "#lock"
 
 
@@ -170,6 +169,7 @@ def input_id(name: str) -> str:
 
 
 def _root(run: CrateRun, parts: Sequence[str], actions: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    stated = run.attribution
     description = (
         f"Images of the campaign {run.campaign}, with every processing step from its recordings to the images. "
         "Recordings and config are listed with their hashes; the files are in the parent folder. Actions have no "
@@ -177,12 +177,14 @@ def _root(run: CrateRun, parts: Sequence[str], actions: Sequence[Mapping[str, An
         "code always give the same crate. Versions are those of the installation that wrote the crate."
     )
     return {
-        "name": run.campaign,
+        "name": stated.title or run.campaign,
         "description": description,
         "datePublished": run.recorded_until,
         "license": {"@id": _licence_id(run)},
-        **({"author": {"@id": _AUTHOR}} if run.author else {}),
-        **({"identifier": f"https://doi.org/{run.doi}"} if run.doi else {}),
+        **({"alternateName": run.campaign} if stated.title else {}),
+        **({"author": _refs(map(_person_id, stated.creators))} if stated.creators else {}),
+        **({"publisher": {"@id": _organisation_id(stated.institution)}} if stated.institution else {}),
+        **({"identifier": f"https://doi.org/{stated.doi}"} if stated.doi else {}),
         "conformsTo": _refs(_PROFILES),
         "hasPart": _refs(parts),
         "mainEntity": {"@id": WORKFLOW},
@@ -191,14 +193,24 @@ def _root(run: CrateRun, parts: Sequence[str], actions: Sequence[Mapping[str, An
 
 
 def _licence_id(run: CrateRun) -> str:
-    return f"https://spdx.org/licenses/{run.licence}" if run.licence else _LICENCE
+    licence = run.attribution.licence
+    return f"https://spdx.org/licenses/{licence}" if licence else _LICENCE
+
+
+def _person_id(creator: Creator) -> str:
+    return f"https://orcid.org/{creator.orcid}" if creator.orcid else f"#person/{quote(creator.name)}"
+
+
+def _organisation_id(name: str) -> str:
+    return f"#organisation/{quote(name)}"
 
 
 def _software(run: CrateRun) -> Iterator[dict[str, Any]]:
     for uri, name in _PROFILES.items():
         yield {"@id": uri, "@type": "CreativeWork", "name": name, "version": uri.rpartition("/")[2]}
-    if run.licence:
-        yield {"@id": _licence_id(run), "@type": "CreativeWork", "name": run.licence, "identifier": run.licence}
+    stated = run.attribution
+    if stated.licence:
+        yield {"@id": _licence_id(run), "@type": "CreativeWork", "name": stated.licence, "identifier": stated.licence}
     else:
         yield {
             "@id": _LICENCE,
@@ -206,8 +218,12 @@ def _software(run: CrateRun) -> Iterator[dict[str, Any]]:
             "name": "not stated",
             "description": "No licence is configured (metadata.licence); ask the owner of the recordings.",
         }
-    if run.author:
-        yield {"@id": _AUTHOR, "@type": "Person", "name": run.author}
+    for creator in stated.creators:
+        member = {"affiliation": {"@id": _organisation_id(creator.affiliation)}} if creator.affiliation else {}
+        yield {"@id": _person_id(creator), "@type": "Person", "name": creator.name, **member}
+    for organisation in (stated.institution, *(creator.affiliation for creator in stated.creators)):
+        if organisation:
+            yield {"@id": _organisation_id(organisation), "@type": "Organization", "name": organisation}
     for name, version in run.software.items():
         yield {"@id": f"#software/{name}", "@type": "SoftwareApplication", "name": name, "version": version}
     yield {

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,10 @@ import numpy as np
 import pystac
 from pystac.layout import CustomLayoutStrategy
 
+from apertura.common.attribution import Attribution
 from apertura.common.errors import CampaignError
 from apertura.common.raster import opened_raster
+from apertura.common.units import frequency_band
 from apertura.core.geometry.geodesy import longitude_range
 from apertura.formats.catalog import CATALOG
 
@@ -28,21 +30,13 @@ EXTENSIONS: Mapping[str, str] = {
     "proj": f"{_BASE}/projection/v2.0.0/schema.json",
     "raster": f"{_BASE}/raster/v2.0.0/schema.json",
     "sar": f"{_BASE}/sar/v1.3.0/schema.json",
+    "sci": f"{_BASE}/scientific/v1.0.0/schema.json",
     "view": f"{_BASE}/view/v1.1.0/schema.json",
 }
 """Prefix of the fields → URI of the schema, which is used only as an identifier and is not downloaded."""
 
-_BANDS_GHZ = {
-    "P": (0.25, 1.0),
-    "L": (1.0, 2.0),
-    "S": (2.0, 4.0),
-    "C": (4.0, 8.0),
-    "X": (8.0, 12.5),
-    "Ku": (12.5, 18.0),
-    "K": (18.0, 26.5),
-    "Ka": (26.5, 40.0),
-}
-"""Frequency bands of the SAR extension, which defines no bands below P and above Ka."""
+POLARISATIONS = frozenset({"HH", "HV", "VH", "VV", "LH", "LV", "RH", "RV"})
+"""Polarisations of the SAR extension that a configured pair of antennas can have."""
 
 _FIRST_CLOCK = datetime(1980, 1, 6, tzinfo=UTC)  # epoch of GPS time; earlier times are pulse counters
 _NO_CLOCK = "none: the recording contains no time of day; times are pulse numbers in seconds since 1970-01-01"
@@ -73,10 +67,9 @@ class AcquisitionTime:
     @property
     def fields(self) -> dict[str, Any]:
         """Fields of the SAR extension; the frequency band is omitted if no letter is defined for it."""
-        ghz = self.centre_hz / 1e9
-        band = next((name for name, (low, high) in _BANDS_GHZ.items() if low <= ghz < high), None)
+        band = frequency_band(self.centre_hz)
         return {
-            "sar:center_frequency": round(ghz, 9),
+            "sar:center_frequency": round(self.centre_hz / 1e9, 9),
             "sar:bandwidth": round(self.bandwidth_hz / 1e9, 9),
             **({"sar:frequency_band": band} if band else {}),
             **({"apertura:clock": _NO_CLOCK} if self.start < _FIRST_CLOCK else {}),
@@ -135,6 +128,36 @@ def projection(wkt: str, shape: tuple[int, int], transform: Sequence[float]) -> 
     }
 
 
+def true_azimuth_deg(wkt: str, point: tuple[float, float], grid_azimuth_deg: float | None) -> float | None:
+    """Convert a direction from grid north to true north, degrees clockwise; None in a local frame.
+
+    Parameters
+    ----------
+    wkt
+        CRS in any format supported by pyproj.
+    point
+        Easting and northing of the point at which the direction is measured, metres.
+    grid_azimuth_deg
+        Direction clockwise from grid north; None: not known.
+
+    Examples
+    --------
+    >>> true_azimuth_deg("EPSG:32632", (600000.0, 5300000.0), 90.0)
+    90.9909
+    """
+    from pyproj import CRS, Geod, Transformer
+
+    crs = CRS.from_user_input(wkt)
+    if grid_azimuth_deg is None or not crs.is_projected:
+        return None
+    (x, y), angle = point, np.radians(grid_azimuth_deg)
+    step_m = 100.0  # long enough for rounding, short enough for the curvature of grid lines: below 1e-3 degrees
+    to_degrees = Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
+    longitude, latitude = to_degrees.transform([x, x + step_m * np.sin(angle)], [y, y + step_m * np.cos(angle)])
+    azimuth, _, _ = Geod(ellps="WGS84").inv(longitude[0], latitude[0], longitude[1], latitude[1])
+    return round(float(azimuth) % 360, 4)
+
+
 # ---- Assets: type, role, size, checksum and bands of a file ---------------------------------------------------------
 
 COG = "image/tiff; application=geotiff; profile=cloud-optimized"
@@ -162,6 +185,9 @@ _ROLES: Mapping[str, tuple[str, ...]] = {
     "quicklook.png": ("overview", "visual"),
     "mask.tif": ("data-mask", "metadata"),
     "incidence.tif": ("local-incidence-angle", "metadata"),
+    "ellipsoidal_incidence.tif": ("incidence-angle", "metadata"),
+    "scattering_area.tif": ("metadata",),
+    "gamma_sigma_ratio.tif": ("metadata",),
     "looks.tif": ("metadata",),
     "bistatic_angle.tif": ("metadata",),
     "nesz.tif": ("noise-power", "metadata"),
@@ -226,7 +252,7 @@ def read_facts(path: Path) -> FileFacts:
     expected, remedy = "a GeoTIFF of the workflow", "Delete the manifest in its folder and run the workflow again."
     try:
         with opened_raster(path, expected=expected, remedy=remedy) as raster:
-            bands = [_band(raster, number) for number in range(raster.count)]
+            bands = [_band(raster, number, path.stem) for number in range(raster.count)]
             facts = json.loads(raster.tags().get("APERTURA_INPUTS", "{}"))
             inputs = {str(name): str(digest) for name, digest in facts.items()}
             place = {"proj:shape": list(raster.shape), "proj:transform": list(raster.transform)[:6]}
@@ -235,12 +261,15 @@ def read_facts(path: Path) -> FileFacts:
         raise CampaignError("cannot be read as GeoTIFF", path, expected, remedy) from error
 
 
-def _band(raster: Any, number: int) -> dict[str, Any]:
+def _band(raster: Any, number: int, name: str) -> dict[str, Any]:
     dtype, nodata, unit = (values[number] for values in (raster.dtypes, raster.nodatavals, raster.units))
     band: dict[str, Any] = {
+        "name": name if raster.count == 1 else f"{name}_{number + 1}",
+        "description": raster.descriptions[number] or name,
         "data_type": {"complex64": "cfloat32", "complex128": "cfloat64"}.get(dtype, dtype),
         "raster:sampling": "area",
         "raster:spatial_resolution": raster.res[0],
+        "raster:bits_per_sample": 8 * np.dtype(dtype).itemsize,
     }
     if nodata is not None:
         band["nodata"] = "nan" if nodata != nodata else nodata  # noqa: PLR0124 - only NaN differs from itself
@@ -267,7 +296,7 @@ def asset_of(path: Path, href: str, *, sha256: str, facts: FileFacts) -> pystac.
     roles = _ROLES.get(name) or _ROLES_OF_TYPE.get(path.suffix) or ("metadata",)
     extra = {"file:checksum": multihash(sha256), "file:size": path.stat().st_size}
     if facts.bands:
-        extra["bands"] = facts.bands
+        extra |= {"bands": facts.bands, "file:byte_order": "little-endian"}
     return pystac.Asset(href, facts.title, media_type=media_type(name), roles=list(roles), extra_fields=extra)
 
 
@@ -319,6 +348,10 @@ class Image:
         return f"{self.flight}-{self.name}"
 
 
+_SOMETIMES = frozenset({"view", "sci"})
+"""Extensions whose fields are not known for every image."""
+
+
 def item_of(image: Image, root: str) -> pystac.Item:
     """Build the STAC item of an image.
 
@@ -350,7 +383,11 @@ def item_of(image: Image, root: str) -> pystac.Item:
         properties,
         acquisition.start,
         acquisition.end,
-        [uri for prefix, uri in EXTENSIONS.items() if prefix != "view" or "view:incidence_angle" in properties],
+        [
+            uri
+            for prefix, uri in EXTENSIONS.items()
+            if prefix not in _SOMETIMES or any(name.startswith(f"{prefix}:") for name in properties)
+        ],
     )
     for key, asset in image.assets.items():
         item.add_asset(key, asset)
@@ -389,10 +426,7 @@ def _positions(nested: Sequence[Any]) -> Iterator[tuple[float, float]]:
 def catalog_files(
     campaign: str,
     images: Sequence[Image],
-    *,
-    licence: str | None = None,
-    author: str | None = None,
-    doi: str | None = None,
+    attribution: Attribution,
 ) -> dict[str, dict[str, Any]]:
     """Return all files of the catalog of images: path in the catalog's folder → JSON.
 
@@ -404,22 +438,26 @@ def catalog_files(
         Name of the campaign, free text.
     images
         The images, in any order; their files are below the parent folder of the catalog's folder.
-    licence, author, doi
-        SPDX identifier, name of the author, and DOI of all images; None: not stated.
+    attribution
+        Attribution of all images.
     """
     ordered = sorted(images, key=lambda image: (image.flight, image.name))
     times = min(image.acquisition.start for image in ordered), max(image.acquisition.end for image in ordered)
     fields = {RECORDED: [pystac.utils.datetime_to_str(time) for time in times]}
     catalog = pystac.Catalog("apertura", f"Images of the campaign {campaign}.", title=campaign, extra_fields=fields)
     parent = _parent(campaign, ordered, times)
+    credited = _credited(attribution, campaign, times[0])
     if isinstance(parent, pystac.Collection):
-        parent.license = licence or "other"
-        parent.providers = [pystac.Provider(author, roles=[pystac.ProviderRole.PRODUCER])] if author else None
-    if doi:
-        parent.add_link(pystac.Link("cite-as", f"https://doi.org/{quote(doi)}"))
+        parent.license = attribution.licence or "other"
+        parent.providers = [pystac.Provider.from_dict(provider) for provider in credited.get("providers", [])] or None
+        cited = {name: value for name, value in credited.items() if name.startswith("sci:")}
+        parent.extra_fields |= cited
+        parent.stac_extensions += [EXTENSIONS["sci"]] if cited else []
+    if attribution.doi:
+        parent.add_link(pystac.Link("cite-as", f"https://doi.org/{quote(attribution.doi)}"))
     catalog.add_child(parent)
     for image in ordered:
-        item = item_of(image, "../../../..")
+        item = item_of(replace(image, properties={**image.properties, **credited}), "../../../..")
         item.set_collection(parent if isinstance(parent, pystac.Collection) else None)
         parent.add_item(item)
     catalog.catalog_type = pystac.CatalogType.SELF_CONTAINED
@@ -428,6 +466,26 @@ def catalog_files(
     for entry in [catalog, parent, *parent.get_items()]:
         files[str(entry.self_href).removeprefix("/stac/")] = entry.to_dict(include_self_link=False)
     return files
+
+
+def _credited(attribution: Attribution, campaign: str, start: datetime) -> dict[str, Any]:
+    """Return the fields of an item that attribute it: providers, licence, platform, instruments and citation."""
+    producers = [attribution.institution] if attribution.institution else []
+    people = [
+        {"name": str(person), "roles": ["producer"]}
+        | ({"url": f"https://orcid.org/{person.orcid}"} if person.orcid else {})
+        for person in attribution.creators
+    ]
+    fields = {
+        "providers": [{"name": name, "roles": ["producer", "processor"]} for name in producers] + people,
+        "license": attribution.licence,
+        "platform": attribution.platform,
+        "instruments": [attribution.instrument] if attribution.instrument else None,
+        "processing:facility": attribution.institution,
+        "sci:doi": attribution.doi,
+        "sci:citation": attribution.citation(campaign, start.year if start >= _FIRST_CLOCK else None),
+    }
+    return {name: value for name, value in fields.items() if value}
 
 
 def _layout() -> CustomLayoutStrategy:

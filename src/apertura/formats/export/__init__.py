@@ -15,6 +15,7 @@ from typing import Any
 
 from apertura.common.lazy import Lazy, module_of, name_of
 from apertura.common.provenance import canonical_json
+from apertura.formats.catalog import DOCUMENTS
 from apertura.formats.export.radiometry import CROSS_SECTIONS, TAG
 
 SOURCES: Mapping[str, str] = {
@@ -30,6 +31,9 @@ SOURCES: Mapping[str, str] = {
     "sigma0": "radiometry",
     "gamma0": "radiometry",
     "beta0": "radiometry",
+    "scattering_area": "radiometry",
+    "gamma_sigma_ratio": "radiometry",
+    "ellipsoidal_incidence": "radiometry",
     "multilook": "multilook",
     "multilook_sigma0": "multilook",
     "multilook_gamma0": "multilook",
@@ -50,9 +54,10 @@ SOURCES: Mapping[str, str] = {
 power sum, stored as complex amplitude without phase. ``magnitude`` is the sum of the magnitudes of the pairs. Layers
 are real rasters that describe the image of a pair, and are stored in the folder of that image. Rasters of radiometry
 exist for calibrated pairs, in the same folder; their values are complex amplitudes whose power is the named
-coefficient. Rasters of multilook exist if requested; their values are the mean power of square blocks of pixels, on a
-coarser grid. ``multilook_noise`` is the mean noise power that is subtracted from the echo power. Rasters of an
-interferogram are computed from two images; ``panels`` is a mapping from their names to these rasters.
+coefficient. With gamma0, they include the ratios of the areas to which the coefficients are normalised, and the
+incidence angle from the vertical. Rasters of multilook exist if requested; their values are the mean power of square
+blocks of pixels, on a coarser grid. ``multilook_noise`` is the mean noise power that is subtracted from the echo power.
+Rasters of an interferogram are computed from two images; ``panels`` is a mapping from their names to these rasters.
 """
 
 
@@ -149,6 +154,15 @@ EXPORTS: tuple[Export, ...] = (
     Export("sigma0_db.qml", "sigma0", _WRITERS.style.write_backscatter_style),
     Export("gamma0_db.tif", "gamma0", _WRITERS.db.write_db),
     Export("gamma0_db.qml", "gamma0", _WRITERS.style.write_backscatter_style),
+    Export("gamma0_power.tif", "gamma0", _WRITERS.cog.write_power),
+    Export("gamma0_power.qml", "gamma0", _WRITERS.style.write_linear_style),
+    Export("gamma0_slc.tif", "gamma0", _WRITERS.cog.write_slc, mosaicked=False),
+    Export("scattering_area.tif", "scattering_area", _WRITERS.layers.write_scattering_area),
+    Export("scattering_area.qml", "scattering_area", _WRITERS.style.write_layer_style),
+    Export("gamma_sigma_ratio.tif", "gamma_sigma_ratio", _WRITERS.layers.write_gamma_sigma_ratio),
+    Export("gamma_sigma_ratio.qml", "gamma_sigma_ratio", _WRITERS.style.write_layer_style),
+    Export("ellipsoidal_incidence.tif", "ellipsoidal_incidence", _WRITERS.layers.write_ellipsoidal_incidence),
+    Export("ellipsoidal_incidence.qml", "ellipsoidal_incidence", _WRITERS.style.write_layer_style),
     Export("beta0_db.tif", "beta0", _WRITERS.db.write_db),
     Export("beta0_db.qml", "beta0", _WRITERS.style.write_backscatter_style),
     *(
@@ -299,7 +313,7 @@ def product_files(images: Mapping[str, Sequence[str]], coefficients: Sequence[st
     for flight, folders in images.items():
         for folder in folders:
             files = [row.file for row in _written(folder, coefficients)]
-            yield from (f"{flight}/{folder}/{file}" for file in (*files, "image.json"))
+            yield from (f"{flight}/{folder}/{file}" for file in (*files, *DOCUMENTS))
     yield from mosaic_files(images, coefficients)
     yield MAP
 

@@ -17,9 +17,10 @@ import numpy as np
 import rasterio
 import rasterio.shutil
 from numpy.typing import NDArray
-from rasterio import Affine
+from rasterio import Affine, warp
 from rasterio.crs import CRS
 from rasterio.errors import CRSError, NotGeoreferencedWarning
+from rasterio.transform import array_bounds
 from rasterio.windows import Window
 
 from apertura.common.errors import CampaignError, ContractError
@@ -186,7 +187,7 @@ def write_cog(
     """
     georeference = placed(image, transform, crs)
     band, tags = with_radiometry(band, tags)
-    all_tags = tags | ({"TIFFTAG_IMAGEDESCRIPTION": title} if title else {})
+    all_tags = tags | _outline_tag(georeference) | ({"TIFFTAG_IMAGEDESCRIPTION": title} if title else {})
     size = int(np.prod(image.shape)) * np.dtype(band.dtype).itemsize
     with gdal_replacement(path, size=size) as temporary:
         source = temporary.with_name("source.tif")
@@ -243,7 +244,14 @@ def with_radiometry(band: Band, tags: Mapping[str, str]) -> tuple[Band, dict[str
         name: value for name, value in raster.items() if name not in {"amplitude", "power"} and value is not None
     }
     tag = canonical_json({**meanings, "quantity": meaning, "unit": band.unit})
-    return replace(band, meaning=meaning), {**tags, TAG: tag}
+    readable = {"APERTURA_QUANTITY": meaning, "APERTURA_UNIT": band.unit}
+    if "one_is" in meanings:
+        readable["APERTURA_REFERENCE"] = f"{'0 dB' if band.unit == 'dB' else '1'}: {meanings['one_is']}"
+        readable["APERTURA_SPECKLE_FILTER"] = meanings.get("speckle_filter", "none")
+        readable["APERTURA_NOISE_REMOVAL"] = "subtracted" if meanings.get("noise") == "subtracted" else "none"
+    if "calibration_std_db" in meanings:
+        readable["APERTURA_CALIBRATION_STD_DB"] = f"{meanings['calibration_std_db']:g}"
+    return replace(band, meaning=meaning), {**tags, **readable, TAG: tag}
 
 
 def placed(image: NorthUpRaster, transform: Affine, crs: str) -> dict[str, Any]:
@@ -262,6 +270,18 @@ def placed(image: NorthUpRaster, transform: Affine, crs: str) -> dict[str, Any]:
             remedy="Check scene.crs.",
         ) from error
     return {"height": image.shape[0], "width": image.shape[1], "transform": transform, "crs": parsed_crs}
+
+
+def _outline_tag(georeference: Mapping[str, Any]) -> dict[str, str]:
+    """Return the outline of a raster, longitude and latitude of WGS 84, as a tag; empty for a local frame."""
+    crs = georeference["crs"]
+    if not (crs.is_projected or crs.is_geographic):
+        return {}
+    west, south, east, north = array_bounds(*(georeference[name] for name in ("height", "width", "transform")))
+    x, y = (west, west, east, east), (north, south, south, north)  # counterclockwise from the north-west corner
+    longitude, latitude = warp.transform(crs, "EPSG:4326", x, y)
+    points = [f"{lon:.7f} {lat:.7f}" for lon, lat in zip(longitude, latitude, strict=True)]
+    return {"APERTURA_OUTLINE_WGS84": f"POLYGON (({', '.join([*points, points[0]])}))"}
 
 
 def halved(pixels: Pixels, band: Band) -> Pixels:

@@ -28,6 +28,7 @@ INCIDENCE = Band(
 BISTATIC_ANGLE = Band(
     "float32", np.nan, "deg", "angle between transmitter and receiver at closest approach", "AVERAGE", smooth=True
 )
+ELLIPSOIDAL_INCIDENCE = replace(INCIDENCE, meaning="incidence angle at closest approach, from the vertical (WGS 84)")
 MASK = Band(
     "uint8",
     OUTSIDE,
@@ -41,6 +42,13 @@ NESZ = Band(
     "float32", np.nan, "dB", "noise-equivalent echo per pulse: relative, not calibrated", "AVERAGE", smooth=True
 )
 
+SCATTERING_AREA = Band(
+    "float32", np.nan, "1", "scattering area relative to the slant-plane area: beta0 / gamma0", "AVERAGE", smooth=True
+)
+GAMMA_SIGMA_RATIO = Band(
+    "float32", np.nan, "1", "area normal to the line of sight per ground area: sigma0 / gamma0", "AVERAGE", smooth=True
+)
+
 NESZ_ABSOLUTE = "noise-equivalent sigma0"
 """Meaning of `NESZ` of a calibrated pair."""
 
@@ -50,6 +58,14 @@ def write_incidence(
 ) -> None:
     """Write the incidence angle, (y, x) float32 degrees, NaN outside. Otherwise as `cog.write_slc`."""
     write_cog(path, angle_deg, INCIDENCE, transform=transform, crs=crs, tags=tags, title=title, value=only("float32"))
+
+
+def write_ellipsoidal_incidence(
+    path: Path, angle_deg: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+) -> None:
+    """Write the angle from the vertical, (y, x) float32 degrees, NaN outside. Otherwise as `cog.write_slc`."""
+    band, check = ELLIPSOIDAL_INCIDENCE, only("float32")
+    write_cog(path, angle_deg, band, transform=transform, crs=crs, tags=tags, title=title, value=check)
 
 
 def write_bistatic_angle(
@@ -97,3 +113,25 @@ def write_nesz(
     """
     band = replace(NESZ, meaning=NESZ_ABSOLUTE) if TAG in tags else NESZ
     write_cog(path, noise_db, band, transform=transform, crs=crs, tags=tags, title=title, value=only("float32"))
+
+
+def write_scattering_area(
+    path: Path, area: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+) -> None:
+    """Write the scattering area, by which β⁰ is divided to give γ⁰, (y, x) float32. Otherwise as `write_incidence`.
+
+    Source: docs/theory/radiometry.md, eq. 6a.
+    """
+    check = only("float32")
+    write_cog(path, area, SCATTERING_AREA, transform=transform, crs=crs, tags=tags, title=title, value=check)
+
+
+def write_gamma_sigma_ratio(
+    path: Path, ratio: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+) -> None:
+    """Write the factor that converts γ⁰ to σ⁰, (y, x) float32. Otherwise as `write_incidence`.
+
+    Source: docs/theory/radiometry.md, eq. 6a.
+    """
+    check = only("float32")
+    write_cog(path, ratio, GAMMA_SIGMA_RATIO, transform=transform, crs=crs, tags=tags, title=title, value=check)
