@@ -1,4 +1,4 @@
-"""`apertura inspect`: identify a file by the first reader that matches the name and reads the file without error."""
+"""`apertura inspect`: identify a file by the first reader that matches its name or first bytes, and reads the file."""
 
 import json
 import logging
@@ -18,8 +18,17 @@ from apertura.check.examination import Examination, Key
 from apertura.check.times import LOST_CAPTURE, Span, TimeFacts, inside, time_facts
 from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError, explained, quoted, shown
-from apertura.formats.names import PHASE_HISTORIES, RECORDERS, TRACKS, log_format, log_suffixes, recording_files
+from apertura.formats.names import (
+    PHASE_HISTORIES,
+    RECORDERS,
+    TRACKS,
+    log_by_content,
+    log_format,
+    log_suffixes,
+    recording_files,
+)
 from apertura.formats.reading import read_phase_history
+from apertura.formats.time_tags import are_time_tags
 from apertura.views.inspect.files import Surroundings, retries, surroundings
 from apertura.views.inspect.report import Report, print_report
 
@@ -177,7 +186,7 @@ def _readers(path: Path, context: Surroundings) -> Iterator[tuple[str, str, Read
     if stated in PHASE_HISTORIES and path.name.endswith(PHASE_HISTORIES[stated].suffix):
         yield "phase history", stated, partial(_history, path, stated, context)
         return  # the campaign reads the file in the configured format, even if other readers match
-    from apertura.views.inspect.files import ARRAY, DEM, array_report, dem_report, log_report
+    from apertura.views.inspect.files import ARRAY, DEM, array_report, dem_report, log_report, time_tags_report
 
     if "format" not in context.typed:
         for row in RECORDERS:
@@ -188,8 +197,15 @@ def _readers(path: Path, context: Surroundings) -> Iterator[tuple[str, str, Read
             if path.name.endswith(history.suffix):
                 yield "phase history", name, partial(_history, path, name, context)
     if path.is_file() and (".track." in path.name or context.options.format is None or "format" in context.typed):
-        with suppress(CampaignError):  # not a known log format
-            yield "flight log", log_format(path, context.options), partial(log_report, path, context)
+        try:
+            log, options = log_format(path, context.options), context.options
+        except CampaignError:  # not the suffix of a log
+            log = log_by_content(path)
+            options = replace(context.options, format=log)
+        if log is not None:
+            yield "flight log", log, partial(log_report, path, replace(context, options=options))
+    if path.is_file() and are_time_tags(path):
+        yield "time tags", "", partial(time_tags_report, path)
     if path.suffix.lower() in DEM:
         yield "elevation model", "", partial(dem_report, path)
     if path.suffix in ARRAY:
