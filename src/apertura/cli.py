@@ -672,9 +672,9 @@ def init(
         chosen = {"transmitter": transmitter, "side": side, "kind": kind, "copy": copy}
         paths, folder = [given(path) for path in files], given(directory)
         words["assign"] = {str(given(Path(name))): target for name, target in words["assign"].items()}
-        from apertura.tools.init import print_initialised
+        from apertura.tools.init import print_created
 
-        raise SystemExit(print_initialised(folder, paths, directory, **words, **chosen))
+        raise SystemExit(print_created(folder, paths, directory, **words, **chosen))
     if from_ is not None:
         path, folder = given(from_), given(directory)
         from apertura.tools.design.flight_plan import read_flight_plan

@@ -22,7 +22,7 @@ _EXPECTED = "a line per capture: time in UTC (ISO 8601 or seconds since 1970), o
 
 
 def are_time_tags(path: Path) -> bool:
-    """Return True if a file starts with time tags.
+    r"""Return True if a file starts with time tags.
 
     Examples
     --------

@@ -13,6 +13,8 @@ from apertura.core.echo.demodulate import subcarrier_numbers
 MOST_CHANNELS = 2
 """Largest number of interleaved channels that is tested: radar and sidelink."""
 
+_BANDS: tuple[Literal["band_start", "band_centre"], ...] = ("band_start", "band_centre")
+
 _CLEARER = 1.5
 """Ratio of compressions above which a hypothesis with more channels, or conjugate samples, is preferred."""
 
@@ -33,6 +35,8 @@ class CaptureStructure:
         Number of interleaved channels.
     iq
         complex, or conjugate if the samples are the conjugates of the transmitted signal, as with I and Q swapped.
+    sent_samples
+        Number of code symbols, or of samples of the pulse.
     compression
         Largest fraction of the recorded energy that a single delay explains, 0 to 1; mean over captures and channels.
     dft_samples
@@ -43,6 +47,7 @@ class CaptureStructure:
 
     channels: int
     iq: Literal["complex", "conjugate"]
+    sent_samples: int
     compression: float
     dft_samples: int | None = None
     carrier_is: Literal["band_start", "band_centre"] | None = None
@@ -93,15 +98,17 @@ def _hypotheses(
             continue
         split = captures.reshape(len(captures), -1, count).transpose(0, 2, 1).reshape(len(captures) * count, -1)
         period = _period(split, sent.size)
-        for iq in ("complex", "conjugate"):
-            samples = split if iq == "complex" else split.conj()
+        orders: dict[Literal["complex", "conjugate"], NDArray[np.complexfloating]]
+        orders = {"complex": split, "conjugate": split.conj()}
+        for iq, samples in orders.items():
             if split.shape[1] >= sent.size:
-                yield CaptureStructure(count, iq, _pulse_compression(samples, sent))  # type: ignore[arg-type]
-            if period is not None:
-                for carrier_is in ("band_start", "band_centre"):
-                    bins = subcarrier_numbers(sent.size, carrier_is=carrier_is) % period
-                    share = _code_compression(samples[:, -period:], sent, bins)
-                    yield CaptureStructure(count, iq, share, period, carrier_is)  # type: ignore[arg-type]
+                yield CaptureStructure(count, iq, sent.size, _pulse_compression(samples, sent))
+            if period is None:
+                continue
+            for carrier_is in _BANDS:
+                bins = subcarrier_numbers(sent.size, carrier_is=carrier_is) % period
+                share = _code_compression(samples[:, -period:], sent, bins)
+                yield CaptureStructure(count, iq, sent.size, share, period, carrier_is)
 
 
 def _period(samples: NDArray[np.complexfloating], subcarriers: int) -> int | None:
