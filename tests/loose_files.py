@@ -1,4 +1,4 @@
-"""Loose files of recorders and autopilots, as taken from simulated campaigns without their folder, config and headers."""
+"""Loose files of recorders and autopilots, taken from simulated campaigns without folder, config and headers."""
 
 import json
 import shutil

@@ -105,8 +105,16 @@ def write_recording(
             data = np.ascontiguousarray(block, block.dtype.newbyteorder("<")).tobytes()
             digest.update(data)
             stream.write(data)
-    of_samples = {"channels": channels, "dtype": dtype, "sha512": digest.hexdigest()}
-    write_meta(stem, captures, **of_samples, sample_rate_hz=sample_rate_hz, frequency_hz=frequency_hz, extra=extra)
+    write_meta(
+        stem,
+        captures,
+        channels=channels,
+        dtype=dtype,
+        sha512=digest.hexdigest(),
+        sample_rate_hz=sample_rate_hz,
+        frequency_hz=frequency_hz,
+        extra=extra,
+    )
 
 
 def write_meta(

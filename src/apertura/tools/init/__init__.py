@@ -179,7 +179,7 @@ def _lines(found: Found, flights: Rows) -> Iterator[str]:
         yield f"not used: {path.name}: {reason}"
 
 
-# ---- Files of raw/ ----------------------------------------------------------------------------------------------------
+# ---- Files of raw/ ---------------------------------------------------------------------------------------------------
 
 
 def _write_raw(root: Path, found: Found, placed: Mapping[str, Path], draft: Draft, place: Place) -> None:
@@ -221,8 +221,8 @@ def _write_recording(one: FoundRecording, stem: Path, draft: Draft, place: Place
     else:
         suffix = PHASE_HISTORIES[one.format].suffix
         for source in one.files:
-            part = "" if len(one.files) == 1 else f".{re.sub(r'[^A-Za-z0-9_]', '_', source.name.removesuffix(suffix))}"
-            place(source, stem.with_name(f"{stem.name}{part}{suffix}"))
+            part = "." + re.sub(r"\W", "_", source.name.removesuffix(suffix), flags=re.ASCII)
+            place(source, stem.with_name(f"{stem.name}{part if len(one.files) > 1 else ''}{suffix}"))
         if one.format == "beat_npy" and one.times is not None:
             np.save(stem.with_name(f"{stem.name}.time.npy"), one.times)
 
@@ -248,7 +248,7 @@ def _place(source: Path, target: Path, *, copy: bool) -> None:
     shutil.copyfile(source, target)
 
 
-# ---- Command ----------------------------------------------------------------------------------------------------------
+# ---- Command ---------------------------------------------------------------------------------------------------------
 
 
 def print_created(folder: Path, files: Sequence[Path], name: Path, **options: Any) -> int:

@@ -41,7 +41,7 @@ def assign(found: Found, assigned: Mapping[Path, str], draft: Draft) -> None:
         If two recordings would be the same node in a flight, if several logs are equally suitable, or if a log cannot
         be read.
     """
-    known = {one.path for one in (*found.recordings, *found.logs)}
+    known = {one.path for one in found.recordings} | {log.path for log in found.logs}
     for path, target in assigned.items():
         if path not in known or not re.fullmatch(r"(\w+/)?\w+", target, re.ASCII):
             expected = f"FILE=NODE or FILE=FLIGHT/NODE, with one of {', '.join(sorted(path.name for path in known))}"
@@ -58,7 +58,7 @@ def assign(found: Found, assigned: Mapping[Path, str], draft: Draft) -> None:
             recording.zone_s = _zone(recording)
 
 
-# ---- Flights and nodes ------------------------------------------------------------------------------------------------
+# ---- Flights and nodes -----------------------------------------------------------------------------------------------
 
 
 def _name(recordings: list[FoundRecording], assigned: Mapping[Path, str]) -> None:
@@ -109,7 +109,7 @@ def _nodes(flight: Sequence[FoundRecording], of_all: set[str]) -> list[str]:
     return names if len({*names}) == len(names) else ["_".join(words(one.path)) for one in flight]
 
 
-# ---- Logs -------------------------------------------------------------------------------------------------------------
+# ---- Logs ------------------------------------------------------------------------------------------------------------
 
 
 def _is_named(log: FoundLog, recording: FoundRecording) -> bool:

@@ -1,6 +1,5 @@
 """Waveform, nodes and scene of a campaign from its files (docs/theory/recordings.md, eqs. 3 to 8)."""
 
-from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from apertura.tools.init.files import Found, FoundRecording, likest
 Placed = dict[str, Path]
 """Target in the campaign folder → file."""
 
-# ---- Waveform ---------------------------------------------------------------------------------------------------------
+# ---- Waveform --------------------------------------------------------------------------------------------------------
 
 _KINDS = {"beat": "fmcw", "history": "phase_history"}
 _FILES = {"ofdm": ("codes", "raw/codes.npy"), "samples": ("pulse", "raw/pulse.npy")}
@@ -197,7 +196,7 @@ def _sweep_times(recording: FoundRecording, found: Found) -> Any:
     return read[fitting[0]] if len(fitting) == 1 else None
 
 
-# ---- Nodes ------------------------------------------------------------------------------------------------------------
+# ---- Nodes -----------------------------------------------------------------------------------------------------------
 
 
 def describe_nodes(draft: Draft, found: Found) -> None:
@@ -222,7 +221,7 @@ def describe_nodes(draft: Draft, found: Found) -> None:
             draft.leave(f"nodes.{node}.position_std_m", "not in the log; write the standard deviation of positions, m")
 
 
-# ---- Scene ------------------------------------------------------------------------------------------------------------
+# ---- Scene -----------------------------------------------------------------------------------------------------------
 
 
 def describe_scene(draft: Draft, found: Found, side: str | None) -> Placed:
@@ -282,7 +281,7 @@ def _tracks(found: Found) -> list[tuple[str, NDArray[np.float64]]]:
 
 def _path_limit_m(draft: Draft) -> float:
     """Return the longest total path whose echo a capture contains, m; inf if it is not known."""
-    values: Mapping[str, Any] = {key.removeprefix("waveform."): value for key, value in draft.values.items()}
+    values: dict[str, Any] = {key.removeprefix("waveform."): value for key, value in draft.values.items()}
     delay_s = values.get("cyclic_prefix_s", values.get("listen_s"))
     if delay_s is not None:
         return SPEED_OF_LIGHT_M_S * float(delay_s)

@@ -106,7 +106,8 @@ class Draft:
         info = described_key(key, self.kind)
         adapter: TypeAdapter[Any] = TypeAdapter(Annotated[info.annotation, info])  # type: ignore[arg-type]
         try:
-            return adapter.dump_python(adapter.validate_python(yaml.safe_load(text)), mode="json")
+            value = adapter.validate_python(yaml.safe_load(text))
+            return adapter.dump_python(value, mode="json", exclude_unset=True)
         except (ValidationError, yaml.YAMLError) as error:
             reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else "not readable as YAML"
             raise CampaignError(f"{quoted(text)}: {reason}", key, str(info.description), "Correct the value.") from None

@@ -131,7 +131,10 @@ class FoundRecording:
         if isinstance(self.content, Recording):
             samples = first_samples(self.content)[:MOST_CAPTURES]
             return samples.reshape(len(samples), -1)
-        kind, captures = np.dtype(TYPES.get(self.path.suffix, "int16")).newbyteorder("<"), np.size(self.times)
+        kind, captures = (
+            np.dtype(TYPES.get(self.path.suffix, "int16")).newbyteorder("<"),
+            0 if self.times is None else len(self.times),
+        )
         stored = np.memmap(self.path, kind, "r").reshape(captures, -1, 2)[:MOST_CAPTURES].astype(np.float32)
         return np.asarray(stored[..., 0] + 1j * stored[..., 1])
 
