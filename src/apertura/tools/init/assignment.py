@@ -96,7 +96,7 @@ def _together(one: FoundRecording, other: FoundRecording) -> bool:
 
 def _nodes(flight: Sequence[FoundRecording], of_all: set[str]) -> list[str]:
     """Return the node of each recording of a flight: the words that distinguish it, preferably those of all flights."""
-    every = [[word for word in words(one.path) if not word.isdigit()] for one in flight]
+    every = [[word for word in _own_words(one) if not word.isdigit()] for one in flight]
     shared = set.intersection(*map(set, every)) if len(flight) > 1 else set[str]()
     names = []
     for own in every:
@@ -106,7 +106,13 @@ def _nodes(flight: Sequence[FoundRecording], of_all: set[str]) -> list[str]:
             if chosen:
                 break
         names.append("_".join(chosen or distinct) or "uav1")
-    return names if len({*names}) == len(names) else ["_".join(words(one.path)) for one in flight]
+    return names if len({*names}) == len(names) else ["_".join(_own_words(one)) for one in flight]
+
+
+def _own_words(recording: FoundRecording) -> list[str]:
+    """Return the words that the names of all files of a recording have in common."""
+    common = set.intersection(*({*words(file)} for file in recording.files))
+    return [word for word in words(recording.path) if word in common]
 
 
 # ---- Logs ------------------------------------------------------------------------------------------------------------

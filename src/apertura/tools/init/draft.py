@@ -1,6 +1,7 @@
 """Draft of a config: values with their origin, questions, and keys left open with the reason."""
 
 from collections.abc import Callable, Mapping, Sequence
+from datetime import date
 from typing import Annotated, Any, NamedTuple, get_args
 
 import yaml
@@ -106,7 +107,8 @@ class Draft:
         info = described_key(key, self.kind)
         adapter: TypeAdapter[Any] = TypeAdapter(Annotated[info.annotation, info])  # type: ignore[arg-type]
         try:
-            value = adapter.validate_python(yaml.safe_load(text))
+            read = yaml.safe_load(text)
+            value = adapter.validate_python(text if isinstance(read, date) else read)  # times are texts in the config
             return adapter.dump_python(value, mode="json", exclude_unset=True)
         except (ValidationError, yaml.YAMLError) as error:
             reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else "not readable as YAML"
