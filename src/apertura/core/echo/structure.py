@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -18,8 +19,11 @@ _BANDS: tuple[Literal["band_start", "band_centre"], ...] = ("band_start", "band_
 _CLEARER = 1.5
 """Ratio of compressions above which a hypothesis with more channels, or conjugate samples, is preferred."""
 
-_ABOVE_CHANCE = 1.5
-"""Smallest compression, relative to that of the same energy without the signal."""
+_FALSE_ALARM = 0.01
+"""Probability at which captures of another signal are taken for the transmitted signal."""
+
+_MOST_PERIODS = 4
+"""Number of peaks of the autocorrelation whose lags are tested with the code."""
 
 _SILENCE = 1e-6
 """Energy of an overlap, relative to the largest, below which rounding errors dominate."""
@@ -79,15 +83,16 @@ def capture_structure(
     >>> found.channels, found.dft_samples, found.carrier_is, round(found.compression, 3)
     (1, 80, 'band_start', 1.0)
     """
-    best = None
-    for tested in _hypotheses(captures, sent, channels):
+    hypotheses, best = list(_hypotheses(captures, sent, channels)), None
+    for tested in hypotheses:
         needed = best and best.compression * (
             _CLEARER if tested.channels > best.channels or tested.iq != best.iq else 1.0
         )
         if needed is None or tested.compression > needed:
             best = tested
-    chance = (np.log(sent.size) + 1) / sent.size  # mean of the largest of N unit exponentials, divided by N
-    return best if best is not None and best.compression > _ABOVE_CHANCE * chance else None
+    # without the signal, each of N values of each hypothesis exceeds x with probability exp(-N·x)
+    least = np.log(sent.size * max(len(hypotheses), 1) / _FALSE_ALARM) / sent.size
+    return best if best is not None and best.compression > least else None
 
 
 def _hypotheses(
@@ -97,25 +102,23 @@ def _hypotheses(
         if captures.shape[1] % count:
             continue
         split = captures.reshape(len(captures), -1, count).transpose(0, 2, 1).reshape(len(captures) * count, -1)
-        period = _period(split, sent.size)
+        periods = _periods(split, sent.size)
         orders: dict[Literal["complex", "conjugate"], NDArray[np.complexfloating]]
         orders = {"complex": split, "conjugate": split.conj()}
         for iq, samples in orders.items():
             if split.shape[1] >= sent.size:
                 yield CaptureStructure(count, iq, sent.size, _pulse_compression(samples, sent))
-            if period is None:
-                continue
-            for carrier_is in _BANDS:
+            for period, carrier_is in product(periods, _BANDS):
                 bins = subcarrier_numbers(sent.size, carrier_is=carrier_is) % period
                 share = _code_compression(samples[:, -period:], sent, bins)
                 yield CaptureStructure(count, iq, sent.size, share, period, carrier_is)
 
 
-def _period(samples: NDArray[np.complexfloating], subcarriers: int) -> int | None:
-    """Return the lag D of the largest normalised autocorrelation (eq. 3), at least N samples; None if too short."""
+def _periods(samples: NDArray[np.complexfloating], subcarriers: int) -> list[int]:
+    """Return the lags D of the largest normalised autocorrelation (eq. 3), at least N samples; none if too short."""
     length = samples.shape[1]
     if length <= subcarriers:
-        return None
+        return []
     size = scipy.fft.next_fast_len(2 * length)
     power = np.abs(samples) ** 2
     lags = np.arange(subcarriers, length)
@@ -124,7 +127,10 @@ def _period(samples: NDArray[np.complexfloating], subcarriers: int) -> int | Non
     energy = np.sqrt(before[length - lags] * (before[length] - before[lags]))
     # few overlapping samples correlate by chance, equally in all captures, because all pulses are identical
     level = np.abs(correlation) / np.maximum(energy, max(_SILENCE * energy.max(), 1e-300)) - 3 / np.sqrt(length - lags)
-    return int(lags[np.argmax(level)]) if energy.any() else None
+    padded = np.pad(level, 1, constant_values=-np.inf)
+    is_peak = (level > padded[:-2]) & (level >= padded[2:]) & energy.any()
+    strongest = np.argsort(-level[is_peak], kind="stable")[:_MOST_PERIODS]
+    return [int(lag) for lag in lags[is_peak][strongest]]
 
 
 def _code_compression(

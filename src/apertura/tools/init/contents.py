@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from apertura.campaign.config.template import WAVEFORMS
 from apertura.check.times import LOST_CAPTURE, time_facts
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.common.errors import CampaignError, shown
+from apertura.common.errors import CampaignError, quoted, shown
 from apertura.core.echo.structure import CaptureStructure, capture_structure
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import LOCAL, map_from_frame
@@ -200,8 +200,12 @@ def _sweep_times(recording: FoundRecording, found: Found) -> Any:
 
 
 def describe_nodes(draft: Draft, found: Found) -> None:
-    """Fill in section `nodes`: source of the attitude, settings of logs, and open keys."""
-    for node in dict.fromkeys(recording.node for recording in found.recordings):
+    """Fill in section `nodes`: source of the attitude, settings of logs, open keys; CampaignError for other nodes."""
+    nodes = list(dict.fromkeys(recording.node for recording in found.recordings))
+    stated = [key.split(".")[1] for key in draft.given if key.startswith("nodes.")]
+    if other := next((node for node in stated if node not in nodes), None):
+        raise CampaignError(f"node {quoted(other)}", "--set", f"one of {', '.join(nodes)}", "Correct the key.")
+    for node in nodes:
         own = [recording for recording in found.recordings if recording.node == node]
         logs = {id(one.log): one.log for one in own if one.log is not None}.values()
         facts = [log.facts for log in logs if log.facts is not None]

@@ -27,7 +27,7 @@ from apertura.views.inspect.path import look
 MOST_FILES = 10_000
 """Largest number of files in the given folders."""
 
-MOST_CAPTURES = 64
+MOST_CAPTURES = 32
 """Number of captures, from the first, from which the structure of a recording is estimated."""
 
 TYPES = {".cf32": "float32", ".fc32": "float32", ".cfile": "float32", ".cs8": "int8", ".sc8": "int8"}
