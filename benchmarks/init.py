@@ -1,4 +1,4 @@
-"""Loose files of five radars to first images with `apertura init`: questions asked, and position errors of targets.
+"""Loose files of five radars to first images with `apertura init`: questions, and position errors of targets.
 
 `PYTHONPATH=tests python benchmarks/init.py [NAME …]` prints the table of docs/howto/from_files.md. Simulated campaigns
 are taken apart into the files that a recorder and an autopilot write; the answers are the values that a user knows.
@@ -149,8 +149,8 @@ def main(names: list[str]) -> None:
             every = 100 * np.concatenate([*errors.values()])
             grid = open_stage(campaign.stage("image", "f01", campaign.image_flights[0].pairs[0]), "image").sizes
             print(
-                f"{name} | {len(made.asked)} | {len(found)} | {every.size} | {np.median(every):.1f}, {every.max():.1f} "
-                f"| {init_s:.1f}, {run_s:.1f} | {grid['x']} × {grid['y']}",
+                f"{name} | {len(made.questions)} | {len(found)} | {every.size} "
+                f"| {np.median(every):.1f}, {every.max():.1f} | {init_s:.1f}, {run_s:.1f} | {grid['x']} × {grid['y']}",
                 flush=True,
             )
             print({pair: np.round(100 * np.array(row), 1).tolist() for pair, row in errors.items()}, file=sys.stderr)

@@ -52,7 +52,7 @@ def loose(tiny, tmp_path):
 
 def test_int16_samples_with_nmea_and_csv_need_three_answers(tiny, loose, tmp_path):
     made = campaign_from_files(tmp_path / "made", [loose], ask=answering(ANSWERS))
-    assert len(made.asked) <= 3
+    assert len(made.questions) <= 3
     assert problems(made.folder) == []
     expected, found = Campaign.load(tiny).settings.waveform, Campaign.load(made.folder).settings.waveform
     assert found.model_dump() == pytest.approx(expected.model_dump())
@@ -104,7 +104,7 @@ def test_fmcw_and_ulog_need_three_answers(tmp_path):
         "scene.height_m": f"{flight.origin[2]} left",
     }
     made = campaign_from_files(tmp_path / "made", [folder], ask=answering(answers))
-    assert len(made.asked) <= 3
+    assert len(made.questions) <= 3
     assert problems(made.folder) == []
     waveform = Campaign.load(made.folder).settings.waveform
     assert [getattr(waveform, key) for key in ("start_hz", "bandwidth_hz", "sweep_s", "sample_rate_hz", "iq")] == [
@@ -265,7 +265,7 @@ def test_names_of_recordings_in_a_folder_give_nodes_of_two_flights(tiny, tmp_pat
 
 
 def test_unknown_values_are_commented_keys_with_a_reason(loose, tmp_path):
-    """Without a terminal, required keys stay open and the check lists them; the sample rate alone writes the headers."""
+    """Without a terminal, required keys stay open, and the check lists them; headers need the sample rate only."""
     made = campaign_from_files(tmp_path / "made", [loose], settings={"waveform.sample_rate_hz": "1.024e9"})
     lines = (made.folder / CONFIG).read_text().splitlines()
     for key in ("carrier_hz", "cyclic_prefix_s", "lever_arms_m", "height_m"):
@@ -275,7 +275,7 @@ def test_unknown_values_are_commented_keys_with_a_reason(loose, tmp_path):
     )
     (problem,) = problems(made.folder)
     assert "waveform.carrier_hz: missing" in str(problem)
-    assert not made.asked
+    assert not made.questions
 
 
 def test_sample_rate_without_header_is_required(loose, tmp_path):

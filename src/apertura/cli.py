@@ -634,7 +634,7 @@ def init(
     files: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="[FILES]…",
+            metavar="FILES",
             help="recordings, flight logs, time tags, transmitted signal, DEM, and folders with such files",
             show_default=False,
         ),
@@ -665,8 +665,11 @@ def init(
 ) -> None:
     """Create a campaign folder from recordings and logs, or with a config from a template or a flight plan.
 
-    Values that no file contains are asked on a terminal; without an answer they are commented keys of the config.
+    Values that no file contains are requested on a terminal; without an answer they are commented keys of the config.
     """
+    if not files and (settings or side or transmitter or assign or copy):
+        options, remedy = "--set, --side, --transmitter, --assign or --copy", "Name recordings and logs."
+        raise CampaignError(f"{options} without files", "init", "files after the campaign folder", remedy)
     if files:
         words = {"settings": _pairs(settings, "--set"), "assign": _pairs(assign, "--assign")}
         chosen = {"transmitter": transmitter, "side": side, "kind": kind, "copy": copy}

@@ -2,7 +2,7 @@
 
 Formats are recognised as by `apertura inspect`; recordings and logs are assigned by times and names; the waveform
 follows from headers, from the transmitted signal and from the samples (docs/theory/recordings.md, eqs. 3 to 8). Values
-that no file contains are asked, or written to the config as commented keys.
+that no file contains are requested, or written to the config as commented keys.
 """
 
 import fcntl
@@ -23,7 +23,7 @@ import numpy as np
 from apertura.campaign.config import CLOCK_COLUMNS, CLOCKS, CONFIG, validated
 from apertura.campaign.config.template import commented_yaml
 from apertura.check import print_findings
-from apertura.common.errors import CampaignError, number_of, shown
+from apertura.common.errors import CampaignError, number_of, quoted, shown
 from apertura.common.provenance import hashes_of_file
 from apertura.formats.campaign_files import new_folder, write_flights, write_meta
 from apertura.formats.names import PHASE_HISTORIES, TRACKS
@@ -48,8 +48,8 @@ class CreatedCampaign:
         Campaign folder.
     lines
         Assignment of each file, and files that are not used.
-    asked
-        Questions that were asked.
+    questions
+        Questions to the user.
     open_keys
         Keys of the config that are left open.
     unaligned
@@ -58,7 +58,7 @@ class CreatedCampaign:
 
     folder: Path
     lines: tuple[str, ...]
-    asked: tuple[Question, ...]
+    questions: tuple[Question, ...]
     open_keys: tuple[str, ...]
     unaligned: tuple[tuple[str, str], ...]
 
@@ -114,6 +114,9 @@ def campaign_from_files(
     directory, draft, paths = Path(directory), Draft(settings or {}, ask), [Path(path) for path in files]
     if side is not None:
         draft.value(SIDE, side)
+    if kind not in {None, "ofdm", "samples"}:
+        remedy = "Omit --kind: the files of other radars determine it."
+        raise CampaignError(f"kind {quoted(kind)}", "init", "ofdm or samples, for recorded samples", remedy)
     with new_folder(directory) as root:
         found = recognised(paths)
         if not found.recordings:
@@ -140,12 +143,12 @@ def campaign_from_files(
         _write_raw(root, found, placed, draft, partial(_place, copy=copy))
     unaligned = [(one.flight, one.node) for one in found.recordings if one.span is None and not one.has_positions]
     return CreatedCampaign(
-        directory, tuple(_lines(found, flights)), tuple(draft.asked), tuple(draft.open), tuple(unaligned)
+        directory, tuple(_lines(found, flights)), tuple(draft.questions), tuple(draft.open), tuple(unaligned)
     )
 
 
 def _flights(draft: Draft, found: Found, transmitter: str | None) -> Rows:
-    """Return the lines of flights.tsv; the transmitter is the given node, the only one without sidelink, or asked."""
+    """Return the lines of flights.tsv; the transmitter is the given node, the node without sidelink, or answered."""
     rows: Rows = []
     for flight in dict.fromkeys(recording.flight for recording in found.recordings):
         own = [recording for recording in found.recordings if recording.flight == flight]
@@ -254,7 +257,7 @@ def _place(source: Path, target: Path, *, copy: bool) -> None:
 def print_created(folder: Path, files: Sequence[Path], name: Path, **options: Any) -> int:
     """Create a campaign by `campaign_from_files`, print the assignment and the check; return 2 for problems, else 0.
 
-    Questions are asked if the input is a terminal.
+    Questions are requested if the input is a terminal.
 
     Parameters
     ----------
@@ -266,7 +269,7 @@ def print_created(folder: Path, files: Sequence[Path], name: Path, **options: An
     made = campaign_from_files(folder, files, **options, ask=_ask_on_terminal if sys.stdin.isatty() else None)
     typed = shlex.quote(str(name))
     print(*(shown(line, 300) for line in made.lines), sep="\n")
-    print(f"created {shown(name, 300)}, after {number_of(len(made.asked), 'question')}")
+    print(f"created {shown(name, 300)}, after {number_of(len(made.questions), 'question')}")
     if made.open_keys:
         print(f"open keys in {typed}/{CONFIG}, each with its reason: {', '.join(made.open_keys)}")
     count = print_findings(folder)

@@ -33,7 +33,7 @@ def assign(found: Found, assigned: Mapping[Path, str], draft: Draft) -> None:
     assigned
         File → node or flight/node, as given by the user.
     draft
-        Settings of logs that are given or asked.
+        Settings of logs that are given or requested.
 
     Raises
     ------
@@ -127,7 +127,7 @@ def _is_named(log: FoundLog, recording: FoundRecording) -> bool:
 
 
 def _read(log: FoundLog, found: Found, assigned: Mapping[Path, str], draft: Draft) -> None:
-    """Read a log; a value that it does not contain is given, or asked with the key that the reader states."""
+    """Read a log; a value that it does not contain is given, or requested with the key that the reader states."""
     named = [one.node for one in found.recordings if _is_named(log, one)]
     node = assigned.get(log.path, "").rpartition("/")[2] or (named or [one.node for one in found.recordings])[0]
     section = f"nodes.{node}.log."

@@ -65,14 +65,14 @@ def _describe_pulses(draft: Draft, found: Found, kind: str | None) -> Placed:
         "waveform.sample_rate_hz": [float(header.sample_rate_hz) for header in headers],
         "waveform.carrier_hz": [float(header.frequency_hz) for header in headers if header.frequency_hz],
     }
-    asked = {
+    meanings = {
         "waveform.sample_rate_hz": ("complex sample rate of the recordings, Hz", "50e6"),
         "waveform.carrier_hz": ("RF frequency of zero baseband frequency, Hz", "1.3e9"),
     }
     for key, values in stated.items():
         if values:
             draft.set(key, values[0], "in the metadata of the recordings")
-    rest = {key: asked[key] for key, values in stated.items() if not values}
+    rest = {key: meanings[key] for key, values in stated.items() if not values}
     draft.need(rest, "not contained in the recordings; write the value, Hz")
     if "waveform.sample_rate_hz" not in draft.values:
         expected, remedy = "a known sample rate, for the SigMF header", "Add --set waveform.sample_rate_hz=HERTZ."

@@ -92,7 +92,7 @@ class Draft:
 
     def __init__(self, given: Mapping[str, str], ask: Ask | None) -> None:
         self.given, self.ask = dict(given), ask
-        self.asked: list[Question] = []
+        self.questions: list[Question] = []
         self.values: dict[str, Any] = {}
         self.comments: dict[str, str] = {}
         self.open: dict[str, str] = {}
@@ -150,7 +150,7 @@ class Draft:
         """
         if self.ask is None:
             return None
-        self.asked.append(question)
+        self.questions.append(question)
         problem = ""
         while text := self.ask(question, problem).strip():
             try:
