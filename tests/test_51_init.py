@@ -322,8 +322,9 @@ def test_strip_lies_on_the_stated_side_between_10_and_80_degrees(side):
     bounds = swath([track], crs=LOCAL, side=side, height_m=20.0, limit_m=np.inf)
     assert bounds[::2] == pytest.approx(edges, abs=1.5)
     assert bounds[1::2] == [0.0, 500.0]
-    near = swath([track], crs=LOCAL, side=side, height_m=20.0, limit_m=800.0)
-    assert abs(near[2] - near[0]) < abs(bounds[2] - bounds[0])
+    near = swath([track], crs=LOCAL, side=side, height_m=20.0, limit_m=800.0)  # half of it at a squint of 20 degrees
+    far = np.sqrt((400 * np.cos(np.radians(20))) ** 2 - 100**2)
+    assert near[::2] == pytest.approx(np.sort(40.0 + sign * np.array([100 * np.tan(np.radians(10)), far])), abs=1.5)
     circle = np.stack([100 * np.cos(north / 60), 100 * np.sin(north / 60), np.full(50, 120.0)], -1)
     assert swath([circle], crs=LOCAL, side=side, height_m=20.0, limit_m=np.inf) is None
 

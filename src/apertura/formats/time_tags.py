@@ -29,18 +29,17 @@ def are_time_tags(path: Path) -> bool:
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
     ...     path = Path(folder) / "tags.txt"
-    ...     _ = path.write_text("2025-05-14T09:30:00.05Z\\n2025-05-14T09:30:00.10Z\\n")
+    ...     _ = path.write_text("2025-05-14T09:30:00.05Z\n2025-05-14T09:30:00.10Z\n")
     ...     are_time_tags(path), read_time_tags(path)[0].astype(str).tolist()[1]
     (True, '2025-05-14T09:30:00.100000000')
     """
     with path.open("rb") as stream:
         head = stream.read(_HEAD_BYTES)
     if path.suffix == ".npy":
-        return b"'<M8[" in head and head.count(b",)") > 0
-    lines = head.decode("utf-8-sig", errors="replace").splitlines()[:2]
-    return any(_LINE.fullmatch(line.strip()) for line in lines) and all(
-        _LINE.fullmatch(line.strip()) or _HEADER.fullmatch(line.strip()) for line in lines[: len(lines)]
-    )
+        return b"'<M8[" in head
+    lines = [line.strip() for line in head.decode("utf-8-sig", errors="replace").splitlines()[:2]]
+    has_header = bool(lines) and _HEADER.fullmatch(lines[0]) is not None
+    return any(_LINE.fullmatch(line) for line in lines[has_header : has_header + 1])
 
 
 def read_time_tags(path: Path) -> tuple[Times, NDArray[np.int64] | None]:

@@ -1,7 +1,7 @@
 """`apertura init CAMPAIGN FILES`: a campaign folder from recordings and flight logs.
 
 Formats are recognised as by `apertura inspect`; recordings and logs are assigned by times and names; the waveform
-follows from headers, from the transmitted signal and from the samples (docs/theory/recordings.md, eqs. 3 to 8). Values
+follows from headers, from the transmitted signal and from the samples (docs/theory/recordings.md, eqs. 3 to 9). Values
 that no file contains are requested, or written to the config as commented keys.
 """
 

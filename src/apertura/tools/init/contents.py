@@ -1,4 +1,4 @@
-"""Waveform, nodes and scene of a campaign from its files (docs/theory/recordings.md, eqs. 3 to 8)."""
+"""Waveform, nodes and scene of a campaign from its files (docs/theory/recordings.md, eqs. 3 to 9)."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -12,13 +12,18 @@ from apertura.check.times import LOST_CAPTURE, time_facts
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError, quoted, shown
 from apertura.core.echo.structure import CaptureStructure, capture_structure
-from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import LOCAL, map_from_frame
-from apertura.core.scene.auto_grid import GRAZING_LIMIT_DEG, auto_bounds, utm_crs
+from apertura.core.scene.auto_grid import GRAZING_LIMIT_DEG, utm_crs
 from apertura.formats.phase_histories.fmcw import sweep_of, times_of
 from apertura.formats.time_tags import read_time_tags
 from apertura.tools.init.draft import SIDE, Draft
 from apertura.tools.init.files import Found, FoundRecording, likest
+
+_STRAIGHT = 0.5
+"""Smallest distance between the ends of a track, relative to its length, at which a side is defined."""
+
+_SQUINT_DEG = 20.0
+"""Largest squint at which echoes from the far edge of the scene are recorded."""
 
 Placed = dict[str, Path]
 """Target in the campaign folder → file."""
@@ -27,7 +32,6 @@ Placed = dict[str, Path]
 
 _KINDS = {"beat": "fmcw", "history": "phase_history"}
 _FILES = {"ofdm": ("codes", "raw/codes.npy"), "samples": ("pulse", "raw/pulse.npy")}
-_STRAIGHT = 0.5  # smallest distance between the ends of a track, relative to its length, at which a side is defined
 
 
 def describe_waveform(draft: Draft, found: Found, kind: str | None) -> Placed:
@@ -298,7 +302,7 @@ def _path_limit_m(draft: Draft) -> float:
 def swath(
     tracks: list[NDArray[np.float64]], *, crs: str, side: str, height_m: float, limit_m: float
 ) -> list[float] | None:
-    """Return the bounds of a strip on one side of the tracks (recordings.md, eq. 8); None if the first track turns.
+    """Return the bounds of a strip on one side of the tracks (recordings.md, eqs. 8, 9); None if the first track turns.
 
     Parameters
     ----------
@@ -319,15 +323,16 @@ def swath(
     >>> swath([track], crs="local", side="right", height_m=0.0, limit_m=100.0)
     [1.0, 0.0, 46.0, 40.0]
     """
-    flat, positions = [map_from_frame(crs, track) for track in tracks], np.concatenate(tracks)
+    flat = [map_from_frame(crs, track) for track in tracks]
     along = flat[0][-1, :2] - flat[0][0, :2]
     length_m = float(np.linalg.norm(along))
     if length_m <= _STRAIGHT * float(np.linalg.norm(np.diff(flat[0][:, :2], axis=0), axis=1).sum()):
         return None
     places = np.concatenate(flat)
-    square = auto_bounds(Aperture(positions, positions), crs=crs, height_m=height_m, path_limit_m=limit_m)
-    above_m, reach_m = max(float(np.median(places[:, 2])) - height_m, 1.0), (square[2] - square[0]) / 2
-    near_m = min(above_m * np.tan(np.radians(GRAZING_LIMIT_DEG)), reach_m / 2)
+    above_m, grazing_rad = max(float(np.median(places[:, 2])) - height_m, 1.0), np.radians(GRAZING_LIMIT_DEG)
+    slant_m = min(limit_m / 2 * np.cos(np.radians(_SQUINT_DEG)), above_m / np.sin(grazing_rad))
+    reach_m = float(np.sqrt(max(slant_m**2 - above_m**2, 1.0)))
+    near_m = min(above_m * float(np.tan(grazing_rad)), reach_m / 2)
     u = along / length_m
     across = np.array([u[1], -u[0]]) * (1 if side == "right" else -1)
     middle = places[:, :2].mean(axis=0)
