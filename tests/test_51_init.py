@@ -1,6 +1,7 @@
 """`apertura init CAMPAIGN FILES`: recognition, assignment by times and names, questions, config, files."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from apertura.core.quality.bright_points import brightest_near
 from apertura.core.quality.point_targets import find_peak
 from apertura.formats.reading import open_recording
 from apertura.formats.time_tags import read_time_tags
+from apertura.simulation import preset, simulate
 from apertura.simulation.fmcw import FmcwFlight, write_fmcw_campaign
 from apertura.tools.init import campaign_from_files
 from apertura.tools.init.contents import swath
@@ -28,10 +30,6 @@ ANSWERS = {
     "waveform.sample_rate_hz": "1.024e9 1.2e9",
     "waveform.cyclic_prefix_s": "0.78125e-6",
     "scene.height_m": "620 right",
-}
-OFFSETS = {
-    "nodes.alpha.path_offset_m": "{radar: 1.374, sidelink: 0.655}",
-    "nodes.bravo.path_offset_m": "{radar: 0.911, sidelink: 0.402}",
 }
 
 
@@ -68,22 +66,47 @@ def test_int16_samples_with_nmea_and_csv_need_three_answers(tiny, loose, tmp_pat
         assert recordings[0].channels == recordings[1].channels
 
 
+@pytest.mark.parametrize("kind", ["int16", "complex64"])
+def test_samples_in_arrays_are_read_back(tiny, loose, tmp_path, kind):
+    """The header of the .npy file is skipped, so that the file is linked like other samples."""
+    for node, name in (("uav1", "alpha"), ("uav2", "bravo")):
+        recording = open_recording(Campaign.load(tiny).recording_files("f01", node))
+        iq = np.asarray(recording.samples.captures(recording.captures.start, recording.captures.length))
+        complex_iq = (iq[..., 0] + 1j * iq[..., 1]).astype(np.complex64)
+        np.save(loose / f"{name}.npy", iq if kind == "int16" else complex_iq)
+        (loose / f"{name}.iq").unlink()
+    made = campaign_from_files(tmp_path / "made", [loose], ask=answering(ANSWERS))
+    assert problems(made.folder) == []
+    for node, name in (("uav1", "alpha"), ("uav2", "bravo")):
+        first = open_recording(Campaign.load(tiny).recording_files("f01", node))
+        second = open_recording(Campaign.load(made.folder).recording_files("f01", name))
+        captures = [one.samples.captures(one.captures.start, one.captures.length) for one in (first, second)]
+        np.testing.assert_array_equal(*captures)
+        assert (first.channels, first.captures.time.tolist()) == (second.channels, second.captures.time.tolist())
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("conjugate", [False, True])
-def test_targets_of_int16_samples_are_within_2_cm(tiny, loose, tmp_path, conjugate):
-    if conjugate:
-        write_samples(Campaign.load(tiny), "uav1", loose, "alpha", conjugate=True)
-        write_samples(Campaign.load(tiny), "uav2", loose, "bravo", conjugate=True)
-    grid = {"scene.spacing_m": "0.05", "nodes.alpha.attitude": "log", "nodes.alpha.position_std_m": "0.001"}
-    arms = {"nodes.alpha.lever_arms_m": "{radar_tx: [0.1, 0.25, 0.12], radar_rx: [0.1, 0.15, 0.12]}"}
-    shutil.copyfile(tiny / "raw/f01/uav1.track.csv", loose / "alpha.csv")  # with attitude
-    (loose / "alpha_gnss.nmea").unlink()
-    made = campaign_from_files(tmp_path / "made", [loose], settings=OFFSETS | grid | arms, ask=answering(ANSWERS))
+def test_targets_of_int16_samples_are_within_2_cm(tmp_path, conjugate):
+    """Conjugate samples, as with I and Q swapped, give the same image."""
+    plan = preset("demo")
+    nodes = {name: replace(node, lever_arms_m={}, path_offset_m={}) for name, node in plan.nodes.items()}
+    root = simulate(tmp_path / "simulated", replace(plan, nodes=nodes), seed=1)
+    folder, targets = int16_and_logs(root, tmp_path / "loose"), truth(root)
+    for node, name in (("uav1", "alpha"), ("uav2", "bravo")) if conjugate else ():
+        write_samples(Campaign.load(root), node, folder, name, conjugate=True)
+    west, south, east, north = (*np.floor(targets.min(axis=0) - 1), *np.ceil(targets.max(axis=0) + 1))
+    grid = {
+        "scene.crs": "EPSG:32632",
+        "scene.bounds_m": f"[{west}, {south}, {east}, {north}]",
+        "scene.spacing_m": "0.05",
+    }
+    made = campaign_from_files(tmp_path / "made", [folder], settings=grid, ask=answering(ANSWERS))
     campaign = run_steps(made.folder, exports=False)
     for pair in ("alpha-alpha", "alpha-bravo"):
         stage = open_stage(campaign.stage("image", "f01", pair), "image")
         x, y = stage.x.values, stage.y.values
-        for east, north in truth(tiny):
+        for east, north in targets:
             row, column = (y[0] - north) / 0.05, (east - x[0]) / 0.05
             peak = find_peak(stage.image.values, *brightest_near(stage.image.values, row, column, 5))
             assert 0.05 * np.hypot(peak.row - row, peak.column - column) < 0.02

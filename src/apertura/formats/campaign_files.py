@@ -127,6 +127,7 @@ def write_meta(
     sample_rate_hz: float,
     frequency_hz: float | None,
     extra: Mapping[str, Any],
+    header_bytes: int = 0,
 ) -> None:
     """Write `stem`.sigmf-meta for existing samples.
 
@@ -140,6 +141,8 @@ def write_meta(
         Hash of the samples.
     frequency_hz
         RF frequency at zero baseband frequency; None: not stated.
+    header_bytes
+        Bytes at the start of the file that are not samples.
     """
     header = {
         "core:datatype": DATATYPES[dtype],
@@ -163,6 +166,8 @@ def write_meta(
         }
         for start, time_utc, frame in captures
     ]
+    if header_bytes:
+        segments[0]["core:header_bytes"] = header_bytes
     meta = {"global": header, "captures": segments, "annotations": []}
     stem.with_name(f"{stem.name}.sigmf-meta").write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
 

@@ -208,8 +208,9 @@ def _write_recording(one: FoundRecording, stem: Path, draft: Draft, place: Place
     elif one.kind == "samples" and one.times is not None:
         data = stem.with_name(f"{stem.name}.sigmf-data")
         place(one.path, data)
-        dtype = np.dtype(TYPES.get(one.path.suffix, "int16"))
-        length = one.path.stat().st_size // (2 * dtype.itemsize * one.channels * len(one.times))
+        dtype = np.dtype(TYPES.get(one.path.suffix, "int16")) if one.content is None else one.content.dtype
+        header_bytes = 0 if one.content is None else one.path.stat().st_size - one.content.nbytes
+        length = (one.path.stat().st_size - header_bytes) // (2 * dtype.itemsize * one.channels * len(one.times))
         frames = [None] * len(one.times) if one.frames is None else one.frames.tolist()
         write_meta(
             stem,
@@ -220,6 +221,7 @@ def _write_recording(one: FoundRecording, stem: Path, draft: Draft, place: Place
             sample_rate_hz=float(draft.values["waveform.sample_rate_hz"]),
             frequency_hz=draft.values.get("waveform.carrier_hz"),
             extra={},
+            header_bytes=header_bytes,
         )
     else:
         suffix = PHASE_HISTORIES[one.format].suffix

@@ -12,7 +12,7 @@ from apertura.check.times import LOST_CAPTURE, time_facts
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError, quoted, shown
 from apertura.core.echo.structure import CaptureStructure, capture_structure
-from apertura.core.geometry.geodesy import LOCAL, map_from_frame
+from apertura.core.geometry.geodesy import LOCAL, geodetic_from_ecef, map_from_frame
 from apertura.core.scene.auto_grid import GRAZING_LIMIT_DEG, utm_crs
 from apertura.formats.phase_histories.fmcw import sweep_of, times_of
 from apertura.formats.time_tags import read_time_tags
@@ -235,6 +235,7 @@ def describe_nodes(draft: Draft, found: Found) -> None:
 def describe_scene(draft: Draft, found: Found, side: str | None) -> Placed:
     """Fill in section `scene`; return the DEM."""
     tracks = _tracks(found)
+    middle = np.median(tracks[0][1], axis=0) if tracks else None
     is_local = any(frame == "local" for frame, _ in tracks)
     draft.set("scene.crs", LOCAL if is_local else "auto", "frame of the positions" if tracks else "no positions")
     placed: Placed = {}
@@ -246,7 +247,9 @@ def describe_scene(draft: Draft, found: Found, side: str | None) -> Placed:
         placed[target] = found.dems[0]
     else:
         height = "z of the ground in the local frame, m" if is_local else "ground height above the ellipsoid, m"
-        keys = {"scene.height_m": (height, "0" if is_local else "620")}
+        flown_m = None if middle is None else middle[2] if is_local else geodetic_from_ecef(middle)[2]
+        above = "" if flown_m is None else f" (median of the track: {flown_m:.0f} m)"
+        keys = {"scene.height_m": (height + above, "0" if is_local else "620")}
         if side is None and "scene.height_m" not in draft.given:
             keys[SIDE] = ("optionally the side of the track on which the scene lies: left, right or both", "right")
         draft.need(keys, f"in no file; write the {height}")

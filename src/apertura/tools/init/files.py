@@ -82,7 +82,8 @@ class FoundRecording:
     times, frames
         Time and frame number of each pulse, if known.
     content
-        `Recording`, array of beat signals, contents of a sound file, or `echo` stage.
+        `Recording`, samples in an array (capture, sample, channel, 2), array of beat signals, contents of a sound
+        file, or `echo` stage.
     channels
         Number of channels; 0 for samples without header before the number is estimated.
     flight, node, log, zone_s
@@ -131,11 +132,14 @@ class FoundRecording:
         if isinstance(self.content, Recording):
             samples = first_samples(self.content)[:MOST_CAPTURES]
             return samples.reshape(len(samples), -1)
-        kind, captures = (
-            np.dtype(TYPES.get(self.path.suffix, "int16")).newbyteorder("<"),
-            0 if self.times is None else len(self.times),
-        )
-        stored = np.memmap(self.path, kind, "r").reshape(captures, -1, 2)[:MOST_CAPTURES].astype(np.float32)
+        stored = self.content
+        if stored is None:
+            kind, captures = (
+                np.dtype(TYPES.get(self.path.suffix, "int16")).newbyteorder("<"),
+                0 if self.times is None else len(self.times),
+            )
+            stored = np.memmap(self.path, kind, "r").reshape(captures, -1, 2)
+        stored = stored[:MOST_CAPTURES].astype(np.float32).reshape(min(len(stored), MOST_CAPTURES), -1, 2)
         return np.asarray(stored[..., 0] + 1j * stored[..., 1])
 
 
@@ -193,14 +197,29 @@ def recognised(files: Iterable[Path]) -> Found:
             raise problem
         elif problem is not None:
             found.unused[path] = problem.found
+    if any(array.ndim == 1 and array.dtype.kind == "c" for array in found.arrays.values()):  # a transmitted signal
+        complex_beats = [one for one in found.recordings if one.kind == "beat" and one.path.suffix == ".npy"]
+        complex_beats = [one for one in complex_beats if one.times is None and one.content.dtype == np.complex64]
+        found.recordings = [one for one in found.recordings if one not in complex_beats]
+        found.arrays |= {one.path: one.content for one in complex_beats}
+    headerless += [path for path, array in found.arrays.items() if _samples_of(array) is not None]
     for path in headerless:
         try:
-            found.recordings.append(_headerless(path, found.tags))
+            found.recordings.append(_headerless(path, found.arrays.pop(path, None), found.tags))
         except CampaignError as problem:
             if listed[path]:
                 raise
             found.unused[path] = problem.found
     return found
+
+
+def _samples_of(array: NDArray[Any]) -> NDArray[Any] | None:
+    """Return recorded samples as (capture, sample, channel, 2), a view of an array; None for other arrays."""
+    if array.dtype == np.complex64 and array.ndim in {2, 3} and array.flags.c_contiguous:
+        array = array.view(np.float32).reshape(*array.shape, 2)
+    if array.dtype.str not in {"|i1", "<i2", "<i4", "<f4"} or array.shape[-1:] != (2,) or not array.flags.c_contiguous:
+        return None
+    return array[:, :, None] if array.ndim == 3 else array if array.ndim == 4 and array.shape[2] <= 2 else None
 
 
 def _listed(files: Iterable[Path]) -> dict[Path, bool]:
@@ -305,12 +324,16 @@ def _add_history(found: Found, path: Path, name: str, *, is_bistatic: bool) -> N
     found.recordings.append(recording)
 
 
-def _headerless(path: Path, tags: Iterable[Path]) -> FoundRecording:
-    """Return a recording of samples without header, with the only suitable file of time tags."""
-    size = path.stat().st_size
+def _headerless(path: Path, array: NDArray[Any] | None, tags: Iterable[Path]) -> FoundRecording:
+    """Return a recording of samples without header or in an array, with the only suitable file of time tags."""
+    size, samples = path.stat().st_size, None if array is None else _samples_of(array)
     each = 2 * np.dtype(TYPES.get(path.suffix, "int16")).itemsize
     read = {tag: read_time_tags(tag) for tag in tags}
-    fitting = likest(path, [tag for tag, (times, _) in read.items() if size % (each * len(times)) == 0])
+    fits = {
+        tag: size % (each * len(times)) == 0 if samples is None else len(times) == len(samples)
+        for tag, (times, _) in read.items()
+    }
+    fitting = likest(path, [tag for tag in read if fits[tag]])
     if len(fitting) != 1:
         which = " and ".join(tag.name for tag in fitting) or "none whose number of tags divides the size"
         raise CampaignError(
@@ -319,4 +342,5 @@ def _headerless(path: Path, tags: Iterable[Path]) -> FoundRecording:
             "one file of time tags with the name of the recording and a line per capture; or SigMF",
             f"Add {path.stem}_tags.txt with the UTC of each capture.",
         )
-    return FoundRecording("samples", "samples without header", (path,), *read[fitting[0]], channels=0)
+    channels = 0 if samples is None else samples.shape[2]
+    return FoundRecording("samples", "samples without header", (path,), *read[fitting[0]], samples, channels)
