@@ -54,7 +54,8 @@ def test_interleaved_channels_are_counted(weaker_db):
 
 
 def test_oversampled_single_channel_is_not_taken_for_two_channels():
-    found = capture_structure(captures(length=900, period=640), codes())
+    # half a cell of D/N samples off the delays of eq. 4, so that the odd samples alone are compressed better
+    found = capture_structure(captures(length=900, period=640, delay=10 / 3, snr_db=60.0), codes())
     assert (found.channels, found.dft_samples) == (1, 640)
 
 
@@ -67,8 +68,8 @@ def test_captures_without_the_signal_have_no_structure():
 
 def test_silence_before_the_first_echo_is_not_a_period():
     """The largest lags compare silence with silence; their rounding errors must not exceed the true period."""
-    samples = captures(snr_db=200.0)
-    samples[:, :3] = 0
+    samples = captures(snr_db=200.0, delay=40)
+    samples[:, :40] = 0
     assert capture_structure(samples, codes()).dft_samples == PERIOD
 
 
