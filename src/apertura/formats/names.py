@@ -5,8 +5,6 @@ Rows refer to readers lazily: looking up a file name does not import a reader, a
 reader and one row in this module.
 """
 
-import re
-from codecs import BOM_UTF8
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -46,31 +44,16 @@ class LogFormat(NamedTuple):
     """Text in the first 8 KiB that distinguishes the format from others with the same suffix; empty: any text."""
     by_lines: bool = False
     """True if epochs are lines of text, so that a log that is being written is valid up to its last complete line."""
-    signature: bytes = b""
-    """Regular expression of the first bytes, by which a log with any suffix is recognised; empty: only by suffix."""
 
 
 TRACKS: Mapping[str, LogFormat] = {
-    "airdata": LogFormat(
-        (".csv",), _TRACKS.airdata.read_airdata, "time(millisecond),datetime(utc)", True, rb"time\(millisecond\)"
-    ),
-    "optitrack": LogFormat(
-        (".csv",), _TRACKS.optitrack.read_optitrack, "Format Version,1.", True, rb"Format Version,1\."
-    ),
-    "csv": LogFormat(
-        (".csv",),
-        _TRACKS.csv_track.read_csv_track,
-        by_lines=True,
-        signature=rb"(?=[^\n]*\b(?:latitude_deg|x_m|east_m)\b)[^\n]*\btime(?:_utc|_s)?\b",
-    ),
-    "nmea": LogFormat((".nmea", ".txt"), _TRACKS.nmea.read_nmea, "$", True, rb"\s*[$!][A-Z]{2}[A-Z0-9]*,"),
-    "px4": LogFormat((".ulg",), _TRACKS.px4_ulog.read_px4_ulog, signature=rb"ULog\x01\x12\x35"),
-    "ardupilot": LogFormat(
-        (".bin", ".log"), _TRACKS.ardupilot.read_ardupilot, heading="FMT", signature=rb"\xa3\x95\x80|FMT,"
-    ),
-    "rtklib": LogFormat(
-        (".pos",), _TRACKS.rtklib.read_rtklib_pos, by_lines=True, signature=rb"% (?:program|\(| *GPST)"
-    ),
+    "airdata": LogFormat((".csv",), _TRACKS.airdata.read_airdata, "time(millisecond),datetime(utc)", True),
+    "optitrack": LogFormat((".csv",), _TRACKS.optitrack.read_optitrack, "Format Version,1.", True),
+    "csv": LogFormat((".csv",), _TRACKS.csv_track.read_csv_track, by_lines=True),
+    "nmea": LogFormat((".nmea", ".txt"), _TRACKS.nmea.read_nmea, "$", True),
+    "px4": LogFormat((".ulg",), _TRACKS.px4_ulog.read_px4_ulog),
+    "ardupilot": LogFormat((".bin", ".log"), _TRACKS.ardupilot.read_ardupilot, heading="FMT"),
+    "rtklib": LogFormat((".pos",), _TRACKS.rtklib.read_rtklib_pos, by_lines=True),
 }
 """Name of a format → its recognition and reader; the first format that matches a file is used."""
 
@@ -169,24 +152,6 @@ def log_format(path: Path, options: LogOptions = DEFAULT_OPTIONS) -> str:
         expected=f"<node>.track.<{'|'.join(log_suffixes())}>; formats {', '.join(TRACKS)}",
         remedy="Convert the log, or write a reader for it.",
     )
-
-
-def log_by_content(path: Path) -> str | None:
-    """Return the format of a log with any suffix, a key of `TRACKS`, from its first bytes; None if no format matches.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as folder:
-    ...     path = Path(folder) / "gps.dat"
-    ...     _ = path.write_text("$GNGGA,093000.00,4825.3530,N,00957.3054,E,4,12,0.6,625.0,M,47.2,M,,*5A")
-    ...     log_by_content(path)
-    'nmea'
-    """
-    with naming(path), path.open("rb") as stream:
-        first = stream.read(_HEADING_BYTES).removeprefix(BOM_UTF8)
-    signed = ((name, row.signature) for name, row in TRACKS.items() if row.signature)
-    return next((name for name, signature in signed if re.match(signature, first)), None)
 
 
 def log_suffixes() -> list[str]:

@@ -293,7 +293,7 @@ def log_key(problem: CampaignError) -> str:
 def _beat(path: Path) -> FoundRecording | None:
     """Return a recording of beat signals, (sweep, sample); None for other contents."""
     beside = path.with_name(path.name.removesuffix(".npy") + ".time.npy")
-    with suppress(CampaignError, ValueError, OSError):
+    with suppress(Exception):  # numpy evaluates the header of an array, and a malformed header may raise any exception
         if path.suffix == ".npy":
             beat = np.load(path, mmap_mode="r", allow_pickle=False)
             if beat.ndim != 2 or beat.shape[1] < 8 or beat.dtype.kind not in "fiuc":

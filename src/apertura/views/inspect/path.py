@@ -21,12 +21,12 @@ from apertura.formats.names import (
     PHASE_HISTORIES,
     RECORDERS,
     TRACKS,
-    log_by_content,
     log_format,
     log_suffixes,
     recording_files,
 )
 from apertura.formats.reading import read_phase_history
+from apertura.formats.signatures import log_by_content
 from apertura.formats.time_tags import are_time_tags
 from apertura.views.inspect.files import Surroundings, retries, surroundings
 from apertura.views.inspect.report import Report, print_report
