@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import rasterio
 import yaml
 from folders import complaint, contents, run_steps
 from loose_files import epochs, int16_and_logs, truth, write_csv, write_nmea, write_samples, write_ulog
+from rasterio.transform import from_origin
 
 from apertura import cli
 from apertura.campaign.config import CLOCKS, CONFIG, FLIGHTS
@@ -348,6 +350,21 @@ def test_strip_lies_on_the_stated_side_between_10_and_80_degrees(side):
     assert near[::2] == pytest.approx(np.sort(40.0 + sign * np.array([100 * np.tan(np.radians(10)), far])), abs=1.5)
     circle = np.stack([100 * np.cos(north / 60), 100 * np.sin(north / 60), np.full(50, 120.0)], -1)
     assert swath([circle], crs=LOCAL, side=side, height_m=20.0, limit_m=np.inf) is None
+
+
+@pytest.mark.parametrize(("datum", "is_known"), [("ellipsoid", True), ("egm2008", False)])
+def test_side_requires_heights_above_the_ellipsoid(loose, tmp_path, datum, is_known):
+    """A DEM of 620 m gives the bounds of a stated height of 620 m; heights above a geoid give automatic bounds."""
+    place = {"crs": "EPSG:32632", "transform": from_origin(570550, 5363800, 4, 4), "width": 60, "height": 60}
+    with rasterio.open(tmp_path / "dem.tif", "w", driver="GTiff", count=1, dtype="float32", **place) as raster:
+        raster.write(np.full((60, 60), 620, np.float32), 1)
+    answers = {**ANSWERS, "scene.dem_datum": datum}
+    made = campaign_from_files(tmp_path / "made", [loose, tmp_path / "dem.tif"], side="right", ask=answering(answers))
+    scene = config_of(made)["scene"]
+    assert (scene["dem"], scene["dem_datum"]) == ("raw/dem.tif", datum)
+    flat = config_of(campaign_from_files(tmp_path / "flat", [loose], ask=answering(ANSWERS)))["scene"]
+    assert scene["bounds_m"] == (flat["bounds_m"] if is_known else "auto")
+    assert "height_m" not in scene
 
 
 # ---- Files

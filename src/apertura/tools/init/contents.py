@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.campaign.config.template import WAVEFORMS
+from apertura.check.facts import dem_facts
 from apertura.check.times import LOST_CAPTURE, time_facts
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError, quoted, shown
@@ -259,19 +260,30 @@ def describe_scene(draft: Draft, found: Found, side: str | None) -> Placed:
     draft.set(
         "scene.bounds_m", "auto", "both sides of the tracks; for one side write [xmin, ymin, xmax, ymax] in crs, m"
     )
-    height_m = draft.values.get("scene.height_m")
-    if side == "both" or height_m is None or not tracks:
+    if side == "both" or middle is None:
         return placed
-    crs = LOCAL if is_local else utm_crs(np.median(tracks[0][1], axis=0))
-    bounds_m = swath(
-        [track for _, track in tracks], crs=crs, side=side, height_m=height_m, limit_m=_path_limit_m(draft)
-    )
-    if bounds_m is None:
-        draft.set("scene.bounds_m", "auto", f"the tracks turn: side {side} does not determine the bounds")
-    else:
+    crs = str(draft.values["scene.crs"])
+    crs = utm_crs(middle) if crs == "auto" else crs
+    height_m, limit_m = _ellipsoidal_m(draft, found), _path_limit_m(draft)
+    bounds_m = None
+    if height_m is not None:
+        bounds_m = swath([track for _, track in tracks], crs=crs, side=side, height_m=height_m, limit_m=limit_m)
+    if bounds_m:
         draft.set("scene.crs", crs, "frame of the positions" if is_local else "UTM zone of the tracks")
         draft.set("scene.bounds_m", bounds_m, f"{side} of the tracks, at grazing angles of 10° to 80°")
+    else:
+        cause = "the ground height above the ellipsoid is not known" if height_m is None else "the tracks turn"
+        draft.set("scene.bounds_m", "auto", f"{cause}: side {side} does not determine the bounds")
     return placed
+
+
+def _ellipsoidal_m(draft: Draft, found: Found) -> float | None:
+    """Return the ground height above the ellipsoid, from the config or the DEM; None if it refers to a geoid."""
+    if not found.dems:
+        is_ellipsoidal = draft.given.get("scene.height_datum", "ellipsoid") == "ellipsoid"
+        return draft.values.get("scene.height_m") if is_ellipsoidal else None
+    heights = dem_facts(found.dems[0]).heights if draft.values.get("scene.dem_datum") == "ellipsoid" else None
+    return None if heights is None else float(np.nanmedian(heights))
 
 
 def _tracks(found: Found) -> list[tuple[str, NDArray[np.float64]]]:
