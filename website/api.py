@@ -24,6 +24,7 @@ _GROUP_OF = {
     "Profiles": "Images",
     "simulate": "Campaigns",
     "open_campaign": "Campaigns",
+    "campaign_from_files": "Campaigns",
     "write_campaign": "Campaigns",
     "RecordedFlight": "Campaigns",
     "RecordedNode": "Campaigns",

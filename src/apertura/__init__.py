@@ -30,6 +30,7 @@ _PUBLIC = {
     "RecordedNode": "apertura.tools.write_campaign",
     "SceneGrid": "apertura.core.scene.grid",
     "backproject": "apertura.core.imaging.backproject",
+    "campaign_from_files": "apertura.tools.init",
     "design": "apertura.tools.design",
     "gradient": "apertura.core.imaging.gradient",
     "judge": "apertura.core.imaging.judgement",

@@ -640,13 +640,54 @@ def map_page(
 
 @app.command()
 def init(
-    directory: Annotated[Path, typer.Argument(help="folder to create")],
-    kind: Annotated[str, typer.Option(help="kind of waveform: ofdm, samples, fmcw, phase_history")] = "ofdm",
+    directory: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="folder to create")],
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="FILES",
+            help="recordings, flight logs, time tags, transmitted signal, DEM, and folders with such files",
+            show_default=False,
+        ),
+    ] = None,
+    *,
+    kind: Annotated[
+        str | None,
+        typer.Option(help="kind of waveform: ofdm (default), samples, fmcw, phase_history", show_default=False),
+    ] = None,
     from_: Annotated[
         Path | None, typer.Option("--from", metavar="PLAN.yaml", help="derive the config from this flight plan")
     ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="value of a key of config.yaml that no file contains"),
+    ] = None,
+    side: Annotated[
+        str | None, typer.Option(help="side of the track on which the scene lies: left, right or both (the default)")
+    ] = None,
+    transmitter: Annotated[str | None, typer.Option(metavar="NODE", help="node that transmits")] = None,
+    assign: Annotated[
+        list[str] | None,
+        typer.Option(metavar="FILE=[FLIGHT/]NODE", help="flight and node of a file, where its name is ambiguous"),
+    ] = None,
+    copy: Annotated[
+        bool, typer.Option("--copy", help="copy files that could be cloned or hard-linked without using disk space")
+    ] = False,
 ) -> None:
-    """Create a campaign folder with a commented config, from a template or from a flight plan."""
+    """Create a campaign folder from recordings and logs, or with a config from a template or a flight plan.
+
+    Values that no file contains are requested on a terminal; without an answer they are commented keys of the config.
+    """
+    if not files and (settings or side or transmitter or assign or copy):
+        options, remedy = "--set, --side, --transmitter, --assign or --copy", "Name recordings and logs."
+        raise CampaignError(f"{options} without files", "init", "files after the campaign folder", remedy)
+    if files:
+        words = {"settings": _pairs(settings, "--set"), "assign": _pairs(assign, "--assign")}
+        chosen = {"transmitter": transmitter, "side": side, "kind": kind, "copy": copy}
+        paths, folder = [given(path) for path in files], given(directory)
+        words["assign"] = {str(given(Path(name))): target for name, target in words["assign"].items()}
+        from apertura.tools.init import print_created
+
+        raise SystemExit(print_created(folder, paths, directory, **words, **chosen))
     if from_ is not None:
         path, folder = given(from_), given(directory)
         from apertura.tools.design.flight_plan import read_flight_plan
@@ -658,6 +699,7 @@ def init(
     from apertura.campaign.config.template import config_template, flights_template
     from apertura.common.atomic import made_folder, write_text
 
+    kind = kind or "ofdm"
     texts = {"config.yaml": config_template(kind), "flights.tsv": flights_template(kind)}
     folder = made_folder(given(directory)) / "config"
     for path, text in ((folder / name, text) for name, text in texts.items()):
@@ -666,6 +708,14 @@ def init(
         write_text(path, text)
         print(as_typed(path))
     print(_next_after_init(directory))
+
+
+def _pairs(words: list[str] | None, option: str) -> dict[str, str]:
+    """Split words NAME=VALUE."""
+    wrong = next((word for word in words or () if "=" not in word), None)
+    if wrong is not None:
+        raise CampaignError(wrong, option, "NAME=VALUE", "Correct the option.")
+    return {name: value for name, _, value in (word.partition("=") for word in words or ())}
 
 
 def _next_after_init(directory: Path) -> str:

@@ -58,6 +58,11 @@ def write_config(
     """
     text = yaml.safe_dump(dict(document), sort_keys=False)
     (root / "config" / "config.yaml").write_text(text, encoding="utf-8")
+    write_flights(root, flights)
+
+
+def write_flights(root: Path, flights: Iterable[tuple[str, str, str, Iterable[str]]]) -> None:
+    """Write config/flights.tsv: name, kind, transmitter and nodes of each flight."""
     rows = ["\t".join((name, kind, transmitter, ",".join(nodes))) for name, kind, transmitter, nodes in flights]
     table = "\n".join(("flight\tkind\ttransmitter\tnodes", *rows)) + "\n"
     (root / "config" / "flights.tsv").write_text(table, encoding="utf-8")
@@ -93,34 +98,76 @@ def write_recording(
     -----
     Source: SigMF specification 1.2.
     """
-    digest, datatype = hashlib.sha512(), "ci16_le"
+    digest, dtype = hashlib.sha512(), "int16"
     with stem.with_name(f"{stem.name}.sigmf-data").open("wb") as stream:
         for block in blocks:
-            datatype = DATATYPES[block.dtype.name]
+            dtype = block.dtype.name
             data = np.ascontiguousarray(block, block.dtype.newbyteorder("<")).tobytes()
             digest.update(data)
             stream.write(data)
+    write_meta(
+        stem,
+        captures,
+        channels=channels,
+        dtype=dtype,
+        sha512=digest.hexdigest(),
+        sample_rate_hz=sample_rate_hz,
+        frequency_hz=frequency_hz,
+        extra=extra,
+    )
+
+
+def write_meta(
+    stem: Path,
+    captures: Iterable[tuple[int, np.datetime64, int | None]],
+    *,
+    channels: Sequence[str],
+    dtype: str,
+    sha512: str,
+    sample_rate_hz: float,
+    frequency_hz: float | None,
+    extra: Mapping[str, Any],
+    header_bytes: int = 0,
+) -> None:
+    """Write `stem`.sigmf-meta for existing samples.
+
+    Parameters
+    ----------
+    stem, captures, channels, extra
+        As for `write_recording`.
+    dtype
+        Type of I and Q, a key of `DATATYPES`.
+    sha512
+        Hash of the samples.
+    frequency_hz
+        RF frequency at zero baseband frequency; None: not stated.
+    header_bytes
+        Bytes at the start of the file that are not samples.
+    """
     header = {
-        "core:datatype": datatype,
+        "core:datatype": DATATYPES[dtype],
         "core:sample_rate": sample_rate_hz,
         "core:version": "1.2.5",
         "core:num_channels": len(channels),
-        "core:sha512": digest.hexdigest(),
+        "core:sha512": sha512,
         "core:description": f"{stem.parent.name} {stem.name}",
         "core:extensions": [{"name": "apertura", "version": "0.1.0", "optional": True}],
         "apertura:channels": list(channels),
         "apertura:node": stem.name,
         **extra,
     }
+    stated = {} if frequency_hz is None else {"core:frequency": frequency_hz}
     segments = [
         {
             "core:sample_start": start,
-            "core:frequency": frequency_hz,
+            **stated,
             "core:datetime": f"{np.datetime_as_string(time_utc)}Z",
             **({} if frame is None else {"apertura:frame": frame}),
         }
         for start, time_utc, frame in captures
     ]
+    if header_bytes:
+        segments[0]["core:header_bytes"] = header_bytes
     meta = {"global": header, "captures": segments, "annotations": []}
     stem.with_name(f"{stem.name}.sigmf-meta").write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
 

@@ -1,6 +1,7 @@
 """Commented config template and JSON schema, both generated from `Settings`."""
 
 import json
+import textwrap
 import types
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -63,6 +64,55 @@ def flights_template(kind: str = "ofdm") -> str:
 
 def _nodes(kind: str) -> tuple[str, ...]:
     return _NODES.get(kind, ("uav1", "uav2"))
+
+
+_WIDTH = 116
+
+
+def commented_yaml(values: Mapping[str, Any], comments: Mapping[str, str], open_keys: Mapping[str, str]) -> str:
+    """Return a config with a comment for each value, and commented keys for values that are not known.
+
+    Parameters
+    ----------
+    values
+        Nested sections; sections without values are omitted.
+    comments
+        Key, with sections separated by dots → origin of its value.
+    open_keys
+        Key → reason for which it is open, and the value to be written.
+
+    Examples
+    --------
+    >>> print(commented_yaml({"a": {"b": 1}}, {"a.b": "of a file"}, {"a.c": "unknown; write c"}), end="")
+    a:
+      # of a file
+      b: 1
+      # unknown; write c
+      # c:
+    """
+    return "\n".join(_commented(values, comments, open_keys, "", 0)) + "\n"
+
+
+def _commented(
+    values: Mapping[str, Any], comments: Mapping[str, str], open_keys: Mapping[str, str], section: str, depth: int
+) -> list[str]:
+    indent, lines = "  " * depth, list[str]()
+
+    def comment(text: str) -> list[str]:
+        return [f"{indent}# {line}" for line in textwrap.wrap(text, _WIDTH - len(indent), break_long_words=False)]
+
+    for name, value in values.items():
+        key = f"{section}{name}"
+        lines += comment(comments[key]) if key in comments else []
+        if isinstance(value, dict) and value and key not in comments:
+            lines += [f"{indent}{name}:", *_commented(value, comments, open_keys, f"{key}.", depth + 1)]
+        else:
+            scalar = yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("\n").removesuffix("\n...")
+            lines.append(f"{indent}{name}: {scalar}")
+    for key, reason in open_keys.items():
+        if key.startswith(section) and "." not in key[len(section) :]:
+            lines += [*comment(reason), f"{indent}# {key[len(section) :]}:"]
+    return lines
 
 
 def config_schema() -> str:

@@ -93,7 +93,7 @@ def read_beat_npy(paths: Sequence[Path], *, pair: str, described: Mapping[str, A
     read = []
     for path in files:
         time_path = by_name.get(path.name.removesuffix(".npy") + _TIMES)
-        time = None if time_path is None else _times(read_npy(time_path, kinds="Mf", **limits), time_path)
+        time = None if time_path is None else times_of(read_npy(time_path, kinds="Mf", **limits), time_path)
         read.append(Sweeps(path, read_npy(path, kinds="fiuc", **limits), time))
     return joined_sweeps(read, pair=pair, described=described)
 
@@ -129,7 +129,7 @@ def read_fields(
 
 def sweeps_of(path: Path, variables: Mapping[str, NDArray[Any]]) -> Sweeps:
     """Convert the variables beat and time of a MATLAB file to sweeps; raise CampaignError if time is invalid."""
-    return Sweeps(path, variables["beat"], _times(variables["time"], path) if "time" in variables else None)
+    return Sweeps(path, variables["beat"], times_of(variables["time"], path) if "time" in variables else None)
 
 
 def sweep_of(described: Mapping[str, Any]) -> FrequencySweep:
@@ -254,7 +254,8 @@ def beginning(described: Mapping[str, Any], path: Path) -> np.datetime64:
     return first
 
 
-def _times(stored: NDArray[Any], path: Path) -> Times:
+def times_of(stored: NDArray[Any], path: Path) -> Times:
+    """Convert times of sweeps, datetime64 or seconds since 1970, to datetime64[ns]; raise CampaignError if invalid."""
     known = stored.dtype.kind in "fiu" or (stored.dtype.kind == "M" and stored.dtype != np.dtype("M8"))
     if not known or stored.ndim != 1 or not stored.size:
         raise _error(f"array of times is {stored.dtype} of shape {stored.shape}", path)

@@ -25,13 +25,14 @@ from apertura.check.facts import (
     log_faults,
     recording_facts,
 )
-from apertura.check.times import TimeFacts, inside, own_clock, utc
+from apertura.check.times import LOST_CAPTURE, TimeFacts, inside, own_clock, time_facts, utc
 from apertura.common.documents import validated
 from apertura.common.errors import CampaignError, number_of, shown
 from apertura.core.scene.dem import open_dem
 from apertura.formats.names import PHASE_HISTORIES, log_format, log_suffixes
 from apertura.formats.npy import read_npy
 from apertura.formats.reading import open_recording, read_phase_history, read_track
+from apertura.formats.time_tags import read_time_tags
 from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions, QualityNumbers, TimeSystem
 from apertura.views.inspect.report import Report
 
@@ -527,6 +528,24 @@ def _tag(tags: Mapping[str, str], name: str, kind: type) -> Any:
     except ValueError:
         value = None
     return value if isinstance(value, kind) else kind()
+
+
+def time_tags_report(path: Path) -> Report:
+    """Return the report of a file of time tags.
+
+    Raises
+    ------
+    CampaignError
+        If a line is not a time, or times do not increase.
+    """
+    times, frames = read_time_tags(path)
+    rows = {
+        "tags": len(times),
+        **time_rows(time_facts(times, longer=LOST_CAPTURE)),
+        "frame_numbers": frames is not None,
+    }
+    lacks = ("the samples: a recording without header and its time tags become a campaign with `apertura init`",)
+    return Report(path, "time tags", "", rows, lacks)
 
 
 def array_report(path: Path) -> Report:

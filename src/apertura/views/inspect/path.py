@@ -1,10 +1,9 @@
-"""`apertura inspect`: identify a file by the first reader that matches the name and reads the file without error."""
+"""`apertura inspect`: identify a file by the first reader that matches its name or first bytes, and reads the file."""
 
 import json
 import logging
 import stat
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,8 +17,17 @@ from apertura.check.examination import Examination, Key
 from apertura.check.times import LOST_CAPTURE, Span, TimeFacts, inside, time_facts
 from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError, explained, quoted, shown
-from apertura.formats.names import PHASE_HISTORIES, RECORDERS, TRACKS, log_format, log_suffixes, recording_files
+from apertura.formats.names import (
+    PHASE_HISTORIES,
+    RECORDERS,
+    TRACKS,
+    log_format,
+    log_suffixes,
+    recording_files,
+)
 from apertura.formats.reading import read_phase_history
+from apertura.formats.signatures import log_by_content
+from apertura.formats.time_tags import are_time_tags
 from apertura.views.inspect.files import Surroundings, retries, surroundings
 from apertura.views.inspect.report import Report, print_report
 
@@ -177,7 +185,7 @@ def _readers(path: Path, context: Surroundings) -> Iterator[tuple[str, str, Read
     if stated in PHASE_HISTORIES and path.name.endswith(PHASE_HISTORIES[stated].suffix):
         yield "phase history", stated, partial(_history, path, stated, context)
         return  # the campaign reads the file in the configured format, even if other readers match
-    from apertura.views.inspect.files import ARRAY, DEM, array_report, dem_report, log_report
+    from apertura.views.inspect.files import ARRAY, DEM, array_report, dem_report
 
     if "format" not in context.typed:
         for row in RECORDERS:
@@ -187,13 +195,28 @@ def _readers(path: Path, context: Surroundings) -> Iterator[tuple[str, str, Read
         for name, history in PHASE_HISTORIES.items():
             if path.name.endswith(history.suffix):
                 yield "phase history", name, partial(_history, path, name, context)
-    if path.is_file() and (".track." in path.name or context.options.format is None or "format" in context.typed):
-        with suppress(CampaignError):  # not a known log format
-            yield "flight log", log_format(path, context.options), partial(log_report, path, context)
+    if path.is_file():
+        yield from _text_readers(path, context)
     if path.suffix.lower() in DEM:
         yield "elevation model", "", partial(dem_report, path)
     if path.suffix in ARRAY:
         yield "array", "", partial(array_report, path)
+
+
+def _text_readers(path: Path, context: Surroundings) -> Iterator[tuple[str, str, Reader]]:
+    """Yield the reader of a flight log, by suffix or else by content, and of time tags."""
+    from apertura.views.inspect.files import log_report, time_tags_report
+
+    if ".track." in path.name or context.options.format is None or "format" in context.typed:
+        try:
+            name: str | None = log_format(path, context.options)
+        except CampaignError:  # not the suffix of a log
+            name = log_by_content(path)
+            context = replace(context, options=replace(context.options, format=name))
+        if name is not None:
+            yield "flight log", name, partial(log_report, path, context)
+    if are_time_tags(path):
+        yield "time tags", "", partial(time_tags_report, path)
 
 
 def _recording(path: Path, suffix: str, context: Surroundings) -> Report:
