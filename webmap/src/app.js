@@ -105,7 +105,10 @@ class Page {
     byId('right-layer').addEventListener('change', () => this.compare(byId('right').value, byId('right-layer').value));
     byId('opacity').addEventListener('input', () => this.chart.fade(byId('opacity').valueAsNumber));
     byId('png').addEventListener('click', () => this.savePicture().catch((error) => notice(error.message)));
-    byId('kmz').addEventListener('click', () => this.saveOverlay().catch((error) => notice(error.message)));
+    byId('kmz').addEventListener('click', () => {
+      byId('kmz').disabled = true; // until the server has made the file
+      this.saveOverlay().catch((error) => notice(error.message)).finally(() => (byId('kmz').disabled = false));
+    });
     byId('colours').addEventListener('change', () => this.show());
     byId('reset').addEventListener('click', () => this.stretch(this.layer.low, this.layer.high));
     for (const name of ['low', 'high'])
