@@ -242,9 +242,13 @@ def _listed(files: Iterable[Path]) -> dict[Path, bool]:
 
 def _add(found: Found, path: Path) -> CampaignError | None:
     """Add a file to `found`; return the problem of a file that cannot be used."""
-    beat = _beat(path)
+    array = _mapped(path) if path.suffix == ".npy" else None
+    beat = _beat(path, array)
     if beat is not None:
         found.recordings.append(beat)
+        return None
+    if array is not None and array.ndim > 2 and _samples_of(array) is not None:
+        found.arrays[path] = array  # of any size, as it is not read
         return None
     report = look(path)
     if report.kind == "flight log" and (report.problem is None or log_key(report.problem)):
@@ -261,7 +265,7 @@ def _add(found: Found, path: Path) -> CampaignError | None:
     elif report.kind == "time tags":
         found.tags.append(path)
     elif report.kind in {"code symbols", "array"}:
-        found.arrays[path] = np.load(path, mmap_mode="r", allow_pickle=False)
+        found.arrays |= {} if array is None else {path: array}
     elif report.kind == "elevation model":
         found.dems.append(path)
     else:
@@ -290,16 +294,21 @@ def log_key(problem: CampaignError) -> str:
     return match[1] if match else ""
 
 
-def _beat(path: Path) -> FoundRecording | None:
+def _mapped(path: Path) -> NDArray[Any] | None:
+    with suppress(Exception):  # numpy evaluates the header of an array, and a malformed header may raise any exception
+        array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+        return array
+    return None
+
+
+def _beat(path: Path, array: NDArray[Any] | None) -> FoundRecording | None:
     """Return a recording of beat signals, (sweep, sample); None for other contents."""
     beside = path.with_name(path.name.removesuffix(".npy") + ".time.npy")
-    with suppress(Exception):  # numpy evaluates the header of an array, and a malformed header may raise any exception
-        if path.suffix == ".npy":
-            beat = np.load(path, mmap_mode="r", allow_pickle=False)
-            if beat.ndim != 2 or beat.shape[1] < 8 or beat.dtype.kind not in "fiuc":
-                return None
-            times = times_of(np.load(beside, allow_pickle=False), beside) if beside.is_file() else None
-            return FoundRecording("beat", "beat_npy", (path,), times, content=beat)
+    if array is not None and array.ndim == 2 and array.shape[1] >= 8 and array.dtype.kind in "fiuc":
+        stored = _mapped(beside)
+        times = None if stored is None else times_of(np.asarray(stored), beside)
+        return FoundRecording("beat", "beat_npy", (path,), times, content=array)
+    with suppress(CampaignError):
         if path.suffix == ".wav":
             return FoundRecording("beat", "beat_wav", (path,), content=next(iter(read_fields(read_wav, [path])))[1])
         if path.suffix == ".mat":
