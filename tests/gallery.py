@@ -40,6 +40,7 @@ WIDTHS, COLOURS = (660, 600, 560), (256, 64, 32, 20)
 
 WITHOUT = {
     "antenna_coupling": "shown by the example of the UAV flight",
+    "describe": "its results are tags, attributes and a sheet",
     "from_files": "its results are a folder and a table",
     "raw_imu": "its recipe runs a library that apertura does not install, and ends in a log",
     "sizing": "its only results are tables of estimates",

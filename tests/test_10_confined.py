@@ -237,6 +237,8 @@ _ELSEWHERE = {
     ("cli.py", "os.open"): "/dev/null",
     ("views/report/step.py", "shutil.copyfile"): "from a temporary folder into a replacement",
     ("tools/design/expected_images.py", "shutil.copyfile"): "into a campaign folder that was just made",
+    ("tools/init/__init__.py", "os.link"): "into a campaign folder that was just made",
+    ("tools/init/__init__.py", "shutil.copyfile"): "into a campaign folder that was just made",
     ("tools/write_campaign.py", "shutil.copyfile"): "into a replacement of the whole campaign folder",
 }
 

@@ -16,7 +16,8 @@ from apertura.common.attribution import Attribution
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.scene.grid import SceneGrid
 from apertura.stages import export, layers
-from apertura.stages.image_tags import acdd_attributes, acquisition_tags
+from apertura.stages.cube import acdd_attributes
+from apertura.stages.image_tags import acquisition_tags
 
 CREATOR = {"name": "A. Nother", "orcid": "0000-0002-1825-0097", "affiliation": "An Institute"}
 STATED = {

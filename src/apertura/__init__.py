@@ -46,7 +46,10 @@ _PUBLIC = {
 """Public name → module that defines it."""
 
 _ON_LINUX = frozenset(
-    ("Dem", "RecordedFlight", "RecordedNode", "design", "open_campaign", "open_dem", "simulate", "write_campaign")
+    (
+        *("Dem", "RecordedFlight", "RecordedNode", "campaign_from_files", "design", "open_campaign", "open_dem"),
+        *("read_geotiff", "simulate", "write_campaign", "write_geotiff"),
+    )
 )
 """Public names that access campaign folders or rasters; the others work on every operating system."""
 

@@ -699,7 +699,7 @@ _OF_BENCHES = {
         "a narrow-band signal in the band adds noise at every range; subtracted tones cause no sidelobes, excluded "
         "subcarriers do",
         "other transmitters; spurious signals of the node's clocks; processing.interference",
-        "methods/bench/links.py, core/echo/tones.py, core/echo/interference.py",
+        "methods/bench/links.py, stages/transfer.py, core/echo/interference.py",
     ),
     "interference_pulsed": Flag(
         "proportion of pulses, strongest frequency and its usual service, power relative to the level of echoes and "
@@ -715,7 +715,7 @@ _OF_BENCHES = {
         "interference in the sidelink: tones are subtracted, and limited subcarriers do not affect its delay and "
         "phase, but interference in the whole band does",
         "other transmitters near this frequency; antenna of the sidelink",
-        "core/echo/tones.py, core/echo/interference.py",
+        "core/echo/transfer.py, core/echo/interference.py",
     ),
     "pulses_noisy": Flag(
         "number of pulses; noise relative to neighbouring pulses, dB",

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from rasterio.warp import transform_bounds
 
+from apertura import __version__
 from apertura.campaign.config import FUSED
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import create, finish, open_array, open_stage, writing
@@ -22,9 +24,8 @@ from apertura.core.quality.measures import BlockRaster, held, image_statistics
 from apertura.core.scene.grid import SceneGrid
 from apertura.methods.interferometry.coherence import chance, coherence, common_band, window_px
 from apertura.stages.agreement import ComparedImage, agreement_of, agreement_report, assessment_of
-from apertura.stages.image_tags import acdd_attributes
 from apertura.stages.scene import settled_scene
-from apertura.stages.tags import stamped
+from apertura.stages.tags import FIRST_CLOCK, stamped
 from apertura.workflow.lineage import result_of
 
 # ---- Coordinates and quality of each flight and pair ----------------------------------------------------------------
@@ -433,3 +434,78 @@ def _empty_cube(
         coherence_window=window_of(images, grid.spacing_m),
         **_between_flights(references, grid, windows),
     )
+
+
+def acdd_attributes(campaign: Campaign, views: Sequence[Mapping[str, Any]], grid: SceneGrid) -> dict[str, str | float]:
+    """Return the global attributes of the cube according to the Attribute Convention for Data Discovery, ACDD-1.3.
+
+    Attributes that require wall-clock time (date_created) are omitted, because identical inputs give identical cubes.
+
+    Parameters
+    ----------
+    campaign
+        Campaign of the images.
+    views
+        `apertura.core.imaging.view.view_report` of every image.
+    grid
+        Grid of the images; without a geodetic position, there are no geospatial attributes.
+    """
+    stated, name = campaign.settings.metadata, campaign.settings.campaign
+    first, last = min(view["first_utc"] for view in views), max(view["last_utc"] for view in views)
+    has_clock = np.datetime64(first) >= FIRST_CLOCK
+    duration_s = (np.datetime64(last) - np.datetime64(first)) / np.timedelta64(1, "s")
+    people = stated.creators
+    urls = [f"https://orcid.org/{person.orcid}" for person in people if person.orcid]
+    attributes: dict[str, str | float | None] = {
+        "title": stated.title or f"SAR images of campaign {name}",
+        "summary": f"Complex SAR images of campaign {name}, formed by time-domain backprojection of UAV-borne radar "
+        "recordings: every flight and pair of transmitter and receiver on one grid, sums of the pairs, and coherence "
+        "and phase between images.",
+        "keywords": "SYNTHETIC APERTURE RADAR, BACKPROJECTION, UAV, RADAR BACKSCATTER, INTERFEROMETRY",
+        "project": name,
+        "id": stated.doi,
+        "naming_authority": "org.doi" if stated.doi else None,
+        "metadata_link": f"https://doi.org/{stated.doi}" if stated.doi else None,
+        "comment": "date_created is omitted: identical inputs give identical cubes",
+        "source": "UAV-borne radar recordings; their hashes are in attribute inputs",
+        "processing_level": "L1",
+        "product_version": __version__,
+        "standard_name_vocabulary": "CF Standard Name Table",
+        "license": stated.licence,
+        "creator_name": ", ".join(person.name for person in people) or None,
+        "creator_type": "person" if people else None,
+        "creator_url": ", ".join(urls) or None,
+        "creator_institution": ", ".join(dict.fromkeys(one.affiliation for one in people if one.affiliation)) or None,
+        "institution": stated.institution,
+        "publisher_name": stated.institution,
+        "publisher_type": "institution" if stated.institution else None,
+        "references": stated.citation(name, int(first[:4]) if has_clock else None),
+        "platform": stated.platform,
+        "instrument": stated.instrument,
+    }
+    if has_clock:
+        attributes |= {
+            "time_coverage_start": f"{first[:26]}Z",
+            "time_coverage_end": f"{last[:26]}Z",
+            "time_coverage_duration": f"PT{duration_s:.6f}S",
+        }
+    return {key: value for key, value in attributes.items() if value is not None} | _geospatial(grid)
+
+
+def _geospatial(grid: SceneGrid) -> dict[str, str | float]:
+    """Return bounds and resolution of a grid as ACDD attributes; empty in a local frame."""
+    if grid.frame == "local":
+        return {}
+    west, south, east, north = transform_bounds(grid.crs_wkt, "EPSG:4326", *grid.bounds_m)
+    corners = ((north, west), (south, west), (south, east), (north, east), (north, west))
+    outline = ", ".join(f"{latitude:.7f} {longitude:.7f}" for latitude, longitude in corners)
+    sides = {"lat_min": south, "lat_max": north, "lon_min": west, "lon_max": east}
+    return {
+        "geospatial_bounds": f"POLYGON (({outline}))",
+        "geospatial_bounds_crs": "EPSG:4326",
+        "geospatial_lat_units": "degrees_north",
+        "geospatial_lon_units": "degrees_east",
+        "geospatial_lat_resolution": f"{grid.spacing_m:g} m",
+        "geospatial_lon_resolution": f"{grid.spacing_m:g} m",
+        **{f"geospatial_{side}": round(value, 7) for side, value in sides.items()},
+    }
