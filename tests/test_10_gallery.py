@@ -27,6 +27,7 @@ def test_picture_is_small_and_not_empty(name):
         assert sum(count > 0 for count in picture.convert("L").histogram()) > 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("cell", "mode"), [(66, "RGB"), (12, "P")])
 def test_picture_keeps_full_colour_below_the_limit(monkeypatch, tmp_path, cell, mode):
     """Cells of random colours: 60 cells fit into 60 kB in full colour, 1815 cells do not."""

@@ -125,6 +125,7 @@ from apertura.common.errors import CampaignError
     return subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
 
 
+@pytest.mark.slow
 def test_library_forms_images_from_arrays_without_linux():
     """All public names either work or are refused: a reflector at the origin has amplitude 1."""
     script = """

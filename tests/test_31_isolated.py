@@ -100,6 +100,7 @@ def test_matlab_file_that_crashes_scipy_is_rejected(tmp_path):
         assert complaint(lambda: read(tmp_path / "a.mat")).startswith(f"{tmp_path / 'a.mat'}: ")
 
 
+@pytest.mark.slow
 def test_reader_that_hangs_is_stopped(tmp_path):
     os.mkfifo(tmp_path / "a.mat")
     start_s = time.monotonic()

@@ -43,7 +43,7 @@ def formed(root, tmp_path, name, **processing):
     return campaign
 
 
-@pytest.mark.quick("two_parameter")
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["divide", "wiener", "gated", "two_parameter"])
 def test_formed_and_stored_transfer_functions_are_bitwise_equal(drifting, tmp_path, method):
     campaign = formed(drifting, tmp_path, "a", sidelink=method)
@@ -100,6 +100,7 @@ def test_images_from_stored_transfer_equal_those_of_recordings(drifting, tmp_pat
     assert results[0] == results[1]
 
 
+@pytest.mark.slow
 def test_stored_transfer_of_another_echo_is_not_read(drifting, tmp_path):
     campaign = formed(drifting, tmp_path, "a")
     transfer.transfer(campaign, "f01", "uav1-uav2")

@@ -54,6 +54,7 @@ def test_oscillators_and_slow_multipath_are_not_spikes(oscillator):
         assert spikes.flags == {}
 
 
+@pytest.mark.slow
 def test_false_alarm_rate_is_below_1e_5_for_white_noise():
     rng = np.random.default_rng(0)
     count = sum(np.count_nonzero(found(0.1 * rng.normal(size=100_000)).error_rad) for _ in range(5))

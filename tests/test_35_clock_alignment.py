@@ -79,6 +79,7 @@ def test_known_path_offset_is_kept():
     assert alignment.offset_s == pytest.approx(BEHIND_S, abs=0.003)
 
 
+@pytest.mark.slow
 def test_clock_drift_is_estimated_on_a_long_recording():
     """Over ten minutes of oscillation, 40 ppm cause 24 ms and a path error of 4 cm, more than half a wavelength."""
 

@@ -140,6 +140,7 @@ def test_texts_of_a_narrow_map_are_not_cut(monkeypatch, tmp_path):
     assert not any(box.overlaps(previous) for number, box in enumerate(boxes) for previous in boxes[:number])
 
 
+@pytest.mark.slow
 def test_legend_is_off_the_data_and_pair_counts_are_integers(monkeypatch, tmp_path):
     several = [covered(f"f{number // 5:02d}", np.roll(RING, number, axis=1)) for number in range(40)]
     _, texts, figure = coverage_map(monkeypatch, tmp_path, several)

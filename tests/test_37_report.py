@@ -104,7 +104,7 @@ def budget(path):
 DRAWN = (geometry, pulses, phase, cuts, waterfall, panels, budget)
 
 
-@pytest.mark.quick("cuts")
+@pytest.mark.slow
 @pytest.mark.parametrize("draw", DRAWN, ids=lambda draw: draw.__name__)
 def test_plot_has_page_width_clips_nothing_and_is_reproducible(draw, tmp_path):
     draw(tmp_path / "first.png")

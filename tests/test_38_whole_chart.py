@@ -18,6 +18,7 @@ def test_peak_loss_of_3_db_spreads_half_of_the_power():
     assert spread_db(0.2) == spread_db(0.0) < -100
 
 
+@pytest.mark.slow
 def test_chart_is_reproducible(tmp_path):
     rows = [whole(), whole("b", loss_db=float("nan"))]
     for name in ("a.png", "b.png"):

@@ -143,7 +143,7 @@ def coarse_report(targets, *, seed, bow_m=0.0):
     return focus_report(formation, formation.image.compute()), points, aperture
 
 
-@pytest.mark.quick("1-5")
+@pytest.mark.slow
 @pytest.mark.parametrize("targets", [5, 12, 30])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_sidelobes_along_a_coarse_range_cell_are_not_points(targets, seed):

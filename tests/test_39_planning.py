@@ -257,6 +257,7 @@ def test_most_accurate_setting_of_equal_cost_is_chosen():
     assert planned.setting.seconds <= 1.05 * cheapest.seconds
 
 
+@pytest.mark.slow
 @compiled
 def test_plan_and_summary_state_the_cost_of_a_missing_kernel(finished_tiny, monkeypatch, capsys):
     stated = "no compiled kernel is installed: engine numba forms the images, 16 to 115 times slower"

@@ -282,6 +282,7 @@ def test_mean_power_is_on_a_coarser_grid_and_states_its_quantity(flown, tmp_path
     assert not list(folder.glob("multilook*"))
 
 
+@pytest.mark.slow
 def test_mean_power_of_a_relative_image_is_its_pixel_mean(finished_tiny, tmp_path):
     """The mean is that of the pixels of power.tif, also in blocks at the edge; the image remains up to date."""
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")

@@ -202,6 +202,7 @@ def test_beam_rotates_with_the_logged_yaw(beamed):
     assert f"its centre is at least {off_deg:.0f}° from the boresight of uav1's radar_tx" in message
 
 
+@pytest.mark.slow
 def test_boresight_to_the_wrong_side_is_refused(beamed):
     campaign = with_antennas(beamed, BEAM | {"boresight_deg": [-90.0, -DEPRESSION_DEG]})
     before = complaint(lambda: expected_plan(campaign, "f01", "uav1-uav1"))
@@ -257,6 +258,7 @@ def test_echo_contains_body_axes_only_with_beams(beamed):
     np.testing.assert_allclose(east_north_up, [AHEAD, RIGHT, [0, 0, -1]], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_presumming_is_refused_with_beams(beamed):
     message = complaint(lambda: expected_plan(with_antennas(beamed, BEAM, presum=4), "f01", "uav1-uav1"))
     assert "config/config.yaml: processing.presum" in message

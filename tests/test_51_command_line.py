@@ -16,6 +16,7 @@ def run(*words, **options):
     return subprocess.run([APERTURA, *map(str, words)], text=True, capture_output=True, check=False, **options)
 
 
+@pytest.mark.slow
 def test_folder_without_campaign_is_one_line_and_status_2(tmp_path):
     done = run("check", tmp_path / "nowhere")
     assert done.returncode == 2

@@ -194,6 +194,7 @@ def test_node_that_does_not_transmit_is_not_aligned(run_command, tiny, node):
     assert "--until echo" in run_command("align", tiny, "f01", "uav1")[2]
 
 
+@pytest.mark.slow
 def test_summary_reports_the_number_of_outdated_results(finished_tiny, tmp_path, run_command):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     assert "out of date" not in run_command("summary", root)[1]

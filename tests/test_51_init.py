@@ -68,6 +68,7 @@ def test_int16_samples_with_nmea_and_csv_need_three_answers(tiny, loose, tmp_pat
         assert recordings[0].channels == recordings[1].channels
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["int16", "complex64"])
 def test_samples_in_arrays_are_read_back(tiny, loose, tmp_path, kind):
     """The header of the .npy file is skipped, so that the file is linked like other samples."""
@@ -191,6 +192,7 @@ def test_unreadable_recording_is_named_and_nothing_is_written(loose, tmp_path):
     assert not (tmp_path / "made").exists()
 
 
+@pytest.mark.slow
 def test_file_of_no_use_is_refused_if_named_and_listed_if_in_a_folder(loose, tmp_path):
     (loose / "notes.md").write_text("windy")
     named = complaint(lambda: campaign_from_files(tmp_path / "made", [loose, loose / "notes.md"]))
@@ -218,6 +220,7 @@ def shift_tags(path, hours):
     path.write_text("\n".join(f"{time}Z" for time in times.astype(str)) + "\n")
 
 
+@pytest.mark.slow
 def test_recorders_in_another_time_zone_are_corrected_in_clocks_tsv(loose, tmp_path):
     """The log of 2 s can cover the recording after one shift by quarter hours only."""
     for name in ("alpha", "bravo"):
@@ -228,6 +231,7 @@ def test_recorders_in_another_time_zone_are_corrected_in_clocks_tsv(loose, tmp_p
     assert sum("time zone -5.5 h" in line for line in made.lines) == 2
 
 
+@pytest.mark.slow
 def test_ambiguous_logs_are_asked_or_refused(loose, tmp_path):
     """Two logs cover the recording of alpha, and none of their names contains a node."""
     shutil.copyfile(loose / "alpha_gnss.nmea", loose / "first.nmea")
@@ -265,6 +269,7 @@ def test_logs_without_names_are_assigned_by_their_times(tiny, tmp_path):
     assert problems(made.folder, without=LAST) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nodes", [("uav1",), ("uav1", "uav2")])
 def test_names_of_recordings_in_a_folder_give_nodes_of_two_flights(tiny, tmp_path, nodes):
     """The word of the flight, which only the recordings of that flight have, does not name a node."""
@@ -351,6 +356,7 @@ def test_strip_lies_on_the_stated_side_between_10_and_80_degrees(side):
     assert swath([circle], crs=LOCAL, side=side, height_m=20.0, limit_m=np.inf) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("datum", "is_known"), [("ellipsoid", True), ("egm2008", False)])
 def test_side_requires_heights_above_the_ellipsoid(loose, tmp_path, datum, is_known):
     """A DEM of 620 m gives the bounds of a stated height of 620 m; heights above a geoid give automatic bounds."""
@@ -375,6 +381,7 @@ def test_existing_campaign_is_refused_and_unchanged(loose, tiny, tmp_path):
     assert contents(tiny) == before
 
 
+@pytest.mark.slow
 def test_files_are_linked_or_copied_and_originals_unchanged(loose, tmp_path):
     before = contents(loose)
     for copy in (False, True):
@@ -387,6 +394,7 @@ def test_files_are_linked_or_copied_and_originals_unchanged(loose, tmp_path):
     assert contents(loose) == before
 
 
+@pytest.mark.slow
 def test_command_asks_on_a_terminal_only_and_names_the_next_command(loose, tmp_path, monkeypatch, capsys):
     answers = iter(["1.024e9 1.2e9", "0.78125e-6", "620 right"])
     monkeypatch.setattr("builtins.input", lambda _: next(answers))

@@ -310,6 +310,7 @@ OPTIONS_INTO_THE_FOLDER = (
 """Options of Snakemake, in all their spellings, with paths into the campaign folder."""
 
 
+@pytest.mark.slow
 def test_profile_in_the_campaign_folder_is_refused(unfinished, tmp_path, monkeypatch):
     plant(unfinished)
     linked = tmp_path / "linked"

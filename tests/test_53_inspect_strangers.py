@@ -90,6 +90,7 @@ def test_hostile_name_in_the_facts_is_escaped(shared, tmp_path, capsys):
     assert "\x1b" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_path_that_is_no_regular_file_is_one_line(tmp_path):
     os.mkfifo(tmp_path / "pipe.csv")
     for name in ("pipe.csv", "nowhere", "x" * 300):

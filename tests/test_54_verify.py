@@ -143,6 +143,7 @@ def test_deleted_file_is_reported_as_missing(root, missing):
     assert wrong(root, "")[missing] == "missing"
 
 
+@pytest.mark.slow
 def test_incomplete_results_are_reported_per_link(root):
     before = wrong(root, "")  # results of steps that were not run
     assert set(before.values()) <= {"missing"}

@@ -379,6 +379,7 @@ def test_image_of_a_short_aperture_is_inconclusive(tiny, monkeypatch):
     assert focus["reason"].startswith("aperture too short")
 
 
+@pytest.mark.slow
 def test_focus_is_judged_once_the_aperture_suffices(tmp_path, monkeypatch):
     plan = replace(preset("demo", pulses=100), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
     preview = Preview(Campaign.load(ap.simulate(tmp_path / "campaign", plan, seed=7)), follow=False)
@@ -433,6 +434,7 @@ def test_delayed_pair_uses_every_second_pulse(tiny):
     assert "1 pulse in 2 used" in (tiny / "results/preview/index.html").read_text()
 
 
+@pytest.mark.slow
 def test_used_pulses_are_weighted_for_skipped_ones(finished_tiny, tmp_path, monkeypatch):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     (whole, _), preview = in_blocks(root, 20, monkeypatch), Preview(Campaign.load(root), follow=False)
