@@ -21,7 +21,7 @@ _PEAK = 20.0
 _LEFT = 0.15
 """Largest share of the power around a tone that remains after its subtraction; more is not a tone (eq. 12)."""
 
-_ABOVE = 5.0
+_ABOVE = 2.0
 """Largest power around a tone after its subtraction relative to the median level of the capture; more is not a tone."""
 
 _WIDTH = 15  # subcarriers to which a tone and the echo are fitted
