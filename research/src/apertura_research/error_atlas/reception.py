@@ -1,4 +1,4 @@
-"""Signals that are received besides the echoes, and their removal as in step `profile`.
+"""Signals that are received besides the echoes, and their removal as in steps `echo` and `profile`.
 
 Levels are relative to the mean power of the echoes of the pair (docs/theory/study.md, "Atlas of error sources").
 """
@@ -10,20 +10,22 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from apertura.common.arrays import Floats
+from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.flags import Flags
 from apertura.core.echo.background import GroupMeans, background_excess_db
 from apertura.core.echo.captures import runs, sampled_pulses
 from apertura.core.echo.compression import window_weights
+from apertura.core.echo.demodulate import Numerology, subcarrier_numbers
 from apertura.core.echo.interference import Interference, PulsedInterference
+from apertura.core.echo.tones import Tones
 from apertura.core.imaging.background import BackgroundScene, decide_removal
 from apertura.core.scene.terrain import FlatGround
 from apertura_research.error_atlas.flight import GRID, Received, TrueFlight
 
 Receive = Callable[[TrueFlight, str, Received, float, Generator], Received]
 
-_TONE_AT, _OFF_BIN = 90, 0.3  # subcarrier of the tone, and its distance from the centre of the subcarrier
+_TONE_AT = 90.3  # subcarriers from the carrier, between two of them
 _PULSED_SHARE = 0.1
 _COUPLING_M = 1.0  # total path between the antennas of node a
 
@@ -36,37 +38,65 @@ def echoes_alone(flown: TrueFlight, pair: str, received: Received, size: float, 
 def with_tone(flown: TrueFlight, pair: str, received: Received, level_db: float, generator: Generator) -> Received:
     """Add a continuous tone, whose phase at the trigger is random, and process the pair."""
     count = len(received.transfer)
-    line = _line(received, _TONE_AT + _OFF_BIN, level_db) * _phases(generator, count)
-    return processed(flown, pair, replace(received, transfer=received.transfer + line.astype(np.complex64)))
+    return _with(flown, pair, received, level_db, _tones(flown, np.full(count, _TONE_AT), generator))
 
 
 def with_pulses(flown: TrueFlight, pair: str, received: Received, level_db: float, generator: Generator) -> Received:
-    """Add pulsed tones at random frequencies to a tenth of the pulses, and process the pair."""
+    """Add pulses of a quarter of a DFT window at random frequencies to a tenth of the pulses, and process the pair."""
     count, subcarriers = received.transfer.shape
     hit = np.less(generator.random(count), _PULSED_SHARE)
-    lines = np.stack([_line(received, at, level_db) for at in generator.uniform(0, subcarriers - 1, count)])
-    signal = hit[:, None] * lines * _phases(generator, count)
-    return processed(flown, pair, replace(received, transfer=received.transfer + signal.astype(np.complex64)))
+    tones = _tones(flown, generator.uniform(0, subcarriers - 1, count), generator, share=0.25)
+    return _with(flown, pair, received, level_db, hit[:, None] * tones)
 
 
 def with_coupling(flown: TrueFlight, pair: str, received: Received, level_db: float, generator: Generator) -> Received:  # noqa: ARG001
     """Add the coupling between the antennas of the monostatic pair, at a constant delay, and process the pair."""
-    if received.sidelink_m is None:
-        turn = np.exp(-2j * np.pi * flown.frequency_hz * _COUPLING_M / SPEED_OF_LIGHT_M_S)
-        coupling = np.sqrt(_mean_power(received) * 10 ** (level_db / 10)) * turn
-        received = replace(received, transfer=received.transfer + coupling.astype(np.complex64))
-    return processed(flown, pair, received)
+    coupling = np.exp(-2j * np.pi * flown.frequency_hz * _COUPLING_M / SPEED_OF_LIGHT_M_S)
+    return _with(flown, pair, received, level_db, coupling[None])
+
+
+def _with(
+    flown: TrueFlight, pair: str, received: Received, level_db: float, signal: NDArray[np.complex128]
+) -> Received:
+    """Add a signal of unit power per subcarrier to the monostatic pair, and process the pair."""
+    if received.sidelink_m is not None:
+        return received
+    amplitude = np.sqrt(np.mean(np.abs(received.transfer) ** 2) * 10 ** (level_db / 10))
+    transfer = received.transfer + np.asarray(amplitude * signal, np.complex64)
+    return processed(flown, pair, replace(received, transfer=transfer))
+
+
+def _tones(flown: TrueFlight, at: Floats, generator: Generator, share: float = 1.0) -> NDArray[np.complex128]:
+    """Return the transfer functions of tones in each pulse, at frequencies in subcarriers, in a share of the window."""
+    numerology, count = _numerology(flown), len(flown.frequency_hz)
+    time = np.arange(numerology.dft_samples) / numerology.dft_samples
+    phase = generator.random((len(at), 1))
+    samples = (
+        np.sqrt(count) * np.exp(2j * np.pi * (at[:, None] * time + phase)) * (np.abs(time - 0.5) < share / 2 + 1e-9)
+    )
+    symbols = np.fft.fft(samples, axis=1, norm="forward")[:, numerology.numbers % numerology.dft_samples]
+    return np.asarray(symbols / flown.scene.waveform.codes)
+
+
+def _numerology(flown: TrueFlight) -> Numerology:
+    waveform = flown.scene.waveform
+    numbers = subcarrier_numbers(len(waveform.codes), carrier_is=waveform.carrier_is)
+    sizes = waveform.prefix_samples, waveform.dft_samples
+    return Numerology(waveform.carrier_hz, waveform.sample_rate_hz, numbers, *sizes)
 
 
 def processed(flown: TrueFlight, pair: str, received: Received) -> Received:
-    """Remove interference and, from a monostatic pair, background, as decided by step `profile`; return the flags."""
-    transfer, frequency_hz = received.transfer, flown.frequency_hz
+    """Remove tones, other interference and background as steps `echo` and `profile` do; return the raised flags."""
+    transfer, frequency_hz, codes = received.transfer, flown.frequency_hz, flown.scene.waveform.codes
     weight, pulses = window_weights("hann", len(frequency_hz)), sampled_pulses(len(transfer))
-    interference = Interference.measured(runs(pulses, [transfer[some] for some in pulses]), frequency_hz, weight)
-    flags = interference.flags
+    tones = Tones.of(_numerology(flown), (1 / codes).astype(np.complex64))
+    tones.lines = tuple(_interference(transfer, frequency_hz, weight).lines)
+    transfer = np.asarray(tones.removed((transfer * codes).astype(np.complex64)) / codes, np.complex64)
+    interference = _interference(transfer, frequency_hz, weight)
+    flags = Flags.merged(tones.flags("interference"), interference.flags)
     if interference.is_removed:
         transfer, weight = transfer * interference.gain, weight * interference.gain
-    if received.sidelink_m is None and background_excess_db([transfer[some] for some in pulses]) >= 0:
+    if background_excess_db([transfer[some] for some in pulses]) >= 0:
         nowhere_s = np.zeros(len(transfer))
         history = flown.truth.history(pair, replace(received, transfer=transfer), frequency_hz)
         scene = BackgroundScene(history, nowhere_s, nowhere_s, flown.time_s, GRID, FlatGround(0.0))
@@ -81,19 +111,6 @@ def processed(flown: TrueFlight, pair: str, received: Received) -> Received:
     return replace(received, transfer=transfer, flags=flags)
 
 
-def _mean_power(received: Received) -> float:
-    return float(np.mean(np.abs(received.transfer) ** 2))
-
-
-def _line(received: Received, at: float, level_db: float) -> Floats:
-    """Return the magnitude of a tone of one DFT window in each subcarrier, its frequency in subcarriers from the first.
-
-    The power of the tone is that of all subcarriers of an echo, and leaks by the Dirichlet kernel of the window.
-    """
-    count = received.transfer.shape[1]
-    kernel = np.sinc(np.arange(count) - at) / np.sinc((np.arange(count) - at) / count)
-    return np.asarray(np.sqrt(count * _mean_power(received) * 10 ** (level_db / 10)) * kernel)
-
-
-def _phases(generator: Generator, count: int) -> NDArray[np.complex128]:
-    return np.asarray(np.exp(2j * np.pi * generator.random((count, 1))))
+def _interference(transfer: Complexes, frequency_hz: Floats, weight: Floats) -> Interference:
+    pulses = sampled_pulses(len(transfer))
+    return Interference.measured(runs(pulses, [transfer[some] for some in pulses]), frequency_hz, weight)
