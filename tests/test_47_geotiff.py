@@ -55,6 +55,30 @@ def test_brightest_pixel_is_at_the_target_in_gdal(image, tmp_path):
     assert np.nanmax(level) == pytest.approx(20 * np.log10(float(abs(image).max())), abs=1e-4)
 
 
+@pytest.mark.parametrize("ahead_m", [0.0, 6.0])
+def test_phase_of_a_complex_file_is_that_of_its_tag(tmp_path, ahead_m):
+    """Around a point, the phase increases by one cycle per wavelength of total path, monostatic and bistatic."""
+    frequency, target = 1.2e9 + 4e6 * np.arange(64), np.array([0.4, -0.3, 0.0])
+    track = np.stack([np.linspace(-4, 4, 128), np.full(128, -20.0), np.full(128, 10.0)], -1)
+    aperture = ap.Aperture(track, track + [ahead_m, 0.0, 0.0])
+    echo = np.exp(-2j * np.pi * frequency * aperture.path(target[None]) / 299792458.0).astype(np.complex64)
+    history = ap.PhaseHistory(echo, frequency, np.full(64, 1 / 64), np.zeros(128), aperture)
+    image = ap.backproject(history, ap.SceneGrid("local", 0.0, 0.1, 0.01, (80, 80)), accuracy_db=-80)
+    path = ap.write_geotiff(image, tmp_path / "slc.tif")
+    with rasterio.open(path) as raster:
+        assert "increases by 1 cycle per wavelength of total path" in raster.tags()["APERTURA_PHASE"]
+    read = ap.read_geotiff(path)
+    middle_m = aperture.path(np.stack([*np.meshgrid(read.x, read.y), np.zeros((80, 80))], -1).reshape(-1, 3)).mean(
+        axis=0
+    )
+    removed = read.values.ravel() * np.exp(-2j * np.pi * middle_m * (frequency.mean() + 2e6) / 299792458.0)
+    near = np.abs(read.values).ravel() > 0.7 * np.abs(read.values).max()
+    assert near.sum() > 20
+    spread = np.angle(removed[near] * removed[near].sum().conj())
+    assert np.std(spread) < 0.15
+    assert np.std(np.angle(read.values.ravel()[near] * read.values.ravel()[near].sum().conj())) > 0.5
+
+
 def test_calibrated_values_have_their_unit_and_meaning(image, tmp_path):
     with rasterio.open(ap.write_geotiff(image.rcs, tmp_path / "rcs.tif")) as raster:
         np.testing.assert_array_equal(raster.read(1), image.rcs.values)

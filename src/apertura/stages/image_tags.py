@@ -62,6 +62,7 @@ def acquisition_tags(campaign: Campaign, views: Mapping[tuple[str, str], Mapping
         "APERTURA_LOOK_SIDE": side if side == "both" or is_observable else f"{side}, assumed",
         "APERTURA_LOOK_DIRECTION_DEG": direction("look_deg"),
         "APERTURA_HEADING_DEG": direction("heading_deg"),
+        "APERTURA_DIRECTIONS": "clockwise from grid north, the y axis of the CRS",
         "APERTURA_LOOK_VECTOR_ECEF": _look_vector(each),
         "APERTURA_RANGE_M": mean("range_m"),
         "APERTURA_HEIGHT_ABOVE_TERRAIN_M": mean("height_m"),
@@ -142,13 +143,19 @@ def quality_tags(report: Mapping[str, Any]) -> dict[str, str]:
         name: report[name] for name in ("budget", "budgets", "focus", "fusion", "recomputed") if report.get(name)
     }
     focus, budgets = report.get("focus", {}), [report.get("budget", ()), *report.get("budgets", {}).values()]
-    lines = [line for budget in budgets for line in budget]
+    lines, brightest = [line for budget in budgets for line in budget], report.get("brightest") or {}
     largest = max(lines, key=lambda line: line["shift_m"] or 0.0, default=None)
     readable = {
         "FOCUS_VERDICT": focus.get("verdict"),
         "PEAK_LOSS_DB": f"{abs(focus['loss_db']):.2f}" if "loss_db" in focus else None,
-        "GEOLOCATION_METHOD": largest and f"predicted by the error budget; largest term: {largest['cause']}",
+        "GEOLOCATION_METHOD": largest
+        and f"predicted by the error budget; largest term: {largest['cause']}, {largest['stated']}",
         "GEOLOCATION_UNCERTAINTY_M": f"{focus['expected_shift_m']:.3g}" if "expected_shift_m" in focus else None,
+        **{
+            f"WIDTH_{axis.upper()}_M": f"{brightest[f'{axis}_width_m']:.3g}"  # -3 dB, of the brightest point
+            for axis in ("cross_range", "ground_range")
+            if brightest.get(f"{axis}_width_m")
+        },
     }
     return {
         "APERTURA_PROCESSING": "time-domain backprojection"

@@ -78,6 +78,12 @@ class Band:
 
 
 SLC = Band("complex64", np.nan, "1", "{amplitude}, complex, with carrier phase", "AVERAGE_MAGPHASE")
+PHASE = (
+    "with carrier: within the response of a point, the phase increases by 1 cycle per wavelength of total path at the "
+    "centre frequency; flat-earth and terrain phase are not removed"
+)
+"""Phase convention of complex images, a tag of their files (docs/theory.md, eq. 4)."""
+
 MAGNITUDE = Band("float32", np.nan, "1", "{amplitude}", "AVERAGE")
 POWER = Band("float32", np.nan, "1", "{power}, linear", "AVERAGE")
 
@@ -245,6 +251,8 @@ def with_radiometry(band: Band, tags: Mapping[str, str]) -> tuple[Band, dict[str
     }
     tag = canonical_json({**meanings, "quantity": meaning, "unit": band.unit})
     readable = {"APERTURA_QUANTITY": meaning, "APERTURA_UNIT": band.unit}
+    if band.dtype.startswith("complex"):
+        readable["APERTURA_PHASE"] = PHASE
     if "one_is" in meanings:
         readable["APERTURA_REFERENCE"] = f"{'0 dB' if band.unit == 'dB' else '1'}: {meanings['one_is']}"
         readable["APERTURA_SPECKLE_FILTER"] = meanings.get("speckle_filter", "none")

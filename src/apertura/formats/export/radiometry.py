@@ -58,7 +58,11 @@ class Radiometry:
         return asdict(self)
 
 
-ECHO = Radiometry("echo amplitude", "echo power", "the echo of a target illuminated by every pulse used")
+ECHO = Radiometry(
+    "echo amplitude",
+    "echo power",
+    "an echo with a transfer function of magnitude 1 in every pulse used; not calibrated",
+)
 """Radiometry of the image of a pair (docs/theory.md, eq. 6)."""
 
 
