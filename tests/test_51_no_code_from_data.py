@@ -662,7 +662,7 @@ HARMLESS = {
     "DASK_SCHEDULER": ["nosuch"],
     "DASK_SCHEDULER_ADDRESS": ["tcp://127.0.0.1:9"],
     "GDAL_DATA": ["/nowhere"],
-    "HOME": ["/nowhere"],
+    "HOME": ["/proc/nowhere"],
     "LC_ALL": ["C", "nosuch"],
     "MPLBACKEND": ["nosuch"],
     "MPLCONFIGDIR": ["/proc/nowhere"],
