@@ -157,10 +157,16 @@ def _user_folder(variable: str, name: str) -> Path | None:
 
 
 def _is_writable(folder: Path | None) -> bool:
-    """Return True if a folder is writable or can be created."""
+    """Return True if a folder is writable or can be created; permissions alone do not tell, such as below /proc."""
     while folder is not None and not folder.exists() and folder != folder.parent:
         folder = folder.parent
-    return folder is not None and folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)
+    if folder is None:
+        return False
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
 
 
 def _private_folder() -> Path:
