@@ -46,10 +46,8 @@ def test_step_writes_a_toy_product_with_the_others(finished_tiny, toy_package, t
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     written = output_of(toy_package, "apertura", "step", "export", "f01", "uav1-uav1", "--campaign", str(root))
     folder = root / "results" / "f01" / "uav1-uav1"
-    assert [Path(line).name for line in written.splitlines() if line.startswith(str(folder))][-2:] == [
-        "power.json",
-        "image.json",
-    ]
+    names = [Path(line).name for line in written.splitlines() if line.startswith(str(folder))]
+    assert names[-4:] == ["power.json", "image.json", "ceos_ard.json", "ceos_ard.html"]
     with rasterio.open(folder / "power.tif") as raster:
         mean, tags = raster.read(1).mean(), raster.tags()
     toy = json.loads((folder / "power.json").read_text())

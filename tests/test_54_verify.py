@@ -132,7 +132,8 @@ def test_changed_code_is_reported_at_affected_results(root, tmp_path):
     assert verified() == (0, [])
     source = copied / "formats" / "export" / "cog.py"
     source.write_text(source.read_text() + "EDITED = 1\n")
-    assert verified() == (1, [f"changed  code of {EXPORT}"])
+    layers = EXPORT.replace("export.manifest", "layers.manifest")
+    assert verified() == (1, [f"changed  code of {result}" for result in (EXPORT, layers)])
 
 
 @pytest.mark.quick("raw*")

@@ -24,7 +24,7 @@ from apertura.common.errors import CampaignError
 from apertura.common.tables import write_table
 from apertura.common.units import decibels
 from apertura.core.quality.budget import is_counted
-from apertura.stages import assess, calibration, cube, echo, export, image, ingest, profile, refine, scene
+from apertura.stages import assess, calibration, cube, echo, export, image, ingest, layers, profile, refine, scene
 from apertura.tools.chart.pareto import save_png
 from apertura.workflow.lineage import result_of, with_inputs
 from apertura.workflow.rules import STUDY
@@ -234,6 +234,7 @@ def _processed(campaign: Campaign) -> _Run:
         assess.assess(campaign, flight.name)
         cube.cube(replace(campaign, flights=(flight,)))
         for pair in flight.pairs:
+            layers.layers(campaign, flight.name, pair)
             export.export(campaign, flight.name, pair)
     elapsed_s = process_time() - start_s[0], perf_counter() - start_s[1]
     files = [campaign.results / flight.name / pair / "image.json" for pair in flight.pairs]
