@@ -19,7 +19,7 @@ from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
 from apertura.common.errors import CampaignError
 from apertura.core.scene.grid import SceneGrid
-from apertura.stages import assess, cube, echo, export, image, ingest, profile, refine, scene
+from apertura.stages import assess, cube, echo, export, image, ingest, layers, profile, refine, scene
 from apertura.stages.scene import settled_scene
 
 
@@ -97,6 +97,7 @@ def _steps(campaign: Campaign, flight: Flight) -> None:
     image_steps(campaign, flight)
     cube.cube(campaign)
     for pair in flight.pairs:
+        layers.layers(campaign, flight.name, pair)
         export.export(campaign, flight.name, pair)
     if FUSED in flight.images:
         export.export_fused(campaign, flight.name)
