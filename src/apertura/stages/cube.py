@@ -18,6 +18,7 @@ from apertura.campaign.store import create, finish, open_array, open_stage, writ
 from apertura.common.contracts import MEASURED, QUOTED, RASTERS, SUMMED, Window
 from apertura.common.documents import undamaged
 from apertura.common.flags import Flags
+from apertura.common.leap_seconds import GPS_EPOCH
 from apertura.core.combination import clutter_reduction_db, coherent_sum, magnitude_sum, noncoherent_sum
 from apertura.core.quality.focus import focus_with_flags
 from apertura.core.quality.measures import BlockRaster, held, image_statistics
@@ -25,7 +26,7 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.methods.interferometry.coherence import chance, coherence, common_band, window_px
 from apertura.stages.agreement import ComparedImage, agreement_of, agreement_report, assessment_of
 from apertura.stages.scene import settled_scene
-from apertura.stages.tags import FIRST_CLOCK, stamped
+from apertura.stages.tags import stamped
 from apertura.workflow.lineage import result_of
 
 # ---- Coordinates and quality of each flight and pair ----------------------------------------------------------------
@@ -452,7 +453,7 @@ def acdd_attributes(campaign: Campaign, views: Sequence[Mapping[str, Any]], grid
     """
     stated, name = campaign.settings.metadata, campaign.settings.campaign
     first, last = min(view["first_utc"] for view in views), max(view["last_utc"] for view in views)
-    has_clock = np.datetime64(first) >= FIRST_CLOCK
+    has_clock = np.datetime64(first) >= GPS_EPOCH  # times of a recording without a clock start in 1970
     duration_s = (np.datetime64(last) - np.datetime64(first)) / np.timedelta64(1, "s")
     people = stated.creators
     urls = [f"https://orcid.org/{person.orcid}" for person in people if person.orcid]

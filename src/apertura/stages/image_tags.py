@@ -8,11 +8,11 @@ import numpy as np
 from apertura.campaign.config import is_monostatic, polarisation_of
 from apertura.campaign.folder import Campaign
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.leap_seconds import GPS_EPOCH
 from apertura.common.provenance import canonical_json
 from apertura.common.raster import opened_raster
 from apertura.common.units import frequency_band
 from apertura.formats.export import product
-from apertura.stages.tags import FIRST_CLOCK
 
 
 def acquisition_tags(campaign: Campaign, views: Mapping[tuple[str, str], Mapping[str, Any]]) -> dict[str, str]:
@@ -36,7 +36,7 @@ def acquisition_tags(campaign: Campaign, views: Mapping[tuple[str, str], Mapping
     side = sides.pop() if len(sides) == 1 else "both"
     is_observable = any(view["side_observable"] for view in each)
     labels = {label for pair in pairs if (label := polarisation_of(campaign.settings.nodes, pair))}
-    has_clock = np.datetime64(first) >= FIRST_CLOCK
+    has_clock = np.datetime64(first) >= GPS_EPOCH  # times of a recording without a clock start in 1970
 
     def mean(name: str) -> str:
         return f"{np.mean([view[name] for view in each]):.2f}"

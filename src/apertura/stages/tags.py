@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import xarray as xr
 
 from apertura import __version__
@@ -18,9 +17,6 @@ from apertura.common.provenance import (
     packages,
     software,
 )
-
-FIRST_CLOCK = np.datetime64("1980-01-06")
-"""Times of a recording without a clock start in 1970."""
 
 
 def stamped(

@@ -32,7 +32,7 @@ _MOST = 4  # tones per capture
 _OUTSIDE = 20  # largest distance of a tone from the occupied band, subcarriers
 
 _FLAGGED_SHARE = 0.01
-"""Smallest share of captures with a tone for which the flag is raised; tones in fewer captures are removed alike."""
+"""Smallest share of captures with a tone for which the flag is raised; tones in fewer captures are also subtracted."""
 
 
 @dataclass
