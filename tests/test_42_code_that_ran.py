@@ -74,7 +74,7 @@ CHANGES = [
     ("common/errors.py", "code", set()),
     ("campaign/config/nodes.py", "docstring", set()),
     ("core/echo/dechirp.py", "docstring", set()),
-    ("formats/export/cog.py", "code", {"export", "fused", "layers", "mosaic", "pictures", "pictures_fused"}),
+    ("formats/export/cog.py", "code", {"export", "fused", "layers", "mosaic", "pictures", "pictures_fused", "whole"}),
     ("workflow/rules.py", "code", set()),  # sources and settings are compared separately
     ("core/backprojection/engines/numba.py", "comment", set()),
     ("core/backprojection/engines/numba.py", "code", FOCUSED | {"pictures", "pictures_fused", "tracks"}),
