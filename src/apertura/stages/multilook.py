@@ -35,6 +35,8 @@ class LazyLayer:
         Number of tiles computed in parallel.
     tile_px
         Side of a tile, pixels.
+    components
+        Number of components of a raster of vectors, its last axis; None: a raster of scalars.
     """
 
     grid: SceneGrid
@@ -42,16 +44,20 @@ class LazyLayer:
     of: Callable[[Window], NDArray[Any]]
     threads: int
     tile_px: int = BLOCK_PX
+    components: int | None = None
 
     @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
-        return self.grid.shape
+    def shape(self) -> tuple[int, ...]:
+        """Rows and columns, and components of a vector."""
+        return self._shape(self.grid)
+
+    def _shape(self, grid: SceneGrid) -> tuple[int, ...]:
+        return grid.shape if self.components is None else (*grid.shape, self.components)
 
     def __getitem__(self, block: Window) -> NDArray[Any]:
         """Return the values of a block of rows and columns."""
         part = self.grid[block]
-        values = np.empty(part.shape, self.dtype)
+        values = np.empty(self._shape(part), self.dtype)
 
         def work(tile: Window) -> None:
             rows, columns = (slice(at.start + by, at.stop + by) for at, by in zip(tile, part.first, strict=True))

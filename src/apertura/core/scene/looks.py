@@ -14,7 +14,8 @@ from apertura.common.contracts import Window
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import EXACT, any_illuminates, illumination_mask
 from apertura.core.geometry.aperture import Aperture
-from apertura.core.scene.angles import bistatic_angle_deg, incidence_deg, surface
+from apertura.core.geometry.geodesy import ned_axes
+from apertura.core.scene.angles import bistatic_angle_deg, incidence_deg, line_of_sight, surface
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.recorded import RecordedShares
 from apertura.core.scene.swath import balls
@@ -446,6 +447,30 @@ class Looks:
         if self._smooth(tile):
             return self.lattice.between(self._angles_deg[1], tile)
         return bistatic_angle_deg(self.terrain.positions(self.grid[tile]), *self.centre(tile))
+
+    def line_of_sight_enu(self, tile: Window) -> NDArray[Any]:
+        """Return the line of sight at closest approach: east, north and up of a unit vector, (row, column, 3) float64.
+
+        The vector points from the ground to the sensor, for a bistatic pair along the bisector of the directions to
+        transmitter and receiver (docs/theory/layers.md, eq. 1b). In a local frame, the axes are those of the frame.
+        """
+        sight = line_of_sight(self.terrain.positions(self.grid[tile]), *self.centre(tile))
+        # The axes turn by less than 1e-5 between nodes, so that they are linear there.
+        if self.grid.frame == "local":
+            return sight
+        return np.asarray(np.einsum("...ij,...j", self.lattice.between(self._enu_axes, tile), sight))
+
+    def slant_ranges_m(self, tile: Window) -> NDArray[Any]:
+        """Return the distances of transmitter and receiver at closest approach, (row, column, 2) float64, metres."""
+        position = self.terrain.positions(self.grid[tile])
+        return np.stack([np.linalg.norm(antenna - position, axis=-1) for antenna in self.centre(tile)], -1)
+
+    @cached_property
+    def _enu_axes(self) -> Floats:
+        """Geodetic east, north and up at the nodes, rows of (node row, node column, 3, 3), in ECEF."""
+        row, column = np.meshgrid(*self.lattice.nodes, indexing="ij")
+        north, east, down = np.moveaxis(ned_axes(self.grid.positions_at(row, column, 0.0)), -1, 0)
+        return np.stack([east, north, -down], axis=-2)
 
     @cached_property
     def _angles_deg(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

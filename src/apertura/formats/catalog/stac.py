@@ -190,6 +190,8 @@ _ROLES: Mapping[str, tuple[str, ...]] = {
     "gamma_sigma_ratio.tif": ("metadata",),
     "looks.tif": ("metadata",),
     "bistatic_angle.tif": ("metadata",),
+    "line_of_sight_enu.tif": ("metadata",),
+    "slant_range_distance.tif": ("metadata",),
     "nesz.tif": ("noise-power", "metadata"),
 }
 _ROLES_OF_TYPE: Mapping[str, tuple[str, ...]] = {".tif": ("data",), ".qml": ("style",)}

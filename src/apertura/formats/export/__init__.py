@@ -28,6 +28,8 @@ SOURCES: Mapping[str, str] = {
     "mask": "layers",
     "looks": "layers",
     "nesz": "layers",
+    "line_of_sight": "layers",
+    "slant_range": "layers",
     "sigma0": "radiometry",
     "gamma0": "radiometry",
     "beta0": "radiometry",
@@ -52,7 +54,8 @@ SOURCES: Mapping[str, str] = {
 
 ``image`` is the complex image of a pair. ``coherent`` is the complex sum of a flight's pairs, and ``noncoherent`` their
 power sum, stored as complex amplitude without phase. ``magnitude`` is the sum of the magnitudes of the pairs. Layers
-are real rasters that describe the image of a pair, and are stored in the folder of that image. Rasters of radiometry
+are real rasters that describe the image of a pair, and are stored in the folder of that image; ``line_of_sight`` and
+``slant_range`` have a last axis of components. Rasters of radiometry
 exist for calibrated pairs, in the same folder; their values are complex amplitudes whose power is the named
 coefficient. With gamma0, they include the ratios of the areas to which the coefficients are normalised, and the
 incidence angle from the vertical. Rasters of multilook exist if requested; their values are the mean power of square
@@ -150,6 +153,8 @@ EXPORTS: tuple[Export, ...] = (
     Export("looks.qml", "looks", _WRITERS.style.write_layer_style),
     Export("nesz.tif", "nesz", _WRITERS.layers.write_nesz),
     Export("nesz.qml", "nesz", _WRITERS.style.write_layer_style),
+    Export("line_of_sight_enu.tif", "line_of_sight", _WRITERS.layers.write_line_of_sight, mosaicked=False),
+    Export("slant_range_distance.tif", "slant_range", _WRITERS.layers.write_slant_range, mosaicked=False),
     Export("sigma0_db.tif", "sigma0", _WRITERS.db.write_db),
     Export("sigma0_db.qml", "sigma0", _WRITERS.style.write_backscatter_style),
     Export("gamma0_db.tif", "gamma0", _WRITERS.db.write_db),

@@ -66,6 +66,9 @@ class Band:
         Value → (red, green, blue), 0 to 255, for a band of classes.
     smooth
         True if neighbouring floating-point pixels have similar values; determines the predictor of the compression.
+    components
+        Names of the components of a vector, one per band of the file, as the first words of the description of the
+        band; the raster then has a last axis of this length. Empty: a raster of scalars.
     """
 
     dtype: str
@@ -75,6 +78,7 @@ class Band:
     overviews: Literal["AVERAGE", "AVERAGE_MAGPHASE", "MODE", "NEAREST"]
     colours: Mapping[int, tuple[int, int, int]] | None = None
     smooth: bool = False
+    components: tuple[str, ...] = ()
 
 
 SLC = Band("complex64", np.nan, "1", "{amplitude}, complex, with carrier phase", "AVERAGE_MAGPHASE")
@@ -178,7 +182,7 @@ def write_cog(
     path, transform, crs, tags, title
         See `write_slc`.
     image
-        (y, x), north-up.
+        (y, x), or (y, x, component) for a band with components; north-up.
     band
         Dtype, no-data value, unit and description.
     value
@@ -191,7 +195,7 @@ def write_cog(
     ContractError, CampaignError
         See `write_slc`.
     """
-    georeference = placed(image, transform, crs)
+    georeference = placed(image, transform, crs, axes=("y", "x", "component") if band.components else ("y", "x"))
     band, tags = with_radiometry(band, tags)
     all_tags = tags | _outline_tag(georeference) | ({"TIFFTAG_IMAGEDESCRIPTION": title} if title else {})
     size = int(np.prod(image.shape)) * np.dtype(band.dtype).itemsize
@@ -262,10 +266,12 @@ def with_radiometry(band: Band, tags: Mapping[str, str]) -> tuple[Band, dict[str
     return replace(band, meaning=meaning), {**tags, **readable, TAG: tag}
 
 
-def placed(image: NorthUpRaster, transform: Affine, crs: str) -> dict[str, Any]:
+def placed(
+    image: NorthUpRaster, transform: Affine, crs: str, *, axes: tuple[str, ...] = ("y", "x")
+) -> dict[str, Any]:
     """Return size and georeference as keyword arguments for rasterio."""
-    if len(image.shape) != 2:
-        raise ContractError(f"image to export has shape {image.shape}, not (y, x)")
+    if len(image.shape) != len(axes):
+        raise ContractError(f"image to export has shape {image.shape}, not ({', '.join(axes)})")
     if transform.b or transform.d or transform.a <= 0 or transform.e >= 0:
         raise ContractError(f"image to export is not north-up: {tuple(transform)[:6]}")
     try:
@@ -303,7 +309,7 @@ def halved(pixels: Pixels, band: Band) -> Pixels:
     >>> halved(np.array([[1, 3, np.nan], [5, 7, 8]], np.float32), POWER)
     array([[4., 8.]], dtype=float32)
     """
-    odd = [(0, size % 2) for size in pixels.shape]
+    odd = [(0, size % 2) for size in pixels.shape[:2]] + [(0, 0)] * (pixels.ndim - 2)
     pixels = np.pad(pixels, odd, constant_values=band.nodata) if np.any(odd) else pixels
     four = [pixels[row::2, column::2] for row in (0, 1) for column in (0, 1)]
     match band.overviews:
@@ -368,8 +374,9 @@ def _fill(
             overview = path.with_name(path.name + level * ".ovr")
             files.append(opened.enter_context(_created(overview, band, {"height": height, "width": width})))
         files[0].update_tags(**tags)
-        files[0].set_band_description(1, band.meaning)
-        files[0].set_band_unit(1, band.unit)
+        for number, component in enumerate(band.components or ("",), 1):
+            files[0].set_band_description(number, f"{component} {band.meaning}".strip())
+            files[0].set_band_unit(number, band.unit)
         if band.colours:
             files[0].write_colormap(1, band.colours)
         for rows, columns in blocks_of(shape):
@@ -377,15 +384,16 @@ def _fill(
             for level, file in enumerate(files):
                 pixels = halved(pixels, band) if level else pixels
                 written = shown(pixels).astype(band.dtype, copy=False)
-                at = Window(columns.start >> level, rows.start >> level, *written.shape[::-1])
-                file.write(written, 1, window=at)
+                at = Window(columns.start >> level, rows.start >> level, *written.shape[1::-1])
+                written = np.moveaxis(written, 2, 0) if band.components else written[None]
+                file.write(written, window=at)
                 checksum = checksum if level else added(checksum, written)
     return checksum
 
 
 def _created(path: Path, band: Band, georeference: Mapping[str, Any]) -> Any:
     layout = {"tiled": True, "blockxsize": BLOCK, "blockysize": BLOCK, "BIGTIFF": "IF_SAFER"}
-    profile = {"driver": "GTiff", "count": 1, "dtype": band.dtype, "nodata": band.nodata}
+    profile = {"driver": "GTiff", "count": max(1, len(band.components)), "dtype": band.dtype, "nodata": band.nodata}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)  # overviews have no georeference
         return rasterio.open(path, "w", **profile, **layout, **georeference)

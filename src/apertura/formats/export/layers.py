@@ -49,6 +49,27 @@ GAMMA_SIGMA_RATIO = Band(
     "float32", np.nan, "1", "area normal to the line of sight per ground area: sigma0 / gamma0", "AVERAGE", smooth=True
 )
 
+LINE_OF_SIGHT = Band(
+    "float32",
+    np.nan,
+    "1",
+    "component of line of sight unit vector (ground to sensor, bisector of transmitter and receiver)",
+    "AVERAGE",
+    smooth=True,
+    components=("East", "North", "Vertical"),
+)
+"""Bands as in the static layers of OPERA DISP-S1; no data is NaN, because a component may be exactly 0."""
+
+SLANT_RANGE = Band(
+    "float32",
+    np.nan,
+    "m",
+    "slant range at closest approach",
+    "AVERAGE",
+    smooth=True,
+    components=("Transmitter", "Receiver"),
+)
+
 NESZ_ABSOLUTE = "noise-equivalent sigma0"
 """Meaning of `NESZ` of a calibrated pair."""
 
@@ -135,3 +156,20 @@ def write_gamma_sigma_ratio(
     """
     check = only("float32")
     write_cog(path, ratio, GAMMA_SIGMA_RATIO, transform=transform, crs=crs, tags=tags, title=title, value=check)
+
+
+def write_line_of_sight(
+    path: Path, vector: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+) -> None:
+    """Write the line of sight, (y, x, 3) float32: east, north and up of a unit vector from the ground to the sensor.
+
+    Source: docs/theory/layers.md, eq. 1b. Otherwise as `write_incidence`.
+    """
+    write_cog(path, vector, LINE_OF_SIGHT, transform=transform, crs=crs, tags=tags, title=title, value=only("float32"))
+
+
+def write_slant_range(
+    path: Path, range_m: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+) -> None:
+    """Write the distances of transmitter and receiver, (y, x, 2) float32 metres. Otherwise as `write_incidence`."""
+    write_cog(path, range_m, SLANT_RANGE, transform=transform, crs=crs, tags=tags, title=title, value=only("float32"))

@@ -104,5 +104,5 @@ def check_written(path: Path, checksum: int, tags: Mapping[str, str]) -> None:
 def _checksum(raster: Any) -> int:
     checksum = 0
     for block in blocks_of(raster.shape):
-        checksum = added(checksum, raster.read(1, window=Window.from_slices(*block)))
+        checksum = added(checksum, raster.read(window=Window.from_slices(*block)))
     return checksum
