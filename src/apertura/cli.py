@@ -735,7 +735,7 @@ def simulate(
         str | None,
         typer.Option(
             help="demo (the default), first-flight, paper, swarm, continuous, flight (13.5 GB), "
-            "paper-lab, paper-static, paper-uav"
+            "paper-lab, paper-static, paper-uav, revisit"
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="seed of the random generator")] = 1,

@@ -21,6 +21,7 @@ from apertura.campaign.config import (
     Settings,
     check_interferometry,
     check_radio,
+    check_stack,
     radio_of,
     read_clocks,
     read_flights,
@@ -222,6 +223,7 @@ class Campaign(RawFolder):
         flights = tuple(read_flights(table, nodes=settings.nodes))
         images = [f"{flight.name}/{pair}" for flight in flights if flight.kind == "image" for pair in flight.pairs]
         check_interferometry(settings.interferometry, images, where=CONFIG)
+        check_stack(settings.stack, images, where=CONFIG)
         imaging = tuple(read_segments(segments, flights=flights))
         campaign = cls(root, settings, flights, imaging, tuple(read_clocks(clocks, flights=flights)))
         campaign.check_radio()

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator, Mapping
+from copy import deepcopy
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -129,6 +130,7 @@ def _write_flights(root: Path, campaign: DrawnCampaign, generator: Generator) ->
     specification = campaign.specification
     origin, targets = specification.origin, specification.targets
     clutter, *streams = independent_streams(generator, 1 + 2 * len(specification.flights))
+    unused = deepcopy(clutter)  # draws the clutter of a changed scene again
     common_scatterers = scatterers(origin, targets, clutter)
     air = specification.air
     true_air = {"refractivity_n": air.atmosphere.refractivity_n if air else 0.0, "at_m": origin.height_m}
@@ -142,6 +144,8 @@ def _write_flights(root: Path, campaign: DrawnCampaign, generator: Generator) ->
         if flight.framing:
             np.save(root / "raw" / flight.name / "preamble.npy", flight.framing.preamble())
         present = common_scatterers if flight.targets is None else scatterers(origin, flight.targets, clutter)
+        if flight.changes:
+            present = scatterers(origin, targets, deepcopy(unused), flight.changes)
         recordings = fly(campaign, flight, present, impairments)
         node_streams = independent_streams(noise, len(recordings))
         for (name, recording), stream in zip(recordings.items(), node_streams, strict=True):
@@ -254,6 +258,11 @@ def flight_truth(
     truth: dict[str, Any] = {"pulses": flight.pulses, "kind": flight.kind, "nodes": {}}
     if flight.targets is not None:
         truth |= targets_truth(specification.origin, flight.targets, specification.scene.crs)
+    if flight.changes:
+        truth["changes"] = [
+            {"target": change.target, "shift_m": list(change.shift_m), "factor": str(change.factor)}
+            for change in flight.changes
+        ]
     for name, recording in recordings.items():
         node, draw, radar = specification.nodes[name], recording.draw, recording.channels["radar"]
         truth["nodes"][name] = {

@@ -23,7 +23,18 @@ from apertura.simulation.impairments import (
 )
 from apertura.simulation.specification import CampaignSpecification, ImageGrid, SimulatedFlight, SimulatedNode
 from apertura.simulation.synthesis import Geometry, straight_pair
-from apertura.simulation.targets import Clutter, Line, Origin, PointTarget, Scatterers, Straight, Target, Vector, Wobble
+from apertura.simulation.targets import (
+    Clutter,
+    Line,
+    Origin,
+    PointTarget,
+    Scatterers,
+    Straight,
+    Target,
+    TargetChange,
+    Vector,
+    Wobble,
+)
 from apertura.simulation.waveform import TransmitWaveform, WaveformSpecification
 
 PAPER_WAVEFORM = WaveformSpecification(4096, 1.2e9, 100e3, 12.5e-6, 3.125e-6, 1.024e9, 100.0, code="newman")
@@ -304,9 +315,82 @@ def flight(*, pulses: int = 300_000) -> CampaignSpecification:
     )
 
 
+def revisit(
+    *, flights: int = 5, offset_m: float = 0.1, error_m: float = 0.01, slope_mm: float = 1.0, pulses: int = 100
+) -> CampaignSpecification:
+    """Return flights past one scene, whose tracks differ, with a slope that moves and targets that change.
+
+    Clutter of 24 m × 24 m contains nine bright points and a slope of 5 m × 5 m. The slope moves by `slope_mm` towards
+    the antennas from flight to flight. In the last flight, one target is absent, one has appeared, one is displaced by
+    20 cm and one has turned (half the amplitude, another phase). Odd flights are `offset_m` farther away and higher.
+    The logs have slowly varying errors of `error_m` per axis, different in every flight.
+
+    Parameters
+    ----------
+    flights, pulses
+        Number of flights, and of pulses per flight.
+    offset_m, error_m
+        Distance between the tracks, and standard deviation of the logged positions per axis, metres.
+    slope_mm
+        Motion of the slope towards the antennas from flight to flight, millimetres.
+
+    Examples
+    --------
+    >>> specification = revisit(flights=2)
+    >>> [flight.name for flight in specification.flights], specification.flights[1].changes[0].shift_m[2] > 0
+    (['f01', 'f02'], True)
+    """
+    rng_m, up_m = -25.0, 25.0
+    middle = np.array([5.0, 4.0, 0.0])  # of the slope
+    slope = Clutter((2.5, 1.5, 7.5, 6.5), 1.0, 20.0)
+    ground = [
+        Clutter((-12.0, -12.0, 12.0, 1.5), 1.0, 20.0),
+        Clutter((-12.0, 6.5, 12.0, 12.0), 1.0, 20.0),
+        Clutter((-12.0, 1.5, 2.5, 6.5), 1.0, 20.0),
+        Clutter((7.5, 1.5, 12.0, 6.5), 1.0, 20.0),
+    ]
+    points = [PointTarget((east, north, 0.0), 8.0) for east in (-8.0, -1.0, 8.5) for north in (-9.0, -1.0, 9.0)]
+    changed = [PointTarget((east, -5.0, 0.0), 4.0) for east in (-6.0, -2.0, 2.0, 6.0)]
+    towards = np.array([0.0, rng_m, up_m]) - middle
+    towards = towards * [0.0, 1.0, 1.0] / np.linalg.norm(towards[1:])
+    first = len(ground) + 1 + len(points)
+    last = (
+        TargetChange(first, factor=0.0),
+        TargetChange(first + 2, shift_m=(0.2, 0.1, 0.0)),
+        TargetChange(first + 3, factor=-0.3 + 0.4j),
+    )
+    step_m = 12.0 / pulses
+    planned = []
+    for number in range(flights):
+        across_m = offset_m * (number % 2) * np.sqrt(0.5)
+        start = (-step_m / 2 * (pulses - 1), rng_m - across_m, up_m + across_m)
+        moved = towards * slope_mm * 1e-3 * number
+        changes = [TargetChange(0, (moved[0], moved[1], moved[2]))] if slope_mm and number else []
+        changes += last if number == flights - 1 else (TargetChange(first + 1, factor=0.0),)
+        track = Straight(start, (step_m * 10.0, 0.0, 0.0))
+        day = f"2025-05-{14 + number:02d}T09:30:00"
+        name = f"f{number + 1:02d}"
+        planned.append(SimulatedFlight(name, "uav1", {"uav1": track}, pulses, start_utc=day, changes=tuple(changes)))
+    node = SimulatedNode(
+        position_std_m=error_m or None,
+        impairments=Impairments(
+            radar_snr_db=20.0, localization=Localization(error_m, window_s=10.0) if error_m else None
+        ),
+    )
+    return CampaignSpecification(
+        "revisit",
+        DEMO_ORIGIN,
+        WaveformSpecification(256, 1.2e9, 1.6e6, 0.625e-6, 0.5e-6, 512e6, 10.0),
+        (slope, *ground, *points, *changed),
+        {"uav1": node},
+        tuple(planned),
+        ImageGrid(_UTM, half_width_m=11.0, spacing_m=0.125),
+    )
+
+
 PRESETS: dict[str, Callable[..., CampaignSpecification]] = {
     preset.__name__.replace("_", "-"): preset
-    for preset in (demo, first_flight, paper, swarm, continuous, flight, paper_lab, paper_static, paper_uav)
+    for preset in (demo, first_flight, paper, swarm, continuous, flight, paper_lab, paper_static, paper_uav, revisit)
 }
 
 

@@ -29,7 +29,15 @@ from apertura.simulation.impairments import (
     independent_streams,
 )
 from apertura.simulation.scatterers import TrueAir
-from apertura.simulation.targets import GaussianBeam, Origin, Target, Track, Trajectory, Vector
+from apertura.simulation.targets import (
+    GaussianBeam,
+    Origin,
+    Target,
+    TargetChange,
+    Track,
+    Trajectory,
+    Vector,
+)
 from apertura.simulation.waveform import TransmittedSpecification, TransmitWaveform
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.]*$")]
@@ -92,6 +100,9 @@ class SimulatedFlight:
     targets: tuple[Target, ...] | None = Field(
         default=None, description="targets of this flight instead of those of the campaign"
     )
+    changes: tuple[TargetChange, ...] = Field(
+        default=(), description="targets of the campaign that differ in this flight: displaced, turned or absent"
+    )
     segments: Mapping[str, tuple[tuple[float, float], ...]] = Field(
         default_factory=dict,
         description="pair → start and end of the imaged segments, s after the first pulse; missing: all pulses",
@@ -103,6 +114,8 @@ class SimulatedFlight:
             raise ValueError(
                 f"transmitter {self.transmitter!r} has no track; nodes with a track: {', '.join(self.tracks)}"
             )
+        if self.targets is not None and self.changes:
+            raise ValueError("changes refer to the targets of the campaign, which `targets` of the flight replace")
         return self
 
 
@@ -205,6 +218,10 @@ class CampaignSpecification:
             raise ValueError("a pulse that is sent once requires synthesis: exact, without framing or continuous")
         if not self.flights or len({flight.name for flight in self.flights}) < len(self.flights):
             raise ValueError("there must be at least one flight, and flights must have different names")
+        last = len(self.targets) - 1
+        for flight in self.flights:
+            if wrong := [change.target for change in flight.changes if change.target > last]:
+                raise ValueError(f"flight {flight.name} changes target {wrong[0]}; the last target is number {last}")
         return self
 
 

@@ -153,16 +153,35 @@ class Clutter:
 Target = Annotated[PointTarget | Line | Plate | Clutter, Field(discriminator="kind")]
 
 
-def scatterers(origin: Origin, targets: tuple[Target, ...], generator: Generator) -> Scatterers:
+@dataclass(frozen=True, config=STRICT_KEYS)
+class TargetChange:
+    """Change of a target of the campaign in one flight: displaced, turned, weaker, stronger or absent."""
+
+    target: int = Field(ge=0, description="number of the target in `targets`, from 0")
+    shift_m: Vector = Field(default=(0.0, 0.0, 0.0), description="displacement of all its points east, north, up, m")
+    factor: complex = Field(default=1.0, description="factor of its echo amplitude; 0: the target is absent")
+
+
+def scatterers(
+    origin: Origin, targets: tuple[Target, ...], generator: Generator, changes: tuple[TargetChange, ...] = ()
+) -> Scatterers:
     """Return the point scatterers of all targets in ECEF (m); `generator` draws the clutter.
+
+    `changes` are applied to the drawn points, so that flights over one scene have the same clutter.
 
     Examples
     --------
     >>> targets = (PointTarget((0, 0, 1)), Line((0, 0, 0), (1, 0, 0), 4))
     >>> scatterers(Origin(0, 0, 0), targets, np.random.default_rng(0)).position_m.shape
     (5, 3)
+    >>> gone = scatterers(Origin(0, 0, 0), targets, np.random.default_rng(0), (TargetChange(0, factor=0.0),))
+    >>> gone.amplitude.real
+    array([0.  , 0.25, 0.25, 0.25, 0.25])
     """
     parts = [target.points(generator) for target in targets]
+    for change in changes:
+        part = parts[change.target]
+        parts[change.target] = Scatterers(part.position_m + np.array(change.shift_m), part.amplitude * change.factor)
     position = np.concatenate([np.empty((0, 3)), *(part.position_m for part in parts)])
     return Scatterers(origin.ecef(position), np.concatenate([[0j][:0], *(part.amplitude for part in parts)]))
 

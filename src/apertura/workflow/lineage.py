@@ -146,6 +146,9 @@ def _candidates(campaign: Campaign, rule: Rule, kind: str) -> list[tuple[str, ..
         return [()] if flights else []
     if rule.of is Scope.TWO:
         return [(name,) for name in campaign.settings.interferometry.pairs]
+    if rule.of is Scope.STACKED:
+        stack = campaign.settings.stack
+        return [(name,) for name in stack.all_flights] if stack else []
     if rule.of is Scope.FLIGHT:
         return [(flight.name,) for flight in flights]
     pairs = rule.of is Scope.PAIR

@@ -20,6 +20,7 @@ class Scope(Enum):
     PAIR = "pair", ("flight", "pair")
     FLIGHT = "flight", ("flight",)
     TWO = "two images", ("two",)
+    STACKED = "flight of the stack", ("flight",)
     CAMPAIGN = "campaign", ()
     CHARTED = "charted pair", ()
 
@@ -55,6 +56,8 @@ class JobScope:
             return [(self.where[0], pair) for pair in campaign.flight(self.where[0]).pairs]
         if self.of is Scope.TWO:
             return [(flight, pair) for flight, pair in campaign.settings.interferometry.images(self.where[0])]
+        if self.of is Scope.STACKED:
+            return stacked_pairs(campaign, self.where[0])
         if self.of is Scope.CHARTED:
             return [charted(campaign)]
         return [(flight.name, pair) for flight in campaign.image_flights for pair in flight.pairs]
@@ -75,6 +78,9 @@ class JobScope:
             values: Iterable[tuple[str, ...]] = ((name, node) for name, pair in self.pairs for node in pair.split("-"))
         elif of is Scope.FLIGHT:
             values = ((name,) for name, _ in self.pairs)
+        elif of is Scope.STACKED:
+            stack = self.campaign.settings.stack
+            values = ((name,) for name in (stack.all_flights if stack else ()))
         else:
             values = self.pairs
         return list(dict.fromkeys(values))
@@ -96,6 +102,27 @@ def charted(campaign: "Campaign") -> tuple[str, str]:
     """
     campaign.check_images()
     return campaign.image_flights[0].name, campaign.image_flights[0].pairs[-1]
+
+
+def stacked_pairs(campaign: "Campaign", flight: str) -> list[tuple[str, str]]:
+    """Return flight and pair of the stack's reference image and of a flight's image; one image for the reference.
+
+    Raises
+    ------
+    CampaignError
+        If the flight is no flight of the stack.
+    """
+    from apertura.common.errors import CampaignError
+
+    stack = campaign.settings.stack
+    if stack is None or flight not in stack.all_flights:
+        raise CampaignError(
+            f"flight {flight} is not in the stack",
+            where="config/config.yaml: stack",
+            expected=f"one of {', '.join(stack.all_flights)}" if stack else "a configured stack; none is configured",
+            remedy="Add the flight to stack.flights.",
+        )
+    return [(name, stack.pair) for name in dict.fromkeys((stack.reference, flight))]
 
 
 def is_sampled(campaign: "Campaign") -> bool:

@@ -16,6 +16,9 @@ from apertura.workflow.rule_inputs import Scope
 INTERFEROMETRY = "interferometry"
 """Results folder of interferograms."""
 
+STACK = "stack"
+"""Results folder of the stack."""
+
 STUDY = "study"
 """Results folder of benchmark measurements, which are only made on demand."""
 
@@ -535,6 +538,40 @@ _ROWS = (
         arguments=("name",),
         demand=Demand(600, pulse_bytes=1000, pixel_bytes=700, pixel_s=60),
         cost=Cost(1.0, mpx_s=20.0, last=True),
+    ),
+    Rule(
+        "stack_image",
+        Scope.STACKED,
+        "Refer the phase of a flight's image to the stack's reference, without the residual motion of the track.",
+        _STAGES.stack.stack_image,
+        sources=(*_FORMED, "image", "layers"),
+        settings=(
+            "campaign",
+            "metadata",
+            "stack",
+            inputs.polarisations,
+            "scene.reference_points",
+            "processing.integration",
+        ),
+        documents=("stack.json",),
+        exports="stack",
+        manifest=f"{STACK}/{{flight}}/stack_image",
+        demand=Demand(600, pulse_bytes=1000, pixel_bytes=500, pixel_s=60),
+        cost=Cost(1.0, mpx_s=10.0),
+    ),
+    Rule(
+        "stack",
+        Scope.CAMPAIGN,
+        "List baselines, coherence and residual phases of the stack's flights, stack/baselines.csv and stack.json.",
+        _STAGES.stack.stack,
+        sources=("stack_image",),
+        settings=("campaign", "stack"),
+        products=("baselines.csv",),
+        documents=("stack.json",),
+        manifest=f"{STACK}/stack",
+        needed=lambda scope: scope.campaign.settings.stack is not None,
+        demand=Demand(350),
+        cost=Cost(0.3, last=True),
     ),
     Rule(
         "mosaic",

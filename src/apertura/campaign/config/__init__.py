@@ -36,7 +36,9 @@ from apertura.campaign.config.processing import (
     KnownReflector,
     Processing,
     Scene,
+    Stack,
     check_interferometry,
+    check_stack,
 )
 from apertura.campaign.config.section import Name, Section
 from apertura.campaign.config.waveform import (
@@ -78,9 +80,11 @@ __all__ = [
     "Section",
     "Segment",
     "Settings",
+    "Stack",
     "Waveform",
     "check_interferometry",
     "check_radio",
+    "check_stack",
     "is_monostatic",
     "located",
     "polarisation_of",

@@ -12,6 +12,7 @@ from apertura.campaign.config.processing import (
     Interferometry,
     Processing,
     Scene,
+    Stack,
 )
 from apertura.campaign.config.section import Name, RawRoot, Section
 from apertura.campaign.config.waveform import PhaseHistoryWaveform, SampledWaveform, Waveform
@@ -43,6 +44,10 @@ class Settings(Section):
     bench: BenchSettings = Field(default_factory=BenchSettings, description="set-up of bench recordings")
     interferometry: Interferometry = Field(
         default_factory=Interferometry, description="pairs of images for interferometry: coherence and heights"
+    )
+    stack: Stack | None = Field(
+        None,
+        description="time stack of one pair: reference, flights, pair, window_px; null: no stack",
     )
     metadata: Attribution = Field(
         default_factory=Attribution,

@@ -1,4 +1,4 @@
-"""Sections `scene`, `processing`, `calibration`, `bench` and `interferometry` of the config."""
+"""Sections `scene`, `processing`, `calibration`, `bench`, `interferometry` and `stack` of the config."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -144,7 +144,15 @@ class BenchSettings(Section):
 LEAST_WINDOW_PX = 3
 """Smallest side of the coherence window, pixels: the coherence of a single pixel is always 1."""
 
+_PAIR = r"^[A-Za-z0-9_.]+-[A-Za-z0-9_.]+$"
 _IMAGE = r"([A-Za-z0-9_.]+)/([A-Za-z0-9_.]+-[A-Za-z0-9_.]+)"
+
+
+def has_a_middle(side: int) -> int:
+    """Return the side of a window, pixels; raise ValueError if it is even."""
+    if side % 2 == 0:
+        raise ValueError("must be odd, so that the window is centred on a pixel")
+    return side
 
 
 class Interferometry(Section):
@@ -173,12 +181,7 @@ class Interferometry(Section):
                 raise ValueError(f"{name}: {images[0]} is named twice; an interferogram requires two different images")
         return pairs
 
-    @field_validator("window_px")
-    @classmethod
-    def _has_a_middle(cls, side: int) -> int:
-        if side % 2 == 0:
-            raise ValueError("must be odd, so that the window is centred on a pixel")
-        return side
+    _has_a_middle = field_validator("window_px")(has_a_middle)
 
     def images(self, name: str) -> tuple[tuple[str, str], tuple[str, str]]:
         """Return flight and pair of the two images of an interferogram.
@@ -213,6 +216,61 @@ def check_interferometry(requested: Interferometry, known: Sequence[str], *, whe
                     expected=f"two of {', '.join(known)}" if known else "two images; the campaign has none",
                     remedy="Correct the flight or the pair, or add them to flights.tsv.",
                 )
+
+
+# ---- Section `stack`: images of several flights for time series and change detection ---------------------------------
+
+
+class Stack(Section):
+    """Stack: images of one pair from several flights, whose phases refer to one reference flight."""
+
+    reference: Name = Field(description="flight to which the phases of all other flights refer")
+    flights: tuple[Name, ...] = Field(min_length=1, description="further flights of the stack")
+    pair: str = Field(pattern=_PAIR, description="pair whose images are stacked, transmitter-receiver")
+    window_px: int = Field(
+        15, ge=LEAST_WINDOW_PX, le=255, description="side of the averaging window of coherence, odd number of pixels"
+    )
+
+    _has_a_middle = field_validator("window_px")(has_a_middle)
+
+    @model_validator(mode="after")
+    def _each_flight_once(self) -> Self:
+        if len({*self.all_flights}) < len(self.all_flights):
+            raise ValueError(f"flights {', '.join(self.all_flights)}: each flight may be named once")
+        return self
+
+    @property
+    def all_flights(self) -> tuple[str, ...]:
+        """The reference flight, then the further flights.
+
+        Examples
+        --------
+        >>> Stack(reference="f01", flights=("f02", "f03"), pair="uav1-uav1").all_flights
+        ('f01', 'f02', 'f03')
+        """
+        return (self.reference, *self.flights)
+
+
+def check_stack(requested: Stack | None, known: Sequence[str], *, where: Path) -> None:
+    """Check that the flights of a stack have images of its pair; raise CampaignError if not.
+
+    Parameters
+    ----------
+    requested
+        Section `stack`; None: no stack.
+    known, where
+        As in `check_interferometry`.
+    """
+    if requested is None:
+        return
+    for flight in requested.all_flights:
+        if (image := f"{flight}/{requested.pair}") not in known:
+            raise CampaignError(
+                f"no image {quoted(image)}",
+                where=f"{where}: stack",
+                expected=f"flights and a pair of the images {', '.join(known)}" if known else "a campaign with images",
+                remedy="Correct stack.reference, stack.flights or stack.pair, or add the flight to flights.tsv.",
+            )
 
 
 # ---- Section `scene`: grid of all rasters, and terrain ---------------------------------------------------------------

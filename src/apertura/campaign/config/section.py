@@ -16,8 +16,8 @@ from apertura.common.errors import CampaignError, quoted
 
 RESERVED_NAMES = frozenset(
     {
-        *("fused", "layers", "stac", "map", "mosaic", "interferometry", "study", "logs", "benchmarks", "tiles"),
-        *("tracks", "workflow", "preview"),
+        *("fused", "layers", "stac", "map", "mosaic", "interferometry", "stack", "study", "logs", "benchmarks"),
+        *("tiles", "tracks", "workflow", "preview"),
     }
 )
 """Names of files and folders in the results folder, which flights and nodes must not have."""

@@ -49,6 +49,10 @@ SOURCES: Mapping[str, str] = {
     "height": "interferogram",
     "height_std": "interferogram",
     "panels": "interferogram",
+    "stack_image": "stack",
+    "residual_phase": "stack",
+    "stack_coherence": "stack",
+    "expected_coherence": "stack",
 }
 """Source raster of a file → kind of folder that contains the file.
 
@@ -61,6 +65,8 @@ coefficient. With gamma0, they include the ratios of the areas to which the coef
 incidence angle from the vertical. Rasters of multilook exist if requested; their values are the mean power of square
 blocks of pixels, on a coarser grid. ``multilook_noise`` is the mean noise power that is subtracted from the echo power.
 Rasters of an interferogram are computed from two images; ``panels`` is a mapping from their names to these rasters.
+``stack_image`` is the complex image of a flight of the stack without the residual phase; the other rasters of the stack
+are that phase, and the measured and the expected coherence with the reference flight.
 """
 
 
@@ -196,6 +202,13 @@ EXPORTS: tuple[Export, ...] = (
     Export("height_std.tif", "height_std", _WRITERS.interferogram.write_height_std),
     Export("height_std.qml", "height_std", _WRITERS.style.write_layer_style),
     Export("quicklook.png", "panels", _WRITERS.interferogram.write_panels, pictured=True),
+    Export("slc.tif", "stack_image", _WRITERS.cog.write_slc, mosaicked=False),
+    Export("residual_phase.tif", "residual_phase", _WRITERS.stack.write_residual_phase),
+    Export("residual_phase.qml", "residual_phase", _WRITERS.style.write_layer_style),
+    Export("coherence.tif", "stack_coherence", _WRITERS.stack.write_stack_coherence),
+    Export("coherence.qml", "stack_coherence", _WRITERS.style.write_layer_style),
+    Export("expected_coherence.tif", "expected_coherence", _WRITERS.stack.write_expected_coherence),
+    Export("expected_coherence.qml", "expected_coherence", _WRITERS.style.write_layer_style),
     *_ADDED,
 )
 """All products of a pair or of a flight's sums, in the order in which they are written."""
@@ -219,7 +232,7 @@ MAP = "map/map.json"
 
 
 def exports_in(folder: str) -> Iterator[Export]:
-    """Yield the rows of a kind: ``pair``, ``fused``, ``layers`` or ``interferogram``.
+    """Yield the rows of a kind: ``pair``, ``fused``, ``layers``, ``interferogram`` or ``stack``.
 
     Examples
     --------

@@ -1,0 +1,1 @@
+"""Stack: residual motion between flights over one scene, and the coherence expected between their images."""
