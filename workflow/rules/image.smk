@@ -69,8 +69,6 @@ rule layers:
         "results/{flight}/{pair}/looks.qml",
         "results/{flight}/{pair}/nesz.tif",
         "results/{flight}/{pair}/nesz.qml",
-        "results/{flight}/{pair}/line_of_sight_enu.tif",
-        "results/{flight}/{pair}/slant_range_distance.tif",
         added_files("layers"),
         "results/{flight}/{pair}/layers.manifest.json",
     log:

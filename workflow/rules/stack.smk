@@ -16,6 +16,8 @@ rule stack_image:
         "results/stack/{flight}/coherence.qml",
         "results/stack/{flight}/expected_coherence.tif",
         "results/stack/{flight}/expected_coherence.qml",
+        "results/stack/{flight}/line_of_sight_enu.tif",
+        "results/stack/{flight}/slant_range_distance.tif",
         added_files("stack_image"),
         "results/stack/{flight}/stack_image.manifest.json",
     log:

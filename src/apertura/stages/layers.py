@@ -339,16 +339,12 @@ def layer_rasters(
         "mask": LazyLayer(grid, np.uint8, _mask(scene, looks), threads),
         "looks": LazyLayer(grid, np.float32, looks.effective, threads),
         "nesz": LazyLayer(grid, np.float32, nesz, threads),
-        "line_of_sight": LazyLayer(grid, np.float32, partial(angle, looks.line_of_sight_enu), threads, components=3),
-        "slant_range": LazyLayer(grid, np.float32, partial(angle, looks.slant_ranges_m), threads, components=2),
     }
 
 
 def _inside(looks: Looks, window: Window, values: NDArray[Any]) -> NDArray[Any]:
     lit = looks.illuminated(window)
-    if lit.all():
-        return values
-    return np.where(lit.reshape(*lit.shape, *(1,) * (values.ndim - 2)), values, values.dtype.type(np.nan))
+    return values if lit.all() else np.where(lit, values, values.dtype.type(np.nan))
 
 
 def _mask(scene: OpenScene, looks: Looks) -> Callable[[Window], NDArray[np.uint8]]:

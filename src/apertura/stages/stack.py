@@ -26,6 +26,7 @@ from apertura.methods.interferometry.coherence import chance, map_coherence, unb
 from apertura.stages.agreement import opened_layer
 from apertura.stages.image_tags import acquisition_tags
 from apertura.stages.interferogram import legs_of, sensed_heights
+from apertura.stages.multilook import LazyLayer
 from apertura.stages.pair import OpenPair, open_pair
 from apertura.stages.planning import gated, integration_of, weighing
 from apertura.stages.scene import OpenScene, open_scene
@@ -152,6 +153,8 @@ def stack_image(campaign: Campaign, flight: str) -> list[Path]:
         "residual_phase": removed,
         "stack_coherence": np.where(common, magnitude, np.nan).astype(np.float32),
         "expected_coherence": np.where(common, expected, np.nan).astype(np.float32),
+        "line_of_sight": LazyLayer(scene.grid, np.float32, image.looks.line_of_sight_enu, 1, components=3),
+        "slant_range": LazyLayer(scene.grid, np.float32, image.looks.slant_ranges_m, 1, components=2),
     }
     title = f"{campaign.settings.campaign} · stack of {requested.pair} · {flight}"
     folder = campaign.result(STACK, flight)
@@ -201,6 +204,7 @@ def _tags(report: dict[str, Any]) -> dict[str, str]:
     return {
         "APERTURA_FLAGS": canonical_json(report["flags"]),
         "APERTURA_STACK_REFERENCE": report["reference"],
+        "APERTURA_PERPENDICULAR_BASELINE_M": f"{report['perpendicular_baseline_m']:.4g}",
         "APERTURA_LOOKS": "none" if report["looks"] is None else f"{report['looks']:.2f}",
         "APERTURA_CHANCE": f"{report['chance']:.3f}",
     }

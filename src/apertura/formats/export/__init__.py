@@ -28,8 +28,6 @@ SOURCES: Mapping[str, str] = {
     "mask": "layers",
     "looks": "layers",
     "nesz": "layers",
-    "line_of_sight": "layers",
-    "slant_range": "layers",
     "sigma0": "radiometry",
     "gamma0": "radiometry",
     "beta0": "radiometry",
@@ -53,20 +51,22 @@ SOURCES: Mapping[str, str] = {
     "residual_phase": "stack",
     "stack_coherence": "stack",
     "expected_coherence": "stack",
+    "line_of_sight": "stack",
+    "slant_range": "stack",
 }
 """Source raster of a file → kind of folder that contains the file.
 
 ``image`` is the complex image of a pair. ``coherent`` is the complex sum of a flight's pairs, and ``noncoherent`` their
 power sum, stored as complex amplitude without phase. ``magnitude`` is the sum of the magnitudes of the pairs. Layers
-are real rasters that describe the image of a pair, and are stored in the folder of that image; ``line_of_sight`` and
-``slant_range`` have a last axis of components. Rasters of radiometry
+are real rasters that describe the image of a pair, and are stored in the folder of that image. Rasters of radiometry
 exist for calibrated pairs, in the same folder; their values are complex amplitudes whose power is the named
 coefficient. With gamma0, they include the ratios of the areas to which the coefficients are normalised, and the
 incidence angle from the vertical. Rasters of multilook exist if requested; their values are the mean power of square
 blocks of pixels, on a coarser grid. ``multilook_noise`` is the mean noise power that is subtracted from the echo power.
 Rasters of an interferogram are computed from two images; ``panels`` is a mapping from their names to these rasters.
 ``stack_image`` is the complex image of a flight of the stack without the residual phase; the other rasters of the stack
-are that phase, and the measured and the expected coherence with the reference flight.
+are that phase, the measured and the expected coherence with the reference flight, and the geometry at closest approach,
+whose last axis contains components.
 """
 
 
@@ -159,8 +159,6 @@ EXPORTS: tuple[Export, ...] = (
     Export("looks.qml", "looks", _WRITERS.style.write_layer_style),
     Export("nesz.tif", "nesz", _WRITERS.layers.write_nesz),
     Export("nesz.qml", "nesz", _WRITERS.style.write_layer_style),
-    Export("line_of_sight_enu.tif", "line_of_sight", _WRITERS.layers.write_line_of_sight, mosaicked=False),
-    Export("slant_range_distance.tif", "slant_range", _WRITERS.layers.write_slant_range, mosaicked=False),
     Export("sigma0_db.tif", "sigma0", _WRITERS.db.write_db),
     Export("sigma0_db.qml", "sigma0", _WRITERS.style.write_backscatter_style),
     Export("gamma0_db.tif", "gamma0", _WRITERS.db.write_db),
@@ -209,6 +207,8 @@ EXPORTS: tuple[Export, ...] = (
     Export("coherence.qml", "stack_coherence", _WRITERS.style.write_layer_style),
     Export("expected_coherence.tif", "expected_coherence", _WRITERS.stack.write_expected_coherence),
     Export("expected_coherence.qml", "expected_coherence", _WRITERS.style.write_layer_style),
+    Export("line_of_sight_enu.tif", "line_of_sight", _WRITERS.layers.write_line_of_sight, mosaicked=False),
+    Export("slant_range_distance.tif", "slant_range", _WRITERS.layers.write_slant_range, mosaicked=False),
     *_ADDED,
 )
 """All products of a pair or of a flight's sums, in the order in which they are written."""
