@@ -5,6 +5,7 @@ rule stack_image:
         scene="results/scene.manifest.json",
         terrain=each("results/terrain.manifest.json", STACKED),
         patterns=files(inputs.patterns, STACKED),
+        refined_track=each("results/{flight}/refined_track.manifest.json", STACKED),
         image=each("results/{flight}/{pair}/image.manifest.json", STACKED),
         layers=each("results/{flight}/{pair}/layers.manifest.json", STACKED),
     output:
