@@ -514,6 +514,35 @@ def reflectors(
     print(as_typed(write_constants(opened, path)))
 
 
+export = typer.Typer(no_args_is_help=True, help="Write results in the layout of other software.")
+app.add_typer(export, name="export")
+
+
+@export.command("stack")
+def export_stack(
+    campaign: CampaignFolder = HERE,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="folder to write, default: time_series in the campaign folder")
+    ] = None,
+) -> None:
+    """Write the stack of a campaign as images, mask, geometry and configuration for dolphin."""
+    opened, folder = _opened(campaign), given(campaign / "time_series" if out is None else out)
+    from apertura.tools.export_stack import write_stack
+
+    print(*map(as_typed, write_stack(opened, folder)), sep="\n")
+
+
+@export.command("time-series")
+def export_time_series(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="folder of `apertura export stack` with a dolphin run")],
+) -> None:
+    """Write the result of dolphin as inputs of MintPy and as a point layer for QGIS (InSAR Explorer)."""
+    path = given(folder)
+    from apertura.tools.time_series import write_time_series
+
+    print(*map(as_typed, write_time_series(path)), sep="\n")
+
+
 @app.command()
 def verify(
     product: Annotated[

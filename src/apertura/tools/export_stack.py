@@ -1,0 +1,208 @@
+"""Hand-off of a stack to InSAR time series software: images, mask, geometry and configuration of dolphin."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from rasterio import Affine
+
+from apertura.campaign.config import Stack
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import check_listed, open_listed
+from apertura.common.atomic import replacement, write_json, write_text
+from apertura.common.errors import CampaignError
+from apertura.common.raster import opened_raster
+from apertura.formats.export.cog import Band, only, write_cog
+from apertura.methods.interferometry.coherence import map_coherence
+from apertura.stages.scene import open_scene
+from apertura.stages.stack import STACK_JSON
+from apertura.workflow.rules import STACK
+
+DATE_FORMAT = "%Y%m%dT%H%M%S"
+"""Start of an acquisition in file names, UTC; several flights of a day differ in the time."""
+
+HANDOFF = "handoff.json"
+"""Description of an exported stack, for `apertura export time-series`."""
+
+GEOMETRY = ("line_of_sight_enu.tif", "slant_range_distance.tif")
+"""Layers of the reference flight that are copied."""
+
+_STRIDES_PER_WINDOW = 5
+"""Output pixels of dolphin along the averaging window: neighbouring output pixels share most of their samples."""
+
+_PS_STD_M = 1e-3
+"""Displacement error, metres, up to which the phase of a single pixel replaces that of its window."""
+
+_PS_DISPERSION = 0.25  # default of dolphin: largest amplitude dispersion that approximates the phase deviation
+
+_HEIGHT = Band("float32", np.nan, "m", "terrain height in the CRS of the scene", "AVERAGE", smooth=True)
+_GOOD = Band("uint8", 255, "class", "1 valid in all flights of the stack, 0 invalid", "MODE")
+
+
+@dataclass(frozen=True)
+class StackedFlight:
+    """Flight of an exported stack.
+
+    Attributes
+    ----------
+    flight, time
+        Name of the flight, and start of its acquisition in `DATE_FORMAT`.
+    perpendicular_baseline_m, temporal_baseline_days
+        Baselines to the reference flight.
+    """
+
+    flight: str
+    time: str
+    perpendicular_baseline_m: float
+    temporal_baseline_days: float
+
+
+def write_stack(campaign: Campaign, out: Path) -> list[Path]:
+    """Write the stack of a campaign in the layout that dolphin reads; return the paths of the files.
+
+    Parameters
+    ----------
+    campaign
+        Campaign with a finished stack.
+    out
+        Folder to write: `slc/<time>.slc.tif`, `mask.tif`, `geometry/`, `dolphin_config.yaml`, `handoff.json`.
+
+    Raises
+    ------
+    CampaignError
+        If the stack is missing, has fewer than two flights, or two flights begin in the same second.
+    """
+    requested = campaign.settings.stack
+    if requested is None:
+        remedy = "Add the section stack, then run the workflow."
+        raise CampaignError("no stack is configured", "config/config.yaml: stack", "a section stack", remedy)
+    flights, grid = _flights(campaign, requested), open_scene(campaign).grid
+    written, window, good = list[Path](), requested.window_px, np.ones(grid.shape, bool)
+    images: dict[str, NDArray[np.complex64]] = {}
+    for one in flights:
+        source = _listed(campaign, one.flight, "slc.tif")
+        written.append(_copied(source, out / "slc" / f"{one.time}.slc.tif"))
+        mask = campaign.result(one.flight, requested.pair, "mask.tif")
+        expected = {"expected": "a raster of the workflow", "remedy": "Run the workflow again."}
+        with opened_raster(source, **expected) as slc, opened_raster(mask, **expected) as visible:
+            images[one.flight], tags = slc.read(1), slc.tags()
+            good &= (visible.read(1) == 0) & np.isfinite(images[one.flight])
+    written += [_copied(_listed(campaign, requested.reference, name), out / "geometry" / name) for name in GEOMETRY]
+    placed: dict[str, Any] = {"transform": Affine(*grid.transform), "crs": grid.crs_wkt, "tags": {}}
+    terrain = open_scene(campaign).terrain
+    height = np.broadcast_to(terrain.heights(grid), grid.shape).astype(np.float32)
+    for name, raster, band in (("geometry/height.tif", height, _HEIGHT), ("mask.tif", good.astype(np.uint8), _GOOD)):
+        written.append(out / name)
+        write_cog(written[-1], raster, band, value=only(band.dtype), **placed)
+    wavelength_m, stride = float(tags["APERTURA_WAVELENGTH_M"]), max(1, window // _STRIDES_PER_WINDOW)
+    tiles = list(grid.tiles(campaign.settings.processing.tile_px))
+    reference = images.pop(requested.reference)
+    similarity = np.where(good, 1.0, -1.0)
+    for image in images.values():
+        magnitude, phase, _, _ = map_coherence(image, reference, tiles, window=window)
+        similarity = np.minimum(similarity, np.nan_to_num(magnitude * np.cos(phase), nan=-1.0))
+    # The cells of dolphin have their centres at these pixels. The best reference is coherent and has not moved.
+    cells = similarity[stride // 2 :: stride, stride // 2 :: stride]
+    row, column = map(int, np.unravel_index(cells.argmax(), cells.shape))
+    names = [path.relative_to(out).as_posix() for path in written if path.parent.name == "slc"]
+    config = dolphin_config(names, wavelength_m, window_px=window, stride=stride, reference_point=(row, column))
+    note = (
+        "# Run in this folder: dolphin run dolphin_config.yaml\n"
+        "# Displacements in dolphin/timeseries are metres along the line of sight, positive towards the sensor.\n"
+    )
+    write_text(out / "dolphin_config.yaml", note + yaml.safe_dump(config, sort_keys=False))
+    write_json(
+        out / HANDOFF,
+        {
+            "campaign": campaign.settings.campaign,
+            "pair": requested.pair,
+            "wavelength_m": wavelength_m,
+            "heading_deg": float(tags.get("APERTURA_HEADING_DEG", 0.0)),
+            "reference_point_m": grid.map_at((row + 0.5) * stride - 0.5, (column + 0.5) * stride - 0.5).tolist(),
+            "flights": [vars(one) for one in flights],
+        },
+    )
+    return [*written, out / "dolphin_config.yaml", out / HANDOFF]
+
+
+def dolphin_config(
+    images: Sequence[str],
+    wavelength_m: float,
+    *,
+    window_px: int,
+    stride: int,
+    reference_point: tuple[int, int],
+) -> dict[str, Any]:
+    """Return the configuration of dolphin's displacement workflow; options not listed keep their defaults.
+
+    The amplitude dispersion of a pixel approximates the standard deviation of its phase, radians. A persistent
+    scatterer keeps its own phase instead of that of its window, which is allowed for up to 1 mm of displacement error.
+
+    Parameters
+    ----------
+    images
+        Paths of the images, relative to the working folder.
+    wavelength_m
+        Wavelength at the centre frequency.
+    window_px, stride
+        Side of the averaging window, and output spacing, pixels.
+    reference_point
+        Row and column of the reference point in the output.
+
+    Examples
+    --------
+    >>> config = dolphin_config(["a.tif"], 0.25, window_px=15, stride=3, reference_point=(4, 5))
+    >>> config["phase_linking"]["half_window"], round(config["ps_options"]["amp_dispersion_threshold"], 3)
+    ({'x': 7, 'y': 7}, 0.05)
+    """
+    dispersion = min(_PS_DISPERSION, 4 * np.pi / wavelength_m * _PS_STD_M)
+    return {
+        "input_options": {"cslc_date_fmt": DATE_FORMAT, "wavelength": wavelength_m},
+        "cslc_file_list": list(images),
+        "mask_file": "mask.tif",
+        "work_directory": "dolphin",
+        "output_options": {"strides": {"x": stride, "y": stride}},
+        "ps_options": {"amp_dispersion_threshold": round(dispersion, 4)},
+        "phase_linking": {"half_window": {"x": window_px // 2, "y": window_px // 2}},
+        "interferogram_network": {"max_bandwidth": 2},
+        "unwrap_options": {"unwrap_method": "snaphu"},
+        "timeseries_options": {"reference_point": list(reference_point)},
+    }
+
+
+def _flights(campaign: Campaign, requested: Stack) -> list[StackedFlight]:
+    """Return the flights of the stack that are used, by time."""
+    folder = campaign.result(STACK)
+    flights = []
+    for name in open_listed(folder / STACK_JSON, folder / "stack.manifest.json")["flights"]:
+        report = open_listed(folder / name / STACK_JSON, folder / name / "stack_image.manifest.json")
+        start = np.datetime64(report["acquisition"]["start_utc"].removesuffix("Z"), "s")
+        baselines = report["perpendicular_baseline_m"] or 0.0, report["temporal_baseline_days"]
+        flights.append(StackedFlight(name, start.item().strftime(DATE_FORMAT), *baselines))
+    flights.sort(key=lambda one: one.time)
+    times = [one.time for one in flights]
+    if len(set(times)) < max(2, len(times)):
+        raise CampaignError(
+            f"flights at {', '.join(times)}",
+            where="results/stack/stack.json",
+            expected="two or more flights that start in different seconds",
+            remedy="Correct stack.flights, or the times of the recordings.",
+        )
+    return flights
+
+
+def _listed(campaign: Campaign, flight: str, name: str) -> Path:
+    """Return the path of a raster of the stack, checked against its manifest."""
+    path = campaign.result(STACK, flight, name)
+    check_listed(path, path.with_name("stack_image.manifest.json"))
+    return path
+
+
+def _copied(source: Path, target: Path) -> Path:
+    with replacement(target) as temporary:
+        temporary.write_bytes(source.read_bytes())
+    return target
