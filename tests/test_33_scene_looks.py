@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pyproj import Geod, Transformer
 from scenes import monostatic, straight_track
 from scipy.interpolate import RegularGridInterpolator
 
 from apertura.core.antenna.beam import Beam, Beams, gaussian_cut
 from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.geodesy import frame_from_map
 from apertura.core.geometry.sector import Sector
 from apertura.core.scene.angles import bistatic_angle_deg, incidence_deg
 from apertura.core.scene.grid import SceneGrid
@@ -211,3 +213,49 @@ def test_aperture_centre_is_not_interpolated_between_passes():
     assert set(np.unique(passed.round(6))) == {0.0, 90.0}
     assert (passed[:80] == 90).all()  # north of 50 m; the boundary is at 45 m
     assert (passed[120:] == 0).all()
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32632", "local"])
+@pytest.mark.parametrize("apart_m", [0.0, 40.0])
+def test_line_of_sight_gives_the_path_change_of_a_displacement(crs, apart_m):
+    """A displacement d changes half the total path by -cos(β/2) d·u (layers.md, eq. 1a).
+
+    The displacements are 0.1 mm along the axes of geographic coordinates, by pyproj.
+    """
+    west_m, north_m = (570600.0, 5363800.0) if crs != "local" else (0.0, 0.0)
+    grid = SceneGrid(crs, west_m, north_m, 1.0, (60, 80))
+    along = np.linspace(-50, 150, 900)
+
+    def flown(across_m):
+        if crs == "local":
+            return np.stack([along, np.full(900, across_m), np.full(900, 700.0)], -1)
+        return frame_from_map(crs, west_m + along, np.full(900, north_m + across_m), np.full(900, 700.0))
+
+    looks = Looks.of(grid, FlatGround(620.0), Aperture(flown(40.0), flown(40.0 + apart_m)), None)
+    tile = (slice(0, 60), slice(0, 80))
+    sight, angle = looks.line_of_sight_enu(tile), np.radians(looks.bistatic_angle_deg(tile))
+    assert np.allclose(np.linalg.norm(sight, axis=-1), 1, atol=1e-9)
+    assert (sight[..., 1] > 0).all()  # the track is north of the scene
+    place, centre = FlatGround(620.0).positions(grid), looks.centre(tile)
+    half_path = np.stack([np.linalg.norm(antenna - place, axis=-1) for antenna in centre]).sum(axis=0) / 2
+    assert np.allclose(looks.slant_ranges_m(tile).mean(axis=-1), half_path, atol=1e-9)
+    for axis, moved in enumerate(displaced(place, 1e-4, crs)):
+        changed = np.stack([np.linalg.norm(antenna - moved, axis=-1) for antenna in centre]).sum(axis=0) / 2
+        assert np.abs((changed - half_path) / 1e-4 + np.cos(angle / 2) * sight[..., axis]).max() < 1e-4
+    assert (np.cos(angle / 2).min() < 0.99) == (apart_m > 0)
+
+
+def displaced(place, by_m, crs):
+    """Return positions displaced to the east, to the north and upwards."""
+    if crs == "local":
+        return [place + by_m * axis for axis in np.eye(3)]
+    to_geodetic = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+    longitude, latitude, height = to_geodetic.transform(*np.moveaxis(place, -1, 0))
+    geod = Geod(ellps="WGS84")
+    moved = []
+    for azimuth in (90.0, 0.0):  # 1 m, so that the rounding of geographic coordinates has no effect
+        east, north, _ = geod.fwd(longitude, latitude, np.full(longitude.shape, azimuth), np.ones(longitude.shape))
+        ahead = np.stack(to_geodetic.transform(east, north, height, direction="INVERSE"), -1) - place
+        moved.append(place + by_m * ahead / np.linalg.norm(ahead, axis=-1, keepdims=True))
+    above = np.stack(to_geodetic.transform(longitude, latitude, height + by_m, direction="INVERSE"), -1)
+    return [*moved, above]

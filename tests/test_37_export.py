@@ -22,7 +22,7 @@ from apertura.formats.export import exports_in
 from apertura.formats.export.cog import MAGNITUDE, POWER, SLC, write_cog, write_power, write_slc
 from apertura.formats.export.db import write_db
 from apertura.formats.export.interferogram import PHASE
-from apertura.formats.export.layers import LAYOVER, LOOKS, MASK, OUTSIDE, SHADOW, write_mask
+from apertura.formats.export.layers import LAYOVER, LOOKS, MASK, OUTSIDE, SHADOW, write_line_of_sight, write_mask
 from apertura.formats.export.map_layout import DPI, LEFT, TOP, MapLayout
 from apertura.formats.export.quicklook import below_peak, shrink, write_quicklook
 from apertura.formats.export.writing import READ
@@ -319,6 +319,25 @@ def test_layers_keep_angles_bits_and_nodata(tmp_path):
             assert np.array_equal(raster.dataset_mask() == 0, np.arange(600)[:, None] + np.zeros(600) < 10)
             assert raster.units == ({"mask.tif": "class", "looks.tif": "pulses", "nesz.tif": "dB"}.get(name, "deg"),)
         assert np.array_equal(overviews(tmp_path / name)[0], layer[::2, ::2], equal_nan=name != "mask.tif")
+
+
+def test_components_of_a_vector_are_bands(tmp_path):
+    """The bands of the line of sight are those of OPERA's static layers: east, north, vertical, ground to sensor."""
+    sight = np.stack([np.full((601, 600), value, np.float32) for value in (0.0, -0.6, 0.8)], -1)
+    sight[:10] = np.nan
+    path = tmp_path / "line_of_sight_enu.tif"
+    write_line_of_sight(path, sight, **UTM, tags=TAGS)
+    with rasterio.open(path) as raster:
+        assert np.array_equal(np.moveaxis(raster.read(), 0, -1), sight, equal_nan=True)
+        assert [name.split(" unit")[0] for name in raster.descriptions] == [
+            f"{axis} component of line of sight" for axis in ("East", "North", "Vertical")
+        ]
+        assert "ground to sensor" in raster.descriptions[0]
+        assert raster.read_masks(1)[10:].all()  # a component of exactly 0 is data
+        halved = raster.read(out_shape=(3, 301, 300))
+    assert np.array_equal(np.moveaxis(halved, 0, -1), sight[::2, ::2], equal_nan=True)
+    with pytest.raises(ContractError, match=r"not \(y, x, component\)"):
+        write_line_of_sight(path, sight[..., 0], **UTM, tags=TAGS)
 
 
 def test_overviews_do_not_mix_shadow_and_layover(tmp_path):

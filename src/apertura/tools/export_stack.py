@@ -10,7 +10,6 @@ import yaml
 from numpy.typing import NDArray
 from rasterio import Affine
 
-from apertura.campaign.config import Stack
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import check_listed, open_listed
 from apertura.common.atomic import replacement, write_json, write_text
@@ -18,6 +17,7 @@ from apertura.common.errors import CampaignError
 from apertura.common.raster import opened_raster
 from apertura.formats.export.cog import Band, only, write_cog
 from apertura.methods.interferometry.coherence import map_coherence
+from apertura.methods.interferometry.heights import phase_std
 from apertura.stages.scene import open_scene
 from apertura.stages.stack import STACK_JSON
 from apertura.workflow.rules import STACK
@@ -34,10 +34,7 @@ GEOMETRY = ("line_of_sight_enu.tif", "slant_range_distance.tif")
 _STRIDES_PER_WINDOW = 5
 """Output pixels of dolphin along the averaging window: neighbouring output pixels share most of their samples."""
 
-_PS_STD_M = 1e-3
-"""Displacement error, metres, up to which the phase of a single pixel replaces that of its window."""
-
-_PS_DISPERSION = 0.25  # default of dolphin: largest amplitude dispersion that approximates the phase deviation
+_PS_DISPERSION = 0.25  # default of dolphin: largest amplitude dispersion that approximates the phase deviation, rad
 
 _HEIGHT = Band("float32", np.nan, "m", "terrain height in the CRS of the scene", "AVERAGE", smooth=True)
 _GOOD = Band("uint8", 255, "class", "1 valid in all flights of the stack, 0 invalid", "MODE")
@@ -53,12 +50,15 @@ class StackedFlight:
         Name of the flight, and start of its acquisition in `DATE_FORMAT`.
     perpendicular_baseline_m, temporal_baseline_days
         Baselines to the reference flight.
+    phase_std_rad
+        Standard deviation of the phase of a window against the reference flight; None for the reference.
     """
 
     flight: str
     time: str
     perpendicular_baseline_m: float
     temporal_baseline_days: float
+    phase_std_rad: float | None
 
 
 def write_stack(campaign: Campaign, out: Path) -> list[Path]:
@@ -80,7 +80,7 @@ def write_stack(campaign: Campaign, out: Path) -> list[Path]:
     if requested is None:
         remedy = "Add the section stack, then run the workflow."
         raise CampaignError("no stack is configured", "config/config.yaml: stack", "a section stack", remedy)
-    flights, grid = _flights(campaign, requested), open_scene(campaign).grid
+    flights, grid = _flights(campaign), open_scene(campaign).grid
     written, window, good = list[Path](), requested.window_px, np.ones(grid.shape, bool)
     images: dict[str, NDArray[np.complex64]] = {}
     for one in flights:
@@ -109,7 +109,10 @@ def write_stack(campaign: Campaign, out: Path) -> list[Path]:
     cells = similarity[stride // 2 :: stride, stride // 2 :: stride]
     row, column = map(int, np.unravel_index(cells.argmax(), cells.shape))
     names = [path.relative_to(out).as_posix() for path in written if path.parent.name == "slc"]
-    config = dolphin_config(names, wavelength_m, window_px=window, stride=stride, reference_point=(row, column))
+    std_rad = float(np.median([one.phase_std_rad for one in flights if one.phase_std_rad is not None]))
+    config = dolphin_config(
+        names, wavelength_m, window_px=window, stride=stride, phase_std_rad=std_rad, reference_point=(row, column)
+    )
     note = (
         "# Run in this folder: dolphin run dolphin_config.yaml\n"
         "# Displacements in dolphin/timeseries are metres along the line of sight, positive towards the sensor.\n"
@@ -135,12 +138,13 @@ def dolphin_config(
     *,
     window_px: int,
     stride: int,
+    phase_std_rad: float,
     reference_point: tuple[int, int],
 ) -> dict[str, Any]:
     """Return the configuration of dolphin's displacement workflow; options not listed keep their defaults.
 
-    The amplitude dispersion of a pixel approximates the standard deviation of its phase, radians. A persistent
-    scatterer keeps its own phase instead of that of its window, which is allowed for up to 1 mm of displacement error.
+    A persistent scatterer keeps its own phase instead of that of its window. The amplitude dispersion of a pixel
+    approximates the standard deviation of its phase, radians; it is limited to that of the phase of a window.
 
     Parameters
     ----------
@@ -150,16 +154,20 @@ def dolphin_config(
         Wavelength at the centre frequency.
     window_px, stride
         Side of the averaging window, and output spacing, pixels.
+    phase_std_rad
+        Standard deviation of the phase of a window.
     reference_point
         Row and column of the reference point in the output.
 
     Examples
     --------
-    >>> config = dolphin_config(["a.tif"], 0.25, window_px=15, stride=3, reference_point=(4, 5))
-    >>> config["phase_linking"]["half_window"], round(config["ps_options"]["amp_dispersion_threshold"], 3)
+    >>> config = dolphin_config(
+    ...     ["a.tif"], 0.25, window_px=15, stride=3, phase_std_rad=0.05, reference_point=(4, 5)
+    ... )
+    >>> config["phase_linking"]["half_window"], config["ps_options"]["amp_dispersion_threshold"]
     ({'x': 7, 'y': 7}, 0.05)
     """
-    dispersion = min(_PS_DISPERSION, 4 * np.pi / wavelength_m * _PS_STD_M)
+    dispersion = min(_PS_DISPERSION, phase_std_rad)
     return {
         "input_options": {"cslc_date_fmt": DATE_FORMAT, "wavelength": wavelength_m},
         "cslc_file_list": list(images),
@@ -174,15 +182,17 @@ def dolphin_config(
     }
 
 
-def _flights(campaign: Campaign, requested: Stack) -> list[StackedFlight]:
+def _flights(campaign: Campaign) -> list[StackedFlight]:
     """Return the flights of the stack that are used, by time."""
     folder = campaign.result(STACK)
     flights = []
     for name in open_listed(folder / STACK_JSON, folder / "stack.manifest.json")["flights"]:
         report = open_listed(folder / name / STACK_JSON, folder / name / "stack_image.manifest.json")
         start = np.datetime64(report["acquisition"]["start_utc"].removesuffix("Z"), "s")
+        coherence, looks = report["coherence"], report["looks"]
+        std_rad = None if looks is None else float(phase_std(np.array([coherence], np.float32), looks)[0])
         baselines = report["perpendicular_baseline_m"] or 0.0, report["temporal_baseline_days"]
-        flights.append(StackedFlight(name, start.item().strftime(DATE_FORMAT), *baselines))
+        flights.append(StackedFlight(name, start.item().strftime(DATE_FORMAT), *baselines, std_rad))
     flights.sort(key=lambda one: one.time)
     times = [one.time for one in flights]
     if len(set(times)) < max(2, len(times)):

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from rasterio.enums import Resampling
+from rasterio.transform import rowcol, xy
 from rasterio.vrt import WarpedVRT
 
 from apertura.common.atomic import replacement, write_json, write_text
@@ -30,7 +31,8 @@ POINTS = "displacement.geojson"
 _EXPECTED = {"expected": "a result of dolphin", "remedy": "Run `dolphin run dolphin_config.yaml` in the folder."}
 
 _MINTPY_CONFIG = """\
-# Run in this folder: smallbaselineApp.py mintpy.cfg --start modify_network
+# Run in this folder: smallbaselineApp.py mintpy.cfg --start modify_network --end reference_point
+# and then: smallbaselineApp.py mintpy.cfg --start invert_network
 mintpy.compute.cluster = none
 mintpy.reference.yx = {row},{column}
 mintpy.networkInversion.weightFunc = no
@@ -93,9 +95,13 @@ class DolphinResult:
     def layer(self, name: str) -> Values:
         """Return a layer of the folder `geometry` averaged to dolphin's pixels, (component, y, x) float32."""
         place = {key: self.profile[key] for key in ("crs", "transform", "width", "height")}
-        with opened_raster(self.folder / "geometry" / name, expected="an exported stack", remedy="Export again.") as raster:
-            with WarpedVRT(raster, resampling=Resampling.average, **place) as warped:
-                values: Values = warped.read().astype(np.float32)
+        with (
+            opened_raster(
+                self.folder / "geometry" / name, expected="an exported stack", remedy="Export again."
+            ) as raster,
+            WarpedVRT(raster, resampling=Resampling.average, **place) as warped,
+        ):
+            values: Values = warped.read().astype(np.float32)
         return values
 
 
@@ -130,7 +136,7 @@ def point_layer(result: DolphinResult, crs: CRS) -> dict[str, Any]:
     """
     moved_mm, coherence = 1e3 * result.displacement_m, result.temporal_coherence
     rows, columns = np.nonzero(np.isfinite(moved_mm).all(axis=0) & (coherence >= LEAST_COHERENCE))
-    x, y = result.profile["transform"] * (columns + 0.5, rows + 0.5)
+    x, y = xy(result.profile["transform"], rows, columns)
     longitude, latitude = Transformer.from_crs(crs, "EPSG:4326", always_xy=True).transform(x, y)
     series = moved_mm[:, rows, columns]
     days = np.array([one["temporal_baseline_days"] for one in result.handoff["flights"]])
@@ -207,8 +213,8 @@ def _write_mintpy(result: DolphinResult, crs: CRS) -> list[Path]:
         with replacement(folder / f"inputs/{name}.h5") as temporary, h5py.File(temporary, "w") as file:
             file.attrs.update({key: str(value) for key, value in (attributes | {"FILE_TYPE": kind}).items()})
             for key, values in datasets.items():
-                values = np.nan_to_num(values) if values.ndim == 3 else values  # MintPy ignores pixels that are 0
-                file.create_dataset(key, data=values)
-    column, row = ~transform * tuple(handoff["reference_point_m"])
-    write_text(folder / "mintpy.cfg", _MINTPY_CONFIG.format(row=int(row), column=int(column)))
+                # MintPy ignores pixels of interferograms that are 0.
+                file.create_dataset(key, data=np.nan_to_num(values) if values.ndim == 3 else values)
+    row, column = rowcol(transform, *handoff["reference_point_m"])
+    write_text(folder / "mintpy.cfg", _MINTPY_CONFIG.format(row=row, column=column))
     return [*(folder / f"inputs/{name}.h5" for name in files), folder / "mintpy.cfg"]

@@ -266,9 +266,7 @@ def with_radiometry(band: Band, tags: Mapping[str, str]) -> tuple[Band, dict[str
     return replace(band, meaning=meaning), {**tags, **readable, TAG: tag}
 
 
-def placed(
-    image: NorthUpRaster, transform: Affine, crs: str, *, axes: tuple[str, ...] = ("y", "x")
-) -> dict[str, Any]:
+def placed(image: NorthUpRaster, transform: Affine, crs: str, *, axes: tuple[str, ...] = ("y", "x")) -> dict[str, Any]:
     """Return size and georeference as keyword arguments for rasterio."""
     if len(image.shape) != len(axes):
         raise ContractError(f"image to export has shape {image.shape}, not ({', '.join(axes)})")
