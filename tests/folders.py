@@ -56,6 +56,7 @@ from apertura.stages import (
     ro_crate,
     scene,
     stac,
+    stack,
     tracks,
 )
 from apertura.stages.pair import open_pair
@@ -147,6 +148,10 @@ def run_steps(root: Path, *, exports: bool = True) -> Campaign:
         coverage.coverage(campaign)
         for name in campaign.settings.interferometry.pairs:
             interferogram.interferogram(campaign, name)
+        if requested := campaign.settings.stack:
+            for name in requested.all_flights:
+                stack.stack_image(campaign, name)
+            stack.stack(campaign)
         mosaic.mosaic(campaign)
         webmap.webmap(campaign)
         stac.stac(campaign)

@@ -60,6 +60,8 @@ def test_inputs_and_outputs_of_rules_match_lineage(tiny):
         "bench",
         "calibrate",
         "interferogram",
+        "stack",
+        "stack_image",
         "terrain",
         "tiles",
         "transfer",
@@ -72,6 +74,7 @@ def test_configured_results_change_rules_and_lineage_alike(tiny):
         tiny,
         lambda document: document.update(
             interferometry={"pairs": {"both": ["f01/uav1-uav1", "f01/uav1-uav2"]}},
+            stack={"reference": "f01", "flights": ["f02"], "pair": "uav1-uav1"},
             processing={"keep": ["echo"], "autofocus": "off", "multilook": {"spacing_m": 1.0, "subtract_noise": True}},
         ),
     )

@@ -354,6 +354,7 @@ def stack_image(campaign: Campaign, flight: str) -> list[Path]:
     )
     rasters = {
         "stack_image": referred.image,
+        "flattened_phase": np.angle(referred.image),
         "residual_phase": referred.removed_rad,
         "stack_coherence": referred.coherence,
         "expected_coherence": referred.expected,
