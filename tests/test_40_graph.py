@@ -74,7 +74,6 @@ def test_configured_results_change_rules_and_lineage_alike(tiny):
         tiny,
         lambda document: document.update(
             interferometry={"pairs": {"both": ["f01/uav1-uav1", "f01/uav1-uav2"]}},
-            stack={"reference": "f01", "flights": ["f02"], "pair": "uav1-uav1"},
             processing={"keep": ["echo"], "autofocus": "off", "multilook": {"spacing_m": 1.0, "subtract_noise": True}},
         ),
     )
