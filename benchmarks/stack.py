@@ -90,15 +90,15 @@ def main() -> None:
     parser.add_argument("--autofocus", default="off", choices=("off", "auto"))
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--keep", type=Path, default=None, help="folder in which the campaigns are kept")
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     with TemporaryDirectory() as folder:
-        for case in asked.cases:
+        for case in arguments.cases:
             offset_m, slope_mm = map(float, case.split(":"))
-            root = (asked.keep or Path(folder)) / f"offset{offset_m:g}_slope{slope_mm:g}_{asked.autofocus}"
+            root = (arguments.keep or Path(folder)) / f"offset{offset_m:g}_slope{slope_mm:g}_{arguments.autofocus}"
             print(
-                f"tracks {offset_m:g} m apart, slope {slope_mm:g} mm a flight, autofocus {asked.autofocus}", flush=True
+                f"tracks {offset_m:g} m apart, slope {slope_mm:g} mm a flight, autofocus {arguments.autofocus}", flush=True
             )
-            measured(formed(root, offset_m=offset_m, slope_mm=slope_mm, autofocus=asked.autofocus, seed=asked.seed))
+            measured(formed(root, offset_m=offset_m, slope_mm=slope_mm, autofocus=arguments.autofocus, seed=arguments.seed))
 
 
 if __name__ == "__main__":
