@@ -11,6 +11,8 @@ rule stack_image:
     output:
         "results/stack/{flight}/stack.json",
         "results/stack/{flight}/slc.tif",
+        "results/stack/{flight}/phase_flattened.tif",
+        "results/stack/{flight}/phase_flattened.qml",
         "results/stack/{flight}/residual_phase.tif",
         "results/stack/{flight}/residual_phase.qml",
         "results/stack/{flight}/coherence.tif",

@@ -322,8 +322,8 @@ def revisit(
 
     Clutter of 24 m × 24 m contains nine bright points and a slope of 5 m × 5 m. The slope moves by `slope_mm` towards
     the antennas from flight to flight. In the last flight, one target is absent, one has appeared, one is displaced by
-    20 cm and one has turned (half the amplitude, another phase). Every second track lies `offset_m` across the line of sight.
-    The logs have slowly varying errors of `error_m` per axis, different in every flight.
+    20 cm and one has turned (half the amplitude, another phase). Every second track lies `offset_m` across the line of
+    sight. The logs have slowly varying errors of `error_m` per axis, different in every flight.
 
     Parameters
     ----------

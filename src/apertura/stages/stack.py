@@ -229,7 +229,7 @@ def refer(
     corrected = (image.image * np.exp(-1j * removed.astype(np.float64))).astype(np.complex64)
     magnitude, _, looks, _ = map_coherence(corrected, reference.image, tiles, window=window)
     common = common & np.isfinite(magnitude)
-    # Expected coherence: noise, spectral overlap, and the residual track (eq. 8).
+    # Expected coherence: noise, spectral overlap, and the residual track (eq. 7).
     sensed = sensed_heights(scene, image.looks, [legs_of(one.looks) for one in (image, reference)], (low, high))
     expected = sensed.overlap
     for one in (image, reference):
@@ -355,6 +355,7 @@ def stack_image(campaign: Campaign, flight: str) -> list[Path]:
     )
     rasters = {
         "stack_image": referred.image,
+        "flattened_phase": np.angle(referred.image),
         "residual_phase": referred.removed_rad,
         "stack_coherence": referred.coherence,
         "expected_coherence": referred.expected,
@@ -407,7 +408,7 @@ def _rounded(value: float) -> float | None:
 def _baseline(
     image: StackedImage, reference: StackedImage, scene: OpenScene, sensed: Sensitivity | None
 ) -> dict[str, float | None]:
-    """Return the baseline at the scene centre (docs/theory/stack.md, eq. 9) and the height of ambiguity."""
+    """Return the baseline at the scene centre (docs/theory/stack.md, eq. 8) and the height of ambiguity."""
     row, column = (size // 2 for size in scene.grid.shape)
     middles = []
     for one in (reference, image):

@@ -1,4 +1,4 @@
-"""Residual track between two flights from the phases of windows in both images, docs/theory/stack.md, eqs. 3 to 8."""
+"""Residual track between two flights from the phases of windows in both images, docs/theory/stack.md, eqs. 3 to 6."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
