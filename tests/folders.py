@@ -56,6 +56,7 @@ from apertura.stages import (
     ro_crate,
     scene,
     stac,
+    stack,
     tracks,
 )
 from apertura.stages.pair import open_pair
@@ -127,6 +128,16 @@ def export_flight(campaign: Campaign, flight: str) -> None:
     tracks.tracks(campaign, flight)
 
 
+def relate_images(campaign: Campaign) -> None:
+    """Run the steps that relate images: interferograms and the stack."""
+    for name in campaign.settings.interferometry.pairs:
+        interferogram.interferogram(campaign, name)
+    if requested := campaign.settings.stack:
+        for name in requested.all_flights:
+            stack.stack_image(campaign, name)
+        stack.stack(campaign)
+
+
 def run_steps(root: Path, *, exports: bool = True) -> Campaign:
     """Run every step of a campaign in this process, in the order of the workflow."""
     campaign = Campaign.load(root)
@@ -145,8 +156,7 @@ def run_steps(root: Path, *, exports: bool = True) -> Campaign:
         for flight in campaign.image_flights:
             export_flight(campaign, flight.name)
         coverage.coverage(campaign)
-        for name in campaign.settings.interferometry.pairs:
-            interferogram.interferogram(campaign, name)
+        relate_images(campaign)
         mosaic.mosaic(campaign)
         webmap.webmap(campaign)
         stac.stac(campaign)

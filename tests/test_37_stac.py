@@ -77,7 +77,7 @@ def test_bands_and_inputs_are_read_from_a_raster(slc):
     assert raster_facts.bands == [
         {
             "name": "slc",
-            "description": "amplitude of the focused scene, complex, with carrier phase",
+            "description": "amplitude of the focused scene, complex, phase flattened, with spatial carrier",
             "data_type": "cfloat32",
             "raster:sampling": "area",
             "raster:spatial_resolution": 0.5,

@@ -60,6 +60,8 @@ def test_inputs_and_outputs_of_rules_match_lineage(tiny):
         "bench",
         "calibrate",
         "interferogram",
+        "stack",
+        "stack_image",
         "terrain",
         "tiles",
         "transfer",

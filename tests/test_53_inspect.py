@@ -254,7 +254,10 @@ def test_product_of_apertura_is_not_an_elevation_model(tmp_path):
     }
     write_power(tmp_path / "power.tif", np.ones((8, 9), "c8"), tags=tags, title="f01 uav1-uav2, power", **PRODUCT)
     write_slc(tmp_path / "slc.tif", np.ones((8, 9), "c8"), tags=tags, title="f01 uav1-uav2", **PRODUCT)
-    for name, values in (("power.tif", "linear (1)"), ("slc.tif", "complex, with carrier phase (1)")):
+    for name, values in (
+        ("power.tif", "linear (1)"),
+        ("slc.tif", "complex, phase flattened, with spatial carrier (1)"),
+    ):
         report = look(tmp_path / name)
         assert report.kind == "product of apertura"
         assert (report.problem, report.missing) == (None, ())

@@ -595,6 +595,31 @@ _OF_IMAGES = {
         "baseline of the tracks; changes between the flights; focus of both images",
         "methods/interferometry/comparison.py",
     ),
+    "stack_flight_excluded": Flag(
+        "reason: coherence, residual phase in rad, or fraction of the windows that follow one residual track",
+        "the flight does not fit into the stack and is left out of its list of flights",
+        "tracks and focus of the flight; baseline; changes of the terrain; processing.autofocus",
+        "methods/stack/limits.py",
+    ),
+    "stack_residual_phase": Flag(
+        "standard deviation of the residual phase over stable windows, rad; number of coherent windows",
+        "phases of the flight have errors of more than 0.3 rad on terrain that does not move",
+        "position accuracy of the logs; processing.autofocus; a DEM",
+        "methods/stack/limits.py",
+    ),
+    "stack_motion_defocuses": Flag(
+        "rms phase of the residual track over the aperture, rad",
+        "the residual track varies during the aperture: it displaces and defocuses points, which the removed phase "
+        "does not correct",
+        "processing.autofocus; position accuracy of the logs",
+        "methods/stack/limits.py",
+    ),
+    "stack_decorrelated": Flag(
+        "median coherence with the reference flight, and its expected value",
+        "the images are less coherent than noise, baseline and residual motion explain",
+        "changes of the terrain between the flights; vegetation; focus of both images",
+        "methods/stack/limits.py",
+    ),
     "height_insensitive": Flag(
         "fraction of pixels where the height of ambiguity exceeds the height range",
         "the baseline is too short to measure heights",

@@ -322,8 +322,8 @@ def revisit(
 
     Clutter of 24 m × 24 m contains nine bright points and a slope of 5 m × 5 m. The slope moves by `slope_mm` towards
     the antennas from flight to flight. In the last flight, one target is absent, one has appeared, one is displaced by
-    20 cm and one has turned (half the amplitude, another phase). Odd flights are `offset_m` farther away and higher.
-    The logs have slowly varying errors of `error_m` per axis, different in every flight.
+    20 cm and one has turned (half the amplitude, another phase). Every second track lies `offset_m` across the line of
+    sight. The logs have slowly varying errors of `error_m` per axis, different in every flight.
 
     Parameters
     ----------
@@ -340,7 +340,7 @@ def revisit(
     >>> [flight.name for flight in specification.flights], specification.flights[1].changes[0].shift_m[2] > 0
     (['f01', 'f02'], True)
     """
-    rng_m, up_m = -25.0, 25.0
+    north_m, up_m = -25.0, 25.0
     middle = np.array([5.0, 4.0, 0.0])  # of the slope
     slope = Clutter((2.5, 1.5, 7.5, 6.5), 1.0, 20.0)
     ground = [
@@ -351,7 +351,7 @@ def revisit(
     ]
     points = [PointTarget((east, north, 0.0), 8.0) for east in (-8.0, -1.0, 8.5) for north in (-9.0, -1.0, 9.0)]
     changed = [PointTarget((east, -5.0, 0.0), 4.0) for east in (-6.0, -2.0, 2.0, 6.0)]
-    towards = np.array([0.0, rng_m, up_m]) - middle
+    towards = np.array([0.0, north_m, up_m]) - middle
     towards = towards * [0.0, 1.0, 1.0] / np.linalg.norm(towards[1:])
     first = len(ground) + 1 + len(points)
     last = (
@@ -359,11 +359,11 @@ def revisit(
         TargetChange(first + 2, shift_m=(0.2, 0.1, 0.0)),
         TargetChange(first + 3, factor=-0.3 + 0.4j),
     )
-    step_m = 12.0 / pulses
+    step_m = 6.0 / pulses
     planned = []
     for number in range(flights):
         across_m = offset_m * (number % 2) * np.sqrt(0.5)
-        start = (-step_m / 2 * (pulses - 1), rng_m - across_m, up_m + across_m)
+        start = (-step_m / 2 * (pulses - 1), north_m + across_m, up_m + across_m)
         moved = towards * slope_mm * 1e-3 * number
         changes = [TargetChange(0, (moved[0], moved[1], moved[2]))] if slope_mm and number else []
         changes += last if number == flights - 1 else (TargetChange(first + 1, factor=0.0),)
@@ -385,6 +385,7 @@ def revisit(
         {"uav1": node},
         tuple(planned),
         ImageGrid(_UTM, half_width_m=11.0, spacing_m=0.125),
+        synthesis="periodic",
     )
 
 

@@ -2,7 +2,8 @@
 
 import csv
 import io
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +18,29 @@ from apertura.common.arrays import Floats
 from apertura.common.atomic import write_json, write_text
 from apertura.common.contracts import Window
 from apertura.common.errors import CampaignError
-from apertura.common.flags import Flags
 from apertura.common.provenance import Provenance, canonical_json
 from apertura.core.imaging.range_profiles import aperture_of
 from apertura.core.scene.looks import Looks
 from apertura.formats.export import write_exports
-from apertura.methods.interferometry.coherence import chance, map_coherence, unbiased
+from apertura.methods.autofocus.inputs import TrackErrors
+from apertura.methods.interferometry.coherence import box_sum, chance, map_coherence, unbiased
+from apertura.methods.interferometry.heights import least_coherence
+from apertura.methods.interferometry.sensitivity import Sensitivity
+from apertura.methods.stack.limits import FlightFit
+from apertura.methods.stack.residual_motion import (
+    LEAST_WINDOWS,
+    ResidualMotion,
+    ResidualTracks,
+    SeenAntenna,
+    WindowPhases,
+    estimate_motion,
+)
 from apertura.stages.agreement import opened_layer
 from apertura.stages.image_tags import acquisition_tags
 from apertura.stages.interferogram import legs_of, sensed_heights
 from apertura.stages.pair import OpenPair, open_pair
 from apertura.stages.planning import gated, integration_of, weighing
+from apertura.stages.refine import errors_of, open_refined
 from apertura.stages.scene import OpenScene, open_scene
 from apertura.stages.tags import tags_of
 from apertura.stages.transfer import PairEcho
@@ -55,6 +68,12 @@ _COLUMNS = (
 )
 
 
+_NODES = 1024  # lattice nodes processed at once
+_SPREAD_NODES, _DRAWS = 64, 24  # nodes and drawn residual tracks from which the variation over the aperture follows
+_SEARCH_SIGMAS = 3.0  # largest constant displacement of the search, in standard deviations of the logs
+_MOST_AMBIGUITY_M = 1e6  # a height of ambiguity above this is not stated
+
+
 @dataclass(frozen=True, eq=False)
 class StackedImage:
     """Image of a flight of the stack, with its geometry.
@@ -80,6 +99,18 @@ class StackedImage:
     noise: Floats
     stage: Any
 
+    def places(self, scene: OpenScene, row: NDArray[Any], column: NDArray[Any]) -> tuple[Floats, list[SeenAntenna]]:
+        """Return the positions of pixels on the terrain, and the antennas at the pulses that form them."""
+        lattice = self.looks.lattice
+        nearest = (np.abs(at[:, None] - px).argmin(axis=0) for at, px in zip(lattice.nodes, (row, column), strict=True))
+        pulses = self.looks.pulses[tuple(nearest)].astype(np.int64)
+        time_s, legs = (
+            self.opened.time_s[pulses],
+            zip(self.opened.name.split("-"), self.looks.aperture.legs, strict=True),
+        )
+        antennas = [SeenAntenna(node, leg[pulses], time_s) for node, leg in legs]
+        return scene.terrain.positions_at(scene.grid, row, column), antennas
+
 
 def open_stacked(campaign: Campaign, flight: str, pair: str, scene: OpenScene) -> StackedImage:
     """Open the image of a flight of the stack."""
@@ -90,10 +121,192 @@ def open_stacked(campaign: Campaign, flight: str, pair: str, scene: OpenScene) -
     stage = open_stage(campaign.stage("image", flight, pair), "image")
     with opened_layer(campaign, flight, pair, "mask.tif") as raster:
         visible, pulse_noise = raster.read(1) == 0, float(raster.tags()["APERTURA_PULSE_NOISE"])
-    whole: Window = (slice(0, scene.grid.shape[0]), slice(0, scene.grid.shape[1]))
     # a pixel is Σw·profile over the count of integrated pulses: its noise power is Σw² times that of one pulse
-    noise = pulse_noise / integration_of(campaign, opened, scene).count ** 2 * looks.weight_squares(whole)
+    noise = pulse_noise / integration_of(campaign, opened, scene).count ** 2 * looks.weight_squares(whole_of(scene))
     return StackedImage(opened, looks, stage.image.values, visible, np.asarray(noise, np.float64), stage)
+
+
+# ---- Phase of a flight referred to the reference --------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Referred:
+    """Image of a flight without the phase of its residual track.
+
+    Attributes
+    ----------
+    image
+        (y, x) complex64.
+    removed_rad, coherence, expected
+        (y, x) float32: removed phase; measured and expected coherence with the reference, NaN where not common.
+    looks
+        Independent samples of a window.
+    fit
+        Measures of the fit, from which the flags follow.
+    track
+        Estimated residual track, for stack.json.
+    sensed
+        Sensitivity of the phase to height; None for the reference.
+    """
+
+    image: NDArray[np.complex64]
+    removed_rad: NDArray[np.float32]
+    coherence: NDArray[np.float32]
+    expected: NDArray[np.float32]
+    looks: float
+    fit: FlightFit
+    track: Mapping[str, Any]
+    sensed: Sensitivity | None = None
+
+    @classmethod
+    def unchanged(cls, image: NDArray[np.complex64], common: NDArray[np.bool_]) -> "Referred":
+        """Return the reference itself."""
+        one = np.where(common, np.float32(1), np.float32(np.nan))
+        fit = FlightFit(0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0)
+        return cls(image, np.zeros(image.shape, np.float32), one, one, np.nan, fit, {})
+
+
+def refer(
+    image: StackedImage,
+    reference: StackedImage,
+    scene: OpenScene,
+    errors: Mapping[str, TrackErrors],
+    common: NDArray[np.bool_],
+    *,
+    tiles: Sequence[Window],
+    window: int,
+) -> Referred:
+    """Estimate the residual track between two flights and remove its phase from the image.
+
+    Parameters
+    ----------
+    image, reference
+        Images of a flight and of the reference flight.
+    scene
+        Scene with grid and terrain.
+    errors
+        Node → errors of the difference between its logs of both flights.
+    common
+        (y, x) bool, pixels of both images.
+    tiles, window
+        Windows that cover the grid, and side of the window of coherence, pixels.
+
+    Notes
+    -----
+    Source: docs/theory/stack.md.
+    """
+    low, high = float(image.opened.frequency_hz.min()), float(image.opened.frequency_hz.max())
+    wavenumber = np.pi * (low + high) / image.opened.wave_speed_m_s
+    lattice = image.looks.lattice
+    node_rows, node_columns = (at.ravel() for at in np.meshgrid(*lattice.nodes, indexing="ij"))
+    nodes_m, of_nodes = image.places(scene, node_rows, node_columns)
+    tracks = ResidualTracks.of(errors, scene.axes, of_nodes, wavenumber)
+    looks = map_coherence(image.image, reference.image, tiles, window=window)[2]
+    phases = WindowPhases.of(image.image, reference.image, common, window=window, looks=looks)
+    motion, failure, spread = None, "", 0.0
+    removed = np.zeros(scene.grid.shape, np.float32)
+    if len(phases) < LEAST_WINDOWS:
+        failure = f"{len(phases)} windows of significant coherence, less than {LEAST_WINDOWS}"
+    else:
+        places_m, antennas = image.places(scene, phases.row, phases.column)
+        radius_m = min(_SEARCH_SIGMAS * max(max(*error.std_m, error.drift_std_m) for error in errors.values()), 1.0)
+        constants = tracks.constant_phase(places_m, antennas)
+        motion = estimate_motion(phases, tracks.phase(places_m, antennas), constants, radius_m=radius_m)
+        # Phase at the nodes of the lattice, in blocks, and between them (eq. 4).
+        at_nodes = np.empty(len(nodes_m))
+        for start in range(0, len(nodes_m), _NODES):
+            part = slice(start, start + _NODES)
+            some = [replace(one, position_m=one.position_m[part], time_s=one.time_s[part]) for one in of_nodes]
+            at_nodes[part] = tracks.phase(nodes_m[part], some) @ motion.unknowns + motion.constant_rad
+        removed = lattice.between(at_nodes.reshape(lattice.shape), whole_of(scene)).astype(np.float32)
+        # Variation over the aperture, which the removed phase does not correct (eq. 7).
+        few = slice(None, None, max(1, len(nodes_m) // _SPREAD_NODES))
+        some = [replace(one, position_m=one.position_m[few], time_s=one.time_s[few]) for one in of_nodes]
+        root = np.linalg.cholesky(motion.covariance + 1e-12 * np.eye(len(motion.covariance)))
+        draws = np.random.default_rng(0).standard_normal((_DRAWS, len(root))) @ root.T + motion.unknowns
+        spread = float(np.sqrt(tracks.spread(nodes_m[few], some, draws).mean()))
+    corrected = (image.image * np.exp(-1j * removed.astype(np.float64))).astype(np.complex64)
+    magnitude, _, looks, _ = map_coherence(corrected, reference.image, tiles, window=window)
+    common = common & np.isfinite(magnitude)
+    # Expected coherence: noise, spectral overlap, and the residual track (eq. 7).
+    sensed = sensed_heights(scene, image.looks, [legs_of(one.looks) for one in (image, reference)], (low, high))
+    expected = sensed.overlap
+    for one in (image, reference):
+        power = box_sum(np.abs(np.where(common, one.image, 0)).astype(np.float64) ** 2, window)
+        noise = box_sum(np.where(common & np.isfinite(one.noise), one.noise, 0.0), window)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            expected = expected * np.sqrt(np.clip(1 - noise / power, 0.0, 1.0))
+    known = unbiased(magnitude, looks) if looks > 1 else magnitude
+    if common.any():
+        # loss common to the scene, as far as the residual track can explain it
+        share = float(np.median((known / np.maximum(expected, 1e-3))[common]))
+        explained = float(np.clip(share, np.exp(-(spread**2) / 2), 1.0))
+        expected, spread = expected * explained, float(np.sqrt(-2 * np.log(explained)))
+    fit = FlightFit(
+        np.inf if motion is None else motion.std_rad,
+        spread,
+        coherence=float(np.median(known[common])) if common.any() else np.nan,
+        expected=float(np.median(expected[common])) if common.any() else np.nan,
+        coherent=float((magnitude > least_coherence(looks))[common].mean()) if common.any() and looks > 1 else 0.0,
+        stable=0.0 if motion is None else motion.stable_fraction,
+        windows=len(phases),
+        failure=failure,
+    )
+    return Referred(
+        corrected,
+        removed,
+        np.where(common, magnitude, np.nan).astype(np.float32),
+        np.where(common, expected, np.nan).astype(np.float32),
+        looks,
+        fit,
+        {} if motion is None else _track_report(motion, tracks, spread),
+        sensed,
+    )
+
+
+def _track_report(motion: ResidualMotion, tracks: ResidualTracks, spread_rad: float) -> dict[str, Any]:
+    """Return the residual track for stack.json: knots, displacements east, north and up, and their accuracy."""
+    moved = tracks.prior.tracks(motion.unknowns)
+    return {
+        "constant_rad": round(motion.constant_rad, 4),
+        "prior_scale": round(motion.scale, 3),
+        "parameters": round(motion.parameters, 2),
+        "spread_rad": round(spread_rad, 4),
+        "stable_fraction": round(motion.stable_fraction, 4),
+        "time_s": np.round(tracks.knots_s, 4).tolist(),
+        "displacement_m": {
+            node: np.round(moved[node] @ prior.axes.T, 5).tolist() for node, prior in tracks.prior.nodes.items()
+        },
+    }
+
+
+def whole_of(scene: OpenScene) -> Window:
+    """Return the window of the whole grid."""
+    return slice(0, scene.grid.shape[0]), slice(0, scene.grid.shape[1])
+
+
+def _errors(campaign: Campaign, *pairs: OpenPair) -> dict[str, TrackErrors]:
+    """Return node → errors of the difference between its positions in two flights, which are independent."""
+    of_flights = []
+    for pair in pairs:
+        refined, own = open_refined(campaign, pair.flight), errors_of([pair])
+        time = pair.began + (pair.time_s * 1e9).astype("timedelta64[ns]")
+        for node, stated in own.items():
+            residual_m = refined.left_m(node, time)
+            if np.isfinite(residual_m).any():
+                std_m = float(np.sqrt(np.nanmean(residual_m**2)))
+                own = {**own, node: replace(stated, std_m=(std_m,) * 3, drift_std_m=std_m)}
+        of_flights.append(own)
+    both = {}
+    for node in of_flights[0]:
+        one, other = (own[node] for own in of_flights)
+        east, north, up = np.hypot(one.std_m, other.std_m).tolist()
+        longest_s = max(one.correlation_s, other.correlation_s)
+        both[node] = TrackErrors((east, north, up), longest_s, float(np.hypot(one.drift_std_m, other.drift_std_m)))
+    return both
+
+
+# ---- Rules ----------------------------------------------------------------------------------------------------------
 
 
 def stack_image(campaign: Campaign, flight: str) -> list[Path]:
@@ -106,41 +319,33 @@ def stack_image(campaign: Campaign, flight: str) -> list[Path]:
     flight
         The reference or another flight of the stack.
     """
-    requested = _requested(campaign)
-    scene = open_scene(campaign)
+    requested, scene = _requested(campaign), open_scene(campaign)
     lineage = result_of(campaign, "stack_image", flight).begin(campaign.root)
     reference = open_stacked(campaign, requested.reference, requested.pair, scene)
     image = reference if flight == requested.reference else open_stacked(campaign, flight, requested.pair, scene)
     tiles = list(scene.grid.tiles(campaign.settings.processing.tile_px))
-    magnitude, phase, looks, _ = map_coherence(image.image, reference.image, tiles, window=requested.window_px)
-    common = reference.visible & image.visible & np.isfinite(magnitude)
+    common = reference.visible & image.visible & np.isfinite(image.image) & np.isfinite(reference.image)
     if image is reference:
-        removed = np.zeros(scene.grid.shape, np.float32)
-        expected = np.where(common, 1.0, np.nan)
+        referred = Referred.unchanged(image.image, common)
     else:
-        sum_of_phasors = (magnitude * np.exp(1j * phase.astype(np.float64)))[common].sum()
-        removed = np.full(scene.grid.shape, np.angle(sum_of_phasors), np.float32)
-        band = (float(image.opened.frequency_hz.min()), float(image.opened.frequency_hz.max()))
-        legs = [legs_of(one.looks) for one in (image, reference)]
-        expected = sensed_heights(scene, image.looks, legs, band).overlap
-    corrected = (image.image * np.exp(-1j * removed.astype(np.float64))).astype(np.complex64)
+        errors = _errors(campaign, image.opened, reference.opened)
+        referred = refer(image, reference, scene, errors, common, tiles=tiles, window=requested.window_px)
+    fit = referred.fit
     report = {
         "flight": flight,
         "pair": requested.pair,
         "reference": requested.reference,
-        "used": True,
-        "reason": None,
-        "residual_track": {"terms": {"constant": float(removed[0, 0])}},
-        "residual_phase_std_rad": 0.0,
-        "perpendicular_baseline_m": 0.0,
-        "along_track_offset_m": 0.0,
-        "height_of_ambiguity_m": None,
+        "used": fit.reason is None,
+        "reason": fit.reason,
+        "residual_track": referred.track,
+        "residual_phase_std_rad": round(fit.residual_rad, 4) if np.isfinite(fit.residual_rad) else None,
+        **_baseline(image, reference, scene, referred.sensed),
         **_times(image, reference),
-        "coherence": _median(unbiased(magnitude, looks) if looks > 1 else magnitude, common),
-        "expected_coherence": _median(expected, common),
-        "looks": round(looks, 3) if np.isfinite(looks) else None,
-        "chance": round(chance(looks), 4) if looks > 1 else 1.0,
-        "flags": Flags(),
+        "coherence": _rounded(fit.coherence),
+        "expected_coherence": _rounded(fit.expected),
+        "looks": _rounded(referred.looks),
+        "chance": round(chance(referred.looks), 4) if referred.looks > 1 else 1.0,
+        "flags": fit.flags,
     }
     origin = Provenance.of(
         lineage.modules,
@@ -148,10 +353,11 @@ def stack_image(campaign: Campaign, flight: str) -> list[Path]:
         settings=lineage.result.settings,
     )
     rasters = {
-        "stack_image": corrected,
-        "residual_phase": removed,
-        "stack_coherence": np.where(common, magnitude, np.nan).astype(np.float32),
-        "expected_coherence": np.where(common, expected, np.nan).astype(np.float32),
+        "stack_image": referred.image,
+        "flattened_phase": np.angle(referred.image),
+        "residual_phase": referred.removed_rad,
+        "stack_coherence": referred.coherence,
+        "expected_coherence": referred.expected,
     }
     title = f"{campaign.settings.campaign} · stack of {requested.pair} · {flight}"
     folder = campaign.result(STACK, flight)
@@ -192,9 +398,31 @@ def _times(image: StackedImage, reference: StackedImage) -> dict[str, Any]:
     return {"acquisition": stated, "temporal_baseline_days": round(days, 6)}
 
 
-def _median(values: NDArray[Any], common: NDArray[np.bool_]) -> float | None:
-    known = values[common & np.isfinite(values)]
-    return round(float(np.median(known)), 4) if known.size else None
+def _rounded(value: float) -> float | None:
+    return round(value, 4) if np.isfinite(value) else None
+
+
+def _baseline(
+    image: StackedImage, reference: StackedImage, scene: OpenScene, sensed: Sensitivity | None
+) -> dict[str, float | None]:
+    """Return the baseline at the scene centre (docs/theory/stack.md, eq. 8) and the height of ambiguity."""
+    row, column = (size // 2 for size in scene.grid.shape)
+    middles = []
+    for one in (reference, image):
+        place, at = one.places(scene, np.array([row]), np.array([column]))
+        middles.append(np.mean([antenna.position_m[0] for antenna in at], axis=0))
+    offset = middles[1].mean(axis=0) - middles[0].mean(axis=0)
+    along = middles[0][-1] - middles[0][0]
+    along /= max(float(np.linalg.norm(along)), 1e-9)
+    sight = middles[0].mean(axis=0) - place[0]
+    across = np.cross(sight, along)
+    across *= np.copysign(1.0, across @ scene.axes[2]) / max(float(np.linalg.norm(across)), 1e-9)
+    ambiguity_m = np.inf if sensed is None else float(sensed.ambiguity_m[row, column])
+    return {
+        "perpendicular_baseline_m": round(float(offset @ across), 4),
+        "along_track_offset_m": round(float(offset @ along), 4),
+        "height_of_ambiguity_m": round(ambiguity_m, 3) if ambiguity_m < _MOST_AMBIGUITY_M else None,
+    }
 
 
 def _tags(report: dict[str, Any]) -> dict[str, str]:

@@ -21,7 +21,7 @@ from apertura.views.quality import (
     read_report,
 )
 from apertura.workflow.lineage import on_demand
-from apertura.workflow.rules import INTERFEROMETRY
+from apertura.workflow.rules import INTERFEROMETRY, STACK
 from apertura.workflow.stale import absent_lines, stale_results
 
 if TYPE_CHECKING:
@@ -80,10 +80,10 @@ def print_summary(campaign: Campaign) -> None:
             f"not in the error budget, because their uncertainty is not configured: {', '.join(not_stated)}; see "
             "image.json"
         )
-    interferograms = dict(_interferograms(campaign))
-    for name, report in interferograms.items():
-        console.print(f"interferogram {name.removeprefix(f'{INTERFEROMETRY} ')}: {report['says']}", soft_wrap=True)
-    _print_flags(console, {**reports, **interferograms})
+    between = {**dict(_interferograms(campaign)), **dict(_stacked(campaign))}
+    for name, report in between.items():
+        console.print(f"{name.replace(INTERFEROMETRY, 'interferogram', 1)}: {report['says']}", soft_wrap=True)
+    _print_flags(console, {**reports, **between})
     if missing := [" ".join(image) for image in names if image not in current]:
         console.print(f"missing or out of date: {_abbreviated(missing)}; `apertura run` computes them", soft_wrap=True)
     print_products(campaign)
@@ -144,6 +144,25 @@ def _interferograms(campaign: Campaign) -> Iterator[tuple[str, dict[str, Any]]]:
             with undamaged(path, expected="the report of an interferogram", remedy="Run the workflow again."):
                 entry = {"says": shown(report["says"], 400), "flags": printable(report["flags"])}
             yield f"{INTERFEROMETRY} {name}", entry
+
+
+def _stacked(campaign: Campaign) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield name and summary of each up-to-date flight of the stack, except the reference."""
+    stack = campaign.settings.stack
+    for flight in stack.flights if stack else ():
+        path = campaign.result(STACK, flight, "stack.json")
+        if campaign.is_current(campaign.result(STACK, flight, "stack_image")):
+            report = open_listed(path, path.with_name("stack_image.manifest.json"))
+            with undamaged(path, expected="the report of a flight of the stack", remedy="Run the workflow again."):
+                says = f"left out: {report['reason']}"
+                if report["used"]:
+                    says = (
+                        f"perpendicular baseline {report['perpendicular_baseline_m']:.2f} m, coherence "
+                        f"{report['coherence']:.2f} ({report['expected_coherence']:.2f} expected), residual phase "
+                        f"{report['residual_phase_std_rad']:.2f} rad"
+                    )
+                entry = {"says": shown(says, 400), "flags": printable(report["flags"])}
+            yield f"{STACK} {flight}", entry
 
 
 def _abbreviated(names: Sequence[str], most: int = 3) -> str:

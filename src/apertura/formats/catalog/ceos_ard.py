@@ -386,7 +386,13 @@ REQUIREMENTS: Sequence[Requirement] = (
         _R("radtalg-appl", "Radiometric terrain correction algorithm", _gamma0("gamma0_power.tif"), None, _NRB),
         _R("radtalg-min", "Radiometric terrain correction algorithm", None, _NO_DEM_RESOLUTION, _GSLC),
         _R("radacc-sar", "Radiometric accuracy", None, _never("no document with a DOI; see radiometry.json, std_db")),
-        _R("flapha", "Flattened phase", None, _inapplicable("slc.tif contains amplitude and phase"), _NRB),
+        _R(
+            "flapha",
+            "Flattened phase",
+            None,
+            _inapplicable("the phase of slc.tif is flattened: tag APERTURA_PHASE"),
+            _NRB,
+        ),
     ),
     *_section(
         "geometric corrections",

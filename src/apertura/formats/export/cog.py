@@ -1,4 +1,4 @@
-"""Export of images as cloud-optimised GeoTIFF: complex with carrier phase (`slc`), and power for measurements.
+"""Export of images as cloud-optimised GeoTIFF: complex with spatial carrier (`slc`), and power for measurements.
 
 Pixels are processed in blocks, so that an image much larger than memory can be read tile by tile from zarr or dask.
 Output contains no time stamps: identical inputs give identical bytes.
@@ -77,12 +77,13 @@ class Band:
     smooth: bool = False
 
 
-SLC = Band("complex64", np.nan, "1", "{amplitude}, complex, with carrier phase", "AVERAGE_MAGPHASE")
+SLC = Band("complex64", np.nan, "1", "{amplitude}, complex, phase flattened, with spatial carrier", "AVERAGE_MAGPHASE")
 PHASE = (
-    "with carrier: within the response of a point, the phase increases by 1 cycle per wavelength of total path at the "
-    "centre frequency; flat-earth and terrain phase are not removed"
+    "flattened: the phase of the path to the pixel's own position on the terrain is removed, so that flat-earth and "
+    "terrain phase are absent; within the response of a point, the spatial carrier remains: the phase increases by 1 "
+    "cycle per wavelength of total path at the centre frequency"
 )
-"""Phase convention of complex images, a tag of their files (docs/theory.md, eq. 4)."""
+"""Phase convention of complex images, a tag of their files (docs/theory/stack.md, eqs. 1 and 2)."""
 
 MAGNITUDE = Band("float32", np.nan, "1", "{amplitude}", "AVERAGE")
 POWER = Band("float32", np.nan, "1", "{power}, linear", "AVERAGE")
@@ -91,7 +92,7 @@ POWER = Band("float32", np.nan, "1", "{power}, linear", "AVERAGE")
 def write_slc(
     path: Path, image: NorthUpRaster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write the complex image unchanged, with carrier phase, as a CFloat32 COG.
+    """Write the complex image unchanged, with its spatial carrier, as a CFloat32 COG.
 
     Overviews contain the mean magnitude and the phase of the complex mean. The magnitude of the complex mean is not
     used, because the carrier phase changes from pixel to pixel, so that pixels would cancel.

@@ -1,4 +1,4 @@
-"""Export of the rasters of a stack: residual phase, measured and expected coherence with the reference flight."""
+"""Export of the rasters of a stack: flattened and residual phase, measured and expected coherence."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,11 +8,21 @@ from rasterio import Affine
 
 from apertura.formats.export.cog import Band, NorthUpRaster, write_cog
 
+FLATTENED = Band(
+    "float32", np.nan, "rad", "flattened phase of slc.tif, without the phase of the residual track", "NEAREST"
+)
 RESIDUAL_PHASE = Band(
     "float32", np.nan, "rad", "phase of the residual track, removed from the image", "AVERAGE", smooth=True
 )
 COHERENCE = Band("float32", np.nan, "1", "estimated coherence with the reference flight of the stack", "AVERAGE")
 EXPECTED = Band("float32", np.nan, "1", "coherence expected from noise, spectral overlap and residual phase", "AVERAGE")
+
+
+def write_flattened_phase(
+    path: Path, phase_rad: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+) -> None:
+    """Write the flattened phase of an image, (y, x) float32 rad. Otherwise as `write_residual_phase`."""
+    write_cog(path, phase_rad, FLATTENED, transform=transform, crs=crs, tags=tags, title=title)
 
 
 def write_residual_phase(
