@@ -172,14 +172,15 @@ def test_regions_list_what_appeared_and_vanished_with_confidence():
         assert (labels == region.number).sum() == region.pixels
 
 
+@pytest.mark.slow
 def test_expected_number_of_false_regions_is_an_upper_limit():
-    expected = 0.5
-    scenes, found = 40, 0
+    expected = 2.0
+    scenes, found = 12, 0
     for number in range(scenes):
         first, second = speckle(np.random.default_rng(number), 160, 0.9)
         changes = detect_changes(first, second, np.full(first.shape, 0.9), window=WINDOW, rate=1e-2)
         found += sum(region.expected_false < expected for region in change_regions(changes, window=WINDOW)[0])
-    assert 0 < found < scenes * expected + 3 * np.sqrt(scenes * expected)
+    assert 0.1 * scenes * expected < found < scenes * expected + 3 * np.sqrt(scenes * expected)
 
 
 def test_windows_without_data_are_not_classified():
@@ -201,7 +202,7 @@ def test_windows_without_data_are_not_classified():
         (WINDOW, 0.95, 0.95, []),
         (1, 0.95, 0.95, ["change_looks"]),
         (WINDOW, 0.3, 0.3, ["change_insensitive"]),
-        (WINDOW, 0.6, 0.95, ["change_decorrelated"]),
+        (2 * WINDOW + 1, 0.8, 0.95, ["change_decorrelated"]),
     ],
 )
 def test_limits_are_flagged(window, coherence, expected, flags):

@@ -52,6 +52,11 @@ SOURCES: Mapping[str, str] = {
     "residual_phase": "stack",
     "stack_coherence": "stack",
     "expected_coherence": "stack",
+    "amplitude_ratio": "change",
+    "coherence_loss": "change",
+    "change": "change",
+    "change_regions": "change",
+    "change_panels": "change",
 }
 """Source raster of a file → kind of folder that contains the file.
 
@@ -64,7 +69,9 @@ incidence angle from the vertical. Rasters of multilook exist if requested; thei
 blocks of pixels, on a coarser grid. ``multilook_noise`` is the mean noise power that is subtracted from the echo power.
 Rasters of an interferogram are computed from two images; ``panels`` is a mapping from their names to these rasters.
 ``stack_image`` is the complex image of a flight of the stack without the residual phase; the other rasters of the stack
-are that phase, and the measured and the expected coherence with the reference flight.
+are that phase, and the measured and the expected coherence with the reference flight. Rasters of a change are computed
+from an image of the stack and the reference; ``change_regions`` are polygons, ``change_panels`` is a mapping from the
+names of the rasters to the rasters.
 """
 
 
@@ -207,6 +214,14 @@ EXPORTS: tuple[Export, ...] = (
     Export("coherence.qml", "stack_coherence", _WRITERS.style.write_layer_style),
     Export("expected_coherence.tif", "expected_coherence", _WRITERS.stack.write_expected_coherence),
     Export("expected_coherence.qml", "expected_coherence", _WRITERS.style.write_layer_style),
+    Export("amplitude_ratio.tif", "amplitude_ratio", _WRITERS.change.write_amplitude_ratio),
+    Export("amplitude_ratio.qml", "amplitude_ratio", _WRITERS.style.write_ratio_style),
+    Export("coherence_loss.tif", "coherence_loss", _WRITERS.change.write_coherence_loss),
+    Export("coherence_loss.qml", "coherence_loss", _WRITERS.style.write_layer_style),
+    Export("change.tif", "change", _WRITERS.change.write_change),
+    Export("change.qml", "change", _WRITERS.style.write_change_style),
+    Export("change_regions.gpkg", "change_regions", _WRITERS.change.write_regions, opened="changes, in a GIS"),
+    Export("change.png", "change_panels", _WRITERS.change_picture.write_change_panels, pictured=True),
     *_ADDED,
 )
 """All products of a pair or of a flight's sums, in the order in which they are written."""
@@ -230,7 +245,7 @@ MAP = "map/map.json"
 
 
 def exports_in(folder: str) -> Iterator[Export]:
-    """Yield the rows of a kind: ``pair``, ``fused``, ``layers``, ``interferogram`` or ``stack``.
+    """Yield the rows of a kind: ``pair``, ``fused``, ``layers``, ``interferogram``, ``stack`` or ``change``.
 
     Examples
     --------

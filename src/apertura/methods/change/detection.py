@@ -39,6 +39,7 @@ LEAST_SCENE_RATIO = 0.9
 _SURROUNDINGS = 5  # windows along a side of the surroundings in which a lower coherence is recognised
 _SIGNIFICANT = 3.0  # standard deviations by which the coherence of the surroundings is lower than expected
 _STABLE = 0.75  # quantile at which measured and expected coherence are compared; most of the scene may be changed
+_POWER = 0.99  # share of the power in the modes that are counted as independent samples
 _SAMPLES = 100_000  # pixels from which the coherence ratio of the scene is estimated
 
 
@@ -60,6 +61,8 @@ class Changes:
         (y, x) float64, probability of a change as significant as measured in unchanged terrain; NaN without data.
     looks, matched
         Number of looks of a window, and number for the probabilities at the false-alarm rate.
+    samples
+        Number of independent samples of a window: modes that contain 99 % of its power.
     gain_db
         Power of the second image over that of the first, median of the scene, dB.
     scene_ratio
@@ -77,6 +80,7 @@ class Changes:
     probability: Floats
     looks: float
     matched: float
+    samples: int
     gain_db: float
     scene_ratio: float
     expected: float
@@ -87,9 +91,9 @@ class Changes:
         """Number of pixels with data."""
         return int((self.classes != NO_DATA).sum())
 
-    def independent_looks(self, window: int) -> float:
-        """Return the number of independent looks of the valid pixels, docs/theory/change.md, eq. 8."""
-        return self.valid * self.looks / window**2
+    def tests(self, window: int) -> float:
+        """Return the number of independent samples of the valid pixels, docs/theory/change.md, eq. 8."""
+        return self.valid * self.samples / window**2
 
 
 def detect_changes(
@@ -152,7 +156,7 @@ def detect_changes(
     log_ratio -= gain
     # Coherence of unchanged terrain (eq. 5), and that of decorrelated surroundings for the ratio (eq. 3).
     distribution = CoherenceDistribution(round(matched, 2))
-    scene_ratio = _scene_ratio(distribution, estimate, explained)
+    scene_ratio = _scene_ratio(modes, estimate, explained)
     unchanged = np.clip(scene_ratio * explained, 0, MOST_COHERENCE)
     surrounding = _surroundings(magnitude, valid, window, looks).ravel()[at]
     deviation = 2 * unchanged * (1 - unchanged**2) / np.sqrt(2 * looks * _SURROUNDINGS**2)
@@ -192,6 +196,7 @@ def detect_changes(
         probability=plane(probability, np.float64),
         looks=looks,
         matched=matched,
+        samples=int(np.searchsorted(np.cumsum(np.sort(modes)[::-1]), _POWER)) + 1,
         gain_db=10 / np.log(10) * gain,
         scene_ratio=scene_ratio,
         expected=level,
@@ -203,11 +208,12 @@ def _no_changes(shape: tuple[int, ...], looks: float) -> Changes:
     """Return a result without valid pixels."""
     empty = np.full(shape, np.nan, np.float32)
     none = np.full(shape, NO_DATA, np.uint8)
-    return Changes(none, empty, empty, empty, empty.astype(np.float64), looks, looks, 0.0, 1.0, 0.0, 0.0)
+    return Changes(none, empty, empty, empty, empty.astype(np.float64), looks, looks, 1, 0.0, 1.0, 0.0, 0.0)
 
 
-def _scene_ratio(distribution: CoherenceDistribution, estimate: Floats, explained: Floats) -> float:
+def _scene_ratio(modes: Floats, estimate: Floats, explained: Floats) -> float:
     """Return the factor of the expected coherence at which a quantile of the scene equals its probability, eq. 5."""
+    distribution = CoherenceDistribution(round(min(matched_looks(modes, 2 * (1 - _STABLE)), MOST_LOOKS), 2))
     step = max(1, len(estimate) // _SAMPLES)
     low, high = 0.0, 1.0 / max(float(np.median(explained)), 1e-3)
     for _ in range(20):
@@ -346,7 +352,7 @@ def change_regions(
     kept = np.bincount(labels.ravel(), minlength=count + 1) >= least_pixels
     kept[0] = False
     labels = (np.cumsum(kept) * kept).astype(np.int32)[labels]
-    tests = changes.independent_looks(window)
+    tests = changes.tests(window)
     regions = []
     for number, box in enumerate(scipy.ndimage.find_objects(labels), start=1):
         inside = labels[box] == number
