@@ -42,6 +42,7 @@ from apertura.simulation.specification import DrawnCampaign, draw_campaign
 from apertura.simulation.targets import scatterers
 from apertura.stages import (
     assess,
+    change,
     coverage,
     cube,
     echo,
@@ -136,6 +137,8 @@ def relate_images(campaign: Campaign) -> None:
         for name in requested.all_flights:
             stack.stack_image(campaign, name)
         stack.stack(campaign)
+        for name in requested.flights:
+            change.change(campaign, name)
 
 
 def run_steps(root: Path, *, exports: bool = True) -> Campaign:

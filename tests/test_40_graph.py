@@ -60,6 +60,7 @@ def test_inputs_and_outputs_of_rules_match_lineage(tiny):
         "bench",
         "calibrate",
         "interferogram",
+        "change",
         "stack",
         "stack_image",
         "terrain",

@@ -86,6 +86,7 @@ def test_memory_requests_cover_use_and_are_below_four_times_it(run_by_snakemake)
         "cphd",
         "transfer",
         "interferogram",
+        "change",
         "stack",
         "stack_image",
         "speed_accuracy",

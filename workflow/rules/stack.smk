@@ -62,3 +62,43 @@ rule stack:
         "listing the baselines of the stack"
     shell:
         "apertura step stack > {log} 2>&1"
+
+
+rule change:
+    input:
+        stack_image="results/stack/{flight}/stack_image.manifest.json",
+        reference=files(inputs.stack_reference, STACKED),
+        image=each("results/{flight}/{pair}/image.manifest.json", STACKED),
+        scene="results/scene.manifest.json",
+    output:
+        "results/stack/{flight}/change.json",
+        "results/stack/{flight}/amplitude_ratio.tif",
+        "results/stack/{flight}/amplitude_ratio.qml",
+        "results/stack/{flight}/coherence_loss.tif",
+        "results/stack/{flight}/coherence_loss.qml",
+        "results/stack/{flight}/change.tif",
+        "results/stack/{flight}/change.qml",
+        "results/stack/{flight}/change_regions.gpkg",
+        report(
+            "results/stack/{flight}/change.png",
+            caption="../report/change.rst",
+            category="changes",
+            labels={"flight": "{flight}"},
+        ),
+        added_files("change"),
+        "results/stack/{flight}/change.manifest.json",
+    log:
+        "results/logs/stack/{flight}.change.log",
+    benchmark:
+        "results/benchmarks/stack/{flight}.change.tsv"
+    conda:
+        "../../environment.yml"
+    threads: job["change"].threads
+    resources:
+        **job["change"].resources,
+    params:
+        **job["change"].params,
+    message:
+        "{wildcards.flight}: detecting changes relative to the reference flight of the stack"
+    shell:
+        "apertura step change {wildcards.flight} > {log} 2>&1"

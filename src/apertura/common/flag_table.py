@@ -645,6 +645,24 @@ _OF_IMAGES = {
         "scene.reference_points",
         "methods/interferometry/comparison.py",
     ),
+    "change_looks": Flag(
+        "looks of a window and the required number",
+        "the window has too few looks: no change is detected",
+        "a wider stack.window_px",
+        "methods/change/detection.py",
+    ),
+    "change_insensitive": Flag(
+        "expected coherence; largest significant estimate and mean estimate of other scatterers",
+        "the explained coherence is too low to detect replaced scatterers: only changes of amplitude are detected",
+        "a shorter baseline; a higher SNR; a wider stack.window_px; a higher stack.change.false_alarm_rate",
+        "methods/change/detection.py",
+    ),
+    "change_decorrelated": Flag(
+        "coherence of the scene relative to the expected coherence",
+        "the whole scene lost coherence, for example by vegetation or rain: only larger local losses are reported",
+        "time between the flights; focus of both images; residual phase of the stack",
+        "methods/change/detection.py",
+    ),
 }
 """Flags of images: name → row."""
 

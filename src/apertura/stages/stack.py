@@ -320,7 +320,7 @@ def stack_image(campaign: Campaign, flight: str) -> list[Path]:
     flight
         The reference or another flight of the stack.
     """
-    requested, scene = _requested(campaign), open_scene(campaign)
+    requested, scene = requested_stack(campaign), open_scene(campaign)
     lineage = result_of(campaign, "stack_image", flight).begin(campaign.root)
     reference = open_stacked(campaign, requested.reference, requested.pair, scene)
     image = reference if flight == requested.reference else open_stacked(campaign, flight, requested.pair, scene)
@@ -380,7 +380,8 @@ def stack_image(campaign: Campaign, flight: str) -> list[Path]:
     return written
 
 
-def _requested(campaign: Campaign) -> Stack:
+def requested_stack(campaign: Campaign) -> Stack:
+    """Return the section `stack` of the config."""
     requested = campaign.settings.stack
     if requested is None:
         raise CampaignError(
@@ -440,7 +441,7 @@ def _tags(report: dict[str, Any]) -> dict[str, str]:
 
 def stack(campaign: Campaign) -> list[Path]:
     """Write results/stack/baselines.csv and stack.json from the reports of all flights of the stack."""
-    requested = _requested(campaign)
+    requested = requested_stack(campaign)
     lineage = result_of(campaign, "stack").begin(campaign.root)
     reports = [
         open_listed(

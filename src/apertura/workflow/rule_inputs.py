@@ -125,6 +125,18 @@ def stacked_pairs(campaign: "Campaign", flight: str) -> list[tuple[str, str]]:
     return [(name, stack.pair) for name in dict.fromkeys((stack.reference, flight))]
 
 
+def has_reference(scope: JobScope) -> bool:
+    """Return True for a flight of the stack other than the reference."""
+    stack = scope.campaign.settings.stack
+    return stack is not None and scope.where[0] != stack.reference
+
+
+def stack_reference(scope: JobScope) -> Iterable[str]:
+    """Return the manifest of the reference image of the stack."""
+    stack = scope.campaign.settings.stack
+    return [scope.campaign.manifest("stack_image", stack.reference)] if stack else []
+
+
 def is_sampled(campaign: "Campaign") -> bool:
     """Return True if samples were recorded; False for phase histories."""
     from apertura.campaign.config import SampledWaveform

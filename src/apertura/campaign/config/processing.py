@@ -221,6 +221,15 @@ def check_interferometry(requested: Interferometry, known: Sequence[str], *, whe
 # ---- Section `stack`: images of several flights for time series and change detection ---------------------------------
 
 
+class ChangeSettings(Section):
+    """Detection of changes relative to the reference flight of the stack."""
+
+    false_alarm_rate: float = Field(
+        1e-4, gt=0, le=0.1, description="probability that a pixel of unchanged terrain is reported as changed"
+    )
+    smallest_m2: float = Field(0.0, ge=0, description="area below which a changed region is not listed, m²")
+
+
 class Stack(Section):
     """Stack: images of one pair from several flights, whose phases refer to one reference flight."""
 
@@ -230,6 +239,8 @@ class Stack(Section):
     window_px: int = Field(
         15, ge=LEAST_WINDOW_PX, le=255, description="side of the averaging window of coherence, odd number of pixels"
     )
+
+    change: ChangeSettings = Field(default_factory=ChangeSettings, description="detection of changes")
 
     _has_a_middle = field_validator("window_px")(has_a_middle)
 

@@ -54,6 +54,11 @@ SOURCES: Mapping[str, str] = {
     "expected_coherence": "stack",
     "line_of_sight": "stack",
     "slant_range": "stack",
+    "amplitude_ratio": "change",
+    "coherence_loss": "change",
+    "change": "change",
+    "change_regions": "change",
+    "change_panels": "change",
 }
 """Source raster of a file → kind of folder that contains the file.
 
@@ -67,7 +72,8 @@ blocks of pixels, on a coarser grid. ``multilook_noise`` is the mean noise power
 Rasters of an interferogram are computed from two images; ``panels`` is a mapping from their names to these rasters.
 ``stack_image`` is the complex image of a flight of the stack without the residual phase; the other rasters of the stack
 are that phase, the measured and the expected coherence with the reference flight, and the geometry at closest approach,
-whose last axis contains components.
+whose last axis contains components. Rasters of a change are computed from an image of the stack and the reference;
+``change_regions`` are polygons, ``change_panels`` is a mapping from the names of the rasters to the rasters.
 """
 
 
@@ -212,6 +218,14 @@ EXPORTS: tuple[Export, ...] = (
     Export("expected_coherence.qml", "expected_coherence", _WRITERS.style.write_layer_style),
     Export("line_of_sight_enu.tif", "line_of_sight", _WRITERS.layers.write_line_of_sight, mosaicked=False),
     Export("slant_range_distance.tif", "slant_range", _WRITERS.layers.write_slant_range, mosaicked=False),
+    Export("amplitude_ratio.tif", "amplitude_ratio", _WRITERS.change.write_amplitude_ratio),
+    Export("amplitude_ratio.qml", "amplitude_ratio", _WRITERS.style.write_ratio_style),
+    Export("coherence_loss.tif", "coherence_loss", _WRITERS.change.write_coherence_loss),
+    Export("coherence_loss.qml", "coherence_loss", _WRITERS.style.write_layer_style),
+    Export("change.tif", "change", _WRITERS.change.write_change),
+    Export("change.qml", "change", _WRITERS.style.write_change_style),
+    Export("change_regions.gpkg", "change_regions", _WRITERS.change.write_regions, opened="changes, in a GIS"),
+    Export("change.png", "change_panels", _WRITERS.change_picture.write_change_panels, pictured=True),
     *_ADDED,
 )
 """All products of a pair or of a flight's sums, in the order in which they are written."""
@@ -235,7 +249,7 @@ MAP = "map/map.json"
 
 
 def exports_in(folder: str) -> Iterator[Export]:
-    """Yield the rows of a kind: ``pair``, ``fused``, ``layers``, ``interferogram`` or ``stack``.
+    """Yield the rows of a kind: ``pair``, ``fused``, ``layers``, ``interferogram``, ``stack`` or ``change``.
 
     Examples
     --------

@@ -5,7 +5,7 @@ of the pixels, all targets of a scene that consists mostly of noise would be sat
 """
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from math import ceil, floor, log10
 from pathlib import Path
@@ -20,6 +20,7 @@ from apertura.common.atomic import write_text
 from apertura.common.confined import on_disk
 from apertura.common.errors import ContractError
 from apertura.common.raster import ISOLATED
+from apertura.formats.export.change import CLASSES as CHANGE_CLASSES
 from apertura.formats.export.layers import CLASSES, OUTSIDE
 from apertura.formats.export.radiometry import TAG
 
@@ -27,6 +28,7 @@ _DOCTYPE = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
 _VERSION = "3.22"
 _RAMP = ("#440154", "#3b528b", "#21918c", "#5ec962", "#fde725")  # viridis
 _GREYS = ("#000000", "#404040", "#808080", "#c0c0c0", "#ffffff")
+_DIVERGING = ("#2166ac", "#92c5de", "#f7f7f7", "#f4a582", "#b2182b")
 _STEP_DB = 5.0  # the limits of the colour scale of a coefficient are multiples of this step
 _DOTS = 1024  # maximum pixels along the longer side for determining the limits of a colour scale
 _LEAST_DB = 1.0  # minimum range of a grey scale, for an image of constant power
@@ -86,9 +88,22 @@ def write_mask_style(path: Path, *_: object, **__: object) -> None:
 
     Parameters as in `write_db_style`.
     """
+    _write_classes(path, CLASSES)
+
+
+def write_change_style(path: Path, *_: object, **__: object) -> None:
+    """Write the style of the raster of changes: a colour and a label for each class; unchanged is transparent.
+
+    Parameters as in `write_db_style`.
+    """
+    _write_classes(path, CHANGE_CLASSES)
+
+
+def _write_classes(path: Path, classes: Mapping[int, tuple[str, tuple[int, int, int]]]) -> None:
+    """Write a colour and a label for each class; the classes 0 and no data are transparent."""
     renderer = _renderer("paletted", band="1")
     palette = ET.SubElement(renderer, "colorPalette")
-    for value, (name, colour) in CLASSES.items():
+    for value, (name, colour) in classes.items():
         is_transparent = value in {0, OUTSIDE}
         entry = {
             "value": str(value),
@@ -108,6 +123,14 @@ def write_layer_style(path: Path, *_: object, **__: object) -> None:
     with _opened_raster_of(path) as raster:
         values, unit = _subsampled(raster), raster.units[0]
     _write_ramp(path, *_round_limits(values[np.isfinite(values)]), unit)
+
+
+def write_ratio_style(path: Path, *_: object, **__: object) -> None:
+    """Write the style of a ratio in decibels: blue below 0 dB, white at 0 dB, red above; limits ±10 dB.
+
+    Parameters as in `write_db_style`.
+    """
+    _write_ramp(path, -10.0, 10.0, "dB", ramp=_DIVERGING)
 
 
 def write_backscatter_style(path: Path, *_: object, **__: object) -> None:

@@ -1,0 +1,1 @@
+"""Changes between two images of one scene: amplitude ratio, loss of coherence, mask at a false-alarm rate, regions."""
