@@ -332,6 +332,23 @@ def test_filter_raises_coherence_from_the_overlap_to_the_limit_of_the_noise(rise
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("rise_m", [4.0, 7.0])
+def test_slope_that_the_terrain_model_lacks_lowers_the_coherence(rise_m):
+    """Eq. 20: the displacement of the spectra is the fringe frequency of the ramp."""
+    lost = []
+    for slope in ((0.0, 0.0), SLOPE):
+        first, second, ground = two_tracks(rise_m, slope=slope)
+        one, other, looks = ground.band.filtered(first, second, WHOLE, window=WINDOW)
+        lost.append(measured_coherence(one, other, np.median(looks)))
+    fringes = np.abs(np.gradient(ground.at(WHOLE).slope * imaged_heights(ground.at(WHOLE)), SPACING_M, axis=0)) / (
+        2 * np.pi
+    )
+    sines = 25 / np.hypot(25, [25, 25 + rise_m])
+    common = (2 * sines[1] * FREQUENCY[-1] - 2 * sines[0] * FREQUENCY[0]) / C  # the higher track has lower frequencies
+    assert lost[1] / lost[0] == pytest.approx(1 - np.median(fringes) / common, abs=0.02)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("rise_m", [1.0, 7.0])
 def test_looks_of_the_common_band_are_those_of_unrelated_images(rise_m):
     """Eq. 4: the mean square of the coherence of unrelated images is 1/L."""

@@ -255,7 +255,7 @@ BY_CHANCE = 1e-3
 _STEPS = 30  # iterations of the fixed-point search for the pixel at which a point is imaged
 _MOST_COVERED = 1.5  # largest number of pixels at which a point is imaged; 2 indicates layover
 _TOLERANCE_PX = 0.05  # largest step of the search at a point that is accepted
-_CONVERGED_PX = 1e-4  # step at which the search ends, so that heights do not depend on the extent of a block
+_CONVERGED_PX = 1e-3  # step at which the search of a point ends
 
 
 def least_coherence(looks: float | NDArray[np.floating]) -> NDArray[np.float64]:
@@ -351,12 +351,14 @@ def place_heights(
     # Pixel at which each point is imaged, eq. 16, by fixed-point iteration; unknown rises are set to the nearest known.
     shift = np.moveaxis(shift_px, -1, 0) * rise_m[tuple(nearest)]
     position = np.stack(np.meshgrid(*map(np.arange, rise_m.shape), indexing="ij")).astype(np.float64)
-    imaged_at, error_px = position, np.full(rise_m.shape, np.inf)
+    imaged_at, error_px = position.copy(), np.full(rise_m.shape, np.inf)
     for _ in range(_STEPS):
-        target = position - [map_coordinates(axis, imaged_at, order=1, mode="nearest") for axis in shift]
-        error_px, imaged_at = np.abs(target - imaged_at).max(axis=0), target
-        if not (error_px > _CONVERGED_PX).any():
+        moving = error_px > _CONVERGED_PX
+        if not moving.any():
             break
+        at = imaged_at[:, moving]
+        target = position[:, moving] - [map_coordinates(axis, at, order=1, mode="nearest") for axis in shift]
+        error_px[moving], imaged_at[:, moving] = np.abs(target - at).max(axis=0), target
     # Points imaged at several pixels, and points without convergence, have no height.
     folds = _covered(position + shift, np.abs(_stretch(shift)) * known) > _MOST_COVERED
     converged = (error_px <= _TOLERANCE_PX) & ~folds
