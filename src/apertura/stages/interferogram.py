@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +15,12 @@ from apertura.campaign.config import CONFIG
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage, record_files
 from apertura.common.atomic import write_json
-from apertura.common.contracts import Window
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import Provenance, canonical_json
 from apertura.core.imaging.range_profiles import aperture_of
 from apertura.core.scene.looks import Lattice, Looks
 from apertura.formats.export import write_exports
+from apertura.methods.interferometry.common_band import CommonBand
 from apertura.methods.interferometry.comparison import (
     AssumedGround,
     Interferogram,
@@ -85,7 +84,7 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
         where = f"{CONFIG}: interferometry.pairs"
         raise CampaignError(f"no interferogram {name!r}", where, expected, "Add the key to interferometry.pairs.")
     images = requested.images(name)
-    bands, legs, looks, antennas = [], [], [], list[FlownAntenna]()
+    bands, looks, antennas = [], [], list[FlownAntenna]()
     began: np.datetime64 | None = None
     for sign, (flight, pair) in zip((1, -1), images, strict=True):
         echo = PairEcho.cleaned(campaign, flight, pair).stage
@@ -93,7 +92,6 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
         opened = gated(campaign, open_pair(campaign, flight, pair, echo=echo), scene)
         bands.append((float(opened.frequency_hz.min()), float(opened.frequency_hz.max())))
         looks.append(Looks.of(scene.grid, scene.terrain, aperture_of(profile), weighing(campaign, opened, scene)))
-        legs.append(legs_of(looks[-1]))
         began = began or opened.began
         antennas += _antennas(campaign, opened, looks[-1], sign=sign, began=began)
     if not np.allclose(bands[0], bands[1], rtol=_BAND_TOLERANCE, atol=0):
@@ -103,18 +101,28 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
         raise CampaignError(f"bands of {measured}", where, expected, "Specify two images of the same band.")
     first, second = ("/".join(image) for image in images)
     stages = [open_stage(campaign.stage("image", *image), "image") for image in images]
-    sensed = sensed_heights(scene, looks[0], legs, bands[0])
-    visible = np.logical_and(*(_visible_pixels(campaign, *image) for image in images))
-    height_m = np.broadcast_to(np.asarray(scene.terrain.heights(scene.grid), np.float64), scene.grid.shape)
-    shift_px = np.stack([-sensed.shift[..., 1], sensed.shift[..., 0]], axis=-1) / scene.grid.spacing_m
+    legs = legs_of(looks[0]), legs_of(looks[1], looks[0].lattice)
+    nodes_m, lattice = _nodes(scene, looks[0]), looks[0].lattice
+    band = CommonBand.of(
+        lattice,
+        nodes_m,
+        scene.axes,
+        legs,
+        (opened.frequency_hz, opened.weight),
+        spacing_m=scene.grid.spacing_m,
+        wave_speed_m_s=opened.wave_speed_m_s,
+    )
+    phase = TrackPhase(nodes_m, scene.axes, antennas, np.pi * sum(bands[0]) / opened.wave_speed_m_s)
+    ground = AssumedGround(
+        band,
+        _node_sensitivity(scene, looks[0], legs, bands[0]),
+        lambda window: np.broadcast_to(scene.terrain.heights(scene.grid[window]), scene.grid[window].shape),
+        np.logical_and(*(_visible_pixels(campaign, *image) for image in images)),
+        track_std=partial(_track_std, phase, lattice) if antennas else None,
+    )
     points = [point.model_dump() for point in campaign.settings.scene.reference_points]
-    heights = (_known_height(point, scene, sensed, height_m, shift_px) for point in points)
-    known = [height for height in heights if height is not None]
-    ground = AssumedGround(height_m, visible, sensed, shift_px, known)
-    if antennas:
-        wavenumber = np.pi * sum(bands[0]) / opened.wave_speed_m_s
-        phase = TrackPhase(_nodes(scene, looks[0]), scene.axes, antennas, wavenumber)
-        ground = replace(ground, track_std=partial(_track_std, phase, looks[0].lattice))
+    heights = (_known_height(point, scene, ground) for point in points)
+    ground = replace(ground, known=[height for height in heights if height is not None])
     return TwoImages((first, second), (stages[0], stages[1]), ground)
 
 
@@ -150,21 +158,34 @@ def _nodes(scene: OpenScene, looks: Looks) -> NDArray[np.float64]:
 
 
 def _track_std(phase: TrackPhase, lattice: Lattice, known: Sequence[KnownHeight]) -> NDArray[np.float64]:
-    """Return the standard deviation of every pixel's phase due to track errors, relative to points of known height."""
+    """Return the standard deviation of each node's phase due to track errors, relative to points of known height."""
     columns = lattice.shape[1]
     nearest = [
         int(np.abs(lattice.nodes[0] - point.row).argmin()) * columns
         + int(np.abs(lattice.nodes[1] - point.column).argmin())
         for point in known
     ]
-    whole: Window = (slice(0, int(lattice.nodes[0][-1]) + 1), slice(0, int(lattice.nodes[1][-1]) + 1))
-    return lattice.between(phase.std(nearest).reshape(lattice.shape), whole)
+    return phase.std(nearest).reshape(lattice.shape)
 
 
-def legs_of(looks: Looks) -> Legs:
-    """Return the phase centres at the sampled pulses of each lattice node, (node, pulse, 3)."""
-    pulses = looks.pulses.reshape(-1, looks.pulses.shape[-1])
-    tx, rx = (leg[pulses] for leg in looks.aperture.legs)
+def legs_of(looks: Looks, lattice: Lattice | None = None) -> Legs:
+    """Return the phase centres at the sampled pulses of each node of a lattice, (node, pulse, 3).
+
+    Parameters
+    ----------
+    looks
+        Looks of an image.
+    lattice
+        Lattice of the same grid (default: that of `looks`), for whose nodes the nearest nodes of `looks` are used.
+    """
+    pulses = looks.pulses
+    if lattice is not None:
+        nearest = [
+            np.abs(own[:, None] - nodes).argmin(axis=0)
+            for own, nodes in zip(looks.lattice.nodes, lattice.nodes, strict=True)
+        ]
+        pulses = pulses[np.ix_(*nearest)]
+    tx, rx = (leg[pulses.reshape(-1, pulses.shape[-1])] for leg in looks.aperture.legs)
     return tx, rx
 
 
@@ -186,15 +207,21 @@ def sensed_heights(
     band_hz, window
         Lowest and highest frequency, and the spectral weights between them (default: flat) for the spectral overlap.
     """
-    lattice, grid, nodes_m = looks.lattice, scene.grid, _nodes(scene, looks)
-    at_nodes = sensitivity(nodes_m, scene.axes, legs[0], legs[1], band_hz=band_hz, window=window)
-    whole: Window = (slice(0, grid.shape[0]), slice(0, grid.shape[1]))
+    rows, columns = (slice(0, size) for size in scene.grid.shape)
+    return _node_sensitivity(scene, looks, legs, band_hz, window).between(looks.lattice, (rows, columns))
 
-    def between(name: str) -> NDArray[np.float64]:
-        values = getattr(at_nodes, name)
-        return lattice.between(values.reshape(*lattice.shape, *values.shape[1:]), whole)
 
-    return Sensitivity(**{name: between(name) for name in ("slope", "bend", "shift", "overlap", "range_m")})
+def _node_sensitivity(
+    scene: OpenScene,
+    looks: Looks,
+    legs: Sequence[Legs],
+    band_hz: tuple[float, float],
+    window: NDArray[np.float64] | None = None,
+) -> Sensitivity:
+    """Return the sensitivity to height at the lattice nodes, (node row, node column, …)."""
+    sensed = sensitivity(_nodes(scene, looks), scene.axes, legs[0], legs[1], band_hz=band_hz, window=window)
+    shape = looks.lattice.shape
+    return Sensitivity(**{name: values.reshape(*shape, *values.shape[1:]) for name, values in vars(sensed).items()})
 
 
 def _visible_pixels(campaign: Campaign, flight: str, pair: str) -> NDArray[np.bool_]:
@@ -204,13 +231,7 @@ def _visible_pixels(campaign: Campaign, flight: str, pair: str) -> NDArray[np.bo
     return visible
 
 
-def _known_height(
-    point: Mapping[str, Any],
-    scene: OpenScene,
-    sensed: Sensitivity,
-    height_m: NDArray[np.float64],
-    shift_px: NDArray[np.float64],
-) -> KnownHeight | None:
+def _known_height(point: Mapping[str, Any], scene: OpenScene, ground: AssumedGround) -> KnownHeight | None:
     """Return the pixel at which a point is imaged, and the topographic phase of the point; None outside the grid."""
     x_m, y_m, z_m = point["position_m"]
     map_pixel = np.array(scene.grid.pixel_of(x_m, y_m))
@@ -218,11 +239,12 @@ def _known_height(
     for _ in range(5):  # iterate the displacement due to the point's height above the assumed terrain
         if not ((pixel >= 0) & (pixel < scene.grid.shape)).all():
             return None
-        row, column = pixel
-        rise = z_m - height_m[row, column]
-        pixel = np.round(map_pixel - shift_px[row, column] * rise).astype(int)
-    phase = sensed.slope[row, column] * rise + sensed.bend[row, column] * rise**2
-    return KnownHeight(point["name"], int(row), int(column), float(phase))
+        row, column = map(int, pixel)
+        at = slice(row, row + 1), slice(column, column + 1)
+        rise = z_m - ground.height_m(at).item()
+        pixel = np.round(map_pixel - ground.shift_px(at)[0, 0] * rise).astype(int)
+    sensed = ground.at(at)
+    return KnownHeight(point["name"], row, column, (sensed.slope * rise + sensed.bend * rise**2).item())
 
 
 def interferogram(campaign: Campaign, name: str) -> list[Path]:
@@ -284,7 +306,6 @@ def _report(formed: Interferogram, two: TwoImages) -> dict[str, Any]:
     return {
         "images": list(two.names),
         "flags_of_images": {name: flags for name, flags in flagged.items() if flags},
-        "looks": round(formed.looks, 3) if isfinite(formed.looks) else None,
         "measured": measured,
         "level": None if formed.level is None else {**asdict(formed.level), "says": _level_line(formed.level)},
         "height_std_m": std_m,
@@ -319,7 +340,7 @@ def _tags(report: dict[str, Any]) -> dict[str, str]:
     return {
         "APERTURA_FLAGS": canonical_json(report["flags"]),
         "APERTURA_LEVEL": report["level"]["says"] if report["level"] else "no heights",
-        "APERTURA_LOOKS": "none" if report["looks"] is None else f"{report['looks']:.2f}",
+        "APERTURA_LOOKS": f"{measured['looks']:.2f}",
         "APERTURA_CHANCE": f"{measured['chance']:.3f}",
         "APERTURA_UNWRAPPED": method if measured["jumps"] else "not needed: no jumps",
     }

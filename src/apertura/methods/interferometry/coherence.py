@@ -121,15 +121,29 @@ def coherence(
         raise ValueError(
             f"{first.shape=}, {second.shape=}, {window=}: equal shapes and an odd, positive window are required"
         )
+    one, other = (np.where(np.isfinite(first) & np.isfinite(second), image, 0) for image in (first, second))
+    return *estimate(first, second, window), _looks(one.astype(np.complex128), other.astype(np.complex128), window)
+
+
+def estimate(
+    first: NDArray[np.complex64], second: NDArray[np.complex64], window: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return magnitude and phase of `coherence`, docs/theory/interferometry.md, eq. 2.
+
+    Examples
+    --------
+    >>> estimate(np.full((3, 3), 2j, np.complex64), np.ones((3, 3), np.complex64), 3)[1].round(3)[1]
+    array([1.571, 1.571, 1.571], dtype=float32)
+    """
     finite = np.isfinite(first) & np.isfinite(second)
     one, other = (np.where(finite, image, 0).astype(np.complex128) for image in (first, second))
     crossed = box_sum(one * other.conj(), window)
     power = box_sum(np.abs(one) ** 2, window) * box_sum(np.abs(other) ** 2, window)
     valid = finite & (power > 0)
-    magnitude, phase = np.full(first.shape, np.nan, np.float32), np.full(first.shape, np.nan, np.float32)
+    magnitude, phase = (np.full(first.shape, np.nan, np.float32) for _ in range(2))
     magnitude[valid] = np.minimum(np.abs(crossed[valid]) / np.sqrt(power[valid]), 1)
     phase[valid] = np.angle(crossed[valid])
-    return magnitude, phase, _looks(one, other, window)
+    return magnitude, phase
 
 
 def chance(looks: float) -> float:
@@ -143,7 +157,7 @@ def chance(looks: float) -> float:
     return exp(lgamma(looks) + lgamma(1.5) - lgamma(looks + 0.5))
 
 
-def unbiased(magnitude: NDArray[np.float32], looks: float) -> NDArray[np.float32]:
+def unbiased(magnitude: NDArray[np.floating], looks: float | NDArray[np.floating]) -> NDArray[np.float32]:
     """Remove the bias of estimated coherence, docs/theory/interferometry.md, eq. 5.
 
     Parameters
@@ -151,7 +165,7 @@ def unbiased(magnitude: NDArray[np.float32], looks: float) -> NDArray[np.float32
     magnitude
         (...) float32, from `coherence`.
     looks
-        Number of looks, more than 1.
+        Number of looks, more than 1: one number, or one for each pixel.
 
     Returns
     -------
@@ -168,8 +182,8 @@ def unbiased(magnitude: NDArray[np.float32], looks: float) -> NDArray[np.float32
     >>> unbiased(np.array([0.2, 0.5, 1.0], np.float32), 25.0).round(3)
     array([0.   , 0.468, 1.   ], dtype=float32)
     """
-    if not looks > 1:
-        raise ValueError(f"{looks=}: the coherence of a single look is 1 for any images; use a wider window")
+    if not np.all(looks > 1):
+        raise ValueError(f"{np.min(looks)=}: the coherence of a single look is 1 for any images; use a wider window")
     square = (looks * magnitude.astype(np.float64) ** 2 - 1) / (looks - 1)
     return np.sqrt(np.maximum(square, 0)).astype(np.float32)
 
@@ -244,27 +258,37 @@ def map_coherence(
     >>> bool((tiled[0] == whole[0]).all() and (tiled[1] == whole[1]).all())
     True
     """
-    shape, margin = first.shape, window // 2
-    planes = [np.full(shape, np.nan, np.float32) for _ in range(3)]
+    planes = [np.full(first.shape, np.nan, np.float32) for _ in range(3)]
     looks: list[float] = []
     for tile in tiles:
-        wider = tuple(
-            slice(max(0, part.start - margin), min(size, part.stop + margin))
-            for part, size in zip(tile, shape, strict=True)
-        )
-        inner = tuple(
-            slice(part.start - wide.start, part.stop - wide.start) for part, wide in zip(tile, wider, strict=True)
-        )
+        wider, inner = with_margin(tile, window // 2, first.shape)
         one, other = np.asarray(first[wider]), np.asarray(second[wider])
         magnitude, phase, looks_of_tile = coherence(one, other, window=window)
         looks.append(looks_of_tile)
         planes[0][tile], planes[1][tile] = magnitude[inner], phase[inner]
-        planes[2][tile] = _shared(one, other, window)[inner]
+        planes[2][tile] = energy_spread(one, other, window)[inner]
     finite = [value for value in looks if np.isfinite(value)]
     return planes[0], planes[1], float(np.median(finite)) if finite else float("nan"), planes[2]
 
 
-def _shared(one: NDArray[np.complex64], other: NDArray[np.complex64], window: int) -> NDArray[np.float64]:
+def with_margin(tile: Window, margin: int, shape: tuple[int, ...]) -> tuple[Window, Window]:
+    """Return a tile widened by a margin within a raster, and the tile relative to the widened one.
+
+    Examples
+    --------
+    >>> with_margin((slice(0, 8), slice(8, 16)), 3, (16, 18))
+    ((slice(0, 11, None), slice(5, 18, None)), (slice(0, 8, None), slice(3, 11, None)))
+    """
+    rows, columns = (
+        slice(max(0, at.start - margin), min(size, at.stop + margin)) for at, size in zip(tile, shape, strict=True)
+    )
+    inner, across = (
+        slice(at.start - wide.start, at.stop - wide.start) for at, wide in zip(tile, (rows, columns), strict=True)
+    )
+    return (rows, columns), (inner, across)
+
+
+def energy_spread(one: NDArray[np.complex64], other: NDArray[np.complex64], window: int) -> NDArray[np.float64]:
     """Return (Σp)²/(N Σp²) over a window about each pixel, with p the magnitude of the product of the images."""
     power = np.abs(one.astype(np.complex128) * other)
     finite = np.isfinite(power)

@@ -10,15 +10,13 @@ from apertura.common.arrays import Floats
 from apertura.common.contracts import Window
 from apertura.common.errors import number_of
 from apertura.common.flags import Flags
-from apertura.methods.interferometry.coherence import chance, map_coherence, unbiased
+from apertura.core.quality.measures import BlockRaster
+from apertura.methods.interferometry.coherence import chance, energy_spread, estimate, unbiased, with_margin
+from apertura.methods.interferometry.common_band import CommonBand
 from apertura.methods.interferometry.heights import (
-    MARGIN,
     KnownHeight,
     Level,
-    PlacedHeights,
-    Unwrapped,
     height_sensitive,
-    height_valid,
     least_coherence,
     level,
     phase_std,
@@ -44,6 +42,8 @@ class InterferogramCounts:
         sensitivity to height.
     coherence, chance
         Median estimated coherence of the common pixels, and its expected value for independent images.
+    looks
+        Median independent samples of a window of the filtered images; 0 without common pixels.
     overlap
         Median fraction of the image spectrum that both images sample.
     ambiguity_m
@@ -64,6 +64,7 @@ class InterferogramCounts:
     sensitive: int
     coherence: float
     chance: float
+    looks: float
     overlap: float
     ambiguity_m: float
     unwrapped: int = 0
@@ -91,7 +92,7 @@ def interferogram_flags(measured: InterferogramCounts) -> Flags:
 
     Examples
     --------
-    >>> sorted(interferogram_flags(InterferogramCounts(100, 10, 100, 0.2, 0.18, 0.0, 2.0)))
+    >>> sorted(interferogram_flags(InterferogramCounts(100, 10, 100, 0.2, 0.18, 25.0, 0.0, 2.0)))
     ['interferogram_decorrelated']
     """
     counts, flags = measured, Flags()
@@ -139,7 +140,7 @@ def interferogram_flags(measured: InterferogramCounts) -> Flags:
 
 # ---- Interferogram: coherence, phase, and geocoded heights ----------------------------------------------------------
 
-LEAST_LOOKS = 4.0
+LEAST_LOOKS = 3.0
 """Minimum number of looks over which the energy of a window is spread; with fewer, a point outside the centre of the
 window dominates.
 """
@@ -151,27 +152,36 @@ class AssumedGround:
 
     Attributes
     ----------
+    band
+        Bands of both images, with the lattice of the grid.
+    sensed
+        Sensitivity of the phase to height at the nodes of the lattice, (node row, node column, …).
     height_m
-        (y, x) float64, metres.
+        Function that returns the heights of a window of the grid, (y, x) float64 metres.
     visible
         (y, x) bool, True for pixels visible in both images, without shadow or layover.
-    sensed
-        Sensitivity of the phase to height.
-    shift_px
-        (y, x, 2) float64, rows and columns from a pixel to the terrain imaged there, per metre of height.
     known
         Points of known height.
     track_std
         Function of the reference points of the heights that returns the standard deviation of the phase due to track
-        errors, (y, x) float64 rad; None if the track errors are unknown.
+        errors, (node row, node column) float64 rad; None if the track errors are unknown.
     """
 
-    height_m: Floats
-    visible: NDArray[np.bool_]
+    band: CommonBand
     sensed: Sensitivity
-    shift_px: Floats
+    height_m: Callable[[Window], Floats]
+    visible: NDArray[np.bool_]
     known: Sequence[KnownHeight] = ()
     track_std: Callable[[Sequence[KnownHeight]], Floats] | None = None
+
+    def at(self, window: Window) -> Sensitivity:
+        """Return the sensitivity at the pixels of a window."""
+        return self.sensed.between(self.band.lattice, window)
+
+    def shift_px(self, window: Window) -> Floats:
+        """Return rows and columns from a pixel to the terrain imaged there, per metre of height, (y, x, 2) float64."""
+        shift_m = self.band.lattice.between(self.sensed.shift, window)
+        return np.asarray(shift_m[..., ::-1] * [-1, 1] / self.band.spacing_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,10 +191,8 @@ class Interferogram:
     Attributes
     ----------
     panels
-        ``phase``, ``coherence`` and ``unwrapped`` at image pixels, ``height`` and ``height_std`` at the position of the
-        terrain: (y, x) float32, NaN where not valid.
-    looks
-        Independent samples of a window; NaN without valid pixels.
+        `PANELS`: phase, coherence and unwrapped at image pixels, height and height_std at the position of the terrain;
+        (y, x) float32, NaN where not valid.
     measured
         Counts for the flags.
     level
@@ -192,20 +200,19 @@ class Interferogram:
     """
 
     panels: Mapping[str, NDArray[np.float32]]
-    looks: float
     measured: InterferogramCounts
     level: Level | None
 
 
 def form_interferogram(
-    first: NDArray[np.complex64],
-    second: NDArray[np.complex64],
+    first: BlockRaster,
+    second: BlockRaster,
     ground: AssumedGround,
     tiles: Iterable[Window],
     *,
     window: int,
 ) -> Interferogram:
-    """Form the interferogram of two images on one grid.
+    """Form the interferogram of two images on one grid, tile by tile except for phase unwrapping.
 
     Parameters
     ----------
@@ -222,113 +229,139 @@ def form_interferogram(
     --------
     Two copies of an image are coherent everywhere, and their phase is insensitive to height.
 
-    >>> generator, one = np.random.default_rng(0), np.ones((32, 32))
+    >>> from apertura.core.scene.looks import Lattice
+    >>> lattice, one = Lattice.of((32, 32)), np.ones((3, 3))
+    >>> track = np.linspace(-4, 4, 9)[:, None] * [1.0, 0, 0] + [0, -20.0, 20.0] + np.zeros((9, 1, 1))
+    >>> nodes = np.stack(np.meshgrid([0, 4, 7.75], [7.75, 3.75, 0], [0]), axis=-1).reshape(9, 3)
+    >>> band = CommonBand.of(lattice, nodes, np.eye(3), ((track, track),) * 2, (1e9 + 4e6 * np.arange(64), np.ones(64)),
+    ...     spacing_m=0.25, wave_speed_m_s=3e8)
+    >>> generator = np.random.default_rng(0)
     >>> image = (generator.normal(size=(32, 32)) + 1j * generator.normal(size=(32, 32))).astype(np.complex64)
-    >>> same = Sensitivity(0 * one, 0 * one, np.zeros((32, 32, 2)), one, 30 * one)
-    >>> flat = AssumedGround(0 * one, one > 0, same, np.zeros((32, 32, 2)))
-    >>> own = form_interferogram(image, image, flat, [(slice(0, 32), slice(0, 32))], window=5)
+    >>> insensitive = Sensitivity(0 * one, 0 * one, np.zeros((3, 3, 2)), one, 30 * one)
+    >>> flat = AssumedGround(band, insensitive, lambda window: np.zeros((32, 32))[window], np.ones((32, 32), bool))
+    >>> own = form_interferogram(image, image, flat, [(slice(0, 32), slice(0, 32))], window=15)
     >>> own.measured.coherent, own.measured.sensitive, bool(np.isnan(own.panels["height"]).all())
     (1024, 0, True)
     """
-    # Coherence, phase and looks of every window (eqs. 2 to 6), and the pixels whose phase determines a height.
-    magnitude, phase, looks, shared = map_coherence(first, second, tiles, window=window)
-    common = ground.visible & np.isfinite(magnitude)
-    enough = looks > 1  # for a single look, the coherence of any two images is 1
-    energy = looks * shared.astype(np.float64)  # looks over which the energy of the window is spread
-    dominated = energy < LEAST_LOOKS
-    valid = (
-        common & ~dominated & height_valid(ground.sensed, magnitude, looks) if enough else np.zeros(common.shape, bool)
-    )
-    # Phase about its mean, unwrapped.
-    centre = float(np.angle(np.exp(1j * phase[valid].astype(np.float64)).sum())) if valid.any() else 0.0
-    centred = np.where(valid, np.angle(np.exp(1j * (phase - centre))), np.nan).astype(np.float32)
-    unwrapped = unwrap(centred, magnitude, looks=looks)
-    effective_looks = np.minimum(looks, 2 * energy)
-    # Phase constant between the images from points of known height (eq. 15), otherwise from the median.
+    tiles = list(tiles)
+    planes, valid, counted = _coherence_of(first, second, ground, tiles, window)
+    phase, magnitude = planes["phase"], planes["coherence"]
+    # Phase about its mean, unwrapped, and its constant (eq. 15) from points of known height, otherwise the median.
+    centre = float(np.angle(sum(np.exp(1j * phase[tile][valid[tile]].astype(np.float64)).sum() for tile in tiles)))
+    centred = np.full(first.shape, np.nan, np.float32)
+    for tile in tiles:
+        about = np.angle(np.exp(1j * (phase[tile].astype(np.float64) - centre)))
+        centred[tile] = np.where(valid[tile], about, np.nan)
+    unwrapped = unwrap(centred, magnitude, looks=counted.looks)
     known = [
         replace(
             point,
-            measured_rad=float(phase[point.row, point.column]) - centre,
+            measured_rad=float(phase[pixel]) - centre,
             # decorrelation about a point is spread over all looks of the window, one of which contains the point; the
             # point response lies at the centre of the window and is not truncated
-            std_rad=float(phase_std(unbiased(magnitude[point.row, point.column], looks), looks)) / MARGIN,
+            std_rad=float(_scatter(magnitude[pixel], looks, looks)),
         )
         for point in ground.known
-        if common[point.row, point.column]
+        if (looks := planes["looks"][pixel := (point.row, point.column)]) > 0
     ]
-    reference = level(unwrapped, known)
-    height_phase = remove_level(unwrapped, reference) if reference else np.full(common.shape, np.nan, np.float32)
-    # σ_φ of eq. 8, combined with the standard deviations due to the level and the tracks; geocoded heights (eq. 16).
-    scatter = phase_std(unbiased(magnitude, looks), effective_looks).astype(np.float64)
+    reference, folded = level(unwrapped, known), 0
+    planes |= {name: np.full(first.shape, np.nan, np.float32) for name in ("unwrapped", "height", "height_std")}
     if reference:
-        scatter = np.hypot(scatter, reference.std_rad or 0.0)
-    if reference and ground.track_std:
-        scatter = np.hypot(scatter, ground.track_std([point for point in known if point.name in reference.points]))
-    geocoded = _placed(ground, height_phase, scatter)
-    panels = {
-        "phase": np.where(common, phase, np.nan).astype(np.float32),
-        "coherence": np.where(common, magnitude, np.nan).astype(np.float32),
-        "unwrapped": height_phase,
-        "height": geocoded.height.astype(np.float32),
-        "height_std": geocoded.std.astype(np.float32),
-    }
-    coherent = magnitude > least_coherence(looks) if enough else np.zeros(common.shape, bool)
-    counted = _measured(ground.sensed, common, coherent, magnitude, chance(looks) if enough else 1.0)
-    return Interferogram(panels, looks, _unwrapping(counted, unwrapped, height_phase, reference, geocoded), reference)
-
-
-def _placed(ground: AssumedGround, height_phase: NDArray[np.float32], phase_std_rad: Floats) -> PlacedHeights:
-    """Return geocoded heights from the height phase and its standard deviation."""
-    rise = ground.sensed.height(height_phase.astype(np.float64))
-    std = np.full(rise.shape, np.nan)
-    finite = np.isfinite(rise)
-    if finite.any():
-        slope = np.abs(ground.sensed.slope + 2 * ground.sensed.bend * rise)[finite]
-        std[finite] = phase_std_rad[finite] / slope
-    return place_heights(ground.height_m, rise, std, ground.shift_px)
-
-
-def _measured(
-    sensed: Sensitivity,
-    common: NDArray[np.bool_],
-    coherent: NDArray[np.bool_],
-    magnitude: NDArray[np.float32],
-    chance_level: float,
-) -> InterferogramCounts:
-    """Return counts and medians of the common pixels."""
-    count = int(common.sum())
-
-    def median(values: NDArray[np.floating]) -> float:
-        return float(np.median(values[common])) if count else 0.0
-
-    return InterferogramCounts(
-        common=count,
-        coherent=int((common & coherent).sum()),
-        sensitive=int((common & height_sensitive(sensed)).sum()),
-        coherence=median(magnitude),
-        chance=chance_level,
-        overlap=median(sensed.overlap),
-        ambiguity_m=min(median(sensed.ambiguity_m), 1e9),  # JSON has no infinity
-    )
-
-
-def _unwrapping(
-    counted: InterferogramCounts,
-    phase: Unwrapped,
-    height_phase: NDArray[np.float32],
-    reference: Level | None,
-    geocoded: PlacedHeights,
-) -> InterferogramCounts:
-    """Return the counts with the results of unwrapping added."""
-    unwrapped, kept = int(np.isfinite(phase.phase).sum()), int(np.isfinite(height_phase).sum())
-    return replace(
+        planes["unwrapped"] = remove_level(unwrapped, reference)
+        used = [point for point in known if point.name in reference.points]
+        folded = _place_heights(ground, planes, np.hypot(planes.pop("scatter"), reference.std_rad or 0.0), used, tiles)
+    count, kept = (int(np.isfinite(values).sum()) for values in (unwrapped.phase, planes["unwrapped"]))
+    counted = replace(
         counted,
-        unwrapped=unwrapped,
-        apart=unwrapped - kept,
-        residues=phase.residues,
-        loops=phase.loops,
-        jumps=phase.jumps,
-        by=phase.by,
-        folded=geocoded.folded,
+        unwrapped=count,
+        apart=count - kept,
+        residues=unwrapped.residues,
+        loops=unwrapped.loops,
+        jumps=unwrapped.jumps,
+        by=unwrapped.by,
+        folded=folded,
         points=len(reference.points) if reference else 0,
     )
+    return Interferogram({name: planes[name] for name in PANELS}, counted, reference)
+
+
+PANELS = ("phase", "coherence", "unwrapped", "height", "height_std")
+"""Rasters of an interferogram."""
+
+Planes = dict[str, NDArray[np.float32]]
+
+
+def _coherence_of(
+    first: BlockRaster, second: BlockRaster, ground: AssumedGround, tiles: Sequence[Window], window: int
+) -> tuple[Planes, NDArray[np.bool_], InterferogramCounts]:
+    """Return coherence, phase, its deviation (eq. 8) and looks of the common band, and pixels with a valid height."""
+    names = ("phase", "coherence", "scatter", "looks")
+    planes: Planes = {name: np.full(first.shape, np.nan, np.float32) for name in names}
+    valid, coherent_px, sensitive_px = np.zeros(first.shape, bool), 0, 0
+    for tile in tiles:
+        wider, inner = with_margin(tile, window // 2, first.shape)
+        one, other, looks_of = ground.band.filtered(first, second, wider, window=window)
+        found = (*estimate(one, other, window), looks_of, energy_spread(one, other, window))
+        magnitude, phase, looks, spread = (plane[inner] for plane in found)
+        sensed, energy = ground.at(tile), looks * spread  # looks over which the energy of the window is spread
+        common = ground.visible[tile] & np.isfinite(magnitude)
+        coherent, sensitive = common & (magnitude > least_coherence(looks)), common & height_sensitive(sensed)
+        valid[tile] = coherent & sensitive & (sensed.overlap > 0) & (energy >= LEAST_LOOKS)
+        coherent_px, sensitive_px = coherent_px + int(coherent.sum()), sensitive_px + int(sensitive.sum())
+        scatter = _scatter(magnitude, looks, np.minimum(looks, 2 * energy))
+        for plane, values in zip(planes.values(), (phase, magnitude, scatter, looks), strict=True):
+            plane[tile] = np.where(common, values, np.nan)
+    common = np.isfinite(planes["coherence"])
+    nodes = common[np.ix_(*ground.band.lattice.nodes)]
+
+    def median(values: NDArray[np.floating], where: NDArray[np.bool_]) -> float:
+        return float(np.median(values[where])) if where.any() else 0.0
+
+    looks_px = median(planes["looks"], common)
+    return (
+        planes,
+        valid,
+        InterferogramCounts(
+            common=int(common.sum()),
+            coherent=coherent_px,
+            sensitive=sensitive_px,
+            coherence=median(planes["coherence"], common),
+            chance=chance(looks_px) if looks_px else 1.0,
+            looks=looks_px,
+            overlap=median(ground.sensed.overlap, nodes),
+            ambiguity_m=min(median(ground.sensed.ambiguity_m, nodes), 1e9),  # JSON has no infinity
+        ),
+    )
+
+
+def _scatter(
+    magnitude: NDArray[np.floating], looks: NDArray[np.floating], averaged: NDArray[np.floating]
+) -> NDArray[np.float32]:
+    """Return the standard deviation of the phase, of which `averaged` of the looks of the window contribute."""
+    return phase_std(unbiased(magnitude, np.maximum(looks, 1 + 1e-6)), averaged)
+
+
+def _place_heights(
+    ground: AssumedGround,
+    planes: Planes,
+    scatter: NDArray[np.float32],
+    reference: Sequence[KnownHeight],
+    tiles: Sequence[Window],
+) -> int:
+    """Compute the planes of heights and their deviation (eqs. 8, 11 and 16); return the number of folded points."""
+    lattice, shape = ground.band.lattice, scatter.shape
+    track_std = ground.track_std(reference) if ground.track_std else np.zeros(lattice.shape)
+    rise, std = (np.full(shape, np.nan, np.float32) for _ in range(2))
+    reach_px, folded = 0.0, 0
+    for tile in tiles:
+        sensed = ground.at(tile)
+        height = sensed.height(planes["unwrapped"][tile].astype(np.float64))
+        rise[tile], slope = height, np.abs(sensed.slope + 2 * sensed.bend * height)
+        std[tile] = np.hypot(scatter[tile], lattice.between(track_std, tile)) / slope
+        reach_px = max(reach_px, np.nanmax(np.abs(ground.shift_px(tile) * height[..., None]), initial=0))
+    for tile in tiles:
+        wider, inner = with_margin(tile, int(reach_px) + 4, shape)
+        geocoded = place_heights(ground.height_m(wider), rise[wider], std[wider], ground.shift_px(wider))
+        planes["height"][tile], planes["height_std"][tile] = geocoded.height[inner], geocoded.std[inner]
+        folded += int(geocoded.folded[inner].sum())
+    return folded

@@ -13,6 +13,7 @@ from apertura.methods.interferometry.sensitivity import Sensitivity
 # ---- Unwrapping and residues ----------------------------------------------------------------------------------------
 
 _LEAST_SHARE = 0.01  # minimum fraction of all pixels in a connected component: default of snaphu
+_ROWS = 256  # rows whose residues are counted at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,13 +100,16 @@ def count_residues(phase: NDArray[np.float32]) -> tuple[int, int, int]:
     >>> count_residues(np.array([[0.0, 2.0], [-2.0, 4.0]], np.float32))
     (1, 1, 1)
     """
-    down, right = np.diff(phase, axis=0), np.diff(phase, axis=1)
-    cycles_down, cycles_right = (np.round(difference / (2 * np.pi)) for difference in (down, right))
-    # Integer cycles around each loop of four pixels.
-    around = cycles_right[:-1] + cycles_down[:, 1:] - cycles_right[1:] - cycles_down[:, :-1]
-    finite = np.isfinite(around)
-    jumps = sum(int(np.count_nonzero(cycles[np.isfinite(cycles)])) for cycles in (cycles_down, cycles_right))
-    return int(np.count_nonzero(around[finite])), int(finite.sum()), jumps
+    residues = loops = jumps = 0
+    for first in range(0, len(phase), _ROWS):
+        block = phase[first : first + _ROWS + 1]  # the last row is the first of the next block
+        down, right = (np.round(np.diff(block, axis=axis) / (2 * np.pi)) for axis in (0, 1))
+        # Integer cycles around each loop of four pixels.
+        around = right[:-1] + down[:, 1:] - right[1:] - down[:, :-1]
+        loops += int(np.isfinite(around).sum())
+        residues += int(np.count_nonzero(np.nan_to_num(around)))
+        jumps += sum(int(np.count_nonzero(np.nan_to_num(cycles))) for cycles in (down, right[:_ROWS]))
+    return residues, loops, jumps
 
 
 def _library() -> str:
@@ -187,12 +191,12 @@ def level(phase: Unwrapped, known: Sequence[KnownHeight]) -> Level | None:
     >>> level(unwrapped, []).phase_rad, round(level(unwrapped, [KnownHeight("mast", 0, 2, 0.5, 0.7)]).phase_rad, 3)
     (0.2, 0.2)
     """
-    valid = np.argwhere(np.isfinite(phase.phase) & (phase.part > 0))
-    if not len(valid):
+    valid = np.isfinite(phase.phase) & (phase.part > 0)
+    if not valid.any():
         return None
     measured = [(point, *_unwrapped(point, phase, valid)) for point in known if np.isfinite(point.measured_rad)]
     if not measured:
-        sizes = np.bincount(phase.part[tuple(valid.T)])
+        sizes = np.bincount(phase.part[valid])
         part = int(np.argmax(sizes[1:])) + 1
         return Level(round(float(np.median(phase.phase[phase.part == part])), 6), part)
     parts = [part for *_, part in measured]
@@ -215,9 +219,18 @@ def _level_std(constants: Sequence[float], stds: Sequence[float]) -> float:
     return float(max(by_points, by_scatter) * (np.sqrt(np.pi / 2) if count > 2 else 1.0))
 
 
-def _unwrapped(point: KnownHeight, phase: Unwrapped, valid: NDArray[np.int64]) -> tuple[float, int]:
+def _unwrapped(point: KnownHeight, phase: Unwrapped, valid: NDArray[np.bool_]) -> tuple[float, int]:
     """Return the unwrapped phase and the component at the valid pixel nearest to a point."""
-    near = tuple(valid[np.argmin(((valid - (point.row, point.column)) ** 2).sum(axis=1))])
+
+    def within(half: int) -> NDArray[np.int64]:
+        top, left = max(point.row - half, 0), max(point.column - half, 0)
+        return np.argwhere(valid[top : point.row + half + 1, left : point.column + half + 1]) + (top, left)
+
+    half = 1
+    while not len(within(half)):
+        half *= 2
+    places = within(int(np.ceil(np.sqrt(2) * half)))  # the circle around the first square with a valid pixel
+    near = tuple(places[np.argmin(((places - (point.row, point.column)) ** 2).sum(axis=1))])
     cycles = np.round((float(phase.phase[near]) - point.measured_rad) / (2 * np.pi))
     return float(point.measured_rad + 2 * np.pi * cycles), int(phase.part[near])
 
@@ -239,27 +252,24 @@ def remove_level(phase: Unwrapped, reference: Level) -> NDArray[np.float32]:
 BY_CHANCE = 1e-3
 """False alarm rate: fraction of incoherent pixels that are accepted as coherent."""
 
-MARGIN = 1.4
-"""Factor on the Cramér-Rao bound of the phase; the phase scatter of simulated terrain is below this bound."""
-
-
 _STEPS = 30  # iterations of the fixed-point search for the pixel at which a point is imaged
 _MOST_COVERED = 1.5  # largest number of pixels at which a point is imaged; 2 indicates layover
-_TOLERANCE_PX = 0.05  # tolerance of the fixed-point search
+_TOLERANCE_PX = 0.05  # largest step of the search at a point that is accepted
+_CONVERGED_PX = 1e-3  # step at which the search of a point ends
 
 
-def least_coherence(looks: float) -> float:
+def least_coherence(looks: float | NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the coherence threshold at the false alarm rate `BY_CHANCE`, docs/theory/interferometry.md, eq. 7.
 
     Examples
     --------
-    >>> [round(least_coherence(looks), 3) for looks in (4.0, 25.0)]
-    [0.949, 0.5]
+    >>> least_coherence(np.array([4.0, 25.0])).round(3)
+    array([0.949, 0.5  ])
     """
-    return float(np.sqrt(1 - BY_CHANCE ** (1 / max(looks - 1, 1e-6))))
+    return np.asarray(np.sqrt(1 - BY_CHANCE ** (1 / np.maximum(looks - 1, 1e-6))))
 
 
-def phase_std(coherence: NDArray[np.float32], looks: float | NDArray[np.float64]) -> NDArray[np.float32]:
+def phase_std(coherence: NDArray[np.floating], looks: float | NDArray[np.floating]) -> NDArray[np.float32]:
     """Return the standard deviation of the phase, rad, docs/theory/interferometry.md, eq. 8.
 
     Parameters
@@ -272,28 +282,12 @@ def phase_std(coherence: NDArray[np.float32], looks: float | NDArray[np.float64]
     Examples
     --------
     >>> phase_std(np.array([0.9, 0.0], np.float32), 25.0).round(3)
-    array([0.096, 1.814], dtype=float32)
+    array([0.068, 1.814], dtype=float32)
     """
     square = np.square(coherence.astype(np.float64))
     with np.errstate(divide="ignore"):
-        bound = MARGIN * np.sqrt((1 - square) / (2 * looks * square))
+        bound = np.sqrt((1 - square) / (2 * looks * square))
     return np.asarray(np.minimum(bound, np.pi / np.sqrt(3)), np.float32)  # π/√3 for a uniformly distributed phase
-
-
-def height_valid(sensed: Sensitivity, coherence: NDArray[np.float32], looks: float) -> NDArray[np.bool_]:
-    """Return a mask of pixels with a valid height: significant coherence, and sufficient sensitivity to height.
-
-    Parameters
-    ----------
-    sensed
-        Sensitivity at the pixels.
-    coherence
-        (...) float32, estimate with bias.
-    looks
-        As for `phase_std`.
-    """
-    with np.errstate(invalid="ignore"):
-        return np.asarray(height_sensitive(sensed) & (sensed.overlap > 0) & (coherence > least_coherence(looks)))
 
 
 def height_sensitive(sensed: Sensitivity) -> NDArray[np.bool_]:
@@ -312,23 +306,27 @@ class PlacedHeights:
     std
         (y, x) float64, standard deviation due to the scatter of phase and level, metres.
     folded
-        Number of points that these heights image at more than one pixel, due to layover or unwrapping errors.
+        (y, x) bool, points that these heights image at more than one pixel, due to layover or unwrapping errors.
     """
 
     height: Floats
     std: Floats
-    folded: int
+    folded: NDArray[np.bool_]
 
 
-def place_heights(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Floats) -> PlacedHeights:
+def place_heights(
+    ground_m: Floats, rise_m: NDArray[np.floating], std_m: NDArray[np.floating], shift_px: Floats
+) -> PlacedHeights:
     """Geocode heights: terrain that is higher than assumed is imaged at a displaced pixel.
+
+    A block with a margin of the largest displacement and three pixels gives the heights of the whole raster.
 
     Parameters
     ----------
     ground_m
         (y, x) float64, heights assumed in image formation.
     rise_m, std_m
-        (y, x) float64, height of the terrain imaged at a pixel above the assumed height, NaN if unknown; and its
+        (y, x), height of the terrain imaged at a pixel above the assumed height, NaN if unknown; and its
         standard deviation.
     shift_px
         (y, x, 2) float64, rows and columns from a pixel to the terrain imaged there, per metre of rise.
@@ -348,22 +346,24 @@ def place_heights(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Flo
 
     known = np.isfinite(rise_m)
     if not known.any():
-        return PlacedHeights(np.full(rise_m.shape, np.nan), np.full(rise_m.shape, np.nan), 0)
+        return PlacedHeights(np.full(rise_m.shape, np.nan), np.full(rise_m.shape, np.nan), known)
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     # Pixel at which each point is imaged, eq. 16, by fixed-point iteration; unknown rises are set to the nearest known.
     shift = np.moveaxis(shift_px, -1, 0) * rise_m[tuple(nearest)]
     position = np.stack(np.meshgrid(*map(np.arange, rise_m.shape), indexing="ij")).astype(np.float64)
-    imaged_at, error_px = position, np.full(rise_m.shape, np.inf)
+    imaged_at, error_px = position.copy(), np.full(rise_m.shape, np.inf)
     for _ in range(_STEPS):
-        target = position - [map_coordinates(axis, imaged_at, order=1, mode="nearest") for axis in shift]
-        error_px, imaged_at = np.abs(target - imaged_at).max(axis=0), target
-        if not (error_px > _TOLERANCE_PX).any():
+        moving = error_px > _CONVERGED_PX
+        if not moving.any():
             break
+        at = imaged_at[:, moving]
+        target = position[:, moving] - [map_coordinates(axis, at, order=1, mode="nearest") for axis in shift]
+        error_px[moving], imaged_at[:, moving] = np.abs(target - at).max(axis=0), target
     # Points imaged at several pixels, and points without convergence, have no height.
     folds = _covered(position + shift, np.abs(_stretch(shift)) * known) > _MOST_COVERED
     converged = (error_px <= _TOLERANCE_PX) & ~folds
     height, std = (map_coordinates(values, imaged_at, order=1, cval=np.nan) for values in (ground_m + rise_m, std_m))
-    folded = int(((error_px > _TOLERANCE_PX) | folds)[np.isfinite(height)].sum())
+    folded = ~converged & np.isfinite(height)
     return PlacedHeights(np.where(converged, height, np.nan), np.where(converged, std, np.nan), folded)
 
 

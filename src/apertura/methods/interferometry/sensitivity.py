@@ -7,7 +7,9 @@ import numpy as np
 
 from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.contracts import Window
 from apertura.core.quality.path_errors import autocorrelation
+from apertura.core.scene.looks import Lattice
 
 Legs = tuple[Floats, Floats]
 """Phase centres of transmitter and receiver for the pulses that illuminate a point, (point, pulse, 3) metres each."""
@@ -46,6 +48,18 @@ class Sensitivity:
     shift: Floats
     overlap: Floats
     range_m: Floats
+
+    def between(self, lattice: Lattice, window: Window) -> "Sensitivity":
+        """Interpolate values at the nodes of a lattice, (node row, node column), bilinearly at the pixels of a window.
+
+        Examples
+        --------
+        >>> lattice, one = Lattice.of((1, 17)), np.array([[0.0, 1.0]])
+        >>> nodes = Sensitivity(one, one, np.zeros((1, 2, 2)), one, one)
+        >>> nodes.between(lattice, (slice(0, 1), slice(4, 6))).slope
+        array([[0.25  , 0.3125]])
+        """
+        return Sensitivity(**{name: lattice.between(values, window) for name, values in vars(self).items()})
 
     @property
     def ambiguity_m(self) -> Floats:
@@ -134,7 +148,7 @@ def _moved(places_m: Floats, axes: Floats, images: tuple[Legs, Legs], paths: lis
         residuals, gradients = [], []
         for legs, path in zip(images, paths, strict=True):
             residuals.append(-_less(path, moved, legs))
-            gradients.append(_gradient(moved, legs) @ east_north.T)
+            gradients.append(path_gradient(moved, legs) @ east_north.T)
         # Unknowns east and north; residuals: path differences of each image about their mean, and mean of both images.
         rows = [residual - residual.mean(axis=1, keepdims=True) for residual in residuals]
         slopes = [gradient - gradient.mean(axis=1, keepdims=True) for gradient in gradients]
@@ -157,7 +171,7 @@ def _less(path: Floats, moved: Floats, legs: Legs) -> Floats:
     return np.asarray(path - _path(moved, legs))
 
 
-def _gradient(places_m: Floats, legs: Legs) -> Floats:
+def path_gradient(places_m: Floats, legs: Legs) -> Floats:
     """Return the gradients of the total paths, (point, pulse, 3)."""
     total = np.zeros_like(legs[0])
     for leg in legs:
@@ -170,7 +184,7 @@ def _overlap(
     places_m: Floats, axes: Floats, images: tuple[Legs, Legs], band_hz: tuple[float, float], window: Floats | None
 ) -> Floats:
     """Return the spectral overlap of both images, the product of the overlaps in range and in cross-range."""
-    ground = [_gradient(places_m, legs) @ axes[:2].T for legs in images]
+    ground = [path_gradient(places_m, legs) @ axes[:2].T for legs in images]
     middle = [gradient.mean(axis=1) for gradient in ground]
     along = middle[0] + middle[1]
     along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-12)

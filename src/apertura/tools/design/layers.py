@@ -233,15 +233,8 @@ def coherence_layers(
     first, second = (image.looks for image in images)
     if first is None or second is None:
         raise TypeError("interferograms require images of pairs, not sums")
-    if first.lattice.shape != second.lattice.shape:
-        rows, columns = np.meshgrid(*first.lattice.nodes, indexing="ij")
-        nearest = [
-            np.abs(nodes[:, None] - targets).argmin(axis=0)
-            for nodes, targets in zip(second.lattice.nodes, (rows[:, 0], columns[0]), strict=True)
-        ]
-        second = replace(second, pulses=second.pulses[np.ix_(*nearest)], lattice=first.lattice)
     band = float(pairs[0].frequency_hz[0]), float(pairs[0].frequency_hz[-1])
-    sensed = sensed_heights(scene, first, [legs_of(first), legs_of(second)], band, pairs[0].weight)
+    sensed = sensed_heights(scene, first, [legs_of(first), legs_of(second, first.lattice)], band, pairs[0].weight)
     coherence = sensed.overlap
     for image in images:
         if "snr" in image.layers and np.isfinite(image.layers["snr"]).any():
