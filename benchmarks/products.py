@@ -58,7 +58,7 @@ def prepare(root: Path, side: int, receivers: int) -> Campaign:
     return campaign
 
 
-def enlarge(campaign: Campaign, flight: str, pair: str, seed: int) -> None:
+def enlarge(campaign: Campaign, flight: str, pair: str, seed: int, lit: float = LIT) -> None:
     """Replace the image of a pair by speckle on the enlarged grid."""
     folder, grid = campaign.stage("image", flight, pair), settled_scene(campaign).grid
     small = open_stage(folder, "image")
@@ -66,12 +66,12 @@ def enlarge(campaign: Campaign, flight: str, pair: str, seed: int) -> None:
     large = xr.Dataset({"image": (("y", "x"), missing, small.image.attrs)}, coords=grid.coordinates, attrs=small.attrs)
     rng = np.random.default_rng(seed)
     peak = small.attrs["quality"]["brightest"]["amplitude"]
-    shutil.rmtree(folder)
+    folder.remove()
     with writing(folder) as wip:
         create(wip, large, {"image": (TILE, TILE)})
         array = open_array(wip, "image")
         for window in grid.tiles(TILE):
-            if rng.random() < LIT:
+            if rng.random() < lit:
                 array[window] = peak * 0.1 * rng.standard_normal((TILE, 2 * TILE), np.float32).view(np.complex64)
         finish(wip, folder)
 
@@ -87,7 +87,7 @@ def run_step(root: str, *step: str) -> None:
     """Run a step in this process; print its peak memory and CPU seconds."""
     from apertura.cli import app
 
-    app([*step, "--campaign", root], standalone_mode=False)
+    app(["step", *step, "--campaign", root], standalone_mode=False)
     used = resource.getrusage(resource.RUSAGE_SELF)
     seconds = used.ru_utime + used.ru_stime
     print(f"{' '.join(step)}: peak {used.ru_maxrss / 2**20:.2f} GiB, {seconds:.1f} CPU s", flush=True)

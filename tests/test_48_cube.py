@@ -9,12 +9,14 @@ import rasterio
 import rioxarray  # noqa: F401
 import xarray as xr
 import zarr
-from folders import ROOT, complaint, copy_writable, edit_config, run_steps
+from folders import ROOT, complaint, contents, copy_writable, edit_config, run_steps
 from pyproj import Transformer
 from walked import walk
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import create, damaged_files, finish, manifest_of, open_stage, writing
+from apertura.common.confined import ConfinedPath
+from apertura.common.contracts import RASTERS
 from apertura.methods.interferometry.coherence import chance, coherence
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.stages import cube
@@ -150,7 +152,6 @@ def test_each_image_states_its_geometry(opened):
 
 
 def test_coherence_and_phase_do_not_depend_on_the_tiles(opened):
-    window = opened.attrs["coherence_window"]
     images = opened.image.load()
     reference = opened.reference_pair.sel(flight="f01").values.item()
     (other,) = set(opened.pair.values.tolist()) - {reference}
@@ -158,12 +159,12 @@ def test_coherence_and_phase_do_not_depend_on_the_tiles(opened):
         ("pair", ("f01", other), ("f01", reference)),
         ("flight", ("f02", "uav1-uav1"), ("f01", "uav1-uav1")),
     ):
+        stored = opened.sel(flight=one[0], pair=one[1])
         whole = coherence(
             images.sel(flight=one[0], pair=one[1]).values,
             images.sel(flight=against[0], pair=against[1]).values,
-            window=window,
+            window=int(stored[f"{kind}_window"]),
         )
-        stored = opened.sel(flight=one[0], pair=one[1])
         np.testing.assert_array_equal(stored[f"{kind}_coherence"], whole[0])
         np.testing.assert_array_equal(stored[f"{kind}_phase"], whole[1])
         assert float(stored[f"{kind}_chance"]) == pytest.approx(chance(whole[2]), abs=0.03)  # looks estimated per tile
@@ -214,6 +215,122 @@ def test_cube_does_not_depend_on_the_number_of_threads(campaign, tmp_path):
     again = Campaign.load(copy_writable(campaign.root, tmp_path / "campaign"))
     cube.cube(again, threads=3)
     assert manifest_of(again.stage("cube")).read_bytes() == manifest_of(campaign.stage("cube")).read_bytes()
+
+
+# ---- Appending: chunks of unchanged flights are linked, and the bytes equal those of a cube written at once ----------
+
+
+@pytest.fixture
+def written(campaign, tmp_path, monkeypatch):
+    """A writable copy of the campaign, a function that writes its cube for some flights, and the flights computed."""
+    root = copy_writable(campaign.root, tmp_path / "campaign")
+    table, computed, real = root / "config/flights.tsv", [], cube._write_images
+    head, *rows = table.read_text().splitlines(keepends=True)
+    monkeypatch.setattr(cube, "_write_images", lambda *given: (computed.append(given[3]), real(*given))[1])
+
+    def write(*flights):
+        computed.clear()
+        table.write_text(head + "".join(row for name in flights for row in rows if row.split()[0] == name))
+        return cube.cube(Campaign.load(root))
+
+    return root, write, computed
+
+
+def test_appended_flight_computes_only_its_own_chunks(campaign, written):
+    root, write, computed = written
+    (root / "results/.cube.zarr.lock").unlink()  # record of the earlier cube
+    folder = write("f01")
+    assert computed == ["f01"]
+    before = {path: path.stat().st_ino for path in (folder / "image/c/0").rglob("*") if path.is_file()}
+    write("f01", "f02")
+    assert computed == ["f02"]
+    assert len(before) == 2 * 16
+    assert all(path.stat().st_ino == inode for path, inode in before.items())
+    assert manifest_of(folder).read_bytes() == manifest_of(campaign.stage("cube")).read_bytes()
+    assert damaged_files(manifest_of(folder)) == []
+
+
+def test_removed_flight_leaves_no_chunks(campaign, written):
+    root, write, computed = written
+    folder = write("f01")
+    assert computed == []
+    assert not any((folder / name / "c" / "1").exists() for name in RASTERS)
+    assert open_stage(folder, "cube").flight.values.tolist() == ["f01"]
+    write("f02")  # without its reference flight
+    assert computed == ["f02"]
+    assert np.isnan(open_stage(folder, "cube").flight_coherence).all()
+
+
+def test_flights_in_another_order_are_moved(written):
+    """Chunks move with their flights; a flight is written again if its reference flight has changed."""
+    root, write, computed = written
+    folder = write("f02", "f01")
+    opened = open_stage(folder, "cube")
+    assert set(computed) == {"f01", "f02"}
+    assert opened.reference_flight.sel(pair="uav1-uav1") == "f02"
+    computed.clear()
+    (root / "results/.cube.zarr.lock").unlink()
+    before = manifest_of(folder).read_bytes()
+    write("f02", "f01")
+    assert manifest_of(folder).read_bytes() == before
+
+
+def test_damaged_chunk_is_written_again_if_no_flight_was_added(campaign, written):
+    _, write, computed = written
+    folder = write("f01", "f02")
+    next(path for path in (folder / "image/c/1").rglob("*") if path.is_file()).write_bytes(b"x")
+    write("f01", "f02")
+    assert computed == ["f02"]
+    assert manifest_of(folder).read_bytes() == manifest_of(campaign.stage("cube")).read_bytes()
+
+
+@pytest.mark.parametrize("step", ["_compare", "finish"])
+def test_killed_append_leaves_the_earlier_cube_valid(campaign, written, monkeypatch, step):
+    _, write, _ = written
+    folder = write("f01")
+    before = contents(folder) | {"manifest": manifest_of(folder).read_bytes()}
+
+    def killed(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(cube, step, killed)
+        write("f01", "f02")
+    assert contents(folder) | {"manifest": manifest_of(folder).read_bytes()} == before
+    assert open_stage(folder, "cube").sizes["flight"] == 1
+    write("f01", "f02")
+    assert manifest_of(folder).read_bytes() == manifest_of(campaign.stage("cube")).read_bytes()
+
+
+def test_writer_killed_between_two_renamings_is_recovered(campaign, written, monkeypatch):
+    _, write, computed = written
+    folder, real = write("f01"), ConfinedPath.rename
+
+    def killed(self, target):
+        if self.name == "cube.zarr.wip":
+            raise KeyboardInterrupt
+        return real(self, target)
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(ConfinedPath, "rename", killed)
+        write("f01", "f02")
+    assert not folder.exists()
+    write("f01", "f02")
+    assert manifest_of(folder).read_bytes() == manifest_of(campaign.stage("cube")).read_bytes()
+
+
+def test_readers_of_the_earlier_metadata_can_read_chunks_with_a_further_flight(written):
+    """Coordinates and measures have chunks of a fixed length, so that a published cube may be replaced file by file."""
+    root, write, _ = written
+    folder = write("f01")
+    metadata = (folder / "zarr.json").read_bytes()
+    before = xr.open_zarr(str(folder)).load()
+    write("f01", "f02")
+    (folder / "zarr.json").write_bytes(metadata)
+    after = xr.open_zarr(str(folder)).load()
+    for name in {*before.variables} - {"reference_flight", "pair", *RASTERS}:
+        np.testing.assert_array_equal(after[name], before[name])
+    np.testing.assert_array_equal(after.image, before.image)
 
 
 def test_images_of_an_older_version_are_one_message(campaign, tmp_path):

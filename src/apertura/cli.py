@@ -613,6 +613,29 @@ def diff(
     raise typer.Exit(print_differences(given(first), given(second), whole=whole))
 
 
+@app.command("publish")
+def publish_results(
+    campaign: Annotated[Path, typer.Argument(help="campaign folder")],
+    url: Annotated[str, typer.Argument(metavar="URL", help="target, such as s3://bucket/prefix")],
+    *,
+    href: Annotated[
+        str, typer.Option(metavar="URL", help="address of the target for readers, if it differs from URL")
+    ] = "",
+    every: Annotated[bool, typer.Option("--all", help="publish intermediate results, too")] = False,
+    raw: Annotated[bool, typer.Option("--raw", help="publish recordings and logs, too")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", "-n", help="list the changes without writing")] = False,
+) -> None:
+    """Copy changed results of a campaign to an object store, catalogs last; credentials are read from the environment.
+
+    Objects of results that no longer exist are deleted. Recordings, logs and intermediate results are not published
+    unless requested.
+    """
+    opened = _opened(campaign)
+    from apertura.tools.publish import publish
+
+    print(*publish(opened, url, href=href, every=every, raw=raw, dry_run=dry_run).lines, sep="\n")
+
+
 @app.command()
 def report(
     campaign: CampaignFolder = HERE,

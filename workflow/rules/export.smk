@@ -69,7 +69,6 @@ rule export_fused:
     input:
         image=each("results/{flight}/{pair}/image.manifest.json"),
         assessment="results/{flight}/assessment.manifest.json",
-        cube="results/cube.manifest.json",
         scene="results/scene.manifest.json",
         layers=each("results/{flight}/{pair}/layers.manifest.json"),
     output:

@@ -210,6 +210,7 @@ rule assess:
         refined_track="results/{flight}/refined_track.manifest.json",
         scene="results/scene.manifest.json",
         terrain=each("results/terrain.manifest.json"),
+        first_flight=files(inputs.first_flight),
     output:
         "results/{flight}/assessment.json",
         "results/{flight}/assessment.manifest.json",

@@ -68,7 +68,7 @@ rule pictures_fused:
     input:
         export=each("results/{flight}/{pair}/export.manifest.json"),
         image=each("results/{flight}/{pair}/image.manifest.json"),
-        cube="results/cube.manifest.json",
+        assessment="results/{flight}/assessment.manifest.json",
         fused=each("results/{flight}/fused/export.manifest.json"),
         scene="results/scene.manifest.json",
     output:

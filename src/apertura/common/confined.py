@@ -299,6 +299,16 @@ class ConfinedPath(PosixPath):
         with self.open("rb") as source, target.open("wb") as copy:
             shutil.copyfileobj(source, copy, 1 << 20)
 
+    def link_or_copy_to(self, target: "ConfinedPath") -> None:
+        """Create a hard link to a regular file, or a copy if the file system does not permit links."""
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if not stat.S_ISREG(self.lstat().st_mode):
+            raise self._refused("not a regular file")
+        with suppress(OSError), self._within() as (folder, name), target._within() as (other, new):
+            os.link(name, new, src_dir_fd=folder, dst_dir_fd=other, follow_symlinks=False)
+            return
+        target.write_bytes(self.read_bytes())
+
     def reference(self) -> str:
         """Serialize the path as text for another process, see `referenced`."""
         return json.dumps([str(self._top.absolute()), self.relative_to(self._top).as_posix()])

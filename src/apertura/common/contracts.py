@@ -42,6 +42,7 @@ RASTERS: dict[str, Row] = {
 """Rasters of the cube, written tile by tile."""
 
 _OF_COHERENCE = {
+    "window": "side of the estimation window, pixels, of",
     "looks": "independent samples in the window of",
     "chance": "expected value, for unrelated images, of",
     "common_band": "upper limit, set by the common band for unchanged terrain, of",
@@ -316,7 +317,7 @@ STAGES: Mapping[str, Stage] = {
         {name: row for name, row in _CUBE.items() if name not in SUMMED},
         {
             "fusion": "flight → pairs of the coherent sum, phase removed from each; excluded pairs with reasons",
-            "coherence_window": "side length of the window for coherence estimation, pixels",
+            "origins": "flight → hash of the code, grid, images and assessment from which its chunks were computed",
         },
         {name: row for name, row in _CUBE.items() if name in SUMMED},
     ),

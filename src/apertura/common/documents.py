@@ -192,13 +192,13 @@ def read_json(path: Path, *, expected: str, remedy: str, largest: int = LARGEST_
 
 
 @contextmanager
-def undamaged(path: Path, *, expected: str, remedy: str) -> Iterator[None]:
+def undamaged(path: object, *, expected: str, remedy: str) -> Iterator[None]:
     """Convert errors raised while a document is parsed to a single message about the file.
 
     Parameters
     ----------
     path
-        File of the document.
+        File of the document, or its address.
     expected, remedy
         Parts of the message; `remedy` is `DAMAGED` for a damaged result.
 

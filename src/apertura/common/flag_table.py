@@ -534,7 +534,7 @@ _OF_IMAGES = {
         "displacement of the points to the east and north, cm",
         "bright points of two flights are displaced relative to each other",
         "base station, datum, time system of one flight",
-        "stages/cube.py",
+        "stages/assess.py",
     ),
     "pair_unconfirmed": Flag(
         "number of common bright points",

@@ -12,6 +12,7 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, requires, version
 from itertools import cycle
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol
 
 from apertura import __version__
@@ -234,10 +235,10 @@ def hashes_of_file(path: Path, algorithms: Sequence[str]) -> dict[str, str]:
     return {name: digest.hexdigest() for name, digest in digests.items()}
 
 
-def sha256_tree(folder: Path) -> dict[str, str]:
-    """Return relative path → SHA-256 of every file below `folder`, sorted by path."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    return {path.relative_to(folder).as_posix(): sha256_file(path) for path in files}
+def sha256_tree(folder: Path, known: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
+    """Return relative path → SHA-256 of every file below `folder`, sorted by path; files with `known` are not read."""
+    files = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*")) if path.is_file()}
+    return {name: known.get(name) or sha256_file(path) for name, path in files.items()}
 
 
 def code_sha256(*modules: str, package: Path = PACKAGE) -> str:

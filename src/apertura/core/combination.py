@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from apertura.common.units import decibels
 from apertura.core.quality.agreement import OUT_OF_PHASE_RAD, Agreement
+from apertura.core.quality.measures import BlockRaster
 
 # ---- Coherence of the images of a sum
 
@@ -517,6 +518,47 @@ def magnitude_sum(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> 
     array([[1.  , 0.25]], dtype=float32)
     """
     return np.asarray(_mean(np.abs(_normalised(images, peaks))), np.float32)
+
+
+@dataclass(frozen=True)
+class PairSum:
+    """Sum of the images of a flight's pairs, computed block by block when it is sliced.
+
+    Attributes
+    ----------
+    images
+        Pair → (y, x) complex64, any array whose slices are numpy arrays.
+    peaks
+        Pair → largest magnitude of its image.
+    phases_rad
+        Pair of the coherent sum → phase removed; other pairs are not part of the coherent sum.
+    kind
+        coherent, noncoherent or magnitude.
+
+    Examples
+    --------
+    >>> images = {"a-a": np.array([[2.0]], np.complex64), "a-b": np.array([[4.0j]], np.complex64)}
+    >>> PairSum(images, {"a-a": 2.0, "a-b": 4.0}, {"a-a": 0.0, "a-b": np.pi / 2}, "coherent")[0:1, 0:1].round(3)
+    array([[1.-0.j]], dtype=complex64)
+    """
+
+    images: Mapping[str, BlockRaster]
+    peaks: Mapping[str, float]
+    phases_rad: Mapping[str, float]
+    kind: str
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Rows and columns."""
+        return next(iter(self.images.values())).shape
+
+    def __getitem__(self, window: tuple[slice, slice]) -> NDArray[Any]:
+        pairs = [pair for pair in self.images if self.kind != "coherent" or pair in self.phases_rad]
+        stack = np.stack([np.asarray(self.images[pair][window]) for pair in pairs])
+        peaks = np.array([self.peaks[pair] for pair in pairs])
+        if self.kind == "coherent":
+            return coherent_sum(stack, peaks, np.array([self.phases_rad[pair] for pair in pairs]))
+        return noncoherent_sum(stack, peaks) if self.kind == "noncoherent" else magnitude_sum(stack, peaks)
 
 
 def _mean(images: NDArray[Any]) -> NDArray[Any]:

@@ -1,4 +1,4 @@
-"""Comparison of two finished images of a campaign, and access to their layers and reports."""
+"""Comparison of two finished images of a campaign, and access to their layers, sums and reports."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -22,6 +22,7 @@ from apertura.common.contracts import Window
 from apertura.common.documents import undamaged
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import sha256_file
+from apertura.core.combination import PairSum
 from apertura.core.quality.agreement import WIDEST_PIXEL, Agreement, agreement, agreement_of_ground
 from apertura.core.quality.bright_points import SPECKLE, BrightPoint, bright_points, has_point, near
 from apertura.core.quality.measures import BlockRaster
@@ -239,6 +240,13 @@ def agreement_report(measured: Agreement | None) -> dict[str, float | str] | Non
     }
 
 
+def sum_of(images: Mapping[str, xr.Dataset], assessed: Mapping[str, Any], kind: str) -> PairSum:
+    """Return a sum of a flight's images; `kind` is coherent, noncoherent or magnitude."""
+    peaks = {pair: image.attrs["quality"]["brightest"]["amplitude"] for pair, image in images.items()}
+    rasters = {pair: image.image for pair, image in images.items()}
+    return PairSum(rasters, peaks, assessed["fusion"]["phases_rad"], kind)
+
+
 def report_of(campaign: Campaign, flight: str, image: str) -> dict[str, Any]:
     """Return image.json of a pair or of 'fused'; raise CampaignError if it is missing or has changed since export."""
     path = campaign.result(flight, image, "image.json")
@@ -261,5 +269,6 @@ def assessment_of(campaign: Campaign, flight: str) -> dict[str, Any]:
         phases = {pair: float(phase_rad) for pair, phase_rad in fusion["phases_rad"].items()}
         excluded = {name: {**fusion[name]} for name in ("excluded", "unmeasured")}
         read["fusion"] = {**fusion, **excluded, "phases_rad": phases}
+        read["first_flight"] = {**document.get("first_flight", {})}
         read["pairs"] = {pair: {**agreed, "flags": {**agreed["flags"]}} for pair, agreed in pairs.items()}
     return {**document, **read}

@@ -11,13 +11,21 @@ import xarray as xr
 from apertura.campaign.config import SampledWaveform
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage, save_document
+from apertura.common.contracts import Window
 from apertura.common.flags import Flags
 from apertura.common.provenance import chained_sha256
 from apertura.core.combination import CoherentSum, agreement_between, choose_fusion
 from apertura.core.imaging.focus_check import UNEXPECTED_DB
 from apertura.core.quality.agreement import Agreement
 from apertura.core.scene.grid import SceneGrid
-from apertura.stages.agreement import ComparedImage, agreement_of, agreement_report, comparable, shows_points_of
+from apertura.stages.agreement import (
+    ComparedImage,
+    agreement_of,
+    agreement_report,
+    assessment_of,
+    comparable,
+    shows_points_of,
+)
 from apertura.stages.hypotheses import LEAST_SHARE, hypotheses
 from apertura.stages.refine import open_refined
 from apertura.stages.scene import settled_scene
@@ -84,6 +92,7 @@ def assess(campaign: Campaign, flight: str) -> Path:
             for (one, two), measured in between.items()
         ],
         "fusion": fusion.report,
+        **_against_first_flight(campaign, flight, compared[reference], windows),
         "code_sha256": chained_sha256(
             lineage.result.code_sha256, [image.attrs["code_sha256"] for image in images.values()]
         ),
@@ -91,6 +100,30 @@ def assess(campaign: Campaign, flight: str) -> Path:
     path = campaign.result(flight, "assessment.json")
     save_document(path, report, lineage)
     return path
+
+
+def _against_first_flight(
+    campaign: Campaign, flight: str, image: ComparedImage, windows: Sequence[Window]
+) -> dict[str, Any]:
+    """Return the displacement of a flight's reference image relative to that of the first flight, and flags.
+
+    The result is empty for the first flight. A comparison with one flight, not with all, leaves the assessments of
+    earlier flights unchanged when a flight is added.
+    """
+    first = campaign.image_flights[0].name
+    if flight == first:
+        return {}
+    reference = open_stage(campaign.stage("image", first, assessment_of(campaign, first)["reference"]), "image")
+    agreement = agreement_of(ComparedImage.of(reference, image.grid, windows), image, image.grid, windows)
+    flags = Flags()
+    if agreement is not None and agreement.shifted:
+        flags["flights_displaced"] = (
+            f"{agreement.evidence} of flight {flight} displaced by {100 * agreement.shift_m:.1f} ± "
+            f"{100 * agreement.shift_std_along_m:.1f} cm relative to flight {first}, "
+            f"{100 * agreement.shift_east_m:+.1f} cm east and "
+            f"{100 * agreement.shift_north_m:+.1f} cm north: a base station, datum or time system differs"
+        )
+    return {"first_flight": {"reference": first, "agreement": agreement_report(agreement), "flags": flags}}
 
 
 def _too_coarse(compared: Mapping[str, ComparedImage], grid: SceneGrid) -> str:

@@ -1,6 +1,6 @@
 """Rule `cube`: every image of the campaign on one grid, sums over each flight's pairs, and interferometric phases."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import compress
@@ -13,18 +13,20 @@ from rasterio.warp import transform_bounds
 
 from apertura import __version__
 from apertura.campaign.config import FUSED
+from apertura.campaign.digests import Lineage
 from apertura.campaign.folder import Campaign
-from apertura.campaign.store import create, finish, open_array, open_stage, writing
+from apertura.campaign.store import attributes_of, create, finish, open_array, open_stage, replacing
+from apertura.common.confined import ConfinedPath
 from apertura.common.contracts import MEASURED, QUOTED, RASTERS, SUMMED, Window
 from apertura.common.documents import undamaged
-from apertura.common.flags import Flags
 from apertura.common.leap_seconds import GPS_EPOCH
+from apertura.common.provenance import canonical_json, sha256_file, sha256_text
 from apertura.core.combination import clutter_reduction_db, coherent_sum, magnitude_sum, noncoherent_sum
 from apertura.core.quality.focus import focus_with_flags
 from apertura.core.quality.measures import BlockRaster, held, image_statistics
 from apertura.core.scene.grid import SceneGrid
 from apertura.methods.interferometry.coherence import chance, coherence, common_band, window_px
-from apertura.stages.agreement import ComparedImage, agreement_of, agreement_report, assessment_of
+from apertura.stages.agreement import assessment_of
 from apertura.stages.scene import settled_scene
 from apertura.stages.tags import stamped
 from apertura.workflow.lineage import result_of
@@ -155,9 +157,9 @@ def compared(images: Images, references: Mapping[str, str], first_flights: Mappi
     return {kind: {one: other for one, other in rows.items() if one != other} for kind, rows in partners.items()}
 
 
-def window_of(images: Images, spacing_m: float) -> int:
-    """Return the side of the coherence window, which contains at least 16 looks of every image, in pixels."""
-    return max(window_px(_spectrum(image), spacing_m) for image in images.values())
+def window_of(images: Sequence[xr.Dataset], spacing_m: float) -> int:
+    """Return the side of the coherence window, which contains at least 16 looks of both images, in pixels."""
+    return max(window_px(_spectrum(image), spacing_m) for image in images)
 
 
 def shared_band(one: xr.Dataset, other: xr.Dataset) -> float:
@@ -247,12 +249,23 @@ def _relative_to(window: Window, whole: Window) -> Window:
 
 _PHASE = "coherence", "phase"
 
+_FLIGHTS_PER_CHUNK = 256
+"""Length of the chunks of coordinates and measures along `flight`.
+
+The length does not depend on the number of flights, so that readers with the earlier metadata can read chunks to which
+a flight was added.
+"""
+
 
 def cube(campaign: Campaign, *, threads: int = 1) -> Path:
     """Write results/cube.zarr: images (flight, pair, y, x), sums of each flight, coherence and phase between images.
 
     The cube has sums if any flight has two or more pairs; the sums are NaN for flights with a single pair. Tiles that
     no pulse of a pair illuminates are not stored and are read as NaN, as in the image.
+
+    Chunks contain values of one flight, which depend on this flight and on its reference images only (see `_origins`).
+    Chunks of flights that have not changed since the cube was last written are linked, not computed again. The earlier
+    cube remains valid until the new one replaces it.
     """
     flights, lineage = campaign.image_flights, result_of(campaign, "cube").begin(campaign.root)
     images = {
@@ -265,8 +278,9 @@ def cube(campaign: Campaign, *, threads: int = 1) -> Path:
     grid, side = settled_scene(campaign).grid, campaign.settings.processing.tile_px
     folder, windows = campaign.stage("cube"), list(grid.tiles(side))
     with undamaged(folder, expected="images formed by this version", remedy="Run the workflow again."):
-        template = _empty_cube(campaign, images, assessed, sums, grid, windows)
-    with writing(folder) as wip, ThreadPoolExecutor(threads) as workers:
+        template = _empty_cube(campaign, images, assessed, sums, grid)
+    template.attrs["origins"] = _origins(campaign, images, lineage)
+    with replacing(folder) as (wip, recorded), ThreadPoolExecutor(threads) as workers:
         empty = stamped(
             template,
             "cube",
@@ -276,22 +290,98 @@ def cube(campaign: Campaign, *, threads: int = 1) -> Path:
         )
         tile = {"y": side, "x": side, "flight": 1, "pair": 1}
         chunks = {name: tuple(tile[dim] for dim in dims) for name, (dims, *_) in RASTERS.items() if name in empty}
-        whole = {name: empty[name].shape for name in MEASURED if name in empty}
-        create(wip, empty, chunks | whole, consolidated=True)
-        arrays = _CubeArrays(
-            {name: open_array(wip, name) for name in (*chunks, *whole)}, [*assessed], empty.attrs["pairs"]
-        )
-        for flight in assessed:
+        measured = {name: empty[name].values.copy() for name in MEASURED if name in empty}
+        whole = {name: (_FLIGHTS_PER_CHUNK, *values.shape[1:]) for name, values in measured.items()}
+        create(wip, empty, chunks | whole, lengths={"flight": _FLIGHTS_PER_CHUNK}, consolidated=True)
+        linked, kept = _linked(folder, wip, recorded, empty, measured)
+        rasters = {name: open_array(wip, name) for name in chunks}
+        arrays = _CubeArrays({**rasters, **measured}, [*assessed], empty.attrs["pairs"])
+        changed = [flight for flight in assessed if flight not in kept]
+        for flight in changed:
             _write_images(images, sums.get(flight), arrays, flight, windows, workers)
         for flight, fusion in sums.items():
-            single_db = [images[flight, pair].attrs["quality"]["noise_floor_db"] for pair in fusion["phases_rad"]]
-            sum_db = image_statistics(arrays.plane("coherent", flight), windows).noise_floor_db
-            arrays.plane("coherent_noise_floor", flight)[()] = sum_db
-            arrays.plane("clutter_reduction", flight)[()] = clutter_reduction_db(single_db, sum_db)
+            if flight in changed:
+                single_db = [images[flight, pair].attrs["quality"]["noise_floor_db"] for pair in fusion["phases_rad"]]
+                sum_db = image_statistics(arrays.plane("coherent", flight), windows).noise_floor_db
+                arrays.plane("coherent_noise_floor", flight)[()] = sum_db
+                arrays.plane("clutter_reduction", flight)[()] = clutter_reduction_db(single_db, sum_db)
         references = {flight: assessment["reference"] for flight, assessment in assessed.items()}
-        _compare(images, references, arrays, grid, side=side, workers=workers)
-        finish(wip, folder, lineage=lineage)
+        _compare(images, references, arrays, grid, changed, side=side, workers=workers)
+        for name, values in measured.items():
+            open_array(wip, name)[...] = values
+        finish(wip, folder, lineage=lineage, known=linked)
     return folder
+
+
+def _origins(campaign: Campaign, images: Images, lineage: Lineage) -> dict[str, str]:
+    """Return flight → hash of everything on which the chunks of the flight depend.
+
+    These are the code, the tile size, the grid, the images and the assessment of the flight, and the images of its
+    pairs in their reference flights. A further flight changes the origin of no other flight.
+    """
+    digests, settings = lineage.sources.digests, campaign.settings.processing.tile_px
+    shared = [lineage.result.code_sha256, settings, digests[campaign.manifest("scene")]]
+    pairs, origins = sorted({pair for _, pair in images}), dict[str, str]()
+    references = reference_flights(images, pairs)
+    for flight in campaign.image_flights:
+        own = [
+            campaign.manifest("image", name, pair) for pair in flight.pairs for name in (flight.name, references[pair])
+        ]
+        named = {name: digests[name] for name in (*own, campaign.manifest("assessment", flight.name))}
+        origins[flight.name] = sha256_text(canonical_json([*shared, named]))
+    return origins
+
+
+def _linked(
+    folder: ConfinedPath, wip: ConfinedPath, recorded: Mapping[str, str], empty: xr.Dataset, measured: Mapping[str, Any]
+) -> tuple[dict[str, str], set[str]]:
+    """Link the chunks of unchanged flights of the earlier cube; copy the quantities measured on them.
+
+    Parameters
+    ----------
+    folder, recorded
+        The earlier cube and its hashes; if `recorded` is empty, there is none.
+    wip, empty
+        The new cube.
+    measured
+        Quantities of the new cube, by name, which are written here.
+
+    Returns
+    -------
+    tuple
+        Linked file → SHA-256, and the names of the unchanged flights. If no flight has changed, all chunks are read,
+        and flights with damaged chunks count as changed.
+    """
+    if not recorded:
+        return {}, set()
+    attributes = attributes_of(folder)
+    earlier, flights, pairs = attributes.get("origins", {}), attributes["flights"], attributes["pairs"]
+    origins = empty.attrs["origins"]
+    kept = {flight for flight in flights if earlier.get(flight) == origins.get(flight)} & origins.keys()
+    chunks = {name: digest for name, digest in recorded.items() if name.split("/")[0] in RASTERS and "/c/" in name}
+    if kept == origins.keys():
+        kept -= {
+            flights[int(name.split("/")[2])] for name, digest in chunks.items() if sha256_file(folder / name) != digest
+        }
+    rows = {flights.index(flight): empty.attrs["flights"].index(flight) for flight in kept}
+    columns = {pairs.index(pair): empty.attrs["pairs"].index(pair) for pair in pairs if pair in empty.attrs["pairs"]}
+    linked = dict[str, str]()
+    for name, digest in chunks.items():
+        array, c, row, *rest = name.split("/")
+        if int(row) in rows and array in empty:
+            if "pair" in empty[array].dims:
+                rest[0] = str(columns[int(rest[0])])
+            new = "/".join([array, c, str(rows[int(row)]), *rest])
+            (folder / name).link_or_copy_to(wip / new)
+            linked[new] = digest
+    for name, values in measured.items():
+        old = open_array(folder, name, "r")[...] if f"{name}/zarr.json" in recorded else np.full_like(values, np.nan)
+        for row, new_row in rows.items():
+            if values.ndim == 1:
+                values[new_row] = old[row]
+            else:
+                values[new_row, [*columns.values()]] = old[row, [*columns]]
+    return linked, kept
 
 
 @dataclass(frozen=True)
@@ -366,44 +456,25 @@ def _compare(
     references: Mapping[str, str],
     arrays: _CubeArrays,
     grid: SceneGrid,
+    changed: Collection[str],
     *,
     side: int,
     workers: Executor,
 ) -> None:
-    """Write coherence and phase of each image relative to its two reference images, see `compared`."""
-    window = window_of(images, grid.spacing_m)
-    for kind, rows in compared(images, references, reference_flights(images, arrays.pairs)).items():
+    """Write coherence and phase of each image of the changed flights relative to its reference images."""
+    for kind, partners in compared(images, references, reference_flights(images, arrays.pairs)).items():
+        rows = {image: reference for image, reference in partners.items() if image[0] in changed}
         for reference in dict.fromkeys(rows.values()):
             reference_raster = held(images[reference].image)
             for name in (image for image, partner in rows.items() if partner == reference):
+                window = window_of([images[name], images[reference]], grid.spacing_m)
                 planes = [arrays.plane(f"{kind}_{measure}", *name) for measure in _PHASE]
                 rasters, outputs = (held(images[name].image), reference_raster), (planes[0], planes[1])
                 measures = write_phase(rasters, outputs, grid, side=side, window=window, workers=workers)
                 shared = shared_band(images[name], images[reference])
-                for measure, value in zip(("looks", "chance", "common_band"), (*measures, shared), strict=True):
+                values = (window, *measures, shared)
+                for measure, value in zip(("window", "looks", "chance", "common_band"), values, strict=True):
                     arrays.plane(f"{kind}_{measure}", *name)[()] = value
-
-
-def _between_flights(
-    references: Mapping[str, xr.Dataset], grid: SceneGrid, windows: Sequence[Window]
-) -> dict[str, Any]:
-    """Return the displacement of each flight's reference image relative to that of the first flight, and flags."""
-    first, *others = references
-    images = {name: ComparedImage.of(image, grid, windows) for name, image in references.items()} if others else {}
-    between: dict[str, Any] = {}
-    flags: dict[str, Flags] = {}
-    for name in others:
-        agreement = agreement_of(images[first], images[name], grid, windows)
-        between[name] = agreement_report(agreement)
-        if agreement is not None and agreement.shifted:
-            line = (
-                f"{agreement.evidence} of flight {name} displaced by {100 * agreement.shift_m:.1f} ± "
-                f"{100 * agreement.shift_std_along_m:.1f} cm relative to flight {first}, "
-                f"{100 * agreement.shift_east_m:+.1f} cm east and "
-                f"{100 * agreement.shift_north_m:+.1f} cm north: a base station, datum or time system differs"
-            )
-            flags[name] = Flags({"flights_displaced": line})
-    return {"agreement": {"reference": first, "flights": between}, "flags": flags}
 
 
 def _empty_cube(
@@ -412,7 +483,6 @@ def _empty_cube(
     assessed: Mapping[str, Mapping[str, Any]],
     sums: Sums,
     grid: SceneGrid,
-    windows: Sequence[Window],
 ) -> xr.Dataset:
     """Return the cube with its coordinates and labels; rasters and measures computed from them are NaN."""
     pairs = sorted({pair for _, pair in images})
@@ -424,7 +494,6 @@ def _empty_cube(
         nan = np.full((), complex(np.nan, np.nan) if dtype == "complex64" else np.nan, dtype)
         content = {"coverage_content_type": "image" if name in RASTERS else "qualityInformation"}
         empty[name] = dims, np.broadcast_to(nan, tuple(sizes[dim] for dim in dims)), content
-    references = {flight: images[flight, assessment["reference"]] for flight, assessment in assessed.items()}
     return empty.assign_coords(grid.coordinates).assign_attrs(
         Conventions="CF-1.11, ACDD-1.3",
         **acdd_attributes(campaign, [image.attrs["quality"]["view"] for image in images.values()], grid),
@@ -432,8 +501,13 @@ def _empty_cube(
         flights=[*assessed],
         pairs=pairs,
         fusion=sums,
-        coherence_window=window_of(images, grid.spacing_m),
-        **_between_flights(references, grid, windows),
+        agreement={
+            "reference": campaign.image_flights[0].name,
+            "flights": {
+                name: one["first_flight"]["agreement"] for name, one in assessed.items() if one["first_flight"]
+            },
+        },
+        flags={name: flags for name, one in assessed.items() if (flags := one["first_flight"].get("flags"))},
     )
 
 

@@ -34,7 +34,7 @@ from apertura.formats.catalog import DOCUMENTS
 from apertura.formats.catalog.ceos_ard import PAGE, SHEET, ImageFiles, ceos_ard_page, ceos_ard_sheet
 from apertura.formats.export import product, remove_outdated, write_exports
 from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, of_sums
-from apertura.stages.agreement import ComparedImage, assessment_of, bright_points_within
+from apertura.stages.agreement import ComparedImage, assessment_of, bright_points_within, sum_of
 from apertura.stages.image_tags import acquisition_tags, angle_tags, quality_tags
 from apertura.stages.multilook import LazyLayer, coarse, mean_power_report, multilook_of
 from apertura.stages.scene import settled_scene
@@ -104,14 +104,12 @@ def _calibrated(campaign: Campaign, flight: str, pair: str, report: Mapping[str,
 def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     """Write the products of the sums of a flight's pairs, and image.json; return their paths."""
     lineage = result_of(campaign, "fused", flight).begin(campaign.root)
-    cube = open_stage(campaign.stage("cube"), "cube")
-    index = cube.attrs["flights"].index(flight)
-    sums: dict[str, BlockRaster] = {
-        "coherent": held(cube.coherent[index]),
-        "noncoherent": held(Amplitude(cube.noncoherent[index])),
-    }
     pairs, assessed = campaign.flight(flight).pairs, assessment_of(campaign, flight)
     images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
+    sums: dict[str, BlockRaster] = {
+        "coherent": held(sum_of(images, assessed, "coherent")),
+        "noncoherent": held(Amplitude(sum_of(images, assessed, "noncoherent"))),
+    }
     folder, grid = campaign.result(flight, FUSED), settled_scene(campaign).grid
     windows = list(grid.tiles(campaign.settings.processing.tile_px))
     measured, isolated = _in_phase(images, assessed, sums["noncoherent"], grid, windows)
@@ -121,7 +119,7 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
         pair: Flags.merged(image.attrs["flags"], assessed["pairs"][pair]["flags"]) for pair, image in images.items()
     }
     sum_flags = Flags.merged(
-        _flags_of_choice(assessed["fusion"]), _incoherent(at_points), cube.attrs["flags"].get(flight, {})
+        _flags_of_choice(assessed["fusion"]), _incoherent(at_points), assessed["first_flight"].get("flags", {})
     )
     # Flags of pairs outside the coherent sum do not affect the focus of the sum.
     relevant = {*sum_flags, *(flag for pair in added for flag in pair_flags[pair])}
@@ -143,7 +141,7 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
             "points": 0 if measured is None else measured.places,
             "isolated": isolated,
         },
-        "agreement": cube.attrs["agreement"]["flights"].get(flight),
+        "agreement": assessed["first_flight"].get("agreement"),
         "flags": Flags.merged(_flags_of_pairs(pair_flags), sum_flags),
     }
     name = f"{campaign.settings.campaign} · flight {flight}"
@@ -152,9 +150,8 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
         "noncoherent": f"non-coherent sum of {' + '.join(pairs)}",
         "magnitude": f"sum of magnitudes of {' + '.join(pairs)}",
     }
-    # The cube depends on every flight, but the products of a flight depend only on the pairs of that flight.
     origin = Provenance.of(lineage.modules, images, settings={"fusion": assessed["fusion"]})
-    code_sha256 = chained_sha256(lineage.result.code_sha256, [cube.attrs["code_sha256"]])
+    code_sha256 = chained_sha256(origin.code_sha256, [assessed["code_sha256"]])
     tags = tags_of(replace(origin, code_sha256=code_sha256), lineage) | quality_tags(report)
     tags |= acquisition_tags(
         campaign, {(flight, pair): image.attrs["quality"]["view"] for pair, image in images.items()}
@@ -163,7 +160,7 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     written = write_exports(
         "fused",
         folder,
-        {**sums, "magnitude": cube.magnitude[index]},
+        {**sums, "magnitude": sum_of(images, assessed, "magnitude")},
         radiometry=report["radiometry"],
         titles={source: f"{name} · {title}" for source, title in titles.items()},
         tags=tags,

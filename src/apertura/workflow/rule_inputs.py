@@ -218,6 +218,15 @@ def echoes_that_bound_the_scene(scope: JobScope) -> Iterable[str]:
     return [campaign.manifest("echo", first.name, pair) for pair in first.pairs] if is_automatic else []
 
 
+def first_flight(scope: JobScope) -> Iterable[str]:
+    """Return the images and the assessment of the first flight, to which the other flights are compared."""
+    campaign, first = scope.campaign, scope.campaign.image_flights[0]
+    if scope.where[0] == first.name:
+        return []
+    images = [campaign.manifest("image", first.name, pair) for pair in first.pairs]
+    return [*images, campaign.manifest("assessment", first.name)]
+
+
 def unstaged_positions(scope: JobScope) -> Iterable[str]:
     """Return the sources of positions for phase histories, which have no stage `track`: flight logs or echoes."""
     campaign = scope.campaign

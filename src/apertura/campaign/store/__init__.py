@@ -22,6 +22,7 @@ from apertura.campaign.store.manifest import (
     states_origin,
 )
 from apertura.campaign.store.progress import (
+    attributes_of,
     blocks_of_rows,
     create,
     finish,
@@ -29,6 +30,7 @@ from apertura.campaign.store.progress import (
     missing,
     open_array,
     open_stage,
+    replacing,
     resume,
     save_stage,
     sharing,
@@ -37,6 +39,7 @@ from apertura.campaign.store.progress import (
 )
 
 __all__ = [
+    "attributes_of",
     "blocks_of_rows",
     "check_listed",
     "compare",
@@ -55,6 +58,7 @@ __all__ = [
     "record_files",
     "remake",
     "remake_from",
+    "replacing",
     "resume",
     "save_document",
     "save_stage",

@@ -6,6 +6,7 @@ import json
 import warnings
 from collections.abc import Hashable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import google_crc32c
@@ -180,7 +181,12 @@ def encoding_of(dataset: "xr.Dataset", chunks: Mapping[str, int]) -> dict[Hashab
 
 
 def skeleton(
-    stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]], *, packed: bool = True, consolidated: bool = False
+    stage: "xr.Dataset",
+    chunks: Mapping[str, tuple[int, ...]],
+    *,
+    packed: bool = True,
+    lengths: Mapping[str, int] = MappingProxyType({}),
+    consolidated: bool = False,
 ) -> dict[str, bytes]:
     """Return metadata and coordinates of a stage before its arrays are computed: path → bytes.
 
@@ -193,12 +199,14 @@ def skeleton(
         Array that is written chunk by chunk → shape of its chunks.
     packed
         True if these arrays are compressed, which does not reduce the size of noise.
+    lengths
+        Dimension → chunk length of the other arrays and coordinates; other dimensions have one chunk.
     consolidated
         True if the metadata of the stage contain those of all arrays, for readers that open several arrays.
     """
     files: dict[str, Buffer] = {}
     whole, store = stage.drop_vars(list(chunks)), MemoryStore(files)
-    whole.to_zarr(store, mode="w", consolidated=False, zarr_format=3, encoding=encoding_of(whole, {}))
+    whole.to_zarr(store, mode="w", consolidated=False, zarr_format=3, encoding=encoding_of(whole, lengths))
     group = zarr.open_group(store, mode="r+")
     for name, shape in chunks.items():
         array = stage[name]

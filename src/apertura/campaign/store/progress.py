@@ -8,13 +8,14 @@ import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apertura.campaign.store.manifest import ResultOrigin, check_stage, manifest_of, write_manifest
-from apertura.common.atomic import confined_target, naming, remove, rename, write_beside
+from apertura.common.atomic import confined_target, naming, remove, write_beside
 from apertura.common.confined import ConfinedPath
 from apertura.common.contracts import Window, check
 from apertura.common.errors import CampaignError, ContractError
@@ -80,6 +81,37 @@ def sharing(
 
 
 @contextmanager
+def replacing(folder: Path) -> Iterator[tuple[ConfinedPath, dict[str, str]]]:
+    """Lock a stage for writing beside its finished folder, which remains valid until `finish`.
+
+    Yields
+    ------
+    tuple
+        ``<folder>.wip``, which is absent, and file → SHA-256 of the finished folder. The hashes are those recorded by
+        `finish`; chunks are not read. They are empty if there is no finished folder, or if its file names or metadata
+        differ from the record.
+    """
+    folder = confined_target(folder)
+    with _opened(folder) as (wip, lock):
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        wip.remove()
+        if not folder.exists(follow_symlinks=False) and _earlier(folder).exists(follow_symlinks=False):
+            _earlier(folder).rename(folder)  # the writer was killed between two renamings
+        lock.seek(0)
+        yield wip, _recorded(folder, lock.read())
+
+
+def _recorded(folder: ConfinedPath, record: str) -> dict[str, str]:
+    try:
+        hashes: dict[str, str] = json.loads(record)
+        if hashes != sha256_tree(folder, {name: digest for name, digest in hashes.items() if "/c/" in name}):
+            return {}
+    except (ValueError, AttributeError, RecursionError, CampaignError):
+        return {}
+    return hashes
+
+
+@contextmanager
 def _opened(folder: ConfinedPath) -> Iterator[tuple[ConfinedPath, IO[str]]]:
     folder.parent.mkdir(parents=True, exist_ok=True)
     with _lock_of(folder).open("a+") as lock:
@@ -97,20 +129,33 @@ def _acquire(lock: IO[str], folder: ConfinedPath, wip: ConfinedPath) -> None:
             folder.rename(wip)
 
 
+def _earlier(folder: ConfinedPath) -> ConfinedPath:
+    return folder.with_name(f".{folder.name}.earlier")
+
+
 def _lock_of(folder: ConfinedPath) -> ConfinedPath:
     """Return the lock file of a stage, which also contains file hashes, because Snakemake removes manifests."""
     return folder.with_name(f".{folder.name}.lock")
 
 
-def finish(wip: Path, folder: Path, *, lineage: ResultOrigin | None = None, **attributes: Any) -> None:
+def finish(
+    wip: Path,
+    folder: Path,
+    *,
+    lineage: ResultOrigin | None = None,
+    known: Mapping[str, str] = MappingProxyType({}),
+    **attributes: Any,
+) -> None:
     """Turn work in progress into the finished stage and write its manifest.
 
     Parameters
     ----------
     wip, folder
-        Work in progress, from `writing`, and the folder of the stage.
+        Work in progress, from `writing` or `replacing`, and the folder of the stage.
     lineage
         Lineage of the stage, for `write_manifest`.
+    known
+        File → SHA-256 of files that are not read again, such as linked chunks of an earlier version of the stage.
     **attributes
         Attributes of the stage that are known only at the end, such as measurements on the finished arrays.
     """
@@ -121,13 +166,19 @@ def finish(wip: Path, folder: Path, *, lineage: ResultOrigin | None = None, **at
         update_attributes(wip, attributes)
     for partial in wip.rglob("*.partial"):  # left by a killed writer
         partial.unlink()
-    files = sha256_tree(wip)
+    files = sha256_tree(wip, known)
+    wip.synchronise()
+    manifest_of(folder).unlink(missing_ok=True)
     with naming(_lock_of(folder)), _lock_of(folder).open("w", encoding="utf-8") as lock:
         lock.write(canonical_json(files))
         lock.flush()
         os.fsync(lock.fileno())
-    remove(folder)
-    rename(wip, folder)
+    earlier = _earlier(folder)
+    earlier.remove()
+    if folder.exists(follow_symlinks=False):
+        folder.rename(earlier)  # faster than the removal of a large folder
+    wip.rename(folder).parent.synchronise_folder()
+    earlier.remove()
     write_manifest(manifest_of(folder), {f"{folder.name}/{name}": digest for name, digest in files.items()}, lineage)
 
 
@@ -162,7 +213,7 @@ def resume(wip: Path, stage: "xr.Dataset", name: str, windows: Sequence[Window])
     wip, files = ConfinedPath.of(wip), skeleton_of(stage, name, windows)
     if is_work_on(wip, stage):
         chunks = {f"{name}/{_key(window, windows)}" for window in windows}
-        for key in chunks.intersection(_attributes(wip).get(_REWRITTEN, [])):
+        for key in chunks.intersection(attributes_of(wip).get(_REWRITTEN, [])):
             remove(wip / key)
         _repair(wip, files, chunks)
     else:
@@ -177,20 +228,21 @@ def mark_rewritten(wip: Path, name: str, windows: Sequence[Window], rewritten: S
     """
     from apertura.campaign.store.chunks import update_attributes
 
-    earlier = set(_attributes(wip).get(_REWRITTEN, []))
+    earlier = set(attributes_of(wip).get(_REWRITTEN, []))
     keys = earlier | {f"{name}/{_key(window, windows)}" for window in rewritten}
     update_attributes(wip, {_REWRITTEN: sorted(keys)})
 
 
-def _attributes(wip: Path) -> dict[str, Any]:
-    attributes: dict[str, Any] = json.loads((wip / "zarr.json").read_bytes())["attributes"]
+def attributes_of(folder: Path) -> dict[str, Any]:
+    """Return the attributes of a stage, finished or not."""
+    attributes: dict[str, Any] = json.loads((folder / "zarr.json").read_bytes())["attributes"]
     return attributes
 
 
 def is_work_on(wip: Path, stage: "xr.Dataset") -> bool:
     """Return True if `wip` has the settings, inputs and code of `stage`."""
     try:
-        attributes = _attributes(wip)
+        attributes = attributes_of(wip)
         return {key: attributes[key] for key in _PROVENANCE} == {key: stage.attrs[key] for key in _PROVENANCE}
     except (FileNotFoundError, NotADirectoryError):
         return False
@@ -284,6 +336,7 @@ def create(
     chunks: Mapping[str, tuple[int, ...]],
     *,
     packed: bool = True,
+    lengths: Mapping[str, int] = MappingProxyType({}),
     consolidated: bool = False,
 ) -> None:
     """Create `wip`: metadata and coordinates of a stage, and empty arrays that are written chunk by chunk.
@@ -299,12 +352,12 @@ def create(
         Array name → shape of the array's chunks. Only one process at a time may write a chunk.
     packed
         True if chunks are compressed.
-    consolidated
+    lengths, consolidated
         See `apertura.campaign.store.chunks.skeleton`.
     """
     from apertura.campaign.store.chunks import skeleton
 
-    _begin(ConfinedPath.of(wip), skeleton(stage, chunks, packed=packed, consolidated=consolidated))
+    _begin(ConfinedPath.of(wip), skeleton(stage, chunks, packed=packed, lengths=lengths, consolidated=consolidated))
 
 
 def open_array(folder: Path, name: str, mode: str = "r+") -> Any:

@@ -31,7 +31,7 @@ from apertura.formats.export import product
 from apertura.formats.export.coverage import footprint
 from apertura.formats.export.map_layout import number, round_length
 from apertura.formats.export.quicklook import below_peak
-from apertura.stages.agreement import averaged, report_of
+from apertura.stages.agreement import assessment_of, averaged, report_of, sum_of
 from apertura.stages.coverage import crs_name, few_looks
 from apertura.stages.pair import open_pair
 from apertura.stages.refine import open_refined
@@ -322,25 +322,23 @@ def pictures_fused(campaign: Campaign, flight: str) -> Sequence[Path]:
     written = [campaign.result(flight, FUSED, f"{name}.png") for name in SUM_PICTURES]
     panels, cuts = written
     grid, report = settled_scene(campaign).grid, report_of(campaign, flight, FUSED)
-    files = {
-        pair: campaign.result(flight, pair, product("image", "write_power").file)
-        for pair in campaign.flight(flight).pairs[:_MOST_PANELS]
-    }
-    images = [open_stage(campaign.stage("image", flight, pair), "image") for pair in files]
+    pairs, assessed = campaign.flight(flight).pairs, assessment_of(campaign, flight)
+    images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
+    power = product("image", "write_power").file
+    files = {pair: campaign.result(flight, pair, power) for pair in pairs[:_MOST_PANELS]}
     for kind in ("coherent", "noncoherent"):
         files[f"{kind} sum"] = campaign.result(flight, FUSED, product(kind, "write_power").file)
     powers = {}
     for name, file in files.items():
         with opened_raster(file, expected="a product of step export", remedy="Run the workflow again.") as raster:
             powers[name] = averaged(raster, _DOTS).astype("f8")
-    cube = open_stage(campaign.stage("cube"), "cube")
-    tags = tags_of(Provenance.of(lineage.modules, [*images, cube]), lineage)
+    tags = tags_of(Provenance.of(lineage.modules, images), lineage)
     west, south, east, north = grid.bounds_m
     brightest = report["brightest"]
     target_m = brightest["x_m"] - west, brightest["y_m"] - south
     where: dict[str, Any] = {"size_m": (east - west, north - south), "target_m": target_m, "local": grid.crs == LOCAL}
     draw_panels(panels, powers, title=f"flight {flight}", tags=tags, **where)
-    coherent = cube.coherent[cube.attrs["flights"].index(flight)]
+    coherent = sum_of(images, assessed, "coherent")
     title = f"flight {flight}, coherent sum of {' + '.join(report['fusion']['phases_rad'])}"
     draw_cuts(cuts, drawn_cuts(coherent, brightest, grid), title=title, tags=tags)
     record_files(campaign.root / lineage.result.manifest, written, lineage)
