@@ -6,10 +6,10 @@ section 4.3.
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.special
+import scipy
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Complexes, Floats
@@ -17,6 +17,31 @@ from apertura.common.errors import CampaignError
 
 Labels = NDArray[np.uint8]
 """Bits of symbols as integers, the bits of I before those of Q, most significant bit first."""
+
+
+DECISION_LOSS_DB = 0.2
+"""Loss of an image by wrong decisions, dB, up to which the decisions of a pulse are used; as for `FIT_SNR_DB`."""
+
+
+_SNRS = 10 ** np.arange(-2.0, 6.0, 0.01)  # from -20 to 60 dB, in steps of 0.1 dB
+
+
+class DecidedReference(NamedTuple):
+    """Properties of symbols ĉ decided in noise, as reference of an echo with the symbols c.
+
+    Attributes
+    ----------
+    gain
+        E[c/ĉ], amplitude of an image relative to that by known symbols.
+    error
+        Var[c/ĉ]/gain², power of the error of a subcarrier relative to the echo.
+    evm
+        √E|y - ĉ|², error vector magnitude of the received symbols y relative to the decisions.
+    """
+
+    gain: float
+    error: float
+    evm: float
 
 
 @dataclass(frozen=True)
@@ -72,7 +97,7 @@ class Constellation:
         values = np.ascontiguousarray(received)
         parts = values.view(values.real.dtype).reshape(*values.shape, 2)
         level = np.rint((parts / self.half_distance + (self.side - 1)) / 2)
-        index = np.nan_to_num(np.clip(level, 0, self.side - 1)).astype(np.uint8)
+        index = np.fmin(np.fmax(level, 0), self.side - 1).astype(np.uint8)  # 0 for NaN
         gray = index ^ (index >> 1)
         return (gray[..., 0] << (self.bits_per_symbol // 2)) | gray[..., 1]
 
@@ -104,6 +129,61 @@ class Constellation:
         tail = scipy.special.erfc(self.half_distance * np.sqrt(np.asarray(snr, float))) / 2
         axis = 2 * (1 - 1 / self.side) * tail
         return np.asarray(axis * (2 - axis))
+
+    def decided(self, snr: float) -> "DecidedReference":
+        """Return the properties of symbols decided in white Gaussian noise of a given SNR (eqs. 4 to 6).
+
+        Examples
+        --------
+        >>> constellation("qpsk").decided(10.0)
+        DecidedReference(gain=0.998..., error=0.003..., evm=0.31...)
+        """
+        # Of one axis: level a_i received in the interval (low_j, high_j) of level a_j, in standard deviations σ of it
+        side, deviation = self.side, np.sqrt(0.5 / snr)
+        levels = (2 * np.arange(side) - side + 1) * self.half_distance
+        edges = np.concatenate([[-np.inf], levels[:-1] + self.half_distance, [np.inf]])
+        bounds = (edges - levels[:, None]) / deviation
+        density = np.exp(-(bounds**2) / 2) / np.sqrt(2 * np.pi)
+        moment = np.where(np.isfinite(bounds), bounds, 0.0) * density
+        chance = np.diff(scipy.special.ndtr(bounds), axis=1)
+        offset = (levels[:, None] - levels) / deviation
+        # E[(x - a_j)²] of an axis; I and Q are alike
+        square = chance - np.diff(moment, axis=1) - 2 * offset * np.diff(density, axis=1) + offset**2 * chance
+        evm = float(np.sqrt(2 * deviation**2 * square.sum() / side))
+        # Σ over sent symbols, given the decision for level j of I and level l of Q; 1/M is the probability of a symbol
+        count, first, second = (levels**power @ chance for power in (0, 1, 2))
+        decided = levels[:, None] + 1j * levels
+        sent = first[:, None] * count + 1j * count[:, None] * first
+        gain = float(np.real(np.sum(sent / decided)) / side**2)
+        power = second[:, None] * count + count[:, None] * second
+        ratio = float(np.sum(power / np.abs(decided) ** 2) / side**2)
+        return DecidedReference(gain, max(ratio / gain**2 - 1, 0.0), evm)
+
+    @cached_property
+    def least_snr(self) -> float:
+        """Least SNR at which decided symbols are the better reference: gain and error within their limits (eq. 7)."""
+        largest_loss = 10 ** (-DECISION_LOSS_DB / 20)
+
+        def inadequate(snr: float) -> bool:
+            decided = self.decided(snr)
+            return decided.gain < largest_loss or decided.error > self.noise_gain / snr
+
+        return float(_SNRS[1 + max(index for index, snr in enumerate(_SNRS) if inadequate(snr))])
+
+    def snr_of_evm(self, evm: Floats) -> Floats:
+        """Return the SNR at which decisions have a given error vector magnitude, the inverse of `decided`.
+
+        Examples
+        --------
+        >>> qam = constellation("64qam")
+        >>> float(qam.snr_of_evm(qam.decided(200.0).evm).round(1))
+        200.0
+        """
+        return np.asarray(np.exp(np.interp(-np.asarray(evm), -self._evms, np.log(_SNRS))))
+
+    @cached_property
+    def _evms(self) -> Floats:
+        return np.array([self.decided(snr).evm for snr in _SNRS])
 
 
 CONSTELLATIONS = {name: Constellation(name, bits) for name, bits in
