@@ -320,10 +320,17 @@ class Campaign(RawFolder):
         return self.root.named(name, where=f"{CONFIG}: {key}")
 
     @property
-    def sent_file(self) -> ConfinedPath:
-        """File of the transmitted signal: code symbols, or the samples of a pulse."""
+    def sent_path(self) -> ConfinedPath | None:
+        """File or Zarr folder of the transmitted signal, code symbols or samples of a pulse; None if generated."""
         key = getattr(self.settings.waveform, "file_key", "")
-        return self.file(getattr(self.settings.waveform, key, ""), f"waveform.{key}")
+        stated = getattr(self.settings.waveform, key, "")
+        return self.file(stated, f"waveform.{key}") if isinstance(stated, str) else None
+
+    @property
+    def sent_files(self) -> list[ConfinedPath]:
+        """Files of the transmitted signal; none if it is generated."""
+        path = self.sent_path
+        return [] if path is None else sorted(_files(path))
 
     @property
     def calibration_file(self) -> ConfinedPath | None:

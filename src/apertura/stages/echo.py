@@ -52,7 +52,7 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
         files = [campaign.root / name for name in lineage.result.sources]
         formed = PairEcho.recorded(recorded_echo(campaign, flight, pair))
     else:
-        files = [campaign.sent_file]
+        files = campaign.sent_files
         sent = transmitted(campaign, waveform)
         tx, rx = pair.split("-")
         nodes = {node: open_acquisition(campaign, flight, node, sent) for node in dict.fromkeys((tx, rx))}
@@ -94,7 +94,8 @@ def pair_echo(
     positions = place(tx, rx, tx.raw.time.values[pulses.tx_index[paired]], hovers=hovers)
     paired = paired[positions.good]
     at = tx.raw.time.values[pulses.tx_index[paired]]
-    measured, sidelink_m = _transfer((tx, rx), pulses.rx_index[paired], at, sent, processing, air)
+    frames = tx.frames.numbers[pulses.tx_index[paired]]
+    measured, sidelink_m = _transfer((tx, rx), (pulses.rx_index[paired], frames), at, sent, processing, air)
     at = at[measured.kept]
     stated = rx.settings.path_offset_m
     stated_m = stated.radar if tx.name == rx.name else stated.radar - stated.sidelink
@@ -115,6 +116,7 @@ def pair_echo(
         {
             "time": ("pulse", at),
             "capture": ("pulse", pulses.rx_index[paired][measured.kept]),
+            "frame": ("pulse", frames[measured.kept]),
             "path_removed": ("pulse", extra_path_m),
             "tx_position": (("pulse", "axis"), aperture.tx_m),
             "rx_position": (("pulse", "axis"), aperture.rx_m),
@@ -182,7 +184,7 @@ def _attributes(
 
 def _transfer(
     nodes: tuple[Acquisition, Acquisition],
-    captures: NDArray[np.int64],
+    captures: tuple[NDArray[np.int64], NDArray[np.int64]],
     at: Times,
     sent: Transmitted,
     processing: Processing,
@@ -190,20 +192,21 @@ def _transfer(
 ) -> tuple[Transfer, NDArray[np.float64]]:
     """Return the transfer functions of captures, and the electrical length of the sidelink per pulse, in metres.
 
-    The length is 0 for a monostatic pair. `at`: time tags of the transmitter, at which both logs are evaluated
-    (docs/theory.md, "Geometry").
+    `captures`: their indices in the receiver's recording, and the frame numbers of their pulses. The length is 0 for
+    a monostatic pair. `at`: time tags of the transmitter, at which both logs are evaluated (docs/theory.md,
+    "Geometry").
     """
-    tx, rx = nodes
+    (tx, rx), (index, frames) = nodes, captures
     sent_ns = nanoseconds(at)
     time_s = (sent_ns - sent_ns[0]) * 1e-9
     if tx.name == rx.name:
-        read = rx.reader(["radar"], captures)
-        measured = transfer_by_code(read, demodulator_of(rx, sent, processing), time_s=time_s)
+        read = rx.reader(["radar"], index)
+        measured = transfer_by_code(read, demodulator_of(rx, sent, processing, frames), time_s=time_s)
         return _with_waveform(measured, sent), np.zeros(len(at))
     length_m = air.electrical_m(tx.antenna("sidelink", at), rx.antenna("sidelink", at))
     measured = transfer_by_sidelink(
-        rx.reader(["radar", "sidelink"], captures),
-        demodulator_of(rx, sent, processing),
+        rx.reader(["radar", "sidelink"], index),
+        demodulator_of(rx, sent, processing, frames),
         sidelink_m=length_m,
         method=processing.sidelink,
         accuracy_db=strictest_accuracy_db(processing.accuracy_db),

@@ -454,8 +454,8 @@ def calibrated_pair(
     noise = measured[0].profile_noise if measured else None
     before = None if noise is None else noise * float((opened.weight**2).sum())
     if link and sent:
-        filtered = (opened.weight * np.abs(sent.inverse)) ** 2
-        thermal = link.pulse_noise(0.0, spacing_hz=sent.numerology.spacing_hz, squares=float(filtered.sum()))
+        squares = ((opened.weight * np.abs(sent.inverses.sampled())) ** 2).sum(axis=1).mean()
+        thermal = link.pulse_noise(0.0, spacing_hz=sent.numerology.spacing_hz, squares=float(squares))
     sidelink = opened.report.get("sidelink")
     if sidelink and opened.history:
         added = sidelink_noise(

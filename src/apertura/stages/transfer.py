@@ -124,7 +124,9 @@ class PairEcho:
         @cache
         def source() -> Form:
             rx, sent, processing = receiver()
-            demodulator = demodulator_of(rx, sent, processing)
+            frames = np.zeros(len(rx.raw.start), np.int64)
+            frames[dataset.capture.values] = dataset.frame.values
+            demodulator = demodulator_of(rx, sent, processing, frames)
             tones.update(demodulator.tones)
             for channel in tones.values():
                 channel.lines = tuple(dataset.attrs.get("tone_lines", ()))
@@ -268,10 +270,20 @@ class _Transfer(BackendArray):
         return np.asarray((transfer if pulses.ndim else transfer[0])[..., key[1]])
 
 
-def demodulator_of(rx: Acquisition, sent: Transmitted, processing: Processing) -> Demodulator:
-    """Return the demodulator of a receiving node; it removes tones unless `processing.interference` is none."""
+def demodulator_of(
+    rx: Acquisition, sent: Transmitted, processing: Processing, frames: NDArray[np.int64]
+) -> Demodulator:
+    """Return the demodulator of a receiving node; it removes tones unless `processing.interference` is none.
+
+    Parameters
+    ----------
+    rx, sent, processing
+        Receiving node, transmitted signal and settings.
+    frames
+        (capture,) int64, frame number of each capture by its number in the reader of samples.
+    """
     create = Demodulator if processing.interference == "none" else Demodulator.without_tones
-    return create(sent.inverse, rx.numerology, sent.waveform.capture_samples)
+    return create(lambda captures: sent.inverses.at(frames[captures]), rx.numerology, sent.waveform.capture_samples)
 
 
 def _correction(stage: xr.Dataset) -> Correction | None:

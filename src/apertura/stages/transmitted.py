@@ -12,8 +12,10 @@ from apertura.campaign.config import CONFIG, OfdmWaveform, PulseWaveform, Sample
 from apertura.campaign.folder import Campaign
 from apertura.common.errors import CampaignError
 from apertura.core.echo.demodulate import Numerology, subcarrier_numbers
+from apertura.core.echo.frame_codes import Inverses, PnCodes, Rows, pn_sequence, sampled_rows
 from apertura.core.echo.pulse_filter import occupied_band, pulse_filter, pulse_spectrum
 from apertura.core.echo.trigger import PulseFraming
+from apertura.formats.code_tables import CodeTable
 from apertura.formats.npy import read_npy
 from apertura.formats.recordings.sample_file import SampleFile
 
@@ -48,9 +50,6 @@ def check_mixing(samples: SampleFile, numerology: Numerology, *, where: object) 
 
 # ---- Transmitted signal: code symbols or samples of a pulse ----------------------------------------------------------
 
-MOST_SYMBOLS = 1 << 24
-"""Largest number of code symbols of a waveform."""
-
 MOST_PULSE_SAMPLES = 1 << 22
 """Largest number of samples of a pulse, and of a capture."""
 
@@ -74,17 +73,18 @@ class Transmitted:
         Configured waveform.
     numerology
         Grid of the frequencies at which echoes are measured.
-    inverse
-        (subcarrier,) complex64, inverse filter of the transmitted signal.
+    inverses
+        Inverse filters of the transmitted pulses.
     mean_power
-        E|s|² during transmission, in the units by which echoes are divided: of a symbol, or of a pulse with peak 1.
+        E|s|² during transmission, in the units by which echoes are divided: of a symbol, or of a pulse with peak 1;
+        the mean over the rows of a code table.
     report, flags
         Report and flags of the inverse filter.
     """
 
     waveform: SampledWaveform
     numerology: Numerology
-    inverse: NDArray[np.complex64]
+    inverses: Inverses
     mean_power: float
     report: dict[str, Any] = field(default_factory=dict)
     flags: dict[str, str] = field(default_factory=dict)
@@ -100,15 +100,33 @@ def transmitted(campaign: Campaign, waveform: SampledWaveform) -> Transmitted:
     CampaignError
         If the file is missing or contradicts the waveform.
     """
-    assumes = campaign.planned and not campaign.sent_file.is_file()
+    path = campaign.sent_path
+    assumes = campaign.planned and path is not None and not path.exists()
     if isinstance(waveform, OfdmWaveform):
-        count = waveform.subcarriers
-        codes = np.ones(count, np.complex64) if assumes else read_codes(campaign.sent_file, count)
-        return Transmitted(waveform, symbol_numerology(waveform), 1 / codes, float((np.abs(codes) ** 2).sum()))
-    if isinstance(waveform, PulseWaveform):
-        pulse = _chirp(waveform) if assumes else read_pulse(campaign.sent_file, waveform)
-        return _transmitted_pulse(pulse, waveform, where=campaign.sent_file)
+        codes = np.ones((1, waveform.subcarriers), np.complex64) if assumes else _code_table(waveform, path)
+        power = (np.abs(codes[sampled_rows(codes.shape[0])]) ** 2).sum(axis=1)
+        return Transmitted(waveform, symbol_numerology(waveform), Inverses.of_codes(codes), float(power.mean()))
+    if isinstance(waveform, PulseWaveform) and path is not None:
+        pulse = _chirp(waveform) if assumes else read_pulse(path, waveform)
+        return _transmitted_pulse(pulse, waveform, where=path)
     raise TypeError(f"no inverse filter for a {type(waveform).__name__}")
+
+
+def _code_table(waveform: OfdmWaveform, path: Path | None) -> Rows:
+    """Return the table of the code symbols: in a file, or generated."""
+    codes = waveform.codes
+    if isinstance(codes, str):
+        return CodeTable(Path() if path is None else path, waveform.subcarriers)
+    try:
+        sequence = pn_sequence(codes.polynomial, codes.seed)
+    except ValueError as problem:
+        raise CampaignError(
+            str(problem),
+            where=f"{CONFIG}: waveform.codes",
+            expected="exponents of a primitive polynomial, and a seed below 2^degree",
+            remedy="Use the polynomial and the seed of the transmitter.",
+        ) from problem
+    return PnCodes(sequence, codes.constellation, waveform.subcarriers, codes.frames)
 
 
 def symbol_numerology(waveform: OfdmWaveform) -> Numerology:
@@ -159,7 +177,7 @@ def _transmitted_pulse(pulse: NDArray[np.complex128], waveform: PulseWaveform, *
     band_hz = [float(number * numerology.spacing_hz) for number in (first, last)]
     report = {**chosen.report, "band_hz": band_hz, "energy_inside": round(inside, 4)}
     mean_power = float((np.abs(pulse) ** 2).mean())
-    return Transmitted(waveform, numerology, chosen.inverse, mean_power, report, chosen.flags)
+    return Transmitted(waveform, numerology, Inverses.fixed(chosen.inverse), mean_power, report, chosen.flags)
 
 
 def read_pulse(path: Path, waveform: PulseWaveform) -> NDArray[np.complex128]:
@@ -196,34 +214,6 @@ def read_pulse(path: Path, waveform: PulseWaveform) -> NDArray[np.complex128]:
         problem = f"{invalid} samples are not finite" if invalid else "all samples are zero"
         raise CampaignError(problem, where=path, expected=expected, remedy=remedy)
     return np.asarray(pulse / level.max(), np.complex128)
-
-
-def read_codes(path: Path, subcarriers: int) -> NDArray[np.complex64]:
-    """Read the transmitted code symbols, (subcarrier,) complex64.
-
-    Raises
-    ------
-    CampaignError
-        If the file is missing or has another length, or a symbol is zero or not finite.
-    """
-    expected = f"({subcarriers},) complex64 without zeros, for config/config.yaml: waveform.subcarriers"
-    remedy = "Use the codes that were transmitted, or correct the waveform."
-    if not path.is_file():
-        raise CampaignError("no such file", where=path, expected=expected, remedy="Copy the file there.")
-    stored = read_npy(path, kinds="c", most=MOST_SYMBOLS, expected=expected, remedy=remedy)
-    with np.errstate(over="ignore", invalid="ignore"):  # infinite and NaN values are rejected below
-        codes = stored.astype(np.complex64)
-        zeros = int((codes == 0).sum())
-    usable = codes.shape == (subcarriers,) and np.isfinite(codes).all() and np.abs(codes).min() > 0
-    if not usable:
-        raise CampaignError(
-            f"{stored.dtype} of shape {codes.shape}, of which {zeros} are zero and "
-            f"{int((~np.isfinite(codes)).sum())} not finite",
-            where=path,
-            expected=expected,
-            remedy=remedy,
-        )
-    return codes
 
 
 def read_framing(path: Path, described: Mapping[str, Any], *, sample_rate_hz: float, where: Path) -> PulseFraming:

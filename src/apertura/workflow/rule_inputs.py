@@ -128,7 +128,7 @@ def recorded_on_the_bench(scope: JobScope) -> Iterable[str]:
     if not is_sampled(campaign):
         return []
     files = (path for node in flight.nodes for path in campaign.promised_files(flight.name, node))
-    return map(campaign.relative, (*files, campaign.sent_file))
+    return map(campaign.relative, (*files, *campaign.sent_files))
 
 
 def stated_paths(scope: JobScope) -> Mapping[str, Any]:
@@ -157,7 +157,7 @@ def transmitted_and_received(scope: JobScope) -> Iterable[str]:
         logs = [campaign.track_file(flight, node) for node in nodes if campaign.logged(flight, node)]
         return map(campaign.relative, (*campaign.history_files(flight, nodes[-1]), *logs))
     samples = [campaign.promised_files(flight, node)[-1] for node in nodes]
-    files = [campaign.relative(path) for path in (campaign.sent_file, *samples)]
+    files = [campaign.relative(path) for path in (*campaign.sent_files, *samples)]
     calibration = campaign.settings.calibration
     if calibration is not None and campaign.flight(flight).kind == "image":
         files.append(campaign.manifest("calibration", calibration.flight))
@@ -168,7 +168,7 @@ def received(scope: JobScope) -> Iterable[str]:
     """Return the files from which transfer functions of the pairs are computed, in addition to stage `echo`."""
     campaign = scope.campaign
     samples = (campaign.promised_files(flight, pair.split("-")[1])[-1] for flight, pair in scope.pairs)
-    return map(campaign.relative, (campaign.sent_file, *samples))
+    return map(campaign.relative, (*campaign.sent_files, *samples))
 
 
 def echoes_that_bound_the_scene(scope: JobScope) -> Iterable[str]:
@@ -335,7 +335,7 @@ def measured_image(scope: JobScope) -> Iterable[str]:
     """Return the image, transmitted signal and file of constants, as far as calibration or multilooking need these."""
     campaign, files = scope.campaign, list[Path]()
     if campaign.calibrated:
-        files += [campaign.sent_file] if is_sampled(campaign) else []
+        files += campaign.sent_files if is_sampled(campaign) else []
         files += [path for path in [campaign.calibration_file] if path is not None]
     is_needed = campaign.calibrated or multilook(scope)
     return [*map(campaign.relative, files), *(campaign.manifest("image", *pair) for pair in scope.pairs if is_needed)]

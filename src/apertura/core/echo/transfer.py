@@ -38,6 +38,9 @@ from apertura.core.echo.sidelink_spikes import find_spikes
 from apertura.core.echo.sidelink_state import SidelinkState, measure_blocks, second_path_flags
 from apertura.core.echo.tones import Tones
 
+Inverse = Callable[[Pulses], Complexes]
+"""Ascending capture numbers, as of `Read` → inverse spectra of their transmitted pulses, as of `Inverses.at`."""
+
 _INVERTED = (
     "the conjugate samples contain the code: set waveform.iq to swapped if I and Q are swapped, or to conjugate if the "
     "local oscillator is above the band; for a single node, set nodes.<n>.iq"
@@ -83,52 +86,60 @@ class Demodulator:
     Attributes
     ----------
     inverse, numerology
-        (subcarrier,) complex64, inverse of the transmitted signal (1/c_n for a symbol); and sampling of the signal.
+        Inverse spectra of the transmitted pulses (1/c_n for a symbol), and sampling of the signal.
     symbol_samples
         (T_cp + T)·f_s, or the length of a capture; later samples are not used.
     tones
         Channel → removal of tones of other transmitters; empty: tones are not removed.
     """
 
-    inverse: Complexes
+    inverse: Inverse
     numerology: Numerology
     symbol_samples: int
     tones: Mapping[str, Tones] = field(default_factory=dict)
 
     @classmethod
-    def without_tones(cls, inverse: Complexes, numerology: Numerology, symbol_samples: int) -> "Demodulator":
+    def without_tones(cls, inverse: Inverse, numerology: Numerology, symbol_samples: int) -> "Demodulator":
         """Return a demodulator that removes the tones of other transmitters from both channels."""
-        tones = {channel: Tones.of(numerology, inverse) for channel in ("radar", "sidelink")}
+        tones = {channel: Tones(numerology) for channel in ("radar", "sidelink")}
         return cls(inverse, numerology, symbol_samples, tones)
 
     def symbols(
-        self, iq: Samples, clock_hz: Floats | None = None, sfo_ppm: float = 0.0, *, channel: str = "radar"
+        self,
+        iq: Samples,
+        captures: Pulses,
+        clock_hz: Floats | None = None,
+        sfo_ppm: float = 0.0,
+        *,
+        channel: str = "radar",
     ) -> Complexes:
-        """Demodulate samples, (pulse, sample, 2), after clock correction; return (pulse, subcarrier) complex64."""
-        numerology = self.numerology
+        """Demodulate samples of captures, (pulse, sample, 2), after clock correction; return (pulse, subcarrier)."""
+        numerology, inverse = self.numerology, self.inverse(captures)
         if clock_hz is None:
             received = demodulate(as_complex(iq), numerology)
         else:
             samples = as_complex(iq[:, : self.symbol_samples])
             received = demodulate(correct_clock(samples, numerology, cfo_hz=clock_hz, sfo_ppm=sfo_ppm), numerology)
         if channel in self.tones:
-            received = self.tones[channel].removed(received)
-        return received * self.inverse
+            received = self.tones[channel].removed(received, inverse)
+        return received * inverse
 
-    def transfer(self, iq: Mapping[str, Samples], correction: Correction | None = None) -> Complexes:
+    def transfer(self, iq: Mapping[str, Samples], captures: Pulses, correction: Correction | None = None) -> Complexes:
         """Return the transfer functions of a block of captures, (pulse, subcarrier) complex64.
 
         Parameters
         ----------
         iq
             Channel → (pulse, sample, 2): `radar`, and `sidelink` if there is a correction.
+        captures
+            Numbers of these captures.
         correction
             Correction of these pulses; None for a node that receives its own echoes.
         """
         if correction is None:
-            return self.symbols(iq["radar"])
+            return self.symbols(iq["radar"], captures)
         clock = correction.clock_hz, correction.sfo_ppm
-        radar, sidelink = (self.symbols(iq[name], *clock, channel=name) for name in ("radar", "sidelink"))
+        radar, sidelink = (self.symbols(iq[name], captures, *clock, channel=name) for name in ("radar", "sidelink"))
         return METHODS[correction.method](radar, limited(sidelink)[0], correction.path)
 
 
@@ -185,10 +196,11 @@ def transfer_by_code(read: Read, demodulator: Demodulator, *, time_s: Floats) ->
 
     Examples
     --------
+    >>> from apertura.core.echo.frame_codes import Inverses
     >>> numerology = Numerology(1e9, 16e6, np.arange(8), prefix_samples=4, dft_samples=16)
     >>> tone = 1000 * np.exp(2j * np.pi * 3 * np.arange(20) / 16)
     >>> iq = np.stack([tone.real, tone.imag], -1)[None].round().astype(np.int16)
-    >>> demodulator = Demodulator(np.full(8, 0.5, np.complex64), numerology, 20)
+    >>> demodulator = Demodulator(Inverses.fixed(np.full(8, 0.5, np.complex64)).at, numerology, 20)
     >>> measured = transfer_by_code(lambda pulses: {"radar": iq[pulses]}, demodulator, time_s=np.zeros(1))
     >>> abs(measured.form(np.arange(1))).round(0)
     array([[  0.,   0.,   0., 500.,   0.,   0.,   0.,   0.]], dtype=float32)
@@ -200,11 +212,13 @@ def transfer_by_code(read: Read, demodulator: Demodulator, *, time_s: Floats) ->
         return formed(captures, None)
 
     checked = np.concatenate(spread(len(time_s), groups=GROUPS, each=_STRETCH))
-    sample = np.concatenate([demodulator.transfer(read(block)) for block in blocks_of(checked)])
+    sample = np.concatenate([demodulator.transfer(read(block), block) for block in blocks_of(checked)])
     code = own_code(sample, prefix_cells=numerology.delay_cells)
     inverted: Mapping[str, str] = {}
     if not code.carried:
-        conjugate = [demodulator.transfer({"radar": conjugates(read(block)["radar"])}) for block in blocks_of(checked)]
+        conjugate = [
+            demodulator.transfer({"radar": conjugates(read(block)["radar"])}, block) for block in blocks_of(checked)
+        ]
         if own_code(np.concatenate(conjugate), prefix_cells=numerology.delay_cells).carried:
             inverted = {"spectrum_inverted": _INVERTED}
     phase = phase_stability(sample, time_s[checked], prefix_cells=numerology.delay_cells)
@@ -327,7 +341,7 @@ def forming(
     def form(captures: Pulses, correction: Correction | None) -> Complexes:
         iq = read(captures)
         saturation.count(iq)
-        return demodulator.transfer(iq, correction)
+        return demodulator.transfer(iq, captures, correction)
 
     return form
 
@@ -337,7 +351,7 @@ def _compresses_conjugated(read: Read, demodulator: Demodulator, count: int) -> 
     pulses = np.concatenate(spread(count, groups=4, each=16))
 
     def compression(samples: Samples) -> float:
-        power = np.abs(np.fft.ifft(demodulator.symbols(samples, channel="sidelink"), axis=1)) ** 2
+        power = np.abs(np.fft.ifft(demodulator.symbols(samples, pulses, channel="sidelink"), axis=1)) ** 2
         return float(np.median(power.max(axis=1) / power.mean(axis=1)))
 
     sidelink = read(pulses)["sidelink"]
@@ -390,7 +404,8 @@ class _Receiver:
         """Yield the symbols of the sidelink, (pulse, subcarrier) complex64, with the code removed."""
         for block in blocks_of(np.arange(self.count)):
             clock_hz = None if self.clock_hz is None else self.clock_hz[block]
-            yield self.demodulator.symbols(self.read(block)["sidelink"], clock_hz, self.sfo_ppm, channel="sidelink")
+            iq = self.read(block)["sidelink"]
+            yield self.demodulator.symbols(iq, block, clock_hz, self.sfo_ppm, channel="sidelink")
             done(len(block))
 
 
