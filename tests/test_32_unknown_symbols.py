@@ -119,7 +119,8 @@ def test_pulses_with_a_changing_strong_reflection_are_unsure() -> None:
     assert not strong.decider(qam).decide(strong.received, strong.numbers).sure.any()
     weak = Sidelink(qam, 25, reflection_db=-20, changing=True)
     decisions = weak.decisions(qam)
-    assert decisions.sure.all() and np.array_equal(decisions.labels, weak.sent)
+    assert decisions.sure.all()
+    assert np.array_equal(decisions.labels, weak.sent)
 
 
 def test_channel_of_a_pulse_lowers_the_error_rate_of_a_changing_reflection() -> None:
@@ -148,7 +149,8 @@ def test_known_symbols_resolve_the_ambiguity_of_a_blind_estimate() -> None:
     assert np.array_equal(decisions.labels, sidelink.sent)
     assert decisions.path.delay_cells == pytest.approx(sidelink.delay[:, 0] + shift, abs=0.01)
     turn = np.angle(np.exp(1j * (decisions.path.phase_rad - sidelink.phase[:, 0])))
-    assert np.ptp(turn) < 0.05 and abs(turn.mean()) < 0.05
+    assert np.ptp(turn) < 0.05
+    assert abs(turn.mean()) < 0.05
     # the ratio of echo to sidelink does not depend on the ambiguity
     echo = sidelink.symbols * np.exp(-2j * np.pi * number * 40 / N)
     ratios = [(echo / d.symbols) / (sidelink.received / d.symbols) for d in (blind, decisions)]

@@ -99,7 +99,7 @@ class Constellation:
         level = np.rint((parts / self.half_distance + (self.side - 1)) / 2)
         index = np.fmin(np.fmax(level, 0), self.side - 1).astype(np.uint8)  # 0 for NaN
         gray = index ^ (index >> 1)
-        return (gray[..., 0] << (self.bits_per_symbol // 2)) | gray[..., 1]
+        return np.asarray((gray[..., 0] << (self.bits_per_symbol // 2)) | gray[..., 1], np.uint8)
 
     def bits(self, labels: Labels) -> NDArray[np.uint8]:
         """Return the bits of labels, (…, symbol), as (…, symbol·b) uint8 of 0 and 1."""

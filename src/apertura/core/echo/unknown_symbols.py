@@ -29,7 +29,7 @@ _ROUNDS = 4  # fits of the mean channel to the decisions
 
 @dataclass(frozen=True, eq=False)
 class Pilots:
-    """Known symbols at regular subcarriers first, first + step, …
+    """Known symbols at equally spaced subcarriers.
 
     Attributes
     ----------
@@ -167,9 +167,9 @@ class SymbolDecider:
         for numbers, received in groups:
             count += len(numbers)
             decider = cls(constellation, np.ones((1, received.shape[1]), np.complex64), np.zeros(1), pilots)
-            decider = decider._shaped_by(received)
-            if decider is not None:
-                shapes.append(decider.shapes[0])
+            shaped = decider._shaped_by(received)
+            if shaped is not None:
+                shapes.append(shaped.shapes[0])
                 middles.append(float(numbers.mean()))
         if not shapes:
             raise CampaignError(
@@ -368,7 +368,7 @@ def _minimum_phase(received: Complexes) -> Complexes:
     middle = power.size // 2
     cepstrum[1:middle] *= 2
     cepstrum[middle + 1 :] = 0
-    return np.exp(scipy.fft.fft(cepstrum)).astype(np.complex64)
+    return np.asarray(np.exp(scipy.fft.fft(cepstrum)), np.complex64)
 
 
 def _reflection(flat: Complexes) -> Floats:
