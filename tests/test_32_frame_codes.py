@@ -10,7 +10,8 @@ import zarr
 from folders import complaint, small_simulation
 
 from apertura.campaign.folder import Campaign
-from apertura.core.echo.frame_codes import Inverses, PnCodes, frame_numbers, pn_sequence
+from apertura.core.echo.constellation import constellation
+from apertura.core.echo.frame_codes import Inverses, PnCodes, displacement, frame_numbers, pn_sequence
 from apertura.formats.code_tables import CodeTable
 from apertura.simulation import Impairments, simulate
 from apertura.simulation.continuous import Framing
@@ -212,3 +213,35 @@ def test_memory_of_a_table_is_that_of_its_block(tmp_path):
     assert (inverses.at(np.arange(1000, 1064)) == -1j).all()
     assert tracemalloc.get_traced_memory()[1] < 8 * 64 * 1024 * 8
     tracemalloc.stop()
+
+
+# ---- Displaced frames
+
+
+@pytest.mark.parametrize("shift", [-16, -3, 0, 1, 16])
+@pytest.mark.parametrize("same_delay", [True, False])
+def test_displacement_of_frames_is_found_by_the_code(shift, same_delay):
+    """Echo 10 dB below the noise per subcarrier with one delay; 10 dB above it if the delay changes."""
+    rng = np.random.default_rng(shift + 20)
+    codes = constellation("64qam").points[rng.integers(0, 64, (200, 256))]
+    frames = np.arange(30, 94)
+    delay = np.full(64, 11.3) if same_delay else rng.uniform(0, 256, 64)
+    level = 10 ** (-0.5 if same_delay else 0.5)
+    echo = level * codes[frames + shift] * np.exp(-2j * np.pi * np.arange(256) * delay[:, None] / 256)
+    received = echo + (rng.normal(size=(64, 256, 2)) @ [1, 1j]) / np.sqrt(2)
+    inverses = Inverses.of_codes(codes)
+    assert displacement(received.astype(np.complex64), inverses, frames, same_delay=same_delay) == shift
+    noise = (received - echo).astype(np.complex64)
+    assert displacement(noise, inverses, frames, same_delay=same_delay) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pair", ["a-a", "a-b"])
+def test_codes_of_later_frames_are_found_and_corrected(tmp_path, pair):
+    changing = campaign_with(tmp_path / "changing", "qpsk", FRAMES * 8, pulses=40)
+    expected = transfer_of(changing, pair)
+    assert "frames_displaced" not in expected.attrs["flags"]
+    np.save(changing / "raw/codes.npy", np.roll(np.load(changing / "raw/codes.npy"), 3, axis=0))
+    formed = transfer_of(changing, pair)
+    assert "after" in formed.attrs["flags"]["frames_displaced"]
+    np.testing.assert_array_equal(formed.transfer, expected.transfer)

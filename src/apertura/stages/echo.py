@@ -21,15 +21,20 @@ from apertura.common.flags import Flags
 from apertura.common.provenance import merged
 from apertura.common.units import nanoseconds
 from apertura.core.echo.association import Association, missing_flags, tag_jitter_s
-from apertura.core.echo.captures import runs, sampled_pulses
+from apertura.core.echo.captures import runs, sampled_pulses, spread
+from apertura.core.echo.demodulate import demodulate
+from apertura.core.echo.frame_codes import displacement
 from apertura.core.echo.interference import Interference
 from apertura.core.echo.pulse_filter import truncation_flags
 from apertura.core.echo.sidelink import DIVIDING
+from apertura.core.echo.symbol_filter import tolerated_sidelobes_db
 from apertura.core.echo.transfer import (
     Transfer,
+    as_complex,
     transfer_by_code,
     transfer_by_sidelink,
 )
+from apertura.core.echo.trigger import ABSENT
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.atmosphere import SceneAir
 from apertura.core.quality.budget import strictest_accuracy_db
@@ -95,6 +100,7 @@ def pair_echo(
     paired = paired[positions.good]
     at = tx.raw.time.values[pulses.tx_index[paired]]
     frames = tx.frames.numbers[pulses.tx_index[paired]]
+    frames, displaced = _placed((tx, rx), pulses.rx_index[paired], frames, sent)
     measured, sidelink_m = _transfer((tx, rx), (pulses.rx_index[paired], frames), at, sent, processing, air)
     at = at[measured.kept]
     stated = rx.settings.path_offset_m
@@ -112,6 +118,10 @@ def pair_echo(
     if tx.name != rx.name:  # b of docs/theory/autofocus.md, eq. 2: the sidelink's length was added to the echo
         sidelink_m = tx.antenna("sidelink", at) - rx.antenna("sidelink", at)
         geometry["sidelink_vector"] = (("pulse", "axis"), sidelink_m)
+    if sent.inverses.count > 1:
+        symbols = {"rows": sent.inverses.count, "frames": tx.frames.basis, **measured.report.get("symbols", {})}
+        report = {**measured.report, "symbols": symbols}
+        measured = replace(measured, report=report, flags=Flags.merged(measured.flags, displaced))
     dataset = xr.Dataset(
         {
             "time": ("pulse", at),
@@ -182,6 +192,29 @@ def _attributes(
     return attrs
 
 
+def _placed(
+    nodes: tuple[Acquisition, Acquisition], captures: NDArray[np.int64], frames: NDArray[np.int64], sent: Transmitted
+) -> tuple[NDArray[np.int64], Flags]:
+    """Return the frame numbers of captures, displaced if the symbols of other frames are found in them, and a flag."""
+    tx, rx = nodes
+    if sent.inverses.count == 1:
+        return frames, Flags()
+    channel = "radar" if tx.name == rx.name else "sidelink"
+    tested = np.concatenate(spread(len(captures), groups=4, each=16))
+    samples = rx.reader([channel], captures[tested])(np.arange(len(tested)))[channel]
+    moved = displacement(
+        demodulate(as_complex(samples), rx.numerology), sent.inverses, frames[tested], same_delay=rx is tx
+    )
+    if not moved:
+        return frames, Flags()
+    by_order = (tx.raw.frame.values == ABSENT).all()
+    line = (
+        f"{rx.files.name}: captures contain the symbols of the {abs(moved)}. frame {'after' if moved > 0 else 'before'}"
+    )
+    flags = Flags({"frames_displaced": f"{line} their frame number; {'corrected' if by_order else 'not corrected'}"})
+    return (frames + moved if by_order else frames), flags
+
+
 def _transfer(
     nodes: tuple[Acquisition, Acquisition],
     captures: tuple[NDArray[np.int64], NDArray[np.int64]],
@@ -197,11 +230,15 @@ def _transfer(
     "Geometry").
     """
     (tx, rx), (index, frames) = nodes, captures
+    accuracy_db = strictest_accuracy_db(processing.accuracy_db)
+    tolerated_db = tolerated_sidelobes_db(processing.accuracy_db)
+    choose = sent.filter_choice(processing.symbol_filter, frames=frames, tolerated_db=tolerated_db)
     sent_ns = nanoseconds(at)
     time_s = (sent_ns - sent_ns[0]) * 1e-9
     if tx.name == rx.name:
         read = rx.reader(["radar"], index)
-        measured = transfer_by_code(read, demodulator_of(rx, sent, processing, frames), time_s=time_s)
+        demodulator = demodulator_of(rx, sent, processing, frames)
+        measured = transfer_by_code(read, demodulator, time_s=time_s, choose_symbols=choose)
         return _with_waveform(measured, sent), np.zeros(len(at))
     length_m = air.electrical_m(tx.antenna("sidelink", at), rx.antenna("sidelink", at))
     measured = transfer_by_sidelink(
@@ -209,9 +246,10 @@ def _transfer(
         demodulator_of(rx, sent, processing, frames),
         sidelink_m=length_m,
         method=processing.sidelink,
-        accuracy_db=strictest_accuracy_db(processing.accuracy_db),
+        accuracy_db=accuracy_db,
         where=str(rx.files),
         time_s=time_s,
+        choose_symbols=choose,
     )
     return _with_waveform(measured, sent), length_m[measured.kept]
 

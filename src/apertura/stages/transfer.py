@@ -29,6 +29,7 @@ from apertura.core.echo.dechirp import sweep_motion_flags
 from apertura.core.echo.demodulate import remove_path
 from apertura.core.echo.interference import PulsedInterference
 from apertura.core.echo.line_of_sight import LineOfSight
+from apertura.core.echo.symbol_filter import filter_of
 from apertura.core.echo.tones import Tones
 from apertura.core.echo.transfer import Correction, Demodulator, forming
 from apertura.core.geometry.geodesy import LOCAL
@@ -127,6 +128,7 @@ class PairEcho:
             frames = np.zeros(len(rx.raw.start), np.int64)
             frames[dataset.capture.values] = dataset.frame.values
             demodulator = demodulator_of(rx, sent, processing, frames)
+            demodulator = replace(demodulator, filter=filter_of(dataset.attrs.get("symbols")))
             tones.update(demodulator.tones)
             for channel in tones.values():
                 channel.lines = tuple(dataset.attrs.get("tone_lines", ()))

@@ -1,6 +1,6 @@
 """Transmitted signal of a campaign: code symbols or samples of a pulse, and the preamble of each symbol."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,10 +10,13 @@ from numpy.typing import NDArray
 
 from apertura.campaign.config import CONFIG, OfdmWaveform, PulseWaveform, SampledWaveform
 from apertura.campaign.folder import Campaign
+from apertura.common.arrays import Complexes
 from apertura.common.errors import CampaignError
+from apertura.common.units import decibels
 from apertura.core.echo.demodulate import Numerology, subcarrier_numbers
 from apertura.core.echo.frame_codes import Inverses, PnCodes, Rows, pn_sequence, sampled_rows
 from apertura.core.echo.pulse_filter import occupied_band, pulse_filter, pulse_spectrum
+from apertura.core.echo.symbol_filter import CONSTANT_DB, FilterChoice, SymbolFilter, choose_filter, echo_snr
 from apertura.core.echo.trigger import PulseFraming
 from apertura.formats.code_tables import CodeTable
 from apertura.formats.npy import read_npy
@@ -78,6 +81,8 @@ class Transmitted:
     mean_power
         E|s|² during transmission, in the units by which echoes are divided: of a symbol, or of a pulse with peak 1;
         the mean over the rows of a code table.
+    power
+        (row, subcarrier) float32, |c_n|² in sampled rows of a code table; None for a pulse.
     report, flags
         Report and flags of the inverse filter.
     """
@@ -88,6 +93,36 @@ class Transmitted:
     mean_power: float
     report: dict[str, Any] = field(default_factory=dict)
     flags: dict[str, str] = field(default_factory=dict)
+    power: NDArray[np.float32] | None = None
+
+    def filter_choice(
+        self, requested: str, *, frames: NDArray[np.int64], tolerated_db: float
+    ) -> Callable[[Complexes | None], FilterChoice] | None:
+        """Return the choice of the filter from a sample of transfer functions, None before they are measured.
+
+        For symbols of constant modulus, there is no choice, and None is returned.
+
+        Parameters
+        ----------
+        requested
+            `processing.symbol_filter`.
+        frames
+            (pulse,) int64, frame numbers of the flight.
+        tolerated_db
+            Tolerated level of data sidelobes relative to the peak, dB.
+        """
+        if self.power is None:
+            return None
+        power, different = self.power, len(np.unique(frames % self.inverses.count))
+        gain = SymbolFilter().noise_gain(power)
+        if decibels(gain) < CONSTANT_DB:
+            return None
+
+        def choose(sample: Complexes | None) -> FilterChoice:
+            snr = np.inf if sample is None else echo_snr(sample, gain)
+            return choose_filter(power, requested=requested, snr=snr, frames=different, tolerated_db=tolerated_db)
+
+        return choose
 
 
 def transmitted(campaign: Campaign, waveform: SampledWaveform) -> Transmitted:
@@ -104,8 +139,11 @@ def transmitted(campaign: Campaign, waveform: SampledWaveform) -> Transmitted:
     assumes = campaign.planned and path is not None and not path.exists()
     if isinstance(waveform, OfdmWaveform):
         codes = np.ones((1, waveform.subcarriers), np.complex64) if assumes else _code_table(waveform, path)
-        power = (np.abs(codes[sampled_rows(codes.shape[0])]) ** 2).sum(axis=1)
-        return Transmitted(waveform, symbol_numerology(waveform), Inverses.of_codes(codes), float(power.mean()))
+        power = np.abs(codes[sampled_rows(codes.shape[0])]) ** 2
+        mean_power = float(power.sum(axis=1).mean())
+        return Transmitted(
+            waveform, symbol_numerology(waveform), Inverses.of_codes(codes), mean_power, power=power.astype(np.float32)
+        )
     if isinstance(waveform, PulseWaveform) and path is not None:
         pulse = _chirp(waveform) if assumes else read_pulse(path, waveform)
         return _transmitted_pulse(pulse, waveform, where=path)

@@ -367,7 +367,17 @@ def grid(scope: JobScope) -> Mapping[str, Any]:
 
 
 _BEFORE_THE_IMAGE = frozenset(
-    {"window", "sidelink", "background", "interference", "false_alarms_per_s", "autofocus", "autofocus_method", "keep"}
+    {
+        "window",
+        "sidelink",
+        "symbol_filter",
+        "background",
+        "interference",
+        "false_alarms_per_s",
+        "autofocus",
+        "autofocus_method",
+        "keep",
+    }
 )
 _AFTER_THE_IMAGE = frozenset({"fusion", "radiometry", "radiometric_calibration", "multilook"})
 

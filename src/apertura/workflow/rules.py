@@ -306,6 +306,7 @@ _ROWS = (
         settings=(
             "waveform",
             "processing.sidelink",
+            "processing.symbol_filter",
             "processing.interference",
             "processing.accuracy_db",
             inputs.pair_settings,

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Complexes
@@ -208,8 +209,8 @@ def frame_numbers(time_ns: NDArray[np.int64], counted: Frames, *, interval_s: fl
 
     Notes
     -----
-    Source: docs/theory/changing_codes.md, "Frames of captures". Missed triggers are counted by the intervals of the time
-    tags, from the closest earlier capture with a counter, or from the first capture, which is frame 0.
+    Source: docs/theory/changing_codes.md, "Frames of captures". Missed triggers are counted by the intervals of the
+    time tags, from the closest earlier capture with a counter, or from the first capture, which is frame 0.
 
     Examples
     --------
@@ -237,3 +238,42 @@ def frame_numbers(time_ns: NDArray[np.int64], counted: Frames, *, interval_s: fl
     unread = int((~known).sum())
     stated = f"; {unread} without a number by time tags" if unread else ""
     return FrameNumbers(numbers, f"frame counter{stated}")
+
+
+MOST_DISPLACED = 16
+"""Largest displacement of frame numbers that is searched, in frames."""
+
+_CLEARER = 2.0  # least ratio of the compression at a displacement to that of undisplaced frames
+
+
+def displacement(received: Complexes, inverses: Inverses, frames: Frames, *, same_delay: bool) -> int:
+    """Return the number of frames by which the symbols of captures lie after their frame numbers; 0 if none is found.
+
+    Parameters
+    ----------
+    received
+        (capture, subcarrier) complex64, received symbols with the code, of any number of captures.
+    inverses, frames
+        Inverse spectra of the transmitted pulses, and frame numbers of the captures.
+    same_delay
+        True if an echo has the same delay in all captures, so that their power may be averaged in each delay cell.
+
+    Notes
+    -----
+    Source: docs/theory/changing_codes.md, "Frames of captures": only the symbols of the right frame compress an echo.
+
+    Examples
+    --------
+    >>> codes = np.exp(2j * np.pi * np.random.default_rng(1).random((50, 64))).astype(np.complex64)
+    >>> displacement(codes[3:40], Inverses.of_codes(codes), np.arange(37), same_delay=True)
+    3
+    """
+    reach = min(MOST_DISPLACED, inverses.count // 2)
+    peaks = {}
+    for shift in sorted(range(-reach, reach + 1), key=abs):
+        power = np.abs(scipy.fft.ifft(received * inverses.at(frames + shift), axis=1)) ** 2
+        cells = power / np.maximum(power.mean(axis=1, keepdims=True), np.finfo(np.float32).tiny)
+        peaks[shift] = float(cells.mean(axis=0).max() if same_delay else cells.max(axis=1).mean())
+    best = max(peaks, key=lambda shift: peaks[shift])
+    # without the code, the mean of K exponentially distributed powers exceeds 2 with a probability of exp(-0.3·K)
+    return best if peaks[best] > _CLEARER * peaks[0] else 0

@@ -36,10 +36,14 @@ from apertura.core.echo.own_pulses import CodeEvidence, own_code, phase_stabilit
 from apertura.core.echo.sidelink import DIVIDING, METHODS, choose, edges
 from apertura.core.echo.sidelink_spikes import find_spikes
 from apertura.core.echo.sidelink_state import SidelinkState, measure_blocks, second_path_flags
+from apertura.core.echo.symbol_filter import FilterChoice, SymbolFilter
 from apertura.core.echo.tones import Tones
 
 Inverse = Callable[[Pulses], Complexes]
 """Ascending capture numbers, as of `Read` → inverse spectra of their transmitted pulses, as of `Inverses.at`."""
+
+ChooseSymbols = Callable[[Complexes], FilterChoice]
+"""Sample of transfer functions divided by the code → filter of the symbols."""
 
 _INVERTED = (
     "the conjugate samples contain the code: set waveform.iq to swapped if I and Q are swapped, or to conjugate if the "
@@ -91,12 +95,15 @@ class Demodulator:
         (T_cp + T)·f_s, or the length of a capture; later samples are not used.
     tones
         Channel → removal of tones of other transmitters; empty: tones are not removed.
+    filter
+        Filter of the radar channel; the sidelink, which is divided by, has the reciprocal one.
     """
 
     inverse: Inverse
     numerology: Numerology
     symbol_samples: int
     tones: Mapping[str, Tones] = field(default_factory=dict)
+    filter: SymbolFilter = field(default_factory=SymbolFilter)
 
     @classmethod
     def without_tones(cls, inverse: Inverse, numerology: Numerology, symbol_samples: int) -> "Demodulator":
@@ -137,9 +144,10 @@ class Demodulator:
             Correction of these pulses; None for a node that receives its own echoes.
         """
         if correction is None:
-            return self.symbols(iq["radar"], captures)
+            return self.filter.applied(self.symbols(iq["radar"], captures), self.inverse(captures))
         clock = correction.clock_hz, correction.sfo_ppm
         radar, sidelink = (self.symbols(iq[name], captures, *clock, channel=name) for name in ("radar", "sidelink"))
+        radar = self.filter.applied(radar, self.inverse(captures))
         return METHODS[correction.method](radar, limited(sidelink)[0], correction.path)
 
 
@@ -178,7 +186,9 @@ class Transfer:
     correction: Correction | None = None
 
 
-def transfer_by_code(read: Read, demodulator: Demodulator, *, time_s: Floats) -> Transfer:
+def transfer_by_code(
+    read: Read, demodulator: Demodulator, *, time_s: Floats, choose_symbols: ChooseSymbols | None = None
+) -> Transfer:
     """Return the monostatic transfer functions of a node; transmitter and receiver have the same clock.
 
     Parameters
@@ -189,6 +199,8 @@ def transfer_by_code(read: Read, demodulator: Demodulator, *, time_s: Floats) ->
         Demodulator of the captures.
     time_s
         (capture,) float64, times of transmission, seconds from any origin.
+    choose_symbols
+        Choice of the filter of the symbols; None: the reciprocal.
 
     Notes
     -----
@@ -206,11 +218,6 @@ def transfer_by_code(read: Read, demodulator: Demodulator, *, time_s: Floats) ->
     array([[  0.,   0.,   0., 500.,   0.,   0.,   0.,   0.]], dtype=float32)
     """
     numerology, saturation = demodulator.numerology, Saturation()
-    formed = forming(read, demodulator, saturation)
-
-    def form(captures: Pulses) -> Complexes:
-        return formed(captures, None)
-
     checked = np.concatenate(spread(len(time_s), groups=GROUPS, each=_STRETCH))
     sample = np.concatenate([demodulator.transfer(read(block), block) for block in blocks_of(checked)])
     code = own_code(sample, prefix_cells=numerology.delay_cells)
@@ -224,6 +231,15 @@ def transfer_by_code(read: Read, demodulator: Demodulator, *, time_s: Floats) ->
     phase = phase_stability(sample, time_s[checked], prefix_cells=numerology.delay_cells)
     flags = Flags.merged(code.flags, inverted, phase.flags if phase else {})
     report = {"code": code.report, **({"own_phase": phase.report} if phase else {})}
+    if choose_symbols is not None:
+        choice = choose_symbols(sample)
+        demodulator = replace(demodulator, filter=choice.filter)
+        flags, report["symbols"] = Flags.merged(flags, choice.flags), choice.report
+    formed = forming(read, demodulator, saturation)
+
+    def form(captures: Pulses) -> Complexes:
+        return formed(captures, None)
+
     return Transfer(np.ones(len(time_s), bool), flags, report, None, form, saturation)
 
 
@@ -236,6 +252,7 @@ def transfer_by_sidelink(
     accuracy_db: float,
     where: str,
     time_s: Floats | None = None,
+    choose_symbols: ChooseSymbols | None = None,
 ) -> Transfer:
     """Return the transfer functions of a secondary node, corrected by its sidelink.
 
@@ -257,6 +274,8 @@ def transfer_by_sidelink(
     time_s
         (capture,) float64, time of transmission, seconds from any origin, to exclude pulses in which only the sidelink
         is disturbed; None: these are not searched for, as on a bench.
+    choose_symbols
+        Choice of the filter of the radar channel's symbols; None: the reciprocal.
 
     Raises
     ------
@@ -311,6 +330,11 @@ def transfer_by_sidelink(
     quality = {"method": chosen, "reason": reason, **_sidelink_report(state, residual)}
     if not np.array_equal(kept, state.locked):
         quality["spikes"] = int((state.locked & ~kept).sum())
+    report = {"clock": receiver.report, "sidelink": quality, "code": _sidelink_code(state).report}
+    if choose_symbols is not None:
+        choice = choose_symbols(receiver.radar())
+        demodulator = replace(demodulator, filter=choice.filter)
+        flags, report["symbols"] = Flags.merged(flags, choice.flags), choice.report
     # Second pass, block by block on demand.
     correction = Correction(chosen, state.path, receiver.clock_hz, receiver.sfo_ppm)
     saturation = Saturation()
@@ -319,7 +343,6 @@ def transfer_by_sidelink(
     def form(captures: Pulses) -> Complexes:
         return formed(captures, correction.select(captures))
 
-    report = {"clock": receiver.report, "sidelink": quality, "code": _sidelink_code(state).report}
     return Transfer(
         kept,
         flags,
@@ -407,6 +430,21 @@ class _Receiver:
             iq = self.read(block)["sidelink"]
             yield self.demodulator.symbols(iq, block, clock_hz, self.sfo_ppm, channel="sidelink")
             done(len(block))
+
+    def radar(self) -> Complexes:
+        """Return the radar channel divided by the code in captures spread over the flight, (pulse, subcarrier)."""
+        blocks = spread(self.count, groups=GROUPS, each=8)
+        return np.concatenate(
+            [
+                self.demodulator.symbols(
+                    self.read(block)["radar"],
+                    block,
+                    None if self.clock_hz is None else self.clock_hz[block],
+                    self.sfo_ppm,
+                )
+                for block in blocks
+            ]
+        )
 
 
 def _sidelink_report(state: SidelinkState, residual: BaselineResidual | None) -> dict[str, float]:
