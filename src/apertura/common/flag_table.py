@@ -242,6 +242,12 @@ _OF_RECORDINGS = {
         "blockage; antenna of the sidelink",
         "core/echo/sidelink_state.py",
     ),
+    "symbols_unsure": Flag(
+        "pulses excluded; or SNR of the sidelink and required SNR, dB",
+        "the data symbols of pulses cannot be decided; of most pulses: echoes are divided by the noisy sidelink",
+        "SNR and reflections of the sidelink; waveform.codes: constellation, pilots",
+        "core/echo/decided_symbols.py",
+    ),
     "sidelink_spikes": Flag(
         "pulses whose sidelink phase deviates, rad and cm; pulses excluded; loss by the others, dB",
         "the sidelink is disturbed in individual pulses; the echoes of these pulses are not affected",

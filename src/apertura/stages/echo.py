@@ -41,6 +41,7 @@ from apertura.core.quality.budget import strictest_accuracy_db
 from apertura.stages.acquisition import Acquisition, common_pulses, open_acquisition
 from apertura.stages.calibration import calibrated, calibration_spec
 from apertura.stages.positions import PulsePositions, place, scene_air, stated_air
+from apertura.stages.symbols import PairSymbols
 from apertura.stages.tags import stamped
 from apertura.stages.transfer import PairEcho, demodulator_of, recorded_echo, save_transfer
 from apertura.stages.transmitted import Transmitted, transmitted
@@ -60,11 +61,22 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
         files = campaign.sent_files
         sent = transmitted(campaign, waveform)
         tx, rx = pair.split("-")
-        nodes = {node: open_acquisition(campaign, flight, node, sent) for node in dict.fromkeys((tx, rx))}
+        source = campaign.symbol_source(flight, pair)
+        names = dict.fromkeys(name for name in (tx, rx, source) if name is not None)
+        nodes = {node: open_acquisition(campaign, flight, node, sent) for node in names}
         parents = [stage for node in nodes.values() for stage in (node.raw, node.track)]
         air = scene_air(campaign, nodes[tx].track.position.values)
         hovers = bool(campaign.segments_of(flight, pair))
-        formed = pair_echo(nodes[tx], nodes[rx], sent, campaign.settings.processing, calibration, air, hovers=hovers)
+        formed = pair_echo(
+            nodes[tx],
+            nodes[rx],
+            sent,
+            campaign.settings.processing,
+            calibration,
+            air,
+            hovers=hovers,
+            source=None if source is None else nodes[source],
+        )
     formed = formed.within(campaign, flight, pair)
     inputs = {name: lineage.sources.digests[name] for name in map(campaign.relative, files)}
     if calibration:
@@ -88,19 +100,33 @@ def pair_echo(
     air: SceneAir,
     *,
     hovers: bool = False,
+    source: Acquisition | None = None,
 ) -> PairEcho:
     """Return the echo of a pair from its nodes' recordings, with calibrated or else configured path offsets.
 
-    Pulses of a hover are excluded unless `hovers` is True, as in `apertura.stages.positions.place`.
+    Pulses of a hover are excluded unless `hovers` is True, as in `apertura.stages.positions.place`. `source`: node
+    whose sidelink gives unknown symbols of the pulses, by default the receiver.
     """
     pulses = common_pulses(tx, rx, prf_hz=sent.waveform.prf_hz)
     repeats = rx.raw.repeats.values[pulses.rx_index]
     paired = np.flatnonzero(~pulses.outlier & ~repeats)
     positions = place(tx, rx, tx.raw.time.values[pulses.tx_index[paired]], hovers=hovers)
     paired = paired[positions.good]
+    if sent.unknown is None:
+        frames = tx.frames.numbers[pulses.tx_index[paired]]
+        frames, displaced = _placed((tx, rx), pulses.rx_index[paired], frames, sent)
+        decided, basis = dict[str, Any](), tx.frames.basis
+    else:
+        decision = PairSymbols.of((tx, rx), source or rx, sent, pulses, paired, processing.accuracy_db)
+        usable = decision.usable()
+        sent, frames, paired = decision.sent, decision.rows[usable], paired[usable]
+        decided, displaced = {"decided": decision.report(usable)}, Flags(decision.symbols.flags(usable))
+        basis = f"captures of {decision.source}"
+        if processing.sidelink == "auto":
+            processing = processing.model_copy(
+                update={"sidelink": "divide" if decision.symbols.divides else "least_noise"}
+            )
     at = tx.raw.time.values[pulses.tx_index[paired]]
-    frames = tx.frames.numbers[pulses.tx_index[paired]]
-    frames, displaced = _placed((tx, rx), pulses.rx_index[paired], frames, sent)
     measured, sidelink_m = _transfer((tx, rx), (pulses.rx_index[paired], frames), at, sent, processing, air)
     at = at[measured.kept]
     stated = rx.settings.path_offset_m
@@ -119,7 +145,7 @@ def pair_echo(
         sidelink_m = tx.antenna("sidelink", at) - rx.antenna("sidelink", at)
         geometry["sidelink_vector"] = (("pulse", "axis"), sidelink_m)
     if sent.inverses.count > 1:
-        symbols = {"rows": sent.inverses.count, "frames": tx.frames.basis, **measured.report.get("symbols", {})}
+        symbols = {"rows": sent.inverses.count, "frames": basis, **decided, **measured.report.get("symbols", {})}
         report = {**measured.report, "symbols": symbols}
         measured = replace(measured, report=report, flags=Flags.merged(measured.flags, displaced))
     dataset = xr.Dataset(
@@ -302,6 +328,7 @@ def _pulse_counts(
         "time_tag_outlier": int(pulses.outlier.sum()),
         "captures_repeated": int((repeats & ~pulses.outlier).sum()),
         **positions.reasons,
+        "symbols_unsure": measured.report.get("symbols", {}).get("decided", {}).get("unsure", 0),
         "sidelink_lost": int((~measured.kept).sum()) - spikes,
         "sidelink_spikes": spikes,
     }

@@ -41,6 +41,7 @@ from apertura.stages.positions import (
     place,
     stated_error,
 )
+from apertura.stages.symbols import decided_symbols, with_symbols
 from apertura.stages.tags import stamped
 from apertura.stages.transmitted import Transmitted, transmitted
 from apertura.workflow.lineage import reads_kept, result_of
@@ -110,8 +111,13 @@ class PairEcho:
             waveform = campaign.settings.waveform
             if not isinstance(waveform, SampledWaveform):
                 raise TypeError("the echo has no transfer functions although its recorder stores them")
-            sent = transmitted(campaign, waveform)
-            return open_acquisition(campaign, flight, pair.split("-")[1], sent), sent, campaign.settings.processing
+            sent, processing = transmitted(campaign, waveform), campaign.settings.processing
+            name, source = pair.split("-")[1], campaign.symbol_source(flight, pair)
+            rx = open_acquisition(campaign, flight, name, sent)
+            if source is not None:
+                node = rx if source == name else open_acquisition(campaign, flight, source, sent)
+                sent = with_symbols(sent, node, decided_symbols(node, sent, processing.accuracy_db))
+            return rx, sent, processing
 
         return cls.formed(stage, receiver)
 

@@ -8,17 +8,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.campaign.config import CONFIG, OfdmWaveform, PulseWaveform, SampledWaveform
+from apertura.campaign.config import CONFIG, OfdmWaveform, PulseWaveform, SampledWaveform, SidelinkCodes
 from apertura.campaign.folder import Campaign
 from apertura.common.arrays import Complexes
 from apertura.common.errors import CampaignError
 from apertura.common.units import decibels
+from apertura.core.echo.constellation import Constellation, constellation
 from apertura.core.echo.demodulate import Numerology, subcarrier_numbers
 from apertura.core.echo.frame_codes import Inverses, PnCodes, Rows, pn_sequence, sampled_rows
+from apertura.core.echo.frame_format import FrameFormat
 from apertura.core.echo.pulse_filter import occupied_band, pulse_filter, pulse_spectrum
 from apertura.core.echo.symbol_filter import CONSTANT_DB, FilterChoice, SymbolFilter, choose_filter, echo_snr
 from apertura.core.echo.trigger import PulseFraming
-from apertura.formats.code_tables import CodeTable
+from apertura.core.echo.unknown_symbols import Pilots
+from apertura.formats.code_tables import MOST_SYMBOLS, CodeTable
 from apertura.formats.npy import read_npy
 from apertura.formats.recordings.sample_file import SampleFile
 
@@ -85,6 +88,9 @@ class Transmitted:
         (row, subcarrier) float32, |c_n|² in sampled rows of a code table; None for a pulse.
     report, flags
         Report and flags of the inverse filter.
+    unknown
+        Format of symbols that are decided from a sidelink; `inverses` are then those of random symbols until
+        `apertura.stages.symbols.with_symbols` replaces them. None: the symbols are known.
     """
 
     waveform: SampledWaveform
@@ -94,6 +100,7 @@ class Transmitted:
     report: dict[str, Any] = field(default_factory=dict)
     flags: dict[str, str] = field(default_factory=dict)
     power: NDArray[np.float32] | None = None
+    unknown: "UnknownSymbols | None" = None
 
     def filter_choice(
         self, requested: str, *, frames: NDArray[np.int64], tolerated_db: float
@@ -125,6 +132,60 @@ class Transmitted:
         return choose
 
 
+@dataclass(frozen=True, eq=False)
+class UnknownSymbols:
+    """Format of symbols that are decided from a sidelink.
+
+    Attributes
+    ----------
+    constellation
+        Constellation of the data symbols.
+    pilots
+        Known symbols; None: there are no pilots.
+    frames
+        Format of the bits; None: not configured.
+    node
+        Node whose sidelink gives the symbols of monostatic images; None: chosen.
+    """
+
+    constellation: Constellation
+    pilots: Pilots | None
+    frames: FrameFormat | None
+    node: str | None
+
+    @classmethod
+    def of(cls, codes: SidelinkCodes, subcarriers: int, pilots: Path | None) -> "UnknownSymbols":
+        """Return the configured format; raise CampaignError if pilots or frame do not fit the symbol."""
+        qam, known, frames = constellation(codes.constellation), None, None
+        count = subcarriers
+        if pilots is not None:
+            expected = f"({subcarriers},) complex64, 0 at data symbols, for {CONFIG}: waveform.subcarriers"
+            remedy = "Write the transmitted pilots, or remove waveform.codes.pilots."
+            if not pilots.is_file():
+                raise CampaignError("no such file", pilots, expected, "Copy the file there.")
+            table = read_npy(pilots, kinds="c", most=MOST_SYMBOLS, expected=expected, remedy=remedy)
+            if table.shape != (subcarriers,):
+                raise CampaignError(f"{table.dtype} of shape {table.shape}", pilots, expected, remedy)
+            known = Pilots.of(table.astype(np.complex64), pilots)
+            count -= known.symbols.size
+        if codes.frame is not None:
+            header = np.unpackbits(np.frombuffer(bytes.fromhex(codes.frame.header), np.uint8))
+            frames = FrameFormat(header, codes.frame.counter_bits, codes.frame.crc, count * qam.bits_per_symbol)
+            if frames.data_bits < 0 or frames.known_labels(qam).size < FEWEST_KNOWN:
+                raise CampaignError(
+                    f"header of {header.size} bits in a frame of {frames.total_bits} bits, of which "
+                    f"{frames.data_bits} are left for data",
+                    where=f"{CONFIG}: waveform.codes.frame",
+                    expected=f"a header of at least {FEWEST_KNOWN} symbols, and room for data",
+                    remedy="Correct header and counter_bits.",
+                )
+        return cls(qam, known, frames, codes.node)
+
+
+FEWEST_KNOWN = 4
+"""Fewest symbols of a header, from which the phase of blind decisions is determined."""
+
+
 def transmitted(campaign: Campaign, waveform: SampledWaveform) -> Transmitted:
     """Return the transmitted signal, from a waveform and the campaign's file of codes or samples.
 
@@ -137,6 +198,19 @@ def transmitted(campaign: Campaign, waveform: SampledWaveform) -> Transmitted:
     """
     path = campaign.sent_path
     assumes = campaign.planned and path is not None and not path.exists()
+    if isinstance(waveform, OfdmWaveform) and isinstance(waveform.codes, SidelinkCodes):
+        unknown = UnknownSymbols.of(waveform.codes, waveform.subcarriers, None if assumes else path)
+        points = unknown.constellation.points
+        # of the same distribution as the symbols, for averages over pulses
+        typical = np.random.default_rng(0).permutation(np.resize(points, 64 * waveform.subcarriers))
+        return Transmitted(
+            waveform,
+            symbol_numerology(waveform),
+            Inverses.of_codes(typical.reshape(64, -1)),
+            float(waveform.subcarriers),
+            power=np.square(np.abs(points))[None],
+            unknown=unknown,
+        )
     if isinstance(waveform, OfdmWaveform):
         codes = np.ones((1, waveform.subcarriers), np.complex64) if assumes else _code_table(waveform, path)
         power = np.abs(codes[sampled_rows(codes.shape[0])]) ** 2
@@ -153,6 +227,8 @@ def transmitted(campaign: Campaign, waveform: SampledWaveform) -> Transmitted:
 def _code_table(waveform: OfdmWaveform, path: Path | None) -> Rows:
     """Return the table of the code symbols: in a file, or generated."""
     codes = waveform.codes
+    if isinstance(codes, SidelinkCodes):
+        raise TypeError("symbols from a sidelink are not a table")
     if isinstance(codes, str):
         return CodeTable(Path() if path is None else path, waveform.subcarriers)
     try:

@@ -156,8 +156,11 @@ def transmitted_and_received(scope: JobScope) -> Iterable[str]:
     if not is_sampled(campaign):
         logs = [campaign.track_file(flight, node) for node in nodes if campaign.logged(flight, node)]
         return map(campaign.relative, (*campaign.history_files(flight, nodes[-1]), *logs))
-    samples = [campaign.promised_files(flight, node)[-1] for node in nodes]
+    source = campaign.symbol_source(flight, pair)
+    others = [source] if source is not None and source not in nodes else []
+    samples = [campaign.promised_files(flight, node)[-1] for node in (*nodes, *others)]
     files = [campaign.relative(path) for path in (*campaign.sent_files, *samples)]
+    files += [campaign.manifest(stage, flight, node) for node in others for stage in ("raw", "track")]
     calibration = campaign.settings.calibration
     if calibration is not None and campaign.flight(flight).kind == "image":
         files.append(campaign.manifest("calibration", calibration.flight))
@@ -166,8 +169,11 @@ def transmitted_and_received(scope: JobScope) -> Iterable[str]:
 
 def received(scope: JobScope) -> Iterable[str]:
     """Return the files from which transfer functions of the pairs are computed, in addition to stage `echo`."""
-    campaign = scope.campaign
-    samples = (campaign.promised_files(flight, pair.split("-")[1])[-1] for flight, pair in scope.pairs)
+    campaign, samples = scope.campaign, list[Path]()
+    for flight, pair in scope.pairs:
+        receiver = pair.split("-")[1]
+        nodes = dict.fromkeys([receiver, campaign.symbol_source(flight, pair) or receiver])
+        samples += [campaign.promised_files(flight, node)[-1] for node in nodes]
     return map(campaign.relative, (*campaign.sent_files, *samples))
 
 

@@ -45,6 +45,7 @@ from apertura.campaign.config.waveform import (
     PhaseHistoryWaveform,
     PulseWaveform,
     SampledWaveform,
+    SidelinkCodes,
     Waveform,
 )
 
@@ -78,6 +79,7 @@ __all__ = [
     "Section",
     "Segment",
     "Settings",
+    "SidelinkCodes",
     "Waveform",
     "check_interferometry",
     "check_radio",

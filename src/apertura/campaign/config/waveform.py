@@ -88,16 +88,49 @@ class GeneratedCodes(Section):
     )
 
 
+class FrameFields(Section):
+    """Fields of the bits of a pulse: header, counter, data, check sum, in ascending order of the data subcarriers."""
+
+    header: str = Field(
+        "1acffc1d", description="known bits at the start of a frame, hexadecimal", pattern="^([0-9a-fA-F]{2})+$"
+    )
+    counter_bits: int = Field(16, ge=1, le=48, description="length of the frame counter after the header, bits")
+    crc: bool = Field(True, description="the last 16 bits are the CRC-16 (x^16 + x^12 + x^5 + 1) of counter and data")
+
+
+class SidelinkCodes(Section):
+    """Code symbols that no file lists, decided from the sidelink of a receiver."""
+
+    source: Literal["sidelink"] = Field(description="sidelink: symbols are decided from the received direct path")
+    constellation: Literal["qpsk", "16qam", "64qam", "256qam"] = Field(
+        description="constellation of the symbols; the Gray code of I precedes that of Q", examples=["qpsk"]
+    )
+    pilots: str | None = Field(
+        None,
+        description="known symbols, complex64 (subcarriers,), 0 at data symbols; null: the channel is estimated from "
+        "the data",
+    )
+    frame: FrameFields | None = Field(
+        None, description="format of the bits; null: bits are not read, and monostatic images need pilots"
+    )
+    node: str | None = Field(
+        None,
+        description="node whose sidelink gives the symbols of monostatic images; null: the first receiver, or the "
+        "transmitter of a flight without receivers",
+    )
+
+
 class OfdmWaveform(SampledWaveform):
     """Waveform with one OFDM symbol per pulse."""
 
     file_key, delay_key, limit_name = "codes", "cyclic_prefix_s", "the cyclic prefix"
 
     kind: Literal["ofdm"] = Field(description=WAVEFORM_KINDS)
-    codes: str | GeneratedCodes = Field(
+    codes: str | GeneratedCodes | SidelinkCodes = Field(
         "raw/codes.npy",
         description="transmitted code symbols, complex64: .npy file or .zarr folder of shape (subcarriers,), or "
-        "(frames, subcarriers) if they change from pulse to pulse; or the parameters of a generator",
+        "(frames, subcarriers) if they change from pulse to pulse; or the parameters of a generator; or "
+        "source: sidelink, if the symbols are unknown",
     )
     carrier_is: Literal["band_start", "band_centre"] = Field(
         "band_start",

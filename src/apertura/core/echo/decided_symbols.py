@@ -160,7 +160,7 @@ class SidelinkSymbols:
         unsure, qam = int((~usable).sum()), self.decider.constellation
         if self.divides:
             line = (
-                f"SNR {decibels(self.snr):.1f} dB, below the {decibels(qam.least_snr):.1f} dB of {qam.name}: echoes are "
+                f"SNR {decibels(self.snr):.1f} dB, below {decibels(qam.least_snr):.1f} dB of {qam.name}: echoes are "
                 "divided by the noisy sidelink"
             )
             return {"symbols_unsure": line}

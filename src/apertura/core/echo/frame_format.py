@@ -91,7 +91,7 @@ class FrameFormat:
         count = self.counter_bits + self.data_bits
         shifts = np.arange(CRC_BITS - 1, -1, -1)
         register, rows = _POLYNOMIAL, []
-        for _ in range(count):  # the last bit first: a bit k places before the end contributes x^(k + 16) mod polynomial
+        for _ in range(count):  # the last bit first: a bit k places before the end contributes x^(k + 16)
             rows.append(register)
             register = _next(register)
         start = _START

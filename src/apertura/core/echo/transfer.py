@@ -33,7 +33,7 @@ from apertura.core.echo.demodulate import Numerology, demodulate
 from apertura.core.echo.interference import SidelinkInterference, limited
 from apertura.core.echo.line_of_sight import LineOfSight
 from apertura.core.echo.own_pulses import CodeEvidence, own_code, phase_stability
-from apertura.core.echo.sidelink import DIVIDING, METHODS, choose, edges
+from apertura.core.echo.sidelink import DIVIDING, LEAST_NOISE, METHODS, choose, edges
 from apertura.core.echo.sidelink_spikes import find_spikes
 from apertura.core.echo.sidelink_state import SidelinkState, measure_blocks, second_path_flags
 from apertura.core.echo.symbol_filter import FilterChoice, SymbolFilter
@@ -266,7 +266,7 @@ def transfer_by_sidelink(
         (capture,) float64, distance between the antennas of the sidelink, metres, with which the measured delay is
         compared.
     method
-        A key of `METHODS`, or 'auto'.
+        A key of `METHODS`; 'auto', for the adequate method of lowest cost, or 'least_noise'.
     accuracy_db
         Tolerated level of clock errors relative to the peak, dB.
     where
@@ -303,7 +303,8 @@ def transfer_by_sidelink(
             )
             raise CampaignError(f"{unlocked.found}; {_INVERTED}", f"{where}: sidelink", expected, remedy) from None
     # Choose the method; raise flags for errors that the method does not remove, and for faults of the recording.
-    chosen, reason = choose(state) if method == "auto" else (method, "requested")
+    orders = {"auto": tuple(METHODS), "least_noise": LEAST_NOISE}
+    chosen, reason = choose(state, orders[method]) if method in orders else (method, "requested")
     clock_flags = receiver.clock_flags if numerology.repeats or chosen not in DIVIDING else {}
     cell_m = SPEED_OF_LIGHT_M_S / (numerology.numbers.size * numerology.spacing_hz)
     delay_m = state.delay_cells * cell_m
