@@ -70,7 +70,9 @@ def test_stored_pulse_parameters_give_the_measured_transfer(drifting, tmp_path, 
     rx, captures = open_acquisition(campaign, "f01", "uav2", sent), stage.capture.values
     measured = transfer_by_sidelink(
         rx.reader(["radar", "sidelink"], captures),
-        Demodulator(sent.inverse, rx.numerology, sent.waveform.capture_samples),
+        Demodulator(
+            lambda pulses: sent.inverses.at(stage.frame.values[pulses]), rx.numerology, sent.waveform.capture_samples
+        ),
         sidelink_m=np.linalg.norm(stage.sidelink_vector.values, axis=1),
         method=method,
         accuracy_db=-60.0,

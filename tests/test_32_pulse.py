@@ -9,6 +9,7 @@ from apertura.campaign.folder import Campaign
 from apertura.common.errors import CampaignError
 from apertura.core.echo.captures import blocks_of
 from apertura.core.echo.demodulate import Numerology, demodulate
+from apertura.core.echo.frame_codes import Inverses
 from apertura.core.echo.pulse_filter import occupied_band, pulse_filter, pulse_spectrum, truncation_flags
 from apertura.core.echo.transfer import Demodulator, transfer_by_sidelink
 from apertura.simulation.scatterers import Paths
@@ -172,7 +173,7 @@ def test_division_needs_no_clock_for_a_single_pulse(cfo_hz):
     numerology = numerology_of(numbers, LENGTH - len(pulse))
     measured = transfer_by_sidelink(
         lambda pulses: {name: samples[pulses] for name, samples in iq.items()},
-        Demodulator(pulse_filter(spectrum, requested="inverse").inverse, numerology, LENGTH),
+        Demodulator(Inverses.fixed(pulse_filter(spectrum, requested="inverse").inverse).at, numerology, LENGTH),
         sidelink_m=np.full(40, 11.7),
         method="divide",
         accuracy_db=-60.0,

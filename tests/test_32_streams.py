@@ -10,6 +10,7 @@ from apertura.core.echo.association import baseline_residual, detect_wrong_assoc
 from apertura.core.echo.captures import Saturation, blocks_of, spread
 from apertura.core.echo.clock import clock_of, estimate_clock
 from apertura.core.echo.demodulate import Numerology, remove_path
+from apertura.core.echo.frame_codes import Inverses
 from apertura.core.echo.line_of_sight import fit_line_of_sight
 from apertura.core.echo.sidelink_state import measure, measure_blocks
 from apertura.core.echo.transfer import Demodulator, transfer_by_code, transfer_by_sidelink
@@ -39,7 +40,7 @@ def formed(iq, **more):
     pulses = len(iq["radar"])
     measured = transfer_by_sidelink(
         lambda pulses: {name: samples[pulses] for name, samples in iq.items()},
-        Demodulator(1 / CODES, NUMEROLOGY, SYMBOL),
+        Demodulator(Inverses.fixed(1 / CODES).at, NUMEROLOGY, SYMBOL),
         sidelink_m=np.full(pulses, 15.0),
         accuracy_db=-60.0,
         where="here",
@@ -199,7 +200,7 @@ def test_memory_does_not_grow_with_the_length_of_a_flight(monkeypatch):
         tracemalloc.start()
         measured = transfer_by_code(
             lambda pulses: {"radar": captures[pulses % 64]},
-            Demodulator(1 / CODES, NUMEROLOGY, SYMBOL),
+            Demodulator(Inverses.fixed(1 / CODES).at, NUMEROLOGY, SYMBOL),
             time_s=np.arange(pulses) / 20,
         )
         for block in blocks_of(np.arange(pulses)):

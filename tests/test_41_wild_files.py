@@ -24,12 +24,13 @@ from apertura.core.echo.dechirp import FrequencySweep, transfer_of
 from apertura.core.geometry.geodesy import ecef_from_geodetic
 from apertura.core.scene.dem import height_range, open_dem
 from apertura.core.scene.grid import SceneGrid
+from apertura.formats.code_tables import CodeTable
 from apertura.formats.phase_histories.pulson import MESSAGE, SAMPLE_RATE_HZ
 from apertura.formats.reading import read_phase_history, read_track
 from apertura.formats.recordings.sigmf import open_sigmf
 from apertura.formats.tracks.log_options import LogOptions
 from apertura.stages import ingest
-from apertura.stages.transmitted import read_codes, read_framing
+from apertura.stages.transmitted import read_framing
 from tests.attack import logs
 
 # The campaign folder
@@ -118,7 +119,7 @@ def codes(tmp_path, content):
         np.save(path, content)
     else:
         path.write_bytes(content)
-    return lambda: read_codes(path, 64)
+    return lambda: CodeTable(path, 64)
 
 
 def header(shape):

@@ -14,6 +14,7 @@ from apertura.core.scene.dem import open_dem
 from apertura.core.scene.geoid import geoid_file, undulation
 from apertura.core.scene.grid import SceneGrid
 from apertura.formats.beam_pattern import read_beam_pattern
+from apertura.formats.code_tables import CodeTable
 from apertura.formats.names import recording_files
 from apertura.formats.phase_histories import (
     cphd,
@@ -36,7 +37,7 @@ from apertura.stages.agreement import assessment_of
 from apertura.stages.calibration import calibrated
 from apertura.stages.radiometry import read_constants
 from apertura.stages.scene import settled_scene
-from apertura.stages.transmitted import read_codes, read_framing, read_pulse
+from apertura.stages.transmitted import read_framing, read_pulse
 from apertura.tools.design.flight_plan import read_flight_plan
 from apertura.tools.open_campaign import OpenCampaign
 
@@ -322,7 +323,7 @@ PARSERS: dict[str, Parser] = {
         True,
     ),
     "pattern.csv": Parser("horn.csv", seeds.patterns, read_beam_pattern, _CSV, "cut azimuth elevation angle_deg , -"),
-    "codes.npy": Parser("codes.npy", seeds.codes, lambda path: read_codes(path, seeds.SYMBOLS), (), _NPY),
+    "codes.npy": Parser("codes.npy", seeds.codes, lambda path: CodeTable(path, seeds.SYMBOLS), (), _NPY),
     "pulse.npy": Parser("pulse.npy", seeds.pulses, lambda path: read_pulse(path, _PULSE), (), _NPY),
     "preamble.npy": Parser("preamble.npy", seeds.preambles, _preamble, (), _NPY),
     "afrl.mat": Parser(

@@ -19,6 +19,7 @@ from apertura.campaign.config import (
     SampledWaveform,
     Segment,
     Settings,
+    SidelinkCodes,
     check_interferometry,
     check_radio,
     check_stack,
@@ -322,10 +323,38 @@ class Campaign(RawFolder):
         return self.root.named(name, where=f"{CONFIG}: {key}")
 
     @property
-    def sent_file(self) -> ConfinedPath:
-        """File of the transmitted signal: code symbols, or the samples of a pulse."""
+    def sent_path(self) -> ConfinedPath | None:
+        """File or Zarr folder of the transmitted signal: codes, pilots or samples of a pulse; None if there is none."""
         key = getattr(self.settings.waveform, "file_key", "")
-        return self.file(getattr(self.settings.waveform, key, ""), f"waveform.{key}")
+        stated = getattr(self.settings.waveform, key, "")
+        stated = getattr(stated, "pilots", stated)
+        return self.file(stated, f"waveform.{key}") if isinstance(stated, str) else None
+
+    @property
+    def sent_files(self) -> list[ConfinedPath]:
+        """Files of the transmitted signal; none if it is generated."""
+        path = self.sent_path
+        return [] if path is None else sorted(_files(path))
+
+    def symbol_source(self, flight: str, pair: str) -> str | None:
+        """Return the node whose sidelink gives the code symbols of a pair; None if the symbols are known."""
+        codes = getattr(self.settings.waveform, "codes", None)
+        if not isinstance(codes, SidelinkCodes):
+            return None
+        transmitter, receiver = pair.split("-")
+        nodes = self.flight(flight).participants
+        if transmitter != receiver:
+            return receiver
+        if codes.node is None:
+            return next((node for node in nodes if node != transmitter), transmitter)
+        if codes.node not in nodes:
+            raise CampaignError(
+                f"node {codes.node!r} is not part of flight {flight}",
+                where=f"{CONFIG}: waveform.codes.node",
+                expected=f"one of {', '.join(nodes)}",
+                remedy="Correct the node, or remove the key.",
+            )
+        return codes.node
 
     @property
     def calibration_file(self) -> ConfinedPath | None:

@@ -56,7 +56,7 @@ def check_files(examined: "Examination") -> Iterator[CampaignError]:
         lookups.append(lambda: {"processing.radiometric_calibration": campaign.calibration_file or campaign.root})
     waveform = campaign.settings.waveform
     if isinstance(waveform, SampledWaveform):
-        lookups.append(lambda: {f"waveform.{waveform.file_key}": campaign.sent_file})
+        lookups.append(lambda: {f"waveform.{waveform.file_key}": path for path in campaign.sent_files})
     for lookup in lookups:
         try:
             named = lookup()

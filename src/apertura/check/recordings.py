@@ -38,8 +38,7 @@ def check_codes(examined: Examination) -> Iterator[CampaignError]:
     waveform = examined.waveform
     if waveform is None:
         return
-    path = examined.campaign.sent_file
-    if path.is_file() and path.stat().st_size:
+    if all(path.is_file() and path.stat().st_size for path in examined.campaign.sent_files):
         yield from examined.transmitted_problems
 
 

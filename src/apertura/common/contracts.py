@@ -209,6 +209,7 @@ STAGES: Mapping[str, Stage] = {
         {
             **_TRANSFER,
             "capture": Variable(("pulse",), "int64", "1", "index of the pulse's capture in the receiver's recording"),
+            "frame": Variable(("pulse",), "int64", "1", "frame number of the pulse, which selects its code symbols"),
             "path_removed": Variable(
                 ("pulse",), "float64", "m", "electrical path outside the scene, already removed from `transfer`"
             ),

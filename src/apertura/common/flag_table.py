@@ -242,6 +242,12 @@ _OF_RECORDINGS = {
         "blockage; antenna of the sidelink",
         "core/echo/sidelink_state.py",
     ),
+    "symbols_unsure": Flag(
+        "pulses excluded; or SNR of the sidelink and required SNR, dB",
+        "the data symbols of pulses cannot be decided; of most pulses: echoes are divided by the noisy sidelink",
+        "SNR and reflections of the sidelink; waveform.codes: constellation, pilots",
+        "core/echo/decided_symbols.py",
+    ),
     "sidelink_spikes": Flag(
         "pulses whose sidelink phase deviates, rad and cm; pulses excluded; loss by the others, dB",
         "the sidelink is disturbed in individual pulses; the echoes of these pulses are not affected",
@@ -295,6 +301,25 @@ _OF_RECORDINGS = {
         "the sidelink does not contain the code that the correction requires",
         "waveform.codes",
         "core/echo/sidelink.py",
+    ),
+    "frames_displaced": Flag(
+        "frames by which the symbols of captures differ from their frame numbers",
+        "the symbols of other frames were found in the captures: the first triggers are missing, or the table of codes "
+        "begins with another frame; numbers by order of captures are corrected, those of a frame counter are not",
+        "first captures of the transmitter; rows of waveform.codes; frame counter",
+        "stages/echo.py",
+    ),
+    "symbols_noise": Flag(
+        "SNR loss by symbols of varying modulus, and smallest loss, dB",
+        "the requested filter of the symbols loses more SNR than another one",
+        "processing.symbol_filter: auto",
+        "core/echo/symbol_filter.py",
+    ),
+    "symbols_sidelobes": Flag(
+        "level of data sidelobes, dB; number of different frames",
+        "the requested filter leaves echo amplitudes that vary with the data, which spread each point over all ranges",
+        "processing.symbol_filter: auto or reciprocal",
+        "core/echo/symbol_filter.py",
     ),
     "waveform_sidelobes": Flag(
         "range sidelobes of every point, dB",

@@ -67,7 +67,7 @@ class Framing:
 
     def centre_hz(self, waveform: TransmitWaveform) -> float:
         """Return the baseband frequency of the carrier of the chips, the centre subcarrier."""
-        return float(waveform.baseband_hz[len(waveform.codes) // 2])
+        return float(waveform.baseband_hz[waveform.subcarriers // 2])
 
     def signal(self, waveform: TransmitWaveform, frame: int, time_s: Floats) -> NDArray[np.complex128]:
         """Return preamble and payload of a frame at baseband, at (...,) seconds from the start of the prefix."""
@@ -76,7 +76,7 @@ class Framing:
         # 1e-6 samples: tolerance for rounding at the edge of a chip
         index = np.floor((time_s * rate + self.lead_samples + 1e-6) / self.chip_samples).astype(int)
         inside = (index >= 0) & (index < len(chips))
-        level = np.sqrt((np.abs(waveform.codes) ** 2).sum()) * 10 ** (self.level_db / 20)
+        level = np.sqrt((np.abs(waveform.codes_at(0)) ** 2).sum()) * 10 ** (self.level_db / 20)
         modulation = np.where(inside, chips[np.clip(index, 0, len(chips) - 1)], 0)
         return np.asarray(level * modulation * np.exp(2j * np.pi * self.centre_hz(waveform) * time_s))
 

@@ -69,6 +69,8 @@ def fly(
             path_offset_m=nodes[name].path_offset_m,
             sidelink=name != sender,
         )
+        first_frame = flight.first_frame if flight.framing else 0
+        channels = {key: replace(channel, first_frame=first_frame) for key, channel in channels.items()}
         radios = nodes[sender].radio, nodes[name].radio
         if radios[0] is not None and radios[1] is not None:
             channels["radar"] = physical(channels["radar"], transmitter=radios[0], receiver=radios[1])

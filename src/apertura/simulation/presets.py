@@ -435,7 +435,7 @@ def paper_waveform(*, prf_hz: float = 100.0) -> TransmitWaveform:
     Examples
     --------
     >>> wave = paper_waveform()
-    >>> len(wave.codes) * wave.subcarrier_spacing_hz
+    >>> wave.subcarriers * wave.subcarrier_spacing_hz
     409600000.0
     """
     return replace(PAPER_WAVEFORM, prf_hz=prf_hz).drawn(np.random.default_rng(0))  # this code has no random part

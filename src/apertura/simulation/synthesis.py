@@ -51,6 +51,8 @@ class Channel:
         Full-scale amplitude of I + jQ if a radio is specified; None: derived from the backoff of the converter.
     interference
         Interferers with the mean power of their samples during transmission.
+    first_frame
+        Frame number of the first pulse, which selects its code symbols.
     """
 
     waveform: TransmitWaveform
@@ -63,6 +65,7 @@ class Channel:
     noise_variance: float = 0.0
     full_scale: float | None = None
     interference: tuple[tuple[Interferer, float], ...] = ()
+    first_frame: int = 0
 
 
 def transfer_functions(channel: Channel, generator: Generator | None) -> Complex:
@@ -150,7 +153,8 @@ def _cumulative_spectra(channel: Channel, pulse: int, order: NDArray[np.intp], s
     # delays at the midpoint of the pulse relative to the start of the capture; these also determine the carrier phase
     late = delay + rate * middle_s - channel.start_s[pulse]
     level = paths.amplitude[pulse, order]
-    factor = waveform.codes * channel.response * np.exp(-2j * np.pi * waveform.baseband_hz * waveform.cyclic_prefix_s)
+    codes = waveform.codes_at(channel.first_frame + pulse)
+    factor = codes * channel.response * np.exp(-2j * np.pi * waveform.baseband_hz * waveform.cyclic_prefix_s)
     out = np.zeros((terms, len(splits) + 2, len(factor)), np.complex128)
     for term in range(terms):
         for group, part in enumerate(np.split(np.arange(len(order)), splits)):
@@ -244,10 +248,12 @@ def periodic_samples(channel: Channel, generator: Generator | None, pulses: NDAr
     if channel.sfo_hz or channel.paths.delay_rate[pulses].any():
         raise ValueError("a sampling frequency offset, or Doppler within the pulse, requires exact synthesis")
     echoes = _prefixed_echoes(channel, pulses) * (
-        waveform.codes * channel.response * np.exp(-2j * np.pi * waveform.baseband_hz * waveform.cyclic_prefix_s)
+        waveform.codes_at(channel.first_frame + pulses)
+        * channel.response
+        * np.exp(-2j * np.pi * waveform.baseband_hz * waveform.cyclic_prefix_s)
     ).astype(np.complex64)
     bins = np.zeros((len(pulses), waveform.dft_samples), np.complex64)
-    bins[:, waveform.first_subcarrier + np.arange(len(waveform.codes))] = echoes
+    bins[:, waveform.first_subcarrier + np.arange(waveform.subcarriers)] = echoes
     period = fft.ifft(bins, axis=1, norm="forward")
     period *= unit_phasor(channel.phase_rad[pulses, None] / (2 * np.pi))
     captures = np.take(period, np.arange(waveform.capture_samples) % waveform.dft_samples, axis=1)
@@ -412,7 +418,7 @@ def receive(
 
 
 def _response(waveform: TransmitWaveform, ripple: Ripple | None) -> Complex:
-    return ripple.response(waveform.frequency_hz) if ripple else np.ones(len(waveform.codes), np.complex128)
+    return ripple.response(waveform.frequency_hz) if ripple else np.ones(waveform.subcarriers, np.complex128)
 
 
 def spectral_power(waveform: TransmitWaveform, paths: Paths, response: Complex | float = 1.0) -> float:
@@ -423,7 +429,7 @@ def spectral_power(waveform: TransmitWaveform, paths: Paths, response: Complex |
     blocks = (paths.at(slice(start, start + _PULSES_AT_ONCE)) for start in starts)
     spectra = (spectrum(block.delay_s, block.amplitude, waveform.frequency_hz) for block in blocks)
     total = sum(float((np.abs(echo * response) ** 2).sum()) for echo in spectra)
-    return total / (len(paths.delay_s) * len(waveform.codes))
+    return total / (len(paths.delay_s) * waveform.subcarriers)
 
 
 def full_scale(channel: Channel, adc: Adc) -> float:

@@ -11,6 +11,7 @@ from pydantic.dataclasses import dataclass
 from scipy import fft
 
 from apertura.common.arrays import Floats
+from apertura.core.echo.constellation import constellation
 from apertura.simulation.impairments import STRICT_KEYS
 
 
@@ -21,7 +22,7 @@ class TransmitWaveform:
     Attributes
     ----------
     codes
-        (subcarrier,) complex128, c_n.
+        (subcarrier,) complex128, c_n; or (frame, subcarrier), repeated after the last frame.
     carrier_hz
         RF frequency of subcarrier n = 0, which is baseband zero.
     carrier_is
@@ -48,12 +49,22 @@ class TransmitWaveform:
     @property
     def first_subcarrier(self) -> int:
         """Smallest subcarrier number n."""
-        return 0 if self.carrier_is == "band_start" else -(len(self.codes) // 2)
+        return 0 if self.carrier_is == "band_start" else -(self.subcarriers // 2)
+
+    @property
+    def subcarriers(self) -> int:
+        """Number of subcarriers."""
+        return int(self.codes.shape[-1])
+
+    def codes_at(self, frames: NDArray[np.integer] | int) -> NDArray[np.complex128]:
+        """Return the code symbols of frames, (frame, subcarrier), or (subcarrier,) of one frame."""
+        return np.asarray(np.atleast_2d(self.codes)[np.asarray(frames) % len(np.atleast_2d(self.codes))])
 
     @property
     def baseband_hz(self) -> Floats:
         """Baseband frequencies nΔf, (subcarrier,) float64, Hz."""
-        return np.asarray((self.first_subcarrier + np.arange(len(self.codes))) * self.subcarrier_spacing_hz, np.float64)
+        numbers = self.first_subcarrier + np.arange(self.subcarriers)
+        return np.asarray(numbers * self.subcarrier_spacing_hz, np.float64)
 
     @property
     def frequency_hz(self) -> Floats:
@@ -82,8 +93,8 @@ class TransmitWaveform:
 
     @property
     def mean_power(self) -> float:
-        """Mean power E|s|² for codes of unit modulus."""
-        return float(len(self.codes))
+        """Mean power E|s|² for codes of unit mean power."""
+        return float(self.subcarriers)
 
     @property
     def noise_at_unit_snr(self) -> float:
@@ -110,8 +121,8 @@ class TransmitWaveform:
         return first, end
 
 
-def qpsk_codes(count: int, generator: Generator) -> NDArray[np.complex128]:
-    """Draw `count` random QPSK code symbols of unit modulus.
+def qpsk_codes(count: int | tuple[int, ...], generator: Generator) -> NDArray[np.complex128]:
+    """Draw random QPSK code symbols of unit modulus: a number of them, or an array of a shape.
 
     Examples
     --------
@@ -284,9 +295,10 @@ class WaveformSpecification:
     carrier_is: Literal["band_start", "band_centre"] = Field(
         default="band_start", description="n = 0…N-1 (band_start) or -N/2…N/2-1 (band_centre)"
     )
-    code: Literal["qpsk", "newman"] = Field(
-        default="qpsk", description="random QPSK, or Newman's code of nearly constant envelope"
+    code: Literal["newman", "qpsk", "16qam", "64qam", "256qam"] = Field(
+        default="qpsk", description="random symbols of a constellation, or Newman's code of nearly constant envelope"
     )
+    frames: int = Field(default=1, ge=1, description="number of frames of random symbols, after which they repeat")
     kind: Literal["ofdm"] = Field(default="ofdm", kw_only=True, repr=False)
 
     @model_validator(mode="after")
@@ -303,13 +315,21 @@ class WaveformSpecification:
 
     def drawn(self, generator: Generator) -> TransmitWaveform:
         """Return the waveform with its code symbols, drawn if they are random."""
-        codes = qpsk_codes(self.subcarriers, generator) if self.code == "qpsk" else newman_codes(self.subcarriers)
-        parameters = {name: value for name, value in vars(self).items() if name not in {"subcarriers", "code", "kind"}}
+        shape = (self.frames, self.subcarriers) if self.frames > 1 else (self.subcarriers,)
+        if self.code == "newman":
+            codes = newman_codes(self.subcarriers)
+        elif self.code == "qpsk":
+            codes = qpsk_codes(shape, generator)
+        else:
+            points = constellation(self.code).points.astype(np.complex128)
+            codes = points[generator.integers(0, len(points), shape)]
+        names = {"subcarriers", "code", "frames", "kind"}
+        parameters = {name: value for name, value in vars(self).items() if name not in names}
         return TransmitWaveform(codes, **parameters)
 
     def section(self, _: TransmitWaveform) -> dict[str, Any]:
         """Return the section `waveform` of the config."""
-        parameters = {name: value for name, value in vars(self).items() if name not in {"code", "kind"}}
+        parameters = {name: value for name, value in vars(self).items() if name not in {"code", "frames", "kind"}}
         return {"kind": self.kind, "codes": "raw/codes.npy", **parameters}
 
 

@@ -17,6 +17,7 @@ from apertura.common.units import nanoseconds
 from apertura.core.echo.association import Association, associate
 from apertura.core.echo.captures import Read, Samples, ordered
 from apertura.core.echo.demodulate import Numerology
+from apertura.core.echo.frame_codes import FrameNumbers, frame_numbers
 from apertura.formats.recordings.sample_file import SampleFile, SampleLayout
 from apertura.stages.node_log import NodeLog, shortest_wave
 from apertura.stages.transmitted import Transmitted, check_mixing
@@ -89,6 +90,8 @@ class Captured:
         Numerology of the symbol.
     order
         Order of I and Q: complex, swapped or conjugate.
+    frames
+        Frame number of each capture; that of a receiver applies to its own clock only.
     """
 
     raw: xr.Dataset
@@ -97,6 +100,7 @@ class Captured:
     recording: str
     numerology: Numerology
     order: str
+    frames: FrameNumbers
 
     def reader(self, channels: Sequence[str], pulses: NDArray[np.int64]) -> Read:
         """Return a function that reads channels of selected captures from the recorder's file, block by block.
@@ -160,7 +164,9 @@ class Captured:
         check_rates(sent.waveform, recorded, where=recording)
         opened = SampleFile(samples, len(raw.attrs["channels"]), SampleLayout.of(raw))
         check_mixing(opened, sent.numerology, where=recording)
-        return cls(raw, opened, files, recording, sent.numerology, order)
+        interval_s = 1 / sent.waveform.prf_hz
+        frames = frame_numbers(nanoseconds(raw.time.values), raw.frame.values, interval_s=interval_s)
+        return cls(raw, opened, files, recording, sent.numerology, order, frames)
 
 
 @dataclass(frozen=True)

@@ -21,21 +21,27 @@ from apertura.common.flags import Flags
 from apertura.common.provenance import merged
 from apertura.common.units import nanoseconds
 from apertura.core.echo.association import Association, missing_flags, tag_jitter_s
-from apertura.core.echo.captures import runs, sampled_pulses
+from apertura.core.echo.captures import runs, sampled_pulses, spread
+from apertura.core.echo.demodulate import demodulate
+from apertura.core.echo.frame_codes import displacement
 from apertura.core.echo.interference import Interference
 from apertura.core.echo.pulse_filter import truncation_flags
 from apertura.core.echo.sidelink import DIVIDING
+from apertura.core.echo.symbol_filter import tolerated_sidelobes_db
 from apertura.core.echo.transfer import (
     Transfer,
+    as_complex,
     transfer_by_code,
     transfer_by_sidelink,
 )
+from apertura.core.echo.trigger import ABSENT
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.atmosphere import SceneAir
 from apertura.core.quality.budget import strictest_accuracy_db
 from apertura.stages.acquisition import Acquisition, common_pulses, open_acquisition
 from apertura.stages.calibration import calibrated, calibration_spec
 from apertura.stages.positions import PulsePositions, place, scene_air, stated_air
+from apertura.stages.symbols import PairSymbols
 from apertura.stages.tags import stamped
 from apertura.stages.transfer import PairEcho, demodulator_of, recorded_echo, save_transfer
 from apertura.stages.transmitted import Transmitted, transmitted
@@ -52,14 +58,25 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
         files = [campaign.root / name for name in lineage.result.sources]
         formed = PairEcho.recorded(recorded_echo(campaign, flight, pair))
     else:
-        files = [campaign.sent_file]
+        files = campaign.sent_files
         sent = transmitted(campaign, waveform)
         tx, rx = pair.split("-")
-        nodes = {node: open_acquisition(campaign, flight, node, sent) for node in dict.fromkeys((tx, rx))}
+        source = campaign.symbol_source(flight, pair)
+        names = dict.fromkeys(name for name in (tx, rx, source) if name is not None)
+        nodes = {node: open_acquisition(campaign, flight, node, sent) for node in names}
         parents = [stage for node in nodes.values() for stage in (node.raw, node.track)]
         air = scene_air(campaign, nodes[tx].track.position.values)
         hovers = bool(campaign.segments_of(flight, pair))
-        formed = pair_echo(nodes[tx], nodes[rx], sent, campaign.settings.processing, calibration, air, hovers=hovers)
+        formed = pair_echo(
+            nodes[tx],
+            nodes[rx],
+            sent,
+            campaign.settings.processing,
+            calibration,
+            air,
+            hovers=hovers,
+            source=None if source is None else nodes[source],
+        )
     formed = formed.within(campaign, flight, pair)
     inputs = {name: lineage.sources.digests[name] for name in map(campaign.relative, files)}
     if calibration:
@@ -83,18 +100,34 @@ def pair_echo(
     air: SceneAir,
     *,
     hovers: bool = False,
+    source: Acquisition | None = None,
 ) -> PairEcho:
     """Return the echo of a pair from its nodes' recordings, with calibrated or else configured path offsets.
 
-    Pulses of a hover are excluded unless `hovers` is True, as in `apertura.stages.positions.place`.
+    Pulses of a hover are excluded unless `hovers` is True, as in `apertura.stages.positions.place`. `source`: node
+    whose sidelink gives unknown symbols of the pulses, by default the receiver.
     """
     pulses = common_pulses(tx, rx, prf_hz=sent.waveform.prf_hz)
     repeats = rx.raw.repeats.values[pulses.rx_index]
     paired = np.flatnonzero(~pulses.outlier & ~repeats)
     positions = place(tx, rx, tx.raw.time.values[pulses.tx_index[paired]], hovers=hovers)
     paired = paired[positions.good]
+    if sent.unknown is None:
+        frames = tx.frames.numbers[pulses.tx_index[paired]]
+        frames, displaced = _placed((tx, rx), pulses.rx_index[paired], frames, sent)
+        decided, basis = dict[str, Any](), tx.frames.basis
+    else:
+        decision = PairSymbols.of((tx, rx), source or rx, sent, pulses, paired, processing.accuracy_db)
+        usable = decision.usable()
+        sent, frames, paired = decision.sent, decision.rows[usable], paired[usable]
+        decided, displaced = {"decided": decision.report(usable)}, Flags(decision.symbols.flags(usable))
+        basis = f"captures of {decision.source}"
+        if processing.sidelink == "auto":
+            processing = processing.model_copy(
+                update={"sidelink": "divide" if decision.symbols.divides else "least_noise"}
+            )
     at = tx.raw.time.values[pulses.tx_index[paired]]
-    measured, sidelink_m = _transfer((tx, rx), pulses.rx_index[paired], at, sent, processing, air)
+    measured, sidelink_m = _transfer((tx, rx), (pulses.rx_index[paired], frames), at, sent, processing, air)
     at = at[measured.kept]
     stated = rx.settings.path_offset_m
     stated_m = stated.radar if tx.name == rx.name else stated.radar - stated.sidelink
@@ -111,10 +144,15 @@ def pair_echo(
     if tx.name != rx.name:  # b of docs/theory/autofocus.md, eq. 2: the sidelink's length was added to the echo
         sidelink_m = tx.antenna("sidelink", at) - rx.antenna("sidelink", at)
         geometry["sidelink_vector"] = (("pulse", "axis"), sidelink_m)
+    if sent.inverses.count > 1:
+        symbols = {"rows": sent.inverses.count, "frames": basis, **decided, **measured.report.get("symbols", {})}
+        report = {**measured.report, "symbols": symbols}
+        measured = replace(measured, report=report, flags=Flags.merged(measured.flags, displaced))
     dataset = xr.Dataset(
         {
             "time": ("pulse", at),
             "capture": ("pulse", pulses.rx_index[paired][measured.kept]),
+            "frame": ("pulse", frames[measured.kept]),
             "path_removed": ("pulse", extra_path_m),
             "tx_position": (("pulse", "axis"), aperture.tx_m),
             "rx_position": (("pulse", "axis"), aperture.rx_m),
@@ -180,9 +218,32 @@ def _attributes(
     return attrs
 
 
+def _placed(
+    nodes: tuple[Acquisition, Acquisition], captures: NDArray[np.int64], frames: NDArray[np.int64], sent: Transmitted
+) -> tuple[NDArray[np.int64], Flags]:
+    """Return the frame numbers of captures, displaced if the symbols of other frames are found in them, and a flag."""
+    tx, rx = nodes
+    if sent.inverses.count == 1:
+        return frames, Flags()
+    channel = "radar" if tx.name == rx.name else "sidelink"
+    tested = np.concatenate(spread(len(captures), groups=4, each=16))
+    samples = rx.reader([channel], captures[tested])(np.arange(len(tested)))[channel]
+    moved = displacement(
+        demodulate(as_complex(samples), rx.numerology), sent.inverses, frames[tested], same_delay=rx is tx
+    )
+    if not moved:
+        return frames, Flags()
+    by_order = (tx.raw.frame.values == ABSENT).all()
+    line = (
+        f"{rx.files.name}: captures contain the symbols of the {abs(moved)}. frame {'after' if moved > 0 else 'before'}"
+    )
+    flags = Flags({"frames_displaced": f"{line} their frame number; {'corrected' if by_order else 'not corrected'}"})
+    return (frames + moved if by_order else frames), flags
+
+
 def _transfer(
     nodes: tuple[Acquisition, Acquisition],
-    captures: NDArray[np.int64],
+    captures: tuple[NDArray[np.int64], NDArray[np.int64]],
     at: Times,
     sent: Transmitted,
     processing: Processing,
@@ -190,25 +251,31 @@ def _transfer(
 ) -> tuple[Transfer, NDArray[np.float64]]:
     """Return the transfer functions of captures, and the electrical length of the sidelink per pulse, in metres.
 
-    The length is 0 for a monostatic pair. `at`: time tags of the transmitter, at which both logs are evaluated
-    (docs/theory.md, "Geometry").
+    `captures`: their indices in the receiver's recording, and the frame numbers of their pulses. The length is 0 for
+    a monostatic pair. `at`: time tags of the transmitter, at which both logs are evaluated (docs/theory.md,
+    "Geometry").
     """
-    tx, rx = nodes
+    (tx, rx), (index, frames) = nodes, captures
+    accuracy_db = strictest_accuracy_db(processing.accuracy_db)
+    tolerated_db = tolerated_sidelobes_db(processing.accuracy_db)
+    choose = sent.filter_choice(processing.symbol_filter, frames=frames, tolerated_db=tolerated_db)
     sent_ns = nanoseconds(at)
     time_s = (sent_ns - sent_ns[0]) * 1e-9
     if tx.name == rx.name:
-        read = rx.reader(["radar"], captures)
-        measured = transfer_by_code(read, demodulator_of(rx, sent, processing), time_s=time_s)
+        read = rx.reader(["radar"], index)
+        demodulator = demodulator_of(rx, sent, processing, frames)
+        measured = transfer_by_code(read, demodulator, time_s=time_s, choose_symbols=choose)
         return _with_waveform(measured, sent), np.zeros(len(at))
     length_m = air.electrical_m(tx.antenna("sidelink", at), rx.antenna("sidelink", at))
     measured = transfer_by_sidelink(
-        rx.reader(["radar", "sidelink"], captures),
-        demodulator_of(rx, sent, processing),
+        rx.reader(["radar", "sidelink"], index),
+        demodulator_of(rx, sent, processing, frames),
         sidelink_m=length_m,
         method=processing.sidelink,
-        accuracy_db=strictest_accuracy_db(processing.accuracy_db),
+        accuracy_db=accuracy_db,
         where=str(rx.files),
         time_s=time_s,
+        choose_symbols=choose,
     )
     return _with_waveform(measured, sent), length_m[measured.kept]
 
@@ -261,6 +328,7 @@ def _pulse_counts(
         "time_tag_outlier": int(pulses.outlier.sum()),
         "captures_repeated": int((repeats & ~pulses.outlier).sum()),
         **positions.reasons,
+        "symbols_unsure": measured.report.get("symbols", {}).get("decided", {}).get("unsure", 0),
         "sidelink_lost": int((~measured.kept).sum()) - spikes,
         "sidelink_spikes": spikes,
     }

@@ -48,6 +48,7 @@ _QUOTED = (
     "interference",
     "positions",
     "time_tags",
+    "symbols",
     "sidelink",
     "clock",
     "code",

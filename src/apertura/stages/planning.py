@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.filesize import decimal
 
-from apertura.campaign.config import CONFIG, Node, SampledWaveform
+from apertura.campaign.config import CONFIG, Node, OfdmWaveform, SampledWaveform
 from apertura.campaign.config.processing import HEIGHT_DEFAULT
 from apertura.campaign.folder import Campaign
 from apertura.common.errors import CampaignError, number_of
@@ -16,6 +16,7 @@ from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.job import Integration, Job
 from apertura.core.echo.compression import centre_frequency, range_step
+from apertura.core.echo.symbol_filter import tolerated_sidelobes_db
 from apertura.core.geometry.atmosphere import USUAL_N
 from apertura.core.geometry.gate import EDGE_CELLS, RangeGate
 from apertura.core.imaging.job import decide_integration, imaging_job
@@ -42,6 +43,7 @@ from apertura.core.scene.swath import swath
 from apertura.core.scene.terrain import GroundModels
 from apertura.stages.pair import OpenPair, scene_illumination
 from apertura.stages.scene import OpenScene
+from apertura.stages.transmitted import transmitted
 
 # ---- Error budget of a pair, from config, logs and echo -------------------------------------------------------------
 
@@ -99,6 +101,10 @@ def budget_of(
     if background.get("removed", "none") != "none":
         effect = Effect(background["middle_loss_db"], 0.0, 0.0)
         lines.append(BudgetLine("background removal", background["removed"], effect))
+    if "filter" in (symbols := symbols_of(campaign, pair)):
+        sidelobes = "none" if symbols["sidelobes_db"] is None else f"{symbols['sidelobes_db']:.1f} dB"
+        stated = f"{symbols['filter']} filter: SNR loss {symbols['loss_db']:.2f} dB, data sidelobes {sidelobes}"
+        lines.append(BudgetLine("data symbols", stated, NO_EFFECT))
     if not monostatic:
         total = paths.aperture.path(paths.point_m)
         lines.append(offset_line(paths, "clock", _PPM * total, _scaled(pair.report, "clock", "std_ppm", 1), unit="ppm"))
@@ -118,6 +124,20 @@ def budget_of(
         rate = f"rate of change of the total path at most {np.abs(paths.rate_m_s).max():.2g} m/s"
         lines.append(BudgetLine("stop and go", rate, effect))
     return [*lines, *_between_epochs(paths, pair)]
+
+
+def symbols_of(campaign: Campaign, pair: OpenPair) -> Mapping[str, Any]:
+    """Return the filter of a pair's symbols and its effect, measured or predicted; empty for a constant modulus."""
+    waveform = campaign.settings.waveform
+    if pair.report or not isinstance(waveform, OfdmWaveform):
+        return dict(pair.report.get("symbols", {}))
+    stated = campaign.settings.processing
+    choose = transmitted(campaign, waveform).filter_choice(
+        stated.symbol_filter,
+        frames=np.arange(len(pair.time_s)),
+        tolerated_db=tolerated_sidelobes_db(stated.accuracy_db),
+    )
+    return choose(None).report if choose else {}
 
 
 def positions_loss_db(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> float:
@@ -203,6 +223,15 @@ def _air(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> BudgetLine:
     return BudgetLine("atmosphere", None if assumed else line, effect, assumed=line if assumed else None)
 
 
+def symbols_decisions(campaign: Campaign, pair: OpenPair) -> list[Decision]:
+    """Return the decision on the filter of symbols of varying modulus; none for a constant modulus."""
+    symbols = symbols_of(campaign, pair)
+    if "filter" not in symbols:
+        return []
+    reason = f"{symbols['reason']}; SNR loss {symbols['loss_db']:.2f} dB"
+    return [Decision("symbol_filter", symbols["filter"], reason)]
+
+
 def air_decision(pair: OpenPair) -> Decision:
     """Return the refractivity assumed on the paths of a pair, and its effect relative to vacuum."""
     air = pair.air
@@ -284,7 +313,13 @@ def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: 
     plan = plan_job(campaign, job_of(campaign, pair, scene, threads=threads), accuracy_db=float(accuracy.value))
     plan = replace(
         plan,
-        decisions=(*plan.decisions, accuracy, air_decision(pair), background_decision(pair)),
+        decisions=(
+            *plan.decisions,
+            accuracy,
+            air_decision(pair),
+            background_decision(pair),
+            *symbols_decisions(campaign, pair),
+        ),
         flags=Flags.merged(flags, scene.flags, plan.flags, recording_flags(campaign, pair, scene)),
     )
     is_written = campaign.is_current(campaign.stage("image", pair.flight, pair.name))

@@ -20,7 +20,8 @@ from apertura.common.provenance import sha256_file
 from apertura.common.units import decibels
 from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import centre_frequency
-from apertura.core.imaging.noise import PulseNoise, noise_places, sidelink_noise
+from apertura.core.echo.symbol_filter import filter_of
+from apertura.core.imaging.noise import PulseNoise, noise_places, sidelink_noise, symbols_noise
 from apertura.core.imaging.radiometry import Calibration, Link, Turn, cell_constant, pointing_std_db
 from apertura.core.imaging.reflectors import DRIFT_SIGMAS
 from apertura.core.quality.bright_points import DEEPEST_DB, SPECKLE, BrightPoint
@@ -207,7 +208,7 @@ LEAST_CONTRAST = 10.0
 """Smallest ratio of peak power to noise and clutter for a cross-section; weaker peaks may be noise or clutter."""
 
 _UNSTATED_STD_DB, _FIGURE_STD_DB = 1.0, 0.5  # assumed, dB: radio without amplitude_std_db; noise figure
-_SIDELINK_STD_DB = 0.3  # standard deviation of the predicted sidelink noise
+_SIDELINK_STD_DB = 0.3  # standard deviation of the predicted noise of sidelink and symbols
 _MOST_POINTS = 50  # number of brightest points whose cross-sections are reported
 
 POINTS_LISTED = {
@@ -244,6 +245,8 @@ class CalibratedPair:
         Noise power of a pulse in the flights that measured the constant; None if it was not measured.
     sidelink_noise
         Noise power that the sidelink adds to a profile; 0 without a sidelink.
+    symbols_noise
+        Noise power in a profile from symbols of varying modulus; 0 for the reciprocal filter.
     noise_figure_db
         Configured noise figure; None if it is not configured.
     pointing_std_db
@@ -260,6 +263,7 @@ class CalibratedPair:
     thermal_noise: float | None
     noise_before: float | None
     sidelink_noise: float
+    symbols_noise: float
     noise_figure_db: float | None
     pointing_std_db: float
 
@@ -354,15 +358,16 @@ class CalibratedPair:
         -----
         Source: docs/theory/radiometry.md, eqs. 8, 8a and 8b.
         """
-        receiver_noise = pulse_noise.power - self.sidelink_noise
+        added = self.sidelink_noise + self.symbols_noise
+        receiver_noise = pulse_noise.power - added
         report = {"noise_figure_db": self.noise_figure_db, "noise_figure_measured_db": None, "std_db": None}
         report |= {"sidelink": self.sidelink_noise or None}
+        report |= {"symbols": self.symbols_noise} if self.symbols_noise else {}
         differences = list[tuple[str, float, float]]()
         if self.thermal_noise and receiver_noise > 0:  # False for NaN
             figure_db = decibels(receiver_noise / self.thermal_noise)
             measured_std_db = (
-                np.hypot(pulse_noise.std_db * pulse_noise.power, _SIDELINK_STD_DB * self.sidelink_noise)
-                / receiver_noise
+                np.hypot(pulse_noise.std_db * pulse_noise.power, _SIDELINK_STD_DB * added) / receiver_noise
             )
             report |= {"noise_figure_measured_db": round(figure_db, 2), "std_db": round(float(measured_std_db), 2)}
             radio_db = _UNSTATED_STD_DB if self.radio_std_db is None else self.radio_std_db
@@ -371,7 +376,7 @@ class CalibratedPair:
                 differences.append(("the configured noise figure", figure_db - self.noise_figure_db, std_db))
             elif figure_db < 0:  # no receiver has a noise figure below 0 dB
                 differences.append(("a noise figure of 0 dB", figure_db, std_db))
-        if self.noise_before and pulse_noise.power > 0 and not self.sidelink_noise:
+        if self.noise_before and pulse_noise.power > 0 and not added:
             std_db = float(np.hypot(2**0.5 * pulse_noise.std_db, _FIGURE_STD_DB))
             since_db = decibels(pulse_noise.power / self.noise_before)
             differences.append(("the noise of the reflector flights (receiver gain changed?)", since_db, std_db))
@@ -450,26 +455,37 @@ def calibrated_pair(
         count=count,
         threads=threads,
     )
-    thermal, added = None, 0.0
+    thermal, added, by_symbols = None, 0.0, 0.0
+    symbols = opened.report.get("symbols", {})
     noise = measured[0].profile_noise if measured else None
     before = None if noise is None else noise * float((opened.weight**2).sum())
     if link and sent:
-        filtered = (opened.weight * np.abs(sent.inverse)) ** 2
-        thermal = link.pulse_noise(0.0, spacing_hz=sent.numerology.spacing_hz, squares=float(filtered.sum()))
+        inverse = sent.inverses.sampled()
+        filtered = filter_of(symbols).applied(inverse, inverse)
+        squares = ((opened.weight * np.abs(filtered)) ** 2).sum(axis=1).mean()
+        thermal = link.pulse_noise(0.0, spacing_hz=sent.numerology.spacing_hz, squares=float(squares))
     sidelink = opened.report.get("sidelink")
-    if sidelink and opened.history:
-        added = sidelink_noise(
-            opened.history,
-            scene.grid,
-            scene.terrain,
-            noise_places(scene.grid, scene.terrain),
-            beams=beams,
-            method=sidelink["method"],
-            snr_db=sidelink["snr_db"],
-        )
+    if opened.history:
+        where = opened.history, scene.grid, scene.terrain, noise_places(scene.grid, scene.terrain)
+        if sidelink:
+            added = sidelink_noise(*where, beams=beams, method=sidelink["method"], snr_db=sidelink["snr_db"])
+        if symbols.get("self_noise") and symbols.get("rows", 1) > 1:  # of equal symbols, the sidelobes are constant
+            by_symbols = symbols_noise(*where, beams=beams, self_noise=symbols["self_noise"])
     pointing_db = pointing_std_db(beams, opened.aperture, scene.middle_m, _attitude_errors(campaign, opened, scene))
     return CalibratedPair(
-        source, link, std_db, flags, calibration, beams, radio_db, thermal, before, added, figure_db, pointing_db
+        source,
+        link,
+        std_db,
+        flags,
+        calibration,
+        beams,
+        radio_db,
+        thermal,
+        before,
+        added,
+        by_symbols,
+        figure_db,
+        pointing_db,
     )
 
 

@@ -29,6 +29,7 @@ from apertura.core.echo.dechirp import sweep_motion_flags
 from apertura.core.echo.demodulate import remove_path
 from apertura.core.echo.interference import PulsedInterference
 from apertura.core.echo.line_of_sight import LineOfSight
+from apertura.core.echo.symbol_filter import filter_of
 from apertura.core.echo.tones import Tones
 from apertura.core.echo.transfer import Correction, Demodulator, forming
 from apertura.core.geometry.geodesy import LOCAL
@@ -40,6 +41,7 @@ from apertura.stages.positions import (
     place,
     stated_error,
 )
+from apertura.stages.symbols import decided_symbols, with_symbols
 from apertura.stages.tags import stamped
 from apertura.stages.transmitted import Transmitted, transmitted
 from apertura.workflow.lineage import reads_kept, result_of
@@ -109,8 +111,13 @@ class PairEcho:
             waveform = campaign.settings.waveform
             if not isinstance(waveform, SampledWaveform):
                 raise TypeError("the echo has no transfer functions although its recorder stores them")
-            sent = transmitted(campaign, waveform)
-            return open_acquisition(campaign, flight, pair.split("-")[1], sent), sent, campaign.settings.processing
+            sent, processing = transmitted(campaign, waveform), campaign.settings.processing
+            name, source = pair.split("-")[1], campaign.symbol_source(flight, pair)
+            rx = open_acquisition(campaign, flight, name, sent)
+            if source is not None:
+                node = rx if source == name else open_acquisition(campaign, flight, source, sent)
+                sent = with_symbols(sent, node, decided_symbols(node, sent, processing.accuracy_db))
+            return rx, sent, processing
 
         return cls.formed(stage, receiver)
 
@@ -124,7 +131,10 @@ class PairEcho:
         @cache
         def source() -> Form:
             rx, sent, processing = receiver()
-            demodulator = demodulator_of(rx, sent, processing)
+            frames = np.zeros(len(rx.raw.start), np.int64)
+            frames[dataset.capture.values] = dataset.frame.values
+            demodulator = demodulator_of(rx, sent, processing, frames)
+            demodulator = replace(demodulator, filter=filter_of(dataset.attrs.get("symbols")))
             tones.update(demodulator.tones)
             for channel in tones.values():
                 channel.lines = tuple(dataset.attrs.get("tone_lines", ()))
@@ -268,10 +278,20 @@ class _Transfer(BackendArray):
         return np.asarray((transfer if pulses.ndim else transfer[0])[..., key[1]])
 
 
-def demodulator_of(rx: Acquisition, sent: Transmitted, processing: Processing) -> Demodulator:
-    """Return the demodulator of a receiving node; it removes tones unless `processing.interference` is none."""
+def demodulator_of(
+    rx: Acquisition, sent: Transmitted, processing: Processing, frames: NDArray[np.int64]
+) -> Demodulator:
+    """Return the demodulator of a receiving node; it removes tones unless `processing.interference` is none.
+
+    Parameters
+    ----------
+    rx, sent, processing
+        Receiving node, transmitted signal and settings.
+    frames
+        (capture,) int64, frame number of each capture by its number in the reader of samples.
+    """
     create = Demodulator if processing.interference == "none" else Demodulator.without_tones
-    return create(sent.inverse, rx.numerology, sent.waveform.capture_samples)
+    return create(lambda captures: sent.inverses.at(frames[captures]), rx.numerology, sent.waveform.capture_samples)
 
 
 def _correction(stage: xr.Dataset) -> Correction | None:

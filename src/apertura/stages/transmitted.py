@@ -1,6 +1,6 @@
 """Transmitted signal of a campaign: code symbols or samples of a pulse, and the preamble of each symbol."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -8,12 +8,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.campaign.config import CONFIG, OfdmWaveform, PulseWaveform, SampledWaveform
+from apertura.campaign.config import CONFIG, OfdmWaveform, PulseWaveform, SampledWaveform, SidelinkCodes
 from apertura.campaign.folder import Campaign
+from apertura.common.arrays import Complexes
 from apertura.common.errors import CampaignError
+from apertura.common.units import decibels
+from apertura.core.echo.constellation import Constellation, constellation
 from apertura.core.echo.demodulate import Numerology, subcarrier_numbers
+from apertura.core.echo.frame_codes import Inverses, PnCodes, Rows, pn_sequence, sampled_rows
+from apertura.core.echo.frame_format import FrameFormat
 from apertura.core.echo.pulse_filter import occupied_band, pulse_filter, pulse_spectrum
+from apertura.core.echo.symbol_filter import CONSTANT_DB, FilterChoice, SymbolFilter, choose_filter, echo_snr
 from apertura.core.echo.trigger import PulseFraming
+from apertura.core.echo.unknown_symbols import Pilots
+from apertura.formats.code_tables import MOST_SYMBOLS, CodeTable
 from apertura.formats.npy import read_npy
 from apertura.formats.recordings.sample_file import SampleFile
 
@@ -48,9 +56,6 @@ def check_mixing(samples: SampleFile, numerology: Numerology, *, where: object) 
 
 # ---- Transmitted signal: code symbols or samples of a pulse ----------------------------------------------------------
 
-MOST_SYMBOLS = 1 << 24
-"""Largest number of code symbols of a waveform."""
-
 MOST_PULSE_SAMPLES = 1 << 22
 """Largest number of samples of a pulse, and of a capture."""
 
@@ -74,20 +79,111 @@ class Transmitted:
         Configured waveform.
     numerology
         Grid of the frequencies at which echoes are measured.
-    inverse
-        (subcarrier,) complex64, inverse filter of the transmitted signal.
+    inverses
+        Inverse filters of the transmitted pulses.
     mean_power
-        E|s|² during transmission, in the units by which echoes are divided: of a symbol, or of a pulse with peak 1.
+        E|s|² during transmission, in the units by which echoes are divided: of a symbol, or of a pulse with peak 1;
+        the mean over the rows of a code table.
+    power
+        (row, subcarrier) float32, |c_n|² in sampled rows of a code table; None for a pulse.
     report, flags
         Report and flags of the inverse filter.
+    unknown
+        Format of symbols that are decided from a sidelink; `inverses` are then those of random symbols until
+        `apertura.stages.symbols.with_symbols` replaces them. None: the symbols are known.
     """
 
     waveform: SampledWaveform
     numerology: Numerology
-    inverse: NDArray[np.complex64]
+    inverses: Inverses
     mean_power: float
     report: dict[str, Any] = field(default_factory=dict)
     flags: dict[str, str] = field(default_factory=dict)
+    power: NDArray[np.float32] | None = None
+    unknown: "UnknownSymbols | None" = None
+
+    def filter_choice(
+        self, requested: str, *, frames: NDArray[np.int64], tolerated_db: float
+    ) -> Callable[[Complexes | None], FilterChoice] | None:
+        """Return the choice of the filter from a sample of transfer functions, None before they are measured.
+
+        For symbols of constant modulus, there is no choice, and None is returned.
+
+        Parameters
+        ----------
+        requested
+            `processing.symbol_filter`.
+        frames
+            (pulse,) int64, frame numbers of the flight.
+        tolerated_db
+            Tolerated level of data sidelobes relative to the peak, dB.
+        """
+        if self.power is None:
+            return None
+        power, different = self.power, len(np.unique(frames % self.inverses.count))
+        gain = SymbolFilter().noise_gain(power)
+        if decibels(gain) < CONSTANT_DB:
+            return None
+
+        def choose(sample: Complexes | None) -> FilterChoice:
+            snr = np.inf if sample is None else echo_snr(sample, gain)
+            return choose_filter(power, requested=requested, snr=snr, frames=different, tolerated_db=tolerated_db)
+
+        return choose
+
+
+@dataclass(frozen=True, eq=False)
+class UnknownSymbols:
+    """Format of symbols that are decided from a sidelink.
+
+    Attributes
+    ----------
+    constellation
+        Constellation of the data symbols.
+    pilots
+        Known symbols; None: there are no pilots.
+    frames
+        Format of the bits; None: not configured.
+    node
+        Node whose sidelink gives the symbols of monostatic images; None: chosen.
+    """
+
+    constellation: Constellation
+    pilots: Pilots | None
+    frames: FrameFormat | None
+    node: str | None
+
+    @classmethod
+    def of(cls, codes: SidelinkCodes, subcarriers: int, pilots: Path | None) -> "UnknownSymbols":
+        """Return the configured format; raise CampaignError if pilots or frame do not fit the symbol."""
+        qam, known, frames = constellation(codes.constellation), None, None
+        count = subcarriers
+        if pilots is not None:
+            expected = f"({subcarriers},) complex64, 0 at data symbols, for {CONFIG}: waveform.subcarriers"
+            remedy = "Write the transmitted pilots, or remove waveform.codes.pilots."
+            if not pilots.is_file():
+                raise CampaignError("no such file", pilots, expected, "Copy the file there.")
+            table = read_npy(pilots, kinds="c", most=MOST_SYMBOLS, expected=expected, remedy=remedy)
+            if table.shape != (subcarriers,):
+                raise CampaignError(f"{table.dtype} of shape {table.shape}", pilots, expected, remedy)
+            known = Pilots.of(table.astype(np.complex64), pilots)
+            count -= known.symbols.size
+        if codes.frame is not None:
+            header = np.unpackbits(np.frombuffer(bytes.fromhex(codes.frame.header), np.uint8))
+            frames = FrameFormat(header, codes.frame.counter_bits, codes.frame.crc, count * qam.bits_per_symbol)
+            if frames.data_bits < 0 or frames.known_labels(qam).size < FEWEST_KNOWN:
+                raise CampaignError(
+                    f"header of {header.size} bits in a frame of {frames.total_bits} bits, of which "
+                    f"{frames.data_bits} are left for data",
+                    where=f"{CONFIG}: waveform.codes.frame",
+                    expected=f"a header of at least {FEWEST_KNOWN} symbols, and room for data",
+                    remedy="Correct header and counter_bits.",
+                )
+        return cls(qam, known, frames, codes.node)
+
+
+FEWEST_KNOWN = 4
+"""Fewest symbols of a header, from which the phase of blind decisions is determined."""
 
 
 def transmitted(campaign: Campaign, waveform: SampledWaveform) -> Transmitted:
@@ -100,15 +196,51 @@ def transmitted(campaign: Campaign, waveform: SampledWaveform) -> Transmitted:
     CampaignError
         If the file is missing or contradicts the waveform.
     """
-    assumes = campaign.planned and not campaign.sent_file.is_file()
+    path = campaign.sent_path
+    assumes = campaign.planned and path is not None and not path.exists()
+    if isinstance(waveform, OfdmWaveform) and isinstance(waveform.codes, SidelinkCodes):
+        unknown = UnknownSymbols.of(waveform.codes, waveform.subcarriers, None if assumes else path)
+        points = unknown.constellation.points
+        # of the same distribution as the symbols, for averages over pulses
+        typical = np.random.default_rng(0).permutation(np.resize(points, 64 * waveform.subcarriers))
+        return Transmitted(
+            waveform,
+            symbol_numerology(waveform),
+            Inverses.of_codes(typical.reshape(64, -1)),
+            float(waveform.subcarriers),
+            power=np.square(np.abs(points))[None],
+            unknown=unknown,
+        )
     if isinstance(waveform, OfdmWaveform):
-        count = waveform.subcarriers
-        codes = np.ones(count, np.complex64) if assumes else read_codes(campaign.sent_file, count)
-        return Transmitted(waveform, symbol_numerology(waveform), 1 / codes, float((np.abs(codes) ** 2).sum()))
-    if isinstance(waveform, PulseWaveform):
-        pulse = _chirp(waveform) if assumes else read_pulse(campaign.sent_file, waveform)
-        return _transmitted_pulse(pulse, waveform, where=campaign.sent_file)
+        codes = np.ones((1, waveform.subcarriers), np.complex64) if assumes else _code_table(waveform, path)
+        power = np.abs(codes[sampled_rows(codes.shape[0])]) ** 2
+        mean_power = float(power.sum(axis=1).mean())
+        return Transmitted(
+            waveform, symbol_numerology(waveform), Inverses.of_codes(codes), mean_power, power=power.astype(np.float32)
+        )
+    if isinstance(waveform, PulseWaveform) and path is not None:
+        pulse = _chirp(waveform) if assumes else read_pulse(path, waveform)
+        return _transmitted_pulse(pulse, waveform, where=path)
     raise TypeError(f"no inverse filter for a {type(waveform).__name__}")
+
+
+def _code_table(waveform: OfdmWaveform, path: Path | None) -> Rows:
+    """Return the table of the code symbols: in a file, or generated."""
+    codes = waveform.codes
+    if isinstance(codes, SidelinkCodes):
+        raise TypeError("symbols from a sidelink are not a table")
+    if isinstance(codes, str):
+        return CodeTable(Path() if path is None else path, waveform.subcarriers)
+    try:
+        sequence = pn_sequence(codes.polynomial, codes.seed)
+    except ValueError as problem:
+        raise CampaignError(
+            str(problem),
+            where=f"{CONFIG}: waveform.codes",
+            expected="exponents of a primitive polynomial, and a seed below 2^degree",
+            remedy="Use the polynomial and the seed of the transmitter.",
+        ) from problem
+    return PnCodes(sequence, codes.constellation, waveform.subcarriers, codes.frames)
 
 
 def symbol_numerology(waveform: OfdmWaveform) -> Numerology:
@@ -159,7 +291,7 @@ def _transmitted_pulse(pulse: NDArray[np.complex128], waveform: PulseWaveform, *
     band_hz = [float(number * numerology.spacing_hz) for number in (first, last)]
     report = {**chosen.report, "band_hz": band_hz, "energy_inside": round(inside, 4)}
     mean_power = float((np.abs(pulse) ** 2).mean())
-    return Transmitted(waveform, numerology, chosen.inverse, mean_power, report, chosen.flags)
+    return Transmitted(waveform, numerology, Inverses.fixed(chosen.inverse), mean_power, report, chosen.flags)
 
 
 def read_pulse(path: Path, waveform: PulseWaveform) -> NDArray[np.complex128]:
@@ -196,34 +328,6 @@ def read_pulse(path: Path, waveform: PulseWaveform) -> NDArray[np.complex128]:
         problem = f"{invalid} samples are not finite" if invalid else "all samples are zero"
         raise CampaignError(problem, where=path, expected=expected, remedy=remedy)
     return np.asarray(pulse / level.max(), np.complex128)
-
-
-def read_codes(path: Path, subcarriers: int) -> NDArray[np.complex64]:
-    """Read the transmitted code symbols, (subcarrier,) complex64.
-
-    Raises
-    ------
-    CampaignError
-        If the file is missing or has another length, or a symbol is zero or not finite.
-    """
-    expected = f"({subcarriers},) complex64 without zeros, for config/config.yaml: waveform.subcarriers"
-    remedy = "Use the codes that were transmitted, or correct the waveform."
-    if not path.is_file():
-        raise CampaignError("no such file", where=path, expected=expected, remedy="Copy the file there.")
-    stored = read_npy(path, kinds="c", most=MOST_SYMBOLS, expected=expected, remedy=remedy)
-    with np.errstate(over="ignore", invalid="ignore"):  # infinite and NaN values are rejected below
-        codes = stored.astype(np.complex64)
-        zeros = int((codes == 0).sum())
-    usable = codes.shape == (subcarriers,) and np.isfinite(codes).all() and np.abs(codes).min() > 0
-    if not usable:
-        raise CampaignError(
-            f"{stored.dtype} of shape {codes.shape}, of which {zeros} are zero and "
-            f"{int((~np.isfinite(codes)).sum())} not finite",
-            where=path,
-            expected=expected,
-            remedy=remedy,
-        )
-    return codes
 
 
 def read_framing(path: Path, described: Mapping[str, Any], *, sample_rate_hz: float, where: Path) -> PulseFraming:

@@ -95,7 +95,8 @@ def write_campaign(
     flights
         Flight → recordings.
     sent
-        Transmitted signal, complex: (subcarriers,) code symbols of an OFDM waveform, or (sample,) samples of a pulse.
+        Transmitted signal, complex: code symbols of an OFDM waveform, (subcarriers,) or (frames, subcarriers), or
+        (sample,) samples of a pulse.
 
     Raises
     ------
@@ -132,7 +133,9 @@ def write_campaign(
             write_config(root, settings.model_dump(mode="json", exclude_unset=True), lines)
             campaign = Campaign.load(root)
             if sent is not None:
-                sent_file = root / campaign.relative(campaign.sent_file)
+                if campaign.sent_path is None:
+                    raise _wrong("write_campaign: sent", "an array", "None, because waveform.codes is a generator")
+                sent_file = root / campaign.relative(campaign.sent_path)
                 sent_file.parent.mkdir(parents=True, exist_ok=True)
                 np.save(sent_file, np.asarray(sent, np.complex64))
             for name, flight in flights.items():

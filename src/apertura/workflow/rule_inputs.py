@@ -167,7 +167,7 @@ def recorded_on_the_bench(scope: JobScope) -> Iterable[str]:
     if not is_sampled(campaign):
         return []
     files = (path for node in flight.nodes for path in campaign.promised_files(flight.name, node))
-    return map(campaign.relative, (*files, campaign.sent_file))
+    return map(campaign.relative, (*files, *campaign.sent_files))
 
 
 def stated_paths(scope: JobScope) -> Mapping[str, Any]:
@@ -195,8 +195,11 @@ def transmitted_and_received(scope: JobScope) -> Iterable[str]:
     if not is_sampled(campaign):
         logs = [campaign.track_file(flight, node) for node in nodes if campaign.logged(flight, node)]
         return map(campaign.relative, (*campaign.history_files(flight, nodes[-1]), *logs))
-    samples = [campaign.promised_files(flight, node)[-1] for node in nodes]
-    files = [campaign.relative(path) for path in (campaign.sent_file, *samples)]
+    source = campaign.symbol_source(flight, pair)
+    others = [source] if source is not None and source not in nodes else []
+    samples = [campaign.promised_files(flight, node)[-1] for node in (*nodes, *others)]
+    files = [campaign.relative(path) for path in (*campaign.sent_files, *samples)]
+    files += [campaign.manifest(stage, flight, node) for node in others for stage in ("raw", "track")]
     calibration = campaign.settings.calibration
     if calibration is not None and campaign.flight(flight).kind == "image":
         files.append(campaign.manifest("calibration", calibration.flight))
@@ -205,9 +208,12 @@ def transmitted_and_received(scope: JobScope) -> Iterable[str]:
 
 def received(scope: JobScope) -> Iterable[str]:
     """Return the files from which transfer functions of the pairs are computed, in addition to stage `echo`."""
-    campaign = scope.campaign
-    samples = (campaign.promised_files(flight, pair.split("-")[1])[-1] for flight, pair in scope.pairs)
-    return map(campaign.relative, (campaign.sent_file, *samples))
+    campaign, samples = scope.campaign, list[Path]()
+    for flight, pair in scope.pairs:
+        receiver = pair.split("-")[1]
+        nodes = dict.fromkeys([receiver, campaign.symbol_source(flight, pair) or receiver])
+        samples += [campaign.promised_files(flight, node)[-1] for node in nodes]
+    return map(campaign.relative, (*campaign.sent_files, *samples))
 
 
 def echoes_that_bound_the_scene(scope: JobScope) -> Iterable[str]:
@@ -383,7 +389,7 @@ def measured_image(scope: JobScope) -> Iterable[str]:
     """Return the image, transmitted signal and file of constants, as far as calibration or multilooking need these."""
     campaign, files = scope.campaign, list[Path]()
     if campaign.calibrated:
-        files += [campaign.sent_file] if is_sampled(campaign) else []
+        files += campaign.sent_files if is_sampled(campaign) else []
         files += [path for path in [campaign.calibration_file] if path is not None]
     is_needed = campaign.calibrated or multilook(scope)
     return [*map(campaign.relative, files), *(campaign.manifest("image", *pair) for pair in scope.pairs if is_needed)]
@@ -415,7 +421,17 @@ def grid(scope: JobScope) -> Mapping[str, Any]:
 
 
 _BEFORE_THE_IMAGE = frozenset(
-    {"window", "sidelink", "background", "interference", "false_alarms_per_s", "autofocus", "autofocus_method", "keep"}
+    {
+        "window",
+        "sidelink",
+        "symbol_filter",
+        "background",
+        "interference",
+        "false_alarms_per_s",
+        "autofocus",
+        "autofocus_method",
+        "keep",
+    }
 )
 _AFTER_THE_IMAGE = frozenset({"fusion", "radiometry", "radiometric_calibration", "multilook"})
 

@@ -309,6 +309,7 @@ _ROWS = (
         settings=(
             "waveform",
             "processing.sidelink",
+            "processing.symbol_filter",
             "processing.interference",
             "processing.accuracy_db",
             inputs.pair_settings,

@@ -47,6 +47,7 @@ from apertura.campaign.config.waveform import (
     PhaseHistoryWaveform,
     PulseWaveform,
     SampledWaveform,
+    SidelinkCodes,
     Waveform,
 )
 
@@ -80,6 +81,7 @@ __all__ = [
     "Section",
     "Segment",
     "Settings",
+    "SidelinkCodes",
     "Stack",
     "Waveform",
     "check_interferometry",

@@ -48,6 +48,11 @@ class Processing(ImagingChoices):
     sidelink: Literal["auto", "divide", "wiener", "gated", "two_parameter"] = Field(
         "auto", description="correction of a receiving node by its sidelink; auto: the simplest adequate method"
     )
+    symbol_filter: Literal["auto", "reciprocal", "matched", "wiener"] = Field(
+        "auto",
+        description="filter that removes code symbols of varying modulus: reciprocal (no data sidelobes), matched "
+        "(least noise) or wiener; auto: the smallest loss of SNR with tolerated data sidelobes",
+    )
     background: Literal["auto", "none", "median", "mean"] | RunningBackground = Field(
         "auto",
         description="echoes at constant delay (antenna coupling, airframe) removed before range compression: median or "

@@ -70,13 +70,68 @@ class SampledWaveform(Section):
         return round(self.capture_s * self.sample_rate_hz)
 
 
+class GeneratedCodes(Section):
+    """Code symbols that carry the bits of a pseudo-noise sequence, frame after frame."""
+
+    generator: Literal["pn"] = Field(description="pn: sequence of a linear feedback shift register")
+    polynomial: tuple[Annotated[int, Field(ge=1, le=24)], ...] = Field(
+        min_length=2,
+        description="exponents of the primitive polynomial other than 0, e.g. [23, 18] for x^23 + x^18 + 1",
+        examples=[[23, 18]],
+    )
+    seed: int = Field(1, ge=1, description="first bits of the sequence as a number, most significant bit first")
+    constellation: Literal["qpsk", "16qam", "64qam", "256qam"] = Field(
+        "qpsk", description="constellation of the symbols; the Gray code of I precedes that of Q"
+    )
+    frames: int | None = Field(
+        None, ge=1, description="number of frames after which the sequence starts again; null: it continues"
+    )
+
+
+class FrameFields(Section):
+    """Fields of the bits of a pulse: header, counter, data, check sum, in ascending order of the data subcarriers."""
+
+    header: str = Field(
+        "1acffc1d", description="known bits at the start of a frame, hexadecimal", pattern="^([0-9a-fA-F]{2})+$"
+    )
+    counter_bits: int = Field(16, ge=1, le=48, description="length of the frame counter after the header, bits")
+    crc: bool = Field(True, description="the last 16 bits are the CRC-16 (x^16 + x^12 + x^5 + 1) of counter and data")
+
+
+class SidelinkCodes(Section):
+    """Code symbols that no file lists, decided from the sidelink of a receiver."""
+
+    source: Literal["sidelink"] = Field(description="sidelink: symbols are decided from the received direct path")
+    constellation: Literal["qpsk", "16qam", "64qam", "256qam"] = Field(
+        description="constellation of the symbols; the Gray code of I precedes that of Q", examples=["qpsk"]
+    )
+    pilots: str | None = Field(
+        None,
+        description="known symbols, complex64 (subcarriers,), 0 at data symbols; null: the channel is estimated from "
+        "the data",
+    )
+    frame: FrameFields | None = Field(
+        None, description="format of the bits; null: bits are not read, and monostatic images need pilots"
+    )
+    node: str | None = Field(
+        None,
+        description="node whose sidelink gives the symbols of monostatic images; null: the first receiver, or the "
+        "transmitter of a flight without receivers",
+    )
+
+
 class OfdmWaveform(SampledWaveform):
     """Waveform with one OFDM symbol per pulse."""
 
     file_key, delay_key, limit_name = "codes", "cyclic_prefix_s", "the cyclic prefix"
 
     kind: Literal["ofdm"] = Field(description=WAVEFORM_KINDS)
-    codes: str = Field("raw/codes.npy", description="transmitted code symbols, complex64 (subcarriers,)")
+    codes: str | GeneratedCodes | SidelinkCodes = Field(
+        "raw/codes.npy",
+        description="transmitted code symbols, complex64: .npy file or .zarr folder of shape (subcarriers,), or "
+        "(frames, subcarriers) if they change from pulse to pulse; or the parameters of a generator; or "
+        "source: sidelink, if the symbols are unknown",
+    )
     carrier_is: Literal["band_start", "band_centre"] = Field(
         "band_start",
         description="position of the carrier in the band: subcarrier numbers n are 0…N-1 (band_start) or -N/2…N/2-1 "

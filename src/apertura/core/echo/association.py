@@ -274,8 +274,8 @@ def pairs_by_frame(
     if modulus is None and ((np.diff(tx_count) < 0).any() or (np.diff(rx_count) < 0).any()):
         modulus = 1 << int(max(tx_count.max(), rx_count.max())).bit_length()
     if modulus is not None:
-        tx_count = _unwrapped(tx_count, tags[0][tx], interval_ns, modulus)
-        rx_count = _unwrapped(rx_count, tags[1][rx], interval_ns, modulus)
+        tx_count = unwrapped(tx_count, tags[0][tx], interval_ns, modulus)
+        rx_count = unwrapped(rx_count, tags[1][rx], interval_ns, modulus)
         # the number of counter wraps between the nodes follows from the offset of their tags
         expected_ns = tags[0][tx[0]] + (rx_count - tx_count[0]) * interval_ns
         rx_count += modulus * int(np.rint(np.median(tags[1][rx] - expected_ns) / (modulus * interval_ns)))
@@ -283,8 +283,14 @@ def pairs_by_frame(
     return tx[at_tx], rx[at_rx]
 
 
-def _unwrapped(count: Integers, tags: Integers, interval_ns: float, modulus: int) -> Integers:
-    """Unwrap the counter; a misread number does not affect later numbers."""
+def unwrapped(count: Integers, tags: Integers, interval_ns: float, modulus: int) -> Integers:
+    """Unwrap a frame counter by time tags; a misread number does not affect later numbers.
+
+    Examples
+    --------
+    >>> unwrapped(np.array([6, 7, 1]), np.array([0, 50, 150]), interval_ns=50.0, modulus=8)
+    array([6, 7, 9])
+    """
     step = np.mod(np.diff(count), modulus)
     step += modulus * np.rint((np.diff(tags) / interval_ns - step) / modulus).astype(np.int64)
     return np.asarray(count[0] + np.concatenate([[0], np.cumsum(step)]), np.int64)

@@ -6,7 +6,7 @@ fading of the sidelink does not amplify a pulse. A new method requires a functio
 `edges`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import scipy
@@ -171,8 +171,12 @@ def edges(method: str, state: SidelinkState) -> dict[str, str]:
     return exceeded
 
 
-def choose(state: SidelinkState) -> tuple[str, str]:
-    """Choose the adequate method of lowest cost; return it and the reason, one line.
+LEAST_NOISE = "two_parameter", "gated", "wiener", "divide"
+"""Methods in ascending order of the noise of the sidelink that they pass on."""
+
+
+def choose(state: SidelinkState, order: Sequence[str] = tuple(METHODS)) -> tuple[str, str]:
+    """Choose the first adequate method of `order`, by default that of lowest cost; return it and the reason, one line.
 
     Examples
     --------
@@ -181,13 +185,14 @@ def choose(state: SidelinkState) -> tuple[str, str]:
     ('divide', 'SNR 17.0 dB per subcarrier, echoes below -41.7 dB, ripple 0.0 dB: adequate method of lowest cost')
     """
     exceeded = {method: edges(method, state) for method in METHODS}
-    adequate = [method for method in METHODS if not exceeded[method]]
+    adequate = [method for method in order if not exceeded[method]]
+    advantage = "noise" if order is LEAST_NOISE else "cost"
     summary = (
         f"SNR {state.snr_db:.1f} dB per subcarrier, echoes {'of' if state.echo_cells else 'below'} "
         f"{state.echo_db:.1f} dB, ripple {max(state.ripple_db, state.fine_ripple_db):.1f} dB"
     )
     if adequate:
-        return adequate[0], f"{summary}: adequate method of lowest cost"
+        return adequate[0], f"{summary}: adequate method of lowest {advantage}"
     # two_parameter makes every locked pulse coherent: an image can be formed, possibly with ghosts
     fallback = "wiener" if "wrong_code" in state.flags else "two_parameter"
     return fallback, f"{summary}: no method is adequate, smallest error ({'; '.join(exceeded[fallback].values())})"

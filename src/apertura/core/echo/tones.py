@@ -43,10 +43,6 @@ class Tones:
     ----------
     numerology
         Numerology of the captures.
-    sent
-        (subcarrier,) complex128, transmitted signal.
-    shape
-        (subcarrier,) float64, its power relative to the mean, at least 0.1.
     lines
         Numbers of subcarriers with a tone in all captures, which is subtracted whatever its power.
     captures, affected
@@ -56,22 +52,24 @@ class Tones:
     """
 
     numerology: Numerology
-    sent: NDArray[np.complex128]
-    shape: Floats
     lines: tuple[int, ...] = ()
     captures: int = 0
     affected: int = 0
-    power: Floats = field(default_factory=lambda: np.zeros(0))
+    power: Floats = field(init=False)
+    _shape: tuple[Complexes, NDArray[np.float32]] | None = field(default=None, init=False, repr=False)
 
-    @classmethod
-    def of(cls, numerology: Numerology, inverse: Complexes) -> "Tones":
-        """Return a removal for a transmitted signal, given the inverse of its spectrum, (subcarrier,) complex64."""
-        sent = np.divide(1.0, inverse, out=np.zeros(len(inverse), np.complex128), where=inverse != 0)
-        power = np.abs(sent) ** 2
-        return cls(numerology, sent, np.maximum(power / power.mean(), 0.1), power=np.zeros(len(power)))
+    def __post_init__(self) -> None:
+        self.power = np.zeros(self.numerology.numbers.size)
 
-    def removed(self, symbols: Complexes) -> Complexes:
-        """Return received symbols, (pulse, subcarrier) complex64 with the code, without the tones in each pulse.
+    def removed(self, symbols: Complexes, inverse: Complexes) -> Complexes:
+        """Return received symbols without the tones in each pulse, (pulse, subcarrier) complex64 with the code.
+
+        Parameters
+        ----------
+        symbols
+            (pulse, subcarrier) complex64, received symbols with the code.
+        inverse
+            (pulse, subcarrier) complex64, inverse spectra of the transmitted pulses; one row if they are equal.
 
         Notes
         -----
@@ -83,8 +81,8 @@ class Tones:
         >>> rng = np.random.default_rng(1)
         >>> echo = np.exp(2j * np.pi * rng.random((10, 64))).astype(np.complex64)
         >>> tone = 1000 * np.exp(2j * np.pi * 20.3 * np.arange(64) / 64)
-        >>> tones = Tones.of(numerology, np.ones(64, np.complex64))
-        >>> left = tones.removed((echo + np.fft.fft(tone, norm="forward")).astype(np.complex64)) - echo
+        >>> tones, inverse = Tones(numerology), np.ones((1, 64), np.complex64)
+        >>> left = tones.removed((echo + np.fft.fft(tone, norm="forward")).astype(np.complex64), inverse) - echo
         >>> float(np.round((np.abs(left) ** 2).mean(), 2)) < 0.1  # echoes have a power of 1, the tone 15 600
         True
         >>> tones.flags("interference")["interference"].partition(" MHz")[0]
@@ -94,18 +92,20 @@ class Tones:
             return symbols
         self.captures += len(symbols)
         has_tone = np.full(len(symbols), bool(self.lines))
+        shape = self._shape_of(inverse)
         cleaned, every = symbols, np.arange(len(symbols))
         for line in self.lines:
             near = np.clip(line + np.arange(-1, 2), 0, symbols.shape[1] - 1)
             peak = near[np.abs(cleaned[:, near]).argmax(axis=1)]
-            cleaned = self._subtracted(cleaned, every, peak, self._fitted(cleaned, peak)[0])
+            cleaned = self._subtracted(cleaned, every, peak, self._fitted(cleaned, peak, inverse, shape)[0])
         for _ in range(_MOST):
-            relative = (np.square(cleaned.real) + np.square(cleaned.imag)) / self.shape
+            relative = (np.square(cleaned.real) + np.square(cleaned.imag)) / shape
             peak = relative.argmax(axis=1)
             suspect = np.flatnonzero(relative.max(axis=1) > _PEAK * relative.mean(axis=1))
             if not suspect.size:
                 break
-            tone, is_tone = self._fitted(cleaned[suspect], peak[suspect])
+            own = np.zeros(1, np.int64) if len(inverse) == 1 else suspect
+            tone, is_tone = self._fitted(cleaned[suspect], peak[suspect], inverse[own], shape[own])
             found = suspect[is_tone]
             if not found.size:
                 break
@@ -113,6 +113,14 @@ class Tones:
             has_tone[found] = True
         self.affected += int(has_tone.sum())
         return cleaned
+
+    def _shape_of(self, inverse: Complexes) -> NDArray[np.float32]:
+        """Return the power of transmitted spectra relative to the mean of each, at least 0.1."""
+        if self._shape is None or self._shape[0] is not inverse:
+            gain = np.square(inverse.real) + np.square(inverse.imag)
+            power = np.divide(1, gain, out=np.zeros_like(gain), where=gain > 0)
+            self._shape = inverse, np.maximum(power / power.mean(axis=1, keepdims=True), np.float32(0.1))
+        return self._shape[1]
 
     def _subtracted(
         self, symbols: Complexes, pulses: NDArray[np.intp], peak: NDArray[np.intp], tone: Complexes
@@ -138,7 +146,7 @@ class Tones:
         )
         return Flags({name: line})
 
-    def _echo(self, near: NDArray[np.intp]) -> NDArray[np.complex128]:
+    def _echo(self, near: NDArray[np.intp], inverse: Complexes) -> NDArray[np.complex128]:
         """Return terms of the echo in the subcarriers of a fit, (pulse, subcarrier, term): paths of equal spacing."""
         numerology = self.numerology
         longest = numerology.prefix_samples if numerology.longest_samples is None else numerology.longest_samples
@@ -148,9 +156,13 @@ class Tones:
         terms = 3 + int(np.ceil(cells))
         delays = np.linspace(-0.5, cells + 0.5, terms) / _WIDTH
         turns = np.exp(-2j * np.pi * numerology.numbers[near][..., None] * delays)
-        return np.asarray(self.sent[near][..., None] * turns / np.sqrt(_WIDTH))
+        around = np.take_along_axis(np.broadcast_to(inverse, (len(near), inverse.shape[1])), near, axis=1)
+        sent = np.divide(1.0, around, out=np.zeros(near.shape, np.complex128), where=around != 0)
+        return np.asarray(sent[..., None] * turns / np.sqrt(_WIDTH))
 
-    def _fitted(self, symbols: Complexes, peak: NDArray[np.intp]) -> tuple[Complexes, NDArray[np.bool_]]:
+    def _fitted(
+        self, symbols: Complexes, peak: NDArray[np.intp], inverse: Complexes, shape: NDArray[np.float32]
+    ) -> tuple[Complexes, NDArray[np.bool_]]:
         """Fit a tone to the subcarriers around the peak; return it in all subcarriers, and whether it is a tone."""
         exact = symbols.astype(np.complex128)
         count, window = symbols.shape[1], self.numerology.dft_samples
@@ -166,7 +178,7 @@ class Tones:
         start = self.numerology.numbers[lower] + ratio / np.where(ratio == 1, np.inf, ratio - 1)
         outside = ((peak == 0) & (start < at)) | ((peak == count - 1) & (start > at))  # next to the occupied band
         at = np.where((np.abs(start - at) < 1) | (outside & (np.abs(start - at) < _OUTSIDE)), start, at)
-        kernel, echo = _kernel(at[:, None] - numbers, window), self._echo(near)
+        kernel, echo = _kernel(at[:, None] - numbers, window), self._echo(near, inverse)
         for _ in range(_STEPS):
             # Gauss-Newton for Y = a·D(κ − k) + echo: the second coefficient is a·δκ.
             distance = at[:, None] - numbers
@@ -179,7 +191,7 @@ class Tones:
         around = np.abs(near - peak[:, None]) <= _NEAR
         left = received - amplitude[:, None] * kernel
         # Level of the echo and of the leakage of the tone: of an exponential distribution, by its median.
-        level = np.median(np.abs(exact) ** 2 / self.shape, axis=1) / np.log(2)
+        level = np.median(np.abs(exact) ** 2 / shape, axis=1) / np.log(2)
         rest, power = (np.sum(np.abs(values) ** 2 * around, axis=1) for values in (left, received))
         is_tone = (rest < _LEFT * power) & (rest < _ABOVE * (2 * _NEAR + 1) * level)
         tone = amplitude[:, None] * _kernel(at[:, None] - self.numerology.numbers, window)

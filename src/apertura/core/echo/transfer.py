@@ -33,10 +33,17 @@ from apertura.core.echo.demodulate import Numerology, demodulate
 from apertura.core.echo.interference import SidelinkInterference, limited
 from apertura.core.echo.line_of_sight import LineOfSight
 from apertura.core.echo.own_pulses import CodeEvidence, own_code, phase_stability
-from apertura.core.echo.sidelink import DIVIDING, METHODS, choose, edges
+from apertura.core.echo.sidelink import DIVIDING, LEAST_NOISE, METHODS, choose, edges
 from apertura.core.echo.sidelink_spikes import find_spikes
 from apertura.core.echo.sidelink_state import SidelinkState, measure_blocks, second_path_flags
+from apertura.core.echo.symbol_filter import FilterChoice, SymbolFilter
 from apertura.core.echo.tones import Tones
+
+Inverse = Callable[[Pulses], Complexes]
+"""Ascending capture numbers, as of `Read` → inverse spectra of their transmitted pulses, as of `Inverses.at`."""
+
+ChooseSymbols = Callable[[Complexes], FilterChoice]
+"""Sample of transfer functions divided by the code → filter of the symbols."""
 
 _INVERTED = (
     "the conjugate samples contain the code: set waveform.iq to swapped if I and Q are swapped, or to conjugate if the "
@@ -83,52 +90,64 @@ class Demodulator:
     Attributes
     ----------
     inverse, numerology
-        (subcarrier,) complex64, inverse of the transmitted signal (1/c_n for a symbol); and sampling of the signal.
+        Inverse spectra of the transmitted pulses (1/c_n for a symbol), and sampling of the signal.
     symbol_samples
         (T_cp + T)·f_s, or the length of a capture; later samples are not used.
     tones
         Channel → removal of tones of other transmitters; empty: tones are not removed.
+    filter
+        Filter of the radar channel; the sidelink, which is divided by, has the reciprocal one.
     """
 
-    inverse: Complexes
+    inverse: Inverse
     numerology: Numerology
     symbol_samples: int
     tones: Mapping[str, Tones] = field(default_factory=dict)
+    filter: SymbolFilter = field(default_factory=SymbolFilter)
 
     @classmethod
-    def without_tones(cls, inverse: Complexes, numerology: Numerology, symbol_samples: int) -> "Demodulator":
+    def without_tones(cls, inverse: Inverse, numerology: Numerology, symbol_samples: int) -> "Demodulator":
         """Return a demodulator that removes the tones of other transmitters from both channels."""
-        tones = {channel: Tones.of(numerology, inverse) for channel in ("radar", "sidelink")}
+        tones = {channel: Tones(numerology) for channel in ("radar", "sidelink")}
         return cls(inverse, numerology, symbol_samples, tones)
 
     def symbols(
-        self, iq: Samples, clock_hz: Floats | None = None, sfo_ppm: float = 0.0, *, channel: str = "radar"
+        self,
+        iq: Samples,
+        captures: Pulses,
+        clock_hz: Floats | None = None,
+        sfo_ppm: float = 0.0,
+        *,
+        channel: str = "radar",
     ) -> Complexes:
-        """Demodulate samples, (pulse, sample, 2), after clock correction; return (pulse, subcarrier) complex64."""
-        numerology = self.numerology
+        """Demodulate samples of captures, (pulse, sample, 2), after clock correction; return (pulse, subcarrier)."""
+        numerology, inverse = self.numerology, self.inverse(captures)
         if clock_hz is None:
             received = demodulate(as_complex(iq), numerology)
         else:
             samples = as_complex(iq[:, : self.symbol_samples])
             received = demodulate(correct_clock(samples, numerology, cfo_hz=clock_hz, sfo_ppm=sfo_ppm), numerology)
         if channel in self.tones:
-            received = self.tones[channel].removed(received)
-        return received * self.inverse
+            received = self.tones[channel].removed(received, inverse)
+        return received * inverse
 
-    def transfer(self, iq: Mapping[str, Samples], correction: Correction | None = None) -> Complexes:
+    def transfer(self, iq: Mapping[str, Samples], captures: Pulses, correction: Correction | None = None) -> Complexes:
         """Return the transfer functions of a block of captures, (pulse, subcarrier) complex64.
 
         Parameters
         ----------
         iq
             Channel → (pulse, sample, 2): `radar`, and `sidelink` if there is a correction.
+        captures
+            Numbers of these captures.
         correction
             Correction of these pulses; None for a node that receives its own echoes.
         """
         if correction is None:
-            return self.symbols(iq["radar"])
+            return self.filter.applied(self.symbols(iq["radar"], captures), self.inverse(captures))
         clock = correction.clock_hz, correction.sfo_ppm
-        radar, sidelink = (self.symbols(iq[name], *clock, channel=name) for name in ("radar", "sidelink"))
+        radar, sidelink = (self.symbols(iq[name], captures, *clock, channel=name) for name in ("radar", "sidelink"))
+        radar = self.filter.applied(radar, self.inverse(captures))
         return METHODS[correction.method](radar, limited(sidelink)[0], correction.path)
 
 
@@ -167,7 +186,9 @@ class Transfer:
     correction: Correction | None = None
 
 
-def transfer_by_code(read: Read, demodulator: Demodulator, *, time_s: Floats) -> Transfer:
+def transfer_by_code(
+    read: Read, demodulator: Demodulator, *, time_s: Floats, choose_symbols: ChooseSymbols | None = None
+) -> Transfer:
     """Return the monostatic transfer functions of a node; transmitter and receiver have the same clock.
 
     Parameters
@@ -178,6 +199,8 @@ def transfer_by_code(read: Read, demodulator: Demodulator, *, time_s: Floats) ->
         Demodulator of the captures.
     time_s
         (capture,) float64, times of transmission, seconds from any origin.
+    choose_symbols
+        Choice of the filter of the symbols; None: the reciprocal.
 
     Notes
     -----
@@ -185,31 +208,38 @@ def transfer_by_code(read: Read, demodulator: Demodulator, *, time_s: Floats) ->
 
     Examples
     --------
+    >>> from apertura.core.echo.frame_codes import Inverses
     >>> numerology = Numerology(1e9, 16e6, np.arange(8), prefix_samples=4, dft_samples=16)
     >>> tone = 1000 * np.exp(2j * np.pi * 3 * np.arange(20) / 16)
     >>> iq = np.stack([tone.real, tone.imag], -1)[None].round().astype(np.int16)
-    >>> demodulator = Demodulator(np.full(8, 0.5, np.complex64), numerology, 20)
+    >>> demodulator = Demodulator(Inverses.fixed(np.full(8, 0.5, np.complex64)).at, numerology, 20)
     >>> measured = transfer_by_code(lambda pulses: {"radar": iq[pulses]}, demodulator, time_s=np.zeros(1))
     >>> abs(measured.form(np.arange(1))).round(0)
     array([[  0.,   0.,   0., 500.,   0.,   0.,   0.,   0.]], dtype=float32)
     """
     numerology, saturation = demodulator.numerology, Saturation()
-    formed = forming(read, demodulator, saturation)
-
-    def form(captures: Pulses) -> Complexes:
-        return formed(captures, None)
-
     checked = np.concatenate(spread(len(time_s), groups=GROUPS, each=_STRETCH))
-    sample = np.concatenate([demodulator.transfer(read(block)) for block in blocks_of(checked)])
+    sample = np.concatenate([demodulator.transfer(read(block), block) for block in blocks_of(checked)])
     code = own_code(sample, prefix_cells=numerology.delay_cells)
     inverted: Mapping[str, str] = {}
     if not code.carried:
-        conjugate = [demodulator.transfer({"radar": conjugates(read(block)["radar"])}) for block in blocks_of(checked)]
+        conjugate = [
+            demodulator.transfer({"radar": conjugates(read(block)["radar"])}, block) for block in blocks_of(checked)
+        ]
         if own_code(np.concatenate(conjugate), prefix_cells=numerology.delay_cells).carried:
             inverted = {"spectrum_inverted": _INVERTED}
     phase = phase_stability(sample, time_s[checked], prefix_cells=numerology.delay_cells)
     flags = Flags.merged(code.flags, inverted, phase.flags if phase else {})
     report = {"code": code.report, **({"own_phase": phase.report} if phase else {})}
+    if choose_symbols is not None:
+        choice = choose_symbols(sample)
+        demodulator = replace(demodulator, filter=choice.filter)
+        flags, report["symbols"] = Flags.merged(flags, choice.flags), choice.report
+    formed = forming(read, demodulator, saturation)
+
+    def form(captures: Pulses) -> Complexes:
+        return formed(captures, None)
+
     return Transfer(np.ones(len(time_s), bool), flags, report, None, form, saturation)
 
 
@@ -222,6 +252,7 @@ def transfer_by_sidelink(
     accuracy_db: float,
     where: str,
     time_s: Floats | None = None,
+    choose_symbols: ChooseSymbols | None = None,
 ) -> Transfer:
     """Return the transfer functions of a secondary node, corrected by its sidelink.
 
@@ -235,7 +266,7 @@ def transfer_by_sidelink(
         (capture,) float64, distance between the antennas of the sidelink, metres, with which the measured delay is
         compared.
     method
-        A key of `METHODS`, or 'auto'.
+        A key of `METHODS`; 'auto', for the adequate method of lowest cost, or 'least_noise'.
     accuracy_db
         Tolerated level of clock errors relative to the peak, dB.
     where
@@ -243,6 +274,8 @@ def transfer_by_sidelink(
     time_s
         (capture,) float64, time of transmission, seconds from any origin, to exclude pulses in which only the sidelink
         is disturbed; None: these are not searched for, as on a bench.
+    choose_symbols
+        Choice of the filter of the radar channel's symbols; None: the reciprocal.
 
     Raises
     ------
@@ -270,7 +303,8 @@ def transfer_by_sidelink(
             )
             raise CampaignError(f"{unlocked.found}; {_INVERTED}", f"{where}: sidelink", expected, remedy) from None
     # Choose the method; raise flags for errors that the method does not remove, and for faults of the recording.
-    chosen, reason = choose(state) if method == "auto" else (method, "requested")
+    orders = {"auto": tuple(METHODS), "least_noise": LEAST_NOISE}
+    chosen, reason = choose(state, orders[method]) if method in orders else (method, "requested")
     clock_flags = receiver.clock_flags if numerology.repeats or chosen not in DIVIDING else {}
     cell_m = SPEED_OF_LIGHT_M_S / (numerology.numbers.size * numerology.spacing_hz)
     delay_m = state.delay_cells * cell_m
@@ -297,6 +331,11 @@ def transfer_by_sidelink(
     quality = {"method": chosen, "reason": reason, **_sidelink_report(state, residual)}
     if not np.array_equal(kept, state.locked):
         quality["spikes"] = int((state.locked & ~kept).sum())
+    report = {"clock": receiver.report, "sidelink": quality, "code": _sidelink_code(state).report}
+    if choose_symbols is not None:
+        choice = choose_symbols(receiver.radar())
+        demodulator = replace(demodulator, filter=choice.filter)
+        flags, report["symbols"] = Flags.merged(flags, choice.flags), choice.report
     # Second pass, block by block on demand.
     correction = Correction(chosen, state.path, receiver.clock_hz, receiver.sfo_ppm)
     saturation = Saturation()
@@ -305,7 +344,6 @@ def transfer_by_sidelink(
     def form(captures: Pulses) -> Complexes:
         return formed(captures, correction.select(captures))
 
-    report = {"clock": receiver.report, "sidelink": quality, "code": _sidelink_code(state).report}
     return Transfer(
         kept,
         flags,
@@ -327,7 +365,7 @@ def forming(
     def form(captures: Pulses, correction: Correction | None) -> Complexes:
         iq = read(captures)
         saturation.count(iq)
-        return demodulator.transfer(iq, correction)
+        return demodulator.transfer(iq, captures, correction)
 
     return form
 
@@ -337,7 +375,7 @@ def _compresses_conjugated(read: Read, demodulator: Demodulator, count: int) -> 
     pulses = np.concatenate(spread(count, groups=4, each=16))
 
     def compression(samples: Samples) -> float:
-        power = np.abs(np.fft.ifft(demodulator.symbols(samples, channel="sidelink"), axis=1)) ** 2
+        power = np.abs(np.fft.ifft(demodulator.symbols(samples, pulses, channel="sidelink"), axis=1)) ** 2
         return float(np.median(power.max(axis=1) / power.mean(axis=1)))
 
     sidelink = read(pulses)["sidelink"]
@@ -390,8 +428,24 @@ class _Receiver:
         """Yield the symbols of the sidelink, (pulse, subcarrier) complex64, with the code removed."""
         for block in blocks_of(np.arange(self.count)):
             clock_hz = None if self.clock_hz is None else self.clock_hz[block]
-            yield self.demodulator.symbols(self.read(block)["sidelink"], clock_hz, self.sfo_ppm, channel="sidelink")
+            iq = self.read(block)["sidelink"]
+            yield self.demodulator.symbols(iq, block, clock_hz, self.sfo_ppm, channel="sidelink")
             done(len(block))
+
+    def radar(self) -> Complexes:
+        """Return the radar channel divided by the code in captures spread over the flight, (pulse, subcarrier)."""
+        blocks = spread(self.count, groups=GROUPS, each=8)
+        return np.concatenate(
+            [
+                self.demodulator.symbols(
+                    self.read(block)["radar"],
+                    block,
+                    None if self.clock_hz is None else self.clock_hz[block],
+                    self.sfo_ppm,
+                )
+                for block in blocks
+            ]
+        )
 
 
 def _sidelink_report(state: SidelinkState, residual: BaselineResidual | None) -> dict[str, float]:

@@ -1,5 +1,6 @@
-"""Noise power of a pulse, measured outside the Doppler band of the scene, and noise added by a sidelink."""
+"""Noise power of a pulse, measured outside the Doppler band of the scene, and noise added by sidelink and symbols."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -164,6 +165,53 @@ def sidelink_noise(
     Source: docs/theory/radiometry.md, eq. 8a. Simulated noise is processed by the correction method itself: the result
     accounts for the fraction of the noise that the method retains, and for its distribution over range.
     """
+
+    def residual(shape: tuple[int, ...], generator: np.random.Generator) -> NDArray[np.complex64]:
+        draws = generator.standard_normal((*shape, 2)) @ np.array([1, 1j])
+        noisy = 1 + draws * 10 ** (-snr_db / 20) / np.sqrt(2)
+        return np.asarray(METHODS[method](np.ones(noisy.shape, np.complex64), noisy.astype(np.complex64)))
+
+    return _noise_of_factors(history, grid, terrain, places_m, beams, residual)
+
+
+def symbols_noise(
+    history: PhaseHistory,
+    grid: SceneGrid,
+    terrain: Terrain,
+    places_m: NDArray[np.float64],
+    *,
+    beams: Beams | None = None,
+    self_noise: float,
+) -> float:
+    """Estimate the noise power in a range profile from echo amplitudes that vary with the data of each pulse.
+
+    Parameters
+    ----------
+    history, grid, terrain, places_m, beams
+        As for `sidelink_noise`.
+    self_noise
+        Variance κ of the echo amplitude over the data.
+
+    Notes
+    -----
+    Source: docs/theory/changing_codes.md, eq. 5, and docs/theory/radiometry.md, eq. 8a with v of variance κ.
+    """
+
+    def residual(shape: tuple[int, ...], generator: np.random.Generator) -> NDArray[np.complex64]:
+        return (np.sqrt(self_noise) * generator.standard_normal(shape)).astype(np.complex64)
+
+    return _noise_of_factors(history, grid, terrain, places_m, beams, residual)
+
+
+def _noise_of_factors(
+    history: PhaseHistory,
+    grid: SceneGrid,
+    terrain: Terrain,
+    places_m: NDArray[np.float64],
+    beams: Beams | None,
+    draw: Callable[[tuple[int, ...], np.random.Generator], NDArray[np.complex64]],
+) -> float:
+    """Return the noise power in a profile from random factors of the transfer functions, drawn by `draw`."""
     starts = np.unique(np.linspace(0, max(0, len(history) - _ALIKE), _GROUPS).astype(int)).tolist()
     groups, generator = [slice(first, min(first + _ALIKE, len(history))) for first in starts], np.random.default_rng(0)
     pulses = np.concatenate([np.arange(group.start, group.stop) for group in groups])
@@ -173,9 +221,7 @@ def sidelink_noise(
         reference_delay_s=history.reference_delay_s[pulses],
         aperture=history.aperture[pulses],
     )
-    draws = generator.standard_normal((*sampled.transfer.shape, 2)) @ np.array([1, 1j])
-    noisy = 1 + draws * 10 ** (-snr_db / 20) / np.sqrt(2)
-    residual = METHODS[method](np.ones(noisy.shape, np.complex64), noisy.astype(np.complex64))
+    residual = draw(sampled.transfer.shape, generator)
     residual -= residual.mean()
     # The echoes already contain such noise, which must not be counted twice.
     residual /= np.sqrt(1 + np.mean(np.abs(residual) ** 2))

@@ -24,9 +24,14 @@ from apertura.core.echo.captures import (
     spread,
 )
 from apertura.core.echo.clock import GROUPS, ClockOffset, clock_of
-from apertura.core.echo.demodulate import demodulate
 from apertura.core.echo.interference import EXCESS_DB
-from apertura.core.echo.transfer import Demodulator, Transfer, as_complex, transfer_by_code, transfer_by_sidelink
+from apertura.core.echo.transfer import (
+    Demodulator,
+    Transfer,
+    as_complex,
+    transfer_by_code,
+    transfer_by_sidelink,
+)
 from apertura.core.quality.budget import strictest_accuracy_db
 from apertura.methods.bench.channels import (
     DC_DB,
@@ -430,7 +435,11 @@ def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, is_t
     channels, saturation = _channels(read, present, captured, len(every))
     flags = [channel.flags for channel in channels] + [saturation.flags]
     pair = f"{campaign.flight(flight).transmitter}-{name}"
-    if _is_inverted(read, sent, "radar" if is_transmitter else "sidelink", len(every)):
+    frames = captured.frames.numbers
+    demodulator = Demodulator(
+        lambda pulses: sent.inverses.at(frames[pulses]), captured.numerology, sent.waveform.capture_samples
+    )
+    if _is_inverted(read, demodulator, "radar" if is_transmitter else "sidelink", len(every)):
         read = _conjugated(read)
         line = (
             f"{name}: the code matches the complex conjugate of the samples; change nodes.{name}.iq, or waveform.iq "
@@ -439,15 +448,15 @@ def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, is_t
         flags.append({"spectrum_inverted": line})
     before, clock, contact, state = None, None, None, None
     measured: Transfer | None = None
-    demodulator = Demodulator(sent.inverse, captured.numerology, sent.waveform.capture_samples)
     if is_transmitter:
         measured = transfer_by_code(read, demodulator, time_s=time_s)
     else:
-        contact = measure_contact(f"{name} sidelink", _by_code(read, sent, "sidelink"), len(every))
+        contact = measure_contact(f"{name} sidelink", _by_code(read, demodulator, "sidelink"), len(every))
         flags.append(contact.flags if contact else {})
         clock, flags_of_clock = _clock(read, sent, name, len(every))
         flags.append(flags_of_clock)
-        uncorrected = measure_link(pair, _by_code(read, sent, "radar"), time_s, captured.numerology, divided=False)
+        by_code = _by_code(read, demodulator, "radar")
+        uncorrected = measure_link(pair, by_code, time_s, captured.numerology, divided=False)
         before = uncorrected.coherence if uncorrected else None
         try:
             measured = transfer_by_sidelink(
@@ -496,11 +505,11 @@ def _channels(
     return tuple(measure_channel(name, blocks(name), captured.numerology) for name in present), saturation
 
 
-def _by_code(read: Read, sent: Transmitted, channel: str) -> Any:
+def _by_code(read: Read, demodulator: Demodulator, channel: str) -> Any:
     """Return a function that computes the transfer functions of a channel from the code, without a sidelink."""
 
     def form(pulses: Pulses) -> Complexes:
-        return np.asarray(demodulate(as_complex(read(pulses)[channel]), sent.numerology) * sent.inverse)
+        return demodulator.symbols(read(pulses)[channel], pulses, channel=channel)
 
     return form
 
@@ -509,12 +518,13 @@ def _conjugated(read: Read) -> Read:
     return lambda pulses: {name: conjugates(iq) for name, iq in read(pulses).items()}
 
 
-def _is_inverted(read: Read, sent: Transmitted, channel: str, count: int) -> bool:
+def _is_inverted(read: Read, demodulator: Demodulator, channel: str, count: int) -> bool:
     """Return True if the code matches the complex conjugate of a channel's samples, but not the samples themselves."""
     pulses = np.concatenate(spread(count, groups=4, each=16))
 
     def locks(reader: Read) -> bool:
-        contact = measure_contact(channel, lambda rows: _by_code(reader, sent, channel)(pulses[rows]), len(pulses))
+        by_code = _by_code(reader, demodulator, channel)
+        contact = measure_contact(channel, lambda rows: by_code(pulses[rows]), len(pulses))
         return contact is not None and 2 * contact.dropouts < contact.pulses
 
     return not locks(read) and locks(_conjugated(read))

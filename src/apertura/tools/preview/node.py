@@ -2,6 +2,7 @@
 
 import time
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, cast
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 from apertura.campaign.folder import Campaign
 from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
+from apertura.common.units import nanoseconds
+from apertura.core.echo.frame_codes import frame_numbers
 from apertura.formats.names import GROWING, TRACKS, log_format
 from apertura.formats.reading import open_recording, read_track
 from apertura.formats.recordings.recording import Captures, Recording
@@ -216,6 +219,8 @@ class NodeSoFar:
         files = Path("raw") / self._flight / self.name
         order = self._campaign.settings.iq_of(self.name)
         captured = Captured.of(raw, self._recording.samples.path, files, str(files), self._sent, order=order)
+        every = frame_numbers(nanoseconds(self.time), self.frame, interval_s=1 / self._sent.waveform.prf_hz)
+        captured = replace(captured, frames=replace(every, numbers=every.numbers[captures]))
         settings = self._campaign.node(self._flight, self.name)
         wave_m = shortest_wave(self._sent.numerology.frequency_hz)
         return Acquisition(self.name, settings, self.track.isel(epoch=near), log, wave_m, **vars(captured))

@@ -1,0 +1,176 @@
+"""Symbols of a recording that are decided from its sidelink, and the choice between decisions and division.
+
+Source: docs/theory/data_symbols.md, "Decisions or division".
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.arrays import Bools, Complexes, Floats
+from apertura.common.errors import CampaignError
+from apertura.common.units import decibels
+from apertura.core.echo.captures import Pulses, Read, correct_clock, spread
+from apertura.core.echo.clock import GROUPS, clock_of, decide_clock
+from apertura.core.echo.constellation import Constellation, Labels
+from apertura.core.echo.demodulate import Numerology, demodulate
+from apertura.core.echo.transfer import as_complex
+from apertura.core.echo.unknown_symbols import Decisions, Pilots, SymbolDecider
+
+_CHANNEL_GROUPS, _CHANNEL_PULSES = 32, 64  # groups of pulses with a mean channel, and pulses in each
+_CLOCK_PULSES = 64  # pulses in each group from which the clock is measured
+
+
+@dataclass(eq=False)
+class SidelinkSymbols:
+    """Symbols of the captures of a recording, decided from its sidelink.
+
+    Attributes
+    ----------
+    read
+        Reader of channel `sidelink`.
+    numerology, symbol_samples
+        Numerology of the symbol, and number of samples of prefix and symbol.
+    decider
+        Decider with the mean channels of the sidelink.
+    clock_hz, sfo_ppm
+        Offset of carrier of each capture (None: not corrected), and of the sampling rate, removed from the samples.
+    snr
+        Median SNR per subcarrier of the pulses with a direct path in the groups.
+    known
+        Labels of the first data symbols of each pulse, of the header; None: the symbols are ambiguous without pilots.
+    """
+
+    read: Read
+    numerology: Numerology
+    symbol_samples: int
+    decider: SymbolDecider
+    clock_hz: Floats | None
+    sfo_ppm: float
+    snr: float = 0.0
+    known: Labels | None = None
+    _latest: tuple[Pulses, Complexes] | None = field(default=None, init=False, repr=False)
+
+    @classmethod
+    def measured(
+        cls,
+        read: Read,
+        numerology: Numerology,
+        *,
+        symbol_samples: int,
+        count: int,
+        accuracy_db: float,
+        constellation: Constellation,
+        pilots: Pilots | None = None,
+        known: Labels | None = None,
+        where: str = "sidelink",
+    ) -> "SidelinkSymbols":
+        """Measure clock and mean channels of a sidelink of `count` captures.
+
+        Raises
+        ------
+        CampaignError
+            If the direct path is not detected in any group of pulses.
+        """
+        clock_hz, sfo_ppm = None, 0.0
+        groups = spread(count, groups=GROUPS, each=_CLOCK_PULSES)
+        sidelink = (as_complex(read(group)["sidelink"][:, :symbol_samples]) for group in groups)
+        try:
+            clock = clock_of(sidelink, numerology, pulses=count)
+        except ValueError:  # the capture contains no second period
+            pass
+        else:
+            if decide_clock(clock, numerology, accuracy_db=accuracy_db).correct:
+                clock_hz, sfo_ppm = clock.cfo_of_pulses_hz(count), clock.sfo_ppm
+        empty = SymbolDecider(constellation, np.ones((1, 1), np.complex64), np.zeros(1), pilots)
+        symbols = cls(read, numerology, symbol_samples, empty, clock_hz, sfo_ppm, known=known)
+        received = {group[0]: (group, symbols.received(group)) for group in _groups(count)}
+        try:
+            symbols.decider = SymbolDecider.measured(received.values(), constellation, pilots)
+        except CampaignError as error:
+            raise CampaignError(error.found, f"{where}: sidelink", error.expected, error.remedy) from None
+        decided = [symbols.decider.decide(block, group) for group, block in received.values()]
+        snr = np.concatenate([decisions.snr[decisions.path.locked] for decisions in decided])
+        symbols.snr = float(np.median(snr)) if snr.size else 0.0
+        return symbols
+
+    @property
+    def divides(self) -> bool:
+        """True if division by the noisy sidelink has the smaller error, because most decisions are unsure (eq. 7)."""
+        return self.snr < self.decider.constellation.least_snr
+
+    @property
+    def unambiguous(self) -> bool:
+        """True if pilots or a header determine the phase of the symbols."""
+        return self.decider.pilots is not None or self.known is not None
+
+    def received(self, captures: Pulses) -> Complexes:
+        """Return the received symbols of the sidelink in captures, (pulse, subcarrier) complex64."""
+        samples = as_complex(self.read(captures)["sidelink"][:, : self.symbol_samples])
+        if self.clock_hz is not None:
+            cfo_hz = self.clock_hz[captures]
+            samples = correct_clock(samples, self.numerology, cfo_hz=cfo_hz, sfo_ppm=self.sfo_ppm)
+        return demodulate(samples, self.numerology)
+
+    def decisions(self, captures: Pulses) -> Decisions:
+        """Return the decided symbols of captures, without ambiguity if pilots or a header are known."""
+        decisions = self.decider.decide(self.received(captures), captures)
+        if self.known is not None and self.decider.pilots is None:
+            return self.decider.resolved(decisions, self.known)
+        return decisions
+
+    def usable(self, decisions: Decisions) -> Bools:
+        """Return True for pulses whose symbols are used: sure ones, or all with a direct path if echoes are divided."""
+        return decisions.path.locked if self.divides else decisions.sure
+
+    def inverse(self, captures: Pulses) -> Complexes:
+        """Return 1/ĉ of captures, (pulse, subcarrier) complex64; 0 in pulses that are not used."""
+        latest = self._latest
+        if latest is None or not np.array_equal(latest[0], captures):  # both channels of a block have the same symbols
+            decisions = self.decisions(captures)
+            inverse = self.usable(decisions)[:, None] / decisions.symbols
+            latest = self._latest = captures, inverse.astype(np.complex64)
+        return latest[1]
+
+    def report(self, usable: NDArray[np.bool_]) -> Mapping[str, Any]:
+        """Return the choice between decisions and division with its reason, and the number of unsure pulses."""
+        qam = self.decider.constellation
+        decided, divided_db = qam.decided(self.snr), decibels(qam.noise_gain / self.snr)
+        method = "division" if self.divides else "decisions"
+        limits = (
+            f"SNR {decibels(self.snr):.1f} dB per subcarrier, {qam.name} requires {decibels(qam.least_snr):.1f} dB: "
+            f"decisions lose {-20 * np.log10(decided.gain):.2f} dB and leave an error of {decibels(decided.error):.1f} "
+            f"dB, division an error of {divided_db:.1f} dB"
+        )
+        return {
+            "method": method,
+            "reason": limits,
+            "constellation": qam.name,
+            "snr_db": round(decibels(self.snr), 2),
+            "evm_db": round(float(20 * np.log10(decided.evm)), 2),
+            "symbol_error_rate": float(f"{float(qam.symbol_error_rate(self.snr)):.2e}"),
+            "unsure": int((~usable).sum()),
+        }
+
+    def flags(self, usable: NDArray[np.bool_]) -> dict[str, str]:
+        """Return a flag if pulses are unsure, or if decisions are so unsure that echoes are divided."""
+        unsure, qam = int((~usable).sum()), self.decider.constellation
+        if self.divides:
+            line = (
+                f"SNR {decibels(self.snr):.1f} dB, below {decibels(qam.least_snr):.1f} dB of {qam.name}: echoes are "
+                "divided by the noisy sidelink"
+            )
+            return {"symbols_unsure": line}
+        if not unsure:
+            return {}
+        return {"symbols_unsure": f"symbols of {unsure} of {usable.size} pulses are unsure; these pulses are excluded"}
+
+
+def _groups(count: int) -> list[Pulses]:
+    """Return the groups of pulses with a mean channel: spread over the flight, or consecutive in a short one."""
+    if count <= _CHANNEL_GROUPS * _CHANNEL_PULSES:
+        return np.array_split(np.arange(count), max(1, count // _CHANNEL_PULSES))
+    return spread(count, groups=_CHANNEL_GROUPS, each=_CHANNEL_PULSES)

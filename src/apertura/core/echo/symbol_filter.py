@@ -1,0 +1,238 @@
+"""Filter that removes code symbols whose modulus is not constant: reciprocal, matched or Wiener.
+
+A received symbol Y = cH + W is multiplied by the reciprocal 1/c and by a real weight w(|c|²) of mean 1. The weight
+trades amplified noise of weak symbols against an echo amplitude that varies with the data
+(docs/theory/changing_codes.md, eqs. 4 to 9).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from apertura.common.arrays import Complexes
+from apertura.common.errors import number_of
+from apertura.common.flags import Flags
+from apertura.common.units import decibels
+
+FilterName = Literal["reciprocal", "matched", "wiener"]
+
+Powers = NDArray[np.floating[Any]]
+"""|c|² of symbols, any shape."""
+
+CONSTANT_DB = 0.05
+"""Noise gain of the reciprocal filter, dB, below which the modulus of symbols counts as constant."""
+
+INVISIBLE_DB = -50.0
+"""Tolerated level of data sidelobes without a requested accuracy, dB: 10 dB below the level of visible sidelobes."""
+
+MOST_EXCESS_DB = 1.0
+"""SNR loss of a filter in excess of the smallest one, dB, above which a flag is raised."""
+
+
+@dataclass(frozen=True)
+class SymbolFilter:
+    """Weight w(|c|²) = scale/(offset + slope/|c|²) by which symbols divided by the code are multiplied.
+
+    Attributes
+    ----------
+    name
+        reciprocal (w = 1), matched (w ∝ |c|²) or wiener (w ∝ |c|²/(|c|² + P/ρ)).
+    scale, offset, slope
+        Parameters of the weight, whose mean over the symbols is 1.
+    """
+
+    name: FilterName = "reciprocal"
+    scale: float = 1.0
+    offset: float = 1.0
+    slope: float = 0.0
+
+    @classmethod
+    def of(cls, name: FilterName, power: Powers, snr: float) -> "SymbolFilter":
+        """Return a filter for the powers |c|² of symbols, any shape, and an SNR per subcarrier ρ (eqs. 4 to 6).
+
+        Examples
+        --------
+        >>> SymbolFilter.of("matched", np.array([0.2, 1.0, 1.0, 1.8]), snr=0.1)
+        SymbolFilter(name='matched', scale=1.0, offset=0.0, slope=1.0)
+        """
+        mean = float(power.mean())
+        if name == "reciprocal" or (name == "wiener" and not np.isfinite(snr)):
+            return cls(name)
+        offset, slope = (0.0, 1.0) if name == "matched" else (1.0, mean / max(snr, 1e-12))
+        return cls(name, 1 / float((1 / (offset + slope / power)).mean()), offset, slope)
+
+    def applied(self, symbols: Complexes, inverse: Complexes) -> Complexes:
+        """Return symbols, (pulse, subcarrier) divided by the code, times the weight; `inverse`: 1/c of the pulses."""
+        if self.slope == 0:
+            return symbols
+        gain = np.square(inverse.real) + np.square(inverse.imag)
+        return symbols * (np.float32(self.scale) / (np.float32(self.offset) + np.float32(self.slope) * gain))
+
+    def weight(self, power: Powers) -> Powers:
+        """Return w(|c|²) of symbol powers of any shape."""
+        return np.asarray(self.scale / (self.offset + self.slope / power))
+
+    def noise_gain(self, power: Powers) -> float:
+        """Return the noise relative to a code of constant modulus and equal mean power, P·E[w²/|c|²] (eq. 4)."""
+        return float(power.mean() * (self.weight(power) ** 2 / power).mean())
+
+    def self_noise(self, power: Powers) -> float:
+        """Return the variance κ of the echo amplitude over the data, E[w²] − 1 (eq. 5)."""
+        return max(float((self.weight(power) ** 2).mean()) - 1, 0.0)
+
+    def loss(self, power: Powers, snr: float) -> float:
+        """Return the noise floor with data relative to that of a constant modulus, L = G + κρ (eq. 7)."""
+        return self.noise_gain(power) + self.self_noise(power) * snr
+
+
+FILTERS: tuple[FilterName, ...] = ("reciprocal", "matched", "wiener")
+
+
+def echo_snr(transfer: Complexes, gain: float) -> float:
+    """Return the SNR per subcarrier ρ of echoes with symbols of constant modulus and equal mean power.
+
+    Parameters
+    ----------
+    transfer
+        (pulse, subcarrier) complex64, divided by the code.
+    gain
+        Noise gain P·E[1/|c|²] of this division.
+
+    Notes
+    -----
+    Source: docs/theory/changing_codes.md, eq. 8: the noise is the median over the delay cells of the mean power,
+    because echoes occupy less than half of the cells.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> noise = rng.normal(size=(2, 200, 256)) @ np.eye(256) / np.sqrt(2)
+    >>> round(echo_snr((0.5 + noise[0] + 1j * noise[1]).astype(np.complex64), 1.0), 2)
+    0.25
+    """
+    count = transfer.shape[1]
+    window = (1 - np.cos(2 * np.pi * (np.arange(count) + 0.5) / count)).astype(np.float32)
+    cells = (np.abs(scipy.fft.ifft(transfer * window, axis=1, norm="ortho")) ** 2).mean(axis=0, dtype=np.float64)
+    noise, total = float(np.median(cells)), float(cells.mean())
+    return max(total - noise, 0.0) / max(noise, np.finfo(float).tiny) * gain
+
+
+@dataclass(frozen=True)
+class FilterChoice:
+    """Filter of the symbols, reason for its choice, and its predicted effect.
+
+    Attributes
+    ----------
+    filter
+        The filter.
+    report
+        Name, reason, parameters, SNR per subcarrier, noise gain, SNR loss and data sidelobes.
+    flags
+        Flag → measured values, one line.
+    """
+
+    filter: SymbolFilter
+    report: dict[str, Any]
+    flags: Flags
+
+
+def choose_filter(power: Powers, *, requested: str, snr: float, frames: int, tolerated_db: float) -> FilterChoice:
+    """Choose the filter of the symbols by its predicted noise floor and data sidelobes.
+
+    Parameters
+    ----------
+    power
+        (row, subcarrier), |c|² of sampled frames.
+    requested
+        A filter, or 'auto'.
+    snr
+        SNR per subcarrier ρ of the echoes; infinite if unknown.
+    frames
+        Number of different frames in the flight, over whose data sidelobes average.
+    tolerated_db
+        Tolerated level of data sidelobes relative to the peak, dB.
+
+    Notes
+    -----
+    Source: docs/theory/changing_codes.md, eqs. 4 to 9.
+
+    Examples
+    --------
+    >>> qam = np.tile([0.2, 1.0, 1.0, 1.8], (1, 64))
+    >>> for snr, frames in ((0.01, 1000), (100.0, 1000), (0.01, 1)):
+    ...     choice = choose_filter(qam, requested="auto", snr=snr, frames=frames, tolerated_db=-45.0)
+    ...     print(choice.filter.name, choice.report["loss_db"])
+    wiener 0.01
+    wiener 2.69
+    reciprocal 2.76
+    """
+    power = np.asarray(power, np.float64)
+    filters = {name: SymbolFilter.of(name, power, snr) for name in FILTERS}
+    sidelobes = {name: data_sidelobes(item.self_noise(power), power.shape[1], frames) for name, item in filters.items()}
+    known = np.isfinite(snr)
+    losses = {name: item.loss(power, snr if known else 0.0) for name, item in filters.items()}
+    summary = f"SNR {decibels(max(snr, 1e-9)):.1f} dB per subcarrier"
+    if requested != "auto":
+        name: FilterName = next(item for item in FILTERS if item == requested)
+        reason = "requested"
+    elif not known:
+        name, reason = "reciprocal", "largest loss; decided by the SNR of the echoes when they are formed"
+    else:
+        tolerated = [item for item in FILTERS if sidelobes[item] <= 10 ** (tolerated_db / 10)]
+        name = min(tolerated, key=lambda item: losses[item])
+        reason = f"{summary}, data sidelobes below {tolerated_db:g} dB: smallest SNR loss"
+    chosen = filters[name]
+    loss_db = decibels(losses[name])
+    report = {
+        "filter": name,
+        "reason": reason,
+        "scale": chosen.scale,
+        "offset": chosen.offset,
+        "slope": chosen.slope,
+        "snr_db": round(decibels(snr), 2) if known and snr > 0 else None,
+        "noise_gain_db": round(decibels(chosen.noise_gain(power)), 2),
+        "self_noise": round(chosen.self_noise(power), 4),
+        "loss_db": round(loss_db, 2),
+        "sidelobes_db": round(decibels(sidelobes[name]), 1) if sidelobes[name] > 0 else None,
+    }
+    flags, best_db = {}, decibels(min(losses.values()))
+    if loss_db > best_db + MOST_EXCESS_DB and requested != "auto":
+        flags["symbols_noise"] = f"SNR loss of the {name} filter {loss_db:.1f} dB, smallest loss {best_db:.1f} dB"
+    if sidelobes[name] > 10 ** (tolerated_db / 10):
+        counted = number_of(frames, "different frame")
+        line = f"data sidelobes of {decibels(sidelobes[name]):.1f} dB after the {name} filter, in {counted}"
+        flags["symbols_sidelobes"] = f"{line}; {tolerated_db:g} dB tolerated"
+    return FilterChoice(chosen, report, Flags(flags))
+
+
+def tolerated_sidelobes_db(accuracy_db: float | Literal["auto"]) -> float:
+    """Return the tolerated level of data sidelobes for `processing.accuracy_db`, dB relative to the peak.
+
+    Examples
+    --------
+    >>> tolerated_sidelobes_db("auto"), tolerated_sidelobes_db(-45.0)
+    (-50.0, -45.0)
+    """
+    return INVISIBLE_DB if accuracy_db == "auto" else accuracy_db
+
+
+def data_sidelobes(self_noise: float, subcarriers: int, frames: int) -> float:
+    """Return the expected level of data sidelobes relative to the peak of a point, κ·1.5/(N·F) (eq. 6, Hann window).
+
+    Examples
+    --------
+    >>> round(data_sidelobes(0.32, 256, 1000), 9)
+    1.875e-06
+    """
+    return 1.5 * self_noise / (subcarriers * max(frames, 1))
+
+
+def filter_of(report: Mapping[str, Any] | None) -> SymbolFilter:
+    """Return the filter of a `FilterChoice.report`; the reciprocal one if the report names none."""
+    if not report or "filter" not in report:
+        return SymbolFilter()
+    return SymbolFilter(report["filter"], report["scale"], report["offset"], report["slope"])

@@ -1,0 +1,391 @@
+"""Estimation of unknown data symbols from the sidelink: channel of the direct path, decisions, and their quality.
+
+A receiver records the direct path of each pulse. Its symbols follow from the constellation, and are then the reference
+of echo and sidelink, as symbols known beforehand would be.
+
+Source: docs/theory/data_symbols.md, "Unknown symbols".
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from apertura.common.arrays import Bools, Complexes, Floats
+from apertura.common.errors import CampaignError
+from apertura.core.echo.constellation import Constellation, Labels
+from apertura.core.echo.line_of_sight import LineOfSight, fit_block, phasor
+from apertura.core.echo.sidelink_state import GATE_CELLS
+
+_UPDATES = 3  # fits of delay, phase and amplitude to the decisions
+_LARGEST_CHANGE = 0.2  # amplitude of a reflection, relative to the direct path, that the mean channel does not contain
+_CHANNELS = 3  # estimates of the channel of a pulse
+_ROUNDS = 4  # fits of the mean channel to the decisions
+
+
+@dataclass(frozen=True, eq=False)
+class Pilots:
+    """Known symbols at equally spaced subcarriers.
+
+    Attributes
+    ----------
+    subcarriers
+        N.
+    first, step
+        Index of the first pilot, and distance between pilots, subcarriers.
+    symbols
+        (pilot,) complex64.
+    """
+
+    subcarriers: int
+    first: int
+    step: int
+    symbols: Complexes
+
+    @classmethod
+    def of(cls, table: Complexes, where: object) -> "Pilots":
+        """Return the pilots of a table, (subcarrier,) complex64, which is 0 at data symbols.
+
+        Raises
+        ------
+        CampaignError
+            If there are fewer than 16 pilots, or their distances differ.
+
+        Examples
+        --------
+        >>> table = np.zeros(64, np.complex64)
+        >>> table[2::4] = 1
+        >>> pilots = Pilots.of(table, "pilots.npy")
+        >>> pilots.first, pilots.step, pilots.symbols.size
+        (2, 4, 16)
+        """
+        indices = np.flatnonzero(table)
+        steps = np.unique(np.diff(indices))
+        if indices.size < 16 or steps.size != 1 or not np.isfinite(table).all():
+            raise CampaignError(
+                f"{indices.size} pilots at distances of {', '.join(map(str, steps[:5])) or 'no'} subcarriers",
+                where=where,
+                expected="at least 16 finite pilot symbols at equal distances, and 0 at all other subcarriers",
+                remedy="Write the transmitted pilots, or remove the key to estimate the channel without pilots.",
+            )
+        return cls(table.size, int(indices[0]), int(steps[0]), table[indices].astype(np.complex64))
+
+    @property
+    def places(self) -> slice:
+        """Subcarriers of the pilots."""
+        return slice(self.first, self.first + self.step * self.symbols.size, self.step)
+
+
+@dataclass(frozen=True, eq=False)
+class Decisions:
+    """Symbols decided in a block of pulses.
+
+    Attributes
+    ----------
+    symbols
+        (pulse, subcarrier) complex64, decided symbols; pilots at their subcarriers.
+    labels
+        (pulse, subcarrier) uint8, labels of the decided symbols; 0 at pilots.
+    path
+        Direct path of each pulse; its `locked` is False if no direct path is detected.
+    evm
+        (pulse,) float64, error vector magnitude relative to the decisions, of data symbols of unit mean power.
+    snr
+        (pulse,) float64, SNR per subcarrier that corresponds to the error vector magnitude.
+    sure
+        (pulse,) bool, True if the direct path is detected and the error vector magnitude is below its limit.
+    """
+
+    symbols: Complexes
+    labels: Labels
+    path: LineOfSight
+    evm: Floats
+    snr: Floats
+    sure: Bools
+
+
+@dataclass(frozen=True, eq=False)
+class SymbolDecider:
+    """Decider of the symbols of a sidelink.
+
+    Attributes
+    ----------
+    constellation
+        Constellation of the data symbols.
+    shapes
+        (group, subcarrier) complex64, mean channel of groups of neighbouring pulses relative to the direct path:
+        transmit ripple and reflections; mean power 1.
+    middles
+        (group,) float64, number of the middle pulse of each group, ascending.
+    pilots
+        Known symbols; None: delay and phase are estimated from the constellation.
+
+    Examples
+    --------
+    >>> from apertura.core.echo.constellation import constellation
+    >>> random, qam = np.random.default_rng(1), constellation("16qam")
+    >>> sent = random.integers(0, 16, (8, 512))
+    >>> delayed = 3 * qam.points[sent] * np.exp(-2j * np.pi * np.arange(512) * 4.3 / 512)
+    >>> received = (delayed + random.normal(scale=0.1, size=(8, 512, 2)) @ [1, 1j]).astype(np.complex64)
+    >>> decider = SymbolDecider.measured([(np.arange(8), received)], qam)
+    >>> decisions = decider.resolved(decider.decide(received, np.arange(8)), sent[:, :16])
+    >>> bool((decisions.labels == sent).all()), (10 * np.log10(decisions.snr.mean())).round().item()
+    (True, 27.0)
+    """
+
+    constellation: Constellation
+    shapes: Complexes
+    middles: Floats
+    pilots: Pilots | None = None
+
+    @classmethod
+    def measured(
+        cls,
+        groups: Iterable[tuple[NDArray[np.int64], Complexes]],
+        constellation: Constellation,
+        pilots: Pilots | None = None,
+    ) -> "SymbolDecider":
+        """Return a decider with the mean channels of groups of neighbouring pulses.
+
+        Parameters
+        ----------
+        groups
+            Pulse numbers, ascending, and their received symbols, (pulse, subcarrier) complex64, of each group.
+        constellation, pilots
+            Constellation of the data symbols, and known symbols.
+
+        Raises
+        ------
+        CampaignError
+            If the direct path is not detected in any group.
+        """
+        shapes, middles, count = [], [], 0
+        for numbers, received in groups:
+            count += len(numbers)
+            decider = cls(constellation, np.ones((1, received.shape[1]), np.complex64), np.zeros(1), pilots)
+            shaped = decider._shaped_by(received)
+            if shaped is not None:
+                shapes.append(shaped.shapes[0])
+                middles.append(float(numbers.mean()))
+        if not shapes:
+            raise CampaignError(
+                f"no direct path of {constellation.name} symbols in {count} pulses",
+                where="sidelink",
+                expected=f"data symbols of constellation {constellation.name} above the noise",
+                remedy="Check waveform.codes.constellation, and antenna, gain and recorded channel of the sidelink.",
+            )
+        return cls(constellation, np.array(shapes), np.array(middles), pilots)
+
+    def _shaped_by(self, received: Complexes) -> "SymbolDecider | None":
+        """Return a decider with the mean channel of pulses; None if the direct path is not detected in any pulse."""
+        decider = self
+        if self.pilots is None:
+            decider = decider._with_shape(_minimum_phase(received))
+        path = decider._detected(received / decider.shapes)
+        received, path = received[path.locked], path.select(path.locked)
+        if not len(received):
+            return None
+        direct = phasor(path, received.shape[1]) * path.amplitude[:, None].astype(np.float32)
+        decider = decider._with_shape(decider._initial_shape(received / direct))
+        for _ in range(_ROUNDS):  # the mean of the channel after removal of the decisions (eq. 11)
+            flat = received / decider.shapes
+            path, symbols, _, error = decider._fitted(flat, decider._detected(flat), decider.shapes)
+            weight = (path.amplitude / np.square(error))[:, None]
+            decider = decider._with_shape((weight * received / (symbols * phasor(path, received.shape[1]))).sum(0))
+        return decider
+
+    def _with_shape(self, channel: NDArray[Any]) -> "SymbolDecider":
+        """Return a decider with the smooth part of one channel, (subcarrier,), scaled to the mean power 1."""
+        smooth = _smooth(channel[None])
+        return replace(self, shapes=smooth / np.sqrt(np.mean(np.square(np.abs(smooth)))))
+
+    def decide(self, sidelink: Complexes, numbers: NDArray[np.int64]) -> Decisions:
+        """Decide the symbols of a block of pulses, each on its own.
+
+        Parameters
+        ----------
+        sidelink
+            (pulse, subcarrier) complex64, received symbols of the direct path.
+        numbers
+            (pulse,) pulse numbers, as those of the groups.
+        """
+        subcarriers = sidelink.shape[1]
+        nearest = np.searchsorted((self.middles[1:] + self.middles[:-1]) / 2, numbers)
+        shape = self.shapes[nearest]
+        flat = sidelink / shape
+        path, symbols, labels, error = self._fitted(flat, self._detected(flat), shape)
+        # Channel of each pulse within ±16 cells of the direct path (eq. 12), which absorbs a part of the noise
+        absorbed, rows = _basis(subcarriers).shape[1] / subcarriers, np.arange(len(sidelink))
+        direct = phasor(path, subcarriers) * np.maximum(path.amplitude, 1e-30)[:, None].astype(np.float32)
+        for _ in range(_CHANNELS):
+            if not rows.size:
+                break
+            relative = _smooth(flat[rows] / (direct[rows] * symbols[rows]))
+            of_rows = path.select(rows)
+            _, own, own_labels, own_error = self._fitted(
+                flat[rows] / relative, of_rows, shape[rows] * relative, updates=0
+            )
+            own_error /= np.sqrt(1 - absorbed)
+            better = own_error < error[rows]
+            rows = rows[better]
+            symbols[rows], labels[rows], error[rows] = own[better], own_labels[better], own_error[better]
+        clear = self.pilots is not None or _reflection(flat) < _LARGEST_CHANGE
+        limit = self.constellation.decided(self.constellation.least_snr).evm
+        path = replace(path, noise_power=np.square(path.amplitude * error))
+        snr = self.constellation.snr_of_evm(error)
+        return Decisions(symbols, labels, path, error, snr, path.locked & (error <= limit) & clear)
+
+    def resolved(self, decisions: Decisions, known: Labels) -> Decisions:
+        """Return decisions without the ambiguity of a blind estimate, from known labels of the first subcarriers.
+
+        Parameters
+        ----------
+        decisions
+            Decisions of this decider.
+        known
+            (symbol,) or (pulse, symbol), known labels of the first data symbols, at least two.
+
+        Notes
+        -----
+        Source: docs/theory/data_symbols.md, eq. 13: of the 16 sequences j^(k + ln), that with most known labels.
+        """
+        data = self.data_places
+        known = np.broadcast_to(known, (len(decisions.labels), known.shape[-1]))
+        first = data[: known.shape[1]]
+        numbers = np.arange(decisions.labels.shape[1])
+        turns = [(k, step) for k in range(4) for step in range(4)]
+        rotations = np.array([1j ** ((k + step * numbers) % 4) for k, step in turns], np.complex64)
+        agreement = np.array([
+            (self.constellation.decide(decisions.symbols[:, first] * rotation[first]) == known).sum(1)
+            for rotation in rotations
+        ])  # fmt: skip
+        best = agreement.argmax(0)
+        symbols = decisions.symbols * rotations[best]
+        labels = self.constellation.decide(symbols)
+        centre, subcarriers = (numbers.size - 1) / 2, numbers.size
+        chosen = np.array(turns)[best]
+        # the direct path turns by the inverse of the symbols: j^-(k + ln) is a delay of lN/4 cells
+        delay = decisions.path.delay_cells + chosen[:, 1] * subcarriers / 4
+        phase = decisions.path.phase_rad - np.pi / 2 * (chosen[:, 0] + chosen[:, 1] * centre)
+        delay = (delay + subcarriers / 2) % subcarriers - subcarriers / 2
+        path = replace(decisions.path, delay_cells=delay, phase_rad=phase)
+        return replace(decisions, symbols=symbols, labels=labels, path=path)
+
+    @property
+    def data_places(self) -> NDArray[np.intp]:
+        """Subcarriers of the data symbols."""
+        places = np.arange(self.shapes.shape[1])
+        return places if self.pilots is None else np.setdiff1d(places, places[self.pilots.places])
+
+    def _detected(self, flat: Complexes) -> LineOfSight:
+        """Return the direct path of each pulse from its pilots, or from the fourth power of its symbols (eqs. 8, 9)."""
+        pilots, subcarriers = self.pilots, flat.shape[1]
+        if pilots is not None:
+            comb = flat[:, pilots.places] / pilots.symbols
+            path = fit_block(np.ascontiguousarray(comb))[0]
+            # the middle of the comb lies beside the middle of the band
+            offset = pilots.first + pilots.step * (pilots.symbols.size - 1) / 2 - (subcarriers - 1) / 2
+            delay = path.delay_cells * subcarriers / (pilots.step * pilots.symbols.size)
+            phase = path.phase_rad + 2 * np.pi * offset * delay / subcarriers
+            return replace(path, delay_cells=delay, phase_rad=phase)
+        rms = np.sqrt(np.mean(np.square(np.abs(flat)), axis=1, keepdims=True))
+        scale = np.where(rms > 0, rms, 1).astype(np.float32)
+        path = fit_block(np.square(np.square(flat / scale)))[0]
+        amplitude = scale[:, 0] * (path.amplitude / abs(self._fourth_moment)) ** 0.25
+        # E[c⁴] is negative
+        return replace(
+            path, delay_cells=path.delay_cells / 4, phase_rad=(path.phase_rad - np.pi) / 4, amplitude=amplitude
+        )
+
+    @property
+    def _fourth_moment(self) -> float:
+        """E[c⁴], negative for all square constellations."""
+        return float(np.mean(self.constellation.points.astype(complex) ** 4).real)
+
+    def _initial_shape(self, aligned: Complexes) -> NDArray[Any]:
+        """Return the channel relative to the direct path from the pilots, or from the mean fourth power (eq. 10)."""
+        pilots, numbers = self.pilots, np.arange(aligned.shape[1])
+        if pilots is not None:
+            comb = (aligned[:, pilots.places] / pilots.symbols).mean(0)
+            known = numbers[pilots.places]
+            return np.asarray(np.interp(numbers, known, comb.real) + 1j * np.interp(numbers, known, comb.imag))
+        # the fourth root is unambiguous because the phase of the minimum-phase channel is accurate to less than π/4
+        residual = ((aligned / self.shapes).astype(complex) ** 4).mean(0) / self._fourth_moment
+        return np.asarray(self.shapes[0] * residual**0.25)
+
+    def _fitted(
+        self, flat: Complexes, path: LineOfSight, shape: Complexes, *, updates: int = _UPDATES
+    ) -> tuple[LineOfSight, Complexes, Labels, Floats]:
+        """Return direct path, symbols, labels and error vector magnitude after fits to the decisions (eq. 11)."""
+        subcarriers = flat.shape[1]
+        number = (np.arange(subcarriers) - (subcarriers - 1) / 2).astype(np.float32)
+        power = np.square(shape.real) + np.square(shape.imag)
+        for update in range(updates + 1):
+            amplitude = np.maximum(path.amplitude, 1e-30)[:, None].astype(np.float32)
+            received = flat * (phasor(path, subcarriers).conj() / amplitude)
+            labels = self.constellation.decide(received)
+            symbols = self.constellation.points[labels]
+            if self.pilots is not None:
+                symbols[:, self.pilots.places] = self.pilots.symbols
+            if update == updates:
+                break
+            # least squares of gain and delay: products with the weights |G_n·ĉ_n|² of the ratios of received to decided
+            product = received * symbols.conj() * power
+            weight = (np.square(symbols.real) + np.square(symbols.imag)) * power
+            gain = product.sum(1) / weight.sum(1)
+            turned = (product @ number) * np.exp(-1j * np.angle(gain))
+            slope = turned.imag / (weight @ np.square(number)) / np.maximum(np.abs(gain), 1e-30)
+            path = replace(
+                path,
+                delay_cells=path.delay_cells - slope * subcarriers / (2 * np.pi),
+                phase_rad=path.phase_rad + np.angle(gain),
+                amplitude=path.amplitude * np.abs(gain),
+            )
+        error = received - symbols
+        error_power = np.square(error.real) + np.square(error.imag)
+        data = np.ones(subcarriers, np.float32)
+        if self.pilots is not None:
+            data[self.pilots.places] = 0
+        evm = np.sqrt((error_power * power) @ data / np.maximum(np.broadcast_to(power, flat.shape) @ data, 1e-30))
+        return path, symbols, labels, np.asarray(evm, np.float64)
+
+
+def _smooth(channel: NDArray[Any]) -> Complexes:
+    """Return the part of channels, (pulse, subcarrier), within ±16 cells of the direct path."""
+    basis = _basis(channel.shape[1])
+    return ((channel.astype(np.complex64) @ basis) @ basis.T).astype(np.complex64)
+
+
+def _minimum_phase(received: Complexes) -> Complexes:
+    """Return the minimum-phase channel, (subcarrier,), of the mean power of pulses, by its cepstrum (eq. 10)."""
+    power = np.square(np.abs(received))
+    power = (power / np.maximum(power.mean(1, keepdims=True), 1e-30)).mean(0)
+    cepstrum = scipy.fft.ifft(np.log(np.maximum(power, 1e-6)) / 2)
+    middle = power.size // 2
+    cepstrum[1:middle] *= 2
+    cepstrum[middle + 1 :] = 0
+    return np.asarray(np.exp(scipy.fft.fft(cepstrum)), np.complex64)
+
+
+def _reflection(flat: Complexes) -> Floats:
+    """Return the amplitude of the strongest reflection in each pulse, (pulse, subcarrier), from its power (eq. 14)."""
+    power = np.square(flat.real) + np.square(flat.imag)
+    power /= np.maximum(power.mean(1, keepdims=True), 1e-30)
+    correlation = scipy.fft.rfft(power - 1, 2 * power.shape[1], axis=1)[:, 2:]
+    return np.asarray(np.abs(correlation).max(1) / power.shape[1], np.float64)
+
+
+@lru_cache(maxsize=4)
+def _basis(subcarriers: int) -> NDArray[np.float32]:
+    """Return an orthonormal basis, (subcarrier, function), of channels within ±16 cells of the direct path.
+
+    Discrete prolate spheroidal sequences represent reflections at fractions of a cell without the sidelobes of a gate
+    in delay. Of few subcarriers, the gate is narrower, so that most of the noise remains outside.
+    """
+    cells = min(GATE_CELLS, max(subcarriers // 64, 1))
+    sequences = scipy.signal.windows.dpss(subcarriers, cells, Kmax=2 * cells + 4)
+    return np.ascontiguousarray(sequences.T, np.float32)

@@ -1,0 +1,113 @@
+"""Symbols of a pair's pulses that are decided from a sidelink, in place of symbols known beforehand."""
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.campaign.config import CONFIG
+from apertura.common.errors import CampaignError
+from apertura.core.echo.association import Association
+from apertura.core.echo.captures import blocks_of
+from apertura.core.echo.decided_symbols import SidelinkSymbols
+from apertura.core.echo.frame_codes import Inverses
+from apertura.core.quality.budget import strictest_accuracy_db
+from apertura.stages.acquisition import Acquisition, common_pulses
+from apertura.stages.transmitted import Transmitted
+
+
+def decided_symbols(source: Acquisition, sent: Transmitted, accuracy_db: float | Literal["auto"]) -> SidelinkSymbols:
+    """Return the symbols in the sidelink of all captures of a node.
+
+    Raises
+    ------
+    CampaignError
+        If the node recorded no sidelink, or no direct path is detected in it.
+    """
+    if sent.unknown is None:
+        raise TypeError("the symbols are known")
+    count, frames = len(source.raw.start), sent.unknown.frames
+    known = None if frames is None else frames.known_labels(sent.unknown.constellation)
+    return SidelinkSymbols.measured(
+        source.reader(["sidelink"], np.arange(count)),
+        source.numerology,
+        symbol_samples=sent.waveform.capture_samples,
+        count=count,
+        accuracy_db=strictest_accuracy_db(accuracy_db),
+        constellation=sent.unknown.constellation,
+        pilots=sent.unknown.pilots,
+        known=known,
+        where=str(source.files),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class PairSymbols:
+    """Symbols of the pulses of a pair.
+
+    Attributes
+    ----------
+    sent
+        Transmitted signal whose rows are the captures of the source.
+    rows
+        (pulse,) int64, row of each pulse; -1 if the source did not record it.
+    symbols, source
+        Symbols of the source, and its name.
+    """
+
+    sent: Transmitted
+    rows: NDArray[np.int64]
+    symbols: SidelinkSymbols
+    source: str
+
+    @classmethod
+    def of(
+        cls,
+        nodes: tuple[Acquisition, Acquisition],
+        source: Acquisition,
+        sent: Transmitted,
+        pulses: Association,
+        paired: NDArray[np.int64],
+        accuracy_db: float | Literal["auto"],
+    ) -> "PairSymbols":
+        """Return the symbols of the `paired` pulses of a transmitter and a receiver, from the sidelink of `source`.
+
+        Raises
+        ------
+        CampaignError
+            If no direct path is detected, or the phase of the symbols of a monostatic pair is ambiguous.
+        """
+        tx, rx = nodes
+        symbols = decided_symbols(source, sent, accuracy_db)
+        if source.name == rx.name:
+            rows = pulses.rx_index[paired]
+        else:
+            both = common_pulses(tx, source, prf_hz=sent.waveform.prf_hz)
+            row_of = np.full(len(tx.raw.time), -1)
+            row_of[both.tx_index] = both.rx_index
+            rows = row_of[pulses.tx_index[paired]]
+        if tx.name == rx.name and not symbols.unambiguous:
+            raise CampaignError(
+                "the phase of symbols decided without pilots and header is ambiguous by quarter turns",
+                where=f"{CONFIG}: waveform.codes",
+                expected="pilots or frame, for monostatic images by the symbols in a sidelink",
+                remedy="Configure waveform.codes.pilots or waveform.codes.frame, or image bistatic pairs only.",
+            )
+        return cls(with_symbols(sent, source, symbols), rows, symbols, source.name)
+
+    def usable(self) -> NDArray[np.bool_]:
+        """Return True for pulses whose symbols are used; all pulses are decided, block by block."""
+        usable = np.zeros(len(self.rows), bool)
+        for block in blocks_of(np.flatnonzero(self.rows >= 0)):
+            usable[block] = self.symbols.usable(self.symbols.decisions(self.rows[block]))
+        return usable
+
+    def report(self, usable: NDArray[np.bool_]) -> dict[str, Any]:
+        """Return the report on the decisions."""
+        return {"node": self.source, **self.symbols.report(usable)}
+
+
+def with_symbols(sent: Transmitted, source: Acquisition, symbols: SidelinkSymbols) -> Transmitted:
+    """Return a transmitted signal whose rows are the decided symbols of the captures of `source`."""
+    return replace(sent, inverses=Inverses(len(source.raw.start), symbols.inverse))

@@ -1,0 +1,184 @@
+"""Unknown symbols of a sidelink: channel, decisions, error rates against theory, unsure pulses, ambiguity."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from apertura.common.errors import CampaignError
+from apertura.core.echo.constellation import CONSTELLATIONS, Constellation, constellation
+from apertura.core.echo.unknown_symbols import Decisions, Pilots, SymbolDecider
+
+N, GROUP = 1024, 64
+
+
+class Sidelink:
+    """Sidelink of pulses with random symbols, clock phases and trigger delays, and one reflection."""
+
+    def __init__(
+        self,
+        qam: Constellation,
+        snr_db: float,
+        *,
+        reflection_db: float = -300.0,
+        changing: bool = False,
+        pulses: int = GROUP,
+        pilots: Pilots | None = None,
+    ) -> None:
+        random = np.random.default_rng(7)
+        number = np.arange(N) - (N - 1) / 2
+        self.sent = random.integers(0, len(qam.points), (pulses, N))
+        self.symbols = qam.points[self.sent]
+        if pilots is not None:
+            self.symbols[:, pilots.places] = pilots.symbols
+        self.delay = random.uniform(-20, 20, (pulses, 1)) + 17.3
+        self.phase = random.uniform(-np.pi, np.pi, (pulses, 1))
+        turn = random.uniform(0, 2 * np.pi, (pulses, 1)) if changing else 1.1
+        self.channel = 1 + 10 ** (reflection_db / 20) * np.exp(1j * turn - 2j * np.pi * number * 5.4 / N)
+        path = 5 * self.channel * np.exp(1j * self.phase - 2j * np.pi * number * self.delay / N)
+        noise = random.normal(scale=5 * np.sqrt(0.5 / 10 ** (snr_db / 10)), size=(pulses, N, 2)) @ [1, 1j]
+        self.received = (path * self.symbols + noise).astype(np.complex64)
+        self.numbers = np.arange(pulses)
+
+    def decider(self, qam: Constellation, pilots: Pilots | None = None) -> SymbolDecider:
+        """Return a decider with the mean channel of all pulses."""
+        groups = [self.numbers[i : i + GROUP] for i in range(0, self.numbers.size, GROUP)]
+        return SymbolDecider.measured([(group, self.received[group]) for group in groups], qam, pilots)
+
+    def decisions(self, qam: Constellation) -> Decisions:
+        """Return the blind decisions, without ambiguity by 16 known symbols."""
+        decider = self.decider(qam)
+        return decider.resolved(decider.decide(self.received, self.numbers), self.sent[:, :16])
+
+    def error_rate(self, qam: Constellation, snr_db: float) -> float:
+        """Return the theoretical symbol error rate, averaged over the channel."""
+        snr = 10 ** (snr_db / 10) * np.abs(self.channel) ** 2
+        return float(np.mean(qam.symbol_error_rate(snr)))
+
+
+@pytest.mark.parametrize("name", CONSTELLATIONS)
+@pytest.mark.parametrize("errors", [0.14, 0.02])
+def test_decided_reference_has_the_gain_error_and_evm_of_the_closed_form(name: str, errors: float) -> None:
+    """Gain, error and EVM of decisions in noise equal eqs. 4 and 5 within the scatter of the simulation."""
+    qam, random, count = constellation(name), np.random.default_rng(3), 60_000
+    snr = np.logspace(0, 4, 2001)
+    snr = snr[np.argmin(np.abs(qam.symbol_error_rate(snr) - errors))]
+    sent = random.integers(0, len(qam.points), count)
+    received = qam.points[sent] + random.normal(scale=np.sqrt(0.5 / snr), size=(count, 2)) @ [1, 1j]
+    decided = qam.points[qam.decide(received)]
+    ratio = qam.points[sent] / decided
+    theory = qam.decided(snr)
+    assert np.mean(ratio) == pytest.approx(theory.gain, abs=5 * np.sqrt(theory.error / count))
+    assert np.var(ratio) / abs(np.mean(ratio)) ** 2 == pytest.approx(theory.error, rel=0.1)
+    assert np.sqrt(np.mean(np.abs(received - decided) ** 2)) == pytest.approx(theory.evm, rel=0.01)
+
+
+@pytest.mark.parametrize("name", CONSTELLATIONS)
+def test_decisions_lose_less_than_division_above_the_least_snr_only(name: str) -> None:
+    """Eq. 7: adequate at the least SNR, inadequate 0.2 dB below; the error is below that of division up to 40 dB."""
+    qam = constellation(name)
+
+    def adequate(snr: float) -> bool:
+        decided = qam.decided(snr)
+        return 20 * np.log10(decided.gain) >= -0.2 and decided.error <= qam.noise_gain / snr
+
+    assert not adequate(qam.least_snr * 10**-0.02)
+    assert all(adequate(snr) for snr in qam.least_snr * 10 ** np.linspace(0, 2, 30))
+
+
+@pytest.mark.parametrize(("name", "snr_db"), [("qpsk", 8), ("16qam", 14), ("64qam", 20), ("256qam", 26)])
+@pytest.mark.parametrize("reflection_db", [-300.0, -20.0, -6.0])
+def test_symbol_error_rate_of_unknown_symbols_equals_theory(name: str, snr_db: float, reflection_db: float) -> None:
+    """Blind decisions have the error rate of a known channel, within 0.5 dB of SNR, and all pulses are sure."""
+    qam = constellation(name)
+    sidelink = Sidelink(qam, snr_db, reflection_db=reflection_db)
+    decisions = sidelink.decisions(qam)
+    errors = float(np.mean(decisions.labels != sidelink.sent))
+    scatter = 4 * np.sqrt(errors / decisions.labels.size)
+    assert sidelink.error_rate(qam, snr_db) - scatter < errors < sidelink.error_rate(qam, snr_db - 0.5) + scatter
+    assert decisions.sure.all()
+
+
+@pytest.mark.parametrize("name", CONSTELLATIONS)
+def test_pulses_are_unsure_below_the_least_snr(name: str) -> None:
+    """The limit of the EVM separates SNRs 1 dB above the least SNR from those 1 dB below."""
+    qam = constellation(name)
+    least_db = 10 * np.log10(qam.least_snr)
+    for change_db, sure in ((1, True), (-1, False)):
+        sidelink = Sidelink(qam, least_db + change_db)
+        decisions = sidelink.decider(qam).decide(sidelink.received, sidelink.numbers)
+        assert np.mean(decisions.sure == sure) > 0.95
+    assert 10 * np.log10(np.median(decisions.snr)) == pytest.approx(least_db - 1, abs=0.4)
+
+
+def test_pulses_with_a_changing_strong_reflection_are_unsure() -> None:
+    """A reflection of -6 dB with another phase in each pulse is detected by its power; one of -20 dB is harmless."""
+    qam = constellation("qpsk")
+    strong = Sidelink(qam, 25, reflection_db=-6, changing=True)
+    assert not strong.decider(qam).decide(strong.received, strong.numbers).sure.any()
+    weak = Sidelink(qam, 25, reflection_db=-20, changing=True)
+    decisions = weak.decisions(qam)
+    assert decisions.sure.all()
+    assert np.array_equal(decisions.labels, weak.sent)
+
+
+def test_channel_of_a_pulse_lowers_the_error_rate_of_a_changing_reflection() -> None:
+    """With a reflection of -20 dB that changes from pulse to pulse, 64-QAM is decided by the channel of each pulse."""
+    qam = constellation("64qam")
+    sidelink = Sidelink(qam, 28, reflection_db=-20, changing=True)
+    decisions = sidelink.decisions(qam)
+    assert np.mean(decisions.labels != sidelink.sent) < 3e-3
+    # the mean channel alone leaves the reflection as an error of -20 dB
+    decider = sidelink.decider(qam)
+    flat = sidelink.received / decider.shapes
+    assert np.median(decider._fitted(flat, decider._detected(flat), decider.shapes)[3]) > 1.3 * np.median(decisions.evm)
+
+
+def test_known_symbols_resolve_the_ambiguity_of_a_blind_estimate() -> None:
+    """Symbols, delay and phase are those sent, for a delay beyond N/8 cells, at which the blind delay is ambiguous."""
+    qam = constellation("16qam")
+    sidelink = Sidelink(qam, 25, pulses=16)
+    number = np.arange(N) - (N - 1) / 2
+    shift = N / 4 + 3.0
+    sidelink.received = (sidelink.received * np.exp(-2j * np.pi * number * shift / N)).astype(np.complex64)
+    decider = sidelink.decider(qam)
+    blind = decider.decide(sidelink.received, sidelink.numbers)
+    assert np.mean(blind.labels != sidelink.sent) > 0.5
+    decisions = decider.resolved(blind, sidelink.sent[:, :8])
+    assert np.array_equal(decisions.labels, sidelink.sent)
+    assert decisions.path.delay_cells == pytest.approx(sidelink.delay[:, 0] + shift, abs=0.01)
+    turn = np.angle(np.exp(1j * (decisions.path.phase_rad - sidelink.phase[:, 0])))
+    assert np.ptp(turn) < 0.05
+    assert abs(turn.mean()) < 0.05
+    # the ratio of echo to sidelink does not depend on the ambiguity
+    echo = sidelink.symbols * np.exp(-2j * np.pi * number * 40 / N)
+    ratios = [(echo / d.symbols) / (sidelink.received / d.symbols) for d in (blind, decisions)]
+    assert np.allclose(*ratios, rtol=1e-4)
+
+
+def test_pilots_estimate_the_channel_below_the_snr_of_a_blind_estimate() -> None:
+    """At 0 dB the fourth power does not detect QPSK; with 128 pilots the error rate is that of theory."""
+    qam, table = constellation("qpsk"), np.zeros(N, np.complex64)
+    table[3::8] = np.exp(2j * np.pi * np.random.default_rng(5).integers(0, 4, 128) / 4)
+    pilots = Pilots.of(table, "pilots.npy")
+    sidelink = Sidelink(qam, 0, reflection_db=-20, pilots=pilots)
+    decider = sidelink.decider(qam, pilots)
+    decisions = decider.decide(sidelink.received, sidelink.numbers)
+    data = decider.data_places
+    errors = float(np.mean(decisions.labels[:, data] != sidelink.sent[:, data]))
+    assert errors == pytest.approx(sidelink.error_rate(qam, 0), abs=0.03)
+    assert np.array_equal(decisions.symbols[:, pilots.places], np.broadcast_to(pilots.symbols, (GROUP, 128)))
+    with pytest.raises(CampaignError, match="no direct path"):
+        Sidelink(qam, -3).decider(qam)
+
+
+@pytest.mark.parametrize("spoil", [lambda table: table[:300:16].fill(0), lambda table: table[::1].fill(0)])
+def test_irregular_pilots_are_refused(spoil: Any) -> None:
+    """The error states the number of pilots and their distances."""
+    table: NDArray[np.complex64] = np.zeros(N, np.complex64)
+    table[3::16] = 1
+    table[5] = 1
+    spoil(table)
+    with pytest.raises(CampaignError, match="pilots at distances of"):
+        Pilots.of(table, "pilots.npy")
