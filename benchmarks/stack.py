@@ -96,9 +96,12 @@ def main() -> None:
             offset_m, slope_mm = map(float, case.split(":"))
             root = (arguments.keep or Path(folder)) / f"offset{offset_m:g}_slope{slope_mm:g}_{arguments.autofocus}"
             print(
-                f"tracks {offset_m:g} m apart, slope {slope_mm:g} mm a flight, autofocus {arguments.autofocus}", flush=True
+                f"tracks {offset_m:g} m apart, slope {slope_mm:g} mm a flight, autofocus {arguments.autofocus}",
+                flush=True,
             )
-            measured(formed(root, offset_m=offset_m, slope_mm=slope_mm, autofocus=arguments.autofocus, seed=arguments.seed))
+            measured(
+                formed(root, offset_m=offset_m, slope_mm=slope_mm, autofocus=arguments.autofocus, seed=arguments.seed)
+            )
 
 
 if __name__ == "__main__":

@@ -256,8 +256,6 @@ class ResidualMotion:
         Phase that is equal at all places.
     unknowns
         (unknown,) float64, residual tracks in the unknowns of the prior.
-    covariance
-        (unknown, unknown) float64, covariance of their errors.
     scale
         Scale of the prior for which the phases are most probable: 1 if the logs are as accurate as stated.
     parameters
@@ -270,7 +268,6 @@ class ResidualMotion:
 
     constant_rad: float
     unknowns: Floats
-    covariance: Floats
     scale: float
     parameters: float
     residual_rad: Floats
@@ -335,7 +332,7 @@ def estimate_motion(phases: WindowPhases, design: Floats, constants: Floats, *, 
     residual = np.angle(np.exp(1j * (phase - model)))
     stable = weight * (scatter * std) ** 2 > _STABLE_WEIGHT
     constant = float(np.angle(np.exp(1j * solved[0])))
-    return ResidualMotion(constant, unknowns, covariance, scale, parameters, residual, stable)
+    return ResidualMotion(constant, unknowns, scale, parameters, residual, stable)
 
 
 def _searched(phases: WindowPhases, constants: Floats, radius_m: float) -> Floats:
