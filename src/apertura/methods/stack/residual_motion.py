@@ -242,7 +242,7 @@ _CUT = 4.0  # residuals of more than this many standard deviations have no weigh
 _ROUNDS = 25
 _MOST_CANDIDATES = 20_000
 _STEP_RAD = 0.8  # largest phase difference between candidates of the search, over the scene
-_SCALES = (0.1, 30.0)  # limits of the scale of the prior
+_SCALES = (0.5, 30.0)  # limits of the scale of the prior: errors of logs are rarely half of those stated
 _STABLE_WEIGHT = 0.25  # windows with a smaller weight are not stable
 
 
