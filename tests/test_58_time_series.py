@@ -23,7 +23,8 @@ from scipy.ndimage import gaussian_filter
 from apertura.campaign.folder import Campaign
 from apertura.common.errors import CampaignError
 from apertura.run.driver import run_workflow
-from apertura.simulation import preset, simulate
+from apertura.simulation import simulate
+from apertura.simulation.presets import revisit
 from apertura.tools.export_stack import DATE_FORMAT, dolphin_config, write_stack
 from apertura.tools.time_series import DolphinResult, write_time_series
 
@@ -58,9 +59,9 @@ def run_dolphin(folder):
 
 def run_mintpy(folder):
     """Run the steps of smallbaselineApp that the how-to names; return the displacements, (time, y, x) metres."""
-    program = interpreter("mintpy").parent / "smallbaselineApp.py"
+    program = [interpreter("mintpy").parent / "mintpy", "smallbaselineApp", "mintpy.cfg"]
     for steps in (["--start", "modify_network", "--end", "reference_point"], ["--start", "invert_network"]):
-        subprocess.run([program, "mintpy.cfg", *steps], cwd=folder / "mintpy", check=True, capture_output=True)
+        subprocess.run([*program, *steps], cwd=folder / "mintpy", check=True, capture_output=True)
     with h5py.File(folder / "mintpy/timeseries.h5") as file:
         return file["timeseries"][:]
 
@@ -164,7 +165,7 @@ def test_displacement_towards_the_sensor_is_positive_in_dolphin_and_mintpy(tmp_p
 
 def stacked(root, *, slope_mm):
     """Simulate five flights past a slope that moves towards the antennas, and form their stack."""
-    simulate(root, preset("revisit", slope_mm=slope_mm), seed=1)
+    simulate(root, revisit(slope_mm=slope_mm), seed=1)
     requested = {"reference": "f01", "flights": ["f02", "f03", "f04", "f05"], "pair": "uav1-uav1"}
     edit_config(root, lambda config: config.update(stack=requested, processing={"autofocus": "off"}))
     assert run_workflow(root, 2, "--until", "stack") == 0
