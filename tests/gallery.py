@@ -449,17 +449,17 @@ def time_series(folder: Path) -> Made | None:
     apertura("export", "stack", "campaign", "--out", "series")
     run_dolphin(folder / "series")
     moved_mm, spacing_m, areas = displacements(folder / "series")
-    figure, (left, right) = figure_of(1, 2, 3.4)
-    mesh = draw(left, moved_mm[-1], spacing_m, "displacement after 4 flights", cmap="RdBu", vmin=-15, vmax=15)
+    figure, (left, right) = figure_of(1, 2, 2.8)
+    mesh = draw(left, moved_mm[-1], spacing_m, "after 4 flights", cmap="RdBu", vmin=-15, vmax=15)
     figure.colorbar(mesh, ax=left).set_label("mm, towards the sensor")
     for name, mask in areas.items():
         median = [np.nanmedian(one[mask]) for one in moved_mm]
         deviation = [np.nanstd(one[mask]) for one in moved_mm]
-        right.errorbar(range(5), median, deviation, fmt="o", capsize=3, label=f"{name}, dolphin")
+        right.errorbar(range(5), median, deviation, fmt="o", capsize=3, label=name)
         right.plot(range(5), trues_mm(3.0)[name], "k--", lw=0.8)
     right.set(xlabel="flight", ylabel="displacement, mm", xticks=range(5), xticklabels=[f"f0{n}" for n in range(1, 6)])
-    right.set_title("median and scatter; dashed: simulated", fontsize="medium")
-    right.legend(frameon=False)
+    right.plot([], "k--", lw=0.8, label="simulated")
+    right.legend(frameon=False, fontsize="small", loc="upper left")
     return figure
 
 
