@@ -242,7 +242,7 @@ _CUT = 4.0  # residuals of more than this many standard deviations have no weigh
 _ROUNDS = 25
 _MOST_CANDIDATES = 20_000
 _STEP_RAD = 0.8  # largest phase difference between candidates of the search, over the scene
-_SCALES = (0.1, 30.0)  # limits of the scale of the prior
+_SCALES = (0.5, 30.0)  # limits of the scale of the prior: errors of logs are rarely half of those stated
 _STABLE_WEIGHT = 0.25  # windows with a smaller weight are not stable
 
 
@@ -256,8 +256,6 @@ class ResidualMotion:
         Phase that is equal at all places.
     unknowns
         (unknown,) float64, residual tracks in the unknowns of the prior.
-    covariance
-        (unknown, unknown) float64, covariance of their errors.
     scale
         Scale of the prior for which the phases are most probable: 1 if the logs are as accurate as stated.
     parameters
@@ -270,7 +268,6 @@ class ResidualMotion:
 
     constant_rad: float
     unknowns: Floats
-    covariance: Floats
     scale: float
     parameters: float
     residual_rad: Floats
@@ -335,7 +332,7 @@ def estimate_motion(phases: WindowPhases, design: Floats, constants: Floats, *, 
     residual = np.angle(np.exp(1j * (phase - model)))
     stable = weight * (scatter * std) ** 2 > _STABLE_WEIGHT
     constant = float(np.angle(np.exp(1j * solved[0])))
-    return ResidualMotion(constant, unknowns, covariance, scale, parameters, residual, stable)
+    return ResidualMotion(constant, unknowns, scale, parameters, residual, stable)
 
 
 def _searched(phases: WindowPhases, constants: Floats, radius_m: float) -> Floats:
