@@ -71,7 +71,9 @@ _COLUMNS = (
 
 _NODES = 1024  # lattice nodes processed at once
 _SPREAD_NODES, _DRAWS = 64, 24  # nodes and drawn tracks from which the likely variation over the aperture follows
-_SEARCH_SIGMAS = 3.0  # largest constant displacement of the search, in standard deviations of the logs
+# largest constant displacement of the search, in standard deviations of the logs, and in metres: beyond the latter,
+# resolution cells of both images do not overlap
+_SEARCH_SIGMAS, _MOST_RADIUS_M = 3.0, 1.0
 _MOST_AMBIGUITY_M = 1e6  # a height of ambiguity above this is not stated
 
 
@@ -218,7 +220,8 @@ def refer(
         failure = f"{len(phases)} windows of significant coherence, less than {LEAST_WINDOWS}"
     else:
         places_m, antennas = image.places(scene, phases.row, phases.column)
-        radius_m = min(_SEARCH_SIGMAS * max(max(*error.std_m, error.drift_std_m) for error in errors.values()), 1.0)
+        largest_m = max(max(*error.std_m, error.drift_std_m) for error in errors.values())
+        radius_m = min(_SEARCH_SIGMAS * largest_m, _MOST_RADIUS_M)
         constants = tracks.constant_phase(places_m, antennas)
         motion = estimate_motion(phases, tracks.phase(places_m, antennas), constants, radius_m=radius_m)
         # Phase at the nodes of the lattice, in blocks, and between them (eq. 4).
