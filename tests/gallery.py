@@ -439,6 +439,30 @@ def stack(folder: Path) -> Made:
     return figure
 
 
+def time_series(folder: Path) -> Made | None:
+    """Run dolphin on a stack; without dolphin, the picture is kept."""
+    from test_58_time_series import displacements, place, run_dolphin, stacked, trues_mm
+
+    if not place("dolphin").exists():
+        return None
+    stacked(folder / "campaign", slope_mm=3.0)
+    apertura("export", "stack", "campaign", "--out", "series")
+    run_dolphin(folder / "series")
+    moved_mm, spacing_m, areas = displacements(folder / "series")
+    figure, (left, right) = figure_of(1, 2, 2.8)
+    mesh = draw(left, moved_mm[-1], spacing_m, "after 4 flights", cmap="RdBu", vmin=-15, vmax=15)
+    figure.colorbar(mesh, ax=left).set_label("mm, towards the sensor")
+    for name, mask in areas.items():
+        median = [np.nanmedian(one[mask]) for one in moved_mm]
+        deviation = [np.nanstd(one[mask]) for one in moved_mm]
+        right.errorbar(range(5), median, deviation, fmt="o", capsize=3, label=name)
+        right.plot(range(5), trues_mm(3.0)[name], "k--", lw=0.8)
+    right.set(xlabel="flight", ylabel="displacement, mm", xticks=range(5), xticklabels=[f"f0{n}" for n in range(1, 6)])
+    right.plot([], "k--", lw=0.8, label="simulated")
+    right.legend(frameon=False, fontsize="small", loc="upper left")
+    return figure
+
+
 def verify(folder: Path) -> Made:
     from spoilt import flip
 
@@ -565,7 +589,7 @@ MAKERS: dict[str, Callable[[Path], Made | None]] = {
     for made in (
         bench, calibrate_radiometry, calibration_flight, catalog, cluster, dem, design, fmcw, gis, gpu, inspect,
         interferometry, long_flights, map_, me_or_the_radar, notebook, refine_tracks, report, run, samples, stack,
-        verify, xarray, your_own_recording, ci, sample, rail_pass, uav_flight, gotcha, px4_flight,
+        time_series, verify, xarray, your_own_recording, ci, sample, rail_pass, uav_flight, gotcha, px4_flight,
     )
 }  # fmt: skip
 """Picture → function that generates it, called in a separate empty folder."""

@@ -16,13 +16,17 @@ import numpy as np
 import pytest
 import rasterio
 import yaml
-from folders import ROOT
+from folders import ROOT, edit_config
 from rasterio.transform import from_origin
 from scipy.ndimage import gaussian_filter
 
+from apertura.campaign.folder import Campaign
 from apertura.common.errors import CampaignError
-from apertura.tools.export_stack import DATE_FORMAT, dolphin_config
-from apertura.tools.time_series import write_time_series
+from apertura.run.driver import run_workflow
+from apertura.simulation import simulate
+from apertura.simulation.presets import revisit
+from apertura.tools.export_stack import DATE_FORMAT, dolphin_config, write_stack
+from apertura.tools.time_series import DolphinResult, write_time_series
 
 PINNED = {"dolphin": "0.42.9", "mintpy": "1.6.4"}
 WAVELENGTH_M, SPACING_M, STRIDE, SHAPE = 0.031, 0.25, 3, (240, 300)
@@ -31,10 +35,14 @@ MOVES_M = {"stable": 0.0, "slow": 1e-3, "fast": 3e-3}
 """Ground → motion towards the sensor from flight to flight."""
 
 
+def place(program):
+    """Return the path of the interpreter in which a program may be installed."""
+    return Path(os.environ.get(f"APERTURA_{program.upper()}", ROOT / f"build/{program}/bin/python"))
+
+
 def interpreter(program):
     """Return the interpreter in which a program of the pinned version is installed; skip without it."""
-    default = ROOT / f"build/{program}/bin/python"
-    path = Path(os.environ.get(f"APERTURA_{program.upper()}", default))
+    path = place(program)
     if not path.exists():
         pytest.skip(f"{program} is not installed: APERTURA_{program.upper()} or build/{program}")
     asked = f"from importlib.metadata import version; print(version('{program}'))"
@@ -51,9 +59,9 @@ def run_dolphin(folder):
 
 def run_mintpy(folder):
     """Run the steps of smallbaselineApp that the how-to names; return the displacements, (time, y, x) metres."""
-    program = interpreter("mintpy").parent / "smallbaselineApp.py"
+    program = [interpreter("mintpy").parent / "mintpy", "smallbaselineApp", "mintpy.cfg"]
     for steps in (["--start", "modify_network", "--end", "reference_point"], ["--start", "invert_network"]):
-        subprocess.run([program, "mintpy.cfg", *steps], cwd=folder / "mintpy", check=True, capture_output=True)
+        subprocess.run([*program, *steps], cwd=folder / "mintpy", check=True, capture_output=True)
     with h5py.File(folder / "mintpy/timeseries.h5") as file:
         return file["timeseries"][:]
 
@@ -150,6 +158,49 @@ def test_displacement_towards_the_sensor_is_positive_in_dolphin_and_mintpy(tmp_p
     known = by_mintpy[4] != 0
     assert known.mean() > 0.9
     assert np.abs(by_mintpy[4] - found[4])[known].max() < 1e-4
+
+
+# ---- Campaign of five flights: from raw samples to displacements ----------------------------------------------------
+
+
+def stacked(root, *, slope_mm):
+    """Simulate five flights past a slope that moves towards the antennas, and form their stack."""
+    simulate(root, revisit(slope_mm=slope_mm), seed=1)
+    requested = {"reference": "f01", "flights": ["f02", "f03", "f04", "f05"], "pair": "uav1-uav1"}
+    edit_config(root, lambda config: config.update(stack=requested, processing={"autofocus": "off"}))
+    assert run_workflow(root, 2, "--until", "stack") == 0
+
+
+def displacements(folder):
+    """Return displacements (time, y, x) in mm, the spacing in m, and masks of the slope and of stable ground."""
+    result = DolphinResult.open(folder)
+    moved_mm, transform = 1e3 * result.displacement_m, result.profile["transform"]
+    rows, columns = np.mgrid[: moved_mm.shape[1], : moved_mm.shape[2]]
+    east, north = transform.a * (columns + 0.5) - 11, 11 - transform.a * (rows + 0.5)  # scene of 22 m x 22 m
+    areas = {
+        "slope": (np.abs(east - 5) < 1.6) & (np.abs(north - 4) < 1.6),
+        "stable ground": ((np.abs(east - 5) > 3.5) | (np.abs(north - 4) > 3.5)) & (north > -3),  # targets change south
+    }
+    return moved_mm, transform.a, areas
+
+
+def trues_mm(slope_mm):
+    """Return the simulated displacements of both areas."""
+    return {"slope": slope_mm * np.arange(5), "stable ground": np.zeros(5)}
+
+
+@pytest.mark.slow
+def test_dolphin_measures_the_motion_of_a_simulated_slope(tmp_path):
+    """Tracks 0.1 m apart, logs with errors of 1 cm: 3 mm a flight, relative to stable ground, within 2 mm."""
+    interpreter("dolphin")
+    stacked(tmp_path / "campaign", slope_mm=3.0)
+    write_stack(Campaign.load(tmp_path / "campaign"), tmp_path / "series")
+    run_dolphin(tmp_path / "series")
+    moved_mm, _, areas = displacements(tmp_path / "series")
+    median = {name: np.nanmedian(moved_mm[:, mask], axis=1) for name, mask in areas.items()}
+    relative = median["slope"] - median["stable ground"]
+    assert np.abs(relative - trues_mm(3.0)["slope"]).max() < 2.0
+    assert np.nanstd(moved_mm[:, areas["stable ground"]], axis=1).max() < 2.0
 
 
 def write_dolphin_result(folder, names, *, moves_mm, coherence):

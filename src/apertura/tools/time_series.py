@@ -31,8 +31,8 @@ POINTS = "displacement.geojson"
 _EXPECTED = {"expected": "a result of dolphin", "remedy": "Run `dolphin run dolphin_config.yaml` in the folder."}
 
 _MINTPY_CONFIG = """\
-# Run in this folder: smallbaselineApp.py mintpy.cfg --start modify_network --end reference_point
-# and then: smallbaselineApp.py mintpy.cfg --start invert_network
+# Run in this folder: mintpy smallbaselineApp mintpy.cfg --start modify_network --end reference_point
+# and then: mintpy smallbaselineApp mintpy.cfg --start invert_network
 mintpy.compute.cluster = none
 mintpy.reference.yx = {row},{column}
 mintpy.networkInversion.weightFunc = no
