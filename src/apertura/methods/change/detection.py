@@ -33,8 +33,8 @@ POINT_LOOKS = 2.0
 POINT_GAIN_STD_DB = 0.5
 """Standard deviation of the gain of a point between two flights: focus and aspect angle differ."""
 
-LEAST_SCENE_RATIO = 0.9
-"""Smallest ratio of measured and expected coherence of a scene that is attributed to the expectation's accuracy."""
+MOST_SCENE_LOSS = 0.1
+"""Largest loss of coherence common to a scene that is attributed to the accuracy of the expected coherence."""
 
 _SURROUNDINGS = 5  # windows along a side of the surroundings in which a lower coherence is recognised
 _SIGNIFICANT = 3.0  # standard deviations by which the coherence of the surroundings is lower than expected
@@ -183,17 +183,17 @@ def detect_changes(
     loss = explained - unbiased(estimate.astype(np.float32), looks)
     level = float(np.median(unchanged))
 
-    def plane(values: Floats, dtype: type = np.float32) -> NDArray[np.floating]:
-        filled = np.full(first.shape, np.nan, dtype)
+    def plane(values: Floats) -> Floats:
+        filled = np.full(first.shape, np.nan)
         filled.ravel()[at] = values
         return filled
 
     return Changes(
         classes=classes,
-        ratio_db=plane(10 / np.log(10) * log_ratio),
-        coherence=plane(estimate),
-        coherence_loss=plane(loss),
-        probability=plane(probability, np.float64),
+        ratio_db=plane(10 / np.log(10) * log_ratio).astype(np.float32),
+        coherence=plane(estimate).astype(np.float32),
+        coherence_loss=plane(loss).astype(np.float32),
+        probability=plane(probability),
         looks=looks,
         matched=matched,
         samples=int(np.searchsorted(np.cumsum(np.sort(modes)[::-1]), _POWER)) + 1,
@@ -264,7 +264,7 @@ def change_flags(changes: Changes) -> Flags:
             f"coherence {changes.expected:.2f} expected for unchanged terrain: only estimates below "
             f"{changes.least_detected:.2f} are significant, and other scatterers have {independent:.2f} on average"
         )
-    if changes.scene_ratio < LEAST_SCENE_RATIO:
+    if changes.expected * (1 / max(changes.scene_ratio, 1e-3) - 1) > MOST_SCENE_LOSS:
         flags["change_decorrelated"] = (
             f"coherence of the scene is {changes.scene_ratio:.2f} times the expected coherence; changes are reported "
             "relative to this level"
