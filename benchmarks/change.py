@@ -54,8 +54,11 @@ def track(offset_m, generator, error_m):
     return logged, logged + error_m * np.sqrt(0.5) * (constant + slow)
 
 
-def image(points, logged, true):
-    """Backproject the echoes of points: S(f) = Σ a exp(-j4πfR/c), range profiles, then Σ p(R) exp(j4πf₀R/c)."""
+def image(points, logged, true, noise=None):
+    """Backproject the echoes of points: S(f) = Σ a exp(-j4πfR/c), range profiles, then Σ p(R) exp(j4πf₀R/c).
+
+    With a generator `noise`, the echoes are white noise instead.
+    """
     step = FREQUENCY_HZ[1] - FREQUENCY_HZ[0]
     at = np.arange(-HALF_M + SPACING_M / 2, HALF_M, SPACING_M)
     x, y = np.meshgrid(at, at[::-1])
@@ -70,6 +73,8 @@ def image(points, logged, true):
         for number in range(len(FREQUENCY_HZ)):
             echo[number] = value.sum()
             value *= factor
+        if noise is not None:
+            echo = noise.normal(size=len(echo)) + 1j * noise.normal(size=len(echo))
         padded = np.zeros(count, np.complex128)
         padded[: len(echo)] = WEIGHTS * echo
         profile = np.fft.ifft(padded) * count
@@ -80,14 +85,6 @@ def image(points, logged, true):
         between = profile[low % count] * (1 - share) + profile[(low + 1) % count] * share
         total += between * np.exp(4j * np.pi * FREQUENCY_HZ[0] * rho / C_M_S)
     return total / PULSES
-
-
-def noise_like(shape, generator, clean):
-    """Return band-limited noise at `SNR` below the mean power of the image, by randomising the image's spectrum."""
-    spectrum = np.abs(np.fft.fft2(clean))
-    white = np.fft.fft2(generator.normal(size=shape) + 1j * generator.normal(size=shape))
-    smooth = np.fft.ifft2(white / np.abs(white) * spectrum * np.sqrt(generator.exponential(size=shape)))
-    return smooth * np.sqrt((np.abs(clean) ** 2).mean() / SNR / (np.abs(smooth) ** 2).mean())
 
 
 def aligned(second, first):
@@ -158,7 +155,9 @@ def scene(seed, offset_m, level_db=None, error_m=ERROR_M):
         sight = logged / np.linalg.norm(logged, axis=1, keepdims=True)
         error_rad = 4 * np.pi * FREQUENCY_HZ.mean() / C_M_S * ((true - logged) * sight).sum(axis=1) - error_rad
         formed = image(sum(points, ground), logged, true)
-        flights.append(formed + noise_like(formed.shape, generator, formed))
+        noise = image(Points(np.zeros((0, 2)), np.zeros(0, complex)), logged, logged, generator)
+        ratio = (np.abs(noise) ** 2).mean() / np.median(np.abs(formed) ** 2) * np.log(2)
+        flights.append(formed + noise / np.sqrt(SNR * ratio))
     flights[1] = aligned(flights[1], flights[0])
     # coherence that remains with the variation of the position errors over the aperture, at the scene centre
     motion = np.abs(np.exp(1j * error_rad).mean())

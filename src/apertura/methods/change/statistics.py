@@ -216,6 +216,17 @@ class CoherenceDistribution:
         far = table[row + 1, column] * (1 - right) + table[row + 1, column + 1] * right
         return np.asarray(np.exp(near * (1 - down) + far * down))
 
+    def median(self, coherence: Floats) -> Floats:
+        """Return the median of the inverse hyperbolic tangent of the estimate at a true `coherence`, (...) float64.
+
+        Examples
+        --------
+        >>> CoherenceDistribution(16.0).median(np.array([0.0, 0.9])).round(2), round(float(np.arctanh(0.9)), 2)
+        (array([0.21, 1.5 ]), 1.47)
+        """
+        medians = [np.interp(np.log(0.5), row, _ESTIMATES) for row in _log_probabilities(self.looks)]
+        return np.interp(np.arctanh(np.clip(coherence, 0, MOST_COHERENCE)), _COHERENCES, medians)
+
     def quantile(self, rate: float, coherence: float) -> float:
         """Return the estimate that is not exceeded with the probability `rate` at a true `coherence`.
 
