@@ -169,6 +169,7 @@ rule map:
         fused=each("results/{flight}/fused/export.manifest.json"),
         coverage="results/coverage.manifest.json",
         scene="results/scene.manifest.json",
+        change=each("results/stack/{flight}/change.manifest.json"),
         truth=files(inputs.truth),
     output:
         "results/map/map.json",

@@ -109,6 +109,7 @@ rule page:
         export=each("results/{flight}/{pair}/export.manifest.json"),
         fused=each("results/{flight}/fused/export.manifest.json"),
         scene="results/scene.manifest.json",
+        changes=files(inputs.changes),
     output:
         report(
             "results/{flight}/report.html",

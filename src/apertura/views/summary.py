@@ -80,7 +80,7 @@ def print_summary(campaign: Campaign) -> None:
             f"not in the error budget, because their uncertainty is not configured: {', '.join(not_stated)}; see "
             "image.json"
         )
-    between = {**dict(_interferograms(campaign)), **dict(_stacked(campaign))}
+    between = {**dict(_interferograms(campaign)), **dict(_stacked(campaign)), **dict(_changes(campaign))}
     for name, report in between.items():
         console.print(f"{name.replace(INTERFEROMETRY, 'interferogram', 1)}: {report['says']}", soft_wrap=True)
     _print_flags(console, {**reports, **between})
@@ -124,6 +124,8 @@ def print_products(campaign: Campaign) -> None:
         for flight in flights[:_MOST_FLIGHTS]
     ]
     folders += [("interferogram", INTERFEROMETRY, name) for name in campaign.settings.interferometry.pairs]
+    if stack := campaign.settings.stack:
+        folders += [("change", STACK, name) for name in stack.flights[:_MOST_FLIGHTS]]
     for kind, *folder in folders:
         for row in sorted(exports_in(kind), key=lambda row: row.pictured):  # rasters first
             path = campaign.result(*folder, row.file)
@@ -163,6 +165,18 @@ def _stacked(campaign: Campaign) -> Iterator[tuple[str, dict[str, Any]]]:
                     )
                 entry = {"says": shown(says, 400), "flags": printable(report["flags"])}
             yield f"{STACK} {flight}", entry
+
+
+def _changes(campaign: Campaign) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield name and summary of the changes of each flight of the stack for which they are up to date."""
+    stack = campaign.settings.stack
+    for flight in stack.flights if stack else ():
+        path = campaign.result(STACK, flight, "change.json")
+        if campaign.is_current(campaign.result(STACK, flight, "change")):
+            report = open_listed(path, path.with_name("change.manifest.json"))
+            with undamaged(path, expected="the changes of a flight", remedy="Run the workflow again."):
+                entry = {"says": shown(report["says"], 400), "flags": printable(report["flags"])}
+            yield f"changes {flight}", entry
 
 
 def _abbreviated(names: Sequence[str], most: int = 3) -> str:

@@ -125,6 +125,12 @@ def stacked_pairs(campaign: "Campaign", flight: str) -> list[tuple[str, str]]:
     return [(name, stack.pair) for name in dict.fromkeys((stack.reference, flight))]
 
 
+def changes(scope: JobScope) -> Iterable[str]:
+    """Return the manifest of the changes of a flight, if it is compared with the reference flight of the stack."""
+    stack = scope.campaign.settings.stack
+    return [scope.campaign.manifest("change", *scope.where)] if stack and scope.where[0] in stack.flights else []
+
+
 def has_reference(scope: JobScope) -> bool:
     """Return True for a flight of the stack other than the reference."""
     stack = scope.campaign.settings.stack

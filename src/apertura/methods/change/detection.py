@@ -33,12 +33,15 @@ POINT_LOOKS = 2.0
 POINT_GAIN_STD_DB = 0.5
 """Standard deviation of the gain of a point between two flights: focus and aspect angle differ."""
 
-LEAST_SCENE_RATIO = 0.9
-"""Smallest ratio of measured and expected coherence of a scene that is attributed to the expectation's accuracy."""
+MOST_SCENE_LOSS = 0.1
+"""Largest loss of coherence common to a scene that is attributed to the accuracy of the expected coherence."""
 
 _SURROUNDINGS = 5  # windows along a side of the surroundings in which a lower coherence is recognised
 _SIGNIFICANT = 3.0  # standard deviations by which the coherence of the surroundings is lower than expected
 _STABLE = 0.75  # quantile at which measured and expected coherence are compared; most of the scene may be changed
+_LEAST_WINDOWS = 30  # windows side by side from which the coherence of unchanged terrain varies over the scene
+_OUTLIER = 2.5  # standard deviations beyond which a pixel does not determine the coherence of unchanged terrain
+_FITS = 8  # fits of that coherence
 _POWER = 0.99  # share of the power in the modes that are counted as independent samples
 _SAMPLES = 100_000  # pixels from which the coherence ratio of the scene is estimated
 
@@ -156,8 +159,7 @@ def detect_changes(
     log_ratio -= gain
     # Coherence of unchanged terrain (eq. 5), and that of decorrelated surroundings for the ratio (eq. 3).
     distribution = CoherenceDistribution(round(matched, 2))
-    scene_ratio = _scene_ratio(modes, estimate, explained)
-    unchanged = np.clip(scene_ratio * explained, 0, MOST_COHERENCE)
+    unchanged = _unchanged_coherence(modes, estimate, explained, np.argwhere(valid), valid.sum() / window**2)
     surrounding = _surroundings(magnitude, valid, window, looks).ravel()[at]
     deviation = 2 * unchanged * (1 - unchanged**2) / np.sqrt(2 * looks * _SURROUNDINGS**2)
     is_lower = surrounding < unchanged**2 - _SIGNIFICANT * deviation
@@ -183,22 +185,22 @@ def detect_changes(
     loss = explained - unbiased(estimate.astype(np.float32), looks)
     level = float(np.median(unchanged))
 
-    def plane(values: Floats, dtype: type = np.float32) -> NDArray[np.floating]:
-        filled = np.full(first.shape, np.nan, dtype)
+    def plane(values: Floats) -> Floats:
+        filled = np.full(first.shape, np.nan)
         filled.ravel()[at] = values
         return filled
 
     return Changes(
         classes=classes,
-        ratio_db=plane(10 / np.log(10) * log_ratio),
-        coherence=plane(estimate),
-        coherence_loss=plane(loss),
-        probability=plane(probability, np.float64),
+        ratio_db=plane(10 / np.log(10) * log_ratio).astype(np.float32),
+        coherence=plane(estimate).astype(np.float32),
+        coherence_loss=plane(loss).astype(np.float32),
+        probability=plane(probability),
         looks=looks,
         matched=matched,
         samples=int(np.searchsorted(np.cumsum(np.sort(modes)[::-1]), _POWER)) + 1,
         gain_db=10 / np.log(10) * gain,
-        scene_ratio=scene_ratio,
+        scene_ratio=float(np.median(unchanged / np.maximum(explained, 1e-3))),
         expected=level,
         least_detected=distribution.quantile(rate / 2, level),
     )
@@ -211,16 +213,46 @@ def _no_changes(shape: tuple[int, ...], looks: float) -> Changes:
     return Changes(none, empty, empty, empty, empty.astype(np.float64), looks, looks, 1, 0.0, 1.0, 0.0, 0.0)
 
 
-def _scene_ratio(modes: Floats, estimate: Floats, explained: Floats) -> float:
-    """Return the factor of the expected coherence at which a quantile of the scene equals its probability, eq. 5."""
-    distribution = CoherenceDistribution(round(min(matched_looks(modes, 2 * (1 - _STABLE)), MOST_LOOKS), 2))
-    step = max(1, len(estimate) // _SAMPLES)
+def _unchanged_coherence(
+    modes: Floats, estimate: Floats, explained: Floats, places: NDArray[np.int64], windows: float
+) -> Floats:
+    """Return the coherence of unchanged terrain, docs/theory/change.md, eq. 5.
+
+    Parameters
+    ----------
+    modes
+        As from `window_modes`.
+    estimate, explained
+        (pixel,) float64, estimated and expected coherence.
+    places
+        (pixel, 2) int64, rows and columns.
+    windows
+        Number of windows side by side.
+    """
+    looks = min(matched_looks(modes, 2 * (1 - _STABLE)), MOST_LOOKS)
+    distribution = CoherenceDistribution(round(looks, 2))
+    some = np.s_[:: max(1, len(estimate) // _SAMPLES)]
+    # Ratio common to the scene: a quantile of the estimates equals its probability.
     low, high = 0.0, 1.0 / max(float(np.median(explained)), 1e-3)
     for _ in range(20):
-        middle = (low + high) / 2
-        probability = distribution.probability(estimate[::step], np.clip(middle * explained[::step], 0, MOST_COHERENCE))
-        low, high = (middle, high) if np.quantile(probability, _STABLE) > _STABLE else (low, middle)
-    return middle
+        ratio = (low + high) / 2
+        probability = distribution.probability(estimate[some], np.clip(ratio * explained[some], 0, MOST_COHERENCE))
+        low, high = (ratio, high) if np.quantile(probability, _STABLE) > _STABLE else (low, ratio)
+    level = np.arctanh(np.clip(ratio * explained, 0, MOST_COHERENCE))
+    # Variation over the scene: quadratic polynomial of the pixels that agree with it.
+    centre, span = places.mean(axis=0), np.maximum(np.ptp(places, axis=0) / 2, 1)
+    north, east = ((places - centre) / span).T
+    powers = [(0, 0), (0, 1), (1, 0), (1, 1), (0, 2), (2, 0)][: 6 if windows > _LEAST_WINDOWS else 1]
+    terms = np.stack([north**i * east**j for i, j in powers], -1)
+    factors = np.zeros(len(powers))
+    found = np.arctanh(np.clip(estimate[some], 0, 1 - 1e-6))
+    for _ in range(_FITS):
+        residual = found - distribution.median(np.tanh(level[some] + terms[some] @ factors))
+        kept = np.abs(residual) < _OUTLIER / np.sqrt(2 * looks)
+        if kept.sum() < len(powers):
+            break
+        factors += np.linalg.lstsq(terms[some][kept], residual[kept], rcond=None)[0]
+    return np.asarray(np.clip(np.tanh(level + terms @ factors), 0, MOST_COHERENCE))
 
 
 def _surroundings(magnitude: NDArray[np.float32], valid: Bools, window: int, looks: float) -> Floats:
@@ -264,7 +296,7 @@ def change_flags(changes: Changes) -> Flags:
             f"coherence {changes.expected:.2f} expected for unchanged terrain: only estimates below "
             f"{changes.least_detected:.2f} are significant, and other scatterers have {independent:.2f} on average"
         )
-    if changes.scene_ratio < LEAST_SCENE_RATIO:
+    if changes.expected * (1 / max(changes.scene_ratio, 1e-3) - 1) > MOST_SCENE_LOSS:
         flags["change_decorrelated"] = (
             f"coherence of the scene is {changes.scene_ratio:.2f} times the expected coherence; changes are reported "
             "relative to this level"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Floats
 
 _SIDE = 21  # samples along a side of the window whose correlation matrix is decomposed, docs/theory/change.md, eq. 1
-_CROP = 1024  # pixels along a side of the part of the image in which the correlation is measured
+_CROP = 256  # smallest side of the part of the image in which the correlation is measured, pixels
 _LEAST_MODE = 1e-6  # modes below this fraction of the largest one are rounding errors
 _LOG_RATIOS = (1e-3, 9.0)  # range of the logarithm of the ratio in which the looks are matched
 _LOOKS = (1.01, 1e5)  # range of the matched looks
@@ -52,22 +52,48 @@ def window_modes(image: NDArray[np.complex64], window: int) -> Floats:
     >>> generator = np.random.default_rng(0)
     >>> noise = (generator.normal(size=(512, 512)) + 1j * generator.normal(size=(512, 512))).astype(np.complex64)
     >>> modes = window_modes(noise, 3)
-    >>> len(modes), round(1 / (modes**2).sum(), 1)
+    >>> len(modes), round(1 / float((modes**2).sum()), 1)
     (9, 9.0)
     """
-    rows, columns = (slice(max(0, (size - _CROP) // 2), (size + _CROP) // 2) for size in image.shape)
+    side = max(_CROP, 4 * window)
+    rows, columns = (slice(max(0, (size - side) // 2), max(0, (size - side) // 2) + side) for size in image.shape)
     part = np.nan_to_num(image[rows, columns].astype(np.complex128))
-    padded = [scipy.fft.next_fast_len(size + window) for size in part.shape]
-    spectrum = scipy.fft.fft2(part, padded)
-    correlation = scipy.fft.ifft2(spectrum.real**2 + spectrum.imag**2)
-    if not correlation[0, 0].real > 0:
+    # Points have no more weight than terrain.
+    power = scipy.ndimage.uniform_filter(np.abs(part) ** 2, 3 * window, mode="constant")
+    part = np.where(power > 0, part / np.sqrt(np.where(power > 0, power, 1)), 0)
+    step = -(-window // _SIDE)
+    carrier = [np.angle(_smooth(_lagged(part, *lag), 2 * window)) for lag in ((1, 0), (0, 1))]
+    lags = [(row, column) for row in range(0, window, step) for column in range(step - window, window, step)]
+    found = {}
+    for row, column in lags:
+        # Phase of the local carrier over the lag; without it, the carriers of distant pixels would cancel.
+        turned = _lagged(part, row, column) * np.exp(-1j * (row * carrier[0] + column * carrier[1]))
+        found[row, column] = turned.mean().real * part.size / ((part.shape[0] - row) * (part.shape[1] - abs(column)))
+    if not found[0, 0] > 0:
         return np.ones(1)
-    pixels = np.arange(0, window, -(-window // _SIDE))
+    pixels = np.arange(0, window, step)
     row, column = (axis.ravel() for axis in np.meshgrid(pixels, pixels, indexing="ij"))
-    matrix = correlation[row[:, None] - row, column[:, None] - column]
-    modes = np.linalg.eigvalsh(matrix)
+    plane = np.zeros((2 * window, 2 * window))  # correlation of lag (i, j) at [i, j], negative lags from the end
+    for (i, j), value in found.items():
+        plane[i, j] = plane[-i, -j] = value
+    modes = np.linalg.eigvalsh(plane[row[:, None] - row, column[:, None] - column])
     modes = modes[modes > _LEAST_MODE * modes.max()]
     return np.asarray(modes / modes.sum())
+
+
+def _lagged(image: NDArray[np.complex128], row: int, column: int) -> NDArray[np.complex128]:
+    """Return the product of the image displaced by half a lag and its conjugate displaced back, 0 beyond the edges."""
+    product = np.zeros_like(image)
+    high, wide = image.shape[0] - row, image.shape[1] - abs(column)
+    ahead = image[row:, max(column, 0) : max(column, 0) + wide]
+    behind = image[:high, max(-column, 0) : max(-column, 0) + wide]
+    product[row // 2 : row // 2 + high, abs(column) // 2 : abs(column) // 2 + wide] = ahead * behind.conj()
+    return product
+
+
+def _smooth(values: NDArray[np.complex128], side: int) -> NDArray[np.complex128]:
+    parts = (scipy.ndimage.uniform_filter(part, side, mode="constant") for part in (values.real, values.imag))
+    return np.asarray(next(parts) + 1j * next(parts))
 
 
 def matched_looks(modes: Floats, rate: float) -> float:
@@ -91,7 +117,7 @@ def matched_looks(modes: Floats, rate: float) -> float:
     >>> round(matched_looks(np.full(9, 1 / 9), 1e-3), 1)
     9.0
     >>> modes = np.repeat([0.2, 0.01], [4, 20])
-    >>> round(matched_looks(modes, 1e-3), 1), round(1 / (modes**2).sum(), 1)
+    >>> round(matched_looks(modes, 1e-3), 1), round(1 / float((modes**2).sum()), 1)
     (7.5, 6.2)
     """
     low, high = _LOG_RATIOS
@@ -189,6 +215,17 @@ class CoherenceDistribution:
         near = table[row, column] * (1 - right) + table[row, column + 1] * right
         far = table[row + 1, column] * (1 - right) + table[row + 1, column + 1] * right
         return np.asarray(np.exp(near * (1 - down) + far * down))
+
+    def median(self, coherence: Floats) -> Floats:
+        """Return the median of the inverse hyperbolic tangent of the estimate at a true `coherence`, (...) float64.
+
+        Examples
+        --------
+        >>> CoherenceDistribution(16.0).median(np.array([0.0, 0.9])).round(2), round(float(np.arctanh(0.9)), 2)
+        (array([0.21, 1.5 ]), 1.47)
+        """
+        medians = [np.interp(np.log(0.5), row, _ESTIMATES) for row in _log_probabilities(self.looks)]
+        return np.interp(np.arctanh(np.clip(coherence, 0, MOST_COHERENCE)), _COHERENCES, medians)
 
     def quantile(self, rate: float, coherence: float) -> float:
         """Return the estimate that is not exceeded with the probability `rate` at a true `coherence`.

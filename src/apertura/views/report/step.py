@@ -9,7 +9,7 @@ from typing import Any
 
 from apertura.campaign.config import FUSED
 from apertura.campaign.folder import Campaign
-from apertura.campaign.store import check_listed, record_files
+from apertura.campaign.store import check_listed, open_listed, record_files
 from apertura.common.atomic import replacement, write_text
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.paths import shipped
@@ -33,6 +33,7 @@ from apertura.views.report import PAGE, PICTURES, SUM_PICTURES
 from apertura.views.report.page import Block, Heading, Paragraph, Picture, Table, rst_table, rst_text
 from apertura.views.report.page import page as page_of
 from apertura.workflow.lineage import result_of
+from apertura.workflow.rules import STACK
 
 SETTING_COLUMNS = ("key", "value")
 """Header of the settings table."""
@@ -64,6 +65,13 @@ def _blocks(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, 
     for pair in campaign.flight(flight).pairs:
         yield from _pair_blocks(campaign, flight, pair, reports[pair])
     raised = flag_rows(reports)
+    if campaign.settings.stack and flight in campaign.settings.stack.flights:
+        folder = campaign.result(STACK, flight)
+        report = open_listed(folder / "change.json", folder / "change.manifest.json")
+        yield Heading(2, f"Changes relative to flight {report['reference']}")
+        yield Paragraph(f"{report['says']}.")
+        yield from _pictures(folder, {"change.png": "change"})
+        raised += flag_rows({"changes": report})
     yield Heading(2, "Flags")
     if raised:
         yield Table("Flags raised, with meaning and advice.", FLAGGED, raised)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, quote, unquote, urlsplit
@@ -23,6 +23,7 @@ from apertura.formats.export import COVERAGE, MAP, Export, exports_in
 from apertura.stages.scene import settled_scene
 from apertura.views.quality import ImageValues, explained_flags, read_report
 from apertura.workflow.lineage import result_of
+from apertura.workflow.rules import STACK
 
 FORMAT = 2
 """Format version of `map.json`; the page rejects other versions."""
@@ -48,6 +49,8 @@ class Layer:
         Quantity and unit of the values.
     low, high
         Values at the ends of the colour scale, in `unit`.
+    folder
+        Folder of the file relative to the results; empty for the folder of the image.
     """
 
     file: str
@@ -57,6 +60,7 @@ class Layer:
     unit: str
     low: float
     high: float
+    folder: str = ""
 
 
 @dataclass(frozen=True)
@@ -110,7 +114,8 @@ def image_entry(
         "acquired": times,
         "licence": tags.get("TIFFTAG_COPYRIGHT"),
         "layers": [
-            {**asdict(layer), "url": url_of(f"{flight}/{image}/{layer.file}", layer.sha256)} for layer in layers
+            {**asdict(layer), "url": url_of(f"{layer.folder or f'{flight}/{image}'}/{layer.file}", layer.sha256)}
+            for layer in layers
         ],
     }
 
@@ -290,7 +295,7 @@ def _layers(campaign: Campaign, flight: str, image: str, report: Mapping[str, An
     """Return the displayed layers of an image: real-valued rasters, in linear units only if there is no dB version."""
     of_pairs = [("export", "pair"), ("layers", "layers"), ("layers", "radiometry")]
     kinds = [("export", "fused")] if image == FUSED else of_pairs
-    return [
+    layers = [
         layer
         for result, kind in kinds
         for row in exports_in(kind)
@@ -298,6 +303,13 @@ def _layers(campaign: Campaign, flight: str, image: str, report: Mapping[str, An
         and (kind != "radiometry" or row.source in campaign.coefficients)
         and (layer := _layer(campaign.root / campaign.manifest(result, flight, image), row, report)) is not None
     ]
+    stack = campaign.settings.stack
+    if stack and flight in stack.flights and image == stack.pair:
+        manifest = campaign.root / campaign.manifest("change", flight)
+        rows = [row for row in exports_in("change") if row.file.endswith(".tif")]
+        changes = [layer for row in rows if (layer := _layer(manifest, row, report)) is not None]
+        layers += [replace(layer, folder=f"{STACK}/{flight}") for layer in changes]
+    return layers
 
 
 def _layer(manifest: Path, row: Export, report: Mapping[str, Any]) -> Layer | None:
