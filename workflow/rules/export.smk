@@ -170,6 +170,7 @@ rule map:
         fused=each("results/{flight}/fused/export.manifest.json"),
         coverage="results/coverage.manifest.json",
         scene="results/scene.manifest.json",
+        interferogram=each("results/interferometry/{two}/interferogram.manifest.json"),
         truth=files(inputs.truth),
     output:
         "results/map/map.json",

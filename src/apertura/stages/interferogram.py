@@ -28,7 +28,14 @@ from apertura.methods.interferometry.comparison import (
     interferogram_flags,
 )
 from apertura.methods.interferometry.heights import KnownHeight, Level
-from apertura.methods.interferometry.sensitivity import FlownAntenna, Legs, Sensitivity, TrackPhase, sensitivity
+from apertura.methods.interferometry.sensitivity import (
+    FlownAntenna,
+    Legs,
+    Sensitivity,
+    TrackPhase,
+    perpendicular_baseline,
+    sensitivity,
+)
 from apertura.stages.agreement import opened_layer
 from apertura.stages.image_tags import acquisition_tags
 from apertura.stages.pair import OpenPair, open_pair
@@ -55,11 +62,14 @@ class TwoImages:
         Stages of both images.
     ground
         Assumed terrain, per pixel of the grid.
+    baseline_m
+        Perpendicular baseline at the scene centre.
     """
 
     names: tuple[str, str]
     images: tuple[xr.Dataset, xr.Dataset]
     ground: AssumedGround
+    baseline_m: float
 
 
 def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
@@ -123,7 +133,10 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
     points = [point.model_dump() for point in campaign.settings.scene.reference_points]
     heights = (_known_height(point, scene, ground) for point in points)
     ground = replace(ground, known=[height for height in heights if height is not None])
-    return TwoImages((first, second), (stages[0], stages[1]), ground)
+    middle = len(nodes_m) // 2 + lattice.shape[1] // 2 * (lattice.shape[0] % 2 == 0)
+    at_middle = [(tx[middle], rx[middle]) for tx, rx in legs]
+    baseline_m = perpendicular_baseline(nodes_m[middle], scene.axes, *at_middle)
+    return TwoImages((first, second), (stages[0], stages[1]), ground, baseline_m)
 
 
 def _antennas(
@@ -305,6 +318,7 @@ def _report(formed: Interferogram, two: TwoImages) -> dict[str, Any]:
     }
     return {
         "images": list(two.names),
+        "perpendicular_baseline_m": round(two.baseline_m, 4),
         "flags_of_images": {name: flags for name, flags in flagged.items() if flags},
         "measured": measured,
         "level": None if formed.level is None else {**asdict(formed.level), "says": _level_line(formed.level)},
