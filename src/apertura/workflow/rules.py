@@ -533,7 +533,7 @@ _ROWS = (
         exports="interferogram",
         manifest=f"{INTERFEROMETRY}/{{two}}/interferogram",
         arguments=("name",),
-        demand=Demand(600, pulse_bytes=1000, pixel_bytes=700, pixel_s=60),
+        demand=Demand(600, pulse_bytes=1000, pixel_bytes=200, pixel_s=60),
         cost=Cost(1.0, mpx_s=20.0, last=True),
     ),
     Rule(

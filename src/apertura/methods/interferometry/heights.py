@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +45,7 @@ class Unwrapped:
     jumps: int
 
 
-def unwrap(phase: NDArray[np.float32], coherence: NDArray[np.float32], *, looks: float) -> Unwrapped:
+def unwrap(phase: NDArray[np.float32], coherence: NDArray[np.float32], *, looks: float, cell_px: int = 1) -> Unwrapped:
     """Unwrap the phase by snaphu if it is installed; otherwise return the wrapped phase.
 
     Parameters
@@ -55,6 +56,9 @@ def unwrap(phase: NDArray[np.float32], coherence: NDArray[np.float32], *, looks:
         (y, x) float32, 0 to 1.
     looks
         Independent samples averaged for a phase.
+    cell_px
+        Side of the cells whose mean phases are unwrapped, pixels; the phase must change by less than half a cycle per
+        cell. Memory and time of snaphu are proportional to the number of cells.
 
     Notes
     -----
@@ -75,12 +79,22 @@ def unwrap(phase: NDArray[np.float32], coherence: NDArray[np.float32], *, looks:
     import snaphu
 
     wrapped = np.where(valid, np.exp(1j * np.where(valid, phase, 0)), 0).astype(np.complex64)
-    weight = np.where(valid, coherence, 0).astype(np.float32)
+    cells, covered, weight = (
+        _cell_sums(values, cell_px) for values in (wrapped, valid.astype(np.float32), np.where(valid, coherence, 0))
+    )
     whole, part = snaphu.unwrap(
-        wrapped, weight, max(1.0, looks), cost="smooth", mask=valid, min_conncomp_frac=_LEAST_SHARE
+        np.exp(1j * np.angle(cells)).astype(np.complex64),
+        (weight / np.maximum(covered, 1)).astype(np.float32),
+        max(1.0, looks),
+        cost="smooth",
+        mask=covered > 0,
+        min_conncomp_frac=_LEAST_SHARE,
+    )
+    whole, part = (
+        values.repeat(cell_px, 0).repeat(cell_px, 1)[: len(phase), : phase.shape[1]] for values in (whole, part)
     )
     known = valid & (part > 0)
-    # because snaphu rounds its phase, only the multiples of 2π are used and added to the measured phase
+    # only the multiples of 2π are used and added to the measured phase of the pixels: snaphu rounds its phase
     cycles = np.round((np.where(known, whole, 0) - np.where(known, phase, 0)) / (2 * np.pi))
     return Unwrapped(
         np.where(known, phase + 2 * np.pi * cycles, np.nan).astype(np.float32),
@@ -90,6 +104,12 @@ def unwrap(phase: NDArray[np.float32], coherence: NDArray[np.float32], *, looks:
         loops,
         jumps,
     )
+
+
+def _cell_sums(values: NDArray[Any], side_px: int) -> NDArray[Any]:
+    """Return the sums over square cells of a plane, the last of which may be smaller."""
+    rows, columns = (range(0, size, side_px) for size in values.shape)
+    return np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1)
 
 
 def count_residues(phase: NDArray[np.float32]) -> tuple[int, int, int]:
