@@ -415,6 +415,18 @@ def test_steep_ramp_is_unwrapped():
     np.testing.assert_array_equal(unwrapped.phase, again.phase)
 
 
+@pytest.mark.parametrize("cell_px", [3, 5])
+def test_phase_unwrapped_in_cells_equals_that_of_all_pixels(cell_px):
+    pytest.importorskip("snaphu")
+    _, wrapped = ramp_of_phase(0.4, noise=0.3)
+    wrapped[20:30, 30:50] = np.nan
+    every, cells = (
+        unwrap(wrapped.astype(np.float32), np.full(wrapped.shape, 0.9, np.float32), looks=9.0, cell_px=side)
+        for side in (1, cell_px)
+    )
+    np.testing.assert_allclose(cells.phase - np.nanmin(cells.phase), every.phase - np.nanmin(every.phase), atol=1e-5)
+
+
 def test_without_snaphu_the_phase_stays_wrapped_and_is_flagged(monkeypatch):
     def missing(name):
         raise PackageNotFoundError(name)

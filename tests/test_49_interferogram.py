@@ -9,6 +9,7 @@ from folders import complaint, contents, copy_writable, edit_config, run_steps
 
 from apertura.campaign.config import Interferometry
 from apertura.campaign.folder import Campaign
+from apertura.formats.catalog.validation import stac_problems
 from apertura.formats.export import exports_in
 from apertura.simulation import (
     CampaignSpecification,
@@ -126,6 +127,27 @@ def test_lineage_of_an_interferogram_includes_both_images(small):
             assert f"results/{flight}/uav1-uav1/{stage}.manifest.json" in sources
     manifest = json.loads((small / "results/interferometry" / NAME / "interferogram.manifest.json").read_text())
     assert set(manifest["sources"]) == set(sources)
+
+
+@pytest.mark.slow
+def test_interferogram_is_on_the_map_and_in_the_catalogue(small):
+    entry = json.loads((small / "results/map/map.json").read_text())["images"][-1]
+    assert (entry["flight"], entry["image"], entry["verdict"]) == ("interferometry", NAME, "interferogram")
+    styles = {layer["file"]: (layer["kind"], layer["low"], layer["high"]) for layer in entry["layers"]}
+    assert styles["phase.tif"] == ("phase", -np.pi, np.pi)
+    assert styles["coherence.tif"] == ("measure", 0.0, 1.0)
+    assert set(styles) == {name for name in FILES if name.endswith(".tif")}
+    assert stac_problems(small / "results/stac") == []
+    item = json.loads((small / f"results/stac/images/interferometry/{NAME}.json").read_text())
+    assert item["assets"]["unwrapped"]["roles"] == ["data", "unwrapped_phase"]
+    assert item["properties"]["insar:temporal_baseline"] == pytest.approx(1 / 24, abs=1e-5)
+    baseline_m = np.sqrt(0.5)  # a metre higher, at an incidence of 45 degrees
+    assert item["properties"]["insar:perpendicular_baseline"] == pytest.approx(baseline_m, rel=0.03)
+    ambiguity_m = 0.2142 * np.hypot(25, 25) * np.sin(np.pi / 4) / (2 * baseline_m)
+    assert item["properties"]["insar:height_of_ambiguity"] == pytest.approx(ambiguity_m, rel=0.05)
+    links = {link["rel"]: link["href"] for link in item["links"]}
+    assert links["reference"] == "../f01/uav1-uav1.json"
+    assert links["secondary"] == "../f02/uav1-uav1.json"
 
 
 @pytest.mark.slow

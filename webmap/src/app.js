@@ -3,7 +3,7 @@
 import 'ol/ol.css';
 import './app.css';
 import { Chart, canDraw } from './chart.js';
-import { MASK, MASK_NAMES, RAMPS, drawRamp } from './colours.js';
+import { MASK, MASK_NAMES, RAMPS, drawRamp, rampOf } from './colours.js';
 import { byId, element, notice, number, save } from './dom.js';
 import * as permalink from './permalink.js';
 import { picture } from './picture.js';
@@ -149,7 +149,7 @@ class Page {
     byId('image').value = `${this.image.flight}/${this.image.image}`;
     byId('title').textContent = quantity(this.layer);
     if (Object.hasOwn(RAMPS, colours ?? '')) byId('colours').value = colours;
-    else if (before?.kind !== this.layer.kind) byId('colours').value = this.layer.kind === 'image' ? 'grey' : 'viridis';
+    else if (before?.kind !== this.layer.kind) byId('colours').value = rampOf(this.layer);
     this.limits(...(stretch ?? [this.layer.low, this.layer.high]));
     showQuality(this.image, byId('verdict'), byId('flags'));
     this.show();
@@ -177,7 +177,7 @@ class Page {
     const { layer } = this.right;
     const [left, right] = [this.layer, layer].map((each) => quantity(each).replace(/\d+/g, '')); // sums of any number of pairs
     const common = left === right;
-    const colours = common ? byId('colours').value : layer.kind === 'image' ? 'grey' : 'viridis';
+    const colours = common ? byId('colours').value : rampOf(layer);
     Object.assign(this.right, { colours, ...(common ? { low: this.low, high: this.high } : { low: layer.low, high: layer.high }) });
     drawRamp(byId('right-ramp'), colours);
     for (const name of ['low', 'high']) byId(`right-ramp-${name}`).textContent = common ? byId(`ramp-${name}`).textContent : `${number(layer[name], 1)} ${layer.unit}`;

@@ -5,6 +5,7 @@ rule stac:
         export=each("results/{flight}/{pair}/export.manifest.json"),
         fused=each("results/{flight}/fused/export.manifest.json"),
         scene="results/scene.manifest.json",
+        interferogram=each("results/interferometry/{two}/interferogram.manifest.json"),
     output:
         "results/stac/catalog.json",
         "results/stac.manifest.json",

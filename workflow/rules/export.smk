@@ -170,6 +170,7 @@ rule map:
         coverage="results/coverage.manifest.json",
         scene="results/scene.manifest.json",
         change=each("results/stack/{flight}/change.manifest.json"),
+        interferogram=each("results/interferometry/{two}/interferogram.manifest.json"),
         truth=files(inputs.truth),
     output:
         "results/map/map.json",

@@ -28,7 +28,14 @@ from apertura.methods.interferometry.comparison import (
     interferogram_flags,
 )
 from apertura.methods.interferometry.heights import KnownHeight, Level
-from apertura.methods.interferometry.sensitivity import FlownAntenna, Legs, Sensitivity, TrackPhase, sensitivity
+from apertura.methods.interferometry.sensitivity import (
+    FlownAntenna,
+    Legs,
+    Sensitivity,
+    TrackPhase,
+    perpendicular_baseline,
+    sensitivity,
+)
 from apertura.stages.agreement import opened_layer
 from apertura.stages.image_tags import acquisition_tags
 from apertura.stages.pair import OpenPair, open_pair
@@ -40,6 +47,7 @@ from apertura.stages.transfer import PairEcho
 from apertura.workflow.lineage import result_of
 from apertura.workflow.rules import INTERFEROMETRY
 
+_CONSTANT_S = 1e6  # correlation time of an error that is constant over a flight
 _BAND_TOLERANCE = 1e-6  # tolerated relative difference between the limits of two bands
 
 
@@ -55,11 +63,17 @@ class TwoImages:
         Stages of both images.
     ground
         Assumed terrain, per pixel of the grid.
+    baseline_m
+        Perpendicular baseline at the scene centre.
+    track_std_m
+        Flight/node → standard deviation of the track errors in each axis; None if unknown.
     """
 
     names: tuple[str, str]
     images: tuple[xr.Dataset, xr.Dataset]
     ground: AssumedGround
+    baseline_m: float
+    track_std_m: Mapping[str, float | None]
 
 
 def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
@@ -84,7 +98,7 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
         where = f"{CONFIG}: interferometry.pairs"
         raise CampaignError(f"no interferogram {name!r}", where, expected, "Add the key to interferometry.pairs.")
     images = requested.images(name)
-    bands, looks, antennas = [], [], list[FlownAntenna]()
+    bands, looks, antennas, track_std_m = [], [], list[FlownAntenna](), dict[str, float | None]()
     began: np.datetime64 | None = None
     for sign, (flight, pair) in zip((1, -1), images, strict=True):
         echo = PairEcho.cleaned(campaign, flight, pair).stage
@@ -93,7 +107,8 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
         bands.append((float(opened.frequency_hz.min()), float(opened.frequency_hz.max())))
         looks.append(Looks.of(scene.grid, scene.terrain, aperture_of(profile), weighing(campaign, opened, scene)))
         began = began or opened.began
-        antennas += _antennas(campaign, opened, looks[-1], sign=sign, began=began)
+        found = _antennas(campaign, opened, looks[-1], looks[0].lattice, sign=sign, began=began)
+        antennas, track_std_m = antennas + found[0], track_std_m | found[1]
     if not np.allclose(bands[0], bands[1], rtol=_BAND_TOLERANCE, atol=0):
         measured = " and ".join(f"{low / 1e6:.6g} to {high / 1e6:.6g} MHz" for low, high in bands)
         where = f"{CONFIG}: interferometry.pairs.{name}"
@@ -123,32 +138,44 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
     points = [point.model_dump() for point in campaign.settings.scene.reference_points]
     heights = (_known_height(point, scene, ground) for point in points)
     ground = replace(ground, known=[height for height in heights if height is not None])
-    return TwoImages((first, second), (stages[0], stages[1]), ground)
+    middle = len(nodes_m) // 2 + lattice.shape[1] // 2 * (lattice.shape[0] % 2 == 0)
+    at_middle = [(tx[middle], rx[middle]) for tx, rx in legs]
+    baseline_m = perpendicular_baseline(nodes_m[middle], scene.axes, *at_middle)
+    return TwoImages((first, second), (stages[0], stages[1]), ground, baseline_m, track_std_m)
 
 
 def _antennas(
-    campaign: Campaign, opened: OpenPair, looks: Looks, *, sign: int, began: np.datetime64
-) -> list[FlownAntenna]:
-    """Return the antennas of an image with known position accuracy, configured or estimated by the refinement."""
-    pulses = looks.pulses.reshape(-1, looks.pulses.shape[-1])
-    at_s, refined = clock_s(opened, began), open_refined(campaign, opened.flight)
+    campaign: Campaign, opened: OpenPair, looks: Looks, lattice: Lattice, *, sign: int, began: np.datetime64
+) -> tuple[list[FlownAntenna], dict[str, float | None]]:
+    """Return the antennas of an image with errors of known size, and flight/node → standard deviation of its errors.
+
+    The size is that of the residual errors after track refinement, otherwise the configured one or that of the log; in
+    addition, a drift is constant over the flight.
+    """
+    pulses = _pulses(looks, lattice)
+    at_s, refined = clock_s(opened, began)[pulses], open_refined(campaign, opened.flight)
     time = opened.began + (opened.time_s * 1e9).astype("timedelta64[ns]")
     names = dict.fromkeys(opened.name.split("-"))
     accuracies = dict(zip(names, opened.positions, strict=True))
-    antennas = []
+    antennas, stated = list[FlownAntenna](), dict[str, float | None]()
     for node, leg in zip(opened.name.split("-"), looks.aperture.legs, strict=True):
-        positions = accuracies[node].assumed
-        residual_m = refined.left_m(node, time)
-        if np.isfinite(residual_m).any():
-            std_m = np.full(3, np.sqrt(np.nanmean(residual_m**2)))
-        elif positions.std_m is not None:
-            std_m = np.array(positions.std_m)
-        else:
-            continue
-        antennas.append(
-            FlownAntenna(f"{opened.flight}/{node}", sign, leg[pulses], at_s[pulses], std_m, positions.correlation_s)
+        platform, positions, residual_m = (
+            f"{opened.flight}/{node}",
+            accuracies[node].assumed,
+            refined.left_m(node, time),
         )
-    return antennas
+        errors = {platform: (positions.std_m, positions.correlation_s)}
+        if np.isfinite(residual_m).any():
+            errors = {platform: ((float(np.sqrt(np.nanmean(residual_m**2))),) * 3, positions.correlation_s)}
+        elif positions.drift_m:
+            errors[f"{platform} drift"] = ((positions.drift_m,) * 3, _CONSTANT_S)
+        known = {
+            name: (np.array(std), correlation_s) for name, (std, correlation_s) in errors.items() if std is not None
+        }
+        antennas += [FlownAntenna(name, sign, leg[pulses], at_s, *error) for name, error in known.items()]
+        size = np.sqrt(sum(np.mean(std_m**2) for std_m, _ in known.values()))
+        stated[platform] = round(float(size), 5) if platform in known else None
+    return antennas, stated
 
 
 def _nodes(scene: OpenScene, looks: Looks) -> NDArray[np.float64]:
@@ -178,15 +205,17 @@ def legs_of(looks: Looks, lattice: Lattice | None = None) -> Legs:
     lattice
         Lattice of the same grid (default: that of `looks`), for whose nodes the nearest nodes of `looks` are used.
     """
-    pulses = looks.pulses
-    if lattice is not None:
-        nearest = [
-            np.abs(own[:, None] - nodes).argmin(axis=0)
-            for own, nodes in zip(looks.lattice.nodes, lattice.nodes, strict=True)
-        ]
-        pulses = pulses[np.ix_(*nearest)]
-    tx, rx = (leg[pulses.reshape(-1, pulses.shape[-1])] for leg in looks.aperture.legs)
+    tx, rx = (leg[_pulses(looks, lattice or looks.lattice)] for leg in looks.aperture.legs)
     return tx, rx
+
+
+def _pulses(looks: Looks, lattice: Lattice) -> NDArray[np.int32]:
+    """Return the sampled pulses of the node of `looks` nearest to each node of a lattice, (node, pulse)."""
+    nearest = [
+        np.abs(own[:, None] - nodes).argmin(axis=0)
+        for own, nodes in zip(looks.lattice.nodes, lattice.nodes, strict=True)
+    ]
+    return looks.pulses[np.ix_(*nearest)].reshape(-1, looks.pulses.shape[-1])
 
 
 def sensed_heights(
@@ -305,23 +334,26 @@ def _report(formed: Interferogram, two: TwoImages) -> dict[str, Any]:
     }
     return {
         "images": list(two.names),
+        "perpendicular_baseline_m": round(two.baseline_m, 4),
+        "track_std_m": two.track_std_m,
         "flags_of_images": {name: flags for name, flags in flagged.items() if flags},
         "measured": measured,
         "level": None if formed.level is None else {**asdict(formed.level), "says": _level_line(formed.level)},
         "height_std_m": std_m,
-        "says": _summary(formed, std_m),
+        "says": _summary(formed, std_m, [platform for platform, std in two.track_std_m.items() if std is None]),
         "flags": interferogram_flags(formed.measured),
     }
 
 
-def _summary(formed: Interferogram, std_m: float | None) -> str:
-    """Return a one-line summary: coherence, height accuracy, height of ambiguity and reference."""
+def _summary(formed: Interferogram, std_m: float | None, unknown: Sequence[str]) -> str:
+    """Return a one-line summary: coherence, height accuracy, height of ambiguity, reference, and unknown errors."""
     coherence = f"coherence {formed.measured.coherence:.2f} ({formed.measured.chance:.2f} for unrelated images)"
     if formed.level is None or std_m is None:
         return f"{coherence}; no heights"
+    excluded = f"; unknown track errors of {' and '.join(unknown)} are not included" if unknown else ""
     return (
-        f"{coherence}; height accuracy {std_m:.2g} m, height of ambiguity {formed.measured.ambiguity_m:.3g} m; "
-        f"{_level_line(formed.level)}"
+        f"{coherence}; height accuracy {std_m:.2g} m{excluded}; height of ambiguity "
+        f"{formed.measured.ambiguity_m:.3g} m; {_level_line(formed.level)}"
     )
 
 

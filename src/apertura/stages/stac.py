@@ -10,6 +10,7 @@ from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
+from pystac.utils import datetime_to_str
 
 from apertura import __version__
 from apertura.campaign.config import FUSED, is_monostatic, polarisation_of
@@ -37,9 +38,13 @@ from apertura.stages.coverage import few_looks, place_of, transform_of
 from apertura.stages.image_tags import mode_of
 from apertura.stages.scene import OpenScene, settled_scene
 from apertura.workflow.lineage import result_of
+from apertura.workflow.rules import INTERFEROMETRY
 
 _SUMS = {"coherent": "SLC", "noncoherent": "MLI"}
 """Mapping from the name of each sum, with which its file names begin, to its product type."""
+
+_COMPARED = ("reference", "secondary")
+"""Relations of the links from an interferogram to its images, in the order of `interferometry.pairs`."""
 
 
 def stac(campaign: Campaign) -> list[Path]:
@@ -63,7 +68,7 @@ class _ImageDescriptions:
     scene: OpenScene
 
     def images(self) -> list[Image]:
-        """Return the images of the catalogue by flight: every pair, then every sum."""
+        """Return the images of the catalogue by flight: every pair, then every sum; then the interferograms."""
         images = []
         for flight in self.campaign.image_flights:
             looks = {pair: few_looks(self.campaign, flight.name, pair) for pair in flight.pairs}
@@ -71,7 +76,40 @@ class _ImageDescriptions:
             all_looks = np.sum(list(looks.values()), axis=0)
             sums = _SUMS if FUSED in flight.images else ()
             images += pairs + [self._sum(flight.name, name, pairs, all_looks) for name in sums]
-        return images
+        by_name = {(image.flight, image.name): image for image in images}
+        requested = self.campaign.settings.interferometry
+        return images + [
+            self._interferogram(name, [by_name[image] for image in requested.images(name)]) for name in requested.pairs
+        ]
+
+    def _interferogram(self, name: str, images: Sequence[Image]) -> Image:
+        path = self.campaign.result(INTERFEROMETRY, name, "interferogram.json")
+        manifest, (first, second) = path.with_suffix(".manifest.json"), (image.acquisition for image in images)
+        report, code = open_listed(path, manifest), read_manifest(manifest).get("code", "unknown")
+        with undamaged(path, expected="the report of an interferogram", remedy=remake_from(manifest)):
+            facts = {
+                "product:type": "INTERFEROGRAM",
+                "sar:instrument_mode": mode_of(list(dict.fromkeys(image.name for image in images))),
+                "processing:level": "L3",
+                "processing:lineage": f"apertura step interferogram {name}; code {code}; lock {self._lock}",
+                "insar:perpendicular_baseline": float(report["perpendicular_baseline_m"]),
+                "insar:temporal_baseline": round((second.middle - first.middle).total_seconds() / 86400, 6),
+                "insar:height_of_ambiguity": float(report["measured"]["ambiguity_m"]),
+                "insar:reference_datetime": datetime_to_str(first.middle),
+                "insar:secondary_datetime": datetime_to_str(second.middle),
+                "apertura:coherence": float(report["measured"]["coherence"]),
+                "apertura:flags": sorted(report["flags"]),
+            }
+        return Image(
+            INTERFEROMETRY,
+            name,
+            f"{self.campaign.settings.campaign} · interferogram {name}",
+            images[0].geometry,
+            AcquisitionTime.together([first, second]),
+            {**self._shared, **facts},
+            *self._assets(self._listed(INTERFEROMETRY, name, "interferogram")),
+            compared={relation: (image.flight, image.name) for relation, image in zip(_COMPARED, images, strict=True)},
+        )
 
     def _pair(self, flight: str, pair: str, looks: NDArray[np.float32]) -> Image:
         files = self._listed(flight, pair, "export") | self._listed(flight, pair, "layers")

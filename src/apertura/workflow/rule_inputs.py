@@ -74,6 +74,8 @@ class JobScope:
             return [self.where]
         if of is Scope.CAMPAIGN:
             return [()]
+        if of is Scope.TWO:
+            return [(name,) for name in self.campaign.settings.interferometry.pairs]
         if of is Scope.NODE:
             values: Iterable[tuple[str, ...]] = ((name, node) for name, pair in self.pairs for node in pair.split("-"))
         elif of is Scope.FLIGHT:

@@ -25,6 +25,7 @@ _BASE = "https://stac-extensions.github.io"
 
 EXTENSIONS: Mapping[str, str] = {
     "file": f"{_BASE}/file/v2.1.0/schema.json",
+    "insar": f"{_BASE}/insar/v1.0.0/schema.json",
     "processing": f"{_BASE}/processing/v1.2.0/schema.json",
     "product": f"{_BASE}/product/v1.0.0/schema.json",
     "proj": f"{_BASE}/projection/v2.0.0/schema.json",
@@ -182,6 +183,9 @@ MEDIA_TYPES: Mapping[str, str] = {
 UNKNOWN_TYPE = "application/octet-stream"
 
 _ROLES: Mapping[str, tuple[str, ...]] = {
+    "coherence.tif": ("data", "coherence"),
+    "phase.tif": ("data", "phase"),
+    "unwrapped.tif": ("data", "unwrapped_phase"),
     "quicklook.png": ("overview", "visual"),
     "mask.tif": ("data-mask", "metadata"),
     "incidence.tif": ("local-incidence-angle", "metadata"),
@@ -312,12 +316,12 @@ _NO_PLACE = "Local frame, not georeferenced: items have no geometry, which a STA
 
 @dataclass(frozen=True)
 class Image:
-    """Image of a flight, the content of a STAC item.
+    """Image of a flight, or interferogram, the content of a STAC item.
 
     Attributes
     ----------
     flight, name
-        Flight, and name of the image: a pair, 'coherent' or 'noncoherent'.
+        Flight, and name of the image: a pair, 'coherent' or 'noncoherent'; or 'interferometry' and the interferogram.
     title
         Title.
     geometry
@@ -332,6 +336,8 @@ class Image:
         File relative to the campaign folder → SHA-256 of its content when it was read.
     made_from
         Names of the flight's images of which this image is the sum.
+    compared
+        Link relation, 'reference' or 'secondary' → flight and name of an image of this interferogram.
     """
 
     flight: str
@@ -343,6 +349,7 @@ class Image:
     assets: Mapping[str, pystac.Asset] = field(default_factory=dict)
     inputs: Mapping[str, str] = field(default_factory=dict)
     made_from: Sequence[str] = ()
+    compared: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
     @property
     def id(self) -> str:
@@ -350,7 +357,7 @@ class Image:
         return f"{self.flight}-{self.name}"
 
 
-_SOMETIMES = frozenset({"view", "sci"})
+_SOMETIMES = frozenset({"view", "sci", "insar"})
 """Extensions whose fields are not known for every image."""
 
 
@@ -400,6 +407,8 @@ def item_of(image: Image, root: str) -> pystac.Item:
     for name in image.made_from:
         title = f"{image.flight} · {name}"
         item.add_link(pystac.Link("derived_from", f"./{name}.json", pystac.MediaType.GEOJSON, title))
+    for relation, (flight, name) in image.compared.items():
+        item.add_link(pystac.Link(relation, f"../{flight}/{name}.json", pystac.MediaType.GEOJSON, f"{flight} · {name}"))
     return item
 
 

@@ -20,7 +20,13 @@ PHASE = Band("float32", np.nan, "rad", "wrapped phase of the first image relativ
 COHERENCE = Band("float32", np.nan, "1", "estimated coherence; bias: see the tag APERTURA_CHANCE", "AVERAGE")
 UNWRAPPED = Band("float32", np.nan, "rad", "unwrapped topographic phase: see the tag APERTURA_LEVEL", "AVERAGE")
 HEIGHT = Band("float32", np.nan, "m", "terrain height in the CRS of the scene: see the tag APERTURA_LEVEL", "AVERAGE")
-HEIGHT_STD = Band("float32", np.nan, "m", "standard deviation of the height due to phase noise only", "AVERAGE")
+HEIGHT_STD = Band(
+    "float32",
+    np.nan,
+    "m",
+    "standard deviation of the height due to phase noise, reference level and track errors",
+    "AVERAGE",
+)
 
 _PANELS = (  # key, label, colour map, limits
     ("coherence", "coherence", "gray", (0.0, 1.0)),

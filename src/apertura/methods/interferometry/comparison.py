@@ -252,7 +252,8 @@ def form_interferogram(
     for tile in tiles:
         about = np.angle(np.exp(1j * (phase[tile].astype(np.float64) - centre)))
         centred[tile] = np.where(valid[tile], about, np.nan)
-    unwrapped = unwrap(centred, magnitude, looks=counted.looks)
+    # The phase is a mean over the window: in a third of the window it changes by less than half a cycle.
+    unwrapped = unwrap(centred, magnitude, looks=counted.looks, cell_px=(window + 1) // 3)
     known = [
         replace(
             point,

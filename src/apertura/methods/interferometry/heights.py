@@ -13,7 +13,7 @@ from apertura.methods.interferometry.sensitivity import Sensitivity
 # ---- Unwrapping and residues ----------------------------------------------------------------------------------------
 
 _LEAST_SHARE = 0.01  # minimum fraction of all pixels in a connected component: default of snaphu
-_ROWS = 256  # rows whose residues are counted at once
+_ROWS = 256  # rows of pixels processed at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Unwrapped:
     jumps: int
 
 
-def unwrap(phase: NDArray[np.float32], coherence: NDArray[np.float32], *, looks: float) -> Unwrapped:
+def unwrap(phase: NDArray[np.float32], coherence: NDArray[np.float32], *, looks: float, cell_px: int = 1) -> Unwrapped:
     """Unwrap the phase by snaphu if it is installed; otherwise return the wrapped phase.
 
     Parameters
@@ -55,6 +55,9 @@ def unwrap(phase: NDArray[np.float32], coherence: NDArray[np.float32], *, looks:
         (y, x) float32, 0 to 1.
     looks
         Independent samples averaged for a phase.
+    cell_px
+        Side of the cells whose mean phases are unwrapped, pixels; the phase must change by less than half a cycle per
+        cell. Memory and time of snaphu are proportional to the number of cells.
 
     Notes
     -----
@@ -74,22 +77,45 @@ def unwrap(phase: NDArray[np.float32], coherence: NDArray[np.float32], *, looks:
         return Unwrapped(phase, valid.astype(np.uint32), by, residues, loops, jumps)
     import snaphu
 
-    wrapped = np.where(valid, np.exp(1j * np.where(valid, phase, 0)), 0).astype(np.complex64)
-    weight = np.where(valid, coherence, 0).astype(np.float32)
+    count = max(1, _ROWS // cell_px)  # rows of cells in a strip
+    strips = [slice(first, first + count * cell_px) for first in range(0, len(phase), count * cell_px)]
+    sums = [_sums_of_cells(phase[strip], coherence[strip], cell_px) for strip in strips]
+    cells, weight, covered = (np.concatenate(values) for values in zip(*sums, strict=True))
     whole, part = snaphu.unwrap(
-        wrapped, weight, max(1.0, looks), cost="smooth", mask=valid, min_conncomp_frac=_LEAST_SHARE
+        np.exp(1j * np.angle(cells)).astype(np.complex64),
+        (weight / np.maximum(covered, 1)).astype(np.float32),
+        max(1.0, looks),
+        cost="smooth",
+        mask=covered > 0,
+        min_conncomp_frac=_LEAST_SHARE,
     )
-    known = valid & (part > 0)
-    # because snaphu rounds its phase, only the multiples of 2π are used and added to the measured phase
-    cycles = np.round((np.where(known, whole, 0) - np.where(known, phase, 0)) / (2 * np.pi))
-    return Unwrapped(
-        np.where(known, phase + 2 * np.pi * cycles, np.nan).astype(np.float32),
-        np.where(known, part, 0).astype(np.uint32),
-        by,
-        residues,
-        loops,
-        jumps,
+    unwrapped, parts = np.full(phase.shape, np.nan, np.float32), np.zeros(phase.shape, np.uint32)
+    for number, strip in enumerate(strips):
+        of_cells = slice(number * count, (number + 1) * count)
+        of_pixels = phase[strip]
+        guess, label = (
+            values[of_cells].repeat(cell_px, 0).repeat(cell_px, 1)[: of_pixels.shape[0], : of_pixels.shape[1]]
+            for values in (whole, part)
+        )
+        known = np.isfinite(of_pixels) & (label > 0)
+        # only the multiples of 2π are used and added to the measured phase of the pixels: snaphu rounds its phase
+        cycles = np.round((guess[known] - of_pixels[known]) / (2 * np.pi))
+        unwrapped[strip][known], parts[strip][known] = of_pixels[known] + 2 * np.pi * cycles, label[known]
+    return Unwrapped(unwrapped, parts, by, residues, loops, jumps)
+
+
+def _sums_of_cells(
+    phase: NDArray[np.float32], coherence: NDArray[np.float32], side_px: int
+) -> tuple[NDArray[np.complex64], NDArray[np.float32], NDArray[np.float32]]:
+    """Return the sums of phasors, coherence and valid pixels over square cells, the last of which may be smaller."""
+    valid = np.isfinite(phase)
+    rows, columns = (range(0, size, side_px) for size in phase.shape)
+    phasors = np.where(valid, np.exp(1j * np.where(valid, phase, 0)), 0).astype(np.complex64)
+    phasor, weight, covered = (
+        np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1)
+        for values in (phasors, np.where(valid, coherence, 0).astype(np.float32), valid.astype(np.float32))
     )
+    return phasor, weight, covered
 
 
 def count_residues(phase: NDArray[np.float32]) -> tuple[int, int, int]:

@@ -136,6 +136,37 @@ def sensitivity(
     )
 
 
+def perpendicular_baseline(place_m: Floats, axes: Floats, first: Legs, second: Legs) -> float:
+    """Return the distance of two tracks perpendicular to the line of sight and to the first track, metres.
+
+    Parameters
+    ----------
+    place_m
+        (3,) float64, point on the terrain.
+    axes
+        As for `sensitivity`.
+    first, second
+        (pulse, 3) float64 for transmitter and receiver of each image; the middle of both is the phase centre.
+
+    Returns
+    -------
+    float
+        Positive if the second track lies on the upper side of the line of sight.
+
+    Examples
+    --------
+    >>> track = np.linspace(-4.0, 4.0, 9)[:, None] * [1.0, 0.0, 0.0] + [0.0, -20.0, 20.0]
+    >>> higher = track + [0.0, 0.0, 1.0]
+    >>> round(perpendicular_baseline(np.zeros(3), np.eye(3), (track, track), (higher, higher)), 3)
+    0.707
+    """
+    phase_centres = [(tx + rx) / 2 for tx, rx in (first, second)]
+    sight = phase_centres[0].mean(axis=0) - place_m
+    across = np.cross(sight, phase_centres[0][-1] - phase_centres[0][0])
+    across *= np.copysign(1.0, across @ axes[2]) / max(float(np.linalg.norm(across)), 1e-12)
+    return float((phase_centres[1].mean(axis=0) - phase_centres[0].mean(axis=0)) @ across)
+
+
 def _moved(places_m: Floats, axes: Floats, images: tuple[Legs, Legs], paths: list[Floats], height_m: Floats) -> Floats:
     """Locate the terrain that is `height_m` higher and imaged at `places_m` in both images.
 

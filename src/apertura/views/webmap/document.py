@@ -23,13 +23,15 @@ from apertura.formats.export import COVERAGE, MAP, Export, exports_in
 from apertura.stages.scene import settled_scene
 from apertura.views.quality import ImageValues, explained_flags, read_report
 from apertura.workflow.lineage import result_of
-from apertura.workflow.rules import STACK
+from apertura.workflow.rules import INTERFEROMETRY, STACK
 
 FORMAT = 2
 """Format version of `map.json`; the page rejects other versions."""
 
-KINDS = ("image", "classes", "measure")
-"""Styles of a layer: greyscale between two adjustable values in dB; a colour for each class; a colour ramp."""
+KINDS = ("image", "classes", "measure", "phase")
+"""Styles of a layer: greyscale between two adjustable values in dB; a colour for each class; a colour ramp; a cyclic
+colour ramp.
+"""
 
 CLASSES = {0: "visible", 1: "shadow", 2: "layover", 3: "shadow and layover"}
 """Value of the mask → class name."""
@@ -266,13 +268,10 @@ def webmap(campaign: Campaign) -> list[Path]:
         report = read_report(campaign, flight, image)
         with undamaged(campaign.result(flight, image, "image.json"), expected="a report", remedy="Run export again."):
             layers = _layers(campaign, flight, image, report)
-            first = campaign.result(flight, image, layers[0].file)
-            with opened_raster(
-                first, expected="an image that the workflow wrote", remedy="Run export again."
-            ) as raster:
-                tags = raster.tags()
+            tags = _tags_of(campaign.result(flight, image, layers[0].file))
             images.append(image_entry(flight, image, report, layers, tags))
             places += found_places(flight, image, report)
+    images += [_interferogram_entry(campaign, name) for name in campaign.settings.interferometry.pairs]
     coverage = None
     if scene.grid.crs != LOCAL:
         coverage = read_manifest(campaign.root / campaign.manifest("coverage"))["files"].get(COVERAGE[1])
@@ -312,6 +311,25 @@ def _layers(campaign: Campaign, flight: str, image: str, report: Mapping[str, An
     return layers
 
 
+def _interferogram_entry(campaign: Campaign, name: str) -> dict[str, Any]:
+    """Return the entry of an interferogram, which is listed as an image of flight 'interferometry'."""
+    path = campaign.result(INTERFEROMETRY, name, "interferogram.json")
+    manifest = path.with_suffix(".manifest.json")
+    report, rows = open_listed(path, manifest), exports_in("interferogram")
+    with undamaged(path, expected="the report of an interferogram", remedy=remake_from(manifest)):
+        layers = [_layer(manifest, row, report) for row in rows if row.file.endswith(".tif")]
+        focus = {"verdict": "interferogram", "reason": report["says"]}
+        quality = {"focus": focus, "numerical_error_db": 0.0, "flags": report["flags"]}
+    tags = _tags_of(path.with_name("phase.tif"))
+    entry = image_entry(INTERFEROMETRY, name, quality, [layer for layer in layers if layer is not None], tags)
+    return {**entry, "error_db": None}
+
+
+def _tags_of(path: Path) -> dict[str, str]:
+    with opened_raster(path, expected="an image that the workflow wrote", remedy="Run export again.") as raster:
+        return dict(raster.tags())
+
+
 def _layer(manifest: Path, row: Export, report: Mapping[str, Any]) -> Layer | None:
     path, root = manifest.with_name(row.file), manifest.parents[3]
 
@@ -324,6 +342,9 @@ def _layer(manifest: Path, row: Export, report: Mapping[str, Any]) -> Layer | No
         title, unit = str(raster.descriptions[0] or row.file), str(raster.units[0] or "")
         if np.dtype(raster.dtypes[0]).kind == "c" or (unit == "1" and row.source in _SHOWN_IN_DB):
             return None
+        if row.source in _LIMITS:
+            kind, low, high = _LIMITS[row.source]
+            return Layer(row.file, sha256, kind, title, unit, low, high)
         if row.source == "mask":
             return Layer(row.file, sha256, "classes", title, "", 0.0, 3.0)
         if unit == "dB" and row.source in _SHOWN_IN_DB:
@@ -339,6 +360,10 @@ def _layer(manifest: Path, row: Export, report: Mapping[str, Any]) -> Layer | No
 
 _SHOWN_IN_DB = frozenset({"image", "coherent", "noncoherent", "magnitude"})
 """Sources of products whose power is also exported in dB."""
+
+
+_LIMITS = {"phase": ("phase", -math.pi, math.pi), "coherence": ("measure", 0.0, 1.0)}
+"""Source of a product with a fixed colour scale → style and ends of the scale."""
 
 
 def _rounded(value: float) -> float:

@@ -28,7 +28,7 @@ from apertura.core.geometry.geodesy import (
 )
 from apertura.views.webmap.document import requested_file
 
-COLOURS = {"grey": "gray", "inferno": "inferno", "viridis": "viridis"}
+COLOURS = {"grey": "gray", "inferno": "inferno", "viridis": "viridis", "cyclic": "twilight_shifted"}
 """Colour ramp of the page → colour map of Matplotlib."""
 
 MOST_PIXELS = 4096
