@@ -251,7 +251,7 @@ def test_appended_flight_computes_only_its_own_chunks(campaign, written):
 
 
 def test_removed_flight_leaves_no_chunks(campaign, written):
-    root, write, computed = written
+    _, write, computed = written
     folder = write("f01")
     assert computed == []
     assert not any((folder / name / "c" / "1").exists() for name in RASTERS)
@@ -293,27 +293,55 @@ def test_killed_append_leaves_the_earlier_cube_valid(campaign, written, monkeypa
     def killed(*_, **__):
         raise KeyboardInterrupt
 
-    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patched:
         patched.setattr(cube, step, killed)
-        write("f01", "f02")
+        with pytest.raises(KeyboardInterrupt):
+            write("f01", "f02")
     assert contents(folder) | {"manifest": manifest_of(folder).read_bytes()} == before
     assert open_stage(folder, "cube").sizes["flight"] == 1
     write("f01", "f02")
     assert manifest_of(folder).read_bytes() == manifest_of(campaign.stage("cube")).read_bytes()
 
 
+@pytest.mark.parametrize("last", [0, 30, 75, 95])
+def test_append_killed_while_files_are_moved_leaves_the_earlier_cube_valid(campaign, written, monkeypatch, last):
+    """Readers of the consolidated metadata see the earlier cube until zarr.json is replaced."""
+    _, write, _ = written
+    folder, real, moved = write("f01"), ConfinedPath.rename, []
+    before = xr.open_zarr(str(folder)).load()
+
+    def killed(self, target):
+        if "cube.zarr.wip" in self.parts and not self.name.endswith(".partial"):
+            moved.append(self.name)
+            if len(moved) > last:
+                raise KeyboardInterrupt
+        return real(self, target)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(ConfinedPath, "rename", killed)
+        with pytest.raises(KeyboardInterrupt):
+            write("f01", "f02")
+    after = xr.open_zarr(str(folder)).load()
+    for name in {*before.variables} - {"flight_window", "reference_flight"}:
+        np.testing.assert_array_equal(after[name], before[name])
+    assert "missing or unfinished" in complaint(lambda: open_stage(folder, "cube"))
+    write("f01", "f02")
+    assert manifest_of(folder).read_bytes() == manifest_of(campaign.stage("cube")).read_bytes()
+
+
 def test_writer_killed_between_two_renamings_is_recovered(campaign, written, monkeypatch):
-    _, write, computed = written
-    folder, real = write("f01"), ConfinedPath.rename
+    root, write, _ = written
+    folder, real = root / "results/cube.zarr", ConfinedPath.rename
 
     def killed(self, target):
         if self.name == "cube.zarr.wip":
             raise KeyboardInterrupt
         return real(self, target)
 
-    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patched:
         patched.setattr(ConfinedPath, "rename", killed)
-        write("f01", "f02")
+        with pytest.raises(KeyboardInterrupt):
+            write("f01")  # removes f02
     assert not folder.exists()
     write("f01", "f02")
     assert manifest_of(folder).read_bytes() == manifest_of(campaign.stage("cube")).read_bytes()
@@ -321,7 +349,7 @@ def test_writer_killed_between_two_renamings_is_recovered(campaign, written, mon
 
 def test_readers_of_the_earlier_metadata_can_read_chunks_with_a_further_flight(written):
     """Coordinates and measures have chunks of a fixed length, so that a published cube may be replaced file by file."""
-    root, write, _ = written
+    _, write, _ = written
     folder = write("f01")
     metadata = (folder / "zarr.json").read_bytes()
     before = xr.open_zarr(str(folder)).load()
