@@ -1,8 +1,10 @@
 """The cube: selection by name, CF metadata, CRS, and phases between pairs and between flights."""
 
+import json
 import warnings
 from dataclasses import replace
 
+import jsonschema
 import numpy as np
 import pytest
 import rasterio
@@ -10,7 +12,7 @@ import rioxarray  # noqa: F401
 import xarray as xr
 import zarr
 from folders import ROOT, complaint, contents, copy_writable, edit_config, run_steps
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 from walked import walk
 
 from apertura.campaign.folder import Campaign
@@ -20,6 +22,7 @@ from apertura.common.contracts import RASTERS
 from apertura.methods.interferometry.coherence import chance, coherence
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.stages import cube
+from apertura.workflow.stale import stale_results
 
 pytestmark = pytest.mark.slow  # the campaign of two flights takes 5 s
 
@@ -108,6 +111,21 @@ def test_cube_has_the_metadata_of_acdd(campaign, opened):
     not_stated = {"license", "creator_name", "institution", "id", "platform", "instrument", "references"}
     assert not attributes.keys() & not_stated
     assert all(array.attrs["coverage_content_type"] for array in opened.data_vars.values())
+
+
+@pytest.mark.parametrize("name", ["spatial", "proj"])
+def test_attributes_follow_the_zarr_conventions(campaign, opened, name):
+    """The group is valid against the schema of each convention, with its UUID, and describes the stored grid."""
+    schema = json.loads((ROOT / "tests/zarr_conventions" / f"{name}.json").read_text())
+    group = json.loads((campaign.stage("cube") / "zarr.json").read_bytes())
+    jsonschema.Draft7Validator(schema).validate(group)
+    stated = {one["name"]: one["uuid"] for one in group["attributes"]["zarr_conventions"]}
+    assert stated[name] == schema["$defs"]["conventionMetadata"]["properties"]["uuid"]["const"]
+    step, _, west, _, down, north = opened.attrs["spatial:transform"]
+    assert opened.x.values[0] == pytest.approx(west + step / 2, abs=1e-9)
+    assert opened.y.values[-1] == pytest.approx(north + down * (opened.sizes["y"] - 0.5), abs=1e-6)
+    assert opened.attrs["spatial:shape"] == [opened.sizes[dim] for dim in opened.attrs["spatial:dimensions"]]
+    assert CRS(opened.attrs["proj:code"]) == CRS(opened.attrs["proj:wkt2"]) == CRS(opened.rio.crs)
 
 
 def test_rioxarray_reads_the_crs_of_every_raster(campaign, opened):
@@ -248,6 +266,15 @@ def test_appended_flight_computes_only_its_own_chunks(campaign, written):
     assert all(path.stat().st_ino == inode for path, inode in before.items())
     assert manifest_of(folder).read_bytes() == manifest_of(campaign.stage("cube")).read_bytes()
     assert damaged_files(manifest_of(folder)) == []
+
+
+def test_further_flight_leaves_results_of_other_flights_up_to_date(campaign, written):
+    """Only results of the campaign as a whole are out of date: the cube, and catalogs where there are any."""
+    root, write, _ = written
+    write("f01")
+    assert stale_results(Campaign.load(root)) == {}
+    (root / "config/flights.tsv").write_text((campaign.root / "config/flights.tsv").read_text())
+    assert stale_results(Campaign.load(root)).keys() == {"results/cube.manifest.json"}
 
 
 def test_removed_flight_leaves_no_chunks(campaign, written):

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from pyproj import CRS
 from rasterio.warp import transform_bounds
 
 from apertura import __version__
@@ -547,6 +548,7 @@ def _empty_cube(
     return empty.assign_coords(grid.coordinates).assign_attrs(
         Conventions="CF-1.11, ACDD-1.3",
         **acdd_attributes(campaign, [image.attrs["quality"]["view"] for image in images.values()], grid),
+        **convention_attributes(grid),
         history="written by rule cube of apertura; runspec, inputs and code_sha256 state settings, data and code",
         flights=[*assessed],
         pairs=pairs,
@@ -559,6 +561,44 @@ def _empty_cube(
         },
         flags={name: flags for name, one in assessed.items() if (flags := one["first_flight"].get("flags"))},
     )
+
+
+_CONVENTIONS = {
+    "spatial": ("689b58e2-cf7b-45e0-9fff-9cfc0883d6b4", "Spatial coordinate information"),
+    "proj": ("f17cb550-5864-4468-aeb7-f3180cfb622f", "Coordinate reference system information for geospatial data"),
+}
+"""Convention of https://github.com/zarr-conventions, version 0.1 → UUID and description."""
+
+
+def convention_attributes(grid: SceneGrid) -> dict[str, Any]:
+    """Return the attributes of the Zarr conventions `spatial` and `proj`; a local frame has no registered CRS.
+
+    Examples
+    --------
+    >>> attributes = convention_attributes(SceneGrid("EPSG:32632", 570000.0, 5363000.0, 0.5, (40, 60)))
+    >>> attributes["spatial:bbox"], attributes["proj:code"]
+    ([570000.0, 5362980.0, 570030.0, 5363000.0], 'EPSG:32632')
+    """
+    crs = {} if grid.frame == "local" else {"proj:code": grid.crs, "proj:wkt2": CRS(grid.crs_wkt).to_wkt()}
+    names = ["spatial", *(["proj"] if crs else [])]
+    return {
+        "zarr_conventions": [
+            {
+                "schema_url": f"https://raw.githubusercontent.com/zarr-conventions/{name}/refs/tags/v0.1/schema.json",
+                "spec_url": f"https://github.com/zarr-conventions/{name}/blob/v0.1/README.md",
+                "uuid": _CONVENTIONS[name][0],
+                "name": name,
+                "description": _CONVENTIONS[name][1],
+            }
+            for name in names
+        ],
+        "spatial:dimensions": ["y", "x"],
+        "spatial:bbox": [float(side) for side in grid.bounds_m],
+        "spatial:transform": [float(value) for value in grid.transform],
+        "spatial:shape": [*grid.shape],
+        "spatial:registration": "pixel",
+        **crs,
+    }
 
 
 def acdd_attributes(campaign: Campaign, views: Sequence[Mapping[str, Any]], grid: SceneGrid) -> dict[str, str | float]:
