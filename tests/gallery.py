@@ -43,6 +43,7 @@ WITHOUT = {
     "antenna_coupling": "shown by the example of the UAV flight",
     "describe": "its results are tags, attributes and a sheet",
     "from_files": "its results are a folder and a table",
+    "publish": "its results are copies in an object store",
     "raw_imu": "its recipe runs a library that apertura does not install, and ends in a log",
     "sizing": "its only results are tables of estimates",
 }

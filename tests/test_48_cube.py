@@ -1,8 +1,10 @@
 """The cube: selection by name, CF metadata, CRS, and phases between pairs and between flights."""
 
+import json
 import warnings
 from dataclasses import replace
 
+import jsonschema
 import numpy as np
 import pytest
 import rasterio
@@ -10,7 +12,7 @@ import rioxarray  # noqa: F401
 import xarray as xr
 import zarr
 from folders import ROOT, complaint, contents, copy_writable, edit_config, run_steps
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 from walked import walk
 
 from apertura.campaign.folder import Campaign
@@ -20,6 +22,7 @@ from apertura.common.contracts import RASTERS
 from apertura.methods.interferometry.coherence import chance, coherence
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.stages import cube
+from apertura.workflow.stale import stale_results
 
 pytestmark = pytest.mark.slow  # the campaign of two flights takes 5 s
 
@@ -108,6 +111,21 @@ def test_cube_has_the_metadata_of_acdd(campaign, opened):
     not_stated = {"license", "creator_name", "institution", "id", "platform", "instrument", "references"}
     assert not attributes.keys() & not_stated
     assert all(array.attrs["coverage_content_type"] for array in opened.data_vars.values())
+
+
+@pytest.mark.parametrize("name", ["spatial", "proj"])
+def test_attributes_follow_the_zarr_conventions(campaign, opened, name):
+    """The group is valid against the schema of each convention, with its UUID, and describes the stored grid."""
+    schema = json.loads((ROOT / "tests/zarr_conventions" / f"{name}.json").read_text())
+    group = json.loads((campaign.stage("cube") / "zarr.json").read_bytes())
+    jsonschema.Draft7Validator(schema).validate(group)
+    stated = {one["name"]: one["uuid"] for one in group["attributes"]["zarr_conventions"]}
+    assert stated[name] == schema["$defs"]["conventionMetadata"]["properties"]["uuid"]["const"]
+    step, _, west, _, down, north = opened.attrs["spatial:transform"]
+    assert opened.x.values[0] == pytest.approx(west + step / 2, abs=1e-9)
+    assert opened.y.values[-1] == pytest.approx(north + down * (opened.sizes["y"] - 0.5), abs=1e-6)
+    assert opened.attrs["spatial:shape"] == [opened.sizes[dim] for dim in opened.attrs["spatial:dimensions"]]
+    assert CRS(opened.attrs["proj:code"]) == CRS(opened.attrs["proj:wkt2"]) == CRS(opened.rio.crs)
 
 
 def test_rioxarray_reads_the_crs_of_every_raster(campaign, opened):
@@ -250,8 +268,17 @@ def test_appended_flight_computes_only_its_own_chunks(campaign, written):
     assert damaged_files(manifest_of(folder)) == []
 
 
+def test_further_flight_leaves_results_of_other_flights_up_to_date(campaign, written):
+    """Only results of the campaign as a whole are out of date: the cube, and catalogs where there are any."""
+    root, write, _ = written
+    write("f01")
+    assert stale_results(Campaign.load(root)) == {}
+    (root / "config/flights.tsv").write_text((campaign.root / "config/flights.tsv").read_text())
+    assert stale_results(Campaign.load(root)).keys() == {"results/cube.manifest.json"}
+
+
 def test_removed_flight_leaves_no_chunks(campaign, written):
-    root, write, computed = written
+    _, write, computed = written
     folder = write("f01")
     assert computed == []
     assert not any((folder / name / "c" / "1").exists() for name in RASTERS)
@@ -293,27 +320,55 @@ def test_killed_append_leaves_the_earlier_cube_valid(campaign, written, monkeypa
     def killed(*_, **__):
         raise KeyboardInterrupt
 
-    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patched:
         patched.setattr(cube, step, killed)
-        write("f01", "f02")
+        with pytest.raises(KeyboardInterrupt):
+            write("f01", "f02")
     assert contents(folder) | {"manifest": manifest_of(folder).read_bytes()} == before
     assert open_stage(folder, "cube").sizes["flight"] == 1
     write("f01", "f02")
     assert manifest_of(folder).read_bytes() == manifest_of(campaign.stage("cube")).read_bytes()
 
 
+@pytest.mark.parametrize("last", [0, 30, 75, 95])
+def test_append_killed_while_files_are_moved_leaves_the_earlier_cube_valid(campaign, written, monkeypatch, last):
+    """Readers of the consolidated metadata see the earlier cube until zarr.json is replaced."""
+    _, write, _ = written
+    folder, real, moved = write("f01"), ConfinedPath.rename, []
+    before = xr.open_zarr(str(folder)).load()
+
+    def killed(self, target):
+        if "cube.zarr.wip" in self.parts and not self.name.endswith(".partial"):
+            moved.append(self.name)
+            if len(moved) > last:
+                raise KeyboardInterrupt
+        return real(self, target)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(ConfinedPath, "rename", killed)
+        with pytest.raises(KeyboardInterrupt):
+            write("f01", "f02")
+    after = xr.open_zarr(str(folder)).load()
+    for name in {*before.variables} - {"flight_window", "reference_flight"}:
+        np.testing.assert_array_equal(after[name], before[name])
+    assert "missing or unfinished" in complaint(lambda: open_stage(folder, "cube"))
+    write("f01", "f02")
+    assert manifest_of(folder).read_bytes() == manifest_of(campaign.stage("cube")).read_bytes()
+
+
 def test_writer_killed_between_two_renamings_is_recovered(campaign, written, monkeypatch):
-    _, write, computed = written
-    folder, real = write("f01"), ConfinedPath.rename
+    root, write, _ = written
+    folder, real = root / "results/cube.zarr", ConfinedPath.rename
 
     def killed(self, target):
         if self.name == "cube.zarr.wip":
             raise KeyboardInterrupt
         return real(self, target)
 
-    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patched:
         patched.setattr(ConfinedPath, "rename", killed)
-        write("f01", "f02")
+        with pytest.raises(KeyboardInterrupt):
+            write("f01")  # removes f02
     assert not folder.exists()
     write("f01", "f02")
     assert manifest_of(folder).read_bytes() == manifest_of(campaign.stage("cube")).read_bytes()
@@ -321,7 +376,7 @@ def test_writer_killed_between_two_renamings_is_recovered(campaign, written, mon
 
 def test_readers_of_the_earlier_metadata_can_read_chunks_with_a_further_flight(written):
     """Coordinates and measures have chunks of a fixed length, so that a published cube may be replaced file by file."""
-    root, write, _ = written
+    _, write, _ = written
     folder = write("f01")
     metadata = (folder / "zarr.json").read_bytes()
     before = xr.open_zarr(str(folder)).load()

@@ -1,21 +1,31 @@
 """Rule `cube`: every image of the campaign on one grid, sums over each flight's pairs, and interferometric phases."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from itertools import compress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
+from pyproj import CRS
 from rasterio.warp import transform_bounds
 
 from apertura import __version__
 from apertura.campaign.config import FUSED
 from apertura.campaign.digests import Lineage
 from apertura.campaign.folder import Campaign
-from apertura.campaign.store import attributes_of, create, finish, open_array, open_stage, replacing
+from apertura.campaign.store import (
+    attributes_of,
+    create,
+    describe_stage,
+    finish,
+    open_array,
+    open_stage,
+    replacing,
+)
 from apertura.common.confined import ConfinedPath
 from apertura.common.contracts import MEASURED, QUOTED, RASTERS, SUMMED, Window
 from apertura.common.documents import undamaged
@@ -34,7 +44,7 @@ from apertura.workflow.lineage import result_of
 # ---- Coordinates and quality of each flight and pair ----------------------------------------------------------------
 
 Images = Mapping[tuple[str, str], xr.Dataset]
-"""Flight and pair → stage `image`."""
+"""Flight and pair → stage `image`, of which only the attributes are needed."""
 
 _TEXTS = np.dtypes.StringDType()
 
@@ -264,15 +274,20 @@ def cube(campaign: Campaign, *, threads: int = 1) -> Path:
     no pulse of a pair illuminates are not stored and are read as NaN, as in the image.
 
     Chunks contain values of one flight, which depend on this flight and on its reference images only (see `_origins`).
-    Chunks of flights that have not changed since the cube was last written are linked, not computed again. The earlier
-    cube remains valid until the new one replaces it.
+    Chunks of flights that have not changed since the cube was last written are not computed again: they remain where
+    they are if further flights follow them, and are linked into a new folder otherwise.
     """
     flights, lineage = campaign.image_flights, result_of(campaign, "cube").begin(campaign.root)
     images = {
-        (flight.name, pair): open_stage(campaign.stage("image", flight.name, pair), "image")
+        (flight.name, pair): describe_stage(campaign.stage("image", flight.name, pair))
         for flight in flights
         for pair in flight.pairs
     }
+
+    @cache
+    def opened(flight: str, pair: str) -> xr.Dataset:
+        return open_stage(campaign.stage("image", flight, pair), "image")
+
     assessed = {flight.name: assessment_of(campaign, flight.name) for flight in flights}
     sums = {flight.name: assessed[flight.name]["fusion"] for flight in flights if FUSED in flight.images}
     grid, side = settled_scene(campaign).grid, campaign.settings.processing.tile_px
@@ -293,12 +308,16 @@ def cube(campaign: Campaign, *, threads: int = 1) -> Path:
         measured = {name: empty[name].values.copy() for name in MEASURED if name in empty}
         whole = {name: (_FLIGHTS_PER_CHUNK, *values.shape[1:]) for name, values in measured.items()}
         create(wip, empty, chunks | whole, lengths={"flight": _FLIGHTS_PER_CHUNK}, consolidated=True)
-        linked, kept = _linked(folder, wip, recorded, empty, measured)
+        earlier = _EarlierCube.of(folder, recorded)
+        kept = earlier.kept(empty.attrs["origins"])
+        appended = earlier.is_continued(empty, kept)
+        known = earlier.carry(kept, empty, measured, None if appended else wip)
         rasters = {name: open_array(wip, name) for name in chunks}
         arrays = _CubeArrays({**rasters, **measured}, [*assessed], empty.attrs["pairs"])
         changed = [flight for flight in assessed if flight not in kept]
         for flight in changed:
-            _write_images(images, sums.get(flight), arrays, flight, windows, workers)
+            present = {pair: opened(flight, pair) for pair in campaign.flight(flight).pairs}
+            _write_images(present, sums.get(flight), arrays, flight, windows, workers)
         for flight, fusion in sums.items():
             if flight in changed:
                 single_db = [images[flight, pair].attrs["quality"]["noise_floor_db"] for pair in fusion["phases_rad"]]
@@ -306,10 +325,10 @@ def cube(campaign: Campaign, *, threads: int = 1) -> Path:
                 arrays.plane("coherent_noise_floor", flight)[()] = sum_db
                 arrays.plane("clutter_reduction", flight)[()] = clutter_reduction_db(single_db, sum_db)
         references = {flight: assessment["reference"] for flight, assessment in assessed.items()}
-        _compare(images, references, arrays, grid, changed, side=side, workers=workers)
+        _compare(images, opened, references, arrays, grid, changed, side=side, workers=workers)
         for name, values in measured.items():
             open_array(wip, name)[...] = values
-        finish(wip, folder, lineage=lineage, known=linked)
+        finish(wip, folder, lineage=lineage, known=known, appended=appended)
     return folder
 
 
@@ -332,56 +351,88 @@ def _origins(campaign: Campaign, images: Images, lineage: Lineage) -> dict[str, 
     return origins
 
 
-def _linked(
-    folder: ConfinedPath, wip: ConfinedPath, recorded: Mapping[str, str], empty: xr.Dataset, measured: Mapping[str, Any]
-) -> tuple[dict[str, str], set[str]]:
-    """Link the chunks of unchanged flights of the earlier cube; copy the quantities measured on them.
+@dataclass(frozen=True)
+class _EarlierCube:
+    """Cube that was written before, whose chunks of unchanged flights are kept.
 
-    Parameters
+    Attributes
     ----------
-    folder, recorded
-        The earlier cube and its hashes; if `recorded` is empty, there is none.
-    wip, empty
-        The new cube.
-    measured
-        Quantities of the new cube, by name, which are written here.
-
-    Returns
-    -------
-    tuple
-        Linked file → SHA-256, and the names of the unchanged flights. If no flight has changed, all chunks are read,
-        and flights with damaged chunks count as changed.
+    folder
+        Its folder.
+    recorded
+        File → SHA-256; empty if there is no such cube.
+    attributes
+        Its attributes.
     """
-    if not recorded:
-        return {}, set()
-    attributes = attributes_of(folder)
-    earlier, flights, pairs = attributes.get("origins", {}), attributes["flights"], attributes["pairs"]
-    origins = empty.attrs["origins"]
-    kept = {flight for flight in flights if earlier.get(flight) == origins.get(flight)} & origins.keys()
-    chunks = {name: digest for name, digest in recorded.items() if name.split("/")[0] in RASTERS and "/c/" in name}
-    if kept == origins.keys():
-        kept -= {
-            flights[int(name.split("/")[2])] for name, digest in chunks.items() if sha256_file(folder / name) != digest
+
+    folder: ConfinedPath
+    recorded: Mapping[str, str]
+    attributes: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, folder: ConfinedPath, recorded: Mapping[str, str]) -> "_EarlierCube":
+        """Return the cube in a folder; `recorded` as yielded by `replacing`."""
+        attributes = attributes_of(folder) if recorded else {}
+        return cls(folder, recorded, {"origins": {}, "flights": [], "pairs": []} | attributes)
+
+    @property
+    def _chunks(self) -> Iterator[tuple[str, int, str]]:
+        """Chunks of rasters: file, row along `flight`, SHA-256."""
+        for name, digest in self.recorded.items():
+            array, *place = name.split("/")
+            if array in RASTERS and place[0] == "c":
+                yield name, int(place[1]), digest
+
+    def kept(self, origins: Mapping[str, str]) -> set[str]:
+        """Return the unchanged flights; if all are unchanged, flights with damaged chunks count as changed."""
+        earlier, flights = self.attributes["origins"], self.attributes["flights"]
+        kept = {flight for flight in origins if origins[flight] == earlier.get(flight)}
+        if kept == origins.keys():
+            kept -= {flights[row] for name, row, digest in self._chunks if sha256_file(self.folder / name) != digest}
+        return kept
+
+    def is_continued(self, empty: xr.Dataset, kept: Collection[str]) -> bool:
+        """Return True if all flights are kept, and further flights follow them."""
+        flights, arrays = self.attributes["flights"], {name.split("/")[0] for name in self.recorded if "/" in name}
+        return (
+            bool(flights)
+            and set(flights) == {*kept}
+            and empty.attrs["flights"][: len(flights)] == flights
+            and empty.attrs["pairs"] == self.attributes["pairs"]
+            and {*empty.variables} == arrays
+        )
+
+    def carry(
+        self, kept: Collection[str], empty: xr.Dataset, measured: Mapping[str, Any], wip: ConfinedPath | None
+    ) -> dict[str, str]:
+        """Copy the measures of kept flights to `measured`, and link their chunks to a new cube.
+
+        Without `wip`, the chunks remain in their place. Return the files of these chunks in the new cube and their
+        hashes.
+        """
+        flights, pairs, carried = self.attributes["flights"], self.attributes["pairs"], dict[str, str]()
+        rows = {flights.index(flight): empty.attrs["flights"].index(flight) for flight in kept}
+        columns = {
+            at: empty.attrs["pairs"].index(pair) for at, pair in enumerate(pairs) if pair in empty.attrs["pairs"]
         }
-    rows = {flights.index(flight): empty.attrs["flights"].index(flight) for flight in kept}
-    columns = {pairs.index(pair): empty.attrs["pairs"].index(pair) for pair in pairs if pair in empty.attrs["pairs"]}
-    linked = dict[str, str]()
-    for name, digest in chunks.items():
-        array, c, row, *rest = name.split("/")
-        if int(row) in rows and array in empty:
-            if "pair" in empty[array].dims:
-                rest[0] = str(columns[int(rest[0])])
-            new = "/".join([array, c, str(rows[int(row)]), *rest])
-            (folder / name).link_or_copy_to(wip / new)
-            linked[new] = digest
-    for name, values in measured.items():
-        old = open_array(folder, name, "r")[...] if f"{name}/zarr.json" in recorded else np.full_like(values, np.nan)
-        for row, new_row in rows.items():
-            if values.ndim == 1:
-                values[new_row] = old[row]
-            else:
-                values[new_row, [*columns.values()]] = old[row, [*columns]]
-    return linked, kept
+        for name, row, digest in self._chunks:
+            array, folder, _, *rest = name.split("/")
+            if row in rows and array in empty:
+                if "pair" in empty[array].dims:
+                    rest[0] = str(columns[int(rest[0])])
+                new = "/".join([array, folder, str(rows[row]), *rest])
+                carried[new] = digest
+                if wip is not None:
+                    (self.folder / name).link_or_copy_to(wip / new)
+        for name, values in measured.items():
+            if rows and f"{name}/zarr.json" in self.recorded:
+                old = open_array(self.folder, name, "r")[...]
+                for row, new_row in rows.items():
+                    if values.ndim == 1:
+                        values[new_row] = old[row]
+                    else:
+                        values[new_row, [*columns.values()]] = old[row, [*columns]]
+        return carried
 
 
 @dataclass(frozen=True)
@@ -419,7 +470,7 @@ class _CubeArrays:
 
 
 def _write_images(
-    images: Images,
+    present: Mapping[str, xr.Dataset],
     fusion: Mapping[str, Any] | None,
     arrays: _CubeArrays,
     flight: str,
@@ -427,7 +478,6 @@ def _write_images(
     workers: Executor,
 ) -> None:
     """Copy the images of a flight and write their sums, tile by tile; `fusion` is None if the flight has no sums."""
-    present = {pair: image for (name, pair), image in images.items() if name == flight}
     copies = [arrays.plane("image", flight, pair) for pair in present]
     phases_rad = {} if fusion is None else fusion["phases_rad"]
     peaks = np.array([image.attrs["quality"]["brightest"]["amplitude"] for image in present.values()])
@@ -453,6 +503,7 @@ def _write_images(
 
 def _compare(
     images: Images,
+    opened: Callable[[str, str], xr.Dataset],
     references: Mapping[str, str],
     arrays: _CubeArrays,
     grid: SceneGrid,
@@ -465,11 +516,11 @@ def _compare(
     for kind, partners in compared(images, references, reference_flights(images, arrays.pairs)).items():
         rows = {image: reference for image, reference in partners.items() if image[0] in changed}
         for reference in dict.fromkeys(rows.values()):
-            reference_raster = held(images[reference].image)
+            reference_raster = held(opened(*reference).image)
             for name in (image for image, partner in rows.items() if partner == reference):
                 window = window_of([images[name], images[reference]], grid.spacing_m)
                 planes = [arrays.plane(f"{kind}_{measure}", *name) for measure in _PHASE]
-                rasters, outputs = (held(images[name].image), reference_raster), (planes[0], planes[1])
+                rasters, outputs = (held(opened(*name).image), reference_raster), (planes[0], planes[1])
                 measures = write_phase(rasters, outputs, grid, side=side, window=window, workers=workers)
                 shared = shared_band(images[name], images[reference])
                 values = (window, *measures, shared)
@@ -497,6 +548,7 @@ def _empty_cube(
     return empty.assign_coords(grid.coordinates).assign_attrs(
         Conventions="CF-1.11, ACDD-1.3",
         **acdd_attributes(campaign, [image.attrs["quality"]["view"] for image in images.values()], grid),
+        **convention_attributes(grid),
         history="written by rule cube of apertura; runspec, inputs and code_sha256 state settings, data and code",
         flights=[*assessed],
         pairs=pairs,
@@ -509,6 +561,44 @@ def _empty_cube(
         },
         flags={name: flags for name, one in assessed.items() if (flags := one["first_flight"].get("flags"))},
     )
+
+
+_CONVENTIONS = {
+    "spatial": ("689b58e2-cf7b-45e0-9fff-9cfc0883d6b4", "Spatial coordinate information"),
+    "proj": ("f17cb550-5864-4468-aeb7-f3180cfb622f", "Coordinate reference system information for geospatial data"),
+}
+"""Convention of https://github.com/zarr-conventions, version 0.1 → UUID and description."""
+
+
+def convention_attributes(grid: SceneGrid) -> dict[str, Any]:
+    """Return the attributes of the Zarr conventions `spatial` and `proj`; a local frame has no registered CRS.
+
+    Examples
+    --------
+    >>> attributes = convention_attributes(SceneGrid("EPSG:32632", 570000.0, 5363000.0, 0.5, (40, 60)))
+    >>> attributes["spatial:bbox"], attributes["proj:code"]
+    ([570000.0, 5362980.0, 570030.0, 5363000.0], 'EPSG:32632')
+    """
+    crs = {} if grid.frame == "local" else {"proj:code": grid.crs, "proj:wkt2": CRS(grid.crs_wkt).to_wkt()}
+    names = ["spatial", *(["proj"] if crs else [])]
+    return {
+        "zarr_conventions": [
+            {
+                "schema_url": f"https://raw.githubusercontent.com/zarr-conventions/{name}/refs/tags/v0.1/schema.json",
+                "spec_url": f"https://github.com/zarr-conventions/{name}/blob/v0.1/README.md",
+                "uuid": _CONVENTIONS[name][0],
+                "name": name,
+                "description": _CONVENTIONS[name][1],
+            }
+            for name in names
+        ],
+        "spatial:dimensions": ["y", "x"],
+        "spatial:bbox": [float(side) for side in grid.bounds_m],
+        "spatial:transform": [float(value) for value in grid.transform],
+        "spatial:shape": [*grid.shape],
+        "spatial:registration": "pixel",
+        **crs,
+    }
 
 
 def acdd_attributes(campaign: Campaign, views: Sequence[Mapping[str, Any]], grid: SceneGrid) -> dict[str, str | float]:

@@ -58,7 +58,7 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
         flags = Flags.merged(echo.flags, cleaning.flags, noisy.flags)  # before samples are read again
         if noisy.excluded.any():
             error_db = write(wip, echo.select(~noisy.excluded), NoisyPulses())
-        attributes = {
+        attributes: dict[str, Any] = {
             "background": {"requested": campaign.settings.processing.background_method, **cleaning.background_report},
             "interference": cleaning.interference_report(noisy),
         }
