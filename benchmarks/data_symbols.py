@@ -25,12 +25,12 @@ PULSES, SIDELINK_DB = 200, 25.0
 PAIRS = "uav1-uav1", "uav1-uav2"
 FIXED = ("qpsk", 1)
 CODES = (FIXED, ("qpsk", PULSES), ("16qam", PULSES), ("64qam", PULSES), ("16qam", 1))
-FILTERS = "auto", "reciprocal", "matched", "wiener"
+FILTERS = "auto", "reciprocal", "matched"
 
 
 def simulated(root: Path, code: str, frames: int, snr_db: float | None) -> Path:
-    """Simulate the demo flight with a code, on a grid of 16 m × 16 m."""
-    plan = replace(preset("demo", pulses=PULSES), scene=ImageGrid("EPSG:32632", half_width_m=8.0, spacing_m=0.16))
+    """Simulate the demo flight with a code, on a grid of 80 m × 80 m."""
+    plan = replace(preset("demo", pulses=PULSES), scene=ImageGrid("EPSG:32632", half_width_m=40.0, spacing_m=0.32))
     own = Impairments(radar_snr_db=snr_db)
     quiet = {"uav1": own, "uav2": replace(own, sidelink_snr_db=None if snr_db is None else SIDELINK_DB)}
     waveform = replace(plan.waveform, code=code, frames=frames)
@@ -61,9 +61,9 @@ def imaged(root: Path, symbol_filter: str) -> tuple[dict[str, np.ndarray], dict[
     nodes = json.loads((root / "truth.json").read_text())["flights"]["f01"]["nodes"]
     for pair in PAIRS:
         image.image(campaign, "f01", pair, threads=1)
-        stage = open_stage(campaign.stage("image", "f01", pair), "image")
+        stage, echoes = (open_stage(campaign.stage(name, "f01", pair), name) for name in ("image", "echo"))
         scale = nodes[pair.split("-")[1]]["channels"]["radar"]["full_scale"]  # of the converter, which includes noise
-        pixels[pair], reports[pair] = stage.image.values * scale, stage.attrs.get("symbols", {})
+        pixels[pair], reports[pair] = stage.image.values * scale, echoes.attrs.get("symbols", {})
     return pixels, reports
 
 
