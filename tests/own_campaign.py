@@ -164,7 +164,7 @@ def write(
         "scene": {
             "crs": "EPSG:32632",
             "bounds_m": [X - 6, Y - 6, X + 6, Y + 6],
-            "spacing_m": 0.1,
+            "spacing_m": 0.05,
             "height_m": HEIGHT,
             "height_datum": "ellipsoid",
             "atmosphere": {"refractivity_n": 0.0},
