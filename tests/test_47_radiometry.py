@@ -101,6 +101,23 @@ def test_noise_of_a_calibrated_image_agrees_with_the_noise_figure(flown, pair):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("symbol_filter", ["reciprocal", "wiener"])
+def test_noise_figure_of_symbols_of_varying_modulus_is_that_of_the_receiver(tmp_path, symbol_filter):
+    """The gain of the filter multiplies the noise of 64-QAM by 2.7 (reciprocal), which the noise figure must not."""
+    base = plan()
+    changing = replace(base, waveform=replace(base.waveform, code="64qam", frames=120))
+    root = simulate(tmp_path / "campaign", changing, seed=3)
+    edit_config(root, lambda document: document.update(processing={"symbol_filter": symbol_filter}))
+    campaign = run_steps(root, exports=False)
+    for pair in PAIRS:
+        layers(campaign, "f01", pair)
+        noise = report_of(campaign, pair)["noise"]
+        assert abs(noise["noise_figure_measured_db"] - 6) < 3 * noise["std_db"] < 1.5
+        assert ("symbols" in noise) is (symbol_filter == "wiener")
+        assert "noise_disagrees" not in report_of(campaign, pair)["flags"]
+
+
+@pytest.mark.slow
 def test_receiver_gain_error_of_6_db_is_flagged_from_noise(flown, tmp_path):
     """By eq. 8b, noise is compared with the configured noise figure or, if not configured, with 0 dB."""
     assert not any("noise_disagrees" in report_of(flown, pair)["flags"] for pair in PAIRS)

@@ -198,7 +198,7 @@ def symbols_noise(
     """
 
     def residual(shape: tuple[int, ...], generator: np.random.Generator) -> NDArray[np.complex64]:
-        return (np.sqrt(self_noise) * generator.standard_normal(shape)).astype(np.complex64)
+        return np.asarray(np.sqrt(self_noise) * generator.standard_normal(shape), np.complex64)
 
     return _noise_of_factors(history, grid, terrain, places_m, beams, residual)
 

@@ -1,0 +1,146 @@
+"""Filters of symbols of varying modulus: noise gain, data sidelobes and SNR loss equal their closed forms."""
+
+import numpy as np
+import pytest
+
+from apertura.core.echo.constellation import constellation
+from apertura.core.echo.frame_codes import Inverses
+from apertura.core.echo.symbol_filter import FILTERS, SymbolFilter, choose_filter, data_sidelobes, echo_snr, filter_of
+
+QAM = ("16qam", "64qam", "256qam")
+SUBCARRIERS = 512
+
+
+def decibels(ratio):
+    return 10 * np.log10(ratio)
+
+
+def powers(name):
+    return np.abs(constellation(name).points.astype(complex)) ** 2
+
+
+def drawn(rng, name, frames):
+    points = constellation(name).points
+    return points[rng.integers(0, len(points), (frames, SUBCARRIERS))]
+
+
+def white(rng, frames):
+    return ((rng.normal(size=(frames, SUBCARRIERS, 2)) @ [1, 1j]) / np.sqrt(2)).astype(np.complex64)
+
+
+def filtered(received, codes, chosen):
+    inverse = Inverses.of_codes(codes).at(np.arange(len(codes)))
+    return chosen.applied((received * inverse).astype(np.complex64), inverse)
+
+
+@pytest.mark.parametrize(
+    ("name", "gain_db", "self_noise"),
+    [("qpsk", 0.0, 0.0), ("16qam", 2.762, 0.32), ("64qam", 4.290, 0.38095), ("256qam", 5.362, 0.39529)],
+)
+def test_noise_gain_and_self_noise_of_constellations(name, gain_db, self_noise):
+    """E|c|⁴ of square QAM is (7M − 13)/(5(M − 1)) for unit mean power."""
+    power = powers(name)
+    reciprocal, matched = (SymbolFilter.of(item, power, 1.0) for item in ("reciprocal", "matched"))
+    assert decibels(reciprocal.noise_gain(power)) == pytest.approx(gain_db, abs=1e-3)
+    assert reciprocal.self_noise(power) == pytest.approx(0, abs=1e-6)
+    assert matched.noise_gain(power) == pytest.approx(1, abs=1e-6)
+    points = len(power)
+    assert matched.self_noise(power) == pytest.approx((7 * points - 13) / (5 * (points - 1)) - 1, abs=1e-6)
+    assert matched.self_noise(power) == pytest.approx(self_noise, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", QAM)
+def test_wiener_filter_has_the_smallest_loss_and_its_closed_form(name):
+    power = powers(name)
+    for snr in 10 ** np.arange(-3.0, 3.1, 0.5):
+        wiener, *others = (SymbolFilter.of(item, power, snr) for item in ("wiener", "reciprocal", "matched"))
+        q = np.mean(power / (power + 1 / snr))
+        assert wiener.loss(power, snr) == pytest.approx(snr * (1 / q - 1), rel=1e-6)
+        assert wiener.loss(power, snr) <= min(other.loss(power, snr) for other in others) * (1 + 1e-6)
+        assert np.mean(wiener.weight(power)) == pytest.approx(1, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", QAM)
+@pytest.mark.parametrize("item", FILTERS)
+def test_noise_of_a_profile_is_multiplied_by_the_noise_gain(name, item):
+    rng = np.random.default_rng(1)
+    codes, noise = drawn(rng, name, 800), white(rng, 800)
+    power = np.abs(codes.astype(complex)) ** 2
+    chosen = SymbolFilter.of(item, power, 0.5)
+    profile = np.fft.fft(filtered(noise, codes, chosen), axis=1, norm="ortho")
+    assert decibels(np.mean(np.abs(profile) ** 2)) == pytest.approx(decibels(chosen.noise_gain(powers(name))), abs=0.1)
+
+
+@pytest.mark.parametrize("name", QAM)
+@pytest.mark.parametrize(("item", "snr"), [("matched", 1.0), ("wiener", 1.0), ("wiener", 10.0)])
+@pytest.mark.parametrize("frames", [1, 30])
+def test_data_sidelobes_of_a_point_have_their_predicted_level(name, item, snr, frames):
+    """Of a fixed code, sidelobes are the same in each pulse; of F frames, they average as 1/F."""
+    rng, pulses = np.random.default_rng(2), 60
+    window, level = np.hanning(SUBCARRIERS + 2)[1:-1], []
+    for _ in range(200):
+        table = drawn(rng, name, frames)
+        codes = table[np.arange(pulses) % frames]
+        power = np.abs(table.astype(complex)) ** 2
+        chosen = SymbolFilter.of(item, power, snr)
+        total = filtered(codes.astype(np.complex64), codes, chosen).sum(axis=0)
+        profile = np.abs(np.fft.fft(total * window)) ** 2 / (pulses * window.sum()) ** 2
+        level.append(profile[20:-20].mean())
+    expected = data_sidelobes(SymbolFilter.of(item, powers(name), snr).self_noise(powers(name)), SUBCARRIERS, frames)
+    assert decibels(np.mean(level)) == pytest.approx(decibels(expected), abs=0.1)
+
+
+@pytest.mark.quick("*-0.0-64qam")
+@pytest.mark.parametrize("name", QAM)
+@pytest.mark.parametrize("snr_db", [-15.0, 0.0, 15.0])
+@pytest.mark.parametrize("item", FILTERS)
+def test_noise_floor_of_a_scene_equals_the_predicted_loss(name, snr_db, item):
+    """Floor in empty delay cells with echoes of a scene, relative to a code of constant modulus, within 0.1 dB."""
+    rng, frames, snr = np.random.default_rng(3), 1500, 10 ** (snr_db / 10)
+    delays = np.arange(100)
+    amplitudes = (rng.normal(size=(100, 2)) @ [1, 1j]) / np.sqrt(200)
+    scene = np.exp(-2j * np.pi * np.outer(np.arange(SUBCARRIERS), delays) / SUBCARRIERS) @ amplitudes
+    snr_of_scene = snr * np.mean(np.abs(scene) ** 2)
+    floors = []
+    for of in (name, "qpsk"):
+        codes = drawn(rng, of, frames)
+        power = np.abs(codes.astype(complex)) ** 2
+        chosen = SymbolFilter.of(item if of == name else "reciprocal", power, snr_of_scene)
+        received = codes * scene * np.sqrt(snr) + white(rng, frames)
+        profile = np.fft.ifft(filtered(received, codes, chosen), axis=1, norm="ortho")
+        floors.append(np.mean(np.abs(profile[:, 120:]) ** 2))
+    predicted = SymbolFilter.of(item, powers(name), snr_of_scene).loss(powers(name), snr_of_scene)
+    assert decibels(floors[0] / floors[1]) == pytest.approx(decibels(predicted), abs=0.1)
+
+
+@pytest.mark.parametrize("name", ["qpsk", *QAM])
+@pytest.mark.parametrize("snr_db", [-20.0, 0.0, 20.0])
+def test_snr_of_echoes_is_measured_behind_the_division(name, snr_db):
+    rng = np.random.default_rng(4)
+    codes = drawn(rng, name, 1000)
+    echo = np.exp(-2j * np.pi * np.arange(SUBCARRIERS) * 17.4 / SUBCARRIERS) * 10 ** (snr_db / 20)
+    received = codes * echo + white(rng, 1000)
+    gain = SymbolFilter().noise_gain(powers(name))
+    measured = echo_snr((received / codes).astype(np.complex64), gain)
+    assert measured == pytest.approx(10 ** (snr_db / 10), rel=0.1, abs=0.005 * gain)
+
+
+def test_choice_needs_tolerated_sidelobes_and_keeps_the_requested_filter():
+    power = np.tile(powers("64qam"), (4, 8))
+    chosen = {
+        (snr, frames): choose_filter(power, requested="auto", snr=snr, frames=frames, tolerated_db=-50.0).filter.name
+        for snr in (0.01, np.inf)
+        for frames in (1, 1000)
+    }
+    assert chosen == {
+        (0.01, 1): "reciprocal",
+        (0.01, 1000): "wiener",
+        (np.inf, 1): "reciprocal",
+        (np.inf, 1000): "reciprocal",
+    }
+    lossy = choose_filter(power, requested="reciprocal", snr=0.01, frames=1000, tolerated_db=-50.0)
+    assert lossy.flags == {"symbols_noise": "SNR loss of the reciprocal filter 4.3 dB, smallest loss 0.0 dB"}
+    loud = choose_filter(power, requested="matched", snr=0.01, frames=1, tolerated_db=-50.0)
+    assert loud.flags["symbols_sidelobes"].startswith("data sidelobes of -29.5 dB after the matched filter, in 1 ")
+    assert filter_of(loud.report) == loud.filter
+    assert filter_of({}) == filter_of(None) == SymbolFilter()
