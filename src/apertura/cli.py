@@ -749,7 +749,7 @@ def simulate(
     preset: Annotated[
         str | None,
         typer.Option(
-            help="demo (the default), first-flight, paper, swarm, continuous, flight (13.5 GB), "
+            help="demo (the default), first-flight, paper, swarm, payload, continuous, flight (13.5 GB), "
             "paper-lab, paper-static, paper-uav"
         ),
     ] = None,

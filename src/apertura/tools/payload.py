@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
@@ -26,6 +25,7 @@ from apertura.stages.acquisition import Captured
 from apertura.stages.ingest import captures_of, checked_recording
 from apertura.stages.symbols import decided_symbols
 from apertura.stages.transmitted import Transmitted, transmitted
+from apertura.tools.chart.pareto import save_png
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,11 @@ class NodePayload:
     prf_hz: float
 
     @property
+    def symbols(self) -> int:
+        """Number of data symbols of a frame."""
+        return self.frames.total_bits // self.constellation.bits_per_symbol
+
+    @property
     def summary(self) -> dict[str, Any]:
         """Numbers of frames and errors, medians of SNR and EVM, and data rates."""
         count, seen = len(self.time), self.detected
@@ -100,6 +105,7 @@ class NodePayload:
             "sure": int(self.sure.sum()),
             "intact": int(self.intact.sum()),
             "frame_error_rate": round(1 - float(self.intact.mean()), 6) if count else None,
+            "frame_error_rate_expected": None if expected is None else round(1 - (1 - expected) ** self.symbols, 6),
             "header_bit_error_rate": round(float(self.header_errors[seen].sum()) / known, 8),
             "symbol_error_rate_expected": None if expected is None else float(f"{expected:.3e}"),
             "snr_db": None if snr_db is None else round(snr_db, 2),
@@ -137,8 +143,8 @@ def payloads(campaign: Campaign) -> list[NodePayload]:
         If the waveform has no frame format, or no node recorded a sidelink.
     """
     waveform = campaign.settings.waveform
-    codes = waveform.codes if isinstance(waveform, OfdmWaveform) else None
-    if not isinstance(codes, SidelinkCodes) or codes.frame is None:
+    codes = getattr(waveform, "codes", None)
+    if not (isinstance(waveform, OfdmWaveform) and isinstance(codes, SidelinkCodes) and codes.frame is not None):
         raise CampaignError(
             "no frame format",
             where=f"{CONFIG}: waveform.codes.frame",
@@ -202,12 +208,12 @@ def _payload(captured: Captured, sent: Transmitted, accuracy_db: Any, flight: st
 def write_payload(campaign: Campaign, folder: Path) -> list[Path]:
     """Write payload.json, payload.png, and table and data of each node into a folder; print a summary."""
     read, root = payloads(campaign), made_folder(folder)
-    files = [root / "payload.json", root / "payload.png"]
+    files: list[Path] = [root / "payload.json", root / "payload.png"]
     write_json(files[0], {"campaign": campaign.settings.campaign, "nodes": [one.summary for one in read]})
     _draw(read, files[1])
     for one in read:
-        table, data = (root / f"{one.flight}.{one.node}.{suffix}" for suffix in ("csv", "npy"))
-        write_table(table, one.rows, digits=3)
+        table, data = root / f"{one.flight}.{one.node}.csv", root / f"{one.flight}.{one.node}.npy"
+        write_table(table, one.rows, digits=4)
         with replacement(data) as temporary, temporary.open("wb") as file:
             np.save(file, one.data)
         files += [table, data]
@@ -229,7 +235,6 @@ def _draw(read: Sequence[NodePayload], path: Path) -> None:
     """Plot SNR and lost frames of each node over time, one panel for each flight."""
     flights = list(dict.fromkeys(one.flight for one in read))
     figure = Figure(figsize=(10, 1.2 + 2.8 * len(flights)), layout="constrained")
-    FigureCanvasAgg(figure)
     panels = figure.subplots(len(flights), squeeze=False)[:, 0]
     for axes, flight in zip(panels, flights, strict=True):
         nodes = [one for one in read if one.flight == flight]
@@ -247,5 +252,4 @@ def _draw(read: Sequence[NodePayload], path: Path) -> None:
         axes.set_ylabel("SNR per subcarrier, dB")
         axes.legend(loc="best", fontsize="small")
     panels[-1].set_xlabel("Time since the first frame, s")
-    with replacement(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=110, metadata={"Software": None})
+    save_png(figure, path)
