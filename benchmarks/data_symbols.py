@@ -1,8 +1,8 @@
 """Known symbols that change from pulse to pulse, compared with a fixed code: image noise, peak, and computing time.
 
 `python benchmarks/data_symbols.py` prints the tables of docs/theory/changing_codes.md. Images of the demo scene are
-formed from recordings with and without noise; the difference from the noiseless image of a fixed QPSK code is the sum
-of noise and data sidelobes, whose power relative to that of the fixed code is the SNR loss.
+formed from recordings with and without noise. The difference of range profiles from those of a fixed QPSK code without
+noise is the sum of noise and data sidelobes; its power relative to that of the fixed code with noise is the SNR loss.
 """
 
 import json
@@ -25,12 +25,12 @@ PULSES, SIDELINK_DB = 200, 25.0
 PAIRS = "uav1-uav1", "uav1-uav2"
 FIXED = ("qpsk", 1)
 CODES = (FIXED, ("qpsk", PULSES), ("16qam", PULSES), ("64qam", PULSES), ("16qam", 1))
-FILTERS = "auto", "reciprocal", "matched", "wiener"
+FILTERS = "auto", "reciprocal", "matched"
 
 
 def simulated(root: Path, code: str, frames: int, snr_db: float | None) -> Path:
-    """Simulate the demo flight with a code, on a grid of 16 m × 16 m."""
-    plan = replace(preset("demo", pulses=PULSES), scene=ImageGrid("EPSG:32632", half_width_m=8.0, spacing_m=0.16))
+    """Simulate the demo flight with a code, on a grid of 40 m × 40 m."""
+    plan = replace(preset("demo", pulses=PULSES), scene=ImageGrid("EPSG:32632", half_width_m=20.0, spacing_m=0.32))
     own = Impairments(radar_snr_db=snr_db)
     quiet = {"uav1": own, "uav2": replace(own, sidelink_snr_db=None if snr_db is None else SIDELINK_DB)}
     waveform = replace(plan.waveform, code=code, frames=frames)
@@ -40,8 +40,11 @@ def simulated(root: Path, code: str, frames: int, snr_db: float | None) -> Path:
     return root
 
 
-def imaged(root: Path, symbol_filter: str) -> tuple[dict[str, np.ndarray], dict[str, dict]]:
-    """Return the images of both pairs, and the reports on their symbols."""
+Formed = dict[str, tuple[np.ndarray, np.ndarray, dict]]
+
+
+def imaged(root: Path, symbol_filter: str) -> Formed:
+    """Return pair → image, range profiles, and report on the symbols."""
     path = root / "config/config.yaml"
     document = yaml.safe_load(path.read_text())
     document["processing"] = {"autofocus": "off", "background": "none", "interference": "none", "sidelink": "divide"}
@@ -57,14 +60,15 @@ def imaged(root: Path, symbol_filter: str) -> tuple[dict[str, np.ndarray], dict[
     for pair in PAIRS:
         profile.profile(campaign, "f01", pair)
     refine.refine(campaign, "f01")
-    pixels, reports = {}, {}
+    formed: Formed = {}
     nodes = json.loads((root / "truth.json").read_text())["flights"]["f01"]["nodes"]
     for pair in PAIRS:
         image.image(campaign, "f01", pair, threads=1)
-        stage = open_stage(campaign.stage("image", "f01", pair), "image")
+        stage = {name: open_stage(campaign.stage(name, "f01", pair), name) for name in ("image", "profile", "echo")}
         scale = nodes[pair.split("-")[1]]["channels"]["radar"]["full_scale"]  # of the converter, which includes noise
-        pixels[pair], reports[pair] = stage.image.values * scale, stage.attrs.get("symbols", {})
-    return pixels, reports
+        pixels, profiles = (stage[name][name].values * scale for name in ("image", "profile"))
+        formed[pair] = pixels, profiles, stage["echo"].attrs.get("symbols", {})
+    return formed
 
 
 def decibels(ratio: float) -> float:
@@ -78,26 +82,30 @@ def losses(snr_db: float) -> None:
     print("| code | frames | filter | pair | loss, dB | predicted | difference, dB | peak, dB |")
     print("|---|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
-        clean, _ = imaged(simulated(Path(folder) / "clean", *FIXED, None), "auto")
-        base: dict[str, float] = {}
-        fixed: dict[str, np.ndarray] = {}
+        clean = imaged(simulated(Path(folder) / "clean", *FIXED, None), "auto")
+        base: dict[str, tuple[float, float]] = {}
+        fixed: Formed = {}
         for code, frames in CODES:
             root = simulated(Path(folder) / f"{code}{frames}", code, frames, snr_db)
             for symbol_filter in FILTERS if code != "qpsk" else ("auto",):
-                pixels, reports = imaged(root, symbol_filter)
-                for pair in PAIRS:
-                    noise = float(np.mean(np.abs(pixels[pair] - clean[pair]) ** 2))
+                formed = imaged(root, symbol_filter)
+                fixed = fixed or formed
+                for pair, (pixels, profiles, symbols) in formed.items():
+                    # noise of pixels and of profiles
+                    noise = tuple(
+                        float(np.mean(np.abs(here - clear) ** 2))
+                        for here, clear in zip((pixels, profiles), clean[pair], strict=False)
+                    )
                     base.setdefault(pair, noise)
-                    fixed.setdefault(pair, pixels[pair])
-                    report = reports[pair] if "filter" in reports[pair] else {"filter": "reciprocal", "loss_db": 0.0}
                     # of two images with independent noise, relative to the sum of their noise
-                    difference = np.mean(np.abs(pixels[pair] - fixed[pair]) ** 2) / (base[pair] + noise)
-                    bright = np.unravel_index(np.abs(clean[pair]).argmax(), clean[pair].shape)
-                    peak = np.abs(pixels[pair][bright] / clean[pair][bright]) ** 2
-                    name = report["filter"] if symbol_filter != "auto" else f"auto: {report['filter']}"
+                    difference = np.mean(np.abs(pixels - fixed[pair][0]) ** 2) / (base[pair][0] + noise[0])
+                    bright = np.unravel_index(np.abs(clean[pair][0]).argmax(), pixels.shape)
+                    peak = np.abs(pixels[bright] / clean[pair][0][bright]) ** 2
+                    name = symbols.get("filter", "reciprocal")
                     print(
-                        f"| {code} | {frames} | {name} | {pair} | {decibels(noise / base[pair]):.2f} | "
-                        f"{report['loss_db']:.2f} | {decibels(max(difference, 1e-9)):.2f} | {decibels(peak):+.2f} |",
+                        f"| {code} | {frames} | {name if symbol_filter != 'auto' else f'auto: {name}'} | {pair} | "
+                        f"{decibels(noise[1] / base[pair][1]):.2f} | {symbols.get('loss_db', 0.0):.2f} | "
+                        f"{decibels(max(difference, 1e-9)):.2f} | {decibels(peak):+.2f} |",
                         flush=True,
                     )
 

@@ -83,3 +83,17 @@ def test_pulse_is_distinguished_from_a_symbol():
     assert capture_structure(samples.conj(), chirp) == replace(
         found, iq="conjugate", compression=pytest.approx(found.compression)
     )
+
+
+def test_codes_that_change_are_found_by_the_rows_of_the_captures():
+    """With the rows of other captures, nothing is found."""
+    rng = np.random.default_rng(7)
+    table = np.exp(0.5j * np.pi * rng.integers(0, 4, (CAPTURES, N)))
+    time = np.arange(LENGTH) - 10  # on a cell of D/N samples
+    both = np.exp(2j * np.pi * np.outer(time, np.arange(N)) / PERIOD) @ table.T / np.sqrt(N)
+    found = capture_structure(both.T, table)
+    assert (found.channels, found.dft_samples, found.carrier_is, found.sent_samples) == (1, PERIOD, "band_start", N)
+    assert found.compression == pytest.approx(1, abs=0.05)
+    interleaved = np.stack([both.T, np.roll(both.T, 5, axis=1)], -1).reshape(CAPTURES, -1)
+    assert capture_structure(interleaved, table).channels == 2
+    assert capture_structure(both.T, np.roll(table, 1, axis=0)) is None

@@ -5,6 +5,7 @@ import pytest
 
 from apertura.core.echo.constellation import constellation
 from apertura.core.echo.frame_codes import Inverses
+from apertura.core.echo.interference import PulsedInterference
 from apertura.core.echo.symbol_filter import FILTERS, SymbolFilter, choose_filter, data_sidelobes, echo_snr, filter_of
 
 QAM = ("16qam", "64qam", "256qam")
@@ -144,3 +145,18 @@ def test_choice_needs_tolerated_sidelobes_and_keeps_the_requested_filter():
     assert loud.flags["symbols_sidelobes"].startswith("data sidelobes of -29.5 dB after the matched filter, in 1 ")
     assert filter_of(loud.report) == loud.filter
     assert filter_of({}) == filter_of(None) == SymbolFilter()
+
+
+@pytest.mark.parametrize("name", QAM)
+def test_weak_symbols_are_not_taken_for_pulsed_interference(name):
+    """Noise alone, divided by the symbols; a burst of 45 dB is found with raised limits, too."""
+    rng = np.random.default_rng(5)
+    codes = drawn(rng, name, 400)
+    transfer = (white(rng, 400) / codes).astype(np.complex64)
+    peak, equal = SymbolFilter().noise_peak(powers(name)), np.full(SUBCARRIERS, 1 / SUBCARRIERS)
+    frequency = 1.05e9 + 1e6 * np.arange(SUBCARRIERS)
+    assert PulsedInterference.measured([transfer], frequency, equal) is not None
+    assert PulsedInterference.measured([transfer], frequency, equal, noise_peak=peak) is None
+    transfer[::10, 20:22] += 10 ** (45 / 20)
+    found = PulsedInterference.measured([transfer], frequency, equal, noise_peak=peak)
+    assert found.hits(transfer[::10])[:, 20:22].all()

@@ -69,6 +69,17 @@ def test_int16_samples_with_nmea_and_csv_need_three_answers(tiny, loose, tmp_pat
 
 
 @pytest.mark.slow
+def test_codes_that_change_from_pulse_to_pulse_are_described(tmp_path):
+    plan = preset("demo", pulses=60)
+    changing = replace(plan, waveform=replace(plan.waveform, code="16qam", frames=60))
+    root = simulate(tmp_path / "simulated", changing, seed=1)
+    made = campaign_from_files(tmp_path / "made", [int16_and_logs(root, tmp_path / "loose")], ask=answering(ANSWERS))
+    expected, found = Campaign.load(root).settings.waveform, Campaign.load(made.folder).settings.waveform
+    assert found.model_dump() == pytest.approx(expected.model_dump())
+    assert (made.folder / "raw/codes.npy").read_bytes() == (root / "raw/codes.npy").read_bytes()
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["int16", "complex64"])
 def test_samples_in_arrays_are_read_back(tiny, loose, tmp_path, kind):
     """The header of the .npy file is skipped, so that the file is linked like other samples."""

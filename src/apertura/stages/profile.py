@@ -153,7 +153,9 @@ def _decide(echo: PairEcho, scene: OpenScene, processing: Processing) -> _Cleani
                 for part, at in zip(sampled, pulses, strict=True)
             ]
     if cleaning.interference:
-        cleaning = replace(cleaning, pulsed=PulsedInterference.measured(sampled, frequency, weight))
+        cleaning = replace(
+            cleaning, pulsed=PulsedInterference.measured(sampled, frequency, weight, noise_peak=echo.noise_peak)
+        )
     return cleaning
 
 

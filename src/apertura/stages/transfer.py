@@ -158,7 +158,9 @@ class PairEcho:
         gain = profile.subcarrier_gain.values if "subcarrier_gain" in profile else None
         if "interference_level" in profile:
             weight = window_weights(profile.attrs["window"], profile.sizes["subcarrier"])
-            pulsed = PulsedInterference(profile.interference_level.values, weight if gain is None else weight * gain)
+            kept_weight = weight if gain is None else weight * gain
+            level = profile.interference_level.values
+            pulsed = PulsedInterference(level, kept_weight, noise_peak=echo.noise_peak)
         kept = np.isin(echo.dataset.time.values, profile.time.values)
         echo = echo if kept.all() else echo.select(kept)
         reports = {name: profile.attrs[name] for name in ("background", "interference")}
@@ -180,6 +182,11 @@ class PairEcho:
         """Flags of the stage, and of the samples read so far."""
         tones = self.tones["radar"].flags("interference") if "radar" in self.tones else {}
         return Flags.merged(self.dataset.attrs["flags"], self.saturation.flags, tones)
+
+    @property
+    def noise_peak(self) -> float:
+        """Largest noise of a symbol relative to that of constant modulus; 1 if the symbols do not change."""
+        return float(self.dataset.attrs.get("symbols", {}).get("noise_peak", 1.0))
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -243,7 +243,9 @@ def frame_numbers(time_ns: NDArray[np.int64], counted: Frames, *, interval_s: fl
 MOST_DISPLACED = 16
 """Largest displacement of frame numbers that is searched, in frames."""
 
-_CLEARER = 2.0  # least ratio of the compression at a displacement to that of undisplaced frames
+_CLEARER, _FEWEST = 2.0, 8
+"""Least ratio of the compression at a displacement to that without one, and fewest captures: noise reaches this ratio
+by chance in fewer captures."""
 
 
 def displacement(received: Complexes, inverses: Inverses, frames: Frames, *, same_delay: bool) -> int:
@@ -268,12 +270,11 @@ def displacement(received: Complexes, inverses: Inverses, frames: Frames, *, sam
     >>> displacement(codes[3:40], Inverses.of_codes(codes), np.arange(37), same_delay=True)
     3
     """
-    reach = min(MOST_DISPLACED, inverses.count // 2)
+    reach = min(MOST_DISPLACED, inverses.count // 2) if len(received) >= _FEWEST else 0
     peaks = {}
     for shift in sorted(range(-reach, reach + 1), key=abs):
         power = np.abs(scipy.fft.ifft(received * inverses.at(frames + shift), axis=1)) ** 2
         cells = power / np.maximum(power.mean(axis=1, keepdims=True), np.finfo(np.float32).tiny)
         peaks[shift] = float(cells.mean(axis=0).max() if same_delay else cells.max(axis=1).mean())
     best = max(peaks, key=lambda shift: peaks[shift])
-    # without the code, the mean of K exponentially distributed powers exceeds 2 with a probability of exp(-0.3·K)
     return best if peaks[best] > _CLEARER * peaks[0] else 0

@@ -313,14 +313,20 @@ class PulsedInterference:
         (subcarrier,) float64, of range compression, zero for subcarriers excluded in all pulses; sums to 1.
     report
         Measured on some pulses, as JSON values: shares, strongest frequency, excess and gain.
+    noise_peak
+        Largest noise of a symbol relative to that of symbols of constant modulus, by which limits are raised if the
+        symbols change from pulse to pulse.
     """
 
     level: NDArray[np.float32]
     weight: Floats
     report: dict[str, Any] = field(default_factory=dict)
+    noise_peak: float = 1.0
 
     @classmethod
-    def measured(cls, groups: Sequence[Complexes], frequency_hz: Floats, weight: Floats) -> "PulsedInterference | None":
+    def measured(
+        cls, groups: Sequence[Complexes], frequency_hz: Floats, weight: Floats, *, noise_peak: float = 1.0
+    ) -> "PulsedInterference | None":
         """Measure the interference on some pulses; None if its exclusion would gain less than `LEAST_GAIN_DB`.
 
         Parameters
@@ -329,6 +335,8 @@ class PulsedInterference:
             (pulse, subcarrier) transfer functions, background removed.
         frequency_hz, weight
             Of the subcarriers.
+        noise_peak
+            As in the attributes.
 
         Notes
         -----
@@ -348,7 +356,7 @@ class PulsedInterference:
         """
         transfer = np.concatenate(groups)
         level = np.median(np.abs(transfer) ** 2, axis=0).astype(np.float32)
-        pulsed = cls(level, weight)
+        pulsed = cls(level, weight, noise_peak=noise_peak)
         hits = pulsed.hits(transfer)
         power = np.abs(transfer) ** 2
         # Power in the image is proportional to the sum of w²·|H|²; echoes add equally to both sums.
@@ -379,7 +387,7 @@ class PulsedInterference:
         inverse = np.divide(1.0, self.level, out=np.zeros_like(self.level), where=self.level > 0)
         relative = (np.square(transfer.real) + np.square(transfer.imag)) * inverse
         relative /= np.maximum(np.median(relative[:, self.level > 0], axis=1, keepdims=True), np.finfo(np.float32).tiny)
-        limit = np.where(relative.max(axis=1) > _HIT, _SKIRT, _HIT)
+        limit = np.where(relative.max(axis=1) > _HIT * self.noise_peak, _SKIRT, _HIT) * np.float32(self.noise_peak)
         hits = relative > limit[:, None]
         hits &= (hits @ self.weight <= _MOST_OF_PULSE)[:, None]
         return np.asarray(hits)

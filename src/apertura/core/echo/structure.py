@@ -67,7 +67,8 @@ def capture_structure(
     captures
         (capture, number) complex, numbers I + jQ in the order of the file, with interleaved channels.
     sent
-        (subcarrier,) code symbols of an OFDM symbol, or (sample,) samples of a pulse; both are tested.
+        (subcarrier,) code symbols of an OFDM symbol, or (sample,) samples of a pulse; both are tested. Code symbols
+        that change from pulse to pulse: (capture, subcarrier).
     channels
         Number of channels, if it is known.
 
@@ -91,7 +92,7 @@ def capture_structure(
         if needed is None or tested.compression > needed:
             best = tested
     # without the signal, each of N values of each hypothesis exceeds x with probability exp(-N·x)
-    least = np.log(sent.size * max(len(hypotheses), 1) / _FALSE_ALARM) / sent.size
+    least = np.log(sent.shape[-1] * max(len(hypotheses), 1) / _FALSE_ALARM) / sent.shape[-1]
     return best if best is not None and best.compression > least else None
 
 
@@ -102,16 +103,17 @@ def _hypotheses(
         if captures.shape[1] % count:
             continue
         split = captures.reshape(len(captures), -1, count).transpose(0, 2, 1).reshape(len(captures) * count, -1)
-        periods = _periods(split, sent.size)
+        periods = _periods(split, sent.shape[-1])
+        codes = np.repeat(sent, count, axis=0) if sent.ndim > 1 else sent[None]
         orders: dict[Literal["complex", "conjugate"], NDArray[np.complexfloating]]
         orders = {"complex": split, "conjugate": split.conj()}
         for iq, samples in orders.items():
-            if split.shape[1] >= sent.size:
+            if sent.ndim == 1 and split.shape[1] >= sent.size:
                 yield CaptureStructure(count, iq, sent.size, _pulse_compression(samples, sent))
             for period, carrier_is in product(periods, _BANDS):
-                bins = subcarrier_numbers(sent.size, carrier_is=carrier_is) % period
-                share = _code_compression(samples[:, -period:], sent, bins)
-                yield CaptureStructure(count, iq, sent.size, share, period, carrier_is)
+                bins = subcarrier_numbers(sent.shape[-1], carrier_is=carrier_is) % period
+                share = _code_compression(samples[:, -period:], codes, bins)
+                yield CaptureStructure(count, iq, sent.shape[-1], share, period, carrier_is)
 
 
 def _periods(samples: NDArray[np.complexfloating], subcarriers: int) -> list[int]:
@@ -136,11 +138,11 @@ def _periods(samples: NDArray[np.complexfloating], subcarriers: int) -> list[int
 def _code_compression(
     window: NDArray[np.complexfloating], codes: NDArray[np.complexfloating], bins: NDArray[np.int64]
 ) -> float:
-    """Return the compression of a DFT window by the code (eq. 4)."""
+    """Return the compression of a DFT window by the code, (capture, subcarrier) or one row (eq. 4)."""
     spectrum = scipy.fft.fft(window, axis=1)
     energy = (np.abs(spectrum) ** 2).sum(axis=1)
-    matched = scipy.fft.ifft(spectrum[:, bins] * codes.conj(), axis=1) * codes.size
-    return _share(matched, energy * float((np.abs(codes) ** 2).sum()))
+    matched = scipy.fft.ifft(spectrum[:, bins] * codes.conj(), axis=1) * codes.shape[1]
+    return _share(matched, energy * (np.abs(codes) ** 2).sum(axis=1))
 
 
 def _pulse_compression(samples: NDArray[np.complexfloating], pulse: NDArray[np.complexfloating]) -> float:

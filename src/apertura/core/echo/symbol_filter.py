@@ -80,6 +80,10 @@ class SymbolFilter:
         """Return the noise relative to a code of constant modulus and equal mean power, P·E[w²/|c|²] (eq. 4)."""
         return float(power.mean() * (self.weight(power) ** 2 / power).mean())
 
+    def noise_peak(self, power: Powers) -> float:
+        """Return the largest noise of a symbol relative to a constant modulus, P·max w²/|c|²."""
+        return float(power.mean() * (self.weight(power) ** 2 / power).max())
+
     def self_noise(self, power: Powers) -> float:
         """Return the variance κ of the echo amplitude over the data, E[w²] − 1 (eq. 5)."""
         return max(float((self.weight(power) ** 2).mean()) - 1, 0.0)
@@ -195,6 +199,7 @@ def choose_filter(power: Powers, *, requested: str, snr: float, frames: int, tol
         "slope": chosen.slope,
         "snr_db": round(decibels(snr), 2) if known and snr > 0 else None,
         "noise_gain_db": round(decibels(chosen.noise_gain(power)), 2),
+        **({"noise_peak": chosen.noise_peak(power)} if frames > 1 else {}),
         "self_noise": round(chosen.self_noise(power), 4),
         "loss_db": round(loss_db, 2),
         "sidelobes_db": round(decibels(sidelobes[name]), 1) if sidelobes[name] > 0 else None,

@@ -103,7 +103,7 @@ def _sent(found: Found) -> tuple[Path | None, CaptureStructure | None]:
     signals = {path: signal for path, array in found.arrays.items() if (signal := _signal(array)) is not None}
     triggered = [one for one in found.recordings if one.is_triggered]
     structures = {
-        (path, one.path): capture_structure(one.numbers(), signal, channels=one.channels or None)
+        (path, one.path): capture_structure(one.numbers(), one.sent(signal), channels=one.channels or None)
         for path, signal in signals.items()
         for one in triggered
     }
@@ -117,11 +117,11 @@ def _sent(found: Found) -> tuple[Path | None, CaptureStructure | None]:
 
 
 def _signal(array: NDArray[Any]) -> NDArray[np.complex128] | None:
-    """Return code symbols or the samples of a pulse as complex numbers; None for other arrays."""
+    """Return code symbols, or the samples of a pulse, as complex numbers; None for other arrays."""
     if array.ndim == 2 and array.shape[1] == 2 and array.dtype.kind == "i":
         return np.asarray(array[:, 0] + 1j * array[:, 1].astype(np.float64))
-    is_signal = array.ndim == 1 and array.dtype.kind == "c" and 1 < array.size <= 1 << 22
-    return np.asarray(array, np.complex128) if is_signal else None
+    is_signal = array.dtype.kind == "c" and array.ndim in {1, 2} and 1 < array.shape[-1] <= 1 << 22
+    return np.asarray(array, np.complex128) if is_signal and array.ndim == 1 else array if is_signal else None
 
 
 def _describe_rate(draft: Draft, recordings: list[FoundRecording], what: str) -> None:

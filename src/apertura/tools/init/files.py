@@ -142,6 +142,15 @@ class FoundRecording:
         stored = stored[:MOST_CAPTURES].astype(np.float32).reshape(min(len(stored), MOST_CAPTURES), -1, 2)
         return np.asarray(stored[..., 0] + 1j * stored[..., 1])
 
+    def sent(self, signal: NDArray[np.complexfloating]) -> NDArray[np.complexfloating]:
+        """Return the signal of the first captures: of a table of codes, the rows of their frames."""
+        if signal.ndim == 1:
+            return signal
+        count = len(self.numbers())
+        known = self.frames is not None and len(self.frames) >= count and (self.frames[:count] >= 0).all()
+        frames = self.frames[:count] if known and self.frames is not None else np.arange(count)
+        return np.asarray(signal[frames % len(signal)], np.complex128)
+
 
 @dataclass
 class Found:
@@ -202,7 +211,9 @@ def recognised(files: Iterable[Path]) -> Found:
         complex_beats = [one for one in complex_beats if one.times is None and one.content.dtype == np.complex64]
         found.recordings = [one for one in found.recordings if one not in complex_beats]
         found.arrays |= {one.path: one.content for one in complex_beats}
-    headerless += [path for path, array in found.arrays.items() if _samples_of(array) is not None]
+    headerless += [
+        path for path, array in found.arrays.items() if path.name != _CODES and _samples_of(array) is not None
+    ]
     for path in headerless:
         try:
             found.recordings.append(_headerless(path, found.arrays.pop(path, None), found.tags))
@@ -211,6 +222,9 @@ def recognised(files: Iterable[Path]) -> Found:
                 raise
             found.unused[path] = problem.found
     return found
+
+
+_CODES = "codes.npy"
 
 
 def _samples_of(array: NDArray[Any]) -> NDArray[Any] | None:
@@ -243,11 +257,12 @@ def _listed(files: Iterable[Path]) -> dict[Path, bool]:
 def _add(found: Found, path: Path) -> CampaignError | None:
     """Add a file to `found`; return the problem of a file that cannot be used."""
     array = _mapped(path) if path.suffix == ".npy" else None
-    beat = _beat(path, array)
+    is_table = path.name == _CODES and array is not None and array.ndim == 2  # code symbols of many frames
+    beat = None if is_table else _beat(path, array)
     if beat is not None:
         found.recordings.append(beat)
         return None
-    if array is not None and array.ndim > 2 and _samples_of(array) is not None:
+    if array is not None and (is_table or (array.ndim > 2 and _samples_of(array) is not None)):
         found.arrays[path] = array  # of any size, as it is not read
         return None
     report = look(path)
