@@ -93,7 +93,7 @@ def main() -> None:
                 except CampaignError:
                     cells.append(f"{snr_db} dB: no path ({theory:.1e})")
                     continue
-                rate = errors(decider, qam, labels, sidelink)
+                rate = errors(decider, labels, sidelink)
                 cells.append(
                     f"{snr_db} dB: {rate:.1e}/{theory:.1e} {100 * sure:.0f}% {method} {loss_db:+.2f} {floor_db:.0f}"
                 )
