@@ -72,9 +72,7 @@ def image(
     )
 
 
-def errors(
-    decider: SymbolDecider, qam: Constellation, labels: NDArray[np.uint8], sidelink: NDArray[np.complex64]
-) -> float:
+def errors(decider: SymbolDecider, labels: NDArray[np.uint8], sidelink: NDArray[np.complex64]) -> float:
     """Return the symbol error rate after removal of the ambiguity by 16 known symbols."""
     decisions = decider.decide(sidelink, np.arange(len(sidelink)))
     return float(np.mean(decider.resolved(decisions, labels[:, :16]).labels != labels))
@@ -110,7 +108,7 @@ def cost() -> None:
     path = measure(direct).path
     steps = {
         "demodulate one channel of 2560 samples": lambda: scipy.fft.fft(samples, axis=1),
-        "divide by known symbols, fit and correct": lambda: METHODS["two_parameter"](
+        "fit the direct path and correct": lambda: METHODS["two_parameter"](
             echo, direct, measure(direct).path
         ),
         "two_parameter alone": lambda: METHODS["two_parameter"](echo, direct, path),
