@@ -108,9 +108,7 @@ def cost() -> None:
     path = measure(direct).path
     steps = {
         "demodulate one channel of 2560 samples": lambda: scipy.fft.fft(samples, axis=1),
-        "fit the direct path and correct": lambda: METHODS["two_parameter"](
-            echo, direct, measure(direct).path
-        ),
+        "fit the direct path and correct": lambda: METHODS["two_parameter"](echo, direct, measure(direct).path),
         "two_parameter alone": lambda: METHODS["two_parameter"](echo, direct, path),
         "decide unknown symbols": lambda: decider.decide(sidelink, numbers),
     }
