@@ -44,6 +44,7 @@ WITHOUT = {
     "describe": "its results are tags, attributes and a sheet",
     "from_files": "its results are a folder and a table",
     "publish": "its results are copies in an object store",
+    "payload": "its results are bits and tables; its plot is a line of SNR over time",
     "raw_imu": "its recipe runs a library that apertura does not install, and ends in a log",
     "sizing": "its only results are tables of estimates",
 }

@@ -51,10 +51,19 @@ def modulated(bits: np.ndarray, per_symbol: int) -> np.ndarray:
     return (axes[:, 0] + 1j * axes[:, 1]) * np.sqrt(1.5 / (side**2 - 1))
 
 
-def write(
-    root: Path, *, constellation: str = "16qam", pulses: int = 200, sidelink_db: float = 15.0, radar_db: float = 10.0
+def write(  # noqa: PLR0915 - one pass through the equations
+    root: Path,
+    *,
+    constellation: str = "16qam",
+    pulses: int = 200,
+    sidelink_db: float = 15.0,
+    radar_db: float = 10.0,
+    weak: slice | None = None,
 ) -> dict[str, np.ndarray]:
-    """Write the campaign; return bits, (pulse, bit), and easting and northing of the targets, (target, 2)."""
+    """Write the campaign; return bits, (pulse, bit), and easting and northing of the targets, (target, 2).
+
+    The SNRs are per subcarrier. `weak`: pulses whose direct path is 14 dB weaker.
+    """
     random, per_symbol = np.random.default_rng(11), BITS[constellation]
     time_s = np.arange(pulses) / PRF_HZ
 
@@ -142,6 +151,7 @@ def write(
     late_s, phase = random.uniform(-40e-9, 40e-9, pulses), random.uniform(-np.pi, np.pi, pulses)
     trigger = np.exp(-2j * np.pi * np.outer(late_s, np.arange(N) * SPACING_HZ))
     direct = np.exp(-2j * np.pi * np.outer(leg(position["uav1"], position["uav2"]), frequency))
+    direct[weak or slice(0)] *= 0.2
     received = {
         "radar": samples(echoes("uav2") * trigger, phase, radar_db),
         "sidelink": samples(direct * trigger, phase, sidelink_db),
@@ -164,7 +174,7 @@ def write(
         "scene": {
             "crs": "EPSG:32632",
             "bounds_m": [X - 6, Y - 6, X + 6, Y + 6],
-            "spacing_m": 0.1,
+            "spacing_m": 0.05,
             "height_m": HEIGHT,
             "height_datum": "ellipsoid",
             "atmosphere": {"refractivity_n": 0.0},

@@ -544,6 +544,21 @@ def export_time_series(
 
 
 @app.command()
+def payload(
+    campaign: CampaignFolder = HERE,
+    to: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="output folder, default: payload in the campaign folder")
+    ] = None,
+) -> None:
+    """Read the data that the frames of a campaign carry: bits, errors and data rate of each node, over time."""
+    opened = _opened(campaign)
+    from apertura.tools.payload import write_payload
+
+    for path in write_payload(opened, opened.root / "payload" if to is None else given(to)):
+        print(as_typed(path))
+
+
+@app.command()
 def verify(
     product: Annotated[
         Path,
@@ -786,7 +801,7 @@ def simulate(
     preset: Annotated[
         str | None,
         typer.Option(
-            help="demo (the default), first-flight, paper, swarm, continuous, flight (13.5 GB), "
+            help="demo (the default), first-flight, paper, swarm, payload, continuous, flight (13.5 GB), "
             "paper-lab, paper-static, paper-uav, revisit"
         ),
     ] = None,

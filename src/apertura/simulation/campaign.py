@@ -29,6 +29,9 @@ from apertura.simulation.specification import (
 from apertura.simulation.synthesis import digitize, full_scale, periodic_samples, samples
 from apertura.simulation.targets import Origin, PointTarget, Target, phase_centre, scatterers
 
+TRUE_SYMBOLS = "symbols.npy"
+"""File of the true code symbols, (frame, subcarrier) complex64, of a campaign whose config does not name them."""
+
 _LOG_MARGIN_S = 2.0
 _RTK_STD_M = 0.005, 0.005, 0.01  # north, east, up: accuracy that a receiver reports for a fixed solution
 _PULSES_AT_ONCE = 16
@@ -74,7 +77,8 @@ def _write_config(root: Path, campaign: DrawnCampaign) -> None:
     )
     _write_segments(root, specification)
     name, sent = campaign.waveform.sent
-    np.save(root / "raw" / name, sent)
+    framed = getattr(specification.waveform, "framed", False)
+    np.save(root / TRUE_SYMBOLS if framed else root / "raw" / name, sent)
 
 
 def _atmosphere_section(specification: CampaignSpecification) -> dict[str, Any]:

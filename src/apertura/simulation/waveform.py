@@ -12,6 +12,7 @@ from scipy import fft
 
 from apertura.common.arrays import Floats
 from apertura.core.echo.constellation import constellation
+from apertura.core.echo.frame_format import FrameFormat
 from apertura.simulation.impairments import STRICT_KEYS
 
 
@@ -281,6 +282,9 @@ class TransmitPulse(TransmitWaveform):
         return np.where(early, -1, np.where(late, _NEVER, 0)), np.where(early, -1, _NEVER)
 
 
+_HEADER, _COUNTER_BITS = "1acffc1d", 16  # fields of simulated frames
+
+
 @dataclass(frozen=True, config=STRICT_KEYS)
 class WaveformSpecification:
     """Specification of an OFDM waveform, one symbol per pulse; docs/theory/simulate.md, eq. 3."""
@@ -299,6 +303,11 @@ class WaveformSpecification:
         default="qpsk", description="random symbols of a constellation, or Newman's code of nearly constant envelope"
     )
     frames: int = Field(default=1, ge=1, description="number of frames of random symbols, after which they repeat")
+    framed: bool = Field(
+        default=False,
+        description="the symbols carry frames: header 1acffc1d, counter of 16 bits, random data and CRC-16; the config "
+        "states their format, not the symbols",
+    )
     kind: Literal["ofdm"] = Field(default="ofdm", kw_only=True, repr=False)
 
     @model_validator(mode="after")
@@ -311,26 +320,44 @@ class WaveformSpecification:
             )
         if self.symbol_s < (1 - 1e-9) / self.subcarrier_spacing_hz:
             raise ValueError(f"symbol_s={self.symbol_s:g} is shorter than 1/subcarrier_spacing_hz")
+        if self.framed and (self.code == "newman" or self._format.data_bits < 0):
+            raise ValueError("framed=true requires a constellation as code, and room for 64 bits in a symbol")
         return self
+
+    @property
+    def _format(self) -> FrameFormat:
+        """Format of the frames, docs/theory/data_symbols.md, "Frames"."""
+        header = np.unpackbits(np.frombuffer(bytes.fromhex(_HEADER), np.uint8))
+        bits = self.subcarriers * constellation(self.code).bits_per_symbol
+        return FrameFormat(header, _COUNTER_BITS, True, bits)
 
     def drawn(self, generator: Generator) -> TransmitWaveform:
         """Return the waveform with its code symbols, drawn if they are random."""
         shape = (self.frames, self.subcarriers) if self.frames > 1 else (self.subcarriers,)
-        if self.code == "newman":
+        if self.framed:
+            data = generator.integers(0, 2, (self.frames, self._format.data_bits), np.uint8)
+            bits = self._format.bits(np.arange(self.frames) % (1 << _COUNTER_BITS), data)
+            codes = constellation(self.code).symbols(bits).astype(np.complex128)
+        elif self.code == "newman":
             codes = newman_codes(self.subcarriers)
         elif self.code == "qpsk":
             codes = qpsk_codes(shape, generator)
         else:
             points = constellation(self.code).points.astype(np.complex128)
             codes = points[generator.integers(0, len(points), shape)]
-        names = {"subcarriers", "code", "frames", "kind"}
+        names = {"subcarriers", "code", "frames", "framed", "kind"}
         parameters = {name: value for name, value in vars(self).items() if name not in names}
         return TransmitWaveform(codes, **parameters)
 
     def section(self, _: TransmitWaveform) -> dict[str, Any]:
         """Return the section `waveform` of the config."""
-        parameters = {name: value for name, value in vars(self).items() if name not in {"code", "frames", "kind"}}
-        return {"kind": self.kind, "codes": "raw/codes.npy", **parameters}
+        names = {"code", "frames", "framed", "kind"}
+        parameters = {name: value for name, value in vars(self).items() if name not in names}
+        codes: str | dict[str, Any] = "raw/codes.npy"
+        if self.framed:
+            frame = {"header": _HEADER, "counter_bits": _COUNTER_BITS, "crc": True}
+            codes = {"source": "sidelink", "constellation": self.code, "frame": frame}
+        return {"kind": self.kind, "codes": codes, **parameters}
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)

@@ -120,7 +120,10 @@ def pair_echo(
         decision = PairSymbols.of((tx, rx), source or rx, sent, pulses, paired, processing.accuracy_db)
         usable = decision.usable()
         sent, frames, paired = decision.sent, decision.rows[usable], paired[usable]
-        decided, displaced = {"decided": decision.report(usable)}, Flags(decision.symbols.flags(usable))
+        decided, displaced = (
+            {"decided": decision.report(usable)},
+            Flags(decision.symbols.flags(usable[decision.rows >= 0])),
+        )
         basis = f"captures of {decision.source}"
         if processing.sidelink == "auto":
             processing = processing.model_copy(

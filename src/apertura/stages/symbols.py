@@ -13,11 +13,11 @@ from apertura.core.echo.captures import blocks_of
 from apertura.core.echo.decided_symbols import SidelinkSymbols
 from apertura.core.echo.frame_codes import Inverses
 from apertura.core.quality.budget import strictest_accuracy_db
-from apertura.stages.acquisition import Acquisition, common_pulses
+from apertura.stages.acquisition import Acquisition, Captured, common_pulses
 from apertura.stages.transmitted import Transmitted
 
 
-def decided_symbols(source: Acquisition, sent: Transmitted, accuracy_db: float | Literal["auto"]) -> SidelinkSymbols:
+def decided_symbols(source: Captured, sent: Transmitted, accuracy_db: float | Literal["auto"]) -> SidelinkSymbols:
     """Return the symbols in the sidelink of all captures of a node.
 
     Raises

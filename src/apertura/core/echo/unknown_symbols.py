@@ -387,5 +387,9 @@ def _basis(subcarriers: int) -> NDArray[np.float32]:
     in delay. Of few subcarriers, the gate is narrower, so that most of the noise remains outside.
     """
     cells = min(GATE_CELLS, max(subcarriers // 64, 1))
-    sequences = scipy.signal.windows.dpss(subcarriers, cells, Kmax=2 * cells + 4)
-    return np.ascontiguousarray(sequences.T, np.float32)
+    # eigenvectors of the tridiagonal matrix that commutes with the band limitation (Slepian 1978, eq. 14)
+    number = np.arange(subcarriers)
+    diagonal = np.square((subcarriers - 1 - 2 * number) / 2) * np.cos(2 * np.pi * cells / subcarriers)
+    beside = number[1:] * (subcarriers - number[1:]) / 2
+    kept = (max(subcarriers - 2 * cells - 4, 0), subcarriers - 1)
+    return np.asarray(scipy.linalg.eigh_tridiagonal(diagonal, beside, select="i", select_range=kept)[1], np.float32)

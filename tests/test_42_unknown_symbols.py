@@ -1,0 +1,133 @@
+"""Campaigns whose symbols are decided from the sidelink: images, unsure pulses, bits of the frames."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import own_campaign
+import pytest
+from folders import edit_config, run_steps
+
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
+from apertura.common.errors import CampaignError
+from apertura.core.quality.point_targets import find_peak
+from apertura.simulation import preset, simulate
+from apertura.stages import echo, ingest
+from apertura.stages.scene import open_scene
+from apertura.stages.transfer import PairEcho
+from apertura.tools.payload import payloads, write_payload
+
+PAIRS = "uav1-uav1", "uav1-uav2"
+
+
+def formed(root, pair="uav1-uav2"):
+    """Ingest both nodes and form the echo of a pair."""
+    campaign = Campaign.load(root)
+    for node in ("uav1", "uav2"):
+        ingest.ingest(campaign, "f01", node)
+    echo.echo(campaign, "f01", pair)
+    return campaign, PairEcho.opened(campaign, "f01", pair)
+
+
+@pytest.fixture(scope="module")
+def imaged(tmp_path_factory):
+    """Image the campaign of 16-QAM frames that was computed apart from the simulator, with a sidelink of 15 dB."""
+    root = tmp_path_factory.mktemp("own") / "campaign"
+    truth = own_campaign.write(root)
+    return run_steps(root, exports=False), truth
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pair", PAIRS)
+def test_targets_focus_within_a_centimetre_by_unknown_symbols(imaged, pair):
+    """Both the monostatic pair, by the symbols of the receiver's sidelink, and the bistatic pair image five targets."""
+    campaign, truth = imaged
+    image, grid = open_stage(campaign.stage("image", "f01", pair), "image").image.values, open_scene(campaign).grid
+    assert len(truth["targets"]) == 5
+    for place in truth["targets"]:
+        row, column = (float(value) for value in grid.pixel_of(*place))
+        peak = find_peak(image, round(row), round(column))
+        assert grid.spacing_m * np.hypot(peak.row - row, peak.column - column) < 0.01
+
+
+@pytest.mark.slow
+def test_report_states_the_choice_between_decisions_and_division(imaged):
+    """The echo states the node, the method with its reason, and the SNR of 15 dB; no pulse is unsure."""
+    decided = open_stage(imaged[0].stage("echo", "f01", "uav1-uav2"), "echo").attrs["symbols"]["decided"]
+    assert (decided["node"], decided["method"], decided["unsure"]) == ("uav2", "decisions", 0)
+    assert decided["snr_db"] == pytest.approx(15, abs=0.2)
+    assert "division an error of -12." in decided["reason"]
+
+
+@pytest.mark.slow
+def test_bits_of_an_independent_campaign_are_read(tmp_path):
+    """QPSK at 15 dB: header, counter, data and CRC of all frames agree with those computed by other code."""
+    bits = own_campaign.write(tmp_path / "campaign", constellation="qpsk", pulses=40)["bits"]
+    (read,) = payloads(Campaign.load(tmp_path / "campaign"))
+    assert read.intact.all()
+    assert np.array_equal(read.counter, np.arange(40))
+    sent = np.packbits(bits[:, 48:-16], axis=1)
+    assert np.array_equal(read.data, sent)
+
+
+@pytest.mark.slow
+def test_noisy_sidelink_is_divided_and_flagged(tmp_path):
+    """At 8 dB, 16-QAM is unsure: all pulses remain, divided by the sidelink; at 15 dB there is no flag."""
+    own_campaign.write(tmp_path / "noisy", pulses=64, sidelink_db=8.0)
+    stage = formed(tmp_path / "noisy")[1].stage
+    assert stage.attrs["symbols"]["decided"]["method"] == "division"
+    assert stage.attrs["sidelink"]["method"] == "divide"
+    assert "below 11.4 dB" in stage.attrs["flags"]["symbols_unsure"]
+    assert stage.sizes["pulse"] > 60
+    own_campaign.write(tmp_path / "clear", pulses=64)
+    attrs = formed(tmp_path / "clear")[1].stage.attrs
+    assert "symbols_unsure" not in attrs["flags"]
+
+
+@pytest.mark.slow
+def test_monostatic_image_without_header_and_pilots_is_refused(tmp_path):
+    """The phase of blind symbols is ambiguous; a bistatic pair does not need it."""
+    root = tmp_path / "campaign"
+    own_campaign.write(root, pulses=32)
+    edit_config(root, lambda config: config["waveform"]["codes"].pop("frame"))
+    assert formed(root)[1].shape[0] == 32
+    with pytest.raises(CampaignError, match="ambiguous by quarter turns"):
+        formed(root, "uav1-uav1")
+    with pytest.raises(CampaignError, match="no frame format"):
+        payloads(Campaign.load(root))
+
+
+@pytest.mark.slow
+def test_payload_of_the_preset_is_that_of_its_truth(tmp_path):
+    """Decided symbols of the simulated frames are those in symbols.npy; files and summary are written."""
+    root = simulate(tmp_path / "campaign", preset("payload", pulses=40))
+    campaign = Campaign.load(root)
+    files = write_payload(campaign, tmp_path / "out")
+    assert [path.name for path in files] == ["payload.json", "payload.png", "f01.uav2.csv", "f01.uav2.npy"]
+    (summary,) = json.loads(files[0].read_text())["nodes"]
+    assert summary["intact"] == summary["frames"]
+    assert summary["received_bit_s"] == pytest.approx((4096 - 64) * 20)
+    (read,) = payloads(campaign)
+    true = np.load(root / "symbols.npy")[read.counter]
+    qam = read.constellation
+    sent = np.packbits(qam.bits(qam.decide(true))[:, 48:-16], axis=1)
+    assert np.array_equal(np.load(tmp_path / "out" / "f01.uav2.npy"), sent)
+
+
+@pytest.mark.slow
+def test_pulses_with_a_weak_sidelink_are_excluded(tmp_path):
+    """A sidelink 14 dB weaker in a part of the flight leaves its pulses unsure: they are counted and flagged."""
+    root = tmp_path / "campaign"
+    own_campaign.write(root, pulses=96, sidelink_db=20.0, weak=slice(10, 24))
+    stage = formed(root)[1].stage
+    assert stage.attrs["symbols"]["decided"]["unsure"] == 14
+    assert stage.attrs["pulses"]["reasons"]["symbols_unsure"] == 14
+    assert stage.attrs["flags"]["symbols_unsure"].startswith("symbols of 14 of 96 pulses are unsure")
+    assert not np.isin(np.arange(10, 24), stage.capture.values).any()
+
+
+def test_framed_symbols_of_a_simulation_require_a_constellation():
+    """Newman's code carries no data."""
+    with pytest.raises(ValueError, match="requires a constellation"):
+        replace(preset("payload").waveform, code="newman")
