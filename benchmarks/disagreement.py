@@ -114,7 +114,7 @@ CAUSES = {
     "time": Cause("time of one log, s", _LENGTHS_M, _later),
     "path": Cause("path of one radar channel, m", _LENGTHS_M, _longer),
     "drift": Cause(
-        "phase of one radar channel over the flight, cycles", (0.1, 0.2, 0.4, 0.7, 1, 1.5, 2, 3, 4, 6, 8, 10), _drifting
+        "phase drift of one channel, cycles", (0.1, 0.2, 0.4, 0.7, 1, 1.5, 2, 3, 4, 6, 8, 10), _drifting
     ),
 }
 """Errors by name."""
