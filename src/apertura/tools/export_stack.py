@@ -18,6 +18,7 @@ from apertura.common.raster import opened_raster
 from apertura.formats.export.cog import Band, only, write_cog
 from apertura.methods.interferometry.coherence import map_coherence
 from apertura.methods.interferometry.heights import phase_std
+from apertura.stages.agreement import opened_layer
 from apertura.stages.scene import open_scene
 from apertura.stages.stack import STACK_JSON
 from apertura.workflow.rules import STACK
@@ -80,33 +81,28 @@ def write_stack(campaign: Campaign, out: Path) -> list[Path]:
     if requested is None:
         remedy = "Add the section stack, then run the workflow."
         raise CampaignError("no stack is configured", "config/config.yaml: stack", "a section stack", remedy)
-    flights, grid = _flights(campaign), open_scene(campaign).grid
-    written, window, good = list[Path](), requested.window_px, np.ones(grid.shape, bool)
-    images: dict[str, NDArray[np.complex64]] = {}
+    flights, scene = _flights(campaign), open_scene(campaign)
+    grid, window = scene.grid, requested.window_px
+    tiles = list(grid.tiles(campaign.settings.processing.tile_px))
+    reference, tags = _image(campaign, requested.reference)
+    written, similarity = list[Path](), np.ones(grid.shape, np.float32)
     for one in flights:
-        source = _listed(campaign, one.flight, "slc.tif")
-        written.append(_copied(source, out / "slc" / f"{one.time}.slc.tif"))
-        mask = campaign.result(one.flight, requested.pair, "mask.tif")
-        expected = {"expected": "a raster of the workflow", "remedy": "Run the workflow again."}
-        with opened_raster(source, **expected) as slc, opened_raster(mask, **expected) as visible:
-            images[one.flight], tags = slc.read(1), slc.tags()
-            good &= (visible.read(1) == 0) & np.isfinite(images[one.flight])
+        written.append(_copied(_listed(campaign, one.flight, "slc.tif"), out / "slc" / f"{one.time}.slc.tif"))
+        with opened_layer(campaign, one.flight, requested.pair, "mask.tif") as visible:
+            similarity[visible.read(1) != 0] = np.nan
+        if one.flight != requested.reference:
+            magnitude, phase, _, _ = map_coherence(_image(campaign, one.flight)[0], reference, tiles, window=window)
+            similarity = np.minimum(similarity, magnitude * np.cos(phase))  # NaN if either is
     written += [_copied(_listed(campaign, requested.reference, name), out / "geometry" / name) for name in GEOMETRY]
     placed: dict[str, Any] = {"transform": Affine(*grid.transform), "crs": grid.crs_wkt, "tags": {}}
-    terrain = open_scene(campaign).terrain
-    height = np.broadcast_to(terrain.heights(grid), grid.shape).astype(np.float32)
-    for name, raster, band in (("geometry/height.tif", height, _HEIGHT), ("mask.tif", good.astype(np.uint8), _GOOD)):
+    height = np.broadcast_to(scene.terrain.heights(grid), grid.shape).astype(np.float32)
+    good = np.isfinite(similarity).astype(np.uint8)
+    for name, raster, band in (("geometry/height.tif", height, _HEIGHT), ("mask.tif", good, _GOOD)):
         written.append(out / name)
         write_cog(written[-1], raster, band, value=only(band.dtype), **placed)
     wavelength_m, stride = float(tags["APERTURA_WAVELENGTH_M"]), max(1, window // _STRIDES_PER_WINDOW)
-    tiles = list(grid.tiles(campaign.settings.processing.tile_px))
-    reference = images.pop(requested.reference)
-    similarity = np.where(good, 1.0, -1.0)
-    for image in images.values():
-        magnitude, phase, _, _ = map_coherence(image, reference, tiles, window=window)
-        similarity = np.minimum(similarity, np.nan_to_num(magnitude * np.cos(phase), nan=-1.0))
     # The cells of dolphin have their centres at these pixels. The best reference is coherent and has not moved.
-    cells = similarity[stride // 2 :: stride, stride // 2 :: stride]
+    cells = np.nan_to_num(similarity[stride // 2 :: stride, stride // 2 :: stride], nan=-1.0)
     row, column = map(int, np.unravel_index(cells.argmax(), cells.shape))
     names = [path.relative_to(out).as_posix() for path in written if path.parent.name == "slc"]
     std_rad = float(np.median([one.phase_std_rad for one in flights if one.phase_std_rad is not None]))
@@ -210,6 +206,13 @@ def _listed(campaign: Campaign, flight: str, name: str) -> Path:
     path = campaign.result(STACK, flight, name)
     check_listed(path, path.with_name("stack_image.manifest.json"))
     return path
+
+
+def _image(campaign: Campaign, flight: str) -> tuple[NDArray[np.complex64], dict[str, str]]:
+    """Return the image of a flight of the stack, (y, x) complex64, and its tags."""
+    expected, remedy = "a raster of the workflow", "Run the workflow again."
+    with opened_raster(campaign.result(STACK, flight, "slc.tif"), expected=expected, remedy=remedy) as raster:
+        return raster.read(1), raster.tags()
 
 
 def _copied(source: Path, target: Path) -> Path:
