@@ -24,7 +24,7 @@ from apertura.campaign.folder import Campaign
 from apertura.common.errors import CampaignError
 from apertura.run.driver import run_workflow
 from apertura.simulation import simulate
-from apertura.simulation.presets import revisit
+from apertura.simulation.presets import demo, revisit
 from apertura.tools.export_stack import DATE_FORMAT, dolphin_config, write_stack
 from apertura.tools.time_series import DolphinResult, write_time_series
 
@@ -194,7 +194,18 @@ def test_dolphin_measures_the_motion_of_a_simulated_slope(tmp_path):
     """Tracks 0.1 m apart, logs with errors of 1 cm: 3 mm a flight, relative to stable ground, within 2 mm."""
     interpreter("dolphin")
     stacked(tmp_path / "campaign", slope_mm=3.0)
-    write_stack(Campaign.load(tmp_path / "campaign"), tmp_path / "series")
+    campaign = Campaign.load(tmp_path / "campaign")
+    written = write_stack(campaign, tmp_path / "series")
+    assert written[1].name == "20250515T093000.slc.tif"
+    assert written[1].read_bytes() == Path(str(campaign.result("stack", "f02", "slc.tif"))).read_bytes()
+    with rasterio.open(tmp_path / "series/mask.tif") as raster:
+        assert set(np.unique(raster.read(1))) <= {0, 1}
+        assert raster.read(1).mean() > 0.9
+    handoff = json.loads((tmp_path / "series/handoff.json").read_text())
+    assert handoff["wavelength_m"] == pytest.approx(299792458 / 1.404e9, rel=1e-3)
+    assert [one["temporal_baseline_days"] for one in handoff["flights"]] == pytest.approx([0, 1, 2, 3, 4])
+    east, north = np.subtract(handoff["reference_point_m"], (570661.25, 5363707.25))
+    assert abs(east - 5) > 2.5 or abs(north - 4) > 2.5  # on stable ground
     run_dolphin(tmp_path / "series")
     moved_mm, _, areas = displacements(tmp_path / "series")
     median = {name: np.nanmedian(moved_mm[:, mask], axis=1) for name, mask in areas.items()}
@@ -262,6 +273,13 @@ def test_inputs_of_mintpy_have_its_angles_and_units(tmp_path):
         assert np.allclose(file["bperp"], 0.5)
         assert np.allclose(file["unwrapPhase"], -4 * np.pi / WAVELENGTH_M * 2e-3)
     assert "mintpy.reference.yx = 2,45" in (tmp_path / "mintpy/mintpy.cfg").read_text()
+
+
+def test_campaign_without_a_stack_is_refused(tmp_path):
+    simulate(tmp_path / "campaign", demo(pulses=4), seed=1)
+    with pytest.raises(CampaignError, match=r"no stack is configured.*Add the section stack"):
+        write_stack(Campaign.load(tmp_path / "campaign"), tmp_path / "series")
+    assert not (tmp_path / "series").exists()
 
 
 def test_folder_without_a_result_of_dolphin_is_refused(tmp_path):

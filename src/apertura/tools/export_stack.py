@@ -1,7 +1,6 @@
 """Hand-off of a stack to InSAR time series software: images, mask, geometry and configuration of dolphin."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from apertura.common.raster import opened_raster
 from apertura.formats.export.cog import Band, only, write_cog
 from apertura.methods.interferometry.coherence import map_coherence
 from apertura.methods.interferometry.heights import phase_std
+from apertura.stages.agreement import opened_layer
 from apertura.stages.scene import open_scene
 from apertura.stages.stack import STACK_JSON
 from apertura.workflow.rules import STACK
@@ -40,27 +40,6 @@ _HEIGHT = Band("float32", np.nan, "m", "terrain height in the CRS of the scene",
 _GOOD = Band("uint8", 255, "class", "1 valid in all flights of the stack, 0 invalid", "MODE")
 
 
-@dataclass(frozen=True)
-class StackedFlight:
-    """Flight of an exported stack.
-
-    Attributes
-    ----------
-    flight, time
-        Name of the flight, and start of its acquisition in `DATE_FORMAT`.
-    perpendicular_baseline_m, temporal_baseline_days
-        Baselines to the reference flight.
-    phase_std_rad
-        Standard deviation of the phase of a window against the reference flight; None for the reference.
-    """
-
-    flight: str
-    time: str
-    perpendicular_baseline_m: float
-    temporal_baseline_days: float
-    phase_std_rad: float | None
-
-
 def write_stack(campaign: Campaign, out: Path) -> list[Path]:
     """Write the stack of a campaign in the layout that dolphin reads; return the paths of the files.
 
@@ -80,36 +59,32 @@ def write_stack(campaign: Campaign, out: Path) -> list[Path]:
     if requested is None:
         remedy = "Add the section stack, then run the workflow."
         raise CampaignError("no stack is configured", "config/config.yaml: stack", "a section stack", remedy)
-    flights, grid = _flights(campaign), open_scene(campaign).grid
-    written, window, good = list[Path](), requested.window_px, np.ones(grid.shape, bool)
-    images: dict[str, NDArray[np.complex64]] = {}
+    flights, scene = _flights(campaign), open_scene(campaign)
+    grid, window = scene.grid, requested.window_px
+    tiles = list(grid.tiles(campaign.settings.processing.tile_px))
+    reference, tags = _image(campaign, requested.reference)
+    written, similarity = list[Path](), np.ones(grid.shape, np.float32)
     for one in flights:
-        source = _listed(campaign, one.flight, "slc.tif")
-        written.append(_copied(source, out / "slc" / f"{one.time}.slc.tif"))
-        mask = campaign.result(one.flight, requested.pair, "mask.tif")
-        expected = {"expected": "a raster of the workflow", "remedy": "Run the workflow again."}
-        with opened_raster(source, **expected) as slc, opened_raster(mask, **expected) as visible:
-            images[one.flight], tags = slc.read(1), slc.tags()
-            good &= (visible.read(1) == 0) & np.isfinite(images[one.flight])
-    written += [_copied(_listed(campaign, requested.reference, name), out / "geometry" / name) for name in GEOMETRY]
+        flight, target = one["flight"], out / "slc" / f"{one['time']}.slc.tif"
+        written.append(_copied(campaign, flight, "slc.tif", target))
+        with opened_layer(campaign, flight, requested.pair, "mask.tif") as visible:
+            similarity[visible.read(1) != 0] = np.nan
+        if flight != requested.reference:
+            magnitude, phase, _, _ = map_coherence(_image(campaign, flight)[0], reference, tiles, window=window)
+            similarity = np.minimum(similarity, magnitude * np.cos(phase))  # NaN if either is
+    written += [_copied(campaign, requested.reference, name, out / "geometry" / name) for name in GEOMETRY]
     placed: dict[str, Any] = {"transform": Affine(*grid.transform), "crs": grid.crs_wkt, "tags": {}}
-    terrain = open_scene(campaign).terrain
-    height = np.broadcast_to(terrain.heights(grid), grid.shape).astype(np.float32)
-    for name, raster, band in (("geometry/height.tif", height, _HEIGHT), ("mask.tif", good.astype(np.uint8), _GOOD)):
+    height = np.broadcast_to(scene.terrain.heights(grid), grid.shape).astype(np.float32)
+    good = np.isfinite(similarity).astype(np.uint8)
+    for name, raster, band in (("geometry/height.tif", height, _HEIGHT), ("mask.tif", good, _GOOD)):
         written.append(out / name)
         write_cog(written[-1], raster, band, value=only(band.dtype), **placed)
     wavelength_m, stride = float(tags["APERTURA_WAVELENGTH_M"]), max(1, window // _STRIDES_PER_WINDOW)
-    tiles = list(grid.tiles(campaign.settings.processing.tile_px))
-    reference = images.pop(requested.reference)
-    similarity = np.where(good, 1.0, -1.0)
-    for image in images.values():
-        magnitude, phase, _, _ = map_coherence(image, reference, tiles, window=window)
-        similarity = np.minimum(similarity, np.nan_to_num(magnitude * np.cos(phase), nan=-1.0))
     # The cells of dolphin have their centres at these pixels. The best reference is coherent and has not moved.
-    cells = similarity[stride // 2 :: stride, stride // 2 :: stride]
+    cells = np.nan_to_num(similarity[stride // 2 :: stride, stride // 2 :: stride], nan=-1.0)
     row, column = map(int, np.unravel_index(cells.argmax(), cells.shape))
     names = [path.relative_to(out).as_posix() for path in written if path.parent.name == "slc"]
-    std_rad = float(np.median([one.phase_std_rad for one in flights if one.phase_std_rad is not None]))
+    std_rad = float(np.median([one["phase_std_rad"] for one in flights if one["phase_std_rad"] is not None]))
     config = dolphin_config(
         names, wavelength_m, window_px=window, stride=stride, phase_std_rad=std_rad, reference_point=(row, column)
     )
@@ -126,7 +101,7 @@ def write_stack(campaign: Campaign, out: Path) -> list[Path]:
             "wavelength_m": wavelength_m,
             "heading_deg": float(tags.get("APERTURA_HEADING_DEG", 0.0)),
             "reference_point_m": grid.map_at((row + 0.5) * stride - 0.5, (column + 0.5) * stride - 0.5).tolist(),
-            "flights": [vars(one) for one in flights],
+            "flights": flights,
         },
     )
     return [*written, out / "dolphin_config.yaml", out / HANDOFF]
@@ -182,8 +157,12 @@ def dolphin_config(
     }
 
 
-def _flights(campaign: Campaign) -> list[StackedFlight]:
-    """Return the flights of the stack that are used, by time."""
+def _flights(campaign: Campaign) -> list[dict[str, Any]]:
+    """Return the flights of the stack that are used, by time, as listed in `HANDOFF`.
+
+    Each has its name, the start of its acquisition in `DATE_FORMAT`, its baselines to the reference flight, and the
+    standard deviation of the phase of a window against that flight (None for the reference itself).
+    """
     folder = campaign.result(STACK)
     flights = []
     for name in open_listed(folder / STACK_JSON, folder / "stack.manifest.json")["flights"]:
@@ -191,10 +170,17 @@ def _flights(campaign: Campaign) -> list[StackedFlight]:
         start = np.datetime64(report["acquisition"]["start_utc"].removesuffix("Z"), "s")
         coherence, looks = report["coherence"], report["looks"]
         std_rad = None if looks is None else float(phase_std(np.array([coherence], np.float32), looks)[0])
-        baselines = report["perpendicular_baseline_m"] or 0.0, report["temporal_baseline_days"]
-        flights.append(StackedFlight(name, start.item().strftime(DATE_FORMAT), *baselines, std_rad))
-    flights.sort(key=lambda one: one.time)
-    times = [one.time for one in flights]
+        flights.append(
+            {
+                "flight": name,
+                "time": start.item().strftime(DATE_FORMAT),
+                "perpendicular_baseline_m": report["perpendicular_baseline_m"] or 0.0,
+                "temporal_baseline_days": report["temporal_baseline_days"],
+                "phase_std_rad": std_rad,
+            }
+        )
+    flights.sort(key=lambda one: str(one["time"]))
+    times = [one["time"] for one in flights]
     if len(set(times)) < max(2, len(times)):
         raise CampaignError(
             f"flights at {', '.join(times)}",
@@ -205,14 +191,17 @@ def _flights(campaign: Campaign) -> list[StackedFlight]:
     return flights
 
 
-def _listed(campaign: Campaign, flight: str, name: str) -> Path:
-    """Return the path of a raster of the stack, checked against its manifest."""
-    path = campaign.result(STACK, flight, name)
-    check_listed(path, path.with_name("stack_image.manifest.json"))
-    return path
+def _image(campaign: Campaign, flight: str) -> tuple[NDArray[np.complex64], dict[str, str]]:
+    """Return the image of a flight of the stack, (y, x) complex64, and its tags."""
+    expected, remedy = "a raster of the workflow", "Run the workflow again."
+    with opened_raster(campaign.result(STACK, flight, "slc.tif"), expected=expected, remedy=remedy) as raster:
+        return raster.read(1), raster.tags()
 
 
-def _copied(source: Path, target: Path) -> Path:
+def _copied(campaign: Campaign, flight: str, name: str, target: Path) -> Path:
+    """Copy a raster of the stack, checked against its manifest."""
+    source = campaign.result(STACK, flight, name)
+    check_listed(source, source.with_name("stack_image.manifest.json"))
     with replacement(target) as temporary:
         temporary.write_bytes(source.read_bytes())
     return target

@@ -50,7 +50,7 @@ def surface(grid: SceneGrid, terrain: Terrain, window: Window) -> tuple[Floats, 
     """
     if isinstance(terrain, FlatGround):
         position = terrain.positions(grid[window])
-        return position, _unit(grid[window].positions(terrain.height_m + 1.0) - position)
+        return position, unit(grid[window].positions(terrain.height_m + 1.0) - position)
     # One pixel more on each side, so that the normals at the edges do not depend on the window.
     extended = [
         np.arange(max(0, part.start - 1), max(2, min(size, part.stop + 1)))
@@ -99,36 +99,11 @@ def bistatic_angle_deg(position: Floats, tx: Floats, rx: Floats) -> Floats:
     return np.degrees(_angle(tx - position, rx - position))
 
 
-def line_of_sight(position: Floats, tx: Floats, rx: Floats) -> Floats:
-    """Return the unit vector along the bisector of the directions from each position to two antennas.
-
-    A displacement d of the ground along this vector shortens half the total path by d·cos(β/2), with the bistatic
-    angle β (docs/theory/layers.md, eq. 1b).
-
-    Parameters
-    ----------
-    position
-        (..., 3) float64, metres.
-    tx, rx
-        (..., 3) float64, metres, in the same frame; equal for a monostatic pair.
-
-    Returns
-    -------
-    ndarray
-        (..., 3) float64; from the ground to the sensor.
-
-    Examples
-    --------
-    >>> line_of_sight(np.zeros(3), np.array([3.0, 0.0, 4.0]), np.array([-6.0, 0.0, 8.0]))
-    array([0., 0., 1.])
-    """
-    return _unit(_unit(tx - position) + _unit(rx - position))
-
-
 def _angle(first: Floats, second: Floats) -> Floats:
-    chord = _unit(first) - _unit(second)  # accurate for small angles, unlike the arc cosine
+    chord = unit(first) - unit(second)  # accurate for small angles, unlike the arc cosine
     return np.asarray(2 * np.arcsin(np.minimum(1.0, np.sqrt(np.einsum("...i,...i", chord, chord)) / 2)))
 
 
-def _unit(vector: Floats) -> Floats:
+def unit(vector: Floats) -> Floats:
+    """Return vectors, (..., 3), divided by their lengths."""
     return np.asarray(vector / np.sqrt(np.einsum("...i,...i", vector, vector))[..., None])

@@ -15,7 +15,7 @@ from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import EXACT, any_illuminates, illumination_mask
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import ned_axes
-from apertura.core.scene.angles import bistatic_angle_deg, incidence_deg, line_of_sight, surface
+from apertura.core.scene.angles import bistatic_angle_deg, incidence_deg, surface, unit
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.recorded import RecordedShares
 from apertura.core.scene.swath import balls
@@ -454,7 +454,9 @@ class Looks:
         The vector points from the ground to the sensor, for a bistatic pair along the bisector of the directions to
         transmitter and receiver (docs/theory/layers.md, eq. 1b). In a local frame, the axes are those of the frame.
         """
-        sight = line_of_sight(self.terrain.positions(self.grid[tile]), *self.centre(tile))
+        position = self.terrain.positions(self.grid[tile])
+        tx, rx = (unit(antenna - position) for antenna in self.centre(tile))
+        sight = unit(tx + rx)
         # The axes turn by less than 1e-5 between nodes, so that they are linear there.
         if self.grid.frame == "local":
             return sight
