@@ -329,7 +329,7 @@ def _layer(manifest: Path, row: Export, report: Mapping[str, Any]) -> Layer | No
         if unit == "dB" and row.source in _SHOWN_IN_DB:
             peak_db = 20 * math.log10(max(float(report["brightest"]["amplitude"]), 1e-30))
             low, high = peak_db + float(report["noise_floor_db"]), peak_db
-            return Layer(row.file, sha256, "image", title, unit, *(round(end, 2) + 0.0 for end in (low, high)))
+            return Layer(row.file, sha256, "image", title, unit, round(low, 2) + 0.0, round(high, 2) + 0.0)
         factor = max(1.0, max(raster.shape) / _RANGE_SAMPLES)
         values = raster.read(1, out_shape=tuple(max(1, round(size / factor)) for size in raster.shape), masked=True)
     valid = np.ma.masked_invalid(values).compressed()
