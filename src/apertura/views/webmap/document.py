@@ -305,7 +305,7 @@ def _layers(campaign: Campaign, flight: str, image: str, report: Mapping[str, An
     ]
     stack = campaign.settings.stack
     if stack and flight in stack.flights and image == stack.pair:
-        manifest = campaign.root / campaign.manifest("change", flight)
+        manifest = campaign.root / campaign.manifest("change", STACK, flight)
         rows = [row for row in exports_in("change") if row.file.endswith(".tif")]
         changes = [layer for row in rows if (layer := _layer(manifest, row, report)) is not None]
         layers += [replace(layer, folder=f"{STACK}/{flight}") for layer in changes]
