@@ -128,7 +128,9 @@ def stacked_pairs(campaign: "Campaign", flight: str) -> list[tuple[str, str]]:
 def changes(scope: JobScope) -> Iterable[str]:
     """Return the manifest of the changes of a flight, if it is compared with the reference flight of the stack."""
     stack = scope.campaign.settings.stack
-    return [scope.campaign.manifest("change", "stack", *scope.where)] if stack and scope.where[0] in stack.flights else []
+    return (
+        [scope.campaign.manifest("change", "stack", *scope.where)] if stack and scope.where[0] in stack.flights else []
+    )
 
 
 def has_reference(scope: JobScope) -> bool:

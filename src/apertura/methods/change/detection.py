@@ -30,6 +30,9 @@ LEAST_LOOKS = 2.0
 POINT_LOOKS = 2.0
 """Number of looks over which the energy of a window is spread below which a point dominates the window."""
 
+STRONG_POINT_LOOKS = 1.2
+"""As `POINT_LOOKS`, for points whose sidelobes also affect the windows beside; not reached in homogeneous terrain."""
+
 POINT_GAIN_STD_DB = 0.5
 """Standard deviation of the gain of a point between two flights: focus and aspect angle differ."""
 
@@ -168,7 +171,9 @@ def detect_changes(
     of_ratio = ratio_probability(log_ratio, around, matched)
     of_coherence = distribution.probability(estimate, unchanged)
     # Windows with a dominant point: amplitude and phase of the point (eq. 6).
-    points = looks * _shared(first, second, window).ravel()[at] < POINT_LOOKS
+    energy = looks * _shared(first, second, window)
+    beside = scipy.ndimage.maximum_filter(energy < STRONG_POINT_LOOKS, 2 * window - 1)
+    points = ((energy < POINT_LOOKS) | beside).ravel()[at]
     noise = np.maximum(1 - estimate[points] ** 2, 0) / (2 * looks - 2)
     gain_std = POINT_GAIN_STD_DB * np.log(10) / 10
     angle = np.minimum(np.abs(phase.ravel()[at][points].astype(np.float64)), np.pi / 2)
