@@ -29,6 +29,7 @@ from PIL import Image
 from walked import run_commands, walk
 
 import apertura as ap
+from apertura.methods.interferometry.coherence import box_sum
 from apertura.simulation import ImageGrid, preset, simulate
 
 HOWTOS = ROOT / "docs/howto"
@@ -412,6 +413,32 @@ def samples(folder: Path) -> Made:
     return Path("campaign/results/f01/uav1-uav2/pictures/range_profiles.png")
 
 
+def stack(folder: Path) -> Made:
+    flights = [f"f{number:02d}" for number in range(1, 6)]
+    apertura("simulate", "campaign", "--preset", "revisit")
+    requested = {"reference": flights[0], "flights": flights[1:], "pair": "uav1-uav1"}
+    edit_config(folder / "campaign", lambda config: config.update(stack=requested, processing={"autofocus": "off"}))
+    apertura("run", "campaign", "--until", "stack")
+    results, last = folder / "campaign/results/stack", flights[-1]
+    with rasterio.open(results / last / "slc.tif") as image, rasterio.open(results / flights[0] / "slc.tif") as first:
+        product, spacing_m = image.read(1) * first.read(1).conj(), image.res[0]
+    figure, four = figure_of(2, 2, 5.2, sharex=True, sharey=True)
+    moved = np.angle(box_sum(product, 15)).astype(float)
+    cyclic: Mapping[str, Any] = {"cmap": "twilight_shifted", "vmin": -1.5, "vmax": 1.5}
+    grey: Mapping[str, Any] = {"cmap": "gray", "vmin": 0, "vmax": 1}
+    panels = [
+        (raster(results / last / "residual_phase.tif")[0], "residual_phase.tif", {"cmap": "twilight_shifted"}, "rad"),
+        (moved, f"phase of {last} minus {flights[0]}", cyclic, "rad"),
+        (raster(results / last / "coherence.tif")[0], "coherence.tif", grey, ""),
+        (raster(results / last / "expected_coherence.tif")[0], "expected_coherence.tif", grey, ""),
+    ]
+    for place, (axes, (values, title, scale, unit)) in enumerate(zip(four.flat, panels, strict=True)):
+        mesh = draw(axes, values, spacing_m, title, left=place % 2 == 0, **scale)
+        axes.set_xlabel("east, m" if place > 1 else "")
+        figure.colorbar(mesh, ax=axes).set_label(unit)
+    return figure
+
+
 def verify(folder: Path) -> Made:
     from spoilt import flip
 
@@ -537,8 +564,8 @@ MAKERS: dict[str, Callable[[Path], Made | None]] = {
     made.__name__.rstrip("_"): made
     for made in (
         bench, calibrate_radiometry, calibration_flight, catalog, cluster, dem, design, fmcw, gis, gpu, inspect,
-        interferometry, long_flights, map_, me_or_the_radar, notebook, refine_tracks, report, run, samples, verify,
-        xarray, your_own_recording, ci, sample, rail_pass, uav_flight, gotcha, px4_flight,
+        interferometry, long_flights, map_, me_or_the_radar, notebook, refine_tracks, report, run, samples, stack,
+        verify, xarray, your_own_recording, ci, sample, rail_pass, uav_flight, gotcha, px4_flight,
     )
 }  # fmt: skip
 """Picture → function that generates it, called in a separate empty folder."""

@@ -26,6 +26,7 @@ from apertura.simulation.targets import (
     Plate,
     PointTarget,
     Straight,
+    TargetChange,
     Waypoints,
     Wobble,
     phase_centre,
@@ -242,3 +243,38 @@ def test_extended_targets_and_clutter_have_the_stated_amplitude():
     assert len(plate.amplitude) == 12
     clutter = Clutter((-10, -10, 10, 10), reflectivity=0.25, density_per_m2=20).points(rng)
     assert (abs(clutter.amplitude) ** 2).sum() / 400 == pytest.approx(0.25, rel=0.05)
+
+
+def test_changed_targets_leave_the_rest_of_the_scene_unchanged(tmp_path):
+    specification = small_simulation()
+    clutter = Clutter((-2.0, -2.0, 2.0, 2.0), 0.5, 8.0)
+    (first,) = specification.flights
+    changes = (TargetChange(1, factor=0.5j), TargetChange(2, shift_m=(0.0, 0.3, 0.1)))
+    flights = (
+        first,
+        replace(first, name="f02", changes=(TargetChange(0),)),
+        replace(first, name="f03", changes=changes),
+    )
+    targets = (clutter, *specification.targets)
+    root = simulate(tmp_path / "campaign", replace(specification, targets=targets, flights=flights))
+    samples = {name: (root / f"raw/{name}/a.sigmf-data").read_bytes() for name in ("f01", "f02", "f03")}
+    assert samples["f02"] == samples["f01"]
+    assert samples["f03"] != samples["f01"]
+    stated = json.loads((root / "truth.json").read_text())["flights"]
+    assert "changes" not in stated["f01"]
+    assert stated["f03"]["changes"][0] == {"target": 1, "shift_m": [0.0, 0.0, 0.0], "factor": "0.5j"}
+    # echoes are linear in the scene: the changed flight is the whole scene with both changed targets
+    before, after = (scatterers(ORIGIN, targets, np.random.default_rng(4), made) for made in ((), changes))
+    same = slice(0, len(before.amplitude) - 2)
+    assert np.array_equal(before.position_m[same], after.position_m[same])
+    assert after.amplitude[-2] == 0.5j * before.amplitude[-2]
+    assert np.linalg.norm(after.position_m[-1] - before.position_m[-1]) == pytest.approx(np.hypot(0.3, 0.1))
+
+
+def test_change_of_an_unknown_target_is_refused():
+    specification = small_simulation()
+    (first,) = specification.flights
+    with pytest.raises(ValueError, match="changes target 2; the last target is number 1"):
+        replace(specification, flights=(replace(first, changes=(TargetChange(2),)),))
+    with pytest.raises(ValueError, match="changes refer to the targets of the campaign"):
+        replace(first, targets=specification.targets, changes=(TargetChange(0),))

@@ -302,7 +302,10 @@ def _prefixed_echoes(channel: Channel, pulses: NDArray[np.intp]) -> NDArray[np.c
     delay_s = channel.paths.delay_s[pulses] - channel.start_s[pulses, None]
     early_s = waveform.symbol_s - 1 / waveform.subcarrier_spacing_hz
     inside = (delay_s >= -early_s) & (delay_s < waveform.cyclic_prefix_s)
-    return spectrum(delay_s, channel.paths.amplitude[pulses] * inside, waveform.frequency_hz).astype(np.complex64)
+    amplitude = channel.paths.amplitude[pulses] * inside
+    # pulse by pulse, because the exponentials of all pulses and thousands of paths do not fit the cache
+    of_pulses = [spectrum(*one, waveform.frequency_hz) for one in zip(delay_s, amplitude, strict=True)]
+    return np.array(of_pulses, np.complex64)
 
 
 _PULSES_AT_ONCE = 64

@@ -69,8 +69,10 @@ _COLUMNS = (
 
 
 _NODES = 1024  # lattice nodes processed at once
-_SPREAD_NODES, _DRAWS = 64, 24  # nodes and drawn residual tracks from which the variation over the aperture follows
-_SEARCH_SIGMAS = 3.0  # largest constant displacement of the search, in standard deviations of the logs
+_SPREAD_NODES, _DRAWS = 64, 24  # nodes and drawn tracks from which the likely variation over the aperture follows
+# largest constant displacement of the search, in standard deviations of the logs, and in metres: beyond the latter,
+# resolution cells of both images do not overlap
+_SEARCH_SIGMAS, _MOST_RADIUS_M = 3.0, 1.0
 _MOST_AMBIGUITY_M = 1e6  # a height of ambiguity above this is not stated
 
 
@@ -98,6 +100,14 @@ class StackedImage:
     visible: NDArray[np.bool_]
     noise: Floats
     stage: Any
+
+    def looks_in(self, side_m: float) -> float:
+        """Return the independent samples in a square window, from the local spectrum at the scene centre.
+
+        The autocorrelation of a large block overestimates them at short range, where the carrier varies over the block.
+        """
+        spectrum = np.array(self.stage.attrs["quality"]["focus"]["spectrum_cycles2_m2"])
+        return float(12 * np.sqrt(max(np.linalg.det(spectrum), 0.0)) * side_m**2)
 
     def places(self, scene: OpenScene, row: NDArray[Any], column: NDArray[Any]) -> tuple[Floats, list[SeenAntenna]]:
         """Return the positions of pixels on the terrain, and the antennas at the pulses that form them."""
@@ -201,7 +211,7 @@ def refer(
     node_rows, node_columns = (at.ravel() for at in np.meshgrid(*lattice.nodes, indexing="ij"))
     nodes_m, of_nodes = image.places(scene, node_rows, node_columns)
     tracks = ResidualTracks.of(errors, scene.axes, of_nodes, wavenumber)
-    looks = map_coherence(image.image, reference.image, tiles, window=window)[2]
+    looks = min(one.looks_in(window * scene.grid.spacing_m) for one in (image, reference))
     phases = WindowPhases.of(image.image, reference.image, common, window=window, looks=looks)
     motion, failure, spread = None, "", 0.0
     removed = np.zeros(scene.grid.shape, np.float32)
@@ -209,7 +219,8 @@ def refer(
         failure = f"{len(phases)} windows of significant coherence, less than {LEAST_WINDOWS}"
     else:
         places_m, antennas = image.places(scene, phases.row, phases.column)
-        radius_m = min(_SEARCH_SIGMAS * max(max(*error.std_m, error.drift_std_m) for error in errors.values()), 1.0)
+        largest_m = max(max(*error.std_m, error.drift_std_m) for error in errors.values())
+        radius_m = min(_SEARCH_SIGMAS * largest_m, _MOST_RADIUS_M)
         constants = tracks.constant_phase(places_m, antennas)
         motion = estimate_motion(phases, tracks.phase(places_m, antennas), constants, radius_m=radius_m)
         # Phase at the nodes of the lattice, in blocks, and between them (eq. 4).
@@ -222,11 +233,10 @@ def refer(
         # Variation over the aperture, which the removed phase does not correct (eq. 7).
         few = slice(None, None, max(1, len(nodes_m) // _SPREAD_NODES))
         some = [replace(one, position_m=one.position_m[few], time_s=one.time_s[few]) for one in of_nodes]
-        root = np.linalg.cholesky(motion.covariance + 1e-12 * np.eye(len(motion.covariance)))
-        draws = np.random.default_rng(0).standard_normal((_DRAWS, len(root))) @ root.T + motion.unknowns
+        draws = max(1.0, motion.scale) * np.random.default_rng(0).standard_normal((_DRAWS, tracks.prior.size))
         spread = float(np.sqrt(tracks.spread(nodes_m[few], some, draws).mean()))
     corrected = (image.image * np.exp(-1j * removed.astype(np.float64))).astype(np.complex64)
-    magnitude, _, looks, _ = map_coherence(corrected, reference.image, tiles, window=window)
+    magnitude, *_ = map_coherence(corrected, reference.image, tiles, window=window)
     common = common & np.isfinite(magnitude)
     # Expected coherence: noise, spectral overlap, and the residual track (eq. 7).
     sensed = sensed_heights(scene, image.looks, [legs_of(one.looks) for one in (image, reference)], (low, high))

@@ -240,9 +240,9 @@ LEAST_WINDOWS = 12
 
 _CUT = 4.0  # residuals of more than this many standard deviations have no weight (biweight)
 _ROUNDS = 25
-_MOST_CANDIDATES = 20_000
+_MOST_CANDIDATES, _MOST_SEARCHED = 20_000, 2000  # displacements and windows of the search
 _STEP_RAD = 0.8  # largest phase difference between candidates of the search, over the scene
-_SCALES = (0.1, 30.0)  # limits of the scale of the prior
+_SCALES = (0.5, 30.0)  # limits of the scale of the prior: errors of logs are rarely half of those stated
 _STABLE_WEIGHT = 0.25  # windows with a smaller weight are not stable
 
 
@@ -256,8 +256,6 @@ class ResidualMotion:
         Phase that is equal at all places.
     unknowns
         (unknown,) float64, residual tracks in the unknowns of the prior.
-    covariance
-        (unknown, unknown) float64, covariance of their errors.
     scale
         Scale of the prior for which the phases are most probable: 1 if the logs are as accurate as stated.
     parameters
@@ -270,7 +268,6 @@ class ResidualMotion:
 
     constant_rad: float
     unknowns: Floats
-    covariance: Floats
     scale: float
     parameters: float
     residual_rad: Floats
@@ -335,7 +332,7 @@ def estimate_motion(phases: WindowPhases, design: Floats, constants: Floats, *, 
     residual = np.angle(np.exp(1j * (phase - model)))
     stable = weight * (scatter * std) ** 2 > _STABLE_WEIGHT
     constant = float(np.angle(np.exp(1j * solved[0])))
-    return ResidualMotion(constant, unknowns, covariance, scale, parameters, residual, stable)
+    return ResidualMotion(constant, unknowns, scale, parameters, residual, stable)
 
 
 def _searched(phases: WindowPhases, constants: Floats, radius_m: float) -> Floats:
@@ -353,10 +350,9 @@ def _searched(phases: WindowPhases, constants: Floats, radius_m: float) -> Float
         middle, half = len(steps[longest]) // 2, len(steps[longest]) // 4
         steps[longest] = steps[longest][middle - half : middle + half + 1]
     candidates = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3) @ directions
-    best, agreement = np.zeros(3), -1.0
-    for block in np.array_split(candidates, max(1, len(candidates) * len(weight) // 2_000_000 + 1)):
-        sums = np.abs(np.exp(-1j * block @ centred.T) @ weight)
-        if (largest := int(sums.argmax())) >= 0 and sums[largest] > agreement:
-            best, agreement = block[largest], float(sums[largest])
+    some = slice(None, None, max(1, len(centred) // _MOST_SEARCHED))
+    blocks = np.array_split(candidates, len(candidates) // 1000 + 1)
+    agreement = np.concatenate([np.abs(np.exp(-1j * block @ centred[some].T) @ weight[some]) for block in blocks])
+    best = candidates[int(agreement.argmax())]
     level = float(np.angle((weight * np.exp(-1j * centred @ best)).sum()))
     return np.asarray(level + centred @ best)
