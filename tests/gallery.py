@@ -413,6 +413,15 @@ def samples(folder: Path) -> Made:
     return Path("campaign/results/f01/uav1-uav2/pictures/range_profiles.png")
 
 
+def change(folder: Path) -> Made:
+    flights = ["f01", "f05"]
+    apertura("simulate", "campaign", "--preset", "revisit")
+    requested = {"reference": flights[0], "flights": flights[1:], "pair": "uav1-uav1"}
+    edit_config(folder / "campaign", lambda config: config.update(stack=requested, processing={"autofocus": "off"}))
+    apertura("run", "campaign", "--until", "change")
+    return folder / "campaign/results/stack" / flights[-1] / "change.png"
+
+
 def stack(folder: Path) -> Made:
     flights = [f"f{number:02d}" for number in range(1, 6)]
     apertura("simulate", "campaign", "--preset", "revisit")
@@ -563,7 +572,7 @@ def px4_flight(folder: Path) -> Made:
 MAKERS: dict[str, Callable[[Path], Made | None]] = {
     made.__name__.rstrip("_"): made
     for made in (
-        bench, calibrate_radiometry, calibration_flight, catalog, cluster, dem, design, fmcw, gis, gpu, inspect,
+        bench, calibrate_radiometry, calibration_flight, catalog, change, cluster, dem, design, fmcw, gis, gpu, inspect,
         interferometry, long_flights, map_, me_or_the_radar, notebook, refine_tracks, report, run, samples, stack,
         verify, xarray, your_own_recording, ci, sample, rail_pass, uav_flight, gotcha, px4_flight,
     )
