@@ -24,11 +24,13 @@ import rasterio
 from folders import ROOT, SHARED, copy_writable, edit_config
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from PIL import Image
 from walked import run_commands, walk
 
 import apertura as ap
+from apertura.formats.export.change import CLASSES
 from apertura.methods.interferometry.coherence import box_sum
 from apertura.simulation import ImageGrid, preset, simulate
 
@@ -415,6 +417,34 @@ def samples(folder: Path) -> Made:
     return Path("campaign/results/f01/uav1-uav2/pictures/range_profiles.png")
 
 
+def change(folder: Path) -> Made:
+    flights = ["f01", "f05"]
+    apertura("simulate", "campaign", "--preset", "revisit")
+    requested = {"reference": flights[0], "flights": flights[1:], "pair": "uav1-uav1"}
+    edit_config(folder / "campaign", lambda config: config.update(stack=requested, processing={"autofocus": "off"}))
+    apertura("run", "campaign", "--until", "change")
+    return changes(folder / "campaign/results/stack" / flights[-1])
+
+
+def changes(results: Path) -> Figure:
+    """Draw the rasters of the changes of a flight."""
+    figure, row = figure_of(1, 3, 2.9, sharey=True)
+    colours = ListedColormap([np.array(CLASSES[value][1]) / 255 for value in range(4)])
+    panels: list[tuple[str, dict[str, Any], str]] = [
+        ("amplitude_ratio.tif", {"cmap": "RdBu_r", "vmin": -10, "vmax": 10}, "dB"),
+        ("coherence_loss.tif", {"cmap": "magma", "vmin": 0, "vmax": 1}, ""),
+        ("change.tif", {"cmap": colours, "vmin": -0.5, "vmax": 3.5}, ""),
+    ]
+    for place, (axes, (name, scale, unit)) in enumerate(zip(row, panels, strict=True)):
+        values, spacing_m, _ = raster(results / name)
+        mesh = draw(axes, values, spacing_m, name, left=not place, **scale)
+        bar = figure.colorbar(mesh, ax=axes, location="bottom")
+        bar.set_label(unit)
+        if name == "change.tif":
+            bar.set_ticks(range(4), labels=["none", "brighter", "darker", "coherent"], fontsize=7)
+    return figure
+
+
 def stack(folder: Path) -> Made:
     flights = [f"f{number:02d}" for number in range(1, 6)]
     apertura("simulate", "campaign", "--preset", "revisit")
@@ -589,7 +619,7 @@ def px4_flight(folder: Path) -> Made:
 MAKERS: dict[str, Callable[[Path], Made | None]] = {
     made.__name__.rstrip("_"): made
     for made in (
-        bench, calibrate_radiometry, calibration_flight, catalog, cluster, dem, design, fmcw, gis, gpu, inspect,
+        bench, calibrate_radiometry, calibration_flight, catalog, change, cluster, dem, design, fmcw, gis, gpu, inspect,
         interferometry, long_flights, map_, me_or_the_radar, notebook, refine_tracks, report, run, samples, stack,
         time_series, verify, xarray, your_own_recording, ci, sample, rail_pass, uav_flight, gotcha, px4_flight,
     )

@@ -90,8 +90,10 @@ def displacement_mm(root, flight):
 @pytest.mark.slow
 def test_stack_writes_its_files_and_is_verified(small, capsys):
     files = {export.file for export in exports_in("stack")} | {"stack.json", "stack_image.manifest.json"}
+    changes = {export.file for export in exports_in("change")} | {"change.json", "change.manifest.json"}
     for flight in FLIGHTS:
-        assert {path.name for path in (small / "results/stack" / flight).iterdir()} == files
+        found = {path.name for path in (small / "results/stack" / flight).iterdir()}
+        assert found == files | (changes if flight != "f01" else set())
     with rasterio.open(small / "results/stack/f02/slc.tif") as opened:
         tags = opened.tags()
         assert opened.dtypes == ("complex64",)
@@ -153,6 +155,9 @@ def test_unrelated_flight_is_left_out_and_named(small, capsys):
     listed = json.loads((small / "results/stack/stack.json").read_text())
     assert listed["flights"] == list(FLIGHTS[:3])
     assert listed["excluded"] == {"f04": report["reason"]}
+    change = json.loads((small / "results/stack/f04/change.json").read_text())
+    assert change["says"].startswith("left out of the stack")
+    assert not any(change["pixels"].values())
     print_summary(Campaign.load(small))
     message = " ".join(capsys.readouterr().out.split())
     assert f"stack f04: left out: {report['reason']}" in message

@@ -130,7 +130,9 @@ def stacked_pairs(campaign: "Campaign", flight: str) -> list[tuple[str, str]]:
 def changes(scope: JobScope) -> Iterable[str]:
     """Return the manifest of the changes of a flight, if it is compared with the reference flight of the stack."""
     stack = scope.campaign.settings.stack
-    return [scope.campaign.manifest("change", *scope.where)] if stack and scope.where[0] in stack.flights else []
+    return (
+        [scope.campaign.manifest("change", "stack", *scope.where)] if stack and scope.where[0] in stack.flights else []
+    )
 
 
 def has_reference(scope: JobScope) -> bool:
@@ -142,7 +144,7 @@ def has_reference(scope: JobScope) -> bool:
 def stack_reference(scope: JobScope) -> Iterable[str]:
     """Return the manifest of the reference image of the stack."""
     stack = scope.campaign.settings.stack
-    return [scope.campaign.manifest("stack_image", stack.reference)] if stack else []
+    return [scope.campaign.manifest("stack_image", "stack", stack.reference)] if stack else []
 
 
 def is_sampled(campaign: "Campaign") -> bool:

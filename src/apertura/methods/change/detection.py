@@ -30,6 +30,9 @@ LEAST_LOOKS = 2.0
 POINT_LOOKS = 2.0
 """Number of looks over which the energy of a window is spread below which a point dominates the window."""
 
+STRONG_POINT_LOOKS = 1.2
+"""As `POINT_LOOKS`, for points whose sidelobes also affect the windows beside; not reached in homogeneous terrain."""
+
 POINT_GAIN_STD_DB = 0.5
 """Standard deviation of the gain of a point between two flights: focus and aspect angle differ."""
 
@@ -41,6 +44,7 @@ _SIGNIFICANT = 3.0  # standard deviations by which the coherence of the surround
 _STABLE = 0.75  # quantile at which measured and expected coherence are compared; most of the scene may be changed
 _LEAST_WINDOWS = 30  # windows side by side from which the coherence of unchanged terrain varies over the scene
 _OUTLIER = 2.5  # standard deviations beyond which a pixel does not determine the coherence of unchanged terrain
+_BLOCK = 3  # windows along a side of a block, which determines that coherence if most of its pixels agree with it
 _FITS = 8  # fits of that coherence
 _POWER = 0.99  # share of the power in the modes that are counted as independent samples
 _SAMPLES = 100_000  # pixels from which the coherence ratio of the scene is estimated
@@ -159,7 +163,7 @@ def detect_changes(
     log_ratio -= gain
     # Coherence of unchanged terrain (eq. 5), and that of decorrelated surroundings for the ratio (eq. 3).
     distribution = CoherenceDistribution(round(matched, 2))
-    unchanged = _unchanged_coherence(modes, estimate, explained, np.argwhere(valid), valid.sum() / window**2)
+    unchanged = _unchanged_coherence(modes, estimate, explained, np.argwhere(valid), window)
     surrounding = _surroundings(magnitude, valid, window, looks).ravel()[at]
     deviation = 2 * unchanged * (1 - unchanged**2) / np.sqrt(2 * looks * _SURROUNDINGS**2)
     is_lower = surrounding < unchanged**2 - _SIGNIFICANT * deviation
@@ -167,7 +171,9 @@ def detect_changes(
     of_ratio = ratio_probability(log_ratio, around, matched)
     of_coherence = distribution.probability(estimate, unchanged)
     # Windows with a dominant point: amplitude and phase of the point (eq. 6).
-    points = looks * _shared(first, second, window).ravel()[at] < POINT_LOOKS
+    energy = looks * _shared(first, second, window)
+    beside = scipy.ndimage.maximum_filter(energy < STRONG_POINT_LOOKS, 2 * window - 1)
+    points = ((energy < POINT_LOOKS) | beside).ravel()[at]
     noise = np.maximum(1 - estimate[points] ** 2, 0) / (2 * looks - 2)
     gain_std = POINT_GAIN_STD_DB * np.log(10) / 10
     angle = np.minimum(np.abs(phase.ravel()[at][points].astype(np.float64)), np.pi / 2)
@@ -214,7 +220,7 @@ def _no_changes(shape: tuple[int, ...], looks: float) -> Changes:
 
 
 def _unchanged_coherence(
-    modes: Floats, estimate: Floats, explained: Floats, places: NDArray[np.int64], windows: float
+    modes: Floats, estimate: Floats, explained: Floats, places: NDArray[np.int64], window: int
 ) -> Floats:
     """Return the coherence of unchanged terrain, docs/theory/change.md, eq. 5.
 
@@ -226,8 +232,8 @@ def _unchanged_coherence(
         (pixel,) float64, estimated and expected coherence.
     places
         (pixel, 2) int64, rows and columns.
-    windows
-        Number of windows side by side.
+    window
+        Pixels along a side of a window.
     """
     looks = min(matched_looks(modes, 2 * (1 - _STABLE)), MOST_LOOKS)
     distribution = CoherenceDistribution(round(looks, 2))
@@ -242,13 +248,16 @@ def _unchanged_coherence(
     # Variation over the scene: quadratic polynomial of the pixels that agree with it.
     centre, span = places.mean(axis=0), np.maximum(np.ptp(places, axis=0) / 2, 1)
     north, east = ((places - centre) / span).T
-    powers = [(0, 0), (0, 1), (1, 0), (1, 1), (0, 2), (2, 0)][: 6 if windows > _LEAST_WINDOWS else 1]
+    powers = [(0, 0), (0, 1), (1, 0), (1, 1), (0, 2), (2, 0)][: 6 if len(places) > _LEAST_WINDOWS * window**2 else 1]
     terms = np.stack([north**i * east**j for i, j in powers], -1)
     factors = np.zeros(len(powers))
     found = np.arctanh(np.clip(estimate[some], 0, 1 - 1e-6))
+    _, block = np.unique(places[some] // (_BLOCK * window), axis=0, return_inverse=True)
     for _ in range(_FITS):
         residual = found - distribution.median(np.tanh(level[some] + terms[some] @ factors))
         kept = np.abs(residual) < _OUTLIER / np.sqrt(2 * looks)
+        # In a changed block, the few pixels that agree by chance would determine the polynomial.
+        kept &= (np.bincount(block, kept) > 0.5 * np.bincount(block))[block]
         if kept.sum() < len(powers):
             break
         factors += np.linalg.lstsq(terms[some][kept], residual[kept], rcond=None)[0]

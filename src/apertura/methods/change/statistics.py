@@ -65,10 +65,10 @@ def window_modes(image: NDArray[np.complex64], window: int) -> Floats:
     carrier = [np.angle(_smooth(_lagged(part, *lag), 2 * window)) for lag in ((1, 0), (0, 1))]
     lags = [(row, column) for row in range(0, window, step) for column in range(step - window, window, step)]
     found = {}
-    for row, column in lags:
+    for i, j in lags:
         # Phase of the local carrier over the lag; without it, the carriers of distant pixels would cancel.
-        turned = _lagged(part, row, column) * np.exp(-1j * (row * carrier[0] + column * carrier[1]))
-        found[row, column] = turned.mean().real * part.size / ((part.shape[0] - row) * (part.shape[1] - abs(column)))
+        turned = _lagged(part, i, j) * np.exp(-1j * (i * carrier[0] + j * carrier[1]))
+        found[i, j] = turned.sum().real / ((part.shape[0] - i) * (part.shape[1] - abs(j)))
     if not found[0, 0] > 0:
         return np.ones(1)
     pixels = np.arange(0, window, step)
@@ -92,8 +92,7 @@ def _lagged(image: NDArray[np.complex128], row: int, column: int) -> NDArray[np.
 
 
 def _smooth(values: NDArray[np.complex128], side: int) -> NDArray[np.complex128]:
-    parts = (scipy.ndimage.uniform_filter(part, side, mode="constant") for part in (values.real, values.imag))
-    return np.asarray(next(parts) + 1j * next(parts))
+    return np.asarray(scipy.ndimage.uniform_filter(values, side, mode="constant"))
 
 
 def matched_looks(modes: Floats, rate: float) -> float:

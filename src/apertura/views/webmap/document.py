@@ -304,7 +304,7 @@ def _layers(campaign: Campaign, flight: str, image: str, report: Mapping[str, An
     ]
     stack = campaign.settings.stack
     if stack and flight in stack.flights and image == stack.pair:
-        manifest = campaign.root / campaign.manifest("change", flight)
+        manifest = campaign.root / campaign.manifest("change", STACK, flight)
         rows = [row for row in exports_in("change") if row.file.endswith(".tif")]
         changes = [layer for row in rows if (layer := _layer(manifest, row, report)) is not None]
         layers += [replace(layer, folder=f"{STACK}/{flight}") for layer in changes]
@@ -350,7 +350,7 @@ def _layer(manifest: Path, row: Export, report: Mapping[str, Any]) -> Layer | No
         if unit == "dB" and row.source in _SHOWN_IN_DB:
             peak_db = 20 * math.log10(max(float(report["brightest"]["amplitude"]), 1e-30))
             low, high = peak_db + float(report["noise_floor_db"]), peak_db
-            return Layer(row.file, sha256, "image", title, unit, *(round(end, 2) + 0.0 for end in (low, high)))
+            return Layer(row.file, sha256, "image", title, unit, round(low, 2) + 0.0, round(high, 2) + 0.0)
         factor = max(1.0, max(raster.shape) / _RANGE_SAMPLES)
         values = raster.read(1, out_shape=tuple(max(1, round(size / factor)) for size in raster.shape), masked=True)
     valid = np.ma.masked_invalid(values).compressed()
