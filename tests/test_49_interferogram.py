@@ -27,6 +27,7 @@ from apertura.simulation import (
 from apertura.stages.interferogram import interferogram
 from apertura.views.summary import print_summary
 from apertura.views.verify.chain import print_verified
+from apertura.views.webmap.server import served
 from apertura.workflow.lineage import result_of
 
 SLOPE = (0.03, 0.06)
@@ -137,6 +138,8 @@ def test_interferogram_is_on_the_map_and_in_the_catalogue(small):
     assert styles["phase.tif"] == ("phase", -np.pi, np.pi)
     assert styles["coherence.tif"] == ("measure", 0.0, 1.0)
     assert set(styles) == {name for name in FILES if name.endswith(".tif")}
+    with served(Campaign.load(small)) as server:
+        assert {f"interferometry/{NAME}/{file}" for file in styles} <= server.files().keys()
     assert stac_problems(small / "results/stac") == []
     item = json.loads((small / f"results/stac/images/interferometry/{NAME}.json").read_text())
     assert item["assets"]["unwrapped"]["roles"] == ["data", "unwrapped_phase"]

@@ -2,6 +2,8 @@
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import matplotlib.style
@@ -12,21 +14,22 @@ from rasterio import Affine
 from rasterio.transform import array_bounds
 
 from apertura.common.atomic import replacement
-from apertura.formats.export.cog import Band, NorthUpRaster, placed, write_cog
+from apertura.formats.export.cog import Band, placed, write_cog
 from apertura.formats.export.map_layout import DPI, PICTURE_DOTS, MapLayout
 from apertura.formats.export.quicklook import crs_name, footer
 
-PHASE = Band("float32", np.nan, "rad", "wrapped phase of the first image relative to the second", "NEAREST")
-COHERENCE = Band("float32", np.nan, "1", "estimated coherence; bias: see the tag APERTURA_CHANCE", "AVERAGE")
-UNWRAPPED = Band("float32", np.nan, "rad", "unwrapped topographic phase: see the tag APERTURA_LEVEL", "AVERAGE")
-HEIGHT = Band("float32", np.nan, "m", "terrain height in the CRS of the scene: see the tag APERTURA_LEVEL", "AVERAGE")
-HEIGHT_STD = Band(
-    "float32",
-    np.nan,
-    "m",
-    "standard deviation of the height due to phase noise, reference level and track errors",
-    "AVERAGE",
-)
+_COHERENCE = Band("float32", np.nan, "1", "estimated coherence; bias: see the tag APERTURA_CHANCE", "AVERAGE")
+_PHASE = replace(_COHERENCE, unit="rad", meaning="wrapped phase of the first image relative to the second")
+_UNWRAPPED = replace(_COHERENCE, unit="rad", meaning="unwrapped topographic phase: see the tag APERTURA_LEVEL")
+_HEIGHT = replace(_COHERENCE, unit="m", meaning="terrain height in the CRS of the scene: see the tag APERTURA_LEVEL")
+_STD = "standard deviation of the height due to phase noise, reference level and track errors"
+
+# Writers of one raster each, (y, x) float32, NaN where invalid; parameters of `apertura.formats.export.cog.write_slc`.
+write_coherence = partial(write_cog, band=_COHERENCE)
+write_phase = partial(write_cog, band=replace(_PHASE, overviews="NEAREST"))  # a mean of wrapped phases has no meaning
+write_unwrapped = partial(write_cog, band=_UNWRAPPED)
+write_height = partial(write_cog, band=_HEIGHT)
+write_height_std = partial(write_cog, band=replace(_HEIGHT, meaning=_STD))
 
 _PANELS = (  # key, label, colour map, limits
     ("coherence", "coherence", "gray", (0.0, 1.0)),
@@ -34,53 +37,6 @@ _PANELS = (  # key, label, colour map, limits
     ("height", "height, m", "viridis", None),
     ("height_std", "standard deviation of height, m", "magma", None),
 )
-
-
-def write_phase(
-    path: Path, phase_rad: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
-) -> None:
-    """Write the wrapped phase, (y, x) float32 rad; overviews are subsampled. Otherwise as `write_height`."""
-    write_cog(path, phase_rad, PHASE, transform=transform, crs=crs, tags=tags, title=title)
-
-
-def write_coherence(
-    path: Path, magnitude: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
-) -> None:
-    """Write the estimated coherence, (y, x) float32, 0 to 1. Otherwise as `write_height`."""
-    write_cog(path, magnitude, COHERENCE, transform=transform, crs=crs, tags=tags, title=title)
-
-
-def write_unwrapped(
-    path: Path, phase_rad: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
-) -> None:
-    """Write the unwrapped topographic phase, (y, x) float32 rad. Otherwise as `write_height`."""
-    write_cog(path, phase_rad, UNWRAPPED, transform=transform, crs=crs, tags=tags, title=title)
-
-
-def write_height(
-    path: Path, height_m: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
-) -> None:
-    """Write heights, (y, x) float32 metres, NaN where invalid; see `apertura.formats.export.cog.write_slc`.
-
-    Examples
-    --------
-    >>> import rasterio
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as folder:
-    ...     path = Path(folder) / "height.tif"
-    ...     write_height(path, np.ones((2, 3), "f4"), transform=Affine(1, 0, 5, 0, -1, 9), crs="EPSG:32632", tags={})
-    ...     with rasterio.open(path) as raster:
-    ...         raster.units[0], raster.read(1)[0, 0].item()
-    ('m', 1.0)
-    """
-    write_cog(path, height_m, HEIGHT, transform=transform, crs=crs, tags=tags, title=title)
-
-
-def write_height_std(
-    path: Path, std_m: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
-) -> None:
-    """Write the standard deviation of heights, (y, x) float32 metres. Otherwise as `write_height`."""
-    write_cog(path, std_m, HEIGHT_STD, transform=transform, crs=crs, tags=tags, title=title)
 
 
 def write_panels(

@@ -33,9 +33,10 @@ from apertura.common.documents import read_json, undamaged
 from apertura.common.errors import CampaignError
 from apertura.common.processes import Interrupted
 from apertura.common.provenance import sha256_file
-from apertura.formats.export import MAP, PREVIEW, product_files
+from apertura.formats.export import MAP, PREVIEW, exports_in, product_files
 from apertura.views.webmap.document import listed_document, named_files, requested_file
 from apertura.views.webmap.kmz import overlay_of
+from apertura.workflow.rules import INTERFEROMETRY
 
 LOOPBACK = "127.0.0.1"
 """The only address on which the server listens; also the host name of the map and its data."""
@@ -556,7 +557,9 @@ def _listing(campaign: Campaign) -> Callable[[], Mapping[str, str]]:
 
     `map.json` and its manifest are read again if the manifest changed, which indicates a new run of the workflow.
     """
-    products = frozenset(product_files(campaign.images, campaign.coefficients))
+    pairs, rows = campaign.settings.interferometry.pairs, list(exports_in("interferogram"))
+    products = {f"{INTERFEROMETRY}/{name}/{row.file}" for name in pairs for row in rows}
+    products |= set(product_files(campaign.images, campaign.coefficients))
 
     @lru_cache(maxsize=1)
     def listed(*_: int) -> Mapping[str, str]:
