@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import jsonschema
@@ -19,6 +20,7 @@ from apertura.campaign.folder import Campaign
 from apertura.campaign.store import create, damaged_files, finish, manifest_of, open_stage, writing
 from apertura.common.confined import ConfinedPath
 from apertura.common.contracts import RASTERS
+from apertura.core.scene.grid import SceneGrid
 from apertura.methods.interferometry.coherence import chance, coherence
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.stages import cube
@@ -113,7 +115,35 @@ def test_cube_has_the_metadata_of_acdd(campaign, opened):
     assert all(array.attrs["coverage_content_type"] for array in opened.data_vars.values())
 
 
-@pytest.mark.parametrize("name", ["spatial", "proj"])
+def test_overviews_are_the_mean_power_of_blocks_of_pixels(campaign, opened):
+    """Each level has its own grid, is valid as a level of the convention, and contains the sum, too."""
+    power = (np.abs(opened.image.load()) ** 2).values
+    layout = opened.attrs["multiscales"]["layout"]
+    assert [level["asset"] for level in layout] == ["image", "overviews/2/power", "overviews/4/power"]
+    for factor, placed in zip((2, 4), layout[1:], strict=True):
+        level = xr.open_zarr(str(campaign.stage("cube")), group=f"overviews/{factor}").load()
+        blocks = power.reshape(2, 2, 60 // factor, factor, 60 // factor, factor)
+        np.testing.assert_allclose(level.power, blocks.mean(axis=(3, 5)), rtol=1e-5)
+        assert placed["spatial:shape"] == [level.sizes["y"], level.sizes["x"]] == [60 // factor] * 2
+        assert level.rio.bounds() == pytest.approx(opened.rio.bounds(), abs=1e-6)
+        assert level.rio.crs == opened.rio.crs
+        assert level.flight.values.tolist() == ["f01", "f02"]
+        sums = opened.noncoherent.values.reshape(2, *blocks.shape[2:])
+        np.testing.assert_allclose(level.noncoherent, sums.mean(axis=(2, 4)), rtol=1e-5)
+
+
+def test_overview_omits_missing_pixels():
+    """Only illuminated pixels are averaged; the last row and column of an odd image are blocks of fewer pixels."""
+    source = np.full((3, 3), np.nan, np.complex64)
+    source[0, 0], source[2, 2] = 2j, 3
+    target = np.full((2, 2), -1, np.float32)
+    grid = SceneGrid("local", 0.0, 0.0, 2.0, (2, 2))
+    with ThreadPoolExecutor(1) as workers:
+        cube._write_overviews(source, [target], [grid], 2, workers)
+    np.testing.assert_array_equal(target, [[4, np.nan], [np.nan, 9]])
+
+
+@pytest.mark.parametrize("name", ["spatial", "proj", "multiscales"])
 def test_attributes_follow_the_zarr_conventions(campaign, opened, name):
     """The group is valid against the schema of each convention, with its UUID, and describes the stored grid."""
     schema = json.loads((ROOT / "tests/zarr_conventions" / f"{name}.json").read_text())
@@ -121,6 +151,10 @@ def test_attributes_follow_the_zarr_conventions(campaign, opened, name):
     jsonschema.Draft7Validator(schema).validate(group)
     stated = {one["name"]: one["uuid"] for one in group["attributes"]["zarr_conventions"]}
     assert stated[name] == schema["$defs"]["conventionMetadata"]["properties"]["uuid"]["const"]
+    for level in ("2", "4"):
+        group = json.loads((campaign.stage("cube") / "overviews" / level / "zarr.json").read_bytes())
+        if name != "multiscales":
+            jsonschema.Draft7Validator(schema).validate(group)
     step, _, west, _, down, north = opened.attrs["spatial:transform"]
     assert opened.x.values[0] == pytest.approx(west + step / 2, abs=1e-9)
     assert opened.y.values[-1] == pytest.approx(north + down * (opened.sizes["y"] - 0.5), abs=1e-6)

@@ -1,6 +1,6 @@
 """Rule `cube`: every image of the campaign on one grid, sums over each flight's pairs, and interferometric phases."""
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
@@ -259,6 +259,12 @@ def _relative_to(window: Window, whole: Window) -> Window:
 
 _PHASE = "coherence", "phase"
 
+_LEVEL = "overviews/{}"
+"""Group of an overview, by the ratio of its pixel spacing to that of the images."""
+
+_CHUNKED = {**RASTERS, "power": RASTERS["image"]}
+"""Rasters of the cube and of its overviews."""
+
 _FLIGHTS_PER_CHUNK = 256
 """Length of the chunks of coordinates and measures along `flight`.
 
@@ -307,17 +313,26 @@ def cube(campaign: Campaign, *, threads: int = 1) -> Path:
         chunks = {name: tuple(tile[dim] for dim in dims) for name, (dims, *_) in RASTERS.items() if name in empty}
         measured = {name: empty[name].values.copy() for name in MEASURED if name in empty}
         whole = {name: (_FLIGHTS_PER_CHUNK, *values.shape[1:]) for name, values in measured.items()}
-        create(wip, empty, chunks | whole, lengths={"flight": _FLIGHTS_PER_CHUNK}, consolidated=True)
+        levels = overview_grids(grid, side)
+        groups = {_LEVEL.format(factor): _empty_level(empty, level, tile) for factor, level in levels.items()}
+        create(wip, empty, chunks | whole, lengths={"flight": _FLIGHTS_PER_CHUNK}, groups=groups, consolidated=True)
+        chunks |= {f"{group}/{name}": shape for group, (_, shapes) in groups.items() for name, shape in shapes.items()}
         earlier = _EarlierCube.of(folder, recorded)
         kept = earlier.kept(empty.attrs["origins"])
-        appended = earlier.is_continued(empty, kept)
-        known = earlier.carry(kept, empty, measured, None if appended else wip)
+        appended = earlier.is_continued(empty, kept, chunks)
+        known = earlier.carry(kept, empty, measured, chunks, None if appended else wip)
         rasters = {name: open_array(wip, name) for name in chunks}
         arrays = _CubeArrays({**rasters, **measured}, [*assessed], empty.attrs["pairs"])
         changed = [flight for flight in assessed if flight not in kept]
         for flight in changed:
             present = {pair: opened(flight, pair) for pair in campaign.flight(flight).pairs}
             _write_images(present, sums.get(flight), arrays, flight, windows, workers)
+            for pair in present:
+                planes = [arrays.plane(f"{group}/power", flight, pair) for group in groups]
+                _write_overviews(arrays.plane("image", flight, pair), planes, levels.values(), side, workers)
+            if flight in sums:
+                planes = [arrays.plane(f"{group}/noncoherent", flight) for group in groups]
+                _write_overviews(arrays.plane("noncoherent", flight), planes, levels.values(), side, workers)
         for flight, fusion in sums.items():
             if flight in changed:
                 single_db = [images[flight, pair].attrs["quality"]["noise_floor_db"] for pair in fusion["phases_rad"]]
@@ -379,9 +394,9 @@ class _EarlierCube:
     def _chunks(self) -> Iterator[tuple[str, int, str]]:
         """Chunks of rasters: file, row along `flight`, SHA-256."""
         for name, digest in self.recorded.items():
-            array, *place = name.split("/")
-            if array in RASTERS and place[0] == "c":
-                yield name, int(place[1]), digest
+            array, _, place = name.partition("/c/")
+            if place and array.rpartition("/")[2] in _CHUNKED:
+                yield name, int(place.split("/")[0]), digest
 
     def kept(self, origins: Mapping[str, str]) -> set[str]:
         """Return the unchanged flights; if all are unchanged, flights with damaged chunks count as changed."""
@@ -391,24 +406,31 @@ class _EarlierCube:
             kept -= {flights[row] for name, row, digest in self._chunks if sha256_file(self.folder / name) != digest}
         return kept
 
-    def is_continued(self, empty: xr.Dataset, kept: Collection[str]) -> bool:
-        """Return True if all flights are kept, and further flights follow them."""
-        flights, arrays = self.attributes["flights"], {name.split("/")[0] for name in self.recorded if "/" in name}
+    def is_continued(self, empty: xr.Dataset, kept: Collection[str], chunked: Collection[str]) -> bool:
+        """Return True if all flights are kept, and further flights follow them; `chunked` as in `carry`."""
+        flights = self.attributes["flights"]
+        arrays = {name.removesuffix("/zarr.json") for name in self.recorded if name.endswith("/zarr.json")}
         return (
             bool(flights)
             and set(flights) == {*kept}
             and empty.attrs["flights"][: len(flights)] == flights
             and empty.attrs["pairs"] == self.attributes["pairs"]
-            and {*empty.variables} == arrays
+            and {*empty.variables} | {*chunked} <= arrays
+            and {name for name in arrays if name.rpartition("/")[2] in _CHUNKED} == {*chunked}
         )
 
     def carry(
-        self, kept: Collection[str], empty: xr.Dataset, measured: Mapping[str, Any], wip: ConfinedPath | None
+        self,
+        kept: Collection[str],
+        empty: xr.Dataset,
+        measured: Mapping[str, Any],
+        chunked: Collection[str],
+        wip: ConfinedPath | None,
     ) -> dict[str, str]:
         """Copy the measures of kept flights to `measured`, and link their chunks to a new cube.
 
-        Without `wip`, the chunks remain in their place. Return the files of these chunks in the new cube and their
-        hashes.
+        Without `wip`, the chunks remain in their place. `chunked` contains the rasters of the new cube. Return the
+        files of these chunks in the new cube and their hashes.
         """
         flights, pairs, carried = self.attributes["flights"], self.attributes["pairs"], dict[str, str]()
         rows = {flights.index(flight): empty.attrs["flights"].index(flight) for flight in kept}
@@ -416,11 +438,12 @@ class _EarlierCube:
             at: empty.attrs["pairs"].index(pair) for at, pair in enumerate(pairs) if pair in empty.attrs["pairs"]
         }
         for name, row, digest in self._chunks:
-            array, folder, _, *rest = name.split("/")
-            if row in rows and array in empty:
-                if "pair" in empty[array].dims:
+            array, _, place = name.partition("/c/")
+            _, *rest = place.split("/")
+            if row in rows and array in chunked:
+                if "pair" in _CHUNKED[array.rpartition("/")[2]][0]:
                     rest[0] = str(columns[int(rest[0])])
-                new = "/".join([array, folder, str(rows[row]), *rest])
+                new = "/".join([array, "c", str(rows[row]), *rest])
                 carried[new] = digest
                 if wip is not None:
                     (self.folder / name).link_or_copy_to(wip / new)
@@ -501,6 +524,62 @@ def _write_images(
         pass
 
 
+def overview_grids(grid: SceneGrid, side: int) -> dict[int, SceneGrid]:
+    """Return the grids of the overviews, by the ratio of pixel spacings.
+
+    The coarsest overview fits into a tile of `side` pixels.
+
+    Examples
+    --------
+    >>> grids = overview_grids(SceneGrid("local", 0.0, 0.0, 0.5, (600, 401)), 256)
+    >>> {factor: (level.shape, level.spacing_m) for factor, level in grids.items()}
+    {2: ((300, 201), 1.0), 4: ((150, 101), 2.0)}
+    """
+    (step, _, west, _, _, north), grids, factor = grid.transform, dict[int, SceneGrid](), 1
+    while max(grid.shape) > side * factor:
+        factor *= 2
+        rows, columns = (-(-size // factor) for size in grid.shape)
+        grids[factor] = SceneGrid(grid.crs, west, north, step * factor, (rows, columns), name=grid.name)
+    return grids
+
+
+def _empty_level(
+    empty: xr.Dataset, grid: SceneGrid, tile: Mapping[str, int]
+) -> tuple[xr.Dataset, dict[str, tuple[int, ...]]]:
+    """Return an overview of the cube without values, and the chunks of its rasters."""
+    level = empty[["flight", "pair"]].assign_coords(grid.coordinates).assign_attrs(convention_attributes(grid))
+    sizes = {**empty.sizes, "y": grid.shape[0], "x": grid.shape[1]}
+    rows = {"power": (RASTERS["image"][0], "mean power of the pixels of `image`")}
+    if "noncoherent" in empty:
+        rows["noncoherent"] = RASTERS["noncoherent"][0], "mean of the pixels of `noncoherent`"
+    for name, (dims, meaning) in rows.items():
+        nan = np.broadcast_to(np.float32(np.nan), tuple(sizes[dim] for dim in dims))
+        level[name] = dims, nan, {"units": "1", "long_name": meaning, "coverage_content_type": "image"}
+    return level, {name: tuple(tile[dim] for dim in dims) for name, (dims, _) in rows.items()}
+
+
+def _write_overviews(
+    source: _Plane, targets: Sequence[_Plane], grids: Iterable[SceneGrid], side: int, workers: Executor
+) -> None:
+    """Write the overviews of an image or a power, each from the next finer one: means of 2 × 2 pixels, without NaN."""
+    for target, grid in zip(targets, grids, strict=True):
+
+        def write(window: Window, source: _Plane = source, target: _Plane = target) -> None:
+            values = source[tuple(slice(2 * part.start, 2 * part.stop) for part in window)]  # type: ignore[index]
+            power = np.abs(values) ** 2 if np.iscomplexobj(values) else values
+            rows, columns = power.shape
+            padded = np.pad(power, ((0, rows % 2), (0, columns % 2)), constant_values=np.nan)
+            blocks = padded.reshape(padded.shape[0] // 2, 2, padded.shape[1] // 2, 2)
+            count = np.isfinite(blocks).sum(axis=(1, 3))
+            if count.any():
+                total = np.nansum(blocks, axis=(1, 3), dtype=np.float64)
+                target[window] = np.where(count, total / np.maximum(count, 1), np.nan).astype(np.float32)
+
+        for _ in workers.map(write, grid.tiles(side)):
+            pass
+        source = target
+
+
 def _compare(
     images: Images,
     opened: Callable[[str, str], xr.Dataset],
@@ -548,7 +627,7 @@ def _empty_cube(
     return empty.assign_coords(grid.coordinates).assign_attrs(
         Conventions="CF-1.11, ACDD-1.3",
         **acdd_attributes(campaign, [image.attrs["quality"]["view"] for image in images.values()], grid),
-        **convention_attributes(grid),
+        **convention_attributes(grid, campaign.settings.processing.tile_px),
         history="written by rule cube of apertura; runspec, inputs and code_sha256 state settings, data and code",
         flights=[*assessed],
         pairs=pairs,
@@ -566,12 +645,16 @@ def _empty_cube(
 _CONVENTIONS = {
     "spatial": ("689b58e2-cf7b-45e0-9fff-9cfc0883d6b4", "Spatial coordinate information"),
     "proj": ("f17cb550-5864-4468-aeb7-f3180cfb622f", "Coordinate reference system information for geospatial data"),
+    "multiscales": ("d35379db-88df-4056-af3a-620245f8e347", "Multiscale layout of zarr datasets"),
 }
 """Convention of https://github.com/zarr-conventions, version 0.1 → UUID and description."""
 
 
-def convention_attributes(grid: SceneGrid) -> dict[str, Any]:
+def convention_attributes(grid: SceneGrid, side: int | None = None) -> dict[str, Any]:
     """Return the attributes of the Zarr conventions `spatial` and `proj`; a local frame has no registered CRS.
+
+    For a group with overviews, `side` is the side of a tile in pixels, and the attributes include the convention
+    `multiscales`.
 
     Examples
     --------
@@ -580,7 +663,12 @@ def convention_attributes(grid: SceneGrid) -> dict[str, Any]:
     ([570000.0, 5362980.0, 570030.0, 5363000.0], 'EPSG:32632')
     """
     crs = {} if grid.frame == "local" else {"proj:code": grid.crs, "proj:wkt2": CRS(grid.crs_wkt).to_wkt()}
-    names = ["spatial", *(["proj"] if crs else [])]
+    levels = {} if side is None else overview_grids(grid, side)
+    layout = [{"asset": "image", **_placed(grid)}]
+    for factor, level in levels.items():
+        derived = {"derived_from": layout[-1]["asset"], "transform": {"scale": [1.0, 1.0, 2.0, 2.0]}}
+        layout.append({"asset": f"{_LEVEL.format(factor)}/power", **derived, **_placed(level)})
+    names = ["spatial", *(["proj"] if crs else []), *(["multiscales"] if levels else [])]
     return {
         "zarr_conventions": [
             {
@@ -594,11 +682,15 @@ def convention_attributes(grid: SceneGrid) -> dict[str, Any]:
         ],
         "spatial:dimensions": ["y", "x"],
         "spatial:bbox": [float(side) for side in grid.bounds_m],
-        "spatial:transform": [float(value) for value in grid.transform],
-        "spatial:shape": [*grid.shape],
         "spatial:registration": "pixel",
+        **_placed(grid),
         **crs,
+        **({"multiscales": {"layout": layout, "resampling_method": "average"}} if levels else {}),
     }
+
+
+def _placed(grid: SceneGrid) -> dict[str, Any]:
+    return {"spatial:shape": [*grid.shape], "spatial:transform": [float(value) for value in grid.transform]}
 
 
 def acdd_attributes(campaign: Campaign, views: Sequence[Mapping[str, Any]], grid: SceneGrid) -> dict[str, str | float]:

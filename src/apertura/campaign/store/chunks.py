@@ -180,12 +180,16 @@ def encoding_of(dataset: "xr.Dataset", chunks: Mapping[str, int]) -> dict[Hashab
     return encoding
 
 
+Groups = Mapping[str, tuple["xr.Dataset", Mapping[str, tuple[int, ...]]]]
+
+
 def skeleton(
     stage: "xr.Dataset",
     chunks: Mapping[str, tuple[int, ...]],
     *,
     packed: bool = True,
     lengths: Mapping[str, int] = MappingProxyType({}),
+    groups: Groups = MappingProxyType({}),
     consolidated: bool = False,
 ) -> dict[str, bytes]:
     """Return metadata and coordinates of a stage before its arrays are computed: path → bytes.
@@ -201,25 +205,30 @@ def skeleton(
         True if these arrays are compressed, which does not reduce the size of noise.
     lengths
         Dimension → chunk length of the other arrays and coordinates; other dimensions have one chunk.
+    groups
+        Path of a group below the stage → its dataset and the chunks of its arrays, as `stage` and `chunks`.
     consolidated
         True if the metadata of the stage contain those of all arrays, for readers that open several arrays.
     """
     files: dict[str, Buffer] = {}
-    whole, store = stage.drop_vars(list(chunks)), MemoryStore(files)
-    whole.to_zarr(store, mode="w", consolidated=False, zarr_format=3, encoding=encoding_of(whole, lengths))
-    group = zarr.open_group(store, mode="r+")
-    for name, shape in chunks.items():
-        array = stage[name]
-        group.create_array(
-            name,
-            shape=array.shape,
-            chunks=shape,
-            dtype=array.dtype,
-            compressors=CODECS if packed else CODECS[-1:],
-            fill_value=array.values.flat[0],  # value of chunks that are never written
-            dimension_names=[str(dim) for dim in array.dims],
-            attributes=array.attrs | ({"grid_mapping": "spatial_ref"} if {"y", "x"} <= set(array.dims) else {}),
-        )
+    store = MemoryStore(files)
+    for place, (dataset, shapes) in {"": (stage, chunks), **groups}.items():
+        whole = dataset.drop_vars(list(shapes))
+        how: Any = {"consolidated": False, "zarr_format": 3, "encoding": encoding_of(whole, lengths)}
+        whole.to_zarr(store, group=place or None, mode="a", **how)
+        group = zarr.open_group(store, path=place, mode="r+")
+        for name, shape in shapes.items():
+            array = dataset[name]
+            group.create_array(
+                name,
+                shape=array.shape,
+                chunks=shape,
+                dtype=array.dtype,
+                compressors=CODECS if packed else CODECS[-1:],
+                fill_value=array.values.flat[0],  # value of chunks that are never written
+                dimension_names=[str(dim) for dim in array.dims],
+                attributes=array.attrs | ({"grid_mapping": "spatial_ref"} if {"y", "x"} <= set(array.dims) else {}),
+            )
     if consolidated:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ZarrUserWarning)  # not yet part of the Zarr version 3 standard

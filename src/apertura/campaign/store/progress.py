@@ -25,8 +25,7 @@ from apertura.common.provenance import canonical_json, sha256_tree
 if TYPE_CHECKING:
     import xarray as xr
 
-if TYPE_CHECKING:
-    import xarray as xr
+    from apertura.campaign.store.chunks import Groups
 
 
 # ---- Lock of a stage, and renaming of the finished stage ------------------------------------------------------------
@@ -363,6 +362,7 @@ def create(
     *,
     packed: bool = True,
     lengths: Mapping[str, int] = MappingProxyType({}),
+    groups: "Groups" = MappingProxyType({}),
     consolidated: bool = False,
 ) -> None:
     """Create `wip`: metadata and coordinates of a stage, and empty arrays that are written chunk by chunk.
@@ -378,12 +378,13 @@ def create(
         Array name → shape of the array's chunks. Only one process at a time may write a chunk.
     packed
         True if chunks are compressed.
-    lengths, consolidated
+    lengths, groups, consolidated
         See `apertura.campaign.store.chunks.skeleton`.
     """
     from apertura.campaign.store.chunks import skeleton
 
-    _begin(ConfinedPath.of(wip), skeleton(stage, chunks, packed=packed, lengths=lengths, consolidated=consolidated))
+    files = skeleton(stage, chunks, packed=packed, lengths=lengths, groups=groups, consolidated=consolidated)
+    _begin(ConfinedPath.of(wip), files)
 
 
 def open_array(folder: Path, name: str, mode: str = "r+") -> Any:
