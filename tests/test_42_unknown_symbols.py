@@ -11,6 +11,7 @@ from folders import edit_config, run_steps
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
 from apertura.common.errors import CampaignError
+from apertura.core.echo.constellation import constellation
 from apertura.core.quality.point_targets import find_peak
 from apertura.simulation import preset, simulate
 from apertura.stages import echo, ingest
@@ -65,8 +66,8 @@ def test_bits_of_an_independent_campaign_are_read(tmp_path):
     """QPSK at 15 dB: header, counter, data and CRC of all frames agree with those computed by other code."""
     bits = own_campaign.write(tmp_path / "campaign", constellation="qpsk", pulses=40)["bits"]
     (read,) = payloads(Campaign.load(tmp_path / "campaign"))
-    assert read.intact.all()
-    assert np.array_equal(read.counter, np.arange(40))
+    assert read.columns["intact"].all()
+    assert np.array_equal(read.columns["counter"], np.arange(40))
     sent = np.packbits(bits[:, 48:-16], axis=1)
     assert np.array_equal(read.data, sent)
 
@@ -109,8 +110,8 @@ def test_payload_of_the_preset_is_that_of_its_truth(tmp_path):
     assert summary["intact"] == summary["frames"]
     assert summary["received_bit_s"] == pytest.approx((4096 - 64) * 20)
     (read,) = payloads(campaign)
-    true = np.load(root / "symbols.npy")[read.counter]
-    qam = read.constellation
+    true = np.load(root / "symbols.npy")[read.columns["counter"]]
+    qam = constellation("16qam")
     sent = np.packbits(qam.bits(qam.decide(true))[:, 48:-16], axis=1)
     assert np.array_equal(np.load(tmp_path / "out" / "f01.uav2.npy"), sent)
 
