@@ -25,10 +25,12 @@ from apertura.stages.symbols import decided_symbols
 from apertura.stages.transmitted import Transmitted, UnknownSymbols, transmitted
 from apertura.tools.chart.pareto import save_png
 
-
 _PRINTED = {
     **{name: name for name in ("flight", "node", "frames", "intact")},
-    **{"snr_db": "SNR dB", "evm_db": "EVM dB", "symbol_error_rate_expected": "SER", "received_bit_s": "bit/s"},
+    "snr_db": "SNR dB",
+    "evm_db": "EVM dB",
+    "symbol_error_rate_expected": "SER",
+    "received_bit_s": "bit/s",
 }
 """Key of the summary → heading of the printed table."""
 
@@ -41,8 +43,8 @@ class NodePayload:
     ----------
     columns
         Quantity → (frame,) values: `time` of the capture, `detected` (direct path), `sure` (decisions within the limit
-        of the error vector magnitude), `snr_db` and `evm_db` (NaN where not detected), `counter`, `header_errors` (wrong
-        bits), and `intact` (header right, and check sum, if there is one, agrees).
+        of the error vector magnitude), `snr_db` and `evm_db` (NaN where not detected), `counter`, `header_errors`
+        (wrong bits), and `intact` (header right, and check sum, if there is one, agrees).
     data
         (frame, byte) uint8, data bits of each frame, padded with zeros to whole bytes.
     summary
