@@ -10,6 +10,7 @@ from folders import edit_config, run_steps
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
+from apertura.check import problems
 from apertura.common.errors import CampaignError
 from apertura.core.echo.constellation import constellation
 from apertura.core.quality.point_targets import find_peak
@@ -132,3 +133,32 @@ def test_framed_symbols_of_a_simulation_require_a_constellation():
     """Newman's code carries no data."""
     with pytest.raises(ValueError, match="requires a constellation"):
         replace(preset("payload").waveform, code="newman")
+
+
+@pytest.mark.slow
+def test_check_refuses_monostatic_pairs_without_a_known_part(tmp_path):
+    """The error is found before the run; with a frame there is no problem."""
+    own_campaign.write(tmp_path / "campaign", pulses=8)
+    assert problems(tmp_path / "campaign") == []
+    edit_config(tmp_path / "campaign", lambda config: config["waveform"]["codes"].pop("frame"))
+    (problem,) = problems(tmp_path / "campaign")
+    assert "ambiguous by quarter turns" in problem.found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("codes", "found"),
+    [
+        ({"frame": {"header": "1a", "counter_bits": 48}, "constellation": "64qam"}, "header of 8 bits"),
+        ({"pilots": "raw/none.npy"}, "no such file"),
+        ({"node": "uav9"}, "node 'uav9' is not part of flight f01"),
+        ({"node": "uav1"}, "node uav1 recorded no channel named 'sidelink'"),
+    ],
+)
+def test_wrong_settings_of_unknown_symbols_are_refused(tmp_path, codes, found):
+    """The error states the setting; a node without sidelink is found when the echo is formed."""
+    own_campaign.write(tmp_path / "campaign", pulses=8)
+    edit_config(tmp_path / "campaign", lambda config: config["waveform"]["codes"].update(codes))
+    with pytest.raises(CampaignError) as caught:
+        formed(tmp_path / "campaign", "uav1-uav1")
+    assert found in caught.value.found
