@@ -118,6 +118,24 @@ def test_payload_of_the_preset_is_that_of_its_truth(tmp_path):
 
 
 @pytest.mark.slow
+def test_transmitter_is_imaged_by_its_own_recording_of_what_it_sent(tmp_path):
+    """The symbols of its loop-back compress the echoes of the transmitter to the same profiles as the true symbols."""
+    root = tmp_path / "campaign"
+    bits = own_campaign.write(root, pulses=64, loopback=True)["bits"]
+    edit_config(root, lambda config: config.update(processing={"symbol_filter": "reciprocal"}))
+    stage = formed(root, "uav1-uav1")[1].stage
+    assert stage.attrs["symbols"]["decided"]["node"] == "uav1"
+    assert stage.attrs["flags"] == {}
+    edit_config(root, lambda config: config["waveform"].update(codes="raw/codes.npy"))
+    codes = np.array([own_campaign.modulated(row, 4) for row in bits])
+    np.save(root / "raw" / "codes.npy", codes.astype(np.complex64))
+    campaign = Campaign.load(root)
+    echo.echo(campaign, "f01", "uav1-uav1")
+    known = PairEcho.opened(campaign, "f01", "uav1-uav1").stage.transfer.values
+    assert np.allclose(stage.transfer.values, known, atol=1e-5 * np.abs(known).max())
+
+
+@pytest.mark.slow
 def test_pulses_with_a_weak_sidelink_are_excluded(tmp_path):
     """A sidelink 14 dB weaker in a part of the flight leaves its pulses unsure: they are counted and flagged."""
     root = tmp_path / "campaign"
