@@ -117,7 +117,7 @@ def test_frames_of_captures_by_counter_or_by_time_tags(counted, expected):
 @pytest.mark.quick("a-b")
 @pytest.mark.parametrize("pair", ["a-a", "a-b"])
 def test_echoes_of_changing_codes_equal_those_of_a_fixed_code(tmp_path, pair):
-    """Without noise, only the quantisation differs; with the symbols of other frames, nothing agrees."""
+    """Without noise, only the quantisation differs; with other symbols, nothing agrees."""
     fixed = transfer_of(campaign_with(tmp_path / "fixed", "qpsk", 1), pair)
     changing = campaign_with(tmp_path / "changing", "qpsk", FRAMES)
     table = np.load(changing / "raw/codes.npy")
@@ -126,7 +126,7 @@ def test_echoes_of_changing_codes_equal_those_of_a_fixed_code(tmp_path, pair):
     np.testing.assert_array_equal(formed.frame, np.arange(12))
     np.testing.assert_array_equal(formed.time, fixed.time)
     assert difference_db(fixed.transfer.values, formed.transfer.values) < -55
-    np.save(changing / "raw/codes.npy", np.roll(table, 1, axis=0))
+    np.save(changing / "raw/codes.npy", np.roll(table, 1, axis=1))  # symbols of other subcarriers
     if pair == "a-a":
         assert difference_db(fixed.transfer.values, transfer_of(changing, pair).transfer.values) > 0
 
