@@ -1,8 +1,8 @@
 """EVM of NB-IoT uplink bursts in a recording of the air, by the functions that decide unknown symbols.
 
-A single-tone NPUSCH burst (3GPP TS 36.211, section 10.1) has one subcarrier of 15 kHz and slots of 7 symbols of 1/15 kHz
-with cyclic prefixes of 10 and 9 samples at 1.92 MHz; its π/4-QPSK symbols are turned by π/4 in every second symbol. A
-carrier offset turns consecutive symbols of the burst as a delay turns consecutive subcarriers of a pulse: the symbols
+A single-tone NPUSCH burst (3GPP TS 36.211, section 10.1) has one subcarrier of 15 kHz, and slots of 7 symbols of 1/15
+kHz with cyclic prefixes of 10 and 9 samples at 1.92 MHz; every second π/4-QPSK symbol is turned by π/4. A carrier
+offset turns consecutive symbols of the burst as a delay turns consecutive subcarriers of a pulse: the symbols
 of a burst are therefore decided as those of one pulse, whose delay is the carrier offset.
 
     python benchmarks/nbiot_evm.py RECORDING.sigmf-meta
@@ -63,7 +63,7 @@ def main(path: Path) -> None:
             offset_hz = -decisions.path.delay_cells[0] / count * PER_SLOT / 0.5e-3
             snr_db, evm = 10 * np.log10(decisions.snr[0]), 100 * decisions.evm[0]
             print(
-                f"{length / rate_hz * 1e3:.0f} ms at {tone_hz / 1e3:+.1f} kHz: {count} symbols, slot {offset:+d} samples, "
+                f"{length / rate_hz * 1e3:.0f} ms at {tone_hz / 1e3:+.1f} kHz: {count} symbols, start {offset:+d}, "
                 f"carrier offset {offset_hz:+.0f} Hz, SNR {snr_db:.1f} dB, EVM {evm:.1f} %, sure {decisions.sure[0]}"
             )
 

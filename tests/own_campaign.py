@@ -59,10 +59,12 @@ def write(  # noqa: PLR0915 - one pass through the equations
     sidelink_db: float = 15.0,
     radar_db: float = 10.0,
     weak: slice | None = None,
+    loopback: bool = False,
 ) -> dict[str, np.ndarray]:
     """Write the campaign; return bits, (pulse, bit), and easting and northing of the targets, (target, 2).
 
-    The SNRs are per subcarrier. `weak`: pulses whose direct path is 14 dB weaker.
+    The SNRs are per subcarrier. `weak`: pulses whose direct path is 14 dB weaker. `loopback`: the transmitter
+    records what it sends as its own sidelink, and gives the symbols of monostatic images.
     """
     random, per_symbol = np.random.default_rng(11), BITS[constellation]
     time_s = np.arange(pulses) / PRF_HZ
@@ -147,7 +149,10 @@ def write(  # noqa: PLR0915 - one pass through the equations
         return (places[:, 2, None] * np.exp(-2j * np.pi * frequency * delay[..., None])).sum(1)
 
     none = np.zeros(pulses)
-    write_node("uav1", {"radar": samples(echoes("uav1"), none, radar_db)}, 0.0)
+    own = {"radar": samples(echoes("uav1"), none, radar_db)}
+    if loopback:
+        own["sidelink"] = samples(np.exp(-2j * np.pi * frequency * 3e-9)[None], none, 30.0)
+    write_node("uav1", own, 0.0)
     late_s, phase = random.uniform(-40e-9, 40e-9, pulses), random.uniform(-np.pi, np.pi, pulses)
     trigger = np.exp(-2j * np.pi * np.outer(late_s, np.arange(N) * SPACING_HZ))
     direct = np.exp(-2j * np.pi * np.outer(leg(position["uav1"], position["uav2"]), frequency))
@@ -161,7 +166,12 @@ def write(  # noqa: PLR0915 - one pass through the equations
         "campaign": "own",
         "waveform": {
             "kind": "ofdm",
-            "codes": {"source": "sidelink", "constellation": constellation, "frame": {"header": f"{HEADER:x}"}},
+            "codes": {
+                "source": "sidelink",
+                "constellation": constellation,
+                "frame": {"header": f"{HEADER:x}"},
+                **({"node": "uav1"} if loopback else {}),
+            },
             "carrier_hz": CARRIER_HZ,
             "subcarriers": N,
             "subcarrier_spacing_hz": SPACING_HZ,

@@ -123,6 +123,17 @@ def test_pulses_with_a_changing_strong_reflection_are_unsure() -> None:
     assert np.array_equal(decisions.labels, weak.sent)
 
 
+def test_pulses_without_signal_are_not_detected() -> None:
+    """Captures of zeros and of noise alone change no other pulse, and are unsure."""
+    qam = constellation("16qam")
+    sidelink = Sidelink(qam, 25)
+    sidelink.received[3:5] = 0
+    sidelink.received[5] = np.random.default_rng(1).normal(size=(N, 2)) @ [1, 1j]
+    decisions = sidelink.decisions(qam)
+    assert np.flatnonzero(~decisions.sure).tolist() == [3, 4, 5]
+    assert np.array_equal(decisions.labels[6:], sidelink.sent[6:])
+
+
 def test_channel_of_a_pulse_lowers_the_error_rate_of_a_changing_reflection() -> None:
     """With a reflection of -20 dB that changes from pulse to pulse, 64-QAM is decided by the channel of each pulse."""
     qam = constellation("64qam")

@@ -10,7 +10,9 @@ from folders import edit_config, run_steps
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
+from apertura.check import problems
 from apertura.common.errors import CampaignError
+from apertura.core.echo.constellation import constellation
 from apertura.core.quality.point_targets import find_peak
 from apertura.simulation import preset, simulate
 from apertura.stages import echo, ingest
@@ -65,8 +67,8 @@ def test_bits_of_an_independent_campaign_are_read(tmp_path):
     """QPSK at 15 dB: header, counter, data and CRC of all frames agree with those computed by other code."""
     bits = own_campaign.write(tmp_path / "campaign", constellation="qpsk", pulses=40)["bits"]
     (read,) = payloads(Campaign.load(tmp_path / "campaign"))
-    assert read.intact.all()
-    assert np.array_equal(read.counter, np.arange(40))
+    assert read.columns["intact"].all()
+    assert np.array_equal(read.columns["counter"], np.arange(40))
     sent = np.packbits(bits[:, 48:-16], axis=1)
     assert np.array_equal(read.data, sent)
 
@@ -109,10 +111,28 @@ def test_payload_of_the_preset_is_that_of_its_truth(tmp_path):
     assert summary["intact"] == summary["frames"]
     assert summary["received_bit_s"] == pytest.approx((4096 - 64) * 20)
     (read,) = payloads(campaign)
-    true = np.load(root / "symbols.npy")[read.counter]
-    qam = read.constellation
+    true = np.load(root / "symbols.npy")[read.columns["counter"]]
+    qam = constellation("16qam")
     sent = np.packbits(qam.bits(qam.decide(true))[:, 48:-16], axis=1)
     assert np.array_equal(np.load(tmp_path / "out" / "f01.uav2.npy"), sent)
+
+
+@pytest.mark.slow
+def test_transmitter_is_imaged_by_its_own_recording_of_what_it_sent(tmp_path):
+    """The symbols of its loop-back compress the echoes of the transmitter to the same profiles as the true symbols."""
+    root = tmp_path / "campaign"
+    bits = own_campaign.write(root, pulses=64, loopback=True)["bits"]
+    edit_config(root, lambda config: config.update(processing={"symbol_filter": "reciprocal"}))
+    stage = formed(root, "uav1-uav1")[1].stage
+    assert stage.attrs["symbols"]["decided"]["node"] == "uav1"
+    assert stage.attrs["flags"] == {}
+    edit_config(root, lambda config: config["waveform"].update(codes="raw/codes.npy"))
+    codes = np.array([own_campaign.modulated(row, 4) for row in bits])
+    np.save(root / "raw" / "codes.npy", codes.astype(np.complex64))
+    campaign = Campaign.load(root)
+    echo.echo(campaign, "f01", "uav1-uav1")
+    known = PairEcho.opened(campaign, "f01", "uav1-uav1").stage.transfer.values
+    assert np.allclose(stage.transfer.values, known, atol=1e-5 * np.abs(known).max())
 
 
 @pytest.mark.slow
@@ -131,3 +151,32 @@ def test_framed_symbols_of_a_simulation_require_a_constellation():
     """Newman's code carries no data."""
     with pytest.raises(ValueError, match="requires a constellation"):
         replace(preset("payload").waveform, code="newman")
+
+
+@pytest.mark.slow
+def test_check_refuses_monostatic_pairs_without_a_known_part(tmp_path):
+    """The error is found before the run; with a frame there is no problem."""
+    own_campaign.write(tmp_path / "campaign", pulses=8)
+    assert problems(tmp_path / "campaign") == []
+    edit_config(tmp_path / "campaign", lambda config: config["waveform"]["codes"].pop("frame"))
+    (problem,) = problems(tmp_path / "campaign")
+    assert "ambiguous by quarter turns" in problem.found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("codes", "found"),
+    [
+        ({"frame": {"header": "1a", "counter_bits": 48}, "constellation": "64qam"}, "header of 8 bits"),
+        ({"pilots": "raw/none.npy"}, "no such file"),
+        ({"node": "uav9"}, "node 'uav9' is not part of flight f01"),
+        ({"node": "uav1"}, "node uav1 recorded no channel named 'sidelink'"),
+    ],
+)
+def test_wrong_settings_of_unknown_symbols_are_refused(tmp_path, codes, found):
+    """The error states the setting; a node without sidelink is found when the echo is formed."""
+    own_campaign.write(tmp_path / "campaign", pulses=8)
+    edit_config(tmp_path / "campaign", lambda config: config["waveform"]["codes"].update(codes))
+    with pytest.raises(CampaignError) as caught:
+        formed(tmp_path / "campaign", "uav1-uav1")
+    assert found in caught.value.found

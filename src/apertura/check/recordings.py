@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from apertura.campaign.config import CONFIG
+from apertura.campaign.config import CONFIG, is_monostatic
 from apertura.check.examination import Examination
 from apertura.check.times import (
     LAG,
@@ -23,6 +23,7 @@ from apertura.methods.causes import mistaken_time
 from apertura.stages.acquisition import check_channels, check_length, check_rates
 from apertura.stages.ingest import framing_of
 from apertura.stages.positions import inside_segments
+from apertura.stages.symbols import ambiguous_symbols
 from apertura.stages.transmitted import check_mixing
 
 _OFF = 0.2
@@ -40,6 +41,11 @@ def check_codes(examined: Examination) -> Iterator[CampaignError]:
         return
     if all(path.is_file() and path.stat().st_size for path in examined.campaign.sent_files):
         yield from examined.transmitted_problems
+    unknown = None if examined.transmitted is None else examined.transmitted.unknown
+    if unknown is not None and unknown.pilots is None and unknown.frames is None:
+        pairs = [pair for flight in examined.campaign.image_flights for pair in flight.pairs]
+        if any(map(is_monostatic, pairs)):
+            yield ambiguous_symbols()
 
 
 def check_recordings(examined: Examination) -> Iterator[CampaignError]:

@@ -389,7 +389,8 @@ def _other_echoes(
         tx, rx = (nodes[name] for name in pair.split("-"))
         air = scene_air(campaign, tx.track.position.values)
         processing = campaign.settings.processing
-        echo = pair_echo(tx, rx, sent, processing, calibration[pair], air)
+        source = campaign.symbol_source(flight, pair)
+        echo = pair_echo(tx, rx, sent, processing, calibration[pair], air, source=nodes[source] if source else None)
         return subset_geometry(nodes, pair, echo.stage, processing.window).history
 
     waveform = sent.waveform

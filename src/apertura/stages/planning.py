@@ -101,7 +101,12 @@ def budget_of(
     if background.get("removed", "none") != "none":
         effect = Effect(background["middle_loss_db"], 0.0, 0.0)
         lines.append(BudgetLine("background removal", background["removed"], effect))
-    if "filter" in (symbols := symbols_of(campaign, pair)):
+    symbols = symbols_of(campaign, pair)
+    if "decided" in symbols:
+        known = symbols["decided"]
+        stated = f"{known['method']}, SNR {known['snr_db']:.1f} dB: error of a subcarrier {known['error_db']:.1f} dB"
+        lines.append(BudgetLine("unknown symbols", stated, Effect(known["loss_db"], 0.0, 0.0)))
+    if "filter" in symbols:
         sidelobes = "none" if symbols["sidelobes_db"] is None else f"{symbols['sidelobes_db']:.1f} dB"
         stated = f"{symbols['filter']} filter: SNR loss {symbols['loss_db']:.2f} dB, data sidelobes {sidelobes}"
         lines.append(BudgetLine("data symbols", stated, NO_EFFECT))
@@ -224,12 +229,14 @@ def _air(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> BudgetLine:
 
 
 def symbols_decisions(campaign: Campaign, pair: OpenPair) -> list[Decision]:
-    """Return the decision on the filter of symbols of varying modulus; none for a constant modulus."""
-    symbols = symbols_of(campaign, pair)
-    if "filter" not in symbols:
-        return []
-    reason = f"{symbols['reason']}; SNR loss {symbols['loss_db']:.2f} dB"
-    return [Decision("symbol_filter", symbols["filter"], reason)]
+    """Return the decisions on unknown symbols and on the filter of symbols of varying modulus, if there are any."""
+    symbols, decisions = symbols_of(campaign, pair), list[Decision]()
+    if "decided" in symbols:
+        decisions.append(Decision("symbols", symbols["decided"]["method"], symbols["decided"]["reason"]))
+    if "filter" in symbols:
+        reason = f"{symbols['reason']}; SNR loss {symbols['loss_db']:.2f} dB"
+        decisions.append(Decision("symbol_filter", symbols["filter"], reason))
+    return decisions
 
 
 def air_decision(pair: OpenPair) -> Decision:

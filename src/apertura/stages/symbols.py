@@ -79,6 +79,13 @@ class PairSymbols:
             If no direct path is detected, or the phase of the symbols of a monostatic pair is ambiguous.
         """
         tx, rx = nodes
+        if "sidelink" not in source.raw.attrs["channels"]:
+            raise CampaignError(
+                f"node {source.name} recorded no channel named 'sidelink'",
+                where=source.recording,
+                expected="the direct path, from which unknown symbols are decided",
+                remedy="Set waveform.codes.node to a node with a sidelink, or name the channel in apertura:channels.",
+            )
         symbols = decided_symbols(source, sent, accuracy_db)
         if source.name == rx.name:
             rows = pulses.rx_index[paired]
@@ -88,12 +95,7 @@ class PairSymbols:
             row_of[both.tx_index] = both.rx_index
             rows = row_of[pulses.tx_index[paired]]
         if tx.name == rx.name and not symbols.unambiguous:
-            raise CampaignError(
-                "the phase of symbols decided without pilots and header is ambiguous by quarter turns",
-                where=f"{CONFIG}: waveform.codes",
-                expected="pilots or frame, for monostatic images by the symbols in a sidelink",
-                remedy="Configure waveform.codes.pilots or waveform.codes.frame, or image bistatic pairs only.",
-            )
+            raise ambiguous_symbols()
         return cls(with_symbols(sent, source, symbols), rows, symbols, source.name)
 
     def usable(self) -> NDArray[np.bool_]:
@@ -106,6 +108,16 @@ class PairSymbols:
     def report(self, usable: NDArray[np.bool_]) -> dict[str, Any]:
         """Return the report on the decisions."""
         return {"node": self.source, **self.symbols.report(usable)}
+
+
+def ambiguous_symbols() -> CampaignError:
+    """Return the error of a monostatic pair without a known part of its symbols."""
+    return CampaignError(
+        "the phase of symbols decided without pilots and header is ambiguous by quarter turns",
+        where=f"{CONFIG}: waveform.codes",
+        expected="pilots or frame, for monostatic images by the symbols in a sidelink",
+        remedy="Configure waveform.codes.pilots or waveform.codes.frame, or image bistatic pairs only.",
+    )
 
 
 def with_symbols(sent: Transmitted, source: Acquisition, symbols: SidelinkSymbols) -> Transmitted:

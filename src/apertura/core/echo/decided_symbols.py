@@ -140,6 +140,8 @@ class SidelinkSymbols:
         qam = self.decider.constellation
         decided, divided_db = qam.decided(self.snr), decibels(qam.noise_gain / self.snr)
         method = "division" if self.divides else "decisions"
+        # of division: the mean of 1/S in noise (docs/theory/echo_methods.md, "Corrections")
+        gain = 1 - np.exp(-self.snr) if self.divides else decided.gain
         limits = (
             f"SNR {decibels(self.snr):.1f} dB per subcarrier, {qam.name} requires {decibels(qam.least_snr):.1f} dB: "
             f"decisions lose {-20 * np.log10(decided.gain):.2f} dB and leave an error of {decibels(decided.error):.1f} "
@@ -152,6 +154,8 @@ class SidelinkSymbols:
             "snr_db": round(decibels(self.snr), 2),
             "evm_db": round(float(20 * np.log10(decided.evm)), 2),
             "symbol_error_rate": float(f"{float(qam.symbol_error_rate(self.snr)):.2e}"),
+            "loss_db": round(float(20 * np.log10(max(gain, 1e-10))), 3),
+            "error_db": round(divided_db if self.divides else decibels(decided.error), 2),
             "unsure": int((~usable).sum()),
         }
 

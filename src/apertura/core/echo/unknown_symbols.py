@@ -219,7 +219,7 @@ class SymbolDecider:
         flat = sidelink / shape
         path, symbols, labels, error = self._fitted(flat, self._detected(flat), shape)
         # Channel of each pulse within ±16 cells of the direct path (eq. 12), which absorbs a part of the noise
-        absorbed, rows = _basis(subcarriers).shape[1] / subcarriers, np.arange(len(sidelink))
+        absorbed, rows = _basis(subcarriers).shape[1] / subcarriers, np.flatnonzero(path.locked)
         direct = phasor(path, subcarriers) * np.maximum(path.amplitude, 1e-30)[:, None].astype(np.float32)
         for _ in range(_CHANNELS):
             if not rows.size:

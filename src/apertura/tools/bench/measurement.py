@@ -422,6 +422,13 @@ def measure_bench(campaign: Campaign, flight: str) -> Bench:
 
 
 def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, is_transmitter: bool) -> BenchNode:
+    if sent.unknown is not None:
+        raise CampaignError(
+            "symbols that are decided from the sidelink",
+            where=f"{CONFIG}: waveform.codes",
+            expected="known symbols, by which a bench test measures links one by one",
+            remedy="Transmit known symbols on the bench, and configure their file or generator.",
+        )
     recording = checked_recording(campaign, flight, name)
     raw = captures_of(recording, campaign, node=name)
     where = f"raw/{flight}/{name}"
