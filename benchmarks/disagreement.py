@@ -113,9 +113,7 @@ CAUSES = {
     "across": Cause("position of one log across its track, m", _LENGTHS_M, partial(_moved, along=(0.0, 1.0, 0.0))),
     "time": Cause("time of one log, s", _LENGTHS_M, _later),
     "path": Cause("path of one radar channel, m", _LENGTHS_M, _longer),
-    "drift": Cause(
-        "phase drift of one channel, cycles", (0.1, 0.2, 0.4, 0.7, 1, 1.5, 2, 3, 4, 6, 8, 10), _drifting
-    ),
+    "drift": Cause("phase drift of one channel, cycles", (0.1, 0.2, 0.4, 0.7, 1, 1.5, 2, 3, 4, 6, 8, 10), _drifting),
 }
 """Errors by name."""
 
