@@ -1,6 +1,7 @@
 """Interferogram of two flights over a ramp: height map, files, tags, flags and invalid configs."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from folders import complaint, contents, copy_writable, edit_config, run_steps
 
 from apertura.campaign.config import Interferometry
 from apertura.campaign.folder import Campaign
+from apertura.core.quality.budget import NodePositions
 from apertura.formats.catalog.validation import stac_problems
 from apertura.formats.export import exports_in
 from apertura.simulation import (
@@ -24,6 +26,7 @@ from apertura.simulation import (
     WaveformSpecification,
     simulate,
 )
+from apertura.stages import interferogram as step
 from apertura.stages.interferogram import interferogram
 from apertura.views.summary import print_summary
 from apertura.views.verify.chain import print_verified
@@ -181,6 +184,32 @@ def test_summary_lists_heights_and_flags_of_an_interferogram(small, tmp_path, ca
     message = capsys.readouterr().out
     assert "height_relative" in message
     assert "interferometry two_tracks: no point of known height is visible" in message
+
+
+def with_positions(small, folder, monkeypatch, positions):
+    """Recompute the interferogram with other position accuracies of its node; return height deviation and report."""
+    root, opened = copy_writable(small, folder), step.open_pair
+    with monkeypatch.context() as patched:
+        patched.setattr(
+            step, "open_pair", lambda *where, **echo: replace(opened(*where, **echo), positions=(positions,))
+        )
+        interferogram(Campaign.load(root), NAME)
+    report = json.loads((root / "results/interferometry" / NAME / "interferogram.json").read_text())
+    return np.nanmedian(read(root, "height_std")[0]), report
+
+
+@pytest.mark.slow
+def test_drift_widens_the_deviation_and_unknown_track_errors_are_named(small, tmp_path, monkeypatch):
+    logged, report = with_positions(small, tmp_path / "logged", monkeypatch, NodePositions((0.01,) * 3, 2.0))
+    assert report["track_std_m"] == {"f01/uav1": 0.01, "f02/uav1": 0.01}
+    drifting = NodePositions((0.01,) * 3, 2.0, drift_m=0.03)
+    drifted, report = with_positions(small, tmp_path / "drifting", monkeypatch, drifting)
+    assert report["track_std_m"]["f01/uav1"] == pytest.approx(np.hypot(0.01, 0.03), abs=1e-4)
+    assert drifted > 1.5 * logged
+    unknown, report = with_positions(small, tmp_path / "unknown", monkeypatch, NodePositions(None))
+    assert report["track_std_m"] == {"f01/uav1": None, "f02/uav1": None}
+    assert "unknown track errors of f01/uav1 and f02/uav1 are not included" in report["says"]
+    assert unknown < logged
 
 
 @pytest.mark.slow
